@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import importlib.util
 from concurrent.futures import ThreadPoolExecutor
 from typing import Any
 
@@ -31,6 +32,7 @@ SHAPED = {name: sensor for name, sensor in SHAPES.items() if sensor.frames}
 SENSORS = {**lidarspec.sensors(), **SHAPED}
 #: sensors that go through what is proved on the shapes: one of each kind of link.
 TRIED = ("ldrobot-stl27l", "velodyne-vlp16")
+BACKENDS = ("numpy", "jit") if importlib.util.find_spec("numba") else ("numpy",)
 
 
 def plan(packets: Packets) -> Any:
@@ -154,7 +156,7 @@ def test_threads_that_decode_with_one_sensor_do_not_meet() -> None:
         assert all(pool.map(same, [0, 1]))
 
 
-@pytest.mark.parametrize("backend", ["numpy", "jit"])
+@pytest.mark.parametrize("backend", BACKENDS)
 def test_sensors_that_share_a_points_function_keep_their_own_scales(backend: str) -> None:
     """Tables are kept for a points function, and one of these sensors measures in other units than the first."""
     for unit in (0.001, 0.002):
@@ -166,7 +168,7 @@ def test_sensors_that_share_a_points_function_keep_their_own_scales(backend: str
         assert_same_points(cloud, plain)
 
 
-@pytest.mark.parametrize("backend", ["numpy"])
+@pytest.mark.parametrize("backend", BACKENDS)
 def test_beams_that_start_beside_the_sensor_are_exact_near_and_far(backend: str) -> None:
     random = np.random.default_rng(5)
     azimuths, elevations, starts = (

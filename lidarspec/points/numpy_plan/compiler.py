@@ -22,7 +22,7 @@ from lidarspec.points.numpy_plan.blocks import Blocks
 from lidarspec.points.numpy_plan.program import Program, Read, Run
 from lidarspec.points.numpy_plan.registers import TYPES
 from lidarspec.points.plan import Plan
-from lidarspec.points.windows import CHEAP, Window, every_value, run_of, shift_of, window, word_of
+from lidarspec.points.windows import CHEAP, Window, beam_of, every_value, run_of, shift_of, window, word_of
 from lidarspec.spec.tree import FieldInfo
 from lidarspec.spec.vocabulary import row_numbers
 from lidarspec.wire.arrays import deep
@@ -126,22 +126,21 @@ class Compiler:
 
         Points up to `FINE` metres away are float32 throughout. Rows that reach farther are computed again in float64.
         """
-        product, start = node.args
-        distance, direction = product.args if product.kind == "call" and product.function is np.multiply else (product, product)
-        info = self._measured(distance) if direction.kind == start.kind == "rows" else None
-        parts = [self._gathered(rows, "single") for rows in (direction, start)] if info is not None else [None]
-        if info is None or None in parts:
+        beam = beam_of(node, self._layout.leaves)
+        parts = [self._gathered(rows, "single") for rows in (beam.direction, beam.start)] if beam is not None else [None]
+        if beam is None or None in parts:
             return None
+        distance, direction, start, step = beam
         measured, toward, begin = Read(self._single(distance)), *(Read(part) for part in parts if part is not None)
-        inner, scale, place = direction.args[1].shape[1], info.scale, ("far", distance)
+        inner, place = direction.args[1].shape[1], ("far", distance)
 
         def far(run: Run) -> tuple[int, NDArray[np.intp], NDArray[np.float64]]:
             """Where the chunk begins, which of its rows reach too far, and their distances as they were sent."""
             if run.prepared.get(place, (-1,))[0] != run.start:
                 rows = measured(run).reshape(-1, inner)
                 which = np.flatnonzero(np.fmax.reduce(rows, axis=1) > FINE) if np.fmax.reduce(rows, axis=None) > FINE else _NOWHERE
-                distances = np.multiply(rows[which], 1 / scale, dtype=np.float64)
-                np.multiply(np.rint(distances, out=distances), scale, out=distances)
+                distances = np.multiply(rows[which], 1 / step, dtype=np.float64)
+                np.multiply(np.rint(distances, out=distances), step, out=distances)
                 run.prepared[place] = run.start, which, distances
             found: tuple[int, NDArray[np.intp], NDArray[np.float64]] = run.prepared[place]
             return found
@@ -163,13 +162,6 @@ class Compiler:
                 out.reshape(-1, inner)[which] = exact
 
         return self.program.step("along beams, float64 where they are long", "single", run, measured, toward, begin)
-
-    def _measured(self, distance: Node) -> FieldInfo | None:
-        """The field that distances are, or nan; None where they are another expression, or float32 does not hold its numbers."""
-        while is_nan_where(distance) or distance.function is returned_range:
-            distance = distance.args[-1]
-        leaf = self._layout.leaves.get(distance.path) if distance.kind == "field" else None
-        return leaf.info if leaf is not None and leaf.info.kind == "int" and leaf.info.bits <= 21 and not leaf.info.offset else None
 
     def _double(self, value: Any) -> int:
         """An expression in float64, or a condition."""
