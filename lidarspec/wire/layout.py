@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from functools import cached_property, lru_cache
+from functools import cached_property, lru_cache, reduce
 from typing import Any, Literal, Protocol
 
 import numpy as np
@@ -303,7 +303,7 @@ class Seal:
     def intact(self, rows: Bytes2D, sums: Sums | None = None) -> NDArray[np.bool_]:
         """Which frames carry the right value, or one that means "not filled", (n,); `sums` computes it, by default the algorithm."""
         stored = self.stored(rows)
-        filled = ~np.isin(stored, np.array(self.absent, np.uint64)) if self.absent else None
+        filled = reduce(np.logical_and, (stored != np.uint64(value) for value in self.absent)) if self.absent else None
         if filled is None or filled.all():
             return np.asarray(stored == self.computed(rows, sums))
         right = np.ones(len(rows), np.bool_)
