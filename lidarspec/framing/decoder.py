@@ -68,7 +68,7 @@ class Decoder:
         rule = link.assembled if isinstance(link, Udp) and not stream else None
         self._assembly = None if rule is None else Assembly(rule, longest, self.stats)
         self._least = max(LEAST, 2 * self._framing.reach)
-        self._size = self._least
+        self._size = max(PIECE, self._least)
 
     def __repr__(self) -> str:
         return f"Decoder({self.sensor.id}, {'stream' if self.stream else 'datagrams'}, {self.backend}: {self.stats})"
