@@ -24,7 +24,7 @@ Bytes1D = NDArray[np.uint8]
 Bytes2D = NDArray[np.uint8]
 Numbers = NDArray[np.intp]
 #: the bytes of a text, None for each that may be any.
-Text = Sequence[int | None]
+Characters = Sequence[int | None]
 
 #: what `Reading.sizes` says of candidates without an end so far, and of those that are no frames.
 SHORT, NONE = 0, -1
@@ -100,7 +100,7 @@ class WireForm(Protocol):
     @property
     def start(self) -> bytes: ...
 
-    def begins(self, texts: Sequence[Text]) -> Text:
+    def begins(self, texts: Sequence[Characters]) -> Characters:
         """The first bytes on the wire of frames that begin with these texts, as far as the place of each is always the same."""
 
     def read(self, buffer: Bytes1D, starts: Numbers, limit: int) -> Reading:
@@ -185,7 +185,7 @@ class Tokens:
         if self.base not in (10, 16):
             raise SpecError(f"digits are decimal or hexadecimal, not of base {self.base}", path="wire")
 
-    def begins(self, texts: Sequence[Text]) -> Text:
+    def begins(self, texts: Sequence[Characters]) -> Characters:
         return [*self.start, *[byte for text in texts if len(text) for byte in (*text, self.sep[0])][:-1]]
 
     def read(self, buffer: Bytes1D, starts: Numbers, limit: int) -> Reading:
@@ -516,7 +516,7 @@ class Lines:
     def start(self) -> bytes:
         return b""
 
-    def begins(self, texts: Sequence[Text]) -> Text:
+    def begins(self, texts: Sequence[Characters]) -> Characters:
         return list(itertools.chain(*texts))[: self.head[0] if self.head else self.width]
 
     def read(self, buffer: Bytes1D, starts: Numbers, limit: int) -> Reading:
@@ -617,7 +617,7 @@ class Escaped:
     def start(self) -> bytes:
         return bytes([self.flag])
 
-    def begins(self, texts: Sequence[Text]) -> Text:
+    def begins(self, texts: Sequence[Characters]) -> Characters:
         return self.start  # any byte behind it may be escaped
 
     def read(self, buffer: Bytes1D, starts: Numbers, limit: int) -> Reading:
