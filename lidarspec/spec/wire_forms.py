@@ -23,6 +23,8 @@ from lidarspec.errors import SpecError
 Bytes1D = NDArray[np.uint8]
 Bytes2D = NDArray[np.uint8]
 Numbers = NDArray[np.intp]
+#: the bytes of a text, None for each that may be any.
+Characters = Sequence[int | None]
 
 #: what `Reading.sizes` says of candidates without an end so far, and of those that are no frames.
 SHORT, NONE = 0, -1
@@ -98,8 +100,8 @@ class WireForm(Protocol):
     @property
     def start(self) -> bytes: ...
 
-    def begins(self, texts: Sequence[bytes]) -> bytes:
-        """The first bytes on the wire of frames that begin with these constant texts, as far as these are always the same."""
+    def begins(self, texts: Sequence[Characters]) -> Characters:
+        """The first bytes on the wire of frames that begin with these texts, as far as the place of each is always the same."""
 
     def read(self, buffer: Bytes1D, starts: Numbers, limit: int) -> Reading:
         """Rows out of bytes: the candidates that begin at `starts`, (n,) ascending, of at most `limit` bytes."""
@@ -183,8 +185,8 @@ class Tokens:
         if self.base not in (10, 16):
             raise SpecError(f"digits are decimal or hexadecimal, not of base {self.base}", path="wire")
 
-    def begins(self, texts: Sequence[bytes]) -> bytes:
-        return self.start + self.sep.join(text for text in texts if text)
+    def begins(self, texts: Sequence[Characters]) -> Characters:
+        return [*self.start, *[byte for text in texts if len(text) for byte in (*text, self.sep[0])][:-1]]
 
     def read(self, buffer: Bytes1D, starts: Numbers, limit: int) -> Reading:
         return _TokenReading(self, buffer, starts, limit)
@@ -599,8 +601,11 @@ class Lines:
     def start(self) -> bytes:
         return b""
 
-    def begins(self, texts: Sequence[bytes]) -> bytes:
-        return b"".join(texts)[: self.head[0] if self.head else self.width]
+    def begins(self, texts: Sequence[Characters]) -> Characters:
+        first = self.head[0] if self.head else self.width
+        known = list(itertools.chain(*texts))[:first]
+        end = first + (self.check is not None and not self.bare)
+        return [*known, *[None] * (end - len(known)), 0x0A] if self.head else known
 
     def read(self, buffer: Bytes1D, starts: Numbers, limit: int) -> Reading:
         stops = np.flatnonzero(buffer == 0x0A)
@@ -716,7 +721,7 @@ class Escaped:
     def start(self) -> bytes:
         return bytes([self.flag])
 
-    def begins(self, texts: Sequence[bytes]) -> bytes:
+    def begins(self, texts: Sequence[Characters]) -> Characters:
         return self.start  # any byte behind it may be escaped
 
     def read(self, buffer: Bytes1D, starts: Numbers, limit: int) -> Reading:

@@ -86,25 +86,18 @@ class Recoder:
         self.tree: HeaderTree = tree
 
     @functools.cached_property
-    def begins(self) -> bytes:
-        """The bytes on the wire that all frames begin with."""
-        texts, (leaves, constants) = list[bytes](), self.tree.first()
-        for _, offset, slot in _elements(leaves, 0, max(constants, default=-1) + 1):
-            known = [constants.get(spot, (0, 0)) for spot in range(offset, offset + slot.size)]
-            if slot.kind != "text" or any(mask != 0xFF for mask, _ in known):
-                break
-            texts.append(bytes(value for _, value in known))
-        return self.form.begins(texts)
+    def prefix(self) -> dict[int, int]:
+        """The bytes on the wire that all frames have at the same places: those of the texts before the first number."""
+        leaves, constants = self.tree.first()
+        slots = itertools.takewhile(lambda slot: slot[2].kind == "text", _elements(leaves, 0, max(constants, default=-1) + 1))
+        known = {spot: value for spot, (mask, value) in constants.items() if mask == 0xFF}
+        begins = self.form.begins([[known.get(spot) for spot in range(offset, offset + slot.size)] for _, offset, slot in slots])
+        return {spot: byte for spot, byte in enumerate(begins) if byte is not None}
 
-    @property
-    def constants(self) -> dict[int, int]:
-        """The bytes on the wire that all frames have in the same places: those they begin with, and the end of a first line."""
-        ends = (
-            {self.form.head[0] + (self.form.check is not None and not self.form.bare): 0x0A}
-            if isinstance(self.form, Lines) and self.form.head
-            else {}
-        )
-        return dict(enumerate(self.begins)) | ends
+    @functools.cached_property
+    def begins(self) -> bytes:
+        """Those of them that all frames begin with."""
+        return bytes(self.prefix[spot] for spot in itertools.takewhile(self.prefix.__contains__, itertools.count()))
 
     def reading(self, buffer: NDArray[np.uint8], starts: Indices) -> Reading:
         """Candidates at these places, ascending."""

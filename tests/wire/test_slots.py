@@ -6,7 +6,7 @@ import dataclasses
 
 import numpy as np
 import pytest
-from construct import Array, Const, Int8ub, Int16sb, Int16ub, Int24ub, Int32ub, Struct, this
+from construct import Array, Bytes, Const, Int8ub, Int16sb, Int16ub, Int24ub, Int32ub, Struct, this
 
 from lidarspec import Sensor, SpecError, UsageError, WireError
 from lidarspec.explaining.explanation import explain
@@ -120,6 +120,19 @@ def test_escapes_are_written_where_they_have_to_be_and_read_wherever_they_are() 
     assert made.parse(other) == made.parse(data)
     assert made.build("data", made.parse(other)) == other
     assert made.decode(b"\x7e\x01\x7d\x7d\x5e\x7e" + data).stats.frames == {"data": 1}
+
+
+def test_a_text_behind_another_of_any_content_tells_what_is_a_candidate() -> None:
+    """What only begins with the same mark is not looked at any further, and so not counted as a frame of a wrong length."""
+    made = sensor(Struct("kind" / Bytes(3), "none" / Bytes(0), "name" / Const(b"scan"), "value" / Int8ub), Tokens(start=b"\x02"))
+    frames = b"".join(b"\x02%s scan 7\x03" % kind for kind in (b"abc", b"a c", b"   "))
+    decoder = made.decoder()
+    stream = b"\x02 \x02\x02abc rest 1 2\x03" + frames + b"\x02abc sca"
+    found = [frame for byte in stream for frame in decoder.feed(bytes([byte]))] + decoder.finish()
+    assert [made.parse(frame.data).value for frame in found] == [7, 7, 7]
+    assert decoder.stats.bad_length == 1  # of the last one, which has no end
+    with pytest.raises(WireError, match="name at byte 5: constant"):
+        made.parse(b"\x02abc sCan 7\x03")
 
 
 def test_a_fault_has_its_place_on_the_wire() -> None:
