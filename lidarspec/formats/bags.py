@@ -22,8 +22,6 @@ from lidarspec.points.cloud import PointCloud
 from lidarspec.scans.scans import Scan
 from lidarspec.transports.protocol import Format
 
-#: the frame that the points are in, by its usual name: x forward, y left, z up (REP-103).
-FRAME = "laser"
 #: the kinds of messages, and where they are published.
 TOPICS = {"sensor_msgs/msg/PointCloud2": "/points", "sensor_msgs/msg/LaserScan": "/scan"}
 #: the numbers by which PointField names types; anything else is written as float64.
@@ -67,17 +65,17 @@ class Messages:
         """
         for number, scan in enumerate(scans):
             self.units |= {name: unit for name, unit in scan.points.units.items() if unit}
-            header = self._header(number, scan.stamp_ns)
+            header = self._header(number, scan.stamp_ns, scan.frame_id)
             for message in [self._cloud(scan.points, header, every_point=every_point), *self._laserscan(scan, header)]:
                 kind = message.__msgtype__
                 yield Message(kind, scan.stamp_ns, self._serialized(message, kind))
 
-    def _header(self, number: int, stamp_ns: int) -> Any:
+    def _header(self, number: int, stamp_ns: int, frame_id: str) -> Any:
         if not 0 <= stamp_ns < _SECOND << 31:
             raise UsageError(f"a scan at {stamp_ns} ns: stamps of ROS hold the years 1970 to 2038")
         kind = self.types.types["std_msgs/msg/Header"]
         counted = {"seq": number} if "seq" in kind.__dataclass_fields__ else {}
-        return kind(**counted, stamp=self.types.types["builtin_interfaces/msg/Time"](*divmod(stamp_ns, _SECOND)), frame_id=FRAME)
+        return kind(**counted, stamp=self.types.types["builtin_interfaces/msg/Time"](*divmod(stamp_ns, _SECOND)), frame_id=frame_id)
 
     def _cloud(self, cloud: PointCloud, header: Any, *, every_point: bool) -> Any:
         """Organised points have a row for each row of the sensor, several returns side by side; of others, and valid ones, there is one."""
