@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import io
 import itertools
+import math
 import os
 import re
 import sys
@@ -25,6 +26,7 @@ from lidarspec.discovery.listen import LOOKED_AT, Heard, beginning, leading
 from lidarspec.errors import CommandError, LidarSpecError, SourceError, UsageError, WireError, suggest, system_errors
 from lidarspec.plugins import sensors
 from lidarspec.scans.scans import Scan
+from lidarspec.scans.selection import Selection
 from lidarspec.spec.sensor import Sensor
 from lidarspec.transports.files import FileTransport, between, hex_chunks, unhexed
 from lidarspec.transports.open_url import is_port, live_address, transport
@@ -294,14 +296,18 @@ class Patience:
             raise nothing_came(self._device, self._source, waited)
 
 
-def scans_of(device: Device, source: str) -> Iterator[Scan]:
-    """The scans of a device, which has to send its first data frame in time.
+def scans_of(device: Device, source: str, select: Selection | None = None, *, until: float = math.inf) -> Iterator[Scan]:
+    """The scans of a device that are wanted, which has to send its first data frame in time; `until`: a time of `time.monotonic`.
 
     Raises:
         CommandError, WireError: where the device has sent nothing, or nothing of the sensor's, for too long.
+        UsageError: where there are scans, and none of them is wanted.
     """
     patience = Patience(device, source)
-    for scan in device.scans(wait=LOOK):
+    for scan in device.scans(wait=LOOK, select=select):
         if scan is not None:
             yield scan
+            del scan
         patience.check()
+        if time.monotonic() >= until:
+            return

@@ -18,6 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lidarspec.errors import UsageError, library
+from lidarspec.formats.writing import picture
 from lidarspec.points.cloud import PointCloud
 from lidarspec.scans.scans import Scan
 from lidarspec.transports.protocol import Format
@@ -80,11 +81,11 @@ class Messages:
     def _cloud(self, cloud: PointCloud, header: Any, *, every_point: bool) -> Any:
         """Organised points have a row for each row of the sensor, several returns side by side; of others, and valid ones, there is one."""
         points = _records(cloud)
-        lacking = {name for name in ("intensity", "ring") if getattr(cloud, name) is None}
+        lacking = {name for name in ("intensity", "ring", "time") if not cloud.shows(name) or getattr(cloud, name) is None}
         if not every_point:
             points = np.compress(cloud.valid, points)  # ten times as quick as an index
         elif cloud.shape and len(cloud):
-            points = points.reshape(*cloud.shape, -1).swapaxes(0, 1).reshape(cloud.shape[1], -1)
+            points = picture(points, cloud)
         height, width = np.atleast_2d(points).shape
         field = self.types.types["sensor_msgs/msg/PointField"]
         return self.types.types["sensor_msgs/msg/PointCloud2"](
@@ -179,7 +180,9 @@ def _record(log: Any, messages: Messages, scans: Iterable[Scan], *, every_point:
             log.set_custom_data(f"unit of {name}", unit)
 
 
-MCAP = Format(".mcap", "an MCAP file with ROS 2 messages", write_mcap)
-BAG = Format(".bag", "a ROS 1 bag", write_ros1)
-ROSBAG2 = Format(".rosbag2", "a ROS 2 bag: a folder with an MCAP file", partial(write_ros2, storage="mcap"))
-DB3 = Format(".db3", "a ROS 2 bag: an SQLite file", partial(write_ros2, storage="sqlite3"))
+#: what messages have a place for.
+_HOLDS = ("scans", "organized", "beams", "frame-id")
+MCAP = Format(".mcap", "an MCAP file with ROS 2 messages", write_mcap, _HOLDS)
+BAG = Format(".bag", "a ROS 1 bag", write_ros1, _HOLDS)
+ROSBAG2 = Format(".rosbag2", "a ROS 2 bag: a folder with an MCAP file", partial(write_ros2, storage="mcap"), _HOLDS)
+DB3 = Format(".db3", "a ROS 2 bag: an SQLite file", partial(write_ros2, storage="sqlite3"), _HOLDS)
