@@ -26,7 +26,7 @@ from lidarspec.discovery.listen import LOOKED_AT, Heard, beginning, leading
 from lidarspec.errors import CommandError, LidarSpecError, SourceError, UsageError, WireError, suggest, system_errors
 from lidarspec.plugins import sensors
 from lidarspec.scans.scans import Scan
-from lidarspec.scans.selection import Selection
+from lidarspec.scans.selection import Selection, Times, received
 from lidarspec.spec.sensor import Sensor
 from lidarspec.transports.files import FileTransport, between, hex_chunks, unhexed
 from lidarspec.transports.open_url import is_port, live_address, transport
@@ -44,8 +44,11 @@ LOOK = 0.1
 
 
 @contextlib.contextmanager
-def opened(words: Sequence[str]) -> Iterator[tuple[Heard, Iterator[Chunk]]]:
+def opened(words: Sequence[str], times: Times = (None, None)) -> Iterator[tuple[Heard, Iterator[Chunk]]]:
     """The beginning of the input that the words of a command line stand for, and all of it, which is read as it is asked for.
+
+    Args:
+        times: of a file only what arrived then.
 
     Raises:
         UsageError: for text that is neither hexadecimal nor a file.
@@ -53,7 +56,7 @@ def opened(words: Sequence[str]) -> Iterator[tuple[Heard, Iterator[Chunk]]]:
     """
     text = " ".join(words)
     if text == "-" or (len(words) == 1 and os.path.exists(text) and not is_port(text)):
-        reading = _file(text)
+        reading = _file(text, times)
     else:
         try:
             if not (data := unhexed(text)):
@@ -62,15 +65,15 @@ def opened(words: Sequence[str]) -> Iterator[tuple[Heard, Iterator[Chunk]]]:
         except ValueError as error:
             if (device := named(text)) is None:
                 raise _no_bytes(words, error) from None
-            reading = opened([device.source])
+            reading = opened([device.source], times)
     with reading as given:
         yield given
 
 
 @contextlib.contextmanager
-def _file(path: str) -> Iterator[tuple[Heard, Iterator[Chunk]]]:
+def _file(path: str, times: Times) -> Iterator[tuple[Heard, Iterator[Chunk]]]:
     with contextlib.closing(transport(path)) as file:
-        chunks = _standard_input(file) if path == "-" and type(file) is FileTransport else file.chunks()
+        chunks = _standard_input(file) if path == "-" and type(file) is FileTransport else received(file, times, path)
         with _beginning(path, chunks, datagrams=file.datagrams, warnings=file.warnings) as given:
             yield given
         for warning in file.warnings if given[0].chunks else ():

@@ -361,7 +361,7 @@ class Replay:
             opened, self._source = self._source or transport(self._file), None
             with contextlib.closing(opened) as source:
                 try:
-                    for chunk, late in replayed(self._checked(self._received(source)), self._outlet, speed=self._speed):
+                    for chunk, late in replayed(self._checked(received(source, self._times, self._file)), self._outlet, speed=self._speed):
                         self._count(chunk, late)
                         yield ""
                 except Disconnected as gone:
@@ -372,9 +372,6 @@ class Replay:
                 raise WireError(f"{self._file} holds nothing that was received")
             if not self._loop:
                 return
-
-    def _received(self, source: Transport) -> Iterator[Chunk]:
-        return source.chunks() if self._times == (None, None) else received(source, self._times, self._file)
 
     def _checked(self, chunks: Iterable[Chunk]) -> Iterator[Chunk]:
         """What was received; without times there is no speed to keep."""

@@ -76,6 +76,9 @@ def test_every_verb_takes_the_same_slice(drive: Path, tmp_path: Path) -> None:
     for selecting in (["--slice", "1s:1.5s", "--range", ":2m"], ["--scans", "12:13", "--range", ":2m"]):
         assert re.search(r"\.\.1\.9\d m, complete\); colours: range 0 to 2 m", ran("view", drive, "--once", *selecting).stdout)
         ran("plot", drive, "-o", tmp_path / "out.svg", *selecting)
+    frames = printed("parse", drive, "--slice", "1s:1.1s")["frames"]
+    assert [frame["frame"] for frame in frames].count("data") in range(70, 80)
+    assert len(printed("explain", drive, "--slice", "1s:1.1s")["frames"]) == len(frames)
     ran("replay", drive, "--to", tmp_path / "part.lsr", "--slice", "500ms:1s")
     with Recording(drive) as whole, Recording(tmp_path / "part.lsr") as part:
         records = list(whole)
