@@ -245,10 +245,10 @@ def shown(found: Contents) -> Sequence[tuple[str, str]]:
             lines.append(("from", f"{endpoint(flow.sender)}{to}: {flow.packets} packets, {flow.bytes} bytes"))
     if further := found.flows[FLOWS:]:
         lines.append(("from", f"{len(further)} others: {sum(flow.packets for flow in further)} packets"))
-    for content in found.contents:
-        lines.extend(_told(content))
     if not found.whole:
         lines.append(("part", "the file is long: what is counted is of its beginning" + ", its end is not known" * (found.last_ns is None)))
+    for content in found.contents:
+        lines.extend(_told(content))
     return lines
 
 
