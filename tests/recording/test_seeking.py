@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import contextlib
 from pathlib import Path
 
 import pytest
 
 from lidarspec.recording.format import LARGEST, MARK, RECEIVED, Recording, packed
 from lidarspec.recording.recorders import Recorder
+from lidarspec.transports.files import RecordingTransport
 from lidarspec.transports.protocol import Chunk
 
 START, STEP, NUMBER = 10**18, 10**7, 4000
@@ -37,6 +39,15 @@ def test_what_follows_a_time_is_all_there_and_what_lies_before_is_not_read(recor
     assert left[-1].at == START + (NUMBER - 1) * STEP
     assert [record.at for record in left] == [left[0].at + step * STEP for step in range(len(left))]
     assert len(left) * 340 < (NUMBER - min(number, NUMBER)) * 340 + 4 * LARGEST + (1 << 17)
+
+
+def test_what_follows_is_no_continuation_of_what_was_read_before(recording: Path) -> None:
+    with contextlib.closing(RecordingTransport(recording)) as source:
+        chunks = source.chunks()
+        assert not next(chunks).gap
+        assert source.skip(START + 3000 * STEP)
+        assert [chunk.gap for chunk in chunks].index(True) == 0
+        assert not source.skip(START)
 
 
 def test_a_damaged_place_in_the_middle_is_no_hindrance(recording: Path, tmp_path: Path) -> None:
