@@ -63,6 +63,8 @@ class Selection:
         start, stop = self.scans
         if min(start, stop or 0) < 0:
             raise UsageError("a scan is counted from the first one: from the last, all of a source would have to be read first")
+        times = (moment.replace(tzinfo=moment.tzinfo or UTC) if isinstance(moment, datetime) else moment for moment in self.times)
+        object.__setattr__(self, "times", tuple(times))
         for low, high in (self.scans, self.times, self.ranges):
             if low is not None and high is not None and (isinstance(low, datetime) != isinstance(high, datetime) or low >= high):  # type: ignore[operator]
                 raise UsageError(f"from {low} up to {high} there is nothing")
@@ -112,8 +114,7 @@ class Slice:
     def ns(self, moment: Moment | None) -> int | None:
         """A moment as a time of the stream, of which one has come."""
         if isinstance(moment, datetime):
-            dated = moment.replace(tzinfo=moment.tzinfo or UTC)
-            return round(dated.timestamp() * 1e6) * 1000
+            return round(moment.timestamp() * 1e6) * 1000
         return None if moment is None or self.first is None else self.first + round(moment * 1e9)
 
 

@@ -93,6 +93,7 @@ def test_every_verb_takes_the_same_slice(drive: Path, tmp_path: Path) -> None:
     [
         ("--slice 100s:", "has scans from 0 s to 2.000 s (20"),
         ("--slice 2016-01-01T00:00:00Z:2016-01-02T00:00:00Z", "and nothing of that is asked for"),
+        ("--slice 2016-01-01:2016-01-02T00:00:00+01:00", "and nothing of that is asked for"),
         ("--scans 50:", "has 21 scans, from 0 to 20, and none of them is asked for"),
         ("--scans -3:", "a scan is counted from the first one"),
         ("--scans 5", "'5' is no slice of whole numbers, such as 5:10, 5: or :10"),
