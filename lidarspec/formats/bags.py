@@ -21,12 +21,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lidarspec.errors import UsageError, library
+from lidarspec.formats.writing import picture
 from lidarspec.points.cloud import PointCloud
 from lidarspec.scans.scans import Scan
 from lidarspec.transports.protocol import Chunk, Format
 
-#: the frame that the points are in, by its usual name: x forward, y left, z up (REP-103).
-FRAME = "laser"
 #: a packet as it was received, which `transports.bags` reads again: ROS has no message for it.
 PACKET, LAYOUT = "lidarspec_msgs/msg/LidarPacket", "builtin_interfaces/Time stamp\nuint8[] data"
 #: the kinds of messages, and where they are published.
@@ -83,15 +82,15 @@ class Messages:
     def _of_scans(self, scans: Iterable[Scan], *, every_point: bool) -> Iterator[Message]:
         for number, scan in enumerate(scans):
             self.units |= {name: unit for name, unit in scan.points.units.items() if unit}
-            header = self._header(number, scan.stamp_ns)
+            header = self._header(number, scan.stamp_ns, scan.frame_id)
             for message in [self._cloud(scan.points, header, every_point=every_point), *self._laserscan(scan, header)]:
                 kind = message.__msgtype__
                 yield Message(kind, scan.stamp_ns, self._serialized(message, kind))
 
-    def _header(self, number: int, stamp_ns: int) -> Any:
+    def _header(self, number: int, stamp_ns: int, frame_id: str) -> Any:
         kind = self.types.types["std_msgs/msg/Header"]
         counted = {"seq": number} if "seq" in kind.__dataclass_fields__ else {}
-        return kind(**counted, stamp=self._time(stamp_ns), frame_id=FRAME)
+        return kind(**counted, stamp=self._time(stamp_ns), frame_id=frame_id)
 
     def _time(self, at: int) -> Any:
         if not 0 <= at < _SECOND << 31:
@@ -101,11 +100,11 @@ class Messages:
     def _cloud(self, cloud: PointCloud, header: Any, *, every_point: bool) -> Any:
         """Organised points have a row for each row of the sensor, several returns side by side; of others, and valid ones, there is one."""
         points = _records(cloud)
-        lacking = {name for name in ("intensity", "ring") if getattr(cloud, name) is None}
+        lacking = {name for name in ("intensity", "ring", "time") if not cloud.shows(name) or getattr(cloud, name) is None}
         if not every_point:
             points = np.compress(cloud.valid, points)  # ten times as quick as an index
         elif cloud.shape and len(cloud):
-            points = points.reshape(*cloud.shape, -1).swapaxes(0, 1).reshape(cloud.shape[1], -1)
+            points = picture(points, cloud)
         height, width = np.atleast_2d(points).shape
         field = self.types.types["sensor_msgs/msg/PointField"]
         return self.types.types["sensor_msgs/msg/PointCloud2"](
@@ -202,7 +201,9 @@ def _record(log: Any, messages: Messages, every: Iterable[Message]) -> None:
             log.set_custom_data(f"unit of {name}", unit)
 
 
-MCAP = Format(".mcap", "an MCAP file with ROS 2 messages", write_mcap)
-BAG = Format(".bag", "a ROS 1 bag", write_ros1)
-ROSBAG2 = Format(".rosbag2", "a ROS 2 bag: a folder with an MCAP file", partial(write_ros2, storage="mcap"))
-DB3 = Format(".db3", "a ROS 2 bag: an SQLite file", partial(write_ros2, storage="sqlite3"))
+#: what messages have a place for.
+_HOLDS = ("scans", "organized", "beams", "frame-id", "packets")
+MCAP = Format(".mcap", "an MCAP file with ROS 2 messages", write_mcap, _HOLDS)
+BAG = Format(".bag", "a ROS 1 bag", write_ros1, _HOLDS)
+ROSBAG2 = Format(".rosbag2", "a ROS 2 bag: a folder with an MCAP file", partial(write_ros2, storage="mcap"), _HOLDS)
+DB3 = Format(".db3", "a ROS 2 bag: an SQLite file", partial(write_ros2, storage="sqlite3"), _HOLDS)

@@ -53,7 +53,7 @@ class RecordingTransport(Transport):
         self.header: Header = self._recording.header
         self.datagrams, self._origin = self.header.datagrams, None if sender is None else origin(sender)
         self.warnings: list[str] = []
-        self._no_events, self._was_set = 0, False
+        self._no_events, self._was_set, self._has_skipped = 0, False, False
 
     def known_sensor(self) -> Sensor:
         """The installed sensor that the recording names, with the options of then.
@@ -73,7 +73,8 @@ class RecordingTransport(Transport):
         """What was received, in order, with the arrival times of then."""
         interrupted, damaged = False, 0
         for record in self._recording:
-            interrupted, damaged = interrupted or self._recording.damaged > damaged, self._recording.damaged
+            interrupted = interrupted or self._has_skipped or self._recording.damaged > damaged
+            damaged, self._has_skipped = self._recording.damaged, False
             if record.direction == "event":
                 interrupted = self._interrupts(record) or interrupted
             elif record.direction == "in" and self._wanted(record):
@@ -84,6 +85,10 @@ class RecordingTransport(Transport):
             self.unread = 0 if self._recording.is_cut else self._recording.leftover
         if self._no_events:
             self.warnings.append(f"{self._recording.path}: {self._no_events} events were passed over, which have no name")
+
+    def skip(self, at: int) -> bool:
+        self._has_skipped = self._recording.seek(at)
+        return self._has_skipped
 
     def write(self, data: bytes) -> None:
         raise SourceError(f"{self._recording.path} is a recording: nothing can be sent to it")

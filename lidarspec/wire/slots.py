@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from lidarspec.errors import SpecError
 from lidarspec.spec.description import Frame
-from lidarspec.spec.wire_forms import NONE, Lines, Reading, Slot, Unescaped, WireForm
+from lidarspec.spec.wire_forms import NONE, Reading, Slot, Unescaped, WireForm
 from lidarspec.wire.compilability import NotCompilable
 from lidarspec.wire.layout import Bytes2D, Layout, Leaf, Refused
 from lidarspec.wire.layout_tree import HeaderNode, HeaderTree, frame_layouts

@@ -134,10 +134,10 @@ def test_explain_shows_what_stands_at_some_bytes_alone(tmp_path: Path) -> None:
     assert ran("explain", path, "--at", "0x3b2", *SENSOR).stdout.startswith(
         "ldrobot-stl27l data at byte 940, 47 bytes; byte 946 is in points[0].distance\n"
     )
-    assert [frame["offset"] for frame in printed("explain", path, "--slice", "46:95", *SENSOR)["frames"]] == [0, 47, 94]
-    assert len(printed("explain", path, "--slice", "14000:", *SENSOR)["frames"]) == 3
+    assert [frame["offset"] for frame in printed("explain", path, "--bytes", "46:95", *SENSOR)["frames"]] == [0, 47, 94]
+    assert len(printed("explain", path, "--bytes", "14000:", *SENSOR)["frames"]) == 3
     assert "14100 bytes: there is no byte 14100" in ran("explain", path, "--at", 14100, *SENSOR, code=2).stderr
-    for words in (("--slice", "9"), ("--slice", "9:8"), ("--slice", "a:"), ("--at", "-1"), ("--at", 1, "--slice", "1:2")):
+    for words in (("--bytes", "9"), ("--bytes", "9:8"), ("--bytes", "a:"), ("--at", "-1"), ("--at", 1, "--bytes", "1:2")):
         ran("explain", path, *words, *SENSOR, code=2)
 
 

@@ -206,5 +206,5 @@ def test_packets_have_no_place_elsewhere(tmp_path: Path) -> None:
     assert "can be read only once: record it first" in ran("convert", "-", "o.mcap", "--packets", "-s", "velodyne-vlp16", code=2).stderr
     path = recorded(tmp_path, "mcap", {"/p": ("nebula_msgs/msg/NebulaPackets", packets(200))})
     said = ran("convert", path, tmp_path / "out.csv", "--packets", "-s", "velodyne-vlp16", code=2).stderr
-    assert "out.csv has no place for packets: .mcap, .bag, .rosbag2, .db3 have, in one file" in said
+    assert "out.csv: .csv has no place for --packets; those that have are .mcap, .bag, .rosbag2, .db3" in said
     assert not list(tmp_path.glob("out.*"))
