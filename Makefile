@@ -30,7 +30,7 @@ demo: $(USERS)
 test: $(DEVELOPERS)
 	@$(BIN)/python -m pytest -n auto --dist worksteal $(ARGS)
 
-# The conformance suite with 4000 examples instead of 20: hours.
+# The conformance suite with 4000 examples instead of 12: hours.
 test-long: $(DEVELOPERS)
 	@LIDARSPEC_EXAMPLES=4000 $(BIN)/python -m pytest -n auto tests/sensors/test_conformance.py $(ARGS)
 

@@ -30,6 +30,13 @@ SENSORS: dict[str, tuple[str, int, dict[str, Any]]] = {
     "m1-long": ("robosense-m1", 63_000, {}),
     "vlp16-long": ("velodyne-vlp16", 20_000, {}),
     "ouster": ("ouster-os1", 640, {"rows": 128}),
+    "livox": ("livox-mid360", 10_000, {}),
+    "multiscan": ("sick-multiscan136", 2000, {}),
+    "picoscan": ("sick-picoscan150", 3000, {}),
+    "colab-tim": ("sick-tim571", 1200, {"cola": "B"}),
+    "colab-lms": ("sick-lms511", 2500, {"cola": "B"}),
+    "colaa": ("sick-tim571", 600, {"cola": "A"}),
+    "scip": ("hokuyo-utm30lxew", 600, {}),
 }
 QUICKER = 50  # times fewer frames in a quick run
 NOISE = 0.02  # share of the frames that is damaged, and share of noise among the bytes

@@ -5,10 +5,12 @@ from __future__ import annotations
 import json
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
+from functools import partial
 from typing import Any
 
 import by_hand
 import by_hand_serial
+import fixed
 import libraries
 import numpy as np
 from inputs import Inputs
@@ -191,6 +193,41 @@ def ouster(inputs: Inputs) -> Work:
     )
 
 
+#: frames with parts, counts or conditions: title, the same with every field at a fixed place, whether they come as a stream.
+FIXED: Mapping[str, tuple[str, Callable[[ls.Sensor, bytes], ls.Sensor], bool]] = {
+    "livox": ("Livox Mid-360 packets, Cartesian", fixed.livox_packet, False),
+    "multiscan": ("multiScan136 telegrams", fixed.compact_telegram, False),
+    "picoscan": ("picoScan150 telegrams", fixed.compact_telegram, False),
+    "colab-tim": ("TiM571 stream, CoLa B", fixed.cola_telegram, True),
+    "colab-lms": ("LMS511 stream, CoLa B", fixed.cola_telegram, True),
+}
+
+
+def beside_fixed(inputs: Inputs, key: str) -> Work:
+    """The sensor's frames, and the same bytes read with every field at a fixed place."""
+    title, made, is_stream = FIXED[key]
+    sensor, simple = inputs.sensor(key), made(inputs.sensor(key), inputs.frames(key)[0])
+    data: Any = b"".join(inputs.frames(key)) if is_stream else inputs.array(key)
+    points = len(sensor.decode(data).points())
+    return Work(
+        title,
+        "points",
+        points,
+        memoryview(data).nbytes,
+        lambda backend: points_of(sensor, data, backend),
+        own=lambda backend: {"fixed": Contender(points_of(simple, data, backend), points)},
+        facts=lambda backend, rates: {"times as long as with fixed places": times(rates, "fixed", "ours")},
+    )
+
+
+def in_text(inputs: Inputs, key: str, title: str) -> Work:
+    """A stream of frames in text."""
+    sensor, data = inputs.sensor(key), b"".join(inputs.frames(key))
+    points = len(sensor.decode(data).points())
+    others: Others = {"plain": lambda: Contender(plainly(sensor, data), points)}
+    return Work(title, "points", points, len(data), lambda backend: points_of(sensor, data, backend), others)
+
+
 def rplidar(inputs: Inputs) -> Work:
     some = inputs.frames("rplidar")[: 10 * FEW]
     return in_memory(inputs, "rplidar", "RPLIDAR nodes", {"rplidar": lambda: libraries.rplidar_nodes(some)})
@@ -234,6 +271,9 @@ ON_BYTES: Mapping[str, Callable[[Inputs], Work]] = {
     "vls128": lambda inputs: velodyne(inputs, "vls128", "VLS-128 packets, look-ahead"),
     "xt32": lambda inputs: in_memory(inputs, "xt32", "Pandar XT32 packets"),
     "ouster": ouster,
+    **{key: partial(beside_fixed, key=key) for key in FIXED},
+    "colaa": lambda inputs: in_text(inputs, "colaa", "TiM571 stream, CoLa A"),
+    "scip": lambda inputs: in_text(inputs, "scip", "UTM-30LX-EW stream, SCIP"),
     "rplidar": rplidar,
     "stl27l-stream": stl27l_stream,
     "m1c1-stream": m1c1_stream,

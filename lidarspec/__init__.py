@@ -52,6 +52,7 @@ if TYPE_CHECKING:
     from lidarspec.points.cloud import PointCloud as PointCloud
     from lidarspec.recording.recorders import Recorder as Recorder
     from lidarspec.scans.scans import LaserScan as LaserScan, Scan as Scan
+    from lidarspec.scans.selection import Selection as Selection
     from lidarspec.simulation.simulator import simulate as simulate
     from lidarspec.spec.sensor import Sensor as Sensor
 
@@ -67,6 +68,7 @@ _NAMES = {
     "packets.packets": ("Packets",),
     "points.cloud": ("PointCloud",),
     "scans.scans": ("Scan", "LaserScan"),
+    "scans.selection": ("Selection",),
     "explaining.explanation": ("explain",),
     "exports": ("export",),
     "simulation.simulator": ("simulate",),

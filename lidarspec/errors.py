@@ -198,7 +198,7 @@ def library(name: str, extra: str) -> Any:
     try:
         return importlib.import_module(name)
     except ImportError as error:
-        reason = f"this takes {name.partition('.')[0]}, which is not installed ({error})"
+        reason = f"this takes {name.removeprefix('backports.').partition('.')[0]}, which is not installed ({error})"
         raise suggest(UsageError(reason), f"pip install 'lidarspec[{extra}]'") from error
 
 

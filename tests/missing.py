@@ -11,9 +11,10 @@ MISSING = (
     (r"tshark", "tshark", "apt-get install tshark"),
     (r"g\+\+ is not", "g++", "apt-get install g++"),
     (r"gcc", "gcc", "apt-get install gcc"),
+    (r"no (xxd|hexdump)", "tools that print bytes", "apt-get install xxd bsdextrautils"),
     (r"Kaitai compiler", "Kaitai's compiler", "npm install kaitai-struct-compiler js-yaml, with NODE_PATH as its node_modules"),
     (
-        r"kaitaistruct|crccheck|velodyne.decoder|[Nn]umba|rosbags|mcap|foxglove|pyarrow|duckdb|laspy|pandas|polars|pye57|zarr",
+        r"kaitaistruct|crccheck|velodyne.decoder|[Nn]umba|rosbags|mcap|foxglove|pyarrow|duckdb|laspy|pandas|polars|pye57|zarr|zstd",
         "Python packages",
         "pip install -e '.[dev]'",
     ),

@@ -19,7 +19,7 @@ sys.path.insert(0, sys.argv[1])
 import by_hand, by_hand_serial
 import numpy as np
 from inputs import Inputs
-from works import BY_HAND
+from works import BY_HAND, FIXED
 from lidarspec.simulation.simulator import opening
 
 inputs = Inputs(Path(sys.argv[2]), quick=True)
@@ -42,6 +42,10 @@ print("payloads")
 scans = [scan.points for scan in inputs.sensor("m1").scans(inputs.array("m1"))]
 np.testing.assert_array_equal(np.hstack(by_hand.m1_scans(inputs.capture("m1")))[0], np.concatenate([cloud.x for cloud in scans]))
 print("scans")
+for key, (_, fixed, is_stream) in FIXED.items():
+    data = b"".join(inputs.frames(key)) if is_stream else inputs.frames(key)
+    cloud = fixed(inputs.sensor(key), inputs.frames(key)[0]).decode(data).points()
+    alike(key, data, [cloud.x, cloud.y, cloud.z, cloud.intensity])
 """
 
 
@@ -73,6 +77,17 @@ def test_the_noisy_stream_loses_no_intact_frame(tmp_path: Path) -> None:
     assert row["not_installed"] in ([], ["lds2d"])
 
 
+def test_frames_with_counts_and_parts_are_measured_beside_fixed_places(tmp_path: Path) -> None:
+    named = [word for name in ("livox", "multiscan", "picoscan", "colab", "scip") for word in ("--only", name)]
+    rows = measured(tmp_path, "--backend", "numpy", *named)
+    compared = {"livox", "multiscan", "picoscan", "colab-tim", "colab-lms"}
+    assert {row["work"]: set(row["facts"]) for row in rows} == {
+        "scip": set(),
+        **{name: {"times as long as with fixed places"} for name in compared},
+    }
+    assert all(row["amount"] > 5000 and row["bytes"] > row["amount"] for row in rows)
+
+
 def test_an_unknown_work_is_refused_with_the_names_there_are() -> None:
     done = subprocess.run([sys.executable, str(RUN), "--only", "fastest"], capture_output=True, text=True, check=False)
     assert done.returncode == 2
@@ -95,4 +110,9 @@ def test_what_is_written_by_hand_gives_the_same_points(tmp_path: Path) -> None:
         "rplidar",
         "payloads",
         "scans",
+        "livox",
+        "multiscan",
+        "picoscan",
+        "colab-tim",
+        "colab-lms",
     ]

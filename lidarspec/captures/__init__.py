@@ -6,5 +6,6 @@ its pieces. Whatever gives no datagram is counted, and no bytes raise past the f
 * `records`: the two file formats: their records, one by one and many alike.
 * `ip`: from a captured frame to the payload of a datagram: link layers, IP, fragments.
 * `pcap`: both joined: a reader that gives datagrams, and a writer.
+* `containers`: what a file is by its first bytes: compressed, and read as what is in it; or of a kind that is refused by its name.
 * `bulk`: the datagrams of a capture as arrays, where they stand in a buffer.
 """

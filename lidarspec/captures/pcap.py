@@ -16,6 +16,7 @@ from dataclasses import dataclass, field
 from functools import lru_cache
 from typing import BinaryIO
 
+from lidarspec.captures.containers import opened
 from lidarspec.captures.ip import LARGEST_PAYLOAD, Reassembly, Refused, address, ip_packet, udp, udp_frame
 from lidarspec.captures.records import (
     SMALLEST,
@@ -30,7 +31,7 @@ from lidarspec.captures.records import (
     records,
     resume,
 )
-from lidarspec.errors import SourceError, UsageError, system_errors
+from lidarspec.errors import SourceError, UsageError
 from lidarspec.transports.protocol import Closing
 
 #: the link types kept for private use: captures of byte streams have the first.
@@ -101,7 +102,8 @@ class CaptureReader(Closing):
     """The UDP datagrams of a capture, in file order, each once: an iterator goes on where the last one stopped.
 
     Args:
-        file: an open binary file, also a pipe, which stays open; or a path, whose file is closed after the last datagram.
+        file: an open binary file, also a pipe, which stays open; or a path, whose file is closed after the last datagram, and which
+            may be compressed.
 
     Attributes:
         stats: what was met so far.
@@ -117,8 +119,7 @@ class CaptureReader(Closing):
         self.stats = CaptureStats()
         self._owned: BinaryIO | None = None
         if isinstance(file, str | os.PathLike):
-            with system_errors(os.fspath(file)):
-                file = self._owned = open(file, "rb")  # noqa: SIM115  closed by `close`
+            file = self._owned = opened(file)  # closed by `close`
         self._source = Source(file, largest=self.largest)
         self._fragments = Reassembly()
         self._datagrams: Iterator[Datagram] | None = None

@@ -27,7 +27,7 @@ from lidarspec.spec.arguments import Octets, Range
 from lidarspec.spec.fields import factor, split_unit
 from lidarspec.spec.sensor import Sensor
 from lidarspec.spec.tree import FieldInfo, evaluated
-from lidarspec.transports.files import unhexed
+from lidarspec.transports.hexadecimal import unhexed
 from lidarspec.transports.open_url import is_live
 from lidarspec.transports.protocol import Chunk
 from lidarspec.wire.build import Steps, argument_slot, given_value, is_index, put, steps

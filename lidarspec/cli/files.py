@@ -1,7 +1,8 @@
-"""`convert` and `plot`: from file to file, and a scan as a picture."""
+"""`info`, `convert` and `plot`: what is in a file, from file to file, and a scan as a picture."""
 
 from __future__ import annotations
 
+import contextlib
 import itertools
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, field
@@ -10,19 +11,23 @@ from shlex import quote
 
 import click
 
+from lidarspec.cli.failures import NO_DATA
 from lidarspec.cli.inputs import again, conclude, fits_instead, nearest_fault, no_frame, nothing_came, refuse_overwriting, scans_of
-from lidarspec.cli.options import colour_option, count_option, sensor_option
+from lidarspec.cli.options import colour_option, count_option, output_options, points_option, selecting, sensor_option
 from lidarspec.cli.output import Progress, emit, emit_json, size
 from lidarspec.cli.terminal import note
 from lidarspec.device.device import Device, open as open_device
 from lidarspec.discovery.detect import detected
 from lidarspec.errors import UsageError, WireError, suggest, suggestion
-from lidarspec.formats import format_of, targets, write, write_imu
+from lidarspec.explaining.contents import contents, shown
+from lidarspec.formats import check_holds, format_of, targets, write, write_imu
 from lidarspec.packets.imu import joined
 from lidarspec.plugins import sensor as named_sensor
 from lidarspec.scans.scans import Scan
+from lidarspec.scans.selection import Selection
 from lidarspec.spec.sensor import Sensor
-from lidarspec.transports.protocol import no_bytes
+from lidarspec.transports.open_url import is_live, transport
+from lidarspec.transports.protocol import Chunk, no_bytes
 from lidarspec.view.polar import look
 from lidarspec.view.svg import svg
 
@@ -55,12 +60,25 @@ class Written:
 @click.argument("target", metavar="OUT")
 @sensor_option
 @count_option("scans")
-@click.option("--all", "every_point", is_flag=True, help="Keep points without a valid return.")
+@selecting("times", "scans", "every", "ranges", "columns", "time", "beams", "frame_id")
+@points_option
+@click.option("--organized", is_flag=True, help="All points of a scan, as rows and columns; missing ones are nan.")
+@click.option("--packets", "with_packets", is_flag=True, help="The packets of IN as well, in a log of ROS, which is a SOURCE then.")
 @click.option("--imu", "is_imu", is_flag=True, help="What the sensor's IMU felt, in place of the points.")
 @click.option("--force", is_flag=True, help="Overwrite OUT.")
 @click.option("--json", "as_json", is_flag=True, help="Print a summary as JSON.")
 def convert(
-    source: str, target: str, sensor_id: str | Sensor | None, count: int | None, every_point: bool, is_imu: bool, force: bool, as_json: bool
+    source: str,
+    target: str,
+    sensor_id: str | Sensor | None,
+    count: int | None,
+    selection: Selection,
+    every_point: bool,
+    organized: bool,
+    with_packets: bool,
+    is_imu: bool,
+    force: bool,
+    as_json: bool,
 ) -> None:
     """Write the points of a capture or raw file to a file, in the format of its suffix.
 
@@ -74,9 +92,17 @@ def convert(
     (.foxglove.mcap) take libraries that are not installed by default: lidarspec[arrow,las,e57,zarr,ros,foxglove].
     """
     format_of(target)
+    for what, is_asked in (
+        ("beams", selection.beams),
+        ("frame-id", selection.frame_id),
+        ("organized", organized),
+        ("packets", with_packets),
+    ):
+        if is_asked:
+            check_holds(target, what)
     refuse_overwriting(targets(target), source, sensor_id, force=force)
     sensor = _detected(source, target) if sensor_id is None else named_sensor(sensor_id)
-    with open_device(source, sensor) as device, Progress() as progress:
+    with open_device(source, sensor) as device, Progress() as progress, _packets(source, wanted=with_packets) as packets:
         written = Written(device, target)
         if is_imu:
             samples = joined(list(device.imu()))[:count]
@@ -88,14 +114,28 @@ def convert(
                 emit_json({"sensor": device.sensor.id, "output": target, "samples": len(samples), "stats": device.stats.to_dict()}, None)
             conclude(device)
             return
-        scans = itertools.islice(scans_of(device, source), count)
+        scans = itertools.islice(scans_of(device, source, selection), count)
         first = next(scans, None)
         if first is None:
             raise _no_data(device, source, target)
-        counted = written.counting(itertools.chain([first], scans), progress, every_point=every_point)
-        write(target, counted, every_point=every_point)
+        counted = written.counting(itertools.chain([first], scans), progress, every_point=every_point or organized)
+        write(target, counted, every_point=every_point, organized=organized, packets=packets)
         progress.clear()
         _sum_up(device, target, written, as_json=as_json)
+
+
+@contextlib.contextmanager
+def _packets(source: str, *, wanted: bool) -> Iterator[Iterator[Chunk] | None]:
+    """The packets of a file, which is read a second time for them; None where they are not wanted."""
+    if not wanted:
+        yield None
+        return
+    if is_live(source) or source == "-":
+        raise UsageError(f"--packets reads IN twice, and {source} can be read only once: record it first")
+    with contextlib.closing(transport(source)) as opened:
+        if not opened.datagrams:
+            raise UsageError(f"{source} is a stream of bytes: packets are those of datagrams")
+        yield opened.chunks()
 
 
 def _detected(source: str, target: str) -> Sensor:
@@ -147,13 +187,37 @@ def _no_data(device: Device, source: str, target: str) -> Exception:
 
 
 @click.command()
+@click.argument("file", metavar="FILE")
+@output_options
+def info(file: str, as_json: bool, output: str | None) -> None:
+    """What is in a file: kind, times, senders, sensor, rates, loss, and how it is read.
+
+    FILE is anything that is read: a recording, a capture, a robotics log, bytes. Of a long one the beginning is looked at, and of a
+    recording the end.
+    """
+    found = contents(file)
+    if as_json:
+        emit_json(found.to_dict(), output)
+    else:
+        lines = [f"{found.path}: {found.kind}, {size(found.size)}", *(f"  {word:<8}  {text}" for word, text in shown(found))]
+        emit("\n".join(lines), output)
+    for warning in found.warnings:
+        note(warning)
+    if not any(content.sensors for content in found.contents):
+        raise click.exceptions.Exit(NO_DATA)
+
+
+@click.command()
 @click.argument("source", metavar="IN")
 @click.option("-o", "--output", metavar="FILE.svg", required=True, help="Where to; - is standard output.")
 @sensor_option
 @click.option("--scan", "number", type=click.IntRange(min=1), metavar="NUMBER", default=1, show_default=True, help="Which whole scan.")
+@selecting("times", "scans", "every", "ranges", "time")
 @colour_option
 @click.option("--max-range", type=click.FloatRange(min=0, min_open=True), metavar="METRES", help="From the middle to the edge.")
-def plot(source: str, output: str, sensor_id: str | Sensor | None, number: int, ramp: str, max_range: float | None) -> None:
+def plot(
+    source: str, output: str, sensor_id: str | Sensor | None, number: int, selection: Selection, ramp: str, max_range: float | None
+) -> None:
     """A scan as an SVG picture.
 
     From above, and from the side where the points are not in one plane.
@@ -164,7 +228,7 @@ def plot(source: str, output: str, sensor_id: str | Sensor | None, number: int, 
     with open_device(source, sensor_id) as device:
         chosen: Scan | None = None
         whole = 0
-        for scan in scans_of(device, source):
+        for scan in scans_of(device, source, selection):
             whole += scan.whole
             chosen = scan if scan.whole or chosen is None or not chosen.whole else chosen
             if whole == number:

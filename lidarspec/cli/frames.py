@@ -11,7 +11,7 @@ import click
 
 from lidarspec.cli.failures import FINDINGS
 from lidarspec.cli.inputs import nearest_fault, no_frame, opened
-from lidarspec.cli.options import OFFSET, count_option, output_options, sensor_option
+from lidarspec.cli.options import OFFSET, count_option, output_options, selecting, sensor_option
 from lidarspec.cli.output import emit_json, emit_json_list, emit_lines, emit_parts, table
 from lidarspec.cli.terminal import note
 from lidarspec.discovery.detect import fitting
@@ -22,6 +22,7 @@ from lidarspec.explaining.listing import LINED, Line, told
 from lidarspec.explaining.pieces import Piece, explained, pieces
 from lidarspec.explaining.wording import Span, number
 from lidarspec.plugins import sensor as named_sensor
+from lidarspec.scans import selection as scans
 from lidarspec.spec.sensor import Sensor
 
 words_argument = click.argument("words", metavar="HEX|FILE|-", nargs=-1, required=True)
@@ -31,13 +32,24 @@ words_argument = click.argument("words", metavar="HEX|FILE|-", nargs=-1, require
 @words_argument
 @sensor_option
 @count_option("frames")
+@selecting("times")
 @output_options
-def parse(words: Sequence[str], sensor_id: str | Sensor | None, count: int | None, as_json: bool, output: str | None) -> None:
-    """The fields of each frame in some bytes."""
-    with opened(words) as (given, chunks):
+def parse(
+    words: Sequence[str],
+    sensor_id: str | Sensor | None,
+    count: int | None,
+    selection: scans.Selection,
+    as_json: bool,
+    output: str | None,
+) -> None:
+    """The fields of each frame in some bytes.
+
+    With --slice, which goes by the times of arrival, offsets count from its beginning.
+    """
+    with opened(words, selection.times) as (given, chunks):
         sensor, fits = _sensor(given, sensor_id)
-        selection = Selection(sensor, count=count)
-        found = selection.frames(pieces(sensor, chunks, datagrams=given.datagrams))
+        wanted = Selection(sensor, count=count)
+        found = wanted.frames(pieces(sensor, chunks, datagrams=given.datagrams))
         first = next(found, None)
         if first is None:
             raise no_frame(sensor, given)
@@ -46,8 +58,8 @@ def parse(words: Sequence[str], sensor_id: str | Sensor | None, count: int | Non
             emit_json_list({"sensor": sensor.id, "fits": fits}, "frames", (_fields(sensor, piece) for piece in frames), output)
         else:
             emit_parts(_tables(sensor, frames, output), output)
-        if selection.unframed:
-            note(f"{selection.unframed} bytes are in no frame; lidarspec explain names them")
+        if wanted.unframed:
+            note(f"{wanted.unframed} bytes are in no frame; lidarspec explain names them")
 
 
 def _fields(sensor: Sensor, piece: Piece) -> dict[str, Any]:
@@ -70,7 +82,8 @@ def _tables(sensor: Sensor, frames: Iterable[Piece], output: str | None) -> Iter
 @count_option("frames")
 @click.option("--bad", is_flag=True, help="What is damaged, or in no frame, alone.")
 @click.option("--at", type=OFFSET, metavar="OFFSET", help="What stands at this byte of the input alone.")
-@click.option("--slice", "stretch", metavar="FROM:TO", help="What stands in these bytes of the input alone, whole frames.")
+@click.option("--bytes", "stretch", metavar="FROM:TO", help="What stands in these bytes of the input alone, whole frames.")
+@selecting("times")
 @click.option("--bits", is_flag=True, help="Draw the bits of every element of an array, not of the first alone.")
 @click.option(
     "--diff", metavar="HEX|FILE|next", help="What differs from this frame, to the bit; 'next': from the second frame of the input."
@@ -84,6 +97,7 @@ def explain(
     bad: bool,
     at: int | None,
     stretch: str | None,
+    selection: scans.Selection,
     bits: bool,
     diff: str | None,
     as_json: bool,
@@ -92,11 +106,12 @@ def explain(
     """Every byte of each frame: offset, hex, field, value, unit, meaning.
 
     A damaged frame is told with what became of it: a flipped bit, a lost or inserted byte, where it is cut off. With --bad the exit
-    code is 1 where something is damaged. OFFSETs are those that are printed, 940 or 0x3ac; of a capture, in the payloads, joined.
+    code is 1 where something is damaged. OFFSETs are those that are printed, 940 or 0x3ac; of a capture, in the payloads, joined; with
+    --slice, which goes by the times of arrival, they count from its beginning.
     """
     if at is not None and stretch is not None:
-        raise UsageError("--at is for one byte, and --slice for several: leave out one of them")
-    with opened(words) as (given, chunks):
+        raise UsageError("--at is for one byte, and --bytes for several: leave out one of them")
+    with opened(words, selection.times) as (given, chunks):
         sensor, fits = _sensor(given, sensor_id, damaged=True)
         if not given.data:
             raise no_frame(sensor, given)
@@ -104,14 +119,14 @@ def explain(
         if diff is not None:
             _compare(sensor, given, found, diff, frame, as_json=as_json, output=output)
             return
-        selection = Selection(sensor, frame, count=count, bad=bad, at=at, stretch=stretch)
-        parts = selection.parts(found)
+        wanted = Selection(sensor, frame, count=count, bad=bad, at=at, stretch=stretch)
+        parts = wanted.parts(found)
         if as_json:
             listed = ({"offset": piece.offset, **part.to_dict()} for piece, part in parts)
             emit_json_list({"sensor": sensor.id, "fits": fits}, "frames", listed, output)
         else:
             emit_lines(listing(sensor, parts, at, every=bits, verdicts=bad), output)
-        selection.conclude(given)
+        wanted.conclude(given)
 
 
 def listing(

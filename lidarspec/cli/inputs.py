@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import io
 import itertools
+import math
 import os
 import re
 import sys
@@ -25,8 +26,10 @@ from lidarspec.discovery.listen import LOOKED_AT, Heard, beginning, leading
 from lidarspec.errors import CommandError, LidarSpecError, SourceError, UsageError, WireError, suggest, system_errors
 from lidarspec.plugins import sensors
 from lidarspec.scans.scans import Scan
+from lidarspec.scans.selection import Selection, Times, received
 from lidarspec.spec.sensor import Sensor
-from lidarspec.transports.files import FileTransport, between, hex_chunks, unhexed
+from lidarspec.transports.files import FileTransport
+from lidarspec.transports.hexadecimal import hex_chunks, is_hexadecimal, unhexed
 from lidarspec.transports.open_url import is_port, live_address, transport
 from lidarspec.transports.protocol import Chunk, no_bytes
 from lidarspec.wire.parse import parse_typed
@@ -42,8 +45,11 @@ LOOK = 0.1
 
 
 @contextlib.contextmanager
-def opened(words: Sequence[str]) -> Iterator[tuple[Heard, Iterator[Chunk]]]:
+def opened(words: Sequence[str], times: Times = (None, None)) -> Iterator[tuple[Heard, Iterator[Chunk]]]:
     """The beginning of the input that the words of a command line stand for, and all of it, which is read as it is asked for.
+
+    Args:
+        times: of a file only what arrived then.
 
     Raises:
         UsageError: for text that is neither hexadecimal nor a file.
@@ -51,7 +57,7 @@ def opened(words: Sequence[str]) -> Iterator[tuple[Heard, Iterator[Chunk]]]:
     """
     text = " ".join(words)
     if text == "-" or (len(words) == 1 and os.path.exists(text) and not is_port(text)):
-        reading = _file(text)
+        reading = _file(text, times)
     else:
         try:
             if not (data := unhexed(text)):
@@ -60,15 +66,15 @@ def opened(words: Sequence[str]) -> Iterator[tuple[Heard, Iterator[Chunk]]]:
         except ValueError as error:
             if (device := named(text)) is None:
                 raise _no_bytes(words, error) from None
-            reading = opened([device.source])
+            reading = opened([device.source], times)
     with reading as given:
         yield given
 
 
 @contextlib.contextmanager
-def _file(path: str) -> Iterator[tuple[Heard, Iterator[Chunk]]]:
+def _file(path: str, times: Times) -> Iterator[tuple[Heard, Iterator[Chunk]]]:
     with contextlib.closing(transport(path)) as file:
-        chunks = _standard_input(file) if path == "-" and type(file) is FileTransport else file.chunks()
+        chunks = _standard_input(file) if path == "-" and type(file) is FileTransport else received(file, times, path)
         with _beginning(path, chunks, datagrams=file.datagrams, warnings=file.warnings) as given:
             yield given
         for warning in file.warnings if given[0].chunks else ():
@@ -93,7 +99,7 @@ def _rest(source: str, chunks: Iterator[Chunk]) -> Iterator[Chunk]:
 def _standard_input(file: FileTransport) -> Iterator[Chunk]:
     """What comes over standard input, as it comes; hexadecimal text as the bytes that it stands for."""
     head, stdin = sys.stdin.buffer.read(LOOKED_AT), sys.stdin.buffer
-    if not _is_hexadecimal(head):
+    if not is_hexadecimal(head, whole=len(head) < LOOKED_AT):
         yield Chunk(head)
         yield from file.chunks()
         return
@@ -104,15 +110,6 @@ def _standard_input(file: FileTransport) -> Iterator[Chunk]:
         return line if line.endswith(b"\n") or len(line) == size else line + stdin.readline(size - len(line))
 
     yield from hex_chunks("standard input", readline)
-
-
-def _is_hexadecimal(head: bytes) -> bool:
-    """Whether input begins as hexadecimal text."""
-    try:
-        text = head.decode("ascii")
-        return bool(unhexed(text[: between(text)] if len(head) == LOOKED_AT else text))
-    except ValueError:
-        return False
 
 
 def read(words: Sequence[str]) -> Heard:
@@ -294,14 +291,18 @@ class Patience:
             raise nothing_came(self._device, self._source, waited)
 
 
-def scans_of(device: Device, source: str) -> Iterator[Scan]:
-    """The scans of a device, which has to send its first data frame in time.
+def scans_of(device: Device, source: str, select: Selection | None = None, *, until: float = math.inf) -> Iterator[Scan]:
+    """The scans of a device that are wanted, which has to send its first data frame in time; `until`: a time of `time.monotonic`.
 
     Raises:
         CommandError, WireError: where the device has sent nothing, or nothing of the sensor's, for too long.
+        UsageError: where there are scans, and none of them is wanted.
     """
     patience = Patience(device, source)
-    for scan in device.scans(wait=LOOK):
+    for scan in device.scans(wait=LOOK, select=select):
         if scan is not None:
             yield scan
+            del scan
         patience.check()
+        if time.monotonic() >= until:
+            return

@@ -1,4 +1,4 @@
-"""The options and the kinds of numbers that verbs share."""
+"""The options and the kinds of values that verbs share, and those that select: the same words in every verb that reads."""
 
 from __future__ import annotations
 
@@ -6,27 +6,30 @@ import functools
 import math
 import tomllib
 from collections.abc import Callable, Sequence
+from datetime import datetime
 from typing import Any, TypeVar
 
 import click
 
 from lidarspec.errors import UsageError
 from lidarspec.plugins import sensor
-from lidarspec.spec.fields import duration, share
+from lidarspec.spec.fields import duration, factor, share, split_unit
 from lidarspec.spec.sensor import Sensor
 
 Function = TypeVar("Function", bound=Callable[..., Any])
 
 
 def sensor_option(function: Function) -> Function:
-    """``-s/--sensor``, and ``-O`` for what it is configured with: the verb is given an id, or the sensor so configured."""
+    """``-s/--sensor``, ``-O`` and ``--calibration``, with which it is configured: the verb is given an id, or the sensor so configured."""
 
     @functools.wraps(function)
-    def configured(*args: Any, sensor_id: str | None, options: Sequence[str], **others: Any) -> Any:
-        return function(*args, sensor_id=_configured(sensor_id, options), **others)
+    def configured(*args: Any, sensor_id: str | None, options: Sequence[str], calibration: str | None, **others: Any) -> Any:
+        files = () if calibration is None else (f"calibration={calibration}",)
+        return function(*args, sensor_id=_configured(sensor_id, (*options, *files)), **others)
 
+    unit = click.option("--calibration", metavar="FILE", help="The unit's own calibration, short for -O calibration=FILE.")(configured)
     told = "An option of the sensor, such as calibration=FILE or answer=FRAME; may be given again."
-    chosen = click.option("-O", "--option", "options", metavar="NAME=VALUE", multiple=True, help=told)(configured)
+    chosen = click.option("-O", "--option", "options", metavar="NAME=VALUE", multiple=True, help=told)(unit)
     named = click.option("-s", "--sensor", "sensor_id", metavar="ID", help="The sensor: an id, an alias, or a file ./mysensor.py.")
     return named(chosen)  # type: ignore[return-value]
 
@@ -35,7 +38,7 @@ def _configured(sensor_id: str | None, options: Sequence[str]) -> str | Sensor |
     if not options:
         return sensor_id
     if sensor_id is None:
-        raise UsageError("-O is an option of a sensor: name the sensor with -s")
+        raise UsageError(f"{options[0].partition('=')[0]} is an option of a sensor: name the sensor with -s")
     given = dict(option.partition("=")[::2] for option in options)
     if unset := [option for option in options if "=" not in option]:
         raise UsageError(f"-O {unset[0]}: an option has a value: NAME=VALUE")
@@ -85,7 +88,7 @@ def output_option(function: Function) -> Function:
 
 
 class Number(click.ParamType):  # type: ignore[type-arg]  # older versions of click have no types
-    """A number that is written in a way of its own.
+    """A number, or two, written in a way of their own.
 
     Args:
         name: what it is, for help pages.
@@ -93,13 +96,13 @@ class Number(click.ParamType):  # type: ignore[type-arg]  # older versions of cl
         form: how it looks, for messages.
     """
 
-    def __init__(self, name: str, parse: Callable[[str], float], form: str) -> None:
+    def __init__(self, name: str, parse: Callable[[str], Any], form: str) -> None:
         self.name, self._parse, self._form = name, parse, form
 
-    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> float:
+    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> Any:
         """The number."""
-        if isinstance(value, float | int):
-            return float(value)
+        if not isinstance(value, str):
+            return value
         try:
             return self._parse(value)
         except (ValueError, UsageError):
@@ -133,6 +136,47 @@ def _speed(text: str) -> float:
     return speed
 
 
+def _between(text: str, parse: Callable[[str], Any]) -> tuple[Any, Any]:
+    """What stands before and behind the colon of a text, None where nothing does; dates have colons of their own."""
+    for place in (place for place, mark in enumerate(text) if mark == ":"):
+        try:
+            low, high = (parse(part) if part else None for part in (text[:place], text[place + 1 :]))
+        except (ValueError, UsageError):
+            continue
+        if (low, high) != (None, None) and (None in (low, high) or type(low) is type(high)):
+            return low, high
+    raise ValueError(text)
+
+
+def _moment(text: str) -> float | datetime:
+    try:
+        return duration(text)
+    except UsageError:
+        return datetime.fromisoformat(text)
+
+
+def _index(text: str) -> int:
+    return int(text)  # one below 0 is refused by `Selection`, which says why
+
+
+def _indices(text: str) -> tuple[int, int | None]:
+    low, high = _between(text, _index)
+    return low or 0, high
+
+
+def _metres(text: str) -> float:
+    number, unit = split_unit(text)
+    scale = factor(unit or "m", "m")
+    if scale is None or not 0 <= float(number) < math.inf:
+        raise ValueError(text)
+    return float(number) * float(scale)
+
+
+def _distances(text: str) -> tuple[float, float]:
+    low, high = _between(text, _metres)
+    return low or 0.0, math.inf if high is None else high
+
+
 #: seconds from "10s", "500ms", "2min", "1h" or a bare number.
 DURATION = Number("duration", _duration, "duration above 0, such as 10s, 500ms, 2min or 1h")
 #: a number from 0 to 1, from "1%" or "0.01".
@@ -141,3 +185,45 @@ SHARE = Number("share", _share, "share, such as 1% or 0.01")
 OFFSET = Number("offset", _offset, "offset of a byte, such as 940 or 0x3ac")
 #: a factor above 0; 0 for "max".
 SPEED = Number("speed", _speed, "speed: a factor such as 1, 0.5 or 10, or max")
+#: from when to when, seconds or dates, from "10s:20s", ":1min" or "2026-11-23T05:02:00Z:".
+SLICE = Number("slice", lambda text: _between(text, _moment), "slice of time, such as 10s:20s, 10s:, :1min or 2026-11-23T05:02:00Z:")
+#: from which number to which, from "5:10".
+INDICES = Number("indices", _indices, "slice of whole numbers, such as 5:10, 5: or :10")
+#: from how far to how far, metres, from "0.5m:30m".
+DISTANCES = Number("distances", _distances, "span of distances, such as 0.5m:30m, 50cm: or :30")
+
+#: what selects, by the name of its argument of `Selection`.
+SELECTING: dict[str, Callable[[Any], Any]] = {
+    "times": click.option("--slice", "times", type=SLICE, metavar="FROM:TO", help="By time from the first scan, 10s:20s, or by date."),
+    "scans": click.option("--scans", "scans", type=INDICES, metavar="FROM:TO", help="By number from 0 on, without the last: 5:10."),
+    "every": click.option("--every", type=click.IntRange(min=1), metavar="N", help="Each Nth scan of those."),
+    "ranges": click.option("--range", "ranges", type=DISTANCES, metavar="NEAR:FAR", help="Returns from elsewhere are none: 0.5m:30m."),
+    "columns": click.option("--columns", metavar="NAME,...", help="Columns of the points, in this order: x,y,z,intensity."),
+    "time": click.option("--time", type=click.Choice(["device", "host"]), help="Whose clock stamps and --slice are by.  [default: device]"),
+    "beams": click.option("--beams", type=click.IntRange(min=1), metavar="N", help="Ranges of a LaserScan: always so many."),
+    "frame_id": click.option("--frame-id", metavar="NAME", help="The frame that ROS's messages name.  [default: laser]"),
+}
+
+
+def selecting(*names: str) -> Callable[[Function], Function]:
+    """Some of the options that select; the verb is given a `Selection`."""
+
+    def options(function: Function) -> Function:
+        @functools.wraps(function)
+        def selected(*args: Any, **others: Any) -> Any:
+            from lidarspec.scans.selection import Selection
+
+            given = {name: value for name in names if (value := others.pop(name)) is not None}
+            if "columns" in given:
+                given["columns"] = tuple(name.strip() for name in given["columns"].split(",") if name.strip())
+            return function(*args, selection=Selection(**given), **others)
+
+        return functools.reduce(lambda decorated, name: SELECTING[name](decorated), reversed(names), selected)  # type: ignore[return-value]
+
+    return options
+
+
+def points_option(function: Function) -> Function:
+    """``--all`` and ``--valid``."""
+    told = "Points without a valid return as well, or not.  [default: --valid]"
+    return click.option("--all/--valid", "every_point", default=False, help=told)(function)

@@ -8,20 +8,21 @@ import math
 import sys
 import time
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import click
 import numpy as np
 
 from lidarspec.cli.failures import FINDINGS
-from lidarspec.cli.inputs import Patience, conclude, nothing_came
-from lidarspec.cli.options import DURATION, SHARE, count_option, sensor_option
+from lidarspec.cli.inputs import Patience, conclude, nothing_came, scans_of
+from lidarspec.cli.options import DURATION, SHARE, count_option, points_option, selecting, sensor_option
 from lidarspec.cli.terminal import note, say
 from lidarspec.device.device import Device, open as open_device
-from lidarspec.errors import UnknownFrame
+from lidarspec.errors import UnknownFrame, UsageError
 from lidarspec.points.conventions import UNITS
 from lidarspec.scans.scans import Scan
+from lidarspec.scans.selection import Selection, Slice
 from lidarspec.spec.sensor import Sensor
 from lidarspec.view.feed import LOOK, Feed, Reading, told
 
@@ -51,7 +52,8 @@ ROUNDED = 1e-6
 @click.option("-f", "--frame", metavar="NAME", help="The packets of this frame type.")
 @count_option("rows")
 @click.option("-t", "--duration", type=DURATION, help="How long at most, such as 10s.")
-@click.option("--all", "every_point", is_flag=True, help="Points without a valid return as well.")
+@selecting("times", "scans", "every", "ranges", "columns", "time")
+@points_option
 @click.option("--json", "as_json", is_flag=True, help="Print a JSON object on each line.")
 def read(
     source: str,
@@ -60,6 +62,7 @@ def read(
     frame: str | None,
     count: int | None,
     duration: float | None,
+    selection: Selection,
     every_point: bool,
     as_json: bool,
 ) -> None:
@@ -67,14 +70,16 @@ def read(
 
     Points come as their scan is completed, with the columns of a PointCloud and the number of the scan: metres, radians, seconds
     since the scan's stamp. Packets have their offset in the input, their time, and the values of their fields in units; arrays are
-    printed only by --json.
+    printed only by --json. Of what selects, --slice and --time are for packets too.
     """
     with open_device(source, sensor_id) as device:
         if frame is not None and frame not in device.sensor.frames:
             raise UnknownFrame(frame, device.sensor.frames, place=device.sensor.id)
         until = time.monotonic() + duration if duration else math.inf
-        patience = Patience(device, source, frame)
-        rows = _packets(device, frame, until, patience) if whole or frame else _points(device, until, patience, every_point=every_point)
+        if whole or frame:
+            rows = _packets(device, frame, until, Patience(device, source, frame), selection)
+        else:
+            rows = _points(scans_of(device, source, selection, until=until), every_point=every_point)
         printed = 0
         for line in _lines(itertools.islice(rows, count), as_json=as_json):
             say(line)
@@ -99,36 +104,35 @@ def _lines(rows: Iterable[tuple[Units, Row]], *, as_json: bool) -> Iterator[str]
         yield _row([_text(name, value) for name, value in shown.items()], widths)
 
 
-def _points(device: Device, until: float, patience: Patience, *, every_point: bool) -> Iterator[tuple[Units, Row]]:
+def _points(scans: Iterable[Scan], *, every_point: bool) -> Iterator[tuple[Units, Row]]:
     """The points of each scan, when it is complete; of the pieces at the beginning and end too."""
     units: Units = UNITS
-    for number, scan in enumerate(_scans(device, until, patience)):
+    for number, scan in enumerate(scans):
         cloud = scan.points if every_point else scan.points[scan.points.valid]
         columns, units = dict(cloud.columns), {**units, **cloud.units}
         for values in zip(*columns.values(), strict=True):
             yield units, {"scan": number, **dict(zip(columns, values, strict=True))}
 
 
-def _scans(device: Device, until: float, patience: Patience) -> Iterator[Scan]:
-    feed = Feed(device)
-    while not feed.ended and time.monotonic() < until:
-        feed.pump(0.0)
-        patience.check()
-        yield from feed.scans
-
-
-def _packets(device: Device, frame: str | None, until: float, patience: Patience) -> Iterator[tuple[Units, Row]]:
+def _packets(device: Device, frame: str | None, until: float, patience: Patience, selection: Selection) -> Iterator[tuple[Units, Row]]:
     """The packets one by one, with the fields of their header in units; arrays as arrays."""
-    for packets in device.packets(frame, wait=LOOK):
+    if replace(selection, times=(None, None), time="device") != Selection():
+        raise UsageError("packets are selected by --slice and --time alone")
+    wanted, number = Slice(selection.times), 0
+    for batch in device.packets(frame, wait=LOOK):
         patience.check()
+        packets = batch.take(wanted.holds(batch.host_ns if selection.time == "host" else batch.time_ns))
+        number += len(packets)
         fields = {path: info for path, info in packets.table.schema.fields.items() if info.const is None}
         units = {path: info.unit for path, info in fields.items()}
         columns = {path: packets[path] for path in fields}
         for place in range(len(packets)):
             times = {"offset": int(packets.offset[place]), "time_ns": int(packets.time_ns[place])}
             yield units, {**times, **{path: _scalar(column[place]) for path, column in columns.items()}}
-        if time.monotonic() >= until:
-            return
+        if time.monotonic() >= until or wanted.ended:
+            break
+    if wanted.first is not None and not number:
+        raise wanted.missed(device.source)
 
 
 def _scalar(value: Any) -> Any:
@@ -227,6 +231,7 @@ class Lines:
 @click.argument("source", metavar="SOURCE")
 @sensor_option
 @count_option("lines")
+@selecting("times", "scans", "every", "ranges", "time")
 @click.option("-t", "--duration", type=DURATION, help="How long, such as 10s; without it until the input ends.")
 @click.option("--interval", type=DURATION, default="1s", show_default=True, help="From line to line.")
 @click.option("--max-errors", type=SHARE, help="Exit code 1 where more of the frames are wrong or lost, such as 1%.")
@@ -235,6 +240,7 @@ def stats(
     source: str,
     sensor_id: str | Sensor | None,
     count: int | None,
+    selection: Selection,
     duration: float | None,
     interval: float,
     max_errors: float | None,
@@ -247,7 +253,7 @@ def stats(
     there an interval can be longer than asked for.
     """
     with open_device(source, sensor_id, period=LOOK) as device:
-        lines, feed, start = Lines(device, as_json), Feed(device), time.monotonic()
+        lines, feed, start = Lines(device, as_json), Feed(device, select=selection), time.monotonic()
         lasting = min(duration or math.inf, interval * count if count else math.inf)
         try:
             if device.is_live:

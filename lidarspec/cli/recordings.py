@@ -10,7 +10,7 @@ import click
 
 from lidarspec.cli.failures import INTERRUPTED
 from lidarspec.cli.inputs import nothing_came, refuse_overwriting
-from lidarspec.cli.options import DURATION, SPEED, count_option, sensor_option
+from lidarspec.cli.options import DURATION, SPEED, count_option, selecting, sensor_option
 from lidarspec.cli.output import Progress, emit_json, size
 from lidarspec.cli.terminal import note, say
 from lidarspec.device.settings import named
@@ -20,6 +20,7 @@ from lidarspec.errors import CommandError, LidarSpecError, SourceError, UsageErr
 from lidarspec.plugins import sensor as named_sensor
 from lidarspec.recording.appending import Appender
 from lidarspec.recording.recorders import SUFFIXES, Recorder, check_suffix, declared_port
+from lidarspec.scans.selection import Selection
 from lidarspec.spec.sensor import Sensor
 from lidarspec.transports.files import RecordingTransport
 from lidarspec.transports.open_url import is_live, live_address, transport
@@ -134,12 +135,22 @@ def _view_of(kept: Appender, sensor: Sensor | None) -> str:
 @click.option("--loop", is_flag=True, help="Begin again at the end, until Ctrl-C.")
 @click.option("--force", is_flag=True, help="Overwrite a file to play to.")
 @sensor_option
+@selecting("times")
 @click.option("--json", "as_json", is_flag=True, help="Print a summary as JSON, with the SHA-256 of all bytes.")
-def replay(file: str, place: str, speed: float | None, loop: bool, force: bool, sensor_id: str | Sensor | None, as_json: bool) -> None:
+def replay(
+    file: str,
+    place: str,
+    speed: float | None,
+    loop: bool,
+    force: bool,
+    sensor_id: str | Sensor | None,
+    selection: Selection,
+    as_json: bool,
+) -> None:
     """A recording or capture, sent again as it came: bit for bit, and by the clock.
 
     To a pty or tcp:// it begins when somebody opens it. udp:// without a port uses those of the recording. A new .lsr or .pcap
-    file keeps the times of the recording.
+    file keeps the times of the recording. --slice goes by the times of arrival.
     """
     if is_live(file):
         raise suggest(
@@ -163,7 +174,7 @@ def replay(file: str, place: str, speed: float | None, loop: bool, force: bool, 
         undo.pop_all()  # the replay closes it
     _announce(file, outlet, sensor, as_json=as_json)
     factor = (None if is_file else 1.0) if speed is None else speed or None
-    played = Replay(file, outlet, speed=factor, needs_times=speed is not None, loop=loop, source=source)
+    played = Replay(file, outlet, speed=factor, needs_times=speed is not None, loop=loop, source=source, times=selection.times)
     is_interrupted = _run(played, outlet, file)
     _sum_up(file, outlet, sensor, played, as_json=as_json)
     if is_interrupted:

@@ -41,6 +41,7 @@ GROUPS = {
         "stats": ("read", "How a sensor is doing: speed, rates, errors, loss, jitter, queue."),
     },
     "files": {
+        "info": ("files", "What is in a file: kind, times, senders, sensor, rates, loss, and how it is read."),
         "convert": ("files", "Write the points of a capture or raw file to a file, in the format of its suffix."),
         "plot": ("files", "A scan as an SVG picture."),
     },

@@ -95,6 +95,10 @@ class Input(Protocol):
         """Chunks that have arrived and wait to be decoded; None where nothing waits."""
         return None
 
+    def skip(self, at: int) -> bool:
+        """Pass over what arrived before a time, ns since 1970, where that can be done without reading it: whether it is."""
+        return False
+
     def begin(self) -> None:
         """Send the commands that the sensor declares for its start.
 
@@ -208,6 +212,9 @@ class FileInput(Input):
         else:
             self.note(found.found)
         return found
+
+    def skip(self, at: int) -> bool:
+        return self._transport.skip(at)
 
     def begin(self) -> None:
         """A file has no sensor to be started."""

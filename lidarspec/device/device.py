@@ -31,6 +31,7 @@ from lidarspec.points.cloud import Mount
 from lidarspec.recording.appending import Log
 from lidarspec.recording.recorders import RecordTo, recorder_for
 from lidarspec.scans.scans import Scan, ScanStream, handed_out
+from lidarspec.scans.selection import Selection, Sieve
 from lidarspec.spec.sensor import Sensor
 from lidarspec.transports.open_url import transport
 from lidarspec.transports.protocol import Closing, LiveTransport, Transport
@@ -126,6 +127,7 @@ class Device(Closing):
     """A sensor read from a source; a context manager.
 
     Attributes:
+        source: where it is read from.
         sensor: the sensor, given or detected.
         mount: how it is mounted, where `lidarspec.toml` says so: scans come in the carrier's axes, packets in the sensor's.
     """
@@ -142,7 +144,7 @@ class Device(Closing):
         period: float = PERIOD,
         mount: Mount | None = None,
     ) -> None:
-        self.sensor, self._source, self.mount = sensor, source, mount
+        self.sensor, self.source, self.mount = sensor, source, mount
         self._streams: dict[str | None, PacketReader] = {}
         self._latest: ScanStream | None = None
         self._unseen = deque[Scan]()
@@ -172,7 +174,7 @@ class Device(Closing):
         that are another sensor's, scans without an end, times without a date, a nominal calibration; and what the plugin failed at."""
         failure = self.stats.failure(self.sensor.id)
         nominal = [_nominal(self.sensor)] if self.stats.nominal else []
-        partial = [f"{self._source}: {text}" for text in (self.stats.unended, self.stats.undated) if text]
+        partial = [f"{self.source}: {text}" for text in (self.stats.unended, self.stats.undated) if text]
         return [*self._input.warnings, *self._doubts(), *partial, *nominal, *([] if failure is None else [str(failure)])]
 
     @property
@@ -227,12 +229,12 @@ class Device(Closing):
                 turn = time.monotonic()
 
     @overload
-    def scans(self) -> Iterator[Scan]: ...
+    def scans(self, *, select: Selection | None = None) -> Iterator[Scan]: ...
 
     @overload
-    def scans(self, *, wait: float) -> Iterator[Scan | None]: ...
+    def scans(self, *, wait: float, select: Selection | None = None) -> Iterator[Scan | None]: ...
 
-    def scans(self, *, wait: float | None = None) -> Iterator[Any]:
+    def scans(self, *, wait: float | None = None, select: Selection | None = None) -> Iterator[Any]:
         """Every scan; the first and last piece, and those before and after an interruption, are marked ``complete=False``.
 
         Where a scan does not end within twice the slowest turn, what there is of it is handed out, and `warnings` says so.
@@ -241,10 +243,16 @@ class Device(Closing):
 
         Args:
             wait: yield None where no scan has come for so many seconds, so that the caller has a turn.
+            select: which of them, and what of each; nothing is read behind the last that is wanted, and of a recording nothing that lies
+                long before the first.
 
         Raises:
             SourceError: where a file has been read to its end before.
+            UsageError: where none of its scans is wanted.
         """
+        return self._scans(wait) if select is None else Sieve(select, self.source, self.skip).of(self._scans(wait))
+
+    def _scans(self, wait: float | None) -> Iterator[Scan | None]:
         reader, ahead, turn = self._reader(None), self._taken_back(), time.monotonic()
         stream = self._scan_stream()
         for arrival in self._arrivals(wait, ahead):
@@ -283,6 +291,13 @@ class Device(Closing):
                 yield felt if self.mount is None else felt.turned(self.mount.rotation)
                 turn = time.monotonic()
 
+    def skip(self, at: int) -> bool:
+        """Pass over what arrived before a time, ns since 1970, where the source can do so without reading it: whether it does.
+
+        What was read already is still given; then the stream goes on as behind an interruption.
+        """
+        return self._input.skip(at)
+
     def latest(self, timeout: float | None = None) -> Scan:
         """The newest whole scan, newer than the one that the last call gave; waits for it. Older ones are passed over.
 
@@ -309,7 +324,7 @@ class Device(Closing):
         deadline, mark, reader = time.monotonic() + wait, self._input.mark(), self._reader(None)
         while not (self._unseen and self._input.caught_up(mark)):
             if self._input.ended:
-                raise SourceError(f"{self._source}: no further scan, since the input is {self._input.state}")
+                raise SourceError(f"{self.source}: no further scan, since the input is {self._input.state}")
             arrival = self._next(max(deadline - time.monotonic(), 0.0))
             if arrival is not None:
                 self._latest = self._latest or self._scan_stream()
@@ -327,8 +342,8 @@ class Device(Closing):
 
     def overdue(self) -> SourceTimeout:
         """What to say when a scan did not come in time."""
-        error = SourceTimeout(f"{self._source}: no scan in time; the source is {self.state}")
-        return suggest(error, f"lidarspec doctor {quote(str(self._source))} -s {self.sensor.id}")
+        error = SourceTimeout(f"{self.source}: no scan in time; the source is {self.state}")
+        return suggest(error, f"lidarspec doctor {quote(str(self.source))} -s {self.sensor.id}")
 
     def send(self, name: str, /, *, timeout: float | None = None, **arguments: Any) -> Reply:
         """The reply to a command; at once with ``confirmed=False`` where none is documented.
@@ -366,19 +381,19 @@ class Device(Closing):
         self._finalizer()
 
     def __repr__(self) -> str:
-        return f"Device({self.sensor.id} on {self._source}, {self.state}: {self.stats})"
+        return f"Device({self.sensor.id} on {self.source}, {self.state}: {self.stats})"
 
     def _opened(self, backend: str, record: RecordTo | None, overflow: str | None, period: float, *, learns: bool) -> Input:
-        opened = transport(self._source, self.sensor)
+        opened = transport(self.source, self.sensor)
         try:
             if not isinstance(opened, LiveTransport):
                 if record is not None:
-                    raise UsageError(f"{self._source} is a file already: there is nothing to record")
-                return FileInput(self._source, self.sensor, opened, backend=backend)
+                    raise UsageError(f"{self.source} is a file already: there is nothing to record")
+                return FileInput(self.source, self.sensor, opened, backend=backend)
             policy = opened.overflow if overflow is None else overflow
-            recorder = partial(_recorder, record, self._source, opened, self._own_recorders)  # which holds no device: it may be forgotten
+            recorder = partial(_recorder, record, self.source, opened, self._own_recorders)  # which holds no device: it may be forgotten
             return LiveInput(
-                self._source, self.sensor, opened, backend=backend, policy=policy, record=recorder, learns=learns, period=period
+                self.source, self.sensor, opened, backend=backend, policy=policy, record=recorder, learns=learns, period=period
             )
         except BaseException:
             _close(opened, self._own_recorders)
@@ -399,7 +414,7 @@ class Device(Closing):
             self._latest = None
             self._unseen.clear()
         elif self._input.state == "ended":
-            raise SourceError(f"{self._source} has been read to its end: open it again to read it once more")
+            raise SourceError(f"{self.source} has been read to its end: open it again to read it once more")
         return ahead
 
     def _arrivals(self, wait: float | None, ahead: Arrival | None = None) -> Iterator[Arrival | None]:
@@ -425,8 +440,8 @@ class Device(Closing):
             self._another = contradiction(self.sensor, self._first)
         if not self._another:
             return []
-        text = f"{self._source}: read as {self.sensor.id}, and {self._another}"
-        return [f"{text}; next: lidarspec detect {quote(str(self._source))}"]
+        text = f"{self.source}: read as {self.sensor.id}, and {self._another}"
+        return [f"{text}; next: lidarspec detect {quote(str(self.source))}"]
 
 
 def _nominal(sensor: Sensor) -> str:

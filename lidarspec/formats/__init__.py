@@ -17,15 +17,17 @@ formats, too. Modules in reading order:
 
 from __future__ import annotations
 
+import dataclasses
 import itertools
 import re
 from collections.abc import Iterable, Iterator, Mapping
+from functools import partial
 from pathlib import Path
 from typing import NoReturn
 
 import numpy as np
 
-from lidarspec.errors import LidarSpecError, SpecError, UnknownFormat, UsageError, system_errors
+from lidarspec.errors import LidarSpecError, SpecError, UnknownFormat, UsageError, suggest, system_errors
 from lidarspec.formats.arrays import NPY, NPZ, ZARR
 from lidarspec.formats.bags import BAG, DB3, MCAP, ROSBAG2
 from lidarspec.formats.clouds import KITTI, LZF_PCD, PCD, PLY
@@ -38,7 +40,7 @@ from lidarspec.formats.writing import replacing
 from lidarspec.packets.imu import ImuSamples
 from lidarspec.plugins import registry
 from lidarspec.scans.scans import Scan
-from lidarspec.transports.protocol import Format
+from lidarspec.transports.protocol import Chunk, Format
 
 #: the places in a path of a scan's number, and of its stamp's date, hour, minute and second, of which these are the letters of an ISO text.
 MOMENT = {"%F": slice(10), "%H": slice(11, 13), "%M": slice(14, 16), "%S": slice(17, 19)}
@@ -109,7 +111,9 @@ def targets(path: str | Path) -> list[str]:
     return sorted(str(file) for file in files if named.fullmatch(str(file)))
 
 
-def write(path: str | Path, scans: Iterable[Scan], *, every_point: bool = False) -> None:
+def write(
+    path: str | Path, scans: Iterable[Scan], *, every_point: bool = False, organized: bool = False, packets: Iterable[Chunk] | None = None
+) -> None:
     """Write scans to a file in the format of its suffix, or to several.
 
     Args:
@@ -118,17 +122,53 @@ def write(path: str | Path, scans: Iterable[Scan], *, every_point: bool = False)
             scan from 0 on, has a file for each; "drive/date=%F/hour=%H/%M.parquet" one for each minute, by the stamp, in UTC; %S is the
             second.
         every_point: also the points without a valid return.
+        organized: every point of a scan in rows and columns, (rows, columns), missing ones as nan: of one scan a file, unless the format
+            keeps scans apart.
+        packets: what the sensor sent, to stand beside the points in a log of ROS.
 
     Raises:
         UnknownFormat: for a suffix that is none.
-        UsageError: where a file that is written would be begun again, since the time in its name came again.
+        UsageError: where a file that is written would be begun again, since the time in its name came again; where points are to be
+            organised or packets to stand beside them, and the format, the sensor or the number of scans is not for that.
         SourceError: where the file cannot be written.
     """
     path = Path(path)
     chosen = format_of(path)
+    beside = {} if packets is None else {"packets": packets}
+    if beside:
+        check_holds(path, "packets")
+        if PLACE.search(str(path)):
+            raise UsageError(f"{path}: packets stand beside the points in one file, and not in several")
+    if organized:
+        check_holds(path, "organized")
+        is_alone = "scans" not in chosen.holds
+        scans, every_point = _organized(path, scans, alone=is_alone and not PLACE.search(str(path))), True
+        chosen = dataclasses.replace(chosen, write=partial(chosen.write, organized=True)) if is_alone else chosen
     for target, held in _each(path, scans) if PLACE.search(str(path)) else [(path, scans)]:
         with replacing(target) as part:
-            chosen(part, held, every_point=every_point)
+            chosen.write(part, held, every_point=every_point, **beside)
+
+
+def check_holds(path: str | Path, what: str) -> None:
+    """Nothing, where the format of a file has a place for something (see `Format.holds`).
+
+    Raises:
+        UsageError: where it has none; it names the formats that have.
+    """
+    if what not in format_of(path).holds:
+        having = ", ".join(suffix for suffix, known in formats().items() if what in known.holds)
+        raise UsageError(f"{path}: {format_of(path).suffix} has no place for --{what}; those that have are {having}")
+
+
+def _organized(path: Path, scans: Iterable[Scan], *, alone: bool) -> Iterator[Scan]:
+    """Scans, while they are organised; `alone`: where there is one."""
+    for number, scan in enumerate(scans):
+        if scan.points.shape is None:
+            raise UsageError(f"{scan.sensor.id}: its points have no rows and columns: leave out --organized")
+        if number and alone:
+            error = UsageError(f"{path} holds the rows and columns of one scan, and there are several")
+            raise suggest(error, f"the same with --scans 1:2, or with a file for each scan: {path.with_suffix('')}-%05d{path.suffix}")
+        yield scan
 
 
 def _each(path: Path, scans: Iterable[Scan]) -> Iterator[tuple[Path, Iterator[Scan]]]:

@@ -18,7 +18,7 @@ from numpy.typing import DTypeLike, NDArray
 
 from lidarspec.errors import library
 from lidarspec.formats.rows import NAMES, Rows, write_rows
-from lidarspec.formats.writing import Spool, written
+from lidarspec.formats.writing import Spool, picture, written
 from lidarspec.points.cloud import structured_type, units_of
 from lidarspec.scans.scans import Scan
 from lidarspec.transports.protocol import Format
@@ -33,19 +33,22 @@ OF_SCANS: dict[str, tuple[DTypeLike, str]] = {
 }
 
 
-def put(archive: zipfile.ZipFile, name: str, column: Spool) -> None:
-    """Put a column into an archive, as NumPy reads it."""
+def put(archive: zipfile.ZipFile, name: str, column: Spool, height: int | None = None) -> None:
+    """Put a column into an archive, as NumPy reads it; of a picture as so many rows."""
     with archive.open(f"{name}.npy", "w", force_zip64=True) as target:
-        shape = {"descr": column.dtype.str, "fortran_order": False, "shape": (column.length,)}
+        lengths = (column.length,) if height is None else (height, column.length // height)
+        shape = {"descr": column.dtype.str, "fortran_order": False, "shape": lengths}
         np.lib.format.write_array_header_1_0(target, shape)
         column.copy_to(target)
 
 
-def write(path: Path, scans: Iterable[Scan], *, every_point: bool) -> None:
+def write(path: Path, scans: Iterable[Scan], *, every_point: bool, organized: bool = False) -> None:
     """Write the columns that all scans have, `scan` for each point, and for each scan `stamp_ns`, `rate_hz` and `complete`.
 
-    The unit of a sensor's further column stands in NAME.unit.
+    The unit of a sensor's further column stands in NAME.unit. With `organized` the columns of the one scan that there is are
+    (rows, columns), several returns of a place side by side.
     """
+    height: int | None = None
     with contextlib.ExitStack() as files:
 
         def column(dtype: DTypeLike) -> Spool:
@@ -56,6 +59,9 @@ def write(path: Path, scans: Iterable[Scan], *, every_point: bool) -> None:
         for number, scan in enumerate(scans):
             cloud = written(scan, every_point=every_point)
             own = cloud.columns
+            if organized:
+                height = len(picture(cloud.valid, cloud))
+                own = {name: picture(column, cloud).ravel() for name, column in own.items()}
             columns = columns if number else {name: column(values.dtype) for name, values in own.items()}
             units = units if number else {name: unit for name, unit in cloud.units.items() if unit}
             columns = {name: kept for name, kept in columns.items() if name in own}
@@ -68,16 +74,19 @@ def write(path: Path, scans: Iterable[Scan], *, every_point: bool) -> None:
         for unit, kept in zip(units.values(), told.values(), strict=True):
             kept.add(np.array([unit]))
         with zipfile.ZipFile(path, "w") as archive:
-            for name, kept in {**columns, "scan": numbers, **of_scans, **told}.items():
+            for name, kept in {**columns, "scan": numbers}.items():
+                put(archive, name, kept, height)
+            for name, kept in {**of_scans, **told}.items():
                 put(archive, name, kept)
 
 
-def write_npy(path: Path, scans: Iterable[Scan], *, every_point: bool) -> None:
+def write_npy(path: Path, scans: Iterable[Scan], *, every_point: bool, organized: bool = False) -> None:
     """Write one structured array with PCL's layout, as `PointCloud.to_structured` makes it: what the sensor lacks is 0.
 
-    Where there are several scans, their number is a further column, `scan`. Such a file can be mapped: ``np.load(path, mmap_mode="r")``.
+    Where there are several scans, their number is a further column, `scan`; with `organized` the one that there is is (rows, columns).
+    Such a file can be mapped: ``np.load(path, mmap_mode="r")``.
     """
-    write_rows(path, Rows(scans, _structured, every_point=every_point), _npy_header)
+    write_rows(path, Rows(scans, _structured, every_point=every_point, is_picture=organized), _npy_header)
 
 
 def _structured(types: Mapping[str, Any]) -> np.dtype[Any]:
@@ -87,7 +96,11 @@ def _structured(types: Mapping[str, Any]) -> np.dtype[Any]:
 def _npy_header(rows: Rows) -> bytes:
     """As long for any number of rows, since NumPy leaves room for it."""
     header = io.BytesIO()
-    shape = {"descr": np.lib.format.dtype_to_descr(rows.dtype), "fortran_order": False, "shape": (rows.length,)}
+    shape = {
+        "descr": np.lib.format.dtype_to_descr(rows.dtype),
+        "fortran_order": False,
+        "shape": rows.shape[::-1] if rows.shape else (rows.length,),
+    }
     np.lib.format.write_array_header_1_0(header, shape)
     return header.getvalue()
 
@@ -150,6 +163,6 @@ def write_zarr(path: Path, scans: Iterable[Scan], *, every_point: bool) -> None:
         column.finish()
 
 
-NPZ = Format(".npz", "NumPy arrays, one a column", write)
-NPY = Format(".npy", "a structured NumPy array with PCL's layout", write_npy)
+NPZ = Format(".npz", "NumPy arrays, one a column", write, ("organized",))
+NPY = Format(".npy", "a structured NumPy array with PCL's layout", write_npy, ("organized",))
 ZARR = Format(".zarr", "Zarr, a folder with an array a column (zarr)", write_zarr)

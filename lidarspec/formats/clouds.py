@@ -28,15 +28,16 @@ _PLY_NAMES = {"f4": "float", "f8": "double", "u1": "uchar", "i4": "int"}
 _MOST_COMPRESSED = (1 << 32) - 1
 
 
-def write_pcd(path: Path, scans: Iterable[Scan], *, every_point: bool) -> None:
+def write_pcd(path: Path, scans: Iterable[Scan], *, every_point: bool, organized: bool = False) -> None:
     """Write a binary PCD 0.7 file: x y z intensity ring time, as far as the sensor has them, and its further columns in their types.
 
-    WIDTH and HEIGHT are those of a single organised scan whose every point is written, missing ones as nan; else HEIGHT is 1.
+    WIDTH and HEIGHT are those of a single organised scan whose every point is written, missing ones as nan, `organized` or not; else
+    HEIGHT is 1.
     """
     write_rows(path, _pcd_rows(scans, every_point=every_point), _pcd_header)
 
 
-def write_lzf_pcd(path: Path, scans: Iterable[Scan], *, every_point: bool) -> None:
+def write_lzf_pcd(path: Path, scans: Iterable[Scan], *, every_point: bool, organized: bool = False) -> None:
     """Write the same as `write_pcd` as DATA binary_compressed: field by field, with LZF.
 
     Raises:
@@ -131,7 +132,7 @@ def write_kitti(path: Path, scans: Iterable[Scan], *, every_point: bool) -> None
     write_rows(path, Rows(scans, lambda types: row, every_point=every_point), lambda rows: b"")
 
 
-PCD = Format(".pcd", "a point cloud of PCL, binary", write_pcd)
-LZF_PCD = Format(".lzf.pcd", "a point cloud of PCL, compressed", write_lzf_pcd)
+PCD = Format(".pcd", "a point cloud of PCL, binary", write_pcd, ("organized",))
+LZF_PCD = Format(".lzf.pcd", "a point cloud of PCL, compressed", write_lzf_pcd, ("organized",))
 PLY = Format(".ply", "a point cloud, binary", write_ply)
 KITTI = Format(".bin", "x y z intensity as KITTI has them, float32", write_kitti)

@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Any
 
 from lidarspec.errors import UsageError, library
-from lidarspec.formats.bags import CHUNK, FRAME, POINTS, SCAN, Planes, fields_of, records
+from lidarspec.formats.bags import CHUNK, POINTS, SCAN, Planes, fields_of, records
 from lidarspec.points.cloud import PointCloud
 from lidarspec.scans.scans import LaserScan, Scan
 from lidarspec.transports.protocol import Format
@@ -39,7 +39,7 @@ def write_foxglove(path: Path, scans: Iterable[Scan], *, every_point: bool) -> N
                 messages[SCAN] = _planar(planar, is_graded=scan.points.intensity is not None)
             for topic, message in messages.items():
                 message.timestamp.FromNanoseconds(scan.stamp_ns)
-                message.frame_id, message.pose.orientation.w = FRAME, 1
+                message.frame_id, message.pose.orientation.w = scan.frame_id, 1
                 log.write_message(topic, message, scan.stamp_ns, scan.stamp_ns)
         if units:
             log.add_metadata("units", units)
@@ -59,4 +59,4 @@ def _planar(scan: LaserScan, *, is_graded: bool) -> Any:
     return message(start_angle=scan.angle_min, end_angle=scan.angle_max, ranges=scan.ranges, intensities=intensities)
 
 
-FOXGLOVE = Format(".foxglove.mcap", "an MCAP file with Foxglove's messages", write_foxglove)
+FOXGLOVE = Format(".foxglove.mcap", "an MCAP file with Foxglove's messages", write_foxglove, ("beams", "frame-id"))

@@ -52,7 +52,7 @@ def _write(path: Path, scans: Iterable[Scan], *, every_point: bool, is_compresse
                 rows = np.zeros(ROWS, header.point_format.dtype())
                 writer = files.enter_context(opened())
             own["returns"] = _returns(own)
-            own["time"] = own["time"] + (scan.stamp_ns - EPOCH) * 1e-9
+            own["time"] = own.get("time", np.zeros(len(own["x"]))) + (scan.stamp_ns - EPOCH) * 1e-9
             for start in range(0, len(own["x"]), ROWS):
                 part = {name: column[start : start + ROWS] for name, column in own.items()}
                 _fill(record := rows[: len(part["x"])], part, further, header.offsets)

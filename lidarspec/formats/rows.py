@@ -10,8 +10,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from lidarspec.formats.writing import columns_of
-from lidarspec.points.cloud import STRUCTURED, grid_of
+from lidarspec.formats.writing import columns_of, picture
+from lidarspec.points.cloud import STRUCTURED
 from lidarspec.scans.scans import Scan, handed_out
 
 #: columns that rows begin with; a sensor's further ones follow.
@@ -35,7 +35,7 @@ class Rows:
     Attributes:
         dtype: of a row.
         length: how many rows there were so far.
-        shape: (columns, rows) of such a picture, else None.
+        shape: (width, height) of such a picture, else None; several returns of a place stand side by side.
         facts: what a header may say of the sensor, the stamp of the first scan and the units, a line each.
     """
 
@@ -51,8 +51,9 @@ class Rows:
             cloud = first[0].points
             columns = self._columns(first[0], 0, (*NAMES, *cloud.extra, *(["scan"] if len(first) > 1 else [])))
             types |= {name: STRUCTURED[name] if name in NAMES else column.dtype for name, column in columns.items()}
-            if is_picture and every_point and len(first) == 1 and grid_of(cloud).returns == 1:
-                self.shape = cloud.shape
+            if is_picture and every_point and len(first) == 1 and cloud.shape:
+                height, width = picture(np.empty(len(cloud), np.bool_), cloud).shape
+                self.shape = width, height
             units = [f"unit {name} {unit}" for name, unit in cloud.units.items() if unit]
             self.facts = [f"sensor {first[0].sensor.id}", f"stamp_ns {cloud.stamp_ns}", *units]
         self.dtype = layout(types)
@@ -65,7 +66,7 @@ class Rows:
             for name, column in columns.items():
                 rows[name] = column
             self.length += len(rows)
-            yield rows.reshape(self.shape).T.reshape(-1) if self.shape else rows
+            yield picture(rows, scan.points).reshape(-1) if self.shape else rows
 
     def _columns(self, scan: Scan, number: int, names: Sequence[str]) -> dict[str, NDArray[Any]]:
         """Those of some columns that the scan has, and its number, of the points that are written."""

@@ -85,11 +85,24 @@ def kept(cloud: PointCloud, *, every_point: bool) -> NDArray[np.intp] | None:
 
 def columns_of(scan: Scan, names: Iterable[str], *, every_point: bool) -> dict[str, NDArray[Any]]:
     """Those of some columns that a scan has, "valid" and its further ones too, of the points that are written."""
-    cloud, named = scan.points, tuple(names)
+    cloud = scan.points
+    named = tuple(name for name in names if name == "valid" or cloud.shows(name))
     source_of(cloud).prepare((*named, "valid"))
     columns = {name: getattr(cloud, name) if name in (*COLUMNS, "valid") else cloud.extra.get(name) for name in named}
     which = kept(cloud, every_point=every_point)
     return {name: column if which is None else column[which] for name, column in columns.items() if column is not None}
+
+
+def picture(values: NDArray[Any], cloud: PointCloud) -> NDArray[Any]:
+    """Values of organised points, (n,), as (rows, columns), a row for each ring; several returns of a place stand side by side."""
+    columns, rows = cloud.shape or (len(cloud), 1)
+    returns, height = len(cloud) // max(columns * rows, 1) or 1, rows
+    if cloud.ring is not None and columns:
+        rings = cloud.ring[: rows * returns : returns]
+        once = len(np.unique(rings))
+        if rows % once == 0 and (rings.reshape(-1, once) == rings[:once]).all():
+            height = once  # a packet's column may hold several firings
+    return values.reshape(-1, height, returns).swapaxes(0, 1).reshape(height, -1)
 
 
 class Spool:

@@ -286,7 +286,7 @@ class RecodedCodec(Codec):
     def __init__(self, frame: Frame, recoder: Recoder, engine: CompiledCodec | InterpretedCodec) -> None:
         super().__init__(frame)
         self.recoder, self.engine, self.size = recoder, engine, None
-        self.prefix = {spot: (0xFF, byte) for spot, byte in enumerate(recoder.begins)}
+        self.prefix = {spot: (0xFF, byte) for spot, byte in recoder.prefix.items()}
         self.marks = marks(self.prefix)
 
     @property
@@ -303,9 +303,12 @@ class RecodedCodec(Codec):
         gathered: bool = True,
         sums: Sums | None = None,
     ) -> Frames:
+        if not len(offsets):  # as most types of a sensor have none, the buffer is not gone through for each
+            return Frames(buffer, repeated(kind, 0), offsets, offsets, status=np.zeros(0, np.uint8))
         reading = self.recoder.reading(buffer, offsets)
-        status, errors = np.where(reading.sizes == 0, SHORT, LENGTH).astype(np.uint8), list[PluginError]()
-        whole = np.flatnonzero(reading.sizes > 0)
+        told = offsets + max(self.prefix, default=-1) < (len(buffer) if stops is None else stops)  # else it may be no candidate at all
+        status, errors = np.where((reading.sizes == 0) | ~told, SHORT, LENGTH).astype(np.uint8), list[PluginError]()
+        whole = np.flatnonzero((reading.sizes > 0) & told)
         if reading.intact is not None:
             status[whole[~reading.intact[whole]]] = CHECKSUM
             whole = whole[reading.intact[whole]]

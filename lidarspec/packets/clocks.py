@@ -29,7 +29,7 @@ class Unwrapper:
     """A clock that starts again at `wraps_at` seconds, made to run on; exact over any number of wraps.
 
     The shorter way round decides between forward and backward, so late packets go back in time. Where the host's
-    times say that more than most of a turn has passed, they decide how many turns it was.
+    times say that more than most of a turn has passed, they decide how many turns it was; from half a turn on, whether it was forward.
     """
 
     def __init__(self, wraps_at: float | None) -> None:
@@ -50,10 +50,11 @@ class Unwrapper:
             return times
         if len(over):
             steps[over] = (steps[over] + half) % self._turn - half
-        if self._turn >= 10**9 and int(host.max()) - min(int(host.min()), at or int(host.max())) > self._turn * 3 // 4:
+        if self._turn >= 10**9 and int(host.max()) - min(int(host.min()), at or int(host.max())) > half:
             before = np.concatenate([[at], host[:-1]])
             passed = np.where((host > 0) & (before > 0), host - before, 0)
-            late = passed > self._turn * 3 // 4
+            forward = (passed > half) & (np.abs(steps + self._turn - passed) < self._turn // 4)
+            late = forward | (passed > self._turn * 3 // 4)
             if late.any():
                 steps += np.where(late, (passed - steps + half) // self._turn, 0) * self._turn
         steps[0] += time

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from functools import cached_property
+from functools import cached_property, lru_cache
 from itertools import pairwise
 from typing import Any
 
@@ -58,7 +58,8 @@ class PacketStream:
         data = sensor.frames[frame].data
         counted = sensor.sequence is not None and data and _has(sensor, frame, sensor.sequence.field)
         clock = _clock_of(sensor, frame, self._codec.schema)
-        self._timer, timed = replace(sensor, clock=clock) if clock else sensor, data and clock is not None
+        self._timer = replace(sensor, clock=clock) if clock is not None and clock is not sensor.clock else sensor
+        timed = data and clock is not None
         self._clock = Unwrapper(clock.wraps_at) if clock else None
         self._turn = repeated(0, 0)  # what completes the times of the packets at hand
         self._epoch = Epoch(self._timer, clock) if timed and clock is not None and clock.told is not None else None
@@ -207,9 +208,9 @@ class ImuStream:
     """
 
     def __init__(self, sensor: Spec, stats: Counters, *, backend: str = "auto", state: Mapping[str, bytes] | None = None) -> None:
-        names = [name for name in sensor.imu_frames if not sensor.frames[name].data]
-        self._streams = [PacketStream(sensor, name, stats, backend=backend, state=state) for name in names]
-        kinds = {_clock_of(sensor, name, codec(sensor.frames[name]).schema) is None for name in (*names, *sensor.data_frames)}
+        self._names = [name for name in sensor.imu_frames if not sensor.frames[name].data]
+        self._stream = lru_cache(lambda name: PacketStream(sensor, name, stats, backend=backend, state=state))
+        kinds = {_clock_of(sensor, name, codec(sensor.frames[name]).schema) is None for name in (*self._names, *sensor.data_frames)}
         self.waiting = Waiting() if sensor.imu_frames and len(kinds) == 1 else None
 
     def add(self, found: Sequence[Frames], data: Packets | None, *, whole: bool = False) -> ImuSamples:
@@ -221,7 +222,8 @@ class ImuStream:
         """
         own = [data] if data is not None and data.sensor.frames[data.frame].imu is not None else []
         parts = list[ImuSamples]()
-        for packets in (*own, *(stream.add(found, whole=whole) for stream in self._streams)):
+        names = [name for name in self._names if not whole or any(_Part.of(frames, name).number for frames in found)]
+        for packets in (*own, *(self._stream(name).add(found, whole=whole) for name in names)):
             try:
                 parts += [packets.imu()] if len(packets) else []
             except SpecError as error:
@@ -233,8 +235,8 @@ class ImuStream:
 
     def interrupt(self) -> None:
         """Input was lost here."""
-        for stream in self._streams:
-            stream.interrupt()
+        for name in self._names:
+            self._stream(name).interrupt()
 
 
 @dataclass(frozen=True, eq=False)

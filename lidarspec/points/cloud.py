@@ -59,6 +59,7 @@ class PointCloud:
         nominal: True where a default calibration stood in for the sensor's own.
         extra: (N,) columns that the sensor gives besides, by name, such as "velocity"; each in its type.
         units: of those in `extra`, by name; "" for a plain number.
+        chosen: the columns that `columns` and files have, see `only`; () for all.
     """
 
     x: Floats
@@ -78,6 +79,7 @@ class PointCloud:
     nominal: np.bool_ = field(default_factory=np.bool_)
     extra: Mapping[str, NDArray[Any]] = field(default_factory=dict)
     units: Mapping[str, str] = field(default_factory=dict)
+    chosen: tuple[str, ...] = ()
 
     def __len__(self) -> int:
         return np.size(self.x)  # 1 of `cloud[0]`
@@ -93,9 +95,30 @@ class PointCloud:
 
     @property
     def columns(self) -> Mapping[str, NDArray[Any]]:
-        """The columns that this cloud has, by name, those in `extra` last."""
-        source_of(self).prepare((*COLUMNS, *self.extra))
-        return {name: getattr(self, name) for name in COLUMNS if getattr(self, name) is not None} | dict(self.extra)
+        """The columns that this cloud has, by name, those in `extra` last; those that were chosen."""
+        names = self.chosen or (*COLUMNS, *self.extra)
+        source_of(self).prepare(names)
+        columns = {name: self.extra[name] if name in self.extra else getattr(self, name) for name in names}
+        return {name: column for name, column in columns.items() if column is not None}
+
+    def shows(self, name: str) -> bool:
+        """Whether a column was chosen, or is a place, which every file of points has."""
+        return not self.chosen or name in (*self.chosen, "x", "y", "z")
+
+    def only(self, *names: str) -> PointCloud:
+        """The same points, of which `columns`, `to_structured` and files have these columns alone; x y z stay where a format takes them.
+
+        Raises:
+            UnknownName: for a column that the cloud has not; it names those that it has.
+        """
+        lacking = [name for name in names if name not in self.extra and (name not in COLUMNS or getattr(self, name) is None)]
+        if lacking:
+            raise UnknownName(lacking[0], self.columns, place="columns of points")
+        source = CloudColumns(self)
+        source.extra = {name: kind for name, kind in source.extra.items() if name in names}
+        cloud = LazyCloud.of(source, self.stamp_ns)
+        cloud.__dict__["chosen"] = names
+        return cloud
 
     def read(self, *names: str) -> dict[str, NDArray[Any]]:
         """Some columns by name, "valid" and those in `extra` too, made together, which is quicker than one after another.
@@ -196,8 +219,9 @@ class PointCloud:
 
         The columns in `extra` follow from byte 32 on, each where its type allows, and the itemsize is a multiple of 16.
         """
-        source_of(self).prepare((*(STRUCTURED.names or ()), *self.extra))
-        columns = {name: getattr(self, name) for name in STRUCTURED.names or ()} | dict(self.extra)
+        names = [name for name in STRUCTURED.names or () if self.shows(name)]
+        source_of(self).prepare((*names, *self.extra))
+        columns = {name: getattr(self, name) for name in names} | dict(self.extra)
         structured = np.zeros(len(self), structured_type({name: column.dtype for name, column in self.extra.items()}))
         for name, column in columns.items():
             if column is not None:
@@ -496,7 +520,9 @@ class LazyCloud(PointCloud):
     def __getitem__(self, which: Any) -> PointCloud:
         if isinstance(which, slice) and which.step in (None, 1):
             first, end, _ = which.indices(len(self))
-            return LazyCloud.of(Stretches([Stretch(CloudColumns(self), first, max(first, end))]), self.stamp_ns)
+            cloud = LazyCloud.of(Stretches([Stretch(CloudColumns(self), first, max(first, end))]), self.stamp_ns)
+            cloud.__dict__["chosen"] = self.chosen
+            return cloud
         return super().__getitem__(which)
 
     def __reduce__(self) -> Any:

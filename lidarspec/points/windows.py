@@ -11,17 +11,20 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from lidarspec.columns.graph import Expression, Node, only_field
+from lidarspec.columns.graph import Expression, Node, is_nan_where, only_field
+from lidarspec.points.conventions import returned_range
 from lidarspec.wire.layout import Layout, Leaf
 
 #: what costs hardly more than looking its result up; with these, whatever is made of numbers stays a number.
 CHEAP: set[Any] = {np.add, np.subtract, np.multiply, np.negative, np.positive, np.absolute, np.deg2rad, np.radians, np.minimum, np.maximum}
 CHEAP |= {np.less, np.less_equal, np.greater, np.greater_equal, np.equal, np.not_equal, np.where}
+#: bits of whole numbers whose multiples by a step, in float32, are told apart.
+SHORT = 21
 #: dividing by one of these numbers, or the rest of it, is a number too.
 _DIVISIONS = {np.true_divide, np.mod}
 
@@ -123,3 +126,34 @@ def is_number(value: Any, leaves: Any) -> bool:
         divisor = value.args[1]
         return not isinstance(divisor, Node) and bool(np.all(divisor)) and is_number(value.args[0], leaves)
     return (value.function in CHEAP or value.function in (np.sin, np.cos)) and all(is_number(arg, leaves) for arg in value.args)
+
+
+class Beam(NamedTuple):
+    """A coordinate of points along beams: a measured distance times a row of a table, and the row of another where the beams start.
+
+    Attributes:
+        distance: as the sensor sent it, in such steps of metres; or nan.
+        direction, start: the rows.
+    """
+
+    distance: Node
+    direction: Node
+    start: Node
+    step: float
+
+
+def beam_of(node: Node, leaves: Mapping[str, Leaf]) -> Beam | None:
+    """The beam that a sum goes along; None where it is another sum, or float32 does not tell apart the steps of the distance."""
+    if node.function is not np.add or not all(isinstance(arg, Node) for arg in node.args):
+        return None
+    product, start = node.args
+    if product.function is not np.multiply or start.kind != "rows" or not all(isinstance(arg, Node) for arg in product.args):
+        return None
+    distance, direction = product.args
+    field = distance
+    while is_nan_where(field) or field.function is returned_range:
+        field = field.args[-1]
+    leaf = leaves.get(field.path) if field.kind == "field" and direction.kind == "rows" else None
+    if leaf is None or leaf.info.kind != "int" or leaf.info.bits > SHORT or leaf.info.offset:
+        return None
+    return Beam(distance, direction, start, leaf.info.scale)

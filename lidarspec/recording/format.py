@@ -17,7 +17,8 @@ was set, and is "ahead_ns" ahead of the arrival times, which go on evenly. What 
 Theory of operation: a length is at most what its one or two bytes can say, so no record claims more than 66 kB, and none is
 believed before its checksum passes. The reader keeps a window of the file that holds one record and what was read with it. It stops at
 the first damaged record, or salvages what lies behind it; what a killed process leaves behind is whole records and at most one that is
-not.
+not. A time is found by bisection (`Recording.seek`): arrival times do not go back, and from anywhere in the file the next mark with a
+good checksum is a record. So no index is kept, which a crash could lose, and every recording can be sought in.
 """
 
 from __future__ import annotations
@@ -35,7 +36,7 @@ from functools import lru_cache
 from pathlib import Path
 from reprlib import repr as shown
 from shlex import quote
-from typing import Any, Literal
+from typing import Any, BinaryIO, Literal
 
 from lidarspec.errors import SourceError, UsageError, WireError, suggest, system_errors
 from lidarspec.plugins import sensor as named_sensor
@@ -195,6 +196,7 @@ class Recording(Closing):
 
     Args:
         path: the file; "-" is standard input.
+        file: it, where it is open already, or is read in another way than as it stands; closed with this one.
         salvage: look for the next good record behind a damaged place, even the header, instead of stopping there.
 
     Attributes:
@@ -210,13 +212,13 @@ class Recording(Closing):
         WireError: where its header is damaged, and `salvage` is not asked for.
     """
 
-    def __init__(self, path: str | Path, *, salvage: bool = False) -> None:
+    def __init__(self, path: str | Path, file: BinaryIO | None = None, *, salvage: bool = False) -> None:
         self.path, self.salvage = str(path), salvage
         self._window, self._place = b"", 0
         self.records = self.damaged = self.leftover = 0
         self.is_cut, self.offset = False, len(MAGIC)
         with system_errors(path):
-            self._file = sys.stdin.buffer if self.path == "-" else open(path, "rb")  # noqa: SIM115  closed by `close`
+            self._file = file or (sys.stdin.buffer if self.path == "-" else open(path, "rb"))  # noqa: SIM115  closed by `close`
         try:
             self._records = self._begin()
         except BaseException:
@@ -230,6 +232,47 @@ class Recording(Closing):
 
     def __iter__(self) -> Iterator[Record]:
         return self._records
+
+    def seek(self, at: int) -> bool:
+        """Go on close before the first record that was received at a time, ns since 1970, or later, a few blocks away at most.
+
+        Damaged places that are passed over are not counted.
+
+        Returns:
+            False where that is behind here, where nobody knows when records arrived, and for a pipe: it then goes on where it was.
+        """
+        here = low = self.offset
+        if not self._file.seekable():
+            return False
+        with system_errors(self.path):
+            high = self._file.seek(0, os.SEEK_END)
+            while high - low > 2 * (LARGEST + _BLOCK):
+                middle = (low + high) // 2
+                found = self._received(middle, high)
+                if found is None or found[0] >= at:
+                    high = middle
+                else:
+                    low = found[1]
+            self._go(low)
+        return low > here
+
+    def _received(self, start: int, stop: int) -> tuple[int, int] | None:
+        """Time and offset of the first record between two places that was received, and when is known."""
+        self._go(start)
+        while self.offset < stop and self._holds(1):
+            size, place = self._good(), self._place
+            if size > 0:
+                kind, record = _unpacked(self._window[place : place + size])
+                if kind == RECEIVED and record.at is not None:
+                    return record.at, self.offset
+                self._skip(size)
+            else:
+                self._next_mark()
+        return None
+
+    def _go(self, offset: int) -> None:
+        self._file.seek(offset)
+        self._window, self._place, self.offset = b"", 0, offset
 
     def _begin(self) -> Iterator[Record]:
         """Read the header; the records behind it."""

@@ -30,6 +30,8 @@ from lidarspec.wire.arrays import alike, repeated
 SLOWEST, UNTIMED = 1.0, 1.0
 #: bytes of a scan at the most where neither points nor a line say so, and packets looked at together.
 LARGEST, TOGETHER = 1 << 26, 1024
+#: the frame that the points are in, by its usual name: x forward, y left, z up (REP-103).
+FRAME_ID = "laser"
 #: how much longer a scan with a gap may become than the whole one before it.
 LONGER = 1.125
 
@@ -41,9 +43,10 @@ class LaserScan:
     Attributes:
         ranges, intensities: (n,) float32.
         angle_min, angle_max, angle_increment: radians, counter-clockwise; ``angle_max = angle_min + (n - 1) * angle_increment``.
-        time_increment, scan_time: seconds.
+        time_increment, scan_time: seconds; the increment is negative where the angle falls with time.
         range_min, range_max: metres, the sensor's.
         stamp_ns: of the first point.
+        host_ns: as in `Scan`.
     """
 
     angle_min: float
@@ -56,6 +59,7 @@ class LaserScan:
     ranges: NDArray[np.float32]
     intensities: NDArray[np.float32]
     stamp_ns: int = 0
+    host_ns: int = 0
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -70,6 +74,9 @@ class Scan:
         sensor: whose.
         whole: whether both ends were seen, and no more is missing between them than is there.
         imu: what the IMU felt from the first point up to that of the next scan; None without an IMU, or where it has another clock.
+        host_ns: when the packet of the first point arrived, int64 ns since 1970 by the computer's clock; 0 where nobody knows it.
+        beams: how many `to_laserscan` gives where it is not told; None: as many as the sensor declares, else as there are points.
+        frame_id: what ROS's messages call the frame of the points.
     """
 
     points: PointCloud
@@ -78,6 +85,9 @@ class Scan:
     sensor: Spec
     whole: bool = False
     imu: ImuSamples | None = None
+    host_ns: int = 0
+    beams: int | None = None
+    frame_id: str = FRAME_ID
 
     @property
     def stamp_ns(self) -> int:
@@ -122,20 +132,27 @@ class Scan:
         """
         return self._binned(_sectors(n, "to_bins"))[0]
 
-    def to_laserscan(self, n: int | None = None) -> LaserScan:
-        """The scan on an even grid of n angles over the whole turn, by default as many as there are points.
+    def to_laserscan(self, beams: int | None = None) -> LaserScan:
+        """The scan on an even grid of so many angles over the whole turn, by default as `beams` says.
 
         Raises:
             UsageError: for a number of angles that is none.
         """
-        count = max(len(self), 1) if n is None else _sectors(n, "to_laserscan")
+        count = _sectors(beams, "to_laserscan") if beams is not None else self.beams or self.sensor.beams or max(len(self), 1)
         ranges, intensities = self._binned(count, centred=True)
         step = 2 * np.pi / count
         period = (
             1 / self.rate_hz if np.isfinite(self.rate_hz) and self.rate_hz > 0 else float(np.ptp(self.points.time)) if len(self) else 0.0
         )
+        each = -period / count if self._falls() else period / count
         near, far = self.sensor.range_limits
-        return LaserScan(-np.pi, -np.pi + (count - 1) * step, step, period / count, period, near, far, ranges, intensities, self.stamp_ns)
+        last = -np.pi + (count - 1) * step
+        return LaserScan(-np.pi, last, step, each, period, near, far, ranges, intensities, self.stamp_ns, self.host_ns)
+
+    def _falls(self) -> bool:
+        """Whether the azimuth falls with time."""
+        steps = np.diff(self.points.azimuth.astype(np.float64))
+        return bool(np.nansum((steps + np.pi) % (2 * np.pi) - np.pi) < 0)
 
     def _binned(self, n: int, *, centred: bool = False) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
         valid = self.points.valid
@@ -370,6 +387,7 @@ class ScanStream:
         self._progress = Progress(sensor)
         self._empty, self._broken = 0, False  # frames without parts that have points, and whether there is a break before those at the end
         self._begins: int | None = None  # time of the first point of the scan under way, ns, where it is known
+        self._host: int | None = None  # when its packet arrived
 
     def add(self, packets: Packets) -> list[Scan]:
         """The scans that these packets complete."""
@@ -416,12 +434,15 @@ class ScanStream:
     def _cut(self, packets: Packets, points: Evaluated) -> Iterator[Scan]:
         start, source = 0, source_of(points.cloud)
         cuts = self._progress.cuts(packets, points, self._cutter.ends(packets, points))
-        first, *times = _times_ns(source, [0, *(cut.point for cut in cuts)])
+        starts = [0, *(cut.point for cut in cuts)]
+        first, *times = _times_ns(source, starts)
+        arrived, *hosts = _hosts_ns(packets, points, starts) if cuts or self._host is None else [None]
         self._begins = first if self._begins is None else self._begins
-        for cut, time in zip(cuts, times, strict=True):
+        self._host = arrived if self._host is None else self._host
+        for cut, time, host in zip(cuts, times, hosts, strict=True):
             self._take(source, start, cut.point)
             scan = self._close(time, whole=cut.whole, complete=cut.complete)
-            self._begins, start = time, cut.point
+            self._begins, self._host, start = time, host, cut.point
             if scan is not None:
                 yield scan
         self._take(source, start, source.size)
@@ -443,7 +464,7 @@ class ScanStream:
         samples = None if self._imu is None else self._imu.until(ends)
         if self._mount is not None:
             cloud, samples = self._mount.applied(cloud), None if samples is None else samples.turned(self._mount.rotation)
-        return Scan(cloud, float(rate) if whole else np.nan, complete, self._sensor, whole, samples)
+        return Scan(cloud, float(rate) if whole else np.nan, complete, self._sensor, whole, samples, self._host or 0)
 
 
 def _times_ns(source: ColumnSource, indices: Sequence[int]) -> list[int | None]:
@@ -451,6 +472,13 @@ def _times_ns(source: ColumnSource, indices: Sequence[int]) -> list[int | None]:
     known = [index for index in indices if index < source.size]
     times = source.times_at(np.array(known, np.intp)).tolist() if known else []
     return [source.base + round(time * 1e9) for time in times] + [None] * (len(indices) - len(known))
+
+
+def _hosts_ns(packets: Packets, points: Evaluated, indices: Sequence[int]) -> list[int | None]:
+    """When the packets of some points arrived, ns; None for points past the end."""
+    first, size = first_points(points), source_of(points.cloud).size
+    known = first.searchsorted([index for index in indices if index < size], side="right") - 1
+    return [*packets.host_ns[known].tolist(), *[None] * (len(indices) - len(known))]
 
 
 def scans_of(sensor: Spec, batches: Iterable[Packets], imu: Waiting | None = None) -> Iterator[Scan]:

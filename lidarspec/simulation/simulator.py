@@ -415,15 +415,10 @@ class PartRows(Rows):
         left = iter(sealed(self))
         axis, kind = self.place
         spots = list[tuple[int, int, NDArray[np.uint8]]]()
-        for group in self.frames.groups:
-            if (region := group.layout.regions.get(axis)) is not None:
-                buffer, walked = region.in_rows(group.rows)
-                pieces = [piece for pieces in walked.rounds for piece in pieces if region.kinds[piece.kind].node.name == kind]
-                spots += [
-                    (int(group.where[owner]), int(spot), buffer)
-                    for piece in pieces
-                    for owner, spot in zip(piece.owners, piece.spots, strict=True)
-                ]
+        for group, buffer, walked in self.frames.walks(axis):
+            kinds = [one.node.name for one in group.layout.regions[axis].kinds]
+            for piece in (piece for pieces in walked.rounds for piece in pieces if kinds[piece.kind] == kind):
+                spots += [(int(group.where[owner]), int(spot), buffer) for owner, spot in zip(piece.owners, piece.spots, strict=True)]
         for _, spot, buffer in sorted(spots, key=lambda found: found[:2]):
             part = next(left)
             buffer[spot : spot + len(part)] = np.frombuffer(part, np.uint8)

@@ -71,6 +71,7 @@ if TYPE_CHECKING:
         wrap as wrap,
     )
     from lidarspec.spec.wire_forms import (
+        Echoes as Echoes,
         Escaped as Escaped,
         Lines as Lines,
         Reading as Reading,
@@ -100,7 +101,7 @@ _NAMES = {
     "columns.columns": ("Fields", "Column"),
     "spec.results": ("Points", "Polar", "Cartesian", "Extra", "Imu"),
     "spec.vocabulary": ("along", "spread", "wrap", "following", "previous", "last", "running", "stack", "steps", "take"),
-    "spec.wire_forms": ("Tokens", "Lines", "SixBits", "Scip", "Escaped", "WireForm", "Reading", "Slot", "Unescaped"),
+    "spec.wire_forms": ("Tokens", "Lines", "SixBits", "Echoes", "Scip", "Escaped", "WireForm", "Reading", "Slot", "Unescaped"),
     "plugins": ("hookimpl",),
     "transports.protocol": ("Format", "Transport", "LiveTransport", "Chunk", "Disconnected"),
 }

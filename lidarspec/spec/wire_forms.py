@@ -23,6 +23,8 @@ from lidarspec.errors import SpecError
 Bytes1D = NDArray[np.uint8]
 Bytes2D = NDArray[np.uint8]
 Numbers = NDArray[np.intp]
+#: the bytes of a text, None for each that may be any.
+Characters = Sequence[int | None]
 
 #: what `Reading.sizes` says of candidates without an end so far, and of those that are no frames.
 SHORT, NONE = 0, -1
@@ -98,8 +100,8 @@ class WireForm(Protocol):
     @property
     def start(self) -> bytes: ...
 
-    def begins(self, texts: Sequence[bytes]) -> bytes:
-        """The first bytes on the wire of frames that begin with these constant texts, as far as these are always the same."""
+    def begins(self, texts: Sequence[Characters]) -> Characters:
+        """The first bytes on the wire of frames that begin with these texts, as far as the place of each is always the same."""
 
     def read(self, buffer: Bytes1D, starts: Numbers, limit: int) -> Reading:
         """Rows out of bytes: the candidates that begin at `starts`, (n,) ascending, of at most `limit` bytes."""
@@ -183,8 +185,8 @@ class Tokens:
         if self.base not in (10, 16):
             raise SpecError(f"digits are decimal or hexadecimal, not of base {self.base}", path="wire")
 
-    def begins(self, texts: Sequence[bytes]) -> bytes:
-        return self.start + self.sep.join(text for text in texts if text)
+    def begins(self, texts: Sequence[Characters]) -> Characters:
+        return [*self.start, *[byte for text in texts if len(text) for byte in (*text, self.sep[0])][:-1]]
 
     def read(self, buffer: Bytes1D, starts: Numbers, limit: int) -> Reading:
         return _TokenReading(self, buffer, starts, limit)
@@ -427,6 +429,79 @@ class Unescaped:
 
 
 @dataclass(frozen=True)
+class Echoes:
+    """Steps of one to some echoes each, joined by a mark; in a row each step has places for all, and an echo that is missing is 0.
+
+    An echo whose numbers are all 0 is not sent when none follows it in its step, but for the first.
+
+    Args:
+        size: the characters of an echo.
+        most: echoes of a step.
+        mark: a character that is no digit.
+    """
+
+    size: int
+    most: int
+    mark: bytes = b"&"
+
+    def apart(self, places: Numbers, values: Bytes1D, begins: Numbers, ends: Numbers, zero: int) -> tuple[Numbers, Bytes1D]:
+        """Characters and where they stand, with all echoes of all steps in their places.
+
+        Args:
+            begins, ends: in the buffer, of what stands behind the head of each frame, (n,) ascending; of frames in one another the first
+                counts.
+            zero: what stands for a character that is missing.
+        """
+        pieces, done = list[tuple[Numbers, Bytes1D]](), 0
+        for begin, end, stop in zip(places.searchsorted(begins), places.searchsorted(ends), ends - 1, strict=True):
+            if begin >= done:
+                steps = self._steps(places[begin:end], values[begin:end], stop, zero)
+                pieces += [(places[done:begin], values[done:begin]), steps]
+                done = end
+        at, characters = zip(*pieces, (places[done:], values[done:]), strict=True)
+        return np.concatenate(at), np.concatenate(characters)
+
+    def _steps(self, places: Numbers, values: Bytes1D, stop: int, zero: int) -> tuple[Numbers, Bytes1D]:
+        """The same of the steps of one frame; a mark that joins no echoes stays, where no number can be read.
+
+        A missing echo stands where the next one does that is there, or at `stop`.
+        """
+        marks = np.flatnonzero(values == self.mark[0])
+        number = np.arange(len(marks))
+        before = marks - number  # characters, without marks
+        goes_on = np.diff(before, prepend=0) == self.size
+        echo = number - np.maximum.accumulate(np.where(goes_on, 0, number)) + 1
+        follows = np.append(values, self.mark[0])[marks + 1]
+        right = (before > 0) & (before % self.size == 0) & (echo < self.most) & (follows != self.mark[0])
+        used = np.ones(len(values), np.bool_)
+        used[marks[right]] = False
+        places, values = places[used], values[used]
+        whole = len(values) // self.size
+        nth = np.zeros(whole + 1, np.intp)  # of its step is each echo
+        nth[before[right] // self.size] = echo[right]
+        firsts = np.flatnonzero(nth[:whole] == 0)
+        slots = (np.cumsum(nth[:whole] == 0) - 1) * self.most + nth[:whole]
+        characters = np.full((len(firsts) * self.most, self.size), zero, np.uint8)
+        characters[slots] = values[: whole * self.size].reshape(-1, self.size)
+        spots = np.append(places, stop)[self.size * np.append(firsts, whole)[1:]].repeat(self.most * self.size).reshape(-1, self.size)
+        spots[slots] = places[: whole * self.size].reshape(-1, self.size)
+        rest = slice(whole * self.size, None)
+        return np.append(spots, places[rest]), np.append(characters, values[rest])
+
+    def joined(self, characters: Bytes2D, zero: int) -> list[bytes]:
+        """The steps of each row as they are sent."""
+        number, size = characters.shape
+        if size % (self.most * self.size):
+            raise SpecError(f"{size} characters behind the head are no steps of {self.most} echoes of {self.size}", path="wire")
+        echoes = characters.reshape(number, -1, self.most, self.size)
+        used = np.logical_or.accumulate((echoes != zero).any(axis=3)[:, :, ::-1], axis=2)[:, :, ::-1, None].repeat(self.size + 1, axis=3)
+        used[:, :, 0] = True
+        used[:, :, 0, 0] = False  # no mark before the first
+        marked = np.concatenate([_repeated(self.mark, (*echoes.shape[:3], 1)), echoes], axis=3)
+        return _pieces(marked.reshape(number, -1), used.reshape(number, -1))
+
+
+@dataclass(frozen=True)
 class SixBits:
     """Numbers in characters of six bits each, the highest first, as many as the field has bytes; behind ``Lines(...) |``.
 
@@ -434,9 +509,19 @@ class SixBits:
 
     Args:
         first: the character that is 0.
+        echoes: how the steps behind the head are sent that have echoes; None where all numbers are.
+
+    Raises:
+        SpecError: for a mark of echoes that is a digit or more than one character, and for echoes without a character.
     """
 
     first: bytes = b"0"
+    echoes: Echoes | None = None
+
+    def __post_init__(self) -> None:
+        each = self.echoes
+        if each is not None and (len(each.mark) != 1 or _digits(64, self.first[0])[each.mark[0]] < 64 or min(each.size, each.most) < 1):
+            raise SpecError("the mark between echoes is one character that is no digit, and an echo has at least one that is", path="wire")
 
     def read(self, rows: Bytes2D, slots: Sequence[Slot]) -> tuple[Bytes2D, NDArray[np.bool_]]:
         """Rows with numbers in place of their characters; and in which all are digits, (n,)."""
@@ -492,7 +577,7 @@ class Lines:
         numbers: how numbers are written; None for bytes as they are.
 
     Raises:
-        SpecError: for lines without a character.
+        SpecError: for lines without a character, and for echoes without a head before them.
     """
 
     is_text: ClassVar[bool] = True
@@ -506,6 +591,8 @@ class Lines:
         object.__setattr__(self, "head", tuple(self.head))
         if self.width < 1 or min(self.head, default=1) < 1 or not 0 <= self.bare <= len(self.head):
             raise SpecError("lines have at least one character, and those without a check are among the first", path="wire")
+        if self.numbers is not None and self.numbers.echoes is not None and not self.head:
+            raise SpecError("steps with echoes stand behind the head of a frame, and these lines have none", path="wire")
 
     def __or__(self, numbers: SixBits) -> Lines:
         return replace(self, numbers=numbers)
@@ -514,8 +601,11 @@ class Lines:
     def start(self) -> bytes:
         return b""
 
-    def begins(self, texts: Sequence[bytes]) -> bytes:
-        return b"".join(texts)[: self.head[0] if self.head else self.width]
+    def begins(self, texts: Sequence[Characters]) -> Characters:
+        first = self.head[0] if self.head else self.width
+        known = list(itertools.chain(*texts))[:first]
+        end = first + (self.check is not None and not self.bare)
+        return [*known, *[None] * (end - len(known)), 0x0A] if self.head else known
 
     def read(self, buffer: Bytes1D, starts: Numbers, limit: int) -> Reading:
         stops = np.flatnonzero(buffer == 0x0A)
@@ -527,16 +617,22 @@ class Lines:
         whole, first, last = whole[first >= 0], first[first >= 0], last[first >= 0]
         kept, intact = buffer != 0x0A, np.ones(len(starts), np.bool_)
         kept[stops[-1] + 1 if len(stops) else 0 :] = False  # a line without an end: nobody knows what is its check
+        cut = starts[sizes == SHORT]  # for who explains it
+        heads = np.concatenate([first, stops.searchsorted(cut)])
         if self.check is not None:
             checked = np.ones(len(stops), np.bool_)
-            heads = np.concatenate([first, stops.searchsorted(starts[sizes == SHORT])])  # of one cut off, too, for who explains it
             bare = (heads[:, None] + np.arange(self.bare)).reshape(-1)
             checked[bare[bare < len(stops)]] = False
             checked &= stops > 0
             kept[stops[checked] - 1] = False
             intact[whole] = self._intact(buffer, starts[whole], stops, first, last)
         places = np.flatnonzero(kept)
-        return Unescaped(sizes, places, buffer[places], intact, self.numbers)
+        values = buffer[places]
+        if self.numbers is not None and self.numbers.echoes is not None:
+            ends = np.concatenate([starts[whole] + sizes[whole], np.full(len(cut), len(buffer))])
+            begins = np.append(stops + 1, len(buffer))[np.minimum(heads + len(self.head) - 1, len(stops))]
+            places, values = self.numbers.echoes.apart(places, values, begins, ends, self.numbers.first[0])
+        return Unescaped(sizes, places, values, intact, self.numbers)
 
     def _lines(self, starts: Numbers, ends: Numbers, stops: Numbers) -> tuple[Numbers, Numbers]:
         """Among `stops`, the end of the first line of each frame and the one after its last; -1 where lines have other lengths."""
@@ -571,15 +667,25 @@ class Lines:
 
     def write(self, rows: Bytes2D, slots: Sequence[Slot]) -> list[bytes]:
         rows = rows if self.numbers is None else self.numbers.write(rows, slots)
+        if self.numbers is None or self.numbers.echoes is None:
+            return self._in_lines(rows)
+        head = sum(self.head)
+        steps = self.numbers.echoes.joined(rows[:, head:], self.numbers.first[0])
+        each = (row.tobytes() + part for row, part in zip(rows[:, :head], steps, strict=True))
+        return [self._in_lines(np.frombuffer(characters, np.uint8)[None])[0] for characters in each]
+
+    def _in_lines(self, rows: Bytes2D) -> list[bytes]:
+        """Rows of characters with the ends of lines, and their checks."""
         parts, start, line = list[Bytes2D](), 0, 0
         while start < rows.shape[1]:
-            stop = start + (self.head[line] if line < len(self.head) else self.width)
-            part = rows[:, start:stop]
-            parts.append(part)
-            if self.check is not None and line >= self.bare:
-                parts.append(self.check(part.sum(axis=1, dtype=np.int64))[:, None])
-            parts.append(_repeated(b"\n", (len(rows), 1)))
-            start, line = stop, line + 1
+            is_head, left = line < len(self.head), rows.shape[1] - start
+            length = min(self.head[line] if is_head else self.width, left)
+            count = 1 if is_head else left // length
+            part = rows[:, start : (start := start + count * length)].reshape(len(rows), count, length)
+            checks = [self.check(part.sum(axis=2, dtype=np.int64))[:, :, None]] if self.check is not None and line >= self.bare else []
+            closed = np.concatenate([part, *checks, _repeated(b"\n", (len(rows), count, 1))], axis=2)
+            parts.append(closed.reshape(len(rows), -1))
+            line += 1
         whole = np.concatenate([*parts, _repeated(b"\n", (len(rows), 1))], axis=1)
         return [row.tobytes() for row in whole]
 
@@ -615,7 +721,7 @@ class Escaped:
     def start(self) -> bytes:
         return bytes([self.flag])
 
-    def begins(self, texts: Sequence[bytes]) -> bytes:
+    def begins(self, texts: Sequence[Characters]) -> Characters:
         return self.start  # any byte behind it may be escaped
 
     def read(self, buffer: Bytes1D, starts: Numbers, limit: int) -> Reading:

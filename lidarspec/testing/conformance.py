@@ -8,7 +8,7 @@ declaration may have functions of its own. Derive a class from `SensorConformanc
 from __future__ import annotations
 
 import traceback
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Collection, Iterable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, ClassVar
@@ -67,7 +67,7 @@ class Property:
 
     def cases(self, subject: Subject) -> Iterable[tuple[str, ...]]:
         """What it is asked of."""
-        names = {"frame": subject.sensor.frames, "data": subject.sensor.data_frames, "command": subject.sensor.commands}
+        names = {"frame": subject.frames, "data": subject.sensor.data_frames, "command": subject.sensor.commands}
         return [()] if self.each == "sensor" else [(name,) for name in names[self.each]]
 
     def findings(self, subject: Subject) -> list[Finding]:
@@ -168,12 +168,14 @@ class SensorConformance:
         examples: how many examples of each frame type a property tries; LIDARSPEC_EXAMPLES says it for all classes.
         strategies: "frame.field" -> a hypothesis strategy of its raw value, or a function of `random.Random`, for what cannot be derived.
         vectors: a file of golden vectors, beside the test's own file where it is no absolute path.
+        elsewhere: frame types that the class of a relative tries, which has the same ones.
     """
 
     sensor: ClassVar[str | Path | Sensor] = ""
     examples: ClassVar[int] = EXAMPLES
     strategies: ClassVar[Mapping[str, Any]] = {}
     vectors: ClassVar[str | Path | None] = None
+    elsewhere: ClassVar[Collection[str]] = ()
 
     @pytest.fixture
     def subject(self, request: pytest.FixtureRequest) -> Subject:
@@ -182,7 +184,7 @@ class SensorConformance:
         if kind not in _SUBJECTS:
             sensor = self.sensor if isinstance(self.sensor, Sensor) else named_sensor(self.sensor)
             vectors = Path(request.path).parent / self.vectors if self.vectors else None
-            _SUBJECTS[kind] = Subject(sensor, self.examples, self.strategies, vectors)
+            _SUBJECTS[kind] = Subject(sensor, self.examples, self.strategies, vectors, elsewhere=self.elsewhere)
         return _SUBJECTS[kind]
 
     def test_the_declaration_is_sound(self, subject: Subject) -> None:

@@ -35,7 +35,7 @@ from lidarspec.testing.findings import Violation, require
 from lidarspec.testing.frames import leaves
 from lidarspec.testing.geometry import read
 from lidarspec.testing.subject import SHORT, Subject, seals
-from lidarspec.transports.files import unhexed
+from lidarspec.transports.hexadecimal import unhexed
 from lidarspec.trust import document
 from lidarspec.wire.layout import Layout
 

@@ -9,6 +9,7 @@ In: a SOURCE as text. Out: an open `Transport`, which gives `Chunk`s and takes b
 * `http`: the web server of a sensor, and that of a simulated one.
 * `simulated`: `sim:`, a sensor that is not there.
 * `bags`: robotics logs, which hold packets as ROS's messages.
+* `hexadecimal`: bytes as people print them.
 * `files`: recordings, captures, raw bytes, standard input.
 * `ports`: which serial and UDP ports this computer has, and who holds them.
 

@@ -26,6 +26,7 @@ UNTOLD = (
     f"{_LIST}uint8[] data\nuint32 size",
     f"{_LIST}builtin_interfaces/Time stamp\nuint8[1500] data\nuint32 size",
     f"{_LIST}builtin_interfaces/Time stamp\nuint8[1206] data",
+    f"{_LIST}builtin_interfaces/Time stamp\nuint8[1248] data",
     "std_msgs/Header header\nuint8 is_info\nuint8 is_first\nuint8[] data",
     "uint8[] buf",
 )

@@ -7,52 +7,31 @@ what they leave out; bytes alone have no times. `open_file` tells them apart by 
 from __future__ import annotations
 
 import contextlib
-import io
 import json
-import os
-import re
 import sys
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from pathlib import Path
 from shlex import quote
 from typing import BinaryIO
 
 from lidarspec.captures.bulk import Batch, CaptureBatches
+from lidarspec.captures.containers import HEAD, damage, head, opened, refuse_container, unpacked
 from lidarspec.captures.pcap import CaptureReader, CaptureStats, StreamReader, is_stream_capture
 from lidarspec.captures.records import is_capture
-from lidarspec.errors import SourceError, UnknownSensor, UsageError, WireError, suggest, system_errors
+from lidarspec.errors import SourceError, UnknownSensor, UsageError, system_errors
 from lidarspec.recording.format import MAGIC, Header, Record, Recording
 from lidarspec.spec.sensor import Sensor
 from lidarspec.transports.bags import BagTransport, log_of
 from lidarspec.transports.base import origin
+from lidarspec.transports.hexadecimal import hex_chunks, is_hexadecimal
 from lidarspec.transports.protocol import Chunk, Transport
 
 #: events behind which a frame begun earlier does not go on.
 INTERRUPTIONS = frozenset({"disconnect", "reconnect", "dropped"})
-#: in hexadecimal text: offsets and comments, what may stand between bytes, and what may not stand anywhere else.
-_BESIDE = re.compile(r"^\s*(?:0[xX])?[0-9a-fA-F]{3,}:(?=\s)|(?:#|//).*", re.MULTILINE)
-_COMMENT = re.compile("#|//")
-_BETWEEN, _NO_DIGIT = re.compile(r"[\s,;:{}]+"), re.compile(r"[^0-9a-fA-F]")
-#: bytes read at once, and bytes that say what a file is.
-BLOCK, HEAD = 1 << 18, 512
-#: digits of a word that a message shows.
-QUOTED = 64
-#: how files begin that hold no bytes as a sensor sent them, or these in a shape of their own; what they are, and what takes the bytes out.
-CONTAINERS = {
-    rb"\x1f\x8b\x08[\x00-\x1f]": ("compressed by gzip", "gunzip -k {}"),
-    rb"BZh[1-9]1AY&SY": ("compressed by bzip2", "bunzip2 -k {}"),
-    rb"\xfd7zXZ\x00": ("compressed by xz", "unxz -k {}"),
-    rb"\x28\xb5\x2f\xfd": ("compressed by zstd", "unzstd {}"),
-    rb"\x04\x22\x4d\x18": ("compressed by lz4", "unlz4 {}"),
-    rb"PK\x03\x04": ("a zip archive, as .npz files are too", "unzip -l {}"),
-    rb"7z\xbc\xaf\x27\x1c": ("a 7z archive", "7z l {}"),
-    rb".{257}ustar": ("a tar archive", "tar -tf {}"),
-    rb"\x89HDF\r\n": ("an HDF5 file", ""),
-    rb"PAR1": ("a Parquet file", ""),
-    rb"\x93NUMPY": ("a NumPy array", ""),
-    rb"# \.PCD v|ply\r?\n|LASF": ("a file of points", ""),
-    rb"snoop\x00{3}|btsnoop\x00|\x34\xcd\xb2\xa1|\xa1\xb2\xcd\x34": ("a capture of another format", "editcap {} capture.pcapng"),
-}
+#: bytes read at once.
+BLOCK = 1 << 18
+#: suffixes of text: of hexadecimal digits, and of what may be that or not.
+HEX_SUFFIXES, TEXT_SUFFIXES = {".hex", ".txt"}, {".log", ".csv", ".asc"}
 
 
 class RecordingTransport(Transport):
@@ -60,6 +39,7 @@ class RecordingTransport(Transport):
 
     Args:
         path: the file.
+        file: it, where it is open already.
         sender: only datagrams from this address, or "ADDRESS:PORT".
         salvage: go on behind damaged places.
 
@@ -67,12 +47,13 @@ class RecordingTransport(Transport):
         header: what the recording says of itself.
     """
 
-    def __init__(self, path: str | Path, *, sender: str | None = None, salvage: bool = False) -> None:
-        self._recording = Recording(path, salvage=salvage)
+    def __init__(self, path: str, file: BinaryIO | None = None, *, sender: str | None = None, salvage: bool = False) -> None:
+        self._file = file or (sys.stdin.buffer if path == "-" else opened(path))
+        self._recording = Recording(path, self._file, salvage=salvage)
         self.header: Header = self._recording.header
         self.datagrams, self._origin = self.header.datagrams, None if sender is None else origin(sender)
         self.warnings: list[str] = []
-        self._no_events, self._was_set = 0, False
+        self._no_events, self._was_set, self._has_skipped = 0, False, False
 
     def known_sensor(self) -> Sensor:
         """The installed sensor that the recording names, with the options of then.
@@ -92,17 +73,22 @@ class RecordingTransport(Transport):
         """What was received, in order, with the arrival times of then."""
         interrupted, damaged = False, 0
         for record in self._recording:
-            interrupted, damaged = interrupted or self._recording.damaged > damaged, self._recording.damaged
+            interrupted = interrupted or self._has_skipped or self._recording.damaged > damaged
+            damaged, self._has_skipped = self._recording.damaged, False
             if record.direction == "event":
                 interrupted = self._interrupts(record) or interrupted
             elif record.direction == "in" and self._wanted(record):
                 yield Chunk(record.data, record.at, record.sender, record.receiver, interrupted or record.gap, record.quiet)
                 interrupted = False
-        if self._recording.damaged:
+        if _is_whole(self, self._file) and self._recording.damaged:
             self.warnings.append(_damage(self._recording))
             self.unread = 0 if self._recording.is_cut else self._recording.leftover
         if self._no_events:
             self.warnings.append(f"{self._recording.path}: {self._no_events} events were passed over, which have no name")
+
+    def skip(self, at: int) -> bool:
+        self._has_skipped = self._recording.seek(at)
+        return self._has_skipped
 
     def write(self, data: bytes) -> None:
         raise SourceError(f"{self._recording.path} is a recording: nothing can be sent to it")
@@ -149,6 +135,15 @@ def _passed_over(path: str, places: int, size: int) -> str:
     return f"{path} is damaged in {places} place{'s' * (places > 1)}: {size} bytes were not read, everything else was"
 
 
+def _is_whole(transport: FileTransport | RecordingTransport, file: BinaryIO) -> bool:
+    """Whether a file that was unpacked ended as it should; its transport takes down where it did not."""
+    fault = damage(file)
+    if fault is not None:
+        transport.warnings.append(fault.text)
+        transport.unread += fault.unread
+    return fault is None
+
+
 class FileTransport(Transport):
     """The bytes of a file as they are, or standard input for "-"."""
 
@@ -160,6 +155,7 @@ class FileTransport(Transport):
         with system_errors(self._path):
             while block := self._file.read(BLOCK):
                 yield Chunk(block)
+        _is_whole(self, self._file)
 
     def write(self, data: bytes) -> None:
         raise SourceError(f"{self._path} is a file: nothing can be sent to it")
@@ -173,7 +169,7 @@ class FileTransport(Transport):
         self.unread = stats.lost
         if stats.damaged:
             self.warnings.append(_passed_over(self._path, stats.damaged, stats.lost))
-        if stats.truncated_tail:
+        if _is_whole(self, self._file) and stats.truncated_tail:
             self.warnings.append(f"{self._path} is cut off in its last record; everything before it was read")
         if stats.snapped:
             self.warnings.append(f"{self._path}: {stats.snapped} packets were cut by the capture's snap length")
@@ -191,63 +187,11 @@ class FileTransport(Transport):
 
 
 class HexTransport(FileTransport):
-    """Bytes written as hexadecimal text, in any way that `unhexed` reads; lines without digits are passed over."""
+    """Bytes written as hexadecimal text, at the times that it tells; lines without digits are passed over."""
 
     def chunks(self) -> Iterator[Chunk]:
-        return hex_chunks(self._path, self._file.readline)
-
-
-def hex_chunks(name: str, readline: Callable[[int], bytes]) -> Iterator[Chunk]:
-    """The bytes of hexadecimal text, a chunk for each line; one that is longer than a block comes in several.
-
-    Args:
-        name: of the file, for messages.
-        readline: the next line, or so many bytes of it.
-
-    Raises:
-        WireError: where something else is in it.
-    """
-    text, goes_on, number = "", "", 1
-    while (block := readline(BLOCK)) or text:
-        text += block.decode("ascii", "replace")
-        end = len(text) if len(block) < BLOCK or block.endswith(b"\n") else between(text)
-        try:
-            yield Chunk(unhexed(goes_on + text[:end]))
-        except ValueError as error:
-            raise WireError(f"{name}, line {number}: not hexadecimal: {error}") from None
-        if block.endswith(b"\n"):
-            goes_on, number = "", number + 1
-        else:  # so does a comment in the line; an offset is at its beginning alone
-            goes_on = "#" if _COMMENT.search(goes_on + text[:end]) else ","
-        text = text[end:]
-
-
-def between(text: str) -> int:
-    """Where hexadecimal text can be cut: behind or before its last mark, else between two bytes."""
-    return max(*(text.rfind(mark) + 1 for mark in " \t\n,;:{}"), *(text.rfind(mark) for mark in "\\/#")) or len(text) // 2 * 2
-
-
-def unhexed(text: str) -> bytes:
-    """The bytes that hexadecimal text stands for, as people print it: "54 2c", "542c", "54:2c", "0x54, 0x2C", "{0x54,0x2c};", "\\x54".
-
-    "#" and "//" begin a comment, which goes to the end of the line; a first column of three digits or more and ":" is an offset.
-
-    Raises:
-        ValueError: where something else is in it, or a word makes no whole bytes.
-    """
-    words = _BETWEEN.split(_BESIDE.sub("", text).replace("\\x", " "))
-    return b"".join(_whole_bytes(word) for word in words if word)
-
-
-def _whole_bytes(word: str) -> bytes:
-    digits = word.removeprefix("0x").removeprefix("0X")
-    if bad := _NO_DIGIT.search(digits):
-        raise ValueError(f"{bad[0]!r} is no digit of it")
-    if len(digits) == 1 and digits != word:
-        digits = f"0{digits}"
-    if not digits or len(digits) % 2:
-        raise ValueError(f"{word[:QUOTED]!r}{' ...' * (len(word) > QUOTED)} makes no whole bytes")
-    return bytes.fromhex(digits)
+        yield from hex_chunks(self._path, self._file.readline)
+        _is_whole(self, self._file)
 
 
 class CaptureTransport(FileTransport):
@@ -292,56 +236,37 @@ class StreamCaptureTransport(FileTransport):
         self._warn(reader.stats)
 
 
-def refuse_container(path: str, head: bytes) -> None:
-    """Nothing, for a file that is read as the bytes it holds.
-
-    Args:
-        head: its first `HEAD` bytes, or all.
-
-    Raises:
-        SourceError: where it begins as a file of another kind, which is named.
-    """
-    for beginning, (what, command) in CONTAINERS.items():
-        if re.match(beginning, head, re.DOTALL):
-            error = SourceError(f"{path} is {what}, and is not read: this takes captures, recordings and bytes as a sensor sent them")
-            raise suggest(error, command.format(quote(path))) if command and os.path.exists(path) else error
-
-
-def open_file(path: str, *, sender: str | None = None) -> FileTransport | RecordingTransport | BagTransport:
+def open_file(path: str, *, sender: str | None = None, member: str = "") -> FileTransport | RecordingTransport | BagTransport:
     """The transport for a file, by what it holds; "-" is standard input, which is told by its beginning too; a folder is a bag's.
 
+    Args:
+        sender: only what comes from this address, or topic.
+        member: which file of a zip archive; "" for the one capture or recording in it.
+
     Raises:
-        SourceError: where it cannot be opened, or is a file of another kind, such as an archive.
-        UsageError: where a library is missing that reads it.
+        SourceError: where it cannot be opened, or is a file of another kind.
+        UsageError: where a library is missing that reads it, and for an archive of several captures.
     """
     if (log := log_of(path)) is not None:
         return BagTransport(path, log, sender=sender)
+    name = "standard input" if path == "-" else path
     with system_errors(path), contextlib.ExitStack() as undo:
-        file = sys.stdin.buffer if path == "-" else undo.enter_context(open(path, "rb"))
-        head = _head(file)
-        path = "standard input" if path == "-" else path
-        log = log_of(path, head)
-        if log is not None and file is sys.stdin.buffer:
-            raise SourceError(f"{path} is {log.what}, and is not read: give its file")
-        refuse_container(path, head)
+        plain = sys.stdin.buffer if path == "-" else undo.enter_context(open(path, "rb"))
+        file = unpacked(name, plain, member)
+        start = head(file)
+        log = log_of(path, start)
+        if log is not None and (file is not plain or path == "-"):
+            raise SourceError(f"{name} is {log.what}{' in a compressed file' * (file is not plain)}, and is not read: give the file itself")
+        refuse_container(name, start)
         if log is not None:
             return BagTransport(path, log, sender=sender)
         undo.pop_all()  # the transport closes it
-    if head.startswith(MAGIC):
-        if file is not sys.stdin.buffer:
-            file.close()
-        return RecordingTransport("-" if file is sys.stdin.buffer else path, sender=sender)
-    if is_stream_capture(head):
-        return StreamCaptureTransport(path, file)
-    if is_capture(head):
-        return CaptureTransport(path, file, sender=sender)
-    return HexTransport(path, file) if Path(path).suffix in (".hex", ".txt") else FileTransport(path, file)
-
-
-def _head(file: BinaryIO) -> bytes:
-    """How a file begins; of a pipe what is there first, which stays there."""
-    if isinstance(file, io.BufferedReader):
-        return file.peek(HEAD)[:HEAD]
-    head = file.read(HEAD)
-    file.seek(-len(head), os.SEEK_CUR)
-    return head
+    if start.startswith(MAGIC):
+        return RecordingTransport(path, file, sender=sender)
+    if is_stream_capture(start):
+        return StreamCaptureTransport(name, file)
+    if is_capture(start):
+        return CaptureTransport(name, file, sender=sender)
+    suffixes = set(Path(path.lower()).suffixes[-2:])  # that of a compressed file is behind it
+    is_text = suffixes & HEX_SUFFIXES or (suffixes & TEXT_SUFFIXES and is_hexadecimal(start, whole=len(start) < HEAD))
+    return HexTransport(name, file) if is_text else FileTransport(name, file)

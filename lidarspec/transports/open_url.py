@@ -20,6 +20,8 @@ from lidarspec.transports.protocol import LiveTransport, Transport
 
 #: scheme -> the module of lidarspec.transports whose `connect(address, sensor)` opens it.
 SCHEMES = {"serial": "serial", "udp": "udp", "tcp": "tcp", "sim": "simulated"}
+#: what may stand behind the ? of a file: who sent, and which file of an archive.
+FILE_OPTIONS = {"src", "file"}
 _SCHEME = re.compile(r"^([a-z][a-z0-9+.-]+):")
 #: names of serial ports: Windows' COM4, and everything that POSIX systems call theirs.
 _PORT = re.compile(r"(COM\d+|\\\\\.\\\w+|/dev/(tty|cu\.|pts/|serial/|rfcomm).*)", re.IGNORECASE)
@@ -45,10 +47,9 @@ def transport(source: str | Path, sensor: Sensor | None = None) -> Transport:
     path, mark, query = text.rpartition("?")
     if mark and not os.path.exists(text):
         options = parse_qs(query, keep_blank_values=True)
-        unknown = set(options) - {"src"}
-        if unknown:
-            raise UnknownOption(min(unknown), ["src"], place=text)
-        return open_file(path, sender=options["src"][-1] if "src" in options else None)
+        if unknown := set(options) - FILE_OPTIONS:
+            raise UnknownOption(min(unknown), FILE_OPTIONS, place=text)
+        return open_file(path, sender=options["src"][-1] if "src" in options else None, member=options.get("file", [""])[-1])
     return open_file(text)
 
 

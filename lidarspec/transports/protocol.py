@@ -76,11 +76,15 @@ class Format:
         suffix: with its dot, ".csv".
         description: a few words for lists.
         write: writes scans to a path; `every_point` also those without a return.
+        holds: what it has a place for that not every format has: "organized" points, as rows and columns, where `write` is given
+            `organized=True` with a single scan; "scans" each by itself, organised ones always; "beams" and "frame-id" of ROS's messages;
+            "packets" as they came, which `write` is given as `packets=`.
     """
 
     suffix: str
     description: str
     write: Callable[..., None]
+    holds: tuple[str, ...] = ()
 
     def __call__(self, path: Path, scans: Iterable[Any], *, every_point: bool = False) -> None:
         """Write the scans."""
@@ -150,6 +154,10 @@ class Transport(ABC):
         Raises:
             SourceError: where it cannot be read.
         """
+
+    def skip(self, at: int) -> bool:
+        """Pass over what arrived before a time, ns since 1970, where that can be done without reading it: whether it was."""
+        return False
 
     @abstractmethod
     def write(self, data: bytes) -> None:

@@ -18,6 +18,7 @@ from pathlib import Path
 
 from lidarspec.errors import UsageError, WireError
 from lidarspec.recording.recorders import recorder
+from lidarspec.scans.selection import Times, received
 from lidarspec.simulation.device import SECOND, SimulatedDevice
 from lidarspec.spec.links import Udp
 from lidarspec.transports.open_url import transport
@@ -313,6 +314,7 @@ class Replay:
         needs_times: whether a file without times is refused, rather than sent as fast as it is taken.
         loop: begin again at the end, for every listener from the beginning.
         source: the file where it is open already, as standard input has to be; read first, and closed then.
+        times: only what arrived then, as in `Selection`.
 
     Attributes:
         chunks, bytes: sent so far.
@@ -332,8 +334,10 @@ class Replay:
         needs_times: bool = False,
         loop: bool = False,
         source: Transport | None = None,
+        times: Times = (None, None),
     ) -> None:
         self._file, self._outlet, self._speed, self._needs_times, self._loop = file, outlet, speed, needs_times, loop
+        self._times = times
         self.chunks = self.bytes = self.late = self.latest = 0
         self._ends, self.is_timed, self.digest = set[tuple[Sender | None, Sender | None]](), True, hashlib.sha256()
         self._began, self._source = time.monotonic(), source
@@ -357,7 +361,7 @@ class Replay:
             opened, self._source = self._source or transport(self._file), None
             with contextlib.closing(opened) as source:
                 try:
-                    for chunk, late in replayed(self._checked(source.chunks()), self._outlet, speed=self._speed):
+                    for chunk, late in replayed(self._checked(received(source, self._times, self._file)), self._outlet, speed=self._speed):
                         self._count(chunk, late)
                         yield ""
                 except Disconnected as gone:

@@ -19,6 +19,7 @@ from lidarspec.device.device import Device
 from lidarspec.framing.results import Counters
 from lidarspec.packets.packets import Packets
 from lidarspec.scans.scans import Scan, ScanStream
+from lidarspec.scans.selection import Selection, Sieve, Slice
 
 #: scans kept for means and medians.
 KEPT = 1 << 12
@@ -192,6 +193,7 @@ class Feed:
     Args:
         device: open; stays so.
         played: scans of a file come at the times that they bear; else as fast as they are read.
+        select: which scans, and what of each; packets at these times.
 
     Attributes:
         packets: the batch that the last look took in, None where it took none.
@@ -202,16 +204,18 @@ class Feed:
         meter: the figures.
     """
 
-    def __init__(self, device: Device, *, played: bool = False) -> None:
+    def __init__(self, device: Device, *, played: bool = False, select: Selection | None = None) -> None:
         self.device, self.number = device, 0
+        self._select = select or Selection()
+        self._sieve, self._slice = Sieve(self._select, device.source, device.skip), Slice(self._select.times)
         self.scan: Scan | None = None
         self.packets: Packets | None = None
         self.scans: list[Scan] = []
-        self.meter = Meter(device.stats, sequenced=device.sensor.sequence is not None or device.sensor.clock is not None)
+        self.meter = self._meter()
         self._played = played and not device.is_live
         self._batches, self._stream = device.packets(wait=LOOK), ScanStream(device.sensor, device.mount)
         self._waiting: deque[Scan] = deque()
-        self._disconnects, self._read_out = 0, False
+        self._disconnects, self._read_out, self._metered = 0, False, False
         self._due: float | None = None
         self._stamp = 0
 
@@ -241,20 +245,39 @@ class Feed:
 
     def _take(self) -> None:
         """The next batch, or the end."""
-        self.packets = packets = next(self._batches, None)
+        before = self._meter() if not self._metered else self.meter
+        self.packets = packets = None if self._sieve.ended else next(self._batches, None)
         if packets is None:
             self._read_out = True
-            self._keep(self._stream.finish())
+            self._keep([] if self._sieve.ended else self._stream.finish())
+            if self._sieve.is_empty:
+                raise self._sieve.missing()
             return
         if self.device.stats.disconnects != self._disconnects:
             self._disconnects = self.device.stats.disconnects
             self._keep(self._stream.finish())
             self._stream = ScanStream(self.device.sensor, self.device.mount)
         if len(packets):
-            self.meter.packets(packets)
+            self.packets = counted = self._within(packets)
+            if len(counted):
+                self.meter, self._metered = before, True
+                self.meter.packets(counted)
             self._keep(self._stream.add(packets))
 
+    def _meter(self) -> Meter:
+        """One that counts from here on."""
+        sensor = self.device.sensor
+        return Meter(self.device.stats, sequenced=sensor.sequence is not None or sensor.clock is not None)
+
+    def _within(self, packets: Packets) -> Packets:
+        """Those of some packets that are wanted by their times."""
+        if not self._select.is_timed:
+            return packets
+        which = self._slice.holds(packets.host_ns if self._select.time == "host" else packets.time_ns)
+        return packets if which.all() else packets.take(which)
+
     def _keep(self, scans: list[Scan]) -> None:
+        scans = [wanted for scan in scans if not self._sieve.ended and (wanted := self._sieve.take(scan)) is not None]
         if self._played:
             self._waiting += scans
         else:

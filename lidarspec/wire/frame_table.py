@@ -19,6 +19,7 @@ from lidarspec.errors import SpecError
 from lidarspec.spec.construct_layer import leaves, member
 from lidarspec.wire.arrays import counted, deep, is_counted, repeated
 from lidarspec.wire.layout import Bytes2D, Layout, Leaf, rows_at
+from lidarspec.wire.parts import Walked
 from lidarspec.wire.schema import Schema, schema, without_indices
 
 
@@ -70,6 +71,7 @@ class Rows:
         self.schema, self.groups = schema, [group for group in groups if len(group.where)]
         self._length = sum(len(group.where) for group in self.groups)
         self._order: NDArray[np.intp] | slice | None = None
+        self._walks: dict[str, list[tuple[Group, NDArray[np.uint8], Walked]]] = {}
 
     def __len__(self) -> int:
         return self._length
@@ -147,16 +149,20 @@ class Rows:
             groups.append(Group(group.layout, there[kept], group.rows[kept]))
         return Rows(self.schema, groups)
 
+    def walks(self, axis: str) -> list[tuple[Group, NDArray[np.uint8], Walked]]:
+        """The groups that have these parts, each with the buffer that its rows are of, and the parts in that; walked through once."""
+        if axis not in self._walks:  # the clock, the points and each kind of parts ask for them
+            regions = ((group, group.layout.regions.get(axis)) for group in self.groups)
+            self._walks[axis] = [(group, *region.in_rows(group.rows)) for group, region in regions if region is not None]
+        return self._walks[axis]
+
     def parts(self, axis: str, kind: str = "") -> tuple[Rows, NDArray[np.intp]]:
         node = self.schema.parts[axis]
         wanted = next(number for number, one in enumerate(node.kinds) if one.name == kind)
         found = list[_Piece]()
-        for group in self.groups:
-            region = group.layout.regions.get(axis)
-            if region is not None:
-                buffer, walked = region.in_rows(group.rows)
-                rounds = (piece for pieces in walked.rounds for piece in pieces if piece.kind == wanted)
-                found += [_Piece(buffer, piece.layout, piece.spots, group.where[piece.owners]) for piece in rounds]
+        for group, buffer, walked in self.walks(axis):
+            rounds = (piece for pieces in walked.rounds for piece in pieces if piece.kind == wanted)
+            found += [_Piece(buffer, piece.layout, piece.spots, group.where[piece.owners]) for piece in rounds]
         counts = np.zeros(len(self), np.intp)
         for piece in found:
             counts[piece.frames] += 1

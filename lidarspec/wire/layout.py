@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from functools import cached_property, lru_cache
+from functools import cached_property, lru_cache, reduce
 from typing import Any, Literal, Protocol
 
 import numpy as np
@@ -114,7 +114,10 @@ class Leaf:
         there = offsets + (self.offset + self.size) <= (len(buffer) if stops is None else stops)
         which = None if there.all() else np.flatnonzero(there)
         spots = (offsets if which is None else offsets[which]) + self.offset
-        return which, self.at(self.offset).load(rows_at(buffer, spots, self.size))
+        if self.wire is not None and len(spots):
+            windows: NDArray[Any] = np.ndarray((len(buffer) - self.size + 1,), self.wire, buffer.data, 0, (1,))
+            return which, windows[spots].astype(self._native)
+        return which, self._alone.load(rows_at(buffer, spots, self.size))
 
     def of(self, frame: bytes | memoryview) -> int | None:
         """Its value in the first bytes of a frame; None where they end before it does."""
@@ -140,6 +143,10 @@ class Leaf:
             given = [list(value[:size].ljust(size, b"\0")) if isinstance(value, bytes) else value for value in given]
         values = np.array([np.asarray(value, np.float64) for value in given])
         return np.asarray(self.info.raw(values.reshape(*values.shape, *(1,) * (1 + len(self.shape) - values.ndim))))
+
+    @cached_property
+    def _alone(self) -> Leaf:
+        return self.at(self.offset)
 
     @cached_property
     def _native(self) -> np.dtype[Any]:
@@ -303,7 +310,7 @@ class Seal:
     def intact(self, rows: Bytes2D, sums: Sums | None = None) -> NDArray[np.bool_]:
         """Which frames carry the right value, or one that means "not filled", (n,); `sums` computes it, by default the algorithm."""
         stored = self.stored(rows)
-        filled = ~np.isin(stored, np.array(self.absent, np.uint64)) if self.absent else None
+        filled = reduce(np.logical_and, (stored != np.uint64(value) for value in self.absent)) if self.absent else None
         if filled is None or filled.all():
             return np.asarray(stored == self.computed(rows, sums))
         right = np.ones(len(rows), np.bool_)

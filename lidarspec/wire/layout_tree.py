@@ -11,7 +11,6 @@ from __future__ import annotations
 import bisect
 import contextlib
 import functools
-import itertools
 import math
 import operator
 from collections.abc import Callable, Iterator, Mapping
@@ -604,19 +603,21 @@ class HeaderTree:
 
     def common(self, rows: NDArray[np.uint8]) -> Layout | None:
         """The layout of candidates, one a row, if they have one and the fields that decide it mean the same in all; else None."""
-        end = self._end(rows[0].tobytes(), self._root)
-        above = [end]
-        while above[0].above is not None:
-            above.insert(0, above[0].above)
-        if not isinstance(end.result, Layout):
-            return None
-        for node, following in itertools.pairwise(above):
-            assert node.leaf is not None
-            values = node.leaf.load(rows)
-            values = values if node.told is None else node.told.all(values)
-            if np.count_nonzero(values == following.values[node.leaf.info.path]) < len(rows):
+        node = self._root
+        while node.result is None:
+            if node.leaf is None:
+                self._explore(node, rows[0].tobytes())
+            leaf = node.leaf
+            if leaf is None:
+                break
+            if isinstance(leaf, Leaf) and leaf.offset + leaf.size > rows.shape[1]:
                 return None
-        return end.result
+            values = leaf.load(rows)
+            values = values if node.told is None else node.told.all(values)
+            if np.count_nonzero(values == values[0]) < len(rows) or (isinstance(leaf, Measure) and values[0] < 0):
+                return None
+            node = node.child(values.item(0))
+        return node.result if isinstance(node.result, Layout) else None
 
     def layout(self, frame: bytes) -> Layout | Refused | None:
         """The layout of one frame, or None where its header is not all there."""

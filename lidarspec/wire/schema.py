@@ -41,6 +41,7 @@ _INDEX = re.compile(r"\[(-?\d+)\]")
 _Field = TypeVar("_Field")
 
 
+@lru_cache(maxsize=1024)
 def without_indices(path: str) -> tuple[str, dict[str, int]]:
     """A path without the indices in it, and these, by the paths of their arrays: "a.b", {"a": 0} for "a[0].b"."""
     names, indices = "", dict[str, int]()

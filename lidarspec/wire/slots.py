@@ -6,6 +6,7 @@ that decide a layout are read first, and then the rest of the row, which has to 
 
 from __future__ import annotations
 
+import bisect
 import functools
 import itertools
 from collections.abc import Iterable, Iterator, Sequence
@@ -85,15 +86,18 @@ class Recoder:
         self.tree: HeaderTree = tree
 
     @functools.cached_property
+    def prefix(self) -> dict[int, int]:
+        """The bytes on the wire that all frames have at the same places: those of the texts before the first number."""
+        leaves, constants = self.tree.first()
+        slots = itertools.takewhile(lambda slot: slot[2].kind == "text", _elements(leaves, 0, max(constants, default=-1) + 1))
+        known = {spot: value for spot, (mask, value) in constants.items() if mask == 0xFF}
+        begins = self.form.begins([[known.get(spot) for spot in range(offset, offset + slot.size)] for _, offset, slot in slots])
+        return {spot: byte for spot, byte in enumerate(begins) if byte is not None}
+
+    @functools.cached_property
     def begins(self) -> bytes:
-        """The bytes on the wire that all frames begin with."""
-        texts, (leaves, constants) = list[bytes](), self.tree.first()
-        for _, offset, slot in _elements(leaves, 0, max(constants, default=-1) + 1):
-            known = [constants.get(spot, (0, 0)) for spot in range(offset, offset + slot.size)]
-            if slot.kind != "text" or any(mask != 0xFF for mask, _ in known):
-                break
-            texts.append(bytes(value for _, value in known))
-        return self.form.begins(texts)
+        """Those of them that all frames begin with."""
+        return bytes(self.prefix[spot] for spot in itertools.takewhile(self.prefix.__contains__, itertools.count()))
 
     def reading(self, buffer: NDArray[np.uint8], starts: Indices) -> Reading:
         """Candidates at these places, ascending."""
@@ -187,7 +191,8 @@ class Recoder:
             inside = reading.places[(reading.places >= len(self.form.start)) & (reading.places < (size if size > 0 else len(data)))]
             row = row if reading.numbers is not None else reading.values[reading.places.searchsorted(inside)].tobytes()
             at = inside[: len(row)].tolist()
-            follows = inside[len(row)] if len(row) < len(inside) else size - 1 if size > 0 and self.form.start else at[-1] + 1 if at else 0
+            has_mark = size > 0 and (self.form.start or reading.numbers is not None)
+            follows = inside[len(row)] if len(row) < len(inside) else size - 1 if has_mark else at[-1] + 1 if at else 0
             return row, [*at, int(follows)]
         starts = reading.starts(start.item(0), _joined(legible.slots))
         at = np.repeat(starts, [slot.size for slot in legible.slots]).tolist()
@@ -198,14 +203,15 @@ class Recoder:
         if not data:
             return Legible((), b"", 0, "", "a frame")
         reading, at, stop = self._alone(data)
-        elements, row, number = list(_elements(*self._leaves(reading, np.zeros(1, np.intp), stop))), b"", 0
-        step = len(elements)
-        while step:  # halved where one of so many cannot be read
-            part, ends = reading.rows(at, stop, _joined(slot for _, _, slot in elements[number : number + step]))
-            if number + step <= len(elements) and ends[0] != NONE:
-                row, at, number = row + part[0].tobytes(), ends, number + step
-            else:
-                step //= 2
+        elements, row = list(_elements(*self._leaves(reading, np.zeros(1, np.intp), stop))), b""
+
+        def read(number: int) -> tuple[Bytes2D, Indices]:
+            return reading.rows(at, stop, _joined(slot for _, _, slot in elements[:number]))
+
+        number = bisect.bisect_left(range(1, len(elements) + 1), True, key=lambda count: read(count)[1].item(0) == NONE)
+        if number:
+            rows, at = read(number)
+            row = rows.tobytes()
         path, _, slot = elements[number] if number < len(elements) else ("", 0, None)
         seen = tuple(slot for _, _, slot in elements[:number])
         return Legible(seen, row, at.item(0), path, "the end of the frame" if slot is None else _in_words(slot))

@@ -147,7 +147,7 @@ def test_paths(tmp_path: Path) -> None:
 
 @pytest.mark.skipif(not Path("/proc/self/mem").exists(), reason="needs a file whose reading fails")
 def test_failing_reads_are_source_errors() -> None:
-    with pytest.raises(SourceError, match="cannot read"):
+    with pytest.raises(SourceError, match="Input/output error"):
         CaptureReader("/proc/self/mem")
 
 

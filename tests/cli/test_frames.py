@@ -134,10 +134,10 @@ def test_explain_shows_what_stands_at_some_bytes_alone(tmp_path: Path) -> None:
     assert ran("explain", path, "--at", "0x3b2", *SENSOR).stdout.startswith(
         "ldrobot-stl27l data at byte 940, 47 bytes; byte 946 is in points[0].distance\n"
     )
-    assert [frame["offset"] for frame in printed("explain", path, "--slice", "46:95", *SENSOR)["frames"]] == [0, 47, 94]
-    assert len(printed("explain", path, "--slice", "14000:", *SENSOR)["frames"]) == 3
+    assert [frame["offset"] for frame in printed("explain", path, "--bytes", "46:95", *SENSOR)["frames"]] == [0, 47, 94]
+    assert len(printed("explain", path, "--bytes", "14000:", *SENSOR)["frames"]) == 3
     assert "14100 bytes: there is no byte 14100" in ran("explain", path, "--at", 14100, *SENSOR, code=2).stderr
-    for words in (("--slice", "9"), ("--slice", "9:8"), ("--slice", "a:"), ("--at", "-1"), ("--at", 1, "--slice", "1:2")):
+    for words in (("--bytes", "9"), ("--bytes", "9:8"), ("--bytes", "a:"), ("--at", "-1"), ("--at", 1, "--bytes", "1:2")):
         ran("explain", path, *words, *SENSOR, code=2)
 
 
@@ -250,12 +250,12 @@ def test_built_frames_go_to_files_and_back(tmp_path: Path) -> None:
 def test_an_input_is_held_in_pieces(words: tuple[str, ...], code: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Of a file, of hexadecimal text in one line, and of what comes through a pipe, no more is held than a piece."""
     monkeypatch.chdir(tmp_path)
-    for data in (bytes(2000), bytes(4 * MEGABYTE)):  # first what is imported and remembered
+    for data in (bytes(2000), bytes(2 * MEGABYTE)):  # first what is imported and remembered
         text = data.hex().encode()
         for name, given in (("zeros.bin", data), ("zeros.hex", text), ("few.bin", data[: MEGABYTE // 2])):
             Path(name).write_bytes(given)
         most = peak(lambda given=text if "-" in words else b"": ran(*words, code=code, given=given))
-    # the whole at once would be 300 MB: a piece is looked through for every kind of frame of a sensor, and some have a dozen
+    # the whole at once would be 150 MB: a piece is looked through for every kind of frame of a sensor, and some have a dozen
     assert most - len(text) * ("-" in words) < 32 * MEGABYTE, f"{most} bytes"
 
 

@@ -50,6 +50,7 @@ def test_columns_and_arrays_come_to_the_same() -> None:
     [
         (lambda f: np.sin(f.points.distance * 2) + 1, "points.distance"),
         (lambda f: take([1, 2, 3], f.points.intensity), "points.intensity"),
+        (lambda f: (f.points.distance * 2).on("points"), "points.distance"),
         (lambda f: f.points.distance + f.points.intensity, None),
         (lambda f: f.points.distance * np.arange(12), None),
         (lambda f: stack(f.points.distance, f.points.distance), None),

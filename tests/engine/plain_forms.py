@@ -6,7 +6,7 @@ from typing import Any
 
 from construct import Array, Bytes, BytesInteger, Const, Construct, Container, FormatField, IfThenElse, Pass, Renamed, Struct, evaluate
 
-from lidarspec.spec import Escaped, Lines, Tokens
+from lidarspec.spec import Echoes, Escaped, Lines, Tokens
 
 
 def plain_row(form: Any, struct: Construct, data: bytes) -> tuple[bytes, int] | None:
@@ -50,12 +50,28 @@ def _lines(form: Lines, struct: Construct, data: bytes) -> tuple[bytes, int] | N
         row += line
     if len(lines) < len(form.head):
         return None
+    if form.numbers is not None and form.numbers.echoes is not None:
+        row = row[: sum(form.head)] + _steps(form.numbers.echoes, row[sum(form.head) :])
     reader = _SixBitReader(row, form)
     try:
         reader.read(struct, Container(), "")
     except ValueError:
         return b"", end + 2
     return bytes(reader.row) + reader.left, end + 2
+
+
+def _steps(form: Echoes, characters: bytes) -> bytes:
+    row = b""
+    while characters:
+        echo, characters = characters[: form.size], characters[form.size :]
+        row += echo
+        given = 1
+        while characters.startswith(form.mark) and given < form.most:
+            echo, characters = characters[1 : 1 + form.size], characters[1 + form.size :]
+            row += echo
+            given += 1
+        row += b"0" * form.size * (form.most - given)
+    return row
 
 
 def _tokens(form: Tokens, struct: Construct, data: bytes) -> tuple[bytes, int] | None:

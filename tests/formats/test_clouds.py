@@ -156,10 +156,11 @@ def test_what_is_no_picture_is_one_row(tmp_path: Path, scans: list[Scan], every_
     np.testing.assert_array_equal(pcd(tmp_path / "a.pcd")["x"], expected(scans, "x", every_point=every_point))
 
 
-def test_two_returns_of_a_place_are_no_picture(tmp_path: Path) -> None:
+def test_two_returns_of_a_place_stand_side_by_side(tmp_path: Path) -> None:
     one = picture()
-    write(tmp_path / "a.pcd", [replace(one, points=replace(one.points, shape=(2, 3)))], every_point=True)
-    assert pypcd4.PointCloud.from_path(tmp_path / "a.pcd").metadata.height == 1
+    write(tmp_path / "a.pcd", [replace(one, points=replace(one.points, shape=(2, 3), ring=None))], every_point=True)
+    assert pypcd4.PointCloud.from_path(tmp_path / "a.pcd").metadata.height == 3
+    np.testing.assert_array_equal(pcd(tmp_path / "a.pcd")["x"].reshape(3, 2, 2).swapaxes(0, 1).ravel(), one.points.x)
 
 
 @pytest.mark.parametrize("points", [1, 32, 70_000])

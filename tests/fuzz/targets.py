@@ -4,15 +4,17 @@ from __future__ import annotations
 
 import contextlib
 import functools
+import gzip
 import io
 import json
+import lzma
 import random
 import re
 import struct
 import tempfile
 import zlib
 from collections.abc import Callable, Iterable, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -29,7 +31,7 @@ from lidarspec.testing import subject as material
 from lidarspec.testing.findings import Violation
 from lidarspec.testing.subject import Subject
 from lidarspec.testing.vectors import vectors_hold
-from lidarspec.transports.files import unhexed
+from lidarspec.transports.hexadecimal import unhexed
 from lidarspec.transports.open_url import is_port, live_address
 from lidarspec.wire.layout import Layout
 from lidarspec_hesai import at128
@@ -74,7 +76,7 @@ class Target:
     run: Callable[[bytes], object]
     examples: Callable[[], list[bytes]]
     documented: tuple[type[Exception], ...] = ()
-    words: Sequence[bytes] = field(default=EDGES, repr=False)
+    words: Callable[[], Sequence[bytes]] = lambda: EDGES
     spots: Callable[[bytes], Sequence[int]] = lambda data: ()
     mended: Callable[[bytes], bytes] = lambda data: data
     is_text: bool = False
@@ -88,9 +90,9 @@ class Target:
         """A neighbour of an input, with a piece of another one in it at times; half of them have their checksums mended."""
         if self.is_text and source.random() < 0.5 and (values := list(VALUE.finditer(data))):
             start, end = source.choice(values).span()
-            return data[:start] + source.choice(self.words) + data[end:]
+            return data[:start] + source.choice(self.words()) + data[end:]
         start = source.randrange(len(other) + 1)
-        words = self.words if source.random() < 0.8 else [other[start : start + source.choice((4, 64, LONGEST))]]
+        words = self.words() if source.random() < 0.8 else [other[start : start + source.choice((4, 64, LONGEST))]]
         found = material.mutated(data, source, words, self.spots(data))[:LONGEST]
         return self.mended(found) if source.random() < 0.5 else found
 
@@ -123,16 +125,16 @@ def targets(folder: Path) -> dict[str, Target]:
     found += [_capture(), _file(folder), _recording(folder), _settings(folder), _scene(folder), _vectors(folder)]
     found += [_calibration(sensor, option, folder) for sensor in ls.sensors().values() for option in sensor.configure.files]
     text = [word.encode() for word in HOSTILE]
-    found.append(
-        Target("hex", lambda data: unhexed(data.decode("latin-1")), lambda: [b"54 2c", b"0: {0x54, 0x2C}; // one"], (ValueError,), text)
-    )
+    printed = [b"54 2c", b"0: {0x54, 0x2C}; // one", b"0000  54 2c  T,\n0002", b"[12:00:01.5] 54 /* */"]
+    printed += [b"(1.5) can0 044#1122", b"time,value\n1,0x54"]
+    found.append(Target("hex", lambda data: unhexed(data.decode("latin-1")), lambda: printed, (ValueError,), lambda: text))
     found.append(
         Target(
             "source",
             _named,
             lambda: [b"udp://:2368?src=192.0.2.1", b"serial:///dev/ttyUSB0?baud=9600&dtr=on", *(word for word in text if b":" in word)],
             (ls.UsageError,),
-            text,
+            lambda: text,
         )
     )
     found.append(Target("arguments", functools.partial(commanded, folder), spoken))
@@ -142,7 +144,6 @@ def targets(folder: Path) -> dict[str, Target]:
 def _frame(sensor: Sensor, name: str) -> Target:
     """Frames of one type, parsed as such, as any, and explained."""
     subject = Subject(sensor)
-    tree = getattr(codec(sensor.frames[name]), "tree", None)
 
     def run(data: bytes) -> None:
         parse = functools.partial(sensor.parse, data)
@@ -154,6 +155,7 @@ def _frame(sensor: Sensor, name: str) -> Target:
 
     @functools.lru_cache(maxsize=256)
     def layout(data: bytes) -> Layout | None:
+        tree = getattr(codec(sensor.frames[name]), "tree", None)
         found = tree.layout(data) if tree is not None else None
         return found if isinstance(found, Layout) and found.size <= len(data) else None
 
@@ -173,14 +175,12 @@ def _frame(sensor: Sensor, name: str) -> Target:
     def made() -> list[bytes]:
         return [subject.example(name, seed=seed) for seed in range(6)]
 
-    return Target(f"frame {sensor.id} {name}", run, made, (), EDGES, spots, mended, cost=100 + max(map(len, made())))
+    return Target(f"frame {sensor.id} {name}", run, made, spots=spots, mended=mended, cost=100 + sensor.frames[name].max_length)
 
 
 def _stream(sensor: Sensor) -> Target:
     """A stream in pieces of any size, or datagrams, through the decoder and on to scans: nothing of it raises."""
     subject = Subject(sensor)
-    pieces = [subject.example(name, seed=seed) for name in sensor.incoming for seed in range(2)]
-    heads = [piece[:size] for piece in pieces for size in (1, 2, 4, 7)]
 
     def run(data: bytes) -> None:
         source = random.Random(zlib.crc32(data))
@@ -198,7 +198,12 @@ def _stream(sensor: Sensor) -> Target:
         talks = [[data for _, data in subject.conversation(seed=seed, rounds=2)][:12] for seed in range(3)]
         return [b"".join(struct.pack("<H", len(data)) + data if sensor.datagrams else data for data in talk) for talk in talks]
 
-    return Target(f"stream {sensor.id}", run, examples, (), [*EDGES, *pieces, *heads])
+    @functools.cache
+    def words() -> list[bytes]:
+        pieces = [subject.example(name, seed=seed) for name in sensor.incoming for seed in range(2)]
+        return [*EDGES, *pieces, *(piece[:size] for piece in pieces for size in (1, 2, 4, 7))]
+
+    return Target(f"stream {sensor.id}", run, examples, words=words)
 
 
 def _datagrams(data: bytes) -> list[bytes]:
@@ -231,7 +236,7 @@ def _capture() -> Target:
         made.record(b""),
     ]
     packets = [made.ipv4(made.udp(b"payload")), made.ipv6(made.udp(b"payload")), made.ethernet(made.ipv4(made.udp(b"x")), ethertype=0x8100)]
-    return Target("capture", run, _captures, (), [*EDGES, *blocks, *packets, *(struct.pack("<I", link) for link in LINKS)])
+    return Target("capture", run, _captures, words=lambda: [*EDGES, *blocks, *packets, *(struct.pack("<I", link) for link in LINKS)])
 
 
 def _captures() -> list[bytes]:
@@ -274,9 +279,11 @@ def _file(folder: Path) -> Target:
             recorded(VLP, velodyne),
             b"".join(frames),
             frames[0].hex(" ").encode(),
+            gzip.compress(made.pcap(*map(made.frame, velodyne))),
+            lzma.compress(recorded(VLP, velodyne)),
         ]
 
-    return Target("file", run, examples, (ls.LidarSpecError,), [*EDGES, *(word.encode() for word in HOSTILE)])
+    return Target("file", run, examples, (ls.LidarSpecError,), lambda: [*EDGES, *(word.encode() for word in HOSTILE)])
 
 
 def recorded(sensor: str, frames: Iterable[bytes]) -> bytes:
@@ -312,7 +319,7 @@ def _recording(folder: Path) -> Target:
         return [recorded(name, [ls.sensor(name).example("data", seed=seed) for seed in range(2)]) for name in (STL, VLP)]
 
     values = [value.encode() for value in ('"a"', "[]", "{}", "null", "1e999", "true", "-1", "[" * 2000, '{"event": []}', '{"a":' * 300)]
-    return Target("recording", run, examples, (ls.SourceError, ls.WireError), [*EDGES, *values], mended=mended)
+    return Target("recording", run, examples, (ls.SourceError, ls.WireError), lambda: [*EDGES, *values], mended=mended)
 
 
 def _settings(folder: Path) -> Target:
@@ -334,7 +341,7 @@ source = "./rear.lsr"
 sensor = "{VLP}"
 options = {{calibration = "./angles.csv"}}
 """
-    return Target("settings", run, lambda: [text.encode()], (ls.UsageError, ls.SourceError), TOML, is_text=True)
+    return Target("settings", run, lambda: [text.encode()], (ls.UsageError, ls.SourceError), lambda: TOML, is_text=True)
 
 
 #: pieces of TOML and JSON that make trouble.
@@ -379,7 +386,7 @@ def _scene(folder: Path) -> Target:
 
     text = b"[room]\nlow=[-3.0,-2.2,-1.2]\nhigh=[4.6,3.1,1.6]\n[[box]]\nlow=[2.0,0.8,-1.2]\nhigh=[2.7,1.6,0.9]\n"
     mover = b"[[mover]]\nsize=[0.4,0.5,1.7]\npath=[[1.4,-1.5],[0.8,1.9]]\nspeed=0.8\nfloor=-1.2\n"
-    return Target("scene", run, lambda: [text + mover], (ls.UsageError, ls.SourceError), TOML, is_text=True)
+    return Target("scene", run, lambda: [text + mover], (ls.UsageError, ls.SourceError), lambda: TOML, is_text=True)
 
 
 def _vectors(folder: Path) -> Target:
@@ -405,7 +412,7 @@ def _vectors(folder: Path) -> Target:
         b'"values":{"points[0]":1}',
     ]
     words += [b'"frame":[]', b'"sensor":1', b'"hex":1', b'"units":[]', b'"reply":"54"', b"NaN", b"null", b"1e999"]
-    return Target("vectors", run, lambda: [json.dumps([vector, {**vector, **more}]).encode()], (Violation,), words, is_text=True)
+    return Target("vectors", run, lambda: [json.dumps([vector, {**vector, **more}]).encode()], (Violation,), lambda: words, is_text=True)
 
 
 def _calibration(sensor: Sensor, option: str, folder: Path) -> Target:
@@ -432,7 +439,12 @@ def _calibration(sensor: Sensor, option: str, folder: Path) -> Target:
         for word in ("nan", "inf", "-inf", "1e999", ",", "\n", '"', "\x00", "1_0", "\u0661", "EEFF", "414", "0", "-0", ",,,,", "9" * 5000)
     ]
     return Target(
-        f"calibration {sensor.id} {option}", run, examples, (ls.UsageError, ls.SourceError), words, is_text=sensor.id != "hesai-at128"
+        f"calibration {sensor.id} {option}",
+        run,
+        examples,
+        (ls.UsageError, ls.SourceError),
+        lambda: words,
+        is_text=sensor.id != "hesai-at128",
     )
 
 

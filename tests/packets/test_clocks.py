@@ -29,6 +29,13 @@ def test_whole_turns_that_nobody_saw_are_counted_by_the_host() -> None:
     assert ((np.concatenate([first, later]) - first[0]) / SECOND).tolist() == [0, 1, 92, 93]
 
 
+def test_a_pause_of_more_than_half_a_turn_goes_forward_where_the_host_says_so() -> None:
+    for pause, arrived in ((18, 18), (22, 21.5), (14, 14), (0.01, 18)):  # the last was held back on its way
+        clock = Unwrapper(30.0)
+        found = [clock.push(times(reading % 30), NOW + times(at)) for reading, at in ((11, 1), (11 + pause, 1 + arrived))]
+        assert (np.concatenate(found)[1] - found[0][0]) / SECOND == pause
+
+
 @pytest.mark.parametrize("arrivals", [[0, 0], [0, NOW], [NOW, 0]])
 def test_an_arrival_that_nobody_knows_counts_no_turns(arrivals: list[int]) -> None:
     clock = Unwrapper(30.0)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import importlib.util
 from concurrent.futures import ThreadPoolExecutor
 from typing import Any
 
@@ -16,7 +17,7 @@ from lidarspec.points.evaluate import evaluated
 from lidarspec.points.plain import evaluate
 from lidarspec.points.plan import Plan, plan_for
 from lidarspec.simulation.simulator import simulate
-from lidarspec.spec import Fields, Polar, Scaled
+from lidarspec.spec import Fields, Polar, Scaled, take
 from lidarspec.spec.links import is_datagram
 from lidarspec.testing.agreement import assert_same_points
 from lidarspec.testing.subject import Subject
@@ -31,6 +32,7 @@ SHAPED = {name: sensor for name, sensor in SHAPES.items() if sensor.frames}
 SENSORS = {**lidarspec.sensors(), **SHAPED}
 #: sensors that go through what is proved on the shapes: one of each kind of link.
 TRIED = ("ldrobot-stl27l", "velodyne-vlp16")
+BACKENDS = ("numpy", "jit") if importlib.util.find_spec("numba") else ("numpy",)
 
 
 def plan(packets: Packets) -> Any:
@@ -154,7 +156,7 @@ def test_threads_that_decode_with_one_sensor_do_not_meet() -> None:
         assert all(pool.map(same, [0, 1]))
 
 
-@pytest.mark.parametrize("backend", ["numpy", "jit"])
+@pytest.mark.parametrize("backend", BACKENDS)
 def test_sensors_that_share_a_points_function_keep_their_own_scales(backend: str) -> None:
     """Tables are kept for a points function, and one of these sensors measures in other units than the first."""
     for unit in (0.001, 0.002):
@@ -164,3 +166,30 @@ def test_sensors_that_share_a_points_function_keep_their_own_scales(backend: str
         plain = made.decode(b"".join(simulate(made, 40)), backend="construct").points()
         assert cloud.valid.any()
         assert_same_points(cloud, plain)
+
+
+@pytest.mark.parametrize("backend", BACKENDS)
+def test_beams_that_start_beside_the_sensor_are_exact_near_and_far(backend: str) -> None:
+    random = np.random.default_rng(5)
+    azimuths, elevations, starts = (
+        random.uniform(-np.pi, np.pi, (9, 32)),
+        random.uniform(-0.8, 0.8, (9, 32)),
+        random.normal(0, 0.05, (3, 9, 32)),
+    )
+
+    def points(f: Fields) -> Polar:
+        azimuth, elevation, *start = (take(table, f.number) for table in (azimuths, elevations, *starts))
+        return Polar(f.ranges, azimuth, elevation, origin=tuple(start))
+
+    struct = Struct("number" / Int16ul, "ranges" / Array(32, Scaled(Int16ul, 0.004, "m")))
+    numbers, ranges = np.arange(200) % 10, random.integers(0, 3000, (200, 32))  # of ten rows, the table has nine
+    ranges[20:60] = random.integers(0, 64_000, (40, 32))
+    ranges[random.random(ranges.shape) < 0.2] = 0
+    frames = np.ascontiguousarray(np.concatenate([numbers[:, None], ranges], axis=1).astype("<u2")).view(np.uint8)
+    xyz = dataclasses.replace(sensor(struct), points=points).decode(frames, backend=backend).points().xyz.reshape(200, 32, 3)
+    assert (np.isnan(xyz).all(axis=2) == ((ranges == 0) | (numbers == 9)[:, None])).all()
+    seen, measured = numbers < 9, np.where(ranges, ranges * 0.004, np.nan)
+    azimuth, elevation, start = (table[..., numbers[seen], :] for table in (azimuths, elevations, starts))
+    level = np.cos(elevation)
+    directions = np.stack([level * np.cos(azimuth), level * np.sin(azimuth), np.sin(elevation)])
+    np.testing.assert_allclose(xyz[seen], np.moveaxis(directions * measured[seen] + start, 0, -1), rtol=0, atol=1e-5)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import random
 import tracemalloc
 from collections.abc import Collection
@@ -232,3 +233,34 @@ def test_scans_end_where_an_angle_jumps_and_not_where_it_passes_0(size: int) -> 
     assert [len(scan) for scan in scans] == [40] * 30
     assert {scan.complete for scan in scans[1:-1]} == {True}
     assert np.ptp(np.rad2deg(scans[1].points.azimuth.astype(np.float64))) == pytest.approx(2 * 28.5 + 0.4, abs=1e-3)
+
+
+@pytest.mark.parametrize(("name", "falls"), [("ldrobot-stl27l", True), ("velodyne-vlp16", True), ("hokuyo-utm30lx", False)])
+def test_a_laserscan_has_the_beams_that_are_asked_for_and_the_way_that_the_azimuth_goes(name: str, falls: bool) -> None:
+    sensor = ls.sensor(name)
+    for scan in list(sensor.scans(simulate(sensor, 400)))[:4]:
+        for beams in (450, 7):
+            planar = scan.to_laserscan(beams=beams)
+            assert len(planar.ranges) == len(planar.intensities) == beams
+            assert planar.angle_max == pytest.approx(planar.angle_min + (beams - 1) * planar.angle_increment)
+            assert (planar.time_increment < 0) == falls
+            assert abs(planar.time_increment) * beams == pytest.approx(planar.scan_time)
+        assert len(scan.to_laserscan().ranges) == (sensor.beams or len(scan))
+
+
+def test_a_scan_says_when_the_packet_of_its_first_point_arrived() -> None:
+    """However the frames come in pieces, and none where nobody knows it."""
+    reading = Reading("velodyne-vlp16")
+    frames = simulate(reading.sensor, 400)
+    arrivals = 10**18 + np.arange(len(frames)) * PACKET_NS
+    decoder, scans = reading.decoder, list[Scan]()
+    for start in range(0, len(frames), 37):
+        part = slice(start, start + 37)
+        scans += reading.scans_of(decoder.datagrams(frames[part], arrivals[part].tolist()))
+    assert len(scans) > 3
+    assert scans[0].host_ns == arrivals[0]
+    for before, after in itertools.pairwise(scans):
+        assert after.host_ns in arrivals
+        assert abs((after.host_ns - before.host_ns) - (after.stamp_ns - before.stamp_ns)) <= PACKET_NS
+        assert after.to_laserscan().host_ns == after.host_ns
+    assert {scan.host_ns for scan in reading.sensor.scans(frames)} == {0}

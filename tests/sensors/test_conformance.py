@@ -9,11 +9,11 @@ from lidarspec.framing.frame_engine import InterpretedCodec, codec
 from lidarspec.testing import SensorConformance, agreement, hostile
 from lidarspec.testing.check import target
 from lidarspec.testing.conformance import PROPERTIES
-from tests.all_sensors import DISTINCT, EVERY
+from tests.all_sensors import DISTINCT, EVERY, FRAMES
 from tests.shapes import SHAPES
 
-#: half of what the kit takes where nothing is said: `make test-long` tries as many as one has time for.
-EXAMPLES = int(os.environ.get("LIDARSPEC_EXAMPLES", "20"))
+#: a third of what the kit takes where nothing is said: `make test-long` tries as many as one has time for.
+EXAMPLES = int(os.environ.get("LIDARSPEC_EXAMPLES", "12"))
 #: frames that construct alone can read.
 REFUSED = {"shape-text data"} | {
     f"{name} {told}" for name in EVERY if name.startswith("hokuyo-") for told in ("version", "parameters", "state")
@@ -36,7 +36,8 @@ def _shared(sensor: Sensor) -> dict[str, None]:
 def _tests(sensor: Sensor) -> type[SensorConformance]:
     """The test class of one sensor."""
     vectors = None if sensor.id in SHAPES else target(sensor.id).vectors
-    values = {"sensor": sensor, "examples": EXAMPLES, "vectors": vectors, "__module__": __name__, **_shared(sensor)}
+    elsewhere = [name for name in sensor.frames if (sensor.id, name) not in FRAMES]
+    values = {"sensor": sensor, "examples": EXAMPLES, "vectors": vectors, "elsewhere": elsewhere, "__module__": __name__, **_shared(sensor)}
     return type(f"Test_{sensor.id.replace('-', '_')}", (SensorConformance,), values)
 
 

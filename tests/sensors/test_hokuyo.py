@@ -62,6 +62,20 @@ def test_scans_of_some_steps_and_clusters_stand_where_they_were_asked_for() -> N
         URG.configure(content="intensities")
 
 
+def test_a_step_with_several_echoes_has_a_point_for_each() -> None:
+    asked = UTM.configure(content="echoes", first=539, last=541)
+    assert asked.command("start") == b"ND0539054101000\n"
+    assert asked.command("get_scan") == b"HD0539054101\n"
+    scan = b"ND0539054101000\n" + hokuyo("status_99") + b"\n" + hokuyo("4char") + b"?\n1Dh1Dh&0Vh&0CB1Dh6\n\n"
+    for sensor in (asked, UTM):
+        cloud = decoded(sensor, scan).points()
+        assert cloud.return_index.tolist() == [0, 1, 2] * 3
+        np.testing.assert_allclose(cloud.range[cloud.valid], [5.432, 5.432, 2.488, 1.234, 5.432], rtol=1e-6)
+        np.testing.assert_allclose(cloud.azimuth, np.deg2rad(np.repeat([-0.25, 0, 0.25], 3)), atol=1e-6)
+    with pytest.raises(ls.UsageError, match="content is one of distances, intensities, short, not 'echoes'"):
+        UST.configure(content="echoes")
+
+
 def test_a_cluster_of_00_is_one_step_and_the_numbers_of_errors_are_no_points() -> None:
     values = UST.parse(next(iter(ls.simulate(UST, 1))))
     values.cluster.ones = 0

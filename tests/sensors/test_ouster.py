@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import functools
 import hashlib
+import importlib.util
 import json
 from pathlib import Path
 from typing import Any
@@ -77,10 +78,11 @@ def test_every_field_has_the_digest_of_the_vendor(name: str) -> None:
     assert len(names) == (5 if legacy else 9)
 
 
+@pytest.mark.parametrize("backend", ("numpy", "jit") if importlib.util.find_spec("numba") else ("numpy",))
 @pytest.mark.parametrize("name", CAPTURES)
-def test_points_are_those_of_the_vendor(name: str) -> None:
+def test_points_are_those_of_the_vendor(name: str, backend: str) -> None:
     sensor, data = unit(name)
-    scan = next(sensor.scans(data))
+    scan = next(sensor.scans(data, backend=backend))
     with np.load(capture(f"ouster/{name}.frame0.npz")) as expected:
         ranges, xyz = expected["RANGE"].T, expected["xyz"].transpose(1, 0, 2)
     shape = (*ranges.shape, -1)

@@ -23,6 +23,7 @@ from tests.shapes import (
     grid,
     headed,
     inertia,
+    joined,
     lengths,
     lines,
     measured,
@@ -87,6 +88,7 @@ _MODULES = (
     fragments,
     tokens,
     lines,
+    joined,
     escaped,
 )
 

@@ -1,4 +1,5 @@
-"""Text in tokens: hexadecimal numbers of all kinds and sizes, arrays with counts of their own, a name with a separator in it."""
+"""Text in tokens: a constant behind any three characters, hexadecimal numbers of all kinds, arrays with counts of their own, and a name
+with a separator in it."""
 
 from __future__ import annotations
 
@@ -11,9 +12,10 @@ from lidarspec import Sensor
 from lidarspec.spec import Clock, Fields, Frame, OnWrap, Polar, Scaled, Sequence, Simulation, Tcp, Tokens, steps
 
 BEAMS = 30
+KIND = np.frombuffer(b"sSN", np.uint8)
 
 SCAN = Struct(
-    "kind" / Const(b"sSN"),
+    "kind" / Bytes(3),
     "name" / Const(b"scandata"),
     "counter" / Int16ub,
     "time" / Scaled(Int32ub, 1, "us"),
@@ -40,7 +42,7 @@ def points(f: Fields) -> Polar:
 
 def sweep(i: int) -> dict[str, Any]:
     """Twelve telegrams a turn."""
-    return dict(counter=i % 65_536, time=i * 5000 % 2**32, scale=1.0, start=(i * BEAMS) % 360 - 180.0, step=1.0, count=BEAMS)
+    return dict(kind=KIND, counter=i % 65_536, time=i * 5000 % 2**32, scale=1.0, start=(i * BEAMS) % 360 - 180.0, step=1.0, count=BEAMS)
 
 
 SENSOR = Sensor(

@@ -13,6 +13,9 @@ import pytest
 
 import lidarspec as ls
 from lidarspec import SourceError
+from lidarspec.captures.ip import ETHERNET
+from lidarspec.captures.pcap import Datagram, datagram_record
+from lidarspec.captures.records import capture_head
 from lidarspec.formats import write
 from lidarspec.simulation.simulator import simulate
 from lidarspec.transports.open_url import transport
@@ -33,6 +36,7 @@ LAYOUTS = {
     "pandar_msgs/msg/PandarScan": f"{STAMPED}uint8[1500] data\nuint32 size".format("pandar_msgs", "PandarPacket"),
     "nebula_msgs/msg/NebulaPackets": f"{STAMPED}uint8[] data".format("nebula_msgs", "NebulaPacket"),
     "hesai_ros_driver/msg/UdpFrame": f"{LIST}uint8[] data\nuint32 size".format("hesai_ros_driver", "UdpPacket"),
+    "rslidar_msgs/msg/rslidarScan": f"{STAMPED}uint8[1248] data".format("rslidar_msgs", "rslidarPacket"),
     "rslidar_msg/msg/RslidarPacket": "std_msgs/Header header\nuint8 is_difop\nuint8 is_frame_begin\nuint8[] data",
     "ouster_sensor_msgs/msg/PacketMsg": "uint8[] buf",
 }
@@ -81,7 +85,9 @@ def messages(store: Any, msgtype: str, data: Sequence[bytes]) -> Iterator[tuple[
 
 def made(store: Any, name: str, data: bytes, at: int) -> Any:
     values: dict[str, Any] = {"stamp": time(store, at), "header": header(store, at), "size": len(data), "is_difop": 0, "is_frame_begin": 0}
-    fixed = {"velodyne_msgs/msg/VelodynePacket": 1206, "pandar_msgs/msg/PandarPacket": 1500}.get(name, len(data))
+    fixed = {"velodyne_msgs/msg/VelodynePacket": 1206, "rslidar_msgs/msg/rslidarPacket": 1248, "pandar_msgs/msg/PandarPacket": 1500}.get(
+        name, len(data)
+    )
     values["data"] = values["buf"] = np.frombuffer(data.ljust(fixed, b"\0"), np.uint8)
     kind = store.types[name]
     return kind(**{field: values[field] for field in kind.__dataclass_fields__ if field != "__msgtype__"})
@@ -105,7 +111,7 @@ def read(source: Path | str) -> list[Chunk]:
 @pytest.mark.parametrize("msgtype", LAYOUTS)
 @pytest.mark.parametrize("kind", KINDS)
 def test_packets_come_back_as_they_were_recorded(tmp_path: Path, kind: str, msgtype: str) -> None:
-    sent = packets(25)
+    sent = packets(25, "robosense-rs16" if msgtype == "rslidar_msgs/msg/rslidarScan" else "velodyne-vlp16")
     chunks = read(recorded(tmp_path, kind, {"/lidar/packets": (msgtype, sent)}))
     assert [chunk.data for chunk in chunks] == sent
     assert {chunk.sender for chunk in chunks} == {None}
@@ -174,3 +180,31 @@ def test_a_damaged_log_is_a_source_error_and_no_other(tmp_path: Path, kind: str)
         target.write_bytes(data)
         with contextlib.suppress(SourceError):
             read(path)
+
+
+def test_packets_are_the_same_through_every_container(tmp_path: Path) -> None:
+    sent = packets(300)
+    source = tmp_path / "it.pcap"
+    ends = ("192.168.1.201", 2368), ("192.168.1.77", 2368)
+    records = [datagram_record(Datagram(data, START + STEP * number, *ends)) for number, data in enumerate(sent)]
+    source.write_bytes(capture_head(ETHERNET) + b"".join(records))
+    for suffix in ("mcap", "bag", "rosbag2", "db3", "lsr", "pcap"):
+        target = tmp_path / f"out.{suffix}"
+        words = ("record",) if suffix in ("lsr", "pcap") else ("convert", "--packets")
+        ran(*words, source, *(["-o"] if len(words) == 1 else []), target, "-s", "velodyne-vlp16")
+        assert [(chunk.data, chunk.at) for chunk in read(target)] == [(data, START + STEP * number) for number, data in enumerate(sent)]
+        source = target if suffix in ("mcap", "lsr") else source  # packets of a log are taken over from log to log
+    ran("convert", tmp_path / "out.mcap", tmp_path / "mcap.csv", "-s", "velodyne-vlp16")
+    ran("convert", tmp_path / "it.pcap", tmp_path / "pcap.csv", "-s", "velodyne-vlp16")
+    assert (tmp_path / "mcap.csv").read_bytes() == (tmp_path / "pcap.csv").read_bytes()
+
+
+def test_packets_have_no_place_elsewhere(tmp_path: Path) -> None:
+    (tmp_path / "it.bin").write_bytes(ls.sensor("ldrobot-stl27l").example("data"))
+    said = ran("convert", tmp_path / "it.bin", tmp_path / "out.mcap", "--packets", "-s", "ldrobot-stl27l", code=2).stderr
+    assert "it.bin is a stream of bytes: packets are those of datagrams" in said
+    assert "can be read only once: record it first" in ran("convert", "-", "o.mcap", "--packets", "-s", "velodyne-vlp16", code=2).stderr
+    path = recorded(tmp_path, "mcap", {"/p": ("nebula_msgs/msg/NebulaPackets", packets(200))})
+    said = ran("convert", path, tmp_path / "out.csv", "--packets", "-s", "velodyne-vlp16", code=2).stderr
+    assert "out.csv: .csv has no place for --packets; those that have are .mcap, .bag, .rosbag2, .db3" in said
+    assert not list(tmp_path.glob("out.*"))

@@ -6,14 +6,15 @@ import dataclasses
 
 import numpy as np
 import pytest
-from construct import Array, Const, Int8ub, Int16sb, Int16ub, Int24ub, Int32ub, Struct, this
+from construct import Array, Bytes, Const, Int8ub, Int16sb, Int16ub, Int24ub, Int32ub, Struct, this
 
 from lidarspec import Sensor, SpecError, UsageError, WireError
+from lidarspec.explaining.explanation import explain
 from lidarspec.exports import Refused, export
-from lidarspec.spec import Escaped, Frame, Lines, Scip, SixBits, Tokens
+from lidarspec.spec import Echoes, Escaped, Frame, Lines, Scip, SixBits, Tokens
 from tests.shapes import SHAPES
 
-TOKENS, LINES, ESCAPED = (SHAPES[f"shape-{name}"] for name in ("tokens", "lines", "escaped"))
+TOKENS, LINES, JOINED, ESCAPED = (SHAPES[f"shape-{name}"] for name in ("tokens", "lines", "joined", "escaped"))
 
 
 def sensor(struct: Struct, form: object, longest: int = 200) -> Sensor:
@@ -69,6 +70,48 @@ def test_a_status_of_scip_has_the_sum_of_the_specification() -> None:
     assert Scip()(np.array([sum(b"00"), sum(b"99"), sum(b"0E")])).tobytes() == b"Pbe"
 
 
+def joined(steps: int, characters: bytes) -> bytes:
+    """A frame of shape-joined of these characters, in lines with their checks."""
+    lines = Lines(32, head=(4, 3), bare=1, check=Scip())
+    return lines.write(np.frombuffer(b"NE0%d000" % steps + characters, np.uint8)[None], ())[0]
+
+
+def test_a_step_has_as_many_echoes_as_are_sent() -> None:
+    data = joined(4, b"1Dh055Dh05&1Dh07" + b"00000" + b"00001&00000&00002")
+    values = JOINED.parse(data)
+    echoes = [[(echo.range, echo.strength) for echo in step.echoes] for step in values.steps]
+    assert echoes == [[(5432, 5), (0, 0), (0, 0)], [(21816, 5), (5432, 7), (0, 0)], [(0, 0)] * 3, [(0, 1), (0, 0), (0, 2)]]
+    assert JOINED.build("data", tens=0, ones=4, time=0, sector=0, steps=values.steps) == data
+    spelled = joined(1, b"1Dh05&00000")  # an echo of nothing, which would not be sent
+    assert JOINED.build("data", JOINED.parse(spelled)) == spelled
+    shown = str(explain(data, JOINED)).splitlines()
+    assert next(line for line in shown if "strength 7" in line).startswith("0015  31 44 68 30 37")
+    assert [line[:10].strip() for line in shown if "strength 2" in line or "(end)" in line] == ["002d  30 3", "0034  0a"]
+
+
+@pytest.mark.parametrize(
+    ("steps", "characters", "place"),
+    [
+        (1, b"1Dh05&", 15),
+        (1, b"&1Dh05", 10),
+        (2, b"1Dh05&&1Dh05", 15),
+        (1, b"1Dh&05", 13),
+        (2, b"1Dh05&1Dh05&1Dh05&1Dh05", 27),
+        (2, b"1Dh05&1Dh05", 24),
+        (1, b"1Dh05&1Dh", 16),
+        (1, b"1Dh051Dh05", 15),
+    ],
+    ids=["behind all", "before all", "twice", "within", "too many", "too few steps", "cut", "too many steps"],
+)
+def test_marks_that_join_no_echoes_make_no_frame(steps: int, characters: bytes, place: int) -> None:
+    data = joined(steps, characters)
+    with pytest.raises(WireError, match=r"is not a number of|is not the end of the frame") as fault:
+        JOINED.parse(data)
+    assert fault.value.offset == place
+    good = joined(1, b"1Dh05")
+    assert JOINED.decode(data + good).stats.frames == {"data": 1}
+
+
 def test_escapes_are_written_where_they_have_to_be_and_read_wherever_they_are() -> None:
     made = sensor(Struct("count" / Int8ub, "bytes" / Array(this.count, Int8ub)), Escaped())
     data = made.build("data", bytes=[0x7E, 0x11, 0x7D])
@@ -77,6 +120,19 @@ def test_escapes_are_written_where_they_have_to_be_and_read_wherever_they_are() 
     assert made.parse(other) == made.parse(data)
     assert made.build("data", made.parse(other)) == other
     assert made.decode(b"\x7e\x01\x7d\x7d\x5e\x7e" + data).stats.frames == {"data": 1}
+
+
+def test_a_text_behind_another_of_any_content_tells_what_is_a_candidate() -> None:
+    """What only begins with the same mark is not looked at any further, and so not counted as a frame of a wrong length."""
+    made = sensor(Struct("kind" / Bytes(3), "none" / Bytes(0), "name" / Const(b"scan"), "value" / Int8ub), Tokens(start=b"\x02"))
+    frames = b"".join(b"\x02%s scan 7\x03" % kind for kind in (b"abc", b"a c", b"   "))
+    decoder = made.decoder()
+    stream = b"\x02 \x02\x02abc rest 1 2\x03" + frames + b"\x02abc sca"
+    found = [frame for byte in stream for frame in decoder.feed(bytes([byte]))] + decoder.finish()
+    assert [made.parse(frame.data).value for frame in found] == [7, 7, 7]
+    assert decoder.stats.bad_length == 1  # of the last one, which has no end
+    with pytest.raises(WireError, match="name at byte 5: constant"):
+        made.parse(b"\x02abc sCan 7\x03")
 
 
 def test_a_fault_has_its_place_on_the_wire() -> None:
@@ -90,7 +146,7 @@ def test_a_fault_has_its_place_on_the_wire() -> None:
 
 @pytest.mark.parametrize("kind", ["c", "wireshark", "ksy", "json"])
 def test_an_export_that_cannot_recode_says_what(kind: str) -> None:
-    for each in (TOKENS, LINES, ESCAPED):
+    for each in (TOKENS, LINES, JOINED, ESCAPED):
         with pytest.raises(Refused, match=r"data in (Tokens|Lines|Escaped)\("):
             export(each, kind)
 
@@ -105,5 +161,12 @@ def test_declarations_that_cannot_be_are_refused() -> None:
         Tokens(start=b" ", sep=b" ")
     with pytest.raises(SpecError, match="max_length may be left out only"):
         Frame(Struct("a" / Int8ub), wire=Escaped())
+    with pytest.raises(SpecError, match="one character that is no digit"):
+        SixBits(echoes=Echoes(3, 3, mark=b"A"))
+    with pytest.raises(SpecError, match="stand behind the head"):
+        Lines(64) | SixBits(echoes=Echoes(3, 3))
+    struct = Struct("kind" / Const(b"ND"), "echoes" / Array(2, Int24ub))
+    with pytest.raises(SpecError, match="6 characters behind the head are no steps of 3 echoes of 3"):
+        sensor(struct, Lines(64, head=(2,)) | SixBits(echoes=Echoes(3, 3))).example("data")
     with pytest.raises(SpecError, match="two bytes that differ"):
         Escaped(0x7E, 0x5E)

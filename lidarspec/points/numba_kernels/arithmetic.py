@@ -100,6 +100,16 @@ def apart(context):
     return types.void(), make
 
 
+@intrinsic
+def fused(context, factor, other, added):
+    """A product and a sum of float32, rounded once."""
+
+    def make(target, builder, signature, args):
+        return builder.fma(*args)
+
+    return types.float32(types.float32, types.float32, types.float32), make
+
+
 def _float_at(bits, kind):
     """What loads a float of so many bits from an index of bytes on, as a float64; one is kept for each order of the bytes."""
 

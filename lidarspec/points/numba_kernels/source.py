@@ -14,12 +14,13 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from lidarspec.columns.graph import FACTORS, Node, is_full, is_nan_where, last_axis, only_field, traverse
 from lidarspec.points.conventions import returned_range
 from lidarspec.points.numba_kernels.writer import TEMPLATES, Value, Wanted, Writer, is_cheap, line
 from lidarspec.points.plan import Plan
-from lidarspec.points.windows import every_value, is_number, possible, window
+from lidarspec.points.windows import Beam, beam_of, every_value, is_number, possible, window
 from lidarspec.spec.vocabulary import LookUp, side_by_side
 
 #: points of which the scratch arrays stay in the fastest cache.
@@ -67,9 +68,9 @@ class Expressions(Writer):
             return self._row(node, "float64")
         return self.given(node)
 
-    def _row(self, node: Node, kind: str) -> Value:
-        """An element of the row of a table at an index."""
-        index, table = node.args
+    def _row(self, node: Node, kind: str, table: NDArray[Any] | None = None) -> Value:
+        """An element of the row of a table, by default the node's own, at an index."""
+        index, table = node.args[0], node.args[1] if table is None else table
         row = self.double(index)
         start = self.once(
             ("row", index, table.shape),
@@ -151,6 +152,10 @@ class Expressions(Writer):
         if found is not None:
             return found
         if is_full(node, self.width) and node.kind == "call" and not exact:
+            beam = beam_of(node, self.layout.leaves) if root else None
+            along = self._along(beam) if beam is not None else None
+            if along is not None:
+                return along
             if node.function is np.multiply or (root and node.function in (np.add, np.subtract)):
                 sign = {np.multiply: "*", np.add: "+", np.subtract: "-"}[node.function]
                 return self.combined(sign, *(self.single(arg) for arg in node.args))
@@ -161,21 +166,32 @@ class Expressions(Writer):
         made = self.double(node)
         return self.let(made.level, f"np.float32({made.text if not exact else f'number({made.text})'})")
 
-    def _marked(self, node: Node) -> Value | None:
+    def _along(self, beam: Beam) -> Value | None:
+        """A place on a beam, rounded once: what was sent times a direction in two halves, and its start; None where NumPy reads these."""
+        sent, table = self._marked(beam.distance, raw=True), beam.direction.args[1]
+        if sent is None or self.shared(beam.direction.args[0]) or self.shared(beam.start.args[0]):
+            return None
+        high, low, _ = self.once(("halves", id(table), beam.step), lambda: (*_halves(table * beam.step), table))
+        first, second = (self._row(beam.direction, "float32", half) for half in (high, low))
+        return self.let(
+            self.inner, f"fused({sent.text}, {first.text}, fused({sent.text}, {second.text}, {self._row(beam.start, 'float32').text}))"
+        )
+
+    def _marked(self, node: Node, *, raw: bool = False) -> Value | None:
         """A distance in float32, nan where nothing came back or a condition says so; None for what is none, or has to be float64 first."""
         if not is_full(node, self.width):
             return None
         if node.kind == "field":
             leaf = self.layout.leaves.get(node.path)
             is_short = leaf is not None and leaf.info.kind == "int" and leaf.info.bits < 32 and not leaf.info.offset
-            raw = self.raw(leaf) if leaf is not None and is_short else None
-            scale = f" * np.float32({float(leaf.info.scale)!r})" if leaf is not None and leaf.info.scaled else ""
-            return None if raw is None else self.let(self.inner, f"np.float32(np.int32({raw.text})){scale}")
+            sent = self.raw(leaf) if leaf is not None and is_short else None
+            scale = f" * np.float32({float(leaf.info.scale)!r})" if leaf is not None and leaf.info.scaled and not raw else ""
+            return None if sent is None else self.let(self.inner, f"np.float32(np.int32({sent.text})){scale}")
         if node.kind != "call" or not isinstance(node.args[-1], Node):
             return None
         if node.function is not returned_range and not is_nan_where(node):
             return None
-        made = self.once(("marked", node.args[-1]), lambda: self._marked(node.args[-1]))
+        made = self.once(("marked", node.args[-1], raw), lambda: self._marked(node.args[-1], raw=raw))
         if made is None or node.function is returned_range:
             return None if made is None else self.let(self.inner, f"{made.text} if np.float32(0) < {made.text} else np.float32(nan)")
         flag = self.double(node.args[0], len(node.shape))
@@ -256,6 +272,12 @@ class Expressions(Writer):
         return self.looked_up(node, source, np.float32 if short else np.float64, factor)
 
 
+def _halves(values: NDArray[np.float64]) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+    """Numbers as the sum of two of float32."""
+    high = values.astype(np.float32)
+    return high, (values - high).astype(np.float32)
+
+
 HEAD = """\
 import math
 
@@ -263,7 +285,7 @@ import numpy as np
 
 from lidarspec.points.numba_kernels.arithmetic import (
     BYTES, DOUBLES, INTEGER, MADE_PLACES, MADE_SINGLES, PLACES, SINGLES, WORDS,
-    MADE, apart, at, byte_at, compiled, cos_sin, float4_big, float4_little, float8_big, float8_little, four_at, larger, looked_up,
+    MADE, apart, at, byte_at, compiled, cos_sin, float4_big, float4_little, float8_big, float8_little, four_at, fused, larger, looked_up,
     modulo, narrowed, number, put, returned, row_at, smaller, word_at,
 )
 

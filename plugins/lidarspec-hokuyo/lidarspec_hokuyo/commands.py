@@ -116,8 +116,8 @@ OF_URG: dict[str, tuple[bytes, int, dict[str, Any]]] = {
 
 
 def orders(kind: str, *, is_urg: bool) -> dict[str, tuple[bytes, int, dict[str, Any]]]:
-    """All that a scanner takes whose scans are of this kind, the second letter of their commands."""
-    scans = {"start": (f"M{kind}".encode(), 13, {"starts": True}), "get_scan": (f"G{kind}".encode(), 10, {})}
+    """All that a scanner takes whose scans are of this kind."""
+    scans = {"start": (KINDS[kind][0].encode(), 13, {"starts": True}), "get_scan": (KINDS[kind][1].encode(), 10, {})}
     return scans | ORDERS | (OF_URG if is_urg else {})
 
 
@@ -146,6 +146,6 @@ def commands(kind: str, steps: bytes, *, is_urg: bool) -> dict[str, Command]:
             own["echoes"] = ("value",)
             own |= {"values": given[name]} if name in given else {"args": {"value": ("value", Text(size))}}
         if name == "get_scan":
-            own |= {"reply": f"one_{KINDS[kind]}", "matches": {}, "echoes": ()}
+            own |= {"reply": f"one_{kind}", "matches": {}, "echoes": ()}
         found[name] = Command(f"{name}_order", **own)
     return found

@@ -1,8 +1,9 @@
-"""The scans that a scanner sends: distances of two or three characters, or distances with intensities.
+"""The scans that a scanner sends: distances of two or three characters, or distances with intensities; of one echo, or of up to three.
 
 Source: SCIP 2.0, C-42-03320B: characters (6), steps (5), MD and MS with the time and the errors (8.1), GD and GS (8.2). ME and GE send a
-distance and an intensity of three characters each (UTM-30LX-EW, C-42-03886). A cluster of steps comes as one distance, its shortest; that
-a last cluster of fewer steps comes too, and that a cluster is seen in its middle, is assumed.
+distance and an intensity of three characters each (UTM-30LX-EW, C-42-03886). ND, NE, HD and HE send the same for each echo of a step, with
+"&" between them (C-42-03886). A cluster of steps comes as one distance, its shortest; that a last cluster of fewer steps comes too, that a
+cluster is seen in its middle, and that a step has three echoes at most (Hokuyo's urg_library makes room for three), is assumed.
 """
 
 from __future__ import annotations
@@ -14,13 +15,21 @@ from typing import Any
 import numpy as np
 from construct import Array, Const, Int8ub, Int16ub, Int24ub, Int32ub, OneOf, Struct, this
 
-from lidarspec.spec import Fields, Frame, Lines, Polar, Scaled, Scip, SixBits, steps
+from lidarspec.spec import Echoes, Fields, Frame, Lines, Polar, Scaled, Scip, SixBits
 
 WIDTH = 64  # characters of a line of data
-LONGEST = 7000  # characters: 1081 distances with intensities take 6727
+LONGEST = {1: 7000, 3: 23_000}  # characters by echoes: 1081 distances with intensities take 6727, with three echoes each 22,327
+ECHOES = 3  # of a step, at most
 WRAP = 2**24 * 1e-3  # seconds after which the clock starts again
 LEAST = 0.02  # metres: what is below is the number of an error (tables 3 and 4)
-KINDS = {"D": "distances", "E": "intensities", "S": "short"}
+#: kind -> the commands for scan after scan, and for one.
+KINDS = {
+    "distances": ("MD", "GD"),
+    "intensities": ("ME", "GE"),
+    "short": ("MS", "GS"),
+    "echoes": ("ND", "HD"),
+    "echo_intensities": ("NE", "HE"),
+}
 DIGITS = {2: ("tens", "ones"), 4: ("thousands", "hundreds", "tens", "ones")}
 FIELDS: dict[str, Any] = {
     "S": Struct("distance" / Scaled(Int16ub, 0.001, "m")),
@@ -47,7 +56,7 @@ class Geometry:
     ahead: int
     end: int
     rate: float
-    kinds: str
+    kinds: tuple[str, ...]
 
 
 @dataclass(frozen=True)
@@ -102,22 +111,24 @@ def plausible(f: Fields, end: int) -> Any:
     return (number(f.last) <= end) & (number(f.first) <= number(f.last))
 
 
-def points(f: Fields, geometry: Geometry) -> Polar:
-    """Points from the first step on, counter-clockwise; a distance below the shortest is the number of an error."""
-    step = number(f.first) + steps(count(f)) * width(f) + (width(f) - 1) / 2
+def points(f: Fields, geometry: Geometry, echoes: int) -> Polar:
+    """Points from the first step on, counter-clockwise; a distance below the shortest is the number of an error, or no echo."""
+    step, seen = number(f.first) + f.points.index * width(f) + (width(f) - 1) / 2, f.points if echoes == 1 else f.points.echoes
     return Polar(
-        range=f.points.distance,
+        range=seen.distance,
         azimuth=(step - geometry.ahead) * (2 * np.pi / geometry.division),
-        intensity=getattr(f.points, "intensity", None),
+        intensity=getattr(seen, "intensity", None),
         time=step / (geometry.division * geometry.rate),
-        invalid=f.points.distance < LEAST,
+        return_index=None if echoes == 1 else np.arange(echoes),
+        invalid=seen.distance < LEAST,
     )
 
 
 @cache
 def scan(command: str, geometry: Geometry) -> Frame:
-    """The answer to MD, MS, ME, GD, GS or GE."""
-    goes_on = command[0] == "M"
+    """The answer to a command for scans."""
+    goes_on, echoes = command[0] in "MN", ECHOES if command[0] in "NH" else 1
+    fields = FIELDS[command[1]]
     rest = ("skip" / Int8ub * "turns left out between scans", decimal("left", 2) * "scans to come; 0: on and on") if goes_on else ()
     struct = Struct(
         "command" / Const(command.encode()),
@@ -127,16 +138,17 @@ def scan(command: str, geometry: Geometry) -> Frame:
         *rest,
         "status" / Const(b"99" if goes_on else b"00"),
         "time" / Scaled(Int32ub, 0.001, "s") * "when the turn was at step 0; 24 bits",
-        "points" / Array(count(this), FIELDS[command[1]]),
+        "points" / Array(count(this), fields if echoes == 1 else Struct("echoes" / Array(echoes, fields))),
     )
     return Frame(
         struct,
         data=True,
-        max_length=LONGEST,
+        max_length=LONGEST[echoes],
         plausible=partial(plausible, end=geometry.end),
-        points=partial(points, geometry=geometry),
+        points=partial(points, geometry=geometry, echoes=echoes),
         acknowledged={"LS711": "it has no step of four digits"} if geometry.end < 1000 else {},
-        wire=Lines(WIDTH, head=(15 if goes_on else 12, 2, 4), bare=1, check=Scip()) | SixBits(),
+        wire=Lines(WIDTH, head=(15 if goes_on else 12, 2, 4), bare=1, check=Scip())
+        | SixBits(echoes=None if echoes == 1 else Echoes(fields.sizeof(), echoes)),
     )
 
 

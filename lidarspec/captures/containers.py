@@ -1,0 +1,249 @@
+"""What a file is by its first bytes: compressed, and read as what is in it, or of a kind that holds no bytes as a sensor sent them.
+
+Nothing is unpacked as a whole: `Unpacking` is a file that unpacks as it is read. Where the packed bytes end too early or are damaged it
+ends, and says so in `damage`; everything before was read, but for what cannot be told from the damage: at most `STEP` bytes, or a block of
+bzip2. The table of a zip archive stands at its end, so that one is read from a file and not from a pipe.
+"""
+
+from __future__ import annotations
+
+import io
+import os
+import re
+import sys
+import zipfile
+from contextlib import ExitStack
+from pathlib import Path
+from shlex import quote
+from typing import Any, BinaryIO, NamedTuple, cast
+
+from lidarspec.captures.records import is_capture
+from lidarspec.errors import SourceError, UnknownName, UsageError, library, suggest, system_errors
+from lidarspec.recording.format import MAGIC
+
+#: bytes that say what a file is.
+HEAD = 512
+#: bytes that are unpacked in one step, and by one reading of a file; of a pipe, it gives what has come.
+STEP, FILLED = 1 << 13, 1 << 20
+#: a capture may be compressed and lie in a zip archive; what is packed more often is none.
+DEEPEST = 2
+#: files of an archive that a message names.
+NAMED = 6
+
+
+class Packing(NamedTuple):
+    """A way of compressing: its name, the module whose `open` unpacks it, and the command that does."""
+
+    name: str
+    module: str
+    command: str
+
+
+ZIP = Packing("zip", "zipfile", "unzip {}")
+#: how compressed files begin.
+PACKINGS = {
+    rb"\x1f\x8b\x08[\x00-\x1f]": Packing("gzip", "gzip", "gunzip -k {}"),
+    rb"BZh[1-9]1AY&SY": Packing("bzip2", "bz2", "bunzip2 -k {}"),
+    rb"\xfd7zXZ\x00": Packing("xz", "lzma", "unxz -k {}"),
+    rb"\x28\xb5\x2f\xfd|[\x50-\x5f]\x2a\x4d\x18": Packing(
+        "zstd", "compression.zstd" if sys.version_info >= (3, 14) else "backports.zstd", "unzstd {}"
+    ),
+    rb"PK\x03\x04": ZIP,
+}
+#: how files begin that hold no bytes as a sensor sent them, or these in a shape of their own; what they are, and what takes the bytes out.
+CONTAINERS = {
+    rb"\x04\x22\x4d\x18": ("compressed by lz4", "unlz4 {}"),
+    rb"7z\xbc\xaf\x27\x1c": ("a 7z archive", "7z x {}"),
+    rb"Rar!\x1a\x07": ("a RAR archive", "7z x {}"),
+    rb".{257}ustar": ("a tar archive", "tar -xf {}"),
+    rb"snoop\x00{3}|btsnoop\x00|\x34\xcd\xb2\xa1|\xa1\xb2\xcd\x34": ("a capture of another format", "editcap {} capture.pcapng"),
+    rb"version https://git-lfs": ("a pointer of Git LFS, in the place of the file itself", "git lfs pull"),
+    rb"\x89HDF\r\n": ("an HDF5 file", ""),
+    rb"PAR1": ("a Parquet file", ""),
+    rb"ARROW1\x00\x00|FEA1": ("an Arrow file", ""),
+    rb"\x93NUMPY": ("a NumPy array", ""),
+    rb"\x80[\x02\x03](?:[\]})(]q\x00|c\w|\x8a\n)|\x80[\x04\x05]\x95.{5}\x00{3}": ("a pickle of Python", ""),
+    rb"# \.PCD v|ply\r?\n|LASF|ASTM-E57": ("a file of points", ""),
+    rb"\x89PNG\r\n|\xff\xd8\xff[\xdb\xe0\xe1\xee]|GIF8[79]a|.{4}ftyp": ("a picture or a film", ""),
+    rb"%PDF-": ("a PDF document", ""),
+    rb"\x7fELF": ("a program", ""),
+    rb"\s*(?:\[\s*)?\{\s*\"[^\"]*\"\s*:": ("JSON", ""),
+    rb"(?i)\s*<(?:\?xml|!doctype|html)": ("an XML or HTML page", ""),
+}
+
+
+class Damage(NamedTuple):
+    """Where unpacking ended too early, in words, and how many packed bytes were not read: 0 where there are none."""
+
+    text: str
+    unread: int
+
+
+class Unpacking(io.RawIOBase):
+    """What is in a compressed file, unpacked as it is read; never seekable.
+
+    Args:
+        name: of the file, for messages.
+        packed: it, which is closed with this one, unless it is standard input.
+        file: what unpacks it.
+
+    Attributes:
+        damage: why it ended too early, else None.
+    """
+
+    def __init__(self, name: str, packed: BinaryIO, file: Any) -> None:
+        self.name, self._packed, self._file = name, packed, file
+        self.damage: Damage | None = None
+        self._step = FILLED if packed.seekable() else HEAD
+        self._count = 0
+
+    def readable(self) -> bool:
+        return True
+
+    def readinto(self, buffer: Any) -> int:
+        room, count = min(len(buffer), self._step), 0
+        while count < room and (data := self._next(room - count)):
+            buffer[count : count + len(data)] = data
+            count += len(data)
+        return count
+
+    def close(self) -> None:
+        if not self.closed:
+            self._file.close()
+            if self._packed is not sys.stdin.buffer:
+                self._packed.close()
+        super().close()
+
+    def _next(self, size: int) -> bytes:
+        if self.damage is not None:
+            return b""
+        try:
+            data: bytes = self._file.read1(min(STEP, size))
+            self._count += len(data)
+            return data
+        except EOFError:
+            self.damage = Damage(f"{self.name} is cut off{self._read}", 0)
+        except Exception as error:  # each library has its own for damaged bytes, and bz2 and gzip take OSError
+            if isinstance(error, OSError) and error.errno is not None:
+                raise
+            place = self._packed.tell() if self._packed.seekable() else 0
+            size = self._packed.seek(0, os.SEEK_END) if place else 0
+            where = f" before byte {place} of {size}" * bool(place)
+            self.damage = Damage(f"{self.name} is damaged{where} ({error}){self._read}", max(size - place, 1))
+        return b""
+
+    @property
+    def _read(self) -> str:
+        return f": the {self._count} bytes that could be unpacked were read"
+
+
+def damage(file: BinaryIO) -> Damage | None:
+    """Why a file ended too early that was unpacked while it was read; None where it did not."""
+    raw = getattr(file, "raw", None)
+    return raw.damage if isinstance(raw, Unpacking) else None
+
+
+def opened(path: str | os.PathLike[str], member: str = "") -> BinaryIO:
+    """The open file, or what is compressed in it.
+
+    Raises:
+        SourceError, UsageError: as `unpacked`; where it cannot be opened.
+    """
+    with system_errors(os.fspath(path)), ExitStack() as undo:
+        file = undo.enter_context(open(path, "rb"))
+        content = unpacked(os.fspath(path), file, member)
+        undo.pop_all()
+    return content
+
+
+def unpacked(name: str, file: BinaryIO, member: str = "") -> BinaryIO:
+    """An open file itself, or where it is compressed one that unpacks it as it is read, and closes it.
+
+    Args:
+        name: of the file, for messages.
+        member: which file of a zip archive; "" for the one capture or recording that is in it.
+
+    Raises:
+        SourceError: for an archive that cannot be unpacked, or holds no capture.
+        UsageError: for one that holds several; where a library is missing.
+    """
+    for _ in range(DEEPEST):
+        packing = _packing(head(file))
+        if packing is None:
+            break
+        if packing is ZIP:
+            content, member = _of_archive(name, file, member), ""
+        else:
+            content = library(packing.module, "zstd").open(file)
+        file = cast(BinaryIO, io.BufferedReader(Unpacking(name, file, content), FILLED))
+    if member:
+        raise UsageError(f"{name} is no zip archive: there is no {member} in it")
+    return file
+
+
+def _packing(start: bytes) -> Packing | None:
+    return next((packing for beginning, packing in PACKINGS.items() if re.match(beginning, start)), None)
+
+
+def _of_archive(name: str, file: BinaryIO, member: str) -> Any:
+    """One file of a zip archive."""
+    if not file.seekable():
+        raise SourceError(f"{name} is a zip archive, and its table stands at its end: give its file, not a pipe")
+    try:
+        archive = zipfile.ZipFile(file)
+        names = [item.filename for item in archive.infolist() if not item.is_dir() and not item.filename.startswith("__MACOSX/")]
+        return archive.open(_chosen(name, archive, names, member))
+    except (UsageError, SourceError):
+        raise
+    except Exception as error:  # of a damaged one, too, zipfile raises what it will
+        command = f"zip -FF {quote(name)} --out mended.zip" if isinstance(error, zipfile.BadZipFile) else f"unzip {quote(name)}"
+        raise suggest(SourceError(f"{name} is a zip archive, and is not read: {error}"), command) from error
+
+
+def _chosen(name: str, archive: zipfile.ZipFile, names: list[str], member: str) -> str:
+    """The member that is asked for, or the only one, or the only one that is a capture or recording."""
+    if member:
+        if member not in names:
+            raise UnknownName(member, names, place=name)
+        return member
+    if len(names) == 1:
+        return names[0]
+    readable = [item for item in names if _is_readable(archive, item)]
+    if len(readable) == 1:
+        return readable[0]
+    shown = ", ".join((readable or names)[:NAMED]) + ", ..." * (len(readable or names) > NAMED)
+    if not readable:
+        raise SourceError(f"{name} is a zip archive, and is not read: there is no capture in it, but {shown or 'nothing'}")
+    raise suggest(UsageError(f"{name} holds {len(readable)} captures: {shown}"), f"the same with {quote(f'{name}?file={readable[0]}')}")
+
+
+def _is_readable(archive: zipfile.ZipFile, member: str) -> bool:
+    """Whether a member begins as a capture or a recording, compressed or not."""
+    with archive.open(member) as file:
+        start = file.read(HEAD)
+    return is_capture(start) or start.startswith(MAGIC) or _packing(start) is not None
+
+
+def refuse_container(path: str, start: bytes) -> None:
+    """Nothing, for a file that is read as the bytes it holds.
+
+    Args:
+        start: its first `HEAD` bytes, or all, as they are unpacked.
+
+    Raises:
+        SourceError: where it begins as a file of another kind, which is named.
+    """
+    packed = {beginning: (f"compressed by {packing.name} again and again", packing.command) for beginning, packing in PACKINGS.items()}
+    for beginning, (what, command) in (CONTAINERS | packed).items():
+        if re.match(beginning, start, re.DOTALL):
+            error = SourceError(f"{path} is {what}, and is not read: this takes captures, recordings and bytes as a sensor sent them")
+            raise suggest(error, command.format(quote(path))) if command and Path(path).exists() else error
+
+
+def head(file: BinaryIO) -> bytes:
+    """How a file begins; of a pipe what is there first. It stays there."""
+    if isinstance(file, io.BufferedReader):
+        return file.peek(HEAD)[:HEAD]
+    start = file.read(HEAD)
+    file.seek(-len(start), os.SEEK_CUR)
+    return start

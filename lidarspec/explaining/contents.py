@@ -1,0 +1,266 @@
+"""What is in a file: its kind, who sent what to where, whose frames these are, from when to when, and how much of them is lost.
+
+A long file is looked at from its beginning for as long as anybody waits; what is counted then is of that part, and says so. Where times
+can be found in it without reading it, the last one is.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import os
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from shlex import quote
+from typing import Any
+
+from lidarspec.device.device import Device
+from lidarspec.discovery.detect import Verdict, chosen, declared, names, verdicts
+from lidarspec.errors import LidarSpecError, UsageError, suggest
+from lidarspec.recording.format import Header
+from lidarspec.scans.selection import dated
+from lidarspec.spec.sensor import Sensor
+from lidarspec.transports.bags import BagTransport
+from lidarspec.transports.files import CaptureTransport, HexTransport, RecordingTransport, StreamCaptureTransport
+from lidarspec.transports.open_url import is_live, transport
+from lidarspec.transports.protocol import Chunk, Sender, Transport, endpoint
+from lidarspec.view.feed import Feed, Reading
+
+#: bytes, and packets, that are looked at from the beginning of a file, and bytes of a sensor that are decoded.
+LOOKED_AT, PACKETS, DECODED = 1 << 26, 1 << 18, 1 << 24
+#: senders that are listed.
+FLOWS = 6
+#: later than any arrival, ns since 1970.
+_END = (1 << 63) - 1
+KINDS = {
+    RecordingTransport: "a recording",
+    CaptureTransport: "a capture",
+    StreamCaptureTransport: "a capture of a byte stream",
+    HexTransport: "hexadecimal text",
+    BagTransport: "a robotics log",
+}
+
+
+@dataclass
+class Flow:
+    """What one sender sent to one place; None where nobody knows the address.
+
+    Attributes:
+        packets, bytes: how much of it was seen.
+    """
+
+    sender: Sender | None
+    receiver: Sender | None
+    packets: int = 0
+    bytes: int = 0
+
+
+@dataclass(frozen=True)
+class Content:
+    """What one sensor sent.
+
+    Attributes:
+        source: how it is read.
+        sensors: those that it may be, by id; where it is one alone, that one.
+        share: of the bytes that are in its frames, from 0 to 1; None where the file itself names the sensor.
+        options: what to type for it, "" where the file says it.
+        reading: how it was doing in the part that was decoded.
+    """
+
+    source: str
+    sensors: tuple[str, ...] = ()
+    share: float | None = None
+    options: str = ""
+    reading: Reading | None = None
+
+    @property
+    def command(self) -> str:
+        """What to type to read it."""
+        return f"lidarspec view {quote(self.source)} {self.options}".rstrip()
+
+
+@dataclass
+class Contents:
+    """What is in a file.
+
+    Attributes:
+        path, kind, size: of the file: its name, what it is in words, its bytes.
+        header: of a recording.
+        flows: who sent to where, most first; of a byte stream one.
+        first_ns, last_ns: when the first and the last packet arrived, ns since 1970; None where nobody knows it.
+        seen_ns: when the last packet that was looked at arrived.
+        whole: whether all of the file was looked at; else what is counted is of its beginning.
+        contents: what was sent, of each sensor.
+        warnings: what is to be said of the file.
+    """
+
+    path: str
+    kind: str
+    size: int
+    header: Header | None = None
+    flows: list[Flow] = field(default_factory=list)
+    first_ns: int | None = None
+    last_ns: int | None = None
+    seen_ns: int | None = None
+    whole: bool = True
+    contents: list[Content] = field(default_factory=list)
+    warnings: list[str] = field(default_factory=list)
+
+    @property
+    def packets(self) -> int:
+        """How many packets, or pieces of a stream, were seen."""
+        return sum(flow.packets for flow in self.flows)
+
+    @property
+    def bytes(self) -> int:
+        """How many bytes of them."""
+        return sum(flow.bytes for flow in self.flows)
+
+    @property
+    def seconds(self) -> float | None:
+        """From the first packet to the last; None where times are not known."""
+        return None if self.first_ns is None or self.last_ns is None else (self.last_ns - self.first_ns) * 1e-9
+
+    @property
+    def seen_seconds(self) -> float | None:
+        """How long what was looked at took."""
+        return None if self.first_ns is None or self.seen_ns is None else (self.seen_ns - self.first_ns) * 1e-9
+
+    def to_dict(self) -> dict[str, Any]:
+        """The same for JSON."""
+        return {
+            **{
+                name: getattr(self, name)
+                for name in ("path", "kind", "size", "whole", "packets", "bytes", "first_ns", "last_ns", "seconds")
+            },
+            "recorded": None if self.header is None else {"source": self.header.source, "at": self.header.created},
+            "flows": [
+                {**vars(flow), **{end: address and endpoint(address) for end in ("sender", "receiver") if [address := getattr(flow, end)]}}
+                for flow in self.flows
+            ],
+            "contents": [
+                {**vars(content), "command": content.command, "reading": content.reading and content.reading.to_dict()}
+                for content in self.contents
+            ],
+            "warnings": self.warnings,
+        }
+
+
+def contents(path: str | Path) -> Contents:
+    """What is in a file.
+
+    Raises:
+        UsageError: for a live source, and standard input, which can be read only once.
+        SourceError: where the file cannot be opened.
+    """
+    if str(path) == "-" or is_live(path):
+        raise suggest(
+            UsageError(f"{path} is no file"), f"lidarspec detect {quote(str(path))}" if str(path) != "-" else "lidarspec info FILE"
+        )
+    with contextlib.closing(transport(path)) as opened:
+        kind = next((what for known, what in KINDS.items() if isinstance(opened, known)), "bytes as a sensor sent them")
+        file = str(path).partition("?")[0] if not os.path.exists(path) else str(path)
+        header = opened.header if isinstance(opened, RecordingTransport) else None
+        found = Contents(str(path), kind, _size(Path(file)), header)
+        _count(found, opened)
+        found.warnings += opened.warnings
+    found.contents += _sent(found) if found.bytes else []
+    return found
+
+
+def _size(path: Path) -> int:
+    return sum(part.stat().st_size for part in path.rglob("*")) if path.is_dir() else path.stat().st_size
+
+
+def _count(found: Contents, opened: Transport) -> None:
+    """Count what is at the beginning, and find the last time."""
+    flows, left = dict[tuple[Sender | None, Sender | None], Flow](), LOOKED_AT
+    chunks = opened.chunks()
+    for number, chunk in enumerate(chunks):
+        flow = flows.setdefault((chunk.sender, chunk.receiver), Flow(chunk.sender, chunk.receiver))
+        flow.packets, flow.bytes, left = flow.packets + 1, flow.bytes + len(chunk.data), left - len(chunk.data)
+        found.first_ns = chunk.at if found.first_ns is None else found.first_ns
+        found.seen_ns = found.last_ns = chunk.at or found.last_ns
+        if left <= 0 or number >= PACKETS:
+            found.last_ns, found.whole = _last(opened, chunks), False
+            break
+    found.flows = sorted(flows.values(), key=lambda flow: -flow.bytes)
+
+
+def _last(opened: Transport, chunks: Iterator[Chunk]) -> int | None:
+    """The time of the last packet, where it can be found without reading all before it."""
+    last = None
+    for chunk in chunks if opened.skip(_END) else ():
+        last = chunk.at or last
+    return last
+
+
+def _sent(found: Contents) -> list[Content]:
+    """What was sent, of each sensor."""
+    try:
+        if (known := declared(found.path)) is not None:
+            return [Content(found.path, (known.id,), None, "", _reading(found.path, known))]
+    except LidarSpecError as error:
+        found.warnings.append(str(error))
+    return [_content(found.path, one) for one in verdicts(found.path)]
+
+
+def _content(path: str, one: Verdict) -> Content:
+    source = f"{path}?src={one.heard.sender}" if one.heard.sender and "?" not in path else path
+    if not one.alike:
+        return Content(source, tuple(names(one)))
+    best = one.alike[0]
+    return Content(source, tuple(names(one)), best.share, chosen(best.sensor), _reading(source, best.sensor))
+
+
+def _reading(source: str, sensor: Sensor) -> Reading | None:
+    """How a sensor was doing at the beginning of a file; None where its frames cannot be read."""
+    try:
+        with Device(source, sensor) as device:
+            feed = Feed(device)
+            while not feed.ended and device.stats.bytes_in < DECODED:
+                feed.pump(0.0)
+            return feed.meter.summary(device.stats)
+    except LidarSpecError:
+        return None
+
+
+def shown(found: Contents) -> Sequence[tuple[str, str]]:
+    """What there is to be said of a file, in lines: a word, and what it is."""
+    lines = list[tuple[str, str]]()
+    if (header := found.header) is not None:
+        lines.append(("recorded", f"{header.created} from {header.source or 'an unknown source'}"))
+    if found.first_ns is not None:
+        until = f" to {dated(found.last_ns)}, {found.seconds:.3f} s" if found.last_ns is not None else ""
+        lines.append(("time", f"{dated(found.first_ns)}{until}"))
+    else:
+        lines.append(("time", "it does not say when its bytes arrived"))
+    seconds = found.seen_seconds or 0.0
+    rate = f", {found.packets / seconds:.1f}/s, {found.bytes / seconds / 1e3:.1f} kB/s" if seconds else ""
+    what = "packets" if any(flow.sender for flow in found.flows) else "pieces"
+    lines.append(("holds", f"{found.packets} {what}, {found.bytes} bytes{rate}"))
+    for flow in found.flows[:FLOWS]:
+        if flow.sender is not None:
+            to = f" to {endpoint(flow.receiver)}" if flow.receiver is not None else ""
+            lines.append(("from", f"{endpoint(flow.sender)}{to}: {flow.packets} packets, {flow.bytes} bytes"))
+    if further := found.flows[FLOWS:]:
+        lines.append(("from", f"{len(further)} others: {sum(flow.packets for flow in further)} packets"))
+    if not found.whole:
+        lines.append(("part", "the file is long: what is counted is of its beginning" + ", its end is not known" * (found.last_ns is None)))
+    for content in found.contents:
+        lines.extend(_told(content))
+    return lines
+
+
+def _told(content: Content) -> Iterator[tuple[str, str]]:
+    if not content.sensors:
+        yield "sensor", f"none that is installed sends such bytes ({content.source})"
+        return
+    sure = "as the file says" if content.share is None else f"{content.share:.1%} of the bytes are in its frames"
+    yield "sensor", f"{' or '.join(content.sensors)}: {sure}"
+    if (reading := content.reading) is not None:
+        if reading.speed_hz is not None:
+            yield "scans", f"{reading.speed_hz:.2f} Hz, {reading.points or 0:.0f} points each, {reading.valid or 0:.0f} of them valid"
+        lost = "" if reading.loss_rate is None else f", lost {reading.loss_rate:.3%}"
+        yield "frames", f"wrong {reading.error_rate:.3%}{lost}, bytes in none of them {reading.skipped_rate:.3%}"
+    yield "next", content.command

@@ -1,0 +1,93 @@
+"""`info`: what is in each kind of file, on one screen, however long it is."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+
+import pytest
+
+import lidarspec as ls
+from lidarspec.captures.ip import ETHERNET
+from lidarspec.captures.pcap import Datagram, datagram_record
+from lidarspec.captures.records import capture_head
+from lidarspec.explaining import contents as looking
+from lidarspec.recording.recorders import Recorder
+from lidarspec.simulation.simulator import simulate
+from lidarspec.transports.protocol import Chunk
+from tests.cli.running import printed, ran
+
+START, STEP = 1_700_000_000 * 10**9, 1_327_104
+
+
+@pytest.fixture(scope="module")
+def frames() -> list[bytes]:
+    """Three turns of a VLP-16 and some more, without one packet."""
+    packets = simulate(ls.sensor("velodyne-vlp16"), 300)
+    return packets[:150] + packets[151:]
+
+
+def test_a_capture_of_two_sensors_of_which_one_lost_a_packet(frames: list[bytes], tmp_path: Path) -> None:
+    path, senders = tmp_path / "drive.pcap", [("10.0.0.1", 2368), ("10.0.0.2", 2368)]
+    datagrams = [
+        Datagram(data, START + number * STEP, sender, ("255.255.255.255", 2368))
+        for number, data in enumerate(frames)
+        for sender in senders[: 1 + (number < 200)]
+    ]
+    path.write_bytes(capture_head(ETHERNET) + b"".join(map(datagram_record, datagrams)))
+    told = printed("info", path)
+    assert (told["kind"], told["size"], told["whole"]) == ("a capture", os.path.getsize(path), True)
+    assert (told["packets"], told["bytes"], told["first_ns"]) == (499, 499 * 1206, START)
+    assert told["seconds"] == pytest.approx(298 * STEP * 1e-9)
+    assert [flow["packets"] for flow in told["flows"]] == [299, 200]
+    assert told["flows"][0]["sender"] == "10.0.0.1:2368"
+    for content, sender, lost in zip(told["contents"], senders, (1, 1), strict=True):
+        assert content["sensors"] == ["velodyne-vlp16"]
+        assert content["share"] == 1
+        assert content["command"] == f"lidarspec view '{path}?src={sender[0]}' -s velodyne-vlp16"
+        assert content["reading"]["loss_rate"] == pytest.approx(lost / (content["reading"]["packets"] + lost))
+        assert content["reading"]["speed_hz"] == pytest.approx(10, abs=0.1)
+    text = ran("info", path).stdout
+    assert "2023-11-14T22:13:20.000Z to 2023-11-14T22:13:20.395Z, 0.395 s" in text
+    assert "sensor    velodyne-vlp16: 100.0% of the bytes are in its frames" in text
+    assert max(len(line) for line in text.replace(str(path), "drive.pcap").splitlines()) <= 80
+
+
+def test_of_a_long_recording_the_beginning_and_the_end_are_read(tmp_path: Path) -> None:
+    path = tmp_path / "long.lsr"
+    number, data = looking.LOOKED_AT // 60_000 * 3, bytes(60_000)
+    with Recorder(path, "ldrobot-stl27l", "/dev/ttyUSB0") as recorder:
+        for place in range(number):
+            recorder.keep_up()
+            recorder.write(Chunk(data, START + place * 10**8))
+    told = printed("info", path)
+    assert told["kind"] == "a recording"
+    assert not told["whole"]
+    assert told["bytes"] < os.path.getsize(path) / 2
+    assert told["seconds"] == pytest.approx((number - 1) * 0.1)
+    assert told["recorded"]["source"] == "/dev/ttyUSB0"
+    assert told["contents"][0]["sensors"] == ["ldrobot-stl27l"]
+    text = ran("info", path).stdout
+    assert "as the file says" in text
+    assert "what is counted is of its beginning" in text
+
+
+def test_a_file_without_times_and_one_of_nobody(tmp_path: Path) -> None:
+    raw, noise, empty = tmp_path / "raw.bin", tmp_path / "noise.bin", tmp_path / "empty.bin"
+    raw.write_bytes(b"".join(simulate(ls.sensor("ldrobot-stl27l"), 100)))
+    noise.write_bytes(bytes(range(256)) * 4)
+    empty.write_bytes(b"")
+    told = printed("info", raw)
+    assert (told["kind"], told["first_ns"], told["flows"][0]["sender"]) == ("bytes as a sensor sent them", None, None)
+    assert "it does not say when its bytes arrived" in ran("info", raw).stdout
+    assert "none that is installed sends such bytes" in ran("info", noise, code=4).stdout
+    ran("info", empty, code=4)
+
+
+@pytest.mark.parametrize(
+    ("words", "code", "said"), [("-", 2, "- is no file"), ("udp://", 2, "udp:// is no file"), ("none.pcap", 3, "No such file")]
+)
+def test_what_is_no_file_is_said(words: str, code: int, said: str) -> None:
+    failed = ran("info", words, code=code)
+    assert said in failed.stderr
+    assert "  next: lidarspec " in failed.stderr

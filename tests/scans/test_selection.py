@@ -1,0 +1,150 @@
+"""Which scans of a source are given, and what of each: the same as of all scans, by time, by number and by place."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from datetime import UTC, datetime, timedelta
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+import lidarspec as ls
+from lidarspec import Scan, Selection, UsageError
+from lidarspec.simulation.simulator import simulate
+from tests.cli.running import ran
+
+ID, SECONDS = "ldrobot-stl27l", 40
+
+
+@pytest.fixture(scope="module")
+def recordings(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
+    """The same 40 s as a recording, in which times are found, and as a capture, which is read through."""
+    folder = tmp_path_factory.mktemp("selection")
+    ran("sim", ID, "--to", folder / "drive.lsr", "-t", f"{SECONDS}s")
+    ran("replay", folder / "drive.lsr", "--to", folder / "drive.pcap", "-s", ID)
+    return {suffix: folder / f"drive.{suffix}" for suffix in ("lsr", "pcap")}
+
+
+def scans(path: Path, select: Selection | None = None) -> Iterator[Scan]:
+    """The scans of a file that are wanted, and that no byte is read behind the last of them."""
+    with ls.open(path, ID) as device:
+        yield from device.scans(select=select)
+
+
+@pytest.fixture(scope="module")
+def every(recordings: dict[str, Path]) -> list[Scan]:
+    """All scans."""
+    return list(scans(recordings["pcap"]))
+
+
+def assert_same(some: list[Scan], others: list[Scan]) -> None:
+    """Scans have the same points at the same times."""
+    assert [scan.stamp_ns for scan in some] == [scan.stamp_ns for scan in others]
+    for one, other in zip(some, others, strict=True):
+        assert list(one.points.columns) == list(other.points.columns)
+        for name, column in one.points.columns.items():
+            np.testing.assert_allclose(column, other.points.columns[name], rtol=0, atol=1e-12 if name == "time" else 0)
+
+
+@pytest.mark.parametrize("suffix", ["lsr", "pcap"])
+@pytest.mark.parametrize(("times", "seconds"), [((25.0, 26.5), (25, 26.5)), ((38.0, None), (38, 99)), ((None, 0.5), (0, 0.5))])
+def test_a_slice_is_the_scans_of_that_time(recordings: dict[str, Path], every: list[Scan], suffix: str, times: Any, seconds: Any) -> None:
+    first = every[0].stamp_ns
+    wanted = [scan for scan in every if seconds[0] * 1e9 <= scan.stamp_ns - first < seconds[1] * 1e9]
+    assert 4 < len(wanted) < 22
+    assert_same(list(scans(recordings[suffix], Selection(times=times))), wanted)
+    dates = tuple(
+        None if moment is None else datetime.fromtimestamp(0, UTC) + timedelta(microseconds=first // 1000) + timedelta(seconds=moment)
+        for moment in times
+    )
+    with ls.open(recordings[suffix], ID) as device:
+        found = list(device.scans(select=Selection(times=dates)))
+        read, size = device.stats.bytes_in, SECONDS * 21600 // 12 * 47
+    assert abs(len(found) - len(wanted)) <= 1
+    assert read < size * (0.6 if suffix == "lsr" else 0.8) or times[1] is None
+    assert suffix == "pcap" or read < size * 0.4
+
+
+def test_each_so_manieth_scan_of_some_by_number(recordings: dict[str, Path], every: list[Scan]) -> None:
+    for selection, wanted in (
+        (Selection(scans=(5, 10)), slice(5, 10)),
+        (Selection(scans=(5, 25), every=7), slice(5, 25, 7)),
+        (Selection(times=(None, 1.0), every=3), slice(0, 11, 3)),
+        (Selection(times=(0.5, 1.5), scans=(0, 9)), slice(5, 9)),
+    ):
+        found = list(scans(recordings["pcap"], selection))
+        assert [scan.stamp_ns for scan in found] == [scan.stamp_ns for scan in every[wanted]]
+
+
+def test_by_the_time_of_arrival(recordings: dict[str, Path]) -> None:
+    every = list(scans(recordings["lsr"], Selection(scans=(0, 30))))
+    hosts = [scan.host_ns for scan in every]
+    found = list(scans(recordings["lsr"], Selection(times=(1.0, 2.0), time="host")))
+    assert [scan.stamp_ns for scan in found] == [host for host in hosts if 10**9 <= host - hosts[0] < 2 * 10**9]
+    assert all(scan.points.stamp_ns == scan.stamp_ns == scan.host_ns for scan in found)
+    assert all(scan.points.time[0] == 0 for scan in found)
+
+
+def test_returns_from_elsewhere_are_none(recordings: dict[str, Path]) -> None:
+    every = list(scans(recordings["pcap"], Selection(scans=(3, 6))))
+    for scan, near in zip(every, scans(recordings["pcap"], Selection(scans=(3, 6), ranges=(1.5, 3.0))), strict=True):
+        ranges, valid = scan.points.range, scan.points.valid
+        inside = valid & (ranges >= 1.5) & (ranges <= 3.0)
+        assert 0 < inside.sum() < valid.sum()
+        cloud = near.points
+        np.testing.assert_array_equal(cloud.valid, inside)
+        np.testing.assert_array_equal(
+            cloud.range, np.where(valid & (ranges < 1.5), -np.inf, np.where(valid & (ranges > 3.0), np.inf, ranges))
+        )
+        for axis in "xyz":
+            np.testing.assert_array_equal(getattr(cloud, axis), np.where(inside, getattr(scan.points, axis), np.nan))
+        np.testing.assert_array_equal(cloud.intensity, scan.points.intensity)
+        planar = near.to_laserscan(100)
+        assert np.isin(planar.ranges[np.isfinite(planar.ranges)], ranges[inside]).all()
+
+
+def test_columns_are_those_that_are_asked_for_in_that_order(recordings: dict[str, Path]) -> None:
+    for scan in scans(recordings["pcap"], Selection(scans=(3, 5), columns=("intensity", "y"))):
+        cloud = scan.points
+        for some in (cloud, cloud[:100], cloud[cloud.valid]):
+            assert list(some.columns) == ["intensity", "y"]
+            assert len(some.columns["y"]) == len(some)
+        assert cloud.to_structured()["time"].max() == 0 < cloud.time.max()
+    with pytest.raises(UsageError, match=r"unknown name 'rings'; did you mean 'range'"):
+        list(scans(recordings["pcap"], Selection(columns=("rings",))))
+
+
+def test_beams_and_frame_go_with_the_scan(recordings: dict[str, Path]) -> None:
+    for scan in scans(recordings["pcap"], Selection(scans=(0, 5), beams=450, frame_id="front")):
+        assert scan.frame_id == "front"
+        assert len(scan.to_laserscan().ranges) == 450
+
+
+@pytest.mark.parametrize(
+    ("selection", "message"),
+    [
+        (Selection(times=(100.0, None)), r"has (400|401) scans, from 0 s to 40\.000 s, and nothing of that is asked for"),
+        (Selection(scans=(1000, None)), r"has (400|401) scans, from 0 to (399|400), and none of them is asked for"),
+    ],
+)
+def test_what_lies_behind_the_end_is_an_error_that_says_what_there_is(
+    recordings: dict[str, Path], selection: Selection, message: str
+) -> None:
+    with pytest.raises(UsageError, match=message):
+        list(scans(recordings["pcap"], selection))
+
+
+def test_bytes_without_times_have_no_slice(tmp_path: Path) -> None:
+    source = tmp_path / "timeless.bin"
+    source.write_bytes(b"".join(simulate(ls.sensor("cspc-coin-d4"), 500)))
+    for selection in (Selection(time="host"), Selection(times=(1.0, None))):
+        with ls.open(source, "cspc-coin-d4") as device, pytest.raises(UsageError, match="does not say when its bytes arrived"):
+            list(device.scans(select=selection))
+
+
+@pytest.mark.parametrize("wrong", [{"scans": (-3, None)}, {"scans": (5, 5)}, {"every": 0}, {"times": (5.0, 1.0)}, {"ranges": (3.0, 1.0)}])
+def test_a_selection_of_nothing_is_refused(wrong: dict[str, Any]) -> None:
+    with pytest.raises(UsageError):
+        Selection(**wrong)
