@@ -71,7 +71,7 @@ def test_a_log_has_a_cloud_for_each_scan_at_its_time(tmp_path: Path, suffix: str
 def test_foxglove_has_its_own_messages(tmp_path: Path, name: str) -> None:
     decoding = pytest.importorskip("mcap_protobuf.decoder", reason="mcap-protobuf-support is not installed")
     pytest.importorskip("foxglove_schemas_protobuf", reason="foxglove-schemas-protobuf is not installed")
-    scans = simulated(name, 120)
+    scans = [dataclasses.replace(one, frame_id="front") for one in simulated(name, 120)]
     write(tmp_path / "a.foxglove.mcap", scans)
     with (tmp_path / "a.foxglove.mcap").open("rb") as file:
         log = mcap.make_reader(file, decoder_factories=[decoding.DecoderFactory()])
@@ -87,7 +87,7 @@ def test_foxglove_has_its_own_messages(tmp_path: Path, name: str) -> None:
             "offsets": [at for _, at in fields.values()], "itemsize": message.point_stride}))  # fmt: skip
         for column in {"x", "y", "z", *one.points.extra}:
             np.testing.assert_array_equal(rows[column], one.points.read(column)[column][one.points.valid])
-        assert (message.frame_id, message.pose.orientation.w) == ("laser", 1)
+        assert (message.frame_id, message.pose.orientation.w) == ("front", 1)
     planar = [message for kind, _, message in found if kind == "foxglove.LaserScan"]
     assert len(planar) == (len(scans) if name == "ldrobot-stl27l" else 0)
     for one, message in zip(scans, planar, strict=False):
