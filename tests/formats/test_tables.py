@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import json
+import subprocess
+import sys
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -84,6 +86,19 @@ def test_row_groups_are_of_many_scans_and_bounded(tmp_path: Path) -> None:
     sizes = [file.metadata.row_group(number).num_rows for number in range(file.num_row_groups)]
     assert sizes == [132_000, 132_000, 36_000]
     assert file.metadata.row_group(1).column(file.schema.names.index("scan")).statistics.min == 132
+
+
+def test_pandas_is_not_loaded_to_write(tmp_path: Path) -> None:
+    pytest.importorskip("pandas")
+    script = f"""
+import sys
+from pathlib import Path
+from lidarspec.formats import write
+from tests.formats.test_formats import scan
+write(Path({str(tmp_path)!r}) / "a.parquet", [scan(0), scan(1)])
+print("pandas" in sys.modules)
+"""
+    assert subprocess.run([sys.executable, "-c", script], check=True, timeout=60, capture_output=True, text=True).stdout == "False\n"
 
 
 def test_folders_of_scans_are_partitions_for_others(tmp_path: Path) -> None:
