@@ -36,17 +36,18 @@ def replacing(path: Path) -> Iterator[Path]:
     part = path.with_name(f".{os.getpid()}.{path.name}")
     try:
         with system_errors(path):
-            _remove(part)
+            remove(part)
             yield part
             if path.is_dir() and part.is_dir():
-                _remove(path)
+                remove(path)
             os.replace(part, path)
     finally:
         with contextlib.suppress(OSError):
-            _remove(part)
+            remove(part)
 
 
-def _remove(path: Path) -> None:
+def remove(path: Path) -> None:
+    """Take a file or folder away, if there is one."""
     if path.is_dir() and not path.is_symlink():
         shutil.rmtree(path)
     else:

@@ -40,6 +40,7 @@ from typing import Any, Literal
 from lidarspec.errors import SourceError, UsageError, WireError, suggest, system_errors
 from lidarspec.plugins import sensor as named_sensor
 from lidarspec.spec.sensor import Learned, Sensor
+from lidarspec.stores import opened
 from lidarspec.transports.protocol import Closing
 
 VERSION = 1
@@ -216,7 +217,7 @@ class Recording(Closing):
         self.records = self.damaged = self.leftover = 0
         self.is_cut, self.offset = False, len(MAGIC)
         with system_errors(path):
-            self._file = sys.stdin.buffer if self.path == "-" else open(path, "rb")  # noqa: SIM115  closed by `close`
+            self._file = sys.stdin.buffer if self.path == "-" else opened(self.path)
         try:
             self._records = self._begin()
         except BaseException:

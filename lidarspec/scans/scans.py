@@ -69,6 +69,7 @@ class Scan:
         sensor: whose.
         whole: whether both ends were seen, and no more is missing between them than is there.
         imu: what the IMU felt from the first point up to that of the next scan; None without an IMU, or where it has another clock.
+        number: which of its file it is, where that is read in pieces.
     """
 
     points: PointCloud
@@ -77,6 +78,7 @@ class Scan:
     sensor: Spec
     whole: bool = False
     imu: ImuSamples | None = None
+    number: int | None = None
 
     @property
     def stamp_ns(self) -> int:
@@ -350,6 +352,16 @@ class ScanStream:
         self._progress = Progress(sensor)
         self._empty, self._broken = 0, False  # frames without parts that have points, and whether there is a break before those at the end
         self._begins: int | None = None  # time of the first point of the scan under way, ns, where it is known
+        self._left_out = False  # whether the scan under way is another's
+
+    @property
+    def is_under_way(self) -> bool:
+        """Whether there are points of a scan that has not ended, and is not another's."""
+        return bool(self._parts) and not self._left_out
+
+    def __getstate__(self) -> dict[str, Any]:
+        """What is pickled goes on behind the scan under way, whose points it does not have."""
+        return {**vars(self), "_parts": [], "_left_out": self._left_out or bool(self._parts)}
 
     def add(self, packets: Packets) -> list[Scan]:
         """The scans that these packets complete."""
@@ -413,6 +425,10 @@ class ScanStream:
     def _close(self, ends: int | None, *, whole: bool = False, complete: bool = False) -> Scan | None:
         """The scan of the points so far; `ends`: the time of the first point after it, ns."""
         parts, self._parts = self._parts, []
+        if self._left_out:
+            self._left_out, parts = False, []
+            if self._imu is not None:
+                self._imu.until(ends)
         if not parts:
             return None
         begins = self._begins

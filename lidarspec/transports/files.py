@@ -23,6 +23,7 @@ from lidarspec.captures.records import is_capture
 from lidarspec.errors import SourceError, UnknownSensor, UsageError, WireError, suggest, system_errors
 from lidarspec.recording.format import MAGIC, Header, Record, Recording
 from lidarspec.spec.sensor import Sensor
+from lidarspec.stores import is_stored, opened
 from lidarspec.transports.bags import BagTransport, log_of
 from lidarspec.transports.base import origin
 from lidarspec.transports.protocol import Chunk, Transport
@@ -150,23 +151,32 @@ def _passed_over(path: str, places: int, size: int) -> str:
 
 
 class FileTransport(Transport):
-    """The bytes of a file as they are, or standard input for "-"."""
+    """The bytes of a file as they are, or standard input for "-".
+
+    Attributes:
+        file: the open file.
+    """
 
     def __init__(self, path: str, file: BinaryIO) -> None:
-        self._path, self._file = path, file
+        self._path, self.file = path, file
         self.warnings: list[str] = []
+
+    @property
+    def can_go_on(self) -> bool:
+        """Whether another one can begin where this one stands: of bytes as they are, and batches of a capture."""
+        return type(self) in (FileTransport, CaptureTransport) and self.file.seekable()
 
     def chunks(self) -> Iterator[Chunk]:
         with system_errors(self._path):
-            while block := self._file.read(BLOCK):
+            while block := self.file.read(BLOCK):
                 yield Chunk(block)
 
     def write(self, data: bytes) -> None:
         raise SourceError(f"{self._path} is a file: nothing can be sent to it")
 
     def close(self) -> None:
-        if self._file is not sys.stdin.buffer:
-            self._file.close()
+        if self.file is not sys.stdin.buffer:
+            self.file.close()
 
     def _warn(self, stats: CaptureStats) -> None:
         """Take down what a capture does not hold whole."""
@@ -194,7 +204,7 @@ class HexTransport(FileTransport):
     """Bytes written as hexadecimal text, in any way that `unhexed` reads; lines without digits are passed over."""
 
     def chunks(self) -> Iterator[Chunk]:
-        return hex_chunks(self._path, self._file.readline)
+        return hex_chunks(self._path, self.file.readline)
 
 
 def hex_chunks(name: str, readline: Callable[[int], bytes]) -> Iterator[Chunk]:
@@ -251,16 +261,21 @@ def _whole_bytes(word: str) -> bytes:
 
 
 class CaptureTransport(FileTransport):
-    """The UDP datagrams of a pcap or pcapng file."""
+    """The UDP datagrams of a pcap or pcapng file.
+
+    Attributes:
+        reader: what `batches` comes from, once it has begun.
+    """
 
     datagrams = True
 
     def __init__(self, path: str, file: BinaryIO, *, sender: str | None = None) -> None:
         super().__init__(path, file)
         self._origin = None if sender is None else origin(sender)
+        self.reader: CaptureBatches | None = None
 
     def chunks(self) -> Iterator[Chunk]:
-        reader = CaptureReader(self._file)
+        reader = CaptureReader(self.file)
         for datagram in reader:
             if self._origin is not None and datagram.source not in self._origin:
                 self.foreign += 1
@@ -274,7 +289,7 @@ class CaptureTransport(FileTransport):
         Raises:
             SourceError: where the file cannot be read.
         """
-        reader = CaptureBatches(self._file)
+        reader = self.reader = self.reader or CaptureBatches(self.file)
         for batch in reader.batches():
             mine = batch if self._origin is None else batch.of(self._origin)
             self.foreign += len(batch) - len(mine)
@@ -287,7 +302,7 @@ class StreamCaptureTransport(FileTransport):
     """The bytes of a capture of a byte stream, packet by packet."""
 
     def chunks(self) -> Iterator[Chunk]:
-        reader = StreamReader(self._file)
+        reader = StreamReader(self.file)
         yield from (Chunk(packet.data, packet.at or None) for packet in reader)
         self._warn(reader.stats)
 
@@ -317,13 +332,15 @@ def open_file(path: str, *, sender: str | None = None) -> FileTransport | Record
     if (log := log_of(path)) is not None:
         return BagTransport(path, log, sender=sender)
     with system_errors(path), contextlib.ExitStack() as undo:
-        file = sys.stdin.buffer if path == "-" else undo.enter_context(open(path, "rb"))
+        file = sys.stdin.buffer if path == "-" else undo.enter_context(contextlib.closing(opened(path)))
         head = _head(file)
         path = "standard input" if path == "-" else path
         log = log_of(path, head)
         if log is not None and file is sys.stdin.buffer:
             raise SourceError(f"{path} is {log.what}, and is not read: give its file")
         refuse_container(path, head)
+        if log is not None and is_stored(path):
+            raise SourceError(f"{path} is {log.what}, which is read from this computer alone: copy it here")
         if log is not None:
             return BagTransport(path, log, sender=sender)
         undo.pop_all()  # the transport closes it
