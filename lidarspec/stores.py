@@ -83,13 +83,30 @@ def found(pattern: str) -> list[tuple[str, str]]:
         system = system_of(pattern)
         with _failures(pattern):
             paths = [system.unstrip_protocol(path) for path in system.glob(pattern)]
-        root = system.unstrip_protocol(fixed)
     else:
-        paths, root = [path for path in glob.glob(pattern, recursive=True) if os.path.isfile(path)], fixed
+        paths = [path for path in glob.glob(pattern, recursive=True) if os.path.isfile(path)]
     if not paths:
         raise SourceError(f"{pattern}: there is no such file")
-    names = (path.removeprefix(root).lstrip("/") if fixed != pattern else path.rpartition("/")[2] for path in paths)
+    names = (plain(path).removeprefix(plain(fixed)).lstrip("/") if fixed != pattern else path.rpartition("/")[2] for path in paths)
     return sorted(zip(paths, names, strict=True))
+
+
+def files_in(folder: str) -> set[str]:
+    """What is in a folder and below, plainly spelt; nothing where there is no folder.
+
+    Raises:
+        SourceError: where the store cannot be reached.
+    """
+    if not is_stored(folder):
+        return {plain(Path(at, name)) for at, folders, files in os.walk(folder) for name in (*folders, *files)}
+    system = system_of(folder)
+    with _failures(folder):
+        return {plain(system.unstrip_protocol(path)) for path in system.find(folder)} if system.exists(folder) else set()
+
+
+def plain(path: object) -> str:
+    """One spelling of a path or URL, to be compared: memory:///a is memory://a, and ./a is a."""
+    return str(path).partition("://")[2].lstrip("/") if is_stored(path) else Path(str(path)).as_posix().removeprefix("./")
 
 
 def stamp(path: str) -> dict[str, Any]:

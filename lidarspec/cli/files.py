@@ -3,15 +3,19 @@
 from __future__ import annotations
 
 import itertools
-from collections.abc import Iterable, Iterator, Mapping
+from collections import Counter
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from shlex import quote
+from typing import Any
 
 import click
 
+from lidarspec import batch
+from lidarspec.cli.failures import FINDINGS
 from lidarspec.cli.inputs import again, conclude, fits_instead, nearest_fault, no_frame, nothing_came, refuse_overwriting, scans_of
-from lidarspec.cli.options import colour_option, count_option, sensor_option
+from lidarspec.cli.options import BYTES, colour_option, count_option, sensor_option
 from lidarspec.cli.output import Progress, emit, emit_json, size
 from lidarspec.cli.terminal import note
 from lidarspec.device.device import Device, open as open_device
@@ -51,16 +55,31 @@ class Written:
 
 
 @click.command()
-@click.argument("source", metavar="IN")
+@click.argument("sources", metavar="IN...", nargs=-1, required=True)
 @click.argument("target", metavar="OUT")
 @sensor_option
 @count_option("scans")
 @click.option("--all", "every_point", is_flag=True, help="Keep points without a valid return.")
 @click.option("--imu", "is_imu", is_flag=True, help="What the sensor's IMU felt, in place of the points.")
-@click.option("--force", is_flag=True, help="Overwrite OUT.")
+@click.option("--force", is_flag=True, help="Overwrite OUT; with --to also what was done before.")
+@click.option("--to", metavar="FORMAT", help="Write each IN to a file of this format in the folder OUT, such as parquet.")
+@click.option("--jobs", type=click.IntRange(min=1), metavar="N", help="With --to: so many processes.")
+@click.option("--dask", "scheduler", metavar="ADDRESS", help="With --to: the workers of this Dask scheduler.")
+@click.option("--piece", "piece_size", type=BYTES, metavar="SIZE", help="With --to: cut larger files into such pieces.  [default: 256MB]")
 @click.option("--json", "as_json", is_flag=True, help="Print a summary as JSON.")
 def convert(
-    source: str, target: str, sensor_id: str | Sensor | None, count: int | None, every_point: bool, is_imu: bool, force: bool, as_json: bool
+    sources: Sequence[str],
+    target: str,
+    sensor_id: str | Sensor | None,
+    count: int | None,
+    every_point: bool,
+    is_imu: bool,
+    force: bool,
+    to: str | None,
+    jobs: int | None,
+    scheduler: str | None,
+    piece_size: float | None,
+    as_json: bool,
 ) -> None:
     """Write the points of a capture or raw file to a file, in the format of its suffix.
 
@@ -71,7 +90,24 @@ def convert(
 
     Tables (.parquet, .arrow, .feather), surveys (.las, .laz, .e57), .zarr and logs of ROS (.mcap, .bag, .rosbag2, .db3) take libraries
     that are not installed by default: lidarspec[arrow,las,e57,zarr,ros].
+
+    With --to each IN is a file, a pattern in quotes, 'drives/**/*.pcap', or a URL, s3://bucket/a.pcap, and OUT a folder. What is done is
+    written down there, in manifest.jsonl: the same command again does what is missing. A file that fails stops no other.
     """
+    if to is not None:
+        if count or is_imu:
+            raise UsageError("-n and --imu are for one file, without --to")
+        if jobs and scheduler:
+            raise UsageError("--dask has its own workers: leave out --jobs")
+        how: dict[str, Any] = {"jobs": jobs or 1, "scheduler": scheduler or "", "size": int(piece_size or batch.PIECE)}
+        records = batch.convert(sources, target, to.removeprefix("."), sensor_id, every_point=every_point, force=force, **how)
+        _convert_all(records, target, as_json=as_json)
+        return
+    if len(sources) > 1 or jobs or scheduler or piece_size:
+        raise suggest(
+            UsageError("several files, and --jobs, --dask and --piece, go into a folder in one format"), "the same with --to parquet"
+        )
+    source = sources[0]
     format_of(target)
     refuse_overwriting(targets(target), source, sensor_id, force=force)
     sensor = _detected(source, target) if sensor_id is None else named_sensor(sensor_id)
@@ -95,6 +131,26 @@ def convert(
         write(target, counted, every_point=every_point)
         progress.clear()
         _sum_up(device, target, written, as_json=as_json)
+
+
+def _convert_all(records: Iterable[tuple[batch.Record, bool]], folder: str, *, as_json: bool) -> None:
+    """Say what becomes of each piece, and in the end of all; exit code 1 where one has failed."""
+    totals, before, failed = Counter[str](), 0, list[batch.Record]()
+    with Progress() as progress:
+        for record, is_old in records:
+            before += is_old
+            if "error" in record:
+                failed.append(record)
+                progress.note(f"{record['source']}: {record['error']}")
+                continue
+            totals.update({"files": record["last"], "pieces": 1, "scans": record["scans"], "points": record["points"]})
+            progress(lambda: f"{folder}: {totals['pieces']} pieces, {totals['points']} points")
+    told = ", ".join(f"{number} {what}" for what, number in totals.items() if what != "pieces" or number > totals["files"])
+    note(f"{folder}: {told or 'nothing'}" + f"; {before} pieces were done before" * bool(before) + f"; {len(failed)} failed" * bool(failed))
+    if as_json:
+        emit_json({"output": folder, **totals, "before": before, "failed": {one["source"]: one["error"] for one in failed}}, None)
+    if failed:
+        raise click.exceptions.Exit(FINDINGS)
 
 
 def _detected(source: str, target: str) -> Sensor:

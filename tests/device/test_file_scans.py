@@ -43,7 +43,7 @@ NAMES = [
 ]
 
 
-def made(sensor: ls.Sensor, path: Path, *, most: int = 120_000) -> None:
+def made(sensor: ls.Sensor, path: Path, *, most: int = 120_000, longest: int = 900) -> None:
     """A file of frames, some lost, doubled, late or damaged, with frames of all other types and noise between them."""
     chance, frames = random.Random(3), list[bytes]()
     others = [sensor.example(name) for name, frame in sensor.incoming.items() if not frame.data]
@@ -56,7 +56,7 @@ def made(sensor: ls.Sensor, path: Path, *, most: int = 120_000) -> None:
         frames.append(frame if what < 0.995 else frame[:-3] + chance.randbytes(3))
         if others and len(frames) % 37 == 5:
             frames.append(others[len(frames) // 37 % len(others)])
-        if len(frames) == 900 or sum(map(len, frames[-50:])) * len(frames) / 50 > most:
+        if len(frames) >= longest or sum(map(len, frames[-50:])) * len(frames) / 50 > most:
             break
     if sensor.datagrams:
         times = itertools.count(1_700_000_000 * 10**9, 1_000_000)
