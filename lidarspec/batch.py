@@ -31,7 +31,6 @@ from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import Executor, Future, ProcessPoolExecutor
 from concurrent.futures.process import BrokenProcessPool
 from dataclasses import dataclass, field, replace
-from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -43,11 +42,10 @@ from lidarspec.discovery.detect import detected
 from lidarspec.errors import LidarSpecError, SourceError, UsageError, WireError, library, suggest, system_errors
 from lidarspec.formats import format_of, write
 from lidarspec.formats.tables import tables
-from lidarspec.formats.writing import remove
 from lidarspec.plugins import sensor as named_sensor
 from lidarspec.scans.scans import Scan
 from lidarspec.spec.sensor import Sensor
-from lidarspec.stores import digest, files_in, found, is_stored, opened, plain, put, stamp
+from lidarspec.stores import digest, files_in, found, is_stored, opened, plain, put, stamp, take_away
 
 #: bytes of a piece that is written to a file, and of one that is a partition in memory.
 PIECE, PARTITION = 256_000_000, 32_000_000
@@ -101,20 +99,23 @@ class Piece:
         options = {name: str(value) for name, value in self.options.items()}
         return {"asked": self.sensor, "options": options, "every_point": self.every_point, "piece_size": self.size, "target": self.target}
 
-    @contextlib.contextmanager
-    def scans(self) -> Iterator[FileScans]:
+    def opened(self) -> FileScans:
         """The file, from where the piece begins."""
-        with FileScans(self.source, _sensor(self.sensor, tuple(self.options.items()), self.source), self.bookmark) as scans:
-            yield scans
+        named = _configured(self.sensor, tuple(self.options.items())) if self.sensor else detected(self.source)
+        return FileScans(self.source, named, self.bookmark)
+
+    def record(self, **more: Any) -> Record:
+        """What the manifest says of it."""
+        return {"source": self.source, "piece": self.number, "last": self.is_last, **self.asked, "versions": VERSIONS, **more}
+
+    def failed(self, error: Exception) -> Record:
+        """What the manifest says where it was not to be made."""
+        return self.record(error=str(error) if isinstance(error, LidarSpecError) else f"{type(error).__name__}: {error}")
 
     def numbered(self, scans: FileScans) -> Iterator[Scan]:
         """Its scans, with their numbers in the file."""
         for number, scan in enumerate(itertools.islice(scans, self.count), self.first):
             yield replace(scan, number=number)
-
-
-def _sensor(name: str, options: tuple[tuple[str, Any], ...], source: str) -> Sensor:
-    return _configured(name, options) if name else detected(source)
 
 
 @functools.lru_cache(maxsize=64)
@@ -127,7 +128,7 @@ def _configured(name: str, options: tuple[tuple[str, Any], ...]) -> Sensor:
 
 def survey(piece: Piece) -> list[Piece]:
     """The piece, with the number of its scans, and what follows it, if anything does."""
-    with piece.scans() as scans:
+    with piece.opened() as scans:
         count, bookmark = scans.survey(piece.size)
     if bookmark is None:
         return [replace(piece, count=count, is_last=True)]
@@ -137,25 +138,23 @@ def survey(piece: Piece) -> list[Piece]:
 
 def converted(piece: Piece) -> Record:
     """What the manifest says of a piece, once its points are written, or it has failed."""
-    record = {"source": piece.source, "piece": piece.number, "last": piece.is_last, **piece.asked, "versions": VERSIONS}
+    counts: Record = {"first_scan": piece.first, "scans": 0, "points": 0}
     try:
-        record |= {**stamp(piece.source), "digest": digest(piece.source)}
-        with piece.scans() as scans:
-            counts = {"first_scan": piece.first, "scans": 0, "points": 0}
-            written_scans = _counted(piece, scans, counts)
-            first = next(written_scans, None)
+        about = {**stamp(piece.source), "digest": digest(piece.source)}
+        with piece.opened() as scans:
+            counted = _counted(piece, piece.numbered(scans), counts)
+            first = next(counted, None)
             if first is None and piece.is_last and not piece.first:
                 raise WireError(f"no scan in {piece.source}: {scans.stats}")
             if first is not None:
-                _write(piece, itertools.chain([first], written_scans))
-            record |= counts | {"output": piece.output if first is not None else None, "warnings": scans.warnings}
+                _write(piece, itertools.chain([first], counted))
+            return piece.record(**about, **counts, output=piece.output if first is not None else None, warnings=scans.warnings)
     except Exception as error:  # of whatever kind: the others go on
-        record["error"] = str(error) if isinstance(error, LidarSpecError) else f"{type(error).__name__}: {error}"
-    return record
+        return piece.failed(error)
 
 
-def _counted(piece: Piece, scans: FileScans, counts: Record) -> Iterator[Scan]:
-    for scan in piece.numbered(scans):
+def _counted(piece: Piece, scans: Iterator[Scan], counts: Record) -> Iterator[Scan]:
+    for scan in scans:
         counts["scans"] += 1
         counts["points"] += len(scan) if piece.every_point else int(scan.points.valid.sum())
         yield scan
@@ -209,7 +208,7 @@ class Manifest:
     def __init__(self, folder: str) -> None:
         self.path = f"{folder.rstrip('/')}/{MANIFEST}"
         self._records: dict[tuple[str, str], dict[int, Record]] = {}
-        self._lines, self._due, self._stamps = list[str](), 0.0, dict[str, Record]()
+        self._lines, self._due = list[str](), 0.0
         self._is_stored = is_stored(folder)
         with contextlib.suppress(SourceError), contextlib.closing(opened(self.path)) as file:
             self._lines = [line for line in file.read().decode(errors="replace").splitlines() if self._known(line)]
@@ -245,7 +244,7 @@ class Manifest:
 
     def _is_same(self, source: str, record: Record) -> bool:
         """Whether a file is the one that a record is of."""
-        now = self._stamps.get(source) or self._stamps.setdefault(source, stamp(source))
+        now = stamp(source)
         return bool(now["size"] == record["size"] and (now["modified"] == record["modified"] or digest(source) == record["digest"]))
 
     def finished(self, piece: Piece) -> list[Record]:
@@ -258,6 +257,13 @@ class Manifest:
             if record["last"]:
                 return records
         return []
+
+    def clear(self, piece: Piece) -> None:
+        """Take away what was made of a file that has changed since, or is made in another way now."""
+        for number, record in self._records.get((piece.source, piece.target), {}).items():
+            output = record.get("output")
+            if output and self.has(output) and self.done(replace(piece, number=number)) is None:
+                take_away(output)
 
     def add(self, record: Record) -> None:
         """Write down what became of a piece."""
@@ -382,6 +388,8 @@ def convert(
             known = {piece.source: manifest.finished(piece) for piece in todo}
             yield from ((record, True) for records in known.values() for record in records)
             todo = [piece for piece in todo if not known[piece.source]]
+        for piece in todo:
+            manifest.clear(piece)
         with _swept(folder, to), _executor(jobs, scheduler) as executor:
             for record, is_old in _run(executor, todo, (lambda _: None) if force else manifest.done):
                 if not is_old:
@@ -392,13 +400,16 @@ def convert(
 def _run(executor: Executor, todo: Iterable[Piece], done: Callable[[Piece], Record | None]) -> Iterator[tuple[Record, bool]]:
     """What became of each piece, as it is done; those of which something is known already are not made again."""
     ended = queue.SimpleQueue[tuple[Piece, Future[Any]]]()
-    tasks, running = deque(_first_task(piece) for piece in todo), 0
+    tasks, running = deque((survey if _is_large(piece) else converted, piece) for piece in todo), 0
     ahead = 1 if isinstance(executor, _Here) else AHEAD
+
+    def hand_over(function: Callable[[Piece], Any], piece: Piece) -> None:
+        executor.submit(function, piece).add_done_callback(lambda future: ended.put((piece, future)))
+
     while tasks or running:
         while tasks and running < ahead:
-            function, piece = tasks.popleft()
+            hand_over(*tasks.popleft())
             running += 1
-            executor.submit(function, piece).add_done_callback(partial(_put_back, ended, piece))
         piece, future = ended.get()
         running -= 1
         try:
@@ -407,7 +418,7 @@ def _run(executor: Executor, todo: Iterable[Piece], done: Callable[[Piece], Reco
             error = SourceError("a worker process was killed, maybe for want of memory; what it was at is not written")
             raise suggest(error, "the same again, which goes on where this ended") from None
         except Exception as failure:  # of a survey, or a worker of Dask that died again and again
-            result = _failed(piece, failure)
+            result = piece.failed(failure)
         if isinstance(result, dict):
             yield result, False
             continue
@@ -418,20 +429,11 @@ def _run(executor: Executor, todo: Iterable[Piece], done: Callable[[Piece], Reco
             yield record, True
 
 
-def _put_back(ended: queue.SimpleQueue[Any], piece: Piece, future: Future[Any]) -> None:
-    ended.put((piece, future))
-
-
-def _first_task(piece: Piece) -> tuple[Callable[[Piece], Any], Piece]:
-    """What is done first with a file: a large one is cut."""
+def _is_large(piece: Piece) -> bool:
+    """Whether a file is larger than a piece; what cannot be looked at is not."""
     with contextlib.suppress(LidarSpecError):
-        return (survey if stamp(piece.source)["size"] > piece.size else converted), piece
-    return converted, piece
-
-
-def _failed(piece: Piece, error: Exception) -> Record:
-    text = str(error) if isinstance(error, LidarSpecError) else f"{type(error).__name__}: {error}"
-    return {"source": piece.source, "piece": piece.number, "last": True, **piece.asked, "versions": VERSIONS, "error": text}
+        return bool(stamp(piece.source)["size"] > piece.size)
+    return False
 
 
 def _try(to: str) -> None:
@@ -443,17 +445,17 @@ def _try(to: str) -> None:
 @contextlib.contextmanager
 def _swept(folder: str, to: str) -> Iterator[None]:
     """A folder in which, before and after, nothing is left that a process was writing when it was killed."""
-    _sweep(folder, to)
+
+    def sweep() -> None:
+        for path in () if is_stored(folder) else Path(folder).rglob(f".*.{to}"):
+            if re.match(r"\.\d+\.", path.name):
+                take_away(path)
+
+    sweep()
     try:
         yield
     finally:
-        _sweep(folder, to)
-
-
-def _sweep(folder: str, to: str) -> None:
-    for path in () if is_stored(folder) else Path(folder).rglob(f".*.{to}"):
-        if re.match(r"\.\d+\.", path.name):
-            remove(path)
+        sweep()
 
 
 def read(urls: str | Sequence[str], sensor: str | Sensor | None = None, *, every_point: bool = False, size: int = PARTITION) -> Any:
@@ -481,7 +483,7 @@ def read(urls: str | Sequence[str], sensor: str | Sensor | None = None, *, every
 
 def _cut(piece: Piece) -> list[Piece]:
     """All pieces of a file."""
-    if _first_task(piece)[0] is converted:
+    if not _is_large(piece):
         return [piece]
     found, following = list[Piece](), [piece]
     while following:
@@ -492,7 +494,7 @@ def _cut(piece: Piece) -> list[Piece]:
 
 def _partition(piece: Piece) -> Any:
     """The points of a piece as a pandas dataframe."""
-    with piece.scans() as scans:
+    with piece.opened() as scans:
         made = tables(piece.numbered(scans), every_point=piece.every_point)
         table = library("pyarrow", "arrow").concat_tables(made)
         if not table.num_rows and piece.is_last and not piece.first:

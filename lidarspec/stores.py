@@ -150,6 +150,24 @@ def put(local: Path, url: str) -> None:
             shutil.copyfileobj(file, cast(Any, target), 1 << 22)
 
 
+def take_away(path: str | Path) -> None:
+    """Remove a file or folder, if there is one.
+
+    Raises:
+        SourceError: where that fails.
+    """
+    if is_stored(path):
+        system = system_of(str(path))
+        with _failures(str(path)):
+            system.rm(str(path), recursive=True)
+        return
+    with system_errors(path):
+        if os.path.isdir(path) and not os.path.islink(path):
+            shutil.rmtree(path)
+        else:
+            Path(path).unlink(missing_ok=True)
+
+
 @contextlib.contextmanager
 def _failures(url: str) -> Iterator[None]:
     """What a store refuses within, in whatever way, as a `SourceError`."""

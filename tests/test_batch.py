@@ -98,7 +98,8 @@ def test_a_second_run_does_what_is_missing_only(drives: Path, tmp_path: Path) ->
     assert outputs(tmp_path / "out") == first
     made(ls.sensor(SENSOR), mine / "a.bin", longest=500)
     assert [Path(record["source"]).name for record, old in run(mine / "*.bin", tmp_path / "out") if not old] == ["a.bin"]
-    assert not any(old for _, old in run(mine / "*.bin", tmp_path / "out", every_point=True))
+    assert not any(old for _, old in run(mine / "*.bin", tmp_path / "out", size=10 * SIZE))
+    assert outputs(tmp_path / "out").keys() == {"long.parquet", "a.parquet"}
 
 
 def test_processes_make_the_same_files(drives: Path, tmp_path: Path) -> None:

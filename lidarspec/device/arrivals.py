@@ -223,6 +223,7 @@ class FileInput(Input):
     def close(self) -> None:
         self.state = "closed"
         self._transport.close()
+        self._arrivals = iter(())  # which holds this one, and both what was read
 
     def first_state(self) -> dict[str, bytes]:
         """The first frame of each type that `points` takes its state from: a file is read as if it stood at the start."""
