@@ -7,7 +7,6 @@ import os
 import signal
 import subprocess
 import sys
-import time
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -60,6 +59,15 @@ def outputs(folder: Path) -> dict[str, bytes]:
 def joined(folder: Path, name: str = "long") -> Any:
     """The points of all pieces of a capture."""
     return pq.read_table([str(path) for path in sorted(folder.glob(f"{name}*.parquet"))])
+
+
+def lives(group: int) -> bool:
+    """Whether any process of a group is there."""
+    try:
+        os.killpg(group, 0)
+    except ProcessLookupError:
+        return False
+    return True
 
 
 def run(sources: Path | str, folder: Path | str, **how: Any) -> list[tuple[batch.Record, bool]]:
@@ -115,7 +123,8 @@ def test_a_run_that_is_killed_is_gone_on_with(drives: Path, whole: Any, tmp_path
     with subprocess.Popen(command, start_new_session=True, stderr=subprocess.DEVNULL) as first:
         until(lambda: (tmp_path / batch.MANIFEST).exists() and len(records(tmp_path)) >= 2, 60)
         os.kill(first.pid, signal.SIGKILL)
-    time.sleep(0.5)  # for the workers, which end with it
+    until(lambda: not lives(first.pid), 10)  # the workers end with it
+    (tmp_path / ".123.long-00001.parquet").touch()  # what one had begun
     before = [record for record in records(tmp_path) if "error" not in record]
     kept = {record["output"]: os.stat(record["output"]).st_mtime_ns for record in before}
     subprocess.run(command, stderr=subprocess.PIPE, check=False)
