@@ -47,6 +47,8 @@ def made(sensor: ls.Sensor, path: Path, *, most: int = 120_000, longest: int = 9
     """A file of frames, some lost, doubled, late or damaged, with frames of all other types and noise between them."""
     chance, frames = random.Random(3), list[bytes]()
     others = [sensor.example(name) for name, frame in sensor.incoming.items() if not frame.data]
+    if sensor.state:  # a calibration that is not the nominal one, and another each time
+        others = [frame[:300] + chance.randbytes(600) + frame[900:] for frame in others for _ in range(5)]
     for frame in itertools.chain.from_iterable(ls.simulate(sensor, 500, start=start) for start in itertools.count(0, 500)):
         what = chance.random()
         if what < 0.01:
