@@ -34,21 +34,21 @@ def _write(path: Path, scans: Iterable[Scan], *, every_point: bool, open_writer:
     `every_point` x, y and z of a point without a return are nan. Each field has its unit in its metadata, and the schema's has `sensor`,
     `source` (what is known of its format), `frame` (where x, y and z point), `units` as JSON, and `calibration`: "nominal" or "own".
     """
-    tables = _tables(scans, every_point=every_point)
-    first = next(tables)
+    made = tables(scans, every_point=every_point)
+    first = next(made)
     with open_writer(path, first.schema) as writer:
-        for table in itertools.chain([first], tables):
+        for table in itertools.chain([first], made):
             writer.write_table(table)
 
 
-def _tables(scans: Iterable[Scan], *, every_point: bool) -> Iterator[Any]:
+def tables(scans: Iterable[Scan], *, every_point: bool) -> Iterator[Any]:
     """The points of scans as tables of `ROWS` rows and more, at least one."""
     arrow = library("pyarrow", "arrow")
     schema, gathered, rows = None, list[Any](), 0
-    for number, scan in enumerate(scans):
+    for place, scan in enumerate(scans):
         cloud = written(scan, every_point=every_point)
         schema = schema or _schema(arrow, scan, cloud)
-        gathered.append(_batch(arrow, schema, cloud, number, scan))
+        gathered.append(_batch(arrow, schema, cloud, place if scan.number is None else scan.number, scan))
         rows += len(cloud)
         if rows >= ROWS:
             yield _table(arrow, gathered, schema)
