@@ -17,7 +17,7 @@ from pathlib import Path
 #: the stations on the way of a byte, bottom to top; a module that is named stands on its own floor, else on that of its package. Imports
 #: go down or stay, wherever in a module they stand and for types alike.
 FLOORS = (
-    "_version errors trust",
+    "_version errors trust stores",
     "transports.protocol",  # what a source is, as values that plugins give too
     "spec",
     "wire",
@@ -35,7 +35,7 @@ FLOORS = (
     "discovery",
     "device",
     "explaining exports formats view",
-    "testing",
+    "batch testing",
     "cli",
     "__main__ __init__",
 )

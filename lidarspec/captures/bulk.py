@@ -203,7 +203,7 @@ class CaptureBatches(CaptureReader):
         """The datagrams of the file, as many at once as were read at once."""
         known: list[Alike] = []
         with self._to_the_end():
-            form = records(self._source)
+            form = self._form = self._form or records(self._source)
             while self._source.begin_record():
                 starts, stuck = walked(self._source.storage, self._source.at, self._source.stop, form)
                 if len(starts) < 2 and not stuck and self._source.more():

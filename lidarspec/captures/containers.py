@@ -12,7 +12,7 @@ import os
 import re
 import sys
 import zipfile
-from contextlib import ExitStack
+from contextlib import ExitStack, closing
 from pathlib import Path
 from shlex import quote
 from typing import Any, BinaryIO, NamedTuple, cast
@@ -20,6 +20,7 @@ from typing import Any, BinaryIO, NamedTuple, cast
 from lidarspec.captures.records import is_capture
 from lidarspec.errors import SourceError, UnknownName, UsageError, library, suggest, system_errors
 from lidarspec.recording.format import MAGIC
+from lidarspec.stores import file_of
 
 #: bytes that say what a file is.
 HEAD = 512
@@ -150,7 +151,7 @@ def opened(path: str | os.PathLike[str], member: str = "") -> BinaryIO:
         SourceError, UsageError: as `unpacked`; where it cannot be opened.
     """
     with system_errors(os.fspath(path)), ExitStack() as undo:
-        file = undo.enter_context(open(path, "rb"))
+        file = undo.enter_context(closing(file_of(os.fspath(path))))
         content = unpacked(os.fspath(path), file, member)
         undo.pop_all()
     return content

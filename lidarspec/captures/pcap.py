@@ -122,6 +122,7 @@ class CaptureReader(Closing):
             file = self._owned = opened(file)  # closed by `close`
         self._source = Source(file, largest=self.largest)
         self._fragments = Reassembly()
+        self._form: Form | None = None
         self._datagrams: Iterator[Datagram] | None = None
         try:
             magic = bytes(self._source.ahead(4))
@@ -131,6 +132,11 @@ class CaptureReader(Closing):
         except SourceError:
             self.close()
             raise
+
+    @property
+    def place(self) -> int:
+        """Where in the file the next record begins."""
+        return self._source.place
 
     def __iter__(self) -> Iterator[Datagram]:
         if self._datagrams is None:  # and not before: it holds the reader, which would live on until the garbage is collected

@@ -110,13 +110,17 @@ class Source:
     """
 
     def __init__(self, file: BinaryIO, *, largest: int = SMALLEST) -> None:
-        self._into, self._largest = _into(file), largest
+        self._file, self._into, self._largest = file, _into(file), largest
         self._kept: list[tuple[NDArray[np.uint8], weakref.ref[Any]]] = []
         self._lent: weakref.ref[Any] | None = None
         self._data = memoryview(b"")
         self._passed = 0  # bytes of the file before `storage`
         self.record = self.at = 0
         self._adopt(np.empty(_first_size(file, largest) + SLACK, np.uint8), 0)
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        """What is pickled goes on at the same place of the file."""
+        return _source_at, (self._file, self._largest, self.place)
 
     @property
     def stop(self) -> int:
@@ -217,6 +221,14 @@ class Source:
         self.storage = storage
         self._view = storage.data
         self._data, self.at = self._view[:have], 0
+
+
+def _source_at(file: BinaryIO, largest: int, place: int) -> Source:
+    """The bytes of a file that can be sought, from a place on."""
+    file.seek(place)
+    source = Source(file, largest=largest)
+    source.record = source._passed = place
+    return source
 
 
 def _into(file: BinaryIO) -> Callable[[memoryview], int | None]:

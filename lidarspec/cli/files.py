@@ -4,16 +4,19 @@ from __future__ import annotations
 
 import contextlib
 import itertools
-from collections.abc import Iterable, Iterator, Mapping
+from collections import Counter
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from shlex import quote
+from typing import Any
 
 import click
 
-from lidarspec.cli.failures import NO_DATA
+from lidarspec import batch
+from lidarspec.cli.failures import FINDINGS, NO_DATA
 from lidarspec.cli.inputs import again, conclude, fits_instead, nearest_fault, no_frame, nothing_came, refuse_overwriting, scans_of
-from lidarspec.cli.options import colour_option, count_option, output_options, points_option, selecting, sensor_option
+from lidarspec.cli.options import BYTES, colour_option, count_option, output_options, points_option, selecting, sensor_option
 from lidarspec.cli.output import Progress, emit, emit_json, size
 from lidarspec.cli.terminal import note
 from lidarspec.device.device import Device, open as open_device
@@ -56,7 +59,7 @@ class Written:
 
 
 @click.command()
-@click.argument("source", metavar="IN")
+@click.argument("sources", metavar="IN...", nargs=-1, required=True)
 @click.argument("target", metavar="OUT")
 @sensor_option
 @count_option("scans")
@@ -65,10 +68,14 @@ class Written:
 @click.option("--organized", is_flag=True, help="All points of a scan, as rows and columns; missing ones are nan.")
 @click.option("--packets", "with_packets", is_flag=True, help="The packets of IN as well, in a log of ROS, which is a SOURCE then.")
 @click.option("--imu", "is_imu", is_flag=True, help="What the sensor's IMU felt, in place of the points.")
-@click.option("--force", is_flag=True, help="Overwrite OUT.")
+@click.option("--force", is_flag=True, help="Overwrite OUT; with --to also what was done before.")
+@click.option("--to", metavar="FORMAT", help="Write each IN to a file of this format in the folder OUT, such as parquet.")
+@click.option("--jobs", type=click.IntRange(min=1), metavar="N", help="With --to: so many processes.")
+@click.option("--dask", "scheduler", metavar="ADDRESS", help="With --to: the workers of this Dask scheduler.")
+@click.option("--piece", "piece_size", type=BYTES, metavar="SIZE", help="With --to: cut larger files into such pieces.  [default: 256MB]")
 @click.option("--json", "as_json", is_flag=True, help="Print a summary as JSON.")
 def convert(
-    source: str,
+    sources: Sequence[str],
     target: str,
     sensor_id: str | Sensor | None,
     count: int | None,
@@ -78,6 +85,10 @@ def convert(
     with_packets: bool,
     is_imu: bool,
     force: bool,
+    to: str | None,
+    jobs: int | None,
+    scheduler: str | None,
+    piece_size: float | None,
     as_json: bool,
 ) -> None:
     """Write the points of a capture or raw file to a file, in the format of its suffix.
@@ -90,16 +101,29 @@ def convert(
 
     Tables (.parquet, .arrow, .feather), surveys (.las, .laz, .e57), .zarr, logs of ROS (.mcap, .bag, .rosbag2, .db3) and of Foxglove
     (.foxglove.mcap) take libraries that are not installed by default: lidarspec[arrow,las,e57,zarr,ros,foxglove].
+
+    With --to each IN is a file, a pattern in quotes, 'drives/**/*.pcap', or a URL, s3://bucket/a.pcap, and OUT a folder. What is done is
+    written down there, in manifest.jsonl: the same command again does what is missing. A file that fails stops no other.
     """
+    asked = {"beams": selection.beams, "frame-id": selection.frame_id, "organized": organized, "packets": with_packets}
+    for what in (what for what, is_asked in asked.items() if is_asked):
+        check_holds(target if to is None else f"{target}.{to.removeprefix('.')}", what)
+    if to is not None:
+        if count or is_imu or organized or with_packets:
+            raise UsageError("-n, --imu, --organized and --packets are for one file, without --to")
+        if jobs and scheduler:
+            raise UsageError("--dask has its own workers: leave out --jobs")
+        how: dict[str, Any] = {"jobs": jobs or 1, "scheduler": scheduler or "", "size": int(piece_size or batch.PIECE)}
+        how |= {"every_point": every_point, "select": selection, "force": force}
+        records = batch.convert(sources, target, to.removeprefix("."), sensor_id, **how)
+        _convert_all(records, target, as_json=as_json)
+        return
+    if len(sources) > 1 or jobs or scheduler or piece_size:
+        raise suggest(
+            UsageError("several files, and --jobs, --dask and --piece, go into a folder in one format"), "the same with --to parquet"
+        )
+    source = sources[0]
     format_of(target)
-    for what, is_asked in (
-        ("beams", selection.beams),
-        ("frame-id", selection.frame_id),
-        ("organized", organized),
-        ("packets", with_packets),
-    ):
-        if is_asked:
-            check_holds(target, what)
     refuse_overwriting(targets(target), source, sensor_id, force=force)
     sensor = _detected(source, target) if sensor_id is None else named_sensor(sensor_id)
     with open_device(source, sensor) as device, Progress() as progress, _packets(source, wanted=with_packets) as packets:
@@ -136,6 +160,26 @@ def _packets(source: str, *, wanted: bool) -> Iterator[Iterator[Chunk] | None]:
         if not opened.datagrams:
             raise UsageError(f"{source} is a stream of bytes: packets are those of datagrams")
         yield opened.chunks()
+
+
+def _convert_all(records: Iterable[tuple[batch.Record, bool]], folder: str, *, as_json: bool) -> None:
+    """Say what becomes of each piece, and in the end of all; exit code 1 where one has failed."""
+    totals, before, failed = Counter[str](), 0, list[batch.Record]()
+    with Progress() as progress:
+        for record, is_old in records:
+            before += is_old
+            if "error" in record:
+                failed.append(record)
+                progress.note(f"{record['source']}: {record['error']}")
+                continue
+            totals.update({"files": record["last"], "pieces": 1, "scans": record["scans"], "points": record["points"]})
+            progress(lambda: f"{folder}: {totals['pieces']} pieces, {totals['points']} points")
+    told = ", ".join(f"{number} {what}" for what, number in totals.items() if what != "pieces" or number > totals["files"])
+    note(f"{folder}: {told or 'nothing'}" + f"; {before} pieces were done before" * bool(before) + f"; {len(failed)} failed" * bool(failed))
+    if as_json:
+        emit_json({"output": folder, **totals, "before": before, "failed": {one["source"]: one["error"] for one in failed}}, None)
+    if failed:
+        raise click.exceptions.Exit(FINDINGS)
 
 
 def _detected(source: str, target: str) -> Sensor:

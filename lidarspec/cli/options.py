@@ -122,6 +122,14 @@ def _share(text: str) -> float:
     return number
 
 
+def _bytes(text: str) -> float:
+    digits = text.upper().removesuffix("B")
+    number = float(digits.rstrip("KMG")) * {"K": 1e3, "M": 1e6, "G": 1e9}.get(digits[-1:], 1)
+    if not 1e6 <= number < math.inf:
+        raise ValueError(text)
+    return number
+
+
 def _offset(text: str) -> int:
     offset = int(text, 0)
     if offset < 0:
@@ -183,6 +191,8 @@ DURATION = Number("duration", _duration, "duration above 0, such as 10s, 500ms, 
 SHARE = Number("share", _share, "share, such as 1% or 0.01")
 #: bytes, from "940" or "0x3ac".
 OFFSET = Number("offset", _offset, "offset of a byte, such as 940 or 0x3ac")
+#: bytes, from "256MB" or "1GB".
+BYTES = Number("size", _bytes, "size from 1MB on, such as 256MB or 1GB")
 #: a factor above 0; 0 for "max".
 SPEED = Number("speed", _speed, "speed: a factor such as 1, 0.5 or 10, or max")
 #: from when to when, seconds or dates, from "10s:20s", ":1min" or "2026-11-23T05:02:00Z:".

@@ -4,6 +4,7 @@ In: a SOURCE and a sensor. Out: packets and scans as they come, replies to comma
 
 * `device`: `Device`, which users hold: packets and scans out of what its input gives.
 * `arrivals`: what an input is, live or not, and that of a file.
+* `file_scans`: the scans of a file, in pieces that other processes read.
 * `senders`: whose datagrams these are, and which of them are read.
 * `live_input`: frames as they come, decoded every few milliseconds; how the source is doing.
 * `capture_thread`: the thread behind it, which reads, records and queues.

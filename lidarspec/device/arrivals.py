@@ -24,6 +24,7 @@ from lidarspec.errors import CommandError, SourceError
 from lidarspec.framing.decoder import Decoder
 from lidarspec.framing.results import Counters, Found, Frames
 from lidarspec.spec.sensor import Sensor
+from lidarspec.stores import is_stored
 from lidarspec.transports.files import CaptureTransport
 from lidarspec.transports.open_url import transport
 from lidarspec.transports.protocol import Chunk, Transport
@@ -177,6 +178,7 @@ class FileInput(Input):
 
     Attributes:
         state: "streaming", "ended" or "closed".
+        senders: who has sent its frames.
     """
 
     state = "streaming"
@@ -184,7 +186,7 @@ class FileInput(Input):
     def __init__(self, source: str | Path, sensor: Sensor, opened: Transport, *, backend: str) -> None:
         self._source, self.sensor, self._transport = source, sensor, opened
         self.decoder: Decoder = sensor.decoder(stream=not opened.datagrams, backend=backend)
-        self._senders = Senders(source, sensor)
+        self.senders = Senders(source, sensor)
         self._arrivals = self._read()
 
     @property
@@ -228,12 +230,13 @@ class FileInput(Input):
     def close(self) -> None:
         self.state = "closed"
         self._transport.close()
+        self._arrivals = iter(())  # which holds this one, and both what was read
 
     def first_state(self) -> dict[str, bytes]:
         """The first frame of each type that `points` takes its state from: a file is read as if it stood at the start."""
         wanted = set(self.sensor.state)
         path = Path(str(self._source).partition("?")[0])
-        if not wanted or not (path.is_file() or path.is_dir()):
+        if not wanted or not (is_stored(self._source) or path.is_file() or path.is_dir()):
             return {}
         first: dict[str, bytes] = {}
         with contextlib.closing(transport(self._source)) as source:
@@ -253,7 +256,7 @@ class FileInput(Input):
         if isinstance(self._transport, CaptureTransport) and not self.decoder.stream:
             for datagrams in self._transport.batches():
                 spans = self.decoder.placed(datagrams.buffer, datagrams.starts, datagrams.sizes, datagrams.at)
-                self._senders.see(datagrams.sent(spans))
+                self.senders.see(datagrams.sent(spans))
                 yield Arrival([spans])
             return
         for batch in _batches(self._transport.chunks()):
@@ -261,7 +264,7 @@ class FileInput(Input):
                 yield Arrival(self.decoder.rest(), interrupted=batch[0].gap)
             found = fed(self.decoder, batch)
             if not self.decoder.stream:
-                self._senders.see(frame_senders(batch, found[0], self.decoder.stats.bytes_in))
+                self.senders.see(frame_senders(batch, found[0], self.decoder.stats.bytes_in))
             yield Arrival(found)
         yield Arrival(self.decoder.rest())
 

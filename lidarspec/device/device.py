@@ -118,6 +118,10 @@ class PacketReader:
         if arrival.interrupted:
             yield from stream.finish()
 
+    def __getstate__(self) -> dict[str, Any]:
+        """What is pickled goes on with the next packets, without the last ones."""
+        return {**vars(self), "last": None, "felt": joined([])}
+
     def _made(self, name: str) -> PacketStream:
         decoder = self._decoder
         return PacketStream(self._sensor, name, decoder.stats, backend=decoder.backend, state=self._state)

@@ -182,7 +182,7 @@ def _each(path: Path, scans: Iterable[Scan]) -> Iterator[tuple[Path, Iterator[Sc
         begun.add(name)
         with system_errors(path):
             Path(name).parent.mkdir(parents=True, exist_ok=True)
-        yield Path(name), (scan for _, scan in group)
+        yield Path(name), (scan if scan.number is not None else dataclasses.replace(scan, number=number) for number, scan in group)
 
 
 def _placed(path: str, number: int, scan: Scan) -> str:

@@ -33,25 +33,25 @@ def _write(path: Path, scans: Iterable[Scan], *, every_point: bool, open_writer:
     `every_point` x, y and z of a point without a return are nan. Each field has its unit in its metadata, and the schema's has `sensor`,
     `source` (what is known of its format), `frame` (where x, y and z point), `units` as JSON, and `calibration`: "nominal" or "own".
     """
-    tables = _tables(scans, _of_scans(path), every_point=every_point)
-    first = next(tables)
+    made = tables(scans, path, every_point=every_point)
+    first = next(made)
     with open_writer(path, first.schema) as writer, behind(writer.write_table) as write:
-        for table in itertools.chain([first], tables):
+        for table in itertools.chain([first], made):
             write(table)
 
 
-def _tables(scans: Iterable[Scan], of_scans: Sequence[Any], *, every_point: bool) -> Iterator[Any]:
+def tables(scans: Iterable[Scan], path: Path | None = None, *, every_point: bool) -> Iterator[Any]:
     """The points of scans as tables of `ROWS` rows and more, at least one.
 
     Args:
-        of_scans: the fields that say of each point which scan it is from.
+        path: where they go; a column that a folder of it says already, such as scan=7, is left out, as Hive has it.
     """
-    arrow = library("pyarrow", "arrow")
+    arrow, of_scans = library("pyarrow", "arrow"), _of_scans(path)
     schema, gathered, rows = None, list[Any](), 0
-    for number, scan in enumerate(scans):
+    for place, scan in enumerate(scans):
         cloud = written(scan, every_point=every_point)
         schema = schema or _schema(arrow, scan, cloud, of_scans)
-        gathered.append(_batch(arrow, schema, cloud, number, scan))
+        gathered.append(_batch(arrow, schema, cloud, place if scan.number is None else scan.number, scan))
         rows += len(cloud)
         if rows >= ROWS:
             yield _table(arrow, gathered, schema)
@@ -66,9 +66,10 @@ def _table(arrow: Any, batches: Sequence[Any], schema: Any) -> Any:
     return table.combine_chunks() if len(batches) > MANY else table
 
 
-def _of_scans(path: Path) -> list[Any]:
-    """The fields that say of each point which scan it is from; not what a folder says already, such as scan=7, as Hive has it."""
-    arrow, said = library("pyarrow", "arrow"), {part.partition("=")[0] for part in path.parent.parts if "=" in part}
+def _of_scans(path: Path | None) -> list[Any]:
+    """The fields that say of each point which scan it is from, but for those that a folder says."""
+    arrow, folders = library("pyarrow", "arrow"), path.parent.parts if path else ()
+    said = {part.partition("=")[0] for part in folders if "=" in part}
     types = {"scan": arrow.int32(), "stamp": arrow.timestamp("ns"), "complete": arrow.bool_()}
     return [arrow.field(name, kind, nullable=False) for name, kind in types.items() if name not in said]
 

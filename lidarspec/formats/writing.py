@@ -18,9 +18,10 @@ from typing import IO, Any, TypeVar
 import numpy as np
 from numpy.typing import DTypeLike, NDArray
 
-from lidarspec.errors import system_errors
+from lidarspec.errors import SourceError, system_errors
 from lidarspec.points.cloud import COLUMNS, PointCloud, source_of
 from lidarspec.scans.scans import Scan
+from lidarspec.stores import take_away
 
 #: ns since 1970 of the GPS epoch, 1980-01-06, for a clock that leaves out leap seconds, with those that there are since 2017.
 GPS_EPOCH = (315_964_800 - 18) * 10**9
@@ -36,15 +37,16 @@ def replacing(path: Path) -> Iterator[Path]:
     """
     part = path.with_name(f".{os.getpid()}.{path.name}")
     try:
+        with contextlib.suppress(SourceError):
+            take_away(part)
         with system_errors(path):
-            _remove(part)
             yield part
             if path.is_dir() and part.is_dir():
-                _remove(path)
+                take_away(path)
             os.replace(part, path)
     finally:
-        with contextlib.suppress(OSError):
-            _remove(part)
+        with contextlib.suppress(SourceError):
+            take_away(part)
 
 
 @contextlib.contextmanager
@@ -63,13 +65,6 @@ def behind(write: Callable[[_Piece], object]) -> Iterator[Callable[[_Piece], Non
 
         yield hand_over
         last.result()
-
-
-def _remove(path: Path) -> None:
-    if path.is_dir() and not path.is_symlink():
-        shutil.rmtree(path)
-    else:
-        path.unlink(missing_ok=True)
 
 
 def written(scan: Scan, *, every_point: bool) -> PointCloud:

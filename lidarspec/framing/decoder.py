@@ -50,6 +50,9 @@ class Decoder:
         stream: a byte stream, or datagrams one for each `feed`.
         backend: what makes points of its packets, "auto", "numpy" or "jit"; "construct" also judges every candidate.
         sums: what computes checksums; by default their algorithms.
+
+    Attributes:
+        framing: the rules by which its frames are told apart, which no byte changes.
     """
 
     def __init__(self, sensor: Spec, *, stream: bool, backend: str = "auto", sums: Sums | None = None) -> None:
@@ -58,7 +61,7 @@ class Decoder:
         self.sensor, self.stream, self.backend = sensor, stream, backend
         self.stats = Counters()
         keep_freed_memory()
-        self._framing = _framing(tuple(sensor.incoming), tuple(sensor.incoming.values()), backend == "construct", sums)
+        self.framing = _framing(tuple(sensor.incoming), tuple(sensor.incoming.values()), backend == "construct", sums)
         answer = sensor.options.get("answer", "")  # as if the frame that the answer comes after had been seen
         self._mode = Mode(after=sensor.frames[answer].after if answer in sensor.frames else None)
         self._pending, self._base, self._need = b"", 0, 0
@@ -67,7 +70,7 @@ class Decoder:
         link, longest = sensor.links.get("data"), max(frame.max_length for frame in sensor.incoming.values())
         rule = link.assembled if isinstance(link, Udp) and not stream else None
         self._assembly = None if rule is None else Assembly(rule, longest, self.stats)
-        self._least = max(LEAST, 2 * self._framing.reach)
+        self._least = max(LEAST, 2 * self.framing.reach)
         self._size = max(PIECE, self._least)
 
     def __repr__(self) -> str:
@@ -163,7 +166,7 @@ class Decoder:
             self.stats.bytes_skipped += joined.heads
             self.stats.bytes_filler += joined.heads
             self.stats.pending = self._assembly.pending
-        piece = sorted_datagrams(self._framing, buffer, starts, sizes, self._mode)
+        piece = sorted_datagrams(self.framing, buffer, starts, sizes, self._mode)
         frames = piece.frames
         self._base, self.stats.bytes_in = self._base + total, self.stats.bytes_in + total
         self._rejected(piece.rejected, piece.errors)
@@ -175,7 +178,7 @@ class Decoder:
             if not is_good:
                 frames, places, at = frames.only(good), array_of(places)[good], at[good]
         self._count(frames.kinds)
-        return frames.located(self._framing.names, places, gaps, at)
+        return frames.located(self.framing.names, places, gaps, at)
 
     def _lost(
         self,
@@ -228,7 +231,7 @@ class Decoder:
 
     def _piece(self, buffer: Bytes1D, *, final: bool) -> Piece:
         """A piece of a stream cut into frames: as rows while nothing disturbs and no weak type is looked for; else by search."""
-        framing, mode = self._framing, self._mode
+        framing, mode = self.framing, self._mode
         piece = None if final or framing.any_weak(mode) else steady_stream(framing, buffer, mode)
         return leftmost(framing, buffer, mode, self._base, final=final) if piece is None else piece
 
@@ -240,7 +243,7 @@ class Decoder:
         self._count(frames.kinds)
         places = frames.places
         places = range(places.start + base, places.stop + base, places.step) if isinstance(places, range) else places + base
-        return frames.located(self._framing.names, places, gaps, repeated(-1 if at is None else at, len(frames)))
+        return frames.located(self.framing.names, places, gaps, repeated(-1 if at is None else at, len(frames)))
 
     def _gaps(self, buffer: NDArray[np.uint8], frames: Frames, end: int) -> NDArray[np.int64]:
         """The bytes skipped before each frame of a piece that ends there, fillers left out; counts them."""
@@ -277,9 +280,9 @@ class Decoder:
         only = alike(kinds)
         for kind, number in [(only, len(kinds))] if only is not None else enumerate(np.bincount(kinds).tolist() if len(kinds) else ()):
             if number:
-                frames[self._framing.names[kind]] = frames.get(self._framing.names[kind], 0) + number
+                frames[self.framing.names[kind]] = frames.get(self.framing.names[kind], 0) + number
         if len(frames) > known > 0:
-            for name in self._framing.names:  # in their order, however the input was cut
+            for name in self.framing.names:  # in their order, however the input was cut
                 if name in frames:
                     frames[name] = frames.pop(name)
 

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from functools import cached_property, lru_cache
+from functools import cached_property, partial
 from itertools import pairwise
 from typing import Any
 
@@ -209,7 +209,7 @@ class ImuStream:
 
     def __init__(self, sensor: Spec, stats: Counters, *, backend: str = "auto", state: Mapping[str, bytes] | None = None) -> None:
         self._names = [name for name in sensor.imu_frames if not sensor.frames[name].data]
-        self._stream = lru_cache(lambda name: PacketStream(sensor, name, stats, backend=backend, state=state))
+        self._made, self._new = dict[str, PacketStream](), partial(PacketStream, sensor, stats=stats, backend=backend, state=state)
         kinds = {_clock_of(sensor, name, codec(sensor.frames[name]).schema) is None for name in (*self._names, *sensor.data_frames)}
         self.waiting = Waiting() if sensor.imu_frames and len(kinds) == 1 else None
 
@@ -237,6 +237,12 @@ class ImuStream:
         """Input was lost here."""
         for name in self._names:
             self._stream(name).interrupt()
+
+    def _stream(self, name: str) -> PacketStream:
+        """The packets of one type, from when there are some on."""
+        if name not in self._made:
+            self._made[name] = self._new(name)
+        return self._made[name]
 
 
 @dataclass(frozen=True, eq=False)

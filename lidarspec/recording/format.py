@@ -41,6 +41,7 @@ from typing import Any, BinaryIO, Literal
 from lidarspec.errors import SourceError, UsageError, WireError, suggest, system_errors
 from lidarspec.plugins import sensor as named_sensor
 from lidarspec.spec.sensor import Learned, Sensor
+from lidarspec.stores import file_of
 from lidarspec.transports.protocol import Closing
 
 VERSION = 1
@@ -218,7 +219,7 @@ class Recording(Closing):
         self.records = self.damaged = self.leftover = 0
         self.is_cut, self.offset = False, len(MAGIC)
         with system_errors(path):
-            self._file = file or (sys.stdin.buffer if self.path == "-" else open(path, "rb"))  # noqa: SIM115  closed by `close`
+            self._file = file or (sys.stdin.buffer if self.path == "-" else file_of(self.path))
         try:
             self._records = self._begin()
         except BaseException:

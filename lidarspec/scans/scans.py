@@ -77,6 +77,7 @@ class Scan:
         host_ns: when the packet of the first point arrived, int64 ns since 1970 by the computer's clock; 0 where nobody knows it.
         beams: how many `to_laserscan` gives where it is not told; None: as many as the sensor declares, else as there are points.
         frame_id: what ROS's messages call the frame of the points.
+        number: which of its file it is, where that is read in pieces.
     """
 
     points: PointCloud
@@ -88,6 +89,7 @@ class Scan:
     host_ns: int = 0
     beams: int | None = None
     frame_id: str = FRAME_ID
+    number: int | None = None
 
     @property
     def stamp_ns(self) -> int:
@@ -388,6 +390,16 @@ class ScanStream:
         self._empty, self._broken = 0, False  # frames without parts that have points, and whether there is a break before those at the end
         self._begins: int | None = None  # time of the first point of the scan under way, ns, where it is known
         self._host: int | None = None  # when its packet arrived
+        self._left_out = False  # whether the scan under way is another's
+
+    @property
+    def is_under_way(self) -> bool:
+        """Whether there are points of a scan that has not ended, and is not another's."""
+        return bool(self._parts) and not self._left_out
+
+    def __getstate__(self) -> dict[str, Any]:
+        """What is pickled goes on behind the scan under way, whose points it does not have."""
+        return {**vars(self), "_parts": [], "_left_out": self._left_out or bool(self._parts)}
 
     def add(self, packets: Packets) -> list[Scan]:
         """The scans that these packets complete."""
@@ -454,6 +466,10 @@ class ScanStream:
     def _close(self, ends: int | None, *, whole: bool = False, complete: bool = False) -> Scan | None:
         """The scan of the points so far; `ends`: the time of the first point after it, ns."""
         parts, self._parts = self._parts, []
+        if self._left_out:
+            self._left_out, parts = False, []
+            if self._imu is not None:
+                self._imu.until(ends)
         if not parts:
             return None
         begins = self._begins

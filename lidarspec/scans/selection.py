@@ -76,6 +76,15 @@ class Selection:
         """Whether times decide."""
         return self.times != (None, None)
 
+    @property
+    def is_counted(self) -> bool:
+        """Whether it takes all scans of a source, from the first one on, to tell which are wanted."""
+        return self.is_timed or self.scans != (0, None) or self.every != 1
+
+
+#: all of a source.
+EVERYTHING = Selection()
+
 
 class Slice:
     """The times of one stream that are wanted.

@@ -194,13 +194,13 @@ class Tokens:
     def write(self, rows: Bytes2D, slots: Sequence[Slot]) -> list[bytes]:
         number, first = len(rows), 0
         characters, used = [_repeated(self.start, (number, 1))], [np.ones((number, 1), np.bool_)]
-        for slot in slots:
-            part = rows[:, first : first + slot.size * slot.count]
-            first += slot.size * slot.count
-            written, told = self._texts(part, slot) if slot.kind == "text" else self._numbers(part, slot)
-            if slot.size:  # a text of no characters is no token
-                characters += [np.concatenate([written, _repeated(self.sep, (number, slot.count, 1))], axis=2).reshape(number, -1)]
-                used += [np.concatenate([told, np.ones((number, slot.count, 1), np.bool_)], axis=2).reshape(number, -1)]
+        for is_text, run in itertools.groupby((slot for slot in slots if slot.size), lambda slot: slot.kind == "text"):
+            for some in ((slot,) for slot in run) if is_text else (tuple(run),):
+                part = rows[:, first : (first := first + sum(slot.size * slot.count for slot in some))]
+                written, told = self._texts(part, some[0]) if is_text else self._numbers(part, some)
+                ends = _repeated(self.sep, (*written.shape[:2], 1))
+                characters += [np.concatenate([written, ends], axis=2).reshape(number, -1)]
+                used += [np.concatenate([told, np.ones(ends.shape, np.bool_)], axis=2).reshape(number, -1)]
         whole, which = np.concatenate(characters, axis=1), np.concatenate(used, axis=1)
         whole[:, -1] = self.end[0]
         return _pieces(whole, which)
@@ -212,14 +212,19 @@ class Tokens:
         texts = part.reshape(len(part), slot.count, slot.size)
         return texts, np.ones(texts.shape, np.bool_)
 
-    def _numbers(self, part: Bytes2D, slot: Slot) -> tuple[NDArray[np.uint8], NDArray[np.bool_]]:
+    def _numbers(self, part: Bytes2D, run: tuple[Slot, ...]) -> tuple[NDArray[np.uint8], NDArray[np.bool_]]:
         """The characters of numbers, (n, count, most), and which of them are written."""
-        values = slot.numbers(part)
-        is_negative = np.zeros(values.shape, np.bool_)
-        if self.base == 10 and slot.kind == "int":
-            is_negative = (values >> np.uint64(8 * slot.size - 1)).astype(np.bool_)
-            values = np.where(is_negative, (~values + np.uint64(1)) & KEPT[slot.size], values)
-        most = max(len(f"{256**slot.size - 1:{'X' if self.base == 16 else 'd'}}"), self.width)
+        counts = [slot.count for slot in run]
+        edges = np.cumsum([0, *(slot.size * slot.count for slot in run)]).tolist()
+        values = np.concatenate(
+            [slot.numbers(part[:, start:end]) for slot, (start, end) in zip(run, itertools.pairwise(edges), strict=True)], axis=1
+        )
+        sizes, is_negative = np.repeat([slot.size for slot in run], counts), np.zeros(values.shape, np.bool_)
+        if self.base == 10:
+            is_signed = np.repeat([slot.kind == "int" for slot in run], counts)
+            is_negative = (values >> (8 * sizes - 1).astype(np.uint64)).astype(np.bool_) & is_signed
+            values = np.where(is_negative, (~values + np.uint64(1)) & KEPT[sizes], values)
+        most = max(len(f"{256 ** int(sizes.max()) - 1:{'X' if self.base == 16 else 'd'}}"), self.width)
         digits = np.empty((*values.shape, most), np.uint8)
         for place in range(most - 1, -1, -1):
             values, digits[:, :, place] = np.divmod(values, np.uint64(self.base))

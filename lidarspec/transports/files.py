@@ -21,6 +21,7 @@ from lidarspec.captures.records import is_capture
 from lidarspec.errors import SourceError, UnknownSensor, UsageError, system_errors
 from lidarspec.recording.format import MAGIC, Header, Record, Recording
 from lidarspec.spec.sensor import Sensor
+from lidarspec.stores import file_of, is_stored
 from lidarspec.transports.bags import BagTransport, log_of
 from lidarspec.transports.base import origin
 from lidarspec.transports.hexadecimal import hex_chunks, is_hexadecimal
@@ -145,31 +146,40 @@ def _is_whole(transport: FileTransport | RecordingTransport, file: BinaryIO) -> 
 
 
 class FileTransport(Transport):
-    """The bytes of a file as they are, or standard input for "-"."""
+    """The bytes of a file as they are, or standard input for "-".
+
+    Attributes:
+        file: the open file.
+    """
 
     def __init__(self, path: str, file: BinaryIO) -> None:
-        self._path, self._file = path, file
+        self._path, self.file = path, file
         self.warnings: list[str] = []
+
+    @property
+    def can_go_on(self) -> bool:
+        """Whether another one can begin where this one stands: of bytes as they are, and batches of a capture."""
+        return type(self) in (FileTransport, CaptureTransport) and self.file.seekable()
 
     def chunks(self) -> Iterator[Chunk]:
         with system_errors(self._path):
-            while block := self._file.read(BLOCK):
+            while block := self.file.read(BLOCK):
                 yield Chunk(block)
-        _is_whole(self, self._file)
+        _is_whole(self, self.file)
 
     def write(self, data: bytes) -> None:
         raise SourceError(f"{self._path} is a file: nothing can be sent to it")
 
     def close(self) -> None:
-        if self._file is not sys.stdin.buffer:
-            self._file.close()
+        if self.file is not sys.stdin.buffer:
+            self.file.close()
 
     def _warn(self, stats: CaptureStats) -> None:
         """Take down what a capture does not hold whole."""
         self.unread = stats.lost
         if stats.damaged:
             self.warnings.append(_passed_over(self._path, stats.damaged, stats.lost))
-        if _is_whole(self, self._file) and stats.truncated_tail:
+        if _is_whole(self, self.file) and stats.truncated_tail:
             self.warnings.append(f"{self._path} is cut off in its last record; everything before it was read")
         if stats.snapped:
             self.warnings.append(f"{self._path}: {stats.snapped} packets were cut by the capture's snap length")
@@ -190,21 +200,26 @@ class HexTransport(FileTransport):
     """Bytes written as hexadecimal text, at the times that it tells; lines without digits are passed over."""
 
     def chunks(self) -> Iterator[Chunk]:
-        yield from hex_chunks(self._path, self._file.readline)
-        _is_whole(self, self._file)
+        yield from hex_chunks(self._path, self.file.readline)
+        _is_whole(self, self.file)
 
 
 class CaptureTransport(FileTransport):
-    """The UDP datagrams of a pcap or pcapng file."""
+    """The UDP datagrams of a pcap or pcapng file.
+
+    Attributes:
+        reader: what `batches` comes from, once it has begun.
+    """
 
     datagrams = True
 
     def __init__(self, path: str, file: BinaryIO, *, sender: str | None = None) -> None:
         super().__init__(path, file)
         self._origin = None if sender is None else origin(sender)
+        self.reader: CaptureBatches | None = None
 
     def chunks(self) -> Iterator[Chunk]:
-        reader = CaptureReader(self._file)
+        reader = CaptureReader(self.file)
         for datagram in reader:
             if self._origin is not None and datagram.source not in self._origin:
                 self.foreign += 1
@@ -218,7 +233,7 @@ class CaptureTransport(FileTransport):
         Raises:
             SourceError: where the file cannot be read.
         """
-        reader = CaptureBatches(self._file)
+        reader = self.reader = self.reader or CaptureBatches(self.file)
         for batch in reader.batches():
             mine = batch if self._origin is None else batch.of(self._origin)
             self.foreign += len(batch) - len(mine)
@@ -231,7 +246,7 @@ class StreamCaptureTransport(FileTransport):
     """The bytes of a capture of a byte stream, packet by packet."""
 
     def chunks(self) -> Iterator[Chunk]:
-        reader = StreamReader(self._file)
+        reader = StreamReader(self.file)
         yield from (Chunk(packet.data, packet.at or None) for packet in reader)
         self._warn(reader.stats)
 
@@ -251,13 +266,15 @@ def open_file(path: str, *, sender: str | None = None, member: str = "") -> File
         return BagTransport(path, log, sender=sender)
     name = "standard input" if path == "-" else path
     with system_errors(path), contextlib.ExitStack() as undo:
-        plain = sys.stdin.buffer if path == "-" else undo.enter_context(open(path, "rb"))
+        plain = sys.stdin.buffer if path == "-" else undo.enter_context(contextlib.closing(file_of(path)))
         file = unpacked(name, plain, member)
         start = head(file)
         log = log_of(path, start)
         if log is not None and (file is not plain or path == "-"):
             raise SourceError(f"{name} is {log.what}{' in a compressed file' * (file is not plain)}, and is not read: give the file itself")
         refuse_container(name, start)
+        if log is not None and is_stored(path):
+            raise SourceError(f"{path} is {log.what}, which is read from this computer alone: copy it here")
         if log is not None:
             return BagTransport(path, log, sender=sender)
         undo.pop_all()  # the transport closes it

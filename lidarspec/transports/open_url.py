@@ -14,6 +14,7 @@ from lidarspec.errors import SpecError, UnknownOption, UsageError
 from lidarspec.plugins import registry
 from lidarspec.spec.links import Http, Link, Tcp, Udp
 from lidarspec.spec.sensor import Sensor
+from lidarspec.stores import is_stored
 from lidarspec.transports.base import Address, failure, numeric
 from lidarspec.transports.files import open_file
 from lidarspec.transports.protocol import LiveTransport, Transport
@@ -87,7 +88,8 @@ def live_address(source: str | Path) -> Address | None:
     if is_port(text):
         return Address.parse(text, scheme="serial")
     scheme = _SCHEME.match(text)
-    return Address.parse(text) if scheme is not None and not os.path.exists(text) else None
+    is_file = scheme is None or is_stored(text) or os.path.exists(text)
+    return None if is_file else Address.parse(text)
 
 
 def is_port(text: str) -> bool:

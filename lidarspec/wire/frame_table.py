@@ -10,7 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any, Protocol
+from typing import TYPE_CHECKING, Any, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,8 +19,10 @@ from lidarspec.errors import SpecError
 from lidarspec.spec.construct_layer import leaves, member
 from lidarspec.wire.arrays import counted, deep, is_counted, repeated
 from lidarspec.wire.layout import Bytes2D, Layout, Leaf, rows_at
-from lidarspec.wire.parts import Walked
 from lidarspec.wire.schema import Schema, schema, without_indices
+
+if TYPE_CHECKING:
+    from lidarspec.wire.parts import Walked
 
 
 class Table(Protocol):

@@ -250,12 +250,12 @@ def test_built_frames_go_to_files_and_back(tmp_path: Path) -> None:
 def test_an_input_is_held_in_pieces(words: tuple[str, ...], code: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Of a file, of hexadecimal text in one line, and of what comes through a pipe, no more is held than a piece."""
     monkeypatch.chdir(tmp_path)
-    for data in (bytes(2000), bytes(2 * MEGABYTE)):  # first what is imported and remembered
+    for data in (bytes(2000), bytes(MEGABYTE)):  # first what is imported and remembered
         text = data.hex().encode()
-        for name, given in (("zeros.bin", data), ("zeros.hex", text), ("few.bin", data[: MEGABYTE // 2])):
+        for name, given in (("zeros.bin", data), ("zeros.hex", text), ("few.bin", data[: MEGABYTE // 4])):
             Path(name).write_bytes(given)
         most = peak(lambda given=text if "-" in words else b"": ran(*words, code=code, given=given))
-    # the whole at once would be 150 MB: a piece is looked through for every kind of frame of a sensor, and some have a dozen
+    # the whole at once would be 75 MB: a piece is looked through for every kind of frame of a sensor, and some have a dozen
     assert most - len(text) * ("-" in words) < 32 * MEGABYTE, f"{most} bytes"
 
 

@@ -1,0 +1,525 @@
+"""Many files, and large ones in pieces, by several processes or machines: files of points, or a table of Dask.
+
+In: captures by path, pattern or URL. Out: a file of points for each, several for one that is larger than a piece, and a manifest; or a Dask
+dataframe with a partition for each piece. Nothing here schedules: tasks go to `concurrent.futures`, or to the scheduler of a Dask cluster.
+
+A large file is cut as `device.file_scans` does it. Its pieces are found one after another: the task that passes over one gives the bookmark
+with which the next one begins, so that points are made of a piece while those behind it are still looked for.
+
+The manifest, `manifest.jsonl` in the folder of the results, has a line of JSON for each piece: what was read, with which sensor and
+versions, what was written, or the error. A file whose lines and results are all there is not read again. A line that is there is true: it
+is written when the result is.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import functools
+import itertools
+import json
+import multiprocessing
+import os
+import platform
+import queue
+import re
+import signal
+import tempfile
+import threading
+import time
+from collections import deque
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from concurrent.futures import Executor, Future, ProcessPoolExecutor
+from concurrent.futures.process import BrokenProcessPool
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from lidarspec._version import __version__
+from lidarspec.device.file_scans import FileScans
+from lidarspec.discovery.detect import detected
+from lidarspec.errors import LidarSpecError, SourceError, UsageError, WireError, library, suggest, system_errors
+from lidarspec.formats import format_of, write
+from lidarspec.formats.tables import tables
+from lidarspec.plugins import sensor as named_sensor
+from lidarspec.scans.scans import Scan
+from lidarspec.scans.selection import EVERYTHING, Selection, Sieve
+from lidarspec.spec.sensor import Sensor
+from lidarspec.stores import digest, file_of, files_in, found, is_stored, plain, put, stamp, take_away
+
+#: bytes of a piece that is written to a file, and of one that is a partition in memory.
+PIECE, PARTITION = 256_000_000, 32_000_000
+MANIFEST = "manifest.jsonl"
+#: tasks handed to an executor at a time, and seconds between two writings of a manifest that cannot be appended to.
+AHEAD, PERIOD = 1000, 2.0
+VERSIONS = {"lidarspec": __version__, "numpy": np.__version__, "python": platform.python_version()}
+
+Record = dict[str, Any]
+
+
+@dataclass(frozen=True)
+class Piece:
+    """Some scans of a file, and where they go.
+
+    Attributes:
+        source: path or URL of the file.
+        sensor, options: whose, by name, with what it is configured with; "" where it is to be found out.
+        target: the file that all scans would go to; a piece has its number in the name. "" for none.
+        every_point: whether points without a valid return count.
+        size: bytes of a piece.
+        select: what is wanted of its scans; by their times and numbers, of a file in one piece.
+        number, first: which piece it is, and the number of its first scan.
+        count: how many scans it has; None for all that follow.
+        bookmark: where it begins, None for the beginning of the file.
+        is_last: whether none follows.
+    """
+
+    source: str
+    sensor: str
+    options: Mapping[str, Any]
+    target: str
+    every_point: bool
+    size: int
+    select: Selection = EVERYTHING
+    number: int = 0
+    first: int = 0
+    count: int | None = None
+    bookmark: bytes | None = field(default=None, repr=False)
+    is_last: bool = True
+
+    @property
+    def output(self) -> str:
+        """The file that it goes to."""
+        if not self.number and self.is_last:
+            return self.target
+        suffix = format_of(self.target).suffix
+        return f"{self.target.removesuffix(suffix)}-{self.number:05d}{suffix}"
+
+    @property
+    def asked(self) -> Record:
+        """What its result depends on, besides the file and which piece of it this is."""
+        options = {name: str(value) for name, value in self.options.items()}
+        select = {name: str(value) for name, value in vars(self.select).items() if value != getattr(Selection, name)}
+        how = {"options": options, "select": select, "every_point": self.every_point, "piece_size": self.size}
+        return {"asked": self.sensor, **how, "target": self.target}
+
+    def opened(self) -> FileScans:
+        """The file, from where the piece begins."""
+        named = _configured(self.sensor, tuple(self.options.items())) if self.sensor else detected(self.source)
+        return FileScans(self.source, named, self.bookmark)
+
+    def record(self, **more: Any) -> Record:
+        """What the manifest says of it."""
+        return {"source": self.source, "piece": self.number, "last": self.is_last, **self.asked, "versions": VERSIONS, **more}
+
+    def failed(self, error: Exception) -> Record:
+        """What the manifest says where it was not to be made."""
+        return self.record(error=str(error) if isinstance(error, LidarSpecError) else f"{type(error).__name__}: {error}")
+
+    def numbered(self, scans: FileScans) -> Iterator[Scan]:
+        """What is wanted of its scans, with their numbers in the file."""
+        sieve = Sieve(self.select, self.source)
+        for number, scan in enumerate(itertools.islice(scans, self.count), self.first):
+            if (wanted := sieve.take(scan)) is not None:
+                yield replace(wanted, number=number)
+            if sieve.ended:
+                break
+        if sieve.is_empty:
+            raise sieve.missing()
+
+
+@functools.lru_cache(maxsize=64)
+def _configured(name: str, options: tuple[tuple[str, Any], ...]) -> Sensor:
+    """One for all files, since what is compiled for it is kept with it."""
+    known = named_sensor(name)
+    configured: Sensor = known.configure(**dict(options)) if options else known
+    return configured
+
+
+def survey(piece: Piece) -> list[Piece]:
+    """The piece, with the number of its scans, and what follows it, if anything does."""
+    with piece.opened() as scans:
+        count, bookmark = scans.survey(piece.size)
+    if bookmark is None:
+        return [replace(piece, count=count, is_last=True)]
+    following = replace(piece, number=piece.number + 1, first=piece.first + count, bookmark=bookmark)
+    return [replace(piece, count=count, is_last=False), following]
+
+
+def converted(piece: Piece) -> Record:
+    """What the manifest says of a piece, once its points are written, or it has failed."""
+    counts: Record = {"first_scan": piece.first, "scans": 0, "points": 0}
+    try:
+        about = {**stamp(piece.source), "digest": digest(piece.source)}
+        with piece.opened() as scans:
+            counted = _counted(piece, piece.numbered(scans), counts)
+            first = next(counted, None)
+            if first is None and piece.is_last and not piece.first:
+                raise WireError(f"no scan in {piece.source}: {scans.stats}")
+            if first is not None:
+                _write(piece, itertools.chain([first], counted))
+            return piece.record(**about, **counts, output=piece.output if first is not None else None, warnings=scans.warnings)
+    except Exception as error:  # of whatever kind: the others go on
+        return piece.failed(error)
+
+
+def _counted(piece: Piece, scans: Iterator[Scan], counts: Record) -> Iterator[Scan]:
+    for scan in scans:
+        counts["scans"] += 1
+        counts["points"] += len(scan) if piece.every_point else int(scan.points.valid.sum())
+        yield scan
+
+
+def _write(piece: Piece, scans: Iterable[Scan]) -> None:
+    """Write scans to where the piece goes, which appears whole."""
+    if not is_stored(piece.output):
+        with system_errors(piece.output):
+            Path(piece.output).parent.mkdir(parents=True, exist_ok=True)
+        write(piece.output, scans, every_point=piece.every_point)
+        return
+    with tempfile.TemporaryDirectory() as folder:
+        local = Path(folder) / piece.output.rpartition("/")[2]
+        write(local, scans, every_point=piece.every_point)
+        put(local, piece.output)
+
+
+def pieces(
+    sources: Sequence[str], sensor: str | Sensor | None, *, folder: str = "", to: str = "", every_point: bool, size: int, select: Selection
+) -> list[Piece]:
+    """The files of some paths, patterns and URLs, each as one piece.
+
+    Raises:
+        SourceError: where there is none.
+        UsageError: where two results would have one name.
+    """
+    name, options = (sensor.id, dict(sensor.options)) if isinstance(sensor, Sensor) else (sensor or "", {})
+    made: dict[str, Piece] = {}
+    for source, below in (pair for pattern in sources for pair in found(str(pattern))):
+        target = f"{folder.rstrip('/')}/{below.rpartition('.')[0] or below}.{to}" if to else source
+        if target in made and made[target].source != source:
+            raise UsageError(f"{made[target].source} and {source} would both become {target}: convert them to two folders")
+        made[target] = Piece(source, name, options, target if to else "", every_point, size, select)
+    return list(made.values())
+
+
+class Manifest:
+    """What is known of the pieces that were written into a folder, by this run and those before.
+
+    Args:
+        folder: path or URL.
+
+    Raises:
+        SourceError: where the folder cannot be written to.
+
+    Attributes:
+        is_new: whether nothing was written into the folder before.
+    """
+
+    def __init__(self, folder: str) -> None:
+        self.path = f"{folder.rstrip('/')}/{MANIFEST}"
+        self._records: dict[tuple[str, str], dict[int, Record]] = {}
+        self._lines, self._due = list[str](), 0.0
+        self._is_stored = is_stored(folder)
+        with contextlib.suppress(SourceError), contextlib.closing(file_of(self.path)) as file:
+            self._lines = [line for line in file.read().decode(errors="replace").splitlines() if self._known(line)]
+        self._outputs = files_in(folder)
+        self.is_new = not self.has(self.path)
+        if not self._is_stored:
+            with system_errors(self.path):
+                Path(folder).mkdir(parents=True, exist_ok=True)
+                self._file = open(self.path, "a", encoding="utf-8")  # noqa: SIM115  closed by `close`
+                if self._file.tell():  # lest a line that was cut off take the next one with it
+                    self._file.write("\n")
+
+    def _known(self, line: str) -> bool:
+        """Whether a line is whole, which is then remembered."""
+        try:
+            record = json.loads(line)
+            self._records.setdefault((record["source"], record["target"]), {})[record["piece"]] = record
+        except (ValueError, KeyError, TypeError):
+            return False
+        return True
+
+    def has(self, path: str) -> bool:
+        """Whether a file was in the folder at the beginning."""
+        return plain(path) in self._outputs
+
+    def done(self, piece: Piece) -> Record | None:
+        """What was said of a piece that need not be made again."""
+        record = self._records.get((piece.source, piece.target), {}).get(piece.number)
+        if record is None or "error" in record or any(record.get(name) != value for name, value in piece.asked.items()):
+            return None
+        is_there = record["output"] is None or self.has(record["output"])
+        return record if is_there and self._is_same(piece.source, record) else None
+
+    def _is_same(self, source: str, record: Record) -> bool:
+        """Whether a file is the one that a record is of."""
+        now = stamp(source)
+        return bool(now["size"] == record["size"] and (now["modified"] == record["modified"] or digest(source) == record["digest"]))
+
+    def finished(self, piece: Piece) -> list[Record]:
+        """What was said of all pieces of a file, none where one is missing."""
+        records = list[Record]()
+        for number in itertools.count():
+            if (record := self.done(replace(piece, number=number))) is None:
+                return []
+            records.append(record)
+            if record["last"]:
+                return records
+        return []
+
+    def clear(self, piece: Piece) -> None:
+        """Take away what was made of a file that has changed since, or is made in another way now."""
+        for number, record in self._records.get((piece.source, piece.target), {}).items():
+            output = record.get("output")
+            if output and self.has(output) and self.done(replace(piece, number=number)) is None:
+                take_away(output)
+
+    def add(self, record: Record) -> None:
+        """Write down what became of a piece."""
+        line = json.dumps(record)
+        if self._is_stored:
+            self._lines.append(line)
+            if (now := time.monotonic()) >= self._due:
+                self._due = now + PERIOD
+                self._put()
+            return
+        self._file.write(f"{line}\n")
+        self._file.flush()
+
+    def close(self) -> None:
+        """Write what has not been written."""
+        if self._is_stored:
+            self._put()
+        else:
+            self._file.close()
+
+    def _put(self) -> None:
+        with tempfile.TemporaryDirectory() as folder:
+            local = Path(folder) / MANIFEST
+            local.write_text("".join(f"{line}\n" for line in self._lines), encoding="utf-8")
+            put(local, self.path)
+
+
+class _Here(Executor):
+    """Runs each task in this process when it is handed over."""
+
+    def submit(self, fn: Callable[..., Any], /, *args: Any, **kwargs: Any) -> Future[Any]:
+        """What the task gives, which is there already."""
+        future: Future[Any] = Future()
+        try:
+            future.set_result(fn(*args, **kwargs))
+        except Exception as error:
+            future.set_exception(error)
+        return future
+
+
+def _begin() -> None:
+    """A worker ends with the process that it works for, however that ends, and without a word where the user ends both."""
+    signal.signal(signal.SIGINT, signal.SIG_DFL)
+    parent = multiprocessing.parent_process()
+    assert parent is not None
+
+    def wait() -> None:
+        parent.join()
+        os._exit(1)
+
+    threading.Thread(target=wait, daemon=True).start()
+
+
+@contextlib.contextmanager
+def _executor(jobs: int, scheduler: str) -> Iterator[Executor]:
+    """What runs tasks: this process, others of this computer, or the workers of a Dask cluster.
+
+    Raises:
+        UsageError: where Dask is not installed.
+        SourceError: where the scheduler cannot be reached.
+    """
+    if scheduler:
+        distributed = library("distributed", "dask")
+        try:
+            client = distributed.Client(scheduler)
+        except (OSError, ValueError) as error:
+            raise suggest(SourceError(f"{scheduler}: no Dask scheduler answers: {error}"), "dask scheduler") from error
+        with client, client.get_executor(pure=False) as executor:
+            yield executor
+    elif jobs == 1:
+        yield _Here()
+    else:
+        context = multiprocessing.get_context("forkserver" if "forkserver" in multiprocessing.get_all_start_methods() else "spawn")
+        context.set_forkserver_preload([__name__])
+        with ProcessPoolExecutor(jobs, context, initializer=_begin) as executor:
+            try:
+                yield executor
+            except BaseException:
+                executor.shutdown(cancel_futures=True)
+                raise
+
+
+def convert(
+    sources: Sequence[str],
+    folder: str,
+    to: str,
+    sensor: str | Sensor | None = None,
+    *,
+    jobs: int = 1,
+    scheduler: str = "",
+    every_point: bool = False,
+    select: Selection = EVERYTHING,
+    size: int = PIECE,
+    force: bool = False,
+) -> Iterator[tuple[Record, bool]]:
+    """Write the points of many files into a folder: what the manifest says of each piece, as it is done, and whether it was done before.
+
+    What fails is said in the "error" of its record, and stops nothing else.
+
+    Args:
+        sources: paths, patterns such as "drives/**/*.pcap", and URLs of fsspec.
+        folder: path or URL; the files in it are named as those that they are of, below the fixed part of the pattern.
+        to: the suffix of a format, "parquet".
+        sensor: as in `lidarspec.open`; found out for each file where left out.
+        jobs: how many processes of this computer work.
+        scheduler: the address of a Dask scheduler, whose workers do it instead; sources and folder have to be theirs too.
+        every_point: also the points without a valid return.
+        select: what is wanted of the scans of each file; by times and numbers, the file is not cut.
+        size: bytes of a piece; a larger file gives several files of points.
+        force: what was done before is done again.
+
+    Raises:
+        SourceError: where there is no such source, the folder cannot be written to, the scheduler not be reached, or a worker was killed.
+        UsageError: for a format that is none, and where a library is missing.
+    """
+    format_of(f"x.{to}")
+    todo = pieces(sources, sensor, folder=folder, to=to, every_point=every_point, size=size, select=select)
+    with contextlib.closing(Manifest(folder)) as manifest:
+        _try(to)
+        if taken := [piece.target for piece in todo if manifest.is_new and not force and manifest.has(piece.target)]:
+            error = UsageError(f"{taken[0]} exists already, and no {MANIFEST} says of what it was made; it is not overwritten")
+            raise suggest(error, "the same with --force, or into another folder")
+        if not force:
+            known = {piece.source: manifest.finished(piece) for piece in todo}
+            yield from ((record, True) for records in known.values() for record in records)
+            todo = [piece for piece in todo if not known[piece.source]]
+        for piece in todo:
+            manifest.clear(piece)
+        with _swept(folder, to), _executor(jobs, scheduler) as executor:
+            for record, is_old in _run(executor, todo, (lambda _: None) if force else manifest.done):
+                if not is_old:
+                    manifest.add(record)
+                yield record, is_old
+
+
+def _run(executor: Executor, todo: Iterable[Piece], done: Callable[[Piece], Record | None]) -> Iterator[tuple[Record, bool]]:
+    """What became of each piece, as it is done; those of which something is known already are not made again."""
+    ended = queue.SimpleQueue[tuple[Piece, Future[Any]]]()
+    tasks, running = deque((survey if _is_large(piece) else converted, piece) for piece in todo), 0
+    ahead = 1 if isinstance(executor, _Here) else AHEAD
+
+    def hand_over(function: Callable[[Piece], Any], piece: Piece) -> None:
+        executor.submit(function, piece).add_done_callback(lambda future: ended.put((piece, future)))
+
+    while tasks or running:
+        while tasks and running < ahead:
+            hand_over(*tasks.popleft())
+            running += 1
+        piece, future = ended.get()
+        running -= 1
+        try:
+            result = future.result()
+        except BrokenProcessPool:
+            error = SourceError("a worker process was killed, maybe for want of memory; what it was at is not written")
+            raise suggest(error, "the same again, which goes on where this ended") from None
+        except Exception as failure:  # of a survey, or a worker of Dask that died again and again
+            result = piece.failed(failure)
+        if isinstance(result, dict):
+            yield result, False
+            continue
+        tasks.extendleft((survey, following) for following in result[1:])
+        if (record := done(result[0])) is None:
+            tasks.appendleft((converted, result[0]))
+        else:
+            yield record, True
+
+
+def _is_large(piece: Piece) -> bool:
+    """Whether a file is larger than a piece, and is cut; what cannot be looked at is not."""
+    if piece.select.is_counted:
+        return False
+    with contextlib.suppress(LidarSpecError):
+        return bool(stamp(piece.source)["size"] > piece.size)
+    return False
+
+
+def _try(to: str) -> None:
+    """Write nothing in a format, which tells whether its library is there, before any file is read."""
+    with tempfile.TemporaryDirectory() as place, contextlib.suppress(ValueError, IndexError):
+        write(Path(place) / f"none.{to}", [])
+
+
+@contextlib.contextmanager
+def _swept(folder: str, to: str) -> Iterator[None]:
+    """A folder in which, before and after, nothing is left that a process was writing when it was killed."""
+
+    def sweep() -> None:
+        for path in () if is_stored(folder) else Path(folder).rglob(f".*.{to}"):
+            if re.match(r"\.\d+\.", path.name):
+                take_away(path)
+
+    sweep()
+    try:
+        yield
+    finally:
+        sweep()
+
+
+def read(
+    urls: str | Sequence[str],
+    sensor: str | Sensor | None = None,
+    *,
+    every_point: bool = False,
+    select: Selection = EVERYTHING,
+    size: int = PARTITION,
+) -> Any:
+    """The points of many files as a Dask dataframe, a partition for each piece, whose columns are those of a Parquet file.
+
+    A file that is larger than a piece is passed over once at this call, without making its points; the rest waits until it is asked for.
+
+    Args:
+        urls: paths, patterns such as "s3://bucket/drives/**/*.pcap", and URLs of fsspec.
+        sensor: as in `lidarspec.open`; found out for each file where left out.
+        every_point: also the points without a valid return.
+        select: as in `convert`.
+        size: bytes of a piece; its points take ten times as many, about.
+
+    Raises:
+        SourceError: where there is no such file.
+        UsageError: where a library is missing.
+    """
+    dask, frames = library("dask", "dask"), library("dask.dataframe", "dask")
+    library("pyarrow", "arrow")
+    todo = pieces([urls] if isinstance(urls, str) else urls, sensor, every_point=every_point, size=size, select=select)
+    found = dask.compute(*(dask.delayed(_cut)(piece) for piece in todo))
+    cut = [piece for pieces in found for piece in pieces if piece.count != 0 or not piece.number]
+    return frames.from_map(_partition, cut, meta=_partition(replace(cut[0], count=1)).iloc[:0])
+
+
+def _cut(piece: Piece) -> list[Piece]:
+    """All pieces of a file."""
+    if not _is_large(piece):
+        return [piece]
+    found, following = list[Piece](), [piece]
+    while following:
+        first, *following = survey(following[0])
+        found.append(first)
+    return found
+
+
+def _partition(piece: Piece) -> Any:
+    """The points of a piece as a pandas dataframe."""
+    with piece.opened() as scans:
+        made = tables(piece.numbered(scans), every_point=piece.every_point)
+        table = library("pyarrow", "arrow").concat_tables(made)
+        if not table.num_rows and piece.is_last and not piece.first:
+            raise WireError(f"no scan in {piece.source}: {scans.stats}")
+    return table.to_pandas()

@@ -1,0 +1,227 @@
+"""The scans of a file in one pass that can be left at a bookmark, behind which another process goes on.
+
+What comes behind a place of a file depends on what was before it: bytes of a frame that has begun, frames that hold state, the turns that
+the clock has made, the counter, packets that wait for others, which way the angle turns. A bookmark is all of this, pickled, so that the
+scans behind it are, bit for bit, those of one pass. What no byte changes stands in it by its name: the sensor's functions, structs and
+rules, which could not be pickled, are those of the sensor that goes on.
+
+A scan belongs to whoever saw its beginning: behind a bookmark the one under way is left out, and before it is read to its end.
+"""
+
+from __future__ import annotations
+
+import io
+import pickle
+import struct
+from collections.abc import Iterator, Mapping
+from dataclasses import fields, is_dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from lidarspec.columns.columns import AROUND
+from lidarspec.device.arrivals import FileInput
+from lidarspec.device.device import PacketReader
+from lidarspec.errors import UsageError
+from lidarspec.framing.decoder import Decoder
+from lidarspec.framing.frame_engine import RecodedCodec, codec
+from lidarspec.framing.results import Counters
+from lidarspec.packets.packets import Packets, StateOf
+from lidarspec.scans.scans import Scan, ScanStream
+from lidarspec.spec.description import Spec
+from lidarspec.spec.sensor import Sensor
+from lidarspec.transports.files import CaptureTransport, FileTransport
+from lidarspec.transports.open_url import transport
+from lidarspec.transports.protocol import Closing, LiveTransport
+from lidarspec.wire.frame_table import Records, Rows, Table
+
+#: what is pickled as it is.
+_PLAIN = (bool, int, float, str, bytes, type(None), type)
+
+
+class FileScans(Closing):
+    """The scans of a file: an iterator, which `survey` passes over quickly.
+
+    Args:
+        source: the file.
+        sensor: whose.
+        bookmark: where to begin: what `survey` gave for the same file and sensor.
+
+    Raises:
+        UsageError: for a source that is no file.
+        SourceError: where it cannot be read.
+    """
+
+    def __init__(self, source: str | Path, sensor: Sensor, bookmark: bytes | None = None) -> None:
+        opened = transport(source, sensor)
+        if isinstance(opened, LiveTransport):
+            opened.close()
+            raise UsageError(f"{source} is no file")
+        self._sensor, self._transport = sensor, opened
+        try:
+            self._input = FileInput(source, sensor, opened, backend="auto")
+            if bookmark is None:
+                self._reader = PacketReader(sensor, None, self._input.decoder, self._input.first_state())
+                self._stream = self._scan_stream()
+            else:
+                self._go_on(bookmark)
+        except BaseException:
+            opened.close()
+            raise
+
+    @property
+    def stats(self) -> Counters:
+        """The counters of everything up to here, of what is before the bookmark too."""
+        return self._input.stats
+
+    @property
+    def warnings(self) -> list[str]:
+        """What is to be said about the file."""
+        return self._input.warnings
+
+    def __iter__(self) -> Iterator[Scan]:
+        while (scans := self._next()) is not None:
+            yield from scans
+        yield from self._stream.finish()
+
+    def survey(self, size: int) -> tuple[int, bytes | None]:
+        """How many scans begin in the next piece of the file, and a bookmark behind it; None where the file ends, or none can be set.
+
+        Args:
+            size: bytes of the piece, at least.
+        """
+        number, end = 0, self._place + size
+        while (scans := self._next()) is not None:
+            number += sum(1 for _ in scans)
+            if self._place >= end and (bookmark := self._bookmark()) is not None:
+                return number + self._stream.is_under_way, bookmark
+        return number + len(self._stream.finish()), None
+
+    def close(self) -> None:
+        """Close the file."""
+        self._input.close()
+
+    def _next(self) -> Iterator[Scan] | None:
+        """The scans that the next bytes complete; None at the end."""
+        arrival = self._input.next(0)
+        return None if arrival is None else self._scans(arrival)
+
+    def _scans(self, arrival: Any) -> Iterator[Scan]:
+        yield from self._reader.scans(self._stream, arrival)
+        if arrival.interrupted:
+            self._stream = self._scan_stream()
+
+    def _scan_stream(self) -> ScanStream:
+        return ScanStream(self._sensor, imu=self._reader.imu.waiting)
+
+    @property
+    def _place(self) -> int:
+        """How much of the file has been read, about."""
+        reader = self._transport.reader if isinstance(self._transport, CaptureTransport) else None
+        return self._input.decoder.stats.bytes_in if reader is None else reader.place
+
+    def _bookmark(self) -> bytes | None:
+        """What has to be known to go on from here; None where that cannot be said, or the file not be sought."""
+        opened = self._transport
+        if not isinstance(opened, FileTransport) or not opened.can_go_on:
+            return None
+        reader = opened.reader if isinstance(opened, CaptureTransport) else None
+        state = (self._input.decoder, self._input.senders, reader, self._reader, self._stream)
+        content = io.BytesIO()
+        try:
+            _Writer(content, self._sensor, self._input.decoder, opened.file).dump(state)
+        except (pickle.PicklingError, TypeError, AttributeError):
+            return None
+        return content.getvalue()
+
+    def _go_on(self, bookmark: bytes) -> None:
+        opened = self._transport
+        assert isinstance(opened, FileTransport)
+        loaded = _Loader(io.BytesIO(bookmark), self._sensor, self._input.decoder, opened.file).load()
+        self._input.decoder, self._input.senders, reader, self._reader, self._stream = loaded
+        if isinstance(opened, CaptureTransport):
+            opened.reader = reader
+        else:
+            opened.file.seek(self._input.decoder.stats.bytes_in)
+
+
+def _constants(sensor: Spec, decoder: Decoder) -> dict[tuple[Any, ...], Any]:
+    """What no byte changes, by name: all that a sensor holds, and what is made of it alone."""
+    found, interpreted = dict[tuple[Any, ...], Any](), decoder.backend == "construct"
+    _walk(sensor, (), found, set())
+    codecs = {("codec", name): codec(frame, interpreted=interpreted) for name, frame in sensor.frames.items()}
+    return {**found, **codecs, ("framing",): decoder.framing}
+
+
+def _walk(value: Any, name: tuple[Any, ...], found: dict[tuple[Any, ...], Any], seen: set[int]) -> None:
+    """Add a value and all that it holds to what was found, each under the names that lead there."""
+    if isinstance(value, _PLAIN) or id(value) in seen:
+        return
+    found[name] = value
+    seen.add(id(value))
+    parts: Mapping[Any, Any] = {}
+    if is_dataclass(value):
+        parts = {field.name: getattr(value, field.name) for field in fields(value)}
+    elif isinstance(value, Mapping):
+        parts = value
+    elif isinstance(value, tuple | list):
+        parts = dict(enumerate(value))
+    for key, part in parts.items():
+        _walk(part, (*name, key), found, seen)
+
+
+class _Writer(pickle.Pickler):
+    """Pickles what a reader remembers."""
+
+    def __init__(self, file: io.BytesIO, sensor: Sensor, decoder: Decoder, source: Any) -> None:
+        super().__init__(file, protocol=pickle.HIGHEST_PROTOCOL)
+        self._constants = _constants(sensor, decoder)
+        self._names = {id(value): name for name, value in self._constants.items()} | {id(source): ("file",)}
+        self._frames = {id(codec(frame).schema): name for name, frame in sensor.frames.items()}
+
+    def persistent_id(self, obj: Any) -> Any:
+        """The name of what is not pickled; of a sensor that reads its time from another clock, that of the clock."""
+        name = self._names.get(id(obj))
+        if name is None and isinstance(obj, Spec):
+            return ("clock", self._names[id(obj.clock)])
+        return name
+
+    def reducer_override(self, obj: Any) -> Any:
+        """Tables as the bytes of their frames, and with packets no more of other frames than belongs to them."""
+        if isinstance(obj, Rows | Records):
+            if id(obj.schema) not in self._frames:
+                raise pickle.PicklingError("parts of frames, whose layout is in what is around them")
+            return _table, (self._constants[()], self._frames[id(obj.schema)], [obj.frame(index) for index in range(len(obj))])
+        if isinstance(obj, Packets):
+            if AROUND in obj.state:
+                raise pickle.PicklingError("parts of frames")
+            state = {name: _of_these(*of) for name, of in obj.state.items()}
+            return object.__new__, (Packets,), {**vars(obj), "state": state, "_index": obj.index}
+        return (struct.Struct, (obj.format,)) if isinstance(obj, struct.Struct) else NotImplemented
+
+
+class _Loader(pickle.Unpickler):
+    """Unpickles what a reader remembered, for the same sensor."""
+
+    def __init__(self, file: io.BytesIO, sensor: Sensor, decoder: Decoder, source: Any) -> None:
+        super().__init__(file)
+        self._constants = {**_constants(sensor, decoder), ("file",): source}
+
+    def persistent_load(self, name: Any) -> Any:
+        if name[0:1] == ("clock",) and name not in self._constants:
+            return replace(self._constants[()], clock=self._constants[name[1]])
+        return self._constants[name]
+
+
+def _table(sensor: Sensor, frame: str, frames: list[bytes]) -> Table:
+    known = codec(sensor.frames[frame])
+    return (known.engine if isinstance(known, RecodedCodec) else known).table(frames)  # of which they are the rows
+
+
+def _of_these(table: Table | None, which: Any) -> StateOf:
+    """The frames of another type that some packets have before them, and which: none that is nobody's."""
+    rows = np.unique(which[which >= 0])
+    if table is None or not len(rows):
+        return None, which
+    return table.take(rows), np.where(which < 0, -1, np.searchsorted(rows, which))

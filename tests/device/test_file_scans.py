@@ -1,0 +1,129 @@
+"""The pieces of a file have the scans of one pass, bit for bit, whatever sensor it is of and however often it is cut."""
+
+from __future__ import annotations
+
+import itertools
+import random
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import lidarspec as ls
+import lidarspec.captures.bulk
+import lidarspec.device.arrivals
+import lidarspec.transports.files
+from lidarspec.captures.pcap import Datagram, datagram_record
+from lidarspec.device.file_scans import FileScans
+from lidarspec.errors import UsageError
+from tests.all_sensors import EVERY
+from tests.made_captures import DESTINATION, SOURCE, pcap_head
+
+#: they differ in what they remember: data in parts, an IMU, calibration in other frames, look-ahead, text, messages of several datagrams.
+NAMES = [
+    "cepton-vista",
+    "hesai-jt16",
+    "hesai-pandar40p",
+    "hokuyo-urg04lx",
+    "hokuyo-utm30lxew",
+    "ldrobot-stl27l",
+    "livox-mid360",
+    "ouster-os1",
+    "robosense-bpearl",
+    "robosense-m1",
+    "seyond-falcon",
+    "shape-tokens",
+    "sick-multiscan136",
+    "ti-iwr6843",
+    "velodyne-hdl64e-s3",
+    "velodyne-vlp16",
+    "ydlidar-g4",
+]
+
+
+def made(sensor: ls.Sensor, path: Path, *, most: int = 120_000, longest: int = 900) -> None:
+    """A file of frames, some lost, doubled, late or damaged, with frames of all other types and noise between them."""
+    chance, frames = random.Random(3), list[bytes]()
+    others = [sensor.example(name) for name, frame in sensor.incoming.items() if not frame.data]
+    if sensor.state:  # a calibration that is not the nominal one, and another each time
+        others = [frame[:300] + chance.randbytes(600) + frame[900:] for frame in others for _ in range(5)]
+    for frame in itertools.chain.from_iterable(ls.simulate(sensor, 500, start=start) for start in itertools.count(0, 500)):
+        what = chance.random()
+        if what < 0.01:
+            continue
+        if what < 0.02:
+            frames.insert(max(len(frames) - 1, 0), frame)
+        frames.append(frame if what < 0.995 else frame[:-3] + chance.randbytes(3))
+        if others and len(frames) % 37 == 5:
+            frames.append(others[len(frames) // 37 % len(others)])
+        if len(frames) >= longest or sum(map(len, frames[-50:])) * len(frames) / 50 > most:
+            break
+    if sensor.datagrams:
+        times = itertools.count(1_700_000_000 * 10**9, 1_000_000)
+        records = (datagram_record(Datagram(frame, at, SOURCE, DESTINATION)) for frame, at in zip(frames, times, strict=False))
+        path.write_bytes(pcap_head() + b"".join(records))
+    else:
+        path.write_bytes(b"".join(frame + chance.randbytes(chance.randrange(90) * (chance.random() < 0.01)) for frame in frames))
+
+
+def told(scan: ls.Scan) -> list[object]:
+    """All that a scan says, as bytes."""
+    columns = [(name, np.ascontiguousarray(column).tobytes()) for name, column in scan.points.columns.items()]
+    felt = [] if scan.imu is None else [scan.imu.time_ns.tobytes(), scan.imu.angular_velocity.tobytes()]
+    return [columns, felt, scan.stamp_ns, scan.complete, scan.whole, repr(scan.rate_hz)]
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_pieces_have_the_scans_of_one_pass(name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    for module, size in ((lidarspec.captures.bulk.CaptureBatches, "largest"), (lidarspec.transports.files, "BLOCK")):
+        monkeypatch.setattr(module, size, 1 << 13)
+    monkeypatch.setattr(lidarspec.device.arrivals, "BATCH_BYTES", 1 << 13)
+    sensor, path = EVERY[name], tmp_path / ("made.pcap" if EVERY[name].datagrams else "made.bin")
+    made(sensor, path)
+    with ls.open(path, sensor) as device:
+        whole = [told(scan) for scan in device.scans()]
+    bookmark, pieces, cuts = None, list[list[object]](), 0
+    while True:
+        with FileScans(path, sensor, bookmark) as piece:
+            number, following = piece.survey(path.stat().st_size // 6)
+        with FileScans(path, sensor, bookmark) as piece:
+            pieces += [told(scan) for scan in itertools.islice(piece, None if following is None else number)]
+        if following is None:
+            break
+        bookmark, cuts = following, cuts + 1
+        assert len(bookmark) < 100_000
+    assert len(pieces) == len(whole)
+    assert pieces == whole
+    assert cuts >= 2
+
+
+def test_another_process_goes_on_behind_a_bookmark(tmp_path: Path) -> None:
+    name, path, mark = "velodyne-vlp16", tmp_path / "made.pcap", tmp_path / "mark"
+    sensor = ls.sensor(name)
+    made(sensor, path, most=9_000_000)
+    with FileScans(path, sensor) as piece:
+        number, bookmark = piece.survey(1)
+    assert bookmark is not None
+    mark.write_bytes(bookmark)
+    with ls.open(path, sensor) as device:
+        stamps = [scan.stamp_ns for scan in itertools.islice(device.scans(), number, None)]
+    code = (
+        "import sys, lidarspec as ls; from pathlib import Path; from lidarspec.device.file_scans import FileScans;"
+        "print([s.stamp_ns for s in FileScans(sys.argv[1], ls.sensor(sys.argv[2]), Path(sys.argv[3]).read_bytes())])"
+    )
+    done = subprocess.run([sys.executable, "-c", code, path, name, mark], capture_output=True, text=True, check=True)
+    assert done.stdout.strip() == str(stamps)
+
+
+def test_a_file_that_cannot_be_sought_is_one_piece(tmp_path: Path) -> None:
+    sensor, path = ls.sensor("ldrobot-stl27l"), tmp_path / "made.hex"
+    path.write_text(b"".join(ls.simulate(sensor, 400)).hex())
+    with FileScans(path, sensor) as piece:
+        number, bookmark = piece.survey(1)
+    with ls.open(path, sensor) as device:
+        assert number == sum(1 for _ in device.scans())
+    assert bookmark is None
+    with pytest.raises(UsageError, match="is no file"):
+        FileScans("sim:ldrobot-stl27l", sensor)
