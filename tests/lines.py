@@ -40,6 +40,13 @@ class Port:
     def send(self, data: bytes) -> None:
         os.write(self._master, data)
 
+    def offer(self, data: bytes) -> None:
+        """Send what there is room for; the rest is lost, as on a line where nobody listens."""
+        os.set_blocking(self._master, False)
+        with contextlib.suppress(BlockingIOError):
+            os.write(self._master, data)
+        os.set_blocking(self._master, True)
+
     def discard(self) -> None:
         """Throw away what was sent and nobody read; a sender that waits for room has it."""
         termios.tcflush(self._slave, termios.TCIFLUSH)

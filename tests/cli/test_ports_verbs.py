@@ -209,7 +209,7 @@ class TestDoctor:
 
     def test_bytes_of_nobody(self, tmp_path: Path) -> None:
         source = random.Random(8)
-        with port(tmp_path) as made, working(lambda stop: paced(made.send, [source.randbytes(90) for _ in range(40)], 200, stop)):
+        with port(tmp_path) as made, working(lambda stop: paced(made.offer, [source.randbytes(90) for _ in range(40)], 200, stop)):
             found = ran("doctor", made.name, "-t", "300ms", code=1).stdout
         assert "no frame of an installed sensor" in found
         assert f"next: lidarspec detect {made.name}" in found
