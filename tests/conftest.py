@@ -43,10 +43,10 @@ def _alone(tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:
         yield
 
 
-@pytest.fixture(autouse=True, scope="session")
+@pytest.fixture(autouse=True, scope="module")
 def _kept() -> None:
-    """What stands when the first test begins stays to the end: the garbage collector need not go through it again and again."""
-    gc.collect()
+    """What stands when a module's first test begins stays: the garbage collector need not go through it again and again."""
+    gc.collect(1)
     gc.freeze()
 
 

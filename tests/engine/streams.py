@@ -110,4 +110,3 @@ def peak(task: Callable[[], object]) -> int:
         return tracemalloc.get_traced_memory()[1] - before
     finally:
         tracemalloc.stop()
-        gc.unfreeze()
