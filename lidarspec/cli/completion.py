@@ -132,6 +132,12 @@ def _columns(ctx: click.Context, incomplete: str) -> Iterable[str]:
     return ("range", "intensity")
 
 
+def _formats(ctx: click.Context, incomplete: str) -> Iterable[str]:
+    from lidarspec.formats import formats  # which brings NumPy
+
+    return [suffix.removeprefix(".") for suffix in formats()]
+
+
 def _files(ctx: click.Context, incomplete: str) -> Iterable[str]:
     return ()
 
@@ -147,17 +153,19 @@ def _either(ctx: click.Context, incomplete: str) -> Iterable[str]:
 
 
 #: what is all that there can be; elsewhere files can stand as well.
-LISTED = (_frames, _commands, _assignments, _verbs, _columns)
+LISTED = (_frames, _commands, _assignments, _verbs, _columns, _formats)
 #: the name of a parameter -> what can stand there.
 BY_NAME: dict[str, Callable[[click.Context, str], Iterable[str]]] = {
     "sensor_id": _sensors,
     "source": _sources,
+    "sources": _sources,
     "frame": _frames,
     "command": _commands,
     "assignments": _assignments,
     "name": _either,
     "verb": _verbs,
     "ramp": _columns,
+    "suffix": _formats,
     **dict.fromkeys(
         ("file", "words", "target", "output", "scene", "vectors", "capture", "into", "diff", "link", "place", "to", "folder"), _files
     ),

@@ -59,7 +59,7 @@ class Written:
 
 
 @click.command()
-@click.argument("sources", metavar="IN...", nargs=-1, required=True)
+@click.argument("sources", metavar="IN...", nargs=-1)
 @click.argument("target", metavar="OUT")
 @sensor_option
 @count_option("scans")
@@ -69,7 +69,7 @@ class Written:
 @click.option("--packets", "with_packets", is_flag=True, help="The packets of IN as well, in a log of ROS, which is a SOURCE then.")
 @click.option("--imu", "is_imu", is_flag=True, help="What the sensor's IMU felt, in place of the points.")
 @click.option("--force", is_flag=True, help="Overwrite OUT; with --to also what was done before.")
-@click.option("--to", metavar="FORMAT", help="Write each IN to a file of this format in the folder OUT, such as parquet.")
+@click.option("--to", "suffix", metavar="FORMAT", help="Write each IN to a file of this format in the folder OUT, such as parquet.")
 @click.option("--jobs", type=click.IntRange(min=1), metavar="N", help="With --to: so many processes.")
 @click.option("--dask", "scheduler", metavar="ADDRESS", help="With --to: the workers of this Dask scheduler.")
 @click.option("--piece", "piece_size", type=BYTES, metavar="SIZE", help="With --to: cut larger files into such pieces.  [default: 256MB]")
@@ -85,7 +85,7 @@ def convert(
     with_packets: bool,
     is_imu: bool,
     force: bool,
-    to: str | None,
+    suffix: str | None,
     jobs: int | None,
     scheduler: str | None,
     piece_size: float | None,
@@ -107,15 +107,17 @@ def convert(
     """
     asked = {"beams": selection.beams, "frame-id": selection.frame_id, "organized": organized, "packets": with_packets}
     for what in (what for what, is_asked in asked.items() if is_asked):
-        check_holds(target if to is None else f"{target}.{to.removeprefix('.')}", what)
-    if to is not None:
+        check_holds(target if suffix is None else f"{target}.{suffix.removeprefix('.')}", what)
+    if not sources:
+        raise UsageError(f"Missing argument 'OUT': where the points of {target} are to go")
+    if suffix is not None:
         if count or is_imu or organized or with_packets:
             raise UsageError("-n, --imu, --organized and --packets are for one file, without --to")
         if jobs and scheduler:
             raise UsageError("--dask has its own workers: leave out --jobs")
         how: dict[str, Any] = {"jobs": jobs or 1, "scheduler": scheduler or "", "size": int(piece_size or batch.PIECE)}
         how |= {"every_point": every_point, "select": selection, "force": force}
-        records = batch.convert(sources, target, to.removeprefix("."), sensor_id, **how)
+        records = batch.convert(sources, target, suffix.removeprefix("."), sensor_id, **how)
         _convert_all(records, target, as_json=as_json)
         return
     if len(sources) > 1 or jobs or scheduler or piece_size:

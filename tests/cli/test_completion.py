@@ -48,6 +48,7 @@ def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
         ("view s", {"sim:", "scans/"}),
         ("view d", {"file d"}),
         ("convert drive.pcap o", {"file o"}),
+        ("convert a.pcap out --to par", {"parquet"}),
         ("plot x.bin --colour ", {"range", "intensity"}),
         ("nonsense fr", set()),
     ],

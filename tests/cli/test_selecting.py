@@ -102,7 +102,7 @@ def test_every_verb_takes_the_same_slice(drive: Path, tmp_path: Path) -> None:
         ("--slice 5s:2016-01-02", "is no slice of time"),
         ("--range 3kg:", "is no span of distances, such as 0.5m:30m"),
         ("--columns x,colour", "unknown name 'colour' (known: azimuth, elevation"),
-        ("--beams 450", ".csv has no place for --beams; those that have are .mcap, .bag"),
+        ("--beams 450", ".csv has no place for --beams; those that have are .mcap, .foxglove.mcap, .bag"),
         ("--organized", ".csv has no place for --organized; those that have are .npz, .npy, .pcd"),
         ("--calibration unit.xml", "name the sensor with -s"),
     ],
