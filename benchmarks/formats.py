@@ -126,10 +126,8 @@ class Spent:
     size: int = 0
 
 
-def process(out: Path, *command: object) -> Spent:
-    """Runs Python with these arguments; what it is to write, and what the last one wrote there, is taken away before."""
-    shutil.rmtree(out.parent, ignore_errors=True)
-    out.parent.mkdir()
+def process(*command: object) -> Spent:
+    """Runs Python with these arguments."""
     line = [sys.executable, "-S", "-c", LAUNCHER, sys.executable, *map(str, command)]
     done = subprocess.run(line, capture_output=True, text=True, check=False)
     if done.returncode:
@@ -187,6 +185,12 @@ def flush(out: Path) -> None:
             os.fsync(opened)
 
 
+def clear(folder: Path) -> None:
+    """Takes away what a run left: removing a large file takes a while that is no part of the next run."""
+    shutil.rmtree(folder, ignore_errors=True)
+    folder.mkdir()
+
+
 def copy(out: Path) -> None:
     """Copies a file or folder beside itself, onto the disk."""
     for number, file in enumerate(list(files(out))):
@@ -204,14 +208,15 @@ class Beside(NamedTuple):
 def written(title: str, out: Path, amount: int, size: int, command: tuple[object, ...], commands: Mapping[str, Beside]) -> Work:
     """A command of lidarspec that writes a file or a folder, beside copying that and beside other commands."""
     spent: dict[str, Spent] = {}
+    clear(out.parent)
 
     def run(name: str, command: tuple[object, ...]) -> None:
-        spent[name] = process(out, *command)
+        spent[name] = process(*command)
 
     def contender(name: str, other: Beside) -> Contender:
         for module in other.modules:
             library(module)
-        return Contender(lambda: run(name, other.command), other.amount)
+        return Contender(lambda: run(name, other.command), other.amount, partial(clear, out.parent))
 
     def after() -> None:
         start = time.perf_counter()
@@ -240,7 +245,7 @@ def written(title: str, out: Path, amount: int, size: int, command: tuple[object
         size,
         lambda backend: partial(run, "ours", ("-m", "lidarspec", "convert", *command)),
         {name: partial(contender, name, other) for name, other in commands.items()},
-        lambda backend: {"copy": Contender(partial(copy, out), amount)},
+        lambda backend: {"copy": Contender(partial(copy, out), amount, partial(clear, out.parent))},
         facts,
         has_backends=False,
         after=after,
