@@ -64,10 +64,11 @@ class Inputs:
     Args:
         folder: where capture files are written.
         quick: make so few frames that a run takes a moment.
+        size: bytes of a capture that is converted.
     """
 
-    def __init__(self, folder: Path, *, quick: bool = False) -> None:
-        self.folder, self.is_quick = folder, quick
+    def __init__(self, folder: Path, *, quick: bool = False, size: int = 0) -> None:
+        self.folder, self.is_quick, self.size = folder, quick, size
         self.frames: Callable[[str], list[bytes]] = functools.cache(self._frames)
         self.capture: Callable[[str], Path] = functools.cache(self._capture)
 

@@ -14,7 +14,7 @@ import numpy as np
 from measure import Contender
 
 #: the distributions.
-LIBRARIES = ("dpkt", "velodyne-decoder", "ouster-sdk", "lds2d", "rplidar")
+LIBRARIES = ("dpkt", "velodyne-decoder", "ouster-sdk", "lds2d", "rplidar", "pyarrow")
 
 
 class Missing(Exception):

@@ -23,10 +23,12 @@ class Contender:
     Attributes:
         run: does it once.
         amount: how many points (or packets, frames, whatever the work counts) that is.
+        after: what follows a run and is not timed.
     """
 
     run: Callable[[], Any]
     amount: int
+    after: Callable[[], None] | None = None
 
 
 Rates = dict[str, list[float]]
@@ -37,12 +39,12 @@ LEAST_STEP = 1e-6
 
 
 def raced(contenders: Mapping[str, Contender], runs: int, least: float, clock: Clock = time.perf_counter) -> Rates:
-    """Seconds for each of the amount, by contender, one figure for each run; each has run twice before.
+    """Seconds for each of the amount, by contender, one figure for each run.
 
     Args:
-        least: seconds; what takes less is repeated within a run until it takes that long.
+        least: seconds; what takes less is repeated within a run until it takes that long. To see that, each runs twice before; not with 0.
     """
-    repeats = {name: _repeats(contender, least, clock) for name, contender in contenders.items()}
+    repeats = {name: _repeats(contender, least, clock) if least else 1 for name, contender in contenders.items()}
     found: Rates = {name: [] for name in contenders}
     for _ in range(runs):
         for name, contender in contenders.items():
@@ -60,7 +62,10 @@ def _seconds(contender: Contender, repeats: int, clock: Clock) -> float:
     start = clock()
     for _ in range(repeats):
         contender.run()
-    return max(clock() - start, LEAST_STEP) / repeats
+    took = max(clock() - start, LEAST_STEP)
+    if contender.after:
+        contender.after()
+    return took / repeats
 
 
 def cpu_seconds() -> float:

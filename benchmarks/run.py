@@ -15,8 +15,9 @@ from pathlib import Path
 from statistics import median
 from typing import Any
 
+from formats import CONVERSIONS
 from inputs import Inputs
-from libraries import versions
+from libraries import Missing, versions
 from live_works import ON_LINES
 from measure import Clock, Contender, Rates, cpu_seconds, memcpy, raced, times
 from more_works import ELSEWHERE
@@ -26,10 +27,11 @@ from works import ON_BYTES, Work
 import lidarspec as ls
 from lidarspec.framing.decoder import BACKENDS
 
-WORKS = {**ON_BYTES, **ELSEWHERE, **ON_LINES}
+WORKS = {**ON_BYTES, **ELSEWHERE, **ON_LINES, **CONVERSIONS}
 LEAST_RUNS = 5
 RUNS = 7
 LEAST_SECONDS = 0.05  # of a run
+SIZE, QUICK_SIZE = 1000, 20  # MB of a capture that is converted
 
 
 def working() -> list[str]:
@@ -51,7 +53,8 @@ def rows(name: str, work: Work, backends: list[str], copy: Contender, *, runs: i
     """The lines of a work, one for each back end, all measured in turn."""
     chosen = backends if work.has_backends else [""]
     others, missing = work.present()
-    ours = {backend: {"ours": Contender(work.ours(backend), work.amount), **work.own(backend)} for backend in chosen}
+    runs, least = (1, 0.0) if work.after else (runs, least)
+    ours = {backend: {"ours": Contender(work.ours(backend), work.amount, work.after), **work.own(backend)} for backend in chosen}
     by_backend = {f"{own} {backend}": contender for backend, owns in ours.items() for own, contender in owns.items()}
     rates = raced({"memcpy": copy, **by_backend, **others}, runs, least, clock)
     for backend in chosen:
@@ -100,10 +103,12 @@ def arguments() -> argparse.Namespace:
     parser.add_argument("--backend", metavar="NAME", action="append", choices=BACKENDS, help="back ends; default: all that work here")
     parser.add_argument("--cpu", action="store_true", help="count processor time, not the time that passes: for a busy machine")
     parser.add_argument("--best", action="store_true", help="show the best run of each contender, not the median")
+    parser.add_argument("--size", metavar="MB", type=int, help=f"of each capture that is converted; default: {SIZE}")
     parser.add_argument("--quick", action="store_true", help="tiny inputs: shows that everything runs, the figures mean nothing")
     given = parser.parse_args()
     if given.runs < LEAST_RUNS:
         parser.error(f"--runs is {LEAST_RUNS} or more")
+    given.size = 1_000_000 * (given.size or (QUICK_SIZE if given.quick else SIZE))
     given.works = [name for name in WORKS if not given.only or name.startswith(tuple(given.only))]
     if not given.works:
         parser.error(f"no work begins so; there are {', '.join(WORKS)}")
@@ -120,7 +125,11 @@ def main() -> int:
     with tempfile.TemporaryDirectory() as folder:
         for name in given.works:
             print(f"{name} ...", file=sys.stderr)
-            work = WORKS[name](Inputs(Path(folder), quick=given.quick))
+            try:
+                work = WORKS[name](Inputs(Path(folder), quick=given.quick, size=given.size))
+            except Missing as missing:
+                print(f"{name}: left out: {missing}", file=sys.stderr)
+                continue
             found += rows(name, work, backends, copy, runs=given.runs, least=least, clock=clock)
     what = f"{'best runs' if given.best else 'medians'}{', processor time' if given.cpu else ''}"
     shown(found, versions(), title="quick: these figures mean nothing" if given.quick else what, best=given.best)

@@ -49,6 +49,7 @@ class Work:
         own: what each back end is compared with of its own, for `facts`.
         facts: more numbers for the last column, by back end and rates.
         has_backends: False where the back end changes nothing.
+        after: what follows a run of ours untimed, where a run takes so long that there is one, and none before.
     """
 
     title: str
@@ -60,6 +61,7 @@ class Work:
     own: Callable[[str], dict[str, Contender]] = lambda backend: {}
     facts: Callable[[str, Rates], Facts] = no_facts
     has_backends: bool = True
+    after: Callable[[], None] | None = None
 
     def present(self) -> tuple[dict[str, Contender], list[str]]:
         """The others that are installed, and the names of those that are not."""

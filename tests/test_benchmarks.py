@@ -88,6 +88,20 @@ def test_frames_with_counts_and_parts_are_measured_beside_fixed_places(tmp_path:
     assert all(row["amount"] > 5000 and row["bytes"] > row["amount"] for row in rows)
 
 
+def test_conversions_are_measured_beside_a_copy_and_what_a_user_would_write(tmp_path: Path) -> None:
+    names = ("to-vlp16.npz", "to-stl27l.mcap", "to-many")
+    only = [word for name in names for word in ("--only", name)]
+    rows = {row["work"]: row for row in measured(tmp_path, "--backend", "numpy", "--size", "1", *only)}
+    beside = ({"np.savez", "velodyne-decoder and np.savez"}, set(), {"one process"})
+    assert {name: {*row["times"], *row["not_installed"]} for name, row in rows.items()} == dict(zip(names, beside, strict=True))
+    for row in rows.values():
+        facts = row["facts"]
+        assert row["runs"] == 1
+        assert min(facts[name] for name in ("s", "s of the processors", "% of the speed of copying that")) > 0
+        assert all(value > 20 for name, value in facts.items() if name.startswith("MB of memory"))
+        assert facts["MB written"] > row["bytes"] / 1e6
+
+
 def test_an_unknown_work_is_refused_with_the_names_there_are() -> None:
     done = subprocess.run([sys.executable, str(RUN), "--only", "fastest"], capture_output=True, text=True, check=False)
     assert done.returncode == 2

@@ -1,0 +1,293 @@
+"""Captures to files of each format: in processes of their own, so that memory is theirs, beside what a user would write instead."""
+
+from __future__ import annotations
+
+import functools
+import itertools
+import json
+import os
+import shutil
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+from inputs import Inputs
+from libraries import Missing, library
+from measure import Contender, Rates
+from works import Facts, Work
+
+import lidarspec as ls
+from lidarspec import formats
+
+#: what holds all points at once is given so many times less, and many captures are so many of this size.
+SMALLER = 8
+
+#: Runs a command and prints the seconds that passed, those of the processors, and the bytes of memory of its largest process. It stands in
+#: between, as a child begins with the peak of its parent, which holds the inputs of all works; on Linux it waits for the workers' parents.
+LAUNCHER = """
+import ctypes, json, os, resource, subprocess, sys, time
+if sys.platform == "linux":
+    ctypes.CDLL(None).prctl(36, 1)  # PR_SET_CHILD_SUBREAPER
+start = time.perf_counter()
+code = subprocess.call(sys.argv[1:], stdout=subprocess.DEVNULL)
+seconds = time.perf_counter() - start
+try:
+    while True:
+        os.wait()
+except ChildProcessError:
+    used = resource.getrusage(resource.RUSAGE_CHILDREN)
+unit = 1 if sys.platform == "darwin" else 1024
+print(json.dumps([seconds, used.ru_utime + used.ru_stime, used.ru_maxrss * unit]))
+sys.exit(code)
+"""
+
+#: What a user would write: all points in memory, then one call.
+BESIDE = """
+import sys
+import numpy as np
+source, path, sensor, target, out = sys.argv[1:]
+
+def clouds():
+    if source == "velodyne-decoder":
+        import velodyne_decoder as vd
+        config = vd.Config()
+        config.model = vd.Model.VLP16
+        for _, rows in vd.read_pcap(path, config):
+            yield {f"c{number}": column for number, column in enumerate(rows.T)}
+        return
+    import lidarspec as ls
+    with ls.open(path, sensor) as device:
+        for scan in device.scans():
+            valid = scan.points.valid
+            yield {name: column[valid] for name, column in scan.points.columns.items()}
+
+parts = list(clouds())
+columns = {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}
+if target == "np.savez":
+    np.savez(out, **columns)
+elif target == "pyarrow.csv":
+    import pyarrow, pyarrow.csv
+    pyarrow.csv.write_csv(pyarrow.table(columns), out)
+else:
+    import pyarrow, pyarrow.parquet
+    pyarrow.parquet.write_table(pyarrow.table(columns), out)
+"""
+TARGETS = {".npz": "np.savez", ".csv": "pyarrow.csv", ".parquet": "pyarrow.parquet"}
+
+
+class Captured(NamedTuple):
+    """Captures of a sensor.
+
+    Attributes:
+        title: of the sensor.
+        sensor: its id.
+        rate: bytes of a capture for each second.
+        suffixes: of the formats.
+        period: seconds after which its clock is where it was, so that a capture may be repeated; 0: it is simulated to the end.
+        share: it is so many times smaller than others.
+    """
+
+    title: str
+    sensor: str
+    rate: float
+    suffixes: tuple[str, ...]
+    period: int = 0
+    share: int = 1
+
+
+CAPTURES: Mapping[str, Captured] = {
+    "m1": Captured("RS-LiDAR-M1", "robosense-m1", 7.99e6, tuple(formats.BUILT_IN)),
+    "stl27l": Captured("STL-27L", "ldrobot-stl27l", 113_400, (".csv", ".parquet", ".mcap"), period=30),
+    "vlp16": Captured("VLP-16", "velodyne-vlp16", 1.035e6, tuple(TARGETS), share=SMALLER),
+}
+
+
+@dataclass
+class Spent:
+    """What a process took, and what it wrote.
+
+    Attributes:
+        seconds, processor: that passed, and of the processors, of those that it started too.
+        memory: bytes, of the largest of these processes.
+        flushed: seconds more until what it wrote was on the disk.
+        size: bytes that it wrote.
+    """
+
+    seconds: float
+    processor: float
+    memory: int
+    flushed: float = 0.0
+    size: int = 0
+
+
+def process(*command: object) -> Spent:
+    """Runs Python with these arguments."""
+    line = [sys.executable, "-S", "-c", LAUNCHER, sys.executable, *map(str, command)]
+    done = subprocess.run(line, capture_output=True, text=True, check=False)
+    if done.returncode:
+        raise RuntimeError(done.stderr)
+    return Spent(*json.loads(done.stdout))
+
+
+def capture(inputs: Inputs, key: str, size: int) -> Path:
+    """A simulated capture of about so many bytes."""
+    path, made = inputs.folder / f"{key}-{size}.pcap", CAPTURES[key]
+    if path.exists():
+        return path
+    if not made.period:
+        return simulated(path, made.sensor, max(0.2, size / made.rate))
+    once = inputs.folder / f"{key}.pcap"
+    return repeated(once if once.exists() else simulated(once, made.sensor, made.period), path, size, made.period)
+
+
+def simulated(path: Path, sensor: str, seconds: float) -> Path:
+    """A capture of a simulated sensor."""
+    line = [sys.executable, "-m", "lidarspec", "sim", sensor, "--to", str(path), "-t", f"{seconds:.1f}s"]
+    subprocess.run(line, capture_output=True, check=True)
+    return path
+
+
+def repeated(once: Path, path: Path, size: int, period: int) -> Path:
+    """A capture of about so many bytes that holds another one again and again, each time a period later; its records have one length."""
+    data = np.fromfile(once, np.uint8)
+    head, records = data[:24], data[24:]
+    rows = records.reshape(-1, 16 + int(records[8:12].view("<u4")[0]))
+    with path.open("wb") as file:
+        file.write(head.tobytes())
+        for _ in range(max(1, round(size / rows.size))):
+            file.write(rows.tobytes())
+            rows[:, :4] = (rows[:, :4].copy().view("<u4") + np.uint32(period)).view(np.uint8)
+    return path
+
+
+@functools.cache
+def points_of(path: Path, sensor: str) -> int:
+    """The points of a capture that are written."""
+    with ls.open(path, sensor) as device:
+        return sum(int(scan.points.valid.sum()) for scan in device.scans())
+
+
+def files(out: Path) -> Iterator[Path]:
+    """A file itself, or all of a folder."""
+    return (file for file in (out.rglob("*") if out.is_dir() else [out]) if file.is_file())
+
+
+def flush(out: Path) -> None:
+    """Waits until a file or folder is on the disk."""
+    for file in files(out):
+        with file.open("rb") as opened:
+            os.fsync(opened)
+
+
+def clear(folder: Path) -> None:
+    """Takes away what a run left: removing a large file takes a while that is no part of the next run."""
+    shutil.rmtree(folder, ignore_errors=True)
+    folder.mkdir()
+
+
+def copy(out: Path) -> None:
+    """Copies a file or folder beside itself, onto the disk."""
+    for number, file in enumerate(list(files(out))):
+        flush(Path(shutil.copyfile(file, out.parent / f"copy-{number}")))
+
+
+class Beside(NamedTuple):
+    """A command that a work is compared with: its arguments, the points that it writes, the modules that it needs."""
+
+    command: tuple[object, ...]
+    amount: int
+    modules: tuple[str, ...] = ()
+
+
+def written(title: str, out: Path, amount: int, size: int, command: tuple[object, ...], commands: Mapping[str, Beside]) -> Work:
+    """A command of lidarspec that writes a file or a folder, beside copying that and beside other commands."""
+    spent: dict[str, Spent] = {}
+    clear(out.parent)
+
+    def run(name: str, command: tuple[object, ...]) -> None:
+        spent[name] = process(*command)
+
+    def contender(name: str, other: Beside) -> Contender:
+        for module in other.modules:
+            library(module)
+        return Contender(lambda: run(name, other.command), other.amount, partial(clear, out.parent))
+
+    def after() -> None:
+        start = time.perf_counter()
+        flush(out)
+        spent["ours"].flushed = time.perf_counter() - start
+        spent["ours"].size = sum(file.stat().st_size for file in files(out))
+
+    def part(other: Beside) -> str:
+        return f" for 1/{round(amount / other.amount)}" if other.amount < amount else ""
+
+    def facts(backend: str, rates: Rates) -> Facts:
+        ours = spent["ours"]
+        return {
+            "s": ours.seconds,
+            "s of the processors": ours.processor,
+            "MB of memory": ours.memory / 1e6,
+            "MB written": ours.size / 1e6,
+            "% of the speed of copying that": 100 * rates["copy"][0] * amount / (ours.seconds + ours.flushed),
+            **{f"MB of memory in {name}{part(other)}": spent[name].memory / 1e6 for name, other in commands.items() if name in spent},
+        }
+
+    return Work(
+        title,
+        "points",
+        amount,
+        size,
+        lambda backend: partial(run, "ours", ("-m", "lidarspec", "convert", *command)),
+        {name: partial(contender, name, other) for name, other in commands.items()},
+        lambda backend: {"copy": Contender(partial(copy, out), amount, partial(clear, out.parent))},
+        facts,
+        has_backends=False,
+        after=after,
+    )
+
+
+def converting(inputs: Inputs, key: str, suffix: str) -> Work:
+    """A capture to a file, beside what a user would write."""
+    made, out = CAPTURES[key], inputs.folder / "out" / f"points{suffix}"
+    path, part = capture(inputs, key, inputs.size // made.share), capture(inputs, key, inputs.size // SMALLER)
+    try:
+        with ls.open(part, made.sensor) as device:
+            formats.write(inputs.folder / f"one{suffix}", itertools.islice(device.scans(), 1))
+    except ls.UsageError as error:
+        raise Missing(str(error)) from error
+    commands: dict[str, Beside] = {}
+    if target := TARGETS.get(suffix):
+        needed = () if target == "np.savez" else ("pyarrow",)
+        amount = points_of(part, made.sensor)
+        commands[target] = Beside(("-c", BESIDE, "lidarspec", part, made.sensor, target, out), amount, needed)
+        if key == "vlp16":
+            line = ("-c", BESIDE, "velodyne-decoder", part, made.sensor, target, out)
+            commands[f"velodyne-decoder and {target}"] = Beside(line, amount, ("velodyne_decoder", *needed))
+    command = (path, out, "-s", made.sensor)
+    return written(f"{made.title} capture to {suffix}", out, points_of(path, made.sensor), path.stat().st_size, command, commands)
+
+
+def many(inputs: Inputs) -> Work:
+    """Several captures into a folder by four processes, beside one."""
+    made, out = CAPTURES["m1"], inputs.folder / "out" / "points"
+    part, folder = capture(inputs, "m1", inputs.size // SMALLER), inputs.folder / "many"
+    folder.mkdir(exist_ok=True)
+    for number in range(SMALLER):
+        (folder / f"{number}.pcap").hardlink_to(part)
+    amount = SMALLER * points_of(part, made.sensor)
+    command = (*sorted(folder.iterdir()), out, "-s", made.sensor, "--to", "parquet", "--jobs")
+    alone = Beside(("-m", "lidarspec", "convert", *command, 1), amount)
+    size = SMALLER * part.stat().st_size
+    return written(f"{SMALLER} captures to .parquet, 4 processes", out, amount, size, (*command, 4), {"one process": alone})
+
+
+CONVERSIONS: Mapping[str, Callable[[Inputs], Work]] = {
+    **{f"to-{key}{suffix}": partial(converting, key=key, suffix=suffix) for key, made in CAPTURES.items() for suffix in made.suffixes},
+    "to-many": many,
+}
