@@ -243,7 +243,7 @@ def single_packets_equal_a_batch(subject: Subject) -> None:
 
 def scans_do_not_depend_on_batches(subject: Subject) -> None:
     """Scans are cut alike, with the same points, however many packets come at a time."""
-    found = subject.sensor.split(material.delivery(subject.sensor, subject.conversation(rounds=5)))
+    found = subject.sensor.split(material.delivery(subject.sensor, subject.conversation()))
 
     def scans(size: int) -> list[Scan]:
         stats = Decoder(subject.sensor, stream=True).stats

@@ -26,7 +26,7 @@ from lidarspec.testing.findings import require
 from lidarspec.testing.subject import Subject
 
 #: bytes of a stream, and how many of each kind are tried.
-LENGTH, TRIES = 16_000, 2
+LENGTH, TRIES = 12_000, 2
 #: how many times as long as its own frames a stream may take, and how many bytes may be kept for each of its bytes.
 DEARER, KEPT = 250, 64
 #: seeds of the examples that streams are made of, frames with random headers, bytes of a head, and of noise behind it.

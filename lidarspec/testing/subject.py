@@ -18,8 +18,8 @@ from lidarspec.framing.frame_engine import codec
 from lidarspec.spec import Frame, Sensor
 from lidarspec.spec.tree import FieldInfo, Sealed, nodes
 
-#: frames up to this length are cut at every byte, longer ones at so many places.
-SHORT = 300
+#: frames up to this length are cut at every byte, longer ones at both ends and at so many places by chance.
+SHORT, SPOTS = 300, 50
 
 
 def delivery(sensor: Sensor, frames: list[tuple[str, bytes]]) -> Any:
@@ -32,7 +32,7 @@ def places(length: int, source: random.Random) -> list[int]:
     """Where to cut so many bytes: everywhere if they are few, else at the ends and at random."""
     if length <= SHORT:
         return list(range(length))
-    return sorted({0, 1, 2, 3, length - 2, length - 1, *source.sample(range(length), SHORT // 2)})
+    return sorted({0, 1, 2, 3, length - 2, length - 1, *source.sample(range(length), SPOTS)})
 
 
 def pieces(data: bytes, source: random.Random) -> Iterator[bytes]:

@@ -36,7 +36,7 @@ from tests.exports.trees import number
 from tests.shapes import SHAPES
 
 EXAMPLE = bytes.fromhex("542c6808ab7ee000e4dc00e2d900e5d500e3d300e4d000e9cd00e4ca00e2c700e9c500e5c200e5c000e5be823a1a50")
-SMALL = 150
+SMALL = 50
 
 
 @functools.cache

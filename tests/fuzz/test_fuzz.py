@@ -16,7 +16,7 @@ from tests.fuzz.campaign import Job, keep, seeded
 from tests.fuzz.targets import SHARES, Target, targets
 
 #: mutations of each target that the test suite reads.
-FEW = 12
+FEW = 6
 
 
 @pytest.fixture(scope="module")

@@ -87,9 +87,9 @@ def test_a_simulated_stream_gives_the_scene_back_within_the_steps_of_its_format(
     room = Room(room.walls, room.boxes)
     several = sum(other.data for other in sensor.frames.values()) > 1
     sensor = sensor.configure(answer=frame) if several else sensor
-    frames = simulate(sensor, 300, start=5, scene=room)
+    frames = simulate(sensor, 150, start=5, scene=room)
     cloud = sensor.decode(frames if sensor.datagrams else b"".join(frames)).points()
-    seen = _seen(sensor, frame, cloud, room, range(5, 305))
+    seen = _seen(sensor, frame, cloud, room, range(5, 155))
     assert cloud.valid[seen].mean() > 0.98 / REPEATING.get((name, frame), 1)
     assert off(room, placed(cloud, len(frames))).max() < half_step(sensor, frame) + EXACT
 
