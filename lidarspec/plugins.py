@@ -196,6 +196,8 @@ def _by_metadata(group: str) -> list[EntryPoint]:
             entries = [EntryPoint(e.name, e.value, name, version) for e in distribution.entry_points.select(group=group)]
         except UnicodeDecodeError:
             entries = [EntryPoint("entry_points.txt", "", name, version)] if group == GROUP else []
+        except FileNotFoundError:  # so the finder of the library importlib_metadata says that there is no metadata
+            continue
         found.setdefault(_normal(name), entries)
     return [entry for entries in found.values() for entry in entries]
 

@@ -66,12 +66,17 @@ def test_odd_installations_are_read_as_importlib_metadata_reads_them(tmp_path: P
 def test_an_import_hook_that_finds_distributions_is_asked(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     distribution(tmp_path, "hooked", "1", "[odd.group]\nh = hooked\n")
 
+    class Bare(importlib.metadata.PathDistribution):
+        @property
+        def metadata(self) -> Any:
+            raise FileNotFoundError("No package metadata was found.")
+
     class Finder(importlib.metadata.DistributionFinder):
         def find_spec(self, *_: Any) -> None:
             return None
 
         def find_distributions(self, context: Any = None) -> Iterable[importlib.metadata.Distribution]:
-            return [importlib.metadata.PathDistribution(tmp_path / "hooked-1.dist-info")]
+            return [Bare(tmp_path), importlib.metadata.PathDistribution(tmp_path / "hooked-1.dist-info")]
 
     monkeypatch.setattr(sys, "meta_path", [*sys.meta_path, Finder()])
     assert [entry.name for entry in entry_points("odd.group")] == ["h"]
