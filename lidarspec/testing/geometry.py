@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import copy
 import dataclasses
+import itertools
 import math
 import random
 from typing import Any
@@ -305,8 +306,11 @@ def _with_values(subject: Subject, name: str, path: str, values: tuple[int, ...]
         SpecError: where `points` fails on them.
     """
     for seed in BASES:
-        frames = [_with(subject, name, path, value, seed) for value in values]
-        packets = [read(subject, name, [frame] * max(2, subject.sensor.frames[name].confirm)) for frame in frames if frame is not None]
+        built = (_with(subject, name, path, value, seed) for value in values)
+        frames = [frame for frame in itertools.takewhile(lambda frame: frame is not None, built) if frame is not None]
+        if len(frames) < len(values):
+            continue
+        packets = [read(subject, name, [frame] * max(2, subject.sensor.frames[name].confirm)) for frame in frames]
         clouds = [each.points() for each in packets if len(each)]
         if len(clouds) == len(values) and len(clouds[0]) and len({len(cloud) for cloud in clouds}) == 1:
             return clouds
