@@ -9,6 +9,7 @@ this module's own (`off`), not the simulator's. What is measured on the way is t
 
 from __future__ import annotations
 
+import contextlib
 import copy
 import dataclasses
 import itertools
@@ -306,8 +307,7 @@ def _with_values(subject: Subject, name: str, path: str, values: tuple[int, ...]
         SpecError: where `points` fails on them.
     """
     for seed in BASES:
-        built = (_with(subject, name, path, value, seed) for value in values)
-        frames = [frame for frame in itertools.takewhile(lambda frame: frame is not None, built) if frame is not None]
+        frames = list(itertools.takewhile(bool, (_with(subject, name, path, value, seed) for value in values)))
         if len(frames) < len(values):
             continue
         packets = [read(subject, name, [frame] * max(2, subject.sensor.frames[name].confirm)) for frame in frames]
@@ -324,17 +324,17 @@ def _turn(info: FieldInfo, nought: PointCloud, turned: PointCloud) -> int:
     return int(np.sign(most)) if 0.5 < abs(most) < 1.5 else 0
 
 
-def _with(subject: Subject, name: str, path: str, value: int, seed: int) -> bytes | None:
-    """An example with every element of one field set; None where no frame can carry it."""
+def _with(subject: Subject, name: str, path: str, value: int, seed: int) -> bytes:
+    """An example with every element of one field set; no bytes where no frame can carry it."""
     parsed = copy.deepcopy(subject.sensor.parse(subject.example(name, seed=seed), frame=name))
     for holder, key, own in list(material.integers(parsed)):
         if own == path:
             holder[key] = value
-    built = acceptable(subject, name, parsed)
-    try:
-        return built if built is not None and subject.sensor.parse(built, frame=name) is not None else None
-    except LidarSpecError:
-        return None
+    built = acceptable(subject, name, parsed) or b""
+    with contextlib.suppress(LidarSpecError):
+        subject.sensor.parse(built, frame=name)
+        return built
+    return b""
 
 
 def off(room: Room, xyz: NDArray[np.float64]) -> NDArray[np.float64]:
