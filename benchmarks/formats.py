@@ -127,9 +127,10 @@ class Spent:
 
 
 def process(*command: object) -> Spent:
-    """Runs Python with these arguments."""
+    """Runs Python with these arguments; modules are compiled once, as where they are installed, whatever this process is told."""
     line = [sys.executable, "-S", "-c", LAUNCHER, sys.executable, *map(str, command)]
-    done = subprocess.run(line, capture_output=True, text=True, check=False)
+    environment = {name: value for name, value in os.environ.items() if name != "PYTHONDONTWRITEBYTECODE"}
+    done = subprocess.run(line, capture_output=True, text=True, check=False, env=environment)
     if done.returncode:
         raise RuntimeError(done.stderr)
     return Spent(*json.loads(done.stdout))
@@ -273,21 +274,21 @@ def converting(inputs: Inputs, key: str, suffix: str) -> Work:
     return written(f"{made.title} capture to {suffix}", out, points_of(path, made.sensor), path.stat().st_size, command, commands)
 
 
-def many(inputs: Inputs) -> Work:
+def many(inputs: Inputs, suffix: str) -> Work:
     """Several captures into a folder by four processes, beside one."""
     made, out = CAPTURES["m1"], inputs.folder / "out" / "points"
-    part, folder = capture(inputs, "m1", inputs.size // SMALLER), inputs.folder / "many"
+    part, folder = capture(inputs, "m1", inputs.size // SMALLER), inputs.folder / f"many{suffix}"
     folder.mkdir(exist_ok=True)
     for number in range(SMALLER):
         (folder / f"{number}.pcap").hardlink_to(part)
     amount = SMALLER * points_of(part, made.sensor)
-    command = (*sorted(folder.iterdir()), out, "-s", made.sensor, "--to", "parquet", "--jobs")
+    command = (*sorted(folder.iterdir()), out, "-s", made.sensor, "--to", suffix[1:], "--jobs")
     alone = Beside(("-m", "lidarspec", "convert", *command, 1), amount)
     size = SMALLER * part.stat().st_size
-    return written(f"{SMALLER} captures to .parquet, 4 processes", out, amount, size, (*command, 4), {"one process": alone})
+    return written(f"{SMALLER} captures to {suffix}, 4 processes", out, amount, size, (*command, 4), {"one process": alone})
 
 
 CONVERSIONS: Mapping[str, Callable[[Inputs], Work]] = {
     **{f"to-{key}{suffix}": partial(converting, key=key, suffix=suffix) for key, made in CAPTURES.items() for suffix in made.suffixes},
-    "to-many": many,
+    **{f"to-many{suffix}": partial(many, suffix=suffix) for suffix in (".parquet", ".csv")},
 }

@@ -42,8 +42,8 @@ def frame(data: bytes) -> bytes:
     return ethernet(ipv4(udp(data)))
 
 
-def pcap_head(order: str = "<", *, magic: int = 0xA1B2C3D4, link: int = 1) -> bytes:
-    return struct.pack(order + "IHHiIII", magic, 2, 4, 0, 0, 65535, link)
+def pcap_head(order: str = "<", *, magic: int = 0xA1B2C3D4, link: int = 1, snap_length: int = 65535) -> bytes:
+    return struct.pack(order + "IHHiIII", magic, 2, 4, 0, 0, snap_length, link)
 
 
 def record(data: bytes, order: str = "<", *, original: int | None = None, seconds: int = SECONDS) -> bytes:

@@ -89,7 +89,7 @@ def test_frames_with_counts_and_parts_are_measured_beside_fixed_places(tmp_path:
 
 
 def test_conversions_are_measured_beside_a_copy_and_what_a_user_would_write(tmp_path: Path) -> None:
-    names = ("to-vlp16.npz", "to-stl27l.mcap", "to-many")
+    names = ("to-vlp16.npz", "to-stl27l.mcap", "to-many.parquet")
     only = [word for name in names for word in ("--only", name)]
     rows = {row["work"]: row for row in measured(tmp_path, "--backend", "numpy", "--size", "1", *only)}
     beside = ({"np.savez", "velodyne-decoder and np.savez"}, set(), {"one process"})

@@ -2,7 +2,7 @@
 
 Consecutive datagrams of a device differ in their payloads, their times and little else. So `CaptureBatches` reads one record as
 `CaptureReader` does; what was found there holds for every record of the same length whose headers have the same bytes, except for
-those that `ip.headers` and the file's format name as free. `walked` finds where the records of a buffer begin, and all that are
+those that its headers and the file's format name as free. `walked` finds where the records of a buffer begin, and all that are
 `Alike` are then found at once. Whatever is not alike is read one by one, so that the datagrams, their order and what is counted
 are the same, whatever is in the file.
 """
@@ -16,12 +16,13 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from lidarspec.captures.ip import Headers, headers
-from lidarspec.captures.pcap import CaptureReader, Datagram
+from lidarspec.captures.ip import Headers
+from lidarspec.captures.pcap import CaptureReader, Datagram, StreamReader
 from lidarspec.captures.records import LARGEST_BLOCK, Damaged, Form, Passed, Source, Times, Truncated, records
 from lidarspec.framing.decoder import Decoder
 from lidarspec.framing.results import Frames, Indices
 from lidarspec.transports.protocol import Origin, Sender
+from lidarspec.wire.layout import rows_at
 
 #: bytes of a record, from its start, that are compared at most; longer headers are read plainly.
 WIDEST = 128
@@ -97,7 +98,8 @@ def alike(record: bytes, headers: Headers, source: Sender, form: Form) -> Alike 
     size = start + -start % 8
     mask = np.zeros(size, np.uint8)
     mask[:start] = 0xFF
-    mask[[*pattern.free, *(head + place for place in headers.free)]] = 0
+    told = pattern.uncut if headers.size else ()  # headers say how long the payload is
+    mask[[*pattern.free, *told, *(head + place for place in headers.free)]] = 0
     value = np.frombuffer(record[:start].ljust(size, b"\0"), np.uint64)
     return Alike(len(record), start, headers.payload, source, pattern.times, value, mask.view(np.uint64), pattern.trailer)
 
@@ -161,6 +163,14 @@ class Batch:
         """The bytes of one datagram."""
         return self.buffer[self.starts[index] : self.starts[index] + self.sizes[index]].tobytes()
 
+    @property
+    def joined(self) -> bytes:
+        """The bytes of all of them."""
+        size = self.sizes.item(0) if len(self) else 0
+        if (self.sizes == size).all():
+            return rows_at(self.buffer, self.starts, size).tobytes()
+        return b"".join(map(self.data, range(len(self))))
+
     def of(self, origin: Origin) -> Batch:
         """The datagrams of the batch that come from one address, or one port of it."""
         if all(name in origin for name in self.names):
@@ -219,6 +229,10 @@ class CaptureBatches(CaptureReader):
                 elif ended is not None:
                     raise ended
                 known = found.still_known()
+
+
+class StreamBatches(StreamReader, CaptureBatches):
+    """The packets of a capture of a byte stream, in batches."""
 
 
 class _Records:
@@ -313,7 +327,7 @@ class _Records:
         self._plain[index] = datagram
         if self._learnt == MOST_KNOWN or not self._are_whole:
             return
-        places = headers(packet.data, packet.link)
+        places = self._reader.headers(packet)
         record = self._storage[self._starts[index] : self._starts[index + 1]].tobytes()
         found = alike(record, places, datagram.source, self._form) if places else None
         if found is not None:

@@ -17,7 +17,7 @@ from functools import lru_cache
 from typing import BinaryIO
 
 from lidarspec.captures.containers import opened
-from lidarspec.captures.ip import LARGEST_PAYLOAD, Reassembly, Refused, address, ip_packet, udp, udp_frame
+from lidarspec.captures.ip import LARGEST_PAYLOAD, Headers, Reassembly, Refused, address, headers, ip_packet, udp, udp_frame
 from lidarspec.captures.records import (
     SMALLEST,
     CapturedPacket,
@@ -211,6 +211,10 @@ class CaptureReader(Closing):
         ends = (address(ip.source), part.source), (address(ip.destination), part.destination)
         return Datagram(ip.body[part.start : part.stop], packet.at, *ends)
 
+    def headers(self, packet: CapturedPacket) -> Headers | None:
+        """Where the payload of a packet that gave a datagram stands, and so that of packets like it; None where others may differ."""
+        return headers(packet.data, packet.link)
+
 
 class StreamReader(CaptureReader):
     """The packets of a capture of a byte stream, link type USER0 to USER15, as datagrams that nobody sent."""
@@ -225,6 +229,10 @@ class StreamReader(CaptureReader):
             return None
         self.stats.snapped += len(packet.data) < packet.original
         return Datagram(packet.data, packet.at, NOBODY, NOBODY)
+
+    def headers(self, packet: CapturedPacket) -> Headers | None:
+        """None for a packet that was cut, which is counted."""
+        return Headers(0, len(packet.data), ()) if len(packet.data) == packet.original else None
 
 
 def datagram_record(datagram: Datagram) -> bytes:

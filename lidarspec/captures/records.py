@@ -298,13 +298,15 @@ class Pattern(NamedTuple):
 
     Attributes:
         head: bytes of a record before the packet.
-        free: places of bytes among them that differ from record to record: times, and the length before the packet was cut.
+        free: places of bytes among them that differ from record to record: the time's.
+        uncut: those of the length that the packet had before it was cut.
         times: how the time is read from them.
         trailer: type of the word at the end that repeats the length, with its byte order; None where there is none.
     """
 
     head: int
     free: tuple[int, ...]
+    uncut: tuple[int, ...]
     times: Times
     trailer: str | None
 
@@ -341,8 +343,8 @@ class PcapRecords:
 
     def pattern(self, record: bytes) -> Pattern:
         """What records like this one have in common."""
-        free = (*range(8), *range(12, 16))
-        return Pattern(self._head.size, free, Times(f"{self.order}u4", 0, 1, _SECOND // self._unit, True), None)
+        times = Times(f"{self.order}u4", 0, 1, _SECOND // self._unit, True)
+        return Pattern(self._head.size, tuple(range(8)), tuple(range(12, 16)), times, None)
 
     def read(self) -> CapturedPacket:
         """The packet of the record that begins here.
@@ -434,7 +436,8 @@ class PcapngBlocks:
         if kind != ENHANCED_PACKET:
             return None
         interface, word = self._interfaces[number], f"{self.order}u4"
-        return Pattern(28, (*range(12, 20), *range(24, 28)), Times(word, 3, 4, interface.ticks, False, interface.offset), word)
+        times = Times(word, 3, 4, interface.ticks, False, interface.offset)
+        return Pattern(28, tuple(range(12, 20)), tuple(range(24, 28)), times, word)
 
     def read(self) -> CapturedPacket | Passed:
         """The packet of the block that begins here.

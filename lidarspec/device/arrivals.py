@@ -16,7 +16,7 @@ from typing import Any, Protocol
 
 import numpy as np
 
-from lidarspec.captures.bulk import first_frames
+from lidarspec.captures.bulk import Batch, first_frames
 from lidarspec.device.senders import Senders, frame_senders
 from lidarspec.device.session import Reply
 from lidarspec.discovery.detect import said
@@ -160,6 +160,15 @@ def fed(decoder: Decoder, chunks: Sequence[Chunk]) -> list[Frames]:
     return [frames.arrived(times[ends.searchsorted(frames.offsets + frames.sizes)]) for frames in found]
 
 
+def _streamed(decoder: Decoder, packets: Batch) -> Iterator[list[Frames]]:
+    """The frames that the packets of a byte stream complete, with the times of the packets that hold their last bytes."""
+    data, ends = packets.joined, decoder.stats.bytes_in + np.cumsum(packets.sizes)
+    at = np.where(packets.at, packets.at, -1)  # nobody knows
+    for start in range(0, len(data), BATCH_BYTES):
+        found = decoder.frames(data[start : start + BATCH_BYTES])
+        yield [frames.arrived(at[ends.searchsorted(frames.offsets + frames.sizes)]) for frames in found]
+
+
 def answers(found: Sequence[Frames], awaited: frozenset[str]) -> list[Found]:
     """The frames of some types, one by one."""
     picked = []
@@ -241,7 +250,7 @@ class FileInput(Input):
         first: dict[str, bytes] = {}
         with contextlib.closing(transport(self._source)) as source:
             decoder = self.sensor.decoder(stream=not source.datagrams)
-            if isinstance(source, CaptureTransport):
+            if isinstance(source, CaptureTransport) and source.datagrams:
                 return first_frames(decoder, source.batches(), wanted)
             for chunk in source.chunks():
                 for item in decoder.feed(chunk.data, chunk.at):
@@ -253,11 +262,15 @@ class FileInput(Input):
 
     def _read(self) -> Iterator[Arrival]:
         """Every incoming frame, in batches."""
-        if isinstance(self._transport, CaptureTransport) and not self.decoder.stream:
+        if isinstance(self._transport, CaptureTransport):
             for datagrams in self._transport.batches():
+                if self.decoder.stream:
+                    yield from map(Arrival, _streamed(self.decoder, datagrams))
+                    continue
                 spans = self.decoder.placed(datagrams.buffer, datagrams.starts, datagrams.sizes, datagrams.at)
                 self.senders.see(datagrams.sent(spans))
                 yield Arrival([spans])
+            yield Arrival(self.decoder.rest())
             return
         for batch in _batches(self._transport.chunks()):
             if batch[0].gap or batch[0].quiet:

@@ -14,7 +14,7 @@ from pathlib import Path
 from shlex import quote
 from typing import BinaryIO
 
-from lidarspec.captures.bulk import Batch, CaptureBatches
+from lidarspec.captures.bulk import Batch, CaptureBatches, StreamBatches
 from lidarspec.captures.containers import HEAD, damage, head, opened, refuse_container, unpacked
 from lidarspec.captures.pcap import CaptureReader, CaptureStats, StreamReader, is_stream_capture
 from lidarspec.captures.records import is_capture
@@ -159,7 +159,7 @@ class FileTransport(Transport):
     @property
     def can_go_on(self) -> bool:
         """Whether another one can begin where this one stands: of bytes as they are, and batches of a capture."""
-        return type(self) in (FileTransport, CaptureTransport) and self.file.seekable()
+        return type(self) in (FileTransport, CaptureTransport, StreamCaptureTransport) and self.file.seekable()
 
     def chunks(self) -> Iterator[Chunk]:
         with system_errors(self._path):
@@ -212,6 +212,7 @@ class CaptureTransport(FileTransport):
     """
 
     datagrams = True
+    in_batches: type[CaptureBatches] = CaptureBatches
 
     def __init__(self, path: str, file: BinaryIO, *, sender: str | None = None) -> None:
         super().__init__(path, file)
@@ -233,7 +234,7 @@ class CaptureTransport(FileTransport):
         Raises:
             SourceError: where the file cannot be read.
         """
-        reader = self.reader = self.reader or CaptureBatches(self.file)
+        reader = self.reader = self.reader or self.in_batches(self.file)
         for batch in reader.batches():
             mine = batch if self._origin is None else batch.of(self._origin)
             self.foreign += len(batch) - len(mine)
@@ -242,8 +243,11 @@ class CaptureTransport(FileTransport):
         self._warn(reader.stats)
 
 
-class StreamCaptureTransport(FileTransport):
+class StreamCaptureTransport(CaptureTransport):
     """The bytes of a capture of a byte stream, packet by packet."""
+
+    datagrams = False
+    in_batches = StreamBatches
 
     def chunks(self) -> Iterator[Chunk]:
         reader = StreamReader(self.file)

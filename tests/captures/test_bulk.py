@@ -20,9 +20,9 @@ import numpy as np
 import pytest
 
 import lidarspec as ls
-from lidarspec.captures.bulk import Batch, CaptureBatches
+from lidarspec.captures.bulk import Batch, CaptureBatches, StreamBatches
 from lidarspec.captures.ip import ETHERNET
-from lidarspec.captures.pcap import CaptureReader, Datagram, datagram_record
+from lidarspec.captures.pcap import USER_LINKS, CaptureReader, Datagram, StreamReader, datagram_record
 from lidarspec.captures.records import capture_head
 from lidarspec.simulation.simulator import simulate
 from lidarspec.transports.files import CaptureTransport, open_file
@@ -33,13 +33,13 @@ from tests.shapes import SHAPES
 Read = tuple[list[tuple[bytes, int, tuple[str, int]]], object]
 
 
-def one_by_one(file: BinaryIO | Path) -> Read:
-    reader = CaptureReader(file)
+def one_by_one(file: BinaryIO | Path, kind: type[CaptureReader] = CaptureReader) -> Read:
+    reader = kind(file)
     return [(datagram.data, datagram.at, datagram.source) for datagram in reader], reader.stats
 
 
-def in_batches(file: BinaryIO | Path) -> Read:
-    reader = CaptureBatches(file)
+def in_batches(file: BinaryIO | Path, kind: type[CaptureBatches] = CaptureBatches) -> Read:
+    reader = kind(file)
     return [row for batch in reader.batches() for row in rows(batch)], reader.stats
 
 
@@ -100,6 +100,21 @@ def test_a_stream_comes_in_few_batches() -> None:
     found, _ = check(capture)
     assert len(found) == 1000
     assert len(list(CaptureBatches(io.BytesIO(capture)).batches())) < 10
+
+
+@pytest.mark.parametrize("sizes", [[47], [47, 9, 130]], ids=["one size", "sizes"])
+def test_a_byte_stream_in_batches_is_what_it_is_packet_by_packet(sizes: list[int]) -> None:
+    packets = [bytes([index & 0xFF]) * sizes[index // 40 % len(sizes)] for index in range(900)]
+    records = [made.record(data, seconds=made.SECONDS + index // 9) for index, data in enumerate(packets)]
+    records[300:305] = [made.record(bytes(47), original=90)] * 5  # cut where the file says, as long as others
+    capture = made.pcap_head(link=USER_LINKS[0], snap_length=47) + b"".join(records)
+    found, stats = in_batches(io.BytesIO(capture), StreamBatches)
+    assert (found, stats) == one_by_one(io.BytesIO(capture), StreamReader)
+    assert [data for data, _, _ in found[:300]] == packets[:300]
+    assert (len(found), getattr(stats, "snapped", None)) == (900, 5)
+    batches = list(StreamBatches(io.BytesIO(capture)).batches())
+    assert len(batches) < 10
+    assert b"".join(batch.joined for batch in batches) == b"".join(data for data, _, _ in found)
 
 
 @pytest.mark.parametrize("order", ["<", ">"])

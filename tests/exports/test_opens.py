@@ -5,6 +5,7 @@ from __future__ import annotations
 import random
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 import lidarspec
@@ -104,3 +105,13 @@ def test_a_capture_of_a_byte_stream_is_read_like_the_stream(tmp_path: Path) -> N
             counted.append((len(scans), [len(scan) for scan in scans], device.stats.frames))
     assert counted[0] == counted[1]
     assert counted[0][2]["data"] > 100
+
+
+def test_frames_of_a_captured_stream_have_the_times_of_their_packets(tmp_path: Path) -> None:
+    capture = tmp_path / "it.pcap"
+    ran("sim", "ldrobot-stl27l", "--to", capture, "-t", "0.2s")
+    with StreamReader(capture) as reader:
+        sent = [packet.at for packet in reader]
+    assert len(set(sent)) > 10
+    with lidarspec.open(capture, "ldrobot-stl27l") as device:
+        assert np.concatenate([packets.host_ns for packets in device.packets()]).tolist() == sent
