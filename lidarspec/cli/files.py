@@ -29,6 +29,7 @@ from lidarspec.plugins import sensor as named_sensor
 from lidarspec.scans.scans import Scan
 from lidarspec.scans.selection import Selection
 from lidarspec.spec.sensor import Sensor
+from lidarspec.stores import found
 from lidarspec.transports.open_url import is_live, transport
 from lidarspec.transports.protocol import Chunk, no_bytes
 from lidarspec.view.polar import look
@@ -54,7 +55,7 @@ class Written:
             self.scans += 1
             self.units = self.units or scan.points.units
             self.points += len(scan) if every_point else int(scan.points.valid.sum())
-            progress(lambda: f"{self}, {size(self.device.stats.bytes_in)} read")
+            progress(lambda: str(self), self.device.place)
             yield scan
 
 
@@ -118,36 +119,50 @@ def convert(
         how: dict[str, Any] = {"jobs": jobs or 1, "scheduler": scheduler or "", "size": int(piece_size or batch.PIECE)}
         how |= {"every_point": every_point, "select": selection, "force": force}
         records = batch.convert(sources, target, suffix.removeprefix("."), sensor_id, **how)
-        _convert_all(records, target, as_json=as_json)
+        _convert_all(records, target, len({path for pattern in sources for path, _ in found(pattern)}), as_json=as_json)
         return
     if len(sources) > 1 or jobs or scheduler or piece_size:
-        raise suggest(
-            UsageError("several files, and --jobs, --dask and --piece, go into a folder in one format"), "the same with --to parquet"
-        )
-    source = sources[0]
+        error = UsageError("several files, and --jobs, --dask and --piece, go into a folder in one format")
+        raise suggest(error, "the same with --to parquet")
     format_of(target)
-    refuse_overwriting(targets(target), source, sensor_id, force=force)
-    sensor = _detected(source, target) if sensor_id is None else named_sensor(sensor_id)
-    with open_device(source, sensor) as device, Progress() as progress, _packets(source, wanted=with_packets) as packets:
-        written = Written(device, target)
+    refuse_overwriting(targets(target), sources[0], sensor_id, force=force)
+    sensor = _detected(sources[0], target) if sensor_id is None else named_sensor(sensor_id)
+    with open_device(sources[0], sensor) as device:
         if is_imu:
-            samples = joined(list(device.imu()))[:count]
-            if not len(samples):
-                raise _no_data(device, source, target)
-            write_imu(target, samples)
-            note(f"{target}: {len(samples)} samples of the IMU of {device.sensor.id}; {device.stats}")
-            if as_json:
-                emit_json({"sensor": device.sensor.id, "output": target, "samples": len(samples), "stats": device.stats.to_dict()}, None)
-            conclude(device)
-            return
-        scans = itertools.islice(scans_of(device, source, selection), count)
+            summary = _write_imu(device, target, count)
+        else:
+            scans = itertools.islice(scans_of(device, sources[0], selection), count)
+            summary = _write_points(device, target, scans, every_point=every_point, organized=organized, with_packets=with_packets)
+        if as_json:
+            emit_json({"sensor": device.sensor.id, "output": target, **summary, "stats": device.stats.to_dict()}, None)
+        conclude(device)
+
+
+def _write_imu(device: Device, target: str, count: int | None) -> dict[str, Any]:
+    """Write what the IMU felt; what is to be said of it."""
+    samples = joined(list(device.imu()))[:count]
+    if not len(samples):
+        raise _no_data(device, target)
+    write_imu(target, samples)
+    note(f"{target}: {len(samples)} samples of the IMU of {device.sensor.id}; {device.stats}")
+    return {"samples": len(samples)}
+
+
+def _write_points(
+    device: Device, target: str, scans: Iterator[Scan], *, every_point: bool, organized: bool, with_packets: bool
+) -> dict[str, Any]:
+    """Write the points of scans; what is to be said of them."""
+    written = Written(device, target)
+    with Progress(size) as progress, _packets(str(device.source), wanted=with_packets) as packets:
         first = next(scans, None)
         if first is None:
-            raise _no_data(device, source, target)
+            raise _no_data(device, target)
         counted = written.counting(itertools.chain([first], scans), progress, every_point=every_point or organized)
         write(target, counted, every_point=every_point, organized=organized, packets=packets)
-        progress.clear()
-        _sum_up(device, target, written, as_json=as_json)
+    note(f"{written} of {device.sensor.id}; {device.stats}")
+    if written.units:
+        note(f"further columns: {', '.join(f'{name} [{unit}]' if unit else name for name, unit in written.units.items())}")
+    return {"scans": written.scans, "points": written.points, "units": dict(written.units)}
 
 
 @contextlib.contextmanager
@@ -164,10 +179,10 @@ def _packets(source: str, *, wanted: bool) -> Iterator[Iterator[Chunk] | None]:
         yield opened.chunks()
 
 
-def _convert_all(records: Iterable[tuple[batch.Record, bool]], folder: str, *, as_json: bool) -> None:
+def _convert_all(records: Iterable[tuple[batch.Record, bool]], folder: str, files: int, *, as_json: bool) -> None:
     """Say what becomes of each piece, and in the end of all; exit code 1 where one has failed."""
     totals, before, failed = Counter[str](), 0, list[batch.Record]()
-    with Progress() as progress:
+    with Progress("{:.1f} files".format) as progress:
         for record, is_old in records:
             before += is_old
             if "error" in record:
@@ -175,7 +190,7 @@ def _convert_all(records: Iterable[tuple[batch.Record, bool]], folder: str, *, a
                 progress.note(f"{record['source']}: {record['error']}")
                 continue
             totals.update({"files": record["last"], "pieces": 1, "scans": record["scans"], "points": record["points"]})
-            progress(lambda: f"{folder}: {totals['pieces']} pieces, {totals['points']} points")
+            progress(lambda: f"{folder}: {totals['points']} points", (totals["files"] + len(failed), files))
     told = ", ".join(f"{number} {what}" for what, number in totals.items() if what != "pieces" or number > totals["files"])
     note(f"{folder}: {told or 'nothing'}" + f"; {before} pieces were done before" * bool(before) + f"; {len(failed)} failed" * bool(failed))
     if as_json:
@@ -194,38 +209,17 @@ def _detected(source: str, target: str) -> Sensor:
         raise error if given is None else nearest_fault(given) from None
 
 
-def _sum_up(device: Device, target: str, written: Written, *, as_json: bool) -> None:
-    note(f"{written} of {device.sensor.id}; {device.stats}")
-    if written.units:
-        note(f"further columns: {', '.join(f'{name} [{unit}]' if unit else name for name, unit in written.units.items())}")
-    if as_json:
-        stats = device.stats.to_dict()
-        emit_json(
-            {
-                "sensor": device.sensor.id,
-                "output": target,
-                "scans": written.scans,
-                "points": written.points,
-                "units": dict(written.units),
-                "stats": stats,
-            },
-            None,
-        )
-    conclude(device)
-
-
-def _no_data(device: Device, source: str, target: str) -> Exception:
+def _no_data(device: Device, target: str) -> Exception:
     """Why nothing came out: an empty file, a damaged frame, another sensor's bytes, or no lidar's at all."""
-    sensor, stats = device.sensor, device.stats
+    sensor, stats, source = device.sensor, device.stats, str(device.source)
     if stats.bytes_in == 0:
         return suggest(WireError(no_bytes(source, device.warnings), sensor=sensor.id), f"lidarspec show {sensor.id}")
     if (failure := stats.failure(sensor.id)) is not None:
         return failure
     instead = fits_instead(sensor, source)
     if instead is not None:
-        return suggest(
-            WireError(f"{source} {instead[0]}", sensor=sensor.id), f"lidarspec convert {quote(source)} {quote(target)} {instead[1]}"
-        )
+        error = WireError(f"{source} {instead[0]}", sensor=sensor.id)
+        return suggest(error, f"lidarspec convert {quote(source)} {quote(target)} {instead[1]}")
     given = again(source) if not stats.frames else None
     if given is not None:
         return no_frame(sensor, given)
@@ -241,15 +235,15 @@ def info(file: str, as_json: bool, output: str | None) -> None:
     FILE is anything that is read: a recording, a capture, a robotics log, bytes. Of a long one the beginning is looked at, and of a
     recording the end.
     """
-    found = contents(file)
+    held = contents(file)
     if as_json:
-        emit_json(found.to_dict(), output)
+        emit_json(held.to_dict(), output)
     else:
-        lines = [f"{found.path}: {found.kind}, {size(found.size)}", *(f"  {word:<8}  {text}" for word, text in shown(found))]
+        lines = [f"{held.path}: {held.kind}, {size(held.size)}", *(f"  {word:<8}  {text}" for word, text in shown(held))]
         emit("\n".join(lines), output)
-    for warning in found.warnings:
+    for warning in held.warnings:
         note(warning)
-    if not any(content.sensors for content in found.contents):
+    if not any(content.sensors for content in held.contents):
         raise click.exceptions.Exit(NO_DATA)
 
 

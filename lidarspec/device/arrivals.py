@@ -6,6 +6,7 @@
 from __future__ import annotations
 
 import contextlib
+import os
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from itertools import accumulate
@@ -94,6 +95,11 @@ class Input(Protocol):
     @property
     def queued(self) -> int | None:
         """Chunks that have arrived and wait to be decoded; None where nothing waits."""
+        return None
+
+    @property
+    def place(self) -> tuple[int, int] | None:
+        """How many bytes of the stored file were read, and how many there are; None where nobody knows."""
         return None
 
     def skip(self, at: int) -> bool:
@@ -215,6 +221,14 @@ class FileInput(Input):
         stats = self.decoder.stats
         stats.foreign, stats.disconnects, stats.unread = self._transport.foreign, self._transport.disconnects, self._transport.unread
         return stats
+
+    @property
+    def place(self) -> tuple[int, int] | None:
+        stored: Any = self._transport.stored
+        if stored is None or not stored.seekable():
+            return None
+        size: int = stored.size if hasattr(stored, "size") else os.fstat(stored.fileno()).st_size  # in a store, or here
+        return stored.tell(), size
 
     def next(self, wait: float) -> Arrival | None:
         found = next(self._arrivals, None)

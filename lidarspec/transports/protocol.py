@@ -13,7 +13,7 @@ from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from types import TracebackType
-from typing import Any, Self
+from typing import Any, BinaryIO, Self
 
 from lidarspec.errors import SourceError, UsageError
 
@@ -137,6 +137,7 @@ class Transport(ABC):
         kernel_drops: datagrams that the system threw away, so far, since nobody fetched them in time.
         disconnects: interruptions of the line that a recording tells of, so far.
         unread: bytes of a damaged file that could not be read, so far.
+        stored: the file that is read, as it is stored: one that unpacks it stands before it.
     """
 
     datagrams: bool = False
@@ -146,6 +147,7 @@ class Transport(ABC):
     kernel_drops: int = 0
     disconnects: int = 0
     unread: int = 0
+    stored: BinaryIO | None = None
 
     @abstractmethod
     def chunks(self) -> Iterator[Chunk]:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import csv
+import gzip
 import json
 import os
 import re
@@ -234,12 +235,37 @@ def test_a_terminal_shows_how_far_it_is(tmp_path: Path) -> None:
     from tests.view.terminal import Terminal
 
     (tmp_path / "drive.bin").write_bytes(b"".join(simulate(ls.sensor("ldrobot-stl27l"), 900)))
-    with Terminal("convert", "drive.bin", "out.npz", "-s", "ldrobot-stl27l", cwd=tmp_path) as terminal:
-        assert terminal.ended() == 0
-        shown = terminal.text()
-    assert re.search(r"\rout\.npz: \d+ points of 1 scan, [\d.]+ kB read", terminal.raw)
-    assert " read" not in shown
-    assert "out.npz: 10800 points of" in shown
+    for more in ((), ("-q", "--force")):
+        with Terminal("convert", "drive.bin", "out.npz", "-s", "ldrobot-stl27l", *more, cwd=tmp_path) as terminal:
+            assert terminal.ended() == 0
+            shown = terminal.text()
+        assert bool(re.search(r"out\.npz: \d+ points of 1 scan .*\d+%.*\d:\d|--:--", terminal.raw)) is not bool(more)
+        assert "%" not in shown
+        assert ("out.npz: 10800 points of" in shown) is not bool(more)
+
+
+def test_how_far_a_file_was_read_is_known_where_it_is_stored(tmp_path: Path) -> None:
+    plain, packed = tmp_path / "drive.bin", tmp_path / "drive.bin.gz"
+    plain.write_bytes(b"".join(simulate(ls.sensor("ldrobot-stl27l"), 900)))
+    packed.write_bytes(gzip.compress(plain.read_bytes()))
+    for path in (plain, packed):
+        with ls.open(path, "ldrobot-stl27l") as device:
+            assert device.place is not None
+            assert device.place[1] == path.stat().st_size
+            assert list(device.scans())
+            assert device.place == (path.stat().st_size, path.stat().st_size)
+    with ls.open("sim:ldrobot-stl27l", "ldrobot-stl27l") as device:
+        assert device.place is None
+
+
+def test_more_and_less_is_said(tmp_path: Path) -> None:
+    path = tmp_path / "drive.bin"
+    path.write_bytes(b"".join(simulate(ls.sensor("ldrobot-stl27l"), 900)))
+    words = ["convert", path, tmp_path / "out.npz", "-s", "ldrobot-stl27l", "--force"]
+    assert re.search(r"10800 points .*\n[\d.]+ s, \d+ MB of memory\n", ran(*words, "-v").stderr)
+    assert ran(*words, "-q").stderr == ""
+    assert "points of" in ran(*words).stderr
+    assert "no/out.npz: No such file" in ran("convert", path, tmp_path / "no" / "out.npz", "-s", "ldrobot-stl27l", "-q", code=3).stderr
 
 
 def test_further_columns_are_written_and_printed_with_their_units(tmp_path: Path) -> None:
