@@ -20,7 +20,13 @@ Function = TypeVar("Function", bound=Callable[..., Any])
 
 
 def sensor_option(function: Function) -> Function:
-    """``-s/--sensor``, ``-O`` and ``--calibration``, with which it is configured: the verb is given an id, or the sensor so configured."""
+    """``-s/--sensor``, and what it is configured with."""
+    told = "The sensor: an id, an alias, or a file ./mysensor.py."
+    return click.option("-s", "--sensor", "sensor_id", metavar="ID", help=told)(configuring(function))
+
+
+def configuring(function: Function) -> Function:
+    """``-O`` and ``--calibration``, with which the sensor is configured: the verb is given an id, or the sensor so configured."""
 
     @functools.wraps(function)
     def configured(*args: Any, sensor_id: str | None, options: Sequence[str], calibration: str | None, **others: Any) -> Any:
@@ -29,9 +35,7 @@ def sensor_option(function: Function) -> Function:
 
     unit = click.option("--calibration", metavar="FILE", help="The unit's own calibration, short for -O calibration=FILE.")(configured)
     told = "An option of the sensor, such as calibration=FILE or answer=FRAME; may be given again."
-    chosen = click.option("-O", "--option", "options", metavar="NAME=VALUE", multiple=True, help=told)(unit)
-    named = click.option("-s", "--sensor", "sensor_id", metavar="ID", help="The sensor: an id, an alias, or a file ./mysensor.py.")
-    return named(chosen)  # type: ignore[return-value]
+    return click.option("-O", "--option", "options", metavar="NAME=VALUE", multiple=True, help=told)(unit)  # type: ignore[return-value]
 
 
 def _configured(sensor_id: str | None, options: Sequence[str]) -> str | Sensor | None:
