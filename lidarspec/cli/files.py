@@ -6,7 +6,7 @@ import contextlib
 import itertools
 from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from shlex import quote
 from typing import Any
@@ -20,20 +20,26 @@ from lidarspec.cli.options import BYTES, colour_option, count_option, output_opt
 from lidarspec.cli.output import Progress, emit, emit_json, size
 from lidarspec.cli.terminal import note
 from lidarspec.device.device import Device, open as open_device
+from lidarspec.device.source_recording import recorder_like
 from lidarspec.discovery.detect import detected
 from lidarspec.errors import UsageError, WireError, suggest, suggestion
 from lidarspec.explaining.contents import contents, shown
 from lidarspec.formats import check_holds, format_of, targets, write, write_imu
+from lidarspec.formats.writing import replacing
 from lidarspec.packets.imu import joined
 from lidarspec.plugins import sensor as named_sensor
+from lidarspec.recording.recorders import SUFFIXES
 from lidarspec.scans.scans import Scan
-from lidarspec.scans.selection import Selection
+from lidarspec.scans.selection import EVERYTHING, Selection, Times, received
 from lidarspec.spec.sensor import Sensor
 from lidarspec.stores import found
 from lidarspec.transports.open_url import is_live, transport
 from lidarspec.transports.protocol import Chunk, no_bytes
 from lidarspec.view.polar import look
 from lidarspec.view.svg import svg
+
+#: of files that hold packets as they were received; bytes alone have the suffix of KITTI's points.
+PACKETS = tuple(suffix for suffix in SUFFIXES if suffix != ".bin")
 
 
 @dataclass
@@ -100,6 +106,8 @@ def convert(
     .xyz x y z. For a file each scan put the place of a number into the name, scans/%05d.pcd; %F, %H, %M and %S
     stand for date, hour, minute and second of the scans that share a file.
 
+    .lsr, .pcap and .pcapng hold the packets themselves, as they were received.
+
     Tables (.parquet, .arrow, .feather), surveys (.las, .laz, .e57), .zarr, logs of ROS (.mcap, .bag, .rosbag2, .db3) and of Foxglove
     (.foxglove.mcap) take libraries that are not installed by default: lidarspec[arrow,las,e57,zarr,ros,foxglove].
 
@@ -124,6 +132,12 @@ def convert(
     if len(sources) > 1 or jobs or scheduler or piece_size:
         error = UsageError("several files, and --jobs, --dask and --piece, go into a folder in one format")
         raise suggest(error, "the same with --to parquet")
+    if Path(target).suffix.lower() in PACKETS:
+        if count or is_imu or replace(selection, times=(None, None), time="device") != EVERYTHING:
+            raise UsageError(f"{target} holds packets, which are selected by --slice alone")
+        refuse_overwriting([target], sources[0], sensor_id, force=force)
+        _write_packets(sources[0], target, sensor_id, selection.times, as_json=as_json)
+        return
     format_of(target)
     refuse_overwriting(targets(target), sources[0], sensor_id, force=force)
     sensor = _detected(sources[0], target) if sensor_id is None else named_sensor(sensor_id)
@@ -146,6 +160,26 @@ def _write_imu(device: Device, target: str, count: int | None) -> dict[str, Any]
     write_imu(target, samples)
     note(f"{target}: {len(samples)} samples of the IMU of {device.sensor.id}; {device.stats}")
     return {"samples": len(samples)}
+
+
+def _write_packets(source: str, target: str, sensor_id: str | Sensor | None, times: Times, *, as_json: bool) -> None:
+    """Write what was received, as it came."""
+    if is_live(source):
+        raise suggest(UsageError(f"{source} is no file"), f"lidarspec record {quote(source)} -o {quote(target)}")
+    with contextlib.closing(transport(source)) as opened, Progress(size) as progress, replacing(Path(target)) as part:
+        needs_sensor = not opened.datagrams and Path(target).suffix.lower() != ".lsr"  # whose frames are the packets
+        sensor = named_sensor(sensor_id) if sensor_id is not None else _detected(source, target) if needs_sensor else None
+        with recorder_like(opened, source, str(part), sensor, overwrite=True) as file:
+            for chunk in received(opened, times, source):
+                file.keep_up()
+                file.write(chunk)
+                progress(lambda: f"{target}: {file.records} packets", opened.place)
+        if not file.records:
+            raise suggest(WireError(no_bytes(source, opened.warnings)), f"lidarspec info {quote(source)}")
+    for remark in (f"{target}: {file.records} packets, {size(file.bytes)}", *opened.warnings):
+        note(remark)
+    if as_json:
+        emit_json({"output": target, "packets": file.records, "bytes": file.bytes}, None)
 
 
 def _write_points(

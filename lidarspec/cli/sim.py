@@ -39,12 +39,13 @@ from lidarspec.view.polar import look, picture
 IN_A_FILE = 10.0
 #: cells of the picture at most, and lines that are kept for the summary.
 WIDEST, HIGHEST, SUMMARY = 100, 42, 8
+PLACES = f"pty, udp://HOST:PORT, tcp://HOST:PORT, or a file ({', '.join(SUFFIXES)}).  [default: pty or udp]"
 
 
 @click.command(short_help="A simulated sensor on a serial port, UDP, TCP or in a file.")
 @click.argument("sensor_id", metavar="SENSOR")
 @configuring
-@click.option("--to", metavar="PLACE", help="pty, udp://HOST:PORT, tcp://HOST:PORT, or a file (.lsr, .pcap, .bin).  [default: pty or udp]")
+@click.option("--to", metavar="PLACE", help=PLACES)
 @click.option("--link", metavar="PATH", help="A symbolic link that leads to the pty.")
 @click.option("-t", "--duration", type=DURATION, help="End after so long; of a file, how much goes in.  [default: never; 10s]")
 @click.option("--rate", metavar="FACTOR", default="1", show_default=True, help="How many times faster than in reality, or max.")

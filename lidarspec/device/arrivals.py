@@ -6,7 +6,6 @@
 from __future__ import annotations
 
 import contextlib
-import os
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from itertools import accumulate
@@ -224,11 +223,7 @@ class FileInput(Input):
 
     @property
     def place(self) -> tuple[int, int] | None:
-        stored: Any = self._transport.stored
-        if stored is None or not stored.seekable():
-            return None
-        size: int = stored.size if hasattr(stored, "size") else os.fstat(stored.fileno()).st_size  # in a store, or here
-        return stored.tell(), size
+        return self._transport.place
 
     def next(self, wait: float) -> Arrival | None:
         found = next(self._arrivals, None)

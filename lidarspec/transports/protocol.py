@@ -6,6 +6,7 @@ A `Transport` is the only place for input and output: it gives `Chunk`s and take
 
 from __future__ import annotations
 
+import os
 import re
 from abc import ABC, abstractmethod
 from collections import defaultdict
@@ -156,6 +157,15 @@ class Transport(ABC):
         Raises:
             SourceError: where it cannot be read.
         """
+
+    @property
+    def place(self) -> tuple[int, int] | None:
+        """How many bytes of the stored file were read, and how many there are; None where nobody knows."""
+        stored: Any = self.stored
+        if stored is None or not stored.seekable():
+            return None
+        size: int = stored.size if hasattr(stored, "size") else os.fstat(stored.fileno()).st_size  # in a store, or here
+        return stored.tell(), size
 
     def skip(self, at: int) -> bool:
         """Pass over what arrived before a time, ns since 1970, where that can be done without reading it: whether it was."""
