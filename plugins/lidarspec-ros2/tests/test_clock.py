@@ -2,17 +2,12 @@
 
 from __future__ import annotations
 
-import sys
-from pathlib import Path
-
 import numpy as np
 import pytest
+from clocks import BEGAN, JITTERS, SET, simulated
 from hypothesis import given, settings, strategies as st
 
 from lidarspec_ros2.clock import DeviceClock
-
-sys.path.insert(0, str(Path(__file__).parent))
-from clocks import BEGAN, JITTERS, SET, simulated
 
 SECOND = 1_000_000_000
 LATE_ONLY = [name for name in JITTERS if "±" not in name]
