@@ -23,18 +23,31 @@ def sensor_option(function: Function) -> Function:
     """``-s/--sensor``, ``-O`` and ``--calibration``, with which it is configured: the verb is given an id, or the sensor so configured."""
 
     @functools.wraps(function)
-    def configured(*args: Any, sensor_id: str | None, options: Sequence[str], calibration: str | None, **others: Any) -> Any:
-        files = () if calibration is None else (f"calibration={calibration}",)
-        return function(*args, sensor_id=_configured(sensor_id, (*options, *files)), **others)
+    def chosen(*args: Any, sensor_id: str | None, options: Sequence[str], calibration: str | None, **others: Any) -> Any:
+        return function(*args, sensor_id=configured(sensor_id, options, calibration), **others)
 
-    unit = click.option("--calibration", metavar="FILE", help="The unit's own calibration, short for -O calibration=FILE.")(configured)
+    return sensor_words(chosen)  # type: ignore[return-value]
+
+
+def sensor_words(function: Callable[..., Any]) -> Callable[..., Any]:
+    """The same options, as they are typed: `sensor_id`, `options` and `calibration`, as `configured` takes them."""
+    unit = click.option("--calibration", metavar="FILE", help="The unit's own calibration, short for -O calibration=FILE.")(function)
     told = "An option of the sensor, such as calibration=FILE or answer=FRAME; may be given again."
     chosen = click.option("-O", "--option", "options", metavar="NAME=VALUE", multiple=True, help=told)(unit)
-    named = click.option("-s", "--sensor", "sensor_id", metavar="ID", help="The sensor: an id, an alias, or a file ./mysensor.py.")
-    return named(chosen)  # type: ignore[return-value]
+    return click.option("-s", "--sensor", "sensor_id", metavar="ID", help="The sensor: an id, an alias, or a file ./mysensor.py.")(chosen)
 
 
-def _configured(sensor_id: str | None, options: Sequence[str]) -> str | Sensor | None:
+def configured(sensor_id: str | None, options: Sequence[str], calibration: str | None) -> str | Sensor | None:
+    """The id, or the sensor with these options.
+
+    Args:
+        options: "NAME=VALUE" each.
+        calibration: a file.
+
+    Raises:
+        UsageError: for options without a sensor or a value, and for those that it does not take.
+    """
+    options = [*options, *(() if calibration is None else (f"calibration={calibration}",))]
     if not options:
         return sensor_id
     if sensor_id is None:
@@ -43,8 +56,8 @@ def _configured(sensor_id: str | None, options: Sequence[str]) -> str | Sensor |
     if unset := [option for option in options if "=" not in option]:
         raise UsageError(f"-O {unset[0]}: an option has a value: NAME=VALUE")
     known: Sensor = sensor(sensor_id)
-    configured: Sensor = known.configure(**{name: _value(known, name, text) for name, text in given.items()})
-    return configured
+    found: Sensor = known.configure(**{name: _value(known, name, text) for name, text in given.items()})
+    return found
 
 
 def _value(sensor: Sensor, name: str, text: str) -> Any:
