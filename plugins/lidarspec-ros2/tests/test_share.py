@@ -14,10 +14,10 @@ import pytest
 import yaml
 from ament_index_python.packages import get_package_prefix, get_package_share_directory
 from client import Client, message
-from lidarspec_ros2.parameters import NAMED
 from sensor_msgs.msg import LaserScan, PointCloud2
 
 import lidarspec as ls
+from lidarspec_ros2.parameters import NAMED
 from tests.docs import pages
 
 DRIVERS, HOW_TO, NODES = "reference/ros2-drivers.md", "how-to/ros2.md", ("/front/lidar", "/back/lidar")
