@@ -12,23 +12,34 @@ SEED ?= 0
 
 BIN := $(VENV)/bin
 PIP := $(BIN)/python -m pip --disable-pip-version-check
-PLUGINS := $(patsubst %/pyproject.toml,%,$(wildcard plugins/*/pyproject.toml))
+ROS2 := plugins/lidarspec-ros2
+DISTRIBUTIONS := $(patsubst %/pyproject.toml,%,$(wildcard plugins/*/pyproject.toml))
+# What needs ROS has an environment of its own.
+PLUGINS := $(filter-out $(ROS2),$(DISTRIBUTIONS))
 PROJECTS := pyproject.toml $(PLUGINS:%=%/pyproject.toml)
 PACKAGES := lidarspec $(wildcard plugins/*/lidarspec_*)
 USERS := $(VENV)/.installed
 DEVELOPERS := $(VENV)/.installed-dev
 WRITERS := $(VENV)/.installed-docs
 PEERS := $(VENV)/.installed-bench
+ROBOTS := $(VENV)/.installed-ros2
 FUZZERS := $(VENV)/.installed-fuzz
 RECENT := import sys; sys.exit(sys.version_info < (3, 11))
 
-.PHONY: demo test test-long soak fuzz lint types docs wheels reference bench bench-here clean
+.PHONY: demo test test-ros2 test-ros2-here test-long soak fuzz lint types docs wheels reference bench bench-here clean
 
 demo: $(USERS)
 	@$(BIN)/lidarspec demo -s ldrobot-stl27l
 
 test: $(DEVELOPERS)
 	@$(BIN)/python -m pytest -n auto --dist worksteal $(ARGS)
+
+# The ROS 2 node, with ROS itself from wheels or from where it was sourced, on the loopback alone.
+test-ros2:
+	@$(MAKE) --no-print-directory VENV=$(VENV)-ros2 test-ros2-here
+
+test-ros2-here: $(ROBOTS)
+	@ROS_AUTOMATIC_DISCOVERY_RANGE=LOCALHOST $(BIN)/python -m pytest $(ROS2) $(ARGS)
 
 # The conformance suite with 4000 examples instead of 12: hours.
 test-long: $(DEVELOPERS)
@@ -54,7 +65,7 @@ docs: $(WRITERS)
 	@NO_MKDOCS_2_WARNING=1 $(BIN)/python -m mkdocs build --strict --site-dir $(abspath $(SITE))
 
 wheels: $(DEVELOPERS)
-	@for project in . $(PLUGINS); do $(BIN)/python -m build --wheel --no-isolation --outdir $(DIST) $$project || exit 1; done
+	@for project in . $(DISTRIBUTIONS); do $(BIN)/python -m build --wheel --no-isolation --outdir $(DIST) $$project || exit 1; done
 
 # The pages of the sensors in docs/reference/sensors, from their specs; those of the verbs, and the manual pages, from the commands.
 reference: $(USERS)
@@ -69,7 +80,7 @@ bench-here: $(PEERS)
 	@$(BIN)/python benchmarks/run.py $(ARGS)
 
 clean:
-	rm -rf .venv .venv-bench .fuzz dist site .hypothesis .mypy_cache .pytest_cache .ruff_cache
+	rm -rf .venv .venv-bench .venv-ros2 .fuzz dist site .hypothesis .mypy_cache .pytest_cache .ruff_cache
 	find lidarspec plugins tests -name __pycache__ -type d -prune -exec rm -rf {} +
 
 # An environment without a working pip, as a failed attempt leaves it behind, is made again.
@@ -94,6 +105,11 @@ $(WRITERS): $(USERS)
 $(PEERS): $(USERS)
 	@echo "installing what lidarspec is measured beside into $(VENV), this once"
 	@$(PIP) install --quiet --editable '.[bench]' || echo "not all of it can be installed here; the table says what is missing" >&2
+	@touch $@
+
+$(ROBOTS): $(USERS) $(ROS2)/pyproject.toml
+	@echo "installing ROS 2 into $(VENV), this once"
+	@$(PIP) install --quiet --editable '.[testing]' --editable '$(ROS2)$(if $(AMENT_PREFIX_PATH),,[ros2])'
 	@touch $@
 
 $(FUZZERS): $(DEVELOPERS)

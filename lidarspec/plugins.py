@@ -4,10 +4,6 @@ A distribution names its sensors in the entry-point group ``lidarspec.sensors``,
 one sensor loads one plugin; modules with other hooks stand in the group ``lidarspec``, and are loaded before any sensor is handed out.
 A hook is a function of a name below, marked with ``@hookimpl``.
 
-Entry points are read straight from the folders that Python imports from: importlib.metadata finds the same ones, but importing it takes
-longer than all else that finding a sensor takes. It is asked where something could be installed in another way than as a folder: in a
-zip file or an egg, or by an import hook.
-
 Each plugin is loaded on its own. One that cannot be imported, names a hook that does not exist or adds a sensor that cannot be, is named
 with its distribution and its error, rolled back, and disturbs no other.
 """
@@ -28,14 +24,14 @@ import traceback
 import warnings
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass, replace
-from importlib.machinery import PathFinder
 from reprlib import repr as shown
 from types import ModuleType
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, Any
 from zlib import crc32
 
 import pluggy
 
+from lidarspec.entry_points import GROUP, SENSORS, VERBS, EntryPoint, entry_points, normal
 from lidarspec.errors import NO_SENSORS, LidarSpecError, SourceError, SpecError, UnknownSensor, UsageError, suggest
 from lidarspec.spec.checksums import Checksum
 from lidarspec.spec.construct_layer import prepare, seals
@@ -47,6 +43,8 @@ from lidarspec.trust import document, own_settings
 
 if TYPE_CHECKING:
     from pathlib import Path
+
+    import click
 
 NAMESPACE = "lidarspec"
 
@@ -70,8 +68,8 @@ def lidarspec_points(sensor: Sensor, fields: Any) -> Points | None:
 
 
 @hookspec(firstresult=True)
-def lidarspec_source(url: str) -> Any:
-    """A transport for a URL scheme that the package does not know, or None."""
+def lidarspec_source(url: str, sensor: Sensor | None) -> Any:
+    """A transport for a URL scheme that the package does not know, or None; `sensor`: whose packets they are to be, where that is known."""
 
 
 @hookspec(firstresult=True)
@@ -80,130 +78,15 @@ def lidarspec_link(source: str, link: Link, host: str | None) -> Any:
 
 
 @hookspec
+def lidarspec_verbs() -> Iterable[click.Command]:  # type: ignore[empty-body]
+    """The verbs of the command line that a module adds, which the entry-point group `lidarspec.verbs` names."""
+
+
+@hookspec
 def lidarspec_formats() -> Iterable[Any]:  # type: ignore[empty-body]
     """File formats by suffix that the plugin adds."""
 
 
-_FOLDERS = (".dist-info", ".egg-info")
-
-
-class _NotOnlyFolders(Exception):
-    """Something that only importlib.metadata knows how to search."""
-
-
-class EntryPoint(NamedTuple):
-    """One entry point: its name, the module or object that it stands for, and the distribution that declares it."""
-
-    name: str
-    value: str
-    distribution: str
-    version: str
-
-    @property
-    def module(self) -> str:
-        """The module that it stands for, or that holds its object."""
-        return self.value.partition("[")[0].partition(":")[0].strip()
-
-    def load(self) -> Any:
-        """The module, or the object in it, imported.
-
-        Raises:
-            SpecError: where a file of entry points cannot be read.
-            Exception: whatever the import fails with.
-        """
-        if not self.module:
-            raise SpecError("its entry_points.txt is not UTF-8, or has an entry without a module")
-        attributes = self.value.partition("[")[0].partition(":")[2]
-        names = [name for name in attributes.strip().split(".") if name]
-        return functools.reduce(getattr, names, importlib.import_module(self.module))
-
-
-def entry_points(group: str) -> list[EntryPoint]:
-    """Every entry point of a group, sorted by name and value; of several distributions of one name those of the first."""
-    try:
-        found = [entry for folder in _distributions() for entry in _declared(folder, group)]
-    except _NotOnlyFolders:
-        found = _by_metadata(group)
-    return sorted(found, key=lambda entry: (entry.name, entry.value))
-
-
-def _distributions() -> Iterator[str]:
-    """The folders that describe the installed distributions, the first one of each name."""
-    if any(hasattr(finder, "find_distributions") and finder is not PathFinder for finder in sys.meta_path):
-        raise _NotOnlyFolders
-    seen = set()
-    for place in sys.path:
-        for name in _listed(place or os.curdir):
-            stem, kind = os.path.splitext(name)
-            if kind.lower() in _FOLDERS:
-                normal = _normal(stem.partition("-")[0])
-                if normal not in seen:
-                    seen.add(normal)
-                    yield os.path.join(place, name)
-
-
-def _normal(distribution: str) -> str:
-    """The name of a distribution, in the one way of the several that people write it in."""
-    return re.sub(r"[-_.]+", "-", distribution).lower()
-
-
-def _listed(place: str) -> list[str]:
-    if place.lower().rstrip("/\\").endswith(".egg"):
-        raise _NotOnlyFolders
-    try:
-        return os.listdir(place)
-    except NotADirectoryError:
-        raise _NotOnlyFolders from None
-    except OSError:
-        return []
-
-
-def _declared(folder: str, group: str) -> Iterator[EntryPoint]:
-    """The entry points of a group that one distribution declares; where not all can be read, one that says so among the modules."""
-    section, text = "", _text(folder, "entry_points.txt")
-    if "\ufffd" in text and group == GROUP:
-        yield EntryPoint("entry_points.txt", "", *_name_and_version(folder))
-    for line in map(str.strip, text.splitlines()):
-        if line.startswith("[") and line.endswith("]"):
-            section = line[1:-1]
-        elif section == group and line and not line.startswith("#"):
-            name, _, value = line.partition("=")
-            yield EntryPoint(name.strip(), value.strip(), *_name_and_version(folder))
-
-
-def _name_and_version(folder: str) -> tuple[str, str]:
-    header = (_text(folder, "METADATA") or _text(folder, "PKG-INFO")).partition("\n\n")[0]
-    fields = dict(re.findall(r"^(Name|Version):[ \t]*(.*?)[ \t\r]*$", header, re.MULTILINE))
-    return fields.get("Name", "?"), fields.get("Version", "?")
-
-
-def _text(folder: str, name: str) -> str:
-    try:
-        with open(os.path.join(folder, name), encoding="utf-8", errors="replace") as file:
-            return file.read()
-    except OSError:
-        return ""
-
-
-def _by_metadata(group: str) -> list[EntryPoint]:
-    import importlib.metadata
-
-    found: dict[str, list[EntryPoint]] = {}
-    for distribution in importlib.metadata.distributions():
-        name, version = str(getattr(distribution, "_path", "?")), "?"
-        try:
-            name, version = distribution.name or name, distribution.version
-            entries = [EntryPoint(e.name, e.value, name, version) for e in distribution.entry_points.select(group=group)]
-        except UnicodeDecodeError:
-            entries = [EntryPoint("entry_points.txt", "", name, version)] if group == GROUP else []
-        except FileNotFoundError:  # so the finder of the library importlib_metadata says that there is no metadata
-            continue
-        found.setdefault(_normal(name), entries)
-    return [entry for entries in found.values() for entry in entries]
-
-
-GROUP = "lidarspec"
-SENSORS = "lidarspec.sensors"
 #: seconds after which a plugin that is being loaded is named, and after which one that is tried counts as hanging.
 PATIENCE, LIMIT = 5.0, 10.0
 HOOKS = tuple(name for name in globals() if name.startswith("lidarspec_"))
@@ -363,13 +246,13 @@ class Registry:
         """Who has a name, of those who claim it; None where nobody can be said to."""
         claims = self._claims.get(name, {})
         homes = [home for home, claimed in claims.items() if claimed] or list(claims)
-        first = {_normal(home[0]): home for home in reversed(homes)}
+        first = {normal(home[0]): home for home in reversed(homes)}
         if len(first) < 2:
             return next(iter(first.values()), None)
         alike = {home: self._alike(home, name) for home in first.values()}
         named = self._named_owners()
-        wanted = {home: {_normal(named[one]) for one in names if one in named} for home, names in alike.items()}
-        chosen = [home for home in alike if _normal(home[0]) in wanted[home]]
+        wanted = {home: {normal(named[one]) for one in names if one in named} for home, names in alike.items()}
+        chosen = [home for home in alike if normal(home[0]) in wanted[home]]
         owners = chosen or [home for home, names in alike.items() if not wanted[home] and _is_vendor(home[0], names)]
         return owners[0] if len(owners) == 1 else None
 
@@ -487,7 +370,7 @@ class Registry:
 
 def _is_vendor(distribution: str, names: Iterable[str]) -> bool:
     """Whether a distribution is `lidarspec-VENDOR`, of the vendor that one of the names begins with."""
-    prefix, _, vendor = _normal(distribution).partition("-")
+    prefix, _, vendor = normal(distribution).partition("-")
     return prefix == NAMESPACE and bool(vendor) and any(name.startswith(f"{vendor}-") for name in names)
 
 
@@ -582,7 +465,7 @@ def tried() -> list[Plugin]:
 
     if len(_registries) > 1:  # one stands in for what is installed
         return registry().plugins
-    groups = [entry_points(GROUP), entry_points(SENSORS)]
+    groups = [_modules(), entry_points(SENSORS)]
     entries = {(entry.distribution, entry.module): entry for group in groups for entry in group}
     with ThreadPoolExecutor(os.cpu_count()) as pool:
         trials = dict(zip(entries, pool.map(_trial, entries), strict=True))
@@ -593,6 +476,14 @@ def tried() -> list[Plugin]:
     ]
     modules, offered = ([entry for entry in group if not trials[entry.distribution, entry.module][0]] for group in groups)
     return [replace(plugin, remark=trials[plugin.home][1]) for plugin in Registry(modules, offered, named_owners).plugins] + lost
+
+
+def _modules() -> list[EntryPoint]:
+    """The entry points of modules with hooks, of each module the first."""
+    found: dict[Home, EntryPoint] = {}
+    for entry in entry_points(GROUP) + entry_points(VERBS):
+        found.setdefault((entry.distribution, entry.module), entry)
+    return list(found.values())
 
 
 def _trial(home: Home) -> tuple[str, str]:
@@ -623,12 +514,28 @@ def load_alone() -> None:
 
     *home, mark, limit = sys.argv[1:]
     faulthandler.dump_traceback_later(float(limit), exit=True)
-    modules, offered = ([one for one in entry_points(group) if [one.distribution, one.module] == home] for group in (GROUP, SENSORS))
+    modules, offered = ([one for one in group if [one.distribution, one.module] == home] for group in (_modules(), entry_points(SENSORS)))
     before = set(threading.enumerate())
     Registry(modules, offered)._load_all()
     left = [thread.name for thread in threading.enumerate() if thread not in before]
     print(mark, ", ".join(left), sep="", end="", flush=True)
     os._exit(0)  # whatever is left behind
+
+
+def verb(entry: EntryPoint) -> click.Command:
+    """The verb that an entry point names, as the hook of its module gives it.
+
+    Raises:
+        SpecError: where the plugin cannot be loaded, or has no such verb.
+    """
+    local, place = Registry(), f"{entry.distribution}:{entry.module}"
+    loaded = _loaded(entry, entry.name, functools.partial(local.add, name=place))
+    if loaded.error:
+        raise SpecError(loaded.error, path=entry.distribution)
+    found: dict[str, click.Command] = {one.name: one for verbs in local.call("lidarspec_verbs") for one in verbs}
+    if entry.name not in found:
+        raise SpecError(f"its lidarspec_verbs has no verb {entry.name!r}", path=entry.distribution)
+    return found[entry.name]
 
 
 @contextlib.contextmanager

@@ -194,7 +194,7 @@ def send(
     if as_json:
         emit_json(_told(sensor, reply), output)
     else:
-        emit(_text(sensor, reply, output), output)
+        emit(replied(sensor, reply, output), output)
 
 
 def _bytes(digits: str) -> bytes:
@@ -297,7 +297,8 @@ def arguments(sensor: Sensor, name: str, assignments: Sequence[str]) -> dict[str
     return found
 
 
-def _text(sensor: Sensor, reply: Reply, output: str | None) -> str:
+def replied(sensor: Sensor, reply: Reply, output: str | None = None) -> str:
+    """A reply in words: each field with its value and its meaning; `output`: the file that it is for, which has no width."""
     if not reply.confirmed or reply.frame is None:
         return f"{sensor.id} {reply.command}: sent; no answer is documented, so whether it took is not known"
     values = explain(reply.data, sensor, reply.frame).fields.values()

@@ -21,24 +21,46 @@ Function = TypeVar("Function", bound=Callable[..., Any])
 
 def sensor_option(function: Function) -> Function:
     """``-s/--sensor``, and what it is configured with."""
-    told = "The sensor: an id, an alias, or a file ./mysensor.py."
-    return click.option("-s", "--sensor", "sensor_id", metavar="ID", help=told)(configuring(function))
+    return _named(configuring(function))  # type: ignore[return-value]
 
 
 def configuring(function: Function) -> Function:
     """``-O`` and ``--calibration``, with which the sensor is configured: the verb is given an id, or the sensor so configured."""
 
     @functools.wraps(function)
-    def configured(*args: Any, sensor_id: str | None, options: Sequence[str], calibration: str | None, **others: Any) -> Any:
-        files = () if calibration is None else (f"calibration={calibration}",)
-        return function(*args, sensor_id=_configured(sensor_id, (*options, *files)), **others)
+    def chosen(*args: Any, sensor_id: str | None, options: Sequence[str], calibration: str | None, **others: Any) -> Any:
+        return function(*args, sensor_id=configured(sensor_id, options, calibration), **others)
 
-    unit = click.option("--calibration", metavar="FILE", help="The unit's own calibration, short for -O calibration=FILE.")(configured)
+    return _optional(chosen)  # type: ignore[return-value]
+
+
+def sensor_words(function: Callable[..., Any]) -> Callable[..., Any]:
+    """The same options, as they are typed: `sensor_id`, `options` and `calibration`, as `configured` takes them."""
+    return _named(_optional(function))
+
+
+def _named(function: Callable[..., Any]) -> Callable[..., Any]:
+    told = "The sensor: an id, an alias, or a file ./mysensor.py."
+    return click.option("-s", "--sensor", "sensor_id", metavar="ID", help=told)(function)
+
+
+def _optional(function: Callable[..., Any]) -> Callable[..., Any]:
+    unit = click.option("--calibration", metavar="FILE", help="The unit's own calibration, short for -O calibration=FILE.")(function)
     told = "An option of the sensor, such as calibration=FILE or answer=FRAME; may be given again."
-    return click.option("-O", "--option", "options", metavar="NAME=VALUE", multiple=True, help=told)(unit)  # type: ignore[return-value]
+    return click.option("-O", "--option", "options", metavar="NAME=VALUE", multiple=True, help=told)(unit)
 
 
-def _configured(sensor_id: str | None, options: Sequence[str]) -> str | Sensor | None:
+def configured(sensor_id: str | None, options: Sequence[str], calibration: str | None) -> str | Sensor | None:
+    """The id, or the sensor with these options.
+
+    Args:
+        options: "NAME=VALUE" each.
+        calibration: a file.
+
+    Raises:
+        UsageError: for options without a sensor or a value, and for those that it does not take.
+    """
+    options = [*options, *(() if calibration is None else (f"calibration={calibration}",))]
     if not options:
         return sensor_id
     if sensor_id is None:
@@ -47,8 +69,8 @@ def _configured(sensor_id: str | None, options: Sequence[str]) -> str | Sensor |
     if unset := [option for option in options if "=" not in option]:
         raise UsageError(f"-O {unset[0]}: an option has a value: NAME=VALUE")
     known: Sensor = sensor(sensor_id)
-    configured: Sensor = known.configure(**{name: _value(known, name, text) for name, text in given.items()})
-    return configured
+    found: Sensor = known.configure(**{name: _value(known, name, text) for name, text in given.items()})
+    return found
 
 
 def _value(sensor: Sensor, name: str, text: str) -> Any:

@@ -5,6 +5,7 @@ Nothing here imports NumPy or construct, so that ``lidarspec --help`` is quick.
 
 from __future__ import annotations
 
+import functools
 import importlib
 import os
 import sys
@@ -17,6 +18,7 @@ import click
 from lidarspec._version import __version__
 from lidarspec.cli.failures import INTERRUPTED, report
 from lidarspec.cli.terminal import note, say, silence, streams, voice
+from lidarspec.entry_points import VERBS as PLUGGED, EntryPoint, entry_points
 from lidarspec.errors import did_you_mean
 
 #: group -> verb -> (module, what it does); the texts are those of the verbs' own help.
@@ -78,17 +80,27 @@ SPOKEN = (
 )
 
 
+@functools.cache
+def added() -> dict[str, EntryPoint]:
+    """The verbs of installed plugins, none of which is loaded for it; ours come first."""
+    return {entry.name: entry for entry in entry_points(PLUGGED) if entry.name not in VERBS}
+
+
 class Verbs(click.Group):
     """The group of all verbs; a verb's module is imported when the verb is used."""
 
     def list_commands(self, ctx: click.Context) -> list[str]:
-        return list(VERBS)
+        return [*VERBS, *added()]
 
     def get_command(self, ctx: click.Context, cmd_name: str) -> click.Command | None:
-        if cmd_name not in VERBS:
+        if cmd_name in VERBS:
+            found: click.Command = getattr(importlib.import_module(f"lidarspec.cli.{VERBS[cmd_name][0]}"), cmd_name)
+        elif cmd_name in added():
+            from lidarspec.plugins import verb
+
+            found = verb(added()[cmd_name])
+        else:
             return None
-        module = importlib.import_module(f"lidarspec.cli.{VERBS[cmd_name][0]}")
-        found: click.Command = getattr(module, cmd_name)
         known = {param.name for param in found.params}
         found.params += [option for option in SPOKEN if option.name not in known]
         if ctx.resilient_parsing:
@@ -98,20 +110,24 @@ class Verbs(click.Group):
         return found
 
     def resolve_command(self, ctx: click.Context, args: list[str]) -> tuple[str | None, click.Command | None, list[str]]:
-        if args[0] not in VERBS and not ctx.resilient_parsing:
-            raise click.UsageError(f"unknown verb {args[0]!r}{did_you_mean(args[0], VERBS)}", ctx)
+        if args[0] not in VERBS and args[0] not in added() and not ctx.resilient_parsing:
+            raise click.UsageError(f"unknown verb {args[0]!r}{did_you_mean(args[0], self.list_commands(ctx))}", ctx)
         return super().resolve_command(ctx, args)
 
     def format_commands(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
         for group, verbs in GROUPS.items():
             with formatter.section(group):
                 formatter.write_dl([(verb, text) for verb, (_, text) in verbs.items()])
+        if added():
+            with formatter.section("plugins"):
+                formatter.write_dl([(verb, _from(entry)) for verb, entry in added().items()])
 
     def shell_complete(self, ctx: click.Context, incomplete: str) -> list[Any]:
         """The verbs, none of which is loaded for it; and the options."""
         from click.shell_completion import CompletionItem
 
-        found = [CompletionItem(verb, help=text) for verb, (_, text) in VERBS.items() if verb.startswith(incomplete)]
+        known = {verb: text for verb, (_, text) in VERBS.items()} | {verb: _from(entry) for verb, entry in added().items()}
+        found = [CompletionItem(verb, help=text) for verb, text in known.items() if verb.startswith(incomplete)]
         return found + click.Command.shell_complete(self, ctx, incomplete)
 
     def main(self, args: Sequence[str] | None = None, prog_name: str | None = None, **extra: Any) -> NoReturn:  # type: ignore[override]
@@ -122,6 +138,10 @@ class Verbs(click.Group):
             sys.exit(completed(self, instruction))
         words = list(sys.argv[1:] if args is None else args)
         sys.exit(_run(self, words))
+
+
+def _from(entry: EntryPoint) -> str:
+    return f"Of the plugin {entry.distribution} {entry.version}."
 
 
 def _run(group: click.Group, words: list[str]) -> int:
@@ -141,7 +161,7 @@ def _run(group: click.Group, words: list[str]) -> int:
         silence()
         return 0
     except Exception as error:
-        return report(error, next((word for word in words if word in VERBS), ""))
+        return report(error, next((word for word in words if word in VERBS or word in added()), ""))
 
 
 def _spent(seconds: float) -> str:

@@ -131,6 +131,7 @@ class Device(Closing):
     """A sensor read from a source; a context manager.
 
     Attributes:
+        felt: what the sensor's IMU felt with the last batch of `packets`, in the carrier's axes where the sensor is mounted.
         source: where it is read from.
         sensor: the sensor, given or detected.
         mount: how it is mounted, where `lidarspec.toml` says so: scans come in the carrier's axes, packets in the sensor's.
@@ -148,7 +149,7 @@ class Device(Closing):
         period: float = PERIOD,
         mount: Mount | None = None,
     ) -> None:
-        self.sensor, self.source, self.mount = sensor, source, mount
+        self.sensor, self.source, self.mount, self.felt = sensor, source, mount, joined([])
         self._streams: dict[str | None, PacketReader] = {}
         self._latest: ScanStream | None = None
         self._unseen = deque[Scan]()
@@ -233,7 +234,10 @@ class Device(Closing):
         reader, ahead, turn = self._reader(frame), self._taken_back(), time.monotonic()
         for arrival in self._arrivals(wait, ahead):
             packets = None if arrival is None else reader.last if arrival is ahead and frame is None else reader.add(arrival)
-            if (packets is not None and len(packets)) or arrival is None or (wait is not None and time.monotonic() - turn >= wait):
+            if frame is None and arrival is not None and arrival is not ahead and self.sensor.imu_frames:
+                reader.feel(arrival, packets)
+            self.felt, is_due = self._felt(reader, arrival), wait is not None and time.monotonic() - turn >= wait
+            if (packets is not None and len(packets)) or len(self.felt) or arrival is None or is_due:
                 yield reader.none() if packets is None else packets
                 turn = time.monotonic()
 
@@ -295,9 +299,9 @@ class Device(Closing):
                 reader.feel(arrival, reader.add(arrival))
             if reader.imu.waiting is not None:
                 reader.imu.waiting.until(None)  # no scan asks for them
-            felt = joined([]) if arrival is None else reader.felt
+            felt = self._felt(reader, arrival)
             if len(felt) or arrival is None or (wait is not None and time.monotonic() - turn >= wait):
-                yield felt if self.mount is None else felt.turned(self.mount.rotation)
+                yield felt
                 turn = time.monotonic()
 
     def skip(self, at: int) -> bool:
@@ -412,6 +416,11 @@ class Device(Closing):
         if frame not in self._streams:
             self._streams[frame] = PacketReader(self.sensor, frame, self._input.decoder, self._input.first_state())
         return self._streams[frame]
+
+    def _felt(self, reader: PacketReader, arrival: Arrival | None) -> ImuSamples:
+        """What came with an arrival of what the IMU felt."""
+        felt = joined([]) if arrival is None else reader.felt
+        return felt if self.mount is None else felt.turned(self.mount.rotation)
 
     def _scan_stream(self) -> ScanStream:
         return ScanStream(self.sensor, self.mount, self._reader(None).imu.waiting)

@@ -11,6 +11,7 @@ formats, too. Modules in reading order:
 * `clouds`: .pcd, .lzf.pcd, .ply and KITTI's .bin.
 * `las`: .las and .laz, for surveyors' tools.
 * `e57`: .e57, a header and points for each scan.
+* `messages`: ROS's messages of scans, packets and IMU samples.
 * `bags`: .mcap, .bag, .rosbag2 and .db3, a message a scan.
 * `foxglove`: .foxglove.mcap, with Foxglove's messages.
 """

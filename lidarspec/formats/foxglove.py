@@ -11,8 +11,10 @@ from pathlib import Path
 from typing import Any
 
 from lidarspec.errors import UsageError, library
-from lidarspec.formats.bags import CHUNK, POINTS, SCAN, Planes, fields_of, records
+from lidarspec.formats.bags import CHUNK, TOPICS
+from lidarspec.formats.messages import CLOUD, SCAN, fields_of, records
 from lidarspec.points.cloud import PointCloud
+from lidarspec.scans.planes import Planes
 from lidarspec.scans.scans import LaserScan, Scan
 from lidarspec.transports.protocol import Format
 
@@ -34,9 +36,9 @@ def write_foxglove(path: Path, scans: Iterable[Scan], *, every_point: bool) -> N
             if scan.stamp_ns < 0:
                 raise UsageError(f"a scan at {scan.stamp_ns} ns: logs begin in 1970")
             units |= {name: unit for name, unit in scan.points.units.items() if unit}
-            messages = {POINTS: _cloud(scan.points, every_point=every_point)}
+            messages = {TOPICS[CLOUD]: _cloud(scan.points, every_point=every_point)}
             if (planar := planes.scan(scan)) is not None:
-                messages[SCAN] = _planar(planar, is_graded=scan.points.intensity is not None)
+                messages[TOPICS[SCAN]] = _planar(planar, is_graded=scan.points.intensity is not None)
             for topic, message in messages.items():
                 message.timestamp.FromNanoseconds(scan.stamp_ns)
                 message.frame_id, message.pose.orientation.w = scan.frame_id, 1

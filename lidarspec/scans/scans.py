@@ -43,9 +43,10 @@ class LaserScan:
     Attributes:
         ranges, intensities: (n,) float32.
         angle_min, angle_max, angle_increment: radians, counter-clockwise; ``angle_max = angle_min + (n - 1) * angle_increment``.
-        time_increment, scan_time: seconds; the increment is negative where the angle falls with time.
+        time_increment: seconds from beam to beam, negative where the angle falls with time.
+        scan_time: seconds from scan to scan.
         range_min, range_max: metres, the sensor's.
-        stamp_ns: of the first point.
+        stamp_ns: when `ranges[0]` was measured; of `ranges[i]` that is ``i * time_increment`` later.
         host_ns: as in `Scan`.
     """
 
@@ -132,43 +133,61 @@ class Scan:
         Raises:
             UsageError: for a number of sectors that is none.
         """
-        return self._binned(_sectors(n, "to_bins"))[0]
+        step = 2 * np.pi / _sectors(n, "to_bins")
+        return self._binned(n, step / 2 - np.pi, step)[0]
 
-    def to_laserscan(self, beams: int | None = None) -> LaserScan:
-        """The scan on an even grid of so many angles over the whole turn, by default as `beams` says.
+    def to_laserscan(self, beams: int | None = None, field: tuple[float, float] | None = None) -> LaserScan:
+        """The scan on an even grid of so many angles, by default as `beams` says.
+
+        Args:
+            field: where the first and the last of them look, radians; by default they go round the whole turn from -pi on. The times of
+                the beams are right where no scan begins within it: `Planes` finds such a field.
 
         Raises:
             UsageError: for a number of angles that is none.
         """
         count = _sectors(beams, "to_laserscan") if beams is not None else self.beams or self.sensor.beams or max(len(self), 1)
-        ranges, intensities = self._binned(count, centred=True)
-        step = 2 * np.pi / count
-        period = (
-            1 / self.rate_hz if np.isfinite(self.rate_hz) and self.rate_hz > 0 else float(np.ptp(self.points.time)) if len(self) else 0.0
-        )
-        each = -period / count if self._falls() else period / count
+        first, last = field or (-np.pi, np.pi - 2 * np.pi / count)
+        step = (last - first) / (count - 1) if count > 1 else 2 * np.pi
+        ranges, intensities = self._binned(count, first, step)
+        begin, slope = self._times(first, last)
+        period = 1 / self.rate_hz if np.isfinite(self.rate_hz) and self.rate_hz > 0 else abs(slope) * 2 * np.pi
         near, far = self.sensor.range_limits
-        last = -np.pi + (count - 1) * step
-        return LaserScan(-np.pi, last, step, each, period, near, far, ranges, intensities, self.stamp_ns, self.host_ns)
+        stamp_ns = self.stamp_ns + round(begin * 1e9)
+        return LaserScan(first, last, step, slope * step, period, near, far, ranges, intensities, stamp_ns, self.host_ns)
 
-    def _falls(self) -> bool:
-        """Whether the azimuth falls with time."""
-        steps = np.diff(self.points.azimuth.astype(np.float64))
-        return bool(np.nansum((steps + np.pi) % (2 * np.pi) - np.pi) < 0)
+    def swept(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Of the points with a direction azimuths that go on over the turn, radians, and times, seconds since the stamp."""
+        azimuth = self.points.azimuth.astype(np.float64)
+        known = np.isfinite(azimuth)
+        return np.unwrap(azimuth[known]), self.points.time[known]
 
-    def _binned(self, n: int, *, centred: bool = False) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-        valid = self.points.valid
-        turns = (self.points.azimuth[valid].astype(np.float64) + np.pi) / (2 * np.pi) * n
-        bins = (np.rint(turns) if centred else np.floor(turns)).astype(np.intp) % n
-        ranges = self.points.range[valid]
+    def _times(self, first: float, last: float) -> tuple[float, float]:
+        """When a beam that looks at `first` was measured, seconds since the stamp, and by how much later one is a radian on: the straight
+        line that is nearest to the points, in the turn that most of those up to `last` are of."""
+        azimuth, time = self.swept()
+        if len(azimuth) < 2 or not (spread := azimuth - azimuth.mean()).any():
+            return 0.0, 0.0
+        slope = float(spread @ time / (spread @ spread))
+        turns = round((float(np.median(azimuth)) - (first + last) / 2) / (2 * np.pi))
+        return float(time.mean() + slope * (first + turns * 2 * np.pi - azimuth.mean())), slope
+
+    def _binned(self, n: int, first: float, step: float) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+        """The nearest return within half a step of each of n angles from `first` on, and its intensity."""
+        points, turn = self.points, 2 * np.pi
+        ahead = (points.azimuth[points.valid].astype(np.float64) - first + step / 2) % turn
+        bins = (ahead % turn / step).astype(np.intp)  # a second time: of what is just below 0 the first is the whole turn
+        inside = bins < n
+        valid = np.flatnonzero(points.valid)[inside]
+        bins, ranges = bins[inside], points.range[valid]
         nearest = np.lexsort((ranges, bins))
-        first = np.ones(len(nearest), np.bool_)
-        first[1:] = np.diff(bins[nearest]) > 0
-        chosen = nearest[first]
+        is_first = np.ones(len(nearest), np.bool_)
+        is_first[1:] = np.diff(bins[nearest]) > 0
+        chosen = nearest[is_first]
         binned, strength = np.full(n, np.inf, np.float32), np.zeros(n, np.float32)
         binned[bins[chosen]] = ranges[chosen]
-        if self.points.intensity is not None:
-            strength[bins[chosen]] = self.points.intensity[valid][chosen]
+        if points.intensity is not None:
+            strength[bins[chosen]] = points.intensity[valid][chosen]
         return binned, strength
 
 

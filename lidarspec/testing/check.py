@@ -20,8 +20,9 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
+from lidarspec.entry_points import GROUP, SENSORS, EntryPoint, entry_points
 from lidarspec.errors import SourceError, SpecError, UnknownSensor
-from lidarspec.plugins import GROUP, SENSORS, EntryPoint, Registry, entry_points, file_and_id, file_module, registry
+from lidarspec.plugins import Registry, file_and_id, file_module, registry
 from lidarspec.spec.sensor import Sensor
 from lidarspec.testing.conformance import PROPERTIES
 from lidarspec.testing.declared import declared

@@ -13,7 +13,18 @@ import lidarspec as ls
 
 #: what a sensor is made of, and how it is found.
 ALLOWED = {
-    *("_version", "columns", "columns.columns", "errors", "plugins", "spec", "spec.arguments", "spec.bits", "spec.checksums"),
+    *(
+        "_version",
+        "columns",
+        "columns.columns",
+        "entry_points",
+        "errors",
+        "plugins",
+        "spec",
+        "spec.arguments",
+        "spec.bits",
+        "spec.checksums",
+    ),
     *("spec.construct_layer", "spec.construct_layer.classes", "spec.construct_layer.meaning", "spec.construct_layer.refusals"),
     *("spec.description", "spec.fields", "spec.links", "spec.results", "spec.sensor", "spec.timing", "spec.tree"),
     *(

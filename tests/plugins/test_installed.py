@@ -18,8 +18,9 @@ from typing import Any
 import pytest
 
 from lidarspec import Sensor, UsageError
+from lidarspec.entry_points import EntryPoint, entry_points
 from lidarspec.errors import UnknownSensor
-from lidarspec.plugins import EntryPoint, HookedPoints, Registry, entry_points, named_owners, tried
+from lidarspec.plugins import HookedPoints, Registry, named_owners, tried
 from lidarspec.spec import hookimpl
 from lidarspec.trust import own_settings
 from tests.shapes import SHAPES

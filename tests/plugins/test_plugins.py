@@ -16,8 +16,9 @@ import pytest
 
 import lidarspec
 from lidarspec import SourceError, SpecError, UsageError
+from lidarspec.entry_points import SENSORS, entry_points
 from lidarspec.errors import UnknownSensor
-from lidarspec.plugins import SENSORS, entry_points, file_module
+from lidarspec.plugins import file_module
 from lidarspec.testing import SensorConformance
 
 HERE = Path(__file__).resolve().parents[1] / "shapes"

@@ -1,0 +1,154 @@
+"""ROS's messages of scans, packets and IMU samples, as the bytes that stand in logs and go over topics.
+
+A scan is a sensor_msgs/PointCloud2, and where the sensor has one plane a sensor_msgs/LaserScan on an even grid of angles. Points have PCL's
+layout: x y z intensity time as float32, ring as uint16, then the further columns; a column that the sensor lacks is no field.
+"""
+
+from __future__ import annotations
+
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lidarspec.errors import UsageError, library
+from lidarspec.formats.writing import picture
+from lidarspec.packets.imu import ImuSamples
+from lidarspec.points.cloud import PointCloud
+from lidarspec.scans.scans import LaserScan, Scan
+from lidarspec.transports.bags import DATAGRAM, RAW, STAMP, STREAM
+from lidarspec.transports.protocol import Chunk
+
+#: a packet as it was received, which `transports.bags` reads again: ROS has no message for it.
+PACKET, LAYOUT = "lidarspec_msgs/msg/LidarPacket", "builtin_interfaces/Time stamp\nuint8[] data"
+CLOUD, SCAN, IMU = (f"sensor_msgs/msg/{name}" for name in ("PointCloud2", "LaserScan", "Imu"))
+#: the numbers by which PointField names types; anything else is written as float64.
+FIELD_TYPES = {"i1": 1, "u1": 2, "b1": 2, "i2": 3, "u2": 4, "i4": 5, "u4": 6, "f4": 7, "f8": 8}
+_SECOND = 1_000_000_000
+
+
+class Message(NamedTuple):
+    """A message as it stands in a log: its type, its time in ns, its bytes."""
+
+    kind: str
+    at: int
+    data: memoryview
+
+
+class Messages:
+    """Makes messages.
+
+    Args:
+        release: whose definitions they follow, as rosbags names them: "ROS1_NOETIC".
+
+    Attributes:
+        types: the definitions.
+
+    Methods raise a UsageError for a stamp that no message can hold.
+    """
+
+    def __init__(self, release: str) -> None:
+        typesys = library("rosbags.typesys", "ros")
+        self.types = typesys.get_typestore(typesys.Stores[release])
+        self.types.register(typesys.get_types_from_msg(LAYOUT, PACKET))
+        self._serialized = self.types.serialize_ros1 if release.startswith("ROS1") else self.types.serialize_cdr
+        self._counts = release.startswith("ROS1")
+
+    def packet(self, packet: Chunk) -> Message:
+        """A packet as it was received."""
+        at = packet.at or 0
+        return self._message(PACKET, at, stamp=self._time(at), data=np.frombuffer(packet.data, np.uint8))
+
+    def raw(self, packet: Chunk, *, datagram: bool) -> Message:
+        """A packet as it was received, as the node publishes it and `transports.bags` reads it again; not a `datagram`: of a stream."""
+        at, size, types = packet.at or 0, len(packet.data), self.types.types
+        dimension = types["std_msgs/msg/MultiArrayDimension"](label=DATAGRAM if datagram else STREAM, size=size, stride=size)
+        layout = types["std_msgs/msg/MultiArrayLayout"](dim=[dimension], data_offset=STAMP.size)
+        return self._message(RAW, at, layout=layout, data=np.frombuffer(STAMP.pack(at) + packet.data, np.uint8))
+
+    def cloud(self, scan: Scan, at: int, *, every_point: bool, number: int = 0) -> Message:
+        """The points of a scan; organised ones have a row for each row of the sensor, several returns side by side; of others, and valid
+        ones, there is one.
+
+        Args:
+            at: its stamp, ns.
+            every_point: also those without a valid return.
+            number: of the scan, which messages of ROS 1 say.
+        """
+        cloud = scan.points
+        points = records(cloud, every_point=every_point)
+        fields = [(name, offset, FIELD_TYPES[kind]) for name, offset, kind in fields_of(cloud, points)]
+        points = points.view(np.dtype((np.void, points.itemsize)))  # copied whole: of records what is between the fields is left out
+        if every_point and cloud.shape and len(cloud):
+            points = picture(points, cloud)
+        height, width = np.atleast_2d(points).shape
+        field = self.types.types["sensor_msgs/msg/PointField"]
+        return self._message(
+            CLOUD,
+            at,
+            header=self._header(number, at, scan.frame_id),
+            height=height,
+            width=width,
+            fields=[field(name, offset, kind, 1) for name, offset, kind in fields],
+            is_bigendian=False,
+            point_step=points.itemsize,
+            row_step=points.itemsize * width,
+            data=np.ascontiguousarray(points).view(np.uint8).reshape(-1),
+            is_dense=not every_point or bool(cloud.valid.all()),
+        )
+
+    def laserscan(self, scan: Scan, planar: LaserScan, at: int, *, number: int = 0) -> Message:
+        """A scan on a grid of angles; `at`, `number`: as of a cloud."""
+        names = self.types.types[SCAN].__dataclass_fields__
+        values = {name: getattr(planar, name) for name in names if hasattr(planar, name)}
+        if scan.points.intensity is None:
+            values["intensities"] = np.empty(0, np.float32)
+        return self._message(SCAN, at, **values, header=self._header(number, at, scan.frame_id))
+
+    def imu(self, felt: ImuSamples, index: int, at: int, frame_id: str) -> Message:
+        """One sample of an IMU, by REP-145: a first covariance of -1 says that something is not measured, 0 that its error is not known."""
+        vector = self.types.types["geometry_msgs/msg/Vector3"]
+        values: dict[str, Any] = {}
+        for name in ("angular_velocity", "linear_acceleration"):
+            measured = getattr(felt, name)[index]
+            known = bool(np.isfinite(measured).all())
+            values |= {name: vector(*np.where(known, measured, 0.0).tolist()), f"{name}_covariance": _covariance(known=known)}
+        upright = self.types.types["geometry_msgs/msg/Quaternion"](0.0, 0.0, 0.0, 1.0)
+        turned = {"orientation": upright, "orientation_covariance": _covariance(known=False)}
+        return self._message(IMU, at, header=self._header(0, at, frame_id), **turned, **values)
+
+    def _message(self, name: str, at: int, **values: Any) -> Message:
+        return Message(name, at, self._serialized(self.types.types[name](**values), name))
+
+    def _header(self, number: int, stamp_ns: int, frame_id: str) -> Any:
+        counted = {"seq": number} if self._counts else {}
+        return self.types.types["std_msgs/msg/Header"](**counted, stamp=self._time(stamp_ns), frame_id=frame_id)
+
+    def _time(self, at: int) -> Any:
+        if not 0 <= at < _SECOND << 31:
+            raise UsageError(f"a scan or packet at {at} ns: stamps of ROS hold the years 1970 to 2038")
+        return self.types.types["builtin_interfaces/msg/Time"](*divmod(at, _SECOND))
+
+
+def _covariance(*, known: bool) -> NDArray[np.float64]:
+    values = np.zeros(9)
+    values[0] = 0.0 if known else -1.0
+    return values
+
+
+def fields_of(cloud: PointCloud, points: NDArray[Any]) -> list[tuple[str, int, str]]:
+    """Name, offset and type ("f4") of each field of the records of a cloud; a column that it lacks is none."""
+    lacking = {name for name in ("intensity", "ring", "time") if not cloud.shows(name) or getattr(cloud, name) is None}
+    return [(name, place[1], place[0].str[1:]) for name, place in (points.dtype.fields or {}).items() if name not in lacking]
+
+
+def records(cloud: PointCloud, *, every_point: bool) -> NDArray[Any]:
+    """The points that are written, in PCL's layout, all columns of types that messages have."""
+    points = cloud.to_structured()
+    if not every_point:
+        points = np.compress(cloud.valid, points)  # ten times as quick as an index
+    kinds = {name: points.dtype[name] for name in points.dtype.names or ()}
+    if all(kind.str[1:] in FIELD_TYPES for kind in kinds.values()):
+        return points
+    known = [(name, kind if kind.str[1:] in FIELD_TYPES else np.dtype(np.float64)) for name, kind in kinds.items()]
+    return points.astype(np.dtype(known, align=True))

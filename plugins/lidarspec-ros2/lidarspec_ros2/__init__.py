@@ -1,0 +1,45 @@
+"""A ROS 2 driver for every lidar that lidarspec knows: the verb `lidarspec ros2`, and the executable `lidarspec_node`.
+
+A lifecycle node over a `Device`, as every verb has one. ROS is imported when the node starts, and not before. Modules in reading order:
+
+* `command`: the verb and the executable; which ROS there is.
+* `parameters`: the one table of parameters, and the values of one configuration.
+* `node`: the lifecycle, services, and the thread that reads.
+* `topics`: what is published.
+* `packets`: packets as a topic, and as a source.
+* `diagnostics`: how the sensor is doing, as /diagnostics says it.
+* `clock`: times of the sensor's clock as those of the host.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+from lidarspec.spec import hookimpl
+
+if TYPE_CHECKING:
+    import click
+
+    from lidarspec.spec import Sensor, Transport
+
+
+@hookimpl
+def lidarspec_verbs() -> list[click.Command]:
+    """The verb `ros2`."""
+    from lidarspec_ros2.command import ros2
+
+    return [ros2]
+
+
+@hookimpl
+def lidarspec_source(url: str, sensor: Sensor | None) -> Transport | None:
+    """The packets of a topic, ``ros2:/TOPIC``."""
+    scheme, _, topic = url.partition(":")
+    if scheme != "ros2":
+        return None
+    from lidarspec_ros2.command import import_ros
+
+    import_ros()
+    from lidarspec_ros2.packets import PacketTransport
+
+    return PacketTransport(url, topic, datagrams=sensor is None or sensor.datagrams)

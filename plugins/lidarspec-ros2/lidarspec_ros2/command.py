@@ -1,0 +1,111 @@
+"""The verb `lidarspec ros2` and the executable `lidarspec_node`: the node in a process of its own, from its start to its end.
+
+Of several ROS installations that one is used that Python imports: a sourced one stands in PYTHONPATH, before the wheels of the
+extra `ros2`.
+"""
+
+from __future__ import annotations
+
+import importlib
+import signal
+import sys
+import threading
+from collections.abc import Mapping, Sequence
+from typing import TYPE_CHECKING, Any
+
+import click
+
+from lidarspec.cli.failures import report
+from lidarspec.cli.options import sensor_words
+from lidarspec.errors import UsageError
+
+if TYPE_CHECKING:
+    from lidarspec_ros2.node import LidarNode
+
+
+class _RosCommand(click.Command):
+    """A verb that leaves what begins with --ros-args to ROS."""
+
+    def parse_args(self, ctx: click.Context, args: list[str]) -> list[str]:
+        place = args.index("--ros-args") if "--ros-args" in args else len(args)
+        ctx.meta["ros_args"] = args[place:]
+        return super().parse_args(ctx, args[:place])
+
+
+@click.command(cls=_RosCommand, options_metavar="[OPTIONS] [--ros-args ...]")
+@click.argument("source", metavar="SOURCE")
+@sensor_words
+@click.pass_context
+def ros2(ctx: click.Context, source: str, sensor_id: str | None, options: Sequence[str], calibration: str | None) -> None:
+    """A sensor as a ROS 2 node, which publishes its scans, until it is interrupted or a file ends.
+
+    What follows --ros-args is ROS's own: parameters (-p frame_id:=front), a file of them (--params-file), names (-r __node:=front,
+    -r scan:=front/scan). The node is configured and activated at once; its parameters are on the page of the reference.
+    """
+    given = {"source": source, "sensor": sensor_id, "options": list(options), "calibration": calibration, "autostart": True}
+    run({name: value for name, value in given.items() if value}, ctx.meta["ros_args"])
+
+
+def main() -> None:
+    """The executable: as the verb, with everything told by ROS's own words."""
+    try:
+        run({}, sys.argv[1:])
+    except Exception as error:
+        sys.exit(report(error, "ros2"))
+
+
+def import_ros() -> None:
+    """Find the ROS that there is.
+
+    Raises:
+        UsageError: where there is none, with the ways to have one.
+    """
+    try:
+        importlib.import_module("rclpy")
+    except ImportError as error:
+        text = f"ROS 2 is not found ({error})"
+        raise UsageError(f"{text}: source one, as with `. /opt/ros/jazzy/setup.bash`, or pip install 'lidarspec-ros2[ros2]'") from None
+
+
+def run(given: Mapping[str, Any], ros_args: Sequence[str]) -> None:
+    """Run the node until it is interrupted, or has come to its end.
+
+    Args:
+        given: parameters, by name.
+        ros_args: the words of the command line that are ROS's.
+
+    Raises:
+        LidarSpecError: where there is no ROS, a parameter cannot be, or the sensor cannot be read.
+    """
+    import_ros()
+    import rclpy
+    from rclpy.executors import SingleThreadedExecutor
+
+    from lidarspec_ros2.node import LidarNode
+
+    previous = signal.signal(signal.SIGTERM, signal.default_int_handler)
+    rclpy.init(args=["lidarspec_node", *ros_args], signal_handler_options=rclpy.SignalHandlerOptions.NO)
+    try:
+        executor, node = SingleThreadedExecutor(), LidarNode(given)
+        try:
+            executor.add_node(node)
+            _spun(node, threading.Thread(target=executor.spin, name="executor"))
+        except KeyboardInterrupt:
+            node.get_logger().info("interrupted")
+        finally:
+            executor.shutdown()
+            node.close()
+            node.destroy_node()
+    finally:
+        rclpy.try_shutdown()
+        signal.signal(signal.SIGTERM, previous)
+
+
+def _spun(node: LidarNode, executor: threading.Thread) -> None:
+    """Serve until the node has come to its end."""
+    if node.autostarts:
+        node.start()
+    executor.start()
+    node.ended.wait()
+    if node.failure is not None:
+        raise node.failure

@@ -1,0 +1,36 @@
+"""How the sensor is doing, as /diagnostics says it once a second."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+
+from diagnostic_msgs.msg import DiagnosticStatus, KeyValue
+
+from lidarspec.cli.read import FIGURES
+from lidarspec.device.device import Device
+from lidarspec.view.feed import Reading
+
+#: states of a device in which nothing comes.
+LOST = ("disconnected", "silent")
+
+
+def status(name: str, device: Device, reading: Reading, said: Sequence[str], more: Mapping[str, str]) -> DiagnosticStatus:
+    """How a device is doing.
+
+    Args:
+        name: of the node.
+        reading: the figures of the last second.
+        said: what is to be said of it besides the device's own warnings.
+        more: further values.
+    """
+    warnings = [*device.warnings, *said]
+    figures = {f"{name} [{unit}]": text(reading) for name, unit, _, text in FIGURES}
+    values = {"state": device.state, **figures, **more, **device.info, **{f"warning {n + 1}": text for n, text in enumerate(warnings)}}
+    level = DiagnosticStatus.ERROR if device.state in LOST else DiagnosticStatus.WARN if warnings else DiagnosticStatus.OK
+    return DiagnosticStatus(
+        level=level,
+        name=f"{name}: {device.sensor.id}",
+        message=warnings[0] if warnings else device.state,
+        hardware_id=device.info.get("serial", str(device.source)),
+        values=[KeyValue(key=key, value=value) for key, value in values.items()],
+    )

@@ -1,0 +1,184 @@
+"""What the node publishes of a sensor: messages as bytes, as logs have them, for whoever listens."""
+
+from __future__ import annotations
+
+import math
+import time
+from typing import Any
+
+from geometry_msgs.msg import Quaternion, Transform, TransformStamped, Vector3
+from rclpy.lifecycle import LifecycleNode
+from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
+from rclpy.qos_overriding_options import QoSOverridingOptions
+from rclpy.time import Time
+from rosgraph_msgs.msg import Clock
+from sensor_msgs.msg import Imu, LaserScan, PointCloud2
+from std_msgs.msg import UInt8MultiArray
+
+from lidarspec.errors import UsageError
+from lidarspec.formats.messages import CLOUD, IMU, SCAN, Message, Messages
+from lidarspec.packets.imu import ImuSamples
+from lidarspec.packets.packets import Packets
+from lidarspec.points.cloud import Mount
+from lidarspec.scans.scans import Scan
+from lidarspec.scans.selection import Sieve
+from lidarspec.spec.sensor import Sensor
+from lidarspec.transports.bags import RAW
+from lidarspec.transports.protocol import Chunk
+from lidarspec_ros2.clock import DeviceClock
+from lidarspec_ros2.parameters import Settings
+
+#: of each kind of message its topic, its class, and how many are kept for those who are slow: about a second of them, or less.
+KINDS = {
+    CLOUD: ("points", PointCloud2, 10),
+    SCAN: ("scan", LaserScan, 10),
+    IMU: ("imu", Imu, 200),
+    RAW: ("packets", UInt8MultiArray, 2000),
+}
+
+
+#: what ROS's own parameters, such as `qos_overrides./scan.publisher.depth`, change of that.
+_OVERRIDING = QoSOverridingOptions.with_default_policies()
+
+
+class Topics:
+    """The topics of one sensor.
+
+    Args:
+        node: whose they are.
+        sensor: as it was opened.
+        played: whether it is a file that is played: then /clock says its time, where `use_sim_time` is set.
+
+    Raises:
+        UsageError: for a transform that cannot be published here.
+
+    Attributes:
+        clock: the sensor's clock by the host's.
+        active: whether what is published is let through.
+        latency_s: seconds from the arrival of the packets that ended the last scan to its being published.
+    """
+
+    def __init__(self, node: LifecycleNode, settings: Settings, sensor: Sensor, *, played: bool) -> None:
+        self._node, self._sensor, self.clock = node, sensor, DeviceClock()
+        self._messages = Messages("ROS2_HUMBLE")
+        self._reliability = ReliabilityPolicy.RELIABLE if settings["qos"] == "reliable" else ReliabilityPolicy.BEST_EFFORT
+        self._publishers: dict[str, Any] = {}
+        self._others = list[Any]()
+        self.active, self.latency_s = False, 0.0
+        self._arrived = 0
+        self.show(settings)
+        self._publisher(CLOUD)
+        if settings["publish_packets"]:
+            self._publisher(RAW)
+        if sensor.imu_frames:
+            self._publisher(IMU)
+        if settings["publish_tf"]:
+            self._publish_transform(settings)
+        self._time = self._other(Clock, "/clock", 10) if played and node.get_parameter("use_sim_time").value else None
+
+    def show(self, settings: Settings) -> None:
+        """Publish by other parameters from now on."""
+        self._settings, self._planes, self._sieve = settings, settings.planes(), Sieve(settings.selection())
+
+    def learn(self, packets: Packets) -> None:
+        """Learn the sensor's clock from packets."""
+        known = packets.host_ns > 0
+        if known.any():
+            self._arrived = int(packets.host_ns[known][0])
+            self.clock.observe(packets.time_ns[known], packets.host_ns[known])
+
+    def publish(self, scan: Scan) -> None:
+        """Publish a scan, as far as anybody listens.
+
+        Raises:
+            UsageError: for a ring that the sensor lacks.
+        """
+        wanted = self._sieve.take(scan)
+        assert wanted is not None  # nothing is selected by number or time
+        at, settings = self._stamp(scan), self._settings
+        if self._listened(CLOUD):
+            organised = settings["organized"] and wanted.points.shape is not None
+            self._send(self._messages.cloud(wanted, at, every_point=organised))
+        if (planar := self._planes.scan(wanted)) is not None and self._listened(SCAN):
+            self._send(self._messages.laserscan(wanted, settings.narrowed(planar), at + planar.stamp_ns - scan.stamp_ns))
+        self.latency_s = (time.time_ns() - self._arrived) / 1e9
+        if self._time is not None and self.active:
+            self._time.publish(Clock(clock=Time(nanoseconds=at).to_msg()))
+
+    def feel(self, felt: ImuSamples) -> None:
+        """Publish what the IMU felt."""
+        for index in range(len(felt)) if len(felt) and self._listened(IMU) else ():
+            at = int(felt.time_ns[index]) + self.clock.offset_ns
+            self._send(self._messages.imu(felt, index, at, self._settings["frame_id"]))
+
+    def raw(self, chunk: Chunk) -> None:
+        """Publish what the sensor sent."""
+        if self._listened(RAW):
+            self._send(self._messages.raw(chunk, datagram=self._sensor.datagrams))
+
+    def activate(self, *, active: bool) -> None:
+        """Let through what is published, or not."""
+        self.active = active
+        for publisher in self._publishers.values():
+            (publisher.on_activate if active else publisher.on_deactivate)(None)
+
+    def close(self) -> None:
+        """Give the topics back."""
+        for publisher in self._publishers.values():
+            self._node.destroy_lifecycle_publisher(publisher)
+        for publisher in self._others:
+            self._node.destroy_publisher(publisher)
+
+    def _stamp(self, scan: Scan) -> int:
+        """The time of the first point, ns, in ROS's time."""
+        if not scan.host_ns:  # of a file that does not say when its bytes arrived
+            return int(self._node.get_clock().now().nanoseconds)
+        by_device = self.clock.stamp(scan.stamp_ns, scan.host_ns)
+        return by_device if self._settings["use_device_time"] else scan.host_ns
+
+    def _publisher(self, kind: str) -> Any:
+        """The publisher of a kind of messages; that of `scan` is made when there is a planar one."""
+        if kind not in self._publishers:
+            topic, message, depth = KINDS[kind]
+            qos = QoSProfile(depth=depth, reliability=self._reliability)
+            publisher = self._node.create_lifecycle_publisher(message, topic, qos, qos_overriding_options=_OVERRIDING)
+            self._publishers[kind] = publisher
+            if self.active:
+                publisher.on_activate(None)
+        return self._publishers[kind]
+
+    def _other(self, message: Any, topic: str, qos: Any) -> Any:
+        """A publisher that is not the lifecycle's."""
+        self._others.append(self._node.create_publisher(message, topic, qos))
+        return self._others[-1]
+
+    def _publish_transform(self, settings: Settings) -> None:
+        try:
+            from tf2_msgs.msg import TFMessage
+        except ImportError as error:
+            raise UsageError(
+                f"publish_tf takes tf2_msgs, which this ROS has not ({error}); static_transform_publisher does it too"
+            ) from None
+        qos = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
+        stamp = self._node.get_clock().now().to_msg()
+        self._other(TFMessage, "/tf_static", qos).publish(TFMessage(transforms=[transform(settings, stamp)]))
+
+    def _listened(self, kind: str) -> bool:
+        return self.active and self._publisher(kind).get_subscription_count() > 0
+
+    def _send(self, message: Message) -> None:
+        self._publisher(message.kind).publish(bytes(message.data))
+
+
+def transform(settings: Settings, stamp: Any) -> TransformStamped:
+    """The mount, from the frame of the carrier to that of the points."""
+    mount = settings.mount() or Mount()
+    roll, pitch, yaw = (math.radians(angle) / 2 for angle in (mount.roll_deg + 180.0 * mount.inverted, mount.pitch_deg, mount.yaw_deg))
+    (sr, cr), (sp, cp), (sy, cy) = ((math.sin(half), math.cos(half)) for half in (roll, pitch, yaw))
+    turned = Quaternion(
+        x=sr * cp * cy - cr * sp * sy, y=cr * sp * cy + sr * cp * sy, z=cr * cp * sy - sr * sp * cy, w=cr * cp * cy + sr * sp * sy
+    )
+    stamped = TransformStamped(child_frame_id=settings["frame_id"])
+    stamped.header.stamp, stamped.header.frame_id = stamp, settings["parent_frame"]
+    stamped.transform = Transform(translation=Vector3(x=mount.x, y=mount.y, z=mount.z), rotation=turned)
+    return stamped

@@ -1,0 +1,111 @@
+"""A client of a node, and what it gets, as somebody else's program would."""
+
+from __future__ import annotations
+
+import signal
+import subprocess
+import time
+from collections.abc import Callable
+from typing import Any
+
+import rclpy
+from diagnostic_msgs.msg import DiagnosticArray
+from lifecycle_msgs.srv import ChangeState, GetState
+from rcl_interfaces.msg import Parameter
+from rcl_interfaces.srv import DescribeParameters, GetParameters, SetParameters
+from rclpy.parameter import Parameter as Value
+from rclpy.qos import QoSProfile, ReliabilityPolicy
+from rosbags.typesys import Stores, get_typestore
+from std_srvs.srv import Trigger
+
+#: seconds after which something that has to come is not waited for any longer.
+PATIENCE = 30.0
+STORE = get_typestore(Stores.ROS2_HUMBLE)
+
+
+class Client:
+    """What somebody else sees of a node called lidar."""
+
+    def __init__(self) -> None:
+        self._node = rclpy.create_node("client")
+        self.received: dict[str, list[bytes]] = {}
+        self.diagnostics: list[Any] = []
+        self._node.create_subscription(DiagnosticArray, "/diagnostics", self.diagnostics.append, 10)
+
+    def listen(self, topic: str, kind: Any, *, reliable: bool = True, take: Callable[[bytes], None] | None = None) -> list[bytes]:
+        """The messages of a topic, as bytes, as they come, or what takes them."""
+        received = self.received[topic] = list[bytes]()
+        reliability = ReliabilityPolicy.RELIABLE if reliable else ReliabilityPolicy.BEST_EFFORT
+        self._node.create_subscription(kind, topic, take or received.append, QoSProfile(depth=5000, reliability=reliability), raw=True)
+        return received
+
+    def until(self, condition: Callable[[], object], *, patience: float = PATIENCE) -> None:
+        """Serve what comes until something holds."""
+        end = time.monotonic() + patience
+        while not condition():
+            assert time.monotonic() < end, f"it did not come about within {patience} s"
+            rclpy.spin_once(self._node, timeout_sec=0.05)
+
+    def publishers(self, topic: str) -> int:
+        """How many publish on a topic."""
+        return int(self._node.count_publishers(topic))
+
+    def call(self, kind: Any, service: str, **fields: Any) -> Any:
+        """The response of a service of the node."""
+        client = self._node.create_client(kind, f"/lidar/{service}")
+        self.until(client.service_is_ready)
+        future = client.call_async(kind.Request(**fields))
+        self.until(future.done)
+        self._node.destroy_client(client)
+        return future.result()
+
+    def change(self, label: str) -> bool:
+        """Whether a transition succeeds."""
+        request = ChangeState.Request()
+        request.transition.label = label
+        return bool(self.call(ChangeState, "change_state", transition=request.transition).success)
+
+    @property
+    def state(self) -> str:
+        """The state of the lifecycle."""
+        return str(self.call(GetState, "get_state").current_state.label)
+
+    def set(self, name: str, value: Any) -> str:
+        """Why a parameter cannot be set, "" where it is."""
+        parameter: Parameter = Value(name, value=value).to_parameter_msg()
+        (result,) = self.call(SetParameters, "set_parameters", parameters=[parameter]).results
+        assert result.successful == (not result.reason)
+        return str(result.reason)
+
+    def value(self, name: str) -> Any:
+        """The value of a parameter."""
+        (value,) = self.call(GetParameters, "get_parameters", names=[name]).values
+        return Value.from_parameter_msg(Parameter(name=name, value=value)).value
+
+    def described(self, *names: str) -> list[Any]:
+        """The descriptors of parameters."""
+        return list(self.call(DescribeParameters, "describe_parameters", names=list(names)).descriptors)
+
+    def trigger(self, name: str) -> Any:
+        """The response of a command's service."""
+        return self.call(Trigger, name)
+
+    def close(self) -> None:
+        self._node.destroy_node()
+
+
+def given(**parameters: Any) -> list[str]:
+    """Parameters in ROS's words."""
+    return [word for name, value in parameters.items() for word in ("-p", f"{name}:={value}")]
+
+
+def message(data: bytes, kind: str) -> Any:
+    """A message as rosbags reads it."""
+    return STORE.deserialize_cdr(data, kind)
+
+
+def ended(process: subprocess.Popen[str], by: int = signal.SIGINT) -> tuple[int, str]:
+    """The exit code and the complaints of a node that is told to end."""
+    process.send_signal(by)
+    _, complaints = process.communicate(timeout=PATIENCE)
+    return process.returncode, complaints

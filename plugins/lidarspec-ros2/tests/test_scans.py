@@ -1,0 +1,152 @@
+"""What a subscriber in another process gets is what the library makes of the same bytes, value for value."""
+
+from __future__ import annotations
+
+import dataclasses
+import os
+import struct
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from builtin_interfaces.msg import Time
+from client import Client, given, message
+from rclpy.serialization import deserialize_message, serialize_message
+from sensor_msgs.msg import Imu, LaserScan, PointCloud2
+from std_msgs.msg import Header, UInt8MultiArray
+
+import lidarspec as ls
+from lidarspec.formats.messages import CLOUD, SCAN, Messages
+from lidarspec.packets.imu import ImuSamples
+from lidarspec.recording.recorders import Recorder
+from lidarspec.scans.planes import Planes
+from lidarspec.simulation.simulator import simulate
+from lidarspec.transports.bags import RAW, raw_chunk
+from lidarspec.transports.protocol import Chunk
+
+MESSAGES = Messages("ROS2_HUMBLE")
+WHOLE, STAMP = 6, 1_700_000_000_123_456_789
+#: bytes between fields that a message of ours has at the most: three before each number behind a text.
+PADDING = 64
+#: seconds of the long test.
+SOAK = float(os.environ.get("LIDARSPEC_SOAK", "600"))
+
+
+def recorded(packets: list[bytes], path: Path, sensor: str) -> Path:
+    """A recording of what the topic of packets had."""
+    with Recorder(path, sensor) as recorder:
+        for packet in packets:
+            recorder.write(raw_chunk(message(packet, RAW)))
+    return path
+
+
+def expected(path: Path, sensor: str, kind: str) -> list[Any]:
+    """The messages that the library makes of the whole scans of a recording."""
+    planes, found = Planes(), []
+    with ls.open(path, sensor) as device:
+        for scan in device.scans():
+            if scan.whole and kind == CLOUD:
+                found.append(MESSAGES.cloud(scan, 0, every_point=scan.points.shape is not None).data)
+            elif scan.whole and (planar := planes.scan(scan)) is not None:
+                found.append(MESSAGES.laserscan(scan, planar, 0).data)
+    return [unstamped(message(bytes(data), kind)) for data in found]
+
+
+def unstamped(content: Any) -> dict[str, Any]:
+    """The values of a message, but for its stamp."""
+    return {**dataclasses.asdict(content), "header": content.header.frame_id}
+
+
+def same(one: dict[str, Any], other: dict[str, Any]) -> bool:
+    return all(np.array_equal(value, other[name], equal_nan=False) for name, value in one.items() if name != "fields") and str(
+        one.get("fields")
+    ) == str(other.get("fields"))
+
+
+@pytest.mark.parametrize(
+    ("sensor", "topic", "kind", "message_class"),
+    [("ldrobot-stl27l", "scan", SCAN, LaserScan), ("robosense-m1", "points", CLOUD, PointCloud2)],
+)
+def test_messages_are_what_the_library_makes_of_the_same_bytes(
+    run: Callable[..., Any], client: Client, tmp_path: Path, sensor: str, topic: str, kind: str, message_class: Any
+) -> None:
+    packets = client.listen("packets", UInt8MultiArray)
+    received = client.listen(topic, message_class)
+    run(f"sim:{sensor}?loss=0.0005&seed=3", "-s", sensor, ros=given(publish_packets=True, qos="reliable"))
+    client.until(lambda: len(received) > WHOLE)
+    number = len(received)
+    client.until(lambda: len(received) > number)  # whose packets have come
+    wanted = expected(recorded(packets, tmp_path / "packets.lsr", sensor), sensor, kind)
+    found = [unstamped(message(data, kind)) for data in received[:number]]
+    begin = next(index for index, content in enumerate(found) if same(content, wanted[0]))
+    assert number - begin >= WHOLE - 2
+    for content, one in zip(found[begin:], wanted, strict=False):
+        assert same(content, one)
+    assert len({np.asarray(content["ranges" if kind == SCAN else "data"]).tobytes() for content in wanted}) > 1
+
+
+@pytest.mark.parametrize(("sensor", "every_point"), [("robosense-m1", True), ("robosense-m1", False), ("ldrobot-stl27l", False)])
+def test_bytes_are_those_of_ros_itself(sensor: str, every_point: bool) -> None:
+    """What rclpy makes of a message that it has read, or that its own classes hold, is the same byte for byte."""
+    spec, planes = ls.sensor(sensor), Planes()
+    scan = next(scan for scan in spec.scans(simulate(spec, 2000)) if scan.whole)
+    made = [(MESSAGES.cloud(scan, STAMP, every_point=every_point), PointCloud2)]
+    if (planar := planes.scan(scan)) is not None:
+        made.append((MESSAGES.laserscan(scan, planar, STAMP), LaserScan))
+        values = {name: getattr(planar, name) for name in LaserScan.get_fields_and_field_types() if name != "header"}
+        by_ros = LaserScan(header=header(scan.frame_id), **values)
+        assert alike(bytes(made[1][0].data), serialize_message(by_ros))
+    felt = ImuSamples(np.array([STAMP]), np.array([[0.1, -0.2, np.nan]]), np.array([[0.0, 0.5, 9.81]]))
+    made.append((MESSAGES.imu(felt, 0, STAMP, "imu"), Imu))
+    made.append((MESSAGES.raw(Chunk(b"\x54\x2c\xff", STAMP), datagram=True), UInt8MultiArray))
+    for known, message_class in made:
+        read = deserialize_message(bytes(known.data), message_class)
+        assert alike(bytes(known.data), serialize_message(read))
+
+
+def test_what_an_imu_felt_is_told_as_rep_145_asks() -> None:
+    felt = ImuSamples(np.array([STAMP]), np.array([[0.1, -0.2, np.nan]]), np.array([[0.0, 0.5, 9.81]]))
+    read = deserialize_message(bytes(MESSAGES.imu(felt, 0, STAMP, "imu").data), Imu)
+    assert (read.header, read.orientation_covariance[0]) == (header("imu"), -1)
+    assert (read.angular_velocity_covariance[0], read.linear_acceleration_covariance[0]) == (-1, 0)
+    assert (read.linear_acceleration.x, read.linear_acceleration.y, read.linear_acceleration.z) == (0.0, 0.5, 9.81)
+
+
+def alike(ours: bytes, theirs: bytes) -> bool:
+    """Whether bytes are the same, but for those between the fields, which ROS leaves as they are in memory, and ours are 0."""
+    one, other = (np.frombuffer(data, np.uint8) for data in (ours, theirs))
+    return len(ours) == len(theirs) and not one[one != other].any() and (one != other).sum() < PADDING
+
+
+def header(frame_id: str) -> Header:
+    return Header(stamp=Time(sec=STAMP // 10**9, nanosec=STAMP % 10**9), frame_id=frame_id)
+
+
+@pytest.mark.soak
+@pytest.mark.parametrize(
+    ("sensor", "topic", "message_class"), [("ldrobot-stl27l", "scan", LaserScan), ("robosense-m1", "points", PointCloud2)]
+)
+@pytest.mark.parametrize("qos", ["reliable", "best_effort"])
+def test_no_scan_is_lost_in_ten_minutes(
+    run: Callable[..., Any], client: Client, sensor: str, topic: str, message_class: Any, qos: str
+) -> None:
+    """Of reliable topics; of the others it is printed how many are."""
+    stamps = list[int]()
+
+    def note(data: bytes) -> None:
+        sec, nanosec = struct.unpack_from("<iI", data, 4)
+        stamps.append(sec * 10**9 + nanosec)
+
+    client.listen(topic, message_class, reliable=qos == "reliable", take=note)
+    run(f"sim:{sensor}", "-s", sensor, ros=given(qos=qos))
+    client.until(lambda: stamps)
+    end = time.monotonic() + SOAK
+    client.until(lambda: time.monotonic() > end, patience=2 * SOAK)
+    steps = np.diff(stamps)
+    lost = int(np.rint(steps / np.median(steps)).sum()) - len(steps)
+    print(f"{sensor}, {qos}: {lost} of {len(stamps) + lost} lost")
+    assert len(stamps) > 9.5 * SOAK
+    assert not lost or qos == "best_effort"

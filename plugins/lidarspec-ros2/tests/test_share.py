@@ -1,0 +1,110 @@
+"""What ROS's own tools find of an installed distribution, and that the pages say what is there."""
+
+from __future__ import annotations
+
+import itertools
+import re
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any
+from xml.etree import ElementTree
+
+import pytest
+import yaml
+from ament_index_python.packages import get_package_prefix, get_package_share_directory
+from client import Client, message
+from sensor_msgs.msg import LaserScan, PointCloud2
+
+import lidarspec as ls
+from lidarspec_ros2.parameters import NAMED
+from tests.docs import pages
+
+DRIVERS, HOW_TO, NODES = "reference/ros2-drivers.md", "how-to/ros2.md", ("/front/lidar", "/back/lidar")
+
+
+@pytest.fixture(autouse=True)
+def _prefix(monkeypatch: pytest.MonkeyPatch) -> None:
+    """This environment is a place of packages, as the page has its reader say."""
+    monkeypatch.setenv("AMENT_PREFIX_PATH", sys.prefix)
+
+
+def share(*parts: str) -> Path:
+    return Path(get_package_share_directory("lidarspec_ros2"), *parts)
+
+
+def files() -> dict[str, Any]:
+    """The files of parameters, by name, as YAML."""
+    (mine,) = [block.text for block in pages.blocks(HOW_TO) if block.title == "mine.yaml"]
+    return {"mine": yaml.safe_load(mine), "two_lidars": yaml.safe_load(share("config", "two_lidars.yaml").read_text())}
+
+
+def test_the_files_of_parameters_name_parameters_and_installed_sensors() -> None:
+    for file in files().values():
+        assert tuple(file) == NODES
+        for node in file.values():
+            assert set(node["ros__parameters"]) <= set(NAMED)
+            assert ls.sensor(node["ros__parameters"]["sensor"])
+
+
+@pytest.mark.parametrize(("name", "topic", "kind"), [("front", "scan", LaserScan), ("back", "points", PointCloud2)])
+def test_a_node_of_the_launch_file_has_its_parameters_from_the_file(client: Client, name: str, topic: str, kind: Any) -> None:
+    program = Path(get_package_prefix("lidarspec_ros2"), "lib", "lidarspec_ros2", "lidarspec_node")  # where launch looks for it
+    config = share("config", "two_lidars.yaml")
+    words = ["--ros-args", "-r", f"__ns:=/{name}", "-r", "__node:=lidar", "--params-file", str(config)]
+    received = client.listen(f"/{name}/{topic}", kind, reliable=name == "back")  # the node's own choice for that one
+    with subprocess.Popen([program, *words]) as node:
+        client.until(lambda: received)
+        node.terminate()
+    got = message(received[0], f"sensor_msgs/msg/{kind.__name__}")
+    assert got.header.frame_id == f"{name}_laser"
+    assert len(got.ranges) == 720 if name == "front" else got.height > 1
+
+
+def test_the_launch_file_starts_both() -> None:
+    pytest.importorskip("launch_ros", reason="there is no wheel of launch: the file is run where ROS is sourced")
+    from launch.launch_description_sources import PythonLaunchDescriptionSource
+
+    from launch import LaunchContext
+
+    context = LaunchContext()
+    description = PythonLaunchDescriptionSource(str(share("launch", "two_lidars.launch.py"))).get_launch_description(context)
+    argument, *nodes = description.entities
+    argument.execute(context)
+    for node in nodes:
+        node._perform_substitutions(context)
+    assert [node.node_name for node in nodes] == list(NODES)
+
+
+def test_the_transforms_of_the_page_are_those_of_the_frames_in_the_files() -> None:
+    (block,) = [block for block in pages.blocks(HOW_TO) if block.language == "xml"]
+    links = {lidar.get("name") for lidar in ElementTree.fromstring(block.text).iter("{http://www.ros.org/wiki/xacro}lidar")}
+    for file in files().values():
+        assert {node["ros__parameters"]["frame_id"] for node in file.values()} == links
+
+
+def rows(page: str) -> list[list[str]]:
+    """The cells of the tables of a page."""
+    text = (pages.DOCS / page).read_text(encoding="utf-8")
+    return [[cell.strip() for cell in row.strip("|").split("|")] for row in re.findall(r"^\|.*\|$", text, re.MULTILINE)]
+
+
+def test_every_row_of_the_vendors_parameters_names_one_of_ours_or_a_reason() -> None:
+    topics, services = {"scan", "points", "imu", "packets", "/diagnostics"}, ls.sensor("hesai-xt32").commands
+    told = [row for row in rows(DRIVERS) if len(row) == 3]
+    assert len(told) > 80
+    for theirs, ours, why in told:
+        assert set(re.findall(r"`([\w./]+)`", ours)) <= {*NAMED, *topics}, theirs
+        assert set(re.findall(r"`~/(\w+)`", ours)) <= set(services), theirs
+        assert ours != "-" or why, theirs
+
+
+def commands() -> list[list[str]]:
+    """What is typed on the page to start a node, in words."""
+    text = "\n".join(block.text for block in pages.blocks(HOW_TO) if block.language == "console")
+    return [line.split() for line in re.findall(r"^\$ lidarspec ros2 (.+)$", text, re.MULTILINE)]
+
+
+@pytest.mark.parametrize("words", commands(), ids=" ".join)
+def test_what_the_page_has_typed_names_parameters(words: list[str]) -> None:
+    assert {word.partition(":=")[0] for before, word in itertools.pairwise(words) if before == "-p"} <= {*NAMED, "use_sim_time"}

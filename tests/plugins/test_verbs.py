@@ -1,0 +1,84 @@
+"""Verbs of plugins stand in the help without being loaded, and do what their command says; one that cannot be loaded disturbs no other."""
+
+from __future__ import annotations
+
+import json
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+MODULE = """
+import sys
+import click
+from lidarspec.spec import hookimpl
+
+print("loaded", file=sys.stderr)
+
+@click.command()
+@click.argument("word")
+def survey(word):
+    '''Says a word.'''
+    click.echo(word)
+
+@hookimpl
+def lidarspec_verbs():
+    return [survey]
+"""
+
+
+@pytest.fixture
+def site(tmp_path: Path) -> Path:
+    """A folder with a distribution of some verbs."""
+    about = tmp_path / "acme_survey-1.2.dist-info"
+    about.mkdir()
+    (about / "METADATA").write_text("Metadata-Version: 2.1\nName: acme-survey\nVersion: 1.2\n", encoding="utf-8")
+    verbs = {"survey": "acme_survey", "read": "acme_survey", "absent": "acme_absent", "other": "acme_survey", "plain": "acme_plain"}
+    lines = "".join(f"{verb} = {module}\n" for verb, module in verbs.items())
+    (about / "entry_points.txt").write_text(f"[lidarspec.verbs]\n{lines}", encoding="utf-8")
+    (tmp_path / "acme_survey.py").write_text(MODULE, encoding="utf-8")
+    (tmp_path / "acme_plain.py").write_text("def lidarspec_verbs():\n    return []\n", encoding="utf-8")
+    return tmp_path
+
+
+def ran(site: Path, *words: str) -> subprocess.CompletedProcess[str]:
+    environment = os.environ | {"PYTHONPATH": os.pathsep.join([str(site), *filter(None, sys.path)])}
+    command = [sys.executable, "-P", "-m", "lidarspec", *words]
+    return subprocess.run(command, env=environment, capture_output=True, text=True, timeout=60, check=False)
+
+
+def test_a_verb_is_listed_without_being_loaded_and_runs(site: Path) -> None:
+    listed = ran(site, "--help")
+    assert "loaded" not in listed.stderr
+    assert "survey  Of the plugin acme-survey 1.2." in listed.stdout
+    done = ran(site, "survey", "hills")
+    assert (done.returncode, done.stdout) == (0, "hills\n")
+    assert "Says a word." in ran(site, "help", "survey").stdout
+    assert "next: lidarspec survey --help" in ran(site, "survey").stderr
+    assert "did you mean 'survey'?" in ran(site, "surveys").stderr
+    assert "The points that a sensor sends" in ran(site, "read", "--help").stdout  # ours comes first
+
+
+@pytest.mark.parametrize(
+    ("verb", "reason"),
+    [
+        ("absent", "No module named 'acme_absent'"),
+        ("other", "its lidarspec_verbs has no verb 'other'"),
+        ("plain", "lidarspec_verbs lacks @hookimpl"),
+    ],
+)
+def test_a_verb_that_cannot_be_loaded_is_named_with_its_distribution(site: Path, verb: str, reason: str) -> None:
+    done = ran(site, verb)
+    assert done.returncode == 1
+    assert "acme-survey" in done.stderr
+    assert reason in done.stderr
+    assert ran(site, "sensors").returncode == 0
+
+
+def test_plugins_with_verbs_are_among_the_plugins(site: Path) -> None:
+    found = json.loads(ran(site, "plugins", "--json").stdout)
+    errors = {one["entry_point"]: one["error"] for one in found if one["distribution"] == "acme-survey"}
+    assert errors["other = acme_survey"] == ""
+    assert "No module named 'acme_absent'" in errors["absent = acme_absent"]
