@@ -7,7 +7,7 @@ A lifecycle node over a `Device`, as every verb has one. ROS is imported when th
 * `node`: the lifecycle, services, and the thread that reads.
 * `topics`: what is published.
 * `diagnostics`: how the sensor is doing, as /diagnostics says it.
-* `clock`: times of the sensor's clock as those of the host.
+* `clock`: stamps in ROS's time, and the sensor's clock by the host's.
 """
 
 from __future__ import annotations

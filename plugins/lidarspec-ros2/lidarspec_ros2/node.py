@@ -193,7 +193,7 @@ class LidarNode(LifecycleNode):
         device, now = feed.device, self.get_clock().now()
         reading = feed.meter.reading(device.stats, SECOND if device.is_live else None)
         more = {"lifecycle": "active" if topics.active else "inactive", "latency [ms]": f"{topics.latency_s * 1e3:.1f}"}
-        found = status(self.get_name(), device, reading, [topics.clock.jump] * bool(topics.clock.jumps), more)
+        found = status(self.get_name(), device, reading, [topics.stamps.clock.jump] * bool(topics.stamps.clock.jumps), more)
         self._diagnostics.publish(DiagnosticArray(header=Header(stamp=now.to_msg()), status=[found]))
 
     def _soon(self, callback: Callable[[], Any]) -> None:

@@ -88,6 +88,8 @@ PARAMETERS = (
         live=True,
     ),
     Parameter("use_device_time", True, "Whether stamps are by the sensor's clock, in the host's time; else by the arrival.", live=True),
+    Parameter("device_time_is_ros_time", False, "Whether the sensor's clock is right, by PTP or GPS: stamps are what it says.", live=True),
+    Parameter("time_offset", 0.0, "Seconds added to every stamp: below 0 for a delay that is always there.", -_SIDE, _SIDE, live=True),
     Parameter("publish_packets", False, "Whether packets has what the sensor sends, as it comes."),
     Parameter("qos", "best_effort", "Of the topics with data: best_effort, as for sensor data, or reliable."),
     Parameter("period", 0.01, "Seconds from decoding to decoding: shorter is sooner, and takes more of the processor.", 0.001, 1.0),

@@ -22,8 +22,9 @@ from lidarspec.points.cloud import Mount
 from lidarspec.scans.scans import Scan
 from lidarspec.scans.selection import Sieve
 from lidarspec.spec.sensor import Sensor
+from lidarspec.transports.base import HostClock
 from lidarspec.transports.protocol import Chunk
-from lidarspec_ros2.clock import DeviceClock
+from lidarspec_ros2.clock import Stamps
 from lidarspec_ros2.parameters import Settings
 
 #: of each kind of message its topic, its class, and how many are kept for those who are slow: about a second of them, or less.
@@ -47,13 +48,13 @@ class Topics:
         UsageError: for a transform that cannot be published here.
 
     Attributes:
-        clock: the sensor's clock by the host's.
+        stamps: the times of messages.
         active: whether what is published is let through.
         latency_s: seconds from the arrival of the packets that ended the last scan to its being published.
     """
 
     def __init__(self, node: LifecycleNode, settings: Settings, sensor: Sensor, *, played: bool) -> None:
-        self._node, self._sensor, self.clock = node, sensor, DeviceClock()
+        self._node, self._sensor, self.stamps = node, sensor, Stamps(None if played else HostClock())
         self._messages = Messages("ROS2_HUMBLE")
         self._reliability = ReliabilityPolicy.RELIABLE if settings["qos"] == "reliable" else ReliabilityPolicy.BEST_EFFORT
         self._publishers: dict[str, Any] = {}
@@ -76,10 +77,8 @@ class Topics:
 
     def learn(self, packets: Packets) -> None:
         """Learn the sensor's clock from packets."""
-        known = packets.host_ns > 0
-        if known.any():
-            self._arrived = int(packets.host_ns[known][0])
-            self.clock.observe(packets.time_ns[known], packets.host_ns[known])
+        self._arrived = int(packets.host_ns[0]) or self._arrived
+        self.stamps.learn(packets.time_ns, packets.host_ns)
 
     def publish(self, scan: Scan) -> None:
         """Publish a scan, as far as anybody listens.
@@ -102,7 +101,7 @@ class Topics:
     def feel(self, felt: ImuSamples) -> None:
         """Publish what the IMU felt."""
         for index in range(len(felt)) if len(felt) and self._listened(IMU) else ():
-            at = int(felt.time_ns[index]) + self.clock.offset_ns
+            at = self.stamps.at(int(felt.time_ns[index]), self._settings)
             self._send(self._messages.imu(felt, index, at, self._settings["frame_id"]))
 
     def raw(self, chunk: Chunk) -> None:
@@ -127,8 +126,7 @@ class Topics:
         """The time of the first point, ns, in ROS's time."""
         if not scan.host_ns:  # of a file that does not say when its bytes arrived
             return int(self._node.get_clock().now().nanoseconds)
-        by_device = self.clock.stamp(scan.stamp_ns, scan.host_ns)
-        return by_device if self._settings["use_device_time"] else scan.host_ns
+        return self.stamps.of(scan.stamp_ns, scan.host_ns, self._settings)
 
     def _publisher(self, kind: str) -> Any:
         """The publisher of a kind of messages; that of `scan` is made when there is a planar one."""
