@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import os
 import random
 import subprocess
@@ -14,7 +15,7 @@ import pytest
 os.environ |= {"ROS_AUTOMATIC_DISCOVERY_RANGE": "LOCALHOST", "ROS_DOMAIN_ID": str(random.randrange(50, 100)), "LIDARSPEC_DEBUG": "1"}
 
 import rclpy
-from client import Client
+from client import PATIENCE, Client
 
 Run = Callable[..., "subprocess.Popen[str]"]
 
@@ -35,7 +36,7 @@ def client() -> Iterator[Client]:
 
 @pytest.fixture
 def run(tmp_path: Path) -> Iterator[Run]:
-    """Starts a node, by the words of the verb, and of ROS; what is left of it at the end is killed."""
+    """Starts a node, by the words of the verb, and of ROS; which is ended at the end."""
     begun: list[subprocess.Popen[str]] = []
 
     def started(*words: str, ros: Sequence[str] = (), executable: str = "lidarspec") -> subprocess.Popen[str]:
@@ -47,5 +48,7 @@ def run(tmp_path: Path) -> Iterator[Run]:
 
     yield started
     for process in begun:
+        process.terminate()
+        with contextlib.suppress(subprocess.TimeoutExpired):
+            process.communicate(timeout=PATIENCE)
         process.kill()
-        process.communicate()

@@ -1,0 +1,228 @@
+"""The node as a client sees it: its lifecycle, parameters, services and diagnostics, a port that goes away, and what is left at the end."""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import re
+import signal
+import subprocess
+import sys
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+from client import PATIENCE, Client, ended, given, message
+from rcl_interfaces.msg import ParameterType
+from sensor_msgs.msg import LaserScan
+
+from lidarspec.formats.messages import SCAN
+from lidarspec_ros2.parameters import PARAMETERS
+
+STL = ("sim:ldrobot-stl27l", "-s", "ldrobot-stl27l")
+
+
+def values(status: Any) -> dict[str, str]:
+    """What a diagnostic says, by name."""
+    return {entry.key: entry.value for entry in status.values}
+
+
+def test_nothing_of_ros_is_imported_before_the_node_starts() -> None:
+    code = "import lidarspec_ros2, lidarspec_ros2.command, lidarspec_ros2.parameters, sys; print('rclpy' in sys.modules)"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True, timeout=PATIENCE)
+    assert done.stdout == "False\n"
+
+
+def test_without_ros_one_line_says_both_ways_to_have_it(tmp_path: Path) -> None:
+    (tmp_path / "rclpy.py").write_text("raise ImportError('no rclpy here')", encoding="utf-8")
+    environment = os.environ | {"PYTHONPATH": str(tmp_path)}
+    command = [sys.executable, "-m", "lidarspec", "ros2", *STL]
+    done = subprocess.run(command, env=environment, capture_output=True, text=True, check=False, timeout=PATIENCE)
+    first, *_ = done.stderr.splitlines()
+    assert done.returncode == 2
+    assert "no rclpy here" in first
+    assert "setup.bash" in first
+    assert "pip install 'lidarspec-ros2[ros2]'" in first
+
+
+def test_the_lifecycle_is_the_managers_where_it_is_asked_for(run: Any, client: Client) -> None:
+    scans = client.listen("scan", LaserScan)
+    process = run(ros=given(source=STL[0], sensor=STL[2], autostart=False, qos="reliable"), executable="lidarspec_node")
+    assert client.state == "unconfigured"
+    assert not client.change("activate")
+    assert client.change("configure")
+    assert (client.state, scans) == ("inactive", [])
+    client.until(lambda: client.diagnostics)
+    assert values(client.diagnostics[-1].status[0])["lifecycle"] == "inactive"
+    assert client.change("activate")
+    client.until(lambda: len(scans) > 2)
+    assert client.change("deactivate")
+    number = len(scans)
+    client.diagnostics.clear()
+    client.until(lambda: client.diagnostics)  # it goes on reading
+    assert values(client.diagnostics[-1].status[0])["packets [/s]"] != "-"
+    assert len(scans) <= number + 1  # one may have been under way
+    assert client.change("cleanup")
+    assert client.state == "unconfigured"
+    assert client.change("configure")
+    assert client.change("activate")
+    client.until(lambda: len(scans) > number + 2)
+    assert client.change("shutdown")
+    assert process.wait(PATIENCE) == 0
+
+
+def test_it_cannot_be_configured_with_what_cannot_be_opened_and_then_can(run: Any, client: Client, tmp_path: Path) -> None:
+    run(ros=given(source=str(tmp_path / "none"), sensor=STL[2], autostart=False), executable="lidarspec_node")
+    assert not client.change("configure")
+    assert client.state == "unconfigured"
+    assert client.set("source", STL[0]) == ""
+    assert client.change("configure")
+    assert client.state == "inactive"
+
+
+@pytest.mark.parametrize(
+    ("words", "parameters"),
+    [
+        (["sim:ldrobot-stl27l", "-s", "ldrobot-stl27"], {"source": "sim:ldrobot-stl27l", "sensor": "ldrobot-stl27"}),
+        (["sim:ldrobot-stl27l", "-s", "ldrobot-stl27l", "-O", "answer"], {"source": STL[0], "sensor": STL[2], "options": "[answer]"}),
+        (["sim:ldrobot-stl27l?bad=1", "-s", "ldrobot-stl27l"], {"source": "sim:ldrobot-stl27l?bad=1", "sensor": STL[2]}),
+        (["absent.pcap", "-s", "robosense-m1"], {"source": "absent.pcap", "sensor": "robosense-m1"}),
+    ],
+)
+def test_what_cannot_be_is_refused_as_on_the_command_line(run: Any, tmp_path: Path, words: list[str], parameters: dict[str, Any]) -> None:
+    stats = [sys.executable, "-m", "lidarspec", "stats", *words]
+    known = subprocess.run(stats, capture_output=True, text=True, check=False, cwd=tmp_path, timeout=PATIENCE)
+    reason = known.stderr.splitlines()[0]
+    for process in (run(*words), run(ros=given(**parameters), executable="lidarspec_node")):
+        _, complaints = process.communicate(timeout=PATIENCE)
+        assert (process.returncode, reason in complaints) == (known.returncode, True)
+
+
+def test_parameters_are_described_and_changed_where_that_makes_sense(run: Any, client: Client) -> None:
+    scans = client.listen("scan", LaserScan)
+    run(*STL, ros=given(qos="reliable", frame_id="front"))
+    client.until(lambda: scans)
+    for parameter, descriptor in zip(PARAMETERS, client.described(*(one.name for one in PARAMETERS)), strict=True):
+        kind = getattr(ParameterType, f"PARAMETER_{parameter.kind.upper()}")
+        assert (descriptor.description, descriptor.type) == (parameter.text, kind)
+    assert (client.value("frame_id"), client.value("beams"), client.value("source")) == ("front", 0, STL[0])
+    assert client.set("beams", 450) == client.set("range_max", 3.0) == client.set("frame_id", "rear") == ""
+    assert client.set("angle_min", -1.0) == client.set("angle_max", 1.0) == ""
+
+    def newest() -> Any:
+        return message(scans[-1], SCAN)
+
+    client.until(lambda: newest().header.frame_id == "rear" and newest().angle_max == 1.0)
+    assert (len(newest().ranges), newest().range_max, newest().angle_min) == (450, 3.0, -1.0)
+    assert all(one <= 3.0 or one == float("inf") for one in newest().ranges)
+    assert "source is read on configuring" in client.set("source", "udp://")
+    assert client.set("angle_min", 2.0) == "from angle_min 2.0 up to angle_max 1.0 there is nothing"
+    assert client.set("range_min", 5.0) == "from 5.0 up to 3.0 there is nothing"
+    assert client.set("beams", -1)
+    assert (client.value("angle_min"), client.value("range_min")) == (-1.0, 0.0)
+
+
+def test_commands_are_services_with_arguments_as_parameters(run: Any, client: Client) -> None:
+    run("sim:ldrobot-ld14p", "-s", "ldrobot-ld14p")
+    client.until(lambda: client.diagnostics)
+    refused = client.trigger("set_speed")
+    assert (refused.success, refused.message) == (False, "ldrobot-ld14p set_speed: field 'speed' is missing")
+    assert client.set("set_speed.speed", 9000.0) == ""
+    assert "outside 720 .. 2880" in client.trigger("set_speed").message
+    assert client.set("set_speed.speed", "6turns") == ""
+    assert not client.trigger("set_speed").success
+    assert client.set("set_speed.speed", 1440) == ""
+    sent = client.trigger("set_speed")
+    assert (sent.success, "no answer is documented" in sent.message) == (True, True)
+    assert client.trigger("stop").success
+
+
+def test_a_reply_stands_in_the_message(run: Any, client: Client) -> None:
+    run("sim:slamtec-rplidar-a1", "-s", "slamtec-rplidar-a1")
+    client.until(lambda: client.diagnostics)
+    assert client.trigger("stop").success
+    found = client.trigger("get_health")
+    assert found.success
+    assert "answered with health" in found.message
+    assert "status" in found.message
+
+
+def test_diagnostics_say_how_the_sensor_is_doing(run: Any, client: Client) -> None:
+    run("sim:ldrobot-stl27l?errors=0.001", "-s", "ldrobot-stl27l")
+    client.until(lambda: len(client.diagnostics) > 3)
+    (status,) = client.diagnostics[-1].status
+    found = values(status)
+    assert (status.name, status.hardware_id) == ("lidar: ldrobot-stl27l", "sim:ldrobot-stl27l?errors=0.001")
+    assert float(found["speed [Hz]"]) == pytest.approx(10, rel=0.2)
+    assert float(found["errors [%]"]) > 0
+    assert (found["state"], found["lifecycle"]) == ("streaming", "active")
+    assert {"packets [/s]", "loss [%]", "jitter [ms]", "latency [ms]"} <= set(found)
+    assert client.diagnostics[-1].header.stamp.sec > 0
+
+
+@pytest.fixture
+def plugged(tmp_path: Path) -> Iterator[Callable[..., tuple[Path, int]]]:
+    """Starts a simulated sensor on a pty: gives the path of that, and the process."""
+    begun = list[subprocess.Popen[str]]()
+
+    def started(*words: str) -> tuple[Path, int]:
+        link = tmp_path / "port"
+        command = [sys.executable, "-m", "lidarspec", "sim", "ldrobot-stl27l", "--to", "pty", "--link", str(link), *words]
+        begun.append(subprocess.Popen(command, stdout=subprocess.PIPE, text=True))
+        assert begun[-1].stdout is not None
+        assert begun[-1].stdout.readline()
+        return link, begun[-1].pid
+
+    yield started
+    for process in begun:
+        process.terminate()
+        process.communicate()
+
+
+def test_a_port_that_goes_away_makes_the_node_inactive_until_it_is_back(run: Any, client: Client, plugged: Any) -> None:
+    port, _ = plugged("--unplug", "5s", "--absent", "3s")
+    scans = client.listen("scan", LaserScan)
+    run(str(port), "-s", "ldrobot-stl27l", ros=given(qos="reliable"))
+    client.until(lambda: len(scans) > 2)
+    assert client.state == "active"
+    client.until(lambda: client.diagnostics and client.diagnostics[-1].status[0].level == b"\2")
+    assert client.state == "inactive"
+    client.until(lambda: values(client.diagnostics[-1].status[0])["lifecycle"] == "inactive")
+    assert "waiting for it to come back" in client.diagnostics[-1].status[0].message
+    number = len(scans)
+    client.until(lambda: len(scans) > number + 2)
+    assert client.state == "active"
+    client.until(lambda: client.diagnostics[-1].status[0].level != b"\2")
+
+
+@pytest.mark.parametrize("by", [signal.SIGINT, signal.SIGTERM])
+def test_nothing_is_left_behind(run: Any, client: Client, plugged: Any, by: int) -> None:
+    port, simulator = plugged()
+    scans, before = client.listen("scan", LaserScan, reliable=False), shared(os.getpid())
+    process = run(str(port), "-s", "ldrobot-stl27l")
+    client.until(lambda: scans)
+    threads, own = os.listdir(f"/proc/{process.pid}/task"), shared(process.pid) - before
+    assert own
+    assert str(process.pid) in holders(port)
+    code, complaints = ended(process, by)
+    assert (code, "Traceback" in complaints, "interrupted" in complaints) == (0, False, True)
+    assert not any(Path(f"/proc/{thread}").exists() for thread in threads)
+    ports = {name for name in shared(os.getpid()) if "_port" in name}  # where the client listens
+    assert not [name for name in own - ports if Path(name).exists()]
+    assert set(holders(port)) <= {str(simulator)}
+
+
+def shared(pid: int) -> set[str]:
+    """The files of shared memory that a process has."""
+    return set(re.findall(r"/dev/shm/fast\w+", Path(f"/proc/{pid}/maps").read_text(encoding="utf-8")))
+
+
+def holders(port: Path) -> list[str]:
+    """The processes that have a port open."""
+    found = []
+    for pid in filter(str.isdecimal, os.listdir("/proc")):
+        with contextlib.suppress(OSError):
+            opened = {os.path.realpath(f"/proc/{pid}/fd/{number}") for number in os.listdir(f"/proc/{pid}/fd")}
+            found += [pid] * (os.path.realpath(port) in opened)
+    return found
