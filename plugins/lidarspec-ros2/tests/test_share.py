@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
-import itertools
+import importlib.util
 import re
 import subprocess
 import sys
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 from xml.etree import ElementTree
@@ -13,11 +14,11 @@ from xml.etree import ElementTree
 import pytest
 import yaml
 from ament_index_python.packages import get_package_prefix, get_package_share_directory
-from client import Client, message
-from lidarspec_ros2.parameters import NAMED
+from client import PATIENCE, Client, message
 from sensor_msgs.msg import LaserScan, PointCloud2
 
 import lidarspec as ls
+from lidarspec_ros2.parameters import NAMED
 from tests.docs import pages
 
 DRIVERS, HOW_TO, NODES = "reference/ros2-drivers.md", "how-to/ros2.md", ("/front/lidar", "/back/lidar")
@@ -106,5 +107,14 @@ def commands() -> list[list[str]]:
 
 
 @pytest.mark.parametrize("words", commands(), ids=" ".join)
-def test_what_the_page_has_typed_names_parameters(words: list[str]) -> None:
-    assert {word.partition(":=")[0] for before, word in itertools.pairwise(words) if before == "-p"} <= {*NAMED, "use_sim_time"}
+def test_what_the_page_has_typed_starts_a_node(run: Callable[..., Any], client: Client, tmp_path: Path, words: list[str]) -> None:
+    place = words.index("--ros-args") if "--ros-args" in words else len(words)
+    source, *others = words[:place]
+    simulated = "sim:ldrobot-stl27l" if source.startswith("/dev/") else source
+    if source.endswith(".lsr"):
+        subprocess.run(["lidarspec", "sim", "ldrobot-stl27l", "--to", source, "-t", "5s"], check=True, cwd=tmp_path)
+    node = run(simulated, *others, ros=words[place + 1 :])
+    if "publish_tf:=true" in words and importlib.util.find_spec("tf2_msgs") is None:
+        assert "publish_tf takes tf2_msgs" in node.communicate(timeout=PATIENCE)[1]
+    else:
+        client.until(lambda: any(status.message == "streaming" for array in client.diagnostics for status in array.status))
