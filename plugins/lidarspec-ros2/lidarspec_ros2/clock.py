@@ -91,10 +91,15 @@ class Stamps:
         """The stamp of the next scan, by the sensor's time and the arrival of its first point, ns."""
         return self._wanted(device_ns, self.clock.stamp(device_ns, host_ns), host_ns, settings)
 
-    def at(self, device_ns: int, settings: Settings) -> int:
-        """A time by the sensor's clock that is between those of packets, ns."""
-        estimated = device_ns + self.clock.offset_ns
-        return self._wanted(device_ns, estimated, estimated, settings)
+    def at(self, time_ns: int, settings: Settings, *, by_clock: bool) -> int:
+        """The stamp of something that is not a scan, ns.
+
+        Args:
+            time_ns: between those of packets.
+            by_clock: whether it is by the sensor's clock; else it is when it arrived.
+        """
+        estimated = time_ns + self.clock.offset_ns * by_clock
+        return self._wanted(time_ns, estimated, estimated, settings)
 
     def _wanted(self, own: int, estimated: int, arrival: int, settings: Settings) -> int:
         """What the parameters want of the three: the sensor's time, what is made of it, and the arrival."""

@@ -16,8 +16,10 @@ from std_msgs.msg import UInt8MultiArray
 
 from lidarspec.errors import UsageError
 from lidarspec.formats.messages import CLOUD, IMU, RAW, SCAN, Message, Messages
+from lidarspec.framing.results import Counters
 from lidarspec.packets.imu import ImuSamples
 from lidarspec.packets.packets import Packets
+from lidarspec.packets.stream import ImuStream
 from lidarspec.points.cloud import Mount
 from lidarspec.scans.scans import Scan
 from lidarspec.scans.selection import Sieve
@@ -65,6 +67,7 @@ class Topics:
         self._publisher(CLOUD)
         if settings["publish_packets"]:
             self._publisher(RAW)
+        self._is_felt_by_clock = ImuStream(sensor, Counters()).waiting is not None
         if sensor.imu_frames:
             self._publisher(IMU)
         if settings["publish_tf"]:
@@ -101,7 +104,7 @@ class Topics:
     def feel(self, felt: ImuSamples) -> None:
         """Publish what the IMU felt."""
         for index in range(len(felt)) if len(felt) and self._listened(IMU) else ():
-            at = self.stamps.at(int(felt.time_ns[index]), self._settings)
+            at = self.stamps.at(int(felt.time_ns[index]), self._settings, by_clock=self._is_felt_by_clock)
             self._send(self._messages.imu(felt, index, at, self._settings["frame_id"]))
 
     def raw(self, chunk: Chunk) -> None:

@@ -1,9 +1,10 @@
-"""A recording that the node plays, and the bag that `convert` makes of it, hold the same bytes at the same times; /clock goes with them."""
+"""The times of what is published: a recording's are those of its bag, /clock goes with them, and an IMU's go with the points'."""
 
 from __future__ import annotations
 
 import subprocess
 import sys
+import time
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -13,7 +14,7 @@ import pytest
 from client import Client, given, message
 from rosbags.rosbag2 import Reader
 from rosgraph_msgs.msg import Clock
-from sensor_msgs.msg import LaserScan, PointCloud2
+from sensor_msgs.msg import Imu, LaserScan, PointCloud2
 
 import lidarspec as ls
 from lidarspec.recording.recorders import Recorder
@@ -36,8 +37,8 @@ def recorded(path: Path, sensor: str) -> tuple[Path, int]:
     packets = simulate(spec, SENSORS[sensor][0])
     times = spec.decode(b"".join(packets)).time_ns
     with Recorder(path, spec) as recorder:
-        for packet, time in zip(packets, times.tolist(), strict=True):
-            at = max(at, time - int(times[0]) + int(random.integers(0, LATEST)))
+        for packet, sent in zip(packets, times.tolist(), strict=True):
+            at = max(at, sent - int(times[0]) + int(random.integers(0, LATEST)))
             recorder.write(Chunk(packet, BEGAN + at))
     return path, BEGAN - int(times[0])
 
@@ -76,5 +77,15 @@ def test_stamps_by_the_sensors_clock_are_closer_to_the_truth_than_arrivals(
     assert (np.diff(stamps) > 0).all()
 
 
-def stamp(time: Any) -> int:
-    return int(time.sec * SECOND + time.nanosec)
+@pytest.mark.parametrize("sensor", ["livox-avia", "ouster-os0"])  # whose samples have no clock, and that of the points
+def test_what_an_imu_felt_is_stamped_beside_the_points(run: Callable[..., Any], client: Client, sensor: str) -> None:
+    felt, clouds = client.listen("imu", Imu), client.listen("points", PointCloud2)
+    run(f"sim:{sensor}", "-s", sensor, ros=given(qos="reliable"))
+    client.until(lambda: len(felt) > WANTED and len(clouds) > 2)
+    now = time.time_ns()
+    for data, kind in ((felt[-1], "Imu"), (clouds[-1], "PointCloud2")):
+        assert abs(stamp(message(data, f"sensor_msgs/msg/{kind}").header.stamp) - now) < 5 * SECOND
+
+
+def stamp(told: Any) -> int:
+    return int(told.sec * SECOND + told.nanosec)
