@@ -68,8 +68,8 @@ def lidarspec_points(sensor: Sensor, fields: Any) -> Points | None:
 
 
 @hookspec(firstresult=True)
-def lidarspec_source(url: str) -> Any:
-    """A transport for a URL scheme that the package does not know, or None."""
+def lidarspec_source(url: str, sensor: Sensor | None) -> Any:
+    """A transport for a URL scheme that the package does not know, or None; `sensor`: whose packets they are to be, where that is known."""
 
 
 @hookspec(firstresult=True)
@@ -465,7 +465,7 @@ def tried() -> list[Plugin]:
 
     if len(_registries) > 1:  # one stands in for what is installed
         return registry().plugins
-    groups = [entry_points(GROUP) + entry_points(VERBS), entry_points(SENSORS)]
+    groups = [_modules(), entry_points(SENSORS)]
     entries = {(entry.distribution, entry.module): entry for group in groups for entry in group}
     with ThreadPoolExecutor(os.cpu_count()) as pool:
         trials = dict(zip(entries, pool.map(_trial, entries), strict=True))
@@ -476,6 +476,14 @@ def tried() -> list[Plugin]:
     ]
     modules, offered = ([entry for entry in group if not trials[entry.distribution, entry.module][0]] for group in groups)
     return [replace(plugin, remark=trials[plugin.home][1]) for plugin in Registry(modules, offered, named_owners).plugins] + lost
+
+
+def _modules() -> list[EntryPoint]:
+    """The entry points of modules with hooks, of each module the first."""
+    found: dict[Home, EntryPoint] = {}
+    for entry in entry_points(GROUP) + entry_points(VERBS):
+        found.setdefault((entry.distribution, entry.module), entry)
+    return list(found.values())
 
 
 def _trial(home: Home) -> tuple[str, str]:
@@ -506,11 +514,9 @@ def load_alone() -> None:
 
     *home, mark, limit = sys.argv[1:]
     faulthandler.dump_traceback_later(float(limit), exit=True)
-    modules, verbs, offered = (
-        [one for one in entry_points(group) if [one.distribution, one.module] == home] for group in (GROUP, VERBS, SENSORS)
-    )
+    modules, offered = ([one for one in group if [one.distribution, one.module] == home] for group in (_modules(), entry_points(SENSORS)))
     before = set(threading.enumerate())
-    Registry(modules + verbs, offered)._load_all()
+    Registry(modules, offered)._load_all()
     left = [thread.name for thread in threading.enumerate() if thread not in before]
     print(mark, ", ".join(left), sep="", end="", flush=True)
     os._exit(0)  # whatever is left behind

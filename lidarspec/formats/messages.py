@@ -6,7 +6,6 @@ layout: x y z intensity time as float32, ring as uint16, then the further column
 
 from __future__ import annotations
 
-import struct
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -17,16 +16,15 @@ from lidarspec.formats.writing import picture
 from lidarspec.packets.imu import ImuSamples
 from lidarspec.points.cloud import PointCloud
 from lidarspec.scans.scans import LaserScan, Scan
+from lidarspec.transports.bags import DATAGRAM, RAW, STAMP, STREAM
 from lidarspec.transports.protocol import Chunk
 
 #: a packet as it was received, which `transports.bags` reads again: ROS has no message for it.
 PACKET, LAYOUT = "lidarspec_msgs/msg/LidarPacket", "builtin_interfaces/Time stamp\nuint8[] data"
-#: the one message of every ROS that holds bytes and says nothing of them; logs of ROS know packets by it, see `transports.bags`.
-RAW = "std_msgs/msg/UInt8MultiArray"
 CLOUD, SCAN, IMU = (f"sensor_msgs/msg/{name}" for name in ("PointCloud2", "LaserScan", "Imu"))
 #: the numbers by which PointField names types; anything else is written as float64.
 FIELD_TYPES = {"i1": 1, "u1": 2, "b1": 2, "i2": 3, "u2": 4, "i4": 5, "u4": 6, "f4": 7, "f8": 8}
-_SECOND, _STAMP = 1_000_000_000, struct.Struct("<q")
+_SECOND = 1_000_000_000
 
 
 class Message(NamedTuple):
@@ -61,18 +59,12 @@ class Messages:
         at = packet.at or 0
         return self._message(PACKET, at, stamp=self._time(at), data=np.frombuffer(packet.data, np.uint8))
 
-    def raw(self, packet: Chunk, label: str) -> Message:
-        """A packet as it was received, in a message of every ROS: the padding before it, of which `data_offset` says the length, is the
-        time of its arrival, int64 ns, little-endian.
-
-        Args:
-            label: of the one dimension, such as the id of the sensor.
-        """
-        at, types = packet.at or 0, self.types.types
-        data = np.frombuffer(_STAMP.pack(at) + packet.data, np.uint8)
-        dimension = types["std_msgs/msg/MultiArrayDimension"](label=label, size=len(packet.data), stride=len(packet.data))
-        layout = types["std_msgs/msg/MultiArrayLayout"](dim=[dimension], data_offset=_STAMP.size)
-        return self._message(RAW, at, layout=layout, data=data)
+    def raw(self, packet: Chunk, *, datagram: bool) -> Message:
+        """A packet as it was received, as the node publishes it and `transports.bags` reads it again; not a `datagram`: of a stream."""
+        at, size, types = packet.at or 0, len(packet.data), self.types.types
+        dimension = types["std_msgs/msg/MultiArrayDimension"](label=DATAGRAM if datagram else STREAM, size=size, stride=size)
+        layout = types["std_msgs/msg/MultiArrayLayout"](dim=[dimension], data_offset=STAMP.size)
+        return self._message(RAW, at, layout=layout, data=np.frombuffer(STAMP.pack(at) + packet.data, np.uint8))
 
     def cloud(self, scan: Scan, at: int, *, every_point: bool, number: int = 0) -> Message:
         """The points of a scan; organised ones have a row for each row of the sensor, several returns side by side; of others, and valid

@@ -4,11 +4,15 @@ A driver publishes a packet as a message, or those of a scan as a list with the 
 whoever named them: a type with a list of `packets`, or one that is itself called a packet; and in each packet its bytes as `data` or
 `buf`, of which the first `size` count where that is a field, and its `stamp`. Logs say how their messages are laid out; of those that do
 not, as ROS 2 bags in SQLite of releases before Iron, the layout is the one of `UNTOLD` that fills a message to its end.
+
+Packets that the ROS 2 node publishes are std_msgs/UInt8MultiArray, the one message of every ROS that holds bytes and says nothing of them.
+The padding before the bytes, as long as `data_offset` says, is the time of the arrival; the label says whether they are a datagram.
 """
 
 from __future__ import annotations
 
 import os
+import struct
 from collections.abc import Iterator, Mapping
 from contextlib import ExitStack, contextmanager
 from pathlib import Path
@@ -34,6 +38,9 @@ UNTOLD = (
 BYTES = ("data", "buf")
 #: topics that a message names.
 NAMED = 6
+#: what the node publishes: the type, the time of arrival, int64 ns, and the label of the dimension of datagrams and of a byte stream.
+RAW, STAMP = "std_msgs/msg/UInt8MultiArray", struct.Struct("<q")
+DATAGRAM, STREAM = "datagram", "stream"
 
 
 class Log(NamedTuple):
@@ -85,6 +92,7 @@ class BagTransport(Transport):
             undo.pop_all()
         carrying = [link for link in self._log.connections if link.id in self._layouts]
         self._links = [link for link in carrying if sender in (None, link.topic, _namespace(link.topic))]
+        self.datagrams = not any(self._streams(link) for link in self._links)
         self.foreign = sum(link.msgcount for link in carrying) - sum(link.msgcount for link in self._links)
         if not self._links:
             named = "; ".join(f"{link.topic} has {link.msgtype}" for link in (carrying or self._log.connections)[:NAMED]) or "it is empty"
@@ -96,10 +104,20 @@ class BagTransport(Transport):
             for link, at, raw in self._log.messages(self._links) if self._links else ():
                 sender = (_namespace(link.topic), 0) if len(namespaces) > 1 else None
                 message = self._message(link, raw)
+                if link.msgtype == RAW:
+                    yield raw_chunk(message)
+                    continue
                 heard = _ns(getattr(message, "header", None)) or at
                 for packet in getattr(message, "packets", [message]) if message is not None else ():
                     data = next(getattr(packet, name) for name in BYTES if hasattr(packet, name))
                     yield Chunk(data[: getattr(packet, "size", None)].tobytes(), _ns(packet) or heard, sender)
+
+    def _streams(self, link: Any) -> bool:
+        """Whether the packets of a connection are pieces of a byte stream."""
+        if link.msgtype != RAW:
+            return False
+        first = next((self._message(link, raw) for _, _, raw in self._log.messages([link])), None)
+        return first is not None and first.layout.dim[0].label == STREAM
 
     def write(self, data: bytes) -> None:
         raise SourceError(f"{self._path} is {self._kind.what}: nothing can be sent to it")
@@ -134,6 +152,12 @@ class BagTransport(Transport):
             raise SourceError(f"{self._path} is {self._kind.what}, and is not read: {error or type(error).__name__}") from error
 
 
+def raw_chunk(message: Any) -> Chunk:
+    """A packet out of a message of the node, as rosbags or rclpy have it."""
+    data, padding = bytes(message.data), message.layout.data_offset
+    return Chunk(data[padding:], STAMP.unpack_from(data)[0] if padding == STAMP.size else None)
+
+
 def _namespace(topic: str) -> str:
     return topic.rpartition("/")[0] or "/"
 
@@ -147,6 +171,8 @@ def _ns(stamped: Any) -> int:
 def _layouts(link: Any) -> list[Any]:
     """How the messages of a connection may be laid out, as stores of types; none where they hold no packets."""
     typesys = library("rosbags.typesys", "ros")
+    if link.msgtype == RAW and "packets" in link.topic:
+        return [typesys.get_typestore(typesys.Stores.ROS2_HUMBLE)]
     is_told = link.msgdef.format.name == "MSG"
     if is_told and "packet" not in (link.msgtype + link.msgdef.data).lower():  # nor need rosbags understand it
         return []

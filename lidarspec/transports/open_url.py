@@ -153,7 +153,7 @@ def _opened(address: Address, sensor: Sensor | None) -> Transport:
         module = importlib.import_module(f"lidarspec.transports.{SCHEMES[address.scheme]}")
         opened: Transport = module.connect(address, sensor)
         return opened
-    plugged = registry().call("lidarspec_source", url=address.text)
+    plugged = registry().call("lidarspec_source", url=address.text, sensor=sensor)
     if plugged is None:
         known = ", ".join(f"{scheme}:" for scheme in SCHEMES)
         raise UsageError(f"no transport is installed for {address.scheme!r} sources; known are files, - (standard input), {known}")

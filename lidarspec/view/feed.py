@@ -193,6 +193,7 @@ class Feed:
     Args:
         device: open; stays so.
         played: scans of a file come at the times that they bear; else as fast as they are read.
+        speed: how many times faster than that.
         select: which scans, and what of each; packets at these times.
 
     Attributes:
@@ -204,8 +205,8 @@ class Feed:
         meter: the figures.
     """
 
-    def __init__(self, device: Device, *, played: bool = False, select: Selection | None = None) -> None:
-        self.device, self.number = device, 0
+    def __init__(self, device: Device, *, played: bool = False, speed: float = 1.0, select: Selection | None = None) -> None:
+        self.device, self.number, self._speed = device, 0, speed
         self._select = select or Selection()
         self._sieve, self._slice = Sieve(self._select, device.source, device.skip), Slice(self._select.times)
         self.scan: Scan | None = None
@@ -298,7 +299,7 @@ class Feed:
             self._due = time.monotonic()
         else:
             step = (scan.stamp_ns - self._stamp) * 1e-9
-            due = max(self._due + (step if 0 < step <= LONGEST else STEP), time.monotonic() - LONGEST)
+            due = max(self._due + (step if 0 < step <= LONGEST else STEP) / self._speed, time.monotonic() - LONGEST)
             if due > until:
                 time.sleep(max(until - time.monotonic(), 0.0))
                 return

@@ -6,6 +6,7 @@ A lifecycle node over a `Device`, as every verb has one. ROS is imported when th
 * `parameters`: the one table of parameters, and the values of one configuration.
 * `node`: the lifecycle, services, and the thread that reads.
 * `topics`: what is published.
+* `packets`: packets as a topic, and as a source.
 * `diagnostics`: how the sensor is doing, as /diagnostics says it.
 * `clock`: stamps in ROS's time, and the sensor's clock by the host's.
 """
@@ -19,6 +20,8 @@ from lidarspec.spec import hookimpl
 if TYPE_CHECKING:
     import click
 
+    from lidarspec.spec import Sensor, Transport
+
 
 @hookimpl
 def lidarspec_verbs() -> list[click.Command]:
@@ -26,3 +29,17 @@ def lidarspec_verbs() -> list[click.Command]:
     from lidarspec_ros2.command import ros2
 
     return [ros2]
+
+
+@hookimpl
+def lidarspec_source(url: str, sensor: Sensor | None) -> Transport | None:
+    """The packets of a topic, ``ros2:/TOPIC``."""
+    scheme, _, topic = url.partition(":")
+    if scheme != "ros2":
+        return None
+    from lidarspec_ros2.command import import_ros
+
+    import_ros()
+    from lidarspec_ros2.packets import PacketTransport
+
+    return PacketTransport(url, topic, datagrams=sensor is None or sensor.datagrams)

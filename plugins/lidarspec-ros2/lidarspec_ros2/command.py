@@ -6,6 +6,7 @@ extra `ros2`.
 
 from __future__ import annotations
 
+import importlib
 import signal
 import sys
 import threading
@@ -53,6 +54,19 @@ def main() -> None:
         sys.exit(report(error, "ros2"))
 
 
+def import_ros() -> None:
+    """Find the ROS that there is.
+
+    Raises:
+        UsageError: where there is none, with the ways to have one.
+    """
+    try:
+        importlib.import_module("rclpy")
+    except ImportError as error:
+        text = f"ROS 2 is not found ({error})"
+        raise UsageError(f"{text}: source one, as with `. /opt/ros/jazzy/setup.bash`, or pip install 'lidarspec-ros2[ros2]'") from None
+
+
 def run(given: Mapping[str, Any], ros_args: Sequence[str]) -> None:
     """Run the node until it is interrupted, or has come to its end.
 
@@ -63,12 +77,10 @@ def run(given: Mapping[str, Any], ros_args: Sequence[str]) -> None:
     Raises:
         LidarSpecError: where there is no ROS, a parameter cannot be, or the sensor cannot be read.
     """
-    try:
-        import rclpy
-        from rclpy.executors import SingleThreadedExecutor
-    except ImportError as error:
-        text = f"ROS 2 is not found ({error})"
-        raise UsageError(f"{text}: source one, as with `. /opt/ros/jazzy/setup.bash`, or pip install 'lidarspec-ros2[ros2]'") from None
+    import_ros()
+    import rclpy
+    from rclpy.executors import SingleThreadedExecutor
+
     from lidarspec_ros2.node import LidarNode
 
     previous = signal.signal(signal.SIGTERM, signal.default_int_handler)

@@ -10,7 +10,7 @@ import threading
 import time
 from collections.abc import Callable, Mapping, Sequence
 from functools import partial
-from typing import Any, Literal
+from typing import Any
 
 from diagnostic_msgs.msg import DiagnosticArray
 from rcl_interfaces.msg import FloatingPointRange, IntegerRange, ParameterDescriptor, SetParametersResult
@@ -23,9 +23,9 @@ from std_srvs.srv import Trigger
 from lidarspec.cli.build import arguments, replied
 from lidarspec.device.device import Device
 from lidarspec.errors import LidarSpecError, UsageError, suggestion
-from lidarspec.transports.protocol import Chunk
 from lidarspec.view.feed import LOOK, Feed
 from lidarspec_ros2.diagnostics import LOST, status
+from lidarspec_ros2.packets import PacketLog
 from lidarspec_ros2.parameters import NAMED, PARAMETERS, Parameter, Settings
 from lidarspec_ros2.topics import Topics
 
@@ -151,7 +151,8 @@ class LidarNode(LifecycleNode):
 
     def _read(self, device: Device, topics: Topics) -> None:
         """Publish what comes, until the node is stopped or the input ends."""
-        feed, due = Feed(device, played=True), time.monotonic()
+        speed = self._settings["replay_speed"]
+        feed, due = Feed(device, played=speed > 0, speed=speed), time.monotonic()
         try:
             while not self._stopping.is_set() and not feed.ended:
                 feed.pump(0.0 if device.is_live else time.monotonic() + LOOK)
@@ -248,30 +249,6 @@ class LidarNode(LifecycleNode):
         else:
             response.success, response.message = True, replied(device.sensor, reply)
         return response
-
-
-class PacketLog:
-    """Hands what arrives on to a topic, in the place of a recording.
-
-    Attributes:
-        publish: what takes each chunk.
-    """
-
-    error = None
-
-    def __init__(self) -> None:
-        self.publish: Callable[[Chunk], None] | None = None
-
-    def write(self, chunk: Chunk, direction: Literal["in", "out"] = "in") -> None:
-        """Hand it on."""
-        if direction == "in" and self.publish is not None:
-            self.publish(chunk)
-
-    def event(self, name: str, at: int | None = None, **details: Any) -> None:
-        """The diagnostics say it."""
-
-    def close(self) -> None:
-        """There is nothing to close."""
 
 
 def _descriptor(parameter: Parameter) -> ParameterDescriptor:

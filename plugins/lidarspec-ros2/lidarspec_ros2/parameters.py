@@ -73,9 +73,11 @@ PARAMETERS = (
     Parameter("frame_id", "laser", "The frame of the points.", live=True),
     Parameter("publish_tf", False, "Whether the mount is published on /tf_static, from parent_frame to frame_id; points stay as measured."),
     Parameter("parent_frame", "base_link", "The frame of the carrier, for publish_tf."),
-    Parameter("beams", 0, "Ranges of a LaserScan: always so many. 0: as many as the sensor has, constant too.", 0, 1 << 20, live=True),
-    Parameter("angle_min", 0.0, "Where the first beam of a LaserScan looks, radians. Not below angle_max: all round.", -10, 10, live=True),
-    Parameter("angle_max", 0.0, "Where the last beam of a LaserScan looks, radians.", -10, 10, live=True),
+    Parameter("beams", 0, "Ranges of a LaserScan: always so many. 0: as many as the sensor has.", 0, 1 << 20, live=True),
+    Parameter(
+        "angle_min", 0.0, "Where the first beam of scan looks, radians. The same as angle_max: all that is seen.", -10, 10, live=True
+    ),
+    Parameter("angle_max", 0.0, "Where the last beam of scan looks, radians; below angle_min it is a turn on.", -10, 10, live=True),
     Parameter("range_min", 0.0, "Metres; nearer returns are none.", 0, _FAR, live=True),
     Parameter("range_max", 0.0, "Metres; farther returns are none. 0: no limit but the sensor's.", 0, _FAR, live=True),
     Parameter("scan_ring", -1, "Of a sensor of several rings the one that scan has. -1: none.", -1, 1 << 16, live=True),
@@ -92,6 +94,7 @@ PARAMETERS = (
     Parameter("time_offset", 0.0, "Seconds added to every stamp: below 0 for a delay that is always there.", -_SIDE, _SIDE, live=True),
     Parameter("publish_packets", False, "Whether packets has what the sensor sends, as it comes."),
     Parameter("qos", "best_effort", "Of the topics with data: best_effort, as for sensor data, or reliable."),
+    Parameter("replay_speed", 1.0, "How many times faster than it was recorded a file is played. 0: as fast as it can be read.", 0, 1000),
     Parameter("period", 0.01, "Seconds from decoding to decoding: shorter is sooner, and takes more of the processor.", 0.001, 1.0),
 )
 NAMED = {parameter.name: parameter for parameter in PARAMETERS}
@@ -112,11 +115,8 @@ class Settings:
         if self["qos"] not in QUALITIES:
             raise UsageError(f"qos is {' or '.join(QUALITIES)}, not {self['qos']!r}")
         self.selection()
-        for low, high in (("angle_min", "angle_max"), ("scan_z_min", "scan_z_max")):
-            if self[low] > self[high]:
-                raise UsageError(f"from {low} {self[low]} up to {high} {self[high]} there is nothing")
-        if self["angle_max"] - self["angle_min"] >= 2 * math.pi:
-            raise UsageError(f"angle_max {self['angle_max']} is a turn or more beyond angle_min {self['angle_min']}")
+        if self["scan_z_min"] > self["scan_z_max"]:
+            raise UsageError(f"from scan_z_min {self['scan_z_min']} up to scan_z_max {self['scan_z_max']} there is nothing")
 
     def __getitem__(self, name: str) -> Any:
         return self.values[name]
@@ -128,11 +128,13 @@ class Settings:
 
     def planes(self) -> Planes:
         """What makes planar scans."""
-        field, heights = (
-            (self[low], self[high]) if self[low] < self[high] else None
-            for low, high in (("angle_min", "angle_max"), ("scan_z_min", "scan_z_max"))
+        first, seen = self["angle_min"], (self["angle_max"] - self["angle_min"]) % (2 * math.pi)
+        low, high = self["scan_z_min"], self["scan_z_max"]
+        return Planes(
+            field=(first, first + seen) if seen else None,
+            ring=self["scan_ring"] if self["scan_ring"] >= 0 else None,
+            heights=(low, high) if low < high else None,
         )
-        return Planes(field=field, ring=self["scan_ring"] if self["scan_ring"] >= 0 else None, heights=heights)
 
     def narrowed(self, planar: LaserScan) -> LaserScan:
         """A planar scan that says of its ranges what is wanted of them, where that is less than the sensor has."""

@@ -9,13 +9,14 @@ from typing import Any
 from geometry_msgs.msg import Quaternion, Transform, TransformStamped, Vector3
 from rclpy.lifecycle import LifecycleNode
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
+from rclpy.qos_overriding_options import QoSOverridingOptions
 from rclpy.time import Time
 from rosgraph_msgs.msg import Clock
 from sensor_msgs.msg import Imu, LaserScan, PointCloud2
 from std_msgs.msg import UInt8MultiArray
 
 from lidarspec.errors import UsageError
-from lidarspec.formats.messages import CLOUD, IMU, RAW, SCAN, Message, Messages
+from lidarspec.formats.messages import CLOUD, IMU, SCAN, Message, Messages
 from lidarspec.framing.results import Counters
 from lidarspec.packets.imu import ImuSamples
 from lidarspec.packets.packets import Packets
@@ -24,6 +25,7 @@ from lidarspec.points.cloud import Mount
 from lidarspec.scans.scans import Scan
 from lidarspec.scans.selection import Sieve
 from lidarspec.spec.sensor import Sensor
+from lidarspec.transports.bags import RAW
 from lidarspec.transports.base import HostClock
 from lidarspec.transports.protocol import Chunk
 from lidarspec_ros2.clock import Stamps
@@ -36,6 +38,10 @@ KINDS = {
     IMU: ("imu", Imu, 200),
     RAW: ("packets", UInt8MultiArray, 2000),
 }
+
+
+#: what ROS's own parameters, such as `qos_overrides./scan.publisher.depth`, change of that.
+_OVERRIDING = QoSOverridingOptions.with_default_policies()
 
 
 class Topics:
@@ -110,7 +116,7 @@ class Topics:
     def raw(self, chunk: Chunk) -> None:
         """Publish what the sensor sent."""
         if self._listened(RAW):
-            self._send(self._messages.raw(chunk, self._sensor.id))
+            self._send(self._messages.raw(chunk, datagram=self._sensor.datagrams))
 
     def activate(self, *, active: bool) -> None:
         """Let through what is published, or not."""
@@ -136,7 +142,8 @@ class Topics:
         if kind not in self._publishers:
             topic, message, depth = KINDS[kind]
             qos = QoSProfile(depth=depth, reliability=self._reliability)
-            publisher = self._publishers[kind] = self._node.create_lifecycle_publisher(message, topic, qos)
+            publisher = self._node.create_lifecycle_publisher(message, topic, qos, qos_overriding_options=_OVERRIDING)
+            self._publishers[kind] = publisher
             if self.active:
                 publisher.on_activate(None)
         return self._publishers[kind]

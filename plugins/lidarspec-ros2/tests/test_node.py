@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import math
 import os
 import re
 import signal
@@ -15,6 +16,8 @@ from typing import Any
 import pytest
 from client import PATIENCE, Client, ended, given, message
 from rcl_interfaces.msg import ParameterType
+from rclpy.serialization import deserialize_message
+from rosgraph_msgs.msg import Clock
 from sensor_msgs.msg import LaserScan
 
 from lidarspec.formats.messages import SCAN
@@ -117,10 +120,13 @@ def test_parameters_are_described_and_changed_where_that_makes_sense(run: Any, c
     assert (len(newest().ranges), newest().range_max, newest().angle_min) == (450, 3.0, -1.0)
     assert all(one <= 3.0 or one == float("inf") for one in newest().ranges)
     assert "source is read on configuring" in client.set("source", "udp://")
-    assert client.set("angle_min", 2.0) == "from angle_min 2.0 up to angle_max 1.0 there is nothing"
+    assert client.set("scan_z_min", 2.0) == "from scan_z_min 2.0 up to scan_z_max 0.0 there is nothing"
     assert client.set("range_min", 5.0) == "from 5.0 up to 3.0 there is nothing"
     assert client.set("beams", -1)
-    assert (client.value("angle_min"), client.value("range_min")) == (-1.0, 0.0)
+    assert (client.value("scan_z_min"), client.value("range_min")) == (0.0, 0.0)
+    assert client.set("angle_min", 2.0) == ""  # on through the back, to where the last beam looks a turn on
+    client.until(lambda: newest().angle_min == 2.0)
+    assert newest().angle_max == pytest.approx(1.0 + 2 * math.pi)
 
 
 def test_commands_are_services_with_arguments_as_parameters(run: Any, client: Client) -> None:
@@ -159,6 +165,31 @@ def test_diagnostics_say_how_the_sensor_is_doing(run: Any, client: Client) -> No
     assert (found["state"], found["lifecycle"]) == ("streaming", "active")
     assert {"packets [/s]", "loss [%]", "jitter [ms]", "latency [ms]"} <= set(found)
     assert client.diagnostics[-1].header.stamp.sec > 0
+
+
+def test_a_file_is_played_with_its_times_on_clock_and_then_the_node_ends(run: Any, client: Client, tmp_path: Path) -> None:
+    file = tmp_path / "drive.lsr"
+    ran = subprocess.run(
+        [sys.executable, "-m", "lidarspec", "sim", "ldrobot-stl27l", "--to", str(file), "-t", "6s"],
+        capture_output=True, text=True, check=True, timeout=PATIENCE)  # fmt: skip
+    scans, clock = client.listen("scan", LaserScan), client.listen("/clock", Clock)
+    process = run(str(file), "-s", "ldrobot-stl27l", ros=given(use_sim_time=True, qos="reliable", replay_speed=2.0))
+    client.until(lambda: len(scans) > 2)
+    assert client.state == "active"
+    client.until(lambda: process.poll() is not None)
+    _, complaints = process.communicate()
+    assert (process.returncode, complaints, ran.returncode) == (0, "", 0)
+    times = [deserialize_message(data, Clock).clock for data in clock]
+    assert times == sorted(times, key=lambda time: (time.sec, time.nanosec))
+    stamps = {message(data, SCAN).header.stamp.sec for data in scans}
+    assert stamps <= {time.sec + later for time in times for later in (0, 1)}
+
+
+def test_a_transform_is_refused_where_ros_has_no_message_for_it(run: Any, client: Client) -> None:
+    process = run(*STL, ros=given(publish_tf=True))
+    _, complaints = process.communicate(timeout=PATIENCE)
+    assert process.returncode == 2
+    assert "publish_tf takes tf2_msgs" in complaints
 
 
 @pytest.fixture

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-import struct
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -17,11 +16,12 @@ from sensor_msgs.msg import Imu, LaserScan, PointCloud2
 from std_msgs.msg import Header, UInt8MultiArray
 
 import lidarspec as ls
-from lidarspec.formats.messages import CLOUD, RAW, SCAN, Messages
+from lidarspec.formats.messages import CLOUD, SCAN, Messages
 from lidarspec.packets.imu import ImuSamples
 from lidarspec.recording.recorders import Recorder
 from lidarspec.scans.planes import Planes
 from lidarspec.simulation.simulator import simulate
+from lidarspec.transports.bags import RAW, raw_chunk
 from lidarspec.transports.protocol import Chunk
 
 MESSAGES = Messages("ROS2_HUMBLE")
@@ -34,10 +34,7 @@ def recorded(packets: list[bytes], path: Path, sensor: str) -> Path:
     """A recording of what the topic of packets had."""
     with Recorder(path, sensor) as recorder:
         for packet in packets:
-            content = message(packet, RAW)
-            padding = content.layout.data_offset
-            (at,) = struct.unpack("<q", content.data[:padding].tobytes())
-            recorder.write(Chunk(content.data[padding:].tobytes(), at))
+            recorder.write(raw_chunk(message(packet, RAW)))
     return path
 
 
@@ -99,7 +96,7 @@ def test_bytes_are_those_of_ros_itself(sensor: str, every_point: bool) -> None:
         assert alike(bytes(made[1][0].data), serialize_message(by_ros))
     felt = ImuSamples(np.array([STAMP]), np.array([[0.1, -0.2, np.nan]]), np.array([[0.0, 0.5, 9.81]]))
     made.append((MESSAGES.imu(felt, 0, STAMP, "imu"), Imu))
-    made.append((MESSAGES.raw(Chunk(b"\x54\x2c\xff", STAMP), sensor), UInt8MultiArray))
+    made.append((MESSAGES.raw(Chunk(b"\x54\x2c\xff", STAMP), datagram=True), UInt8MultiArray))
     for known, message_class in made:
         read = deserialize_message(bytes(known.data), message_class)
         assert alike(bytes(known.data), serialize_message(read))
