@@ -119,20 +119,15 @@ class DeviceClock:
 
     Attributes:
         jumps: how often the sensor's clock was set.
-        jump: by how much the last time, in a sentence; empty before.
+        jump: by how much, in a sentence, for ten seconds after it; else empty.
     """
 
     def __init__(self) -> None:
         self._stamp = -(1 << 62)
         self.jumps, self.jump = 0, ""
         self._least, self._strays, self._since = deque[Sample](maxlen=PARTS), deque[Sample](maxlen=PROBABLY), 0
-        self._shown: Sample | None = None
-        self.reset()
-
-    def reset(self) -> None:
-        """Forget the sensor, for another one: times that come out go on forward all the same."""
-        self._begin()
         self._line, self._known = Line(0, 0, 0.0), 0.0
+        self._shown: Sample | None = None
 
     @property
     def offset_ns(self) -> int:
@@ -235,6 +230,8 @@ class DeviceClock:
             self._least.pop()
         self._least.append(sample)
         self._line = drawn(self._least, self._known)
+        if len(self._least) >= SETTLED:
+            self.jump = ""
         if len(self._least) == PARTS:
             self._known = self._line.slope
 

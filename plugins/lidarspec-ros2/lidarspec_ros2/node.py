@@ -194,7 +194,9 @@ class LidarNode(LifecycleNode):
         device, now = feed.device, self.get_clock().now()
         reading = feed.meter.reading(device.stats, SECOND if device.is_live else None)
         more = {"lifecycle": "active" if topics.active else "inactive", "latency [ms]": f"{topics.latency_s * 1e3:.1f}"}
-        found = status(self.get_name(), device, reading, [topics.stamps.clock.jump] * bool(topics.stamps.clock.jumps), more)
+        clock = topics.stamps.clock
+        more |= {"clock drift [ppm]": f"{clock.drift_ppm:+.1f}", "clock set": f"{clock.jumps} times"}
+        found = status(self.get_name(), device, reading, [clock.jump] * bool(clock.jump), more)
         self._diagnostics.publish(DiagnosticArray(header=Header(stamp=now.to_msg()), status=[found]))
 
     def _soon(self, callback: Callable[[], Any]) -> None:

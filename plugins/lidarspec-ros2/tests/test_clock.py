@@ -28,7 +28,8 @@ def test_stamps_are_within_a_millisecond_and_a_clock_that_is_set_is_reported(jit
         assert (np.diff(run.stamps) > 0).all()
         assert (run.stamps <= run.host).all()
         assert run.clock.jumps == 2  # set, and started again
-        assert run.clock.jump.startswith("the sensor's clock was set by -4294.9")
+        assert [float(text.split()[-2]) for text in run.said] == pytest.approx([step, -4294.967], abs=0.02)
+        assert run.clock.jump == ""  # and it is well again
         assert run.clock.drift_ppm == pytest.approx(drift_ppm, abs=100)
 
 
@@ -118,14 +119,6 @@ def test_a_source_that_pauses_goes_on(pause: int) -> None:
     assert np.abs(stamps / SECOND - times)[times % (40 + pause) > 5].max() < 1e-3
     assert np.abs(stamps / SECOND - times)[times > 30].max() < 5e-3
     assert (clock.jumps, clock.jump) == (0, "")
-
-
-def test_another_sensor_begins_anew_and_stamps_go_on() -> None:
-    clock = DeviceClock()
-    before = [clock.stamp(at * SECOND, BEGAN + at * SECOND) for at in range(20)]
-    clock.reset()
-    assert clock.stamp(77, BEGAN + 20 * SECOND) == BEGAN + 20 * SECOND > before[-1]
-    assert (clock.jumps, clock.offset_ns) == (0, BEGAN + 20 * SECOND - 77)
 
 
 @given(
