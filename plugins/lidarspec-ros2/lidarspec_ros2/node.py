@@ -232,13 +232,13 @@ class LidarNode(LifecycleNode):
         return SetParametersResult(successful=True)
 
     def _serve_commands(self, device: Device) -> None:
-        """A service for each command of the sensor, and a parameter for each of its arguments."""
+        """A service for each command of the sensor, beside the node's own, such as get_state, and a parameter for each of its arguments."""
         for name, command in device.sensor.commands.items():
             for argument in command.args:
                 if not self.has_parameter(f"{name}.{argument}"):
                     text = f"An argument of the service {name}, in the unit of its field, or with a unit."
                     self.declare_parameter(f"{name}.{argument}", None, ParameterDescriptor(description=text, dynamic_typing=True))
-            self._services_of_sensor.append(self.create_service(Trigger, f"~/{name}", partial(self._send, device, name)))
+            self._services_of_sensor.append(self.create_service(Trigger, f"~/send/{name}", partial(self._send, device, name)))
 
     def _send(self, device: Device, name: str, request: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
         """Send a command, and answer with its reply, or why there is none."""

@@ -96,7 +96,7 @@ def test_every_row_of_the_vendors_parameters_names_one_of_ours_or_a_reason() -> 
     assert len(told) > 80
     for theirs, ours, why in told:
         assert set(re.findall(r"`([\w./]+)`", ours)) <= {*NAMED, *topics}, theirs
-        assert set(re.findall(r"`~/(\w+)`", ours)) <= set(services), theirs
+        assert set(re.findall(r"`~/send/(\w+)`", ours)) <= set(services), theirs
         assert ours != "-" or why, theirs
 
 
