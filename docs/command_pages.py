@@ -1,15 +1,18 @@
-"""Makes the manual pages in docs/man, and the usage and options of each verb in docs/reference/command-line.md, from the commands.
+"""Makes the manual pages in docs/man, the usage and options of each verb in docs/reference/command-line.md, and the parameters of the ROS 2
+node in docs/reference/ros2.md.
 
     python docs/command_pages.py
 
-`make reference` runs it; tests/docs/test_reference_pages.py holds that the pages are up to date. In command-line.md only what stands
-between the marks is made; the words around it are written by hand.
+`make reference` runs it; tests/docs/test_reference_pages.py holds that the pages are up to date. In the pages of the reference only what
+stands between the marks is made; the words around it are written by hand.
 """
 
 from __future__ import annotations
 
 import inspect
+import json
 import re
+import sys
 from pathlib import Path
 
 import click
@@ -18,7 +21,7 @@ from lidarspec import __version__
 from lidarspec.cli.root import VERBS, main as root
 
 DOCS = Path(__file__).parent
-PAGE = "reference/command-line.md"
+PAGE, NODE = "reference/command-line.md", "reference/ros2.md"
 BEGIN, END = "<!-- made by make reference -->", "<!-- until here -->"
 
 
@@ -62,6 +65,17 @@ def page(text: str) -> str:
     return text
 
 
+def node(text: str) -> str:
+    """ros2.md with the parameters as they are now."""
+    sys.path.insert(0, str(DOCS.parent / "plugins" / "lidarspec-ros2"))
+    from lidarspec_ros2.parameters import PARAMETERS
+
+    rows = [f"| `{one.name}` | {one.kind} | `{json.dumps(one.default)}` | {one.text} | {'yes' if one.live else ''} |" for one in PARAMETERS]
+    table = "\n".join(["| parameter | type | default | | at run time |", "|---|---|---|---|---|", *rows])
+    before, after = text.partition(BEGIN)[0], text.partition(END)[2]
+    return f"{before}{BEGIN}\n\n{table}\n\n{END}{after}"
+
+
 def manual(verb: str) -> str:
     """The manual page of a verb; of "" that of the command."""
     name = f"lidarspec-{verb}" if verb else "lidarspec"
@@ -84,7 +98,8 @@ def _roff(text: str) -> str:
 def pages() -> dict[str, str]:
     """The text of every file, by its path under docs."""
     names = {verb: f"man/lidarspec-{verb}.1" for verb in VERBS} | {"": "man/lidarspec.1"}
-    return {PAGE: page((DOCS / PAGE).read_text(encoding="utf-8"))} | {path: manual(verb) for verb, path in names.items()}
+    made = {path: make((DOCS / path).read_text(encoding="utf-8")) for path, make in ((PAGE, page), (NODE, node))}
+    return made | {path: manual(verb) for verb, path in names.items()}
 
 
 def main() -> None:

@@ -1,7 +1,7 @@
 """The lifecycle node: a sensor opened on configuring, published while active, closed on cleaning up.
 
-One thread reads the device, publishes what comes and says once a second how the sensor is doing. The executor's thread serves transitions,
-parameters and commands, and whatever the reading thread wants done to the lifecycle: while the sensor is gone the node is inactive.
+One thread reads the device and publishes what comes. The executor's thread serves transitions, parameters and commands, and does what the
+reading thread asks for: to say once a second how the sensor is doing, and to be inactive while it is gone.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ from std_srvs.srv import Trigger
 from lidarspec.cli.build import arguments, replied
 from lidarspec.device.device import Device
 from lidarspec.errors import LidarSpecError, UsageError, suggestion
-from lidarspec.view.feed import LOOK, Feed
+from lidarspec.view.feed import LOOK, Feed, Reading
 from lidarspec_ros2.diagnostics import LOST, status
 from lidarspec_ros2.packets import PacketLog
 from lidarspec_ros2.parameters import NAMED, PARAMETERS, Parameter, Settings
@@ -160,7 +160,8 @@ class LidarNode(LifecycleNode):
                 self._watch(device)
                 if (now := time.monotonic()) >= due:
                     due = now + SECOND
-                    self._tell(feed, topics)
+                    reading = feed.meter.reading(device.stats, SECOND if device.is_live else None)
+                    self._soon(partial(self._tell, device, topics, reading))
         except Exception as error:
             self._fail(error)
         if not self._stopping.is_set():
@@ -189,15 +190,15 @@ class LidarNode(LifecycleNode):
             self.trigger_deactivate()
             self._was_lost = True
 
-    def _tell(self, feed: Feed, topics: Topics) -> None:
+    def _tell(self, device: Device, topics: Topics, reading: Reading) -> None:
         """Say how the sensor is doing."""
-        device, now = feed.device, self.get_clock().now()
-        reading = feed.meter.reading(device.stats, SECOND if device.is_live else None)
+        if device is not self._device:  # which is closed
+            return
         more = {"lifecycle": "active" if topics.active else "inactive", "latency [ms]": f"{topics.latency_s * 1e3:.1f}"}
         clock = topics.stamps.clock
         more |= {"clock drift [ppm]": f"{clock.drift_ppm:+.1f}", "clock set": f"{clock.jumps} times"}
         found = status(self.get_name(), device, reading, [clock.jump] * bool(clock.jump), more)
-        self._diagnostics.publish(DiagnosticArray(header=Header(stamp=now.to_msg()), status=[found]))
+        self._diagnostics.publish(DiagnosticArray(header=Header(stamp=self.get_clock().now().to_msg()), status=[found]))
 
     def _soon(self, callback: Callable[[], Any]) -> None:
         """Have something done in the thread of the executor."""

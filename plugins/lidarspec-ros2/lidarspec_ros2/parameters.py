@@ -95,7 +95,7 @@ PARAMETERS = (
     Parameter("publish_packets", False, "Whether packets has what the sensor sends, as it comes."),
     Parameter("qos", "best_effort", "Of the topics with data: best_effort, as for sensor data, or reliable."),
     Parameter("replay_speed", 1.0, "How many times faster than it was recorded a file is played. 0: as fast as it can be read.", 0, 1000),
-    Parameter("period", 0.01, "Seconds from decoding to decoding: shorter is sooner, and takes more of the processor.", 0.001, 1.0),
+    Parameter("period", 0.02, "Seconds from decoding to decoding: shorter is sooner, and takes more of the processor.", 0.001, 1.0),
 )
 NAMED = {parameter.name: parameter for parameter in PARAMETERS}
 QUALITIES = ("best_effort", "reliable")

@@ -32,18 +32,18 @@ class Client:
         self.diagnostics: list[Any] = []
         self._node.create_subscription(DiagnosticArray, "/diagnostics", self.diagnostics.append, 10)
 
-    def listen(self, topic: str, kind: Any, *, reliable: bool = True) -> list[bytes]:
-        """The messages of a topic, as bytes, as they come."""
+    def listen(self, topic: str, kind: Any, *, reliable: bool = True, take: Callable[[bytes], None] | None = None) -> list[bytes]:
+        """The messages of a topic, as bytes, as they come, or what takes them."""
         received = self.received[topic] = list[bytes]()
         reliability = ReliabilityPolicy.RELIABLE if reliable else ReliabilityPolicy.BEST_EFFORT
-        self._node.create_subscription(kind, topic, received.append, QoSProfile(depth=5000, reliability=reliability), raw=True)
+        self._node.create_subscription(kind, topic, take or received.append, QoSProfile(depth=5000, reliability=reliability), raw=True)
         return received
 
-    def until(self, condition: Callable[[], object]) -> None:
+    def until(self, condition: Callable[[], object], *, patience: float = PATIENCE) -> None:
         """Serve what comes until something holds."""
-        end = time.monotonic() + PATIENCE
+        end = time.monotonic() + patience
         while not condition():
-            assert time.monotonic() < end, f"it did not come about within {PATIENCE} s"
+            assert time.monotonic() < end, f"it did not come about within {patience} s"
             rclpy.spin_once(self._node, timeout_sec=0.05)
 
     def publishers(self, topic: str) -> int:

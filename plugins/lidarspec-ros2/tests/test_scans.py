@@ -3,6 +3,9 @@
 from __future__ import annotations
 
 import dataclasses
+import os
+import struct
+import time
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -28,6 +31,8 @@ MESSAGES = Messages("ROS2_HUMBLE")
 WHOLE, STAMP = 6, 1_700_000_000_123_456_789
 #: bytes between fields that a message of ours has at the most: three before each number behind a text.
 PADDING = 64
+#: seconds of the long test.
+SOAK = float(os.environ.get("LIDARSPEC_SOAK", "600"))
 
 
 def recorded(packets: list[bytes], path: Path, sensor: str) -> Path:
@@ -118,3 +123,30 @@ def alike(ours: bytes, theirs: bytes) -> bool:
 
 def header(frame_id: str) -> Header:
     return Header(stamp=Time(sec=STAMP // 10**9, nanosec=STAMP % 10**9), frame_id=frame_id)
+
+
+@pytest.mark.soak
+@pytest.mark.parametrize(
+    ("sensor", "topic", "message_class"), [("ldrobot-stl27l", "scan", LaserScan), ("robosense-m1", "points", PointCloud2)]
+)
+@pytest.mark.parametrize("qos", ["reliable", "best_effort"])
+def test_no_scan_is_lost_in_ten_minutes(
+    run: Callable[..., Any], client: Client, sensor: str, topic: str, message_class: Any, qos: str
+) -> None:
+    """Of reliable topics; of the others it is printed how many are."""
+    stamps = list[int]()
+
+    def note(data: bytes) -> None:
+        sec, nanosec = struct.unpack_from("<iI", data, 4)
+        stamps.append(sec * 10**9 + nanosec)
+
+    client.listen(topic, message_class, reliable=qos == "reliable", take=note)
+    run(f"sim:{sensor}", "-s", sensor, ros=given(qos=qos))
+    client.until(lambda: stamps)
+    end = time.monotonic() + SOAK
+    client.until(lambda: time.monotonic() > end, patience=2 * SOAK)
+    steps = np.diff(stamps)
+    lost = int(np.rint(steps / np.median(steps)).sum()) - len(steps)
+    print(f"{sensor}, {qos}: {lost} of {len(stamps) + lost} lost")
+    assert len(stamps) > 9.5 * SOAK
+    assert not lost or qos == "best_effort"

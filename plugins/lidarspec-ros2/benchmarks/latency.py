@@ -1,0 +1,185 @@
+"""How late a scan is at a subscriber, and what the node takes of a processor, beside what it is made of.
+
+    python plugins/lidarspec-ros2/benchmarks/latency.py [SENSOR] [SECONDS]
+
+Three runs with processes of their own, of as many seconds each. A sender, in real time, sends what a sensor would, and notes when the
+packet left that ends each scan; the node publishes, and a subscriber notes when its callback was called. `lidarspec stats` reads the same.
+Then a publisher alone publishes as large a message as often. Printed are the milliseconds from the last byte, and from publishing, to the
+callback, and the shares of a core.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import os
+import random
+import socket
+import subprocess
+import sys
+import tempfile
+import time
+import tty
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+import lidarspec as ls
+from lidarspec.simulation.simulator import simulate
+
+os.environ |= {"ROS_AUTOMATIC_DISCOVERY_RANGE": "LOCALHOST"}
+#: seconds in which everything comes to run before anything is measured, and from which on packets are sent.
+WARMING, PORT = 5.0, 26699
+
+
+def send(sensor: str, seconds: float, place: str, notes: str) -> None:
+    """Send packets in real time, and write down when each of those left that end a scan."""
+    spec = ls.sensor(sensor)
+    frames = list(simulate(spec, 20000))
+    packets = spec.decode(b"".join(frames) if not spec.datagrams else frames)
+    pace = (int(packets.time_ns[-1]) - int(packets.time_ns[0])) * 1e-9 / (len(frames) - 1)
+    cloud = packets.points()
+    each = len(cloud) // len(frames)
+    ends = set((np.cumsum([len(scan) for scan in spec.scans(frames)]) // each).tolist())
+    write = _line(place) if place else _socket()
+    begin, left = time.monotonic(), []
+    for number in range(int(seconds / pace)):
+        time.sleep(max(begin + number * pace - time.monotonic(), 0))
+        write(frames[number % len(frames)])
+        if number % len(frames) in ends:
+            left.append(time.time_ns())
+    Path(notes).write_text(json.dumps(left), encoding="utf-8")
+
+
+def _line(place: str) -> Any:
+    ours, theirs = os.openpty()
+    tty.setraw(theirs)
+    os.symlink(os.ttyname(theirs), place)
+    return lambda data: os.write(ours, data)
+
+
+def _socket() -> Any:
+    sock = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+    return lambda data: sock.sendto(data, ("127.0.0.1", PORT))
+
+
+def subscribe(kind: str, topic: str, seconds: float, notes: str) -> None:
+    """Write down when the callback was called, and how large the message is."""
+    import rclpy
+    from sensor_msgs import msg
+
+    rclpy.init()
+    node, came = rclpy.create_node("subscriber"), list[tuple[int, int]]()
+    node.create_subscription(getattr(msg, kind), topic, lambda data: came.append((time.time_ns(), len(data))), 10, raw=True)
+    end = time.monotonic() + seconds
+    while time.monotonic() < end:
+        rclpy.spin_once(node, timeout_sec=0.1)
+    Path(notes).write_text(json.dumps(came), encoding="utf-8")
+    rclpy.shutdown()
+
+
+def publish(kind: str, size: int, rate: float, seconds: float, notes: str) -> None:
+    """Publish bytes of a size, and write down when."""
+    import rclpy
+    from sensor_msgs import msg
+
+    rclpy.init()
+    node = rclpy.create_node("publisher")
+    publisher, left, data = node.create_publisher(getattr(msg, kind), "alone", 10), list[int](), bytes(size)
+    begin, number = time.monotonic(), 0
+    while time.monotonic() < begin + seconds:
+        number += 1
+        time.sleep(max(begin + number / rate - time.monotonic(), 0))
+        left.append(time.time_ns())
+        publisher.publish(data)
+    Path(notes).write_text(json.dumps(left), encoding="utf-8")
+    rclpy.shutdown()
+
+
+@contextlib.contextmanager
+def process(*words: object) -> Iterator[subprocess.Popen[bytes]]:
+    """A program, which is ended at the end."""
+    begun = subprocess.Popen([sys.executable, *map(str, words)], stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
+    try:
+        yield begun
+    finally:
+        begun.terminate()
+        begun.wait()
+
+
+def share(pid: int, seconds: float) -> float:
+    """The share of a core that a process takes in so many seconds."""
+
+    def taken() -> float:
+        fields = Path(f"/proc/{pid}/stat").read_text(encoding="utf-8").rpartition(")")[2].split()
+        return (int(fields[11]) + int(fields[12])) / os.sysconf("SC_CLK_TCK")
+
+    before, begin = taken(), time.monotonic()
+    time.sleep(seconds)
+    return (taken() - before) / (time.monotonic() - begin)
+
+
+def late(left: list[int], came: list[tuple[int, int]]) -> str:
+    """Median and 99th percentile from each time to the next one of a callback, ms."""
+    times = np.array(left)
+    after = np.array([at for at, _ in came if at > times[0]])
+    which = np.searchsorted(times, after, side="right") - 1
+    found = (after - times[which]) * 1e-6
+    return f"median {np.median(found):6.2f} ms, 99 % {np.percentile(found, 99):6.2f} ms of {len(found)}"
+
+
+def main(sensor: str = "ldrobot-stl27l", seconds: float = 20.0) -> None:
+    """Print the figures."""
+    os.environ["ROS_DOMAIN_ID"] = str(random.randrange(50, 100))
+    spec, lasting = ls.sensor(sensor), seconds + 2 * WARMING
+    kind, topic = ("PointCloud2", "points") if spec.datagrams else ("LaserScan", "scan")
+    with tempfile.TemporaryDirectory() as folder:
+        left, came, place = f"{folder}/left", f"{folder}/came", "" if spec.datagrams else f"{folder}/port"
+        source = f"udp://127.0.0.1:{PORT}" if spec.datagrams else place
+        with (
+            process(__file__, "send", sensor, lasting, place, left) as sender,
+            process(__file__, "subscribe", kind, topic, lasting, came) as subscriber,
+        ):
+            while place and not os.path.islink(place):
+                time.sleep(0.1)
+            with process("-m", "lidarspec", "ros2", source, "-s", sensor, "--ros-args", "-p", "qos:=reliable") as node:
+                time.sleep(WARMING)
+                taken = share(node.pid, seconds)
+                sender.wait()
+                subscriber.wait()
+        ends, messages = json.loads(Path(left).read_text()), json.loads(Path(came).read_text())
+        size, rate = messages[-1][1], len(ends) / lasting
+        print(f"{sensor}: {size} bytes, {rate:.1f} a second")
+        print(f"  the node, from the last byte:   {late(ends, messages)}; {taken:.1%} of a core")
+        if place:
+            Path(place).unlink()
+        with process(__file__, "send", sensor, lasting, place, left):
+            while place and not os.path.islink(place):
+                time.sleep(0.1)
+            with process("-m", "lidarspec", "stats", source, "-s", sensor) as stats:
+                time.sleep(WARMING)
+                reading = share(stats.pid, seconds)
+        with (
+            process(__file__, "subscribe", kind, "alone", lasting, came) as subscriber,
+            process(__file__, "publish", kind, size, rate, lasting - 2, left) as publisher,
+        ):
+            time.sleep(WARMING)
+            publishing = share(publisher.pid, seconds)
+            subscriber.wait()
+        alone = late(json.loads(Path(left).read_text()), json.loads(Path(came).read_text()))
+        print(f"  publishing alone:               {alone}; {publishing:.1%} of a core")
+        print(f"  lidarspec stats: {reading:.1%} of a core; the node takes {taken / (reading + publishing):.2f} times both")
+
+
+if __name__ == "__main__":
+    role, *words = sys.argv[1:] or [""]
+    if role == "send":
+        send(words[0], float(words[1]), words[2], words[3])
+    elif role == "subscribe":
+        subscribe(words[0], words[1], float(words[2]), words[3])
+    elif role == "publish":
+        publish(words[0], int(words[1]), float(words[2]), float(words[3]), words[4])
+    else:
+        main(*[role] * bool(role), *map(float, words))
