@@ -95,9 +95,10 @@ PARAMETERS = (
     Parameter("publish_packets", False, "Whether packets has what the sensor sends, as it comes."),
     Parameter("qos", "best_effort", "Of the topics with data: best_effort, as for sensor data, or reliable."),
     Parameter("replay_speed", 1.0, "How many times faster than it was recorded a file is played. 0: as fast as it can be read.", 0, 1000),
-    Parameter("period", 0.02, "Seconds from decoding to decoding: shorter is sooner, and takes more of the processor.", 0.001, 1.0),
 )
 NAMED = {parameter.name: parameter for parameter in PARAMETERS}
+#: seconds from decoding to decoding when a scan is expected to end.
+PERIOD = 0.002
 QUALITIES = ("best_effort", "reliable")
 
 
@@ -170,4 +171,4 @@ class Settings:
             raise UsageError("source is missing, such as /dev/ttyUSB0, udp:// or sim:ID")
         mount = None if self["publish_tf"] else self.mount()
         record_to = record if self["publish_packets"] else None
-        return Device(self["source"], self.sensor(), record=record_to, period=self["period"], mount=mount)
+        return Device(self["source"], self.sensor(), record=record_to, period=PERIOD, mount=mount)

@@ -38,8 +38,6 @@ KINDS = {
     IMU: ("imu", Imu, 200),
     RAW: ("packets", UInt8MultiArray, 2000),
 }
-
-
 #: what ROS's own parameters, such as `qos_overrides./scan.publisher.depth`, change of that.
 _OVERRIDING = QoSOverridingOptions.with_default_policies()
 
@@ -52,13 +50,14 @@ class Topics:
         sensor: as it was opened.
         played: whether it is a file that is played: then /clock says its time, where `use_sim_time` is set.
 
-    Raises:
-        UsageError: for a transform that cannot be published here.
-
     Attributes:
         stamps: the times of messages.
         active: whether what is published is let through.
+        fault: why there is no planar scan that was asked for, "" where there is.
         latency_s: seconds from the arrival of the packets that ended the last scan to its being published.
+
+    Raises:
+        UsageError: for a transform that cannot be published here.
     """
 
     def __init__(self, node: LifecycleNode, settings: Settings, sensor: Sensor, *, played: bool) -> None:
@@ -67,7 +66,7 @@ class Topics:
         self._reliability = ReliabilityPolicy.RELIABLE if settings["qos"] == "reliable" else ReliabilityPolicy.BEST_EFFORT
         self._publishers: dict[str, Any] = {}
         self._others = list[Any]()
-        self.active, self.latency_s = False, 0.0
+        self.active, self.latency_s, self.fault = False, 0.0, ""
         self._arrived = 0
         self.show(settings)
         self._publisher(CLOUD)
@@ -90,18 +89,18 @@ class Topics:
         self.stamps.learn(packets.time_ns, packets.host_ns)
 
     def publish(self, scan: Scan) -> None:
-        """Publish a scan, as far as anybody listens.
-
-        Raises:
-            UsageError: for a ring that the sensor lacks.
-        """
+        """Publish a scan, as far as anybody listens."""
         wanted = self._sieve.take(scan)
         assert wanted is not None  # nothing is selected by number or time
         at, settings = self._stamp(scan), self._settings
         if self._listened(CLOUD):
             organised = settings["organized"] and wanted.points.shape is not None
             self._send(self._messages.cloud(wanted, at, every_point=organised))
-        if (planar := self._planes.scan(wanted)) is not None and self._listened(SCAN):
+        try:
+            planar, self.fault = self._planes.scan(wanted), ""
+        except UsageError as error:  # a ring that the sensor lacks: it is set at run time
+            planar, self.fault = None, str(error)
+        if planar is not None and self._listened(SCAN):
             self._send(self._messages.laserscan(wanted, settings.narrowed(planar), at + planar.stamp_ns - scan.stamp_ns))
         self.latency_s = (time.time_ns() - self._arrived) / 1e9
         if self._time is not None and self.active:
