@@ -105,6 +105,9 @@ class Input(Protocol):
         """Pass over what arrived before a time, ns since 1970, where that can be done without reading it: whether it is."""
         return False
 
+    def gather(self, until: float) -> None:
+        """Let what comes wait up to a time of `time.monotonic`, to be decoded together, and no longer than one wait for it takes."""
+
     def begin(self) -> None:
         """Send the commands that the sensor declares for its start.
 
@@ -235,6 +238,9 @@ class FileInput(Input):
 
     def skip(self, at: int) -> bool:
         return self._transport.skip(at)
+
+    def gather(self, until: float) -> None:
+        """What is in a file is there."""
 
     def begin(self) -> None:
         """A file has no sensor to be started."""

@@ -311,6 +311,13 @@ class Device(Closing):
         """
         return self._input.skip(at)
 
+    def gather(self, until: float) -> None:
+        """Let what comes of a live source wait up to a time of `time.monotonic`, to be decoded together, which takes less of the processor.
+
+        It waits no longer than the `wait` of whoever iterates.
+        """
+        self._input.gather(until)
+
     def latest(self, timeout: float | None = None) -> Scan:
         """The newest whole scan, newer than the one that the last call gave; waits for it. Older ones are passed over.
 

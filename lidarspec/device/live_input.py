@@ -259,6 +259,9 @@ class LiveInput(Input):
                 if wait <= 0 and not self._ready:
                     return None
 
+    def gather(self, until: float) -> None:
+        self._due = max(self._due, until)
+
     def mark(self) -> int:
         return self.queue.produced
 

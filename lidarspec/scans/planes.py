@@ -74,6 +74,8 @@ class Planes:
         """How many beams, and where the first and the last one look."""
         azimuth, _ = scan.swept()
         begin, end, low, high = (float(angle) for angle in (azimuth[0], azimuth[-1], azimuth.min(), azimuth.max()))
+        if low == high:  # it looks one way
+            return 1, (low, high)
         count, turn = self._beams or scan.beams or scan.sensor.beams or len(scan), 2 * np.pi
         step = (high - low) / (len(azimuth) - 1)
         if high - low > TURN * turn:

@@ -34,6 +34,13 @@ def beams_of(one: LaserScan, scan: Scan) -> np.ndarray:
     return np.floor(ahead % (2 * math.pi) / one.angle_increment).astype(int)
 
 
+def test_a_sensor_that_looks_one_way_has_one_beam() -> None:
+    for planes in (Planes(), Planes(beams=360), Planes(field=(-1.0, 1.0))):
+        for scan, one in zip(scans := simulated("benewake-tfmini"), planar(planes, scans), strict=True):
+            assert one.ranges.tolist() == [scan.points.range[scan.points.valid].min()]
+            assert one.angle_min == one.angle_max == 0
+
+
 @pytest.mark.parametrize("name", ["ldrobot-stl27l", "hokuyo-utm30lx", "sick-tim571"])
 def test_each_beam_is_as_late_as_its_points(name: str) -> None:
     """Within three beams, and two steps of a clock that counts in ms."""

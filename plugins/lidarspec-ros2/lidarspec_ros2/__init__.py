@@ -8,7 +8,7 @@ A lifecycle node over a `Device`, as every verb has one. ROS is imported when th
 * `topics`: what is published.
 * `packets`: packets as a topic, and as a source.
 * `diagnostics`: how the sensor is doing, as /diagnostics says it.
-* `clock`: times of the sensor's clock as those of the host.
+* `clock`: stamps in ROS's time, and the sensor's clock by the host's.
 """
 
 from __future__ import annotations

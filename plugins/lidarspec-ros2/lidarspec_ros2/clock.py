@@ -22,7 +22,12 @@ from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
+
+from lidarspec.transports.base import HostClock
+from lidarspec_ros2.parameters import Settings
+
+Times = NDArray[np.int64]
 
 #: ns of which the least difference is kept, and how many of them: half a minute.
 PART, PARTS = 250_000_000, 120
@@ -57,36 +62,77 @@ class Line(NamedTuple):
         return self.delay + round(self.slope * (device - self.device))
 
 
+class Stamps:
+    """The stamps of one sensor's messages, in ROS's time.
+
+    Args:
+        wall: the computer's clock, of a live sensor: arrival times go on evenly where it is set, and ROS's time does not. None where a
+            recording is played.
+
+    Attributes:
+        clock: the sensor's clock by the host's.
+    """
+
+    def __init__(self, wall: HostClock | None) -> None:
+        self.clock, self._wall, self._ahead = DeviceClock(), wall, 0
+
+    def learn(self, device_ns: Times, host_ns: Times) -> None:
+        """Learn from packets how the sensor's clock goes, and look whether the computer's was set.
+
+        Args:
+            device_ns, host_ns: as of `DeviceClock.observe`; a packet of whose arrival nobody knows has 0 and tells nothing.
+        """
+        known = host_ns > 0
+        self.clock.observe(device_ns[known], host_ns[known])
+        ahead = None if self._wall is None else self._wall.parted()
+        self._ahead = self._ahead if ahead is None else ahead
+
+    def of(self, device_ns: int, host_ns: int, settings: Settings) -> int:
+        """The stamp of the next scan, by the sensor's time and the arrival of its first point, ns."""
+        return self._wanted(device_ns, self.clock.stamp(device_ns, host_ns), host_ns, settings)
+
+    def at(self, time_ns: int, settings: Settings, *, by_clock: bool) -> int:
+        """The stamp of something that is not a scan, ns.
+
+        Args:
+            time_ns: between those of packets.
+            by_clock: whether it is by the sensor's clock; else it is when it arrived.
+        """
+        estimated = time_ns + self.clock.offset_ns * by_clock
+        return self._wanted(time_ns, estimated, estimated, settings)
+
+    def _wanted(self, own: int, estimated: int, arrival: int, settings: Settings) -> int:
+        """What the parameters want of the three: the sensor's time, what is made of it, and the arrival."""
+        if settings["use_device_time"] and settings["device_time_is_ros_time"]:
+            at = own
+        else:
+            at = (estimated if settings["use_device_time"] else arrival) + self._ahead
+        offset: float = settings["time_offset"]
+        return at + round(offset * 1e9)
+
+
 class DeviceClock:
     """Times of a sensor as those of the host.
 
     A delay that never changes cannot be told from an offset: the time on the line, and what the sensor needs before it sends, stay in the
     times that come out.
 
-    Args:
-        latency_ns: what is known of that delay, and is taken off.
-
     Attributes:
         jumps: how often the sensor's clock was set.
-        jump: by how much the last time, in a sentence; empty before.
+        jump: by how much, in a sentence, for ten seconds after it; else empty.
     """
 
-    def __init__(self, latency_ns: int = 0) -> None:
-        self._latency, self._stamp = latency_ns, -(1 << 62)
+    def __init__(self) -> None:
+        self._stamp = -(1 << 62)
         self.jumps, self.jump = 0, ""
         self._least, self._strays, self._since = deque[Sample](maxlen=PARTS), deque[Sample](maxlen=PROBABLY), 0
-        self._shown: Sample | None = None
-        self.reset()
-
-    def reset(self) -> None:
-        """Forget the sensor, for another one: times that come out go on forward all the same."""
-        self._begin()
         self._line, self._known = Line(0, 0, 0.0), 0.0
+        self._shown: Sample | None = None
 
     @property
     def offset_ns(self) -> int:
         """What the host's clock is ahead of the sensor's, at the newest packet."""
-        return self._line.delay - self._latency
+        return self._line.delay
 
     @property
     def drift_ppm(self) -> float:
@@ -117,7 +163,7 @@ class DeviceClock:
         went_back = self._shown is not None and device_ns <= self._shown.device
         offset = host_ns - device_ns if went_back else min(self._slewed(device_ns), host_ns - device_ns)
         self._shown = Sample(device_ns, offset)
-        self._stamp = max(device_ns + offset - self._latency, self._stamp + 1)
+        self._stamp = max(device_ns + offset, self._stamp + 1)
         return self._stamp
 
     def _slewed(self, device: int) -> int:
@@ -184,6 +230,8 @@ class DeviceClock:
             self._least.pop()
         self._least.append(sample)
         self._line = drawn(self._least, self._known)
+        if len(self._least) >= SETTLED:
+            self.jump = ""
         if len(self._least) == PARTS:
             self._known = self._line.slope
 

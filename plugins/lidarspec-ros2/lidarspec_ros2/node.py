@@ -6,6 +6,7 @@ reading thread asks for: to say once a second how the sensor is doing, and to be
 
 from __future__ import annotations
 
+import math
 import threading
 import time
 from collections.abc import Callable, Mapping, Sequence
@@ -31,6 +32,8 @@ from lidarspec_ros2.topics import Topics
 
 #: seconds between two diagnostics.
 SECOND = 1.0
+#: seconds by which the end of a scan is looked for too early, and for which it is looked for; which what an IMU felt may wait.
+EARLY, LATE, SOON = 0.003, 0.02, 0.01
 
 
 class LidarNode(LifecycleNode):
@@ -103,7 +106,7 @@ class LidarNode(LifecycleNode):
         self.failure = None
         try:
             self._open()
-        except LidarSpecError as error:
+        except Exception as error:  # of which rclpy would say nothing
             self._fail(error)
             self.close()
             return TransitionCallbackReturn.FAILURE
@@ -146,17 +149,20 @@ class LidarNode(LifecycleNode):
         packets.publish = topics.raw
         self._serve_commands(device)
         self._stopping.clear()
+        self._was_lost = False
         self._thread = threading.Thread(target=self._read, args=(device, self._topics), name="reading")
         self._thread.start()
 
     def _read(self, device: Device, topics: Topics) -> None:
         """Publish what comes, until the node is stopped or the input ends."""
         speed = self._settings["replay_speed"]
-        feed, due = Feed(device, played=speed > 0, speed=speed), time.monotonic()
+        feed, due, expected = Feed(device, played=speed > 0, speed=speed), time.monotonic(), 0.0
         try:
             while not self._stopping.is_set() and not feed.ended:
                 feed.pump(0.0 if device.is_live else time.monotonic() + LOOK)
                 self._publish(feed, topics)
+                expected = _expected(expected, feed)
+                device.gather(min(expected, time.monotonic() + SOON) if device.sensor.imu_frames else expected)
                 self._watch(device)
                 if (now := time.monotonic()) >= due:
                     due = now + SECOND
@@ -179,7 +185,7 @@ class LidarNode(LifecycleNode):
         """Have the node be inactive while the sensor is gone, which has been there."""
         is_lost = device.state in LOST and bool(device.stats.frames)
         if is_lost != self._was_lost and (self._was_lost or self._is_active):
-            self._soon(self._lose if is_lost else self.trigger_activate)
+            self._soon(self._lose if is_lost else self._regain)
 
     @property
     def _is_active(self) -> bool:
@@ -190,12 +196,18 @@ class LidarNode(LifecycleNode):
             self.trigger_deactivate()
             self._was_lost = True
 
+    def _regain(self) -> None:
+        if self._was_lost:
+            self.trigger_activate()
+
     def _tell(self, device: Device, topics: Topics, reading: Reading) -> None:
         """Say how the sensor is doing."""
         if device is not self._device:  # which is closed
             return
         more = {"lifecycle": "active" if topics.active else "inactive", "latency [ms]": f"{topics.latency_s * 1e3:.1f}"}
-        found = status(self.get_name(), device, reading, [topics.clock.jump] * bool(topics.clock.jumps), more)
+        clock = topics.stamps.clock
+        more |= {"clock drift [ppm]": f"{clock.drift_ppm:+.1f}", "clock set": f"{clock.jumps} times"}
+        found = status(self.get_name(), device, reading, [*filter(None, (clock.jump, topics.fault))], more)
         self._diagnostics.publish(DiagnosticArray(header=Header(stamp=self.get_clock().now().to_msg()), status=[found]))
 
     def _soon(self, callback: Callable[[], Any]) -> None:
@@ -209,7 +221,8 @@ class LidarNode(LifecycleNode):
             self.trigger_deactivate()
         if self.failure is not None:
             self.trigger_cleanup()
-        self.ended.set()
+        if self.autostarts:
+            self.ended.set()
 
     def _fail(self, error: Exception) -> None:
         self.failure = error
@@ -231,13 +244,13 @@ class LidarNode(LifecycleNode):
         return SetParametersResult(successful=True)
 
     def _serve_commands(self, device: Device) -> None:
-        """A service for each command of the sensor, and a parameter for each of its arguments."""
+        """A service for each command of the sensor, beside the node's own, such as get_state, and a parameter for each of its arguments."""
         for name, command in device.sensor.commands.items():
             for argument in command.args:
                 if not self.has_parameter(f"{name}.{argument}"):
                     text = f"An argument of the service {name}, in the unit of its field, or with a unit."
                     self.declare_parameter(f"{name}.{argument}", None, ParameterDescriptor(description=text, dynamic_typing=True))
-            self._services_of_sensor.append(self.create_service(Trigger, f"~/{name}", partial(self._send, device, name)))
+            self._services_of_sensor.append(self.create_service(Trigger, f"~/send/{name}", partial(self._send, device, name)))
 
     def _send(self, device: Device, name: str, request: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
         """Send a command, and answer with its reply, or why there is none."""
@@ -250,6 +263,15 @@ class LidarNode(LifecycleNode):
         else:
             response.success, response.message = True, replied(device.sensor, reply)
         return response
+
+
+def _expected(before: float, feed: Feed) -> float:
+    """When the next scan may end, a time of `time.monotonic`, a little too early; one that is late is waited for less eagerly."""
+    now = time.monotonic()
+    for scan in feed.scans:
+        if scan.whole and math.isfinite(scan.rate_hz):
+            return now + 1 / scan.rate_hz - EARLY
+    return before if now - before < LATE else now + LOOK
 
 
 def _descriptor(parameter: Parameter) -> ParameterDescriptor:

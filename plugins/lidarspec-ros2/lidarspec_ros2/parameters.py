@@ -90,12 +90,15 @@ PARAMETERS = (
         live=True,
     ),
     Parameter("use_device_time", True, "Whether stamps are by the sensor's clock, in the host's time; else by the arrival.", live=True),
+    Parameter("device_time_is_ros_time", False, "Whether the sensor's clock is right, by PTP or GPS: stamps are what it says.", live=True),
+    Parameter("time_offset", 0.0, "Seconds added to every stamp: below 0 for a delay that is always there.", -_SIDE, _SIDE, live=True),
     Parameter("publish_packets", False, "Whether packets has what the sensor sends, as it comes."),
     Parameter("qos", "best_effort", "Of the topics with data: best_effort, as for sensor data, or reliable."),
     Parameter("replay_speed", 1.0, "How many times faster than it was recorded a file is played. 0: as fast as it can be read.", 0, 1000),
-    Parameter("period", 0.02, "Seconds from decoding to decoding: shorter is sooner, and takes more of the processor.", 0.001, 1.0),
 )
 NAMED = {parameter.name: parameter for parameter in PARAMETERS}
+#: seconds from decoding to decoding when a scan is expected to end.
+PERIOD = 0.002
 QUALITIES = ("best_effort", "reliable")
 
 
@@ -168,4 +171,4 @@ class Settings:
             raise UsageError("source is missing, such as /dev/ttyUSB0, udp:// or sim:ID")
         mount = None if self["publish_tf"] else self.mount()
         record_to = record if self["publish_packets"] else None
-        return Device(self["source"], self.sensor(), record=record_to, period=self["period"], mount=mount)
+        return Device(self["source"], self.sensor(), record=record_to, period=PERIOD, mount=mount)

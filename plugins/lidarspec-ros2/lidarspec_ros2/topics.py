@@ -17,15 +17,18 @@ from std_msgs.msg import UInt8MultiArray
 
 from lidarspec.errors import UsageError
 from lidarspec.formats.messages import CLOUD, IMU, SCAN, Message, Messages
+from lidarspec.framing.results import Counters
 from lidarspec.packets.imu import ImuSamples
 from lidarspec.packets.packets import Packets
+from lidarspec.packets.stream import ImuStream
 from lidarspec.points.cloud import Mount
 from lidarspec.scans.scans import Scan
 from lidarspec.scans.selection import Sieve
 from lidarspec.spec.sensor import Sensor
 from lidarspec.transports.bags import RAW
+from lidarspec.transports.base import HostClock
 from lidarspec.transports.protocol import Chunk
-from lidarspec_ros2.clock import DeviceClock
+from lidarspec_ros2.clock import Stamps
 from lidarspec_ros2.parameters import Settings
 
 #: of each kind of message its topic, its class, and how many are kept for those who are slow: about a second of them, or less.
@@ -35,8 +38,6 @@ KINDS = {
     IMU: ("imu", Imu, 200),
     RAW: ("packets", UInt8MultiArray, 2000),
 }
-
-
 #: what ROS's own parameters, such as `qos_overrides./scan.publisher.depth`, change of that.
 _OVERRIDING = QoSOverridingOptions.with_default_policies()
 
@@ -49,27 +50,29 @@ class Topics:
         sensor: as it was opened.
         played: whether it is a file that is played: then /clock says its time, where `use_sim_time` is set.
 
+    Attributes:
+        stamps: the times of messages.
+        active: whether what is published is let through.
+        fault: why there is no planar scan that was asked for, "" where there is.
+        latency_s: seconds from the arrival of the packets that ended the last scan to its being published.
+
     Raises:
         UsageError: for a transform that cannot be published here.
-
-    Attributes:
-        clock: the sensor's clock by the host's.
-        active: whether what is published is let through.
-        latency_s: seconds from the arrival of the packets that ended the last scan to its being published.
     """
 
     def __init__(self, node: LifecycleNode, settings: Settings, sensor: Sensor, *, played: bool) -> None:
-        self._node, self._sensor, self.clock = node, sensor, DeviceClock()
+        self._node, self._sensor, self.stamps = node, sensor, Stamps(None if played else HostClock())
         self._messages = Messages("ROS2_HUMBLE")
         self._reliability = ReliabilityPolicy.RELIABLE if settings["qos"] == "reliable" else ReliabilityPolicy.BEST_EFFORT
         self._publishers: dict[str, Any] = {}
         self._others = list[Any]()
-        self.active, self.latency_s = False, 0.0
+        self.active, self.latency_s, self.fault = False, 0.0, ""
         self._arrived = 0
         self.show(settings)
         self._publisher(CLOUD)
         if settings["publish_packets"]:
             self._publisher(RAW)
+        self._is_felt_by_clock = ImuStream(sensor, Counters()).waiting is not None
         if sensor.imu_frames:
             self._publisher(IMU)
         if settings["publish_tf"]:
@@ -82,24 +85,22 @@ class Topics:
 
     def learn(self, packets: Packets) -> None:
         """Learn the sensor's clock from packets."""
-        known = packets.host_ns > 0
-        if known.any():
-            self._arrived = int(packets.host_ns[known][0])
-            self.clock.observe(packets.time_ns[known], packets.host_ns[known])
+        self._arrived = int(packets.host_ns[0]) or self._arrived
+        self.stamps.learn(packets.time_ns, packets.host_ns)
 
     def publish(self, scan: Scan) -> None:
-        """Publish a scan, as far as anybody listens.
-
-        Raises:
-            UsageError: for a ring that the sensor lacks.
-        """
+        """Publish a scan, as far as anybody listens."""
         wanted = self._sieve.take(scan)
         assert wanted is not None  # nothing is selected by number or time
         at, settings = self._stamp(scan), self._settings
         if self._listened(CLOUD):
             organised = settings["organized"] and wanted.points.shape is not None
             self._send(self._messages.cloud(wanted, at, every_point=organised))
-        if (planar := self._planes.scan(wanted)) is not None and self._listened(SCAN):
+        try:
+            planar, self.fault = self._planes.scan(wanted), ""
+        except UsageError as error:  # a ring that the sensor lacks: it is set at run time
+            planar, self.fault = None, str(error)
+        if planar is not None and self._listened(SCAN):
             self._send(self._messages.laserscan(wanted, settings.narrowed(planar), at + planar.stamp_ns - scan.stamp_ns))
         self.latency_s = (time.time_ns() - self._arrived) / 1e9
         if self._time is not None and self.active:
@@ -108,7 +109,7 @@ class Topics:
     def feel(self, felt: ImuSamples) -> None:
         """Publish what the IMU felt."""
         for index in range(len(felt)) if len(felt) and self._listened(IMU) else ():
-            at = int(felt.time_ns[index]) + self.clock.offset_ns
+            at = self.stamps.at(int(felt.time_ns[index]), self._settings, by_clock=self._is_felt_by_clock)
             self._send(self._messages.imu(felt, index, at, self._settings["frame_id"]))
 
     def raw(self, chunk: Chunk) -> None:
@@ -133,8 +134,7 @@ class Topics:
         """The time of the first point, ns, in ROS's time."""
         if not scan.host_ns:  # of a file that does not say when its bytes arrived
             return int(self._node.get_clock().now().nanoseconds)
-        by_device = self.clock.stamp(scan.stamp_ns, scan.host_ns)
-        return by_device if self._settings["use_device_time"] else scan.host_ns
+        return self.stamps.of(scan.stamp_ns, scan.host_ns, self._settings)
 
     def _publisher(self, kind: str) -> Any:
         """The publisher of a kind of messages; that of `scan` is made when there is a planar one."""

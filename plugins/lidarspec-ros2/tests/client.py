@@ -88,7 +88,7 @@ class Client:
 
     def trigger(self, name: str) -> Any:
         """The response of a command's service."""
-        return self.call(Trigger, name)
+        return self.call(Trigger, f"send/{name}")
 
     def close(self) -> None:
         self._node.destroy_node()

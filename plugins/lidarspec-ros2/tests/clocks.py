@@ -40,6 +40,7 @@ class Run:
         times: when it was measured, s.
         device, host, stamps: of each scan, ns.
         clock: what made the stamps.
+        said: what it said of jumps, each once.
     """
 
     times: Floats
@@ -47,6 +48,7 @@ class Run:
     host: NDArray[np.int64]
     stamps: NDArray[np.int64]
     clock: DeviceClock
+    said: list[str]
 
     @property
     def errors(self) -> Floats:
@@ -85,13 +87,14 @@ def simulated(
     device = np.rint(times * (1 + drift_ppm * 1e-6) * 1e9).astype(np.int64) + (times >= SET) * round(step * 1e9)
     device -= (times >= AGAIN) * TURN * wraps
     host = BEGAN + np.rint(np.maximum.accumulate(times + late) * 1e9).astype(np.int64)
-    clock, stamps = DeviceClock(), []
+    clock, stamps, said = DeviceClock(), list[int](), dict[str, None]()
     for first in range(0, len(times) - each + 1, each):
         if each > 1:
             clock.observe(device[first : first + each], host[first : first + each])
         stamps.append(clock.stamp(int(device[first]), int(host[first])))
+        said |= {clock.jump: None}
     which = slice(0, len(stamps) * each, each)
-    return Run(times[which], device[which], host[which], np.array(stamps), clock)
+    return Run(times[which], device[which], host[which], np.array(stamps), clock, list(said)[1:])
 
 
 #: scans a second, packets observed with each, and the drift in ppm, of the columns.

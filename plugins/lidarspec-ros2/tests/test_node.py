@@ -18,7 +18,7 @@ from client import PATIENCE, Client, ended, given, message
 from rcl_interfaces.msg import ParameterType
 from rclpy.serialization import deserialize_message
 from rosgraph_msgs.msg import Clock
-from sensor_msgs.msg import LaserScan
+from sensor_msgs.msg import LaserScan, PointCloud2
 
 from lidarspec.formats.messages import SCAN
 from lidarspec_ros2.parameters import PARAMETERS
@@ -75,6 +75,13 @@ def test_the_lifecycle_is_the_managers_where_it_is_asked_for(run: Any, client: C
     assert process.wait(PATIENCE) == 0
 
 
+def test_a_command_may_be_called_as_a_service_of_every_node(run: Any, client: Client) -> None:
+    run("sim:hokuyo-utm30lx", "-s", "hokuyo-utm30lx")
+    client.until(lambda: client.diagnostics)
+    answered = client.trigger("get_state")
+    assert (answered.success, client.state) == (True, "active")
+
+
 def test_it_cannot_be_configured_with_what_cannot_be_opened_and_then_can(run: Any, client: Client, tmp_path: Path) -> None:
     run(ros=given(source=str(tmp_path / "none"), sensor=STL[2], autostart=False), executable="lidarspec_node")
     assert not client.change("configure")
@@ -127,6 +134,17 @@ def test_parameters_are_described_and_changed_where_that_makes_sense(run: Any, c
     assert client.set("angle_min", 2.0) == ""  # on through the back, to where the last beam looks a turn on
     client.until(lambda: newest().angle_min == 2.0)
     assert newest().angle_max == pytest.approx(1.0 + 2 * math.pi)
+
+
+def test_a_ring_that_the_sensor_lacks_is_a_warning_and_clouds_go_on(run: Any, client: Client) -> None:
+    clouds, scans = client.listen("points", PointCloud2), client.listen("scan", LaserScan)
+    run("sim:velodyne-vlp16", "-s", "velodyne-vlp16", ros=given(qos="reliable", scan_ring=7, frame_id="mast"))
+    client.until(lambda: len(scans) > 1)
+    assert message(scans[-1], SCAN).header.frame_id == "mast"
+    assert client.set("scan_ring", 99) == ""
+    client.until(lambda: any("ring 99 is asked for" in text for text in values(client.diagnostics[-1].status[0]).values()))
+    number = len(clouds)
+    client.until(lambda: len(clouds) > number)
 
 
 def test_commands_are_services_with_arguments_as_parameters(run: Any, client: Client) -> None:

@@ -88,6 +88,23 @@ def test_messages_are_what_the_library_makes_of_the_same_bytes(
     assert len({np.asarray(content["ranges" if kind == SCAN else "data"]).tobytes() for content in wanted}) > 1
 
 
+def test_what_an_imu_felt_is_what_the_library_makes_of_the_same_bytes(run: Callable[..., Any], client: Client, tmp_path: Path) -> None:
+    packets = client.listen("packets", UInt8MultiArray)
+    received = client.listen("imu", Imu)
+    run("sim:livox-mid360?shake=0.5&seed=3", "-s", "livox-mid360", ros=given(publish_packets=True, qos="reliable", frame_id="head"))
+    client.until(lambda: len(received) > 400)
+    with ls.open(recorded(packets, tmp_path / "packets.lsr", "livox-mid360"), "livox-mid360") as device:
+        wanted = [
+            row for felt in device.imu() for row in np.concatenate([felt.angular_velocity, felt.linear_acceleration], axis=1).tolist()
+        ]
+    read = [deserialize_message(data, Imu) for data in received[:400]]
+    found = [[getattr(part, axis) for part in (one.angular_velocity, one.linear_acceleration) for axis in "xyz"] for one in read]
+    begin = found.index(wanted[0]) if wanted[0] in found else 0
+    shift = wanted.index(found[begin])
+    assert found[begin:] == wanted[shift : shift + len(found) - begin]
+    assert (len(found) - begin > 50, {one.header.frame_id for one in read}) == (True, {"head"})
+
+
 @pytest.mark.parametrize(("sensor", "every_point"), [("robosense-m1", True), ("robosense-m1", False), ("ldrobot-stl27l", False)])
 def test_bytes_are_those_of_ros_itself(sensor: str, every_point: bool) -> None:
     """What rclpy makes of a message that it has read, or that its own classes hold, is the same byte for byte."""

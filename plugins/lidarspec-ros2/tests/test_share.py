@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
-import itertools
+import importlib.util
 import re
 import subprocess
 import sys
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 from xml.etree import ElementTree
@@ -13,7 +14,7 @@ from xml.etree import ElementTree
 import pytest
 import yaml
 from ament_index_python.packages import get_package_prefix, get_package_share_directory
-from client import Client, message
+from client import PATIENCE, Client, message
 from sensor_msgs.msg import LaserScan, PointCloud2
 
 import lidarspec as ls
@@ -95,7 +96,7 @@ def test_every_row_of_the_vendors_parameters_names_one_of_ours_or_a_reason() -> 
     assert len(told) > 80
     for theirs, ours, why in told:
         assert set(re.findall(r"`([\w./]+)`", ours)) <= {*NAMED, *topics}, theirs
-        assert set(re.findall(r"`~/(\w+)`", ours)) <= set(services), theirs
+        assert set(re.findall(r"`~/send/(\w+)`", ours)) <= set(services), theirs
         assert ours != "-" or why, theirs
 
 
@@ -106,5 +107,14 @@ def commands() -> list[list[str]]:
 
 
 @pytest.mark.parametrize("words", commands(), ids=" ".join)
-def test_what_the_page_has_typed_names_parameters(words: list[str]) -> None:
-    assert {word.partition(":=")[0] for before, word in itertools.pairwise(words) if before == "-p"} <= {*NAMED, "use_sim_time"}
+def test_what_the_page_has_typed_starts_a_node(run: Callable[..., Any], client: Client, tmp_path: Path, words: list[str]) -> None:
+    place = words.index("--ros-args") if "--ros-args" in words else len(words)
+    source, *others = words[:place]
+    simulated = "sim:ldrobot-stl27l" if source.startswith("/dev/") else source
+    if source.endswith(".lsr"):
+        subprocess.run([sys.executable, "-m", "lidarspec", "sim", "ldrobot-stl27l", "--to", source, "-t", "5s"], check=True, cwd=tmp_path)
+    node = run(simulated, *others, ros=words[place + 1 :])
+    if "publish_tf:=true" in words and importlib.util.find_spec("tf2_msgs") is None:
+        assert "publish_tf takes tf2_msgs" in node.communicate(timeout=PATIENCE)[1]
+    else:
+        client.until(lambda: any(status.message == "streaming" for array in client.diagnostics for status in array.status))

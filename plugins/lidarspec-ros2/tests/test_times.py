@@ -1,9 +1,10 @@
-"""A recording that the node plays, and the bag that `convert` makes of it, hold the same bytes at the same times; /clock goes with them."""
+"""The times of what is published: a recording's are those of its bag, /clock goes with them, and an IMU's go with the points'."""
 
 from __future__ import annotations
 
 import subprocess
 import sys
+import time
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -13,7 +14,7 @@ import pytest
 from client import Client, given, message
 from rosbags.rosbag2 import Reader
 from rosgraph_msgs.msg import Clock
-from sensor_msgs.msg import LaserScan, PointCloud2
+from sensor_msgs.msg import Imu, LaserScan, PointCloud2
 
 import lidarspec as ls
 from lidarspec.recording.recorders import Recorder
@@ -30,14 +31,18 @@ SENSORS = {
 }
 
 
-def recorded(path: Path, sensor: str) -> tuple[Path, int]:
-    """A recording of a simulated sensor, each of whose packets arrived up to 5 ms late, and what its clock is behind."""
-    spec, random, at = ls.sensor(sensor), np.random.default_rng(0), 0
-    packets = simulate(spec, SENSORS[sensor][0])
-    times = spec.decode(b"".join(packets)).time_ns
+def recorded(path: Path, sensor: str, *, jumps: int = 0) -> tuple[Path, int]:
+    """A recording of a simulated sensor, each of whose packets arrived up to 5 ms late, and what its clock is behind.
+
+    Args:
+        jumps: by how many packets its clock is set in the middle.
+    """
+    spec, random, at, number = ls.sensor(sensor), np.random.default_rng(0), 0, SENSORS[sensor][0]
+    times = spec.decode(b"".join(simulate(spec, number))).time_ns
+    packets = simulate(spec, number // 2) + simulate(spec, number - number // 2, start=number // 2 + jumps)
     with Recorder(path, spec) as recorder:
-        for packet, time in zip(packets, times.tolist(), strict=True):
-            at = max(at, time - int(times[0]) + int(random.integers(0, LATEST)))
+        for packet, sent in zip(packets, times.tolist(), strict=True):
+            at = max(at, sent - int(times[0]) + int(random.integers(0, LATEST)))
             recorder.write(Chunk(packet, BEGAN + at))
     return path, BEGAN - int(times[0])
 
@@ -54,9 +59,9 @@ def test_the_messages_of_a_recording_are_those_of_its_bag(run: Callable[..., Any
     run(str(path), ros=given(use_sim_time=True, use_device_time=False, qos="reliable", frame_id="front", beams=360))
     client.until(lambda: len(received) >= WANTED and len(clock) > WANTED)
     assert set(received) < wanted
-    told = [stamp(message(data, "rosgraph_msgs/msg/Clock").clock) for data in clock]
-    assert told == sorted(told)
-    assert BEGAN <= told[0] < told[-1] < BEGAN + 10 * SECOND
+    clocked = [stamp(message(data, "rosgraph_msgs/msg/Clock").clock) for data in clock]
+    assert clocked == sorted(clocked)
+    assert BEGAN <= clocked[0] < clocked[-1] < BEGAN + 10 * SECOND
 
 
 @pytest.mark.parametrize("sensor", SENSORS)
@@ -76,5 +81,30 @@ def test_stamps_by_the_sensors_clock_are_closer_to_the_truth_than_arrivals(
     assert (np.diff(stamps) > 0).all()
 
 
-def stamp(time: Any) -> int:
-    return int(time.sec * SECOND + time.nanosec)
+def test_a_clock_that_is_set_is_reported(run: Callable[..., Any], client: Client, tmp_path: Path) -> None:
+    path, _ = recorded(tmp_path / "drive.lsr", "velodyne-vlp16", jumps=7540)  # packets of ten seconds
+    clouds = client.listen("points", PointCloud2)
+    run(str(path), ros=given(qos="reliable"))
+    client.until(lambda: any("clock was set by +10.0" in text for text in told(client)))
+    stamps = np.array([stamp(message(data, "sensor_msgs/msg/PointCloud2").header.stamp) for data in clouds])
+    assert (np.diff(stamps) > 0).all()
+    assert stamps[-1] < BEGAN + 10 * SECOND
+
+
+@pytest.mark.parametrize("sensor", ["livox-avia", "ouster-os0"])  # whose samples have no clock, and that of the points
+def test_what_an_imu_felt_is_stamped_beside_the_points(run: Callable[..., Any], client: Client, sensor: str) -> None:
+    felt, clouds = client.listen("imu", Imu), client.listen("points", PointCloud2)
+    run(f"sim:{sensor}", "-s", sensor, ros=given(qos="reliable"))
+    client.until(lambda: len(felt) > WANTED and len(clouds) > 2)
+    now = time.time_ns()
+    for data, kind in ((felt[-1], "Imu"), (clouds[-1], "PointCloud2")):
+        assert abs(stamp(message(data, f"sensor_msgs/msg/{kind}").header.stamp) - now) < 5 * SECOND
+
+
+def told(client: Client) -> list[str]:
+    """What all diagnostics have said."""
+    return [entry.value for array in client.diagnostics for status in array.status for entry in status.values]
+
+
+def stamp(time_of: Any) -> int:
+    return int(time_of.sec * SECOND + time_of.nanosec)
