@@ -18,7 +18,7 @@ from pathlib import Path
 import click
 
 from lidarspec import __version__
-from lidarspec.cli.root import VERBS, main as root
+from lidarspec.cli.root import SPOKEN, VERBS, main as root
 
 DOCS = Path(__file__).parent
 PAGE, NODE = "reference/command-line.md", "reference/ros2.md"
@@ -44,8 +44,9 @@ def usage(verb: str) -> str:
 
 
 def options(verb: str) -> list[tuple[str, str]]:
-    """Each option as it is typed, and what it does."""
-    records = (param.get_help_record(context(verb)) for param in context(verb).command.params if isinstance(param, click.Option))
+    """Each option of its own as it is typed, and what it does."""
+    own = (param for param in context(verb).command.params if isinstance(param, click.Option) and param not in SPOKEN)
+    records = (param.get_help_record(context(verb)) for param in own)
     return [(typed, " ".join(text.split())) for typed, text in filter(None, records)]
 
 

@@ -28,7 +28,7 @@ from lidarspec.wire.layout import rows_at
 WIDEST = 128
 
 #: bytes that a buffer grows to, where the file has so many.
-LARGEST = 8 * LARGEST_BLOCK
+LARGEST = 2 * LARGEST_BLOCK
 _TRAILER = 4
 _HEAD = 16  # bytes of a record of either format, as far as they tell the length and whether that is sure
 #: records of one length in a row for which looking at all of them at once is worth while.

@@ -236,21 +236,37 @@ class StreamReader(CaptureReader):
 
 
 def datagram_record(datagram: Datagram) -> bytes:
-    """The record of one datagram, unfragmented, as Ethernet, IP and UDP.
+    """The record of one datagram in a pcap file.
 
     Raises:
-        UsageError: more bytes than UDP carries, an address that is none, or a port or time that no record can hold.
+        UsageError: as `datagram_frame`, and for a time that no record can hold.
+    """
+    return packet_record(datagram_frame(datagram), datagram.at)
+
+
+def datagram_frame(datagram: Datagram) -> bytes:
+    """One datagram, unfragmented, as Ethernet, IP and UDP.
+
+    Raises:
+        UsageError: more bytes than UDP carries, an address that is none, or a port that there is not.
     """
     source, destination = _endpoints(datagram.source, datagram.destination)
     most = LARGEST_PAYLOAD + 20 * (len(source[0]) == 16)
     if len(datagram.data) > most:
         raise UsageError(f"a datagram of {len(datagram.data)} bytes: UDP carries at most {most}")
-    return packet_record(udp_frame(datagram.data, source, destination), datagram.at)
+    return udp_frame(datagram.data, source, destination)
 
 
 def is_stream_capture(head: bytes) -> bool:
-    """Whether the first 24 bytes of a file are those of a pcap capture of a byte stream."""
-    return is_capture(head) and len(head) >= 24 and int.from_bytes(head[20:22], "little") in USER_LINKS and head[0] in b"\x4d\xd4"
+    """Whether a file that begins so is a capture of a byte stream, little-endian; 24 bytes of pcap tell, 64 of pcapng as written here."""
+    link = 20
+    if head.startswith(b"\x0a\x0d\x0d\x0a"):
+        link = 8 + int.from_bytes(head[4:8], "little")
+        if head[link - 8 : link - 4] != b"\x01\0\0\0":  # no interface
+            return False
+    elif head[:1] not in (b"\x4d", b"\xd4"):
+        return False
+    return is_capture(head) and len(head) >= link + 4 and int.from_bytes(head[link : link + 2], "little") in USER_LINKS
 
 
 @lru_cache(maxsize=256)

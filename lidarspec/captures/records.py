@@ -591,3 +591,44 @@ def record_size(data: bytes | bytearray, at: int) -> int:
     if at == 0 and is_capture(bytes(data[:4])):
         return _HEAD.size
     return _RECORD.size + int.from_bytes(data[at + 8 : at + 12], "little")
+
+
+class Writing(NamedTuple):
+    """How captures of a format are written.
+
+    Attributes:
+        head: what a file begins with, for a link type.
+        record: of a packet, with its time in ns since 1970.
+        size: of the record that begins at a place of a piece of the file, or of its head.
+    """
+
+    head: Callable[[int], bytes]
+    record: Callable[[bytes, int], bytes]
+    size: Callable[[bytes | bytearray, int], int]
+
+
+def _pcapng_head(link: int) -> bytes:
+    """A section, and an interface whose times are in nanoseconds; little-endian."""
+    section = _block(_SECTION_KIND, struct.pack("<IHHq", 0x1A2B3C4D, 1, 0, -1))
+    return section + _block(_INTERFACE, struct.pack("<HHIHHB3xHH", link, 0, LARGEST_PACKET, _TIME_RESOLUTION, 1, 9, 0, 0))
+
+
+def _pcapng_record(data: bytes, at: int) -> bytes:
+    if not 0 <= at < 1 << 63:
+        raise UsageError(f"a capture time of {at} ns: times count from 1970")
+    if len(data) > LARGEST_PACKET:
+        raise UsageError(f"a packet of {len(data)} bytes: a record holds at most {LARGEST_PACKET}")
+    head = struct.pack("<IIIII", 0, at >> 32, at & 0xFFFFFFFF, len(data), len(data))
+    return _block(ENHANCED_PACKET, head + data + bytes(-len(data) % 4))
+
+
+def _block(kind: int, body: bytes) -> bytes:
+    size = struct.pack("<I", len(body) + 12)
+    return struct.pack("<I", kind) + size + body + size
+
+
+#: by the suffix of the file.
+WRITINGS = {
+    ".pcap": Writing(capture_head, packet_record, record_size),
+    ".pcapng": Writing(_pcapng_head, _pcapng_record, lambda data, at: int.from_bytes(data[at + 4 : at + 8], "little")),
+}

@@ -9,7 +9,7 @@ import traceback
 import click
 
 from lidarspec import errors
-from lidarspec.cli.terminal import note
+from lidarspec.cli.terminal import note, voice
 
 FINDINGS, USAGE, SOURCE, NO_DATA, DEVICE, INTERRUPTED = 1, 2, 3, 4, 5, 130
 
@@ -28,11 +28,13 @@ CODES: tuple[tuple[type[Exception] | tuple[type[Exception], ...], int, str], ...
 
 def report(error: Exception, verb: str) -> int:
     """Print what went wrong and what to do next; the exit code."""
+    is_detailed = voice.loudness > 0 or bool(os.environ.get("LIDARSPEC_DEBUG"))
+    voice.loudness = 0
+    if is_detailed:
+        note("".join(traceback.format_exception(error)))
     code, command = next(((code, command) for kind, code, command in CODES if isinstance(error, kind)), (FINDINGS, ""))
     if not command:
         note(f"a bug in lidarspec: {type(error).__name__}: {error}")
-        if os.environ.get("LIDARSPEC_DEBUG"):
-            note("".join(traceback.format_exception(error)))
         note("  next: the same with LIDARSPEC_DEBUG=1, and report it with what that prints")
         return code
     message = _message(error)

@@ -6,7 +6,7 @@ import contextlib
 import itertools
 from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from shlex import quote
 from typing import Any
@@ -20,19 +20,26 @@ from lidarspec.cli.options import BYTES, colour_option, count_option, output_opt
 from lidarspec.cli.output import Progress, emit, emit_json, size
 from lidarspec.cli.terminal import note
 from lidarspec.device.device import Device, open as open_device
+from lidarspec.device.source_recording import recorder_like
 from lidarspec.discovery.detect import detected
 from lidarspec.errors import UsageError, WireError, suggest, suggestion
 from lidarspec.explaining.contents import contents, shown
 from lidarspec.formats import check_holds, format_of, targets, write, write_imu
+from lidarspec.formats.writing import replacing
 from lidarspec.packets.imu import joined
 from lidarspec.plugins import sensor as named_sensor
+from lidarspec.recording.recorders import SUFFIXES
 from lidarspec.scans.scans import Scan
-from lidarspec.scans.selection import Selection
+from lidarspec.scans.selection import EVERYTHING, Selection, Times, received
 from lidarspec.spec.sensor import Sensor
+from lidarspec.stores import found
 from lidarspec.transports.open_url import is_live, transport
 from lidarspec.transports.protocol import Chunk, no_bytes
 from lidarspec.view.polar import look
 from lidarspec.view.svg import svg
+
+#: of files that hold packets as they were received; bytes alone have the suffix of KITTI's points.
+PACKETS = tuple(suffix for suffix in SUFFIXES if suffix != ".bin")
 
 
 @dataclass
@@ -54,7 +61,7 @@ class Written:
             self.scans += 1
             self.units = self.units or scan.points.units
             self.points += len(scan) if every_point else int(scan.points.valid.sum())
-            progress(lambda: f"{self}, {size(self.device.stats.bytes_in)} read")
+            progress(lambda: str(self), self.device.place)
             yield scan
 
 
@@ -99,6 +106,8 @@ def convert(
     .xyz x y z. For a file each scan put the place of a number into the name, scans/%05d.pcd; %F, %H, %M and %S
     stand for date, hour, minute and second of the scans that share a file.
 
+    .lsr, .pcap and .pcapng hold the packets themselves, as they were received.
+
     Tables (.parquet, .arrow, .feather), surveys (.las, .laz, .e57), .zarr, logs of ROS (.mcap, .bag, .rosbag2, .db3) and of Foxglove
     (.foxglove.mcap) take libraries that are not installed by default: lidarspec[arrow,las,e57,zarr,ros,foxglove].
 
@@ -118,36 +127,76 @@ def convert(
         how: dict[str, Any] = {"jobs": jobs or 1, "scheduler": scheduler or "", "size": int(piece_size or batch.PIECE)}
         how |= {"every_point": every_point, "select": selection, "force": force}
         records = batch.convert(sources, target, suffix.removeprefix("."), sensor_id, **how)
-        _convert_all(records, target, as_json=as_json)
+        _convert_all(records, target, len({path for pattern in sources for path, _ in found(pattern)}), as_json=as_json)
         return
     if len(sources) > 1 or jobs or scheduler or piece_size:
-        raise suggest(
-            UsageError("several files, and --jobs, --dask and --piece, go into a folder in one format"), "the same with --to parquet"
-        )
-    source = sources[0]
+        error = UsageError("several files, and --jobs, --dask and --piece, go into a folder in one format")
+        raise suggest(error, "the same with --to parquet")
+    if Path(target).suffix.lower() in PACKETS:
+        if count or is_imu or replace(selection, times=(None, None), time="device") != EVERYTHING:
+            raise UsageError(f"{target} holds packets, which are selected by --slice alone")
+        refuse_overwriting([target], sources[0], sensor_id, force=force)
+        _write_packets(sources[0], target, sensor_id, selection.times, as_json=as_json)
+        return
     format_of(target)
-    refuse_overwriting(targets(target), source, sensor_id, force=force)
-    sensor = _detected(source, target) if sensor_id is None else named_sensor(sensor_id)
-    with open_device(source, sensor) as device, Progress() as progress, _packets(source, wanted=with_packets) as packets:
-        written = Written(device, target)
+    refuse_overwriting(targets(target), sources[0], sensor_id, force=force)
+    sensor = _detected(sources[0], target) if sensor_id is None else named_sensor(sensor_id)
+    with open_device(sources[0], sensor) as device:
         if is_imu:
-            samples = joined(list(device.imu()))[:count]
-            if not len(samples):
-                raise _no_data(device, source, target)
-            write_imu(target, samples)
-            note(f"{target}: {len(samples)} samples of the IMU of {device.sensor.id}; {device.stats}")
-            if as_json:
-                emit_json({"sensor": device.sensor.id, "output": target, "samples": len(samples), "stats": device.stats.to_dict()}, None)
-            conclude(device)
-            return
-        scans = itertools.islice(scans_of(device, source, selection), count)
+            summary = _write_imu(device, target, count)
+        else:
+            scans = itertools.islice(scans_of(device, sources[0], selection), count)
+            summary = _write_points(device, target, scans, every_point=every_point, organized=organized, with_packets=with_packets)
+        if as_json:
+            emit_json({"sensor": device.sensor.id, "output": target, **summary, "stats": device.stats.to_dict()}, None)
+        conclude(device)
+
+
+def _write_imu(device: Device, target: str, count: int | None) -> dict[str, Any]:
+    """Write what the IMU felt; what is to be said of it."""
+    samples = joined(list(device.imu()))[:count]
+    if not len(samples):
+        raise _no_data(device, target)
+    write_imu(target, samples)
+    note(f"{target}: {len(samples)} samples of the IMU of {device.sensor.id}; {device.stats}")
+    return {"samples": len(samples)}
+
+
+def _write_packets(source: str, target: str, sensor_id: str | Sensor | None, times: Times, *, as_json: bool) -> None:
+    """Write what was received, as it came."""
+    if is_live(source):
+        raise suggest(UsageError(f"{source} is no file"), f"lidarspec record {quote(source)} -o {quote(target)}")
+    with contextlib.closing(transport(source)) as opened, Progress(size) as progress, replacing(Path(target)) as part:
+        needs_sensor = not opened.datagrams and Path(target).suffix.lower() != ".lsr"  # whose frames are the packets
+        sensor = named_sensor(sensor_id) if sensor_id is not None else _detected(source, target) if needs_sensor else None
+        with recorder_like(opened, source, str(part), sensor, overwrite=True) as file:
+            for chunk in received(opened, times, source):
+                file.keep_up()
+                file.write(chunk)
+                progress(lambda: f"{target}: {file.records} packets", opened.place)
+        if not file.records:
+            raise suggest(WireError(no_bytes(source, opened.warnings)), f"lidarspec info {quote(source)}")
+    for remark in (f"{target}: {file.records} packets, {size(file.bytes)}", *opened.warnings):
+        note(remark)
+    if as_json:
+        emit_json({"output": target, "packets": file.records, "bytes": file.bytes}, None)
+
+
+def _write_points(
+    device: Device, target: str, scans: Iterator[Scan], *, every_point: bool, organized: bool, with_packets: bool
+) -> dict[str, Any]:
+    """Write the points of scans; what is to be said of them."""
+    written = Written(device, target)
+    with Progress(size) as progress, _packets(str(device.source), wanted=with_packets) as packets:
         first = next(scans, None)
         if first is None:
-            raise _no_data(device, source, target)
+            raise _no_data(device, target)
         counted = written.counting(itertools.chain([first], scans), progress, every_point=every_point or organized)
         write(target, counted, every_point=every_point, organized=organized, packets=packets)
-        progress.clear()
-        _sum_up(device, target, written, as_json=as_json)
+    note(f"{written} of {device.sensor.id}; {device.stats}")
+    if written.units:
+        note(f"further columns: {', '.join(f'{name} [{unit}]' if unit else name for name, unit in written.units.items())}")
+    return {"scans": written.scans, "points": written.points, "units": dict(written.units)}
 
 
 @contextlib.contextmanager
@@ -164,10 +213,10 @@ def _packets(source: str, *, wanted: bool) -> Iterator[Iterator[Chunk] | None]:
         yield opened.chunks()
 
 
-def _convert_all(records: Iterable[tuple[batch.Record, bool]], folder: str, *, as_json: bool) -> None:
+def _convert_all(records: Iterable[tuple[batch.Record, bool]], folder: str, files: int, *, as_json: bool) -> None:
     """Say what becomes of each piece, and in the end of all; exit code 1 where one has failed."""
     totals, before, failed = Counter[str](), 0, list[batch.Record]()
-    with Progress() as progress:
+    with Progress("{:.1f} files".format) as progress:
         for record, is_old in records:
             before += is_old
             if "error" in record:
@@ -175,7 +224,7 @@ def _convert_all(records: Iterable[tuple[batch.Record, bool]], folder: str, *, a
                 progress.note(f"{record['source']}: {record['error']}")
                 continue
             totals.update({"files": record["last"], "pieces": 1, "scans": record["scans"], "points": record["points"]})
-            progress(lambda: f"{folder}: {totals['pieces']} pieces, {totals['points']} points")
+            progress(lambda: f"{folder}: {totals['points']} points", (totals["files"] + len(failed), files))
     told = ", ".join(f"{number} {what}" for what, number in totals.items() if what != "pieces" or number > totals["files"])
     note(f"{folder}: {told or 'nothing'}" + f"; {before} pieces were done before" * bool(before) + f"; {len(failed)} failed" * bool(failed))
     if as_json:
@@ -194,38 +243,17 @@ def _detected(source: str, target: str) -> Sensor:
         raise error if given is None else nearest_fault(given) from None
 
 
-def _sum_up(device: Device, target: str, written: Written, *, as_json: bool) -> None:
-    note(f"{written} of {device.sensor.id}; {device.stats}")
-    if written.units:
-        note(f"further columns: {', '.join(f'{name} [{unit}]' if unit else name for name, unit in written.units.items())}")
-    if as_json:
-        stats = device.stats.to_dict()
-        emit_json(
-            {
-                "sensor": device.sensor.id,
-                "output": target,
-                "scans": written.scans,
-                "points": written.points,
-                "units": dict(written.units),
-                "stats": stats,
-            },
-            None,
-        )
-    conclude(device)
-
-
-def _no_data(device: Device, source: str, target: str) -> Exception:
+def _no_data(device: Device, target: str) -> Exception:
     """Why nothing came out: an empty file, a damaged frame, another sensor's bytes, or no lidar's at all."""
-    sensor, stats = device.sensor, device.stats
+    sensor, stats, source = device.sensor, device.stats, str(device.source)
     if stats.bytes_in == 0:
         return suggest(WireError(no_bytes(source, device.warnings), sensor=sensor.id), f"lidarspec show {sensor.id}")
     if (failure := stats.failure(sensor.id)) is not None:
         return failure
     instead = fits_instead(sensor, source)
     if instead is not None:
-        return suggest(
-            WireError(f"{source} {instead[0]}", sensor=sensor.id), f"lidarspec convert {quote(source)} {quote(target)} {instead[1]}"
-        )
+        error = WireError(f"{source} {instead[0]}", sensor=sensor.id)
+        return suggest(error, f"lidarspec convert {quote(source)} {quote(target)} {instead[1]}")
     given = again(source) if not stats.frames else None
     if given is not None:
         return no_frame(sensor, given)
@@ -241,15 +269,15 @@ def info(file: str, as_json: bool, output: str | None) -> None:
     FILE is anything that is read: a recording, a capture, a robotics log, bytes. Of a long one the beginning is looked at, and of a
     recording the end.
     """
-    found = contents(file)
+    held = contents(file)
     if as_json:
-        emit_json(found.to_dict(), output)
+        emit_json(held.to_dict(), output)
     else:
-        lines = [f"{found.path}: {found.kind}, {size(found.size)}", *(f"  {word:<8}  {text}" for word, text in shown(found))]
+        lines = [f"{held.path}: {held.kind}, {size(held.size)}", *(f"  {word:<8}  {text}" for word, text in shown(held))]
         emit("\n".join(lines), output)
-    for warning in found.warnings:
+    for warning in held.warnings:
         note(warning)
-    if not any(content.sensors for content in found.contents):
+    if not any(content.sensors for content in held.contents):
         raise click.exceptions.Exit(NO_DATA)
 
 

@@ -20,21 +20,34 @@ Function = TypeVar("Function", bound=Callable[..., Any])
 
 
 def sensor_option(function: Function) -> Function:
-    """``-s/--sensor``, ``-O`` and ``--calibration``, with which it is configured: the verb is given an id, or the sensor so configured."""
+    """``-s/--sensor``, and what it is configured with."""
+    return _named(configuring(function))  # type: ignore[return-value]
+
+
+def configuring(function: Function) -> Function:
+    """``-O`` and ``--calibration``, with which the sensor is configured: the verb is given an id, or the sensor so configured."""
 
     @functools.wraps(function)
     def chosen(*args: Any, sensor_id: str | None, options: Sequence[str], calibration: str | None, **others: Any) -> Any:
         return function(*args, sensor_id=configured(sensor_id, options, calibration), **others)
 
-    return sensor_words(chosen)  # type: ignore[return-value]
+    return _optional(chosen)  # type: ignore[return-value]
 
 
 def sensor_words(function: Callable[..., Any]) -> Callable[..., Any]:
     """The same options, as they are typed: `sensor_id`, `options` and `calibration`, as `configured` takes them."""
+    return _named(_optional(function))
+
+
+def _named(function: Callable[..., Any]) -> Callable[..., Any]:
+    told = "The sensor: an id, an alias, or a file ./mysensor.py."
+    return click.option("-s", "--sensor", "sensor_id", metavar="ID", help=told)(function)
+
+
+def _optional(function: Callable[..., Any]) -> Callable[..., Any]:
     unit = click.option("--calibration", metavar="FILE", help="The unit's own calibration, short for -O calibration=FILE.")(function)
     told = "An option of the sensor, such as calibration=FILE or answer=FRAME; may be given again."
-    chosen = click.option("-O", "--option", "options", metavar="NAME=VALUE", multiple=True, help=told)(unit)
-    return click.option("-s", "--sensor", "sensor_id", metavar="ID", help="The sensor: an id, an alias, or a file ./mysensor.py.")(chosen)
+    return click.option("-O", "--option", "options", metavar="NAME=VALUE", multiple=True, help=told)(unit)
 
 
 def configured(sensor_id: str | None, options: Sequence[str], calibration: str | None) -> str | Sensor | None:

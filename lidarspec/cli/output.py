@@ -12,14 +12,17 @@ import time
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from pathlib import Path
 from textwrap import indent
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from rich.console import Console
 from rich.text import Text
 
-from lidarspec.cli.terminal import note, say
+from lidarspec.cli.terminal import note, say, voice
 from lidarspec.errors import printable, system_errors
 from lidarspec.explaining.listing import Line, folded, text as plain_text
+
+if TYPE_CHECKING:
+    from rich.progress import Progress as Bar
 
 #: seconds between two lines.
 PERIOD = 0.2
@@ -40,20 +43,31 @@ STYLES = {
 
 
 class Progress(contextlib.AbstractContextManager["Progress"]):
-    """The line, on standard error; a context manager that takes it away at the end."""
+    """A line on standard error, where that is a terminal; a context manager that takes it away at the end.
 
-    def __init__(self) -> None:
-        self._is_shown = sys.stderr.isatty()
-        self._due, self._width = 0.0, 0
+    Args:
+        unit: an amount of work in words.
+    """
 
-    def __call__(self, text: Callable[[], str]) -> None:
-        """Show a text, made only where it is time for one."""
+    def __init__(self, unit: Callable[[float], str] = str) -> None:
+        self._is_shown, self._due = sys.stderr.isatty() and voice.loudness >= 0, 0.0
+        self._unit = unit
+        self._bar: Bar | None = None
+
+    def __call__(self, text: Callable[[], str], done: tuple[float, float] | None = None) -> None:
+        """Show a text, made only where it is time for one; a bar, the rate and the time that is left, where it is known what of how much
+        is done."""
         if not self._is_shown or time.monotonic() < self._due:
             return
         self._due = time.monotonic() + PERIOD
-        line = text()[: shutil.get_terminal_size().columns - 1]
-        note(line.ljust(self._width), begin="\r", nl=False)
-        self._width = len(line)
+        if self._bar is None:
+            self._bar = _bar(is_measured=done is not None)
+        (task,) = self._bar.tasks
+        rate = f"{self._unit(task.speed)}/s" if task.speed else ""
+        completed, total = done or (0, 0)
+        self._bar.update(task.id, description=printable(text()), completed=completed, total=total, rate=rate)
+        self._bar.start()
+        self._bar.refresh()
 
     def follow(self, remarks: Iterable[str], text: Callable[[], str]) -> None:
         """Show a text while something goes on, and what it remarks; empty remarks only pass the time."""
@@ -69,12 +83,25 @@ class Progress(contextlib.AbstractContextManager["Progress"]):
 
     def clear(self) -> None:
         """Take the line away."""
-        if self._width:
-            note("", begin=f"\r{' ' * self._width}\r", nl=False)
-            self._width, self._due = 0, 0.0
+        if self._bar is not None:
+            self._bar.stop()
+            self._bar, self._due = None, 0.0
 
     def __exit__(self, *_: object) -> None:
         self.clear()
+
+
+def _bar(*, is_measured: bool) -> Bar:
+    """A line of text, with a bar behind it where it is measured how far it is."""
+    from rich.progress import BarColumn, Progress as Bar, TaskProgressColumn, TextColumn, TimeRemainingColumn
+    from rich.table import Column
+
+    text = TextColumn("{task.description}", markup=False, table_column=Column(no_wrap=True, ratio=1))
+    rate = TextColumn("{task.fields[rate]}", markup=False)
+    columns = (text, BarColumn(20), TaskProgressColumn(), rate, TimeRemainingColumn(compact=True)) if is_measured else (text,)
+    bar = Bar(*columns, console=Console(stderr=True), transient=True, auto_refresh=False, expand=True)
+    bar.add_task("", rate="")
+    return bar
 
 
 def size(number: float) -> str:

@@ -31,7 +31,9 @@ from lidarspec.transports.serving import LATE, Replay
 
 @click.command()
 @click.argument("source", metavar="SOURCE")
-@click.option("-o", "--output", "target", metavar="FILE", required=True, help="The file: .lsr, .pcap for Wireshark, .bin for bytes alone.")
+@click.option(
+    "-o", "--output", "target", metavar="FILE", required=True, help="The file: .lsr, .pcap and .pcapng for Wireshark, .bin for bytes."
+)
 @sensor_option
 @click.option("-t", "--duration", "seconds", type=DURATION, help="How long, such as 10s; until Ctrl-C by default.")
 @count_option("packets (the sensor's data packets, or datagrams) at least")

@@ -9,6 +9,7 @@ import functools
 import importlib
 import os
 import sys
+import time
 from collections.abc import Sequence
 from typing import Any, NoReturn
 
@@ -16,7 +17,7 @@ import click
 
 from lidarspec._version import __version__
 from lidarspec.cli.failures import INTERRUPTED, report
-from lidarspec.cli.terminal import note, say, silence, streams
+from lidarspec.cli.terminal import note, say, silence, streams, voice
 from lidarspec.entry_points import VERBS as PLUGGED, EntryPoint, entry_points
 from lidarspec.errors import did_you_mean
 
@@ -62,6 +63,23 @@ GROUPS = {
 VERBS = {verb: place for verbs in GROUPS.values() for verb, place in verbs.items()}
 
 
+def _spoken(loudness: int, *names: str, help: str) -> click.Option:
+    """An option that says how much is said."""
+
+    def chosen(ctx: click.Context, param: click.Parameter, value: bool) -> None:
+        if value:
+            voice.loudness = loudness
+
+    return click.Option(names, is_flag=True, expose_value=False, callback=chosen, help=help)
+
+
+#: the options of all verbs, but for those that have one of the same name.
+SPOKEN = (
+    _spoken(-1, "-q", "--quiet", help="No remarks, and nothing on how far it is; failures are told all the same."),
+    _spoken(1, "-v", "--verbose", help="Also how long it took, the memory that it needed, and where in the code a failure arose."),
+)
+
+
 @functools.cache
 def added() -> dict[str, EntryPoint]:
     """The verbs of installed plugins, none of which is loaded for it; ours come first."""
@@ -83,6 +101,8 @@ class Verbs(click.Group):
             found = verb(added()[cmd_name])
         else:
             return None
+        known = {param.name for param in found.params}
+        found.params += [option for option in SPOKEN if option.name not in known]
         if ctx.resilient_parsing:
             from lidarspec.cli.completion import attach
 
@@ -125,9 +145,12 @@ def _from(entry: EntryPoint) -> str:
 
 
 def _run(group: click.Group, words: list[str]) -> int:
+    began = time.monotonic()
     try:
         with streams(), group.make_context("lidarspec", words) as ctx:
             group.invoke(ctx)
+            if voice.loudness > 0:
+                note(_spent(time.monotonic() - began))
         return 0
     except click.exceptions.Exit as done:
         return done.exit_code
@@ -139,6 +162,16 @@ def _run(group: click.Group, words: list[str]) -> int:
         return 0
     except Exception as error:
         return report(error, next((word for word in words if word in VERBS or word in added()), ""))
+
+
+def _spent(seconds: float) -> str:
+    """The time that a verb took, and its memory, where the system counts it."""
+    try:
+        import resource
+    except ImportError:
+        return f"{seconds:.1f} s"
+    unit = 1 if sys.platform == "darwin" else 1024
+    return f"{seconds:.1f} s, {resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * unit / 1e6:.0f} MB of memory"
 
 
 @click.group(cls=Verbs, invoke_without_command=True, context_settings={"help_option_names": ["-h", "--help"], "max_content_width": 120})
@@ -154,6 +187,9 @@ def main(ctx: click.Context) -> None:
         from lidarspec.cli.sensors import guide
 
         say(guide())
+
+
+main.params += SPOKEN
 
 
 @click.command()

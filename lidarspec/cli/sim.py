@@ -15,10 +15,11 @@ import numpy as np
 from rich.text import Text
 
 from lidarspec.cli.failures import FINDINGS
-from lidarspec.cli.options import DURATION, SHARE, count_option, sensor_option
+from lidarspec.cli.options import DURATION, SHARE, configuring, count_option, sensor_option
 from lidarspec.cli.output import Progress, drawn, emit_json, size
 from lidarspec.cli.terminal import note, say
 from lidarspec.device.demo import Demonstration, demonstrate
+from lidarspec.discovery.detect import chosen
 from lidarspec.errors import NO_SENSORS, UsageError, suggest
 from lidarspec.plugins import registry, sensor as named_sensor
 from lidarspec.recording.recorders import SUFFIXES
@@ -38,11 +39,13 @@ from lidarspec.view.polar import look, picture
 IN_A_FILE = 10.0
 #: cells of the picture at most, and lines that are kept for the summary.
 WIDEST, HIGHEST, SUMMARY = 100, 42, 8
+PLACES = f"pty, udp://HOST:PORT, tcp://HOST:PORT, or a file ({', '.join(SUFFIXES)}).  [default: pty or udp]"
 
 
 @click.command(short_help="A simulated sensor on a serial port, UDP, TCP or in a file.")
 @click.argument("sensor_id", metavar="SENSOR")
-@click.option("--to", metavar="PLACE", help="pty, udp://HOST:PORT, tcp://HOST:PORT, or a file (.lsr, .pcap, .bin).  [default: pty or udp]")
+@configuring
+@click.option("--to", metavar="PLACE", help=PLACES)
 @click.option("--link", metavar="PATH", help="A symbolic link that leads to the pty.")
 @click.option("-t", "--duration", type=DURATION, help="End after so long; of a file, how much goes in.  [default: never; 10s]")
 @click.option("--rate", metavar="FACTOR", default="1", show_default=True, help="How many times faster than in reality, or max.")
@@ -58,7 +61,7 @@ WIDEST, HIGHEST, SUMMARY = 100, 42, 8
 @click.option("--force", is_flag=True, help="Write over a file that exists.")
 @click.option("--json", "as_json", is_flag=True, help="Print as JSON where the sensor is.")
 def sim(
-    sensor_id: str,
+    sensor_id: str | Sensor,
     to: str | None,
     link: str | None,
     duration: float | None,
@@ -97,7 +100,7 @@ def sim(
     try:
         opened = simulated_outlet(sensor, place, link)
     except UsageError as error:
-        raise suggest(error, f"lidarspec sim {shlex.quote(str(sensor_id))} --to {'udp://' + HERE if sensor.datagrams else 'pty'}") from None
+        raise suggest(error, f"lidarspec sim {sensor.id} --to {'udp://' + HERE if sensor.datagrams else 'pty'}") from None
     try:
         controls = {name: control.place for name, control in opened.controls.items()}
         _tell(sensor, opened.place, opened.source, controls, as_json=as_json)
@@ -111,7 +114,7 @@ def sim(
 
 def _tell(sensor: Sensor, where: str, source: str, controls: Mapping[str, str], *, as_json: bool) -> None:
     """Where the sensor is, with its other links, and what to type next."""
-    following = f"lidarspec view {shlex.quote(source)} -s {sensor.id}"
+    following = f"lidarspec view {shlex.quote(source)} {chosen(sensor)}"
     if as_json:
         emit_json(
             {"sensor": sensor.id, "place": where, "source": source, **({"controls": controls} if controls else {}), "next": following}, None

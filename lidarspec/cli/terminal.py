@@ -18,6 +18,18 @@ import click
 
 from lidarspec.errors import SourceError, printable
 
+
+class Voice:
+    """How much is said beside the data.
+
+    Attributes:
+        loudness: -1 nothing, 1 more than by default; each command begins with 0.
+    """
+
+    loudness = 0
+
+
+voice = Voice()
 #: what a line changes about colours, and nothing else.
 _COLOURS = re.compile(r"(\x1b\[[0-9;]*m)")
 
@@ -38,14 +50,12 @@ def say(content: str | bytes, *, nl: bool = True, colour: bool | None = None) ->
         click.echo(content, nl=nl, color=colour)
 
 
-def note(text: str, *, nl: bool = True, begin: str = "") -> None:
-    """Print a remark beside the data on standard error, if anybody reads there.
-
-    Args:
-        begin: what goes before it as it stands.
-    """
+def note(text: str) -> None:
+    """Print a remark beside the data on standard error, if anybody reads there and wants to."""
+    if voice.loudness < 0:
+        return
     try:
-        click.echo(begin + printable(text), nl=nl, err=True)
+        click.echo(printable(text), err=True)
     except (OSError, ValueError):
         _lose(sys.stderr)
 
@@ -57,6 +67,7 @@ def streams() -> Iterator[None]:
     Raises:
         BrokenPipeError, SourceError: as `say`.
     """
+    voice.loudness = 0
     for name, flags in (("stdin", os.O_RDONLY), ("stdout", os.O_RDONLY), ("stderr", os.O_WRONLY)):
         if getattr(sys, name) is None:  # a file opened later would take its number, and what is printed; output that was closed is refused
             setattr(sys, name, open(os.open(os.devnull, flags), "r" if name == "stdin" else "w", closefd=False))  # noqa: SIM115

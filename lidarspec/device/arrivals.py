@@ -96,6 +96,11 @@ class Input(Protocol):
         """Chunks that have arrived and wait to be decoded; None where nothing waits."""
         return None
 
+    @property
+    def place(self) -> tuple[int, int] | None:
+        """How many bytes of the stored file were read, and how many there are; None where nobody knows."""
+        return None
+
     def skip(self, at: int) -> bool:
         """Pass over what arrived before a time, ns since 1970, where that can be done without reading it: whether it is."""
         return False
@@ -218,6 +223,10 @@ class FileInput(Input):
         stats = self.decoder.stats
         stats.foreign, stats.disconnects, stats.unread = self._transport.foreign, self._transport.disconnects, self._transport.unread
         return stats
+
+    @property
+    def place(self) -> tuple[int, int] | None:
+        return self._transport.place
 
     def next(self, wait: float) -> Arrival | None:
         found = next(self._arrivals, None)

@@ -22,6 +22,7 @@ from lidarspec.framing.results import Counters
 from lidarspec.packets.imu import ImuSamples
 from lidarspec.packets.packets import Packets
 from lidarspec.scans.scans import Scan
+from lidarspec.scans.selection import EVERYTHING, Selection, Sieve
 from lidarspec.spec.sensor import Sensor
 
 T = TypeVar("T")
@@ -87,16 +88,26 @@ class AsyncDevice:
         async for packets in self._drained(feed):
             yield packets
 
-    async def scans(self) -> AsyncIterator[Scan]:
+    async def scans(self, *, select: Selection = EVERYTHING) -> AsyncIterator[Scan]:
         """Every scan; the first and last piece, and those before and after an interruption, are marked ``complete=False``.
+
+        Args:
+            select: which of them, and what of each; those before the first that is wanted are read.
 
         Raises:
             SourceError: where a file has been read to its end before.
+            UsageError: where none of its scans is wanted.
         """
         if self._scans is None:
             self._scans = _Feed(self.device.scans(wait=STEP), lambda scan: scan is None)
+        sieve = Sieve(select, self.device.source)
         async for scan in self._drained(self._scans):
-            yield scan
+            if (wanted := sieve.take(scan)) is not None:
+                yield wanted
+            if sieve.ended:
+                break
+        if sieve.is_empty:
+            raise sieve.missing()
 
     async def imu(self) -> AsyncIterator[ImuSamples]:
         """What the sensor's IMU felt, in batches, until the input ends or the device is closed.

@@ -204,6 +204,11 @@ class Device(Closing):
         return self._input.queued
 
     @property
+    def place(self) -> tuple[int, int] | None:
+        """How many bytes of a file were read, as it is stored, compressed or not, and how many there are; None where nobody knows."""
+        return self._input.place
+
+    @property
     def is_live(self) -> bool:
         """Whether data come at their own pace, and not from a file."""
         return self._input.is_live

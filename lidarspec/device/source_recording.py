@@ -48,7 +48,7 @@ class SourceRecording:
 
     Args:
         source: any SOURCE.
-        target: an .lsr, .pcap or .bin file.
+        target: an .lsr, .pcap, .pcapng or .bin file.
         sensor: whose bytes they are; without it they are recorded as they come.
         seconds, count: when it ends: after a time, or so many data packets of the sensor, or datagrams; None: never.
         start: whether the sensor is sent the commands for its start and end.

@@ -400,7 +400,7 @@ def detected(source: str | Path) -> Sensor:
 
 def chosen(sensor: Sensor) -> str:
     """What to type for a sensor and what it is configured with."""
-    return " ".join([f"-s {sensor.id}", *(f"-O {name}={value}" for name, value in sensor.options.items())])
+    return " ".join([f"-s {sensor.id}", *(f"-O {quote(f'{name}={value}')}" for name, value in sensor.options.items())])
 
 
 def names(found: Verdict) -> list[str]:

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import contextlib
 import os
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from shlex import quote
@@ -32,7 +32,7 @@ LOOKED_AT, PACKETS, DECODED = 1 << 26, 1 << 18, 1 << 24
 FLOWS = 6
 #: later than any arrival, ns since 1970.
 _END = (1 << 63) - 1
-KINDS = {
+KINDS: Mapping[type[Transport], str] = {
     RecordingTransport: "a recording",
     CaptureTransport: "a capture",
     StreamCaptureTransport: "a capture of a byte stream",
@@ -158,7 +158,7 @@ def contents(path: str | Path) -> Contents:
             UsageError(f"{path} is no file"), f"lidarspec detect {quote(str(path))}" if str(path) != "-" else "lidarspec info FILE"
         )
     with contextlib.closing(transport(path)) as opened:
-        kind = next((what for known, what in KINDS.items() if isinstance(opened, known)), "bytes as a sensor sent them")
+        kind = KINDS.get(type(opened), "bytes as a sensor sent them")
         file = str(path).partition("?")[0] if not os.path.exists(path) else str(path)
         header = opened.header if isinstance(opened, RecordingTransport) else None
         found = Contents(str(path), kind, _size(Path(file)), header)
@@ -262,5 +262,6 @@ def _told(content: Content) -> Iterator[tuple[str, str]]:
         if reading.speed_hz is not None:
             yield "scans", f"{reading.speed_hz:.2f} Hz, {reading.points or 0:.0f} points each, {reading.valid or 0:.0f} of them valid"
         lost = "" if reading.loss_rate is None else f", lost {reading.loss_rate:.3%}"
-        yield "frames", f"wrong {reading.error_rate:.3%}{lost}, bytes in none of them {reading.skipped_rate:.3%}"
+        rest = f", bytes in none of them {reading.skipped_rate:.3%}" * (content.share is None)
+        yield "frames", f"wrong {reading.error_rate:.3%}{lost}{rest}"
     yield "next", content.command

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import itertools
 from collections.abc import Iterable, Mapping
 from functools import partial
 from pathlib import Path
@@ -12,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lidarspec.errors import UsageError, library, suggest
-from lidarspec.formats.writing import GPS_EPOCH, columns_of
+from lidarspec.formats.writing import GPS_EPOCH, behind, columns_of
 from lidarspec.scans.scans import Scan
 from lidarspec.transports.protocol import Format
 
@@ -25,7 +26,7 @@ STEP, NEAR = 1e-4, 1e5
 #: ns since 1970 at what adjusted standard GPS time counts from.
 EPOCH = GPS_EPOCH + 10**18
 #: points put together at once; the farthest step, the largest intensity, the last number of a return, and the flag of what is withheld.
-ROWS, FARTHEST, BRIGHTEST, LAST, WITHHELD = 1 << 15, (1 << 31) - 1, 0xFFFF, 15, 1 << 2
+ROWS, FARTHEST, BRIGHTEST, LAST, WITHHELD = 1 << 17, (1 << 31) - 1, 0xFFFF, 15, 1 << 2
 
 
 def _write(path: Path, scans: Iterable[Scan], *, every_point: bool, is_compressed: bool) -> None:
@@ -49,14 +50,15 @@ def _write(path: Path, scans: Iterable[Scan], *, every_point: bool, is_compresse
             own["scan"] = np.full(len(own["x"]), number, np.uint32)
             if writer is None:
                 further = _describe(laspy, header, own, scan)
-                rows = np.zeros(ROWS, header.point_format.dtype())
+                buffers = itertools.cycle(np.zeros((2, ROWS), header.point_format.dtype()))  # of which one is written, one is filled
                 writer = files.enter_context(opened())
+                write = files.enter_context(behind(writer.write_points))
             own["returns"] = _returns(own)
             own["time"] = own.get("time", np.zeros(len(own["x"]))) + (scan.stamp_ns - EPOCH) * 1e-9
             for start in range(0, len(own["x"]), ROWS):
                 part = {name: column[start : start + ROWS] for name, column in own.items()}
-                _fill(record := rows[: len(part["x"])], part, further, header.offsets)
-                writer.write_points(laspy.PackedPointRecord(record, header.point_format))
+                _fill(record := next(buffers)[: len(part["x"])], part, further, header.offsets)
+                write(laspy.PackedPointRecord(record, header.point_format))
         if writer is None:
             opened().close()
 

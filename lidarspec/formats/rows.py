@@ -10,8 +10,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from lidarspec.formats.writing import columns_of, picture
-from lidarspec.points.cloud import STRUCTURED
+from lidarspec.formats.writing import behind, columns_of, picture
+from lidarspec.points.cloud import STRUCTURED, PointCloud
 from lidarspec.scans.scans import Scan, handed_out
 
 #: columns that rows begin with; a sensor's further ones follow.
@@ -60,13 +60,20 @@ class Rows:
         self._scans = itertools.chain(handed_out(first), scans)
 
     def __iter__(self) -> Iterator[NDArray[Any]]:
+        return itertools.starmap(self.filled, self.parts())
+
+    def parts(self) -> Iterator[tuple[Mapping[str, NDArray[Any]], PointCloud]]:
+        """The columns of each scan, and its points, of which `filled` makes rows."""
         for number, scan in enumerate(self._scans):
-            columns = self._columns(scan, number, self.dtype.names or ())
-            rows = np.zeros(len(columns["x"]), self.dtype)
-            for name, column in columns.items():
-                rows[name] = column
-            self.length += len(rows)
-            yield picture(rows, scan.points).reshape(-1) if self.shape else rows
+            yield self._columns(scan, number, self.dtype.names or ()), scan.points
+
+    def filled(self, columns: Mapping[str, NDArray[Any]], points: PointCloud) -> NDArray[Any]:
+        """The rows of a scan, which are counted."""
+        rows = np.zeros(len(columns["x"]), self.dtype)
+        for name, column in columns.items():
+            rows[name] = column
+        self.length += len(rows)
+        return picture(rows, points).reshape(-1) if self.shape else rows
 
     def _columns(self, scan: Scan, number: int, names: Sequence[str]) -> dict[str, NDArray[Any]]:
         """Those of some columns that the scan has, and its number, of the points that are written."""
@@ -78,10 +85,15 @@ def write_rows(path: Path, rows: Rows, header: Callable[[Rows], bytes]) -> None:
     """Write rows behind a header, which is made again when they are counted: its length must not depend on their number."""
     with path.open("wb") as file:
         file.write(header(rows))
-        for block in rows:
-            data = block.view(np.uint8).data
+
+        def append(part: tuple[Mapping[str, NDArray[Any]], PointCloud]) -> None:
+            data = rows.filled(*part).view(np.uint8).data
             for start in range(0, len(data), PIECE):
                 file.write(data[start : start + PIECE])
+
+        with behind(append) as write:
+            for part in rows.parts():
+                write(part)
         file.seek(0)
         file.write(header(rows))
 

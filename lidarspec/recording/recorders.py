@@ -1,6 +1,6 @@
 """Recorders: what arrives over a link, and what is sent, taken at the speed of the capture and brought into a file.
 
-The suffix of the file says which: .lsr holds everything, .pcap packets for Wireshark, .bin the bytes alone. All of them grow by
+The suffix of the file says which: .lsr holds everything, .pcap and .pcapng packets for Wireshark, .bin the bytes alone. All of them grow by
 whole records, which a thread of their own writes (`appending`).
 """
 
@@ -16,8 +16,8 @@ from typing import Any, Literal
 
 from lidarspec._version import __version__
 from lidarspec.captures.ip import ETHERNET
-from lidarspec.captures.pcap import NOBODY, USER_LINKS, Datagram, datagram_record
-from lidarspec.captures.records import capture_head, packet_record, record_size
+from lidarspec.captures.pcap import NOBODY, USER_LINKS, Datagram, datagram_frame
+from lidarspec.captures.records import WRITINGS
 from lidarspec.errors import UnknownFormat, UsageError
 from lidarspec.framing.decoder import Decoder
 from lidarspec.framing.results import Found
@@ -28,7 +28,7 @@ from lidarspec.spec.description import Spec
 from lidarspec.spec.links import Udp
 from lidarspec.transports.protocol import Chunk, Transport
 
-SUFFIXES = (".lsr", ".pcap", ".bin")
+SUFFIXES = (".lsr", *WRITINGS, ".bin")
 #: bytes between frames that make one packet at most.
 LARGEST_GAP = 1 << 16
 
@@ -112,9 +112,10 @@ class PcapRecorder(Appender):
     """
 
     def __init__(self, path: str | Path, *, port: int = 0, overwrite: bool = False) -> None:
-        super().__init__(path, record_size, overwrite=overwrite)
+        self._writing = WRITINGS[check_suffix(path)]
+        super().__init__(path, self._writing.size, overwrite=overwrite)
         self._receiver = (NOBODY[0], port)
-        self._put(capture_head(ETHERNET))
+        self._put(self._writing.head(ETHERNET))
 
     def write(self, chunk: Chunk, direction: Literal["in", "out"] = "in") -> None:
         """Take a datagram that was received; one that was sent is none of the sensor's, and is left out.
@@ -124,7 +125,7 @@ class PcapRecorder(Appender):
         """
         if direction == "in":
             datagram = Datagram(chunk.data, chunk.at or 0, chunk.sender or NOBODY, chunk.receiver or self._receiver)
-            self._put(datagram_record(datagram), len(chunk.data))
+            self._put(self._writing.record(datagram_frame(datagram), datagram.at), len(chunk.data))
 
 
 class FrameRecorder(Appender):
@@ -140,8 +141,9 @@ class FrameRecorder(Appender):
     def __init__(self, path: str | Path, sensor: Spec, *, overwrite: bool = False) -> None:
         self._decoder = Decoder(sensor, stream=True)
         self._held, self._base, self._at = bytearray(), 0, 0
-        super().__init__(path, record_size, overwrite=overwrite)
-        self._put(capture_head(USER_LINKS[0]))
+        self._writing = WRITINGS[check_suffix(path)]
+        super().__init__(path, self._writing.size, overwrite=overwrite)
+        self._put(self._writing.head(USER_LINKS[0]))
 
     def write(self, chunk: Chunk, direction: Literal["in", "out"] = "in") -> None:
         """Take bytes that were received; those that were sent are left out."""
@@ -166,7 +168,7 @@ class FrameRecorder(Appender):
             size -= part
 
     def _packet(self, size: int, at: int) -> None:
-        self._put(packet_record(bytes(self._held[:size]), at), size)
+        self._put(self._writing.record(bytes(self._held[:size]), at), size)
         del self._held[:size]
         self._base += size
 
@@ -215,11 +217,11 @@ def recorder(
     baud: int | None = None,
     overwrite: bool = False,
 ) -> Appender:
-    """The open recorder for a file, by its suffix: .lsr, .pcap or .bin.
+    """The open recorder for a file, by its suffix: .lsr, .pcap, .pcapng or .bin.
 
     Args:
         path: the new file.
-        sensor: whose bytes these are, as far as it is known; a .pcap of a byte stream needs it.
+        sensor: whose bytes these are, as far as it is known; a capture of a byte stream needs it.
         source: where they come from, for the header of an .lsr.
         datagrams: whether chunks are datagrams, or pieces of a stream.
         baud: of a serial line, for the header of an .lsr.
@@ -231,7 +233,7 @@ def recorder(
         SourceError: where it cannot be made.
     """
     suffix = check_suffix(path)
-    if suffix == ".pcap" and not datagrams:
+    if suffix in WRITINGS and not datagrams:
         if not sensor:
             raise UsageError(f"{path}: a capture of a byte stream has a packet for each frame: name the sensor with -s, or record an .lsr")
         return FrameRecorder(path, sensor if isinstance(sensor, Spec) else named_sensor(sensor), overwrite=overwrite)
@@ -240,7 +242,7 @@ def recorder(
     if suffix == ".lsr":
         return Recorder(path, sensor, source, datagrams=datagrams, baud=baud, overwrite=overwrite)
     port = declared_port(sensor if isinstance(sensor, Spec) else None)
-    return PcapRecorder(path, port=port, overwrite=overwrite) if suffix == ".pcap" else RawRecorder(path, overwrite=overwrite)
+    return PcapRecorder(path, port=port, overwrite=overwrite) if suffix in WRITINGS else RawRecorder(path, overwrite=overwrite)
 
 
 def recorder_for(target: RecordTo, sensor: Spec | str | None, source: str | Path, opened: Transport) -> tuple[Log, bool]:

@@ -30,6 +30,7 @@ if TYPE_CHECKING:
     from lidarspec.packets.imu import Waiting
     from lidarspec.packets.packets import Packets
     from lidarspec.scans.scans import Scan
+    from lidarspec.scans.selection import Selection
 
 #: bytes of something learned at most, where a file says it.
 LARGEST = 1 << 20
@@ -241,7 +242,7 @@ class Sensor(Spec):
             imu.add(frames, packets, whole=True)
         return packets, None if imu is None else imu.waiting
 
-    def scans(self, data: Any, *, backend: str = "auto") -> Iterator[Scan]:
+    def scans(self, data: Any, *, backend: str = "auto", select: Selection | None = None) -> Iterator[Scan]:
         """Every scan of the data; the first and last piece are marked ``complete=False``.
 
         Where there is no data frame in the data, or `points` raises at some of the packets, a Python warning says so.
@@ -249,18 +250,22 @@ class Sensor(Spec):
         Args:
             data: bytes (a stream), an iterable of datagrams, or an (n, size) uint8 array of datagrams.
             backend: "auto", "numpy", "jit" or "construct": the same results.
+            select: which scans, and what of each.
 
         Raises:
-            UsageError: for a text or a path, an unknown back end, or a sensor that has no frames before it is configured.
+            UsageError: for a text or a path, an unknown back end, a sensor that has no frames before it is configured, or where none of
+                the scans is wanted.
         """
         from lidarspec.scans.scans import scans_of
+        from lidarspec.scans.selection import Sieve
 
         packets, imu = self._decoded(data, None, backend)
         if packets.stats.bytes_in and not len(packets):
             warnings.warn(f"{self.id}: no {packets.frame} frame in the data ({packets.stats}): is it of another sensor?", stacklevel=2)
-        return self._followed(scans_of(self, [packets], imu), packets)
+        found = scans_of(self, [packets], imu)
+        return self._followed(found if select is None else Sieve(select, "the data").of(found), packets)
 
-    def _followed(self, scans: Iterator[Scan], packets: Packets) -> Iterator[Scan]:
+    def _followed(self, scans: Iterator[Any], packets: Packets) -> Iterator[Scan]:
         """Scans, and behind them what the plugin failed at, and that they have no end."""
         yield from scans
         if packets.stats.unended:

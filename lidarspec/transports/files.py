@@ -282,6 +282,13 @@ def open_file(path: str, *, sender: str | None = None, member: str = "") -> File
         if log is not None:
             return BagTransport(path, log, sender=sender)
         undo.pop_all()  # the transport closes it
+    found = _by_content(path, name, file, start, sender)
+    found.stored = plain
+    return found
+
+
+def _by_content(path: str, name: str, file: BinaryIO, start: bytes, sender: str | None) -> FileTransport | RecordingTransport:
+    """The transport for what a file begins with."""
     if start.startswith(MAGIC):
         return RecordingTransport(path, file, sender=sender)
     if is_stream_capture(start):

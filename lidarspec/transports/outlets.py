@@ -597,7 +597,7 @@ def _data_outlet(sensor: Sensor, place: str, link: str | Path | None) -> Outlet:
         return PtyOutlet(link)
     scheme = place.partition("://")[0] if "://" in place else ""
     if scheme not in ("udp", "tcp"):
-        raise UsageError(f"{place!r} is no destination: pty, udp://HOST:PORT, tcp://HOST:PORT, or a file (.lsr, .pcap, .bin)")
+        raise UsageError(f"{place!r} is no destination: pty, udp://HOST:PORT, tcp://HOST:PORT, or a file (.lsr, .pcap, .pcapng, .bin)")
     if link is not None:
         raise UsageError("a link leads to a pseudo-terminal: it goes with pty alone")
     host, port = _host_and_port(place)

@@ -6,6 +6,7 @@ A `Transport` is the only place for input and output: it gives `Chunk`s and take
 
 from __future__ import annotations
 
+import os
 import re
 from abc import ABC, abstractmethod
 from collections import defaultdict
@@ -13,7 +14,7 @@ from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from types import TracebackType
-from typing import Any, Self
+from typing import Any, BinaryIO, Self
 
 from lidarspec.errors import SourceError, UsageError
 
@@ -137,6 +138,7 @@ class Transport(ABC):
         kernel_drops: datagrams that the system threw away, so far, since nobody fetched them in time.
         disconnects: interruptions of the line that a recording tells of, so far.
         unread: bytes of a damaged file that could not be read, so far.
+        stored: the file that is read, as it is stored: one that unpacks it stands before it.
     """
 
     datagrams: bool = False
@@ -146,6 +148,7 @@ class Transport(ABC):
     kernel_drops: int = 0
     disconnects: int = 0
     unread: int = 0
+    stored: BinaryIO | None = None
 
     @abstractmethod
     def chunks(self) -> Iterator[Chunk]:
@@ -154,6 +157,15 @@ class Transport(ABC):
         Raises:
             SourceError: where it cannot be read.
         """
+
+    @property
+    def place(self) -> tuple[int, int] | None:
+        """How many bytes of the stored file were read, and how many there are; None where nobody knows."""
+        stored: Any = self.stored
+        if stored is None or not stored.seekable():
+            return None
+        size: int = stored.size if hasattr(stored, "size") else os.fstat(stored.fileno()).st_size  # in a store, or here
+        return stored.tell(), size
 
     def skip(self, at: int) -> bool:
         """Pass over what arrived before a time, ns since 1970, where that can be done without reading it: whether it was."""

@@ -205,7 +205,7 @@ def write_file(device: SimulatedDevice, path: str | Path, seconds: float, *, ove
     Nothing waits: the times in the file are the device's. The commands that open the device are sent to it, and recorded too.
 
     Args:
-        path: an .lsr, .pcap or .bin file.
+        path: an .lsr, .pcap, .pcapng or .bin file.
 
     Raises:
         UnknownFormat, UsageError: for a file that cannot hold it, or exists.

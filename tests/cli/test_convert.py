@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import contextlib
 import csv
+import gzip
+import itertools
 import json
 import os
 import re
@@ -15,7 +18,9 @@ import numpy as np
 import pytest
 
 import lidarspec as ls
+from lidarspec.captures.records import WRITINGS
 from lidarspec.simulation.simulator import simulate
+from lidarspec.transports.open_url import transport
 from tests.cli.running import COIN_D4, EXAMPLE, LD06, printed, process, ran
 from tests.sensors.evidence import capture
 from tests.shapes import SHAPES
@@ -234,12 +239,68 @@ def test_a_terminal_shows_how_far_it_is(tmp_path: Path) -> None:
     from tests.view.terminal import Terminal
 
     (tmp_path / "drive.bin").write_bytes(b"".join(simulate(ls.sensor("ldrobot-stl27l"), 900)))
-    with Terminal("convert", "drive.bin", "out.npz", "-s", "ldrobot-stl27l", cwd=tmp_path) as terminal:
-        assert terminal.ended() == 0
-        shown = terminal.text()
-    assert re.search(r"\rout\.npz: \d+ points of 1 scan, [\d.]+ kB read", terminal.raw)
-    assert " read" not in shown
-    assert "out.npz: 10800 points of" in shown
+    for more in ((), ("-q", "--force")):
+        with Terminal("convert", "drive.bin", "out.npz", "-s", "ldrobot-stl27l", *more, cwd=tmp_path) as terminal:
+            assert terminal.ended() == 0
+            shown = terminal.text()
+        assert bool(re.search(r"out\.npz: \d+ points of 1 scan .*\d+%.*\d:\d|--:--", terminal.raw)) is not bool(more)
+        assert "%" not in shown
+        assert ("out.npz: 10800 points of" in shown) is not bool(more)
+
+
+def test_how_far_a_file_was_read_is_known_where_it_is_stored(tmp_path: Path) -> None:
+    plain, packed = tmp_path / "drive.bin", tmp_path / "drive.bin.gz"
+    plain.write_bytes(b"".join(simulate(ls.sensor("ldrobot-stl27l"), 900)))
+    packed.write_bytes(gzip.compress(plain.read_bytes()))
+    for path in (plain, packed):
+        with ls.open(path, "ldrobot-stl27l") as device:
+            assert device.place is not None
+            assert device.place[1] == path.stat().st_size
+            assert list(device.scans())
+            assert device.place == (path.stat().st_size, path.stat().st_size)
+    with ls.open("sim:ldrobot-stl27l", "ldrobot-stl27l") as device:
+        assert device.place is None
+
+
+@pytest.mark.parametrize("name", ["velodyne-vlp16", "ldrobot-stl27l"])
+def test_packets_go_from_container_to_container_as_they_are(name: str, tmp_path: Path) -> None:
+    files = [tmp_path / f"drive.{suffix}" for suffix in ("pcap", "pcapng", "lsr", "pcap.pcap")]
+    ran("sim", name, "--to", files[0], "-t", "300ms")
+    for one, other in itertools.pairwise(files):
+        assert f"{other}: " in ran("convert", one, other).stderr
+    for file in files[1:]:
+        with contextlib.closing(transport(files[0])) as before, contextlib.closing(transport(file)) as after:
+            assert list(after.chunks()) == list(before.chunks())
+    assert files[3].read_bytes() == files[0].read_bytes()
+    part = tmp_path / "part.pcapng"
+    told = printed("convert", files[2], part, "--slice", "100ms:200ms", "-s", name)
+    assert told["packets"] < printed("info", files[0])["packets"] / 2
+    with contextlib.closing(transport(part)) as opened:
+        times = [chunk.at or 0 for chunk in opened.chunks()]
+    assert len(times) == told["packets"]
+    assert 0 <= min(times) - printed("info", files[0])["first_ns"] - 100_000_000 < 20_000_000
+    assert max(times) - min(times) < 100_000_000
+
+
+def test_files_of_packets_are_of_packets_alone_and_of_files(tmp_path: Path) -> None:
+    ran("sim", "ldrobot-stl27l", "--to", tmp_path / "drive.lsr", "-t", "100ms")
+    out = tmp_path / "out.pcapng"
+    assert "selected by --slice alone" in ran("convert", tmp_path / "drive.lsr", out, "--scans", "1:2", code=2).stderr
+    assert f"lidarspec record sim:ldrobot-stl27l -o {out}" in ran("convert", "sim:ldrobot-stl27l", out, code=2).stderr
+    (tmp_path / "empty.pcap").write_bytes(WRITINGS[".pcap"].head(1))
+    assert "without a packet" in ran("convert", tmp_path / "empty.pcap", out, code=4).stderr
+    assert not out.exists()
+    assert not [file for file in tmp_path.iterdir() if file.name.startswith(".")]
+
+
+def test_more_and_less_is_said(tmp_path: Path) -> None:
+    path = tmp_path / "drive.bin"
+    path.write_bytes(b"".join(simulate(ls.sensor("ldrobot-stl27l"), 900)))
+    words = ["convert", path, tmp_path / "out.npz", "-s", "ldrobot-stl27l", "--force"]
+    assert re.search(r"10800 points .*\n[\d.]+ s, \d+ MB of memory\n", ran(*words, "-v").stderr)
+    assert ran(*words, "-q").stderr == ""
+    assert "points of" in ran(*words).stderr
+    assert "no/out.npz: No such file" in ran("convert", path, tmp_path / "no" / "out.npz", "-s", "ldrobot-stl27l", "-q", code=3).stderr
 
 
 def test_further_columns_are_written_and_printed_with_their_units(tmp_path: Path) -> None:

@@ -72,6 +72,13 @@ def test_of_a_long_recording_the_beginning_and_the_end_are_read(tmp_path: Path) 
     assert "what is counted is of its beginning" in text
 
 
+def test_a_capture_of_a_byte_stream_is_called_so(tmp_path: Path) -> None:
+    ran("sim", "ldrobot-stl27l", "--to", tmp_path / "line.pcap", "-t", "1s")
+    told = printed("info", tmp_path / "line.pcap")
+    assert (told["kind"], told["packets"]) == ("a capture of a byte stream", 1800)
+    assert told["contents"][0]["sensors"] == ["ldrobot-stl27l"]
+
+
 def test_a_file_without_times_and_one_of_nobody(tmp_path: Path) -> None:
     raw, noise, empty = tmp_path / "raw.bin", tmp_path / "noise.bin", tmp_path / "empty.bin"
     raw.write_bytes(b"".join(simulate(ls.sensor("ldrobot-stl27l"), 100)))

@@ -65,6 +65,14 @@ def test_a_port_is_the_default_of_a_serial_sensor_and_datagrams_of_the_others() 
     assert " data" in result.stderr
 
 
+def test_a_sensor_is_simulated_as_it_is_configured(tmp_path: Path) -> None:
+    path = tmp_path / "two echoes.bin"
+    said = ran("sim", "hokuyo-utm30lxew", "-O", "content=echoes", "--to", path, "-t", "200ms").stderr
+    assert f"next: lidarspec view '{path}' -s hokuyo-utm30lxew -O content=echoes" in said
+    read = ran("read", path, "-s", "hokuyo-utm30lxew", "-O", "content=echoes", "-n", 3).stdout
+    assert "return_index" in read
+
+
 def test_the_place_as_json() -> None:
     made = json.loads(ran("sim", "velodyne-vlp16", "-t", "50ms", "--to", "udp://127.0.0.1:2999", "--json").stdout)
     assert made == {

@@ -10,8 +10,8 @@ import pytest
 
 import lidarspec
 from lidarspec.captures.ip import ETHERNET
-from lidarspec.captures.pcap import CaptureStats, Datagram, StreamReader, datagram_record
-from lidarspec.captures.records import capture_head
+from lidarspec.captures.pcap import CaptureStats, Datagram, StreamReader, datagram_frame
+from lidarspec.captures.records import WRITINGS
 from lidarspec.recording.recorders import FrameRecorder, recorder
 from lidarspec.transports.open_url import transport
 from lidarspec.transports.protocol import Chunk
@@ -23,14 +23,16 @@ CHECKED = ("-o", "ip.check_checksum:TRUE", "-o", "udp.check_checksum:TRUE")
 
 
 @needs_tshark
-def test_the_writer_s_captures(tmp_path: Path) -> None:
-    draw, capture = random.Random(1), tmp_path / "it.pcap"
+@pytest.mark.parametrize("suffix", WRITINGS)
+def test_the_writer_s_captures(suffix: str, tmp_path: Path) -> None:
+    draw, capture, writing = random.Random(1), tmp_path / f"it{suffix}", WRITINGS[suffix]
     sizes = [0, 1, 47, 1248, 65_507]
     with capture.open("wb") as file:
-        file.write(capture_head(ETHERNET))
+        file.write(writing.head(ETHERNET))
         for number, size in enumerate(sizes):
             at = 1_700_000_000_123_456_789 + number
-            file.write(datagram_record(Datagram(draw.randbytes(size), at, ("192.0.2.1", 49_152 + number), ("192.0.2.2", 49_000))))
+            datagram = Datagram(draw.randbytes(size), at, ("192.0.2.1", 49_152 + number), ("192.0.2.2", 49_000))
+            file.write(writing.record(datagram_frame(datagram), at))
     fields = ["frame.time_epoch", "udp.length", "ip.src", "udp.dstport"]
     text = tshark(capture, "-T", "fields", *(option for name in fields for option in ("-e", name)), *CHECKED)
     times = [f"1700000000.{123_456_789 + number}" for number in range(len(sizes))]
@@ -43,7 +45,7 @@ def test_the_writer_s_captures(tmp_path: Path) -> None:
 @pytest.mark.parametrize(("name", "time"), [("velodyne-vlp16", "30ms"), ("ldrobot-stl27l", "20ms")])
 def test_simulated_and_recorded_captures(name: str, time: str, tmp_path: Path) -> None:
     sensor, script = lidarspec.sensor(name), written(lidarspec.sensor(name), tmp_path)
-    simulated, recorded, again = tmp_path / "sim.pcap", tmp_path / "it.lsr", tmp_path / "again.pcap"
+    simulated, recorded, again = tmp_path / "sim.pcap", tmp_path / "it.lsr", tmp_path / "again.pcapng"
     ran("sim", name, "--to", simulated, "-t", time)
     ran("record", simulated, "-s", name, "-o", recorded)
     ran("record", recorded, "-o", again)
@@ -59,6 +61,7 @@ def test_a_byte_stream_becomes_a_packet_for_each_frame_and_for_what_is_none(tmp_
     frames = [sensor.example("data", seed=seed) for seed in range(4)]
     stream = b"\x01\x02" + frames[0] + frames[1] + b"\x54\x2c\x03" + frames[2] + frames[3][:30]
     for step in (1, 7, 1000):
+        capture = capture.with_suffix(".pcapng" if step == 7 else ".pcap")
         with FrameRecorder(capture, sensor, overwrite=True) as out:
             for start in range(0, len(stream), step):
                 out.write(Chunk(stream[start : start + step], 1000 + start))

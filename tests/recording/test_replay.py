@@ -145,7 +145,7 @@ def test_datagrams_come_out_as_they_went_in_at_every_speed(datagrams: Path, spee
     assert sensor.decode(received).raw.tobytes() == sensor.decode(sent).raw.tobytes()
 
 
-@pytest.mark.parametrize("suffix", [".lsr", ".pcap"])
+@pytest.mark.parametrize("suffix", [".lsr", ".pcap", ".pcapng"])
 def test_into_a_file_datagrams_keep_their_times_and_addresses(datagrams: Path, tmp_path: Path, suffix: str) -> None:
     copy = tmp_path / f"copy{suffix}"
     with playing(datagrams, FileOutlet(recorder(copy, DATAGRAMS, datagrams=True)), speed=None) as failed:

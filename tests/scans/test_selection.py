@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import asyncio
 from collections.abc import Iterator
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
@@ -46,6 +47,26 @@ def assert_same(some: list[Scan], others: list[Scan]) -> None:
         assert list(one.points.columns) == list(other.points.columns)
         for name, column in one.points.columns.items():
             np.testing.assert_allclose(column, other.points.columns[name], rtol=0, atol=1e-12 if name == "time" else 0)
+
+
+def test_the_same_is_selected_wherever_scans_come_from(recordings: dict[str, Path], every: list[Scan]) -> None:
+    select = Selection(scans=(3, 20), every=4, columns=("x", "y"))
+    wanted = list(scans(recordings["pcap"], select))
+    assert [scan.stamp_ns for scan in wanted] == [scan.stamp_ns for scan in every[3:20:4]]
+    frames = [frame for packets in ls.open(recordings["pcap"], ID).packets() for frame in packets.raw]
+    of_bytes = ls.sensor(ID).scans(b"".join(bytes(frame) for frame in frames), select=select)
+    assert [len(scan) for scan in of_bytes] == [len(scan) for scan in wanted]
+
+    async def collected() -> list[Scan]:
+        async with ls.open_async(recordings["pcap"], ID) as device:
+            found = [scan async for scan in device.scans(select=select)]
+            with pytest.raises(UsageError, match="none of them is asked for"):
+                _ = [scan async for scan in device.scans(select=Selection(scans=(10_000, None)))]
+            return found
+
+    assert_same(asyncio.run(collected()), wanted)
+    with pytest.raises(UsageError, match=r"the data has .* none of them is asked for"):
+        list(ls.sensor(ID).scans(bytes(frames[0]) * 30, select=Selection(scans=(10, 12))))
 
 
 @pytest.mark.parametrize("suffix", ["lsr", "pcap"])

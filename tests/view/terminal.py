@@ -138,6 +138,10 @@ class Terminal:
             if numbers == "1049":  # the other screen; the text of the main one is not kept here, its cursor is
                 self.grid = [[" "] * len(line) for line in self.grid]
                 self._place, self._kept = self._kept, self._place
+        elif letter == "A":
+            self._place = row - int(numbers), column
+        elif letter == "K" and row < len(self.grid):
+            self.grid[row] = [" "] * len(self.grid[row])
         elif letter == "J":
             self.grid = [[" "] * len(line) for line in self.grid]
         elif control == "\n" and row == len(self.grid) - 1:

@@ -127,7 +127,7 @@ def test_a_source_that_pauses_goes_on(pause: int) -> None:
 @settings(max_examples=10, deadline=None)
 def test_any_drift_and_any_step_come_out_right(wraps: bool, jitter: str, seed: int, drift: float, step: float, sign: int) -> None:
     run = simulated(seed, jitter, drift_ppm=drift, step=sign * step, wraps=wraps)
-    assert np.abs(run.errors[run.is_settled]).max() < 1.5e-3
+    assert np.abs(run.errors[run.is_settled]).max() < 2e-3
     assert (np.diff(run.stamps) > 0).all()
     assert run.clock.jumps == 1 + wraps
 

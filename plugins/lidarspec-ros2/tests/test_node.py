@@ -75,6 +75,13 @@ def test_the_lifecycle_is_the_managers_where_it_is_asked_for(run: Any, client: C
     assert process.wait(PATIENCE) == 0
 
 
+def test_a_command_may_be_called_as_a_service_of_every_node(run: Any, client: Client) -> None:
+    run("sim:hokuyo-utm30lx", "-s", "hokuyo-utm30lx")
+    client.until(lambda: client.diagnostics)
+    answered = client.trigger("get_state")
+    assert (answered.success, client.state) == (True, "active")
+
+
 def test_it_cannot_be_configured_with_what_cannot_be_opened_and_then_can(run: Any, client: Client, tmp_path: Path) -> None:
     run(ros=given(source=str(tmp_path / "none"), sensor=STL[2], autostart=False), executable="lidarspec_node")
     assert not client.change("configure")

@@ -112,7 +112,7 @@ def test_what_the_page_has_typed_starts_a_node(run: Callable[..., Any], client: 
     source, *others = words[:place]
     simulated = "sim:ldrobot-stl27l" if source.startswith("/dev/") else source
     if source.endswith(".lsr"):
-        subprocess.run(["lidarspec", "sim", "ldrobot-stl27l", "--to", source, "-t", "5s"], check=True, cwd=tmp_path)
+        subprocess.run([sys.executable, "-m", "lidarspec", "sim", "ldrobot-stl27l", "--to", source, "-t", "5s"], check=True, cwd=tmp_path)
     node = run(simulated, *others, ros=words[place + 1 :])
     if "publish_tf:=true" in words and importlib.util.find_spec("tf2_msgs") is None:
         assert "publish_tf takes tf2_msgs" in node.communicate(timeout=PATIENCE)[1]
