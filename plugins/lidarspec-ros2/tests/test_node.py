@@ -13,7 +13,9 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
+from builtin_interfaces.msg import Time
 from client import PATIENCE, Client, ended, given, message
 from rcl_interfaces.msg import ParameterType
 from rclpy.serialization import deserialize_message
@@ -21,7 +23,8 @@ from rosgraph_msgs.msg import Clock
 from sensor_msgs.msg import LaserScan, PointCloud2
 
 from lidarspec.formats.messages import SCAN
-from lidarspec_ros2.parameters import PARAMETERS
+from lidarspec_ros2.parameters import PARAMETERS, Settings
+from lidarspec_ros2.topics import transform
 
 STL = ("sim:ldrobot-stl27l", "-s", "ldrobot-stl27l")
 
@@ -201,6 +204,25 @@ def test_a_file_is_played_with_its_times_on_clock_and_then_the_node_ends(run: An
     assert times == sorted(times, key=lambda time: (time.sec, time.nanosec))
     stamps = {message(data, SCAN).header.stamp.sec for data in scans}
     assert stamps <= {time.sec + later for time in times for later in (0, 1)}
+
+
+@pytest.mark.parametrize(
+    ("roll", "pitch", "yaw", "inverted"), [(0.0, 0.0, 90.0, False), (10.0, -20.0, 130.0, True), (0.0, 90.0, 5.0, False)]
+)
+def test_a_transform_turns_as_the_mount_does(roll: float, pitch: float, yaw: float, inverted: bool) -> None:
+    given = {"mount.x": 0.5, "mount.roll_deg": roll, "mount.pitch_deg": pitch, "mount.yaw_deg": yaw, "mount.inverted": inverted}
+    settings = Settings({one.name: one.default for one in PARAMETERS} | given | {"source": "udp://", "frame_id": "mast"})
+    found = transform(settings, Time(sec=5))
+    q = found.transform.rotation
+    turned = [
+        [1 - 2 * (q.y**2 + q.z**2), 2 * (q.x * q.y - q.z * q.w), 2 * (q.x * q.z + q.y * q.w)],
+        [2 * (q.x * q.y + q.z * q.w), 1 - 2 * (q.x**2 + q.z**2), 2 * (q.y * q.z - q.x * q.w)],
+        [2 * (q.x * q.z - q.y * q.w), 2 * (q.y * q.z + q.x * q.w), 1 - 2 * (q.x**2 + q.y**2)],
+    ]
+    mount = settings.mount()
+    assert mount is not None
+    np.testing.assert_allclose(turned, mount.rotation, atol=1e-12)
+    assert (found.header.frame_id, found.child_frame_id, found.transform.translation.x) == ("base_link", "mast", 0.5)
 
 
 def test_a_transform_is_refused_where_ros_has_no_message_for_it(run: Any, client: Client) -> None:
