@@ -3,12 +3,15 @@
 from __future__ import annotations
 
 import contextlib
+import itertools
 import math
 import os
 import re
 import signal
+import socket
 import subprocess
 import sys
+import threading
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
@@ -22,7 +25,9 @@ from rclpy.serialization import deserialize_message
 from rosgraph_msgs.msg import Clock
 from sensor_msgs.msg import LaserScan, PointCloud2
 
+import lidarspec as ls
 from lidarspec.formats.messages import SCAN
+from lidarspec.simulation.simulator import simulate
 from lidarspec_ros2.parameters import PARAMETERS, Settings
 from lidarspec_ros2.topics import transform
 
@@ -137,6 +142,20 @@ def test_parameters_are_described_and_changed_where_that_makes_sense(run: Any, c
     assert client.set("angle_min", 2.0) == ""  # on through the back, to where the last beam looks a turn on
     client.until(lambda: newest().angle_min == 2.0)
     assert newest().angle_max == pytest.approx(1.0 + 2 * math.pi)
+
+
+def test_quality_is_sensor_datas_unless_it_is_asked_for_or_overridden(run: Any, client: Client) -> None:
+    client.listen("/points", PointCloud2, reliable=False)
+    for words, is_reliable in (
+        ([], False),
+        (given(qos="reliable"), True),
+        (["-p", "qos_overrides./points.publisher.reliability:=reliable"], True),
+    ):
+        process = run(*STL, ros=words or given(qos="best_effort"))
+        client.until(lambda: client.reliable("/points"))
+        assert client.reliable("/points") == [is_reliable]
+        assert ended(process)[0] == 0
+        client.until(lambda: not client.reliable("/points"))
 
 
 def test_a_ring_that_the_sensor_lacks_is_a_warning_and_clouds_go_on(run: Any, client: Client) -> None:
@@ -265,6 +284,38 @@ def test_a_port_that_goes_away_makes_the_node_inactive_until_it_is_back(run: Any
     client.until(lambda: len(scans) > number + 2)
     assert client.state == "active"
     client.until(lambda: client.diagnostics[-1].status[0].level != b"\2")
+
+
+def test_a_sensor_that_falls_silent_makes_the_node_inactive_until_it_sends(run: Any, client: Client) -> None:
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as sender:
+        sender.bind(("127.0.0.1", 0))
+        free = sender.getsockname()[1] + 1
+        sends, over = threading.Event(), threading.Event()
+        sends.set()
+
+        def send() -> None:
+            for frame in itertools.cycle(simulate(ls.sensor("velodyne-vlp16"), 1500)):
+                sends.wait()
+                if over.wait(0.001):
+                    return
+                sender.sendto(frame, ("127.0.0.1", free))
+
+        thread = threading.Thread(target=send)
+        thread.start()
+        try:
+            run(f"udp://127.0.0.1:{free}", "-s", "velodyne-vlp16")
+            client.until(lambda: client.diagnostics)
+            client.until(lambda: client.state == "active")
+            sends.clear()
+            client.until(lambda: client.state == "inactive")
+            client.until(lambda: client.diagnostics[-1].status[0].level == b"\2")
+            assert "nothing has arrived" in client.diagnostics[-1].status[0].message
+            sends.set()
+            client.until(lambda: client.state == "active")
+        finally:
+            over.set()
+            sends.set()
+            thread.join()
 
 
 @pytest.mark.parametrize("by", [signal.SIGINT, signal.SIGTERM])
