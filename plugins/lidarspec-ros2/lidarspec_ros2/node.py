@@ -205,6 +205,7 @@ class LidarNode(LifecycleNode):
         if device is not self._device:  # which is closed
             return
         more = {"lifecycle": "active" if topics.active else "inactive", "latency [ms]": f"{topics.latency_s * 1e3:.1f}"}
+        more |= {f"{topic} sent": str(number) for topic, number in topics.sent.items()}
         clock = topics.stamps.clock
         more |= {"clock drift [ppm]": f"{clock.drift_ppm:+.1f}", "clock set": f"{clock.jumps} times"}
         found = status(self.get_name(), device, reading, [*filter(None, (clock.jump, topics.fault))], more)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import time
+from collections import Counter
 from typing import Any
 
 from geometry_msgs.msg import Quaternion, Transform, TransformStamped, Vector3
@@ -52,6 +53,7 @@ class Topics:
 
     Attributes:
         stamps: the times of messages.
+        sent: how many messages were published, by topic.
         active: whether what is published is let through.
         fault: why there is no planar scan that was asked for, "" where there is.
         latency_s: seconds from the arrival of the packets that ended the last scan to its being published.
@@ -65,6 +67,7 @@ class Topics:
         self._messages = Messages("ROS2_HUMBLE")
         self._reliability = ReliabilityPolicy.RELIABLE if settings["qos"] == "reliable" else ReliabilityPolicy.BEST_EFFORT
         self._publishers: dict[str, Any] = {}
+        self.sent = Counter[str]()
         self._others = list[Any]()
         self.active, self.latency_s, self.fault = False, 0.0, ""
         self._arrived = 0
@@ -168,6 +171,7 @@ class Topics:
 
     def _send(self, message: Message) -> None:
         self._publisher(message.kind).publish(bytes(message.data))
+        self.sent[KINDS[message.kind][0]] += 1
 
 
 def transform(settings: Settings, stamp: Any) -> TransformStamped:

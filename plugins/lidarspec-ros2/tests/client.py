@@ -46,9 +46,10 @@ class Client:
             assert time.monotonic() < end, f"it did not come about within {patience} s"
             rclpy.spin_once(self._node, timeout_sec=0.05)
 
-    def publishers(self, topic: str) -> int:
-        """How many publish on a topic."""
-        return int(self._node.count_publishers(topic))
+    def reliable(self, topic: str) -> list[bool]:
+        """Whether what is published on a topic is reliable, for each who does."""
+        reliable = ReliabilityPolicy.RELIABLE
+        return [one.qos_profile.reliability == reliable for one in self._node.get_publishers_info_by_topic(topic)]
 
     def call(self, kind: Any, service: str, **fields: Any) -> Any:
         """The response of a service of the node."""

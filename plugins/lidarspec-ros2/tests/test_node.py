@@ -3,25 +3,33 @@
 from __future__ import annotations
 
 import contextlib
+import itertools
 import math
 import os
 import re
 import signal
+import socket
 import subprocess
 import sys
+import threading
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
+from builtin_interfaces.msg import Time
 from client import PATIENCE, Client, ended, given, message
 from rcl_interfaces.msg import ParameterType
 from rclpy.serialization import deserialize_message
 from rosgraph_msgs.msg import Clock
 from sensor_msgs.msg import LaserScan, PointCloud2
 
+import lidarspec as ls
 from lidarspec.formats.messages import SCAN
-from lidarspec_ros2.parameters import PARAMETERS
+from lidarspec.simulation.simulator import simulate
+from lidarspec_ros2.parameters import PARAMETERS, Settings
+from lidarspec_ros2.topics import transform
 
 STL = ("sim:ldrobot-stl27l", "-s", "ldrobot-stl27l")
 
@@ -136,6 +144,20 @@ def test_parameters_are_described_and_changed_where_that_makes_sense(run: Any, c
     assert newest().angle_max == pytest.approx(1.0 + 2 * math.pi)
 
 
+def test_quality_is_sensor_datas_unless_it_is_asked_for_or_overridden(run: Any, client: Client) -> None:
+    client.listen("/points", PointCloud2, reliable=False)
+    for words, is_reliable in (
+        ([], False),
+        (given(qos="reliable"), True),
+        (["-p", "qos_overrides./points.publisher.reliability:=reliable"], True),
+    ):
+        process = run(*STL, ros=words or given(qos="best_effort"))
+        client.until(lambda: client.reliable("/points"))
+        assert client.reliable("/points") == [is_reliable]
+        assert ended(process)[0] == 0
+        client.until(lambda: not client.reliable("/points"))
+
+
 def test_a_ring_that_the_sensor_lacks_is_a_warning_and_clouds_go_on(run: Any, client: Client) -> None:
     clouds, scans = client.listen("points", PointCloud2), client.listen("scan", LaserScan)
     run("sim:velodyne-vlp16", "-s", "velodyne-vlp16", ros=given(qos="reliable", scan_ring=7, frame_id="mast"))
@@ -203,6 +225,25 @@ def test_a_file_is_played_with_its_times_on_clock_and_then_the_node_ends(run: An
     assert stamps <= {time.sec + later for time in times for later in (0, 1)}
 
 
+@pytest.mark.parametrize(
+    ("roll", "pitch", "yaw", "inverted"), [(0.0, 0.0, 90.0, False), (10.0, -20.0, 130.0, True), (0.0, 90.0, 5.0, False)]
+)
+def test_a_transform_turns_as_the_mount_does(roll: float, pitch: float, yaw: float, inverted: bool) -> None:
+    given = {"mount.x": 0.5, "mount.roll_deg": roll, "mount.pitch_deg": pitch, "mount.yaw_deg": yaw, "mount.inverted": inverted}
+    settings = Settings({one.name: one.default for one in PARAMETERS} | given | {"source": "udp://", "frame_id": "mast"})
+    found = transform(settings, Time(sec=5))
+    q = found.transform.rotation
+    turned = [
+        [1 - 2 * (q.y**2 + q.z**2), 2 * (q.x * q.y - q.z * q.w), 2 * (q.x * q.z + q.y * q.w)],
+        [2 * (q.x * q.y + q.z * q.w), 1 - 2 * (q.x**2 + q.z**2), 2 * (q.y * q.z - q.x * q.w)],
+        [2 * (q.x * q.z - q.y * q.w), 2 * (q.y * q.z + q.x * q.w), 1 - 2 * (q.x**2 + q.y**2)],
+    ]
+    mount = settings.mount()
+    assert mount is not None
+    np.testing.assert_allclose(turned, mount.rotation, atol=1e-12)
+    assert (found.header.frame_id, found.child_frame_id, found.transform.translation.x) == ("base_link", "mast", 0.5)
+
+
 def test_a_transform_is_refused_where_ros_has_no_message_for_it(run: Any, client: Client) -> None:
     process = run(*STL, ros=given(publish_tf=True))
     _, complaints = process.communicate(timeout=PATIENCE)
@@ -243,6 +284,38 @@ def test_a_port_that_goes_away_makes_the_node_inactive_until_it_is_back(run: Any
     client.until(lambda: len(scans) > number + 2)
     assert client.state == "active"
     client.until(lambda: client.diagnostics[-1].status[0].level != b"\2")
+
+
+def test_a_sensor_that_falls_silent_makes_the_node_inactive_until_it_sends(run: Any, client: Client) -> None:
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as sender:
+        sender.bind(("127.0.0.1", 0))
+        free = sender.getsockname()[1] + 1
+        sends, over = threading.Event(), threading.Event()
+        sends.set()
+
+        def send() -> None:
+            for frame in itertools.cycle(simulate(ls.sensor("velodyne-vlp16"), 1500)):
+                sends.wait()
+                if over.wait(0.001):
+                    return
+                sender.sendto(frame, ("127.0.0.1", free))
+
+        thread = threading.Thread(target=send)
+        thread.start()
+        try:
+            run(f"udp://127.0.0.1:{free}", "-s", "velodyne-vlp16")
+            client.until(lambda: client.diagnostics)
+            client.until(lambda: client.state == "active")
+            sends.clear()
+            client.until(lambda: client.state == "inactive")
+            client.until(lambda: client.diagnostics[-1].status[0].level == b"\2")
+            assert "nothing has arrived" in client.diagnostics[-1].status[0].message
+            sends.set()
+            client.until(lambda: client.state == "active")
+        finally:
+            over.set()
+            sends.set()
+            thread.join()
 
 
 @pytest.mark.parametrize("by", [signal.SIGINT, signal.SIGTERM])

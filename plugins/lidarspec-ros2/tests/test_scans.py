@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import dataclasses
 import os
-import struct
 import time
 from collections.abc import Callable
 from pathlib import Path
@@ -99,10 +98,9 @@ def test_what_an_imu_felt_is_what_the_library_makes_of_the_same_bytes(run: Calla
         ]
     read = [deserialize_message(data, Imu) for data in received[:400]]
     found = [[getattr(part, axis) for part in (one.angular_velocity, one.linear_acceleration) for axis in "xyz"] for one in read]
-    begin = found.index(wanted[0]) if wanted[0] in found else 0
-    shift = wanted.index(found[begin])
-    assert found[begin:] == wanted[shift : shift + len(found) - begin]
-    assert (len(found) - begin > 50, {one.header.frame_id for one in read}) == (True, {"head"})
+    shared = [row for row in found if row in wanted]  # on a busy computer some of either may be lost
+    assert shared == [row for row in wanted if row in found]
+    assert (len(shared) > 100, {one.header.frame_id for one in read}) == (True, {"head"})
 
 
 @pytest.mark.parametrize(("sensor", "every_point"), [("robosense-m1", True), ("robosense-m1", False), ("ldrobot-stl27l", False)])
@@ -151,19 +149,26 @@ def test_no_scan_is_lost_in_ten_minutes(
     run: Callable[..., Any], client: Client, sensor: str, topic: str, message_class: Any, qos: str
 ) -> None:
     """Of reliable topics; of the others it is printed how many are."""
-    stamps = list[int]()
+    received = [0]
 
     def note(data: bytes) -> None:
-        sec, nanosec = struct.unpack_from("<iI", data, 4)
-        stamps.append(sec * 10**9 + nanosec)
+        received[0] += 1
+
+    def counted(seconds: float) -> tuple[int, int]:
+        """How many were sent and received after so many seconds, when no more come."""
+        assert client.change("activate")
+        end = time.monotonic() + seconds
+        client.until(lambda: time.monotonic() > end, patience=2 * seconds)
+        assert client.change("deactivate")
+        client.diagnostics.clear()
+        client.until(lambda: len(client.diagnostics) > 2)
+        said = {entry.key: entry.value for entry in client.diagnostics[-1].status[0].values}
+        return int(said[f"{topic} sent"]), received[0]
 
     client.listen(topic, message_class, reliable=qos == "reliable", take=note)
-    run(f"sim:{sensor}", "-s", sensor, ros=given(qos=qos))
-    client.until(lambda: stamps)
-    end = time.monotonic() + SOAK
-    client.until(lambda: time.monotonic() > end, patience=2 * SOAK)
-    steps = np.diff(stamps)
-    lost = int(np.rint(steps / np.median(steps)).sum()) - len(steps)
-    print(f"{sensor}, {qos}: {lost} of {len(stamps) + lost} lost")
-    assert len(stamps) > 9.5 * SOAK
-    assert not lost or qos == "best_effort"
+    run(ros=given(source=f"sim:{sensor}", sensor=sensor, qos=qos, autostart=False), executable="lidarspec_node")
+    assert client.change("configure")
+    (sent, came), (all_sent, all_came) = counted(3.0), counted(SOAK)
+    print(f"{sensor}, {qos}: {all_came - came} of {all_sent - sent} came")
+    assert all_sent - sent > 9.5 * SOAK
+    assert all_came - came == all_sent - sent or qos == "best_effort"
