@@ -32,10 +32,10 @@ from lidarspec.transports.protocol import Chunk
 from lidarspec_ros2.clock import Stamps
 from lidarspec_ros2.parameters import Settings
 
-#: of each kind of message its topic, its class, and how many are kept for those who are slow: about a second of them, or less.
+#: of each kind of message its topic, its class, and how many are kept for those who are slow: one or two seconds of them.
 KINDS = {
-    CLOUD: ("points", PointCloud2, 10),
-    SCAN: ("scan", LaserScan, 10),
+    CLOUD: ("points", PointCloud2, 20),
+    SCAN: ("scan", LaserScan, 20),
     IMU: ("imu", Imu, 200),
     RAW: ("packets", UInt8MultiArray, 2000),
 }
