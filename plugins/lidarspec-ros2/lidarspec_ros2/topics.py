@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import threading
 import time
 from collections import Counter
 from typing import Any
@@ -67,7 +68,7 @@ class Topics:
         self._messages = Messages("ROS2_HUMBLE")
         self._reliability = ReliabilityPolicy.RELIABLE if settings["qos"] == "reliable" else ReliabilityPolicy.BEST_EFFORT
         self._publishers: dict[str, Any] = {}
-        self.sent = Counter[str]()
+        self.sent, self._publishing = Counter[str](), threading.Lock()
         self._others = list[Any]()
         self.active, self.latency_s, self.fault = False, 0.0, ""
         self._arrived = 0
@@ -122,9 +123,10 @@ class Topics:
 
     def activate(self, *, active: bool) -> None:
         """Let through what is published, or not."""
-        self.active = active
-        for publisher in self._publishers.values():
-            (publisher.on_activate if active else publisher.on_deactivate)(None)
+        with self._publishing:
+            self.active = active
+            for publisher in self._publishers.values():
+                (publisher.on_activate if active else publisher.on_deactivate)(None)
 
     def close(self) -> None:
         """Give the topics back."""
@@ -170,8 +172,11 @@ class Topics:
         return self.active and self._publisher(kind).get_subscription_count() > 0
 
     def _send(self, message: Message) -> None:
-        self._publisher(message.kind).publish(bytes(message.data))
-        self.sent[KINDS[message.kind][0]] += 1
+        publisher, data = self._publisher(message.kind), bytes(message.data)
+        with self._publishing:  # packets come from a thread of their own, transitions from another one
+            if self.active:
+                publisher.publish(data)
+                self.sent[KINDS[message.kind][0]] += 1
 
 
 def transform(settings: Settings, stamp: Any) -> TransformStamped:
