@@ -28,11 +28,10 @@ CODES: tuple[tuple[type[Exception] | tuple[type[Exception], ...], int, str], ...
 
 def report(error: Exception, verb: str) -> int:
     """Print what went wrong and what to do next; the exit code."""
-    is_detailed = voice.loudness > 0 or bool(os.environ.get("LIDARSPEC_DEBUG"))
-    voice.loudness = 0
+    code, command = next(((code, command) for kind, code, command in CODES if isinstance(error, kind)), (FINDINGS, ""))
+    is_detailed, voice.loudness = voice.loudness > 0 or (not command and bool(os.environ.get("LIDARSPEC_DEBUG"))), 0
     if is_detailed:
         note("".join(traceback.format_exception(error)))
-    code, command = next(((code, command) for kind, code, command in CODES if isinstance(error, kind)), (FINDINGS, ""))
     if not command:
         note(f"a bug in lidarspec: {type(error).__name__}: {error}")
         note("  next: the same with LIDARSPEC_DEBUG=1, and report it with what that prints")
