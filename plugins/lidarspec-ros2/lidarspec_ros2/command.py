@@ -6,6 +6,7 @@ extra `ros2`.
 
 from __future__ import annotations
 
+import contextlib
 import importlib
 import signal
 import sys
@@ -20,6 +21,8 @@ from lidarspec.cli.options import sensor_words
 from lidarspec.errors import UsageError
 
 if TYPE_CHECKING:
+    from rclpy.executors import Executor
+
     from lidarspec_ros2.node import LidarNode
 
 
@@ -83,29 +86,41 @@ def run(given: Mapping[str, Any], ros_args: Sequence[str]) -> None:
 
     from lidarspec_ros2.node import LidarNode
 
-    previous = signal.signal(signal.SIGTERM, signal.default_int_handler)
+    ended, nodes = threading.Event(), list[LidarNode]()
+
+    def told(number: int, frame: object) -> None:
+        """End in good order; only what waits for a sensor is broken off."""
+        ended.set()
+        if any(node.opening for node in nodes):
+            raise KeyboardInterrupt
+
+    previous = {number: signal.signal(number, told) for number in (signal.SIGINT, signal.SIGTERM)}
     rclpy.init(args=["lidarspec_node", *ros_args], signal_handler_options=rclpy.SignalHandlerOptions.NO)
     try:
-        executor, node = SingleThreadedExecutor(), LidarNode(given)
-        try:
-            executor.add_node(node)
-            _spun(node, threading.Thread(target=executor.spin, name="executor"))
-        except KeyboardInterrupt:
-            node.get_logger().info("interrupted")
-        finally:
-            executor.shutdown()
-            node.close()
-            node.destroy_node()
+        nodes.append(LidarNode(given, ended))
+        executor = SingleThreadedExecutor()
+        executor.add_node(nodes[0])
+        _serve(nodes[0], executor)
     finally:
         rclpy.try_shutdown()
-        signal.signal(signal.SIGTERM, previous)
+        for number, handler in previous.items():
+            signal.signal(number, handler)
 
 
-def _spun(node: LidarNode, executor: threading.Thread) -> None:
-    """Serve until the node has come to its end."""
-    if node.autostarts:
-        node.start()
-    executor.start()
-    node.ended.wait()
-    if node.failure is not None:
+def _serve(node: LidarNode, executor: Executor) -> None:
+    """Serve until the node has come to its end, or is told to end."""
+    serving = threading.Thread(target=executor.spin, name="executor")
+    try:
+        with contextlib.suppress(KeyboardInterrupt):
+            if node.autostarts and not node.ended.is_set():
+                node.start()
+            serving.start()
+            node.ended.wait()
+    finally:
+        executor.shutdown()
+        if serving.ident is not None:
+            serving.join()
+        node.close()
+        node.destroy_node()
+    if node.autostarts and node.failure is not None:
         raise node.failure

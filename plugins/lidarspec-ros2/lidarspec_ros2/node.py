@@ -41,19 +41,21 @@ class LidarNode(LifecycleNode):
 
     Args:
         given: parameters that come before those of the command line and of files.
+        ended: is set when nothing more will come of it by itself.
 
     Attributes:
         failure: why the node could not be configured, or the sensor cannot be read any more; None where it can.
-        ended: set when nothing more will come of it by itself.
+        ended: as given.
+        opening: whether it waits for a sensor to be found, and to answer.
 
     Raises:
         UsageError: for a parameter that cannot be.
     """
 
-    def __init__(self, given: Mapping[str, Any]) -> None:
+    def __init__(self, given: Mapping[str, Any], ended: threading.Event) -> None:
         super().__init__("lidar", parameter_overrides=[RosParameter(name, value=value) for name, value in given.items()])
         self.failure: Exception | None = None
-        self.ended = threading.Event()
+        self.ended, self.opening = ended, False
         self._device: Device | None = None
         self._topics: Topics | None = None
         self._thread: threading.Thread | None = None
@@ -144,7 +146,11 @@ class LidarNode(LifecycleNode):
     def _open(self) -> None:
         settings = self._settings
         packets = PacketLog()
-        device = self._device = settings.device(lambda opened: packets)
+        self.opening = True
+        try:
+            device = self._device = settings.device(lambda opened: packets)
+        finally:
+            self.opening = False
         topics = self._topics = Topics(self, settings, device.sensor, played=not device.is_live)
         packets.publish = topics.raw
         self._serve_commands(device)

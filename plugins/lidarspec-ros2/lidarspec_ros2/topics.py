@@ -147,9 +147,10 @@ class Topics:
             topic, message, depth = KINDS[kind]
             qos = QoSProfile(depth=depth, reliability=self._reliability)
             publisher = self._node.create_lifecycle_publisher(message, topic, qos, qos_overriding_options=_OVERRIDING)
-            self._publishers[kind] = publisher
-            if self.active:
-                publisher.on_activate(None)
+            with self._publishing:
+                self._publishers[kind] = publisher
+                if self.active:
+                    publisher.on_activate(None)
         return self._publishers[kind]
 
     def _other(self, message: Any, topic: str, qos: Any) -> Any:

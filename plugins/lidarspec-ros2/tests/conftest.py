@@ -12,7 +12,7 @@ from pathlib import Path
 
 import pytest
 
-os.environ |= {"ROS_AUTOMATIC_DISCOVERY_RANGE": "LOCALHOST", "ROS_DOMAIN_ID": str(random.randrange(50, 100)), "LIDARSPEC_DEBUG": "1"}
+os.environ |= {"ROS_AUTOMATIC_DISCOVERY_RANGE": "LOCALHOST", "ROS_DOMAIN_ID": str(random.randrange(50, 100))}
 
 import rclpy
 from client import PATIENCE, Client

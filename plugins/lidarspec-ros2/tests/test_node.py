@@ -328,7 +328,7 @@ def test_nothing_is_left_behind(run: Any, client: Client, plugged: Any, by: int)
     assert own
     assert str(process.pid) in holders(port)
     code, complaints = ended(process, by)
-    assert (code, "Traceback" in complaints, "interrupted" in complaints) == (0, False, True)
+    assert (code, complaints) == (0, "")
     assert not any(Path(f"/proc/{thread}").exists() for thread in threads)
     ports = {name for name in shared(os.getpid()) if "_port" in name}  # where the client listens
     assert not [name for name in own - ports if Path(name).exists()]
