@@ -95,6 +95,10 @@ class Client:
         self._node.destroy_node()
 
 
+#: parameters with which planar scans are on one grid, whichever scan comes first.
+GRID: dict[str, Any] = {"beams": 720, "angle_min": -3.0, "angle_max": 3.0}
+
+
 def given(**parameters: Any) -> list[str]:
     """Parameters in ROS's words."""
     return [word for name, value in parameters.items() for word in ("-p", f"{name}:={value}")]

@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 import pytest
 from builtin_interfaces.msg import Time
-from client import Client, given, message
+from client import GRID, Client, given, message
 from rclpy.serialization import deserialize_message, serialize_message
 from sensor_msgs.msg import Imu, LaserScan, PointCloud2
 from std_msgs.msg import Header, UInt8MultiArray
@@ -44,7 +44,7 @@ def recorded(packets: list[bytes], path: Path, sensor: str) -> Path:
 
 def expected(path: Path, sensor: str, kind: str) -> list[Any]:
     """The messages that the library makes of the whole scans of a recording."""
-    planes, found = Planes(), []
+    planes, found = Planes(GRID["beams"], (GRID["angle_min"], GRID["angle_max"])), []
     with ls.open(path, sensor) as device:
         for scan in device.scans():
             if scan.whole and kind == CLOUD:
@@ -74,7 +74,7 @@ def test_messages_are_what_the_library_makes_of_the_same_bytes(
 ) -> None:
     packets = client.listen("packets", UInt8MultiArray)
     received = client.listen(topic, message_class)
-    run(f"sim:{sensor}?loss=0.0005&seed=3", "-s", sensor, ros=given(publish_packets=True, qos="reliable"))
+    run(f"sim:{sensor}?loss=0.0005&seed=3", "-s", sensor, ros=given(publish_packets=True, qos="reliable", **GRID))
     client.until(lambda: len(received) > WHOLE)
     number = len(received)
     client.until(lambda: len(received) > number)  # whose packets have come
