@@ -26,6 +26,10 @@ if TYPE_CHECKING:
     from lidarspec_ros2.node import LidarNode
 
 
+#: seconds between two looks at whether a signal has come.
+LOOK = 0.1
+
+
 class _RosCommand(click.Command):
     """A verb that leaves what begins with --ros-args to ROS."""
 
@@ -86,36 +90,37 @@ def run(given: Mapping[str, Any], ros_args: Sequence[str]) -> None:
 
     from lidarspec_ros2.node import LidarNode
 
-    ended, nodes = threading.Event(), list[LidarNode]()
+    signals, nodes = list[int](), list[LidarNode]()
 
     def told(number: int, frame: object) -> None:
         """End in good order; only what waits for a sensor is broken off."""
-        ended.set()
+        signals.append(number)
         if any(node.opening for node in nodes):
             raise KeyboardInterrupt
 
     previous = {number: signal.signal(number, told) for number in (signal.SIGINT, signal.SIGTERM)}
     rclpy.init(args=["lidarspec_node", *ros_args], signal_handler_options=rclpy.SignalHandlerOptions.NO)
     try:
-        nodes.append(LidarNode(given, ended))
+        nodes.append(LidarNode(given))
         executor = SingleThreadedExecutor()
         executor.add_node(nodes[0])
-        _serve(nodes[0], executor)
+        _serve(nodes[0], executor, signals)
     finally:
         rclpy.try_shutdown()
         for number, handler in previous.items():
             signal.signal(number, handler)
 
 
-def _serve(node: LidarNode, executor: Executor) -> None:
-    """Serve until the node has come to its end, or is told to end."""
+def _serve(node: LidarNode, executor: Executor, signals: Sequence[int]) -> None:
+    """Serve until the node has come to its end, or is told to end by a signal."""
     serving = threading.Thread(target=executor.spin, name="executor")
     try:
         with contextlib.suppress(KeyboardInterrupt):
-            if node.autostarts and not node.ended.is_set():
+            if node.autostarts and not signals:
                 node.start()
             serving.start()
-            node.ended.wait()
+            while not signals and not node.ended.wait(LOOK):  # a signal that comes just before it waits does not end the wait
+                pass
     finally:
         executor.shutdown()
         if serving.ident is not None:

@@ -41,21 +41,20 @@ class LidarNode(LifecycleNode):
 
     Args:
         given: parameters that come before those of the command line and of files.
-        ended: is set when nothing more will come of it by itself.
 
     Attributes:
         failure: why the node could not be configured, or the sensor cannot be read any more; None where it can.
-        ended: as given.
+        ended: set when nothing more will come of it by itself.
         opening: whether it waits for a sensor to be found, and to answer.
 
     Raises:
         UsageError: for a parameter that cannot be.
     """
 
-    def __init__(self, given: Mapping[str, Any], ended: threading.Event) -> None:
+    def __init__(self, given: Mapping[str, Any]) -> None:
         super().__init__("lidar", parameter_overrides=[RosParameter(name, value=value) for name, value in given.items()])
         self.failure: Exception | None = None
-        self.ended, self.opening = ended, False
+        self.ended, self.opening = threading.Event(), False
         self._device: Device | None = None
         self._topics: Topics | None = None
         self._thread: threading.Thread | None = None
