@@ -17,13 +17,14 @@ from pathlib import Path
 from typing import Any
 
 from lidarspec.errors import library
-from lidarspec.formats.messages import CLOUD, PACKET, SCAN, Message, Messages
+from lidarspec.formats.messages import CLOUD, SCAN, Message, Messages
 from lidarspec.scans.planes import Planes
 from lidarspec.scans.scans import Scan
+from lidarspec.transports.bags import RAW
 from lidarspec.transports.protocol import Chunk, Format
 
 #: where messages are published, by their kind.
-TOPICS = {CLOUD: "/points", SCAN: "/scan", PACKET: "/packets"}
+TOPICS = {CLOUD: "/points", SCAN: "/scan", RAW: "/packets"}
 #: bytes of a chunk of an MCAP file, which a reader holds at once: a scan or some.
 CHUNK = 1 << 20
 
@@ -49,7 +50,7 @@ class Log:
         Raises:
             UsageError: for a stamp that no message can hold.
         """
-        return heapq.merge(self._of_scans(scans, every_point=every_point), map(self._messages.packet, packets), key=attrgetter("at"))
+        return heapq.merge(self._of_scans(scans, every_point=every_point), map(self._messages.raw, packets), key=attrgetter("at"))
 
     def _of_scans(self, scans: Iterable[Scan], *, every_point: bool) -> Iterator[Message]:
         for number, scan in enumerate(scans):

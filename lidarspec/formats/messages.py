@@ -19,8 +19,6 @@ from lidarspec.scans.scans import LaserScan, Scan
 from lidarspec.transports.bags import DATAGRAM, RAW, STAMP, STREAM
 from lidarspec.transports.protocol import Chunk
 
-#: a packet as it was received, which `transports.bags` reads again: ROS has no message for it.
-PACKET, LAYOUT = "lidarspec_msgs/msg/LidarPacket", "builtin_interfaces/Time stamp\nuint8[] data"
 CLOUD, SCAN, IMU = (f"sensor_msgs/msg/{name}" for name in ("PointCloud2", "LaserScan", "Imu"))
 #: the numbers by which PointField names types; anything else is written as float64.
 FIELD_TYPES = {"i1": 1, "u1": 2, "b1": 2, "i2": 3, "u2": 4, "i4": 5, "u4": 6, "f4": 7, "f8": 8}
@@ -50,17 +48,11 @@ class Messages:
     def __init__(self, release: str) -> None:
         typesys = library("rosbags.typesys", "ros")
         self.types = typesys.get_typestore(typesys.Stores[release])
-        self.types.register(typesys.get_types_from_msg(LAYOUT, PACKET))
         self._serialized = self.types.serialize_ros1 if release.startswith("ROS1") else self.types.serialize_cdr
         self._counts = release.startswith("ROS1")
 
-    def packet(self, packet: Chunk) -> Message:
-        """A packet as it was received."""
-        at = packet.at or 0
-        return self._message(PACKET, at, stamp=self._time(at), data=np.frombuffer(packet.data, np.uint8))
-
-    def raw(self, packet: Chunk, *, datagram: bool) -> Message:
-        """A packet as it was received, as the node publishes it and `transports.bags` reads it again; not a `datagram`: of a stream."""
+    def raw(self, packet: Chunk, *, datagram: bool = True) -> Message:
+        """A packet as it was received, which `transports.bags` reads again; not a `datagram`: of a stream."""
         at, size, types = packet.at or 0, len(packet.data), self.types.types
         dimension = types["std_msgs/msg/MultiArrayDimension"](label=DATAGRAM if datagram else STREAM, size=size, stride=size)
         layout = types["std_msgs/msg/MultiArrayLayout"](dim=[dimension], data_offset=STAMP.size)

@@ -5,8 +5,9 @@ whoever named them: a type with a list of `packets`, or one that is itself calle
 `buf`, of which the first `size` count where that is a field, and its `stamp`. Logs say how their messages are laid out; of those that do
 not, as ROS 2 bags in SQLite of releases before Iron, the layout is the one of `UNTOLD` that fills a message to its end.
 
-Packets that the ROS 2 node publishes are std_msgs/UInt8MultiArray, the one message of every ROS that holds bytes and says nothing of them.
-The padding before the bytes, as long as `data_offset` says, is the time of the arrival; the label says whether they are a datagram.
+Packets that lidarspec writes into logs, or its ROS 2 node publishes, are std_msgs/UInt8MultiArray, the one message of every ROS that holds
+bytes and says nothing of them. The padding before the bytes, as long as `data_offset` says, is the time of the arrival; the label says
+whether they are a datagram.
 """
 
 from __future__ import annotations
@@ -38,7 +39,7 @@ UNTOLD = (
 BYTES = ("data", "buf")
 #: topics that a message names.
 NAMED = 6
-#: what the node publishes: the type, the time of arrival, int64 ns, and the label of the dimension of datagrams and of a byte stream.
+#: what lidarspec writes: the type, the time of arrival, int64 ns, and the label of the dimension of datagrams and of a byte stream.
 RAW, STAMP = "std_msgs/msg/UInt8MultiArray", struct.Struct("<q")
 DATAGRAM, STREAM = "datagram", "stream"
 

@@ -111,6 +111,11 @@ def test_a_program_says_and_ends_with_the_same(folder: Path, words: tuple[str, .
     assert (done.returncode, done.stdout, done.stderr.decode()) == (code, b"", ran(*words, code=code).stderr)
 
 
+def test_a_verb_of_a_plugin_that_is_missing_says_which() -> None:
+    told = ran("ros2", "sim:cspc-m1c1-mini", code=2).stderr
+    assert "the verb 'ros2' comes with a plugin that is not installed\n  next: pip install 'lidarspec-ros2[ros2]'" in told
+
+
 def test_every_verb_says_that_checksums_are_never_right(tmp_path: Path) -> None:
     crc, path, chosen = Crc(width=8, poly=0x4D), tmp_path / "bug.bin", ["-s", "ldrobot-stl27l"]
     frames = simulate(ls.sensor("ldrobot-stl27l"), 20)
