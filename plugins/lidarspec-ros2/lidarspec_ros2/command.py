@@ -38,8 +38,11 @@ class _RosCommand(click.Command):
         ctx.meta["ros_args"] = args[place:]
         return super().parse_args(ctx, args[:place])
 
+    def collect_usage_pieces(self, ctx: click.Context) -> list[str]:
+        return [*super().collect_usage_pieces(ctx), "[--ros-args ...]"]
 
-@click.command(cls=_RosCommand, options_metavar="[OPTIONS] [--ros-args ...]")
+
+@click.command(cls=_RosCommand)
 @click.argument("source", metavar="SOURCE")
 @sensor_words
 @click.pass_context

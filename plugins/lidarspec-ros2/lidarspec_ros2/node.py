@@ -23,7 +23,7 @@ from std_srvs.srv import Trigger
 
 from lidarspec.cli.build import arguments, replied
 from lidarspec.device.device import Device
-from lidarspec.errors import LidarSpecError, UsageError, suggestion
+from lidarspec.errors import LidarSpecError, UsageError, did_you_mean, suggestion
 from lidarspec.view.feed import LOOK, Feed, Reading
 from lidarspec_ros2.diagnostics import LOST, status
 from lidarspec_ros2.packets import PacketLog
@@ -153,6 +153,7 @@ class LidarNode(LifecycleNode):
         topics = self._topics = Topics(self, settings, device.sensor, played=not device.is_live)
         packets.publish = topics.raw
         self._serve_commands(device)
+        self._warn_of_unknown_parameters()
         self._stopping.clear()
         self._was_lost = False
         self._thread = threading.Thread(target=self._read, args=(device, self._topics), name="reading")
@@ -232,8 +233,9 @@ class LidarNode(LifecycleNode):
 
     def _fail(self, error: Exception) -> None:
         self.failure = error
-        following = suggestion(error)
-        self.get_logger().error(f"{error}{f'; next: {following}' if following else ''}")
+        if not self.autostarts:  # else it ends the process, which says so
+            following = suggestion(error)
+            self.get_logger().error(f"{error}{f'; next: {following}' if following else ''}")
 
     def _set(self, parameters: Sequence[RosParameter]) -> SetParametersResult:
         """Take parameters that are set at run time, or say why not."""
@@ -248,6 +250,13 @@ class LidarNode(LifecycleNode):
         if self._topics is not None and ours:
             self._topics.show(self._settings)
         return SetParametersResult(successful=True)
+
+    def _warn_of_unknown_parameters(self) -> None:
+        """Say which parameters are given that no node of this sensor has, of which ROS itself says nothing."""
+        for name in self._parameter_overrides:
+            if not self.has_parameter(name) and not name.startswith("qos_overrides."):
+                close = did_you_mean(name, [one.name for one in PARAMETERS])
+                self.get_logger().warning(f"parameter {name!r} is left out, as there is none of that name{close}")
 
     def _serve_commands(self, device: Device) -> None:
         """A service for each command of the sensor, beside the node's own, such as get_state, and a parameter for each of its arguments."""

@@ -144,6 +144,14 @@ def test_parameters_are_described_and_changed_where_that_makes_sense(run: Any, c
     assert newest().angle_max == pytest.approx(1.0 + 2 * math.pi)
 
 
+def test_a_parameter_that_is_none_is_said(run: Any, client: Client) -> None:
+    process = run(*STL, ros=[*given(beam=720, qos="reliable"), "-p", "qos_overrides./points.publisher.depth:=5"])
+    client.until(lambda: client.diagnostics)
+    code, complaints = ended(process)
+    (said,) = complaints.splitlines()
+    assert (code, said.endswith("parameter 'beam' is left out, as there is none of that name; did you mean 'beams'?")) == (0, True)
+
+
 def test_quality_is_sensor_datas_unless_it_is_asked_for_or_overridden(run: Any, client: Client) -> None:
     client.listen("/points", PointCloud2, reliable=False)
     for words, is_reliable in (
