@@ -33,10 +33,11 @@ from lidarspec.transports.protocol import Chunk
 from lidarspec_ros2.clock import Stamps
 from lidarspec_ros2.parameters import Settings
 
-#: of each kind of message its topic, its class, and how many are kept for those who are slow: one or two seconds of them.
+#: of each kind of message its topic, its class, and how many are kept for those who are slow: of scans those of five seconds, as Fast DDS
+#: asks only every three for what was lost on the way, and a busy computer loses some of clouds of megabytes.
 KINDS = {
-    CLOUD: ("points", PointCloud2, 20),
-    SCAN: ("scan", LaserScan, 20),
+    CLOUD: ("points", PointCloud2, 50),
+    SCAN: ("scan", LaserScan, 50),
     IMU: ("imu", Imu, 200),
     RAW: ("packets", UInt8MultiArray, 2000),
 }
