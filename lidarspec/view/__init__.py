@@ -8,4 +8,5 @@ In: a device, or points. Out: pictures. Modules in reading order:
 * `canvas`: pictures in character cells, and their inks.
 * `screen`: the terminal: cells that changed, single keys.
 * `svg`: one scan as a file.
+* `scene`: one scan as the message that a page in a browser draws.
 """
