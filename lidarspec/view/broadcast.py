@@ -68,6 +68,7 @@ class Broadcast(Closing):
         shown: the newest scan; None before there is one.
         backlog: the newest bytes.
         paused, speed: of a file.
+        warnings, info: those of the device.
         history: the figures of the last minute, one after another, by name.
         failure: what ended the reading; None while it goes on.
         news: called in the thread that reads, whenever there is something new.
@@ -86,6 +87,7 @@ class Broadcast(Closing):
         self._reopened, self._select = reopened, select
         self.shown: Shown | None = None
         self.paused, self.speed = False, 1.0
+        self.warnings, self.info = list[str](), dict[str, str]()
         self.history = deque[dict[str, Any]](maxlen=round(HISTORY / FIGURES))
         self.failure: LidarSpecError | None = None
         self.news: Callable[[], None] = lambda: None
@@ -125,7 +127,7 @@ class Broadcast(Closing):
         """Why nothing more comes."""
         if self.failure is not None:
             return str(self.failure)
-        return "; ".join([f"{self.source} has ended", *self.device.warnings])
+        return "; ".join([f"{self.source} has ended", *self.warnings])
 
     @property
     def began_ns(self) -> int:
@@ -245,9 +247,11 @@ class Broadcast(Closing):
         if now - self._measured >= FIGURES:
             if self.is_live or not (self.paused or feed.ended):
                 self.history.append(self._figures(now - self._measured))
+            self.warnings, self.info = self.device.warnings, self.device.info
             self._measured, is_new = now, True
         if is_new or feed.ended != self._has_ended:
             self._has_ended = feed.ended
+            self.warnings = self.device.warnings if feed.ended else self.warnings
             self.news()
 
     def _figures(self, seconds: float) -> dict[str, Any]:
