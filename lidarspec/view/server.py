@@ -206,7 +206,7 @@ class Viewer:
         if self._most is not None and (shown := self._unseen()) is not None:
             most, self._most = self._most, None
             self._held.append(shown)
-            return await asyncio.to_thread(shown.message, most)
+            return shown.message(most)  # here: the large blocks of further threads would stay in arenas of theirs
         if broadcast.has_ended != self._has_ended:
             self._has_ended = broadcast.has_ended
             return {"is": "ended", "text": broadcast.ending} if self._has_ended else None
@@ -219,7 +219,7 @@ class Viewer:
                 return await asyncio.to_thread(self._answers.frame, taken, "last")
         if now >= self._due["state"]:
             self._due["state"] = now + STATE
-            state = await asyncio.to_thread(self._answers.state, frozen=self._frozen is not None, since=self._known)
+            state = self._answers.state(frozen=self._frozen is not None, since=self._known)
             self._known = state["damaged"]["total"]
             return state
         return None
