@@ -260,8 +260,10 @@ class Broadcast(Closing):
         return {"at": time.time(), **reading, "lost": stats.lost, "disconnects": stats.disconnects, "latency_s": latency}
 
     def _position(self, scan: Scan) -> float:
-        """Seconds from the first scan; by their number where they bear no times."""
+        """Seconds from the first scan: by arrival, of a file as its scans are selected, or by their number where they bear no times."""
         assert self._first is not None
+        if self.is_live:
+            return (scan.host_ns - self._first.host_ns) * 1e-9
         has_times = scan.host_ns or scan.sensor.clock is not None
         return (scan.stamp_ns - self._first.stamp_ns) * 1e-9 if has_times else self._number * STEP
 
