@@ -211,10 +211,10 @@ function located(data: ArrayBuffer | ArrayBufferView): [ArrayBuffer, number] {
 /** Milliseconds that a picture may take, so that there are ten a second, and how many points are asked for at first, at least and at most. */
 const BUDGET = 80;
 const FIRST = 40_000;
-const LEAST = 5_000;
+const LEAST = 20_000;
 const MOST = 1_000_000;
 
-/** How many points are asked for: as many as are drawn in time. */
+/** How many points are asked for: as many as are drawn in time; below the least of them other work is what takes long. */
 export class Pace {
   most = FIRST;
 
@@ -289,9 +289,11 @@ export class Connection {
       this.listener.connected(true);
     };
     socket.onmessage = ({ data }: MessageEvent<string | ArrayBuffer>) => {
-      if (typeof data === "string") return this.listener.said(JSON.parse(data) as Message);
-      this.#waiting = false;
-      this.listener.scan(decoded(data));
+      if (typeof data === "string") this.listener.said(JSON.parse(data) as Message);
+      else {
+        this.#waiting = false;
+        this.listener.scan(decoded(data));
+      }
     };
     socket.onclose = () => {
       if (this.#socket !== socket) return;
