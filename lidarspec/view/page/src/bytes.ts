@@ -37,7 +37,7 @@ export class Bytes {
     readonly element: HTMLElement,
     readonly ask: (words: Ask) => void,
   ) {
-    const step = (by: number) => () => this.#frame && this.#hold({ do: "frame", number: this.#frame.number + by });
+    const step = (by: number) => () => this.#step(by);
     const bar = made(
       "div",
       { className: "bar" },
@@ -81,6 +81,12 @@ export class Bytes {
     this.ask(words);
   }
 
+  #step(by: number): void {
+    if (!this.#frame) return;
+    const number = this.#frame.number + by;
+    this.#hold(this.#frame.why === "damaged" ? { do: "frame", damaged: number } : { do: "frame", number });
+  }
+
   /** The frame that a point came from. */
   ofPoint(scan: number, index: number): void {
     this.#hold({ do: "frame", point: { scan, index } });
@@ -119,9 +125,10 @@ export class Bytes {
     return node && (this.#anatomy?.nodes.get(node.path) ?? null);
   }
 
-  #head({ number, position, explanation }: Frame): void {
+  #head({ number, position, explanation, why }: Frame): void {
     const { frame, size, fault, notes } = explanation;
-    this.#title.textContent = `${frame || "no frame"} · number ${COUNTS.format(number)} · ${COUNTS.format(size)} bytes · at ${position.toFixed(3)} s`;
+    const time = position === null ? "" : ` · at ${position.toFixed(3)} s`;
+    this.#title.textContent = `${frame || "no frame"} · ${why === "damaged" ? "damaged" : "number"} ${COUNTS.format(number)} · ${COUNTS.format(size)} bytes${time}`;
     this.#verdict.textContent = [fault?.reason ?? "valid", ...notes].join(" · ");
     this.#verdict.title = this.#verdict.textContent;
     this.#verdict.className = fault ? "verdict bad" : "verdict good";

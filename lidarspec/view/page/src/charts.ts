@@ -59,8 +59,10 @@ export class Charts {
     this.#watcher.observe(element);
   }
 
-  /** Take in the figures of a moment, seconds of the server's clock. */
-  add(at: number, figures: Figures): void {
+  /** Take in the figures of a moment. */
+  add(figures: Figures): void {
+    const { at } = figures;
+    if (at === this.#times.at(-1)) return;
     this.#times.push(at);
     this.#series.forEach((series, number) => series.push(CHARTS[number]!.of(figures)));
     const old = this.#times.findIndex((time) => time >= at - SHOWN);
@@ -69,8 +71,8 @@ export class Charts {
   }
 
   /** Write all figures down, with those that the page adds. */
-  tell(figures: Figures, more: [string, string][]): void {
-    const told = FIGURES.map(([name, text]): [string, string | null] => [name, text(figures)]).filter((pair): pair is [string, string] => pair[1] !== null);
+  tell(figures: Figures | null, more: [string, string][]): void {
+    const told = FIGURES.map(([name, text]): [string, string | null] => [name, figures && text(figures)]).filter((pair): pair is [string, string] => pair[1] !== null);
     this.list.replaceChildren(...[...told, ...more].flatMap(([name, text]) => [made("dt", {}, name), made("dd", { textContent: text })]));
   }
 

@@ -49,7 +49,7 @@ export class Commands {
   composed({ command, hex, explanation }: Composed): void {
     if (command !== this.#command?.name) return;
     this.#send.disabled = !this.#control;
-    const rows = explanation.rows.map((row) =>
+    const rows = (explanation?.rows ?? []).map((row) =>
       made("tr", {}, ...[row.offset.toString(16).padStart(4, "0"), row.hex, row.path, row.meaning].map((text) => made("td", { textContent: text }))),
     );
     this.#bytes.replaceChildren(made("code", { className: "whole", textContent: hex.match(/../g)?.join(" ") ?? "" }), made("table", {}, made("tbody", {}, ...rows)));
@@ -97,8 +97,8 @@ function field({ name, text, unit, low, high, choices, default: fallback }: Argu
   const range = low === null || high === null ? "" : `${low} to ${high}`;
   const allowed = [range, unit].filter(Boolean).join(" ");
   const value = fallback === null ? "" : String(fallback);
-  const input = choices
-    ? made("select", { name }, ...choices.map((choice) => made("option", { value: choice, textContent: choice, selected: choice === value })))
+  const input = choices.length
+    ? made("select", { name }, ...choices.map((choice) => made("option", { ...choice, selected: choice.value === value })))
     : made("input", { name, value, placeholder: allowed, autocomplete: "off", spellcheck: false });
   return made("label", {}, made("span", { textContent: name }), input, made("small", { textContent: [allowed, text].filter(Boolean).join(" · ") }));
 }

@@ -79,9 +79,9 @@ export class Controls {
     this.#placed(position);
   }
 
-  state({ paused, speed, position, recording }: State): void {
-    this.#paused = paused;
-    this.#play.textContent = paused ? "▶ Play" : "❚❚ Pause";
+  state({ state, paused, speed, position, recording }: State): void {
+    this.#paused = paused || state === "ended";
+    this.#play.textContent = this.#paused ? "▶ Play" : "❚❚ Pause";
     this.#step.disabled = !paused;
     this.#record.classList.toggle("on", recording !== null);
     named("recording").textContent = recording ? `${recording.name} · ${(recording.bytes / 1e6).toFixed(1)} MB` : "Record";

@@ -38,7 +38,7 @@ export class Damaged {
   }
 
   #row({ number, position, size, verdict }: Damage): HTMLElement {
-    const cells = [String(number), `${position.toFixed(3)} s`, `${size} bytes`, verdict].map((text) => made("span", { textContent: text, title: text }));
+    const cells = [String(number), position === null ? "" : `${position.toFixed(3)} s`, `${size} bytes`, verdict].map((text) => made("span", { textContent: text, title: text }));
     const choose = (): void => {
       this.#chosen = number;
       this.#list.show(this.#frames.length);

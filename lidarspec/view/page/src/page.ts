@@ -78,6 +78,7 @@ class Page {
     this.#open = open;
     this.#ended = "";
     this.#notice();
+    if (open) this.#connection.next(this.#pace.most);
   }
 
   #said(message: Message): void {
@@ -113,10 +114,9 @@ class Page {
     if (!isSame || !this.#picture) this.#begin(hello);
     this.#damaged.clear();
     this.#charts.clear();
-    for (const { at, figures } of hello.history) this.#charts.add(at, figures);
+    for (const figures of hello.history) this.#charts.add(figures);
     this.#commands.show(hello);
     if (this.#tab === "bytes" && (this.#watched || this.#bytes.empty)) this.#ask({ do: "watch", frames: true });
-    this.#connection.next(this.#pace.most);
   }
 
   #begin(hello: Hello): void {
@@ -160,8 +160,12 @@ class Page {
     const status = named("status");
     status.textContent = state.paused ? "paused" : state.state;
     status.className = `badge ${state.paused ? "" : ["streaming", "playing"].includes(state.state) ? "good" : state.state === "ended" ? "" : "bad"}`;
-    this.#charts.add(state.at, state.figures);
+    if (state.state !== "ended" && this.#ended) {
+      this.#ended = "";
+      this.#notice();
+    }
     const isLive = this.#hello?.live === true && !state.paused;
+    if (state.figures) this.#charts.add(state.figures);
     this.#charts.tell(state.figures, [["Pictures", `${this.#rate().toFixed(1)} /s`], ...(isLive && this.#latency ? [["To the screen", `${this.#latency.toFixed(0)} ms`] as [string, string]] : [])]);
     named("warnings").replaceChildren(...state.warnings.map((text) => made("p", { textContent: text })));
     named("info").replaceChildren(...Object.entries(state.info).flatMap(([name, text]) => [made("dt", { textContent: name }), made("dd", { textContent: text })]));

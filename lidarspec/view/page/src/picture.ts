@@ -97,7 +97,9 @@ export class Picture {
   #hovered: number | null = null;
   #marked: number | null = null;
   #pointer: Place | null = null;
-  #drawn = "";
+  #pointed = false;
+  #around = "";
+  #within = "";
 
   constructor(
     readonly element: HTMLElement,
@@ -437,9 +439,17 @@ export class Picture {
     uniforms.disc!.value = size > 2;
     this.#renderer.render(this.#scene, this.#camera);
     const outlook = this.#outlook();
-    const seen = JSON.stringify([outlook, this.#camera.projectionMatrix.elements, this.#camera.matrixWorld.elements]);
-    if (seen !== this.#drawn) ground(this.#under.getContext("2d")!, outlook);
-    this.#drawn = seen;
+    this.#hovered = this.#pointer ? this.pick(...this.#pointer) : null;
+    const camera = [...this.#camera.projectionMatrix.elements, ...this.#camera.matrixWorld.elements];
+    const around = JSON.stringify([outlook, camera]);
+    const within = JSON.stringify([around, this.#by, this.#span, this.#scan !== null]);
+    if (around !== this.#around) ground(this.#under.getContext("2d")!, outlook);
+    if (within !== this.#within || this.#hovered !== null || this.#marked !== null || this.#pointed) this.#label(outlook);
+    [this.#around, this.#within] = [around, within];
+  }
+
+  /** What stands over the points. */
+  #label(outlook: Outlook): void {
     const over = this.#over.getContext("2d")!;
     over.clearRect(0, 0, outlook.width, outlook.height);
     labels(over, outlook);
@@ -451,7 +461,7 @@ export class Picture {
 
   /** Mark the point that was picked and the one under the pointer, and say where that is. */
   #point(over: CanvasRenderingContext2D, outlook: Outlook): void {
-    this.#hovered = this.#pointer ? this.pick(...this.#pointer) : null;
+    this.#pointed = this.#hovered !== null || this.#marked !== null;
     const columns = this.#columns();
     for (const row of [this.#marked, this.#hovered]) {
       const spot = row === null || !columns ? null : outlook.place(columns[0][row]!, columns[1][row]!, columns[2][row]!);
