@@ -266,6 +266,8 @@ class Viewer:
                     self._answer(reply)
             except LidarSpecError as error:
                 self._refuse(word, error, command)
+            except Exception as error:
+                self._refuse(word, LidarSpecError(_bug(error)), command)
             self.stir()
 
         task = asyncio.create_task(answered())
@@ -346,6 +348,10 @@ class Viewer:
         "send": _command,
         "record": _record,
     }
+
+
+def _bug(error: Exception) -> str:
+    return f"a bug in lidarspec: {type(error).__name__}: {error}"
 
 
 def _number(message: Mapping[str, Any], name: str, low: float, high: float) -> float:
@@ -457,6 +463,8 @@ class Site:
         became = "closed"
         try:
             became = await viewer.serve()
+        except Exception as error:
+            became = f"closed: {_bug(error)}"
         finally:
             self._viewers.discard(viewer)
             self._say(f"page {number} {became}; {len(self._viewers)} open")
