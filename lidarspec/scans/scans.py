@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lidarspec.columns.columns import Carry
+from lidarspec.display import drawn
 from lidarspec.errors import UsageError
 from lidarspec.packets.continuity import Reorder
 from lidarspec.packets.imu import ImuSamples, Waiting
@@ -107,6 +108,8 @@ class Scan:
         nominal = ", nominal calibration" if self.points.nominal else ""
         state = "complete" if self.complete else "with gaps" if self.whole else "partial"
         return f"Scan({len(self)} points, {rate}{span}, {state}{nominal})"
+
+    _repr_svg_ = drawn("scan")
 
     @property
     def facts(self) -> dict[str, str]:

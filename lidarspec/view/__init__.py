@@ -1,4 +1,4 @@
-"""Scans drawn, in a terminal or as SVG.
+"""Scans drawn: in a terminal, as pictures in files, in notebooks.
 
 In: a device, or points. Out: pictures. Modules in reading order:
 
@@ -8,4 +8,5 @@ In: a device, or points. Out: pictures. Modules in reading order:
 * `canvas`: pictures in character cells, and their inks.
 * `screen`: the terminal: cells that changed, single keys.
 * `svg`: one scan as a file.
+* `notebook`: what notebooks show of scans, packets, explained frames and sensors.
 """

@@ -166,7 +166,7 @@ def test_plot_writes_a_picture(capture: Path, tmp_path: Path) -> None:
 
     ran("plot", capture, *SENSOR, "-o", tmp_path / "scan.svg", "--scan", "3", "--color", "intensity")
     root = ET.fromstring((tmp_path / "scan.svg").read_text(encoding="utf-8"))
-    dots = [place for path in root.findall(".//{*}path") if path.get("stroke-linecap") for place in path.get("d", "").split("M")[1:]]
+    dots = [place for path in root.findall(".//{*}path") if "dots" in path.get("class", "") for place in path.get("d", "").split("m")[1:]]
     assert 500 < len(dots) <= 2160
     assert "10.0 Hz, " in "".join(text.text or "" for text in root.findall(".//{*}text"))
     assert ran("plot", capture, *SENSOR, "-o", "-").stdout.startswith("<svg")
