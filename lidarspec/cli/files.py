@@ -108,8 +108,8 @@ def convert(
 
     .lsr, .pcap and .pcapng hold the packets themselves, as they were received.
 
-    Tables (.parquet, .arrow, .feather), surveys (.las, .laz, .e57), .zarr, logs of ROS (.mcap, .bag, .rosbag2, .db3) and of Foxglove
-    (.foxglove.mcap) take libraries that are not installed by default: lidarspec[arrow,las,e57,zarr,ros,foxglove].
+    Tables (.parquet, .arrow, .feather), surveys (.las, .laz, .e57), .zarr, logs of ROS (.mcap, .bag, .rosbag2, .db3), of Foxglove
+    (.foxglove.mcap) and of Rerun (.rrd) take libraries that are not installed by default: lidarspec[arrow,las,e57,zarr,ros,foxglove,rerun].
 
     With --to each IN is a file, a pattern in quotes, 'drives/**/*.pcap', or a URL, s3://bucket/a.pcap, and OUT a folder. What is done is
     written down there, in manifest.jsonl: the same command again does what is missing. A file that fails stops no other.

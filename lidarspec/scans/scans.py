@@ -80,6 +80,7 @@ class Scan:
         beams: how many `to_laserscan` gives where it is not told; None: as many as the sensor declares, else as there are points.
         frame_id: what ROS's messages call the frame of the points.
         number: which of its file it is, where that is read in pieces.
+        mount: how the sensor is mounted: the points are in its carrier's axes; None where they are in its own.
     """
 
     points: PointCloud
@@ -92,6 +93,7 @@ class Scan:
     beams: int | None = None
     frame_id: str = FRAME_ID
     number: int | None = None
+    mount: Mount | None = None
 
     @property
     def stamp_ns(self) -> int:
@@ -502,7 +504,8 @@ class ScanStream:
         samples = None if self._imu is None else self._imu.until(ends)
         if self._mount is not None:
             cloud, samples = self._mount.applied(cloud), None if samples is None else samples.turned(self._mount.rotation)
-        return Scan(cloud, float(rate) if whole else np.nan, complete, self._sensor, whole, samples, self._host or 0)
+        rate = float(rate) if whole else np.nan
+        return Scan(cloud, rate, complete, self._sensor, whole, samples, self._host or 0, mount=self._mount)
 
 
 def _times_ns(source: ColumnSource, indices: Sequence[int]) -> list[int | None]:

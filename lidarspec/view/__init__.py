@@ -8,5 +8,6 @@ In: a device, or points. Out: pictures. Modules in reading order:
 * `canvas`: pictures in character cells, and their inks.
 * `screen`: the terminal: cells that changed, single keys.
 * `svg`: one scan as a file.
+* `rerun`: the scans in Rerun's viewer.
 * `notebook`: what notebooks show of scans, packets, explained frames and sensors.
 """
