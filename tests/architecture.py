@@ -54,6 +54,8 @@ CONFINED = {
     "serial": {"transports.serial", "transports.ports"},
     "click": {"cli"},
     "rich": {"cli", "view"},
+    "starlette": {"view.server"},
+    "uvicorn": {"view.server"},
     "hypothesis": {"testing"},
     "pytest": {"testing"},
 }

@@ -119,6 +119,7 @@ class Row:
         remarks: what else is to be said: constants, the verdict of a checksum, what is missing.
         right: False where the bytes are not what the spec asks for.
         points: the points that this element gives.
+        numbers: of each of them which part of the frame it is of, and which point of that, from 0.
     """
 
     offset: int
@@ -128,6 +129,7 @@ class Row:
     remarks: tuple[str, ...] = ()
     right: bool = True
     points: tuple[Point, ...] = ()
+    numbers: tuple[tuple[int, int], ...] = ()
 
     @property
     def meaning(self) -> str:

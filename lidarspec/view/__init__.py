@@ -1,6 +1,6 @@
-"""Scans drawn: in a terminal, as pictures in files, in notebooks.
+"""Scans drawn: in a terminal, as pictures in files, in notebooks, or by a page in a browser.
 
-In: a device, or points. Out: pictures. Modules in reading order:
+In: a device, or points. Out: pictures, and what a page makes them of. Modules in reading order:
 
 * `live`: the window that shows a sensor at work: keys in, pictures and figures out, a recording switched on and off.
 * `feed`: what the device delivers, taken in and counted between two pictures.
@@ -10,4 +10,9 @@ In: a device, or points. Out: pictures. Modules in reading order:
 * `svg`: one scan as a file.
 * `rerun`: the scans in Rerun's viewer.
 * `notebook`: what notebooks show of scans, packets, explained frames and sensors.
+* `scene`: one scan as the message that a page draws.
+* `broadcast`: a source that is read once and shown to any number of pages; files played, moved through.
+* `backlog`: the newest bytes of it, frame by frame, and what was damaged.
+* `answers`: what a page is told, in JSON.
+* `server`: the page's files, its socket, and what may reach them.
 """
