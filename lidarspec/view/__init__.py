@@ -15,4 +15,5 @@ In: a device, or points. Out: pictures, and what a page makes them of. Modules i
 * `backlog`: the newest bytes of it, frame by frame, and what was damaged.
 * `answers`: what a page is told, in JSON.
 * `server`: the page's files, its socket, and what may reach them.
+* `widget`: a source in a cell of a notebook, drawn as by the page.
 """
