@@ -8,6 +8,7 @@ In: a device, or points. Out: pictures, and what a page makes them of. Modules i
 * `canvas`: pictures in character cells, and their inks.
 * `screen`: the terminal: cells that changed, single keys.
 * `svg`: one scan as a file.
+* `figures`: a scan, intensities, ranges and rates over time, for reports.
 * `rerun`: the scans in Rerun's viewer.
 * `notebook`: what notebooks show of scans, packets, explained frames and sensors.
 * `scene`: one scan as the message that a page draws.
