@@ -8,7 +8,6 @@ import io
 import json
 import math
 import re
-import shutil
 import signal
 import socket
 import subprocess
@@ -25,11 +24,9 @@ import pytest
 import lidarspec as ls
 from lidarspec.simulation.scenes import Room
 from lidarspec.transports.protocol import Chunk
+from tests.view.browser import FLAGS, chromium, installed
 
 BUNDLE = Path(ls.__file__).parent / "view" / "page" / "dist" / "page.js"
-CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser") or shutil.which("google-chrome")
-#: graphics without a graphics card.
-FLAGS = ["--no-sandbox", "--use-angle=swiftshader", "--enable-unsafe-swiftshader"]
 #: the columns of the points that are shown, and their places in the picture, one after another.
 SHOWN = """(() => {
   const { picture } = lidarspec, { columns } = picture.scan, [x, y, z] = ["x", "y", "z"].map((name) => columns.get(name));
@@ -55,12 +52,10 @@ RATE = 1800
 #: seconds that a machine with other work may need.
 PATIENCE = 60.0
 
-if CHROMIUM is None:
-    pytest.skip("Chromium is not installed", allow_module_level=True)
 if not BUNDLE.is_file():
     pytest.skip("the page is not built: make page", allow_module_level=True)
-for library in ("playwright.sync_api", "starlette", "uvicorn", "websockets"):
-    pytest.importorskip(library, reason=f"{library.partition('.')[0]} is not installed: the page is not served")
+for library in ("starlette", "uvicorn", "websockets"):
+    pytest.importorskip(library, reason=f"{library} is not installed: the page is not served")
 
 
 @contextlib.contextmanager
@@ -166,12 +161,8 @@ class Visit:
 
 @pytest.fixture(scope="module")
 def browser() -> Iterator[Any]:
-    from playwright.sync_api import sync_playwright
-
-    with sync_playwright() as playwright:
-        started = playwright.chromium.launch(executable_path=CHROMIUM, args=FLAGS)
+    with chromium() as started:
         yield started
-        started.close()
 
 
 @pytest.fixture(scope="module")
@@ -424,7 +415,7 @@ def tabs(link: str, folder: Path) -> Iterator[tuple[Callable[[str], Any], Callab
     """A page in a tab: what evaluates an expression in it, and what puts it in front of another tab or behind it."""
     from websockets.sync.client import connect
 
-    words = [str(CHROMIUM), "--headless=new", *FLAGS, "--no-first-run", "--remote-debugging-port=0", f"--user-data-dir={folder}", link]
+    words = [installed(), "--headless=new", *FLAGS, "--no-first-run", "--remote-debugging-port=0", f"--user-data-dir={folder}", link]
     process = subprocess.Popen(words, stderr=subprocess.PIPE, text=True)
     try:
         assert process.stderr is not None
