@@ -11,12 +11,13 @@ from pathlib import Path
 
 import click
 
-from lidarspec.cli.inputs import PATIENCE, conclude, nothing_came
+from lidarspec.cli.inputs import PATIENCE, conclude, nothing_came, refuse_overwriting
 from lidarspec.cli.options import DURATION, colour_option, selecting, sensor_option
 from lidarspec.cli.output import drawn
 from lidarspec.cli.terminal import ended_by_terminate, note, say
 from lidarspec.device.device import Device, open as open_device
 from lidarspec.errors import UsageError, library, suggest
+from lidarspec.formats.rerun import RERUN
 from lidarspec.scans.selection import Selection
 from lidarspec.spec.sensor import Sensor
 from lidarspec.transports.open_url import is_live
@@ -25,6 +26,7 @@ from lidarspec.view.canvas import Cells
 from lidarspec.view.feed import LOOK, Feed
 from lidarspec.view.live import Switch, Window
 from lidarspec.view.polar import look, picture
+from lidarspec.view.rerun import SCHEMES, show as show_in_rerun
 from lidarspec.view.screen import Screen, Terminated, encodable, interactive, keyboard
 
 
@@ -41,6 +43,10 @@ from lidarspec.view.screen import Screen, Terminated, encodable, interactive, ke
     "--address", metavar="HOST[:PORT]", help="Where the page is; by default 127.0.0.1 and a free port. Elsewhere the link has a token."
 )
 @click.option("--control", is_flag=True, help="Let the page send commands to the sensor; to a simulated one it always may.")
+@click.option("--rerun", "in_rerun", is_flag=True, help="In Rerun's 3D viewer, which is opened, and not in the terminal.")
+@click.option(
+    "-o", "--output", metavar="FILE.rrd|URL", help="With --rerun: into a file, or a viewer that runs, rerun+http://HOST:9876/proxy."
+)
 def view(
     source: str,
     sensor_id: str | Sensor | None,
@@ -52,6 +58,8 @@ def view(
     opens: bool,
     address: str | None,
     control: bool,
+    in_rerun: bool,
+    output: str | None,
 ) -> None:
     """A sensor at work, drawn in the terminal, or with --web in the browser.
 
@@ -59,6 +67,8 @@ def view(
     where standard output is no terminal.
 
     Keys: space pauses, r records, c switches colours, + - zoom, arrows move, 0 shows all again, ? helps, q quits.
+
+    --rerun needs lidarspec[rerun]; a file is read there as fast as possible, and its time runs in the viewer.
     """
     if web and once:
         raise UsageError("--web and --once are for two kinds of pictures: leave out one of them")
@@ -67,6 +77,11 @@ def view(
         return
     if opens or address is not None or control:
         raise UsageError("--open, --address and --control are for the page: add --web")
+    if output is not None and not in_rerun:
+        raise UsageError("-o is for --rerun; a picture is drawn into a file by lidarspec plot")
+    if in_rerun:
+        _in_rerun(source, sensor_id, output or "", ramp, duration, selection)
+        return
     if once or not interactive():
         with open_device(source, sensor_id) as device:
             say(_printed(device, source, ramp, duration or PATIENCE, selection), colour=True)
@@ -136,6 +151,21 @@ def listening(address: str | None) -> tuple[str, int]:
     except UsageError:
         raise UsageError(f"--address is HOST or HOST:PORT, not {address}") from None
     return origin.host, origin.port or 0
+
+
+def _in_rerun(source: str, sensor_id: str | Sensor | None, target: str, ramp: str, duration: float | None, selection: Selection) -> None:
+    """Scans in Rerun's viewer, or in a file of its, until the input ends or somebody has had enough."""
+    if target and not target.startswith(SCHEMES):
+        if not target.lower().endswith(RERUN.suffix):
+            raise UsageError(f"{target}: a recording for Rerun's viewer has the suffix {RERUN.suffix}")
+        refuse_overwriting([target], source, sensor_id)
+    with open_device(source, sensor_id, period=LOOK) as device:
+        feed = Feed(device, select=selection)
+        show_in_rerun(feed, target, ramp=ramp, until=time.monotonic() + (duration or math.inf))
+        if feed.scan is None:
+            raise nothing_came(device, source, duration)
+        note(f"{target or 'shown'}: {feed.number} scans of {device.sensor.id}")
+        conclude(device)
 
 
 def _show(device: Device, window: Window, *, taken: bool) -> None:

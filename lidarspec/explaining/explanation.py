@@ -19,6 +19,7 @@ from typing import Any
 
 import numpy as np
 
+from lidarspec.display import drawn
 from lidarspec.errors import LidarSpecError, WireError
 from lidarspec.explaining.damage import told
 from lidarspec.explaining.listing import Line, Listing, text
@@ -66,6 +67,8 @@ class Explanation:
 
     def __repr__(self) -> str:
         return f"Explanation({self.sensor} {self.frame or 'skipped'}, {len(self.data)} bytes: {self.verdict})"
+
+    _repr_html_ = drawn("explanation")
 
     def __str__(self) -> str:
         return "\n".join(text(line) for line in self.lines())

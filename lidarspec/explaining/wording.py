@@ -101,11 +101,13 @@ class Value:
         return f"{text} {self.unit}".strip() + turns
 
     def to_dict(self) -> dict[str, Any]:
-        """The value for JSON: bytes as hexadecimal text, no entry for what is not there, null for nan and infinity."""
+        """The value for JSON: bytes and masks as hexadecimal text, no entry for what is not there, null for nan and infinity."""
         raw = self.raw.hex(" ") if isinstance(self.raw, bytes | bytearray) else number(self.raw)
         physical = {} if self.physical is None else {"value": number(self.physical)}
-        more = {name: getattr(self, name) for name in ("unit", "label", "bits", "docs") if getattr(self, name)}
-        return {"path": self.path, "raw": raw, **physical, **more}
+        place = {"start": self.start, "masks": self.masks.hex(" ")}
+        more = {name: text for name in ("unit", "label", "bits", "docs") if (text := getattr(self, name))}
+        more |= {"text": text} if (text := str(self)) else {}
+        return {"path": self.path, "raw": raw, **physical, **more, **place}
 
 
 @dataclass(frozen=True)
@@ -171,7 +173,8 @@ class Row:
         """The row for JSON."""
         facts = {"offset": self.offset, "hex": self.data.hex(" "), "path": self.path, "meaning": self.meaning, "right": self.right}
         points = [{name: number(value) for name, value in point._asdict().items()} for point in self.points]
-        return {**facts, "values": [value.to_dict() for value in self.values]} | ({"points": points} if points else {})
+        more = {"remarks": list(self.remarks), "values": [value.to_dict() for value in self.values]}
+        return {**facts, **more} | ({"points": points} if points else {})
 
 
 @dataclass(frozen=True)

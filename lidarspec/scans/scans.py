@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lidarspec.columns.columns import Carry
+from lidarspec.display import drawn
 from lidarspec.errors import UsageError
 from lidarspec.packets.continuity import Reorder
 from lidarspec.packets.imu import ImuSamples, Waiting
@@ -138,6 +139,7 @@ class Scan:
         beams: how many `to_laserscan` gives where it is not told; None: as many as the sensor declares, else as there are points.
         frame_id: what ROS's messages call the frame of the points.
         number: which of its file it is, where that is read in pieces.
+        mount: how the sensor is mounted: the points are in its carrier's axes; None where they are in its own.
         provenance: the frame that each point came from.
     """
 
@@ -151,6 +153,7 @@ class Scan:
     beams: int | None = None
     frame_id: str = FRAME_ID
     number: int | None = None
+    mount: Mount | None = None
     provenance: Provenance = field(default_factory=Provenance)
 
     @property
@@ -168,6 +171,8 @@ class Scan:
         nominal = ", nominal calibration" if self.points.nominal else ""
         state = "complete" if self.complete else "with gaps" if self.whole else "partial"
         return f"Scan({len(self)} points, {rate}{span}, {state}{nominal})"
+
+    _repr_svg_ = drawn("scan")
 
     @property
     def facts(self) -> dict[str, str]:
@@ -565,7 +570,8 @@ class ScanStream:
         samples = None if self._imu is None else self._imu.until(ends)
         if self._mount is not None:
             cloud, samples = self._mount.applied(cloud), None if samples is None else samples.turned(self._mount.rotation)
-        return Scan(cloud, rate, complete, self._sensor, whole, samples, self._host or 0, provenance=provenance)
+        rate = float(rate) if whole else np.nan
+        return Scan(cloud, rate, complete, self._sensor, whole, samples, self._host or 0, mount=self._mount, provenance=provenance)
 
 
 def _times_ns(source: ColumnSource, indices: Sequence[int]) -> list[int | None]:

@@ -1,4 +1,4 @@
-"""Scans drawn: in a terminal, as SVG, or by a page in a browser.
+"""Scans drawn: in a terminal, as pictures in files, in notebooks, or by a page in a browser.
 
 In: a device, or points. Out: pictures, and what a page makes them of. Modules in reading order:
 
@@ -8,9 +8,13 @@ In: a device, or points. Out: pictures, and what a page makes them of. Modules i
 * `canvas`: pictures in character cells, and their inks.
 * `screen`: the terminal: cells that changed, single keys.
 * `svg`: one scan as a file.
+* `figures`: a scan, intensities, ranges and rates over time, for reports.
+* `rerun`: the scans in Rerun's viewer.
+* `notebook`: what notebooks show of scans, packets, explained frames and sensors.
 * `scene`: one scan as the message that a page draws.
 * `broadcast`: a source that is read once and shown to any number of pages; files played, moved through.
 * `backlog`: the newest bytes of it, frame by frame, and what was damaged.
 * `answers`: what a page is told, in JSON.
 * `server`: the page's files, its socket, and what may reach them.
+* `widget`: a source in a cell of a notebook, drawn as by the page.
 """
