@@ -178,6 +178,16 @@ class Batch:
         wanted = np.array([name in origin for name in self.names], np.bool_)[self.senders]
         return Batch(self.buffer, self.starts[wanted], self.sizes[wanted], self.at[wanted], self.senders[wanted], self.names)
 
+    def parts(self, size: int) -> Iterator[Batch]:
+        """The datagrams in stretches of about so many bytes."""
+        ends = np.cumsum(self.sizes)
+        start = 0
+        while start < len(self):
+            stop = max(int(ends.searchsorted(ends[start] - self.sizes[start] + size, side="right")), start + 1)
+            own = slice(start, stop)
+            yield Batch(self.buffer, self.starts[own], self.sizes[own], self.at[own], self.senders[own], self.names)
+            start = stop
+
     def sent(self, found: Frames) -> Iterator[tuple[str, Sender]]:
         """The types of frames found in these datagrams, and who sent them: of each type again where the sender changes."""
         if len(self.names) == 1:

@@ -2,12 +2,9 @@
 
 from __future__ import annotations
 
-import functools
 import math
-import re
 import time
-from collections.abc import Mapping, Sequence
-from fractions import Fraction
+from collections.abc import Sequence
 from shlex import quote
 from typing import Any, Literal
 
@@ -19,24 +16,19 @@ from lidarspec.cli.output import emit, emit_json, emit_lines, table
 from lidarspec.cli.terminal import note
 from lidarspec.device.device import Device, open as open_device
 from lidarspec.device.session import Reply
-from lidarspec.errors import CommandError, LidarSpecError, OutOfRange, UnknownCommand, UnknownField, UnknownFrame, UsageError, suggest
+from lidarspec.errors import CommandError, LidarSpecError, UnknownFrame, UsageError, suggest
+from lidarspec.explaining.assignments import arguments, values
 from lidarspec.explaining.explanation import explain
 from lidarspec.explaining.pieces import explained, pieces
 from lidarspec.plugins import sensor as named_sensor
-from lidarspec.spec.arguments import Octets, Range
-from lidarspec.spec.fields import factor, split_unit
 from lidarspec.spec.sensor import Sensor
-from lidarspec.spec.tree import FieldInfo, evaluated
 from lidarspec.transports.hexadecimal import unhexed
 from lidarspec.transports.open_url import is_live
 from lidarspec.transports.protocol import Chunk
-from lidarspec.wire.build import Steps, argument_slot, given_value, is_index, put, steps
-from lidarspec.wire.schema import Schema, schema
+from lidarspec.wire.schema import schema
 
 #: seconds to wait for what comes back on bytes sent by hand, and of silence behind it that end it.
 ANSWERED, QUIET = 1.0, 0.2
-_STEP = r"\w+(?:\[(?:\d+|\*)\])*"
-_PATH = re.compile(rf"{_STEP}(?:\.{_STEP})*")
 
 
 @click.command()
@@ -61,100 +53,6 @@ def build(sensor_id: str, frame: str, assignments: Sequence[str], as_json: bool,
         emit_json({"sensor": sensor.id, "frame": frame, "size": len(data), "hex": data.hex(" ")}, output)
     else:
         emit(data.hex(" ") if output is None or output.endswith(".hex") else data, output)
-
-
-def values(table: Schema, assignments: Sequence[str], place: str) -> dict[str, Any]:
-    """Raw values, nested as in the struct.
-
-    Raises:
-        UsageError: for an assignment that is none, an unknown field, or a value that its field cannot take.
-    """
-    parsed = [_assignment(table, text, place) for text in assignments]
-    found: dict[str, Any] = {}
-    for names, value in sorted(parsed, key=lambda item: any(is_index(step) for step in item[0])):
-        put(found, names, value, lambda path: _length(table, found, path, place))
-    return found
-
-
-def _assignment(table: Schema, text: str, place: str) -> tuple[Steps, Any]:
-    path, equals, value = text.partition("=")
-    if not equals or not _PATH.fullmatch(path):
-        raise UsageError(f"{place}: {text!r} is not field=value")
-    names = steps(path)
-    plain = ".".join(str(step) for step in names if not is_index(step))
-    info = table.all_fields.get(plain)
-    if info is None:
-        raise UnknownField(path, table.all_fields, place=place)
-    arrays = len(info.axes) - (info.kind == "bytes")
-    given = sum(map(is_index, names))
-    if given != arrays:
-        raise UsageError(f"{place}: {plain} is in {arrays} array{'s' * (arrays != 1)}, and {path!r} has {given} indices")
-    return names, _raw(info, value.strip(), path, place)
-
-
-def _raw(info: FieldInfo, text: str, path: str, place: str) -> Any:
-    """The raw value that a text stands for: hexadecimal for bytes, a label, a number, or a number with a unit."""
-    if info.kind == "bytes":
-        return _octets(text, f"{place}: {path}")
-    for raw, label in info.labels.items():
-        if text == label:
-            return raw
-    number, unit = _number(text, info.unit, f"{place}: {path}", "a number")
-    if unit:
-        return _nearest(info, number, path, place)
-    if number.denominator == 1 and info.kind != "float":
-        return int(number)
-    if info.kind == "int":
-        raise UsageError(f"{place}: {path} = {text} is not a raw integer{f'; give it a unit: {text}{info.unit}' if info.unit else ''}")
-    return float(number)
-
-
-def _octets(text: str, place: str) -> bytes:
-    try:
-        return unhexed(text)
-    except ValueError:
-        raise UsageError(f"{place} takes bytes in hexadecimal, not {text!r}") from None
-
-
-def _number(text: str, unit: str, place: str, wanted: str) -> tuple[Fraction, str]:
-    """A number, turned into a unit where it has one of its own, and this one."""
-    digits, given = split_unit(text)
-    per_unit = factor(given, unit) if given else Fraction(1)
-    if per_unit is None:
-        raise UsageError(f"{place} is in {unit or 'no unit'}, and {given!r} cannot be turned into that")
-    try:
-        number = Fraction(int(digits, 0)) if digits[:2].lower() in ("0x", "0b", "0o") else Fraction(digits)
-    except ValueError:
-        raise UsageError(f"{place} takes {wanted}, not {text!r}") from None
-    return number * per_unit, given
-
-
-def _nearest(info: FieldInfo, number: Fraction, path: str, place: str) -> int | float:
-    """The raw value nearest to a physical one."""
-    raw: int | float = info.raw(number)
-    if info.kind != "int":
-        return float(raw)
-    low, high = info.limits
-    if not low <= raw <= high:
-        edges = [float(info.physical(Fraction(edge))) for edge in (low, high)]
-        raise OutOfRange(path, float(number), *edges, unit=info.unit, place=place)
-    return raw
-
-
-def _length(table: Schema, given: Mapping[str, Any], path: str, place: str) -> int:
-    """The length of an array: declared, or from the count fields given; 0 where it follows from single elements given."""
-    declared = table.arrays.get(path)
-    if isinstance(declared, int):
-        return declared
-    try:
-        return int(evaluated(declared, functools.partial(given_value, given, table.fields)))  # type: ignore[arg-type]
-    except Exception:
-        target: Any = given
-        for name in path.removesuffix("[]").split("."):
-            target = target.get(name, {}) if isinstance(target, Mapping) else {}
-        if isinstance(target, list) and target:
-            return 0
-        raise UsageError(f"{place}: how many elements {path}[*] has is not known: give the count field, or {path}[0]=...") from None
 
 
 @click.command()
@@ -268,33 +166,6 @@ def _sent(device: Device, source: str, command: str, assignments: Sequence[str],
 def _refuse_file(device: Device, source: str) -> None:
     if not device.is_live:
         raise suggest(UsageError(f"{source} is a file: nothing can be sent to it"), "lidarspec ports")
-
-
-def arguments(sensor: Sensor, name: str, assignments: Sequence[str]) -> dict[str, Any]:
-    """The arguments of a command: numbers in the units of their fields, texts and addresses as they are, bytes from hexadecimal digits.
-
-    Raises:
-        UsageError: for an unknown command or argument, or a text that stands for no value of it.
-    """
-    if name not in sensor.commands:
-        hint = "" if sensor.commands else "; it takes no commands"
-        raise UnknownCommand(name, sensor.commands, place=sensor.id, hint=hint)
-    command = sensor.commands[name]
-    found: dict[str, Any] = {}
-    for text in assignments:
-        argument, equals, value = text.partition("=")
-        if not equals:
-            raise UsageError(f"{sensor.id} {name}: {text!r} is not argument=value")
-        if argument not in command.args or command.frame is None:
-            raise UnknownField(argument, command.args, place=f"{sensor.id} {name}")
-        slot, kind, place = argument_slot(sensor, name, argument), command.arguments[argument].kind, f"{sensor.id} {name}: {argument}"
-        if isinstance(kind, Range):
-            unit = slot.info.unit
-            number, _ = _number(value.strip(), unit, place, f"a number in {unit}" if unit else "a number")
-            found[argument] = int(number) if number.denominator == 1 else float(number)
-        else:
-            found[argument] = _octets(value, place) if isinstance(kind, Octets) else value
-    return found
 
 
 def replied(sensor: Sensor, reply: Reply, output: str | None = None) -> str:

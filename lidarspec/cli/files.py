@@ -3,7 +3,10 @@
 from __future__ import annotations
 
 import contextlib
+import io
 import itertools
+import math
+import time
 from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
@@ -15,8 +18,18 @@ import click
 
 from lidarspec import batch
 from lidarspec.cli.failures import FINDINGS, NO_DATA
-from lidarspec.cli.inputs import again, conclude, fits_instead, nearest_fault, no_frame, nothing_came, refuse_overwriting, scans_of
-from lidarspec.cli.options import BYTES, colour_option, count_option, output_options, points_option, selecting, sensor_option
+from lidarspec.cli.inputs import (
+    PATIENCE,
+    again,
+    conclude,
+    fits_instead,
+    nearest_fault,
+    no_frame,
+    nothing_came,
+    refuse_overwriting,
+    scans_of,
+)
+from lidarspec.cli.options import BYTES, DURATION, colour_option, count_option, output_options, points_option, selecting, sensor_option
 from lidarspec.cli.output import Progress, emit, emit_json, size
 from lidarspec.cli.terminal import note
 from lidarspec.device.device import Device, open as open_device
@@ -35,6 +48,8 @@ from lidarspec.spec.sensor import Sensor
 from lidarspec.stores import found
 from lidarspec.transports.open_url import is_live, transport
 from lidarspec.transports.protocol import Chunk, no_bytes
+from lidarspec.view import figures
+from lidarspec.view.feed import Feed
 from lidarspec.view.polar import look
 from lidarspec.view.svg import svg
 
@@ -108,8 +123,8 @@ def convert(
 
     .lsr, .pcap and .pcapng hold the packets themselves, as they were received.
 
-    Tables (.parquet, .arrow, .feather), surveys (.las, .laz, .e57), .zarr, logs of ROS (.mcap, .bag, .rosbag2, .db3) and of Foxglove
-    (.foxglove.mcap) take libraries that are not installed by default: lidarspec[arrow,las,e57,zarr,ros,foxglove].
+    Tables (.parquet, .arrow, .feather), surveys (.las, .laz, .e57), .zarr, logs of ROS (.mcap, .bag, .rosbag2, .db3), of Foxglove
+    (.foxglove.mcap) and of Rerun (.rrd) take libraries that are not installed by default: lidarspec[arrow,las,e57,zarr,ros,foxglove,rerun].
 
     With --to each IN is a file, a pattern in quotes, 'drives/**/*.pcap', or a URL, s3://bucket/a.pcap, and OUT a folder. What is done is
     written down there, in manifest.jsonl: the same command again does what is missing. A file that fails stops no other.
@@ -283,34 +298,89 @@ def info(file: str, as_json: bool, output: str | None) -> None:
 
 @click.command()
 @click.argument("source", metavar="IN")
-@click.option("-o", "--output", metavar="FILE.svg", required=True, help="Where to; - is standard output.")
+@click.option("-o", "--output", metavar="FILE", required=True, help="Where to: .svg, .png or .pdf; - is standard output, as SVG.")
 @sensor_option
+@click.option("--kind", type=click.Choice(["scan", "intensity", "ranges", "rates"]), default="scan", show_default=True, help="What of it.")
 @click.option("--scan", "number", type=click.IntRange(min=1), metavar="NUMBER", default=1, show_default=True, help="Which whole scan.")
+@click.option("-t", "--duration", type=DURATION, help="Of a live source so long.  [default: 10s, but for a scan]")
 @selecting("times", "scans", "every", "ranges", "time")
 @colour_option
 @click.option("--max-range", type=click.FloatRange(min=0, min_open=True), metavar="METRES", help="From the middle to the edge.")
 def plot(
-    source: str, output: str, sensor_id: str | Sensor | None, number: int, selection: Selection, ramp: str, max_range: float | None
+    source: str,
+    output: str,
+    sensor_id: str | Sensor | None,
+    kind: str,
+    number: int,
+    duration: float | None,
+    selection: Selection,
+    ramp: str,
+    max_range: float | None,
 ) -> None:
-    """A scan as an SVG picture.
+    """A scan as a picture; or intensities, ranges and rates over time.
 
-    From above, and from the side where the points are not in one plane.
+    A scan is drawn to scale, from above, and from the side where the points are not in one plane. --kind intensity counts how often each
+    intensity comes, ranges says how many returns there are at each range over time, and rates how many packets and scans a second,
+    with what is lost or wrong among them. All but the SVG of a scan takes matplotlib: lidarspec[plot].
     """
-    if output != "-" and Path(output).suffix.lower() != ".svg":
-        raise UsageError(f"{output}: pictures are written as .svg; browsers show them, Inkscape and rsvg-convert turn them into others")
+    suffix = ".svg" if output == "-" else Path(output).suffix.lower()
+    if suffix not in figures.SUFFIXES:
+        raise UsageError(f"{output}: pictures are written as {', '.join(figures.SUFFIXES)}")
     refuse_overwriting(output, source, sensor_id)
     with open_device(source, sensor_id) as device:
-        chosen: Scan | None = None
-        whole = 0
-        for scan in scans_of(device, source, selection):
-            whole += scan.whole
-            chosen = scan if scan.whole or chosen is None or not chosen.whole else chosen
-            if whole == number:
-                break
-        if chosen is None:
-            raise nothing_came(device, source)
-        if whole < number:
-            note(f"{source} has {whole} whole scan{'s' * (whole != 1)}; drawn is the last piece of it that could be")
-        title = f"{device.sensor.id}: {chosen}"
-        emit(svg(chosen.points, look(chosen.points, ramp=ramp, reach=max_range), title), output)
+        if kind == "scan":
+            chosen = _numbered(device, source, selection, number)
+            conclude(device)  # before a picture is drawn, while a live source goes on
+            how, title = look(chosen.points, ramp=ramp, reach=max_range), f"{device.sensor.id}: {chosen}"
+            if suffix == ".svg":
+                emit(svg(chosen.points, how, title), output)
+            else:
+                _save(figures.of_scan(chosen, how, title), output, suffix)
+        else:
+            until = time.monotonic() + (duration or (PATIENCE if device.is_live else math.inf))
+            _save(_over_time(device, source, selection, kind, until), output, suffix)
+
+
+def _numbered(device: Device, source: str, selection: Selection, number: int) -> Scan:
+    """A whole scan by its number; the last piece that could be drawn, where there are fewer."""
+    chosen: Scan | None = None
+    whole = 0
+    for scan in scans_of(device, source, selection):
+        whole += scan.whole
+        chosen = scan if scan.whole or chosen is None or not chosen.whole else chosen
+        if whole == number:
+            break
+    if chosen is None:
+        raise nothing_came(device, source)
+    if whole < number:
+        note(f"{source} has {whole} whole scan{'s' * (whole != 1)}; drawn is the last piece of it that could be")
+    return chosen
+
+
+def _over_time(device: Device, source: str, selection: Selection, kind: str, until: float) -> Any:
+    """A figure of what comes up to a time of `time.monotonic`."""
+    title = f"{device.sensor.id}, {Path(source).name if device.place else source}"
+    if kind == "rates":
+        rates = figures.Rates(Feed(device, select=selection), until)
         conclude(device)
+        return figures.of_rates(rates, title)
+
+    if (first := next(scans := scans_of(device, source, selection, until=until), None)) is None:
+        raise nothing_came(device, source)
+
+    def every() -> Iterator[Scan]:
+        yield first
+        yield from scans
+        conclude(device)
+
+    return (figures.of_ranges if kind == "ranges" else figures.of_intensities)(every(), title)
+
+
+def _save(figure: Any, output: str, suffix: str) -> None:
+    if output == "-":
+        text = io.BytesIO()
+        figures.save(figure, text, suffix)
+        emit(text.getvalue().decode(), output)
+        return
+    with replacing(Path(output)) as part:
+        figures.save(figure, part, suffix)

@@ -2,12 +2,10 @@
 
 from __future__ import annotations
 
-import contextlib
 import shlex
 import shutil
-import signal
 import time
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Mapping
 from pathlib import Path
 
 import click
@@ -17,7 +15,7 @@ from rich.text import Text
 from lidarspec.cli.failures import FINDINGS
 from lidarspec.cli.options import DURATION, SHARE, configuring, count_option, sensor_option
 from lidarspec.cli.output import Progress, drawn, emit_json, size
-from lidarspec.cli.terminal import note, say
+from lidarspec.cli.terminal import ended_by_terminate, note, say
 from lidarspec.device.demo import Demonstration, demonstrate
 from lidarspec.discovery.detect import chosen
 from lidarspec.errors import NO_SENSORS, UsageError, suggest
@@ -104,7 +102,7 @@ def sim(
     try:
         controls = {name: control.place for name, control in opened.controls.items()}
         _tell(sensor, opened.place, opened.source, controls, as_json=as_json)
-        with _ended_by_terminate(), Progress() as progress:
+        with ended_by_terminate(), Progress() as progress:
             serve(device, opened, seconds=duration, turn=_watching(device, opened, progress))
     finally:
         opened.close()
@@ -145,16 +143,6 @@ def _watching(device: SimulatedDevice, opened: Outlet, progress: Progress) -> Ca
 def _sent(device: SimulatedDevice) -> str:
     frames = [f"{number} {name}" for name, number in device.sent.items()]
     return f"{', '.join(frames) or 'no'} frames sent"
-
-
-@contextlib.contextmanager
-def _ended_by_terminate() -> Iterator[None]:
-    """SIGTERM ends it as Ctrl-C does, so that a link does not stay behind."""
-    before = signal.signal(signal.SIGTERM, signal.default_int_handler)
-    try:
-        yield
-    finally:
-        signal.signal(signal.SIGTERM, before)
 
 
 @click.command()

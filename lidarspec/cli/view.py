@@ -2,25 +2,31 @@
 
 from __future__ import annotations
 
+import math
 import shutil
 import sys
 import time
+import webbrowser
 from pathlib import Path
 
 import click
 
-from lidarspec.cli.inputs import PATIENCE, conclude, nothing_came
+from lidarspec.cli.inputs import PATIENCE, conclude, nothing_came, refuse_overwriting
 from lidarspec.cli.options import DURATION, colour_option, selecting, sensor_option
 from lidarspec.cli.output import drawn
-from lidarspec.cli.terminal import note, say
+from lidarspec.cli.terminal import ended_by_terminate, note, say
 from lidarspec.device.device import Device, open as open_device
+from lidarspec.errors import UsageError, library, suggest
+from lidarspec.formats.rerun import RERUN
 from lidarspec.scans.selection import Selection
 from lidarspec.spec.sensor import Sensor
 from lidarspec.transports.open_url import is_live
+from lidarspec.transports.protocol import Origin
 from lidarspec.view.canvas import Cells
 from lidarspec.view.feed import LOOK, Feed
 from lidarspec.view.live import Switch, Window
 from lidarspec.view.polar import look, picture
+from lidarspec.view.rerun import SCHEMES, show as show_in_rerun
 from lidarspec.view.screen import Screen, Terminated, encodable, interactive, keyboard
 
 
@@ -31,14 +37,51 @@ from lidarspec.view.screen import Screen, Terminated, encodable, interactive, ke
 @click.option("--once", is_flag=True, help="Print one picture and end, as where standard output is no terminal.")
 @selecting("times", "scans", "every", "ranges", "time")
 @colour_option
-def view(source: str, sensor_id: str | Sensor | None, duration: float | None, once: bool, selection: Selection, ramp: str) -> None:
-    """A sensor at work, drawn in the terminal.
+@click.option("--web", is_flag=True, help="A page in the browser; its link is printed.")
+@click.option("--open", "opens", is_flag=True, help="Open the page in the browser.")
+@click.option(
+    "--address", metavar="HOST[:PORT]", help="Where the page is; by default 127.0.0.1 and a free port. Elsewhere the link has a token."
+)
+@click.option("--control", is_flag=True, help="Let the page send commands to the sensor; to a simulated one it always may.")
+@click.option("--rerun", "in_rerun", is_flag=True, help="In Rerun's 3D viewer, which is opened, and not in the terminal.")
+@click.option(
+    "-o", "--output", metavar="FILE.rrd|URL", help="With --rerun: into a file, or a viewer that runs, rerun+http://HOST:9876/proxy."
+)
+def view(
+    source: str,
+    sensor_id: str | Sensor | None,
+    duration: float | None,
+    once: bool,
+    selection: Selection,
+    ramp: str,
+    web: bool,
+    opens: bool,
+    address: str | None,
+    control: bool,
+    in_rerun: bool,
+    output: str | None,
+) -> None:
+    """A sensor at work, drawn in the terminal, or with --web in the browser.
 
     From above, and from the side where the points are not in one plane. A file is played at its own speed. One picture is printed
     where standard output is no terminal.
 
     Keys: space pauses, r records, c switches colours, + - zoom, arrows move, 0 shows all again, ? helps, q quits.
+
+    --rerun needs lidarspec[rerun]; a file is read there as fast as possible, and its time runs in the viewer.
     """
+    if web and once:
+        raise UsageError("--web and --once are for two kinds of pictures: leave out one of them")
+    if web:
+        _serve(source, sensor_id, duration, selection, opens=opens, address=address, control=control)
+        return
+    if opens or address is not None or control:
+        raise UsageError("--open, --address and --control are for the page: add --web")
+    if output is not None and not in_rerun:
+        raise UsageError("-o is for --rerun; a picture is drawn into a file by lidarspec plot")
+    if in_rerun:
+        _in_rerun(source, sensor_id, output or "", ramp, duration, selection)
+        return
     if once or not interactive():
         with open_device(source, sensor_id) as device:
             say(_printed(device, source, ramp, duration or PATIENCE, selection), colour=True)
@@ -54,8 +97,75 @@ def view(source: str, sensor_id: str | Sensor | None, duration: float | None, on
             taken=source == "-",
         )
         conclude(device)
+    _tell_recordings(switch)
+
+
+def _tell_recordings(switch: Switch | None) -> None:
     for path, size in switch.written if switch else ():
         note(f"recorded {size} bytes; next: lidarspec view {Path(path).name}")
+
+
+def _serve(
+    source: str,
+    sensor_id: str | Sensor | None,
+    duration: float | None,
+    selection: Selection,
+    *,
+    opens: bool,
+    address: str | None,
+    control: bool,
+) -> None:
+    """The page, until the time is over or somebody ends it."""
+    host, port = listening(address)
+    for name in ("starlette", "uvicorn", "websockets"):
+        library(name, "web")
+    from lidarspec.view.broadcast import Broadcast
+    from lidarspec.view.server import PAGE, Site
+
+    if not (PAGE / "index.html").is_file():
+        raise suggest(UsageError("the page of --web is not built in this checkout"), "make page")
+    switch = Switch(source, Path.cwd()) if is_live(source) else None
+    device = open_device(source, sensor_id, record=switch.attached if switch else None, period=LOOK)
+    if switch is not None:
+        switch.sensor_id = device.sensor.id
+    broadcast = Broadcast(source, device, reopened=lambda: open_device(source, device.sensor), select=selection, switch=switch)
+    try:
+        with ended_by_terminate(), broadcast, Site(broadcast, host=host, port=port, control=control, say=note) as site:
+            say(site.link)
+            if opens and not webbrowser.open(site.link):
+                note("no browser was found: open the link yourself")
+            broadcast.run(math.inf if duration is None else time.monotonic() + duration)
+            conclude(broadcast.device)
+    finally:
+        _tell_recordings(switch)
+
+
+def listening(address: str | None) -> tuple[str, int]:
+    """The host and the port that an address of a page names; port 0 is a free one.
+
+    Raises:
+        UsageError: for a port that is none.
+    """
+    try:
+        origin = Origin.parse(address or "127.0.0.1")
+    except UsageError:
+        raise UsageError(f"--address is HOST or HOST:PORT, not {address}") from None
+    return origin.host, origin.port or 0
+
+
+def _in_rerun(source: str, sensor_id: str | Sensor | None, target: str, ramp: str, duration: float | None, selection: Selection) -> None:
+    """Scans in Rerun's viewer, or in a file of its, until the input ends or somebody has had enough."""
+    if target and not target.startswith(SCHEMES):
+        if not target.lower().endswith(RERUN.suffix):
+            raise UsageError(f"{target}: a recording for Rerun's viewer has the suffix {RERUN.suffix}")
+        refuse_overwriting([target], source, sensor_id)
+    with open_device(source, sensor_id, period=LOOK) as device:
+        feed = Feed(device, select=selection)
+        show_in_rerun(feed, target, ramp=ramp, until=time.monotonic() + (duration or math.inf))
+        if feed.scan is None:
+            raise nothing_came(device, source, duration)
+        note(f"{target or 'shown'}: {feed.number} scans of {device.sensor.id}")
+        conclude(device)
 
 
 def _show(device: Device, window: Window, *, taken: bool) -> None:

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import contextlib
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from itertools import accumulate
 from pathlib import Path
 from shlex import quote
@@ -105,6 +105,9 @@ class Input(Protocol):
         """Pass over what arrived before a time, ns since 1970, where that can be done without reading it: whether it is."""
         return False
 
+    def read_ahead(self, size: int) -> None:
+        """Read a file in portions of about so many bytes from now on; what is live comes as it does."""
+
     def gather(self, until: float) -> None:
         """Let what comes wait up to a time of `time.monotonic`, to be decoded together, and no longer than one wait for it takes."""
 
@@ -168,12 +171,12 @@ def fed(decoder: Decoder, chunks: Sequence[Chunk]) -> list[Frames]:
     return [frames.arrived(times[ends.searchsorted(frames.offsets + frames.sizes)]) for frames in found]
 
 
-def _streamed(decoder: Decoder, packets: Batch) -> Iterator[list[Frames]]:
+def _streamed(decoder: Decoder, packets: Batch, together: int) -> Iterator[list[Frames]]:
     """The frames that the packets of a byte stream complete, with the times of the packets that hold their last bytes."""
     data, ends = packets.joined, decoder.stats.bytes_in + np.cumsum(packets.sizes)
     at = np.where(packets.at, packets.at, -1)  # nobody knows
-    for start in range(0, len(data), BATCH_BYTES):
-        found = decoder.frames(data[start : start + BATCH_BYTES])
+    for start in range(0, len(data), together):
+        found = decoder.frames(data[start : start + together])
         yield [frames.arrived(at[ends.searchsorted(frames.offsets + frames.sizes)]) for frames in found]
 
 
@@ -204,6 +207,7 @@ class FileInput(Input):
         self._source, self.sensor, self._transport = source, sensor, opened
         self.decoder: Decoder = sensor.decoder(stream=not opened.datagrams, backend=backend)
         self.senders = Senders(source, sensor)
+        self._together = 0  # bytes; 0: as many as are worth it
         self._arrivals = self._read()
 
     @property
@@ -241,6 +245,9 @@ class FileInput(Input):
 
     def gather(self, until: float) -> None:
         """What is in a file is there."""
+
+    def read_ahead(self, size: int) -> None:
+        self._together = size
 
     def begin(self) -> None:
         """A file has no sensor to be started."""
@@ -280,14 +287,15 @@ class FileInput(Input):
         if isinstance(self._transport, CaptureTransport):
             for datagrams in self._transport.batches():
                 if self.decoder.stream:
-                    yield from map(Arrival, _streamed(self.decoder, datagrams))
+                    yield from map(Arrival, _streamed(self.decoder, datagrams, self._together or BATCH_BYTES))
                     continue
-                spans = self.decoder.placed(datagrams.buffer, datagrams.starts, datagrams.sizes, datagrams.at)
-                self.senders.see(datagrams.sent(spans))
-                yield Arrival([spans])
+                for part in datagrams.parts(self._together) if self._together else [datagrams]:
+                    spans = self.decoder.placed(part.buffer, part.starts, part.sizes, part.at)
+                    self.senders.see(part.sent(spans))
+                    yield Arrival([spans])
             yield Arrival(self.decoder.rest())
             return
-        for batch in _batches(self._transport.chunks()):
+        for batch in self._batches():
             if batch[0].gap or batch[0].quiet:
                 yield Arrival(self.decoder.rest(), interrupted=batch[0].gap)
             found = fed(self.decoder, batch)
@@ -296,16 +304,24 @@ class FileInput(Input):
             yield Arrival(found)
         yield Arrival(self.decoder.rest())
 
-
-def _batches(chunks: Iterator[Chunk]) -> Iterator[list[Chunk]]:
-    """The chunks, as many at once as are worth decoding together, up to where the line was interrupted or fell silent."""
-    found: list[Chunk] = []
-    size = 0
-    for chunk in chunks:
-        if found and (chunk.gap or chunk.quiet or size >= BATCH_BYTES or len(found) >= BATCH_CHUNKS):
+    def _batches(self) -> Iterator[list[Chunk]]:
+        """The chunks, as many at once as are worth decoding together, up to where the line was interrupted or fell silent."""
+        found: list[Chunk] = []
+        size = 0
+        for chunk in self._portions():
+            if found and (chunk.gap or chunk.quiet or size >= (self._together or BATCH_BYTES) or len(found) >= BATCH_CHUNKS):
+                yield found
+                found, size = [], 0
+            found.append(chunk)
+            size += len(chunk.data)
+        if found:
             yield found
-            found, size = [], 0
-        found.append(chunk)
-        size += len(chunk.data)
-    if found:
-        yield found
+
+    def _portions(self) -> Iterator[Chunk]:
+        """The chunks, of a stream cut where they are longer than what is read ahead."""
+        for chunk in self._transport.chunks():
+            rest = chunk
+            while self.decoder.stream and 0 < (size := self._together) < len(rest.data):
+                yield replace(rest, data=rest.data[:size])
+                rest = replace(rest, data=rest.data[size:], gap=False, quiet=False)
+            yield rest

@@ -21,7 +21,7 @@ from lidarspec.device.session import Reply
 from lidarspec.device.settings import named
 from lidarspec.discovery.detect import contradiction, detected, said
 from lidarspec.errors import SourceError, SourceTimeout, UsageError, suggest
-from lidarspec.framing.decoder import Decoder
+from lidarspec.framing.decoder import Decoder, Witness
 from lidarspec.framing.results import Counters, Found, Frames
 from lidarspec.packets.imu import ImuSamples, joined
 from lidarspec.packets.packets import Packets
@@ -317,6 +317,15 @@ class Device(Closing):
         It waits no longer than the `wait` of whoever iterates.
         """
         self._input.gather(until)
+
+    def read_ahead(self, size: int) -> None:
+        """Read a file in portions of about so many bytes from now on, for whoever shows it at the pace of its times: then counters, and
+        what a `Witness` is shown, are not far ahead of what is seen. 0: as many as are decoded quickest."""
+        self._input.read_ahead(size)
+
+    def witnessed(self, by: Witness) -> None:
+        """Show someone everything that is decoded from now on, and the frames that are found in it, in the thread that reads."""
+        self._input.decoder.witness = by
 
     def latest(self, timeout: float | None = None) -> Scan:
         """The newest whole scan, newer than the one that the last call gave; waits for it. Older ones are passed over.

@@ -262,6 +262,9 @@ class LiveInput(Input):
     def gather(self, until: float) -> None:
         self._due = max(self._due, until)
 
+    def read_ahead(self, size: int) -> None:
+        """Nothing can be read before it comes."""
+
     def mark(self) -> int:
         return self.queue.produced
 

@@ -9,5 +9,6 @@ Modules in reading order:
 * `pieces`: a stream in pieces: frames, and what was one before it was damaged.
 * `wording`: the words for values, bits, rows, points and differences.
 * `contents`: what is in a file.
+* `assignments`: the other way round, from what people write to values.
 * `listing`: rows and differences as lines, with roles for colours.
 """

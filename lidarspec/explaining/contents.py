@@ -168,6 +168,18 @@ def contents(path: str | Path) -> Contents:
     return found
 
 
+def duration(path: str | Path) -> float | None:
+    """Seconds from the first packet of a file to the last, where that is found without reading all of a long one; None where not.
+
+    Raises:
+        SourceError: where the file cannot be opened.
+    """
+    with contextlib.closing(transport(path)) as opened:
+        found = Contents(str(path), "", 0)
+        _count(found, opened)
+    return found.seconds
+
+
 def _size(path: Path) -> int:
     return sum(part.stat().st_size for part in path.rglob("*")) if path.is_dir() else path.stat().st_size
 

@@ -19,6 +19,7 @@ from typing import Any
 
 import numpy as np
 
+from lidarspec.display import drawn
 from lidarspec.errors import LidarSpecError, WireError
 from lidarspec.explaining.damage import told
 from lidarspec.explaining.listing import Line, Listing, text
@@ -27,6 +28,7 @@ from lidarspec.framing.frame_engine import codec
 from lidarspec.framing.results import IMPLAUSIBLE, Counters, Found, packed
 from lidarspec.packets.stream import PacketStream
 from lidarspec.points.plain import evaluate
+from lidarspec.scans.cutter import first_points
 from lidarspec.spec import Checksummed, Frame, Sensor
 from lidarspec.spec.bits import BitField
 from lidarspec.spec.construct_layer import UNNAMED, Seen, field_path, leaves, member
@@ -66,6 +68,8 @@ class Explanation:
     def __repr__(self) -> str:
         return f"Explanation({self.sensor} {self.frame or 'skipped'}, {len(self.data)} bytes: {self.verdict})"
 
+    _repr_html_ = drawn("explanation")
+
     def __str__(self) -> str:
         return "\n".join(text(line) for line in self.lines())
 
@@ -83,6 +87,10 @@ class Explanation:
     def is_filler(self) -> bool:
         """Whether it is no frame, and nothing but bytes that the sensor sends between frames."""
         return not self.frame and all(row.right for row in self.rows)
+
+    def path_of(self, number: int, part: int = 0) -> str | None:
+        """The path of the row that gives a point, by its number in the frame, or in a part of it; None where no row does."""
+        return next((row.path for row in self.rows if (part, number) in row.numbers), None)
 
     def lines(self, *, every: bool = False) -> list[Line]:
         """The listing in pieces; `every` draws the bits of all elements of an array, and not of the first alone."""
@@ -127,8 +135,7 @@ def explain(data: bytes, sensor: Sensor, frame: str | None = None) -> Explanatio
     if fault is not None and not fits(sensor, data[: trail.after], name):
         guessed = told(sensor.frames[name], data, lambda sent: values(sent, sensor, name))
         return Explanation(sensor.id, name, data, rows, fault, tuple(guessed))
-    points, notes = _points(sensor, name, data[: trail.after], rows)
-    rows = tuple(replace(row, points=given) for row, given in zip(rows, points, strict=True))
+    rows, notes = _with_points(sensor, name, data[: trail.after], rows)
     return Explanation(sensor.id, name, data, rows, fault, notes)
 
 
@@ -303,38 +310,38 @@ def _verdicts(data: bytes, seen: Seen) -> Iterator[tuple[str, tuple[str, bool]]]
     yield path, (f"{shown} {said} {how}", stored == computed or stored in seal.absent)
 
 
-def _points(sensor: Sensor, name: str, data: bytes, rows: Sequence[Row]) -> tuple[list[tuple[Point, ...]], tuple[str, ...]]:
-    """The points of each row, and what is to be said of the frame."""
+def _with_points(sensor: Sensor, name: str, data: bytes, rows: tuple[Row, ...]) -> tuple[tuple[Row, ...], tuple[str, ...]]:
+    """The rows with their points, and what is to be said of the frame."""
     frame = sensor.frames[name]
     survey = codec(frame).survey(np.frombuffer(data, np.uint8), np.zeros(1, np.intp))
     notes = ["not plausible: a decoder passes over this frame"] * bool(survey.status[0] == IMPLAUSIBLE)
-    none: list[tuple[Point, ...]] = [()] * len(rows)
     if not (frame.data or frame.points):
-        return none, tuple(notes)
+        return rows, tuple(notes)
     try:
         packets = PacketStream(sensor, name, Counters()).add([packed([Found(name, 0, data)])]).with_points
         if not len(packets):
-            return none, tuple(notes)
+            return rows, tuple(notes)
         evaluated = evaluate(packets)
     except LidarSpecError as error:
-        return none, (*notes, f"no points: {error}")
+        return rows, (*notes, f"no points: {error}")
     notes += ["defaults stand in for what a frame of another type would say"] * bool(evaluated.cloud.nominal)
     points = [Point.of(evaluated.cloud, index) for index in range(len(evaluated.cloud))]
     chain, parts = packets.table.schema.chain, _parts(sensor, name, data)
     if not chain and not parts:
-        return none, (*notes, *(f"point {point}" for point in points[:TOLD]))
+        return rows, (*notes, *(f"point {point}" for point in points[:TOLD]))
     arrays = {axis for info in packets.table.schema.fields.values() for axis in info.axes}
     along = tuple(axis for axis in evaluated.axes if axis in arrays)
     chain = along if len(along) == len(chain) else chain  # which of several arrays side by side points go with, they say
     inside = evaluated.counts.astype(np.bool_)
     numbers = np.where(inside, np.cumsum(inside).reshape(inside.shape) - 1, -1)
-    given: list[tuple[Point, ...]] = []
+    first, given = first_points(evaluated), list[Row]()
     for row in rows:
         spot = next((spot for spot, part in enumerate(parts) if f"{row.path}.".startswith(f"{part}.")), None if parts else 0)
         path = row.path if not parts or spot is None else row.path[len(parts[spot]) + 1 :]
-        own = () if spot is None else _numbers(path, chain, evaluated.axes, numbers[spot])
-        given.append(tuple(points[number] for number in own))
-    return given, tuple(notes)
+        own = [] if spot is None else _numbers(path, chain, evaluated.axes, numbers[spot])
+        within = tuple((spot or 0, number - int(first[spot or 0])) for number in own)
+        given.append(replace(row, points=tuple(points[number] for number in own), numbers=within))
+    return tuple(given), tuple(notes)
 
 
 def _parts(sensor: Sensor, name: str, data: bytes) -> list[str]:

@@ -101,11 +101,13 @@ class Value:
         return f"{text} {self.unit}".strip() + turns
 
     def to_dict(self) -> dict[str, Any]:
-        """The value for JSON: bytes as hexadecimal text, no entry for what is not there, null for nan and infinity."""
+        """The value for JSON: bytes and masks as hexadecimal text, no entry for what is not there, null for nan and infinity."""
         raw = self.raw.hex(" ") if isinstance(self.raw, bytes | bytearray) else number(self.raw)
         physical = {} if self.physical is None else {"value": number(self.physical)}
-        more = {name: getattr(self, name) for name in ("unit", "label", "bits", "docs") if getattr(self, name)}
-        return {"path": self.path, "raw": raw, **physical, **more}
+        place = {"start": self.start, "masks": self.masks.hex(" ")}
+        more = {name: text for name in ("unit", "label", "bits", "docs") if (text := getattr(self, name))}
+        more |= {"text": text} if (text := str(self)) else {}
+        return {"path": self.path, "raw": raw, **physical, **more, **place}
 
 
 @dataclass(frozen=True)
@@ -119,6 +121,7 @@ class Row:
         remarks: what else is to be said: constants, the verdict of a checksum, what is missing.
         right: False where the bytes are not what the spec asks for.
         points: the points that this element gives.
+        numbers: of each of them which part of the frame it is of, and which point of that, from 0.
     """
 
     offset: int
@@ -128,6 +131,7 @@ class Row:
     remarks: tuple[str, ...] = ()
     right: bool = True
     points: tuple[Point, ...] = ()
+    numbers: tuple[tuple[int, int], ...] = ()
 
     @property
     def meaning(self) -> str:
@@ -169,7 +173,8 @@ class Row:
         """The row for JSON."""
         facts = {"offset": self.offset, "hex": self.data.hex(" "), "path": self.path, "meaning": self.meaning, "right": self.right}
         points = [{name: number(value) for name, value in point._asdict().items()} for point in self.points]
-        return {**facts, "values": [value.to_dict() for value in self.values]} | ({"points": points} if points else {})
+        more = {"remarks": list(self.remarks), "values": [value.to_dict() for value in self.values]}
+        return {**facts, **more} | ({"points": points} if points else {})
 
 
 @dataclass(frozen=True)

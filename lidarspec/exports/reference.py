@@ -99,7 +99,7 @@ def _clock(clock: Clock) -> str:
 
 
 def _commands(sensor: Sensor) -> Iterator[str]:
-    rows = [(f"`{name}`", _asked(sensor, name), _answer(command), _effect(sensor, name)) for name, command in sensor.commands.items()]
+    rows = [(f"`{name}`", _asked(sensor, name), _answer(command), effect(sensor, name)) for name, command in sensor.commands.items()]
     return _table(["command", "bytes or arguments", "reply", ""], rows)
 
 
@@ -118,7 +118,8 @@ def _answer(command: Command) -> str:
     return " or ".join(f"`{name}`" for name in command.replies) if command.replies else "none documented"
 
 
-def _effect(sensor: Sensor, name: str) -> str:
+def effect(sensor: Sensor, name: str) -> str:
+    """What a command does, and when it is sent, in words."""
     command = sensor.commands[name]
     said = {
         "starts the data": command.starts,

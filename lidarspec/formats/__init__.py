@@ -14,6 +14,7 @@ formats, too. Modules in reading order:
 * `messages`: ROS's messages of scans, packets and IMU samples.
 * `bags`: .mcap, .bag, .rosbag2 and .db3, a message a scan.
 * `foxglove`: .foxglove.mcap, with Foxglove's messages.
+* `rerun`: .rrd, for Rerun's viewer.
 """
 
 from __future__ import annotations
@@ -35,6 +36,7 @@ from lidarspec.formats.clouds import KITTI, LZF_PCD, PCD, PLY
 from lidarspec.formats.e57 import E57
 from lidarspec.formats.foxglove import FOXGLOVE
 from lidarspec.formats.las import LAS, LAZ
+from lidarspec.formats.rerun import RERUN
 from lidarspec.formats.tables import ARROW, FEATHER, PARQUET
 from lidarspec.formats.text import CSV, CSV_GZ, XYZ, write_columns
 from lidarspec.formats.writing import replacing
@@ -47,7 +49,7 @@ from lidarspec.transports.protocol import Chunk, Format
 MOMENT = {"%F": slice(10), "%H": slice(11, 13), "%M": slice(14, 16), "%S": slice(17, 19)}
 PLACE = re.compile(rf"%0?\d?d|{'|'.join(MOMENT)}")
 ARRAYS, TABLES = (CSV, CSV_GZ, XYZ, NPZ, NPY, ZARR), (PARQUET, ARROW, FEATHER)
-CLOUDS, BAGS = (PCD, LZF_PCD, PLY, KITTI, LAS, LAZ, E57), (MCAP, FOXGLOVE, BAG, ROSBAG2, DB3)
+CLOUDS, BAGS = (PCD, LZF_PCD, PLY, KITTI, LAS, LAZ, E57), (MCAP, FOXGLOVE, BAG, ROSBAG2, DB3, RERUN)
 BUILT_IN = {known.suffix: known for known in (*ARRAYS, *TABLES, *CLOUDS, *BAGS)}
 
 

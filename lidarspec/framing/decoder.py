@@ -9,7 +9,7 @@ from __future__ import annotations
 import os
 from collections.abc import Mapping, Sequence
 from functools import lru_cache
-from typing import Any
+from typing import Any, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -42,6 +42,16 @@ BACKENDS = ("auto", "numpy", "jit", "construct")
 BACKEND = "LIDARSPEC_BACKEND"
 
 
+class Witness(Protocol):
+    """Who is shown what a decoder is fed, and what it finds in it."""
+
+    def fed(self, decoder: Decoder, buffer: NDArray[np.uint8], starts: Numbers, sizes: NDArray[np.intp]) -> None:
+        """What a decoder, whose `stats` do not count it yet, is fed: a piece of a stream, or datagrams, whose buffer stays as it is."""
+
+    def found(self, frames: Frames) -> None:
+        """Frames, in stream order."""
+
+
 class Decoder:
     """Finds the frames of one sensor in what it is fed.
 
@@ -53,6 +63,7 @@ class Decoder:
 
     Attributes:
         framing: the rules by which its frames are told apart, which no byte changes.
+        witness: who is shown its bytes and frames; None for nobody.
     """
 
     def __init__(self, sensor: Spec, *, stream: bool, backend: str = "auto", sums: Sums | None = None) -> None:
@@ -60,6 +71,7 @@ class Decoder:
             raise UsageError(f"{sensor.id} has no frames yet: configure it with its file first")
         self.sensor, self.stream, self.backend = sensor, stream, backend
         self.stats = Counters()
+        self.witness: Witness | None = None
         keep_freed_memory()
         self.framing = _framing(tuple(sensor.incoming), tuple(sensor.incoming.values()), backend == "construct", sums)
         answer = sensor.options.get("answer", "")  # as if the frame that the answer comes after had been seen
@@ -108,6 +120,9 @@ class Decoder:
         view = np.ascontiguousarray(data).data.cast("B") if isinstance(data, np.ndarray) else memoryview(data).cast("B")
         if not self.stream:
             return [self.datagrams([view], [at])]
+        if self.witness is not None:
+            buffer = np.frombuffer(data if isinstance(data, bytes) else bytes(view), np.uint8)
+            self.witness.fed(self, buffer, range(1), repeated(len(view), 1))
         self.stats.bytes_in += len(view)
         found: list[Frames] = []
         start, lasting = 0, isinstance(data, bytes)
@@ -160,6 +175,8 @@ class Decoder:
         """
         size = alike(sizes)
         total, places, joined = int(sizes.sum()) if size is None else size * len(sizes), _places(sizes, self._base), None
+        if self.witness is not None:
+            self.witness.fed(self, buffer, starts, sizes)
         if self._assembly is not None:
             joined = self._assembly.join(buffer, starts, sizes, at, self._base)
             buffer, starts, sizes, at, places = joined.buffer, joined.starts, joined.sizes, joined.at, joined.places
@@ -178,7 +195,12 @@ class Decoder:
             if not is_good:
                 frames, places, at = frames.only(good), array_of(places)[good], at[good]
         self._count(frames.kinds)
-        return frames.located(self.framing.names, places, gaps, at)
+        return self._shown(frames.located(self.framing.names, places, gaps, at))
+
+    def _shown(self, frames: Frames) -> Frames:
+        if self.witness is not None:
+            self.witness.found(frames)
+        return frames
 
     def _lost(
         self,
@@ -243,7 +265,7 @@ class Decoder:
         self._count(frames.kinds)
         places = frames.places
         places = range(places.start + base, places.stop + base, places.step) if isinstance(places, range) else places + base
-        return frames.located(self.framing.names, places, gaps, repeated(-1 if at is None else at, len(frames)))
+        return self._shown(frames.located(self.framing.names, places, gaps, repeated(-1 if at is None else at, len(frames))))
 
     def _gaps(self, buffer: NDArray[np.uint8], frames: Frames, end: int) -> NDArray[np.int64]:
         """The bytes skipped before each frame of a piece that ends there, fillers left out; counts them."""

@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lidarspec.columns.columns import AROUND, Batch, physical
+from lidarspec.display import drawn
 from lidarspec.errors import SpecError, UnknownField
 from lidarspec.framing.results import Counters, Numbers, array_of
 from lidarspec.packets.clocks import part_times
@@ -77,6 +78,8 @@ class Packets:
     def __repr__(self) -> str:
         span = f", {(int(self.time_ns[-1]) - int(self.time_ns[0])) / 1e9:.3f} s" if len(self) > 1 else ""
         return f"Packets({len(self)} {self.frame} frames of {self.sensor.id}{span})"
+
+    _repr_html_ = drawn("packets")
 
     def __getitem__(self, path: str) -> NDArray[np.float64]:
         """A field in its unit: float64, shape (n, *lengths of its arrays); nan where a frame lacks the field.

@@ -19,6 +19,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import DTypeLike, NDArray
 
+from lidarspec.display import drawn
 from lidarspec.errors import UnknownName, UsageError, library
 from lidarspec.points.conventions import TYPES, UNITS, Floats, Grid, Grids, Kind, narrowed, whole_columns
 
@@ -92,6 +93,8 @@ class PointCloud:
         near, far = (f(self.range[self.valid], initial=start) for f, start in ((np.min, np.inf), (np.max, 0)))
         span = f", {near:.2f}..{far:.2f} m" if self.valid.any() else ""
         return f"PointCloud({len(self)} points, {int(self.valid.sum())} valid{span}{', nominal calibration' if self.nominal else ''})"
+
+    _repr_svg_ = drawn("cloud")
 
     @property
     def columns(self) -> Mapping[str, NDArray[Any]]:

@@ -5,13 +5,14 @@ from __future__ import annotations
 import dataclasses
 import math
 from collections.abc import Iterable, Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from lidarspec.columns.columns import Carry
+from lidarspec.display import drawn
 from lidarspec.errors import UsageError
 from lidarspec.packets.continuity import Reorder
 from lidarspec.packets.imu import ImuSamples, Waiting
@@ -63,6 +64,65 @@ class LaserScan:
     host_ns: int = 0
 
 
+class Place(NamedTuple):
+    """The frame that a point came from.
+
+    Attributes:
+        frame: its type.
+        offset: of its first byte in the input.
+        host_ns: when it arrived, ns since 1970; 0 where nobody knows it.
+        part: which of the frame's parts that have points, from 0; 0 where it has them itself.
+        number: which point of the frame, or of that part.
+        data: the bytes of the frame; those that its fields stand in, where the wire has another form of them (`Frame.wire`).
+    """
+
+    frame: str
+    offset: int
+    host_ns: int
+    part: int
+    number: int
+    data: bytes
+
+
+class Provenance:
+    """The packets that the points of a scan are made of, in stream order."""
+
+    def __init__(self) -> None:
+        self._size, self._batches = 0, list[tuple[int, int, Packets, Evaluated, int]]()
+
+    def add(self, packets: Packets, points: Evaluated, start: int, stop: int, before: int) -> None:
+        """Further points, from `start` to `stop` of those of a batch; `before`: parts of the first frame that an earlier batch had."""
+        self._batches.append((self._size, start, packets, points, before))
+        self._size += stop - start
+
+    def __call__(self, point: int) -> Place:
+        """Where a point of the scan, by its index, came from.
+
+        Raises:
+            IndexError: for a point that the scan does not have.
+        """
+        if not 0 <= point < self._size:
+            raise IndexError(f"point {point} of {self._size}")
+        first, start, packets, points, before = next(batch for batch in reversed(self._batches) if batch[0] <= point)
+        starts, local = first_points(points), start + point - first
+        row = int(starts.searchsorted(local, side="right")) - 1
+        frame, offset, at = packets.frame.partition(".")[0], int(packets.offset[row]), int(packets.host_ns[row])
+        table, which = packets.frames
+        data = table.frame(row if isinstance(which, slice) else int(which[row]))
+        return Place(frame, offset, at, rank(packets, row, before), local - int(starts[row]), data)
+
+    def __reduce__(self) -> Any:
+        return Provenance, ()  # packets do not go with a scan to another process
+
+
+def rank(packets: Packets, row: int, before: int) -> int:
+    """Which of its frame's parts a packet is, from 0; `before`: how many of the first one's frame an earlier batch had."""
+    _, which = packets.frames
+    if isinstance(which, slice):
+        return 0
+    return row - int(which.searchsorted(which[row])) + before * bool(which[row] == which[0])
+
+
 @dataclass(frozen=True, eq=False, repr=False)
 class Scan:
     """The points between two cuts.
@@ -79,6 +139,8 @@ class Scan:
         beams: how many `to_laserscan` gives where it is not told; None: as many as the sensor declares, else as there are points.
         frame_id: what ROS's messages call the frame of the points.
         number: which of its file it is, where that is read in pieces.
+        mount: how the sensor is mounted: the points are in its carrier's axes; None where they are in its own.
+        provenance: the frame that each point came from.
     """
 
     points: PointCloud
@@ -91,6 +153,8 @@ class Scan:
     beams: int | None = None
     frame_id: str = FRAME_ID
     number: int | None = None
+    mount: Mount | None = None
+    provenance: Provenance = field(default_factory=Provenance)
 
     @property
     def stamp_ns(self) -> int:
@@ -107,6 +171,8 @@ class Scan:
         nominal = ", nominal calibration" if self.points.nominal else ""
         state = "complete" if self.complete else "with gaps" if self.whole else "partial"
         return f"Scan({len(self)} points, {rate}{span}, {state}{nominal})"
+
+    _repr_svg_ = drawn("scan")
 
     @property
     def facts(self) -> dict[str, str]:
@@ -404,6 +470,7 @@ class ScanStream:
         self._waiting: Packets | None = None
         self._carry: Carry = {}
         self._parts: list[Stretch] = []
+        self._provenance, self._split = Provenance(), 0  # parts of a frame that were ready before others of it
         self._epoch: int | None = None
         self._progress = Progress(sensor)
         self._empty, self._broken = 0, False  # frames without parts that have points, and whether there is a break before those at the end
@@ -418,7 +485,7 @@ class ScanStream:
 
     def __getstate__(self) -> dict[str, Any]:
         """What is pickled goes on behind the scan under way, whose points it does not have."""
-        return {**vars(self), "_parts": [], "_left_out": self._left_out or bool(self._parts)}
+        return {**vars(self), "_parts": [], "_provenance": Provenance(), "_left_out": self._left_out or bool(self._parts)}
 
     def add(self, packets: Packets) -> list[Scan]:
         """The scans that these packets complete."""
@@ -445,10 +512,12 @@ class ScanStream:
         points = guarded(packets, self._carry, final=final, epoch=self._epoch)
         if points is None:
             return []
-        self._carry = points.carry
+        self._carry, before = points.carry, self._split
         if points.ready < len(packets):
-            self._waiting = packets.take(slice(points.ready, None))
-        return list(self._cut(packets, points))
+            self._waiting, self._split = packets.take(slice(points.ready, None)), rank(packets, points.ready, before)
+        else:
+            self._split = 0
+        return list(self._cut(packets, points, before))
 
     def _with_points(self, packets: Packets) -> Packets:
         """The packets that points are made of: these, or the parts in them; a frame without any leaves no gap."""
@@ -462,7 +531,7 @@ class ScanStream:
             self._broken = bool(left.any()) or (self._broken and not len(spots))
         return parts
 
-    def _cut(self, packets: Packets, points: Evaluated) -> Iterator[Scan]:
+    def _cut(self, packets: Packets, points: Evaluated, before: int) -> Iterator[Scan]:
         start, source = 0, source_of(points.cloud)
         cuts = self._progress.cuts(packets, points, self._cutter.ends(packets, points))
         starts = [0, *(cut.point for cut in cuts)]
@@ -471,20 +540,22 @@ class ScanStream:
         self._begins = first if self._begins is None else self._begins
         self._host = arrived if self._host is None else self._host
         for cut, time, host in zip(cuts, times, hosts, strict=True):
-            self._take(source, start, cut.point)
+            self._take(packets, points, start, cut.point, before)
             scan = self._close(time, whole=cut.whole, complete=cut.complete)
             self._begins, self._host, start = time, host, cut.point
             if scan is not None:
                 yield scan
-        self._take(source, start, source.size)
+        self._take(packets, points, start, source.size, before)
 
-    def _take(self, source: ColumnSource, start: int, stop: int) -> None:
+    def _take(self, packets: Packets, points: Evaluated, start: int, stop: int, before: int) -> None:
         if start < stop:
-            self._parts.append(Stretch(source, start, stop))
+            self._parts.append(Stretch(source_of(points.cloud), start, stop))
+            self._provenance.add(packets, points, start, stop, before)
 
     def _close(self, ends: int | None, *, whole: bool = False, complete: bool = False) -> Scan | None:
         """The scan of the points so far; `ends`: the time of the first point after it, ns."""
         parts, self._parts = self._parts, []
+        provenance, self._provenance = self._provenance, Provenance()
         if self._left_out:
             self._left_out, parts = False, []
             if self._imu is not None:
@@ -494,12 +565,13 @@ class ScanStream:
         begins = self._begins
         assert begins is not None  # since there are points
         period = (ends - begins) * 1e-9 if ends is not None else np.nan
-        rate = 1 / period if period > 0 else np.nan
+        rate = 1 / period if whole and period > 0 else np.nan
         cloud: PointCloud = LazyCloud.of(Stretches(parts, from_first=True), begins)
         samples = None if self._imu is None else self._imu.until(ends)
         if self._mount is not None:
             cloud, samples = self._mount.applied(cloud), None if samples is None else samples.turned(self._mount.rotation)
-        return Scan(cloud, float(rate) if whole else np.nan, complete, self._sensor, whole, samples, self._host or 0)
+        rate = float(rate) if whole else np.nan
+        return Scan(cloud, rate, complete, self._sensor, whole, samples, self._host or 0, mount=self._mount, provenance=provenance)
 
 
 def _times_ns(source: ColumnSource, indices: Sequence[int]) -> list[int | None]:

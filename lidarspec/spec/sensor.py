@@ -18,6 +18,7 @@ from os import PathLike
 from reprlib import repr as shown
 from typing import TYPE_CHECKING, Any
 
+from lidarspec.display import drawn
 from lidarspec.errors import LidarSpecError, PluginError, UnknownOption, UsageError
 from lidarspec.spec.description import Spec
 from lidarspec.trust import beside
@@ -124,6 +125,8 @@ class Sensor(Spec):
     Raises:
         SpecError: for an id, status or reference between its parts that cannot be.
     """
+
+    _repr_html_ = drawn("sensor")
 
     def __post_init__(self) -> None:
         super().__post_init__()

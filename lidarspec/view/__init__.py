@@ -1,6 +1,6 @@
-"""Scans drawn, in a terminal or as SVG.
+"""Scans drawn: in a terminal, as pictures in files, in notebooks, or by a page in a browser.
 
-In: a device, or points. Out: pictures. Modules in reading order:
+In: a device, or points. Out: pictures, and what a page makes them of. Modules in reading order:
 
 * `live`: the window that shows a sensor at work: keys in, pictures and figures out, a recording switched on and off.
 * `feed`: what the device delivers, taken in and counted between two pictures.
@@ -8,4 +8,13 @@ In: a device, or points. Out: pictures. Modules in reading order:
 * `canvas`: pictures in character cells, and their inks.
 * `screen`: the terminal: cells that changed, single keys.
 * `svg`: one scan as a file.
+* `figures`: a scan, intensities, ranges and rates over time, for reports.
+* `rerun`: the scans in Rerun's viewer.
+* `notebook`: what notebooks show of scans, packets, explained frames and sensors.
+* `scene`: one scan as the message that a page draws.
+* `broadcast`: a source that is read once and shown to any number of pages; files played, moved through.
+* `backlog`: the newest bytes of it, frame by frame, and what was damaged.
+* `answers`: what a page is told, in JSON.
+* `server`: the page's files, its socket, and what may reach them.
+* `widget`: a source in a cell of a notebook, drawn as by the page.
 """

@@ -15,6 +15,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from lidarspec.device.arrivals import BATCH_BYTES
 from lidarspec.device.device import Device
 from lidarspec.framing.results import Counters
 from lidarspec.packets.packets import Packets
@@ -28,6 +29,8 @@ Seconds = NDArray[np.float64]
 STEP, LONGEST = 0.1, 2.0
 #: seconds that one look at a live source waits for data.
 LOOK = 0.04
+#: seconds of a file that is played that are read at once, and bytes of it at first.
+AHEAD, PORTION = 0.1, 1 << 12
 
 
 @dataclass(frozen=True)
@@ -193,7 +196,7 @@ class Feed:
     Args:
         device: open; stays so.
         played: scans of a file come at the times that they bear; else as fast as they are read.
-        speed: how many times faster than that.
+        speed: how many times faster than that; may be set while it plays.
         select: which scans, and what of each; packets at these times.
 
     Attributes:
@@ -206,7 +209,7 @@ class Feed:
     """
 
     def __init__(self, device: Device, *, played: bool = False, speed: float = 1.0, select: Selection | None = None) -> None:
-        self.device, self.number, self._speed = device, 0, speed
+        self.device, self.number, self.speed = device, 0, speed
         self._select = select or Selection()
         self._sieve, self._slice = Sieve(self._select, device.source, device.skip), Slice(self._select.times)
         self.scan: Scan | None = None
@@ -218,7 +221,9 @@ class Feed:
         self._waiting: deque[Scan] = deque()
         self._disconnects, self._read_out, self._metered = 0, False, False
         self._due: float | None = None
-        self._stamp = 0
+        self._stamp, self._portion = 0, PORTION
+        if self._played:
+            device.read_ahead(PORTION)
 
     @property
     def ended(self) -> bool:
@@ -239,6 +244,21 @@ class Feed:
                 self._take()
             if time.monotonic() >= until:
                 return
+
+    def step(self) -> None:
+        """Show the next scan of a file that is played, whenever it is due; none where that has ended.
+
+        Raises:
+            LidarSpecError: where the source fails.
+        """
+        self.scans, number = [], self.number
+        while self.number == number and not self.ended:
+            if self._waiting:
+                self._stamp = self._waiting[0].stamp_ns
+                self._show(self._waiting.popleft())
+            else:
+                self._take()
+        self.rest()
 
     def rest(self) -> None:
         """Let the time of a file stand still; call it while the picture does."""
@@ -264,6 +284,18 @@ class Feed:
                 self.meter, self._metered = before, True
                 self.meter.packets(counted)
             self._keep(self._stream.add(packets))
+            if self._played:
+                self._pace(int(packets.time_ns[-1]) - int(packets.time_ns[0]))
+
+    def _pace(self, lasted: int) -> None:
+        """Read about as much of a file at once as is shown in a moment; `lasted`: what was read, ns."""
+        seconds, portion = lasted * 1e-9, self._portion
+        if seconds < AHEAD / 2 and portion < BATCH_BYTES:
+            self._portion *= 2
+        elif seconds > AHEAD and portion > PORTION:
+            self._portion //= 2
+        if self._portion != portion:
+            self.device.read_ahead(self._portion)
 
     def _meter(self) -> Meter:
         """One that counts from here on."""
@@ -299,7 +331,7 @@ class Feed:
             self._due = time.monotonic()
         else:
             step = (scan.stamp_ns - self._stamp) * 1e-9
-            due = max(self._due + (step if 0 < step <= LONGEST else STEP) / self._speed, time.monotonic() - LONGEST)
+            due = max(self._due + (step if 0 < step <= LONGEST else STEP) / self.speed, time.monotonic() - LONGEST)
             if due > until:
                 time.sleep(max(until - time.monotonic(), 0.0))
                 return

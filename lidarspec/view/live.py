@@ -91,6 +91,11 @@ class Switch:
             self.trouble = str(error)
 
     @property
+    def bytes(self) -> int:
+        """The bytes of the wire in the file that is being written; 0 while it is off."""
+        return self._recorder.bytes if self._recorder is not None else 0
+
+    @property
     def error(self) -> SourceError | None:
         """What went wrong with the file that is being written."""
         return self._recorder.error if self._recorder is not None else None

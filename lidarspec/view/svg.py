@@ -1,104 +1,184 @@
-"""A cloud as an SVG picture: the same views as in the terminal, for a page."""
+"""A cloud as an SVG picture: the same views as in the terminal, for a page, light or dark as its reader wishes."""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Iterator
+from dataclasses import dataclass
 from html import escape
 
 import numpy as np
 from numpy.typing import NDArray
 
 from lidarspec.points.cloud import PointCloud
-from lidarspec.view.canvas import STEPS, Rgb
+from lidarspec.view.canvas import INKS, STEPS, Rgb, first_ink
 from lidarspec.view.polar import Look, ring_step, shade
 
-#: pixels: of each side of the view from above, of the margins, of a dot, and of the highest view from the side.
-SIDE, MARGIN, DOT, HIGHEST = 720, 40, 1.6, 320
+#: pixels: of each side of the view from above, of the margins, of the lines above it, of one above each view, and of a dot.
+SIDE, MARGIN, HEAD, LINE, DOT = 720, 24, 58, 18, 1.6
+#: share of a side that heights take at most, and how near to dots and to the sensor the view from above ends, pixels.
+HIGHEST, NEAR = 0.45, 24
+#: pixels from dot to dot, where there would be too many of them the next.
+GRIDS = (0.5, 1.0, 1.5, 2.0, 3.0, 4.0, 6.0)
 #: near to far, or weak to strong: hues that can be told apart on white.
 _INK: tuple[Rgb, ...] = ((205, 40, 45), (214, 116, 0), (140, 138, 0), (24, 138, 62), (0, 128, 150), (44, 84, 200), (118, 48, 176))
+#: of ground, lines, text and headings, on white; and on a dark ground.
+_LIGHT, _DARK = ("#fff", "#ddd", "#555", "#222"), ("#14161b", "#34373f", "#9ea3ae", "#e4e6eb")
+_PARTS = ("ground", "line", "text", "head")
 
 
-def svg(points: PointCloud, look: Look, title: str) -> str:
-    """The cloud from above and, unless the look is flat, from its right side, as an SVG document."""
+def svg(points: PointCloud, look: Look, title: str, *, side: int = SIDE, most: int | None = None) -> str:
+    """The cloud from above and, unless the look is flat, from its right side, as an SVG document.
+
+    Args:
+        side: pixels of a side of the view from above.
+        most: dots of a view at most: where there are more returns, one stands for its neighbours.
+    """
     cloud = points[points.valid]
-    scale = SIDE / 2 / look.reach
-    colours = np.clip(shade(cloud, look) * STEPS, 0, STEPS - 1).astype(np.intp)
-    above = list(_above(cloud, colours, look, scale))
-    side, height = (list(_side(cloud, colours, look, scale)), _heights(cloud, scale)[1]) if not look.flat else ([], 0.0)
-    width, total = SIDE + 2 * MARGIN, SIDE + 3 * MARGIN + (height + MARGIN if side else 0)
-    parts = [
-        f'<svg xmlns="http://www.w3.org/2000/svg" viewBox="0 0 {width} {total:.0f}" width="{width}" height="{total:.0f}" '
-        'font-family="sans-serif" font-size="12" fill="#555">',
-        f'<rect width="100%" height="100%" fill="#fff"/><text x="{MARGIN}" y="24" font-size="14" fill="#222">{escape(title)}</text>',
-        *_legend(look),
-        f'<svg x="{MARGIN}" y="{MARGIN * 1.5}" width="{SIDE}" height="{SIDE}">',
-        *above,
-        "</svg>",
+    views = _Views(cloud, look, side, most, np.clip(shade(cloud, look) * STEPS, 0, STEPS - 1).astype(np.intp))
+    shown = [views.above()] if look.flat else [views.above(), views.beside()]
+    width, top = side + 2 * MARGIN, HEAD
+    body: list[str] = []
+    for view in shown:
+        body.append(f'<text x="{MARGIN}" y="{top + 12}" {_as("text")}>{view.told}</text>')
+        box = f'viewBox="0 {view.top:.0f} {side} {view.height:.0f}"'
+        body += [f'<svg x="{MARGIN}" y="{top + LINE}" width="{side}" height="{view.height:.0f}" {box}>', *view.parts, "</svg>"]
+        top += round(view.height) + LINE + MARGIN
+    drawn = " and ".join(f"{view.dots:,}" for view in shown)
+    head = [
+        f'<svg xmlns="http://www.w3.org/2000/svg" viewBox="0 0 {width} {top}" width="{width}" height="{top}" '
+        'font-family="system-ui, sans-serif" font-size="12">',
+        f"<style>{_style()}</style>",
+        f'<rect width="100%" height="100%" {_as("ground")}/>',
+        f'<text x="{MARGIN}" y="26" font-size="14" {_as("head")}>{escape(title)}</text>',
+        f'<text x="{MARGIN}" y="48" {_as("text")}>{len(cloud):,} returns as {drawn} dots</text>',
+        *_legend(look, width - MARGIN),
     ]
-    if side:
-        parts += [f'<svg x="{MARGIN}" y="{SIDE + MARGIN * 2.5}" width="{SIDE}" height="{height:.0f}">', *side, "</svg>"]
-    return "\n".join([*parts, "</svg>"]) + "\n"
+    return "\n".join([*head, *body, "</svg>"]) + "\n"
 
 
-def _above(cloud: PointCloud, colours: NDArray[np.intp], look: Look, scale: float) -> Iterator[str]:
-    """Rings with their ranges, axes, points, and the sensor; forward is up."""
-    across, down = SIDE / 2 + look.middle[1] * scale, SIDE / 2 + look.middle[0] * scale
-    yield f'<g fill="none" stroke="#ddd"><path d="M{across:.1f} 0V{SIDE}M0 {down:.1f}H{SIDE}"/>'
-    step = ring_step(look.reach)
-    radii = [step * number for number in range(1, int(look.reach * math.sqrt(2) / step) + 1)]
-    for radius in radii:
-        yield f'<circle cx="{across:.1f}" cy="{down:.1f}" r="{radius * scale:.1f}"/>'
-    yield "</g>"
-    yield from _dots(across - cloud.y * scale, down - cloud.x * scale, colours)
-    for radius in radii:
-        yield f'<text x="{across + radius * scale - 3:.1f}" y="{down - 4:.1f}" text-anchor="end">{radius:g} m</text>'
-    yield f'<path d="M{across:.1f} {down - 9:.1f}l6 15h-12z" fill="#222"/>'
-    yield f'<text x="{across + 6:.1f}" y="12">0° forward</text><text x="2" y="{down - 4:.1f}">90°</text>'
+@dataclass(frozen=True)
+class _View:
+    """A view: what it is, what is drawn, where that begins and how high it is in pixels, how many dots there are."""
+
+    told: str
+    parts: list[str]
+    top: float
+    height: float
+    dots: int
 
 
-def _side(cloud: PointCloud, colours: NDArray[np.intp], look: Look, scale: float) -> Iterator[str]:
-    """Heights with their labels, and points; forward is right."""
-    top, height, larger = _heights(cloud, scale)
-    across, level = SIDE / 2 - look.middle[0] * scale, top * scale * larger
-    step = ring_step(height / scale / larger)
-    marks = [number * step for number in range(math.ceil((level - height) / scale / larger / step), int(top / step) + 1)]
-    for mark in marks:
-        at = level - mark * scale * larger
-        yield f'<path d="M0 {at:.1f}H{SIDE}" stroke="#ddd"/><text x="2" y="{at - 3:.1f}">z {mark:.4g} m</text>'
-    yield from _dots(across + cloud.x * scale, level - cloud.z * scale * larger, colours)
-    told = f"from the right, forward is right{f', heights x{larger}' if larger > 1 else ''}"
-    yield f'<path d="M{across + 9:.1f} {level:.1f}l-15 6v-12z" fill="#222"/><text x="{SIDE}" y="12" text-anchor="end">{told}</text>'
+@dataclass(frozen=True)
+class _Views:
+    """The views of a cloud of valid points, in pixels; `colours`: the step of the ramp of each, (n,)."""
+
+    cloud: PointCloud
+    look: Look
+    side: int
+    most: int | None
+    colours: NDArray[np.intp]
+
+    @property
+    def _scale(self) -> float:
+        return self.side / 2 / self.look.reach
+
+    def above(self) -> _View:
+        """Rings with their ranges, axes, points, and the sensor; forward is up."""
+        scale, side, (forward, left) = self._scale, self.side, self.look.middle
+        across, down = side / 2 + left * scale, side / 2 + forward * scale
+        step = ring_step(self.look.reach)
+        radii = [step * number for number in range(1, int(self.look.reach * math.sqrt(2) / step) + 1)]
+        circles = "".join(f'<circle cx="{across:.1f}" cy="{down:.1f}" r="{radius * scale:.1f}"/>' for radius in radii)
+        rows = down - self.cloud.x * scale
+        dots, paths = self._dots(across - self.cloud.y * scale, rows, side)
+        top, bottom = max(min(float(rows.min(initial=down)), down) - NEAR, 0), min(max(float(rows.max(initial=down)), down) + NEAR, side)
+        labels = "".join(f'<text x="{across + r * scale - 3:.1f}" y="{down - 4:.1f}" text-anchor="end">{r:g} m</text>' for r in radii)
+        directions = f'<text x="{across + 6:.1f}" y="{top + 12:.1f}">0°</text><text x="2" y="{down - 4:.1f}">90°</text>'
+        axes = f'<path d="M{across:.1f} 0V{side}M0 {down:.1f}H{side}"/>'
+        parts = [
+            f'<g fill="none" {_as("line", "stroke")}>{axes}{circles}</g>',
+            *paths,
+            f"<g {_as('text')}>{labels}{directions}</g>",
+            f'<path d="M{across:.1f} {down - 9:.1f}l6 15h-12z" {_as("head")}/>',
+        ]
+        return _View("from above, forward is up", parts, top, bottom - top, dots)
+
+    def beside(self) -> _View:
+        """Heights with their labels, and points; forward is right."""
+        scale, side = self._scale, self.side
+        low, high = (min(float(self.cloud.z.min(initial=0)), 0.0), max(float(self.cloud.z.max(initial=0)), 0.0))
+        span = max(high - low, 1e-3)
+        larger = max((n for n in (1, 2, 5, 10) if span * scale * n <= HIGHEST * side), default=1)
+        steep, top, height = scale * larger, high + 0.05 * span, span * 1.1 * scale * larger
+        across, level = side / 2 - self.look.middle[0] * scale, top * steep
+        step = ring_step(height / steep)
+        marks = [number * step for number in range(math.ceil((level - height) / steep / step), int(top / step) + 1)]
+        lines = "".join(f"M0 {level - mark * steep:.1f}H{side}" for mark in marks)
+        labels = "".join(f'<text x="2" y="{level - mark * steep - 3:.1f}">z {mark:.4g} m</text>' for mark in marks)
+        told = f"from the right, forward is right{f', heights x{larger}' if larger > 1 else ''}"
+        dots, paths = self._dots(across + self.cloud.x * scale, level - self.cloud.z * steep, height)
+        parts = [
+            f'<path d="{lines}" {_as("line", "stroke")}/>',
+            *paths,
+            f"<g {_as('text')}>{labels}</g>",
+            f'<path d="M{across + 9:.1f} {level:.1f}l-15 6v-12z" {_as("head")}/>',
+        ]
+        return _View(told, parts, 0, height, dots)
+
+    def _dots(self, across: NDArray[np.float32], down: NDArray[np.float32], height: float) -> tuple[int, list[str]]:
+        """How many round dots points make, one path for each colour, on the finest grid that holds no more than are wanted."""
+        inside = np.flatnonzero((across >= 0) & (across <= self.side) & (down >= 0) & (down <= height))
+        for grid in GRIDS:
+            places = np.rint(np.stack([down[inside], across[inside]], axis=1) / grid).astype(np.int64)
+            _, first = np.unique(places @ (1 << 20, 1), return_index=True)
+            if self.most is None or len(first) <= self.most:
+                break
+        places, colours = places[first], self.colours[inside[first]]
+        width = max(DOT, grid * 1.3) / grid
+        paths = [
+            f'<path class="dots{step}" d="{_path(places[colours == step])}" stroke="{_colour(step)}"/>'
+            for step in np.unique(colours).tolist()
+        ]
+        group = f'<g transform="scale({grid:g})" fill="none" stroke-width="{width:.2g}" stroke-linecap="round">'
+        return len(first), [group, *paths, "</g>"]
 
 
-def _heights(cloud: PointCloud, scale: float) -> tuple[float, float, int]:
-    """The highest z, the height of the view in pixels, and by how much heights are drawn larger."""
-    low, high = min(float(cloud.z.min(initial=0)), 0.0), max(float(cloud.z.max(initial=0)), 0.0)
-    span = max(high - low, 1e-3)
-    larger = max((n for n in (1, 2, 5, 10) if span * scale * n <= HIGHEST), default=1)
-    return high + 0.05 * span, span * 1.1 * scale * larger, larger
+def _path(places: NDArray[np.int64]) -> str:
+    """Dots at (row, column), each said from the one before."""
+    steps = np.diff(places, axis=0, prepend=0)
+    return "".join(f"m{across} {down}h0" for down, across in steps.tolist())
 
 
-def _dots(across: NDArray[np.float32], down: NDArray[np.float32], colours: NDArray[np.intp]) -> Iterator[str]:
-    """Points as round dots, one path for each colour; of several in half a pixel the first."""
-    places = np.rint(np.stack([across, down], axis=1) * 2).astype(np.int64)
-    _, kept = np.unique(places, axis=0, return_index=True)
+def _legend(look: Look, right: int) -> Iterator[str]:
+    """A bar of the ramp, with what it shows and the values at its ends, which ends at `right`."""
+    low, high = (escape(text) for text in look.ends)
+    left = right - 7 * len(high) - 12 - STEPS * 6
+    yield f'<g {_as("text")}><text x="{left - 8}" y="48" text-anchor="end">{escape(look.ramp)}, {low}</text>'
+    yield f'<text x="{right}" y="48" text-anchor="end">{high}</text></g>'
     for step in range(STEPS):
-        mine = kept[colours[kept] == step]
-        if len(mine):
-            data = "".join(f"M{x / 2:g} {y / 2:g}h0" for x, y in places[np.sort(mine)].tolist())
-            yield f'<path d="{data}" stroke="{_colour(step)}" stroke-width="{DOT}" stroke-linecap="round" fill="none"/>'
+        yield f'<rect class="ramp{step}" x="{left + step * 6}" y="40" width="6" height="8" fill="{_colour(step)}"/>'
 
 
-def _legend(look: Look) -> Iterator[str]:
-    left, width = SIDE + MARGIN - STEPS * 8, 8
-    for step in range(STEPS):
-        yield f'<rect x="{left + step * width}" y="16" width="{width}" height="8" fill="{_colour(step)}"/>'
-    begin, end = (escape(text) for text in look.ends)
-    yield f'<text x="{left}" y="38">{begin}</text><text x="{left + STEPS * width}" y="38" text-anchor="end">{end}</text>'
-    yield f'<text x="{left + STEPS * width / 2}" y="38" text-anchor="middle">{look.ramp}</text>'
+def _as(part: str, attribute: str = "fill") -> str:
+    """The attributes of a part of the picture: its colour on white, and the class that has that on a dark ground."""
+    return f'class="{part}" {attribute}="{_LIGHT[_PARTS.index(part)]}"'
+
+
+def _style() -> str:
+    """What is different where a dark page is preferred."""
+    inks = enumerate(INKS[first_ink("range") :][:STEPS])
+    ramp = [
+        f".dots{step}{{stroke:{ink}}}.ramp{step}{{fill:{ink}}}" for step, ink in ((step, _hex(ink.rgb or (0, 0, 0))) for step, ink in inks)
+    ]
+    parts = [f".{part}{{{'stroke' if part == 'line' else 'fill'}:{colour}}}" for part, colour in zip(_PARTS, _DARK, strict=True)]
+    return f"@media(prefers-color-scheme:dark){{{''.join([*parts, *ramp])}}}"
 
 
 def _colour(step: int) -> str:
     place = step / (STEPS - 1) * (len(_INK) - 1)
-    return "#" + "".join(f"{round(float(np.interp(place, range(len(_INK)), [ink[part] for ink in _INK]))):02x}" for part in range(3))
+    red, green, blue = (round(float(np.interp(place, range(len(_INK)), [ink[part] for ink in _INK]))) for part in range(3))
+    return _hex((red, green, blue))
+
+
+def _hex(rgb: Rgb) -> str:
+    return "#" + "".join(f"{part:02x}" for part in rgb)

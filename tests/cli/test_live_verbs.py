@@ -8,6 +8,7 @@ import signal
 import subprocess
 import sys
 import time
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
@@ -166,8 +167,28 @@ def test_plot_writes_a_picture(capture: Path, tmp_path: Path) -> None:
 
     ran("plot", capture, *SENSOR, "-o", tmp_path / "scan.svg", "--scan", "3", "--color", "intensity")
     root = ET.fromstring((tmp_path / "scan.svg").read_text(encoding="utf-8"))
-    dots = [place for path in root.findall(".//{*}path") if path.get("stroke-linecap") for place in path.get("d", "").split("M")[1:]]
+    dots = [place for path in root.findall(".//{*}path") if "dots" in path.get("class", "") for place in path.get("d", "").split("m")[1:]]
     assert 500 < len(dots) <= 2160
     assert "10.0 Hz, " in "".join(text.text or "" for text in root.findall(".//{*}text"))
     assert ran("plot", capture, *SENSOR, "-o", "-").stdout.startswith("<svg")
-    assert "pictures are written as .svg" in ran("plot", capture, *SENSOR, "-o", tmp_path / "scan.png", code=2).stderr
+    assert "pictures are written as" in ran("plot", capture, *SENSOR, "-o", tmp_path / "scan.gif", code=2).stderr
+
+
+@pytest.mark.parametrize(
+    ("library", "words", "extra"),
+    [
+        ("matplotlib", ("plot", "IN", "-o", "a.png"), "plot"),
+        ("matplotlib", ("plot", "IN", "--kind", "rates", "-o", "a.svg"), "plot"),
+        ("rerun", ("convert", "IN", "a.rrd"), "rerun"),
+        ("rerun", ("view", "IN", "--rerun", "-o", "a.rrd"), "rerun"),
+    ],
+)
+def test_what_takes_a_library_says_how_to_get_it(capture: Path, tmp_path: Path, library: str, words: Sequence[str], extra: str) -> None:
+    given = [str(capture) if word == "IN" else str(tmp_path / word) if word.startswith("a.") else word for word in words]
+    script = f"import sys; sys.modules[{library!r}] = None; from lidarspec.cli import main; main({[*given, *SENSOR]!r})"
+    done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, check=False)
+    assert done.returncode == 2
+    first, second = done.stderr.splitlines()[-2:]
+    assert first.startswith(f"this takes {library}, which is not installed")
+    assert second == f"  next: pip install 'lidarspec[{extra}]'"
+    assert not list(tmp_path.iterdir())

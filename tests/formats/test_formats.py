@@ -28,6 +28,7 @@ EXTRAS = {
     **dict.fromkeys(("a.las", "a.laz"), ("laspy", "las")),
     "a.e57": ("pye57", "e57"),
     "a.foxglove.mcap": ("mcap_protobuf.writer", "foxglove"),
+    "a.rrd": ("rerun", "rerun"),
     "a.zarr": ("zarr", "zarr"),
 }
 COLUMNS = ["x", "y", "z", "range", "azimuth", "elevation", "intensity", "time"]

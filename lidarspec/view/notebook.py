@@ -1,0 +1,142 @@
+"""What a notebook shows: a scan and a cloud as a picture, packets and an explained frame as tables, a sensor as its packet diagrams.
+
+`lidarspec.display` calls what is named here after the kind of value. All are bounded in size, escaped, and readable on light and dark
+pages: pictures have their own ground, tables take the page's letters.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable, Sequence
+from html import escape
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lidarspec.errors import UsageError, printable
+from lidarspec.explaining.explanation import Explanation
+from lidarspec.explaining.listing import parents
+from lidarspec.exports import narrowed
+from lidarspec.exports.diagram import svg as diagram
+from lidarspec.packets.packets import Packets
+from lidarspec.points.cloud import PointCloud
+from lidarspec.scans.scans import Scan
+from lidarspec.spec.sensor import Sensor
+from lidarspec.spec.tree import FieldInfo
+from lidarspec.view.polar import look
+from lidarspec.view.svg import svg
+
+#: pixels of a side of a picture, and the dots of each of its views at most.
+SIDE, DOTS = 520, 12_000
+#: rows of packets at the beginning and at the end, their fields at most, and rows of an explanation.
+ENDS, FIELDS, ROWS = 5, 24, 200
+#: degrees of hue from one field to the next, and the most pixels that a table is high before it scrolls.
+HUE, TALL = 67, 520
+_CELL = "text-align:{align};white-space:nowrap;padding:1px 8px;vertical-align:top"
+
+
+def scan(value: Scan) -> str:
+    """A scan from above, and from the side where it is not flat, as SVG."""
+    return _picture(value.points, f"{value.sensor.id}: {value}")
+
+
+def cloud(value: PointCloud) -> str | None:
+    """The same of a cloud; None of a single point."""
+    return _picture(value, str(value)) if np.ndim(value.x) else None
+
+
+def packets(value: Packets) -> str:
+    """The first and the last packets as an HTML table: offset, times, fields in their units; of arrays number and span."""
+    fields = {path: info for path, info in value.table.schema.fields.items() if info.const is None}
+    shown = dict(list(fields.items())[:FIELDS])
+    columns: dict[str, list[str]] = {"offset": [str(place) for place in value.offset[_ends(len(value))].tolist()]}
+    columns["time [s]"] = _since(value.time_ns)
+    if value.host_ns.any():
+        columns["arrival [s]"] = _since(value.host_ns)
+    ends = value.take(_ends(len(value)))
+    for path, info in shown.items():
+        columns[f"{path} [{info.unit}]" if info.unit else path] = _values(ends[path], info)
+    rows = [list(row) for row in zip(*columns.values(), strict=True)]
+    if len(value) > 2 * ENDS:
+        rows.insert(ENDS, ["⋮"] * len(columns))
+    more = f"; {len(fields) - len(shown)} further fields" * (len(fields) > len(shown))
+    first = f"; first at {np.datetime64(int(value.time_ns[0]), 'ns')} by the {_clock(value)} clock" if len(value) else ""
+    return _table(f"{value}{first}{more}", list(columns), [[escape(cell) for cell in row] for row in rows], align="right")
+
+
+def explanation(value: Explanation) -> str:
+    """Every byte of a frame as an HTML table, a colour for each field; what is wrong is red."""
+    rows = []
+    for number, row in enumerate(value.rows[:ROWS]):
+        indent = "&nbsp;" * 2 * len(parents(row.path))
+        name, meaning = escape(row.path.rpartition(".")[2]), escape(printable(row.meaning))
+        tint = f"hsl({number * HUE % 360} 70% 50% / .25)" if row.right else "hsl(0 90% 50% / .55)"
+        data = "<br>".join(row.data[start : start + 16].hex(" ") for start in range(0, len(row.data), 16))
+        code = f'<code style="background:{tint};padding:1px 3px;color:inherit">{data}</code>' if data else ""
+        meaning = meaning if row.right else f"<b>{meaning}</b>"
+        rows.append([f"<code>{row.offset:04x}</code>", code, f"{indent}{name}", f'<span style="white-space:normal">{meaning}</span>'])
+    notes = [*value.notes, *[f"{len(value.rows) - ROWS} further rows: print(...) shows them"] * (len(value.rows) > ROWS)]
+    title = f"{value.sensor} {value.frame or 'skipped'}, {len(value.data)} bytes: {value.verdict}"
+    return _table("; ".join([title, *notes]), ["offset", "bytes", "field", "meaning"], rows)
+
+
+def sensor(value: Sensor) -> str:
+    """The packet diagrams of a sensor as HTML, those of data open and others folded."""
+    head = f"<b>{escape(printable(f'{value.vendor} {value.model}'))}</b> <code>{escape(value.id)}</code>, proven by {escape(value.status)}"
+    source = f'<div style="opacity:.75">{escape(printable(value.source))}</div>'
+    return "\n".join([f"<div>{head}{source}</div>", *(_diagram(value, name) for name in value.frames)])
+
+
+def _diagram(sensor: Sensor, name: str) -> str:
+    frame = sensor.frames[name]
+    try:
+        drawn = diagram(narrowed(sensor, name))
+    except UsageError as refused:
+        drawn = f"<div>{escape(str(refused))}</div>"
+    title = f'<summary style="cursor:pointer">{escape(name)}</summary>'
+    return f'<details{" open" * frame.data}>{title}<div style="overflow:auto">{drawn}</div></details>'
+
+
+def _picture(points: PointCloud, title: str) -> str:
+    return svg(points, look(points), title, side=SIDE, most=DOTS)
+
+
+def _ends(number: int) -> NDArray[np.intp]:
+    """The first and the last of so many."""
+    return np.array([index for index in range(number) if index < ENDS or index >= number - ENDS], np.intp)
+
+
+def _clock(packets: Packets) -> str:
+    return "host's" if packets.sensor.clock is None else "sensor's"
+
+
+def _since(times: NDArray[np.int64]) -> list[str]:
+    """Times of the first and the last packets as seconds since the first, "-" where one is not known."""
+    return [f"{(at - int(times[0])) * 1e-9:.6f}" if at else "-" for at in times[_ends(len(times))].tolist()]
+
+
+def _values(column: NDArray[np.float64], info: FieldInfo) -> list[str]:
+    """A field of some packets, (n, ...), in words."""
+    if info.kind == "bytes":
+        return [f"{row.size} bytes" for row in column]
+    return [_number(float(row)) if not row.ndim else _span(row) for row in column]
+
+
+def _span(values: NDArray[np.float64]) -> str:
+    known = values[np.isfinite(values)]
+    return f"{len(known)} x {_number(float(known.min()))} to {_number(float(known.max()))}" if len(known) else "-"
+
+
+def _number(value: float) -> str:
+    return f"{value:.10g}" if math.isfinite(value) else "-"
+
+
+def _table(caption: str, heads: Iterable[str], rows: Iterable[Sequence[str]], *, align: str = "left") -> str:
+    """A table; the cells are HTML, caption and heads are text."""
+    cell = _CELL.format(align=align)
+    head = "".join(f'<th style="{cell}">{escape(printable(name))}</th>' for name in heads)
+    body = "\n".join(f"<tr>{''.join(f'<td style={chr(34)}{cell}{chr(34)}>{text}</td>' for text in row)}</tr>" for row in rows)
+    return (
+        f'<div style="overflow:auto;max-height:{TALL}px;font-size:90%"><div style="padding:0 8px 4px">{escape(printable(caption))}</div>'
+        f'<table style="border-collapse:collapse"><thead><tr>{head}</tr></thead>\n<tbody>{body}</tbody></table></div>'
+    )

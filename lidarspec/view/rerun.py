@@ -1,0 +1,56 @@
+"""A sensor at work in Rerun's viewer, or in a recording of Rerun's while it comes."""
+
+from __future__ import annotations
+
+import os
+import sys
+import time
+
+from lidarspec.errors import UsageError, suggest, system_errors
+from lidarspec.formats.rerun import Log
+from lidarspec.view.feed import LOOK, Feed
+
+#: seconds between two readings of the figures, by the time of the scans.
+FIGURES = 1.0
+#: which of them; what stands in a scan is logged with each.
+FIGURED = ("packet_rate_hz", "error_rate", "skipped_rate", "loss_rate", "jitter_s", "bytes_per_s")
+#: what the URL of a viewer begins with.
+SCHEMES = ("rerun://", "rerun+http://", "rerun+https://")
+
+
+def show(feed: Feed, target: str, *, ramp: str = "range", until: float) -> None:
+    """Log scans as they come, and figures, until the feed ends or a time of `time.monotonic` has come.
+
+    Args:
+        target: a file to write, the URL of a viewer that runs, or "" to open one here.
+
+    Raises:
+        UsageError: where no viewer can be opened, or Rerun's SDK is not installed.
+        SourceError: where the file cannot be written.
+    """
+    with system_errors(target or "Rerun's viewer"), Log(ramp) as log:
+        _open(log, target)
+        read_at, last = time.monotonic(), None
+        while not feed.ended and time.monotonic() < until:
+            feed.pump(time.monotonic() + LOOK)
+            for scan in feed.scans:
+                log.scan(scan)
+                if last is None or not 0 <= scan.stamp_ns - last < FIGURES * 1e9:
+                    now, is_live = time.monotonic(), feed.device.is_live
+                    reading = feed.meter.reading(feed.device.stats, now - read_at if is_live else None)
+                    log.figures({name: getattr(reading, name) for name in FIGURED})
+                    read_at, last = now, scan.stamp_ns
+
+
+def _open(log: Log, target: str) -> None:
+    if target.startswith(SCHEMES):
+        log.stream.connect_grpc(target)
+    elif target:
+        log.save(target)
+    elif sys.platform == "linux" and not (os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY")):
+        raise suggest(UsageError("there is no display for Rerun's viewer"), "lidarspec view SOURCE --rerun -o scans.rrd")
+    else:
+        try:
+            log.stream.spawn(hide_welcome_screen=True)
+        except Exception as error:
+            raise suggest(UsageError(f"Rerun's viewer cannot be opened: {error}"), "lidarspec view SOURCE --rerun -o scans.rrd") from error

@@ -1,0 +1,524 @@
+"""A broadcast as a page: the files of the page, a WebSocket for each one that is open, and scans to be saved.
+
+One event loop in a thread of its own serves them all. A page is sent a scan only where it has asked for one, so that a slow or hidden one
+costs nothing; and nobody but the page itself is served: of requests to another host, or from another page in the browser, none is.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import ipaddress
+import json
+import math
+import os
+import secrets
+import socket
+import tempfile
+import threading
+import time
+from collections import deque
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from types import TracebackType
+from typing import Any, Self
+
+import uvicorn
+from starlette.applications import Starlette
+from starlette.datastructures import Headers, MutableHeaders, QueryParams
+from starlette.requests import Request
+from starlette.responses import FileResponse, PlainTextResponse, Response
+from starlette.routing import Mount, Route, WebSocketRoute
+from starlette.staticfiles import StaticFiles
+from starlette.types import ASGIApp, Message, Receive, Scope, Send
+from starlette.websockets import WebSocket, WebSocketDisconnect
+
+from lidarspec.errors import LidarSpecError, SourceError, UsageError, suggestion
+from lidarspec.formats import write
+from lidarspec.view.answers import Answers, saves
+from lidarspec.view.backlog import Backlog
+from lidarspec.view.broadcast import Broadcast, Shown
+from lidarspec.view.polar import look
+from lidarspec.view.svg import svg
+
+#: the page, as it was built.
+PAGE = Path(__file__).parent / "page" / "dist"
+#: bytes of a message from a page at most, answers that wait to be sent to one, and how much of what it asked for is done at a time.
+LARGEST, WAITING, BUSY = 1 << 16, 16, 4
+#: seconds from one state to the next, and from one frame that is watched to the next.
+STATE, WATCHED = 0.5, 0.5
+#: seconds after which a page that takes nothing, or does not answer a ping, is dropped; and that pages are given at the end.
+STALLED, PING, FAREWELL = 20.0, 10.0, 1
+#: seconds that a page waits for a first scan before it is told what there is; how a page ends that is closed; and how many may be open.
+GREETING, CLOSED, PAGES = 1.0, (1000, 1001, 1012), 64
+#: points of a message at most, and the scans that a page may still ask about: the one that is drawn, and the one that is on its way.
+POINTS, HELD = 1 << 24, 2
+#: the largest number in a message, and one digit more than a scan's number has.
+LONGEST, DIGITS = 1e12, 12
+#: how a page on this computer is called.
+LOCAL = ("127.0.0.1", "localhost", "[::1]")
+HEADERS = {
+    "content-security-policy": "default-src 'none'; script-src 'self'; style-src 'self'; font-src 'self'; img-src 'self' data: blob:; "
+    "connect-src 'self'; base-uri 'none'; form-action 'none'; frame-ancestors 'none'",
+    "x-content-type-options": "nosniff",
+    "referrer-policy": "no-referrer",
+    "cross-origin-opener-policy": "same-origin",
+    "cross-origin-resource-policy": "same-origin",
+    "cache-control": "no-store",
+}
+
+
+class Guard:
+    """Lets through what comes from the page itself, and adds what browsers are to keep to.
+
+    Args:
+        inside: what is guarded.
+        host, port: where it listens.
+        token: what the link has to bring along; "" where it listens on this computer alone.
+    """
+
+    def __init__(self, inside: ASGIApp, host: str, port: int, token: str) -> None:
+        self._inside, self._port, self._token = inside, port, token
+        self._names = {*LOCAL, f"[{host}]" if ":" in host else host}
+        self._anywhere = host in ("0.0.0.0", "::")
+
+    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
+        """Serve a request, or refuse it."""
+        if scope["type"] not in ("http", "websocket"):
+            return
+        reason = self.refusal(scope["type"], scope["path"], Headers(scope=scope), QueryParams(scope["query_string"]))
+        if reason and scope["type"] == "websocket":
+            await send({"type": "websocket.close"})
+            return
+
+        async def hardened(message: Message) -> None:
+            if message["type"] == "http.response.start":
+                MutableHeaders(scope=message).update(HEADERS)
+            await send(message)
+
+        await (PlainTextResponse(reason, 403) if reason else self._inside)(scope, receive, hardened)
+
+    def refusal(self, kind: str, path: str, headers: Headers, query: QueryParams) -> str:
+        """Why a request is not served; "" where it is."""
+        host = headers.get("host", "")
+        if not self._is_own(host):
+            return "this is not the host that is asked for"
+        origin = headers.get("origin")
+        if (origin is None and kind == "websocket") or origin not in (None, f"http://{host}"):
+            return "another page asks"
+        if path.startswith("/save/") and headers.get("sec-fetch-site", "same-origin") not in ("same-origin", "none"):
+            return "another page asks"
+        guarded = path in ("/", "/index.html", "/socket") or path.startswith("/save/")
+        if self._token and guarded and not secrets.compare_digest(query.get("token", "").encode(), self._token.encode()):
+            return "the link to this page has a token, which is missing or wrong"
+        return ""
+
+    def _is_own(self, host: str) -> bool:
+        """Whether a host is one that it listens at; where that is any, an address, since a name can be made to point here."""
+        name, _, port = host.rpartition(":") if host.rpartition("]")[2] else (host, "", "")
+        if (port or "80") != str(self._port):
+            return False
+        return name in self._names or (self._anywhere and _is_address(name.strip("[]")))
+
+
+def _is_address(text: str) -> bool:
+    try:
+        ipaddress.ip_address(text)
+    except ValueError:
+        return False
+    return True
+
+
+class Viewer:
+    """One page that is open.
+
+    Args:
+        answers: what it is told.
+        socket: to the page.
+    """
+
+    def __init__(self, answers: Answers, socket: WebSocket) -> None:
+        self._answers, self._broadcast, self._socket = answers, answers.broadcast, socket
+        self._replies, self._tasks, self._stirred = deque[dict[str, Any]](), set[asyncio.Task[None]](), asyncio.Event()
+        self._most: int | None = None  # points of the scan that is wanted; None where none is
+        self._held = deque[Shown](maxlen=HELD)
+        self._frozen: Backlog | None = None  # the bytes as they were when a live source was paused
+        self._watches, self._watched, self._known = False, -1, 0
+        self._has_ended = False
+        self._due = {"state": 0.0, "frame": 0.0}
+
+    async def serve(self) -> str:
+        """Answer the page until it goes away: what became of it, in words."""
+        await self._socket.accept()
+        parts = {asyncio.create_task(self._listen()), asyncio.create_task(self._speak())}
+        try:
+            done, _ = await asyncio.wait(parts, return_when=asyncio.FIRST_COMPLETED)
+            return next(iter(done)).result()
+        finally:
+            left = {*parts, *self._tasks}
+            for task in left:
+                task.cancel()
+            await asyncio.gather(*left, return_exceptions=True)
+
+    def stir(self) -> None:
+        """Look whether there is something for the page."""
+        self._stirred.set()
+
+    async def _listen(self) -> str:
+        while (message := await self._socket.receive())["type"] == "websocket.receive":
+            self._hear(message.get("text") or "")
+            while len(self._replies) > WAITING:  # of a page that asks, and does not listen
+                await asyncio.sleep(STATE)
+        return "closed" if message.get("code") in CLOSED else "dropped: it does not answer any more"
+
+    async def _speak(self) -> str:
+        await self._greet()
+        while True:
+            self._stirred.clear()
+            message = await self._next()
+            try:
+                if message is None:
+                    await asyncio.wait_for(self._stirred.wait(), max(min(self._due.values()) - time.monotonic(), 0.0))
+                else:
+                    await asyncio.wait_for(self._send(message), STALLED)
+            except TimeoutError:
+                if message is not None:
+                    return "dropped: it takes nothing any more"
+            except WebSocketDisconnect:
+                return "closed"
+
+    async def _greet(self) -> None:
+        """Say hello as soon as there is a scan, which says what is drawn, or after a moment."""
+        patience = time.monotonic() + GREETING
+        while self._broadcast.shown is None and time.monotonic() < patience:
+            await asyncio.sleep(GREETING / 20)
+        await self._send(await asyncio.to_thread(self._answers.hello))
+
+    async def _send(self, message: bytes | dict[str, Any]) -> None:
+        if isinstance(message, bytes):
+            await self._socket.send_bytes(message)
+        else:
+            await self._socket.send_text(json.dumps(message, allow_nan=False))
+
+    async def _next(self) -> bytes | dict[str, Any] | None:
+        """What is to be sent now; None where there is nothing."""
+        broadcast, now = self._broadcast, time.monotonic()
+        if self._replies:
+            return self._replies.popleft()
+        if self._most is not None and (shown := self._unseen()) is not None:
+            most, self._most = self._most, None
+            self._held.append(shown)
+            return shown.message(most)  # here: the large blocks of further threads would stay in arenas of theirs
+        if broadcast.has_ended != self._has_ended:
+            self._has_ended = broadcast.has_ended
+            return {"is": "ended", "text": broadcast.ending} if self._has_ended else None
+        self._due["frame"] = self._due["frame"] if self._watches else math.inf
+        if now >= self._due["frame"]:
+            self._due["frame"] = now + WATCHED
+            newest = self._bytes.newest
+            if newest != self._watched and (taken := self._bytes.frame(newest)) is not None:
+                self._watched = newest
+                return await asyncio.to_thread(self._answers.frame, taken, "last")
+        if now >= self._due["state"]:
+            self._due["state"] = now + STATE
+            state = self._answers.state(frozen=self._frozen is not None, since=self._known)
+            self._known = state["damaged"]["total"]
+            return state
+        return None
+
+    def _unseen(self) -> Shown | None:
+        """The newest scan, where the page has not had it yet and wants to see it go on."""
+        shown = self._broadcast.shown if self._frozen is None else None
+        return shown if shown is not None and not (self._held and self._held[-1].number == shown.number) else None
+
+    @property
+    def _bytes(self) -> Backlog:
+        return self._frozen or self._broadcast.backlog
+
+    def _hear(self, text: str) -> None:
+        """Do what a page asks for; what is nonsense is refused, with a word."""
+        word = ""
+        try:
+            message = json.loads(text)
+            if not isinstance(message, dict) or (word := str(message.get("do"))) not in self._words:
+                raise UsageError(f"a message says what to do: {', '.join(self._words)}")
+            self._words[word](self, message)
+        except (ValueError, RecursionError):
+            self._refuse(word, UsageError("a message is an object in JSON"))
+        except LidarSpecError as error:
+            self._refuse(word, error)
+
+    def _refuse(self, word: str, error: LidarSpecError, command: str = "") -> None:
+        facts = {"is": "refused", "of": word, "text": str(error)}
+        facts |= {name: text for name, text in (("command", command), ("next", suggestion(error))) if text}
+        self._answer(facts)
+
+    def _answer(self, reply: dict[str, Any]) -> None:
+        self._replies.append(reply)
+        self.stir()
+
+    def _later(self, word: str, work: Callable[[], dict[str, Any] | None], command: str = "") -> None:
+        """Do in a thread what may take a while, and answer then."""
+        if len(self._tasks) >= BUSY:
+            raise UsageError("too much at once: wait for an answer first")
+
+        async def answered() -> None:
+            try:
+                if (reply := await asyncio.to_thread(work)) is not None:
+                    self._answer(reply)
+            except LidarSpecError as error:
+                self._refuse(word, error, command)
+            except Exception as error:
+                self._refuse(word, LidarSpecError(_bug(error)), command)
+            self.stir()
+
+        task = asyncio.create_task(answered())
+        self._tasks.add(task)
+        task.add_done_callback(self._tasks.discard)
+
+    def _next_scan(self, message: Mapping[str, Any]) -> None:
+        self._most = round(_number(message, "most", 1, POINTS))
+        self.stir()
+
+    def _pause(self, message: Mapping[str, Any]) -> None:
+        if self._broadcast.is_live:
+            self._frozen = self._broadcast.backlog.frozen()
+        else:
+            self._broadcast.pause()
+        self._due["state"] = 0.0
+        self.stir()
+
+    def _play(self, message: Mapping[str, Any]) -> None:
+        if self._broadcast.is_live:
+            self._frozen = None
+        else:
+            self._broadcast.play()
+        self._due["state"] = 0.0
+        self.stir()
+
+    def _step(self, message: Mapping[str, Any]) -> None:
+        self._broadcast.step()
+
+    def _seek(self, message: Mapping[str, Any]) -> None:
+        self._broadcast.seek(_number(message, "to", 0.0, LONGEST))
+
+    def _speed(self, message: Mapping[str, Any]) -> None:
+        self._broadcast.play_at(_number(message, "times", 0.0, LONGEST))
+
+    def _watch(self, message: Mapping[str, Any]) -> None:
+        self._watches, self._watched = message.get("frames") is True, -1
+        self._due["frame"] = 0.0
+        self.stir()
+
+    def _frame(self, message: Mapping[str, Any]) -> None:
+        backlog, point = self._bytes, message.get("point")
+        if isinstance(point, dict):
+            number, index = round(_number(point, "scan", 0, LONGEST)), round(_number(point, "index", 0, POINTS))
+            shown = next((one for one in self._held if one.number == number), None)
+            self._later("frame", lambda: self._answers.origin(shown, number, index, backlog))
+        elif "damaged" in message:
+            number = round(_number(message, "damaged", 0, LONGEST))
+            self._later("frame", lambda: self._answers.damaged(number, backlog))
+        else:
+            number = round(_number(message, "number", 0, LONGEST))
+            self._later("frame", lambda: self._answers.numbered(number, backlog))
+
+    def _compose(self, message: Mapping[str, Any]) -> None:
+        name, words = _command(message)
+        self._later("compose", lambda: self._answers.composed(name, words), name)
+
+    def _command(self, message: Mapping[str, Any]) -> None:
+        name, words = _command(message)
+        self._later("send", lambda: self._answers.sent(name, words), name)
+
+    def _record(self, message: Mapping[str, Any]) -> None:
+        if (switch := self._broadcast.switch) is None:
+            raise UsageError(f"{self._broadcast.source} is a file already: there is nothing to record")
+        self._due["state"] = 0.0
+        self._later("record", switch.toggle)
+
+    _words: Mapping[str, Callable[[Viewer, Mapping[str, Any]], None]] = {
+        "next": _next_scan,
+        "pause": _pause,
+        "play": _play,
+        "step": _step,
+        "seek": _seek,
+        "speed": _speed,
+        "watch": _watch,
+        "frame": _frame,
+        "compose": _compose,
+        "send": _command,
+        "record": _record,
+    }
+
+
+def _bug(error: Exception) -> str:
+    return f"a bug in lidarspec: {type(error).__name__}: {error}"
+
+
+def _number(message: Mapping[str, Any], name: str, low: float, high: float) -> float:
+    """A number of a message."""
+    value = message.get(name)
+    if isinstance(value, bool) or not isinstance(value, int | float) or not low <= value <= high:
+        raise UsageError(f"{name} is a number from {low:g} to {high:g}")
+    return value
+
+
+def _command(message: Mapping[str, Any]) -> tuple[str, dict[str, str]]:
+    """The name of a command, and its arguments as they were typed; those that were left empty are left out."""
+    name, words = message.get("command"), message.get("arguments", {})
+    if not isinstance(name, str) or not isinstance(words, dict) or not all(isinstance(text, str) for text in words.values()):
+        raise UsageError("a command has a name, and arguments that are texts")
+    return name, {argument: text for argument, text in words.items() if text}
+
+
+class Site:
+    """The page of a broadcast, served while this is entered.
+
+    Args:
+        broadcast: what is shown.
+        host, port: where to listen; 0 is a free port. At another address than this computer's own, the link has a token.
+        control: whether commands may be sent to a sensor that is no simulated one.
+        page: the folder of the page's files; by default `PAGE`.
+        say: is told, line by line, of pages that come and go.
+
+    Attributes:
+        link: to the page.
+
+    Raises:
+        SourceError: where it cannot listen there.
+    """
+
+    def __init__(
+        self,
+        broadcast: Broadcast,
+        *,
+        host: str = "127.0.0.1",
+        port: int = 0,
+        control: bool = False,
+        page: Path | None = None,
+        say: Callable[[str], None] = lambda text: None,
+    ) -> None:
+        self._broadcast, self._say, self._answers = broadcast, say, Answers(broadcast, control=control)
+        self._viewers, self._pages = set[Viewer](), 0
+        self._socket = _listening(host, port)
+        port = self._socket.getsockname()[1]
+        token = "" if _is_loopback(host) else secrets.token_urlsafe(24)
+        name = {"0.0.0.0": socket.gethostname(), "::": socket.gethostname()}.get(host, f"[{host}]" if ":" in host else host)
+        self.link = f"http://{name}:{port}/{f'?token={token}' if token else ''}"
+        routes = [
+            WebSocketRoute("/socket", self._watched),
+            Route("/save/{name}", self._saved),
+            Mount("/", StaticFiles(directory=page or PAGE, html=True)),
+        ]
+        self._server = uvicorn.Server(
+            uvicorn.Config(
+                Guard(Starlette(routes=routes), host, port, token),
+                log_config=None,
+                log_level="critical",  # what it has to say of requests is not for a terminal
+                access_log=False,
+                lifespan="off",
+                server_header=False,
+                loop="asyncio",
+                ws="websockets-sansio",
+                ws_max_size=LARGEST,
+                ws_ping_interval=PING,
+                ws_ping_timeout=STALLED,
+                ws_per_message_deflate=False,
+                timeout_graceful_shutdown=FAREWELL,
+            )
+        )
+        self._thread = threading.Thread(target=lambda: asyncio.run(self._serve()), name="pages")
+
+    def __enter__(self) -> Self:
+        self._thread.start()
+        return self
+
+    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None) -> None:
+        self._broadcast.news = lambda: None
+        self._server.should_exit = True
+        self._thread.join()
+        self._socket.close()
+
+    async def _serve(self) -> None:
+        loop = asyncio.get_running_loop()
+
+        def stir() -> None:
+            loop.call_soon_threadsafe(self._stir)
+
+        self._broadcast.news = stir
+        await self._server.serve(sockets=[self._socket])
+
+    def _stir(self) -> None:
+        for viewer in self._viewers:
+            viewer.stir()
+
+    async def _watched(self, socket: WebSocket) -> None:
+        """One page, from its opening until it is closed."""
+        if len(self._viewers) >= PAGES:
+            await socket.close()
+            return
+        viewer, number = Viewer(self._answers, socket), self._pages + 1
+        self._viewers.add(viewer)
+        self._pages = number
+        self._say(f"page {number} opened by {socket.client.host if socket.client else 'nobody'}; {len(self._viewers)} open")
+        became = "closed"
+        try:
+            became = await viewer.serve()
+        except Exception as error:
+            became = f"closed: {_bug(error)}"
+        finally:
+            self._viewers.discard(viewer)
+            self._say(f"page {number} {became}; {len(self._viewers)} open")
+
+    async def _saved(self, request: Request) -> Response:
+        """A scan as a file, by the number that a page knows it by."""
+        number, _, suffix = request.path_params["name"].partition(".")
+        shown = self._broadcast.numbered(int(number)) if number.isdecimal() and len(number) < DIGITS else None
+        if suffix not in saves():
+            return PlainTextResponse(f"a scan is saved as {', '.join(saves())}", 404)
+        if shown is None:
+            return PlainTextResponse("this scan is not kept any more: pause before saving", 404)
+        folder = tempfile.TemporaryDirectory(prefix="lidarspec-")
+        path = Path(folder.name) / f"{shown.scan.sensor.id}-{number}.{suffix}"
+        try:
+            await asyncio.to_thread(_write, path, shown)
+        except LidarSpecError as error:
+            folder.cleanup()
+            return PlainTextResponse(str(error), 500)
+        return Fleeting(path, folder)
+
+
+class Fleeting(FileResponse):
+    """A file that is gone when it has been sent, or was not."""
+
+    def __init__(self, path: Path, folder: tempfile.TemporaryDirectory[str]) -> None:
+        super().__init__(path, filename=path.name, media_type="application/octet-stream")
+        self._folder = folder
+
+    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
+        """Send it."""
+        with self._folder:
+            await super().__call__(scope, receive, send)
+
+
+def _write(path: Path, shown: Shown) -> None:
+    """Write a scan to a file."""
+    if path.suffix == ".svg":
+        points = shown.scan.points
+        path.write_text(svg(points, look(points), f"{shown.scan.sensor.id}: {shown.scan}"), encoding="utf-8")
+    else:
+        write(path, [shown.scan])
+
+
+def _listening(host: str, port: int) -> socket.socket:
+    try:
+        found = socket.create_server((host, port), family=socket.AF_INET6 if ":" in host else socket.AF_INET)
+    except OSError as error:
+        raise SourceError(f"no page can be served at {host}:{port}: {os.strerror(error.errno) if error.errno else error}") from error
+    if hasattr(socket, "TCP_USER_TIMEOUT"):  # so that the system gives up what a page never takes; connections have it from here
+        found.setsockopt(socket.IPPROTO_TCP, socket.TCP_USER_TIMEOUT, round(STALLED * 1000))
+    return found
+
+
+def _is_loopback(host: str) -> bool:
+    return host == "localhost" or (_is_address(host) and ipaddress.ip_address(host).is_loopback)

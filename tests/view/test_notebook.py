@@ -1,0 +1,173 @@
+"""What a notebook shows: pictures where the points are, tables of what was sent, bounded, escaped, on light and dark pages."""
+
+from __future__ import annotations
+
+import dataclasses
+import re
+import subprocess
+import sys
+import xml.etree.ElementTree as ET
+
+import numpy as np
+import pytest
+
+import lidarspec as ls
+from tests.view.browser import chromium
+from tests.view.test_polar import cloud
+
+SCRIPT = "<script>alert('x')</script>"
+
+
+def dots(svg: str, view: int = 0) -> list[tuple[float, float]]:
+    """Places of the dots of a view in pixels, from its left upper corner."""
+    group = ET.fromstring(svg).findall("{*}svg")[view].find("{*}g[@transform]")
+    assert group is not None
+    scale = float(group.get("transform", "").removeprefix("scale(").removesuffix(")"))
+    found = []
+    for path in group:
+        steps = np.array([list(map(int, step)) for step in re.findall(r"m(-?\d+) (-?\d+)h0", path.get("d", ""))])
+        found += (np.cumsum(steps, axis=0) * scale).tolist()
+    return [(across, down) for across, down in found]
+
+
+def test_a_cloud_is_drawn_where_its_points_are() -> None:
+    svg = cloud((4, 0, 0), (0, 2, 0))._repr_svg_()
+    assert svg is not None
+    middle, metre = 260, 260 / 4  # four metres from the middle to the edge
+    assert sorted(dots(svg)) == [(middle - 2 * metre, middle), (middle, middle - 4 * metre)]
+    assert "2 returns as 2 dots" in svg
+    assert len(ET.fromstring(svg).findall("{*}svg")) == 1  # flat: from above alone
+
+
+def test_a_cloud_with_heights_is_drawn_from_the_side_as_well() -> None:
+    svg = cloud((4, 0, 1), (2, 0, -1))._repr_svg_()
+    assert svg is not None
+    (first, high), (second, low) = sorted(dots(svg, 1), reverse=True)
+    assert first - second == pytest.approx(2 * 260 / 4, abs=0.5)
+    assert low - high == pytest.approx(2 * 260 / 4, abs=0.5)
+
+
+def test_a_point_shows_as_text_and_nothing_as_a_picture() -> None:
+    assert cloud((1, 2, 0))[0]._repr_svg_() is None
+    assert "0 returns" in str(cloud()._repr_svg_())
+
+
+def test_a_large_cloud_makes_a_small_picture_that_says_so() -> None:
+    rng = np.random.default_rng(1)
+    svg = cloud(*map(tuple, rng.uniform(-9, 9, (200_000, 3)).tolist()))._repr_svg_()
+    assert svg is not None
+    assert len(svg) < 300_000
+    told = re.search(r"200,000 returns as ([\d,]+) and ([\d,]+) dots", svg)
+    assert told is not None
+    assert [len(dots(svg, view)) for view in (0, 1)] == [int(number.replace(",", "")) for number in told.groups()]
+
+
+def packets(sensor: ls.Sensor, number: int) -> ls.Packets:
+    data = [sensor.example(sensor.data_frame, seed=seed) for seed in range(number)]
+    return sensor.decode(data if sensor.datagrams else b"".join(data))
+
+
+def cells(html: str) -> list[list[str]]:
+    """The texts of the cells of a table, row by row."""
+    table = re.search(r"<table.*</table>", html, re.DOTALL)
+    assert table is not None
+    rows = ET.fromstring(table[0].replace("<br>", "<br/>").replace("&nbsp;", " ")).iter("tr")
+    return [["".join(cell.itertext()).strip() for cell in row] for row in rows]
+
+
+def test_packets_are_a_table_with_units_and_times() -> None:
+    some = packets(ls.sensor("ldrobot-stl27l"), 12)
+    heads, *rows = cells(str(some._repr_html_()))
+    assert heads[:4] == ["offset", "time [s]", "speed [deg/s]", "start_angle [deg]"]
+    assert [row[0] for row in rows] == [*map(str, range(0, 5 * 47, 47)), "⋮", *map(str, range(7 * 47, 12 * 47, 47))]
+    assert [float(row[3]) for row in rows[:5]] == pytest.approx(some["start_angle"][:5].tolist())
+    distances = some["points.distance"][0]
+    assert rows[0][heads.index("points.distance [m]")] == f"12 x {distances.min():.10g} to {distances.max():.10g}"
+    assert len(cells(str(some.take([])._repr_html_()))) == 1
+
+
+@pytest.mark.parametrize("sensor_id", ["robosense-m1", "ouster-os1", "sick-tim571", "slamtec-rplidar-a1", "ti-iwr6843", "velodyne-vls128"])
+def test_tables_and_diagrams_are_bounded(sensor_id: str) -> None:
+    sensor = ls.sensor(sensor_id)
+    some, frame = packets(sensor, 4), sensor.example(sensor.data_frame)
+    assert len(str(some._repr_html_())) < 100_000
+    explained = ls.explain(frame, sensor)
+    table = explained._repr_html_()
+    assert len(table) < 150_000
+    shown = bytes.fromhex(
+        " ".join(re.sub(r"[^0-9a-f ]", "", row[1].replace("\n", " ")) for row in cells(table)[1:] if row[1]).replace(" ", "")
+    )
+    assert frame.startswith(shown)
+    assert (shown == frame) == ("further rows" not in table)
+    diagrams = str(sensor._repr_html_())
+    assert diagrams.count("<details") == len(sensor.frames)
+    assert diagrams.count("<svg") >= len(sensor.data_frames)
+
+
+def test_what_is_wrong_is_marked() -> None:
+    sensor = ls.sensor("ldrobot-stl27l")
+    frame = bytearray(sensor.example("data"))
+    good = str(ls.explain(bytes(frame), sensor)._repr_html_())
+    frame[-1] ^= 1
+    bad = str(ls.explain(bytes(frame), sensor)._repr_html_())
+    assert "<b>" not in good
+    assert re.search(r"hsl\(0 90%[^>]*>[0-9a-f]{2}</code>.*<b>[^<]* wrong, expected", bad)
+
+
+def test_words_of_the_wire_and_of_a_spec_are_text() -> None:
+    sensor = dataclasses.replace(ls.sensor("ldrobot-stl27l"), model=SCRIPT, source=SCRIPT)
+    scan = next(ls.sensor("ldrobot-stl27l").scans(sensor.example("data")))
+    marked = dataclasses.replace(scan, sensor=dataclasses.replace(sensor, id="ldrobot-stl27l"))
+    for text in (sensor._repr_html_(), marked._repr_svg_(), packets(sensor, 2)._repr_html_()):
+        assert "<script" not in str(text)
+    assert "&lt;script&gt;" in str(sensor._repr_html_())
+    named = dataclasses.replace(ls.explain(sensor.example("data"), sensor), sensor=SCRIPT, notes=(SCRIPT,))
+    assert str(named._repr_html_()).count("&lt;script&gt;") == 2
+    assert "<script" not in str(named._repr_html_())
+
+
+def test_a_frame_that_no_export_draws_says_why() -> None:
+    html = str(ls.sensor("hokuyo-urg04lx")._repr_html_())
+    assert "Python code" in html
+    assert "<svg" in html
+
+
+def test_nothing_that_draws_is_imported_before_a_notebook_asks() -> None:
+    script = (
+        "import sys, lidarspec as ls; s = ls.sensor('ldrobot-stl27l'); scans = list(s.scans(s.example('data')))\n"
+        "assert not any(name.startswith(('lidarspec.view', 'lidarspec.exports')) for name in sys.modules)\n"
+        "assert scans[0]._repr_svg_().startswith('<svg') and 'lidarspec.view.svg' in sys.modules"
+    )
+    subprocess.run([sys.executable, "-c", script], check=True)
+
+
+def test_pictures_and_tables_are_readable_on_light_and_dark_pages() -> None:
+    scan = next(ls.sensor("ldrobot-stl27l").scans(ls.sensor("ldrobot-stl27l").example("data")))
+    explained = ls.explain(ls.sensor("ldrobot-stl27l").example("data"), ls.sensor("ldrobot-stl27l"))
+    with chromium() as browser:
+        for scheme, colours in (("light", "background:#fff;color:#111"), ("dark", "background:#111;color:#ddd")):
+            page = browser.new_page(color_scheme=scheme)
+            page.set_content(f"<body style='{colours}'>{scan._repr_svg_()}{explained._repr_html_()}")
+            seen = page.evaluate(
+                """() => Object.fromEntries([["ground", "rect"], ["head", "text"], ["dots", "path[class^=dots]"]].map(([name, what]) => {
+                    const style = getComputedStyle(document.querySelector("svg " + what));
+                    return [name, name == "dots" ? style.stroke : style.fill];
+                }))"""
+            )
+            ground, head, dot = (luminance(seen[name]) for name in ("ground", "head", "dots"))
+            assert contrast(ground, head) > 7
+            assert contrast(ground, dot) > 2.5
+            assert page.evaluate("getComputedStyle(document.querySelector('td code')).color") == page.evaluate(
+                "getComputedStyle(document.body).color"
+            )
+
+
+def luminance(colour: str) -> float:
+    """The relative luminance of "rgb(r, g, b)", as WCAG has it."""
+    channels = np.array([int(number) for number in re.findall(r"\d+", colour)[:3]]) / 255
+    linear = np.where(channels <= 0.04045, channels / 12.92, ((channels + 0.055) / 1.055) ** 2.4)
+    return float(linear @ [0.2126, 0.7152, 0.0722])
+
+
+def contrast(one: float, other: float) -> float:
+    return (max(one, other) + 0.05) / (min(one, other) + 0.05)
