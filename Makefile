@@ -24,15 +24,24 @@ WRITERS := $(VENV)/.installed-docs
 PEERS := $(VENV)/.installed-bench
 ROBOTS := $(VENV)/.installed-ros2
 FUZZERS := $(VENV)/.installed-fuzz
+PAGE := lidarspec/view/page
+MODULES := $(PAGE)/node_modules/.installed
+BUNDLE := $(PAGE)/dist/page.js
 RECENT := import sys; sys.exit(sys.version_info < (3, 11))
 
-.PHONY: demo test test-ros2 test-ros2-here test-long soak fuzz lint types docs wheels reference bench bench-here clean
+.PHONY: demo page page-test test test-ros2 test-ros2-here test-long soak fuzz lint types docs wheels reference bench bench-here clean
 
 demo: $(USERS)
 	@$(BIN)/lidarspec demo -s ldrobot-stl27l
 
 test: $(DEVELOPERS)
 	@$(BIN)/python -m pytest -n auto --dist worksteal $(ARGS)
+
+# The page of `view --web`, from its TypeScript; with npm.
+page: $(BUNDLE)
+
+page-test: $(BUNDLE)
+	@cd $(PAGE) && npm run --silent lint && npm test --silent
 
 # The ROS 2 node, with ROS itself from wheels or from where it was sourced, on the loopback alone.
 test-ros2:
@@ -64,7 +73,7 @@ types: $(DEVELOPERS)
 docs: $(WRITERS)
 	@PATH="$(abspath $(BIN)):$$PATH" NO_MKDOCS_2_WARNING=1 $(BIN)/python -m mkdocs build --strict --site-dir $(abspath $(SITE))
 
-wheels: $(DEVELOPERS)
+wheels: $(DEVELOPERS) $(BUNDLE)
 	@for project in . $(DISTRIBUTIONS); do $(BIN)/python -m build --wheel --no-isolation --outdir $(DIST) $$project || exit 1; done
 
 # The pages of the sensors in docs/reference/sensors, from their specs; those of the verbs, and the manual pages, from the commands.
@@ -80,6 +89,7 @@ bench-here: $(PEERS)
 	@$(BIN)/python benchmarks/run.py $(ARGS)
 
 clean:
+	rm -rf $(PAGE)/node_modules $(PAGE)/dist $(PAGE)/dist-tests
 	rm -rf .venv .venv-bench .venv-ros2 .fuzz dist site .hypothesis .mypy_cache .pytest_cache .ruff_cache
 	find lidarspec plugins tests -name __pycache__ -type d -prune -exec rm -rf {} +
 
@@ -111,6 +121,15 @@ $(ROBOTS): $(USERS) $(ROS2)/pyproject.toml
 	@echo "installing ROS 2 into $(VENV), this once"
 	@$(PIP) install --quiet --editable '.[testing]' --editable '$(ROS2)$(if $(AMENT_PREFIX_PATH),,[ros2])'
 	@touch $@
+
+$(MODULES): $(PAGE)/package-lock.json $(PAGE)/package.json
+	@command -v npm >/dev/null || { echo "the page is built with npm, which is missing here: install Node.js 20 or later" >&2; exit 1; }
+	@echo "installing what builds the page into $(PAGE)/node_modules, this once"
+	@npm --prefix $(PAGE) ci --silent
+	@touch $@
+
+$(BUNDLE): $(MODULES) $(PAGE)/build.mjs $(wildcard $(PAGE)/src/*)
+	@cd $(PAGE) && npm run --silent build
 
 $(FUZZERS): $(DEVELOPERS)
 	@$(PIP) install --quiet 'atheris>=3.0' || echo "atheris cannot be installed here: inputs are chosen by seed" >&2

@@ -321,7 +321,7 @@ class FileInput(Input):
         """The chunks, of a stream cut where they are longer than what is read ahead."""
         for chunk in self._transport.chunks():
             rest = chunk
-            while self.decoder.stream and 0 < self._together < len(rest.data):
-                yield replace(rest, data=rest.data[: self._together])
-                rest = replace(rest, data=rest.data[self._together :], gap=False, quiet=False)
+            while self.decoder.stream and 0 < (size := self._together) < len(rest.data):
+                yield replace(rest, data=rest.data[:size])
+                rest = replace(rest, data=rest.data[size:], gap=False, quiet=False)
             yield rest

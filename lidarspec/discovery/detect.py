@@ -110,7 +110,10 @@ def _shown(sensor: Sensor, found: Sequence[Found]) -> dict[str, str]:
     data = [item.data for item in found if item.frame == sensor.data_frame] if single else []
     if not data:
         return {}
-    fields = Fields(sensor.decode(data).batch())
+    packets = sensor.decode(data)
+    if not len(packets):
+        return {}
+    fields = Fields(packets.batch())
     return {name: relative.told_by for name, relative in single.items() if np.mean(np.asarray(relative.sends(fields))) > 0.5}
 
 

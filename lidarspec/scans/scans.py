@@ -73,6 +73,7 @@ class Place(NamedTuple):
         host_ns: when it arrived, ns since 1970; 0 where nobody knows it.
         part: which of the frame's parts that have points, from 0; 0 where it has them itself.
         number: which point of the frame, or of that part.
+        data: the bytes of the frame; those that its fields stand in, where the wire has another form of them (`Frame.wire`).
     """
 
     frame: str
@@ -80,6 +81,7 @@ class Place(NamedTuple):
     host_ns: int
     part: int
     number: int
+    data: bytes
 
 
 class Provenance:
@@ -105,7 +107,9 @@ class Provenance:
         starts, local = first_points(points), start + point - first
         row = int(starts.searchsorted(local, side="right")) - 1
         frame, offset, at = packets.frame.partition(".")[0], int(packets.offset[row]), int(packets.host_ns[row])
-        return Place(frame, offset, at, rank(packets, row, before), local - int(starts[row]))
+        table, which = packets.frames
+        data = table.frame(row if isinstance(which, slice) else int(which[row]))
+        return Place(frame, offset, at, rank(packets, row, before), local - int(starts[row]), data)
 
     def __reduce__(self) -> Any:
         return Provenance, ()  # packets do not go with a scan to another process

@@ -60,7 +60,7 @@ class Answers:
             "duration": self.duration,
             "control": not self.why_no_control,
             "why_no_control": self.why_no_control,
-            "commands": [_command(sensor, name) for name in sensor.commands],
+            "commands": [form(sensor, name) for name in sensor.commands],
             "saves": saves(),
             "records": broadcast.switch is not None,
             "history": list(broadcast.history),
@@ -69,7 +69,7 @@ class Answers:
 
     def state(self, *, frozen: bool, since: int) -> dict[str, Any]:
         """How it goes; `since`: the number of damaged pieces that the page knows of."""
-        broadcast, device, shown = self.broadcast, self.broadcast.device, self.broadcast.shown
+        broadcast, shown = self.broadcast, self.broadcast.shown
         switch, paused = broadcast.switch, frozen or broadcast.paused
         recording = None if switch is None or switch.name is None else {"name": switch.name, "bytes": switch.bytes}
         trouble = [switch.trouble] if switch is not None and switch.trouble else []
@@ -81,8 +81,8 @@ class Answers:
             "paused": paused,
             "speed": broadcast.speed,
             "figures": broadcast.history[-1] if broadcast.history else None,
-            "warnings": [*device.warnings, *trouble],
-            "info": device.info,
+            "warnings": [*broadcast.warnings, *trouble],
+            "info": broadcast.info,
             "recording": recording,
             "damaged": {"total": broadcast.backlog.damaged, "newest": self._damaged(since)},
         }
@@ -151,7 +151,13 @@ class Answers:
     def _damaged(self, since: int) -> list[dict[str, Any]]:
         backlog, sensor = self.broadcast.backlog, self.broadcast.device.sensor
         return [
-            {"number": one.number, "position": self._position(one.at), "size": one.size, "verdict": one.verdict(sensor)}
+            {
+                "number": one.number,
+                "position": self._position(one.at),
+                "offset": one.offset,
+                "size": one.size,
+                "verdict": one.verdict(sensor),
+            }
             for one in backlog.since(max(since, backlog.damaged - TOLD))
         ]
 
@@ -181,7 +187,7 @@ def saves() -> list[str]:
     return ["pcd", "ply", "csv", *["las"] * (find_spec("laspy") is not None), "svg"]
 
 
-def _command(sensor: Sensor, name: str) -> dict[str, Any]:
+def form(sensor: Sensor, name: str) -> dict[str, Any]:
     """A command as a form."""
     return {"name": name, "text": effect(sensor, name), "arguments": [_argument(sensor, name, one) for one in sensor.commands[name].args]}
 

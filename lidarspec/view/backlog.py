@@ -28,7 +28,7 @@ from lidarspec.wire.parse import parse_typed
 
 #: bytes, and decodings, that are kept; and of what was damaged how many pieces, and bytes of each.
 BYTES, DECODINGS = 1 << 23, 1024
-DAMAGED, LONGEST = 100, 1 << 14
+DAMAGED, LONGEST = 500, 1 << 13
 #: bytes that are in no frame which stand at the beginning of a stream: whoever begins to listen hears the end of a frame.
 _BEGINNING = "the end of a frame that began before"
 
@@ -65,9 +65,9 @@ class Damaged:
 
 @dataclass(frozen=True)
 class Taken:
-    """One frame out of the backlog; `at` as in `Damaged`."""
+    """One frame; `at` as in `Damaged`, `number` None where it has gone out of the backlog."""
 
-    number: int
+    number: int | None
     frame: str
     at: int
     data: bytes
@@ -142,14 +142,15 @@ class Backlog:
         return None if frames is None or not 0 <= number - first < len(frames) else _taken(first, frames, number - first)
 
     def at(self, place: Place) -> Taken | None:
-        """The frame that a point came from; None where it is not kept any more."""
+        """The frame that a point came from; None where it is not kept any more, and the scan has its bytes in another form."""
         with self._lock:
             spot = bisect_right(self._found, place.offset, key=lambda entry: int(entry[1].places[0])) - 1
             first, frames = self._found[spot] if spot >= 0 else (0, None)
-        if frames is None:
-            return None
-        index = int(frames.offsets.searchsorted(place.offset))
-        return _taken(first, frames, index) if index < len(frames) and frames.offsets[index] == place.offset else None
+        if frames is not None:
+            index = int(frames.offsets.searchsorted(place.offset))
+            if index < len(frames) and frames.offsets[index] == place.offset:
+                return _taken(first, frames, index)
+        return Taken(None, place.frame, place.host_ns or -1, place.data) if self.sensor.frames[place.frame].wire is None else None
 
     def broken(self, number: int) -> Damaged | None:
         """A damaged piece by its number; None where it is not kept any more."""

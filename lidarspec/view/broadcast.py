@@ -43,15 +43,14 @@ class Shown:
         self.scan, self.number, self.position = scan, number, position
         arrived = scan.provenance(len(scan) - 1).host_ns if live and len(scan) else 0
         self.sent = arrived * 1e-9 if arrived else time.time()
-        self._message, self._most, self._lock = b"", -1, threading.Lock()
+        self._message, self._most = b"", -1
 
     def message(self, most: int) -> bytes:
         """The scan as a message of so many points at most, made once for all who ask alike."""
-        with self._lock:
-            if most != self._most:
-                self._message = message(self.scan, self.number, position=self.position, sent=self.sent, most=most)
-                self._most = most
-            return self._message
+        if most != self._most:
+            self._message = message(self.scan, self.number, position=self.position, sent=self.sent, most=most)
+            self._most = most
+        return self._message
 
 
 class Broadcast(Closing):
@@ -68,6 +67,7 @@ class Broadcast(Closing):
         shown: the newest scan; None before there is one.
         backlog: the newest bytes.
         paused, speed: of a file.
+        warnings, info: those of the device.
         history: the figures of the last minute, one after another, by name.
         failure: what ended the reading; None while it goes on.
         news: called in the thread that reads, whenever there is something new.
@@ -86,12 +86,13 @@ class Broadcast(Closing):
         self._reopened, self._select = reopened, select
         self.shown: Shown | None = None
         self.paused, self.speed = False, 1.0
+        self.warnings, self.info = list[str](), dict[str, str]()
         self.history = deque[dict[str, Any]](maxlen=round(HISTORY / FIGURES))
         self.failure: LidarSpecError | None = None
         self.news: Callable[[], None] = lambda: None
         self.backlog = Backlog(device.sensor)
         self._numbered = weakref.WeakValueDictionary[int, Shown]()
-        self._number, self._seen = 0, 0
+        self._number, self._seen, self._has_ended = 0, 0, False
         self._first: Scan | None = None
         self._moved, self._steps = False, 0
         self._target: float | None = None
@@ -118,14 +119,14 @@ class Broadcast(Closing):
     @property
     def has_ended(self) -> bool:
         """Whether nothing more comes, unless a file is played again."""
-        return self.failure is not None or (self._feed.ended and self._target is None)
+        return self.failure is not None or self._has_ended
 
     @property
     def ending(self) -> str:
         """Why nothing more comes."""
         if self.failure is not None:
             return str(self.failure)
-        return "; ".join([f"{self.source} has ended", *self.device.warnings])
+        return "; ".join([f"{self.source} has ended", *self.warnings])
 
     @property
     def began_ns(self) -> int:
@@ -205,8 +206,6 @@ class Broadcast(Closing):
         elif self.is_live or not (self.paused or feed.ended):
             feed.speed = self.speed
             self._guarded(lambda: feed.pump(time.monotonic() + LOOK))
-            if feed.ended:
-                self.news()
         else:
             feed.rest()
             self._stirred.wait(IDLE)
@@ -240,15 +239,18 @@ class Broadcast(Closing):
         feed, now, is_new = self._feed, time.monotonic(), False
         if feed.scan is not None and feed.number != self._seen:
             self._seen, is_new = feed.number, True
-            self._first = self._first or feed.scan
+            self._first = self._first or next(iter(feed.scans), feed.scan)
             self.shown = Shown(feed.scan, self._number, self._position(feed.scan), live=self.is_live)
             self._numbered[self._number] = self.shown
             self._number += 1
         if now - self._measured >= FIGURES:
             if self.is_live or not (self.paused or feed.ended):
                 self.history.append(self._figures(now - self._measured))
+            self.warnings, self.info = self.device.warnings, self.device.info
             self._measured, is_new = now, True
-        if is_new:
+        if is_new or feed.ended != self._has_ended:
+            self._has_ended = feed.ended
+            self.warnings = self.device.warnings if feed.ended else self.warnings
             self.news()
 
     def _figures(self, seconds: float) -> dict[str, Any]:
@@ -258,9 +260,12 @@ class Broadcast(Closing):
         return {"at": time.time(), **reading, "lost": stats.lost, "disconnects": stats.disconnects, "latency_s": latency}
 
     def _position(self, scan: Scan) -> float:
-        """Seconds from the first scan; by their number where they bear no times."""
+        """Seconds from the first scan: by arrival, of a file as its scans are selected, or by their number where they bear no times."""
         assert self._first is not None
-        return (scan.stamp_ns - self._first.stamp_ns) * 1e-9 if scan.stamp_ns else self._number * STEP
+        if self.is_live:
+            return (scan.host_ns - self._first.host_ns) * 1e-9
+        has_times = scan.host_ns or scan.sensor.clock is not None
+        return (scan.stamp_ns - self._first.stamp_ns) * 1e-9 if has_times else self._number * STEP
 
     def _refuse_live(self, reason: str) -> None:
         if self.is_live:

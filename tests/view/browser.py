@@ -17,8 +17,13 @@ FLAGS = ("--no-sandbox", "--use-angle=swiftshader", "--enable-unsafe-swiftshader
 def chromium() -> Iterator[Any]:
     """A browser of playwright's, closed at the end."""
     api = pytest.importorskip("playwright.sync_api", reason="playwright is not installed")
+    with api.sync_playwright() as running, contextlib.closing(running.chromium.launch(executable_path=installed(), args=FLAGS)) as browser:
+        yield browser
+
+
+def installed() -> str:
+    """Where it is."""
     path = shutil.which("chromium") or shutil.which("chromium-browser") or shutil.which("google-chrome")
     if path is None:
         pytest.skip("Chromium is not installed")
-    with api.sync_playwright() as running, contextlib.closing(running.chromium.launch(executable_path=path, args=FLAGS)) as browser:
-        yield browser
+    return path

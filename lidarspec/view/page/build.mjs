@@ -17,7 +17,7 @@ const options = {
   outdir: folder,
   bundle: true,
   format: "esm",
-  target: tests ? "node20" : "es2022",
+  target: tests ? "node20" : "es2023",
   platform: tests ? "node" : "browser",
   minify: !tests && !watch,
   sourcemap: watch ? "linked" : false,

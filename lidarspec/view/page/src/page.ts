@@ -1,9 +1,258 @@
+/** The page: what the server says goes to the picture, the figures, the bytes and the lists; what one does goes back. */
+
 import "./style.css";
-import { Picture } from "./picture";
-import { Connection, Pace } from "./protocol";
-const pace = new Pace();
-let picture: Picture;
-const url = new URL("socket", location.href.replace(/^http/, "ws"));
-const c = new Connection(url.href, { scan: (s) => picture.show(s), connected: () => {}, said: (m) => { if (m.is === "hello") {
-  picture = new Picture(document.getElementById("picture")!, { planar: m.planar, theme: matchMedia("(prefers-color-scheme: dark)").matches ? "dark" : "light", drawn: (ms, s) => { pace.drawn(ms, s.points, s.of); (window as any).log = [ms, s.points, Date.now()/1000 - s.sent]; c.next(pace.most); } });
-  (window as any).picture = picture; c.next(pace.most); } } });
+import { Bytes } from "./bytes";
+import { Charts } from "./charts";
+import { Commands } from "./commands";
+import { Controls } from "./controls";
+import { Damaged } from "./damaged";
+import { chosen, made, named } from "./dom";
+import { Picture, type Theme } from "./picture";
+import { type Ask, Connection, type Hello, type Message, Pace, type Refused, type Scan, type State, thinned } from "./protocol";
+
+/** Milliseconds that a refusal is shown, and of the stretch that pictures a second are counted over. */
+const TOLD = 8000;
+const COUNTED = 3000;
+/** Pixels of the window's height from which on the bytes are open at first. */
+const ROOMY = 800;
+const TABS = { bytes: "Bytes", damaged: "Damaged", commands: "Commands" };
+type Tab = keyof typeof TABS;
+
+class Page {
+  readonly #pace = new Pace();
+  readonly #connection: Connection;
+  readonly #charts = new Charts(named("charts"), named("figures"));
+  readonly #bytes = new Bytes(named("bytes"), (words) => this.#ask(words));
+  readonly #damaged = new Damaged(named("damaged"), (number) => {
+    this.#show("bytes");
+    this.#bytes.ofDamaged(number);
+  });
+  readonly #commands = new Commands(named("commands"), (words) => this.#ask(words));
+  readonly #dark = matchMedia("(prefers-color-scheme: dark)");
+  readonly #pictures: number[] = [];
+  #picture: Picture | null = null;
+  #controls: Controls | null = null;
+  #hello: Hello | null = null;
+  #tab: Tab | null = null;
+  #theme: Theme = "dark";
+  #ended = "";
+  #refused = "";
+  #refusals = 0;
+  #open = false;
+  #latency = 0;
+
+  constructor() {
+    const url = new URL(`socket${location.search}`, location.href);
+    url.protocol = url.protocol.replace("http", "ws");
+    this.#tabs();
+    this.#dress(this.#dark.matches ? "dark" : "light");
+    this.#dark.onchange = () => this.#dress(this.#dark.matches ? "dark" : "light");
+    named("theme").onclick = () => this.#dress(this.#theme === "dark" ? "light" : "dark");
+    document.addEventListener("visibilitychange", () => this.#ask({ do: "watch", frames: !document.hidden && this.#watched }));
+    this.#connection = new Connection(url.href, {
+      scan: (scan) => this.#picture?.show(scan),
+      said: (message) => this.#said(message),
+      connected: (open) => this.#connected(open),
+    });
+  }
+
+  /** What the picture shows, for the console and for tests. */
+  get picture(): Picture | null {
+    return this.#picture;
+  }
+
+  /** Milliseconds from the last packet of the newest scan to when it was on the screen, and pictures a second. */
+  get figures(): { latency: number; rate: number } {
+    return { latency: this.#latency, rate: this.#rate() };
+  }
+
+  get #watched(): boolean {
+    return this.#bytes.watching && this.#tab === "bytes";
+  }
+
+  #ask(words: Ask): void {
+    if (!this.#connection.ask(words)) this.#notice();
+  }
+
+  #connected(open: boolean): void {
+    this.#open = open;
+    this.#ended = "";
+    this.#notice();
+    if (open) this.#connection.next(this.#pace.most);
+  }
+
+  #said(message: Message): void {
+    switch (message.is) {
+      case "hello":
+        return this.#greet(message);
+      case "state":
+        return this.#state(message);
+      case "frame":
+        return this.#frame(message);
+      case "gone":
+        return this.#bytes.gone(message.what);
+      case "composed":
+        return this.#commands.composed(message);
+      case "replied":
+        return this.#commands.replied(message);
+      case "refused":
+        return this.#refuse(message);
+      case "ended":
+        this.#ended = message.text;
+        return this.#notice();
+    }
+  }
+
+  /** The first word of a server: what there is to see. */
+  #greet(hello: Hello): void {
+    const isSame = this.#hello?.sensor === hello.sensor && this.#hello.source === hello.source;
+    this.#hello = hello;
+    document.title = `${hello.title} · lidarspec`;
+    named("title").textContent = hello.title;
+    named("title").title = hello.sensor;
+    named("source").textContent = hello.source;
+    if (!isSame || !this.#picture) this.#begin(hello);
+    this.#damaged.clear();
+    this.#charts.clear();
+    for (const figures of hello.history) this.#charts.add(figures);
+    this.#commands.show(hello);
+    if (this.#tab === "bytes" && (this.#watched || this.#bytes.empty)) this.#ask({ do: "watch", frames: true });
+  }
+
+  #begin(hello: Hello): void {
+    this.#picture?.close();
+    const element = named("picture");
+    try {
+      this.#picture = new Picture(element, {
+        theme: this.#theme,
+        planar: hello.planar,
+        picked: (row, scan) => this.#picked(row, scan),
+        drawn: (milliseconds, scan) => this.#drawn(milliseconds, scan),
+      });
+    } catch (error) {
+      element.replaceChildren(made("p", { className: "empty", textContent: `This browser cannot draw in three dimensions: ${String(error)}` }));
+      return;
+    }
+    this.#controls = new Controls(this.#picture, hello, (words) => this.#ask(words), (as) => void this.#save(as));
+  }
+
+  #picked(row: number, scan: Scan): void {
+    this.#picture?.mark(row);
+    this.#show("bytes");
+    this.#bytes.ofPoint(scan.scan, scan.columns.get("index")![row]!);
+  }
+
+  #drawn(milliseconds: number, scan: Scan): void {
+    this.#pace.drawn(milliseconds, scan.points, scan.of);
+    this.#latency = Date.now() - 1000 * scan.sent;
+    this.#pictures.push(performance.now());
+    while (this.#pictures[0]! < performance.now() - COUNTED) this.#pictures.shift();
+    named("amount").textContent = [thinned(scan.points, scan.of), scan.whole ? "" : "a part of a scan", scan.nominal ? "nominal calibration" : ""].filter(Boolean).join(" · ");
+    this.#controls?.scanned(scan.position);
+    this.#connection.next(this.#pace.most);
+  }
+
+  #rate(): number {
+    return (1000 * this.#pictures.filter((time) => time > performance.now() - COUNTED).length) / COUNTED;
+  }
+
+  #state(state: State): void {
+    const status = named("status");
+    status.textContent = state.paused ? "paused" : state.state;
+    status.className = `badge ${state.paused ? "" : ["streaming", "playing"].includes(state.state) ? "good" : state.state === "ended" ? "" : "bad"}`;
+    if (state.state !== "ended" && this.#ended) {
+      this.#ended = "";
+      this.#notice();
+    }
+    const isLive = this.#hello?.live === true && !state.paused;
+    if (state.figures) this.#charts.add(state.figures);
+    this.#charts.tell(state.figures, [["Pictures", `${this.#rate().toFixed(1)} /s`], ...(isLive && this.#latency ? [["To the screen", `${this.#latency.toFixed(0)} ms`] as [string, string]] : [])]);
+    named("warnings").replaceChildren(...state.warnings.map((text) => made("p", { textContent: text })));
+    named("info").replaceChildren(...Object.entries(state.info).flatMap(([name, text]) => [made("dt", { textContent: name }), made("dd", { textContent: text })]));
+    this.#damaged.add(state.damaged.newest);
+    named("tabs").querySelector("[data-value=damaged] b")!.textContent = state.damaged.total ? String(state.damaged.total) : "";
+    this.#controls?.state(state);
+  }
+
+  #frame(frame: Extract<Message, { is: "frame" }>): void {
+    this.#bytes.show(frame);
+    if (frame.why === "last" && !this.#watched) this.#ask({ do: "watch", frames: false });
+  }
+
+  #refuse(refused: Refused): void {
+    if (refused.of === "compose" || refused.of === "send") return this.#commands.refused(refused);
+    this.#refused = [refused.text, refused.next ? `next: ${refused.next}` : ""].filter(Boolean).join(" · ");
+    clearTimeout(this.#refusals);
+    this.#refusals = window.setTimeout(() => {
+      this.#refused = "";
+      this.#notice();
+    }, TOLD);
+    this.#notice();
+  }
+
+  /** The one line that says what is wrong: the connection before the source, and that before what was refused. */
+  #notice(): void {
+    const lost = this.#hello ? "The connection is lost; it is tried again." : "Connecting.";
+    const text = this.#open ? this.#ended || this.#refused : lost;
+    const notice = named("notice");
+    notice.textContent = text;
+    notice.hidden = !text;
+    notice.className = this.#open && this.#ended ? "" : "bad";
+    if (!this.#open) [named("status").textContent, named("status").className] = ["disconnected", "badge bad"];
+  }
+
+  async #save(as: string): Promise<void> {
+    const scan = this.#picture?.scan;
+    if (!this.#picture || !scan) return;
+    try {
+      const name = `${this.#hello!.sensor}-scan${scan.scan}.${as}`;
+      download(as === "png" ? await this.#picture.image() : await fetched(`save/${scan.scan}.${as}${location.search}`), name);
+    } catch (error) {
+      this.#refuse({ is: "refused", of: "save", text: error instanceof Error ? error.message : String(error) });
+    }
+  }
+
+  #dress(theme: Theme): void {
+    this.#theme = theme;
+    document.documentElement.dataset.theme = theme;
+    this.#picture?.theme(theme);
+    this.#charts.theme();
+  }
+
+  #tabs(): void {
+    const buttons = Object.entries(TABS).map(([tab, text]) => made("button", { data: { value: tab }, onclick: () => this.#show(this.#tab === tab ? null : (tab as Tab)) }, text, made("b")));
+    named("tabs").append(...buttons);
+    const splitter = named("splitter");
+    const drawer = named("drawer");
+    splitter.onpointerdown = (event) => splitter.setPointerCapture(event.pointerId);
+    splitter.onpointermove = (event) => {
+      if (splitter.hasPointerCapture(event.pointerId)) drawer.style.height = `${Math.min(Math.max(innerHeight - event.clientY, 90), innerHeight - 200)}px`;
+    };
+    this.#show(innerHeight >= ROOMY ? "bytes" : null);
+  }
+
+  /** Open one of the panels, or none. */
+  #show(tab: Tab | null): void {
+    const before = this.#watched;
+    this.#tab = tab;
+    chosen(named("tabs").querySelectorAll("button"), tab ?? "");
+    named("drawer").classList.toggle("open", tab !== null);
+    for (const name of Object.keys(TABS)) named(name).hidden = name !== tab;
+    const first = tab === "bytes" && this.#bytes.empty;
+    if (this.#open && (before !== this.#watched || first)) this.#ask({ do: "watch", frames: this.#watched || first });
+  }
+}
+
+async function fetched(path: string): Promise<Blob> {
+  const answer = await fetch(path);
+  if (!answer.ok) throw new Error((await answer.text()) || `the scan was not saved: ${answer.status}`);
+  return answer.blob();
+}
+
+function download(blob: Blob, name: string): void {
+  const href = URL.createObjectURL(blob);
+  made("a", { href, download: name }).click();
+  setTimeout(() => URL.revokeObjectURL(href), TOLD);
+}
+
+Object.assign(window, { lidarspec: new Page() });

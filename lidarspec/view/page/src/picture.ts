@@ -65,6 +65,9 @@ const CENTRED = 0.3;
 const BESIDE = 9;
 const STILL = 4;
 const FIELD_OF_VIEW = 45;
+/** From where a cloud is seen at first: behind the sensor and above it; and how often the distance is bettered until all is seen. */
+const LOOK = new Vector3(-0.8, 0.14, 0.55).normalize();
+const FITTED = 4;
 
 export class Picture {
   readonly #renderer: WebGLRenderer;
@@ -94,7 +97,9 @@ export class Picture {
   #hovered: number | null = null;
   #marked: number | null = null;
   #pointer: Place | null = null;
-  #drawn = "";
+  #pointed = false;
+  #around = "";
+  #within = "";
 
   constructor(
     readonly element: HTMLElement,
@@ -320,10 +325,16 @@ export class Picture {
     const [deep, wide, tall] = low.map((end, axis) => high[axis]! - end) as [number, number, number];
     this.#controls.target.copy(middle);
     if (this.#view === "orbit") {
-      const radius = Math.hypot(deep, wide, tall) / 2;
-      const away = (radius * 0.82) / Math.sin((FIELD_OF_VIEW * Math.PI) / 360) / Math.min(aspect, 1);
-      this.#deep.position.copy(middle).addScaledVector(new Vector3(-0.8, 0.12, 0.58).normalize(), away);
-      [this.#deep.aspect, this.#deep.near, this.#deep.far] = [aspect, away / 500, away * 50];
+      this.#deep.aspect = aspect;
+      let away = Math.hypot(deep, wide, tall);
+      for (let time = 0; time < FITTED; time++) {
+        this.#deep.position.copy(middle).addScaledVector(LOOK, away);
+        [this.#deep.near, this.#deep.far] = [away / 500, away * 50];
+        this.#deep.lookAt(middle);
+        this.#deep.updateProjectionMatrix();
+        this.#deep.updateMatrixWorld();
+        away *= Math.max(...corners(this.#box).flatMap((corner) => corner.project(this.#deep).toArray().slice(0, 2)).map(Math.abs)) * MARGIN;
+      }
     } else {
       const [across, up] = this.#view === "side" ? [deep, tall] : [wide, deep];
       const half = (Math.max(up, across / aspect, 0.1) / 2) * MARGIN;
@@ -428,9 +439,17 @@ export class Picture {
     uniforms.disc!.value = size > 2;
     this.#renderer.render(this.#scene, this.#camera);
     const outlook = this.#outlook();
-    const seen = JSON.stringify([outlook, this.#camera.projectionMatrix.elements, this.#camera.matrixWorld.elements]);
-    if (seen !== this.#drawn) ground(this.#under.getContext("2d")!, outlook);
-    this.#drawn = seen;
+    this.#hovered = this.#pointer ? this.pick(...this.#pointer) : null;
+    const camera = [...this.#camera.projectionMatrix.elements, ...this.#camera.matrixWorld.elements];
+    const around = JSON.stringify([outlook, camera]);
+    const within = JSON.stringify([around, this.#by, this.#span, this.#scan !== null]);
+    if (around !== this.#around) ground(this.#under.getContext("2d")!, outlook);
+    if (within !== this.#within || this.#hovered !== null || this.#marked !== null || this.#pointed) this.#label(outlook);
+    [this.#around, this.#within] = [around, within];
+  }
+
+  /** What stands over the points. */
+  #label(outlook: Outlook): void {
     const over = this.#over.getContext("2d")!;
     over.clearRect(0, 0, outlook.width, outlook.height);
     labels(over, outlook);
@@ -442,7 +461,7 @@ export class Picture {
 
   /** Mark the point that was picked and the one under the pointer, and say where that is. */
   #point(over: CanvasRenderingContext2D, outlook: Outlook): void {
-    this.#hovered = this.#pointer ? this.pick(...this.#pointer) : null;
+    this.#pointed = this.#hovered !== null || this.#marked !== null;
     const columns = this.#columns();
     for (const row of [this.#marked, this.#hovered]) {
       const spot = row === null || !columns ? null : outlook.place(columns[0][row]!, columns[1][row]!, columns[2][row]!);
@@ -507,6 +526,10 @@ export function around(scan: Scan): Box {
     box.high[axis] = above;
   });
   return box;
+}
+
+function corners({ low, high }: Box): Vector3[] {
+  return Array.from({ length: 8 }, (_, number) => new Vector3(...low.map((end, axis) => ((number >> axis) & 1 ? high[axis]! : end))));
 }
 
 /** A point in words: range and angle of a planar scan, x y z of others, and what else is known of it. */

@@ -74,7 +74,8 @@ export interface Argument {
   unit: string;
   low: number | null;
   high: number | null;
-  choices: string[] | null;
+  /** values that have a name; none where any in the range will do */
+  choices: { value: string; text: string }[];
   default: string | number | null;
 }
 
@@ -84,7 +85,8 @@ export interface Command {
   arguments: Argument[];
 }
 
-export type Figures = Record<string, number | null | undefined>;
+/** By name, and `at`: seconds of the server's clock. */
+export type Figures = Record<string, number | null | undefined> & { at: number };
 
 export interface Hello {
   is: "hello";
@@ -99,13 +101,14 @@ export interface Hello {
   commands: Command[];
   saves: string[];
   records: boolean;
-  history: { at: number; figures: Figures }[];
+  /** the figures of the last minute */
+  history: Figures[];
   version: string;
 }
 
 export interface Damage {
   number: number;
-  position: number;
+  position: number | null;
   size: number;
   verdict: string;
 }
@@ -117,7 +120,7 @@ export interface State {
   state: string;
   paused: boolean;
   speed: number;
-  figures: Figures;
+  figures: Figures | null;
   warnings: string[];
   info: Record<string, string>;
   recording: { name: string; bytes: number } | null;
@@ -126,8 +129,9 @@ export interface State {
 
 export interface Frame {
   is: "frame";
+  /** among all frames, or among the damaged pieces where it is one */
   number: number;
-  position: number;
+  position: number | null;
   hex: string;
   why: "last" | "point" | "damaged" | "number";
   value: string | null;
@@ -138,7 +142,7 @@ export interface Composed {
   is: "composed";
   command: string;
   hex: string;
-  explanation: Explanation;
+  explanation: Explanation | null;
 }
 
 export interface Replied {
@@ -211,10 +215,10 @@ function located(data: ArrayBuffer | ArrayBufferView): [ArrayBuffer, number] {
 /** Milliseconds that a picture may take, so that there are ten a second, and how many points are asked for at first, at least and at most. */
 const BUDGET = 80;
 const FIRST = 40_000;
-const LEAST = 5_000;
+const LEAST = 20_000;
 const MOST = 1_000_000;
 
-/** How many points are asked for: as many as are drawn in time. */
+/** How many points are asked for: as many as are drawn in time; below the least of them other work is what takes long. */
 export class Pace {
   most = FIRST;
 
@@ -289,9 +293,11 @@ export class Connection {
       this.listener.connected(true);
     };
     socket.onmessage = ({ data }: MessageEvent<string | ArrayBuffer>) => {
-      if (typeof data === "string") return this.listener.said(JSON.parse(data) as Message);
-      this.#waiting = false;
-      this.listener.scan(decoded(data));
+      if (typeof data === "string") this.listener.said(JSON.parse(data) as Message);
+      else {
+        this.#waiting = false;
+        this.listener.scan(decoded(data));
+      }
     };
     socket.onclose = () => {
       if (this.#socket !== socket) return;

@@ -1,0 +1,280 @@
+/**
+ * The bytes of a frame beside the tree of its names: pointing at one marks the other.
+ *
+ * Only the rows that are seen are made, so that a large frame costs no more than a small one.
+ */
+
+import { Anatomy, bitPicture, hexed, type Part } from "./anatomy";
+import { made, Rows } from "./dom";
+import type { Ask, Frame } from "./protocol";
+
+const ACROSS = 16;
+/** Pixels of a row of bytes, and of the tree. */
+const LINE = 19;
+const BRANCH = 22;
+/** Colours of fields, which begin again after so many. */
+const KINDS = 8;
+const COUNTS = new Intl.NumberFormat("en-US");
+
+export class Bytes {
+  readonly #live = made("button", { textContent: "Live", title: "The newest frame, twice a second", data: { value: "live" } });
+  readonly #title = made("span", { className: "caption" });
+  readonly #verdict = made("span", { className: "verdict" });
+  readonly #said = made("p", { className: "said" });
+  readonly #dump: Rows;
+  readonly #tree: Rows;
+  readonly #cells = new Map<number, HTMLElement[]>();
+  readonly #branches = new Map<string, HTMLElement>();
+  #anatomy: Anatomy | null = null;
+  #frame: Frame | null = null;
+  #seen: Part[] = [];
+  #unfolded = new Set<string>();
+  #pointed: Part | null = null;
+  #kept: Part | null = null;
+  #watching = false;
+
+  constructor(
+    readonly element: HTMLElement,
+    readonly ask: (words: Ask) => void,
+  ) {
+    const step = (by: number) => () => this.#step(by);
+    const bar = made(
+      "div",
+      { className: "bar" },
+      made("button", { textContent: "‹", title: "The frame before", onclick: step(-1) }),
+      made("button", { textContent: "›", title: "The frame after", onclick: step(1) }),
+      this.#live,
+      this.#title,
+      this.#verdict,
+    );
+    const dump = made("div", { className: "dump scroll", tabIndex: 0 });
+    const tree = made("div", { className: "tree scroll", tabIndex: 0 });
+    const heading = made("div", { className: "heading branch" }, ...["Field", "Raw", "Value", "Meaning"].map((name) => made("span", {}, name)));
+    element.append(bar, made("div", { className: "beside" }, made("div", { className: "column" }, dump, this.#said), made("div", { className: "column" }, heading, tree)));
+    this.#dump = new Rows(dump, LINE, (number) => this.#line(number));
+    this.#tree = new Rows(tree, BRANCH, (number) => this.#branch(this.#seen[number]!));
+    this.#live.onclick = () => this.watch(!this.#watching);
+    this.#listen(dump, tree);
+    this.#say(null, null);
+  }
+
+  /** Show the newest frame again and again, or hold the one that is shown. */
+  watch(frames: boolean): void {
+    this.#watching = frames;
+    this.#live.setAttribute("aria-pressed", String(frames));
+    this.ask({ do: "watch", frames });
+  }
+
+  /** Whether the newest frame is shown again and again. */
+  get watching(): boolean {
+    return this.#watching;
+  }
+
+  /** Whether there is a frame to look at. */
+  get empty(): boolean {
+    return this.#frame === null;
+  }
+
+  /** Ask for one frame, and hold it. */
+  #hold(words: Ask): void {
+    this.watch(false);
+    this.ask(words);
+  }
+
+  #step(by: number): void {
+    if (!this.#frame) return;
+    const number = this.#frame.number + by;
+    this.#hold(this.#frame.why === "damaged" ? { do: "frame", damaged: number } : { do: "frame", number });
+  }
+
+  /** The frame that a point came from. */
+  ofPoint(scan: number, index: number): void {
+    this.#hold({ do: "frame", point: { scan, index } });
+  }
+
+  /** A damaged frame by its number. */
+  ofDamaged(damaged: number): void {
+    this.#hold({ do: "frame", damaged });
+  }
+
+  /** Say that a frame is not kept any more. */
+  gone(what: string): void {
+    this.#verdict.textContent = what;
+    this.#verdict.className = "verdict bad";
+  }
+
+  show(frame: Frame): void {
+    if (frame.why === "last" && !this.#watching && this.#frame) return;
+    const before = this.#anatomy?.explanation.frame;
+    this.#frame = frame;
+    this.#anatomy = new Anatomy(frame.hex, frame.explanation);
+    if (before !== frame.explanation.frame) this.#unfolded = this.#anatomy.unfolded();
+    this.#pointed = this.#same(this.#pointed);
+    this.#kept = frame.value === null ? (frame.why === "last" ? this.#same(this.#kept) : null) : (this.#anatomy.nodes.get(frame.value) ?? null);
+    this.#head(frame);
+    this.#cells.clear();
+    this.#dump.show(Math.ceil(this.#anatomy.bytes.length / ACROSS));
+    this.#fold();
+    if (frame.value !== null && this.#kept) this.#reveal(this.#kept);
+    const fault = frame.explanation.fault;
+    if (frame.why === "damaged" && fault) this.#dump.reveal(Math.floor(Math.min(fault.offset, this.#anatomy.bytes.length - 1) / ACROSS));
+    this.#mark();
+  }
+
+  #same(node: Part | null): Part | null {
+    return node && (this.#anatomy?.nodes.get(node.path) ?? null);
+  }
+
+  #head({ number, position, explanation, why }: Frame): void {
+    const { frame, size, fault, notes } = explanation;
+    const time = position === null ? "" : ` · at ${position.toFixed(3)} s`;
+    this.#title.textContent = `${frame || "no frame"} · ${why === "damaged" ? "damaged" : "number"} ${COUNTS.format(number)} · ${COUNTS.format(size)} bytes${time}`;
+    this.#verdict.textContent = [fault?.reason ?? "valid", ...notes].join(" · ");
+    this.#verdict.title = this.#verdict.textContent;
+    this.#verdict.className = fault ? "verdict bad" : "verdict good";
+  }
+
+  #fold(): void {
+    this.#seen = this.#anatomy?.seen(this.#unfolded) ?? [];
+    this.#branches.clear();
+    this.#tree.show(this.#seen.length);
+  }
+
+  /** Unfold what is around a node, and scroll both sides to it. */
+  #reveal(node: Part): void {
+    this.#anatomy!.around(node.path).forEach((path) => this.#unfolded.add(path));
+    this.#fold();
+    this.#tree.reveal(this.#seen.indexOf(node));
+    this.#dump.reveal(Math.floor(node.start / ACROSS));
+  }
+
+  #listen(dump: HTMLElement, tree: HTMLElement): void {
+    const target = (event: Event, key: "offset" | "path"): string | undefined => (event.target as Element).closest<HTMLElement>(`[data-${key}]`)?.dataset[key];
+    const byte = (event: Event): number | null => {
+      const offset = target(event, "offset");
+      return offset === undefined ? null : Number(offset);
+    };
+    const point = (node: Part | null, offset: number | null = null): void => {
+      this.#pointed = node;
+      this.#mark(offset);
+    };
+    dump.addEventListener("mouseover", (event) => {
+      const offset = byte(event);
+      point(offset === null ? null : this.#anatomy!.at(offset), offset);
+    });
+    tree.addEventListener("mouseover", (event) => point(this.#anatomy?.nodes.get(target(event, "path") ?? "") ?? null));
+    for (const side of [dump, tree]) side.addEventListener("mouseleave", () => point(null));
+    dump.addEventListener("click", (event) => {
+      const offset = byte(event);
+      this.#kept = offset === null ? null : this.#anatomy!.at(offset);
+      if (this.#kept) this.#reveal(this.#kept);
+      this.#mark(offset);
+    });
+    tree.addEventListener("click", (event) => {
+      const node = this.#anatomy?.nodes.get(target(event, "path") ?? "");
+      if (!node) return;
+      this.#kept = node;
+      if (node.inside.length) {
+        if (!this.#unfolded.delete(node.path)) this.#unfolded.add(node.path);
+        this.#fold();
+      }
+      this.#dump.reveal(Math.floor(node.start / ACROSS));
+      this.#mark();
+    });
+  }
+
+  /** Mark the bytes of what is pointed at and of what was clicked, and say what it is. */
+  #mark(offset: number | null = null): void {
+    const anatomy = this.#anatomy;
+    if (!anatomy) return;
+    const marked = [this.#kept, this.#pointed].map((node) => (node ? anatomy.bits(node) : new Map<number, number>()));
+    this.#cells.forEach((cells, place) => marks(cells, marked[0]!.get(place) ?? 0, marked[1]!.get(place) ?? 0));
+    this.#branches.forEach((branch, path) => {
+      branch.classList.toggle("kept", path === this.#kept?.path);
+      branch.classList.toggle("pointed", this.#pointed !== null && (path === this.#pointed.path || this.#isFolded(path, this.#pointed)));
+    });
+    const owners = offset === null ? [] : anatomy.owners(offset);
+    this.#say(this.#pointed ?? this.#kept, owners.length > 1 ? offset : null);
+  }
+
+  /** Whether a node is inside of what is seen folded at a path. */
+  #isFolded(path: string, node: Part): boolean {
+    return !this.#unfolded.has(path) && (node.path.startsWith(`${path}.`) || node.path.startsWith(`${path}[`));
+  }
+
+  /** Name what is pointed at below the bytes; of a byte that several fields share, each with its bits. */
+  #say(node: Part | null, shared: number | null): void {
+    const anatomy = this.#anatomy;
+    this.#said.replaceChildren();
+    if (!node || !anatomy) return this.#said.append("Point at a byte or at a field; a click holds it.");
+    const nodes = shared === null ? [node] : anatomy.owners(shared).map((owner) => anatomy.nodes.get(anatomy.values[owner]!.path)!);
+    for (const [number, part] of nodes.entries()) this.#said.append(...(number ? [made("br")] : []), ...this.#words(part, anatomy));
+  }
+
+  #words(node: Part, anatomy: Anatomy): (HTMLElement | string)[] {
+    const value = node.value === null ? null : anatomy.values[node.value]!;
+    const bytes = [...anatomy.bits(node)];
+    const size = node.end - node.start;
+    const hex = hexed(anatomy.bytes.slice(node.start, node.start + Math.min(size, 8))) + (size > 8 ? " …" : "");
+    const drawn = value?.bits ? bytes.slice(0, 4).map(([offset, mask]) => bitPicture(anatomy.bytes[offset]!, mask)).join(" ") : hex;
+    const where = `0x${node.start.toString(16).padStart(4, "0")}`;
+    const text = value ? [value.text ?? "", value.bits ?? ""].filter(Boolean).join(", ") : `${COUNTS.format(size)} bytes`;
+    return [made("code", {}, `${where}  ${drawn}`), " ", made("b", {}, node.path), ` ${text}`, node.meaning ? ` · ${node.meaning}` : ""];
+  }
+
+  /** Sixteen bytes: where they are, in hexadecimal, and as text. */
+  #line(number: number): HTMLElement {
+    const { bytes } = this.#anatomy!;
+    const first = number * ACROSS;
+    const row = made("div", { className: "line" }, made("span", { className: "offset" }, first.toString(16).padStart(4, "0")));
+    const [left, right] = [made("span", { className: "hex" }), made("span", { className: "text" })];
+    for (let offset = first; offset < Math.min(first + ACROSS, bytes.length); offset++) {
+      const byte = bytes[offset]!;
+      const cells = [hexed([byte]), byte > 31 && byte < 127 ? String.fromCharCode(byte) : "·"].map((text) => this.#cell(offset, text));
+      left.append(cells[0]!);
+      right.append(cells[1]!);
+      this.#cells.set(offset, cells);
+      marks(cells, this.#kept ? (this.#anatomy!.bits(this.#kept).get(offset) ?? 0) : 0, 0);
+    }
+    row.append(left, right);
+    return row;
+  }
+
+  #cell(offset: number, text: string): HTMLElement {
+    const anatomy = this.#anatomy!;
+    const kind = anatomy.kind(offset);
+    const colours = anatomy.wrong(offset) ? "wrong" : kind === null ? "" : `kind${kind % KINDS}`;
+    return made("i", { className: colours, textContent: text, data: { offset: String(offset) } });
+  }
+
+  #branch(node: Part): HTMLElement {
+    const value = node.value === null ? null : this.#anatomy!.values[node.value]!;
+    const isFolder = node.inside.length > 0;
+    const fold = isFolder ? (this.#unfolded.has(node.path) ? "▾" : "▸") : "";
+    const name = made("span", { className: "name" }, made("i", { className: "fold", textContent: fold }), node.name);
+    const kind = this.#anatomy!.kind(node.start);
+    if (!isFolder && kind !== null) name.classList.add(`kind${kind % KINDS}`);
+    name.style.paddingLeft = `${6 + 14 * node.depth}px`;
+    const raw = isFolder ? folded(node) : String(value?.raw ?? "");
+    const cells = [raw, value?.text ?? "", node.meaning].map((text) => made("span", { textContent: text, title: text }));
+    const row = made("div", { className: node.right ? "branch" : "branch wrong", data: { path: node.path } }, name, ...cells);
+    this.#branches.set(node.path, row);
+    row.classList.toggle("kept", node.path === this.#kept?.path);
+    return row;
+  }
+}
+
+/** What a folded node holds, in words. */
+function folded(node: Part): string {
+  const isArray = node.inside[0]!.name.startsWith("[");
+  return isArray ? `${COUNTS.format(node.inside.length)} ×` : "";
+}
+
+/** Mark a byte in both its places: all of it, or some of its bits. */
+function marks(cells: HTMLElement[], kept: number, pointed: number): void {
+  for (const cell of cells) {
+    cell.classList.toggle("kept", kept !== 0);
+    cell.classList.toggle("pointed", pointed !== 0);
+    cell.classList.toggle("some", (kept | pointed) !== 0 && (kept | pointed) !== 0xff);
+  }
+}

@@ -1,0 +1,104 @@
+/** The sensor's commands: a form for each, the bytes before they are sent, and what came back. */
+
+import { made } from "./dom";
+import type { Argument, Ask, Command, Composed, Hello, Refused, Replied } from "./protocol";
+
+/** Milliseconds from the last key to when the bytes are asked for. */
+const SETTLED = 200;
+
+export class Commands {
+  readonly #list = made("div", { className: "list scroll" });
+  readonly #form = made("form", { className: "form" });
+  readonly #bytes = made("div", { className: "bytes" });
+  readonly #reply = made("div", { className: "reply" });
+  readonly #send = made("button", { textContent: "Send", className: "primary", disabled: true });
+  readonly #hindrance = made("p", { className: "hindrance" });
+  #command: Command | null = null;
+  #control = false;
+  #timer = 0;
+
+  constructor(
+    readonly element: HTMLElement,
+    readonly ask: (words: Ask) => void,
+  ) {
+    element.append(made("div", { className: "beside" }, this.#list, made("div", { className: "detail scroll" }, this.#hindrance, this.#form, this.#bytes, this.#reply)));
+    this.#form.onsubmit = (event) => {
+      event.preventDefault();
+      this.#say("sent, waiting for the reply");
+      this.#words("send");
+    };
+    this.#form.oninput = () => {
+      this.#send.disabled = true;
+      clearTimeout(this.#timer);
+      this.#timer = window.setTimeout(() => this.#words("compose"), SETTLED);
+    };
+  }
+
+  /** The commands of a sensor. */
+  show({ commands, control, why_no_control }: Hello): void {
+    this.#control = control;
+    this.#hindrance.textContent = control ? "" : why_no_control;
+    const buttons = commands.map((command) => made("button", { textContent: command.name, title: command.text, data: { value: command.name }, onclick: () => this.#choose(command) }));
+    this.#list.replaceChildren(...(buttons.length ? buttons : [made("p", { className: "empty", textContent: "This sensor has no commands." })]));
+    const again = commands.find(({ name }) => name === this.#command?.name) ?? commands[0];
+    if (again) this.#choose(again);
+    else this.#form.replaceChildren();
+  }
+
+  /** The bytes that would be sent. */
+  composed({ command, hex, explanation }: Composed): void {
+    if (command !== this.#command?.name) return;
+    this.#send.disabled = !this.#control;
+    const rows = (explanation?.rows ?? []).map((row) =>
+      made("tr", {}, ...[row.offset.toString(16).padStart(4, "0"), row.hex, row.path, row.meaning].map((text) => made("td", { textContent: text }))),
+    );
+    this.#bytes.replaceChildren(made("code", { className: "whole", textContent: hex.match(/../g)?.join(" ") ?? "" }), made("table", {}, made("tbody", {}, ...rows)));
+  }
+
+  replied({ command, text, hex }: Replied): void {
+    if (command !== this.#command?.name) return;
+    this.#say(text);
+    if (hex) this.#reply.append(made("code", { className: "whole", textContent: hex.match(/../g)?.join(" ") ?? "" }));
+  }
+
+  refused({ of, text, next }: Refused): void {
+    if (of === "compose") {
+      this.#bytes.replaceChildren(made("p", { className: "bad", textContent: text }));
+      this.#send.disabled = true;
+    } else this.#say([text, next ? `next: ${next}` : ""].filter(Boolean).join("\n"), "bad");
+  }
+
+  #say(text: string, verdict = "good"): void {
+    this.#reply.replaceChildren(made("pre", { className: verdict, textContent: text }));
+  }
+
+  #choose(command: Command): void {
+    this.#command = command;
+    for (const button of this.#list.querySelectorAll("button")) button.setAttribute("aria-pressed", String(button.dataset.value === command.name));
+    this.#form.replaceChildren(made("h2", {}, command.name), made("p", { textContent: command.text }), ...command.arguments.map(field), this.#send);
+    this.#bytes.replaceChildren();
+    this.#reply.replaceChildren();
+    this.#send.disabled = true;
+    this.#words("compose");
+  }
+
+  /** What the form says, once all that is needed is there. */
+  #words(word: "compose" | "send"): void {
+    if (!this.#command) return;
+    const given = [...new FormData(this.#form)].map(([name, text]) => [name, text as string] as const).filter(([, text]) => text !== "");
+    const missing = this.#command.arguments.find(({ name, default: fallback }) => fallback === null && !given.some(([one]) => one === name));
+    if (missing) this.#bytes.replaceChildren(made("p", { className: "faint", textContent: `The bytes show when ${missing.name} is given.` }));
+    else this.ask({ do: word, command: this.#command.name, arguments: Object.fromEntries(given) });
+  }
+}
+
+/** A label and what takes an argument: a choice, or text with what may be in it. */
+function field({ name, text, unit, low, high, choices, default: fallback }: Argument): HTMLElement {
+  const range = low === null || high === null ? "" : `${low} to ${high}`;
+  const allowed = [range, unit].filter(Boolean).join(" ");
+  const value = fallback === null ? "" : String(fallback);
+  const input = choices.length
+    ? made("select", { name }, ...choices.map((choice) => made("option", { ...choice, selected: choice.value === value })))
+    : made("input", { name, value, placeholder: allowed, autocomplete: "off", spellcheck: false });
+  return made("label", {}, made("span", { textContent: name }), input, made("small", { textContent: [allowed, text].filter(Boolean).join(" · ") }));
+}

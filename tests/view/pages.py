@@ -1,0 +1,202 @@
+"""A broadcast that is served, and pages that are open on it: real sockets, and what a page says and hears."""
+
+from __future__ import annotations
+
+import json
+import socket
+import threading
+import time
+from collections import deque
+from collections.abc import Callable
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+import lidarspec as ls
+from lidarspec.device.device import open as open_device
+from lidarspec.errors import LidarSpecError
+from lidarspec.scans.selection import EVERYTHING, Selection
+from lidarspec.simulation.device import SimulatedDevice
+from lidarspec.transports.open_url import is_live
+from lidarspec.transports.serving import write_file
+from lidarspec.view.feed import LOOK
+from lidarspec.view.live import Switch
+from tests.view.messages import parsed
+
+pytest.importorskip("starlette", reason="starlette is not installed (the extra web)")
+pytest.importorskip("uvicorn", reason="uvicorn is not installed (the extra web)")
+client = pytest.importorskip("websockets.sync.client", reason="websockets is not installed (the extra web)")
+
+#: seconds that anything may take; many times what it does.
+DEADLINE = 30.0
+FLAT, SOLID = "ldrobot-stl27l", "robosense-m1"
+
+
+class Station:
+    """A source that is read in a thread and served, as `lidarspec view --web` does; a context manager.
+
+    Attributes:
+        said: what was told of pages.
+        failure: what reading it ended with.
+    """
+
+    def __init__(self, source: object, folder: Path, sensor: Any = None, *, select: Selection = EVERYTHING, **options: Any) -> None:
+        from lidarspec.view.broadcast import Broadcast
+        from lidarspec.view.server import Site
+
+        self.source, self.said = str(source), list[str]()
+        self.switch = Switch(self.source, folder) if is_live(self.source) else None
+        device = open_device(self.source, sensor, record=self.switch.attached if self.switch else None, period=LOOK)
+        if self.switch is not None:
+            self.switch.sensor_id = device.sensor.id
+        reopened = partial(open_device, self.source, device.sensor)
+        self.broadcast = Broadcast(self.source, device, reopened=reopened, select=select, switch=self.switch)
+        (folder / "page").mkdir(exist_ok=True)
+        (folder / "page" / "index.html").write_text("<!doctype html><title>page</title>")
+        self.site = Site(self.broadcast, page=folder / "page", say=self.said.append, **options)
+        self.failure: LidarSpecError | None = None
+        self._thread = threading.Thread(target=self._read, name="reading")
+
+    def _read(self) -> None:
+        try:
+            self.broadcast.run(time.monotonic() + 10 * DEADLINE)
+        except LidarSpecError as error:
+            self.failure = error
+
+    @property
+    def link(self) -> str:
+        return self.site.link
+
+    @property
+    def port(self) -> int:
+        return int(self.link.rpartition(":")[2].partition("/")[0])
+
+    def page(self, **options: Any) -> Page:
+        return Page(self.link, **options)
+
+    def __enter__(self) -> Station:
+        self.site.__enter__()
+        self._thread.start()
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.broadcast.stop()
+        self._thread.join()
+        self.site.__exit__(None, None, None)
+        self.broadcast.close()
+
+
+class Page:
+    """What a page says, and hears; a context manager."""
+
+    def __init__(self, link: str, **options: Any) -> None:
+        address, _, query = link.partition("?")
+        given = {"origin": address.rstrip("/"), "max_size": None, "compression": None, "open_timeout": DEADLINE, **options}
+        self._opened = client.connect(f"ws{address.removeprefix('http')}socket{'?' * bool(query)}{query}", **given)
+        self._kept = deque[Any]()
+
+    def say(self, word: str, **facts: Any) -> None:
+        self.socket.send(json.dumps({"do": word, **facts}))
+
+    def heard(self, is_it: Callable[[Any], bool], *, within: float = DEADLINE) -> Any:
+        """The first message that is it, of those that were not asked for yet; the others wait."""
+        for message in self._kept:
+            if is_it(message):
+                self._kept.remove(message)
+                return message
+        end = time.monotonic() + within
+        while (left := end - time.monotonic()) > 0:
+            message = self.socket.recv(left)
+            message = parsed(message) if isinstance(message, bytes) else json.loads(message, parse_constant=_no_constant)
+            if is_it(message):
+                return message
+            self._kept.append(message)
+        raise TimeoutError([message["is"] for message in self._kept if isinstance(message, dict)])
+
+    def until(self, word: str, holds: Callable[[Any], bool] = lambda message: True) -> Any:
+        """The next message of a word of which something holds."""
+        return self.heard(lambda message: isinstance(message, dict) and message["is"] == word and holds(message))
+
+    def state(self, holds: Callable[[Any], bool] = lambda state: True) -> Any:
+        """The next state from now on of which something holds."""
+        self._kept = deque(message for message in self._kept if not (isinstance(message, dict) and message["is"] == "state"))
+        return self.until("state", holds)
+
+    def scan(self, most: int = 1 << 20) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
+        """The newest scan that the page has not had."""
+        self.say("next", most=most)
+        return self.heard(lambda message: isinstance(message, tuple))  # type: ignore[no-any-return]
+
+    def scan_at(self, position: float) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
+        """The first scan from now on that is near a place; one that was on its way may come before it."""
+        while True:
+            header, columns = self.scan()
+            if abs(header["position"] - position) < 0.21:
+                return header, columns
+
+    def asked(self, word: str, **facts: Any) -> Any:
+        """What comes back on a question: whatever is neither a scan nor a state."""
+        self.say(word, **facts)
+        return self.heard(lambda message: isinstance(message, dict) and message["is"] not in ("state", "hello", "ended"))
+
+    def __enter__(self) -> Page:
+        self.socket = self._opened.__enter__()
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._opened.__exit__(None, None, None)
+
+
+def _no_constant(name: str) -> None:
+    raise ValueError(f"{name} is not JSON")
+
+
+def recorded(folder: Path, sensor: str = FLAT, seconds: float = 5.0, suffix: str = ".lsr", **faults: Any) -> Path:
+    """A file of what a simulated sensor sends."""
+    path = folder / f"sent{suffix}"
+    write_file(SimulatedDevice(ls.sensor(sensor), **faults), path, seconds)
+    return path
+
+
+def answered(port: int, path: str, *, host: str = "", **headers: str) -> tuple[int, dict[str, str], bytes]:
+    """Status, headers and body of what comes back on a raw request.
+
+    Args:
+        host: what the request calls the server; by default what it is called.
+        headers: further ones, with "_" for "-"; a WebSocket is asked for where one of them is `upgrade`.
+    """
+    given = {"Host": host or f"127.0.0.1:{port}", "Connection": "Upgrade" if "upgrade" in headers else "close", **headers}
+    lines = [f"GET {path} HTTP/1.1", *(f"{name.replace('_', '-')}: {value}" for name, value in given.items()), "", ""]
+    with socket.create_connection(("127.0.0.1", port), DEADLINE) as raw:
+        raw.settimeout(DEADLINE)
+        raw.sendall("\r\n".join(lines).encode("latin-1"))
+        data = b""
+        while b"\r\n\r\n" not in data and (more := raw.recv(1 << 16)):
+            data += more
+        head, _, body = data.partition(b"\r\n\r\n")
+        lines = head.decode("latin-1").split("\r\n")
+        told = {name.lower(): value.strip() for name, _, value in (line.partition(":") for line in lines[1:])}
+        while len(body) < int(told.get("content-length", 0)) and (more := raw.recv(1 << 16)):
+            body += more
+    return int(lines[0].split()[1]), told, body
+
+
+#: the headers that ask for a WebSocket, with which a browser says whose page asks.
+UPGRADE = {"upgrade": "websocket", "Sec_WebSocket_Key": "dGhlIHNhbXBsZSBub25jZQ==", "Sec_WebSocket_Version": "13"}
+
+
+def handshake(port: int) -> bytes:
+    """What opens a WebSocket by hand."""
+    host = f"127.0.0.1:{port}"
+    given = {"Host": host, "Origin": f"http://{host}", "Connection": "Upgrade", **UPGRADE}
+    lines = ["GET /socket HTTP/1.1", *(f"{name.replace('_', '-')}: {value}" for name, value in given.items()), "", ""]
+    return "\r\n".join(lines).encode()
+
+
+def masked(message: dict[str, Any]) -> bytes:
+    """A short message as a frame of a WebSocket, masked with zeros."""
+    text = json.dumps(message).encode()
+    return bytes([0x81, 0x80 | len(text), 0, 0, 0, 0]) + text

@@ -1,0 +1,445 @@
+"""The page in a real browser: what is drawn is the room, bytes and fields mark each other, and what one clicks happens."""
+
+from __future__ import annotations
+
+import contextlib
+import csv
+import io
+import json
+import math
+import re
+import signal
+import socket
+import subprocess
+import sys
+import time
+import urllib.request
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+import lidarspec as ls
+from lidarspec.simulation.scenes import Room
+from lidarspec.transports.protocol import Chunk
+from tests.view.browser import FLAGS, chromium, installed
+
+BUNDLE = Path(ls.__file__).parent / "view" / "page" / "dist" / "page.js"
+#: the columns of the points that are shown, and their places in the picture, one after another.
+SHOWN = """(() => {
+  const { picture } = lidarspec, { columns } = picture.scan, [x, y, z] = ["x", "y", "z"].map((name) => columns.get(name));
+  const places = [...x].flatMap((_, row) => picture.place(x[row], y[row], z[row]));
+  return [Object.fromEntries([...columns].map(([name, column]) => [name, [...column]])), places];
+})()"""
+#: the size of the picture, and the numbers of the pixels in it that are neither black, grey nor white.
+COLOURED = """(async () => {
+  const image = await createImageBitmap(await lidarspec.picture.image()), { width, height } = image;
+  const context = new OffscreenCanvas(width, height).getContext("2d");
+  context.drawImage(image, 0, 0);
+  const { data } = context.getImageData(0, 0, width, height), coloured = [];
+  for (let pixel = 0; pixel < width * height; pixel++) {
+    const [red, green, blue] = [data[4 * pixel], data[4 * pixel + 1], data[4 * pixel + 2]];
+    if (Math.max(red, green, blue) - Math.min(red, green, blue) > 60) coloured.push(pixel);
+  }
+  return [width, height, coloured];
+})()"""
+#: pixels around the sensor in which its axes are drawn.
+AXES = 50
+#: packets a second of the planar sensor.
+RATE = 1800
+#: seconds that a machine with other work may need.
+PATIENCE = 60.0
+
+if not BUNDLE.is_file():
+    pytest.skip("the page is not built: make page", allow_module_level=True)
+for library in ("starlette", "uvicorn", "websockets"):
+    pytest.importorskip(library, reason=f"{library} is not installed: the page is not served")
+
+
+@contextlib.contextmanager
+def served(*words: str, address: str = "127.0.0.1") -> Iterator[str]:
+    """The link to the page of a source."""
+    command = [sys.executable, "-m", "lidarspec", "view", *words, "--web", "--address", address]
+    process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+    try:
+        assert process.stdout is not None
+        line = process.stdout.readline()
+        link = re.search(r"http://\S+", line)
+        assert link, process.communicate()[1]
+        yield link[0]
+    finally:
+        process.send_signal(signal.SIGINT)
+        process.communicate(timeout=PATIENCE)
+
+
+class Visit:
+    """A page that is open, and what it and the server have said to each other.
+
+    Attributes:
+        asked: what the page has sent, newest last.
+        told: the last message of each kind that it was sent.
+        states: how often it was told how things are.
+    """
+
+    def __init__(self, browser: Any, link: str, *, theme: str = "dark") -> None:
+        self.link = link
+        self.asked: list[dict[str, Any]] = []
+        self.told: dict[str, dict[str, Any]] = {}
+        self.states = 0
+        self.errors: list[str] = []
+        self.context = browser.new_context(viewport={"width": 1440, "height": 900}, color_scheme=theme)
+        self.page = self.context.new_page()
+        self.page.on("pageerror", lambda error: self.errors.append(str(error)))
+        self.page.on("console", lambda message: message.type == "error" and self.errors.append(message.text))
+        self.page.on("websocket", self._listen)
+        self.page.goto(link)
+        self.until(lambda: self.value("lidarspec.figures.latency > 0"), "nothing is drawn")
+
+    def _listen(self, socket: Any) -> None:
+        socket.on("framesent", lambda text: self.asked.append(json.loads(text)))
+        socket.on("framereceived", self._hear)
+
+    def _hear(self, data: str | bytes) -> None:
+        if isinstance(data, str):
+            message = json.loads(data)
+            self.told[message["is"]] = message
+            self.states += message["is"] == "state"
+
+    def value(self, expression: str, argument: Any = None) -> Any:
+        return self.page.evaluate(expression, argument)
+
+    def until(self, holds: Callable[[], Any], otherwise: str) -> Any:
+        """What holds, once it does."""
+        end = time.monotonic() + PATIENCE
+        while not (found := holds()):
+            assert time.monotonic() < end, otherwise
+            self.page.wait_for_timeout(30)
+        return found
+
+    def text(self, selector: str) -> str:
+        return str(self.page.locator(selector).inner_text())
+
+    def asked_for(self, word: str) -> list[dict[str, Any]]:
+        return [message for message in self.asked if message["do"] == word]
+
+    def pause(self) -> None:
+        """Let the picture stand, and be on the screen."""
+        self.page.click("#play")
+        self.until(lambda: self.text("#status") == "paused", "it is not paused")
+        self.page.wait_for_timeout(500)
+
+    def play(self) -> None:
+        self.page.click("#play")
+        self.until(lambda: self.text("#status") != "paused", "it does not go on")
+
+    @property
+    def scan(self) -> dict[str, np.ndarray]:
+        """The columns of the points that are shown, and where each of them is in the picture, in pixels."""
+        columns, places = self.value(SHOWN)
+        return {**{name: np.array(column) for name, column in columns.items()}, "place": np.array(places).reshape(-1, 2)}
+
+    @property
+    def coloured(self) -> tuple[np.ndarray, np.ndarray]:
+        """Which pixels of the picture have a colour, and which are nothing but points and what lies under them, (height, width) each."""
+        width, height, pixels = self.value(COLOURED)
+        coloured, looked = np.zeros(height * width, bool), np.ones((height, width), bool)
+        coloured[pixels] = True
+        looked[-60:, -220:] = False  # what the colours mean
+        across, down = (round(part) for part in self.value("lidarspec.picture.place(0, 0, 0)"))
+        looked[max(down - AXES, 0) : down + AXES, max(across - AXES, 0) : across + AXES] = False
+        return coloured.reshape(height, width), looked
+
+    def saved(self) -> list[dict[str, str]]:
+        """The scan that is shown as the server saves it, row by row."""
+        number = self.value("lidarspec.picture.scan.scan")
+        answer = self.page.request.get(f"{self.link}save/{number}.csv")
+        assert answer.ok, answer.text()
+        return list(csv.DictReader(io.StringIO(answer.text())))
+
+
+@pytest.fixture(scope="module")
+def browser() -> Iterator[Any]:
+    with chromium() as started:
+        yield started
+
+
+@pytest.fixture(scope="module")
+def m1(browser: Any) -> Iterator[Visit]:
+    with served("sim:robosense-m1") as link:
+        visit = Visit(browser, link)
+        yield visit
+        visit.context.close()
+        assert not visit.errors
+
+
+def near(mask: np.ndarray, reach: int) -> np.ndarray:
+    """The pixels that are at most so far from one of these, along each axis."""
+    for axis in (0, 1):
+        mask = np.any([np.roll(mask, step, axis) for step in range(-reach, reach + 1)], axis=0)
+    return mask
+
+
+def check_drawing(visit: Visit) -> None:
+    """Hold the pixels of the picture against the scan that the server saves: points are where it has some, and nowhere else."""
+    scan, (coloured, looked) = visit.scan, visit.coloured
+    own = np.array([[float(row[axis]) for axis in "xyz"] for row in visit.saved()])
+    assert visit.value("lidarspec.picture.scan.of") == len(own)
+    np.testing.assert_allclose(np.stack([scan[axis] for axis in "xyz"], axis=1), own[scan["index"]], atol=1e-3)
+    across, down = np.rint(scan["place"]).astype(int).T
+    inside = (across >= 0) & (across < coloured.shape[1]) & (down >= 0) & (down < coloured.shape[0])
+    points = np.zeros_like(coloured)
+    points[down[inside], across[inside]] = True
+    assert np.count_nonzero(points & looked) > 300
+    assert near(coloured, 2)[points & looked].mean() > 0.95, "points of the scan are not drawn"
+    assert near(points, 4)[coloured & looked].mean() > 0.95, "something is drawn where the scan has no points"
+
+
+def test_the_room_of_a_3d_sensor_is_seen(m1: Visit) -> None:
+    m1.page.click("#views [data-value=top]")
+    m1.pause()
+    (ahead, left, home) = (m1.value("place => lidarspec.picture.place(...place)", place) for place in ([1, 0, 0], [0, 1, 0], [0, 0, 0]))
+    assert ahead[1] < home[1], "forward is up"
+    assert left[0] < home[0], "left is left"
+    assert math.isclose(home[1] - ahead[1], home[0] - left[0], rel_tol=1e-3)
+    check_drawing(m1)
+    walls = Room().walls
+    assert walls is not None
+    assert np.mean(np.abs(m1.scan["x"] - walls.high[0]) < 0.05) > 0.1, "the wall ahead is in the scan"
+    m1.page.click("#views [data-value=orbit]")
+    check_drawing(m1)
+    m1.play()
+
+
+def test_colours_and_keys(m1: Visit) -> None:
+    for name in ("intensity", "height", "range"):
+        m1.page.select_option("#colour", name)
+    m1.page.locator("#picture").click(position={"x": 5, "y": 5})
+    m1.page.keyboard.press("c")
+    assert m1.page.locator("#colour").input_value() == "intensity"
+    m1.page.keyboard.press("?")
+    assert m1.page.locator("#keys").is_visible()
+    m1.page.keyboard.press("Escape")
+    home = m1.value("lidarspec.picture.place(0, 0, 0)")
+    m1.page.keyboard.press("ArrowUp")
+    assert m1.value("lidarspec.picture.place(0, 0, 0)") != home
+    m1.page.keyboard.press("0")
+
+
+def test_a_click_on_a_point_opens_its_frame_and_pointing_at_a_byte_names_its_field(m1: Visit) -> None:
+    m1.page.click("#views [data-value=orbit]")
+    m1.pause()
+    scan = m1.scan
+    across, down = scan["place"][len(scan["x"]) // 2]
+    asked = len(m1.asked_for("frame"))
+    m1.page.locator("#picture canvas").nth(1).click(position={"x": across, "y": down})
+    m1.until(lambda: len(m1.asked_for("frame")) > asked and m1.told.get("frame", {}).get("why") == "point", "no frame is asked for")
+    index = m1.asked_for("frame")[-1]["point"]["index"]
+    row = int(np.flatnonzero(scan["index"] == index)[0])
+    frame = m1.told["frame"]
+    kept = m1.page.locator(".branch.kept")
+    assert m1.until(lambda: kept.count() and kept.get_attribute("data-path"), "the point's value is not marked") == frame["value"]
+    explained = ls.explain(bytes.fromhex(frame["hex"]), ls.sensor("robosense-m1"))
+    path = frame["value"].rpartition(".")[0] or frame["value"]
+    element = next(one for one in explained.rows if one.path and (frame["value"] + ".").startswith(one.path + "."))
+    assert any(math.isclose(point.range, scan["range"][row], abs_tol=1e-3) for point in element.points), path
+    assert m1.page.locator(".dump i.kept").count() > 0
+    check_bytes(m1, explained)
+    m1.play()
+
+
+def check_bytes(visit: Visit, explained: Any) -> None:
+    """Point at some bytes of the dump that are seen, and at a field."""
+    offsets = [int(cell.get_attribute("data-offset")) for cell in visit.page.locator(".hex i").all()[::40]]
+    assert offsets
+    for offset in offsets:
+        visit.page.locator(f".hex i[data-offset='{offset}']").hover()
+        names = [value.path for value in explained.fields.values() if value.covers(offset)]
+        said = visit.page.locator(".said b").all_inner_texts()
+        assert said == names, f"byte {offset}"
+    path = visit.page.locator(".branch[data-path]").last.get_attribute("data-path")
+    visit.page.locator(f".branch[data-path='{path}']").hover()
+    marked = {int(cell.get_attribute("data-offset")) for cell in visit.page.locator(".hex i.pointed").all()}
+    inside = [value for value in explained.fields.values() if f"{value.path}.".startswith((f"{path}.", f"{path}["))]
+    assert marked
+    assert all(any(value.covers(offset) for value in inside) for offset in marked)
+
+
+@pytest.fixture(scope="module")
+def stl27l(browser: Any, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Visit]:
+    """A file of a planar sensor, with damage in it."""
+    sensor, path, began = ls.sensor("ldrobot-stl27l"), tmp_path_factory.mktemp("page") / "stl27l.lsr", 1_700_000_000_000_000_000
+    with ls.Recorder(path, sensor) as recorder:
+        for number, frame in enumerate(ls.simulate(sensor, packets=20 * RATE)):
+            data = frame if number % 500 else frame[:20] + bytes([frame[20] ^ 1]) + frame[21:]
+            recorder.write(Chunk(data, began + number * 1_000_000_000 // RATE))
+    with served(str(path)) as link:
+        visit = Visit(browser, link, theme="light")
+        yield visit
+        visit.context.close()
+        assert not visit.errors
+
+
+def test_the_room_of_a_planar_sensor_is_seen(stl27l: Visit) -> None:
+    stl27l.pause()
+    assert stl27l.page.locator("#views [aria-pressed=true]").inner_text() == "Polar"
+    check_drawing(stl27l)
+    walls, scan = Room().walls, stl27l.scan
+    assert walls is not None
+    for axis, wall in (("x", walls.low[0]), ("x", walls.high[0]), ("y", walls.low[1]), ("y", walls.high[1])):
+        assert np.mean(np.abs(scan[axis] - wall) < 0.05) > 0.05, f"the wall at {axis} {wall} m is seen"
+    stl27l.play()
+
+
+def test_a_file_is_sought_stepped_through_and_played_at_another_speed(stl27l: Visit) -> None:
+    def position() -> float:
+        return float(stl27l.value("lidarspec.picture.scan.position"))
+
+    stl27l.pause()
+    stands = position()
+    stl27l.page.wait_for_timeout(500)
+    assert position() == stands
+    stl27l.page.click("#step")
+    stl27l.until(lambda: stands < position() < stands + 0.5, "it does not step to the next scan")
+    seek = stl27l.page.locator("#seek")
+    seek.click(position={"x": seek.bounding_box()["width"] * 0.7, "y": 5})
+    stl27l.until(lambda: 12.5 < position() < 15.5, "it is not where the bar was clicked")
+    assert float(seek.input_value()) == pytest.approx(position(), abs=0.5)
+    stl27l.page.select_option("#speed", "0.25")
+    stl27l.play()
+    stl27l.until(lambda: stl27l.told["state"]["speed"] == 0.25, "its speed does not change")
+    stl27l.page.select_option("#speed", "8")
+    seek.click(position={"x": seek.bounding_box()["width"] * 0.95, "y": 5})
+    stl27l.until(lambda: "has ended" in stl27l.text("#notice"), "its end is not said")
+    stl27l.until(lambda: stl27l.text("#play") == "▶ Play", "it cannot be played again")
+    stl27l.page.select_option("#speed", "1")
+    stl27l.page.click("#play")
+    stl27l.until(lambda: position() < 10 and not stl27l.page.locator("#notice").is_visible(), "it does not begin anew")
+
+
+def test_a_damaged_frame_is_explained(stl27l: Visit) -> None:
+    stl27l.page.click("#tabs [data-value=damaged]")
+    first = stl27l.page.locator("button.damage").first
+    stl27l.until(first.count, "no damaged frame is listed")
+    stl27l.pause()
+    verdict = stl27l.page.locator("button.damage span").nth(3).inner_text()
+    first.click()
+    stl27l.until(lambda: stl27l.told["frame"]["why"] == "damaged", "no frame is shown")
+    explanation = stl27l.told["frame"]["explanation"]
+    stl27l.until(lambda: "bad" in stl27l.page.locator(".verdict").get_attribute("class"), "its verdict is not shown")
+    assert explanation["fault"]["reason"] in stl27l.text(".verdict")
+    assert verdict
+    stl27l.play()
+
+
+def test_a_command_shows_its_bytes_and_its_reply(browser: Any) -> None:
+    with served("sim:ldrobot-ld14p") as link:
+        visit = Visit(browser, link)
+        visit.page.click("#tabs [data-value=commands]")
+        visit.page.click(".list [data-value=set_speed]")
+        speed, send = visit.page.locator(".form input[name=speed]"), visit.page.locator(".form .primary")
+        assert send.is_disabled()
+        speed.fill("100000")
+        visit.until(lambda: visit.page.locator("#commands .bytes .bad").count(), "what is out of range is not refused")
+        assert send.is_disabled()
+        speed.fill("2520")
+        visit.until(send.is_enabled, "its bytes are not shown")
+        assert visit.text("#commands .bytes .whole") == ls.sensor("ldrobot-ld14p").command("set_speed", speed=2520).hex(" ")
+        assert "2520 deg/s" in visit.text("#commands .bytes")
+        assert not visit.asked_for("send")
+        send.click()
+        visit.until(lambda: "replied" in visit.told, "there is no reply")
+        assert visit.asked_for("send")[0]["arguments"] == {"speed": "2520"}
+        assert visit.until(lambda: visit.text("#commands .reply pre"), "the reply is not shown") == visit.told["replied"]["text"]
+        visit.context.close()
+        assert not visit.errors
+
+
+def test_text_of_the_sensor_is_never_part_of_the_page(browser: Any, tmp_path: Path) -> None:
+    sensor, name = ls.sensor("hokuyo-ust-10lx"), "<script>window.taken=1</script><img src=x onerror='window.taken=1'>"
+    parameters = sensor.parse(sensor.example("parameters"))
+    parameters["model"]["text"] = name.encode()
+    path = tmp_path / "ust.bin"
+    path.write_bytes(b"".join([sensor.build("parameters", parameters), *ls.simulate(sensor, 200)]))
+    with served(str(path), "-s", sensor.id) as link:
+        visit = Visit(browser, link)
+        visit.until(lambda: name in visit.text("#info"), "the model's name is not shown")
+        assert visit.value("window.taken === undefined && document.querySelectorAll('body img, body script').length === 0")
+        visit.context.close()
+        assert not visit.errors
+
+
+def test_a_page_whose_server_is_gone_connects_again(browser: Any) -> None:
+    with socket.create_server(("127.0.0.1", 0)) as free:
+        port = free.getsockname()[1]
+    with served("sim:ldrobot-stl27l", address=f"127.0.0.1:{port}") as link:
+        visit = Visit(browser, link)
+    visit.until(lambda: "connection is lost" in visit.text("#notice"), "nothing is said of it")
+    assert visit.text("#status") == "disconnected"
+    with served("sim:ldrobot-stl27l", address=f"127.0.0.1:{port}"):
+        visit.until(lambda: visit.text("#status") == "streaming", "it does not connect again")
+        assert not visit.page.locator("#notice").is_visible()
+        asked = len(visit.asked_for("next"))
+        visit.until(lambda: len(visit.asked_for("next")) > asked + 3, "no scan comes any more")
+        visit.context.close()
+
+
+def test_a_hidden_page_asks_for_nothing(tmp_path: Path) -> None:
+    """Without playwright, which keeps every page visible: tabs of one window, by the browser's own protocol."""
+    with served("sim:ldrobot-stl27l") as link, tabs(link, tmp_path) as (evaluated, turned):
+        newest = "globalThis.lidarspec?.picture?.scan?.scan ?? 0"
+
+        def goes_on() -> bool:
+            before = evaluated(newest)
+            time.sleep(1.0)
+            return (evaluated(newest) or 0) > (before or 0)
+
+        until(goes_on, "no scan is shown")
+        turned(False)
+        assert evaluated("document.visibilityState") == "hidden"
+        until(lambda: not goes_on(), "it goes on")
+        assert not goes_on()
+        turned(True)
+        until(goes_on, "it does not go on when it is seen again")
+
+
+def until(holds: Callable[[], Any], otherwise: str) -> None:
+    end = time.monotonic() + PATIENCE
+    while not holds():
+        assert time.monotonic() < end, otherwise
+
+
+@contextlib.contextmanager
+def tabs(link: str, folder: Path) -> Iterator[tuple[Callable[[str], Any], Callable[[bool], None]]]:
+    """A page in a tab: what evaluates an expression in it, and what puts it in front of another tab or behind it."""
+    from websockets.sync.client import connect
+
+    words = [installed(), "--headless=new", *FLAGS, "--no-first-run", "--remote-debugging-port=0", f"--user-data-dir={folder}", link]
+    process = subprocess.Popen(words, stderr=subprocess.PIPE, text=True)
+    try:
+        assert process.stderr is not None
+        root = next(found[1] for line in process.stderr if (found := re.search(r"ws:(//[^/]+)/devtools", line)))
+
+        def ask(path: str, method: str = "GET") -> bytes:
+            with urllib.request.urlopen(urllib.request.Request(f"http:{root}/json/{path}", method=method)) as answer:
+                return bytes(answer.read())
+
+        tab = next(one for one in json.loads(ask("list")) if one["type"] == "page")
+        other = json.loads(ask("new?about:blank", "PUT"))
+        ask(f"activate/{tab['id']}")
+        with connect(tab["webSocketDebuggerUrl"]) as socket:
+
+            def evaluated(expression: str) -> Any:
+                asked = {"id": 1, "method": "Runtime.evaluate", "params": {"expression": expression, "returnByValue": True}}
+                socket.send(json.dumps(asked))
+                return json.loads(socket.recv()).get("result", {}).get("result", {}).get("value")  # none while a page is loaded
+
+            def turned(front: bool) -> None:
+                ask(f"activate/{(tab if front else other)['id']}")
+                until(lambda: (evaluated("document.visibilityState") == "visible") == front, "the tab is not turned to")
+
+            yield evaluated, turned
+    finally:
+        process.terminate()
+        process.communicate(timeout=PATIENCE)
