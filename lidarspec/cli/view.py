@@ -70,6 +70,8 @@ def view(
 
     --rerun needs lidarspec[rerun]; a file is read there as fast as possible, and its time runs in the viewer.
     """
+    if web and once:
+        raise UsageError("--web and --once are for two kinds of pictures: leave out one of them")
     if web:
         _serve(source, sensor_id, duration, selection, opens=opens, address=address, control=control)
         return
@@ -114,6 +116,7 @@ def _serve(
     control: bool,
 ) -> None:
     """The page, until the time is over or somebody ends it."""
+    host, port = listening(address)
     for name in ("starlette", "uvicorn", "websockets"):
         library(name, "web")
     from lidarspec.view.broadcast import Broadcast
@@ -121,7 +124,6 @@ def _serve(
 
     if not (PAGE / "index.html").is_file():
         raise suggest(UsageError("the page of --web is not built in this checkout"), "make page")
-    host, port = listening(address)
     switch = Switch(source, Path.cwd()) if is_live(source) else None
     device = open_device(source, sensor_id, record=switch.attached if switch else None, period=LOOK)
     if switch is not None:
@@ -144,7 +146,10 @@ def listening(address: str | None) -> tuple[str, int]:
     Raises:
         UsageError: for a port that is none.
     """
-    origin = Origin.parse(address or "127.0.0.1")
+    try:
+        origin = Origin.parse(address or "127.0.0.1")
+    except UsageError:
+        raise UsageError(f"--address is HOST or HOST:PORT, not {address}") from None
     return origin.host, origin.port or 0
 
 

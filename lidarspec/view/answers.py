@@ -60,7 +60,7 @@ class Answers:
             "duration": self.duration,
             "control": not self.why_no_control,
             "why_no_control": self.why_no_control,
-            "commands": [_command(sensor, name) for name in sensor.commands],
+            "commands": [form(sensor, name) for name in sensor.commands],
             "saves": saves(),
             "records": broadcast.switch is not None,
             "history": list(broadcast.history),
@@ -187,7 +187,7 @@ def saves() -> list[str]:
     return ["pcd", "ply", "csv", *["las"] * (find_spec("laspy") is not None), "svg"]
 
 
-def _command(sensor: Sensor, name: str) -> dict[str, Any]:
+def form(sensor: Sensor, name: str) -> dict[str, Any]:
     """A command as a form."""
     return {"name": name, "text": effect(sensor, name), "arguments": [_argument(sensor, name, one) for one in sensor.commands[name].args]}
 

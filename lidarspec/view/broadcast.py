@@ -43,15 +43,14 @@ class Shown:
         self.scan, self.number, self.position = scan, number, position
         arrived = scan.provenance(len(scan) - 1).host_ns if live and len(scan) else 0
         self.sent = arrived * 1e-9 if arrived else time.time()
-        self._message, self._most, self._lock = b"", -1, threading.Lock()
+        self._message, self._most = b"", -1
 
     def message(self, most: int) -> bytes:
         """The scan as a message of so many points at most, made once for all who ask alike."""
-        with self._lock:
-            if most != self._most:
-                self._message = message(self.scan, self.number, position=self.position, sent=self.sent, most=most)
-                self._most = most
-            return self._message
+        if most != self._most:
+            self._message = message(self.scan, self.number, position=self.position, sent=self.sent, most=most)
+            self._most = most
+        return self._message
 
 
 class Broadcast(Closing):
@@ -261,8 +260,10 @@ class Broadcast(Closing):
         return {"at": time.time(), **reading, "lost": stats.lost, "disconnects": stats.disconnects, "latency_s": latency}
 
     def _position(self, scan: Scan) -> float:
-        """Seconds from the first scan; by their number where they bear no times."""
+        """Seconds from the first scan: by arrival, of a file as its scans are selected, or by their number where they bear no times."""
         assert self._first is not None
+        if self.is_live:
+            return (scan.host_ns - self._first.host_ns) * 1e-9
         has_times = scan.host_ns or scan.sensor.clock is not None
         return (scan.stamp_ns - self._first.stamp_ns) * 1e-9 if has_times else self._number * STEP
 

@@ -10,6 +10,7 @@ import asyncio
 import ipaddress
 import json
 import math
+import os
 import secrets
 import socket
 import tempfile
@@ -48,7 +49,7 @@ STATE, WATCHED = 0.5, 0.5
 #: seconds after which a page that takes nothing, or does not answer a ping, is dropped; and that pages are given at the end.
 STALLED, PING, FAREWELL = 20.0, 10.0, 1
 #: seconds that a page waits for a first scan before it is told what there is; how a page ends that is closed; and how many may be open.
-GREETING, CLOSED, PAGES = 1.0, (1000, 1001), 64
+GREETING, CLOSED, PAGES = 1.0, (1000, 1001, 1012), 64
 #: points of a message at most, and the scans that a page may still ask about: the one that is drawn, and the one that is on its way.
 POINTS, HELD = 1 << 24, 2
 #: the largest number in a message, and one digit more than a scan's number has.
@@ -206,7 +207,7 @@ class Viewer:
         if self._most is not None and (shown := self._unseen()) is not None:
             most, self._most = self._most, None
             self._held.append(shown)
-            return await asyncio.to_thread(shown.message, most)
+            return shown.message(most)  # here: the large blocks of further threads would stay in arenas of theirs
         if broadcast.has_ended != self._has_ended:
             self._has_ended = broadcast.has_ended
             return {"is": "ended", "text": broadcast.ending} if self._has_ended else None
@@ -219,7 +220,7 @@ class Viewer:
                 return await asyncio.to_thread(self._answers.frame, taken, "last")
         if now >= self._due["state"]:
             self._due["state"] = now + STATE
-            state = await asyncio.to_thread(self._answers.state, frozen=self._frozen is not None, since=self._known)
+            state = self._answers.state(frozen=self._frozen is not None, since=self._known)
             self._known = state["damaged"]["total"]
             return state
         return None
@@ -377,7 +378,7 @@ class Site:
         broadcast: what is shown.
         host, port: where to listen; 0 is a free port. At another address than this computer's own, the link has a token.
         control: whether commands may be sent to a sensor that is no simulated one.
-        page: the folder of the page's files.
+        page: the folder of the page's files; by default `PAGE`.
         say: is told, line by line, of pages that come and go.
 
     Attributes:
@@ -394,7 +395,7 @@ class Site:
         host: str = "127.0.0.1",
         port: int = 0,
         control: bool = False,
-        page: Path = PAGE,
+        page: Path | None = None,
         say: Callable[[str], None] = lambda text: None,
     ) -> None:
         self._broadcast, self._say, self._answers = broadcast, say, Answers(broadcast, control=control)
@@ -407,7 +408,7 @@ class Site:
         routes = [
             WebSocketRoute("/socket", self._watched),
             Route("/save/{name}", self._saved),
-            Mount("/", StaticFiles(directory=page, html=True)),
+            Mount("/", StaticFiles(directory=page or PAGE, html=True)),
         ]
         self._server = uvicorn.Server(
             uvicorn.Config(
@@ -513,7 +514,7 @@ def _listening(host: str, port: int) -> socket.socket:
     try:
         found = socket.create_server((host, port), family=socket.AF_INET6 if ":" in host else socket.AF_INET)
     except OSError as error:
-        raise SourceError(f"no page can be served at {host}:{port}: {error.strerror or error}") from error
+        raise SourceError(f"no page can be served at {host}:{port}: {os.strerror(error.errno) if error.errno else error}") from error
     if hasattr(socket, "TCP_USER_TIMEOUT"):  # so that the system gives up what a page never takes; connections have it from here
         found.setsockopt(socket.IPPROTO_TCP, socket.TCP_USER_TIMEOUT, round(STALLED * 1000))
     return found
