@@ -71,7 +71,7 @@ types: $(DEVELOPERS)
 
 # Without --quiet, which would let broken links pass.
 docs: $(WRITERS)
-	@NO_MKDOCS_2_WARNING=1 $(BIN)/python -m mkdocs build --strict --site-dir $(abspath $(SITE))
+	@PATH="$(abspath $(BIN)):$$PATH" NO_MKDOCS_2_WARNING=1 $(BIN)/python -m mkdocs build --strict --site-dir $(abspath $(SITE))
 
 wheels: $(DEVELOPERS) $(BUNDLE)
 	@for project in . $(DISTRIBUTIONS); do $(BIN)/python -m build --wheel --no-isolation --outdir $(DIST) $$project || exit 1; done
