@@ -268,7 +268,7 @@ export class Picture {
 
   #listen(canvas: HTMLCanvasElement): void {
     let pressed: Place = [0, 0];
-    const at = (event: PointerEvent): Place => [event.offsetX, event.offsetY];
+    const at = (event: MouseEvent): Place => [event.offsetX, event.offsetY];
     canvas.addEventListener("pointerdown", (event) => (pressed = at(event)));
     canvas.addEventListener("pointermove", (event) => {
       this.#pointer = event.buttons ? null : at(event);
@@ -280,7 +280,7 @@ export class Picture {
     });
     canvas.addEventListener("click", (event) => {
       if (Math.hypot(event.offsetX - pressed[0], event.offsetY - pressed[1]) > STILL || !this.#scan) return;
-      const row = this.pick(event.offsetX, event.offsetY);
+      const row = this.pick(...(this.#pointer ?? at(event))); // the one that is marked: a click comes in whole pixels
       if (row !== null) this.options.picked?.(row, this.#scan);
     });
   }
