@@ -69,9 +69,10 @@ lint: $(DEVELOPERS)
 types: $(DEVELOPERS)
 	@$(BIN)/mypy $(PACKAGES) benchmarks
 
-# Without --quiet, which would let broken links pass.
+# With the pictures of the front page, and the notebook run. Without --quiet, which would let broken links pass.
 docs: $(WRITERS)
-	@NO_MKDOCS_2_WARNING=1 $(BIN)/python -m mkdocs build --strict --site-dir $(abspath $(SITE))
+	@$(BIN)/python docs/pictures.py
+	@PATH="$(abspath $(BIN)):$$PATH" NO_MKDOCS_2_WARNING=1 $(BIN)/python -m mkdocs build --strict --site-dir $(abspath $(SITE))
 
 wheels: $(DEVELOPERS) $(BUNDLE)
 	@for project in . $(DISTRIBUTIONS); do $(BIN)/python -m build --wheel --no-isolation --outdir $(DIST) $$project || exit 1; done

@@ -131,7 +131,7 @@ def told(frame: Frame, data: bytes, values: Callable[[bytes], Mapping[str, Value
         return
     before = values(data) if found else {}
     for change in found:
-        explains = f"{'one' if len(found) == 1 else 'a'} {change.kind} would explain it"
+        explains = f"{'one' if len(found) == 1 else 'an' if change.kind[0] in 'aeiou' else 'a'} {change.kind} would explain it"
         yield f"{explains}: {_place(change, before, values(change.mended(data)))}"
 
 

@@ -31,7 +31,7 @@ SIDE, DOTS = 520, 12_000
 #: rows of packets at the beginning and at the end, their fields at most, and rows of an explanation.
 ENDS, FIELDS, ROWS = 5, 24, 200
 #: degrees of hue from one field to the next, and the most pixels that a table is high before it scrolls.
-HUE, TALL = 67, 520
+HUE, TALL = 67, 640
 _CELL = "text-align:{align};white-space:nowrap;padding:1px 8px;vertical-align:top"
 
 

@@ -49,7 +49,7 @@ STATE, WATCHED = 0.5, 0.5
 #: seconds after which a page that takes nothing, or does not answer a ping, is dropped; and that pages are given at the end.
 STALLED, PING, FAREWELL = 20.0, 10.0, 1
 #: seconds that a page waits for a first scan before it is told what there is; how a page ends that is closed; and how many may be open.
-GREETING, CLOSED, PAGES = 1.0, (1000, 1001, 1012), 64
+GREETING, CLOSED, PAGES = 3.0, (1000, 1001, 1012), 64
 #: points of a message at most, and the scans that a page may still ask about: the one that is drawn, and the one that is on its way.
 POINTS, HELD = 1 << 24, 2
 #: the largest number in a message, and one digit more than a scan's number has.
@@ -190,7 +190,7 @@ class Viewer:
         """Say hello as soon as there is a scan, which says what is drawn, or after a moment."""
         patience = time.monotonic() + GREETING
         while self._broadcast.shown is None and time.monotonic() < patience:
-            await asyncio.sleep(GREETING / 20)
+            await asyncio.sleep(GREETING / 60)
         await self._send(await asyncio.to_thread(self._answers.hello))
 
     async def _send(self, message: bytes | dict[str, Any]) -> None:

@@ -55,15 +55,17 @@ def test_a_point_leads_to_its_frame_and_its_field(tmp_path: Path, sensor: str) -
             agree(page, header, columns, spot, shown.scan)
 
 
-@pytest.mark.parametrize(("sensor", "suffix"), [(FLAT, ".lsr"), (FLAT, ".bin"), (SOLID, ".pcap")])
-def test_a_point_of_a_file_leads_to_its_frame(tmp_path: Path, sensor: str, suffix: str) -> None:
-    path = recorded(tmp_path, sensor, suffix=suffix)
+@pytest.mark.parametrize(("sensor", "suffix", "to"), [(FLAT, ".lsr", 15), (FLAT, ".bin", 3), (SOLID, ".pcap", 3)])
+def test_a_point_of_a_file_leads_to_its_frame(tmp_path: Path, sensor: str, suffix: str, to: int) -> None:
+    """Also where what lies before it was passed over without being read, so that the same bytes stand elsewhere in the input."""
+    path = recorded(tmp_path, sensor, to + 2, suffix)
     with Station(path, tmp_path, sensor) as station, station.page() as page:
         page.scan()
         page.say("pause")
         page.state(lambda state: state["paused"])
-        page.say("seek", to=3)
-        header, columns = page.scan_at(3.0)
+        page.say("seek", to=to)
+        header, columns = page.scan_at(to)
+        assert page.asked("frame", number=0)["is"] == "gone"  # of what was read before
         shown = station.broadcast.numbered(header["scan"])
         assert shown is not None
         for spot in range(0, header["points"], header["points"] // ASKED):

@@ -167,6 +167,18 @@ def test_a_file_is_played_at_its_speed_and_at_another(tmp_path: Path) -> None:
         assert page.asked("speed", times=0)["is"] == "refused"
 
 
+@pytest.mark.parametrize(("sensor", "suffix"), [(FLAT, ".bin"), (FLAT, ".lsr"), (SOLID, ".pcap")])
+def test_a_file_is_read_as_it_is_played(tmp_path: Path, sensor: str, suffix: str) -> None:
+    """Figures, bytes and damaged frames are those of the scans that are shown, and not of the rest of the file."""
+    path = recorded(tmp_path, sensor, 8, suffix)
+    with Station(path, tmp_path, sensor) as station, station.page() as page:
+        header, _ = page.scan()
+        page.say("pause")
+        position = page.state(lambda state: state["paused"])["position"]
+        assert station.broadcast.device.stats.bytes_in < path.stat().st_size * (position + 1.5) / 8
+        assert header["position"] < 3
+
+
 def test_a_file_ends_and_is_played_again(tmp_path: Path) -> None:
     path = recorded(tmp_path, seconds=1)
     with Station(path, tmp_path) as station, station.page() as page:

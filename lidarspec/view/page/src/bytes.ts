@@ -17,7 +17,7 @@ const KINDS = 8;
 const COUNTS = new Intl.NumberFormat("en-US");
 
 export class Bytes {
-  readonly #live = made("button", { textContent: "Live", title: "The newest frame, twice a second", data: { value: "live" } });
+  readonly #live = made("button", { className: "live", textContent: "Live", title: "Follow the newest frame, twice a second" });
   readonly #title = made("span", { className: "caption" });
   readonly #verdict = made("span", { className: "verdict" });
   readonly #said = made("p", { className: "said" });
@@ -206,7 +206,7 @@ export class Bytes {
   #say(node: Part | null, shared: number | null): void {
     const anatomy = this.#anatomy;
     this.#said.replaceChildren();
-    if (!node || !anatomy) return this.#said.append("Point at a byte or at a field; a click holds it.");
+    if (!node || !anatomy) return this.#said.append("Point at a byte or at a field; a click keeps it marked. Live follows the newest frame.");
     const nodes = shared === null ? [node] : anatomy.owners(shared).map((owner) => anatomy.nodes.get(anatomy.values[owner]!.path)!);
     for (const [number, part] of nodes.entries()) this.#said.append(...(number ? [made("br")] : []), ...this.#words(part, anatomy));
   }

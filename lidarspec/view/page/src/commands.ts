@@ -37,7 +37,7 @@ export class Commands {
   /** The commands of a sensor. */
   show({ commands, control, why_no_control }: Hello): void {
     this.#control = control;
-    this.#hindrance.textContent = control ? "" : why_no_control;
+    this.#hindrance.textContent = control || !commands.length ? "" : why_no_control;
     const buttons = commands.map((command) => made("button", { textContent: command.name, title: command.text, data: { value: command.name }, onclick: () => this.#choose(command) }));
     this.#list.replaceChildren(...(buttons.length ? buttons : [made("p", { className: "empty", textContent: "This sensor has no commands." })]));
     const again = commands.find(({ name }) => name === this.#command?.name) ?? commands[0];

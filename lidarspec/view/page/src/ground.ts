@@ -141,7 +141,7 @@ function ringLabels(context: CanvasRenderingContext2D, outlook: Outlook): void {
   const [right, down] = direction(along);
   for (const radius of radii(outlook, seen)) {
     const place: Place = [home[0] + right * radius * scale + (right ? 0 : 4), home[1] + down * radius * scale + (down ? -7 : -9)];
-    if (inside(place, outlook, 2 * EDGE)) written(context, metres(radius), place, outlook.theme, right ? "center" : "left");
+    if (inside(place, outlook, 3.4 * EDGE)) written(context, metres(radius), place, outlook.theme, right ? "center" : "left");
   }
   for (let angle = -150; angle <= 180; angle += SPOKES) {
     const place = exit(home, direction(angle), outlook);

@@ -268,19 +268,19 @@ export class Picture {
 
   #listen(canvas: HTMLCanvasElement): void {
     let pressed: Place = [0, 0];
-    const at = (event: PointerEvent): Place => [event.offsetX, event.offsetY];
+    const at = (event: MouseEvent): Place => [event.offsetX, event.offsetY];
     canvas.addEventListener("pointerdown", (event) => (pressed = at(event)));
     canvas.addEventListener("pointermove", (event) => {
       this.#pointer = event.buttons ? null : at(event);
-      this.#ask();
+      this.#wake();
     });
     canvas.addEventListener("pointerleave", () => {
       this.#pointer = null;
-      this.#ask();
+      this.#wake();
     });
     canvas.addEventListener("click", (event) => {
       if (Math.hypot(event.offsetX - pressed[0], event.offsetY - pressed[1]) > STILL || !this.#scan) return;
-      const row = this.pick(event.offsetX, event.offsetY);
+      const row = this.pick(...(this.#pointer ?? at(event))); // the one that is marked: a click comes in whole pixels
       if (row !== null) this.options.picked?.(row, this.#scan);
     });
   }
@@ -307,6 +307,7 @@ export class Picture {
       [layer.width, layer.height] = [Math.round(width * ratio), Math.round(height * ratio)];
       layer.getContext("2d")!.setTransform(ratio, 0, 0, ratio, 0, 0);
     }
+    this.#around = this.#within = "";
     if (this.#moved) {
       const before = (this.#flat.right - this.#flat.left) / (this.#flat.top - this.#flat.bottom);
       this.#flat.left *= width / height / before;
@@ -374,7 +375,7 @@ export class Picture {
       this.#fence = null;
       this.options.drawn?.(performance.now() - this.#begun, this.#scan!);
     }
-    if (!this.#dirty) return;
+    if (!this.#dirty) return this.#surround();
     const isFresh = this.#fresh;
     this.#dirty = this.#fresh = false;
     if (isFresh) {
@@ -438,6 +439,11 @@ export class Picture {
     uniforms.size!.value = size * window.devicePixelRatio;
     uniforms.disc!.value = size > 2;
     this.#renderer.render(this.#scene, this.#camera);
+    this.#surround();
+  }
+
+  /** Draw what lies around the points, where it has changed. */
+  #surround(): void {
     const outlook = this.#outlook();
     this.#hovered = this.#pointer ? this.pick(...this.#pointer) : null;
     const camera = [...this.#camera.projectionMatrix.elements, ...this.#camera.matrixWorld.elements];

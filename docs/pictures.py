@@ -1,0 +1,106 @@
+"""Makes the pictures of the front page and the README from simulated sensors alone: the same bytes each time.
+
+    python docs/pictures.py [--into FOLDER]    # a terminal, a point cloud, a packet diagram: SVG; `make docs` runs it
+    python docs/pictures.py --page             # the page in the browser, as PNG; takes playwright, Chromium and what `make page` makes
+
+A PNG has other bytes wherever fonts are others, so the page is made by hand when it has changed. tests/docs/test_pictures.py holds that the
+rest is up to date.
+"""
+
+from __future__ import annotations
+
+import argparse
+import shutil
+import subprocess
+import sys
+import tempfile
+import time
+from pathlib import Path
+
+from screens import svg as drawn
+
+import lidarspec as ls
+from lidarspec.exports import narrowed
+from lidarspec.exports.diagram import svg as diagram
+from lidarspec.simulation.simulator import simulate
+from lidarspec.view.feed import Feed
+from lidarspec.view.live import FIGURES, Window
+from lidarspec.view.polar import look
+from lidarspec.view.svg import svg
+
+HERE = Path(__file__).parent / "pictures"
+#: pixels of the page, light or dark, milliseconds that it is let run, and colours of the PNG.
+SIZE, SCHEME, SETTLED, COLOURS = (1280, 800), "dark", 9_000, 256
+#: of Chromium, which draws in software.
+FLAGS = ("--no-sandbox", "--use-angle=swiftshader", "--enable-unsafe-swiftshader")
+
+
+def simulated(sensor: str, file: Path, duration: str) -> Path:
+    """A file with what a simulated sensor sends in a while."""
+    words = ["sim", sensor, "--to", str(file), "-t", duration, "--seed", "7", "-q"]
+    subprocess.run([sys.executable, "-m", "lidarspec", *words], check=True, stdout=subprocess.DEVNULL)
+    return file
+
+
+def terminal(folder: Path) -> str:
+    """The window of `view`, some seconds into a file."""
+    with ls.open(simulated("ldrobot-stl27l", folder / "room.pcap", "5s"), "ldrobot-stl27l") as device:
+        feed = Feed(device)
+        window = Window(feed, "/dev/ttyUSB0")
+        feed.pump(0.0)
+        time.sleep(FIGURES)  # after which the window reads its figures, which are by the packets' own times
+        return drawn(window.cells(92, 28))
+
+
+def cloud() -> str:
+    """A scan of a spinning lidar."""
+    sensor = ls.sensor("ouster-os1")
+    scan = next(scan for scan in sensor.scans(simulate(sensor, 600)) if scan.complete)
+    return svg(scan.points, look(scan.points), f"{sensor.id}: {len(scan):,} points", side=520, most=9000)
+
+
+def packet() -> str:
+    """The packet diagram of a sensor."""
+    return diagram(narrowed(ls.sensor("ldrobot-stl27l"), "data"))
+
+
+def page(folder: Path, target: Path) -> None:
+    """The page while a file is played, with the newest frame below the picture, as PNG in few colours."""
+    from PIL import Image
+    from playwright.sync_api import sync_playwright
+
+    file = simulated("robosense-m1", folder / "room.lsr", "15s")
+    command = [sys.executable, "-m", "lidarspec", "view", file.name, "-s", "robosense-m1", "--web", "-q"]
+    with subprocess.Popen(command, cwd=folder, stdout=subprocess.PIPE, text=True) as serving, sync_playwright() as running:
+        assert serving.stdout is not None
+        browser = running.chromium.launch(executable_path=shutil.which("chromium"), args=FLAGS)
+        try:
+            seen = browser.new_page(viewport={"width": SIZE[0], "height": SIZE[1]}, color_scheme=SCHEME)
+            seen.goto(serving.stdout.readline().strip())
+            seen.wait_for_timeout(SETTLED)
+            seen.click("text=Live")  # the newest frame
+            seen.wait_for_timeout(SETTLED / 5)
+            seen.screenshot(path=target)
+        finally:
+            browser.close()
+            serving.terminate()
+    Image.open(target).convert("RGB").quantize(COLOURS, Image.Quantize.FASTOCTREE, dither=Image.Dither.NONE).save(target, optimize=True)
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description="Makes the pictures of the front page and the README.")
+    parser.add_argument("--into", type=Path, default=HERE, metavar="FOLDER")
+    parser.add_argument("--page", action="store_true", help="the page in the browser, and nothing else")
+    given = parser.parse_args()
+    given.into.mkdir(exist_ok=True)
+    with tempfile.TemporaryDirectory() as folder:
+        if given.page:
+            page(Path(folder), given.into / "page.png")
+            return
+        pictures = {"terminal": terminal(Path(folder)), "cloud": cloud(), "packet": packet()}
+    for name, text in pictures.items():
+        (given.into / f"{name}.svg").write_text(text, encoding="utf-8")
+
+
+if __name__ == "__main__":
+    main()
