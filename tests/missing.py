@@ -14,7 +14,7 @@ MISSING = (
     (r"no (xxd|hexdump)", "tools that print bytes", "apt-get install xxd bsdextrautils"),
     (r"Kaitai compiler", "Kaitai's compiler", "npm install kaitai-struct-compiler js-yaml, with NODE_PATH as its node_modules"),
     (
-        r"kaitaistruct|crccheck|velodyne.decoder|[Nn]umba|rosbags|mcap|foxglove|pyarrow|duckdb|laspy|pandas|polars|pye57|zarr|zstd|rerun|matplotlib|anywidget|nbclient|playwright",
+        r"kaitaistruct|crccheck|velodyne.decoder|[Nn]umba|rosbags|mcap|foxglove|pyarrow|duckdb|laspy|pandas|polars|pye57|zarr|zstd|rerun|matplotlib|anywidget|nbclient|playwright|starlette|uvicorn|websockets",
         "Python packages",
         "pip install -e '.[dev]'",
     ),

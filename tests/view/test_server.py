@@ -24,6 +24,7 @@ def test_a_page_is_told_what_it_shows(tmp_path: Path, sensor: str, planar: bool)
         assert (hello["duration"], hello["records"]) == (None, True)
         assert {"pcd", "csv", "svg"} <= set(hello["saves"])
         state = page.state(lambda state: state["figures"])
+        assert 0 < state["position"] < 10  # since the first scan
         assert (state["state"], state["paused"], state["damaged"]) == ("streaming", False, {"total": 0, "newest": []})
         assert state["figures"]["speed_hz"] == pytest.approx(10, rel=0.2)
         assert {"lost", "disconnects", "latency_s", "jitter_s", "loss_rate", "at"} <= state["figures"].keys()
