@@ -68,9 +68,15 @@ class Answers:
             "version": __version__,
         }
 
-    def state(self, *, frozen: bool, since: int) -> dict[str, Any]:
-        """How it goes; `since`: the number of damaged pieces that the page knows of."""
-        broadcast, shown = self.broadcast, self.broadcast.shown
+    def state(self, *, frozen: bool, since: int, at: Shown | None = None) -> dict[str, Any]:
+        """How it goes.
+
+        Args:
+            frozen: whether a page has paused a live source.
+            since: the number of damaged pieces that it knows of.
+            at: the scan that it stands at; by default the newest.
+        """
+        broadcast, shown = self.broadcast, at or self.broadcast.shown
         switch, paused = broadcast.switch, frozen or broadcast.paused
         recording = None if switch is None or switch.name is None else {"name": switch.name, "bytes": switch.bytes}
         trouble = [switch.trouble] if switch is not None and switch.trouble else []

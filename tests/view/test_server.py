@@ -100,7 +100,8 @@ def test_a_live_source_that_a_page_pauses_goes_on_for_the_others(tmp_path: Path)
     with Station(f"sim:{FLAT}", tmp_path) as station, station.page() as paused, station.page() as other:
         header, columns = paused.scan()
         paused.say("pause")
-        assert paused.state(lambda state: state["paused"])["state"] == "paused"
+        stands = paused.state(lambda state: state["paused"])
+        assert (stands["state"], stands["position"]) == ("paused", header["position"])
         paused.say("next", most=1000)
         first, _ = other.scan()
         assert not other.state()["paused"]
