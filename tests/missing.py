@@ -14,11 +14,12 @@ MISSING = (
     (r"no (xxd|hexdump)", "tools that print bytes", "apt-get install xxd bsdextrautils"),
     (r"Kaitai compiler", "Kaitai's compiler", "npm install kaitai-struct-compiler js-yaml, with NODE_PATH as its node_modules"),
     (
-        r"kaitaistruct|crccheck|velodyne.decoder|[Nn]umba|rosbags|mcap|foxglove|pyarrow|duckdb|laspy|pandas|polars|pye57|zarr|zstd|rerun|matplotlib|anywidget|nbclient|playwright",
+        r"kaitaistruct|crccheck|velodyne.decoder|[Nn]umba|rosbags|mcap|foxglove|pyarrow|duckdb|laspy|pandas|polars|pye57|zarr|zstd|rerun|matplotlib|anywidget|nbclient|playwright|starlette|uvicorn|websockets",
         "Python packages",
         "pip install -e '.[dev]'",
     ),
     (r"Chromium", "Chromium", "apt-get install chromium"),
+    (r"page is not built", "the page of view --web", "make page"),
     (r"open3d", "Open3D", "pip install open3d"),
     (
         r"LIDARSPEC_CAPTURES|protocol vectors",

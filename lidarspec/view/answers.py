@@ -21,7 +21,7 @@ from lidarspec.exports.reference import effect
 from lidarspec.scans.scans import Place
 from lidarspec.spec.arguments import Range
 from lidarspec.spec.sensor import Sensor
-from lidarspec.view.backlog import Backlog, Taken
+from lidarspec.view.backlog import DAMAGED, Backlog, Taken
 from lidarspec.view.broadcast import Broadcast, Shown
 from lidarspec.view.polar import is_flat
 from lidarspec.wire.build import argument_slot
@@ -46,6 +46,7 @@ class Answers:
         self.broadcast, self.duration = broadcast, _duration(broadcast)
         self.why_no_control = _why_no_control(broadcast, control=control)
         self._frame = functools.lru_cache(maxsize=KEPT)(self._explained)
+        self._verdict = functools.lru_cache(maxsize=DAMAGED)(lambda piece: piece.verdict(broadcast.device.sensor))
 
     def hello(self) -> dict[str, Any]:
         """What a page is told first."""
@@ -67,9 +68,15 @@ class Answers:
             "version": __version__,
         }
 
-    def state(self, *, frozen: bool, since: int) -> dict[str, Any]:
-        """How it goes; `since`: the number of damaged pieces that the page knows of."""
-        broadcast, shown = self.broadcast, self.broadcast.shown
+    def state(self, *, frozen: bool, since: int, at: Shown | None = None) -> dict[str, Any]:
+        """How it goes.
+
+        Args:
+            frozen: whether a page has paused a live source.
+            since: the number of damaged pieces that it knows of.
+            at: the scan that it stands at; by default the newest.
+        """
+        broadcast, shown = self.broadcast, at or self.broadcast.shown
         switch, paused = broadcast.switch, frozen or broadcast.paused
         recording = None if switch is None or switch.name is None else {"name": switch.name, "bytes": switch.bytes}
         trouble = [switch.trouble] if switch is not None and switch.trouble else []
@@ -149,14 +156,14 @@ class Answers:
         return (at - began) * 1e-9 if at > 0 and began else None
 
     def _damaged(self, since: int) -> list[dict[str, Any]]:
-        backlog, sensor = self.broadcast.backlog, self.broadcast.device.sensor
+        backlog = self.broadcast.backlog
         return [
             {
                 "number": one.number,
                 "position": self._position(one.at),
                 "offset": one.offset,
                 "size": one.size,
-                "verdict": one.verdict(sensor),
+                "verdict": self._verdict(one),
             }
             for one in backlog.since(max(since, backlog.damaged - TOLD))
         ]

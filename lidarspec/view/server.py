@@ -7,6 +7,7 @@ costs nothing; and nobody but the page itself is served: of requests to another 
 from __future__ import annotations
 
 import asyncio
+import contextlib
 import ipaddress
 import json
 import math
@@ -217,10 +218,12 @@ class Viewer:
             newest = self._bytes.newest
             if newest != self._watched and (taken := self._bytes.frame(newest)) is not None:
                 self._watched = newest
-                return await asyncio.to_thread(self._answers.frame, taken, "last")
+                with contextlib.suppress(LidarSpecError):  # what cannot be explained is not shown
+                    return await asyncio.to_thread(self._answers.frame, taken, "last")
         if now >= self._due["state"]:
             self._due["state"] = now + STATE
-            state = self._answers.state(frozen=self._frozen is not None, since=self._known)
+            frozen = self._frozen is not None
+            state = self._answers.state(frozen=frozen, since=self._known, at=self._held[-1] if frozen else None)
             self._known = state["damaged"]["total"]
             return state
         return None
@@ -281,6 +284,8 @@ class Viewer:
 
     def _pause(self, message: Mapping[str, Any]) -> None:
         if self._broadcast.is_live:
+            if not self._held:
+                raise UsageError("there is nothing to pause before the first scan")
             self._frozen = self._broadcast.backlog.frozen()
         else:
             self._broadcast.pause()

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import threading
+import time
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -17,8 +18,8 @@ from lidarspec.view.answers import Answers
 from lidarspec.view.broadcast import Broadcast
 from lidarspec.view.feed import LOOK
 
-#: what draws, as it was built; and the height of the picture in pixels.
-DRAWING, HEIGHT = Path(__file__).parent / "page" / "dist" / "widget.js", 420
+#: what draws, as it was built; the height of the picture in pixels; and seconds from one state to the next.
+DRAWING, HEIGHT, STATE = Path(__file__).parent / "page" / "dist" / "widget.js", 420, 0.5
 
 
 class Viewer(Closing):
@@ -43,7 +44,8 @@ class Viewer(Closing):
         self._lock, self._closed = threading.RLock(), False
         self._broadcast: Broadcast | None = None
         self._answers: Answers | None = None
-        self._greets, self._most, self._sent, self._failure = False, 0, -1, ""
+        self._greets, self._most, self._sent, self._failure, self._ending = False, 0, -1, "", ""
+        self._due = math.inf  # when the cell, once it has asked who it is, is told how that is doing
         self._widget = _widget(height)
         self._widget.on_msg(lambda widget, message, buffers: self._hear(message))
         self._thread = threading.Thread(target=self._run, name=f"viewer of {source}", daemon=True)
@@ -77,8 +79,8 @@ class Viewer(Closing):
                     broadcast.run(math.inf)
         except LidarSpecError as error:
             self._failure = "; next: ".join(filter(None, (str(error), suggestion(error))))
-        with self._lock:
-            self._say({"is": "ended", "text": self._failure or f"{self._source} is closed"})
+        self._ending = self._failure or f"{self._source} is closed"
+        self._tell()
 
     def _hear(self, message: Mapping[str, Any]) -> None:
         """Do what the cell asks for."""
@@ -99,18 +101,16 @@ class Viewer(Closing):
             shown = self._broadcast.shown if self._broadcast is not None else None
             if shown is not None and self._answers is not None:
                 if self._greets:
-                    self._greets = False
+                    self._greets, self._due = False, 0.0
                     self._say(self._answers.hello())
-                    self._say(self._state())
+                if time.monotonic() >= self._due:
+                    self._due = time.monotonic() + STATE
+                    self._say(self._answers.state(frozen=False, since=self._answers.broadcast.backlog.damaged))
                 if self._most and shown.number != self._sent:
                     most, self._most, self._sent = self._most, 0, shown.number
                     self._say({"is": "scan"}, shown.message(most))
-            if self._failure:
-                self._say({"is": "ended", "text": self._failure})
-
-    def _state(self) -> dict[str, Any]:
-        assert self._answers is not None
-        return self._answers.state(frozen=False, since=self._answers.broadcast.backlog.damaged)
+            if self._ending:
+                self._say({"is": "ended", "text": self._ending})
 
     def _say(self, message: Mapping[str, Any], *buffers: bytes) -> None:
         self._widget.send(message, list(buffers))

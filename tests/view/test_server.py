@@ -24,6 +24,7 @@ def test_a_page_is_told_what_it_shows(tmp_path: Path, sensor: str, planar: bool)
         assert (hello["duration"], hello["records"]) == (None, True)
         assert {"pcd", "csv", "svg"} <= set(hello["saves"])
         state = page.state(lambda state: state["figures"])
+        assert 0 < state["position"] < 10  # since the first scan
         assert (state["state"], state["paused"], state["damaged"]) == ("streaming", False, {"total": 0, "newest": []})
         assert state["figures"]["speed_hz"] == pytest.approx(10, rel=0.2)
         assert {"lost", "disconnects", "latency_s", "jitter_s", "loss_rate", "at"} <= state["figures"].keys()
@@ -99,7 +100,8 @@ def test_a_live_source_that_a_page_pauses_goes_on_for_the_others(tmp_path: Path)
     with Station(f"sim:{FLAT}", tmp_path) as station, station.page() as paused, station.page() as other:
         header, columns = paused.scan()
         paused.say("pause")
-        assert paused.state(lambda state: state["paused"])["state"] == "paused"
+        stands = paused.state(lambda state: state["paused"])
+        assert (stands["state"], stands["position"]) == ("paused", header["position"])
         paused.say("next", most=1000)
         first, _ = other.scan()
         assert not other.state()["paused"]

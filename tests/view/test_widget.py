@@ -6,12 +6,14 @@ import base64
 import queue
 import time
 from collections.abc import Callable, Iterator
+from pathlib import Path
 from typing import Any
 
 import pytest
 
 from lidarspec.errors import UsageError
 from lidarspec.view import widget
+from tests.cli.running import ran
 from tests.view.browser import chromium
 
 pytest.importorskip("anywidget", reason="anywidget is not installed")
@@ -102,11 +104,11 @@ def test_a_cell_shows_one_scan_after_another_and_closes_its_source(page: Any) ->
         "height",
     ]
     assert colours(page) > 20  # of points, on the ground and the lines of the picture
-    page.click("text=pause")
+    page.click("button")
     cell.until(lambda: cell.comm.sent.empty() and cell.asked.count("next") <= cell.scans + 1)
     scans = cell.scans
     time.sleep(0.5)
-    page.click("text=play")
+    page.click("button")
     assert cell.scans == scans
     cell.until(lambda: cell.scans >= scans + 2)
     page.select_option("select[title=view]", "top")
@@ -121,6 +123,18 @@ def test_a_sensor_of_one_plane_is_seen_from_above(page: Any) -> None:
         cell.until(lambda: cell.scans >= 2)
         assert page.input_value("select[title=view]") == "polar"
     cell.until(lambda: "sim:ldrobot-stl27l is closed" in cell.text)
+
+
+def test_a_file_is_played_stands_still_and_ends(page: Any, tmp_path: Path) -> None:
+    ran("sim", "ldrobot-stl27l", "--to", tmp_path / "a.pcap", "-t", "4s")
+    with widget.Viewer(tmp_path / "a.pcap", "ldrobot-stl27l") as viewer:
+        cell = Cell(page, viewer)
+        cell.until(lambda: cell.scans >= 2 and "playing" in cell.text)
+        page.click("button")
+        cell.until(lambda: "paused" in cell.text)
+        page.click("button")
+        cell.until(lambda: "ended" in cell.text)
+        assert cell.scans > 10
 
 
 def test_what_is_wrong_with_a_source_stands_in_the_cell_in_one_line(page: Any) -> None:

@@ -1,0 +1,87 @@
+"""The frame that each point of a scan came from, however the input was cut into batches."""
+
+from __future__ import annotations
+
+import math
+import pickle
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+import lidarspec as ls
+from lidarspec import Scan, Sensor
+from lidarspec.packets.stream import PacketStream
+from lidarspec.scans.scans import ScanStream
+from lidarspec.simulation.simulator import simulate
+from lidarspec.spec import Fields, Polar, following
+from lidarspec.spec.description import with_frames
+from tests.shapes import segments
+
+FRAMES = 200
+
+
+def waiting_points(f: Fields) -> Polar:
+    """Those of the segments, each of which waits for the segment behind it, in whatever frame that is."""
+    cloud = segments.points(f)
+    return replace(cloud, range=cloud.range + 0 * following(f.start))
+
+
+def waiting() -> Sensor:
+    """A sensor with parts whose points wait."""
+    data = replace(segments.SENSOR.frames["data"], points={"segments": waiting_points})
+    return with_frames(segments.SENSOR, {"data": data})
+
+
+def scans_of(sensor: Sensor, frames: list[bytes], together: int) -> tuple[list[Scan], list[int]]:
+    """The scans of frames that come so many at a time, and where each frame begins in the input."""
+    decoder = sensor.decoder()
+    packets, stream, scans = PacketStream(sensor, sensor.data_frame, decoder.stats), ScanStream(sensor), list[Scan]()
+    offsets = list[int]()
+    for start in range(0, len(frames), together):
+        found = []
+        for frame in frames[start : start + together]:
+            offsets.append(decoder.stats.bytes_in)
+            found += decoder.frames(frame)
+        scans += stream.add(packets.add(found))
+    return scans + stream.finish(), offsets
+
+
+@pytest.mark.parametrize("together", [1, 3, FRAMES])
+@pytest.mark.parametrize("name", ["parts", "waiting parts", "ldrobot-stl27l", "robosense-airy", "velodyne-vlp16"])
+def test_each_point_leads_to_its_frame_and_row(name: str, together: int) -> None:
+    known = segments.SENSOR if name in ("parts", "waiting parts") else ls.sensor(name)
+    sensor, frames = waiting() if name == "waiting parts" else known, list(simulate(known, FRAMES))
+    scans, offsets = scans_of(sensor, frames, together)
+    seen = 0
+    for scan in scans:
+        for index in range(0, len(scan), 37):
+            place = scan.provenance(index)
+            assert place.data == frames[offsets.index(place.offset)]
+            explanation = ls.explain(place.data, sensor, place.frame)
+            row = next(row for row in explanation.rows if (place.part, place.number) in row.numbers)
+            assert row.path == explanation.path_of(place.number, place.part)
+            point = row.points[row.numbers.index((place.part, place.number))]
+            if not math.isnan(point.range):  # it follows from this frame alone
+                assert point.range == pytest.approx(float(scan.points.range[index]), abs=1e-5)
+            if not math.isnan(point.azimuth_deg):
+                turned = math.degrees(float(scan.points.azimuth[index])) - point.azimuth_deg
+                assert abs((turned + 180) % 360 - 180) < 0.01
+            seen += 1
+    assert seen > 20
+
+
+def test_points_that_a_scan_has_not_have_no_frame() -> None:
+    scans, _ = scans_of(segments.SENSOR, list(simulate(segments.SENSOR, FRAMES)), FRAMES)
+    for index in (-1, len(scans[0])):
+        with pytest.raises(IndexError, match=f"point {index} of"):
+            scans[0].provenance(index)
+
+
+def test_packets_do_not_go_with_a_scan_to_another_process() -> None:
+    sensor = ls.sensor("ldrobot-stl27l")
+    scan = next(iter(sensor.scans(b"".join(simulate(sensor, FRAMES)))))
+    sent = pickle.loads(pickle.dumps(scan))
+    assert np.array_equal(sent.points.x, scan.points.x)
+    with pytest.raises(IndexError):
+        sent.provenance(0)
