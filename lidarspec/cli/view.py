@@ -17,7 +17,6 @@ from lidarspec.cli.output import drawn
 from lidarspec.cli.terminal import ended_by_terminate, note, say
 from lidarspec.device.device import Device, open as open_device
 from lidarspec.errors import UsageError, library, suggest
-from lidarspec.formats.rerun import RERUN
 from lidarspec.scans.selection import Selection
 from lidarspec.spec.sensor import Sensor
 from lidarspec.transports.open_url import is_live
@@ -26,7 +25,6 @@ from lidarspec.view.canvas import Cells
 from lidarspec.view.feed import LOOK, Feed
 from lidarspec.view.live import Switch, Window
 from lidarspec.view.polar import look, picture
-from lidarspec.view.rerun import SCHEMES, show as show_in_rerun
 from lidarspec.view.screen import Screen, Terminated, encodable, interactive, keyboard
 
 
@@ -155,13 +153,16 @@ def listening(address: str | None) -> tuple[str, int]:
 
 def _in_rerun(source: str, sensor_id: str | Sensor | None, target: str, ramp: str, duration: float | None, selection: Selection) -> None:
     """Scans in Rerun's viewer, or in a file of its, until the input ends or somebody has had enough."""
+    from lidarspec.formats.rerun import RERUN  # with all other formats, which take a moment
+    from lidarspec.view.rerun import SCHEMES, show
+
     if target and not target.startswith(SCHEMES):
         if not target.lower().endswith(RERUN.suffix):
             raise UsageError(f"{target}: a recording for Rerun's viewer has the suffix {RERUN.suffix}")
         refuse_overwriting([target], source, sensor_id)
     with open_device(source, sensor_id, period=LOOK) as device:
         feed = Feed(device, select=selection)
-        show_in_rerun(feed, target, ramp=ramp, until=time.monotonic() + (duration or math.inf))
+        show(feed, target, ramp=ramp, until=time.monotonic() + (duration or math.inf))
         if feed.scan is None:
             raise nothing_came(device, source, duration)
         note(f"{target or 'shown'}: {feed.number} scans of {device.sensor.id}")
