@@ -36,7 +36,7 @@ GROUPS = {
     },
     "stream": {
         "read": ("read", "The points that a sensor sends, a row each; or its packets."),
-        "view": ("view", "A sensor at work, drawn in the terminal."),
+        "view": ("view", "A sensor at work, drawn in the terminal, or with --web in the browser."),
         "record": ("recordings", "Everything that a source sends, with the time of its arrival, in one file that survives a crash."),
         "replay": ("recordings", "A recording or capture, sent again as it came: bit for bit, and by the clock."),
         "sim": ("sim", "A simulated sensor on a serial port, UDP, TCP or in a file."),
@@ -46,7 +46,7 @@ GROUPS = {
     "files": {
         "info": ("files", "What is in a file: kind, times, senders, sensor, rates, loss, and how it is read."),
         "convert": ("files", "Write the points of a capture or raw file to a file, in the format of its suffix."),
-        "plot": ("files", "A scan as an SVG picture."),
+        "plot": ("files", "A scan as a picture; or intensities, ranges and rates over time."),
     },
     "bytes": {
         "parse": ("frames", "The fields of each frame in some bytes."),

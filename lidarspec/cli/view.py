@@ -1,4 +1,4 @@
-"""`view`: a sensor at work, drawn in the terminal."""
+"""`view`: a sensor at work, drawn in the terminal, on a page in the browser, or in the viewer of Rerun."""
 
 from __future__ import annotations
 
