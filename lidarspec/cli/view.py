@@ -68,15 +68,15 @@ def view(
 
     --rerun needs lidarspec[rerun]; a file is read there as fast as possible, and its time runs in the viewer.
     """
-    if web and once:
-        raise UsageError("--web and --once are for two kinds of pictures: leave out one of them")
-    if web:
-        _serve(source, sensor_id, duration, selection, opens=opens, address=address, control=control)
-        return
-    if opens or address is not None or control:
+    if once + web + in_rerun > 1:
+        raise UsageError("--once, --web and --rerun are three ways to look at it: choose one")
+    if (opens or address is not None or control) and not web:
         raise UsageError("--open, --address and --control are for the page: add --web")
     if output is not None and not in_rerun:
         raise UsageError("-o is for --rerun; a picture is drawn into a file by lidarspec plot")
+    if web:
+        _serve(source, sensor_id, duration, selection, opens=opens, address=address, control=control)
+        return
     if in_rerun:
         _in_rerun(source, sensor_id, output or "", ramp, duration, selection)
         return

@@ -101,5 +101,7 @@ def test_where_no_viewer_can_be_shown_one_line_says_so(tmp_path: Path) -> None:
     assert done.returncode == 2
     assert done.stderr.splitlines() == ["there is no display for Rerun's viewer", "  next: lidarspec view SOURCE --rerun -o scans.rrd"]
     assert "has the suffix .rrd" in ran("view", "sim:ldrobot-stl27l", "--rerun", "-o", "a.txt", code=2).stderr
-    assert "-o is for --rerun" in ran("view", "sim:ldrobot-stl27l", "-o", "a.rrd", code=2).stderr
+    assert "-o is for --rerun" in ran("view", "sim:ldrobot-stl27l", "--web", "-o", "a.rrd", code=2).stderr
+    assert "choose one" in ran("view", "sim:ldrobot-stl27l", "--rerun", "--web", code=2).stderr
+    assert "add --web" in ran("view", "sim:ldrobot-stl27l", "--rerun", "--open", code=2).stderr
     assert str(tmp_path / "no") in ran("view", "sim:ldrobot-stl27l", "--rerun", "-o", tmp_path / "no" / "a.rrd", code=3).stderr
