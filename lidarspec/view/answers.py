@@ -6,7 +6,6 @@ Each answer is a dict with the word `is`; the scans alone go another way (`scene
 from __future__ import annotations
 
 import functools
-import time
 from collections.abc import Mapping
 from importlib.util import find_spec
 from typing import Any
@@ -82,7 +81,7 @@ class Answers:
         trouble = [switch.trouble] if switch is not None and switch.trouble else []
         return {
             "is": "state",
-            "at": time.time(),
+            "at": broadcast.now(),
             "position": shown.position if shown is not None else 0.0,
             "state": "paused" if frozen else broadcast.state,
             "paused": paused,

@@ -18,6 +18,7 @@ from lidarspec.device.device import Device
 from lidarspec.errors import LidarSpecError, UsageError
 from lidarspec.scans.scans import Scan
 from lidarspec.scans.selection import EVERYTHING, Selection
+from lidarspec.transports.base import HostClock
 from lidarspec.transports.protocol import Closing
 from lidarspec.view.backlog import Backlog
 from lidarspec.view.feed import LOOK, STEP, Feed
@@ -39,10 +40,8 @@ class Shown:
         sent: when its last packet arrived; of a file, when it was shown; seconds since 1970.
     """
 
-    def __init__(self, scan: Scan, number: int, position: float, *, live: bool) -> None:
-        self.scan, self.number, self.position = scan, number, position
-        arrived = scan.provenance(len(scan) - 1).host_ns if live and len(scan) else 0
-        self.sent = arrived * 1e-9 if arrived else time.time()
+    def __init__(self, scan: Scan, number: int, position: float, sent: float) -> None:
+        self.scan, self.number, self.position, self.sent = scan, number, position, sent
         self._message, self._most = b"", -1
 
     def message(self, most: int) -> bytes:
@@ -97,6 +96,7 @@ class Broadcast(Closing):
         self._moved, self._steps = False, 0
         self._target: float | None = None
         self._stirred, self._stopped, self._measured = threading.Event(), False, time.monotonic()
+        self._clock = HostClock()
         self._feed = self._fed(select)
 
     @property
@@ -127,6 +127,10 @@ class Broadcast(Closing):
         if self.failure is not None:
             return str(self.failure)
         return "; ".join([f"{self.source} has ended", *self.warnings])
+
+    def now(self) -> float:
+        """Seconds since 1970, as times of arrival count them."""
+        return self._clock.now() * 1e-9
 
     @property
     def began_ns(self) -> int:
@@ -240,7 +244,7 @@ class Broadcast(Closing):
         if feed.scan is not None and feed.number != self._seen:
             self._seen, is_new = feed.number, True
             self._first = self._first or next(iter(feed.scans), feed.scan)
-            self.shown = Shown(feed.scan, self._number, self._position(feed.scan), live=self.is_live)
+            self.shown = Shown(feed.scan, self._number, self._position(feed.scan), self._sent(feed.scan))
             self._numbered[self._number] = self.shown
             self._number += 1
         if now - self._measured >= FIGURES:
@@ -256,8 +260,14 @@ class Broadcast(Closing):
     def _figures(self, seconds: float) -> dict[str, Any]:
         stats = self.device.stats
         reading = self._feed.meter.reading(stats, seconds if self.is_live else None).to_dict()
-        latency = time.time() - self.shown.sent if self.is_live and self.shown is not None else None
-        return {"at": time.time(), **reading, "lost": stats.lost, "disconnects": stats.disconnects, "latency_s": latency}
+        at = self.now()
+        latency = at - self.shown.sent if self.is_live and self.shown is not None else None
+        return {"at": at, **reading, "lost": stats.lost, "disconnects": stats.disconnects, "latency_s": latency}
+
+    def _sent(self, scan: Scan) -> float:
+        """When the last packet of a scan arrived; of a file: now."""
+        arrived = scan.provenance(len(scan) - 1).host_ns if self.is_live and len(scan) else 0
+        return arrived * 1e-9 if arrived else self.now()
 
     def _position(self, scan: Scan) -> float:
         """Seconds from the first scan: by arrival, of a file as its scans are selected, or by their number where they bear no times."""

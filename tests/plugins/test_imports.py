@@ -17,6 +17,7 @@ ALLOWED = {
         "_version",
         "columns",
         "columns.columns",
+        "display",
         "entry_points",
         "errors",
         "plugins",

@@ -21,9 +21,10 @@ from rclpy.parameter import Parameter as RosParameter
 from std_msgs.msg import Header
 from std_srvs.srv import Trigger
 
-from lidarspec.cli.build import arguments, replied
+from lidarspec.cli.build import replied
 from lidarspec.device.device import Device
 from lidarspec.errors import LidarSpecError, UsageError, did_you_mean, suggestion
+from lidarspec.explaining.assignments import arguments
 from lidarspec.view.feed import LOOK, Feed, Reading
 from lidarspec_ros2.diagnostics import LOST, status
 from lidarspec_ros2.packets import PacketLog
