@@ -254,7 +254,7 @@ class LidarNode(LifecycleNode):
 
     def _warn_of_unknown_parameters(self) -> None:
         """Say which parameters are given that no node of this sensor has, of which ROS itself says nothing."""
-        for name in self._parameter_overrides:
+        for name in self._parameter_overrides:  # which rclpy tells in no other way
             if not self.has_parameter(name) and not name.startswith("qos_overrides."):
                 close = did_you_mean(name, [one.name for one in PARAMETERS])
                 self.get_logger().warning(f"parameter {name!r} is left out, as there is none of that name{close}")
