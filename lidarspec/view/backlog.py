@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lidarspec.errors import WireError
-from lidarspec.explaining.explanation import Explanation, explain
+from lidarspec.explaining.explanation import Explanation
 from lidarspec.explaining.pieces import Piece, explained
 from lidarspec.framing.decoder import Decoder
 from lidarspec.framing.results import Frames, Numbers, array_of
@@ -160,10 +160,6 @@ class Backlog:
         """The damaged pieces from a number on that are kept."""
         with self._lock:
             return [piece for piece in self._broken if piece.number >= number]
-
-    def explained(self, data: bytes, frame: str) -> dict[str, Any]:
-        """A frame as `Explanation.to_dict` has it."""
-        return explain(data, self.sensor, frame).to_dict()
 
     def mended(self, piece: Damaged) -> dict[str, Any]:
         """A damaged piece in one explanation: what was a frame in it, with what would explain the damage, and what is between these."""

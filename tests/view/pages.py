@@ -161,14 +161,13 @@ def recorded(folder: Path, sensor: str = FLAT, seconds: float = 5.0, suffix: str
     return path
 
 
-def answered(port: int, path: str, *, host: str = "", **headers: str) -> tuple[int, dict[str, str], bytes]:
+def answered(port: int, path: str, **headers: str) -> tuple[int, dict[str, str], bytes]:
     """Status, headers and body of what comes back on a raw request.
 
     Args:
-        host: what the request calls the server; by default what it is called.
-        headers: further ones, with "_" for "-"; a WebSocket is asked for where one of them is `upgrade`.
+        headers: in the place of the usual ones and beside them, with "_" for "-"; a WebSocket is asked for where one of them is `upgrade`.
     """
-    given = {"Host": host or f"127.0.0.1:{port}", "Connection": "Upgrade" if "upgrade" in headers else "close", **headers}
+    given = {"Host": f"127.0.0.1:{port}", "Connection": "Upgrade" if "upgrade" in headers else "close", **headers}
     lines = [f"GET {path} HTTP/1.1", *(f"{name.replace('_', '-')}: {value}" for name, value in given.items()), "", ""]
     with socket.create_connection(("127.0.0.1", port), DEADLINE) as raw:
         raw.settimeout(DEADLINE)

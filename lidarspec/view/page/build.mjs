@@ -1,16 +1,14 @@
 // Bundles the page, and the notebook's widget, into dist/; `--watch` goes on doing so, `--tests` makes dist-tests/ for node's test runner.
 
 import { build, context } from "esbuild";
-import { copyFileSync, existsSync, readdirSync, readFileSync, rmSync, writeFileSync } from "node:fs";
+import { copyFileSync, readdirSync, readFileSync, rmSync, writeFileSync } from "node:fs";
 
 const tests = process.argv.includes("--tests");
 const watch = process.argv.includes("--watch");
 const folder = tests ? "dist-tests" : "dist";
 
 rmSync(folder, { recursive: true, force: true });
-const entries = tests
-  ? readdirSync("tests").map((name) => `tests/${name}`)
-  : ["src/page.ts", "src/widget.ts"].filter((name) => existsSync(name));
+const entries = tests ? readdirSync("tests").map((name) => `tests/${name}`) : ["src/page.ts", "src/widget.ts"];
 
 const options = {
   entryPoints: entries,
