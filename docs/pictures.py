@@ -22,10 +22,10 @@ from screens import svg as drawn
 import lidarspec as ls
 from lidarspec.exports import narrowed
 from lidarspec.exports.diagram import svg as diagram
+from lidarspec.points.look import look
 from lidarspec.simulation.simulator import simulate
 from lidarspec.view.feed import Feed
 from lidarspec.view.live import FIGURES, Window
-from lidarspec.view.polar import look
 from lidarspec.view.svg import svg
 
 HERE = Path(__file__).parent / "pictures"

@@ -41,6 +41,7 @@ from lidarspec.formats import check_holds, format_of, targets, write, write_imu
 from lidarspec.formats.writing import replacing
 from lidarspec.packets.imu import joined
 from lidarspec.plugins import sensor as named_sensor
+from lidarspec.points.look import look
 from lidarspec.recording.recorders import SUFFIXES
 from lidarspec.scans.scans import Scan
 from lidarspec.scans.selection import EVERYTHING, Selection, Times, received
@@ -50,7 +51,6 @@ from lidarspec.transports.open_url import is_live, transport
 from lidarspec.transports.protocol import Chunk, no_bytes
 from lidarspec.view import figures
 from lidarspec.view.feed import Feed
-from lidarspec.view.polar import look
 from lidarspec.view.svg import svg
 
 #: of files that hold packets as they were received; bytes alone have the suffix of KITTI's points.

@@ -20,6 +20,7 @@ from lidarspec.device.demo import Demonstration, demonstrate
 from lidarspec.discovery.detect import chosen
 from lidarspec.errors import NO_SENSORS, UsageError, suggest
 from lidarspec.plugins import registry, sensor as named_sensor
+from lidarspec.points.look import look
 from lidarspec.recording.recorders import SUFFIXES
 from lidarspec.scans.scans import Scan
 from lidarspec.simulation.device import SimulatedDevice
@@ -31,7 +32,7 @@ from lidarspec.transports.base import data_link
 from lidarspec.transports.outlets import HERE, Outlet, has_terminals, simulated_outlet
 from lidarspec.transports.serving import serve, write_file
 from lidarspec.transports.simulated import rate_of
-from lidarspec.view.polar import look, picture
+from lidarspec.view.polar import picture
 
 #: seconds that go into a file where nobody says how many.
 IN_A_FILE = 10.0

@@ -17,6 +17,7 @@ from lidarspec.cli.output import drawn
 from lidarspec.cli.terminal import ended_by_terminate, note, say
 from lidarspec.device.device import Device, open as open_device
 from lidarspec.errors import UsageError, library, suggest
+from lidarspec.points.look import look
 from lidarspec.scans.selection import Selection
 from lidarspec.spec.sensor import Sensor
 from lidarspec.transports.open_url import is_live
@@ -24,7 +25,7 @@ from lidarspec.transports.protocol import Origin
 from lidarspec.view.canvas import Cells
 from lidarspec.view.feed import LOOK, Feed
 from lidarspec.view.live import Switch, Window
-from lidarspec.view.polar import look, picture
+from lidarspec.view.polar import picture
 from lidarspec.view.screen import Screen, Terminated, encodable, interactive, keyboard
 
 

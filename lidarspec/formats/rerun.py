@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 from lidarspec.errors import library
 from lidarspec.formats.writing import columns_of
 from lidarspec.points.cloud import PointCloud
+from lidarspec.points.look import BRIGHT, Look, blended, look, steps
 from lidarspec.scans.scans import Scan
 from lidarspec.transports.protocol import Format
 
@@ -147,23 +148,15 @@ class _Colours:
     """The colours of points, on the scale of the first cloud."""
 
     def __init__(self) -> None:
-        from lidarspec.view.canvas import INKS, STEPS, first_ink
-
-        self._ramps = {
-            name: np.array([(*(ink.rgb or ()), 255) for ink in INKS[first_ink(name) :][:STEPS]], np.uint8)
-            for name in ("range", "intensity")
-        }
-        self._look: Any = None
-        self._known = False
+        self._look: Look | None = None
 
     def __call__(self, cloud: PointCloud, ramp: str) -> NDArray[np.uint8]:
-        """(n, 4) from red to alpha."""
-        from lidarspec.view.polar import look, shade
-
-        if not self._known:
-            self._look, self._known = look(cloud, ramp=ramp), len(cloud) > 0
-        inks = self._ramps["range" if self._look.ramp == "range" else "intensity"]
-        return inks[np.clip(np.nan_to_num(shade(cloud, self._look)) * len(inks), 0, len(inks) - 1).astype(np.intp)]
+        """(n, 3), red, green and blue."""
+        shown = self._look or look(cloud, ramp=ramp)
+        if len(cloud):  # an empty one tells nothing of the scale
+            self._look = shown
+        colours = np.array(blended(BRIGHT["range" if shown.ramp == "range" else "intensity"]), np.uint8)
+        return colours[steps(cloud, shown)]
 
 
 def write_rerun(path: Path, scans: Iterable[Scan], *, every_point: bool) -> None:

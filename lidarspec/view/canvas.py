@@ -7,7 +7,6 @@ each ink looks like with true colour, 256 colours, 16, or none.
 from __future__ import annotations
 
 import functools
-from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import groupby
 from typing import Any, Literal
@@ -18,18 +17,12 @@ from rich.color import Color, ColorSystem
 from rich.text import Text
 
 from lidarspec.errors import printable
+from lidarspec.points.look import BRIGHT, STEPS, Rgb, blended
 
 Depth = Literal["truecolor", "256", "standard", "none"]
-Rgb = tuple[int, int, int]
 
-#: colours of a ramp; few, so that noise in a range does not make every cell change with every scan.
-STEPS = 20
-#: near to far: hues that stay bright on a dark ground.
-_RANGE: tuple[Rgb, ...] = ((255, 92, 87), (255, 170, 60), (236, 220, 72), (96, 216, 110), (64, 208, 220), (92, 150, 255), (186, 128, 255))
-#: weak to strong.
-_INTENSITY: tuple[Rgb, ...] = ((92, 78, 190), (160, 70, 190), (226, 84, 140), (255, 138, 84), (255, 204, 92), (255, 250, 190))
-#: the same two for 16 colours.
-_RANGE_16, _INTENSITY_16 = (91, 33, 92, 96, 94, 95), (34, 35, 95, 31, 93, 97)
+#: the ramps for 16 colours.
+_STANDARD = {"range": (91, 33, 92, 96, 94, 95), "intensity": (34, 35, 95, 31, 93, 97)}
 PLAIN, STRONG, FAINT, LABEL, GOOD, ALARM = range(6)
 ACROSS, DOWN = 2, 4
 #: the bit of each dot of a braille character, by row and column.
@@ -51,11 +44,9 @@ class Ink:
     faint: bool = False
 
 
-def _ramp(stops: Sequence[Rgb], standard: Sequence[int]) -> list[Ink]:
-    places = np.linspace(0, len(stops) - 1, STEPS)
-    channels = [np.interp(places, range(len(stops)), [stop[channel] for stop in stops]) for channel in range(3)]
-    nearest = np.minimum(np.arange(STEPS) * len(standard) // STEPS, len(standard) - 1)
-    return [Ink((round(r), round(g), round(b)), standard[n]) for r, g, b, n in zip(*channels, nearest.tolist(), strict=True)]
+def _ramp(name: str) -> list[Ink]:
+    standard = _STANDARD[name]
+    return [Ink(rgb, standard[min(step * len(standard) // STEPS, len(standard) - 1)]) for step, rgb in enumerate(blended(BRIGHT[name]))]
 
 
 _FIXED = (
@@ -68,7 +59,7 @@ _FIXED = (
 )
 #: the first ink of each ramp, by what it shows: from near to far, or from weak to strong.
 RAMPS = {"range": len(_FIXED), "intensity": len(_FIXED) + STEPS}
-INKS: tuple[Ink, ...] = (*_FIXED, *_ramp(_RANGE, _RANGE_16), *_ramp(_INTENSITY, _INTENSITY_16))
+INKS: tuple[Ink, ...] = (*_FIXED, *_ramp("range"), *_ramp("intensity"))
 
 
 def first_ink(ramp: str) -> int:

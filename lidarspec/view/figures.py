@@ -12,9 +12,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lidarspec.errors import UsageError, library
+from lidarspec.points.look import Look
 from lidarspec.scans.scans import Scan
 from lidarspec.view.feed import Feed, totals
-from lidarspec.view.polar import Look
 
 #: what `save` writes, by suffix.
 SUFFIXES = (".png", ".pdf", ".svg")

@@ -17,13 +17,14 @@ from typing import Any, Literal
 import numpy as np
 
 from lidarspec.errors import LidarSpecError, SourceError
+from lidarspec.points.look import STEPS, Look, look, ramps
 from lidarspec.recording.appending import Appender, Log
 from lidarspec.recording.recorders import recorder
 from lidarspec.scans.scans import Scan
 from lidarspec.transports.protocol import Chunk, Transport
-from lidarspec.view.canvas import ALARM, FAINT, GOOD, LABEL, PLAIN, STEPS, STRONG, Cells, first_ink
+from lidarspec.view.canvas import ALARM, FAINT, GOOD, LABEL, PLAIN, STRONG, Cells, first_ink
 from lidarspec.view.feed import NOTHING, Feed, Reading, told
-from lidarspec.view.polar import Look, look, picture, ramps
+from lidarspec.view.polar import picture
 from lidarspec.view.screen import Screen
 
 #: seconds from picture to picture at least, and between two readings of the figures.

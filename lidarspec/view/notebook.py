@@ -20,10 +20,10 @@ from lidarspec.exports import narrowed
 from lidarspec.exports.diagram import svg as diagram
 from lidarspec.packets.packets import Packets
 from lidarspec.points.cloud import PointCloud
+from lidarspec.points.look import look
 from lidarspec.scans.scans import Scan
 from lidarspec.spec.sensor import Sensor
 from lidarspec.spec.tree import FieldInfo
-from lidarspec.view.polar import look
 from lidarspec.view.svg import svg
 
 #: pixels of a side of a picture, and the dots of each of its views at most.

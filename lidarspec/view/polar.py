@@ -3,84 +3,20 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
-from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
-from lidarspec.errors import UnknownName
 from lidarspec.points.cloud import PointCloud
+from lidarspec.points.look import MOST, Look, ring_step, shade
 from lidarspec.view.canvas import ACROSS, DOWN, FAINT, LABEL, STRONG, Canvas, Cells
 
-#: share of the points that the picture's reach takes in, where a few are far beyond all others.
-MOST, FAR_BEYOND = 99.0, 1.5
-#: rings at most between the middle and an edge, and dots from one dot of a ring to the next.
-RINGS, RING_GAP = 4, 4
+#: dots from one dot of a ring to the next.
+RING_GAP = 4
 #: share of the height that the view from above gets where there are two.
 ABOVE = 0.62
-#: elevations below this, in radians, make a cloud a flat one.
-FLAT = 1e-3
 #: by how much heights may be drawn larger than lengths, and the share of the side view that they then fill at most.
 HEIGHTS, FILLED = (1, 2, 5, 10), 0.9
-#: what a reach is rounded up to, so that the picture keeps its scale from scan to scan.
-ROUND = (1.0, 1.2, 1.5, 2.0, 2.5, 3.0, 4.0, 5.0, 6.0, 8.0, 10.0)
-#: share of the points whose intensity is within the ramp.
-WITHIN = 98.0
-
-
-@dataclass(frozen=True)
-class Look:
-    """How a cloud is drawn.
-
-    Attributes:
-        ramp: what colours show: "range", "intensity", or a column in `PointCloud.extra`.
-        reach: metres from the middle to the nearer edge.
-        full: the range in metres, the intensity, or the value at the end of the ramp.
-        middle: what is in the middle, metres forward and left of the sensor.
-        flat: from above only.
-        low, unit: the value at the beginning of the ramp, and what values are in, where they are no ranges.
-    """
-
-    ramp: str
-    reach: float
-    full: float
-    middle: tuple[float, float] = (0.0, 0.0)
-    flat: bool = True
-    low: float = 0.0
-    unit: str = ""
-
-    @property
-    def ends(self) -> tuple[str, str]:
-        """The values at the beginning and end of the ramp, in words."""
-        unit = "m" if self.ramp == "range" else self.unit
-        return f"{self.low:g}", f"{self.full:g} {unit}".rstrip()
-
-
-def ramps(cloud: PointCloud) -> list[str]:
-    """What colours can show of a cloud."""
-    return ["range", *["intensity"] * (cloud.intensity is not None), *cloud.extra]
-
-
-def look(points: PointCloud, *, ramp: str = "range", reach: float | None = None) -> Look:
-    """How to draw a cloud so that all of it is seen; intensity is shown only where the cloud has some.
-
-    Raises:
-        UnknownName: for a column that the cloud does not have.
-    """
-    cloud = points[points.valid]
-    found = reach or reach_of(cloud)
-    if ramp not in (known := ramps(cloud)):
-        if ramp != "intensity":
-            raise UnknownName(ramp, known, place="colours")
-        ramp = "range"
-    if ramp == "range":
-        return Look("range", found, found, flat=is_flat(cloud))
-    values = _shown(cloud, ramp)
-    values = values[np.isfinite(values)]
-    weak, strong = np.percentile(values, (100 - WITHIN, WITHIN)) if len(values) else (0.0, 0.0)
-    low = -rounded_up(-float(weak)) if weak < 0 else 0.0
-    return Look(ramp, found, rounded_up(max(float(strong), 1e-3)), flat=is_flat(cloud), low=low, unit=cloud.units.get(ramp, ""))
 
 
 def picture(points: PointCloud, *, width: int, height: int, look: Look) -> Cells:
@@ -99,46 +35,9 @@ def picture(points: PointCloud, *, width: int, height: int, look: Look) -> Cells
     return whole
 
 
-def is_flat(cloud: PointCloud) -> bool:
-    """Whether all points are in the sensor's plane."""
-    return not len(cloud) or float(np.nanmax(np.abs(cloud.elevation))) < FLAT
-
-
-def reach_of(cloud: PointCloud) -> float:
-    """The range that shows a cloud of valid points: the farthest one's, or most points' where a few are far beyond; rounded up."""
-    if not len(cloud):
-        return 1.0
-    distance = np.hypot(cloud.x, cloud.y)
-    farthest, most = float(distance.max()), float(np.percentile(distance, MOST))
-    return rounded_up(max(farthest if farthest <= FAR_BEYOND * most else most, 1e-3))
-
-
-def rounded_up(value: float, steps: Sequence[float] = ROUND) -> float:
-    """The next of a few round numbers, by default such as 1.2, 1.5, 2, 2.5, 3, 4 ... 10, 12."""
-    power = 10.0 ** math.floor(math.log10(value))
-    return next((step * power for step in steps if step * power >= value * 0.999), 10 * power)
-
-
-def ring_step(reach: float) -> float:
-    """Metres from ring to ring: 1, 2 or 5 times a power of ten, at most four rings."""
-    return rounded_up(reach / RINGS, (1, 2, 5, 10))
-
-
 def _scale(width: int, height: int, reach: float) -> float:
     """Dots per metre, so that `reach` fits into half of the canvas both ways."""
     return (min(width * ACROSS, height * DOWN) - 1) / 2 / reach
-
-
-def shade(cloud: PointCloud, look: Look) -> NDArray[np.float64]:
-    """How far along the ramp of inks each point is, (n,), from 0."""
-    if look.ramp == "range":
-        return np.hypot(cloud.x, cloud.y).astype(np.float64) / look.full
-    return np.nan_to_num((_shown(cloud, look.ramp) - look.low) / (look.full - look.low))
-
-
-def _shown(cloud: PointCloud, ramp: str) -> NDArray[np.float64]:
-    """The column that colours show, (n,)."""
-    return np.asarray(cloud.intensity if ramp == "intensity" else cloud.extra[ramp], np.float64)
 
 
 def _from_above(cloud: PointCloud, width: int, height: int, look: Look) -> Cells:

@@ -35,10 +35,10 @@ from starlette.websockets import WebSocket, WebSocketDisconnect
 
 from lidarspec.errors import LidarSpecError, SourceError, UsageError, suggestion
 from lidarspec.formats import write
+from lidarspec.points.look import look
 from lidarspec.view.answers import Answers, saves
 from lidarspec.view.backlog import Backlog
 from lidarspec.view.broadcast import Broadcast, Shown
-from lidarspec.view.polar import look
 from lidarspec.view.svg import svg
 
 #: the page, as it was built.

@@ -11,8 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lidarspec.points.cloud import PointCloud
-from lidarspec.view.canvas import INKS, STEPS, Rgb, first_ink
-from lidarspec.view.polar import Look, ring_step, shade
+from lidarspec.points.look import BRIGHT, STEPS, Look, Rgb, blended, ring_step, steps
 
 #: pixels: of each side of the view from above, of the margins, of the lines above it, of one above each view, and of a dot.
 SIDE, MARGIN, HEAD, LINE, DOT = 720, 24, 58, 18, 1.6
@@ -35,7 +34,7 @@ def svg(points: PointCloud, look: Look, title: str, *, side: int = SIDE, most: i
         most: dots of a view at most: where there are more returns, one stands for its neighbours.
     """
     cloud = points[points.valid]
-    views = _Views(cloud, look, side, most, np.clip(shade(cloud, look) * STEPS, 0, STEPS - 1).astype(np.intp))
+    views = _Views(cloud, look, side, most, steps(cloud, look))
     shown = [views.above()] if look.flat else [views.above(), views.beside()]
     width, top = side + 2 * MARGIN, HEAD
     body: list[str] = []
@@ -136,7 +135,7 @@ class _Views:
         places, colours = places[first], self.colours[inside[first]]
         width = max(DOT, grid * 1.3) / grid
         paths = [
-            f'<path class="dots{step}" d="{_path(places[colours == step])}" stroke="{_colour(step)}"/>'
+            f'<path class="dots{step}" d="{_path(places[colours == step])}" stroke="{_COLOURS[step]}"/>'
             for step in np.unique(colours).tolist()
         ]
         group = f'<g transform="scale({grid:g})" fill="none" stroke-width="{width:.2g}" stroke-linecap="round">'
@@ -156,7 +155,7 @@ def _legend(look: Look, right: int) -> Iterator[str]:
     yield f'<g {_as("text")}><text x="{left - 8}" y="48" text-anchor="end">{escape(look.ramp)}, {low}</text>'
     yield f'<text x="{right}" y="48" text-anchor="end">{high}</text></g>'
     for step in range(STEPS):
-        yield f'<rect class="ramp{step}" x="{left + step * 6}" y="40" width="6" height="8" fill="{_colour(step)}"/>'
+        yield f'<rect class="ramp{step}" x="{left + step * 6}" y="40" width="6" height="8" fill="{_COLOURS[step]}"/>'
 
 
 def _as(part: str, attribute: str = "fill") -> str:
@@ -166,19 +165,13 @@ def _as(part: str, attribute: str = "fill") -> str:
 
 def _style() -> str:
     """What is different where a dark page is preferred."""
-    inks = enumerate(INKS[first_ink("range") :][:STEPS])
-    ramp = [
-        f".dots{step}{{stroke:{ink}}}.ramp{step}{{fill:{ink}}}" for step, ink in ((step, _hex(ink.rgb or (0, 0, 0))) for step, ink in inks)
-    ]
+    ramp = [f".dots{step}{{stroke:{ink}}}.ramp{step}{{fill:{ink}}}" for step, ink in enumerate(map(_hex, blended(BRIGHT["range"])))]
     parts = [f".{part}{{{'stroke' if part == 'line' else 'fill'}:{colour}}}" for part, colour in zip(_PARTS, _DARK, strict=True)]
     return f"@media(prefers-color-scheme:dark){{{''.join([*parts, *ramp])}}}"
 
 
-def _colour(step: int) -> str:
-    place = step / (STEPS - 1) * (len(_INK) - 1)
-    red, green, blue = (round(float(np.interp(place, range(len(_INK)), [ink[part] for ink in _INK]))) for part in range(3))
-    return _hex((red, green, blue))
-
-
 def _hex(rgb: Rgb) -> str:
     return "#" + "".join(f"{part:02x}" for part in rgb)
+
+
+_COLOURS = [_hex(rgb) for rgb in blended(_INK)]

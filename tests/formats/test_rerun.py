@@ -16,8 +16,8 @@ import pytest
 import lidarspec as ls
 from lidarspec.formats import write
 from lidarspec.points.cloud import Mount
+from lidarspec.points.look import look, shade
 from lidarspec.simulation.simulator import simulate
-from lidarspec.view.polar import look, shade
 from tests.cli.running import ran
 from tests.formats.test_formats import scan
 

@@ -7,7 +7,8 @@ import re
 import numpy as np
 import pytest
 
-from lidarspec.view.canvas import ALARM, BLANK, FAINT, INKS, PLAIN, RAMPS, STEPS, Canvas, Cells, sgr, style
+from lidarspec.points.look import STEPS
+from lidarspec.view.canvas import ALARM, BLANK, FAINT, INKS, PLAIN, RAMPS, Canvas, Cells, sgr, style
 from lidarspec.view.screen import changes
 from tests.view.test_polar import DOTS
 

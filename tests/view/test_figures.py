@@ -15,9 +15,9 @@ import pytest
 import lidarspec as ls
 from lidarspec import Scan
 from lidarspec.errors import UsageError
+from lidarspec.points.look import look
 from lidarspec.simulation.simulator import simulate
 from lidarspec.view.feed import Feed
-from lidarspec.view.polar import look
 from tests.cli.running import ran
 from tests.formats.test_formats import scan
 

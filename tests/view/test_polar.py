@@ -11,8 +11,9 @@ import pytest
 
 from lidarspec import PointCloud
 from lidarspec.errors import UnknownName
-from lidarspec.view.canvas import BLANK, RAMPS, STEPS
-from lidarspec.view.polar import Look, look, picture, ramps, ring_step, rounded_up, shade
+from lidarspec.points.look import STEPS, Look, look, ramps, ring_step, rounded_up, shade
+from lidarspec.view.canvas import BLANK, RAMPS
+from lidarspec.view.polar import picture
 
 DOTS = {0x01: (0, 0), 0x02: (1, 0), 0x04: (2, 0), 0x40: (3, 0), 0x08: (0, 1), 0x10: (1, 1), 0x20: (2, 1), 0x80: (3, 1)}
 FLAT = Look("range", 5, 5)
