@@ -1,8 +1,6 @@
-"""Makes the screens of the how-to pages: `view` as SVG, from a simulated sensor and from a capture, and what other verbs print.
+"""Makes the screens of the how-to pages: `view` as SVG, and what other verbs print, all from simulated sensors.
 
-    python docs/screens.py CAPTURES
-
-CAPTURES is the folder with velodyne/vlp16_old_firmware in it; without it the 3D screen shows a simulated sensor as well.
+python docs/screens.py
 """
 
 from __future__ import annotations
@@ -35,7 +33,6 @@ ACROSS, DOWN, MARGIN, DOT = 8, 16, 12, 2.3
 GROUND, PLAIN = "#101218", "#d8dae0"
 #: what the pages call the port of the sensor.
 PORT = "/dev/ttyUSB0"
-CAPTURE = "velodyne/vlp16_old_firmware/vlp-16-test-90deg-1-50-frames.pcap"
 
 
 def screen(source: str, sensor: str, *, columns: int, lines: int, seconds: float, ramp: str = "range", called: str = "") -> Cells:
@@ -106,9 +103,7 @@ def main() -> None:
     HERE.mkdir(exist_ok=True)
     flat = screen("sim:ldrobot-stl27l?errors=0.0001", "ldrobot-stl27l", columns=80, lines=24, seconds=4, called="/dev/ttyUSB0")
     (HERE / "view-2d.svg").write_text(svg(flat), encoding="utf-8")
-    captures = Path(sys.argv[1]) if len(sys.argv) > 1 else None
-    source = str(captures / CAPTURE) if captures else "sim:velodyne-vlp16"
-    tall = screen(source, "velodyne-vlp16", columns=110, lines=36, seconds=2.2, called="corridor.pcap")
+    tall = screen("sim:velodyne-vlp16", "velodyne-vlp16", columns=110, lines=36, seconds=2.2, called=":2368")
     (HERE / "view-3d.svg").write_text(svg(tall), encoding="utf-8")
     for name in ("view.md", "find.md"):
         page = HERE.parent / name
