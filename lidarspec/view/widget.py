@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import math
 import threading
 import time
@@ -71,7 +72,7 @@ class Viewer(Closing):
         """Read until the end, which the cell is told of."""
         try:
             device = open_device(self._source, self._sensor, period=LOOK)
-            reopened = lambda: open_device(self._source, device.sensor)  # noqa: E731
+            reopened = functools.partial(open_device, self._source, device.sensor)
             with Broadcast(self._source, device, reopened=reopened, select=self._select) as broadcast:
                 broadcast.news = self._tell
                 self._broadcast, self._answers = broadcast, Answers(broadcast, control=False)

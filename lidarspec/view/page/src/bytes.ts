@@ -83,6 +83,7 @@ export class Bytes {
 
   #step(by: number): void {
     if (!this.#frame) return;
+    if (this.#frame.number === null) return this.gone("The frames beside this one are not kept any more.");
     const number = this.#frame.number + by;
     this.#hold(this.#frame.why === "damaged" ? { do: "frame", damaged: number } : { do: "frame", number });
   }
@@ -128,7 +129,8 @@ export class Bytes {
   #head({ number, position, explanation, why }: Frame): void {
     const { frame, size, fault, notes } = explanation;
     const time = position === null ? "" : ` · at ${position.toFixed(3)} s`;
-    this.#title.textContent = `${frame || "no frame"} · ${why === "damaged" ? "damaged" : "number"} ${COUNTS.format(number)} · ${COUNTS.format(size)} bytes${time}`;
+    const which = number === null ? "" : ` · ${why === "damaged" ? "damaged" : "number"} ${COUNTS.format(number)}`;
+    this.#title.textContent = `${frame || "no frame"}${which} · ${COUNTS.format(size)} bytes${time}`;
     this.#verdict.textContent = [fault?.reason ?? "valid", ...notes].join(" · ");
     this.#verdict.title = this.#verdict.textContent;
     this.#verdict.className = fault ? "verdict bad" : "verdict good";

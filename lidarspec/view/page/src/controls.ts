@@ -1,10 +1,10 @@
 /** What one does to the picture and to the source: views, colours, playing, recording, saving; with the mouse and with keys. */
 
 import { chosen, made, named } from "./dom";
-import type { Picture, View } from "./picture";
+import { type View, VIEWS } from "./ground";
+import type { Picture } from "./picture";
 import type { Ask, Hello, State } from "./protocol";
 
-const VIEWS: Record<View, string> = { polar: "Polar", top: "Top", side: "Side", orbit: "3D" };
 const SIZES = ["auto", "1", "2", "3", "4", "6", "8"];
 const SPEEDS = [0.1, 0.25, 0.5, 1, 2, 4, 8];
 /** What a key zooms by, and the share of the picture that it moves. */

@@ -7,7 +7,9 @@
 
 import { colour, roundedUp, type Span, type Theme } from "./colours";
 
-export type View = "polar" | "top" | "side" | "orbit";
+/** The views, by what people call them. */
+export const VIEWS = { polar: "Polar", top: "Top", side: "Side", orbit: "3D" };
+export type View = keyof typeof VIEWS;
 export type Place = [number, number];
 
 /** The bounds of what is seen, in metres, and the height of the floor under it. */

@@ -129,8 +129,8 @@ export interface State {
 
 export interface Frame {
   is: "frame";
-  /** among all frames, or among the damaged pieces where it is one */
-  number: number;
+  /** among all frames, or among the damaged pieces where it is one; none where it is not kept any more but in its scan */
+  number: number | null;
   position: number | null;
   hex: string;
   why: "last" | "point" | "damaged" | "number";

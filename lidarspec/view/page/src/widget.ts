@@ -4,7 +4,8 @@
  * What goes to and fro is what page and server say to each other, over the notebook's own connection; the scans are its buffers.
  */
 
-import { Picture, type View } from "./picture";
+import { VIEWS } from "./ground";
+import { Picture } from "./picture";
 import { type Ask, decoded, type Hello, Pace, type State, thinned } from "./protocol";
 
 interface Model {
@@ -18,7 +19,6 @@ type Heard = (said: Said, buffers: DataView[]) => void;
 
 /** The number of widgets that are shown, by their model: the last one that goes closes the source. */
 const SHOWN = new WeakMap<Model, number>();
-const VIEWS: Record<View, string> = { polar: "rings", top: "above", side: "side", orbit: "3D" };
 
 function render({ model, el }: { model: Model; el: HTMLElement }): () => void {
   const head = document.createElement("div");
