@@ -18,7 +18,7 @@ from lidarspec.device.device import Device, open as open_device
 from lidarspec.device.session import Reply
 from lidarspec.errors import CommandError, LidarSpecError, UnknownFrame, UsageError, suggest
 from lidarspec.explaining.assignments import arguments, values
-from lidarspec.explaining.explanation import explain
+from lidarspec.explaining.explanation import explain, replied
 from lidarspec.explaining.pieces import explained, pieces
 from lidarspec.plugins import sensor as named_sensor
 from lidarspec.spec.sensor import Sensor
@@ -92,7 +92,9 @@ def send(
     if as_json:
         emit_json(_told(sensor, reply), output)
     else:
-        emit(replied(sensor, reply, output), output)
+        said, rows = replied(sensor, reply)
+        shown = f"\n{table(['field', 'value', 'meaning'], rows, output)}" if rows else ""
+        emit(f"{sensor.id} {reply.command}: {said}{shown}", output)
 
 
 def _bytes(digits: str) -> bytes:
@@ -166,15 +168,6 @@ def _sent(device: Device, source: str, command: str, assignments: Sequence[str],
 def _refuse_file(device: Device, source: str) -> None:
     if not device.is_live:
         raise suggest(UsageError(f"{source} is a file: nothing can be sent to it"), "lidarspec ports")
-
-
-def replied(sensor: Sensor, reply: Reply, output: str | None = None) -> str:
-    """A reply in words: each field with its value and its meaning; `output`: the file that it is for, which has no width."""
-    if not reply.confirmed or reply.frame is None:
-        return f"{sensor.id} {reply.command}: sent; no answer is documented, so whether it took is not known"
-    values = explain(reply.data, sensor, reply.frame).fields.values()
-    rows = [[value.path, value.raw.hex(" ") if isinstance(value.raw, bytes) else str(value), value.docs] for value in values]
-    return f"{sensor.id} {reply.command}: answered with {reply.frame}\n{table(['field', 'value', 'meaning'], rows, output)}"
 
 
 def _told(sensor: Sensor, reply: Reply) -> dict[str, Any]:

@@ -19,6 +19,7 @@ from typing import Any
 
 import numpy as np
 
+from lidarspec.device.session import Reply
 from lidarspec.display import drawn
 from lidarspec.errors import LidarSpecError, WireError
 from lidarspec.explaining.damage import told
@@ -142,6 +143,15 @@ def explain(data: bytes, sensor: Sensor, frame: str | None = None) -> Explanatio
 def values(data: bytes, sensor: Sensor, frame: str) -> dict[str, Value]:
     """Every value of one frame of this type, by its path with array indices, in the order of the wire."""
     return _Trail(sensor.frames[frame], data).values()
+
+
+def replied(sensor: Sensor, reply: Reply) -> tuple[str, list[tuple[str, str, str]]]:
+    """What became of a command, in a sentence, and of the reply each field with its value and its meaning."""
+    if not reply.confirmed or reply.frame is None:
+        return "sent; no answer is documented, so whether it took is not known", []
+    values = explain(reply.data, sensor, reply.frame).fields.values()
+    rows = [(value.path, value.raw.hex(" ") if isinstance(value.raw, bytes) else str(value), value.docs) for value in values]
+    return f"answered with {reply.frame}", rows
 
 
 def fits(sensor: Sensor, data: bytes, name: str) -> bool:

@@ -129,7 +129,7 @@ def _is_address(text: str) -> bool:
     return True
 
 
-class Viewer:
+class Page:
     """One page that is open.
 
     Args:
@@ -341,7 +341,7 @@ class Viewer:
         self._due["state"] = 0.0
         self._later("record", switch.toggle)
 
-    _words: Mapping[str, Callable[[Viewer, Mapping[str, Any]], None]] = {
+    _words: Mapping[str, Callable[[Page, Mapping[str, Any]], None]] = {
         "next": _next_scan,
         "pause": _pause,
         "play": _play,
@@ -404,7 +404,7 @@ class Site:
         say: Callable[[str], None] = lambda text: None,
     ) -> None:
         self._broadcast, self._say, self._answers = broadcast, say, Answers(broadcast, control=control)
-        self._viewers, self._pages = set[Viewer](), 0
+        self._open, self._pages = set[Page](), 0
         self._socket = _listening(host, port)
         port = self._socket.getsockname()[1]
         token = "" if _is_loopback(host) else secrets.token_urlsafe(24)
@@ -454,26 +454,26 @@ class Site:
         await self._server.serve(sockets=[self._socket])
 
     def _stir(self) -> None:
-        for viewer in self._viewers:
-            viewer.stir()
+        for page in self._open:
+            page.stir()
 
     async def _watched(self, socket: WebSocket) -> None:
         """One page, from its opening until it is closed."""
-        if len(self._viewers) >= PAGES:
+        if len(self._open) >= PAGES:
             await socket.close()
             return
-        viewer, number = Viewer(self._answers, socket), self._pages + 1
-        self._viewers.add(viewer)
+        page, number = Page(self._answers, socket), self._pages + 1
+        self._open.add(page)
         self._pages = number
-        self._say(f"page {number} opened by {socket.client.host if socket.client else 'nobody'}; {len(self._viewers)} open")
+        self._say(f"page {number} opened by {socket.client.host if socket.client else 'nobody'}; {len(self._open)} open")
         became = "closed"
         try:
-            became = await viewer.serve()
+            became = await page.serve()
         except Exception as error:
             became = f"closed: {_bug(error)}"
         finally:
-            self._viewers.discard(viewer)
-            self._say(f"page {number} {became}; {len(self._viewers)} open")
+            self._open.discard(page)
+            self._say(f"page {number} {became}; {len(self._open)} open")
 
     async def _saved(self, request: Request) -> Response:
         """A scan as a file, by the number that a page knows it by."""
