@@ -7,12 +7,12 @@ import re
 import subprocess
 import sys
 import xml.etree.ElementTree as ET
+from typing import Any
 
 import numpy as np
 import pytest
 
 import lidarspec as ls
-from tests.view.browser import chromium
 from tests.view.test_polar import cloud
 
 SCRIPT = "<script>alert('x')</script>"
@@ -141,25 +141,24 @@ def test_nothing_that_draws_is_imported_before_a_notebook_asks() -> None:
     subprocess.run([sys.executable, "-c", script], check=True)
 
 
-def test_pictures_and_tables_are_readable_on_light_and_dark_pages() -> None:
+def test_pictures_and_tables_are_readable_on_light_and_dark_pages(browser: Any) -> None:
     scan = next(ls.sensor("ldrobot-stl27l").scans(ls.sensor("ldrobot-stl27l").example("data")))
     explained = ls.explain(ls.sensor("ldrobot-stl27l").example("data"), ls.sensor("ldrobot-stl27l"))
-    with chromium() as browser:
-        for scheme, colours in (("light", "background:#fff;color:#111"), ("dark", "background:#111;color:#ddd")):
-            page = browser.new_page(color_scheme=scheme)
-            page.set_content(f"<body style='{colours}'>{scan._repr_svg_()}{explained._repr_html_()}")
-            seen = page.evaluate(
-                """() => Object.fromEntries([["ground", "rect"], ["head", "text"], ["dots", "path[class^=dots]"]].map(([name, what]) => {
-                    const style = getComputedStyle(document.querySelector("svg " + what));
-                    return [name, name == "dots" ? style.stroke : style.fill];
-                }))"""
-            )
-            ground, head, dot = (luminance(seen[name]) for name in ("ground", "head", "dots"))
-            assert contrast(ground, head) > 7
-            assert contrast(ground, dot) > 2.5
-            assert page.evaluate("getComputedStyle(document.querySelector('td code')).color") == page.evaluate(
-                "getComputedStyle(document.body).color"
-            )
+    for scheme, colours in (("light", "background:#fff;color:#111"), ("dark", "background:#111;color:#ddd")):
+        page = browser.new_page(color_scheme=scheme)
+        page.set_content(f"<body style='{colours}'>{scan._repr_svg_()}{explained._repr_html_()}")
+        seen = page.evaluate(
+            """() => Object.fromEntries([["ground", "rect"], ["head", "text"], ["dots", "path[class^=dots]"]].map(([name, what]) => {
+                const style = getComputedStyle(document.querySelector("svg " + what));
+                return [name, name == "dots" ? style.stroke : style.fill];
+            }))"""
+        )
+        ground, head, dot = (luminance(seen[name]) for name in ("ground", "head", "dots"))
+        assert contrast(ground, head) > 7
+        assert contrast(ground, dot) > 2.5
+        assert page.evaluate("getComputedStyle(document.querySelector('td code')).color") == page.evaluate(
+            "getComputedStyle(document.body).color"
+        )
 
 
 def luminance(colour: str) -> float:

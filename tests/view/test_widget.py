@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import base64
+import contextlib
 import queue
 import time
 from collections.abc import Callable, Iterator
@@ -14,7 +15,6 @@ import pytest
 from lidarspec.errors import UsageError
 from lidarspec.view import widget
 from tests.cli.running import ran
-from tests.view.browser import chromium
 
 pytest.importorskip("anywidget", reason="anywidget is not installed")
 pytestmark = pytest.mark.skipif(not widget.DRAWING.is_file(), reason="npm has not built the page: make page")
@@ -86,9 +86,9 @@ class Cell:
 
 
 @pytest.fixture
-def page() -> Iterator[Any]:
-    with chromium() as browser:
-        yield browser.new_page(viewport={"width": 640, "height": 480})
+def page(browser: Any) -> Iterator[Any]:
+    with contextlib.closing(browser.new_page(viewport={"width": 640, "height": 480})) as page:
+        yield page
 
 
 def test_a_cell_shows_one_scan_after_another_and_closes_its_source(page: Any) -> None:

@@ -198,7 +198,7 @@ class Page {
     notice.textContent = text;
     notice.hidden = !text;
     notice.className = this.#open && this.#ended ? "" : "bad";
-    if (!this.#open) [named("status").textContent, named("status").className] = ["disconnected", "badge bad"];
+    if (!this.#open) [named("status").textContent, named("status").className] = ["no server", "badge bad"];
   }
 
   async #save(as: string): Promise<void> {
