@@ -1,10 +1,10 @@
 """Makes the pictures of the front page and the README from simulated sensors alone: the same bytes each time.
 
-    python docs/pictures.py [--into FOLDER]    # a terminal, a point cloud, a packet diagram: SVG; `make docs` runs it
-    python docs/pictures.py --page             # the page in the browser, as PNG; takes playwright, Chromium and what `make page` makes
+    python docs/pictures.py [--into FOLDER]           # a terminal, a point cloud, a packet diagram: SVG
+    python docs/pictures.py --page [--into FOLDER]    # the page in the browser, as PNG; takes Chromium and what `make page` makes
 
-A PNG has other bytes wherever fonts are others, so the page is made by hand when it has changed. tests/docs/test_pictures.py holds that the
-rest is up to date.
+`make docs` runs both. A PNG has other bytes wherever fonts are others: that of the page goes into the site alone, and for the README it is
+made by hand when the page has changed. tests/docs/test_pictures.py holds that the rest is up to date.
 """
 
 from __future__ import annotations
@@ -29,6 +29,7 @@ from lidarspec.view.live import FIGURES, Window
 from lidarspec.view.svg import svg
 
 HERE = Path(__file__).parent / "pictures"
+BUNDLE, CHROMIUM = Path(ls.__file__).parent / "view" / "page" / "dist" / "page.js", shutil.which("chromium")
 #: pixels of the page, light or dark, milliseconds that it is let run, and colours of the PNG.
 SIZE, SCHEME, SETTLED, COLOURS = (1280, 800), "dark", 9_000, 256
 #: of Chromium, which draws in software.
@@ -69,11 +70,14 @@ def page(folder: Path, target: Path) -> None:
     from PIL import Image
     from playwright.sync_api import sync_playwright
 
+    if missing := [what for what, path in (("Chromium", CHROMIUM), ("the bundle of `make page`", BUNDLE.is_file())) if not path]:
+        print(f"the picture of the page stays as it was: {' and '.join(missing)} not found", file=sys.stderr)
+        return
     file = simulated("robosense-m1", folder / "room.lsr", "15s")
     command = [sys.executable, "-m", "lidarspec", "view", file.name, "-s", "robosense-m1", "--web", "-q"]
     with subprocess.Popen(command, cwd=folder, stdout=subprocess.PIPE, text=True) as serving, sync_playwright() as running:
         assert serving.stdout is not None
-        browser = running.chromium.launch(executable_path=shutil.which("chromium"), args=FLAGS)
+        browser = running.chromium.launch(executable_path=CHROMIUM, args=FLAGS)
         try:
             seen = browser.new_page(viewport={"width": SIZE[0], "height": SIZE[1]}, color_scheme=SCHEME)
             seen.goto(serving.stdout.readline().strip())
