@@ -154,6 +154,12 @@ def replied(sensor: Sensor, reply: Reply) -> tuple[str, list[tuple[str, str, str
     return f"answered with {reply.frame}", rows
 
 
+def reply_text(sensor: Sensor, reply: Reply) -> str:
+    """What became of a command, and of the reply each field with its value, a line each."""
+    said, rows = replied(sensor, reply)
+    return "\n".join([said, *(f"{path}: {value}" for path, value, _ in rows)])
+
+
 def fits(sensor: Sensor, data: bytes, name: str) -> bool:
     """Whether bytes are one valid frame of a type."""
     try:

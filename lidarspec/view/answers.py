@@ -14,7 +14,7 @@ from lidarspec._version import __version__
 from lidarspec.errors import LidarSpecError, UsageError
 from lidarspec.explaining.assignments import arguments
 from lidarspec.explaining.contents import duration
-from lidarspec.explaining.explanation import Explanation, explain, replied
+from lidarspec.explaining.explanation import Explanation, explain, reply_text
 from lidarspec.explaining.wording import asked
 from lidarspec.exports.reference import effect
 from lidarspec.points.look import is_flat
@@ -141,9 +141,7 @@ class Answers:
         device = self.broadcast.device
         found = arguments(device.sensor, name, [f"{argument}={text}" for argument, text in words.items()])
         reply = device.send(name, **found)
-        said, rows = replied(device.sensor, reply)
-        text = "\n".join([said, *(f"{path}: {value}" for path, value, _ in rows)])
-        return {"is": "replied", "command": name, "text": text, "hex": reply.data.hex()}
+        return {"is": "replied", "command": name, "text": reply_text(device.sensor, reply), "hex": reply.data.hex()}
 
     def _explained(self, frame: str, data: bytes) -> Explanation:
         return explain(data, self.broadcast.device.sensor, frame)

@@ -21,10 +21,10 @@ from rclpy.parameter import Parameter as RosParameter
 from std_msgs.msg import Header
 from std_srvs.srv import Trigger
 
-from lidarspec.cli.build import replied
 from lidarspec.device.device import Device
 from lidarspec.errors import LidarSpecError, UsageError, did_you_mean, suggestion
 from lidarspec.explaining.assignments import arguments
+from lidarspec.explaining.explanation import reply_text
 from lidarspec.view.feed import LOOK, Feed, Reading
 from lidarspec_ros2.diagnostics import LOST, status
 from lidarspec_ros2.packets import PacketLog
@@ -277,7 +277,7 @@ class LidarNode(LifecycleNode):
         except LidarSpecError as error:
             response.success, response.message = False, str(error)
         else:
-            response.success, response.message = True, replied(device.sensor, reply)
+            response.success, response.message = True, reply_text(device.sensor, reply)
         return response
 
 
