@@ -147,6 +147,7 @@ class Batch:
         at: (n,) int64 arrival times, ns since 1970; -1 where nobody knows.
         senders: (n,) indices into `names`.
         names: address and port of each sender.
+        gap: whether datagrams before them were passed over.
     """
 
     buffer: NDArray[np.uint8]
@@ -155,6 +156,7 @@ class Batch:
     at: NDArray[np.int64]
     senders: Indices
     names: tuple[Sender, ...]
+    gap: bool = False
 
     def __len__(self) -> int:
         return len(self.starts)
@@ -230,10 +232,12 @@ class CaptureBatches(CaptureReader):
                     continue
                 starts = starts if len(starts) > 1 else np.array([self._source.at])
                 found = _Records(self, self._source, form, starts, known)
-                ended = found.read()
+                ended, place = found.read(), self._source.place
                 if len(batch := found.batch()):
                     self.stats.datagrams += len(batch)
                     yield batch
+                if self._source.place != place:
+                    continue  # somebody has gone on to another time
                 if isinstance(ended, Damaged):
                     self._pass_over(form)
                 elif ended is not None:

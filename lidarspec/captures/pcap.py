@@ -30,6 +30,7 @@ from lidarspec.captures.records import (
     packet_record,
     records,
     resume,
+    sought,
 )
 from lidarspec.errors import SourceError, UsageError
 from lidarspec.transports.protocol import Closing
@@ -143,6 +144,13 @@ class CaptureReader(Closing):
             self._datagrams = self._walk()
         return self._datagrams
 
+    def skip(self, at: int) -> bool:
+        """Go on close before the first datagram that came at a time, ns since 1970, or later, where a file can be sought: whether it did.
+
+        What is passed over is not counted, and datagrams whose fragments stand on both sides are left out.
+        """
+        return self._form is not None and sought(self._source, self._form, at)
+
     def close(self) -> None:
         """Closes the file, if it was given as a path."""
         if self._owned is not None:
@@ -150,7 +158,7 @@ class CaptureReader(Closing):
 
     def _walk(self) -> Iterator[Datagram]:
         with self._to_the_end():
-            form = records(self._source)
+            form = self._form = records(self._source)
             while self._source.begin_record():
                 try:
                     datagram = self.datagram(form.read())

@@ -13,6 +13,7 @@ Source: the IETF drafts "PCAP Capture File Format" (draft-ietf-opsawg-pcap) and 
 
 from __future__ import annotations
 
+import copy
 import functools
 import io
 import os
@@ -58,6 +59,8 @@ MOST_KEPT = 2
 LARGEST_BLOCK = 1 << 20  # a packet with its options; longer blocks are passed over unread
 #: places that are looked at together for the next record, and bytes behind each that may be needed: a packet, its options, a head.
 _STEP, _REACH = 1 << 16, LARGEST_PACKET + (1 << 12)
+#: bytes before a time that is sought which are read all the same.
+NEAR = 1 << 21
 #: seconds between two packets in a row, and between two of a file, at most, where a record may begin.
 _DAY, _YEAR = 86_400, 31_536_000
 _MOST_INTERFACES = 1024
@@ -130,6 +133,22 @@ class Source:
     @property
     def place(self) -> int:
         return self._passed + self.at
+
+    def from_place(self, place: int) -> Source:
+        """The same file's bytes from a place on, in a small buffer. Its position is then not this one's any more: see `go`."""
+        return _source_at(self._file, SMALLEST, place)
+
+    def go(self, place: int) -> None:
+        """Go on from a place of a file that can be sought."""
+        self._file.seek(place)
+        self._lent = None  # what is held elsewhere is not written to: the buffer is another
+        self._adopt(np.empty_like(self.storage), 0)
+        self.record = self._passed = place
+
+    @property
+    def size(self) -> int | None:
+        """Bytes of the file; None where it cannot be sought. The position is then not this one's any more: see `go`."""
+        return self._file.seek(0, os.SEEK_END) if self._file.seekable() else None
 
     def ahead(self, size: int) -> memoryview:
         """The next `size` bytes, which stay there; fewer at the end."""
@@ -331,6 +350,12 @@ class PcapRecords:
         self._lengths = struct.Struct(self.order + "II")
         self._began: int | None = None
 
+    def over(self, source: Source) -> PcapRecords:
+        """The same form of other bytes of the file."""
+        other = copy.copy(self)
+        other._source = source
+        return other
+
     def length(self, data: memoryview | bytes, at: int) -> int:
         """The length of the record that begins there, of which 16 bytes are there; 0 where it is doubtful, or cannot be."""
         captured, original = self._lengths.unpack_from(data, at + 8)
@@ -419,6 +444,12 @@ class PcapngBlocks:
         self.order = "<"
         self._interfaces: list[Interface] = []
         self._knows_all = True  # interfaces of the section so far
+
+    def over(self, source: Source) -> PcapngBlocks:
+        """The same form, with the interfaces that are known, of other bytes of the file."""
+        other = copy.copy(self)
+        other._source, other._interfaces = source, list(self._interfaces)
+        return other
 
     def length(self, data: memoryview | bytes, at: int) -> int:
         """The length of the block that begins there; 0 where it can only be read by itself, since it says something that cannot be,
@@ -518,6 +549,48 @@ def resume(source: Source, form: Form) -> bool:
         if found is not None:
             return True
     return False
+
+
+def sought(source: Source, form: Form, at: int) -> bool:
+    """Goes on close before the first packet that was captured at a time, ns since 1970, or later: `NEAR` bytes away at most.
+
+    Packets are taken to stand in the order of their times. Further sections of a pcapng file are taken to have the interfaces of this
+    one: where a section begins, or times are years away, since they are counted otherwise there, nothing is passed over.
+
+    Returns:
+        False where that is behind here, and for a pipe or a packed file: it then goes on where it was.
+    """
+    here = low = source.place
+    high = source.size
+    if high is None:
+        return False
+    first = _captured(source.from_place(here), form, high)
+    while first is not None and high - low > NEAR:
+        middle = (low + high) // 2
+        found = _captured(source.from_place(middle), form, high)
+        if found is None or found[0] >= at or abs(found[0] - first[0]) > _YEAR * _SECOND:
+            high = middle
+        else:
+            low = found[1]
+    source.go(low)
+    return low > here
+
+
+def _captured(source: Source, form: Form, stop: int) -> tuple[int, int] | None:
+    """Time and place of the first packet behind here, of those whose time is known; None where there is none up to a place."""
+    form, section = form.over(source), form.sections
+    while resume(source, form) and source.begin_record() and source.record < stop:
+        try:
+            packet = form.read()
+        except Damaged:
+            continue
+        except Truncated:
+            break
+        if form.sections != section:
+            break
+        if isinstance(packet, CapturedPacket) and packet.at:
+            return packet.at, source.record
+    return None
 
 
 def _can_be(length: int) -> bool:

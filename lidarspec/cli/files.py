@@ -281,8 +281,8 @@ def _no_data(device: Device, target: str) -> Exception:
 def info(file: str, as_json: bool, output: str | None) -> None:
     """What is in a file: kind, times, senders, sensor, rates, loss, and how it is read.
 
-    FILE is anything that is read: a recording, a capture, a robotics log, bytes. Of a long one the beginning is looked at, and of a
-    recording the end.
+    FILE is anything that is read: a recording, a capture, a robotics log, bytes. Of a long one the beginning is looked at, and when it
+    ends.
     """
     held = contents(file)
     if as_json:

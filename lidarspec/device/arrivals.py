@@ -286,6 +286,8 @@ class FileInput(Input):
         """Every incoming frame, in batches."""
         if isinstance(self._transport, CaptureTransport):
             for datagrams in self._transport.batches():
+                if datagrams.gap:
+                    yield Arrival(self.decoder.rest(), interrupted=True)
                 if self.decoder.stream:
                     yield from map(Arrival, _streamed(self.decoder, datagrams, self._together or BATCH_BYTES))
                     continue

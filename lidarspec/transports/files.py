@@ -10,6 +10,7 @@ import contextlib
 import json
 import sys
 from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
 from shlex import quote
 from typing import BinaryIO
@@ -218,14 +219,16 @@ class CaptureTransport(FileTransport):
         super().__init__(path, file)
         self._origin = None if sender is None else origin(sender)
         self.reader: CaptureBatches | None = None
+        self._reading: CaptureReader | None = None
+        self._has_skipped = False
 
     def chunks(self) -> Iterator[Chunk]:
-        reader = CaptureReader(self.file)
+        reader = self._reading = CaptureReader(self.file)
         for datagram in reader:
             if self._origin is not None and datagram.source not in self._origin:
                 self.foreign += 1
                 continue
-            yield Chunk(datagram.data, datagram.at, datagram.source, datagram.destination)
+            yield Chunk(datagram.data, datagram.at, datagram.source, datagram.destination, self._gap())
         self._warn(reader.stats)
 
     def batches(self) -> Iterator[Batch]:
@@ -234,13 +237,23 @@ class CaptureTransport(FileTransport):
         Raises:
             SourceError: where the file cannot be read.
         """
-        reader = self.reader = self.reader or self.in_batches(self.file)
+        reader = self._reading = self.reader = self.reader or self.in_batches(self.file)
         for batch in reader.batches():
             mine = batch if self._origin is None else batch.of(self._origin)
             self.foreign += len(batch) - len(mine)
             if len(mine):
-                yield mine
+                yield replace(mine, gap=True) if self._gap() else mine
         self._warn(reader.stats)
+
+    def skip(self, at: int) -> bool:
+        with system_errors(self._path):
+            self._has_skipped = self._reading is not None and self._reading.skip(at)
+        return self._has_skipped
+
+    def _gap(self) -> bool:
+        """Whether something was passed over, once."""
+        gap, self._has_skipped = self._has_skipped, False
+        return gap
 
 
 class StreamCaptureTransport(CaptureTransport):
@@ -250,8 +263,8 @@ class StreamCaptureTransport(CaptureTransport):
     in_batches = StreamBatches
 
     def chunks(self) -> Iterator[Chunk]:
-        reader = StreamReader(self.file)
-        yield from (Chunk(packet.data, packet.at or None) for packet in reader)
+        reader = self._reading = StreamReader(self.file)
+        yield from (Chunk(packet.data, packet.at or None, gap=self._gap()) for packet in reader)
         self._warn(reader.stats)
 
 

@@ -146,7 +146,7 @@ def test_beams_and_frame_go_with_the_scan(recordings: dict[str, Path]) -> None:
 @pytest.mark.parametrize(
     ("selection", "message"),
     [
-        (Selection(times=(100.0, None)), r"has (400|401) scans, from 0 s to 40\.000 s, and nothing of that is asked for"),
+        (Selection(times=(100.0, None)), r"has scans from 0 s to 40\.000 s, and nothing of that is asked for"),
         (Selection(scans=(1000, None)), r"has (400|401) scans, from 0 to (399|400), and none of them is asked for"),
     ],
 )

@@ -1,0 +1,149 @@
+"""A time in a capture is found without reading what lies before it."""
+
+from __future__ import annotations
+
+import contextlib
+import gzip
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import lidarspec as ls
+from lidarspec.captures.ip import ETHERNET
+from lidarspec.captures.pcap import NOBODY, Datagram, StreamReader, datagram_frame
+from lidarspec.captures.records import NEAR, WRITINGS
+from lidarspec.explaining.contents import duration
+from lidarspec.scans.selection import Selection
+from lidarspec.simulation.simulator import simulate
+from lidarspec.transports.files import CaptureTransport, open_file
+from tests import made_captures as made
+
+START, STEP, NUMBER = 1_700_000_000_000_000_000, 10_000_000, 6000
+#: of a capture of a byte stream.
+USER0 = 147
+
+
+def written(path: Path, *, first: int = 0, number: int = NUMBER, link: int = ETHERNET, head: bool = True) -> Path:
+    """A minute of datagrams of 1000 bytes, or of pieces of a byte stream."""
+    writing = WRITINGS[path.suffix]
+    with path.open("ab") as file:
+        file.write(writing.head(link) if head else b"")
+        for count in range(first, first + number):
+            data = count.to_bytes(4, "big") * 250
+            packet = datagram_frame(Datagram(data, 0, ("192.168.1.201", 2368), NOBODY)) if link == ETHERNET else data
+            file.write(writing.record(packet, START + count * STEP))
+    return path
+
+
+def opened(path: Path) -> CaptureTransport:
+    found = open_file(str(path))
+    assert isinstance(found, CaptureTransport)
+    return found
+
+
+def rest(source: CaptureTransport, to: int, *, in_batches: bool) -> list[int]:
+    """When what follows the first few packets came, once all up to a time was passed over."""
+    if not in_batches:
+        chunks = source.chunks()
+        assert not next(chunks).gap
+        assert source.skip(to)
+        left = list(chunks)
+        assert [chunk.gap for chunk in left[:3]] == [True, False, False]
+        assert all(int.from_bytes(chunk.data[:4], "big") * STEP == (chunk.at or 0) - START for chunk in left)
+        return [chunk.at or 0 for chunk in left]
+    batches = source.batches()
+    assert not next(batches).gap
+    assert source.skip(to)
+    parts = list(batches)
+    assert [batch.gap for batch in parts] == [True, *[False] * (len(parts) - 1)]
+    assert all(batch.data(0)[:4] == ((int(batch.at[0]) - START) // STEP).to_bytes(4, "big") for batch in parts)
+    return np.concatenate([batch.at for batch in parts]).tolist()
+
+
+@pytest.mark.parametrize("in_batches", [False, True])
+@pytest.mark.parametrize("name", ["drive.pcap", "drive.pcapng"])
+@pytest.mark.parametrize("link", [ETHERNET, USER0])
+@pytest.mark.parametrize("number", [4500, 10 * NUMBER])
+def test_what_follows_a_time_is_all_there_and_what_lies_before_is_not_read(
+    tmp_path: Path, name: str, link: int, number: int, in_batches: bool
+) -> None:
+    with contextlib.closing(opened(written(tmp_path / name, link=link))) as source:
+        times = rest(source, START + number * STEP, in_batches=in_batches)
+        assert not source.warnings
+        assert not source.skip(START)
+    assert times[0] <= START + min(number, NUMBER - 1) * STEP
+    assert times == list(range(times[0], START + NUMBER * STEP, STEP))
+    assert len(times) * 1000 < max(NUMBER - number, 0) * 1000 + NEAR + (1 << 16)
+
+
+def test_damage_on_the_way_is_no_hindrance(tmp_path: Path) -> None:
+    path = written(tmp_path / "drive.pcap")
+    data = bytearray(path.read_bytes())
+    for place in range(len(data) // 4, len(data) * 3 // 4, 5000):
+        data[place : place + 8] = bytes(byte ^ 0xFF for byte in data[place : place + 8])
+    path.write_bytes(data)
+    with contextlib.closing(opened(path)) as source:
+        times = rest(source, START + 5500 * STEP, in_batches=True)
+    assert START + 3000 * STEP < times[0] <= START + 5500 * STEP
+    assert times[-1] == START + (NUMBER - 1) * STEP
+
+
+def test_nothing_is_passed_over_where_times_are_counted_otherwise(tmp_path: Path) -> None:
+    """In a second section, whose interface has another clock than the first."""
+    path = written(tmp_path / "drive.pcapng", number=NUMBER * 2 // 3)
+    ticks = made.interface(options=made.option(9, bytes([6])))
+    packet = datagram_frame(Datagram(bytes(1000), 0, ("192.168.1.201", 2368), NOBODY))
+    end = START + NUMBER * STEP
+    path.write_bytes(path.read_bytes() + made.section() + ticks + made.packet(packet, ticks=end // 1000) * 3000)
+    with contextlib.closing(opened(path)) as source:
+        batches = source.batches()
+        next(batches)
+        assert source.skip(end)
+        times = np.concatenate([batch.at for batch in batches])
+    assert times[0] < START + NUMBER * 2 // 3 * STEP
+    assert np.count_nonzero(times == end) == 3000
+
+
+def test_a_packed_capture_is_read_from_its_beginning(tmp_path: Path) -> None:
+    path = tmp_path / "drive.pcap.gz"
+    path.write_bytes(gzip.compress(written(tmp_path / "drive.pcap").read_bytes(), 1))
+    with contextlib.closing(opened(path)) as source:
+        batches = source.batches()
+        number = len(next(batches))
+        assert not source.skip(START + 4000 * STEP)
+        assert number + sum(map(len, batches)) == NUMBER
+
+
+def test_the_duration_of_a_long_capture_is_known_without_reading_it(tmp_path: Path) -> None:
+    path = written(tmp_path / "long.pcap", number=12 * NUMBER)
+    assert duration(path) == pytest.approx((12 * NUMBER - 1) * STEP * 1e-9)
+
+
+def test_a_slice_of_a_capture_has_the_scans_that_reading_all_of_it_gives(tmp_path: Path) -> None:
+    sensor, path = ls.sensor("velodyne-vlp16"), tmp_path / "drive.pcap"
+    with path.open("wb") as file:
+        file.write(WRITINGS[".pcap"].head(ETHERNET))
+        for number, data in enumerate(simulate(sensor, 754 * 40)):
+            frame = datagram_frame(Datagram(data, 0, ("192.168.1.201", 2368), NOBODY))
+            file.write(WRITINGS[".pcap"].record(frame, START + number * 1_000_000_000 // 754))
+    packed = tmp_path / "drive.pcap.gz"  # of which nothing can be passed over
+    packed.write_bytes(gzip.compress(path.read_bytes(), 1))
+    found, read = [], []
+    for source in (path, packed):
+        with ls.open(source, sensor) as device:
+            scans = device.scans(select=Selection(times=(30.0, 31.0)))
+            found.append([(scan.host_ns, scan.complete, len(scan), float(scan.points.range.sum())) for scan in scans])
+            read.append(device.stats.bytes_in)
+    assert len(found[0]) >= 9
+    assert found[0] == found[1]
+    assert read[0] < read[1] / 2
+
+
+def test_a_stream_reader_goes_on_as_well(tmp_path: Path) -> None:
+    with written(tmp_path / "stream.pcap", link=USER0).open("rb") as file:
+        reader = StreamReader(file)
+        assert not reader.skip(START)  # nothing was read
+        next(iter(reader))
+        assert reader.skip(START + 5000 * STEP)
+        assert next(iter(reader)).at > START + 3000 * STEP
