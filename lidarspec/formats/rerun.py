@@ -73,7 +73,8 @@ class Log:
         Raises:
             OSError: where it cannot be written.
         """
-        if not self._home:
+        is_first = not self._home
+        if is_first:
             self._begin(scan)
         self._set_times(scan)
         names = ("x", "y", "z", "intensity", "ring", "return_index", "range", "time", *scan.points.extra)
@@ -86,6 +87,8 @@ class Log:
         if self._waiting >= HELD:
             self.flush()
         self.figures({"points": len(scan), "valid": int(scan.points.valid.sum()), "speed_hz": scan.rate_hz})
+        if is_first:  # it names what there has to be by then: a time that runs
+            self.stream.send_blueprint(self._layout())
 
     def figures(self, figures: Mapping[str, float | None]) -> None:
         """Log figures by name at the time of the last scan; those that are not known are left out."""
@@ -114,7 +117,6 @@ class Log:
         units = {f"unit of {name}": unit for name, unit in scan.points.units.items() if unit}
         text = "\n".join(f"{name}: {value}" for name, value in {**facts, **units}.items())
         self.stream.log(f"{self._home}/about", rerun.TextDocument(text), static=True)
-        self.stream.send_blueprint(self._layout())
 
     def _set_times(self, scan: Scan) -> None:
         self.stream.set_time(NUMBER, sequence=self._number)
