@@ -18,7 +18,8 @@ from numpy.typing import NDArray
 
 from lidarspec.captures.ip import Headers
 from lidarspec.captures.pcap import CaptureReader, Datagram, StreamReader
-from lidarspec.captures.records import LARGEST_BLOCK, Damaged, Form, Passed, Source, Times, Truncated, records
+from lidarspec.captures.records import LARGEST_BLOCK, Damaged, Form, Passed, Times, records
+from lidarspec.captures.source import Source, Truncated
 from lidarspec.framing.decoder import Decoder
 from lidarspec.framing.results import Frames, Indices
 from lidarspec.transports.protocol import Origin, Sender

@@ -19,19 +19,17 @@ from typing import BinaryIO
 from lidarspec.captures.containers import opened
 from lidarspec.captures.ip import LARGEST_PAYLOAD, Headers, Reassembly, Refused, address, headers, ip_packet, udp, udp_frame
 from lidarspec.captures.records import (
-    SMALLEST,
     CapturedPacket,
     Damaged,
     Form,
     Passed,
-    Source,
-    Truncated,
     is_capture,
     packet_record,
     records,
     resume,
     sought,
 )
+from lidarspec.captures.source import SMALLEST, Source, Truncated
 from lidarspec.errors import SourceError, UsageError
 from lidarspec.transports.protocol import Closing
 

@@ -1,11 +1,8 @@
 """The records of pcap and pcapng files: all that is known of the two formats, for one record and for many alike.
 
-Hostile input: `Source` reads in bounded steps, so that a length in the file never becomes an allocation, and each turn of
-the walkers either advances or ends the reading. Damaged input: a doubtful length is believed unless other records begin within
-what it claims, and behind a record that cannot be read `resume` goes to the next place where records follow each other.
-
-`Source` reads into buffers that can be lent out: one is not written to again while an
-array that was `lent`, or anything made from it without a copy, is alive. So whoever needs the bytes for longer just keeps them.
+Hostile input: bytes come in bounded steps (`source`), and each turn of the walkers either advances or ends the reading. Damaged input:
+a doubtful length is believed unless other records begin within what it claims, and behind a record that cannot be read `resume` goes to
+the next place where records follow each other.
 
 Source: the IETF drafts "PCAP Capture File Format" (draft-ietf-opsawg-pcap) and "PCAP Now Generic Capture File Format"
 (draft-ietf-opsawg-pcapng).
@@ -14,22 +11,18 @@ Source: the IETF drafts "PCAP Capture File Format" (draft-ietf-opsawg-pcap) and 
 from __future__ import annotations
 
 import copy
-import functools
-import io
-import os
 import re
-import stat
 import struct
-import weakref
 from collections.abc import Callable
 from dataclasses import dataclass
 from enum import Enum
-from typing import Any, BinaryIO, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from lidarspec.errors import SourceError, UsageError
+from lidarspec.captures.source import Source, Truncated
+from lidarspec.errors import UsageError
 
 LARGEST_PACKET = 1 << 18  # what libpcap and Wireshark allow on the link types read here
 NANOSECOND_MAGIC = b"\x4d\x3c\xb2\xa1"
@@ -50,12 +43,6 @@ _PACKETS = {_OBSOLETE_PACKET, _SIMPLE_PACKET, ENHANCED_PACKET}
 _LAST_KIND = 10  # that the draft gives a number, but for the section's
 _TIME_RESOLUTION, _TIME_OFFSET = 9, 14  # options of an interface
 
-#: bytes of a buffer at first, and most of those that are passed over at once.
-SMALLEST = 1 << 16
-#: bytes behind what was read that may be looked at, whatever they are, so that records can be compared in words.
-SLACK = 256
-#: buffers kept for use again.
-MOST_KEPT = 2
 LARGEST_BLOCK = 1 << 20  # a packet with its options; longer blocks are passed over unread
 #: places that are looked at together for the next record, and bytes behind each that may be needed: a packet, its options, a head.
 _STEP, _REACH = 1 << 16, LARGEST_PACKET + (1 << 12)
@@ -66,10 +53,6 @@ _DAY, _YEAR = 86_400, 31_536_000
 _MOST_INTERFACES = 1024
 _SECOND = 1_000_000_000
 _FURTHEST = 4_000_000_000  # seconds; times further on are read one by one, so that none overflows
-
-
-class Truncated(Exception):
-    """The input ended within a record."""
 
 
 class Damaged(Exception):
@@ -97,178 +80,6 @@ class Passed(Enum):
 
     NO_PACKET = 0
     MALFORMED = 1
-
-
-class Source:
-    """Bytes of a file or pipe, in buffers that can be lent out: what is held follows what is there, never a length that it claims.
-
-    Args:
-        largest: bytes that a buffer grows to where the file has so many; a record that does not fit makes it longer.
-
-    Attributes:
-        storage: the buffer in use, `SLACK` bytes longer than it is ever filled.
-        at: where in `storage` the next byte stands.
-        record: file offset of the record that was begun last.
-        place: file offset of the next byte.
-    """
-
-    def __init__(self, file: BinaryIO, *, largest: int = SMALLEST) -> None:
-        self._file, self._into, self._largest = file, _into(file), largest
-        self._kept: list[tuple[NDArray[np.uint8], weakref.ref[Any]]] = []
-        self._lent: weakref.ref[Any] | None = None
-        self._data = memoryview(b"")
-        self._passed = 0  # bytes of the file before `storage`
-        self.record = self.at = 0
-        self._adopt(np.empty(_first_size(file, largest) + SLACK, np.uint8), 0)
-
-    def __reduce__(self) -> tuple[Any, ...]:
-        """What is pickled goes on at the same place of the file."""
-        return _source_at, (self._file, self._largest, self.place)
-
-    @property
-    def stop(self) -> int:
-        """How much of `storage` is filled."""
-        return len(self._data)
-
-    @property
-    def place(self) -> int:
-        return self._passed + self.at
-
-    def from_place(self, place: int) -> Source:
-        """The same file's bytes from a place on, in a small buffer. Its position is then not this one's any more: see `go`."""
-        return _source_at(self._file, SMALLEST, place)
-
-    def go(self, place: int) -> None:
-        """Go on from a place of a file that can be sought."""
-        self._file.seek(place)
-        self._lent = None  # what is held elsewhere is not written to: the buffer is another
-        self._adopt(np.empty_like(self.storage), 0)
-        self.record = self._passed = place
-
-    @property
-    def size(self) -> int | None:
-        """Bytes of the file; None where it cannot be sought. The position is then not this one's any more: see `go`."""
-        return self._file.seek(0, os.SEEK_END) if self._file.seekable() else None
-
-    def ahead(self, size: int) -> memoryview:
-        """The next `size` bytes, which stay there; fewer at the end."""
-        self._has(size)
-        return self._data[self.at : self.at + size]
-
-    def begin_record(self) -> bool:
-        """Whether a record begins here, rather than the end of the input."""
-        self.record = self.place
-        return self._has(1)
-
-    def take(self, size: int) -> bytes:
-        """The next `size` bytes; the caller sees to it that `size` is bounded.
-
-        Raises:
-            Truncated: fewer are left.
-        """
-        if not self._has(size):
-            raise Truncated
-        self.at += size
-        return bytes(self._data[self.at - size : self.at])
-
-    def skip(self, size: int) -> None:
-        """Passes over `size` bytes, however many.
-
-        Raises:
-            Truncated: fewer are left.
-        """
-        while size:
-            step = min(size, SMALLEST)
-            if not self._has(step):
-                raise Truncated
-            self.at += step
-            size -= step
-
-    def more(self) -> bool:
-        """Whether bytes came after those that are there; they may all move."""
-        return self._has(len(self._data) - self.at + 1)
-
-    def lent(self) -> NDArray[np.uint8]:
-        """The bytes in the buffer, (n,), read-only: not written to again while this array or a view of it is alive."""
-        array = np.frombuffer(self._view[: len(self._data)], np.uint8)
-        array.flags.writeable = False
-        self._lent = weakref.ref(array)
-        return array
-
-    def _has(self, size: int) -> bool:
-        have = len(self._data) - self.at
-        if have >= size:
-            return True
-        self._turn(have)
-        while have < size:
-            if have == len(self.storage) - SLACK:
-                self._turn(have)
-            try:
-                count = self._into(self._view[have : len(self.storage) - SLACK])
-            except OSError as error:
-                raise SourceError(f"cannot read the capture: {error}") from error
-            if not count:
-                break
-            have += count
-            self._data = self._view[:have]
-        return have >= size
-
-    def _turn(self, have: int) -> None:
-        """Puts what is not read yet to the front of a buffer that nobody holds."""
-        size = len(self.storage) - SLACK
-        tail, at = self.storage[self.at : self.at + have], self.at
-        if len(self._data) == size:
-            size = 2 * size if have == size else max(size, min(2 * size, self._largest))
-        if self._lent is not None:
-            self._kept = [*self._kept[1 - MOST_KEPT :], (self.storage, self._lent)]
-        spare = self._spare(size)
-        spare[:have] = tail
-        self._passed += at
-        self._adopt(spare, have)
-
-    def _spare(self, size: int) -> NDArray[np.uint8]:
-        if self._lent is None and len(self.storage) - SLACK == size:
-            return self.storage
-        self._lent = None
-        for index, (storage, lent) in enumerate(self._kept):
-            if lent() is None and len(storage) - SLACK == size:
-                del self._kept[index]
-                return storage
-        return np.empty(size + SLACK, np.uint8)
-
-    def _adopt(self, storage: NDArray[np.uint8], have: int) -> None:
-        self.storage = storage
-        self._view = storage.data
-        self._data, self.at = self._view[:have], 0
-
-
-def _source_at(file: BinaryIO, largest: int, place: int) -> Source:
-    """The bytes of a file that can be sought, from a place on."""
-    file.seek(place)
-    source = Source(file, largest=largest)
-    source.record = source._passed = place
-    return source
-
-
-def _into(file: BinaryIO) -> Callable[[memoryview], int | None]:
-    """What fills a buffer with the bytes that have arrived: of a pipe, others would wait for as many as there is room for."""
-    if isinstance(file, io.BufferedIOBase):
-        return file.readinto1
-    return file.readinto if isinstance(file, io.RawIOBase) else functools.partial(_copied, file)
-
-
-def _copied(file: BinaryIO, buffer: memoryview) -> int:
-    data = file.read(len(buffer))
-    buffer[: len(data)] = data
-    return len(data)
-
-
-def _first_size(file: BinaryIO, largest: int) -> int:
-    try:
-        status = os.fstat(file.fileno())
-    except (AttributeError, OSError):
-        return SMALLEST
-    return min(max(status.st_size, SMALLEST), largest) if stat.S_ISREG(status.st_mode) else SMALLEST
 
 
 def is_capture(head: bytes) -> bool:
