@@ -7,10 +7,12 @@ several can be opened together: its points, where it is mounted, what is known o
 from __future__ import annotations
 
 import contextlib
+import os
+import threading
 from collections.abc import Iterable, Iterator, Mapping
 from pathlib import Path
 from types import TracebackType
-from typing import Any
+from typing import Any, BinaryIO
 
 import numpy as np
 from numpy.typing import NDArray
@@ -26,6 +28,8 @@ from lidarspec.transports.protocol import Format
 RADIUS, AXES = 1.5, 0.3
 #: points that are handed over together, which bounds what is held.
 HELD = 1 << 13
+#: bytes that are taken out of a pipe at once.
+PIPED = 1 << 16
 #: the names of the timelines: by the sensor's clock, by arrival, by number.
 SENSOR, HOST, NUMBER = "sensor_time", "host_time", "scan"
 
@@ -47,6 +51,7 @@ class Log:
         self.stream.set_log_tick_enabled(False)
         self._ramp, self._colours, self._number = ramp, _Colours(), 0
         self._home, self._waiting = "", 0
+        self._copy: _Copy | None = None
 
     def __enter__(self) -> Log:
         return self
@@ -57,6 +62,10 @@ class Log:
                 self.flush()
         finally:
             self.stream.disconnect()
+            if self._copy is not None:
+                self._copy.join()
+        if self._copy is not None and self._copy.failure is not None and error is None:
+            raise self._copy.failure
 
     def save(self, path: str | Path) -> None:
         """Write it to a file.
@@ -64,8 +73,13 @@ class Log:
         Raises:
             OSError: where that cannot be written.
         """
-        with _told():
-            self.stream.save(path)
+        if os.name != "posix":
+            with _told():
+                self.stream.save(path)
+            return
+        self._copy, pipe = _Copy.into(path)
+        with _told(), os.fdopen(pipe, "wb"):
+            self.stream.save(f"/dev/fd/{pipe}")
 
     def scan(self, scan: Scan, *, every_point: bool = False) -> None:
         """Log a scan, and before the first what is known of its sensor.
@@ -105,6 +119,8 @@ class Log:
         self._waiting = 0
         with _told():
             self.stream.flush()
+        if self._copy is not None and self._copy.failure is not None:
+            raise self._copy.failure
 
     def _begin(self, scan: Scan) -> None:
         self._home, rerun = f"/{scan.sensor.id}", self._rerun
@@ -135,6 +151,44 @@ class Log:
         beside = views.Vertical(*figures, facts)
         whole = views.Horizontal(views.Spatial3DView(origin="/", name=self._home[1:]), beside, column_shares=[3, 1])
         return views.Blueprint(whole, views.TimePanel(timeline=SENSOR, state="collapsed"), collapse_panels=True)
+
+
+class _Copy(threading.Thread):
+    """Writes to a file what Rerun's SDK writes into a pipe: where a disk is full, the SDK may wait for ever for its own file.
+
+    Attributes:
+        failure: what the system said of the file; what comes then is read, and lost.
+    """
+
+    def __init__(self, file: BinaryIO, pipe: int) -> None:
+        super().__init__(name="rerun", daemon=True)
+        self._file, self._pipe = file, pipe
+        self.failure: OSError | None = None
+
+    @classmethod
+    def into(cls, path: str | Path) -> tuple[_Copy, int]:
+        """The running copy, and the end of the pipe to write to.
+
+        Raises:
+            OSError: where the file cannot be written.
+        """
+        file = open(path, "wb")  # noqa: SIM115 -- the thread closes it
+        pipe, end = os.pipe()
+        copy = cls(file, pipe)
+        copy.start()
+        return copy, end
+
+    def run(self) -> None:
+        """Copy until the other end is closed."""
+        with open(self._pipe, "rb", buffering=0) as pipe:
+            try:
+                with self._file:
+                    while data := pipe.read(PIPED):
+                        self._file.write(data)
+            except OSError as error:
+                self.failure = error
+            while pipe.read(PIPED):  # the SDK is not to wait for it
+                pass
 
 
 @contextlib.contextmanager
