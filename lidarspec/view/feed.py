@@ -198,6 +198,8 @@ class Feed:
         played: scans of a file come at the times that they bear; else as fast as they are read.
         speed: how many times faster than that; may be set while it plays.
         select: which scans, and what of each; packets at these times.
+        ahead: seconds of a file that is played that are read at once, so that figures and bytes are those of what is seen; None: as much
+            as is decoded quickest.
 
     Attributes:
         packets: the batch that the last look took in, None where it took none.
@@ -208,7 +210,15 @@ class Feed:
         meter: the figures.
     """
 
-    def __init__(self, device: Device, *, played: bool = False, speed: float = 1.0, select: Selection | None = None) -> None:
+    def __init__(
+        self,
+        device: Device,
+        *,
+        played: bool = False,
+        speed: float = 1.0,
+        select: Selection | None = None,
+        ahead: float | None = AHEAD,
+    ) -> None:
         self.device, self.number, self.speed = device, 0, speed
         self._select = select or Selection()
         self._sieve, self._slice = Sieve(self._select, device.source, device.skip), Slice(self._select.times)
@@ -221,8 +231,8 @@ class Feed:
         self._waiting: deque[Scan] = deque()
         self._disconnects, self._read_out, self._metered = 0, False, False
         self._due: float | None = None
-        self._stamp, self._portion = 0, PORTION
-        if self._played:
+        self._stamp, self._portion, self._ahead = 0, PORTION, ahead if self._played else None
+        if self._ahead is not None:
             device.read_ahead(PORTION)
 
     @property
@@ -284,15 +294,15 @@ class Feed:
                 self.meter, self._metered = before, True
                 self.meter.packets(counted)
             self._keep(self._stream.add(packets))
-            if self._played:
-                self._pace(int(packets.time_ns[-1]) - int(packets.time_ns[0]))
+            if self._ahead is not None:
+                self._pace((int(packets.time_ns[-1]) - int(packets.time_ns[0])) * 1e-9, self._ahead)
 
-    def _pace(self, lasted: int) -> None:
-        """Read about as much of a file at once as is shown in a moment; `lasted`: what was read, ns."""
-        seconds, portion = lasted * 1e-9, self._portion
-        if seconds < AHEAD / 2 and portion < BATCH_BYTES:
+    def _pace(self, seconds: float, ahead: float) -> None:
+        """Read about as much of a file at once as is shown in a moment; `seconds`: what was read lasted so long."""
+        portion = self._portion
+        if seconds < ahead / 2 and portion < BATCH_BYTES:
             self._portion *= 2
-        elif seconds > AHEAD and portion > PORTION:
+        elif seconds > ahead and portion > PORTION:
             self._portion //= 2
         if self._portion != portion:
             self.device.read_ahead(self._portion)

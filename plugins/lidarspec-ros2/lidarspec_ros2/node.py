@@ -163,7 +163,8 @@ class LidarNode(LifecycleNode):
     def _read(self, device: Device, topics: Topics) -> None:
         """Publish what comes, until the node is stopped or the input ends."""
         speed = self._settings["replay_speed"]
-        feed, due, expected = Feed(device, played=speed > 0, speed=speed), time.monotonic(), 0.0
+        feed = Feed(device, played=speed > 0, speed=speed, ahead=None)  # what is read tells of the sensor's clock before it is shown
+        due, expected = time.monotonic(), 0.0
         try:
             while not self._stopping.is_set() and not feed.ended:
                 feed.pump(0.0 if device.is_live else time.monotonic() + LOOK)
