@@ -69,7 +69,8 @@ lint: $(DEVELOPERS)
 types: $(DEVELOPERS)
 	@$(BIN)/mypy $(PACKAGES) benchmarks
 
-# With the pictures of the front page, that of the page in the browser where Chromium is, and the notebook run. Without --quiet, which would let broken links pass.
+# With the pictures of the front page, that of the page in the browser where Chromium is, and the notebook run.
+# Without --quiet, which would let broken links pass.
 docs: $(WRITERS)
 	@$(BIN)/python docs/pictures.py
 	@PATH="$(abspath $(BIN)):$$PATH" NO_MKDOCS_2_WARNING=1 $(BIN)/python -m mkdocs build --strict --site-dir $(abspath $(SITE))

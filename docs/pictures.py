@@ -29,7 +29,6 @@ from lidarspec.view.live import FIGURES, Window
 from lidarspec.view.svg import svg
 
 HERE = Path(__file__).parent / "pictures"
-BUNDLE, CHROMIUM = Path(ls.__file__).parent / "view" / "page" / "dist" / "page.js", shutil.which("chromium")
 #: pixels of the page, light or dark, milliseconds that it is let run, and colours of the PNG.
 SIZE, SCHEME, SETTLED, COLOURS = (1280, 800), "dark", 9_000, 256
 #: of Chromium, which draws in software.
@@ -70,14 +69,18 @@ def page(folder: Path, target: Path) -> None:
     from PIL import Image
     from playwright.sync_api import sync_playwright
 
-    if missing := [what for what, path in (("Chromium", CHROMIUM), ("the bundle of `make page`", BUNDLE.is_file())) if not path]:
-        print(f"the picture of the page stays as it was: {' and '.join(missing)} not found", file=sys.stderr)
+    from lidarspec.view.server import PAGE
+
+    chromium = shutil.which("chromium")
+    if chromium is None or not PAGE.is_dir():
+        what = "what `make page` makes" if chromium else "Chromium"
+        print(f"the picture of the page stays as it was: {what} is not here", file=sys.stderr)
         return
     file = simulated("robosense-m1", folder / "room.lsr", "15s")
     command = [sys.executable, "-m", "lidarspec", "view", file.name, "-s", "robosense-m1", "--web", "-q"]
     with subprocess.Popen(command, cwd=folder, stdout=subprocess.PIPE, text=True) as serving, sync_playwright() as running:
         assert serving.stdout is not None
-        browser = running.chromium.launch(executable_path=CHROMIUM, args=FLAGS)
+        browser = running.chromium.launch(executable_path=chromium, args=FLAGS)
         try:
             seen = browser.new_page(viewport={"width": SIZE[0], "height": SIZE[1]}, color_scheme=SCHEME)
             seen.goto(serving.stdout.readline().strip())

@@ -1,7 +1,4 @@
-"""Makes the screens of the how-to pages: `view` as SVG, and what other verbs print, all from simulated sensors.
-
-python docs/screens.py
-"""
+"""Makes the screens of the how-to pages, `view` as SVG and what other verbs print, from simulated sensors alone."""
 
 from __future__ import annotations
 

@@ -375,10 +375,10 @@ def sought(source: Source, form: Form, at: int) -> bool:
     high = source.size
     if high is None:
         return False
-    first = _captured(source.from_place(here), form, high)
+    first = _captured(source.apart(here), form, high)
     while first is not None and high - low > NEAR:
         middle = (low + high) // 2
-        found = _captured(source.from_place(middle), form, high)
+        found = _captured(source.apart(middle), form, high)
         if found is None or found[0] >= at or abs(found[0] - first[0]) > _YEAR * _SECOND:
             high = middle
         else:

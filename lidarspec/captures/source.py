@@ -66,8 +66,8 @@ class Source:
     def place(self) -> int:
         return self._passed + self.at
 
-    def from_place(self, place: int) -> Source:
-        """The same file's bytes from a place on, in a small buffer. Its position is then not this one's any more: see `go`."""
+    def apart(self, place: int) -> Source:
+        """The same file's bytes from a place on, in a buffer apart; this one then has to `go` to where it goes on."""
         return _source_at(self._file, SMALLEST, place)
 
     def go(self, place: int) -> None:
@@ -79,8 +79,13 @@ class Source:
 
     @property
     def size(self) -> int | None:
-        """Bytes of the file; None where it cannot be sought. The position is then not this one's any more: see `go`."""
-        return self._file.seek(0, os.SEEK_END) if self._file.seekable() else None
+        """Bytes of the file; None where it cannot be sought."""
+        if not self._file.seekable():
+            return None
+        here = self._file.tell()
+        size = self._file.seek(0, os.SEEK_END)
+        self._file.seek(here)
+        return size
 
     def ahead(self, size: int) -> memoryview:
         """The next `size` bytes, which stay there; fewer at the end."""

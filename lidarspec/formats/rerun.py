@@ -12,7 +12,7 @@ import threading
 from collections.abc import Iterable, Iterator, Mapping
 from pathlib import Path
 from types import TracebackType
-from typing import Any, BinaryIO
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -77,9 +77,10 @@ class Log:
             with _told():
                 self.stream.save(path)
             return
-        self._copy, pipe = _Copy.into(path)
-        with _told(), os.fdopen(pipe, "wb"):
-            self.stream.save(f"/dev/fd/{pipe}")
+        self._copy = _Copy(path)
+        self._copy.start()
+        with _told(), os.fdopen(self._copy.end, "wb"):
+            self.stream.save(f"/dev/fd/{self._copy.end}")
 
     def scan(self, scan: Scan, *, every_point: bool = False) -> None:
         """Log a scan, and before the first what is known of its sensor.
@@ -157,30 +158,22 @@ class _Copy(threading.Thread):
     """Writes to a file what Rerun's SDK writes into a pipe: where a disk is full, the SDK may wait for ever for its own file.
 
     Attributes:
+        end: of the pipe, to write to.
         failure: what the system said of the file; what comes then is read, and lost.
+
+    Raises:
+        OSError: where the file cannot be written.
     """
 
-    def __init__(self, file: BinaryIO, pipe: int) -> None:
+    def __init__(self, path: str | Path) -> None:
         super().__init__(name="rerun", daemon=True)
-        self._file, self._pipe = file, pipe
+        self._file = open(path, "wb")  # noqa: SIM115 -- `run` closes it
+        self._begin, self.end = os.pipe()
         self.failure: OSError | None = None
-
-    @classmethod
-    def into(cls, path: str | Path) -> tuple[_Copy, int]:
-        """The running copy, and the end of the pipe to write to.
-
-        Raises:
-            OSError: where the file cannot be written.
-        """
-        file = open(path, "wb")  # noqa: SIM115 -- the thread closes it
-        pipe, end = os.pipe()
-        copy = cls(file, pipe)
-        copy.start()
-        return copy, end
 
     def run(self) -> None:
         """Copy until the other end is closed."""
-        with open(self._pipe, "rb", buffering=0) as pipe:
+        with open(self._begin, "rb", buffering=0) as pipe:
             try:
                 with self._file:
                     while data := pipe.read(PIPED):

@@ -104,10 +104,10 @@ def reach_of(cloud: PointCloud) -> float:
     return rounded_up(max(farthest if farthest <= FAR_BEYOND * most else most, 1e-3))
 
 
-def rounded_up(value: float, steps: Sequence[float] = ROUND) -> float:
+def rounded_up(value: float, rounds: Sequence[float] = ROUND) -> float:
     """The next of a few round numbers, by default such as 1.2, 1.5, 2, 2.5, 3, 4 ... 10, 12."""
     power = 10.0 ** math.floor(math.log10(value))
-    return next((step * power for step in steps if step * power >= value * 0.999), 10 * power)
+    return next((one * power for one in rounds if one * power >= value * 0.999), 10 * power)
 
 
 def ring_step(reach: float) -> float:

@@ -17,7 +17,7 @@ from typing import BinaryIO
 
 from lidarspec.captures.bulk import Batch, CaptureBatches, StreamBatches
 from lidarspec.captures.containers import HEAD, damage, head, opened, refuse_container, unpacked
-from lidarspec.captures.pcap import CaptureReader, CaptureStats, StreamReader, is_stream_capture
+from lidarspec.captures.pcap import CaptureStats, is_stream_capture
 from lidarspec.captures.records import is_capture
 from lidarspec.errors import SourceError, UnknownSensor, UsageError, system_errors
 from lidarspec.recording.format import MAGIC, Header, Record, Recording
@@ -209,7 +209,7 @@ class CaptureTransport(FileTransport):
     """The UDP datagrams of a pcap or pcapng file.
 
     Attributes:
-        reader: what `batches` comes from, once it has begun.
+        reader: what `chunks` or `batches` come from, once one of them has begun.
     """
 
     datagrams = True
@@ -219,11 +219,10 @@ class CaptureTransport(FileTransport):
         super().__init__(path, file)
         self._origin = None if sender is None else origin(sender)
         self.reader: CaptureBatches | None = None
-        self._reading: CaptureReader | None = None
         self._has_skipped = False
 
     def chunks(self) -> Iterator[Chunk]:
-        reader = self._reading = CaptureReader(self.file)
+        reader = self.reader = self.in_batches(self.file)
         for datagram in reader:
             if self._origin is not None and datagram.source not in self._origin:
                 self.foreign += 1
@@ -237,7 +236,7 @@ class CaptureTransport(FileTransport):
         Raises:
             SourceError: where the file cannot be read.
         """
-        reader = self._reading = self.reader = self.reader or self.in_batches(self.file)
+        reader = self.reader = self.reader or self.in_batches(self.file)
         for batch in reader.batches():
             mine = batch if self._origin is None else batch.of(self._origin)
             self.foreign += len(batch) - len(mine)
@@ -247,7 +246,7 @@ class CaptureTransport(FileTransport):
 
     def skip(self, at: int) -> bool:
         with system_errors(self._path):
-            self._has_skipped = self._reading is not None and self._reading.skip(at)
+            self._has_skipped = self.reader is not None and self.reader.skip(at)
         return self._has_skipped
 
     def _gap(self) -> bool:
@@ -263,7 +262,7 @@ class StreamCaptureTransport(CaptureTransport):
     in_batches = StreamBatches
 
     def chunks(self) -> Iterator[Chunk]:
-        reader = self._reading = StreamReader(self.file)
+        reader = self.reader = self.in_batches(self.file)
         yield from (Chunk(packet.data, packet.at or None, gap=self._gap()) for packet in reader)
         self._warn(reader.stats)
 

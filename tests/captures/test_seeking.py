@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import gzip
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -22,6 +23,7 @@ from tests import made_captures as made
 START, STEP, NUMBER = 1_700_000_000_000_000_000, 10_000_000, 6000
 #: of a capture of a byte stream.
 USER0 = 147
+SENT = Datagram(bytes(1000), 0, ("192.168.1.201", 2368), NOBODY)
 
 
 def written(path: Path, *, first: int = 0, number: int = NUMBER, link: int = ETHERNET, head: bool = True) -> Path:
@@ -31,7 +33,7 @@ def written(path: Path, *, first: int = 0, number: int = NUMBER, link: int = ETH
         file.write(writing.head(link) if head else b"")
         for count in range(first, first + number):
             data = count.to_bytes(4, "big") * 250
-            packet = datagram_frame(Datagram(data, 0, ("192.168.1.201", 2368), NOBODY)) if link == ETHERNET else data
+            packet = datagram_frame(replace(SENT, data=data)) if link == ETHERNET else data
             file.write(writing.record(packet, START + count * STEP))
     return path
 
@@ -89,11 +91,35 @@ def test_damage_on_the_way_is_no_hindrance(tmp_path: Path) -> None:
     assert times[-1] == START + (NUMBER - 1) * STEP
 
 
+def test_damage_that_was_passed_over_is_not_counted(tmp_path: Path) -> None:
+    path = written(tmp_path / "drive.pcapng")
+    data, size = bytearray(path.read_bytes()), len(WRITINGS[".pcapng"].record(datagram_frame(SENT), START))
+    place = len(WRITINGS[".pcapng"].head(ETHERNET)) + 50 * size
+    data[place + 4 : place + 8] = (2 * size).to_bytes(4, "little")  # a block as long as two
+    path.write_bytes(data)
+    with contextlib.closing(opened(path)) as source:
+        rest(source, START + 5000 * STEP, in_batches=True)
+        assert not source.warnings
+        assert source.unread == 0
+
+
+def test_it_goes_on_and_never_back(tmp_path: Path) -> None:
+    with contextlib.closing(opened(written(tmp_path / "drive.pcap"))) as source:
+        batches = source.batches()
+        next(batches)
+        assert source.skip(START + 4500 * STEP)
+        seen = [next(batches)]
+        assert not source.skip(START + 1000 * STEP)
+        times = np.concatenate([batch.at for batch in (*seen, *batches)])
+    assert (np.diff(times) == STEP).all()
+    assert times[-1] == START + (NUMBER - 1) * STEP
+
+
 def test_nothing_is_passed_over_where_times_are_counted_otherwise(tmp_path: Path) -> None:
     """In a second section, whose interface has another clock than the first."""
     path = written(tmp_path / "drive.pcapng", number=NUMBER * 2 // 3)
     ticks = made.interface(options=made.option(9, bytes([6])))
-    packet = datagram_frame(Datagram(bytes(1000), 0, ("192.168.1.201", 2368), NOBODY))
+    packet = datagram_frame(SENT)
     end = START + NUMBER * STEP
     path.write_bytes(path.read_bytes() + made.section() + ticks + made.packet(packet, ticks=end // 1000) * 3000)
     with contextlib.closing(opened(path)) as source:
@@ -120,24 +146,63 @@ def test_the_duration_of_a_long_capture_is_known_without_reading_it(tmp_path: Pa
     assert duration(path) == pytest.approx((12 * NUMBER - 1) * STEP * 1e-9)
 
 
-def test_a_slice_of_a_capture_has_the_scans_that_reading_all_of_it_gives(tmp_path: Path) -> None:
-    sensor, path = ls.sensor("velodyne-vlp16"), tmp_path / "drive.pcap"
+def captured(path: Path, seconds: int, rate: int = 754) -> Path:
+    """What a simulated sensor sends, as it would come."""
     with path.open("wb") as file:
         file.write(WRITINGS[".pcap"].head(ETHERNET))
-        for number, data in enumerate(simulate(sensor, 754 * 40)):
-            frame = datagram_frame(Datagram(data, 0, ("192.168.1.201", 2368), NOBODY))
-            file.write(WRITINGS[".pcap"].record(frame, START + number * 1_000_000_000 // 754))
-    packed = tmp_path / "drive.pcap.gz"  # of which nothing can be passed over
-    packed.write_bytes(gzip.compress(path.read_bytes(), 1))
+        for number, data in enumerate(simulate(ls.sensor("velodyne-vlp16"), rate * seconds)):
+            frame = datagram_frame(replace(SENT, data=data))
+            file.write(WRITINGS[".pcap"].record(frame, START + number * 1_000_000_000 // rate))
+    return path
+
+
+def test_a_slice_of_a_capture_has_the_scans_that_reading_all_of_it_gives(tmp_path: Path) -> None:
+    path, packed = captured(tmp_path / "drive.pcap", 40), tmp_path / "drive.pcap.gz"
+    packed.write_bytes(gzip.compress(path.read_bytes(), 1))  # of which nothing can be passed over
     found, read = [], []
     for source in (path, packed):
-        with ls.open(source, sensor) as device:
+        with ls.open(source, "velodyne-vlp16") as device:
             scans = device.scans(select=Selection(times=(30.0, 31.0)))
             found.append([(scan.host_ns, scan.complete, len(scan), float(scan.points.range.sum())) for scan in scans])
             read.append(device.stats.bytes_in)
     assert len(found[0]) >= 9
     assert found[0] == found[1]
     assert read[0] < read[1] / 2
+
+
+def test_no_scan_goes_on_behind_what_was_passed_over(tmp_path: Path) -> None:
+    with ls.open(captured(tmp_path / "drive.pcap", 20), "velodyne-vlp16") as device:
+        scans = device.scans()
+        next(scans)
+        assert device.skip(START + 18 * 10**9)
+        left = list(scans)
+        assert device.stats.lost == 0
+    gap = int(np.diff([scan.host_ns for scan in left]).argmax())
+    assert left[gap + 1].host_ns - left[gap].host_ns > 5 * 10**9
+    pieces = [place for place, scan in enumerate(left) if not scan.complete]
+    assert pieces == [gap, gap + 1, len(left) - 1]
+    assert all(scan.points.time.max() < 0.2 for scan in left)
+
+
+def test_no_frame_goes_on_behind_what_was_passed_over(tmp_path: Path) -> None:
+    """Of a byte stream, whose pieces end anywhere."""
+    sensor, path = ls.sensor("ldrobot-stl27l"), tmp_path / "stream.pcap"
+    data = b"".join(simulate(sensor, 240_000))
+    with path.open("wb") as file:
+        file.write(WRITINGS[".pcap"].head(USER0))
+        for number, place in enumerate(range(0, len(data), 1000)):
+            file.write(WRITINGS[".pcap"].record(data[place : place + 1000], START + number * STEP))
+    with ls.open(path, sensor) as device:
+        packets = device.packets()
+        next(packets)
+        assert device.skip(START + 11_000 * STEP)
+        number = sum(map(len, packets))
+        stats = device.stats
+    assert stats.lost <= 1  # the one that is torn
+    assert 0 < number < 240_000
+    assert stats.bad_checksum <= 1  # of the two halves that meet there, the first may be taken for the beginning of a frame
+    assert stats.bytes_skipped < 2 * 47
+    assert stats.pending == 0
 
 
 def test_a_stream_reader_goes_on_as_well(tmp_path: Path) -> None:
