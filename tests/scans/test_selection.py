@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import gzip
 from collections.abc import Iterator
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
@@ -21,11 +22,12 @@ ID, SECONDS = "ldrobot-stl27l", 40
 
 @pytest.fixture(scope="module")
 def recordings(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
-    """The same 40 s as a recording, in which times are found, and as a capture, which is read through."""
+    """The same 40 s as a recording and a capture, in which times are found, and as a packed capture, which is read through."""
     folder = tmp_path_factory.mktemp("selection")
     ran("sim", ID, "--to", folder / "drive.lsr", "-t", f"{SECONDS}s")
     ran("replay", folder / "drive.lsr", "--to", folder / "drive.pcap", "-s", ID)
-    return {suffix: folder / f"drive.{suffix}" for suffix in ("lsr", "pcap")}
+    (folder / "drive.gz").write_bytes(gzip.compress((folder / "drive.pcap").read_bytes(), 1))
+    return {suffix: folder / f"drive.{suffix}" for suffix in ("lsr", "pcap", "gz")}
 
 
 def scans(path: Path, select: Selection | None = None) -> Iterator[Scan]:
@@ -144,17 +146,18 @@ def test_beams_and_frame_go_with_the_scan(recordings: dict[str, Path]) -> None:
 
 
 @pytest.mark.parametrize(
-    ("selection", "message"),
+    ("suffix", "selection", "message"),
     [
-        (Selection(times=(100.0, None)), r"has scans from 0 s to 40\.000 s, and nothing of that is asked for"),
-        (Selection(scans=(1000, None)), r"has (400|401) scans, from 0 to (399|400), and none of them is asked for"),
+        ("gz", Selection(times=(100.0, None)), r"has (400|401) scans, from 0 s to 40\.000 s, and nothing of that is asked for"),
+        ("pcap", Selection(times=(100.0, None)), r"has scans from 0 s to 40\.000 s, and nothing of that is asked for"),
+        ("pcap", Selection(scans=(1000, None)), r"has (400|401) scans, from 0 to (399|400), and none of them is asked for"),
     ],
 )
 def test_what_lies_behind_the_end_is_an_error_that_says_what_there_is(
-    recordings: dict[str, Path], selection: Selection, message: str
+    recordings: dict[str, Path], suffix: str, selection: Selection, message: str
 ) -> None:
     with pytest.raises(UsageError, match=message):
-        list(scans(recordings["pcap"], selection))
+        list(scans(recordings[suffix], selection))
 
 
 def test_bytes_without_times_have_no_slice(tmp_path: Path) -> None:
