@@ -29,13 +29,18 @@ MODULES := $(PAGE)/node_modules/.installed
 BUNDLE := $(PAGE)/dist/page.js
 RECENT := import sys; sys.exit(sys.version_info < (3, 11))
 
-.PHONY: demo page page-test test test-ros2 test-ros2-here test-long soak fuzz lint types docs wheels reference bench bench-here clean
+.PHONY: demo page page-test test test-all test-ros2 test-ros2-here test-long soak fuzz lint types docs wheels reference bench bench-here clean
 
 demo: $(USERS)
 	@$(BIN)/lidarspec demo -s ldrobot-stl27l
 
+# The quick tier: the engine on the shapes and ten sensors, and the golden vectors of all.
 test: $(DEVELOPERS)
 	@$(BIN)/python -m pytest -n auto --dist worksteal $(ARGS)
+
+# The quick tier, and every sensor, file format, export, page and document.
+test-all: $(DEVELOPERS)
+	@$(BIN)/python -m pytest -n auto --dist worksteal -m "not soak" $(ARGS)
 
 # The page of `view --web`, from its TypeScript; with npm.
 page: $(BUNDLE)

@@ -1,0 +1,18 @@
+"""Ten sensors that stand for all mechanisms of the installed ones.
+
+A promise about the engine is proved on the shapes of `tests.shapes` and, where real variety matters, on these; a promise about a
+sensor is proved in the `tests` folder of its plugin. Ids only: a sensor is loaded when a test needs it.
+"""
+
+REPRESENTATIVES = (
+    "ldrobot-stl27l",  # serial, fixed frames, CRC-8, interpolated angles
+    "cspc-m1c1-mini",  # variable count, XOR over words, an angle that depends on range
+    "slamtec-rplidar-a1",  # answers of several types, each after its descriptor, differential angles
+    "velodyne-vlp16",  # firings, rotation between blocks, a position packet as clock
+    "robosense-m1",  # MEMS directions in the packet, two returns
+    "hesai-qt128",  # large blocks, optional parts, calibration from a file
+    "ouster-os1",  # frames that depend on metadata, columns and rows
+    "livox-mid360",  # Cartesian points, IMU, commands over UDP
+    "sick-multiscan136",  # segments of variable shape in long datagrams
+    "hokuyo-ust10lx",  # text frames, characters of six bits
+)
