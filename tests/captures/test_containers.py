@@ -56,6 +56,10 @@ PACKED: dict[str, Callable[[bytes], bytes]] = {
 }
 
 
+#: one in the quick tier: what follows the decompression is the same for all.
+COMPRESSIONS = ["gzip", *(pytest.param(name, marks=pytest.mark.slow) for name in ("bzip2", "xz", "zstd"))]
+
+
 @pytest.fixture(autouse=True)
 def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
@@ -95,6 +99,7 @@ def test_what_is_compressed_is_read_as_it_was(packing: str) -> None:
     assert [datagram.data for datagram in CaptureReader("it.x")] == simulate(ls.sensor(SENSOR), 40)
 
 
+@pytest.mark.slow
 def test_verbs_take_compressed_files_and_pipes() -> None:
     Path("a.pcap").write_bytes(capture())
     Path("a.pcap.gz").write_bytes(gzip.compress(capture()))
@@ -136,7 +141,7 @@ def test_one_file_of_an_archive_is_named_where_several_are_captures() -> None:
     assert "it.pcap is no zip archive: there is no a.pcap in it" in ran("read", "it.pcap?file=a.pcap", "-s", SENSOR, code=2).stderr
 
 
-@pytest.mark.parametrize("packing", ["gzip", "bzip2", "xz", "zstd"])
+@pytest.mark.parametrize("packing", COMPRESSIONS)
 def test_what_came_before_the_end_of_a_cut_file_is_read(packing: str) -> None:
     if packing == "zstd":
         pytest.importorskip(ZSTD)
@@ -152,7 +157,7 @@ def test_what_came_before_the_end_of_a_cut_file_is_read(packing: str) -> None:
         assert opened.unread == 0
 
 
-@pytest.mark.parametrize("packing", ["gzip", "bzip2", "xz", "zstd"])
+@pytest.mark.parametrize("packing", COMPRESSIONS)
 def test_what_came_before_damage_is_read_and_it_is_said_once(packing: str) -> None:
     if packing == "zstd":
         pytest.importorskip(ZSTD)
@@ -198,6 +203,7 @@ def test_a_missing_library_is_said_with_what_installs_it(monkeypatch: pytest.Mon
     assert "next: pip install 'lidarspec[zstd]'" in ran("read", "it.zst", "-s", SENSOR, code=2).stderr
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(sys.platform != "linux", reason="reads /proc")
 def test_a_compressed_capture_is_decoded_in_bounded_memory(tmp_path: Path) -> None:
     written(tmp_path / "long.pcap", 60)

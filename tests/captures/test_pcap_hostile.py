@@ -95,7 +95,7 @@ def test_a_damaged_length_costs_its_own_packet_alone(is_pcapng: bool) -> None:
     records = [made.packet(each) if is_pcapng else made.record(each) for each in frames]
     head = made.section() + made.interface() if is_pcapng else made.pcap_head()
     draw = random.Random(4)
-    for _ in range(60):
+    for _ in range(25):
         at = draw.randrange(len(records))
         whole = records[at]
         place, length = (4, len(whole)) if is_pcapng else (8, len(whole) - 16)
@@ -167,11 +167,12 @@ def test_truncated_at_every_byte_gives_all_complete_packets(parts: list[bytes]) 
 
 
 @pytest.mark.parametrize("parts", [PCAP_PARTS, PCAPNG_PARTS], ids=["pcap", "pcapng"])
-def test_mutations_raise_nothing_but_source_error(parts: list[bytes]) -> None:
+@pytest.mark.parametrize("inputs", [1000, pytest.param(20_000, marks=pytest.mark.slow)])
+def test_mutations_raise_nothing_but_source_error(parts: list[bytes], inputs: int) -> None:
     draw = random.Random(14)
     capture = b"".join(parts)
     outcomes = Counter[str]()
-    for _ in range(10_000):
+    for _ in range(inputs):
         data = bytearray(capture)
         for _ in range(draw.randint(1, 6)):
             at = draw.randrange(len(data))
@@ -194,7 +195,7 @@ def test_mutations_raise_nothing_but_source_error(parts: list[bytes]) -> None:
         assert stats.datagrams + stats.other + stats.snapped <= stats.packets
         assert stats.truncated_tail <= (stats.stopped_at is not None)
         outcomes.update(name for name in ("datagrams", "truncated_tail", "malformed", "stopped_at") if getattr(stats, name))
-    assert min(outcomes[name] for name in ("refused", "datagrams", "truncated_tail", "malformed", "stopped_at")) > 200
+    assert min(outcomes[name] for name in ("refused", "datagrams", "truncated_tail", "malformed", "stopped_at")) > inputs / 50
 
 
 HUGE = struct.pack("<I", 0x7FFFFFFC)
@@ -218,8 +219,11 @@ def test_claimed_lengths_take_no_memory(case: str, buffering: int, tmp_path: Pat
 
 @pytest.mark.parametrize(
     "blocks",
-    [made.block(0x0BAD, bytes(16 << 20)), made.interface() * 200_000, made.packet(FRAME, number=1) * 50_000],
-    ids=["block", "interfaces", "packets"],
+    [
+        pytest.param(made.block(0x0BAD, bytes(16 << 20)), id="block"),
+        pytest.param(made.interface() * 50_000, id="interfaces"),
+        pytest.param(made.packet(FRAME, number=1) * 10_000, id="packets"),
+    ],
 )
 def test_long_files_take_bounded_memory(blocks: bytes) -> None:
     assert peak_memory(io.BytesIO(HEAD + blocks)) < 3 << 20
