@@ -26,7 +26,6 @@ ROBOTS := $(VENV)/.installed-ros2
 FUZZERS := $(VENV)/.installed-fuzz
 PAGE := lidarspec/view/page
 MODULES := $(PAGE)/node_modules/.installed
-BUNDLE := $(PAGE)/dist/page.js
 RECENT := import sys; sys.exit(sys.version_info < (3, 11))
 
 .PHONY: demo page page-test test test-all test-ros2 test-ros2-here test-long soak fuzz lint types docs wheels reference bench bench-here clean
@@ -42,11 +41,13 @@ test: $(DEVELOPERS)
 test-all: $(DEVELOPERS)
 	@$(BIN)/python -m pytest -n auto --dist worksteal -m "not soak" $(ARGS)
 
-# The page of `view --web`, from its TypeScript; with npm.
-page: $(BUNDLE)
+# Build the page of `view --web` from its TypeScript with npm; commit the result.
+page: $(MODULES)
+	@cd $(PAGE) && npm run --silent build
 
-page-test: $(BUNDLE)
-	@cd $(PAGE) && npm run --silent lint && npm test --silent
+# Check types and style of the page, run its unit tests, and compare the tracked files with a fresh build.
+page-test: $(MODULES)
+	@cd $(PAGE) && npm run --silent lint && npm test --silent && npm run --silent check
 
 # The ROS 2 node, with ROS itself from wheels or from where it was sourced, on the loopback alone.
 test-ros2:
@@ -81,7 +82,7 @@ docs: $(WRITERS)
 	@PATH="$(abspath $(BIN)):$$PATH" NO_MKDOCS_2_WARNING=1 $(BIN)/python -m mkdocs build --strict --site-dir $(abspath $(SITE))
 	@$(BIN)/python docs/pictures.py --page --into $(SITE)/pictures
 
-wheels: $(DEVELOPERS) $(BUNDLE)
+wheels: $(DEVELOPERS)
 	@for project in . $(DISTRIBUTIONS); do $(BIN)/python -m build --wheel --no-isolation --outdir $(DIST) $$project || exit 1; done
 
 # The pages of the sensors in docs/reference/sensors, from their specs; those of the verbs, and the manual pages, from the commands.
@@ -97,7 +98,7 @@ bench-here: $(PEERS)
 	@$(BIN)/python benchmarks/run.py $(ARGS)
 
 clean:
-	rm -rf $(PAGE)/node_modules $(PAGE)/dist $(PAGE)/dist-tests
+	rm -rf $(PAGE)/node_modules $(PAGE)/dist-check $(PAGE)/dist-tests
 	rm -rf .venv .venv-bench .venv-ros2 .fuzz dist site .hypothesis .mypy_cache .pytest_cache .ruff_cache
 	find lidarspec plugins tests -name __pycache__ -type d -prune -exec rm -rf {} +
 
@@ -135,9 +136,6 @@ $(MODULES): $(PAGE)/package-lock.json $(PAGE)/package.json
 	@echo "installing what builds the page into $(PAGE)/node_modules, this once"
 	@npm --prefix $(PAGE) ci --silent
 	@touch $@
-
-$(BUNDLE): $(MODULES) $(PAGE)/build.mjs $(wildcard $(PAGE)/src/*)
-	@cd $(PAGE) && npm run --silent build
 
 $(FUZZERS): $(DEVELOPERS)
 	@$(PIP) install --quiet 'atheris>=3.0' || echo "atheris cannot be installed here: inputs are chosen by seed" >&2

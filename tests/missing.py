@@ -19,7 +19,6 @@ MISSING = (
         "pip install -e '.[dev]'",
     ),
     (r"Chromium", "Chromium", "apt-get install chromium"),
-    (r"page is not built", "the page of view --web", "make page"),
     (r"open3d", "Open3D", "pip install open3d"),
     (
         r"LIDARSPEC_CAPTURES|protocol vectors",

@@ -16,7 +16,7 @@ from lidarspec.cli.options import DURATION, colour_option, selecting, sensor_opt
 from lidarspec.cli.output import drawn
 from lidarspec.cli.terminal import ended_by_terminate, note, say
 from lidarspec.device.device import Device, open as open_device
-from lidarspec.errors import UsageError, library, suggest
+from lidarspec.errors import UsageError, library
 from lidarspec.points.look import look
 from lidarspec.scans.selection import Selection
 from lidarspec.spec.sensor import Sensor
@@ -119,10 +119,8 @@ def _serve(
     for name in ("starlette", "uvicorn", "websockets"):
         library(name, "web")
     from lidarspec.view.broadcast import Broadcast
-    from lidarspec.view.server import PAGE, Site
+    from lidarspec.view.server import Site
 
-    if not (PAGE / "index.html").is_file():
-        raise suggest(UsageError("the page of --web is not built in this checkout"), "make page")
     switch = Switch(source, Path.cwd()) if is_live(source) else None
     device = open_device(source, sensor_id, record=switch.attached if switch else None, period=LOOK)
     if switch is not None:

@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Any
 
 from lidarspec.device.device import open as open_device
-from lidarspec.errors import LidarSpecError, UsageError, library, suggest, suggestion
+from lidarspec.errors import LidarSpecError, library, suggestion
 from lidarspec.scans.selection import EVERYTHING, Selection
 from lidarspec.spec.sensor import Sensor
 from lidarspec.transports.protocol import Closing
@@ -35,7 +35,7 @@ class Viewer(Closing):
         height: of the picture, pixels.
 
     Raises:
-        UsageError: where anywidget is not installed, or what draws is not built in this checkout.
+        UsageError: if anywidget is not installed.
     """
 
     def __init__(
@@ -120,6 +120,4 @@ class Viewer(Closing):
 def _widget(height: int) -> Any:
     """A widget of anywidget's, which draws in the cell."""
     kind, traits = library("anywidget", "notebook").AnyWidget, library("traitlets", "notebook")
-    if not DRAWING.is_file():
-        raise suggest(UsageError("what draws in a cell is not built in this checkout"), "make page")
     return type("Viewer", (kind,), {"_esm": DRAWING, "height": traits.Int(height).tag(sync=True)})()

@@ -130,13 +130,6 @@ def test_without_the_extra_it_says_how_to_get_it(missing: str) -> None:
     assert done.stderr.splitlines()[-1].strip() == "next: pip install 'lidarspec[web]'"
 
 
-def test_without_the_built_page_it_says_how_to_make_it(tmp_path: Path) -> None:
-    command = [sys.executable, "-c", MAIN, str(tmp_path), "view", f"sim:{FLAT}", "--web"]
-    done = subprocess.run(command, capture_output=True, text=True, check=False)
-    assert (done.returncode, done.stdout) == (2, "")
-    assert done.stderr.splitlines()[-1].strip() == "next: make page"
-
-
 def test_a_port_that_vanishes_and_comes_back_goes_on(tmp_path: Path) -> None:
     """The simulator on a pty is ended and begun anew, behind the same link."""
     port = tmp_path / "port"

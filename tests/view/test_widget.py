@@ -12,12 +12,10 @@ from typing import Any
 
 import pytest
 
-from lidarspec.errors import UsageError
 from lidarspec.view import widget
 from tests.cli.running import ran
 
 pytest.importorskip("anywidget", reason="anywidget is not installed")
-pytestmark = pytest.mark.skipif(not widget.DRAWING.is_file(), reason="npm has not built the page: make page")
 #: what a notebook's front end is to a widget of anywidget's: a model that sends and hears, and an element to render into.
 CELL = """async (esm) => {
     const heard = new Set();
@@ -141,12 +139,6 @@ def test_what_is_wrong_with_a_source_stands_in_the_cell_in_one_line(page: Any) -
     cell = Cell(page, widget.Viewer("/dev/ttyUSB99"))
     cell.until(lambda: "no such port" in cell.text)
     assert cell.text.strip() == cell.viewer.failure == "/dev/ttyUSB99: no such port; next: lidarspec ports"
-
-
-def test_a_checkout_without_the_bundle_says_how_to_get_it(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(widget, "DRAWING", widget.DRAWING.with_name("none.js"))
-    with pytest.raises(UsageError, match="not built in this checkout"):
-        widget.Viewer("sim:ldrobot-stl27l")
 
 
 def colours(page: Any) -> int:

@@ -1,11 +1,21 @@
-// Bundles the page, and the notebook's widget, into dist/; `--watch` goes on doing so, `--tests` makes dist-tests/ for node's test runner.
+// Build the page and the notebook widget into dist/, which is tracked in git.
+//
+//   --check   build into a temporary folder and fail if dist/ differs
+//   --watch   build again after each change, not minified
+//   --tests   build dist-tests/ for the test runner of Node.js
+//
+// The output depends only on the sources and on package-lock.json: it contains no dates and no paths.
 
 import { build, context } from "esbuild";
-import { copyFileSync, readdirSync, readFileSync, rmSync, writeFileSync } from "node:fs";
+import { copyFileSync, existsSync, readdirSync, readFileSync, rmSync, writeFileSync } from "node:fs";
 
 const tests = process.argv.includes("--tests");
 const watch = process.argv.includes("--watch");
-const folder = tests ? "dist-tests" : "dist";
+const check = process.argv.includes("--check");
+
+let folder = "dist";
+if (tests) folder = "dist-tests";
+if (check) folder = "dist-check";
 
 rmSync(folder, { recursive: true, force: true });
 const entries = tests ? readdirSync("tests").map((name) => `tests/${name}`) : ["src/page.ts", "src/widget.ts"];
@@ -19,7 +29,7 @@ const options = {
   platform: tests ? "node" : "browser",
   minify: !tests && !watch,
   sourcemap: watch ? "linked" : false,
-  legalComments: "none", // the licences stand whole in LICENSES.txt
+  legalComments: "none", // LICENSES.txt contains the complete licences
   logLevel: "warning",
   outExtension: tests ? { ".js": ".mjs" } : {},
 };
@@ -27,7 +37,7 @@ const options = {
 if (watch) {
   const running = await context(options);
   await running.watch();
-  console.log(`watching; ${folder}/ is made anew after each change`);
+  console.log(`watching; builds ${folder}/ again after each change; run make page before you commit`);
 } else {
   await build(options);
 }
@@ -36,4 +46,17 @@ if (!tests) {
   const licences = bundled.map((name) => `${name}\n\n${readFileSync(`node_modules/${name}/LICENSE`, "utf8")}`);
   copyFileSync("src/index.html", `${folder}/index.html`);
   writeFileSync(`${folder}/LICENSES.txt`, licences.join(`\n${"-".repeat(80)}\n\n`));
+}
+if (check) {
+  const names = [...new Set([...readdirSync("dist"), ...readdirSync(folder)])];
+  const stale = names.filter((name) => !isEqual(`dist/${name}`, `${folder}/${name}`));
+  rmSync(folder, { recursive: true });
+  if (stale.length > 0) {
+    console.error(`dist/ differs from a fresh build in ${stale.join(", ")}: run make page and commit the result`);
+    process.exitCode = 1;
+  }
+}
+
+function isEqual(path, other) {
+  return existsSync(path) && existsSync(other) && readFileSync(path).equals(readFileSync(other));
 }
