@@ -75,17 +75,20 @@ lint: $(DEVELOPERS)
 types: $(DEVELOPERS)
 	@$(BIN)/mypy $(PACKAGES) benchmarks
 
-# With the pictures of the front page, that of the page in the browser where Chromium is, and the notebook run.
+# With the pages of the sensors, the pictures of the front page, that of the page in the browser where Chromium is, and the notebook run.
 # Without --quiet, which would let broken links pass.
 docs: $(WRITERS)
+	@$(BIN)/python docs/reference_pages.py
 	@$(BIN)/python docs/pictures.py
 	@PATH="$(abspath $(BIN)):$$PATH" NO_MKDOCS_2_WARNING=1 $(BIN)/python -m mkdocs build --strict --site-dir $(abspath $(SITE))
 	@$(BIN)/python docs/pictures.py --page --into $(SITE)/pictures
 
 wheels: $(DEVELOPERS)
+	@$(BIN)/python docs/command_pages.py --man
 	@for project in . $(DISTRIBUTIONS); do $(BIN)/python -m build --wheel --no-isolation --outdir $(DIST) $$project || exit 1; done
 
-# The pages of the sensors in docs/reference/sensors, from their specs; those of the verbs, and the manual pages, from the commands.
+# Writes the pages of the sensors and the manual pages, which git ignores, and the generated parts of
+# docs/reference/command-line.md and docs/reference/ros2.md, which are tracked.
 reference: $(USERS)
 	@$(BIN)/python docs/reference_pages.py
 	@$(BIN)/python docs/command_pages.py
@@ -99,7 +102,7 @@ bench-here: $(PEERS)
 
 clean:
 	rm -rf $(PAGE)/node_modules $(PAGE)/dist-check $(PAGE)/dist-tests
-	rm -rf .venv .venv-bench .venv-ros2 .fuzz dist site .hypothesis .mypy_cache .pytest_cache .ruff_cache
+	rm -rf .venv .venv-bench .venv-ros2 .fuzz dist site docs/man docs/reference/sensors .hypothesis .mypy_cache .pytest_cache .ruff_cache
 	find lidarspec plugins tests -name __pycache__ -type d -prune -exec rm -rf {} +
 
 # An environment without a working pip, as a failed attempt leaves it behind, is made again.

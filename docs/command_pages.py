@@ -1,10 +1,12 @@
-"""Makes the manual pages in docs/man, the usage and options of each verb in docs/reference/command-line.md, and the parameters of the ROS 2
-node in docs/reference/ros2.md.
+"""Write the manual pages, and the generated parts of two pages of the reference.
 
-    python docs/command_pages.py
+    python docs/command_pages.py          # all of it
+    python docs/command_pages.py --man    # the manual pages only
 
-`make reference` runs it; tests/docs/test_reference_pages.py holds that the pages are up to date. In the pages of the reference only what
-stands between the marks is made; the words around it are written by hand.
+`make reference` runs the first, `make wheels` the second. The manual pages go to docs/man, which git
+ignores. In docs/reference/command-line.md (usage and options of each verb) and docs/reference/ros2.md
+(parameters of the node) the text between the marks is generated and the rest is written by hand;
+tests/docs/test_reference_pages.py fails if a generated part is out of date.
 """
 
 from __future__ import annotations
@@ -96,16 +98,27 @@ def _roff(text: str) -> str:
     return f"\\&{escaped}" if escaped.startswith((".", "'")) else escaped
 
 
-def pages() -> dict[str, str]:
-    """The text of every file, by its path under docs."""
-    names = {verb: f"man/lidarspec-{verb}.1" for verb in VERBS} | {"": "man/lidarspec.1"}
-    made = {path: make((DOCS / path).read_text(encoding="utf-8")) for path, make in ((PAGE, page), (NODE, node))}
-    return made | {path: manual(verb) for verb, path in names.items()}
+def make_manuals() -> dict[str, str]:
+    """Return the text of every manual page, by its path under docs."""
+    manuals = {f"man/lidarspec-{verb}.1": manual(verb) for verb in VERBS}
+    manuals["man/lidarspec.1"] = manual("")
+    return manuals
+
+
+def update_pages() -> dict[str, str]:
+    """Return the pages of the reference with their generated parts renewed, by path under docs."""
+    return {
+        PAGE: page((DOCS / PAGE).read_text(encoding="utf-8")),
+        NODE: node((DOCS / NODE).read_text(encoding="utf-8")),
+    }
 
 
 def main() -> None:
-    for path, text in pages().items():
-        (DOCS / path).parent.mkdir(exist_ok=True)
+    files = make_manuals()
+    if "--man" not in sys.argv[1:]:
+        files |= update_pages()
+    (DOCS / "man").mkdir(exist_ok=True)
+    for path, text in files.items():
         (DOCS / path).write_text(text, encoding="utf-8")
 
 

@@ -1,44 +1,53 @@
-"""Makes the page and the packet diagram of every installed sensor in docs/reference/sensors, and the list of them.
+"""Write a page and packet diagrams for every installed sensor, and an index of the pages.
 
-    python docs/reference_pages.py [FOLDER]
+    python docs/reference_pages.py
 
-`make reference` runs it; tests/docs/test_reference_pages.py holds that the pages are up to date.
+`make reference` and `make docs` run this. The files go to docs/reference/sensors, which git ignores.
 """
 
 from __future__ import annotations
 
-import sys
+import shutil
 from pathlib import Path
 
 import lidarspec as ls
 from lidarspec.exports import export, narrowed
 from lidarspec.exports.reference import page
 
-HERE = Path(__file__).parent / "reference" / "sensors"
+FOLDER = Path(__file__).parent / "reference" / "sensors"
 
 
-def pages() -> dict[str, str]:
-    """The text of every file, by name."""
-    found = {}
-    rows = ["# Sensors", "", "One page each, made from the spec by `make reference`.", "", "| sensor | id | proven |", "|---|---|---|"]
-    for name, sensor in ls.sensors().items():
-        data = [frame for frame, value in sensor.frames.items() if value.data]
-        pictures = {frame: f"{name}.svg" if len(data) == 1 else f"{name}-{frame}.svg" for frame in data}
-        found |= {picture: export(narrowed(sensor, frame), "svg") for frame, picture in pictures.items()}
-        found[f"{name}.md"] = page(sensor, pictures)
-        rows.append(f"| [{sensor.vendor} {sensor.model}]({name}.md) | `{name}` | {sensor.status} |")
-    return found | {"index.md": "\n".join(rows) + "\n"}
+def make_sensor_files(sensor: ls.Sensor) -> dict[str, str]:
+    """Return the text of a sensor's page and packet diagrams, by file name."""
+    data_frames = [name for name, frame in sensor.frames.items() if frame.data]
+    if len(data_frames) == 1:
+        diagrams = {data_frames[0]: f"{sensor.id}.svg"}
+    else:
+        diagrams = {name: f"{sensor.id}-{name}.svg" for name in data_frames}
+    files = {file: export(narrowed(sensor, name), "svg") for name, file in diagrams.items()}
+    files[f"{sensor.id}.md"] = page(sensor, diagrams)
+    return files
+
+
+def make_index(sensors: list[ls.Sensor]) -> str:
+    """Return a page with a link to the page of each sensor."""
+    lines = ["# Sensors", "", "One page each, generated from the spec by `make docs`.", ""]
+    lines += ["| sensor | id | proven |", "|---|---|---|"]
+    for sensor in sensors:
+        name = f"{sensor.vendor} {sensor.model}"
+        lines.append(f"| [{name}]({sensor.id}.md) | `{sensor.id}` | {sensor.status} |")
+    return "\n".join(lines) + "\n"
 
 
 def main() -> None:
-    folder = Path(sys.argv[1]) if len(sys.argv) > 1 else HERE
-    folder.mkdir(parents=True, exist_ok=True)
-    made = pages()
-    for old in folder.iterdir():
-        if old.name not in made and old.suffix in (".md", ".svg"):
-            old.unlink()
-    for name, text in made.items():
-        (folder / name).write_text(text, encoding="utf-8")
+    sensors = list(ls.sensors().values())
+    files = {"index.md": make_index(sensors)}
+    for sensor in sensors:
+        files |= make_sensor_files(sensor)
+    shutil.rmtree(FOLDER, ignore_errors=True)
+    FOLDER.mkdir(parents=True)
+    for name, text in files.items():
+        (FOLDER / name).write_text(text, encoding="utf-8")
 
 
 if __name__ == "__main__":
