@@ -7,7 +7,8 @@
 
 In: a sensor. Out: passed tests, or findings with place, reason and what to write. Modules in reading order:
 
-* `conformance`: every property that a sensor is held to, in one table.
+* `properties`: the table of properties that every sensor must have.
+* `conformance`: the same properties as a class of tests for pytest.
 * `findings`: the rules, and how a property says that it does not hold.
 * `subject`: a sensor under test, and what it is fed.
 * `declared`: what shows in the declaration alone.

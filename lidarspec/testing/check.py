@@ -3,7 +3,7 @@
 A name is made a `Target` first: the sensors that it stands for, what kept others from being loaded, and the modules that they are written
 in. The text of these modules is read twice: for mistakes that show in it alone (what Python accepts, and what then does something else
 than it says), and for where fields, frames, functions, commands and sensors stand, so that a finding names file and line (`Places`). Then
-each sensor is held to its declaration and to the properties of `conformance`, in their order, and what it acknowledges is left out of the
+each sensor is held to its declaration and to the properties of `properties.PROPERTIES`, in their order, and what it acknowledges is left out of the
 `Report`.
 """
 
@@ -24,9 +24,9 @@ from lidarspec.entry_points import GROUP, SENSORS, EntryPoint, entry_points
 from lidarspec.errors import SourceError, SpecError, UnknownSensor
 from lidarspec.plugins import Registry, file_and_id, file_module, registry
 from lidarspec.spec.sensor import Sensor
-from lidarspec.testing.conformance import PROPERTIES
 from lidarspec.testing.declared import declared
 from lidarspec.testing.findings import Finding, left_over
+from lidarspec.testing.properties import PROPERTIES
 from lidarspec.testing.subject import EXAMPLES, Subject
 from lidarspec.testing.vectors import lacking
 from lidarspec.trust import document

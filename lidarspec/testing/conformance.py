@@ -1,167 +1,28 @@
-"""Every property that a sensor is held to, in one table: for `lidarspec check`, and as a class of tests for pytest.
+"""`SensorConformance`: the table of properties as a class of tests for pytest.
 
-A property is a function of a `Subject` that raises where it does not hold. It proves the declaration, not the engine: what holds for
-every struct is proved once, where the engine is; one canary stays here (`agreement.parse_decode_and_any_cutting_agree`), since a
-declaration may have functions of its own. Derive a class from `SensorConformance`, name the sensor, and let pytest collect it.
+Derive a class from it, name the sensor, and let pytest collect it.
 """
 
 from __future__ import annotations
 
-import traceback
-from collections.abc import Callable, Collection, Iterable, Mapping
-from dataclasses import dataclass
+from collections.abc import Callable, Collection, Mapping
 from pathlib import Path
 from typing import Any, ClassVar
 
 import pytest
 
-from lidarspec.errors import SpecError
-from lidarspec.framing.frame_engine import codec
 from lidarspec.plugins import sensor as named_sensor
 from lidarspec.spec.sensor import Sensor
-from lidarspec.testing import agreement, commands, frames, geometry, hostile, vectors
 from lidarspec.testing.declared import declared
-from lidarspec.testing.findings import Finding, Violation, left_over
+from lidarspec.testing.findings import left_over
+from lidarspec.testing.properties import PROPERTIES, Property
 from lidarspec.testing.subject import EXAMPLES, Subject
-
-
-def _no_sweep(subject: Subject) -> str:
-    names = subject.sensor.data_frames
-    if not any(subject.sensor.simulation_of(name).sweep for name in names):
-        return "it declares no `sweep`, and cannot be simulated"
-    alone = [name for name in names if codec(subject.sensor.frames[name]).compiled is None]
-    return f"{', '.join(alone)} is not compiled, and cannot be simulated" if alone else ""
-
-
-def _no_commands(subject: Subject) -> str:
-    return "" if subject.sensor.commands else "it has no commands"
-
-
-def _no_device(subject: Subject) -> str:
-    has_replies = any(command.replies for command in subject.sensor.commands.values())
-    return _no_sweep(subject) if has_replies else "it has no commands with a documented reply"
-
-
-@dataclass(frozen=True)
-class Property:
-    """Something that has to hold.
-
-    Attributes:
-        function: of the subject, and of a name where it holds for each frame, data frame or command.
-        each: "sensor", "frame", "data" or "command".
-        rule: that a plain assertion in it falls under.
-        lacks: why it does not apply to a sensor, "" where it does.
-        unless: rules that say it better; where one of them is broken, this is not looked at.
-    """
-
-    function: Callable[..., None]
-    each: str
-    rule: str
-    lacks: Callable[[Subject], str] = lambda subject: ""
-    unless: tuple[str, ...] = ()
-
-    @property
-    def name(self) -> str:
-        """The name of the property: that of its function."""
-        return self.function.__name__
-
-    def cases(self, subject: Subject) -> Iterable[tuple[str, ...]]:
-        """What it is asked of."""
-        names = {"frame": subject.frames, "data": subject.sensor.data_frames, "command": subject.sensor.commands}
-        return [()] if self.each == "sensor" else [(name,) for name in names[self.each]]
-
-    def findings(self, subject: Subject) -> list[Finding]:
-        """What does not hold."""
-        found = []
-        for case in self.cases(subject):
-            try:
-                self.function(subject, *case)
-            except Violation as error:
-                file = str(subject.vectors) if error.code == "LS702" else ""  # a fault of that file
-                found.append(Finding(error.code, error.what, error.path, subject.sensor.id, file))
-            except AssertionError as error:
-                code = "LS414" if "Traceback" in str(error) else self.rule
-                found.append(Finding(code, _gist(error), ".".join(case), subject.sensor.id))
-            except SpecError as error:
-                place = ".".join(case)
-                path = error.path if error.path.startswith(place) else place
-                found.append(Finding(error.rule or _rule_of(error), error.reason, path, subject.sensor.id))
-            except Exception as error:
-                found.append(_unexpected(error, ".".join(case), subject))
-        return found
-
-
-#: rules that a plugin breaks which fails at work.
-FAILS = ("LS213", "LS214", "LS215", "LS414")
-
-PROPERTIES = (
-    Property(frames.examples_are_valid_and_repeat, "frame", "LS301"),
-    Property(frames.bytes_survive_parsing_and_building, "frame", "LS302"),
-    Property(frames.every_raw_value_survives, "frame", "LS302", unless=("LS302", "LS303")),
-    Property(frames.what_follows_is_held, "frame", "LS312", unless=("LS302", "LS303")),
-    Property(frames.values_in_units_build_the_same_bytes, "frame", "LS304", unless=("LS302", "LS303")),
-    Property(frames.values_survive_building_and_parsing, "frame", "LS305", unless=("LS302", "LS303")),
-    Property(frames.parse_finds_out_the_type, "frame", "LS306"),
-    Property(frames.a_truncated_frame_is_a_wire_error, "frame", "LS307"),
-    Property(frames.a_damaged_frame_is_at_worst_a_wire_error, "frame", "LS308"),
-    Property(frames.every_single_bit_error_is_seen, "frame", "LS310"),
-    Property(vectors.every_checksum_is_checked, "frame", "LS212"),
-    Property(vectors.the_status_is_proven, "sensor", "LS710"),
-    Property(vectors.vectors_hold, "sensor", "LS706", lacks=vectors.lacking),
-    Property(vectors.every_data_field_is_pinned_down, "data", "LS711", lacks=vectors.lacking, unless=("LS702", "LS703", "LS707")),
-    Property(vectors.points_stand_in_two_quadrants, "data", "LS712", lacks=vectors.lacking, unless=("LS702", "LS703", "LS707")),
-    Property(geometry.clouds_keep_the_conventions, "data", "LS501"),
-    Property(geometry.directions_are_radians, "data", "LS502", unless=FAILS),
-    Property(geometry.a_single_point_has_a_direction, "data", "LS503", unless=FAILS),
-    Property(geometry.the_full_circle_is_the_same_as_none, "data", "LS505", unless=(*FAILS, "LS503")),
-    Property(geometry.the_points_turn_as_the_axes_do, "data", "LS511", unless=(*FAILS, "LS502")),
-    Property(geometry.angles_are_in_order, "data", "LS506", lacks=_no_sweep, unless=(*FAILS, "LS502")),
-    Property(geometry.counters_run_on, "data", "LS509", lacks=_no_sweep, unless=FAILS),
-    Property(agreement.the_same_bytes_give_the_same_points, "sensor", "LS415", unless=FAILS),
-    Property(agreement.a_clean_input_loses_nothing, "sensor", "LS401"),
-    Property(agreement.parse_decode_and_any_cutting_agree, "sensor", "LS402", unless=("LS308", "LS306", "LS401", *FAILS, "LS415")),
-    Property(hostile.no_stream_costs_much_more_than_frames, "sensor", "LS416", unless=("LS301", *FAILS)),
-    Property(agreement.single_packets_equal_a_batch, "sensor", "LS403", unless=("LS415",)),
-    Property(agreement.scans_do_not_depend_on_batches, "sensor", "LS404", unless=(*FAILS, "LS415")),
-    Property(geometry.a_simulated_scene_comes_back, "data", "LS507", lacks=_no_sweep, unless=("LS201", *FAILS, "LS502", "LS415", "LS503")),
-    Property(commands.a_command_parses_back, "command", "LS601", lacks=_no_commands),
-    Property(commands.arguments_are_held_to_their_ranges, "command", "LS602", lacks=_no_commands),
-    Property(commands.replies_can_match, "command", "LS603", lacks=_no_commands),
-    Property(
-        commands.the_simulated_sensor_answers, "command", "LS604", lacks=_no_device, unless=(*FAILS, "LS201", "LS508", "LS601", "LS603")
-    ),
-)
-
-
-def _gist(error: BaseException) -> str:
-    """The last line that says something."""
-    lines = [line for line in str(error).splitlines() if line.strip()]
-    return (lines[-1] if "Traceback" in str(error) else lines[0]) if lines else type(error).__name__
-
-
-def _rule_of(error: SpecError) -> str:
-    return "LS115" if "expression of the struct" in error.reason else "LS301" if "random frame" in error.reason else "LS414"
-
-
-def _unexpected(error: Exception, path: str, subject: Subject) -> Finding:
-    """The finding for an exception that nobody documented, at the plugin's own line where it comes from one."""
-    spots = [spot for spot in traceback.extract_tb(error.__traceback__) if not _ours(spot.filename)]
-    spot = spots[-1] if spots else None
-    text = f"{type(error).__name__}: {str(error).splitlines()[0] if str(error) else ''}"
-    return Finding("LS308", text, path, subject.sensor.id, spot.filename if spot else "", (spot.lineno or 0) if spot else 0)
-
-
-def _ours(file: str) -> bool:
-    """Whether a file is the engine's, or a library's that it stands on."""
-    package = Path(__file__).resolve().parents[1]
-    return package in Path(file).parents or any(part in Path(file).parts for part in ("construct", "numpy", "hypothesis", "_pytest"))
-
 
 _SUBJECTS: dict[type, Subject] = {}
 
 
 class SensorConformance:
-    """What holds for every sensor: a test for each property in `lidarspec.testing.conformance`.
+    """What holds for every sensor: a test for each property in `lidarspec.testing.properties`.
 
     Attributes:
         sensor: an id, a `Sensor`, or a file that describes one.

@@ -8,7 +8,7 @@ from lidarspec import Sensor
 from lidarspec.framing.frame_engine import InterpretedCodec, codec
 from lidarspec.testing import SensorConformance, agreement, hostile
 from lidarspec.testing.check import target
-from lidarspec.testing.conformance import PROPERTIES
+from lidarspec.testing.properties import PROPERTIES
 from tests.all_sensors import DISTINCT, EVERY, FRAMES
 from tests.shapes import SHAPES
 

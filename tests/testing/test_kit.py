@@ -21,11 +21,11 @@ from hypothesis import strategies as st
 from lidarspec import Sensor
 from lidarspec.spec import Checksummed, Crc, Fields, Frame, Polar, Scaled, Sum, take
 from lidarspec.testing.check import Target, reports
-from lidarspec.testing.conformance import PROPERTIES
 from lidarspec.testing.declared import declared
 from lidarspec.testing.findings import Violation, left_over
 from lidarspec.testing.frames import values_in_units_build_the_same_bytes, values_survive_building_and_parsing
 from lidarspec.testing.geometry import the_points_turn_as_the_axes_do
+from lidarspec.testing.properties import PROPERTIES
 from lidarspec.testing.subject import Subject
 from lidarspec.testing.vectors import vectors_hold
 from tests.broken import sound

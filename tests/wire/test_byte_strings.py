@@ -53,7 +53,7 @@ from construct import (
 from lidarspec import SpecError, UsageError, WireError
 from lidarspec.exports import Refused, export
 from lidarspec.framing.frame_engine import CompiledCodec, InterpretedCodec, codec
-from lidarspec.testing.conformance import PROPERTIES
+from lidarspec.testing.properties import PROPERTIES
 from lidarspec.testing.subject import Subject
 from tests.engine.against_construct import BACKENDS, agree, plain, sensor
 from tests.engine.engines import clean_and_damaged_input_read_alike, values_at_the_edges_read_alike
