@@ -39,9 +39,10 @@ import numpy as np
 from lidarspec._version import __version__
 from lidarspec.device.file_scans import FileScans
 from lidarspec.discovery.detect import detected
-from lidarspec.errors import LidarSpecError, SourceError, UsageError, WireError, library, suggest, system_errors
+from lidarspec.errors import LidarSpecError, SourceError, UsageError, WireError, suggest, system_errors
 from lidarspec.formats import format_of, write
 from lidarspec.formats.tables import tables
+from lidarspec.libraries import import_library
 from lidarspec.plugins import sensor as named_sensor
 from lidarspec.scans.scans import Scan
 from lidarspec.scans.selection import EVERYTHING, Selection, Sieve
@@ -337,7 +338,7 @@ def _executor(jobs: int, scheduler: str) -> Iterator[Executor]:
         SourceError: where the scheduler cannot be reached.
     """
     if scheduler:
-        distributed = library("distributed", "dask")
+        distributed = import_library("distributed", "dask")
         try:
             client = distributed.Client(scheduler)
         except (OSError, ValueError) as error:
@@ -496,8 +497,8 @@ def read(
         SourceError: where there is no such file.
         UsageError: where a library is missing.
     """
-    dask, frames = library("dask", "dask"), library("dask.dataframe", "dask")
-    library("pyarrow", "arrow")
+    dask, frames = import_library("dask", "dask"), import_library("dask.dataframe", "dask")
+    import_library("pyarrow", "arrow")
     todo = pieces([urls] if isinstance(urls, str) else urls, sensor, every_point=every_point, size=size, select=select)
     found = dask.compute(*(dask.delayed(_cut)(piece) for piece in todo))
     cut = [piece for pieces in found for piece in pieces if piece.count != 0 or not piece.number]
@@ -519,7 +520,7 @@ def _partition(piece: Piece) -> Any:
     """The points of a piece as a pandas dataframe."""
     with piece.opened() as scans:
         made = tables(piece.numbered(scans), every_point=piece.every_point)
-        table = library("pyarrow", "arrow").concat_tables(made)
+        table = import_library("pyarrow", "arrow").concat_tables(made)
         if not table.num_rows and piece.is_last and not piece.first:
             raise WireError(f"no scan in {piece.source}: {scans.stats}")
     return table.to_pandas()

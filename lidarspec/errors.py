@@ -7,7 +7,6 @@ own text from typed arguments, so that the place of a fault can be read from the
 
 from __future__ import annotations
 
-import importlib
 import os
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
@@ -144,6 +143,35 @@ class UsageError(LidarSpecError):
     """A call that cannot be carried out as it was made: the caller's fault."""
 
 
+class LibraryError(UsageError):
+    """An optional library is missing, too old, or fails when it is imported.
+
+    Attributes:
+        distribution: name of the library on the package index.
+        extra: the extra of lidarspec that installs it.
+        least_version: the least version needed, "" if any will do.
+        installed_version: the version found, "" if it is missing.
+    """
+
+    def __init__(
+        self,
+        distribution: str,
+        extra: str,
+        *,
+        least_version: str = "",
+        installed_version: str = "",
+        cause: str = "",
+    ) -> None:
+        self.distribution = distribution
+        self.extra = extra
+        self.least_version = least_version
+        self.installed_version = installed_version
+        needed = f"{distribution} {least_version} or later" if least_version else distribution
+        found = f"version {installed_version} is installed" if installed_version else "it is missing"
+        super().__init__(f"this needs {needed}; {found}" + (f" ({cause})" if cause else ""))
+        suggest(self, f"pip install 'lidarspec[{extra}]'")
+
+
 #: names that have what was typed as a part, which are suggested together at most.
 SUGGESTED = 6
 
@@ -187,19 +215,6 @@ def suggestion(error: BaseException) -> str:
     """The next command to type that an error was given, "" where it has none."""
     notes: Sequence[str] = getattr(error, "__notes__", ())
     return next((note.removeprefix(_NEXT) for note in notes if note.startswith(_NEXT)), "")
-
-
-def library(name: str, extra: str) -> Any:
-    """A module of an optional library.
-
-    Raises:
-        UsageError: where it is not installed, with what to type.
-    """
-    try:
-        return importlib.import_module(name)
-    except ImportError as error:
-        reason = f"this takes {name.removeprefix('backports.').partition('.')[0]}, which is not installed ({error})"
-        raise suggest(UsageError(reason), f"pip install 'lidarspec[{extra}]'") from error
 
 
 def refuse_text(data: object) -> None:

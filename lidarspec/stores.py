@@ -12,7 +12,8 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any, BinaryIO, cast
 
-from lidarspec.errors import LidarSpecError, SourceError, UsageError, library, suggest, system_errors
+from lidarspec.errors import LidarSpecError, SourceError, UsageError, suggest, system_errors
+from lidarspec.libraries import import_library
 
 #: what a URL of a store begins with, and the library that fsspec takes for it, where it has none of its own.
 DRIVERS = {
@@ -44,7 +45,7 @@ def system_of(url: str) -> Any:
         UsageError: where fsspec, or its driver, is not installed.
         SourceError: where the store cannot be reached.
     """
-    fsspec = library("fsspec", "fsspec")
+    fsspec = import_library("fsspec", "fsspec")
     scheme = url.partition("://")[0]
     with _failures(url):
         try:

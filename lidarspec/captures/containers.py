@@ -18,7 +18,8 @@ from shlex import quote
 from typing import Any, BinaryIO, NamedTuple, cast
 
 from lidarspec.captures.records import is_capture
-from lidarspec.errors import SourceError, UnknownName, UsageError, library, suggest, system_errors
+from lidarspec.errors import SourceError, UnknownName, UsageError, suggest, system_errors
+from lidarspec.libraries import import_library
 from lidarspec.recording.format import MAGIC
 from lidarspec.stores import file_of
 
@@ -175,7 +176,7 @@ def unpacked(name: str, file: BinaryIO, member: str = "") -> BinaryIO:
         if packing is ZIP:
             content, member = _of_archive(name, file, member), ""
         else:
-            content = library(packing.module, "zstd").open(file)
+            content = import_library(packing.module, "zstd").open(file)
         file = cast(BinaryIO, io.BufferedReader(Unpacking(name, file, content), FILLED))
     if member:
         raise UsageError(f"{name} is no zip archive: there is no {member} in it")

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-import importlib.util
 from pathlib import Path
 from shlex import quote
 
@@ -17,6 +16,7 @@ from lidarspec.discovery.draft import Link, Names, captured, draft, invented, jo
 from lidarspec.discovery.listen import beginning
 from lidarspec.errors import UsageError, WireError, suggest
 from lidarspec.exports import EXPORTS, Refused, export as exported, narrowed
+from lidarspec.libraries import import_library
 from lidarspec.plugins import sensor as named_sensor, sensors
 from lidarspec.testing.check import Report, reports, target
 from lidarspec.testing.subject import EXAMPLES
@@ -91,8 +91,7 @@ def check(ctx: click.Context, name: str, max_examples: int, vectors: str | None,
 
     Everything that the test kit asks, without a test file. Exit code 1 where there are findings.
     """
-    if importlib.util.find_spec("hypothesis") is None:
-        raise UsageError("check needs hypothesis: pip install 'lidarspec[testing]'")
+    import_library("hypothesis", "testing")
     file = Path(vectors) if vectors else None
     with Progress() as line:
         found = list(reports(target(name), name, examples=max_examples, vectors=file, watch=lambda text: line(lambda: text)))

@@ -16,7 +16,8 @@ from lidarspec.cli.options import DURATION, colour_option, selecting, sensor_opt
 from lidarspec.cli.output import drawn
 from lidarspec.cli.terminal import ended_by_terminate, note, say
 from lidarspec.device.device import Device, open as open_device
-from lidarspec.errors import UsageError, library
+from lidarspec.errors import UsageError
+from lidarspec.libraries import import_library
 from lidarspec.points.look import look
 from lidarspec.scans.selection import Selection
 from lidarspec.spec.sensor import Sensor
@@ -117,7 +118,7 @@ def _serve(
     """The page, until the time is over or somebody ends it."""
     host, port = listening(address)
     for name in ("starlette", "uvicorn", "websockets"):
-        library(name, "web")
+        import_library(name, "web")
     from lidarspec.view.broadcast import Broadcast
     from lidarspec.view.server import Site
 

@@ -16,9 +16,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import DTypeLike, NDArray
 
-from lidarspec.errors import library
 from lidarspec.formats.rows import NAMES, Rows, write_rows
 from lidarspec.formats.writing import Spool, picture, written
+from lidarspec.libraries import import_library
 from lidarspec.points.cloud import structured_type, units_of
 from lidarspec.scans.scans import Scan
 from lidarspec.transports.protocol import Format
@@ -145,7 +145,7 @@ def write_zarr(path: Path, scans: Iterable[Scan], *, every_point: bool) -> None:
     Arrays have their `units`; the group has `sensor`, `source`, `frame` (where x, y and z point) and `calibration`. A column that a later
     scan lacks is nan there, or 0 where it holds whole numbers.
     """
-    group = library("zarr", "zarr").open_group(str(path), mode="w")
+    group = import_library("zarr", "zarr").open_group(str(path), mode="w")
     of_scans = {name: _ZarrColumn(group, name, dtype, unit=unit, along="scans") for name, (dtype, unit) in OF_SCANS.items()}
     columns = {"scan": _ZarrColumn(group, "scan", np.int32)}
     for number, scan in enumerate(scans):

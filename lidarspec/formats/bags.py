@@ -16,8 +16,8 @@ from operator import attrgetter
 from pathlib import Path
 from typing import Any
 
-from lidarspec.errors import library
 from lidarspec.formats.messages import CLOUD, SCAN, Message, Messages
+from lidarspec.libraries import import_library
 from lidarspec.scans.planes import Planes
 from lidarspec.scans.scans import Scan
 from lidarspec.transports.bags import RAW
@@ -62,7 +62,7 @@ class Log:
 
 def write_mcap(path: Path, scans: Iterable[Scan], packets: Iterable[Chunk] = (), *, every_point: bool) -> None:
     """Write an MCAP file as ROS 2 records it, which Foxglove, `ros2 bag` and PlotJuggler read."""
-    mcap = library("mcap.writer", "ros")
+    mcap = import_library("mcap.writer", "ros")
     held, channels = Log("ROS2_HUMBLE"), dict[str, int]()
     with path.open("wb") as file:
         log = mcap.Writer(file, chunk_size=CHUNK, compression=mcap.CompressionType.NONE)
@@ -80,7 +80,7 @@ def write_mcap(path: Path, scans: Iterable[Scan], packets: Iterable[Chunk] = (),
 def write_ros1(path: Path, scans: Iterable[Scan], packets: Iterable[Chunk] = (), *, every_point: bool) -> None:
     """Write a bag as `rosbag record` does."""
     held = Log("ROS1_NOETIC")
-    _record(library("rosbags.rosbag1", "ros").Writer(path), held, held.messages(scans, packets, every_point=every_point))
+    _record(import_library("rosbags.rosbag1", "ros").Writer(path), held, held.messages(scans, packets, every_point=every_point))
 
 
 def write_ros2(path: Path, scans: Iterable[Scan], packets: Iterable[Chunk] = (), *, storage: str, every_point: bool) -> None:
@@ -91,7 +91,7 @@ def write_ros2(path: Path, scans: Iterable[Scan], packets: Iterable[Chunk] = (),
     """
     import sqlite3  # which the whole module would otherwise wait for
 
-    rosbag2 = library("rosbags.rosbag2", "ros")
+    rosbag2 = import_library("rosbags.rosbag2", "ros")
     with tempfile.TemporaryDirectory(prefix=".", dir=path.parent) as folder:
         bag = Path(folder) / "scans"
         log = rosbag2.Writer(bag, version=8, storage_plugin=rosbag2.StoragePlugin[storage.upper()])

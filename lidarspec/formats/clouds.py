@@ -14,9 +14,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from lidarspec.errors import UsageError, library, suggest
+from lidarspec.errors import UsageError, suggest
 from lidarspec.formats.rows import Rows, room, write_rows
 from lidarspec.formats.writing import Spool
+from lidarspec.libraries import import_library
 from lidarspec.scans.scans import Scan
 from lidarspec.transports.protocol import Format
 
@@ -43,7 +44,7 @@ def write_lzf_pcd(path: Path, scans: Iterable[Scan], *, every_point: bool, organ
     Raises:
         UsageError: where the points take 4 GiB or more, which the format cannot say.
     """
-    compress = library("lzf", "pcd").compress
+    compress = import_library("lzf", "pcd").compress
     rows = _pcd_rows(scans, every_point=every_point)
     with contextlib.ExitStack() as files, path.open("wb") as target:
         names = rows.dtype.names or ()

@@ -11,8 +11,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from lidarspec.errors import library
 from lidarspec.formats.writing import GPS_EPOCH, columns_of
+from lidarspec.libraries import import_library
 from lidarspec.scans.scans import Scan
 from lidarspec.transports.protocol import Format
 
@@ -43,7 +43,7 @@ def _write(path: Path, scans: Iterable[Scan], *, every_point: bool) -> None:
     description. With `every_point`, a point without a return is at 0 with cartesianInvalidState 2. Headers are in memory until the file
     is closed, as the library has it.
     """
-    pye57, libe57 = library("pye57", "e57"), library("pye57.libe57", "e57")
+    pye57, libe57 = import_library("pye57", "e57"), import_library("pye57.libe57", "e57")
     with contextlib.ExitStack() as files:
         try:
             file = pye57.E57(str(path), mode="w")

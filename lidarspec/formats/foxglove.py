@@ -10,9 +10,10 @@ from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
-from lidarspec.errors import UsageError, library
+from lidarspec.errors import UsageError
 from lidarspec.formats.bags import CHUNK, TOPICS
 from lidarspec.formats.messages import CLOUD, SCAN, fields_of, records
+from lidarspec.libraries import import_library
 from lidarspec.points.cloud import PointCloud
 from lidarspec.scans.planes import Planes
 from lidarspec.scans.scans import LaserScan, Scan
@@ -28,7 +29,7 @@ def write_foxglove(path: Path, scans: Iterable[Scan], *, every_point: bool) -> N
     Raises:
         UsageError: for a stamp before 1970.
     """
-    mcap, support = library("mcap.writer", "foxglove"), library("mcap_protobuf.writer", "foxglove")
+    mcap, support = import_library("mcap.writer", "foxglove"), import_library("mcap_protobuf.writer", "foxglove")
     planes, units = Planes(), dict[str, str]()
     with path.open("wb") as file:
         log = support.Writer(file, chunk_size=CHUNK, compression=mcap.CompressionType.NONE)
@@ -51,12 +52,12 @@ def write_foxglove(path: Path, scans: Iterable[Scan], *, every_point: bool) -> N
 def _cloud(cloud: PointCloud, *, every_point: bool) -> Any:
     points = records(cloud, every_point=every_point)
     fields = [{"name": name, "offset": offset, "type": FIELD_TYPES[kind]} for name, offset, kind in fields_of(cloud, points)]
-    message = library("foxglove_schemas_protobuf.PointCloud_pb2", "foxglove").PointCloud
+    message = import_library("foxglove_schemas_protobuf.PointCloud_pb2", "foxglove").PointCloud
     return message(point_stride=points.itemsize, fields=fields, data=points.tobytes())
 
 
 def _planar(scan: LaserScan, *, is_graded: bool) -> Any:
-    message = library("foxglove_schemas_protobuf.LaserScan_pb2", "foxglove").LaserScan
+    message = import_library("foxglove_schemas_protobuf.LaserScan_pb2", "foxglove").LaserScan
     intensities = scan.intensities if is_graded else ()
     return message(start_angle=scan.angle_min, end_angle=scan.angle_max, ranges=scan.ranges, intensities=intensities)
 

@@ -12,8 +12,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from lidarspec.errors import UsageError, library, suggest
+from lidarspec.errors import UsageError, suggest
 from lidarspec.formats.writing import GPS_EPOCH, behind, columns_of
+from lidarspec.libraries import import_library
 from lidarspec.scans.scans import Scan
 from lidarspec.transports.protocol import Format
 
@@ -41,7 +42,7 @@ def _write(path: Path, scans: Iterable[Scan], *, every_point: bool, is_compresse
     Raises:
         UsageError: where places are farther apart than numbers of 32 bits reach, 214 km.
     """
-    laspy = library("laspy", "las")
+    laspy = import_library("laspy", "las")
     with contextlib.ExitStack() as files:
         header, writer = laspy.LasHeader(point_format=6, version="1.4"), None
         opened = partial(laspy.open, files.enter_context(path.open("wb")), "w", header=header, do_compress=is_compressed, closefd=False)
@@ -109,7 +110,7 @@ def _fill(rows: NDArray[Any], part: Mapping[str, NDArray[Any]], further: Mapping
 
 def _write_compressed(path: Path, scans: Iterable[Scan], *, every_point: bool) -> None:
     """Write the same, compressed: a sixth to a half as large, in seven times the time."""
-    lazrs = library("lazrs", "las")
+    lazrs = import_library("lazrs", "las")
     try:
         _write(path, scans, every_point=every_point, is_compressed=True)
     except lazrs.LazrsError as error:  # of the system's errors alone, without its words

@@ -11,8 +11,9 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from lidarspec.errors import UsageError, library
+from lidarspec.errors import UsageError
 from lidarspec.formats.writing import picture
+from lidarspec.libraries import import_library
 from lidarspec.packets.imu import ImuSamples
 from lidarspec.points.cloud import PointCloud
 from lidarspec.scans.scans import LaserScan, Scan
@@ -46,7 +47,7 @@ class Messages:
     """
 
     def __init__(self, release: str) -> None:
-        typesys = library("rosbags.typesys", "ros")
+        typesys = import_library("rosbags.typesys", "ros")
         self.types = typesys.get_typestore(typesys.Stores[release])
         self._serialized = self.types.serialize_ros1 if release.startswith("ROS1") else self.types.serialize_cdr
         self._counts = release.startswith("ROS1")

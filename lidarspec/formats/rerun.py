@@ -17,8 +17,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from lidarspec.errors import library
 from lidarspec.formats.writing import columns_of
+from lidarspec.libraries import import_library
 from lidarspec.points.cloud import PointCloud
 from lidarspec.points.look import BRIGHT, Look, blended, look, steps
 from lidarspec.scans.scans import Scan
@@ -45,7 +45,7 @@ class Log:
     """
 
     def __init__(self, ramp: str = "range") -> None:
-        self._rerun = library("rerun", "rerun")
+        self._rerun = import_library("rerun", "rerun")
         self.stream = self._rerun.RecordingStream("lidarspec", send_properties=False)
         self.stream.set_log_time_enabled(False)  # when it was logged is not when it was measured
         self.stream.set_log_tick_enabled(False)
@@ -144,7 +144,7 @@ class Log:
 
     def _layout(self) -> Any:
         """The points, and beside them figures and facts; the sensor's time runs."""
-        views = library("rerun.blueprint", "rerun")
+        views = import_library("rerun.blueprint", "rerun")
         figures = [
             views.TimeSeriesView(origin=f"{self._home}/statistics", contents=f"$origin/{name}", name=name) for name in ("speed_hz", "valid")
         ]

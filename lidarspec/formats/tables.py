@@ -13,8 +13,8 @@ from typing import Any
 
 import numpy as np
 
-from lidarspec.errors import library
 from lidarspec.formats.writing import behind, written
+from lidarspec.libraries import import_library
 from lidarspec.points.cloud import PointCloud, arrow_schema
 from lidarspec.scans.scans import Scan
 from lidarspec.transports.protocol import Format
@@ -46,7 +46,7 @@ def tables(scans: Iterable[Scan], path: Path | None = None, *, every_point: bool
     Args:
         path: where they go; a column that a folder of it says already, such as scan=7, is left out, as Hive has it.
     """
-    arrow, of_scans = library("pyarrow", "arrow"), _of_scans(path)
+    arrow, of_scans = import_library("pyarrow", "arrow"), _of_scans(path)
     schema, gathered, rows = None, list[Any](), 0
     for place, scan in enumerate(scans):
         cloud = written(scan, every_point=every_point)
@@ -68,7 +68,7 @@ def _table(arrow: Any, batches: Sequence[Any], schema: Any) -> Any:
 
 def _of_scans(path: Path | None) -> list[Any]:
     """The fields that say of each point which scan it is from, but for those that a folder says."""
-    arrow, folders = library("pyarrow", "arrow"), path.parent.parts if path else ()
+    arrow, folders = import_library("pyarrow", "arrow"), path.parent.parts if path else ()
     said = {part.partition("=")[0] for part in folders if "=" in part}
     types = {"scan": arrow.int32(), "stamp": arrow.timestamp("ns"), "complete": arrow.bool_()}
     return [arrow.field(name, kind, nullable=False) for name, kind in types.items() if name not in said]
@@ -103,13 +103,13 @@ def _parquet(path: Path, schema: Any) -> Any:
     """A writer of Parquet, not compressed, which takes longer than all else; numbers of few values take few bits, as in a dictionary."""
     few = [field.name for field in schema if str(field.type) not in ("float", "double", "bool")]
     timed = [name for name in ("scan", "stamp") if name in schema.names]
-    parquet = library("pyarrow.parquet", "arrow")
+    parquet = import_library("pyarrow.parquet", "arrow")
     return parquet.ParquetWriter(path, schema, compression="none", use_dictionary=few, write_statistics=timed)
 
 
 def _batches(path: Path, schema: Any, compression: str | None) -> Any:
     """A writer of Arrow's file format."""
-    ipc = library("pyarrow.ipc", "arrow")
+    ipc = import_library("pyarrow.ipc", "arrow")
     return ipc.new_file(str(path), schema, options=ipc.IpcWriteOptions(compression=compression))
 
 

@@ -20,7 +20,8 @@ import numpy as np
 from numpy.typing import DTypeLike, NDArray
 
 from lidarspec.display import drawn
-from lidarspec.errors import UnknownName, UsageError, library
+from lidarspec.errors import UnknownName, UsageError
+from lidarspec.libraries import import_library
 from lidarspec.points.conventions import TYPES, UNITS, Floats, Grid, Grids, Kind, narrowed, whole_columns
 
 #: names of the columns that a cloud can have, in the order in which files list them.
@@ -240,7 +241,9 @@ class PointCloud:
         Raises:
             UsageError: where pyarrow is not installed.
         """
-        return library("pyarrow", "arrow").table(dict(self.columns), arrow_schema(self, {"stamp_ns": str(self.stamp_ns), **(facts or {})}))
+        return import_library("pyarrow", "arrow").table(
+            dict(self.columns), arrow_schema(self, {"stamp_ns": str(self.stamp_ns), **(facts or {})})
+        )
 
     def __arrow_c_stream__(self, requested_schema: object = None) -> object:
         """The table of `to_arrow`, as DuckDB, Polars and pandas take it from the object itself."""
@@ -252,7 +255,7 @@ class PointCloud:
         Raises:
             UsageError: where pandas is not installed.
         """
-        frame = library("pandas", "pandas").DataFrame(dict(self.columns), copy=False)
+        frame = import_library("pandas", "pandas").DataFrame(dict(self.columns), copy=False)
         frame.attrs.update(units=units_of(self), stamp_ns=self.stamp_ns)
         return frame
 
@@ -262,7 +265,7 @@ class PointCloud:
         Raises:
             UsageError: where Polars is not installed.
         """
-        return library("polars", "polars").DataFrame(dict(self.columns))
+        return import_library("polars", "polars").DataFrame(dict(self.columns))
 
 
 def units_of(cloud: PointCloud) -> dict[str, str]:
@@ -276,7 +279,7 @@ def arrow_schema(cloud: PointCloud, facts: Mapping[str, str]) -> Any:
     Args:
         facts: metadata of the schema, beside `units` as JSON and `calibration`: "nominal" or "own".
     """
-    arrow, units = library("pyarrow", "arrow"), units_of(cloud)
+    arrow, units = import_library("pyarrow", "arrow"), units_of(cloud)
     fields = [
         arrow.field(name, arrow.from_numpy_dtype(column.dtype), column.dtype.kind != "f", {"unit": units.get(name, "")})
         for name, column in cloud.columns.items()

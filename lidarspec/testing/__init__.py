@@ -27,6 +27,8 @@ from __future__ import annotations
 import sys
 from typing import TYPE_CHECKING, Any
 
+from lidarspec.libraries import import_library
+
 if TYPE_CHECKING:
     from lidarspec.testing.conformance import SensorConformance
 
@@ -36,11 +38,8 @@ __all__ = ["SensorConformance"]
 def __getattr__(name: str) -> Any:
     if name not in __all__:
         raise AttributeError(f"module 'lidarspec.testing' has no attribute {name!r}")
-    try:
-        import hypothesis  # noqa: F401
-        import pytest
-    except ImportError as error:
-        raise ImportError("the test kit needs pytest and hypothesis: pip install 'lidarspec[testing]'") from error
+    import_library("hypothesis", "testing")
+    pytest = import_library("pytest", "testing")
     if "lidarspec.testing.agreement" not in sys.modules:  # pytest warns of one that is
         pytest.register_assert_rewrite("lidarspec.testing.agreement")
     from lidarspec.testing.conformance import SensorConformance

@@ -3,7 +3,7 @@
 A name is made a `Target` first: the sensors that it stands for, what kept others from being loaded, and the modules that they are written
 in. The text of these modules is read twice: for mistakes that show in it alone (what Python accepts, and what then does something else
 than it says), and for where fields, frames, functions, commands and sensors stand, so that a finding names file and line (`Places`). Then
-each sensor is held to its declaration and to the properties of `properties.PROPERTIES`, in their order, and what it acknowledges is left out of the
+each sensor is held to its declaration and to the properties of `properties`, in their order, and what it acknowledges is left out of the
 `Report`.
 """
 

@@ -19,7 +19,8 @@ from contextlib import ExitStack, contextmanager
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from lidarspec.errors import LidarSpecError, SourceError, library
+from lidarspec.errors import LidarSpecError, SourceError
+from lidarspec.libraries import import_library
 from lidarspec.transports.protocol import Chunk, Transport
 
 _RULE = "=" * 80
@@ -84,7 +85,7 @@ class BagTransport(Transport):
     def __init__(self, path: str, log: Log, *, sender: str | None = None) -> None:
         self._path, self._kind = path, log
         self.warnings: list[str] = []
-        reader = getattr(library(log.module, "ros"), log.reader)
+        reader = getattr(import_library(log.module, "ros"), log.reader)
         with self._failures(), ExitStack() as undo:
             self._log = reader(Path(path))
             self._log.open()
@@ -132,7 +133,7 @@ class BagTransport(Transport):
         for layout in layouts:
             try:
                 message = getattr(layout, f"deserialize_{self._kind.form}")(raw, link.msgtype)
-            except library("rosbags.serde", "ros").SerdeError:
+            except import_library("rosbags.serde", "ros").SerdeError:
                 if len(layouts) == 1:
                     raise
                 continue
@@ -171,7 +172,7 @@ def _ns(stamped: Any) -> int:
 
 def _layouts(link: Any) -> list[Any]:
     """How the messages of a connection may be laid out, as stores of types; none where they hold no packets."""
-    typesys = library("rosbags.typesys", "ros")
+    typesys = import_library("rosbags.typesys", "ros")
     if link.msgtype == RAW and "packets" in link.topic:
         return [typesys.get_typestore(typesys.Stores.ROS2_HUMBLE)]
     is_told = link.msgdef.format.name == "MSG"

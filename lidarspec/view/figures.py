@@ -11,7 +11,8 @@ from typing import Any, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-from lidarspec.errors import UsageError, library
+from lidarspec.errors import UsageError
+from lidarspec.libraries import import_library
 from lidarspec.points.look import Look
 from lidarspec.scans.scans import Scan
 from lidarspec.view.feed import Feed, totals
@@ -45,7 +46,7 @@ def _styled(draw: _Drawing) -> _Drawing:
 
     @functools.wraps(draw)
     def drawn(*args: Any, **options: Any) -> Any:
-        with library("matplotlib", "plot").rc_context(STYLE):
+        with import_library("matplotlib", "plot").rc_context(STYLE):
             return draw(*args, **options)
 
     return drawn  # type: ignore[return-value]
@@ -139,7 +140,7 @@ def of_ranges(scans: Iterable[Scan], title: str) -> Any:
     counts = np.stack([np.histogram(every[which][1], edges)[0] for which in order], axis=1)
     figure = _figure(f"{title}: {number:,} scans" + f", of which one in {step} is shown" * (step > 1))
     axes = figure.subplots()
-    colours = library("matplotlib.colors", "plot").LogNorm(1, max(int(counts.max()), 2))
+    colours = import_library("matplotlib.colors", "plot").LogNorm(1, max(int(counts.max()), 2))
     begins = np.append(times[order], times[order][-1] + last)
     shown = axes.pcolormesh(begins, edges, np.ma.masked_equal(counts, 0), norm=colours, rasterized=True)
     medians = [float(np.median(every[which][1])) if len(every[which][1]) else np.nan for which in order]
@@ -242,6 +243,6 @@ def _share(some: NDArray[np.float64], others: NDArray[np.float64]) -> NDArray[np
 
 
 def _figure(title: str, height: float = PANEL) -> Any:
-    figure = library("matplotlib.figure", "plot").Figure(figsize=(WIDTH, height), layout="constrained")
+    figure = import_library("matplotlib.figure", "plot").Figure(figsize=(WIDTH, height), layout="constrained")
     figure.suptitle(title, x=0.01, ha="left", fontsize=10)
     return figure

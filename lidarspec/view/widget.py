@@ -11,7 +11,8 @@ from pathlib import Path
 from typing import Any
 
 from lidarspec.device.device import open as open_device
-from lidarspec.errors import LidarSpecError, library, suggestion
+from lidarspec.errors import LidarSpecError, suggestion
+from lidarspec.libraries import import_library
 from lidarspec.scans.selection import EVERYTHING, Selection
 from lidarspec.spec.sensor import Sensor
 from lidarspec.transports.protocol import Closing
@@ -119,5 +120,8 @@ class Viewer(Closing):
 
 def _widget(height: int) -> Any:
     """A widget of anywidget's, which draws in the cell."""
-    kind, traits = library("anywidget", "notebook").AnyWidget, library("traitlets", "notebook")
-    return type("Viewer", (kind,), {"_esm": DRAWING, "height": traits.Int(height).tag(sync=True)})()
+    widget_class = import_library("anywidget", "notebook").AnyWidget
+    import traitlets  # anywidget requires it
+
+    attributes = {"_esm": DRAWING, "height": traitlets.Int(height).tag(sync=True)}
+    return type("Viewer", (widget_class,), attributes)()

@@ -14,7 +14,7 @@ import pytest
 
 import lidarspec as ls
 from lidarspec import Scan, SourceError
-from lidarspec.errors import UsageError, suggestion
+from lidarspec.errors import LibraryError, UsageError
 from lidarspec.formats import write
 from lidarspec.simulation.simulator import simulate
 from tests.formats.test_formats import scan
@@ -181,9 +181,9 @@ def test_what_fails_leaves_nothing_behind(tmp_path: Path, suffix: str, monkeypat
     with pytest.raises(SourceError, match=f"none.a.{suffix}: No such file"):
         write(tmp_path / "none" / f"a.{suffix}", [scan(0)])
     monkeypatch.setitem(sys.modules, "rosbags.typesys", None)
-    with pytest.raises(UsageError, match="takes rosbags, which is not installed") as caught:
+    with pytest.raises(LibraryError) as caught:
         write(tmp_path / f"a.{suffix}", [scan(0)])
-    assert suggestion(caught.value) == "pip install 'lidarspec[ros]'"
+    assert (caught.value.distribution, caught.value.extra) == ("rosbags", "ros")
     assert not list(tmp_path.iterdir())
 
 

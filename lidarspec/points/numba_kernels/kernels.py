@@ -23,6 +23,7 @@ from numpy.typing import NDArray
 
 from lidarspec._version import __version__
 from lidarspec.errors import UsageError
+from lidarspec.libraries import import_library
 from lidarspec.points.numba_kernels.cache import Kept, is_kept
 from lidarspec.points.numba_kernels.source import Text, written
 from lidarspec.points.plan import Maker, Plan, PointsFunction, Values
@@ -162,12 +163,9 @@ def require() -> None:
     """Import Numba.
 
     Raises:
-        UsageError: where it is not installed, or does not work here.
+        LibraryError: if it is missing, too old, or does not work here.
     """
-    try:
-        import lidarspec.points.numba_kernels.arithmetic  # noqa: F401
-    except ImportError as error:
-        raise UsageError(f"backend 'jit' needs Numba: pip install 'lidarspec[jit]' ({error})") from error
+    import_library("numba", "jit")
 
 
 @functools.cache
