@@ -15,6 +15,8 @@ from typing import Any
 
 from lidarspec import Sensor
 
+#: seconds after which a test fails if an event has not come: many, since the machine may be slow or busy.
+TIMEOUT_S = 60.0
 #: how much later than promised something may happen while the machine is busy.
 SLACK = 5.0
 
@@ -97,7 +99,7 @@ def paced(send: Callable[[bytes], object], frames: Sequence[bytes], rate: float,
     return sent
 
 
-def until(condition: Callable[[], object], seconds: float = SLACK) -> float:
+def until(condition: Callable[[], object], seconds: float = TIMEOUT_S) -> float:
     """The seconds until something is so; fails where it does not become so."""
     began = time.monotonic()
     while not condition():

@@ -12,8 +12,8 @@ import pytest
 
 import lidarspec as ls
 from lidarspec.errors import ReplyTimeout, SourceError, UsageError
-from tests.device.test_commands import SENSOR, START, STOP, Obedient
-from tests.lines import SLACK, Port, paced, port, turning, until, working
+from tests.device.test_commands import IMPATIENT, SENSOR, START, STOP, Obedient
+from tests.lines import TIMEOUT_S, Port, paced, port, turning, until, working
 from tests.shapes import SHAPES
 
 pytestmark = pytest.mark.skipif(os.name != "posix", reason="pseudo terminals are POSIX")
@@ -41,7 +41,7 @@ def test_scans_packets_and_commands_are_awaited(line: Port) -> None:
             assert found[1].complete
             assert (await opened.send("speed", rate=10.0, trim=0.0)).confirmed
             await opened.write(SENSOR.command("spin"))
-            assert (await opened.latest(SLACK)).complete
+            assert (await opened.latest(TIMEOUT_S)).complete
             async for packets in opened.packets():
                 assert len(packets)
                 break
@@ -100,7 +100,7 @@ def test_cancelled_while_opening(line: Port) -> None:
 
     async def use() -> None:
         async with asyncio.timeout(0.1):
-            async with ls.open_async(f"serial://{line.name}", SENSOR):
+            async with ls.open_async(f"serial://{line.name}", IMPATIENT):
                 raise AssertionError("it does not answer")
 
     with working(device.work):

@@ -20,16 +20,22 @@ import numpy as np
 import pytest
 
 import lidarspec as ls
+from lidarspec.device import live_input
 from lidarspec.errors import CommandError, OutOfRange, ReplyTimeout, SourceError, UsageError
 from lidarspec.recording.format import Recording
 from lidarspec.spec import Command, Serial, Tcp, Udp
 from tests.broken import sound
-from tests.lines import SLACK, Port, free_port, port, turning, udp, until, working
+from tests.lines import TIMEOUT_S, Port, free_port, port, turning, udp, until, working
 from tests.shapes import SHAPES
 
 pytestmark = pytest.mark.skipif(os.name != "posix", reason="pseudo terminals are POSIX")
 
-SENSOR = SHAPES["shape-commands"]
+IMPATIENT = SHAPES["shape-commands"]
+#: the same, which waits for a reply as long as a busy machine may need.
+SENSOR = dataclasses.replace(
+    IMPATIENT,
+    commands={name: dataclasses.replace(command, timeout=TIMEOUT_S) for name, command in IMPATIENT.commands.items()},
+)
 START, STOP, SPEED = 1, 2, 3
 ROOT = Path(__file__).parents[2]
 
@@ -40,7 +46,9 @@ class Obedient:
     def __init__(self, line: Port, *, deaf: bool = False, streaming: bool = False) -> None:
         self.line, self.deaf, self.streaming = line, deaf, streaming
         self.heard: list[int] = []
-        self._frames, self._sent, self._rest = turning(SENSOR, 200), 0, b""
+        self.sent = 0
+        self._frames = turning(SENSOR, 180)  # ten turns
+        self._rest = b""
 
     def work(self, stop: threading.Event) -> None:
         while not stop.is_set():
@@ -55,8 +63,8 @@ class Obedient:
             order, self._rest = self._rest[:6], self._rest[6:]
             self._obey(SENSOR.parse(order, "order").code)
         if self.streaming:
-            self.line.send(self._frames[self._sent % 200])
-            self._sent += 1
+            self.line.send(self._frames[self.sent % len(self._frames)])
+            self.sent += 1
 
     def _obey(self, code: int) -> None:
         self.heard.append(code)
@@ -78,7 +86,7 @@ def test_started_on_opening_and_stopped_on_closing(line: Port) -> None:
     with working(device.work):
         with ls.open(f"serial://{line.name}", SENSOR) as opened:
             assert device.heard == [START]
-            assert opened.latest(SLACK).complete
+            assert opened.latest(TIMEOUT_S).complete
         until(lambda: device.heard == [START, STOP])
         assert not device.streaming
 
@@ -86,7 +94,7 @@ def test_started_on_opening_and_stopped_on_closing(line: Port) -> None:
 def test_without_start_nothing_is_sent(line: Port) -> None:
     device = Obedient(line, streaming=True)
     with working(device.work), ls.open(f"serial://{line.name}", SENSOR, start=False) as opened:
-        opened.latest(SLACK)
+        opened.latest(TIMEOUT_S)
     assert device.heard == []
 
 
@@ -128,14 +136,14 @@ def test_an_answer_that_has_come_is_taken_before_the_command_is_given_up(line: P
             return now() + (60_000_000_000 if call else 0)
 
         monkeypatch.setattr(clock, "now", held_up)
-        assert opened.send("speed", rate=10.0, trim=1.0).confirmed
+        assert opened.send("speed", rate=10.0, trim=1.0, timeout=1.0).confirmed
 
 
 def test_bytes_by_hand_go_out_as_they_are(line: Port, tmp_path: Path) -> None:
     device = Obedient(line)
     with working(device.work), ls.open(f"serial://{line.name}", SENSOR, start=False, record=tmp_path / "all.lsr") as opened:
         opened.write(SENSOR.command("start"))
-        assert opened.latest(SLACK).complete
+        assert opened.latest(TIMEOUT_S).complete
         for wrong, reason in ((lambda: opened.write("a5 50"), "bytes are taken"), (lambda: opened.write(b"1", "power"), "no link 'power'")):
             with pytest.raises(UsageError, match=reason):
                 wrong()
@@ -166,8 +174,8 @@ def test_a_command_from_another_thread_while_scans_are_read(line: Port) -> None:
 def test_a_device_that_does_not_answer_does_not_open(line: Port) -> None:
     device = Obedient(line, deaf=True)
     with working(device.work):
-        with pytest.raises(ReplyTimeout, match="no ack frame came") as caught:
-            ls.open(f"serial://{line.name}", SENSOR)
+        with pytest.raises(ReplyTimeout) as caught:
+            ls.open(f"serial://{line.name}", IMPATIENT)
         assert caught.value.__notes__[0].startswith("next: lidarspec doctor")
         until(lambda: device.heard == [START, STOP])
     ls.open(f"serial://{line.name}", SENSOR, start=False).close()
@@ -175,16 +183,16 @@ def test_a_device_that_does_not_answer_does_not_open(line: Port) -> None:
 
 def test_a_device_that_was_left_streaming_opens_all_the_same(line: Port) -> None:
     device = Obedient(line, deaf=True, streaming=True)
-    with working(device.work), ls.open(f"serial://{line.name}", SENSOR) as opened:
+    with working(device.work), ls.open(f"serial://{line.name}", IMPATIENT) as opened:
         assert any("data come all the same" in warning for warning in opened.warnings)
-        opened.latest(SLACK)
+        opened.latest(TIMEOUT_S)
 
 
 def test_started_again_after_it_was_unplugged(line: Port) -> None:
     device = Obedient(line)
     with working(device.work):
         with ls.open(f"serial://{line.name}", SENSOR) as opened:
-            opened.latest(SLACK)
+            opened.latest(TIMEOUT_S)
             device.streaming = False
             line.unplug()
             until(lambda: opened.newest(0.01) or opened.state == "disconnected")
@@ -198,10 +206,9 @@ def test_a_command_to_a_device_that_is_gone_fails_at_once(line: Port) -> None:
     with working(device.work), ls.open(f"serial://{line.name}", SENSOR) as opened:
         line.unplug()
         until(lambda: opened.newest(0.01) or opened.state == "disconnected")
-        began = time.monotonic()
-        with pytest.raises(CommandError, match="connection was lost"):
-            opened.send("speed", rate=10.0, trim=0.0, timeout=10 * SLACK)
-        assert time.monotonic() - began < SLACK
+        with pytest.raises(CommandError) as caught:
+            opened.send("speed", rate=10.0, trim=0.0, timeout=10 * TIMEOUT_S)
+    assert not isinstance(caught.value, ReplyTimeout)
 
 
 def test_a_command_under_way_fails_when_the_device_goes_away(line: Port) -> None:
@@ -209,21 +216,21 @@ def test_a_command_under_way_fails_when_the_device_goes_away(line: Port) -> None
     with working(device.work), ls.open(f"serial://{line.name}", SENSOR, start=False) as opened:
         timer = threading.Timer(0.1, line.unplug)
         timer.start()
-        began = time.monotonic()
-        with pytest.raises(CommandError, match="connection was lost"):
-            opened.send("speed", rate=10.0, trim=0.0, timeout=10 * SLACK)
-        assert time.monotonic() - began < SLACK
+        with pytest.raises(CommandError) as caught:
+            opened.send("speed", rate=10.0, trim=0.0, timeout=10 * TIMEOUT_S)
         timer.join()
+    assert not isinstance(caught.value, ReplyTimeout)
 
 
-def test_closing_without_a_device_is_quick(line: Port) -> None:
+def test_closing_without_a_device_waits_for_no_reply(line: Port, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(live_input, "FAREWELL", 10 * TIMEOUT_S)
     device = Obedient(line)
-    with working(device.work):
-        with ls.open(f"serial://{line.name}", SENSOR) as opened:
-            line.unplug()
-            until(lambda: opened.newest(0.01) or opened.state == "disconnected")
-            began = time.monotonic()
-        assert time.monotonic() - began < 1.0 * SLACK
+    with working(device.work), ls.open(f"serial://{line.name}", SENSOR) as opened:
+        line.unplug()
+        until(lambda: opened.newest(0.01) or opened.state == "disconnected")
+        closing = threading.Thread(target=opened.close, daemon=True)
+        closing.start()
+        until(lambda: not closing.is_alive())
 
 
 PROGRAM = """
@@ -240,8 +247,14 @@ print("open", flush=True)
 
 @pytest.mark.parametrize(
     "rest",
-    ["with device: list(device.scans())", "with device: 1 / 0", "1 / 0", "del device", "list(device.scans())", "sys.exit(3)"],
-    ids=["interrupt in with", "exception in with", "exception", "garbage", "interrupt", "exit"],
+    [
+        pytest.param("with device: list(device.scans())", id="interrupt in with"),
+        pytest.param("sys.exit(3)", id="exit"),
+        pytest.param("with device: 1 / 0", id="exception in with", marks=pytest.mark.slow),
+        pytest.param("1 / 0", id="exception", marks=pytest.mark.slow),
+        pytest.param("del device", id="garbage", marks=pytest.mark.slow),
+        pytest.param("list(device.scans())", id="interrupt", marks=pytest.mark.slow),
+    ],
 )
 def test_stopped_whatever_ends_the_program(line: Port, rest: str) -> None:
     device = Obedient(line)
@@ -255,16 +268,16 @@ def test_stopped_whatever_ends_the_program(line: Port, rest: str) -> None:
             assert program.stdout is not None
             assert program.stdout.readline() == b"open\n"
             if "scans" in rest:
-                time.sleep(0.2)
+                until(lambda: device.sent > 20)
                 program.send_signal(signal.SIGINT)
-            program.wait(SLACK * 2)
+            program.wait(TIMEOUT_S)
         until(lambda: device.heard == [START, STOP])
 
 
 @pytest.fixture
 def server() -> Iterator[socket.socket]:
     with socket.create_server(("127.0.0.1", 0)) as made:
-        made.settimeout(SLACK)
+        made.settimeout(TIMEOUT_S)
         yield made
 
 
@@ -321,7 +334,7 @@ def datagram_sensor(number: int) -> ls.Sensor:
 def test_a_command_waits_for_the_first_datagram_that_says_where_the_sensor_is() -> None:
     number, heard = free_port(), list[str]()
     with silent_at_first(number, 0.3, heard), ls.open(f"udp://127.0.0.1:{number}", datagram_sensor(number), start=False) as opened:
-        assert opened.send("speed", rate=10.0, trim=0.0, timeout=SLACK).confirmed
+        assert opened.send("speed", rate=10.0, trim=0.0, timeout=TIMEOUT_S).confirmed
         assert heard
         assert sum(len(batch) for batch, _ in zip(opened.packets(wait=0.3), range(3), strict=False)) > 0
 
@@ -344,7 +357,7 @@ def test_a_command_goes_to_the_sensor_and_a_strangers_answer_is_none() -> None:
             other.sendto(ack, ("127.0.0.1", number))
             own.sendto(SENSOR.build("ack", code=SPEED, result=7), who)
 
-        own.settimeout(SLACK)
+        own.settimeout(TIMEOUT_S)
         with working(answer), pytest.raises(CommandError, match="result 7 instead of 0"):  # which is the sensor's own
             opened.send("speed", rate=10.0, trim=0.0, timeout=1.0)
         other.setblocking(False)
@@ -356,9 +369,9 @@ def test_a_sensor_that_nothing_was_heard_of_cannot_be_sent_to() -> None:
     number = free_port()
     with ls.open(f"udp://127.0.0.1:{number}", datagram_sensor(number), start=False) as opened:
         began = time.monotonic()
-        with pytest.raises(CommandError, match="no frame of the sensor has arrived yet, so nobody knows its address"):
+        with pytest.raises(CommandError, match="address"):
             opened.send("speed", rate=10.0, trim=0.0, timeout=0.2)
-        assert 0.2 <= time.monotonic() - began < 0.2 + SLACK
+        assert time.monotonic() - began >= 0.2
 
 
 def test_an_unknown_control_address_is_asked_for() -> None:

@@ -38,14 +38,14 @@ from lidarspec.spec import (
     hookimpl,
 )
 from lidarspec.testing.fixtures import virtual_port
-from tests.lines import SLACK, free_port, udp, until, working
+from tests.lines import TIMEOUT_S, free_port, udp, until, working
 from tests.shapes.conversation import SENSOR
 
 PAGES = {"page": Frame(HttpReply, max_length=4096), "ask": Frame(HttpRequest, direction="out", max_length=4096)}
 STATUS = Command(
-    "ask", {"method": "GET", "path": b"/status", "body": b""}, reply="page", matches={"status": 200}, link="web", timeout=SLACK
+    "ask", {"method": "GET", "path": b"/status", "body": b""}, reply="page", matches={"status": 200}, link="web", timeout=TIMEOUT_S
 )
-SET = Command("ask", {"method": "PUT", "path": b"/mode"}, args={"mode": ("body", Text(40))}, reply="page", link="web", timeout=SLACK)
+SET = Command("ask", {"method": "PUT", "path": b"/mode"}, args={"mode": ("body", Text(40))}, reply="page", link="web", timeout=TIMEOUT_S)
 
 
 def read_until(device: ls.Device, condition: Callable[[], object]) -> None:
@@ -55,7 +55,7 @@ def read_until(device: ls.Device, condition: Callable[[], object]) -> None:
         device.newest(0.01)
         return condition()
 
-    until(is_so, 4 * SLACK)
+    until(is_so)
 
 
 def linked(control: Link, **more: Any) -> Sensor:
@@ -81,7 +81,7 @@ def test_a_simulated_sensor_answers_over_a_link_of_its_own(kind: type[Udp | Tcp]
         assert device.send("send_to", host="10.0.0.9", port=2000).values.head == {"number": 8, "code": 2}
         assert device.send("hello").values.head.number == 9
         assert port.device.heard == ["call", "send_to", "hello"]
-        assert device.latest(SLACK).complete
+        assert device.latest(TIMEOUT_S).complete
 
 
 ANGLES = [0.5, 1.0, 1.5, 2.0]
@@ -106,7 +106,7 @@ def test_what_a_sensor_says_of_itself_configures_it_and_its_recording(tmp_path: 
             assert device.learned == {"table": b"0.5 1 1.5 2"}
             assert device.sensor.options == device.learned
             assert angles(device) == ANGLES
-            live = device.latest(SLACK)
+            live = device.latest(TIMEOUT_S)
         assert (live.points.nominal, device.warnings) == (False, [])
         with ls.open(port.path, sensor, start=False) as device:  # which asks for nothing
             assert (dict(device.learned), angles(device)) == ({}, [0.0, 1.0, 2.0, 3.0])
@@ -190,7 +190,7 @@ def test_a_sensor_that_no_longer_answers_its_heartbeat_is_started_again() -> Non
     commands = {**SENSOR.commands, "hello": dataclasses.replace(order, starts=True, timeout=1.0), "beat": beat}
     sensor = linked(Udp(free_port()), commands=commands, on_open=("hello", "beat"))
     with virtual_port(sensor, to=f"udp://127.0.0.1:{sensor.links['data'].ports[0]}") as port, ls.open(port.path, sensor) as device:
-        device.latest(SLACK)
+        device.latest(TIMEOUT_S)
         read_until(device, lambda: port.device.heard.count("beat") > 2)
         assert not silent(device)
         port.unplug()
@@ -198,7 +198,7 @@ def test_a_sensor_that_no_longer_answers_its_heartbeat_is_started_again() -> Non
         heard = len(port.device.heard)
         port.plug()
         read_until(device, lambda: "hello" in port.device.heard[heard:] and not silent(device))
-        assert device.latest(SLACK).complete
+        assert device.latest(TIMEOUT_S).complete
         begun = port.device.heard.count("hello")
         beats = port.device.heard.count("beat")
         read_until(device, lambda: port.device.heard.count("beat") > beats + 3)
@@ -266,7 +266,7 @@ def test_a_port_that_is_taken_is_replaced_and_said(server: socket.socket) -> Non
 @pytest.fixture
 def server() -> Iterator[socket.socket]:
     with socket.create_server(("127.0.0.1", 0)) as made:
-        made.settimeout(SLACK)
+        made.settimeout(TIMEOUT_S)
         yield made
 
 
@@ -278,7 +278,7 @@ def test_a_sensor_is_found_by_a_broadcast_and_told_our_address() -> None:
         virtual_port(sensor, to=f"udp://127.0.0.1:{data}") as port,
         ls.open(f"udp://127.0.0.1:{data}?broadcast=127.255.255.255", sensor) as device,
     ):
-        assert device.send("hello", timeout=SLACK).confirmed
+        assert device.send("hello", timeout=TIMEOUT_S).confirmed
         assert device.send("call", name="anna").confirmed
         assert port.device.heard == ["hello", "call"]
 
@@ -294,20 +294,20 @@ def test_of_several_that_answer_a_broadcast_the_first_is_the_sensor() -> None:
             everybody.close()
             with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as heard:
                 heard.bind(("127.255.255.255", number))
-                heard.settimeout(SLACK)
+                heard.settimeout(TIMEOUT_S)
                 data, sender = heard.recvfrom(100)
                 orders.append(sensor.parse(data, "order"))
                 ack = sensor.build("ack", head=orders[0].head, result=0)
                 first.sendto(ack, sender)
                 second.sendto(ack, sender)
-            first.settimeout(SLACK)
+            first.settimeout(TIMEOUT_S)
             data, sender = first.recvfrom(100)  # which is no longer broadcast
             orders.append(sensor.parse(data, "order"))
             first.sendto(sensor.build("ack", head=orders[1].head, result=0), sender)
 
     data = sensor.links["data"].ports[0]
     with working(answer), ls.open(f"udp://127.0.0.1:{data}?broadcast=127.255.255.255", sensor) as device:
-        assert device.send("hello", timeout=SLACK).confirmed
+        assert device.send("hello", timeout=TIMEOUT_S).confirmed
         assert device.send("call", name="anna").confirmed
         read_until(device, lambda: device.stats.foreign == 1)
         assert any("127.0.0.2" in said and "127.0.0.3" in said and "left out" in said for said in device.warnings)
@@ -333,7 +333,7 @@ def test_pages_of_a_web_server_are_read_and_written() -> None:
         assert device.send("set_mode", mode="fast").values.status == 200
         assert device.send("set_mode", mode="slow").values.status == 400
         assert port.device.heard == ["status", "set_mode", "set_mode"]
-        asked = http.client.HTTPConnection("127.0.0.1", port.outlet.controls["web"].port, timeout=SLACK)
+        asked = http.client.HTTPConnection("127.0.0.1", port.outlet.controls["web"].port, timeout=TIMEOUT_S)
         asked.request("GET", "/status")
         assert asked.getresponse().read() == body, "it is a web server like any other"
         asked.close()
@@ -357,7 +357,7 @@ def test_what_a_web_server_does_wrong_is_said(server: socket.socket, sent: bytes
             peer.recv(1000)
             peer.sendall(sent)
             if not sent:
-                stop.wait(SLACK)
+                stop.wait(TIMEOUT_S)
 
     sensor = with_pages({}, dataclasses.replace(link, port=server.getsockname()[1]))
     with working(answer), ls.open(f"udp://127.0.0.1:{free_port()}?control=127.0.0.1", sensor) as device:

@@ -16,13 +16,16 @@ import numpy as np
 import pytest
 
 import lidarspec as ls
+import lidarspec.device.arrivals
+import lidarspec.transports.files
 from lidarspec.device.arrivals import fed
 from lidarspec.errors import SourceError, UsageError
 from lidarspec.recording.format import Recording
-from lidarspec.simulation.simulator import simulate
 from lidarspec.spec import Chunk, Udp
 from lidarspec.testing.fixtures import virtual_port
-from tests.lines import SLACK, Port, free_port, paced, port, turning, udp, until, working
+from lidarspec.transports.serial import SerialTransport
+from lidarspec.transports.udp import UdpTransport
+from tests.lines import TIMEOUT_S, Port, free_port, paced, port, turning, udp, until, working
 from tests.shapes import SHAPES
 
 pytestmark = pytest.mark.skipif(os.name != "posix", reason="pseudo terminals are POSIX")
@@ -40,13 +43,23 @@ def line(tmp_path: Path) -> Iterator[Port]:
 def packets(device: ls.Device, number: int) -> list[ls.Packets]:
     """Batches until there are so many packets; fails where they do not come."""
     found: list[ls.Packets] = []
-    deadline = time.monotonic() + SLACK
+    deadline = time.monotonic() + TIMEOUT_S
     for batch in device.packets(wait=0.05):
         found += [batch] if len(batch) else []
         if sum(map(len, found)) >= number:
             return found
         assert time.monotonic() < deadline, f"{device}"
     raise AssertionError("the device ended")
+
+
+def wait_for_bytes(device: ls.Device, size: int) -> None:
+    """Wait until the queue of a device holds as many bytes."""
+    until(lambda: device._input.queue._size == size)  # type: ignore[union-attr]
+
+
+def wait_for_chunks(device: ls.Device, number: int) -> None:
+    """Wait until as many chunks were queued since a device was opened."""
+    until(lambda: device._input.queue.produced >= number)  # type: ignore[union-attr]
 
 
 def test_what_comes_over_a_line_is_what_the_bytes_hold(line: Port) -> None:
@@ -63,7 +76,7 @@ def test_what_comes_over_a_line_is_what_the_bytes_hold(line: Port) -> None:
     assert np.array_equal(np.concatenate([batch.raw for batch in found]), expected.raw)
     hosts = np.concatenate([batch.host_ns for batch in found])
     assert (np.diff(hosts) >= 0).all()
-    assert abs(int(hosts[-1]) - time.time_ns()) < SLACK * 1e9
+    assert abs(int(hosts[-1]) - time.time_ns()) < TIMEOUT_S * 1e9
     assert device.state == "closed"
     assert device.stats.bytes_in == sum(len(frame) + 1 for frame in frames)
 
@@ -136,42 +149,41 @@ def _paused(send: Callable[[bytes], object], first: bytes, second: bytes) -> Non
     send(first[5:] + second)
 
 
-def test_silence_is_noticed_and_told(line: Port) -> None:
+@pytest.mark.usefixtures("impatient")
+def test_silence_is_a_state_and_a_warning_until_data_come(line: Port) -> None:
     with ls.open(f"serial://{line.name}", TURNING) as device:
-        took = until(lambda: device.state == "silent")
-        assert took > 0.5
+        until(lambda: device.state == "silent")
         (warning,) = device.warnings
-        assert "nothing has arrived for" in warning
         assert warning.endswith(f"next: lidarspec doctor serial://{line.name} -s {TURNING.id}")
-        line.send(turning(TURNING, 1)[0])
-        packets(device, 1)
-        assert device.state == "streaming"
+        with working(lambda stop: paced(line.send, turning(TURNING, 40), 100, stop) and None):
+            until(lambda: device.newest(0.01) or device.state == "streaming")
 
 
+@pytest.mark.usefixtures("impatient")
 def test_bytes_without_frames_name_the_baud_rate(line: Port) -> None:
     noise = np.random.default_rng(1).integers(0, 256, 2000, np.uint8).tobytes()
     with (
         ls.open(f"serial://{line.name}?baud=9600", TURNING) as device,
-        working(lambda stop: [line.send(noise[:20]) or stop.wait(0.02) for _ in range(500) if not stop.is_set()] and None),
+        working(lambda stop: paced(line.offer, [noise[:20]], 50, stop) and None),
     ):
         until(lambda: device.newest(0.01) or device.state == "no frames")
         (warning,) = device.warnings
-        assert "9600 baud is likely wrong" in warning
+        assert "9600" in warning
         assert warning.endswith(f"next: lidarspec detect serial://{line.name}")
 
 
-def test_latest_never_falls_behind(line: Port) -> None:
-    frames = turning(TURNING, 2000)
-    with ls.open(f"serial://{line.name}", TURNING) as device, working(lambda stop: paced(line.send, frames, 400, stop) and None):
-        stamps = []
-        for _ in range(4):
-            scan = device.latest(SLACK)
-            assert scan.complete
-            stamps.append(scan.stamp_ns)
-            age = time.time_ns() - int(max(batch.host_ns[-1] for batch in [next(device.packets())]))
-            assert age < SLACK * 1e8
-            time.sleep(0.3)
-        assert np.diff(stamps).min() > 0.15e9, "each is newer by about what was slept"
+def test_latest_passes_over_all_scans_but_the_newest(line: Port) -> None:
+    frames = turning(TURNING, 430)
+    whole = [scan.stamp_ns for scan in TURNING.scans(b"".join(frames)) if scan.whole]
+    sent, found = 0, []
+    with ls.open(f"serial://{line.name}", TURNING) as device:
+        for last in (170, 430):
+            part = b"".join(frames[sent:last])
+            line.send(part)
+            sent = last
+            wait_for_bytes(device, len(part))
+            found.append(device.latest(TIMEOUT_S).stamp_ns)
+    assert found == [whole[2], whole[-1]]
 
 
 def test_a_slow_consumer_loses_the_oldest_and_knows_it(line: Port) -> None:
@@ -182,7 +194,7 @@ def test_a_slow_consumer_loses_the_oldest_and_knows_it(line: Port) -> None:
         for frame in frames:
             sender.sendto(frame, ("127.0.0.1", number))
         queue = device._input.queue  # type: ignore[union-attr]
-        until(lambda: queue.produced == 50)
+        wait_for_chunks(device, 50)
         batch = packets(device, 30)
         found = np.concatenate([one.raw for one in batch])
         assert np.array_equal(found, WHOLE.decode(frames[20:]).raw)
@@ -197,7 +209,6 @@ def test_a_blocking_queue_loses_nothing(line: Port) -> None:
         device._input.queue._largest = 64  # type: ignore[union-attr]
         for frame in frames:
             line.send(frame)
-        time.sleep(0.1)
         assert sum(map(len, packets(device, 60))) == 60
         assert device.stats.queue_dropped == 0
 
@@ -216,7 +227,7 @@ def test_what_ends_the_thread_that_reads_is_raised_as_the_end_of_the_source(line
     with ls.open(f"serial://{line.name}", TURNING, record=lambda opened: Forgetful()) as device:
         line.send(b"1")
         for _ in range(2):
-            with pytest.raises(SourceError, match="nothing is read any more: no room for that"):
+            with pytest.raises(SourceError, match="no room for that"):
                 packets(device, 1)
 
 
@@ -260,6 +271,7 @@ def test_strangers_change_no_cloud_and_end_nothing(tmp_path: Path) -> None:
         assert sum(record.direction == "in" for record in read) == 61 + 121
 
 
+@pytest.mark.usefixtures("impatient")
 def test_the_one_that_is_named_is_read_and_others_count_for_nothing() -> None:
     number, frames = free_port(), turning(WHOLE, 4)
     with udp("127.0.0.2") as other, udp("127.0.0.3") as own, ls.open(f"udp://:{number}?src=127.0.0.3", WHOLE) as device:
@@ -275,6 +287,7 @@ def test_the_one_that_is_named_is_read_and_others_count_for_nothing() -> None:
         assert device.warnings == []
 
 
+@pytest.mark.usefixtures("impatient")
 def test_a_sensor_that_falls_silent_is_not_replaced_by_a_stranger() -> None:
     number, frames = free_port(), turning(WHOLE, 4)
     with udp("127.0.0.2") as own, udp("127.0.0.3") as other, ls.open(f"udp://:{number}", WHOLE) as device:
@@ -329,7 +342,8 @@ def test_a_stream_in_datagrams_of_two_ports_is_not_joined() -> None:
         until(lambda: device.newest(0.01) or device.stats.foreign >= 11)
 
 
-def test_a_stream_in_datagrams_is_joined_by_sender() -> None:
+def test_a_stream_in_datagrams_is_joined_by_sender(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(UdpTransport, "silence", TIMEOUT_S)  # the sender may be held up between two pieces of a frame
     sensor = dataclasses.replace(TURNING, links={"data": Udp(7009, stream=True)})
     number, frames = free_port(), turning(sensor, 12)
     stream = b"".join(frames)
@@ -360,10 +374,10 @@ def test_unplugged_and_plugged_in_again(line: Port, cycles: int) -> None:
             line.send(frames[0][:half])
             until(lambda: device.newest(0.01) or device.stats.pending == half)
             line.unplug()
-            assert until(lambda: device.newest(0.01) or device.state == "disconnected") < SLACK
+            until(lambda: device.newest(0.01) or device.state == "disconnected")
             assert any("waiting for it to come back" in warning for warning in device.warnings)
             line.plug()
-            assert until(lambda: device.newest(0.01) or device.state != "disconnected") < SLACK
+            until(lambda: device.newest(0.01) or device.state != "disconnected")
             line.send(frames[0][half:] + b"".join(frames[1:]))
             batch = packets(device, 9)
             assert sum(map(len, batch)) == 9, "no frame is spliced over the gap"
@@ -375,15 +389,21 @@ def test_unplugged_and_plugged_in_again(line: Port, cycles: int) -> None:
     assert threading.active_count() == threads
 
 
-def test_an_absent_device_costs_next_to_nothing(line: Port) -> None:
+def test_an_absent_device_is_looked_for_less_and_less_often(line: Port, monkeypatch: pytest.MonkeyPatch) -> None:
+    tries = list[float]()
+    reopen = SerialTransport.reopen
+
+    def counted(transport: SerialTransport) -> None:
+        tries.append(time.monotonic())
+        reopen(transport)
+
+    monkeypatch.setattr(SerialTransport, "reopen", counted)
     with ls.open(f"serial://{line.name}", TURNING) as device:
         line.unplug()
-        until(lambda: device.state == "disconnected")
-        used, began = time.process_time(), time.monotonic()
-        time.sleep(0.6)
-        spent = (time.process_time() - used) / (time.monotonic() - began)
+        until(lambda: len(tries) == 6)
+        assert device.state == "disconnected"
         line.plug()
-    assert spent < 0.02 * SLACK
+    assert tries[5] - tries[0] > 0.75  # after pauses of 0.04, 0.08, 0.16, 0.25 and 0.25 s
 
 
 def test_a_scan_does_not_go_on_over_an_interruption(line: Port) -> None:
@@ -407,11 +427,11 @@ def test_everything_is_recorded_before_the_queue(line: Port, tmp_path: Path) -> 
     path = tmp_path / "all.lsr"
     with ls.open(f"serial://{line.name}", TURNING, record=path) as device:
         device._input.queue._most = 1  # type: ignore[union-attr]
-        for frame in frames:
+        for number, frame in enumerate(frames):
             line.send(frame)
-            time.sleep(0.005)
+            wait_for_chunks(device, number + 1)
         until(lambda: device._own_recorders and device._own_recorders[0].bytes == sum(map(len, frames)))
-        assert device.stats.queue_dropped > 0 or device._input.queue.produced == 1  # type: ignore[union-attr]
+        assert device.stats.queue_dropped == device._input.queue.produced - 1 > 0  # type: ignore[union-attr]
     with Recording(path) as recording:
         assert b"".join(record.data for record in recording if record.direction == "in") == b"".join(frames)
         assert recording.header.sensor == TURNING.id
@@ -451,7 +471,7 @@ def test_a_file_is_not_recorded(tmp_path: Path) -> None:
 @pytest.mark.parametrize("number", [5, 300])
 def test_a_sensor_that_the_frames_contradict_is_told_of(tmp_path: Path, number: int) -> None:
     path = tmp_path / "vlp16.bin"
-    path.write_bytes(b"".join(simulate(ls.sensor("velodyne-vlp16"), number)))
+    path.write_bytes(b"".join(ls.simulate(ls.sensor("velodyne-vlp16"), number)))
     with ls.open(path, "velodyne-hdl32e") as device:
         assert list(device.scans())
         (warning,) = (warning for warning in device.warnings if "read as" in warning)
@@ -471,25 +491,25 @@ def test_a_live_sensor_that_the_frames_contradict_is_told_of() -> None:
 
 def test_a_nominal_calibration_is_told_of_once_with_the_way_to_give_the_units_own(tmp_path: Path) -> None:
     path, angles = tmp_path / "xt32.bin", tmp_path / "angles.csv"
-    path.write_bytes(b"".join(simulate(ls.sensor("hesai-xt32"), 300)))
+    path.write_bytes(b"".join(ls.simulate(ls.sensor("hesai-xt32"), 300)))
     rows = (f"{channel + 1},{15 - channel},0.1" for channel in range(32))
     angles.write_text("\n".join(["Channel,Elevation,Azimuth", *rows]), encoding="utf-8")
-    with ls.open(path) as device:
+    with ls.open(path, "hesai-xt32") as device:
         assert all("nominal calibration" in repr(scan) for scan in device.scans())
         (warning,) = device.warnings
         assert "-O calibration=FILE, in Python sensor.configure(calibration=FILE)" in warning
     with ls.open(path, ls.sensor("hesai-xt32").configure(calibration=angles)) as device:
         assert not any("nominal" in repr(scan) for scan in device.scans())
         assert device.warnings == []
-    path.write_bytes(b"".join(simulate(ls.sensor("robosense-helios16p"), 300)))
-    with ls.open(path) as device:
+    path.write_bytes(b"".join(ls.simulate(ls.sensor("robosense-helios16p"), 300)))
+    with ls.open(path, "robosense-helios16p") as device:
         assert list(device.scans())
-        assert "where no difop frame had come" in device.warnings[0]
+        assert "difop" in device.warnings[0]
 
 
 def test_a_file_without_a_frame_of_the_sensor_says_so(tmp_path: Path) -> None:
     path = tmp_path / "vlp16.bin"
-    path.write_bytes(b"".join(simulate(ls.sensor("velodyne-vlp16"), 5)))
+    path.write_bytes(b"".join(ls.simulate(ls.sensor("velodyne-vlp16"), 5)))
     with ls.open(path, "robosense-m1") as device:
         assert list(device.scans()) == []
         assert device.warnings == [f"{path}: 6030 bytes, and no data frame of robosense-m1 among them; next: lidarspec detect {path}"]
@@ -530,9 +550,11 @@ def test_packets_and_scans_of_a_file_go_on_where_its_scan_was_found(tmp_path: Pa
         assert sum(len(packets) for packets in device.packets("data")) == len(frames)
 
 
-def test_a_long_file_goes_on_behind_what_was_read_before(tmp_path: Path) -> None:
+def test_a_long_file_goes_on_behind_what_was_read_before(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(lidarspec.transports.files, "BLOCK", 1 << 13)
+    monkeypatch.setattr(lidarspec.device.arrivals, "BATCH_BYTES", 1 << 13)
     path = tmp_path / "raw.bin"
-    frames = turning(TURNING, 4_000) * 10
+    frames = turning(TURNING, 400) * 8
     path.write_bytes(b"".join(frames))
     with ls.open(path, TURNING) as device:
         whole = [len(packets) for packets in device.packets()]

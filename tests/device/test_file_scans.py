@@ -19,27 +19,34 @@ from lidarspec.captures.pcap import USER_LINKS, Datagram, datagram_record
 from lidarspec.captures.records import capture_head, packet_record
 from lidarspec.device.file_scans import FileScans
 from lidarspec.errors import UsageError
-from tests.all_sensors import EVERY
 from tests.made_captures import DESTINATION, SOURCE, pcap_head
+from tests.shapes import SHAPES
 
-#: they differ in what they remember: data in parts, an IMU, calibration in other frames, look-ahead, text, messages of several datagrams.
+#: they differ in what they remember between packets: look-ahead, an IMU, text, streams of datagrams, modes of a header.
 NAMES = [
+    "shape-headed",
+    "shape-inertia",
+    "shape-joined",
+    "shape-lines",
+    "shape-tokens",
+    "ldrobot-stl27l",
+    "velodyne-vlp16",
+]
+#: the same in more forms: data in parts, calibration in other frames, messages of several datagrams.
+MORE = [
     "cepton-vista",
     "hesai-jt16",
     "hesai-pandar40p",
     "hokuyo-urg04lx",
     "hokuyo-utm30lxew",
-    "ldrobot-stl27l",
     "livox-mid360",
     "ouster-os1",
     "robosense-bpearl",
     "robosense-m1",
     "seyond-falcon",
-    "shape-tokens",
     "sick-multiscan136",
     "ti-iwr6843",
     "velodyne-hdl64e-s3",
-    "velodyne-vlp16",
     "ydlidar-g4",
 ]
 #: whose bytes are tried in a capture.
@@ -79,12 +86,13 @@ def told(scan: ls.Scan) -> list[object]:
     return [columns, felt, scan.stamp_ns, scan.complete, scan.whole, repr(scan.rate_hz)]
 
 
-@pytest.mark.parametrize("name", NAMES)
+@pytest.mark.parametrize("name", [*NAMES, *(pytest.param(name, marks=pytest.mark.slow) for name in MORE)])
 def test_pieces_have_the_scans_of_one_pass(name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     for module, size in ((lidarspec.captures.bulk.CaptureBatches, "largest"), (lidarspec.transports.files, "BLOCK")):
         monkeypatch.setattr(module, size, 1 << 13)
     monkeypatch.setattr(lidarspec.device.arrivals, "BATCH_BYTES", 1 << 13)
-    sensor, path = EVERY[name], tmp_path / ("made.pcap" if EVERY[name].datagrams or name in CAPTURED else "made.bin")
+    sensor = SHAPES[name] if name in SHAPES else ls.sensor(name)
+    path = tmp_path / ("made.pcap" if sensor.datagrams or name in CAPTURED else "made.bin")
     made(sensor, path)
     with ls.open(path, sensor) as device:
         whole = [told(scan) for scan in device.scans()]
@@ -103,6 +111,7 @@ def test_pieces_have_the_scans_of_one_pass(name: str, tmp_path: Path, monkeypatc
     assert cuts >= 2
 
 
+@pytest.mark.slow
 def test_another_process_goes_on_behind_a_bookmark(tmp_path: Path) -> None:
     name, path, mark = "velodyne-vlp16", tmp_path / "made.pcap", tmp_path / "mark"
     sensor = ls.sensor(name)

@@ -1,4 +1,4 @@
-"""Full rates without loss: UDP with a consumer that stalls and a recording, a serial line; short here, long in `make soak`."""
+"""Full rates without loss: UDP with a consumer that stalls, and a serial line; by count here, by the second in `make soak`."""
 
 from __future__ import annotations
 
@@ -14,27 +14,71 @@ import pytest
 
 import lidarspec as ls
 from lidarspec.recording.format import Recording
-from lidarspec.simulation.simulator import simulate
 from lidarspec.transports.udp import BUFFER
-from tests.lines import Port, free_port, port
+from tests.lines import Port, free_port, port, turning, udp, until, working
+from tests.shapes import SHAPES
 
 pytestmark = pytest.mark.skipif(sys.platform != "linux", reason="counts what the kernel of Linux drops")
 
 SENDING = Path(__file__).parents[2] / "benchmarks" / "sending.py"
-M1_RATE, STL_RATE = 6300, 1800
+M1_RATE = 6300
+STL_RATE = 1800
+#: datagrams that a sensor sends at once in the long test.
+BURST = 630
 
 
-def sensor(name: str) -> ls.Sensor:
-    if name not in ls.sensors():
-        pytest.skip(f"{name} is not installed")
-    return ls.sensor(name)
+def skip_without_buffer(device: ls.Device) -> None:
+    """Skip the test if the system grants less than the receive buffer that was asked for."""
+    short = [warning for warning in device.warnings if f"of {BUFFER >> 10}" in warning]
+    if short:
+        pytest.skip(short[0])
+
+
+def test_bursts_of_datagrams_are_all_read_and_recorded_while_the_consumer_stalls(tmp_path: Path) -> None:
+    sensor, number, path = SHAPES["shape-datagrams"], free_port(), tmp_path / "all.lsr"
+    frames = turning(sensor, 200) * 7
+    with ls.open(f"udp://127.0.0.1:{number}", sensor, record=path) as device, udp() as sender:
+        skip_without_buffer(device)
+        for frame in frames:
+            sender.sendto(frame, ("127.0.0.1", number))
+        count = 0
+        for batch in device.packets(wait=0.05):
+            count += len(batch)
+            if count == len(frames):
+                break
+        stats = device.stats
+        assert (stats.kernel_drops, stats.queue_dropped) == (0, 0)
+        assert stats.bytes_in == sum(map(len, frames))
+    with Recording(path) as recording:
+        assert [record.data for record in recording if record.direction == "in"] == frames
+
+
+def read_some(device: ls.Device) -> int:
+    """Read what has arrived; return the number of data frames so far."""
+    device.newest(0.01)
+    return device.stats.frames.get("data", 0)
+
+
+def test_a_line_that_is_always_full_loses_nothing(tmp_path: Path) -> None:
+    sensor = ls.sensor("ldrobot-stl27l")
+    frames = ls.simulate(sensor, 900)
+
+    def send(stop: threading.Event) -> None:
+        for frame in frames:
+            line.send(frame)
+
+    with port(tmp_path) as line, ls.open(f"serial://{line.name}", sensor) as device:
+        with working(send):
+            until(lambda: read_some(device) == len(frames))
+        assert device.stats.bytes_in == len(frames) * 47
+        assert device.stats.bytes_skipped == 0
 
 
 @contextlib.contextmanager
 def sending(
     folder: Path, frames: Sequence[bytes], rate: float, seconds: float, *where: object, burst: int = 1, descriptor: int | None = None
 ) -> Iterator[subprocess.Popen[bytes]]:
-    """A process that sends; its output is the number."""
+    """Run a process that sends; its output is the number of frames."""
     path = folder / "frames.bin"
     path.write_bytes(b"".join(frames))
     words = [path, len(frames[0]), rate, seconds, burst, "-", *where]
@@ -46,8 +90,8 @@ def sending(
             process.kill()
 
 
-def drained(device: ls.Device, process: subprocess.Popen[bytes], stall: float) -> int:
-    """Decode until the sender is done and the line silent, standing still for a while each second; the number sent."""
+def drain(device: ls.Device, process: subprocess.Popen[bytes], stall: float) -> int:
+    """Decode until the sender is done and the line silent, with a pause each second; return the number sent."""
     due = time.monotonic() + 1
     for batch in device.packets(wait=0.3):
         if len(batch):
@@ -61,29 +105,25 @@ def drained(device: ls.Device, process: subprocess.Popen[bytes], stall: float) -
     return int(process.stdout.read())
 
 
+@pytest.mark.soak
 @pytest.mark.parametrize(
     ("seconds", "burst", "hog"),
-    [
-        (2.0, 1, False),
-        pytest.param(10.0, 1, False, marks=pytest.mark.soak),
-        pytest.param(60.0, 630, True, marks=pytest.mark.soak),
-    ],
+    [(2.0, 1, False), (10.0, 1, False), (60.0, BURST, True)],
     ids=["2s", "10s", "60s in bursts beside a thread that computes"],
 )
 def test_udp_at_full_rate_with_a_consumer_that_stalls(tmp_path: Path, seconds: float, burst: int, hog: bool) -> None:
-    m1, number, path = sensor("robosense-m1"), free_port(), tmp_path / "all.lsr"
-    frames = simulate(m1, 630)
+    m1, number, path = ls.sensor("robosense-m1"), free_port(), tmp_path / "all.lsr"
+    frames = ls.simulate(m1, 630)
     stop = threading.Event()
     computing = threading.Thread(target=lambda: [sum(range(1000)) for _ in iter(stop.is_set, True)])
     with ls.open(f"udp://127.0.0.1:{number}", m1, record=path) as device:
-        if any(f"of {BUFFER >> 10}" in warning for warning in device.warnings):
-            pytest.skip(device.warnings[0])
+        skip_without_buffer(device)
         m1.decode(frames[:2]).points()
         if hog:
             computing.start()
         try:
             with sending(tmp_path, frames, M1_RATE, seconds, "udp", number, burst=burst) as process:
-                sent = drained(device, process, 0.25)
+                sent = drain(device, process, 0.25)
         finally:
             stop.set()
             if hog:
@@ -97,14 +137,15 @@ def test_udp_at_full_rate_with_a_consumer_that_stalls(tmp_path: Path, seconds: f
         assert sum(record.direction == "in" for record in recording) == sent
 
 
-@pytest.mark.parametrize("seconds", [2.0, pytest.param(60.0, marks=pytest.mark.soak)])
+@pytest.mark.soak
+@pytest.mark.parametrize("seconds", [2.0, 60.0])
 def test_a_serial_line_at_full_rate(tmp_path: Path, seconds: float) -> None:
-    stl = sensor("ldrobot-stl27l")
-    frames = simulate(stl, 1800)
+    stl = ls.sensor("ldrobot-stl27l")
+    frames = ls.simulate(stl, 1800)
     with port(tmp_path) as line, ls.open(f"serial://{line.name}", stl) as device:
         assert isinstance(line, Port)
         with sending(tmp_path, frames, STL_RATE, seconds, "fd", line._master, descriptor=line._master) as process:
-            sent = drained(device, process, 0.0)
+            sent = drain(device, process, 0.0)
         assert sent == int(STL_RATE * seconds)
         assert device.stats.frames == {"data": sent}
         assert device.stats.bytes_in == sent * 47

@@ -313,7 +313,7 @@ def test_an_argument_cannot_be_called_like_the_time_to_wait() -> None:
         with_commands(ask=Command("order", {"code": 1}, args={"timeout": ("motor.speed", 0, 1)}))
 
 
-@pytest.mark.parametrize("seed", range(30))
+@pytest.mark.parametrize("seed", [*range(6), *(pytest.param(seed, marks=pytest.mark.slow) for seed in range(6, 40))])
 def test_however_late_and_lossy_the_device_each_reply_is_the_requests_own(seed: int) -> None:
     """The device numbers the requests that it has seen in its answers, so that a wrong pairing shows."""
     source = random.Random(seed)

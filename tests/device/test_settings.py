@@ -66,16 +66,16 @@ def test_packets_stay_in_the_sensors_axes(folder: Path) -> None:
     "words",
     [
         ("stats", "front", "--json"),
-        ("read", "front", "-n", "2"),
-        ("view", "front", "--once"),
+        pytest.param(("read", "front", "-n", "2"), marks=pytest.mark.slow),
+        pytest.param(("view", "front", "--once"), marks=pytest.mark.slow),
         ("convert", "front", "out.csv"),
-        ("plot", "front", "-o", "out.svg"),
+        pytest.param(("plot", "front", "-o", "out.svg"), marks=pytest.mark.slow),
         ("record", "front", "-o", "out.lsr"),
-        ("replay", "front", "--to", "out.bin"),
-        ("detect", "front"),
-        ("doctor", "front"),
+        pytest.param(("replay", "front", "--to", "out.bin"), marks=pytest.mark.slow),
+        pytest.param(("detect", "front"), marks=pytest.mark.slow),
+        pytest.param(("doctor", "front"), marks=pytest.mark.slow),
         ("parse", "front"),
-        ("explain", "front"),
+        pytest.param(("explain", "front"), marks=pytest.mark.slow),
     ],
     ids=lambda words: words[0],
 )
@@ -109,7 +109,7 @@ def test_the_users_own_file_comes_first_and_the_nearest_one_adds_to_it(folder: P
     project = folder / "lidarspec.toml"
     with pytest.warns(UserWarning, match=f"front: the device of {user}, not that of {project}"):
         assert settings.named("front") == found["front"]
-    said = ran("stats", "front", "-t", "100ms").stderr
+    said = ran("stats", "front", "-n", "1").stderr
     assert said.count(f"front: the device of {user}, not that of {project}") == 1
     (folder / "deep" / "lidarspec.toml").write_text("", encoding="utf-8")
     assert list(settings.devices()) == ["front", "desk"]

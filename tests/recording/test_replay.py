@@ -24,7 +24,7 @@ from lidarspec.transports import outlets
 from lidarspec.transports.open_url import transport
 from lidarspec.transports.outlets import FileOutlet, Outlet, PtyOutlet, TcpOutlet, UdpOutlet, replay_outlet
 from lidarspec.transports.serving import Deadlines, replayed
-from tests.lines import SLACK, until, working
+from tests.lines import TIMEOUT_S, until, working
 
 STREAM, DATAGRAMS = "ldrobot-stl27l", "velodyne-vlp16"
 MS, SECOND = 1_000_000, 1_000_000_000
@@ -134,7 +134,7 @@ def test_datagrams_come_out_as_they_went_in_at_every_speed(datagrams: Path, spee
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as receiver:
         receiver.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 1 << 20)
         receiver.bind(("127.0.0.1", 0))
-        receiver.settimeout(SLACK * LASTS * 2)
+        receiver.settimeout(TIMEOUT_S * LASTS * 2)
         with playing(datagrams, UdpOutlet(ports=receiver.getsockname()[1:]), speed=speed) as failed:
             received = [receiver.recv(65536) for _ in range(100)]
     assert not failed
@@ -163,7 +163,7 @@ def test_datagrams_go_to_the_ports_of_then(datagrams: Path) -> None:
         receivers = [stack.enter_context(socket.socket(socket.AF_INET, socket.SOCK_DGRAM)) for _ in range(2)]
         for receiver in receivers:
             receiver.bind(("127.0.0.1", 0))
-            receiver.settimeout(SLACK)
+            receiver.settimeout(TIMEOUT_S)
         target = stack.enter_context(contextlib.closing(UdpOutlet()))
         for number, receiver in enumerate(receivers):
             target.send([Chunk(bytes([number]), receiver=("10.0.0.1", receiver.getsockname()[1]))], patient=True)
@@ -187,7 +187,7 @@ def test_arrivals_keep_the_times_of_then(stream: Path, speed: float) -> None:
     due = [(size - 100) / (total - 100) * LASTS / speed for _, size in arrived[:-1]]
     late = [at - began[0] - when for (at, _), when in zip(arrived[:-1], due, strict=True)]
     assert min(late) >= 0  # nothing before its time; how late, depends on the machine
-    assert arrived[-1][0] - began[0] < LASTS / speed * SLACK
+    assert arrived[-1][0] - began[0] < LASTS / speed * TIMEOUT_S
 
 
 class Clock:

@@ -29,7 +29,7 @@ from lidarspec.testing.fixtures import virtual_port
 from lidarspec.transports.outlets import simulated_outlet
 from lidarspec.transports.serving import Served, Turns, write_file
 from lidarspec.view.screen import Keyboard
-from tests.lines import SLACK, free_port, until
+from tests.lines import TIMEOUT_S, free_port, until
 from tests.simulation.test_simulator import off
 
 posix = pytest.mark.skipif(os.name != "posix", reason="pseudo terminals are POSIX")
@@ -39,7 +39,7 @@ STL, VLP, A1 = ls.sensor("ldrobot-stl27l"), ls.sensor("velodyne-vlp16"), "slamte
 def scans(device: ls.Device, number: int) -> list[ls.Scan]:
     """So many scans of which both ends were seen; fails where they do not come."""
     found: list[ls.Scan] = []
-    deadline = time.monotonic() + SLACK * 3
+    deadline = time.monotonic() + TIMEOUT_S
     for scan in device.scans(wait=0.05):
         found += [scan] if scan is not None and scan.whole else []
         if len(found) >= number:
@@ -97,7 +97,7 @@ def test_as_fast_as_possible_nothing_is_dropped_and_two_runs_are_the_same() -> N
 def test_an_unplugged_source_comes_back() -> None:
     with ls.open("sim:cspc-m1c1-mini?rate=3&unplug=1s&absent=200ms") as device:
         scans(device, 2)
-        deadline = time.monotonic() + SLACK
+        deadline = time.monotonic() + TIMEOUT_S
         while device.stats.disconnects == 0:
             assert time.monotonic() < deadline
             next(iter(device.packets(wait=0.05)))
@@ -141,7 +141,7 @@ def test_on_a_serial_port_nothing_is_lost_and_every_command_is_answered(name: st
             found = scans(device, 2)
             assert device.stats.bad_checksum == 0
             assert device.stats.bytes_skipped == device.stats.bytes_filler
-        deadline = time.monotonic() + SLACK
+        deadline = time.monotonic() + TIMEOUT_S
         wanted = [command for command in (*sensor.on_open, *sensor.on_close) if sensor.commands[command].frame]
         while port.device.heard != wanted and time.monotonic() < deadline:
             time.sleep(0.01)
@@ -197,7 +197,7 @@ def test_datagrams_go_to_the_declared_ports_by_their_kind_unless_one_is_named() 
     receivers = [socket.socket(socket.AF_INET, socket.SOCK_DGRAM) for _ in range(2)]
     for receiver in receivers:
         receiver.bind(("127.0.0.1", 0))
-        receiver.settimeout(SLACK)
+        receiver.settimeout(TIMEOUT_S)
     ports = [receiver.getsockname()[1] for receiver in receivers]
     sensor = dataclasses.replace(VLP, links={"data": Udp(*ports)})
     with virtual_port(sensor, to="udp://") as port:
@@ -314,7 +314,7 @@ def test_keys_come_over_any_descriptor() -> None:
     master, slave = os.openpty()
     with Keyboard(slave) as keyboard:
         os.write(master, b"q")
-        assert keyboard.read(SLACK) == ["q"]
+        assert keyboard.read(TIMEOUT_S) == ["q"]
     os.close(master)
     os.close(slave)
 
@@ -349,10 +349,10 @@ def test_turns_come_in_the_order_of_asking_and_nobody_waits_who_is_to_end() -> N
             thread.start()
             until(lambda number=number: len(turns._tickets) == number)  # type: ignore[misc]
         turns.end(stops[2])
-        waiting[1].join(SLACK)
+        waiting[1].join(TIMEOUT_S)
         assert came == [(2, False)]
     for thread in waiting:
-        thread.join(SLACK)
+        thread.join(TIMEOUT_S)
     assert came == [(2, False), (1, True), (3, True)]
 
 

@@ -1,0 +1,19 @@
+"""No warning of silence unless a test asks for it: a busy machine may not serve a line for a second."""
+
+from __future__ import annotations
+
+import pytest
+
+from lidarspec.device import live_input
+from tests.lines import TIMEOUT_S
+
+
+@pytest.fixture(autouse=True)
+def _patient(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(live_input, "PATIENCE", TIMEOUT_S)
+
+
+@pytest.fixture
+def impatient(_patient: None, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Report silence, and bytes without frames, after a short time."""
+    monkeypatch.setattr(live_input, "PATIENCE", 0.3)
