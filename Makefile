@@ -58,7 +58,7 @@ test-ros2-here: $(ROBOTS)
 
 # The conformance suite with 4000 examples instead of 12: hours.
 test-long: $(DEVELOPERS)
-	@LIDARSPEC_EXAMPLES=4000 $(BIN)/python -m pytest -n auto tests/sensors/test_conformance.py $(ARGS)
+	@LIDARSPEC_EXAMPLES=4000 $(BIN)/python -m pytest -n auto tests/testing/test_conformance.py $(ARGS)
 
 # Every promise and every other long test, and the table in docs/explanation/reliability.md: most of an hour.
 soak: $(DEVELOPERS)

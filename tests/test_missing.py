@@ -4,16 +4,19 @@ from __future__ import annotations
 
 from tests.missing import told
 
+HESAI = "plugins/lidarspec-hesai/tests/test_hesai.py"
+
 
 def test_what_is_missing_is_told_once_with_its_files_and_its_remedy() -> None:
     skipped = [
         ("tests/exports/test_opens.py::test_a", "Skipped: tshark is not installed"),
         ("tests/exports/test_wireshark.py::test_b[x]", "Skipped: tshark is not installed"),
         ("tests/exports/test_wireshark.py::test_b[y]", "Skipped: tshark is not installed"),
-        ("tests/sensors/test_hesai.py::test_c", "Skipped: a.pcap is not here: set LIDARSPEC_CAPTURES to the folder of captures"),
-        ("tests/sensors/test_conformance.py::Test_x::test_vectors_hold", "Skipped: there is no file of golden vectors"),
+        (f"{HESAI}::test_c", "Skipped: a.pcap is not here: set LIDARSPEC_CAPTURES to the folder of captures"),
+        ("tests/testing/test_conformance.py::Test_x::test_vectors_hold", "Skipped: there is no file of golden vectors"),
     ]
     tools, captures = told(skipped)
     files = "exports/test_opens.py, exports/test_wireshark.py"
     assert tools == f"not run without tshark: 3 tests ({files}); to have them: apt-get install tshark"
-    assert captures.startswith("not run without captures and vectors: 1 tests (sensors/test_hesai.py); to have them: LIDARSPEC_CAPTURES=")
+    start = f"not run without captures and vectors: 1 tests ({HESAI}); to have them: LIDARSPEC_CAPTURES="
+    assert captures.startswith(start)

@@ -22,7 +22,7 @@ from lidarspec.captures.records import WRITINGS
 from lidarspec.simulation.simulator import simulate
 from lidarspec.transports.open_url import transport
 from tests.cli.running import COIN_D4, EXAMPLE, LD06, printed, process, ran
-from tests.sensors.evidence import capture
+from tests.evidence import capture
 from tests.shapes import SHAPES
 
 COLUMNS = ["x", "y", "z", "range", "azimuth", "elevation", "intensity", "time", "scan"]

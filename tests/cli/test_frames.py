@@ -13,7 +13,7 @@ import lidarspec as ls
 from lidarspec.cli.frames import plain
 from tests.cli.running import COIN_D4, EXAMPLE, LD06, printed, process, ran
 from tests.engine.streams import MEGABYTE, peak
-from tests.sensors.evidence import capture
+from tests.evidence import capture
 from tests.shapes import SHAPES
 
 SENSOR = ("-s", "ldrobot-stl27l")

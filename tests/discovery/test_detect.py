@@ -20,8 +20,8 @@ from lidarspec.discovery.periods import structure
 from lidarspec.simulation.simulator import simulate
 from lidarspec.spec import Crc
 from lidarspec.testing.fixtures import virtual_port
+from tests.evidence import capture
 from tests.lines import Port, port, working
-from tests.sensors.evidence import capture
 
 CAPTURED = {
     "cspc/coin_d4_ludovatech_issue2_partial.bin": "cspc-coin-d4",

@@ -21,7 +21,7 @@ from lidarspec.simulation.simulator import simulate
 from lidarspec.spec import Checksum, Crc, Fold15, Sequence, Sum, WordXor, Xor
 from lidarspec.transports.open_url import transport
 from tests.cli.running import ran
-from tests.sensors.evidence import capture
+from tests.evidence import capture
 from tests.shapes import SHAPES
 
 LD06, COIN_D4 = "ldrobot/ld06_3_consecutive_frames.bin", "cspc/coin_d4_ludovatech_issue2_partial.bin"

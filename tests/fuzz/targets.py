@@ -37,8 +37,8 @@ from lidarspec.wire.layout import Layout
 from lidarspec_hesai import at128
 from tests import made_captures as made
 from tests.all_sensors import DISTINCT, EVERY, FRAMES
+from tests.calibration_files import write_velodyne_xml
 from tests.fuzz.words import HOSTILE, commanded, spoken
-from tests.sensors.test_velodyne import db_xml
 from tests.shapes import SHAPES
 from tests.transports import test_bags
 
@@ -429,7 +429,7 @@ def _calibration(sensor: Sensor, option: str, folder: Path) -> Target:
         if sensor.id == "hesai-at128" and option == "calibration":
             return [at128.TABLE.told()]
         if sensor.id.startswith("velodyne-hdl64e"):
-            return [db_xml(folder / "db.xml").read_bytes()]
+            return [write_velodyne_xml(folder / "db.xml").read_bytes()]
         heading = "Channel,Elevation,Azimuth" if option == "calibration" else "Channel,fire time(us)"
         rows = [f"{channel},{20.5 - channel / 2}{f',{channel % 5 * 15 - 30}' * heading.count('Azimuth')}" for channel in range(1, 129)]
         return ["\n".join([heading, *rows[:number]]).encode() for number in (16, 32, 40, 64, 128)]

@@ -37,7 +37,7 @@ from lidarspec.recording.format import (
 from lidarspec.recording.recorders import Recorder
 from lidarspec.spec import Chunk
 from lidarspec.transports.open_url import transport
-from tests.sensors.evidence import capture
+from tests.evidence import capture
 
 STREAM, DATAGRAMS = "ldrobot-stl27l", "velodyne-hdl32e"
 HDL32E = "velodyne/hdl32e/sample_velodyne_hdl32.pcap"

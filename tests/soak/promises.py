@@ -46,7 +46,7 @@ EVERY = (
         figures.linear,
     ),
     Promise("P6", "a frame is out before one longest frame more has come", (LIMITS,), "", figures.delay),
-    Promise("P7", "exact round trip", ("tests/sensors/test_conformance.py",), "", figures.round_trips),
+    Promise("P7", "exact round trip", ("tests/testing/test_conformance.py",), "", figures.round_trips),
     Promise(
         "P8",
         "a recording survives kill -9 at any byte",

@@ -1,0 +1,60 @@
+"""A place of their own for the tests: no settings, kernels or variables of the user's, and at the end what was left out for want of a tool.
+
+Ctrl-C reaches the programs that tests start, also in the background of a shell, where it is ignored and that is inherited.
+"""
+
+from __future__ import annotations
+
+import gc
+import os
+import signal
+from collections.abc import Iterator
+
+import pytest
+
+from tests.missing import told
+
+#: plugins whose tests need an environment of their own: `make test-ros2`.
+collect_ignore = ["plugins/lidarspec-ros2"]
+
+if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
+    signal.signal(signal.SIGINT, signal.default_int_handler)
+
+#: variables that change what a program does; those of the tests themselves (LIDARSPEC_CAPTURES, LIDARSPEC_EXAMPLES, LIDARSPEC_KSC) stay.
+CHANGING = ("LIDARSPEC_BACKEND", "LIDARSPEC_THREADS", "LIDARSPEC_DEBUG", "LIDARSPEC_TRUST")
+
+
+@pytest.fixture(autouse=True, scope="session")
+def _alone(tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:
+    """A working directory in which no `lidarspec.toml` is found, in itself or above, and folders for settings and kernels."""
+    base = tmp_path_factory.getbasetemp()
+    (base / "lidarspec.toml").touch()  # the nearest one counts, and none above it is looked at
+    here = base / "here"
+    here.mkdir()
+    every = base.parent if "PYTEST_XDIST_WORKER" in os.environ else base
+    with pytest.MonkeyPatch.context() as patch:
+        for name in CHANGING:
+            patch.delenv(name, raising=False)
+        for name in ("XDG_CONFIG_HOME", "APPDATA"):
+            patch.setenv(name, str(base / "settings"))
+        patch.setenv("LIDARSPEC_CACHE", str(every / "kernels"))  # one for all workers
+        patch.setenv("OPENBLAS_NUM_THREADS", "1")  # programs that tests start multiply no matrices
+        if os.environ.get("PYTHONDONTWRITEBYTECODE"):  # and compile their modules once all the same, beside the sources of nobody
+            patch.delenv("PYTHONDONTWRITEBYTECODE")
+            patch.setenv("PYTHONPYCACHEPREFIX", str(every / "bytecode"))
+        patch.chdir(here)
+        yield
+
+
+@pytest.fixture(autouse=True, scope="module")
+def _kept() -> None:
+    """What stands when a module's first test begins stays: the garbage collector need not go through it again and again."""
+    gc.collect(1)
+    gc.freeze()
+
+
+def pytest_terminal_summary(terminalreporter: pytest.TerminalReporter) -> None:
+    """Say which tests were left out for want of a tool or a capture, and where that is had."""
+    skipped = [report for report in terminalreporter.stats.get("skipped", []) if isinstance(report.longrepr, tuple)]
+    for line in told((report.nodeid, report.longrepr[2]) for report in skipped):
+        terminalreporter.write_line(line)

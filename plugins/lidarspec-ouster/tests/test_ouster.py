@@ -1,0 +1,255 @@
+"""Ouster: real packets of six layouts against the vendor's digests and points; metadata, recognition, a simulated web server."""
+
+from __future__ import annotations
+
+import dataclasses
+import functools
+import hashlib
+import importlib.util
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+import lidarspec as ls
+from lidarspec.captures.pcap import CaptureReader
+from lidarspec.discovery.detect import verdicts
+from lidarspec.simulation.simulator import simulate
+from lidarspec.spec import Learned
+from lidarspec_ouster import nominal
+from lidarspec_ouster.metadata import read
+from lidarspec_ouster.packets import NOT_FILLED, PROFILES, size
+from lidarspec_ouster.recognition import recognise
+from tests.evidence import capture, decoded, vector_bytes, vectors
+
+OS0, OS1, OS2 = (ls.sensor(f"ouster-os{number}") for number in range(3))
+#: capture, the metadata beside it, and the layout that packets alone tell.
+CAPTURES = {
+    "OS-0-32-U1_v2.2.0_1024x10": ("OS-0-32-U1_v2.2.0_1024x10", ("RNG19_RFL8_SIG16_NIR16_DUAL", 32, 1024)),
+    "OS-2-32-U0_v2.0.0_1024x10": ("OS-2-32-U0_v2.0.0_1024x10", ("LEGACY", 32, 1024)),
+    "OS-1-128_v2.3.0_1024x10_lb_n3": ("OS-1-128_v2.3.0_1024x10", ("RNG15_RFL8_NIR8", 128, 1024)),
+}
+VECTORS = ["legacy_os1_32", "dual_os0_32", "rng15_os0_128", "single_os2_128", "crc64_rng15", "fusa_os1_128"]
+FILE = "vectors_udp3d.json"
+TYPES = {"range": "u4", "signal": "u2", "near_ir": "u2", "reflectivity": "u1", "flags": "u1"}
+
+
+@functools.cache
+def payloads(path: Path) -> list[bytes]:
+    with path.open("rb") as file:
+        return [datagram.data for datagram in CaptureReader(file)]
+
+
+def unit(name: str) -> tuple[ls.Sensor, list[bytes]]:
+    """The sensor of a capture with its metadata, and the datagrams."""
+    metadata = capture(f"ouster/{CAPTURES[name][0]}.json")
+    return ls.sensor(f"ouster-os{name[3]}").configure(metadata=metadata), payloads(capture(f"ouster/{name}.pcap"))
+
+
+def digest(values: Any) -> str:
+    return hashlib.md5(np.ascontiguousarray(values).tobytes()).hexdigest()
+
+
+def pixels(packets: ls.Packets, name: str) -> Any:
+    """A field of the pixels in the vendor's type and full width: (packets, rows, columns)."""
+    return packets.raw["columns"]["pixels"][name].transpose(0, 2, 1).astype(TYPES[name.rstrip("2")])
+
+
+@pytest.mark.parametrize("name", list(CAPTURES)[:2])
+def test_every_field_has_the_digest_of_the_vendor(name: str) -> None:
+    sensor, data = unit(name)
+    packets = sensor.decode(data)
+    digests = json.loads(capture(f"ouster/{name}_digest.json").read_text(encoding="utf-8"))["packet_hash"]
+    columns = packets.raw["columns"]
+    legacy = "encoder" in columns.dtype.names
+    absent = np.zeros(columns.shape)  # what the vendor's reader says of columns that have no number of their turn, and no encoder
+    found = {
+        "TIMESTAMP": digest(columns["timestamp"].astype("u8")),
+        "MEASUREMENT_ID": digest(columns["measurement_id"].astype("u2")),
+        "STATUS": digest(columns["status"].astype("u4")),
+        "FRAME_ID": digest((columns["frame_id"] if legacy else absent).astype("u2")),
+        "ENCODER_COUNT": digest((columns["encoder"] if legacy else absent).astype("u4")),
+    }
+    names = [key for key in digests if key not in found and not key.startswith("RAW")]  # RAW32 are the words that the fields are cut out of
+    found |= {key: digest(pixels(packets, key.lower())) for key in names}
+    assert found == {key: digests[key] for key in found}
+    assert len(names) == (5 if legacy else 9)
+
+
+@pytest.mark.parametrize("backend", ("numpy", "jit") if importlib.util.find_spec("numba") else ("numpy",))
+@pytest.mark.parametrize("name", CAPTURES)
+def test_points_are_those_of_the_vendor(name: str, backend: str) -> None:
+    sensor, data = unit(name)
+    scan = next(sensor.scans(data, backend=backend))
+    with np.load(capture(f"ouster/{name}.frame0.npz")) as expected:
+        ranges, xyz = expected["RANGE"].T, expected["xyz"].transpose(1, 0, 2)
+    shape = (*ranges.shape, -1)
+    valid, points = scan.points.valid.reshape(shape)[..., 0], scan.points.xyz.reshape(*shape, 3)[:, :, 0]
+    np.testing.assert_array_equal(valid, ranges > 0)
+    np.testing.assert_allclose(points[valid], xyz[valid], rtol=0, atol=1e-5)
+
+
+@pytest.mark.parametrize("name", CAPTURES)
+def test_a_capture_is_read_whole(name: str) -> None:
+    sensor, data = unit(name)
+    packets = decoded(sensor, data[:4] + data[-4:])
+    assert packets.stats.bytes_skipped == 0
+    stats = sensor.decode(data).stats
+    assert (stats.frames["data"] + stats.frames.get("imu", 0), stats.bytes_skipped, stats.lost) == (len(data), 0, 0)
+    assert sensor.build("data", sensor.parse(data[0], "data")) == data[0]
+
+
+@pytest.mark.parametrize("name", VECTORS)
+def test_published_packets(name: str) -> None:
+    vector, data = vectors(FILE)[f"ouster_{name}"], vector_bytes(FILE, f"ouster_{name}")
+    params, expected = vector["params"], vector["expected"]
+    assert size(params["profile"], params["H"]) == len(data)
+    sensor = OS0.configure(metadata=Learned(json.dumps(metadata_of(params)).encode()))
+    packets = decoded(sensor, [data])
+    fields = packets.raw["columns"]["pixels"]
+    shift = {"RANGE": 3, "RANGE2": 3, "NEAR_IR": 4} if "RNG15" in params["profile"] else {}
+    sums = {key: int(fields[key.lower()].astype(np.int64).sum()) << shift.get(key, 0) for key in expected["sum"]}
+    assert sums == expected["sum"]
+    head = packets.raw if "init_id" in expected else packets.raw["columns"]
+    assert {key: np.ravel(head[key])[0] for key in ("frame_id", "init_id", "serial") if key in expected} == {
+        key: expected[key] for key in ("frame_id", "init_id", "serial") if key in expected
+    }
+    cloud = packets.points()
+    xyz = cloud.xyz.reshape(16, params["H"], -1, 3)[:, :, 0]
+    for point in expected["first"]:
+        np.testing.assert_allclose(xyz[point["mid"], point["row"]], point["xyz"], atol=6e-4)
+
+
+def metadata_of(params: dict[str, Any]) -> dict[str, Any]:
+    """What a vector's parameters say, in the form of a file."""
+    beam = [1, 0, 0, params["n"], 0, 1, 0, 0, 0, 0, 1, params["nz"], 0, 0, 0, 1]
+    layout = {"columns_per_frame": params["W"], "columns_per_packet": params["columns_per_packet"], "udp_profile_lidar": params["profile"]}
+    angles = {"beam_altitude_angles": params["alt"], "beam_azimuth_angles": params["az"], "beam_to_lidar_transform": beam}
+    return {"lidar_data_format": layout, "beam_intrinsics": angles, "lidar_intrinsics": {"lidar_to_sensor_transform": params["l2s"]}}
+
+
+def test_bits_of_every_profile_stand_where_the_table_has_them() -> None:
+    vectors(FILE)
+    table = json.loads((capture("ouster").parents[1] / "protocols" / "tables_udp3d.json").read_text(encoding="utf-8"))["ouster"]["profiles"]
+    assert set(table) == set(PROFILES)
+    names = {"red": "R", "green": "G", "blue": "B"}
+    for profile, bits in PROFILES.items():
+        spots = np.cumsum([0, *bits.values()]).tolist()
+        stand = {
+            names.get(name, name.upper()): [spot, width] for (name, width), spot in zip(bits.items(), spots, strict=False) if name[0] != "_"
+        }
+        listed = table[profile]["fields_bit_offset_bits_leftshift"]
+        assert stand == {name: place[:2] for name, place in listed.items() if name != "RGB"}
+        assert spots[-1] == 8 * table[profile]["bytes_per_pixel"]
+
+
+def test_a_wrong_crc_is_refused_and_one_that_is_not_filled_passes() -> None:
+    sealed = vector_bytes(FILE, "ouster_crc64_rng15")
+    sensor = OS0.configure(rows=128, turn=512, profile="RNG15_RFL8_NIR8")
+    damaged = sealed[:100] + bytes([sealed[100] ^ 1]) + sealed[101:]
+    assert len(sensor.decode([sealed])) == 1
+    assert len(sensor.decode([damaged])) == 0
+    for crc in NOT_FILLED:
+        assert len(sensor.decode([damaged[:-8] + crc.to_bytes(8, "little")])) == 1
+
+
+def test_the_imu_by_the_published_packet() -> None:
+    vector = vectors(FILE)["ouster_imu_legacy"]
+    felt = OS0.decode([bytes.fromhex(vector["hex"])], "imu").imu()
+    assert felt.time_ns.tolist() == [vector["expected"]["gyro_ts"]]
+    np.testing.assert_allclose(felt.linear_acceleration[0] / 9.80665, vector["expected"]["acc_g"], atol=1e-6)
+    np.testing.assert_allclose(np.rad2deg(felt.angular_velocity[0]), vector["expected"]["gyro_dps"], atol=1e-6)
+
+
+def test_lost_and_invalid_columns_leave_gaps() -> None:
+    sensor = OS1.configure(rows=16, turn=512)
+    packets = simulate(sensor, 32)
+    parsed = sensor.parse(packets[5], "data")
+    parsed.columns[3].status = 0
+    packets[5] = sensor.build("data", {**parsed, "crc": None})
+    cloud = sensor.decode([*packets[:2], *packets[3:]]).points().organised(512)
+    valid = cloud.valid.reshape(cloud.shape)
+    missing = {*range(32, 48), 83}
+    assert cloud.shape == (512, 16)
+    assert set(np.flatnonzero(~valid.any(axis=1)).tolist()) == missing
+    assert valid[sorted(set(range(512)) - missing)].all()
+
+
+def test_packets_alone_tell_their_layout() -> None:
+    for name, (_, layout) in CAPTURES.items():
+        found = verdicts(capture(f"ouster/{name}.pcap"))[0]
+        options = found.alike[0].sensor.options
+        assert (options["profile"], options["rows"], options["turn"]) == layout
+        assert f"profile={layout[0]}, rows={layout[1]}, turn=1024" in found.alike[0].why
+
+
+@pytest.mark.parametrize("name", VECTORS)
+def test_one_packet_tells_its_layout(name: str) -> None:
+    params = vectors(FILE)[f"ouster_{name}"]["params"]
+    assert recognise([vector_bytes(FILE, f"ouster_{name}")]) == {"profile": params["profile"], "rows": params["H"], "turn": params["W"]}
+
+
+@pytest.mark.parametrize("data", [b"", bytes(8448), b"\x01" + bytes(8447), bytes(6464)])
+def test_what_only_has_the_length_is_not_recognised(data: bytes) -> None:
+    assert recognise([data]) == {}
+
+
+@pytest.mark.parametrize("profile", PROFILES)
+def test_every_profile_is_simulated_and_read(profile: str) -> None:
+    sensor = OS2.configure(rows=16, turn=512, profile=profile)
+    packets = decoded(sensor, simulate(sensor, 2))
+    cloud = packets.points()
+    assert (len(packets), cloud.shape) == (2, (32, 16))
+    assert cloud.nominal
+    assert cloud.valid.all()
+
+
+def test_metadata_are_learned_from_the_web_server_of_a_simulated_sensor() -> None:
+    with ls.open("sim:ouster-os1") as device:
+        assert not device.latest(timeout=30).points.nominal
+        assert set(device.learned) == {"metadata"}
+        assert device.sensor.on_open == ()
+
+
+def test_older_and_newer_metadata_say_the_same(tmp_path: Path) -> None:
+    made = dataclasses.replace(nominal("OS1", 16, 512, "LEGACY"), nominal=False, serial="7")
+    sections = json.loads(made.told())
+    flat = {key: value for section in sections.values() for key, value in section.items()}
+    flat["data_format"] = {key: flat.pop(key) for key in sections["lidar_data_format"]}
+    for name, data in (("new", sections), ("old", flat)):
+        (tmp_path / name).write_text(json.dumps(data))
+    new, old = read(tmp_path / "new"), read(tmp_path / "old")
+    assert new.told() == old.told() == made.told()
+    assert (
+        OS1.configure(metadata=tmp_path / "old").configure(frame="vendor").frames["data"]
+        is OS1.configure(metadata=tmp_path / "new").frames["data"]
+    )
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"beam_altitude_angles": None}, "beam_altitude_angles is missing"),
+        ({"beam_azimuth_angles": [1, 2]}, "beam_azimuth_angles has 2 numbers, not 16"),
+        ({"beam_azimuth_angles": [float("nan")] * 16}, "beam_azimuth_angles is no list of numbers"),
+        ({"columns_per_frame": 1 << 40}, "columns_per_frame is not within 1 .. 4096"),
+        ({"columns_per_frame": 500}, "500 is no multiple of 16"),
+        ({"pixels_per_column": 32}, "16 angles for 32 pixels"),
+        ({"udp_profile_lidar": "RNG99"}, "RNG99 is none of LEGACY"),
+        ({"lidar_to_sensor_transform": [1, 2]}, "lidar_to_sensor_transform has 2 numbers"),
+        ({"prod_line": "OS-0-32"}, "of an OS-0-32: -s ouster-os0"),
+    ],
+)
+def test_metadata_that_cannot_be_are_refused_by_name(tmp_path: Path, change: dict[str, Any], message: str) -> None:
+    data = {key: value for section in json.loads(nominal("OS1", 16, 512, "LEGACY").told()).values() for key, value in section.items()}
+    (tmp_path / "unit.json").write_text(json.dumps({**data, **change}))
+    with pytest.raises(ls.UsageError, match=message):
+        OS1.configure(metadata=tmp_path / "unit.json")
+
+
+@pytest.mark.parametrize("options", [{"rows": 8}, {"rows": 1 << 20}, {"turn": 500}, {"profile": "RNG99"}, {"metadata": "x", "rows": 16}])
+def test_layouts_that_there_are_not_are_refused(options: dict[str, Any]) -> None:
+    with pytest.raises(ls.UsageError):
+        OS1.configure(**options)

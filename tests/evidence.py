@@ -1,0 +1,71 @@
+"""What the tests of the sensors share: where vectors and captures are, and decoding on both back ends."""
+
+from __future__ import annotations
+
+import functools
+import json
+import os
+from collections.abc import Iterable, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from lidarspec import Packets, PointCloud, Sensor
+from lidarspec.testing.agreement import assert_same_points
+
+_SHARED = Path(__file__).resolve().parents[2] / "shared"
+CAPTURES = Path(os.environ.get("LIDARSPEC_CAPTURES", _SHARED / "captures"))
+PROTOCOLS = CAPTURES.parent / "protocols"
+
+
+def capture(name: str) -> Path:
+    """The path of a capture; the test is skipped where it is absent."""
+    return _present(CAPTURES / name)
+
+
+@functools.cache
+def _listed(file: str) -> dict[str, dict[str, Any]]:
+    return {vector["id"]: vector for vector in json.loads((PROTOCOLS / file).read_text(encoding="utf-8"))}
+
+
+def vectors(file: str) -> dict[str, dict[str, Any]]:
+    """The test vectors of a file by id; the test is skipped where it is absent."""
+    _present(PROTOCOLS / file)
+    return _listed(file)
+
+
+def vector_bytes(file: str, name: str) -> bytes:
+    """The bytes of one vector, out of the list or out of the file that it names."""
+    vector = vectors(file)[name]
+    return bytes.fromhex(vector["hex"]) if vector["hex"] else _present(PROTOCOLS / vector["file"]).read_bytes()
+
+
+def _present(path: Path) -> Path:
+    if not path.exists():
+        pytest.skip(f"{path.name} is not here: set LIDARSPEC_CAPTURES to the folder of captures, with protocols beside it")
+    return path
+
+
+def decoded(sensor: Sensor, data: Any, frame: str | None = None) -> Packets:
+    """The packets of this input, after the compiled and the interpreted path gave the same ones, points and counters."""
+    packets, interpreted = sensor.decode(data, frame), sensor.decode(data, frame, backend="construct")
+    assert interpreted.raw.dtype == packets.raw.dtype
+    assert interpreted.raw.tobytes() == packets.raw.tobytes()
+    assert interpreted.stats == packets.stats
+    assert interpreted.time_ns.tolist() == packets.time_ns.tolist()
+    if frame is None:
+        assert_same_points(interpreted.points(), packets.points())
+    return packets
+
+
+def clockwise(cloud: PointCloud) -> Any:
+    """The azimuths as a clockwise sensor counts them: degrees in [0, 360)."""
+    return np.rad2deg(-cloud.azimuth.astype(np.float64)) % 360
+
+
+def assert_points(cloud: PointCloud, expected: Iterable[tuple[int, Sequence[float]]], *, atol: float = 2e-5) -> None:
+    """Fail unless the points with these indices are at these x y z."""
+    for index, xyz in expected:
+        np.testing.assert_allclose(cloud.xyz[index], xyz, atol=atol, err_msg=f"point {index}")

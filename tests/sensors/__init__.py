@@ -1,1 +1,0 @@
-"""Each family of sensors against its manuals, test vectors and real captures."""
