@@ -13,7 +13,7 @@ from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
-from lidarspec import Sensor
+from lidarspec import Device, Sensor
 
 #: seconds after which a test fails if an event has not come: many, since the machine may be slow or busy.
 TIMEOUT_S = 60.0
@@ -106,6 +106,16 @@ def until(condition: Callable[[], object], seconds: float = TIMEOUT_S) -> float:
         assert time.monotonic() - began < seconds, "it did not happen in time"
         time.sleep(0.005)
     return time.monotonic() - began
+
+
+def read_until(device: Device, condition: Callable[[], object]) -> None:
+    """Read a live device until a condition holds; fail if it does not become true."""
+
+    def read_and_check() -> object:
+        device.newest(0.01)
+        return condition()
+
+    until(read_and_check)
 
 
 @contextlib.contextmanager

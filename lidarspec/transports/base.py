@@ -29,6 +29,8 @@ PAUSE = 0.002
 PARTED = 50_000_000
 #: times that both are read where something comes between; what may come between is a part of that.
 TRIES = 10
+#: ns between two readings of a clock after which a thread was held up: a reading takes less than a thousandth of it.
+HELD_UP_NS = 200_000
 _BOOTTIME: int | None = getattr(time, "CLOCK_BOOTTIME", None)
 L = TypeVar("L", bound=Link)
 _Descriptor = int | socket.socket
@@ -166,6 +168,23 @@ class HostClock:
     def now(self) -> int:
         """Nanoseconds since 1970."""
         return steady_ns() + self._offset
+
+    def now_and_wall(self) -> tuple[int, int]:
+        """Return the time of this clock and of the wall clock at one moment, ns since 1970.
+
+        A thread may be held up between the two readings: then both are taken again, and the closest ones are returned.
+        """
+        closest: tuple[int, int, int] | None = None
+        for _ in range(TRIES):
+            now = self.now()
+            wall = self._wall()
+            gap = self.now() - now
+            if closest is None or gap < closest[0]:
+                closest = gap, now, wall
+            if gap < HELD_UP_NS:
+                break
+        assert closest is not None
+        return closest[1:]
 
     def parted(self) -> int | None:
         """By how many ns the wall clock is ahead of these times, where it was set by more than 50 ms since the last call; else None."""

@@ -23,6 +23,7 @@ import struct
 import sys
 import time
 from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import replace
 from shlex import quote
 
 from lidarspec.errors import SourceError, UsageError
@@ -260,9 +261,10 @@ class UdpTransport(LiveTransport):
 
     def _fetch(self, one: _Socket, found: list[Chunk]) -> None:
         """Everything that waits in a socket, up to a limit that is fair to the others."""
+        start = len(found)
         try:
             own = self._origin
-            for data, sender, at in one.datagrams(self.clock.now()):
+            for data, sender, at in one.datagrams(*self.clock.now_and_wall()):
                 if own is not None and sender not in own:
                     self.foreign, self.stranger = self.foreign + 1, sender
                     continue
@@ -272,6 +274,7 @@ class UdpTransport(LiveTransport):
         except OSError as error:
             if not self.closed:
                 raise SourceError(f"{self.label}: {reason(error)}") from None
+        _order_times(found, start)
 
     def _bound(self, host: str, port: int, group: str | None) -> socket.socket:
         family = socket.AF_INET6 if ":" in host or ":" in (group or "") else socket.AF_INET
@@ -324,8 +327,12 @@ class _Socket:
                 found.setsockopt(socket.SOL_SOCKET, option, 1)
                 self.is_timed |= option == SO_TIMESTAMPNS
 
-    def datagrams(self, now: int) -> Iterator[tuple[bytes, tuple[str, int], int]]:
+    def datagrams(self, now: int, wall: int) -> Iterator[tuple[bytes, tuple[str, int], int]]:
         """What waits, with sender and arrival time; counts what the kernel dropped.
+
+        Args:
+            now: the time of the clock that arrival times are given in, ns since 1970.
+            wall: the time of the wall clock at the same moment, which the kernel's times are of.
 
         Raises:
             OSError: what the system says.
@@ -333,16 +340,15 @@ class _Socket:
         if self._slots is None:
             yield from self._one_by_one(now)
             return
-        anchor = time.time_ns()
         for _ in range(TOGETHER // MANY):
             number = self._slots.fill(self.socket.fileno())
             for index in range(number):
                 data, sender = self._slots.datagram(index)
                 told = self._slots.numbers(index)
                 if told is not None and told[0] == SO_TIMESTAMPNS:
-                    yield data, sender, _carried(told[1], told[2], now, anchor)
+                    yield data, sender, _carried(told[1], told[2], now, wall)
                 else:
-                    yield data, sender, self._told(self._slots.said(index), now, anchor)
+                    yield data, sender, self._told(self._slots.said(index), now, wall)
             if number < MANY:
                 return
 
@@ -354,22 +360,36 @@ class _Socket:
                 return
             yield data, sender[:2], now
 
-    def _told(self, said: Iterable[tuple[int, memoryview]], now: int, anchor: int) -> int:
+    def _told(self, said: Iterable[tuple[int, memoryview]], now: int, wall: int) -> int:
         """When the datagram arrived; counts what was dropped before it."""
         at = now
         for kind, data in said:
             if kind == SO_TIMESTAMPNS and len(data) == 16:
                 seconds, nanoseconds = TIME.unpack(data)
-                at = _carried(seconds, nanoseconds, now, anchor)
+                at = _carried(seconds, nanoseconds, now, wall)
             elif kind == SO_RXQ_OVFL and len(data) == 4:
                 drops = int.from_bytes(data, sys.byteorder)
                 self.drops += (drops - self.drops) & 0xFFFFFFFF
         return at
 
 
-def _carried(seconds: int, nanoseconds: int, now: int, anchor: int) -> int:
-    """A time of the wall clock, which reads `anchor` now, as one of a clock that reads `now`; of the last minute, whatever it says."""
-    return now - min(max(anchor - seconds * 1_000_000_000 - nanoseconds, 0), LATEST)
+def _order_times(chunks: list[Chunk], start: int) -> None:
+    """Give no datagram, from `start` on, a later time than those that were queued behind it.
+
+    For some milliseconds after a socket was opened Linux stamps datagrams when they are fetched instead of when they arrive.
+    """
+    times = [chunk.at or 0 for chunk in chunks[start:]]
+    if times == sorted(times):
+        return
+    earliest = times[-1]
+    for index in reversed(range(len(times))):
+        earliest = min(earliest, times[index])
+        chunks[start + index] = replace(chunks[start + index], at=earliest)
+
+
+def _carried(seconds: int, nanoseconds: int, now: int, wall: int) -> int:
+    """A time of the wall clock, which reads `wall` now, as one of a clock that reads `now`; of the last minute, whatever it says."""
+    return now - min(max(wall - seconds * 1_000_000_000 - nanoseconds, 0), LATEST)
 
 
 def connect(address: Address, sensor: Sensor | None = None) -> UdpTransport:

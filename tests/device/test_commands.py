@@ -25,7 +25,7 @@ from lidarspec.errors import CommandError, OutOfRange, ReplyTimeout, SourceError
 from lidarspec.recording.format import Recording
 from lidarspec.spec import Command, Serial, Tcp, Udp
 from tests.broken import sound
-from tests.lines import TIMEOUT_S, Port, free_port, port, turning, udp, until, working
+from tests.lines import TIMEOUT_S, Port, free_port, port, read_until, turning, udp, until, working
 from tests.shapes import SHAPES
 
 pytestmark = pytest.mark.skipif(os.name != "posix", reason="pseudo terminals are POSIX")
@@ -195,7 +195,7 @@ def test_started_again_after_it_was_unplugged(line: Port) -> None:
             opened.latest(TIMEOUT_S)
             device.streaming = False
             line.unplug()
-            until(lambda: opened.newest(0.01) or opened.state == "disconnected")
+            read_until(opened, lambda: opened.state == "disconnected")
             line.plug()
             until(lambda: opened.newest(0.01))
         until(lambda: device.heard == [START, START, STOP])
@@ -205,7 +205,7 @@ def test_a_command_to_a_device_that_is_gone_fails_at_once(line: Port) -> None:
     device = Obedient(line)
     with working(device.work), ls.open(f"serial://{line.name}", SENSOR) as opened:
         line.unplug()
-        until(lambda: opened.newest(0.01) or opened.state == "disconnected")
+        read_until(opened, lambda: opened.state == "disconnected")
         with pytest.raises(CommandError) as caught:
             opened.send("speed", rate=10.0, trim=0.0, timeout=10 * TIMEOUT_S)
     assert not isinstance(caught.value, ReplyTimeout)
@@ -227,7 +227,7 @@ def test_closing_without_a_device_waits_for_no_reply(line: Port, monkeypatch: py
     device = Obedient(line)
     with working(device.work), ls.open(f"serial://{line.name}", SENSOR) as opened:
         line.unplug()
-        until(lambda: opened.newest(0.01) or opened.state == "disconnected")
+        read_until(opened, lambda: opened.state == "disconnected")
         closing = threading.Thread(target=opened.close, daemon=True)
         closing.start()
         until(lambda: not closing.is_alive())
@@ -348,9 +348,9 @@ def test_a_command_goes_to_the_sensor_and_a_strangers_answer_is_none() -> None:
         ls.open(f"udp://:{number}", datagram_sensor(number), start=False) as opened,
     ):
         own.sendto(frames[0], ("127.0.0.1", number))
-        until(lambda: opened.newest(0.01) or opened.stats.frames)
+        read_until(opened, lambda: opened.stats.frames)
         other.sendto(frames[1], ("127.0.0.1", number))
-        until(lambda: opened.newest(0.01) or opened.stats.foreign)
+        read_until(opened, lambda: opened.stats.foreign)
 
         def answer(stop: threading.Event) -> None:
             who = own.recvfrom(100)[1]

@@ -9,7 +9,7 @@ import queue
 import socket
 import sys
 import threading
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -38,7 +38,7 @@ from lidarspec.spec import (
     hookimpl,
 )
 from lidarspec.testing.fixtures import virtual_port
-from tests.lines import TIMEOUT_S, free_port, udp, until, working
+from tests.lines import TIMEOUT_S, free_port, read_until, udp, working
 from tests.shapes.conversation import SENSOR
 
 PAGES = {"page": Frame(HttpReply, max_length=4096), "ask": Frame(HttpRequest, direction="out", max_length=4096)}
@@ -46,16 +46,6 @@ STATUS = Command(
     "ask", {"method": "GET", "path": b"/status", "body": b""}, reply="page", matches={"status": 200}, link="web", timeout=TIMEOUT_S
 )
 SET = Command("ask", {"method": "PUT", "path": b"/mode"}, args={"mode": ("body", Text(40))}, reply="page", link="web", timeout=TIMEOUT_S)
-
-
-def read_until(device: ls.Device, condition: Callable[[], object]) -> None:
-    """Read a device until something is so."""
-
-    def is_so() -> object:
-        device.newest(0.01)
-        return condition()
-
-    until(is_so)
 
 
 def linked(control: Link, **more: Any) -> Sensor:

@@ -25,7 +25,7 @@ from lidarspec.spec import Chunk, Udp
 from lidarspec.testing.fixtures import virtual_port
 from lidarspec.transports.serial import SerialTransport
 from lidarspec.transports.udp import UdpTransport
-from tests.lines import TIMEOUT_S, Port, free_port, paced, port, turning, udp, until, working
+from tests.lines import TIMEOUT_S, Port, free_port, paced, port, read_until, turning, udp, until, working
 from tests.shapes import SHAPES
 
 pytestmark = pytest.mark.skipif(os.name != "posix", reason="pseudo terminals are POSIX")
@@ -105,7 +105,7 @@ def test_datagrams_and_their_gaps(line: Port) -> None:
             sender.sendto(frame, ("127.0.0.1", number))
             sender.sendto(b"noise", ("127.0.0.1", number))
         found = packets(device, 20)
-        until(lambda: device.newest(0.01) or device.stats.bytes_in == sum(len(frame) + 5 for frame in frames))
+        read_until(device, lambda: device.stats.bytes_in == sum(len(frame) + 5 for frame in frames))
     assert np.array_equal(np.concatenate([batch.raw for batch in found]), WHOLE.decode(frames).raw)
     assert device.stats.bytes_skipped == 5 * len(frames)
 
@@ -156,7 +156,7 @@ def test_silence_is_a_state_and_a_warning_until_data_come(line: Port) -> None:
         (warning,) = device.warnings
         assert warning.endswith(f"next: lidarspec doctor serial://{line.name} -s {TURNING.id}")
         with working(lambda stop: paced(line.send, turning(TURNING, 40), 100, stop) and None):
-            until(lambda: device.newest(0.01) or device.state == "streaming")
+            read_until(device, lambda: device.state == "streaming")
 
 
 @pytest.mark.usefixtures("impatient")
@@ -166,7 +166,7 @@ def test_bytes_without_frames_name_the_baud_rate(line: Port) -> None:
         ls.open(f"serial://{line.name}?baud=9600", TURNING) as device,
         working(lambda stop: paced(line.offer, [noise[:20]], 50, stop) and None),
     ):
-        until(lambda: device.newest(0.01) or device.state == "no frames")
+        read_until(device, lambda: device.state == "no frames")
         (warning,) = device.warnings
         assert "9600" in warning
         assert warning.endswith(f"next: lidarspec detect serial://{line.name}")
@@ -250,7 +250,7 @@ def test_strangers_change_no_cloud_and_end_nothing(tmp_path: Path) -> None:
     calibration = WHOLE.build("info", elevation=[1.0, 2.0, 3.0])
     with udp("127.0.0.2") as own, udp("127.0.0.3") as other, ls.open(f"udp://:{number}", WHOLE, record=recording) as device:
         other.sendto(TILTED, ("127.0.0.1", number))  # before anybody knows who the sensor is
-        until(lambda: device.newest(0.01) or device.stats.frames)
+        read_until(device, lambda: device.stats.frames)
         for frame in [frames[0], calibration, *frames[1:30]]:
             own.sendto(frame, ("127.0.0.1", number))
         found = packets(device, 30)
@@ -262,7 +262,7 @@ def test_strangers_change_no_cloud_and_end_nothing(tmp_path: Path) -> None:
         first = WHOLE.decode(frames[:1]).points().xyz  # by the nominal calibration, and not by a stranger's
         assert np.array_equal(points(found), np.concatenate([first, WHOLE.decode([calibration, *frames[1:]]).points().xyz]))
         assert device.stats.lost == device.stats.duplicates == 0
-        until(lambda: device.newest(0.01) or device.stats.foreign == 120)
+        read_until(device, lambda: device.stats.foreign == 120)
         (said,) = (warning for warning in device.warnings if "left out" in warning)
         senders = [":".join(map(str, each.getsockname())) for each in (own, other)]
         assert f"udp://:{number}: {senders[0]} is read; {senders[1]} sends as well, and is left out" in said
@@ -277,8 +277,8 @@ def test_the_one_that_is_named_is_read_and_others_count_for_nothing() -> None:
     with udp("127.0.0.2") as other, udp("127.0.0.3") as own, ls.open(f"udp://:{number}?src=127.0.0.3", WHOLE) as device:
         for frame in frames:
             other.sendto(frame, ("127.0.0.1", number))
-        until(lambda: device.newest(0.01) or device.stats.foreign == 4)
-        until(lambda: device.newest(0.01) or device.state == "silent")
+        read_until(device, lambda: device.stats.foreign == 4)
+        read_until(device, lambda: device.state == "silent")
         said, stranger = device.warnings[-1], other.getsockname()[1]
         assert f"nothing has arrived from the sensor, and 4 datagrams from others, such as 127.0.0.2:{stranger}, for" in said
         for frame in frames:
@@ -316,7 +316,7 @@ def test_two_senders_of_one_address_are_told_apart_by_their_ports() -> None:
             other.sendto(frames[5], ("127.0.0.1", number))
             own.sendto(frame, ("127.0.0.1", number))
         found = packets(device, 29)
-        until(lambda: device.newest(0.01) or device.stats.foreign >= 28)  # the very first may be that of a restarted sensor
+        read_until(device, lambda: device.stats.foreign >= 28)  # the very first may be that of a restarted sensor
         assert sum(map(len, found)) <= 30
         assert f"127.0.0.2:{other.getsockname()[1]} sends as well" in device.warnings[-1]
 
@@ -339,7 +339,7 @@ def test_a_stream_in_datagrams_of_two_ports_is_not_joined() -> None:
             for each in (one, two):
                 each.sendto(frame, ("127.0.0.1", number))
         assert sum(map(len, packets(device, 12))) <= 13
-        until(lambda: device.newest(0.01) or device.stats.foreign >= 11)
+        read_until(device, lambda: device.stats.foreign >= 11)
 
 
 def test_a_stream_in_datagrams_is_joined_by_sender(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -356,7 +356,7 @@ def test_a_stream_in_datagrams_is_joined_by_sender(monkeypatch: pytest.MonkeyPat
         assert device.stats.foreign == -(-len(stream) // 7)
         for frame in frames:
             two.sendto(frame, ("127.0.0.1", number))
-        until(lambda: device.newest(0.01) or device.stats.foreign == -(-len(stream) // 7) + 12)
+        read_until(device, lambda: device.stats.foreign == -(-len(stream) // 7) + 12)
         assert device.stats.frames == {"data": 12}
 
 
@@ -372,12 +372,12 @@ def test_unplugged_and_plugged_in_again(line: Port, cycles: int) -> None:
         descriptors = len(os.listdir("/dev/fd"))
         for cycle in range(cycles):
             line.send(frames[0][:half])
-            until(lambda: device.newest(0.01) or device.stats.pending == half)
+            read_until(device, lambda: device.stats.pending == half)
             line.unplug()
-            until(lambda: device.newest(0.01) or device.state == "disconnected")
+            read_until(device, lambda: device.state == "disconnected")
             assert any("waiting for it to come back" in warning for warning in device.warnings)
             line.plug()
-            until(lambda: device.newest(0.01) or device.state != "disconnected")
+            read_until(device, lambda: device.state != "disconnected")
             line.send(frames[0][half:] + b"".join(frames[1:]))
             batch = packets(device, 9)
             assert sum(map(len, batch)) == 9, "no frame is spliced over the gap"
@@ -444,9 +444,9 @@ def test_a_recording_knows_where_the_line_was_interrupted(line: Port, tmp_path: 
         line.send(b"".join(frames[:10]) + frames[10][:6])
         live = packets(device, 10)
         line.unplug()
-        until(lambda: device.newest(0.01) or device.state == "disconnected")
+        read_until(device, lambda: device.state == "disconnected")
         line.plug()
-        until(lambda: device.newest(0.01) or device.state != "disconnected")
+        read_until(device, lambda: device.state != "disconnected")
         line.send(frames[10][6:] + b"".join(frames[11:]))
         live += packets(device, 9)
     with Recording(path) as recording:

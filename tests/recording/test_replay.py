@@ -30,6 +30,8 @@ STREAM, DATAGRAMS = "ldrobot-stl27l", "velodyne-vlp16"
 MS, SECOND = 1_000_000, 1_000_000_000
 #: seconds that the recordings of these tests take.
 LASTS = 0.25
+#: times as fast as it was recorded; None: without a pause.
+SPEEDS = [10.0, None, *(pytest.param(speed, marks=pytest.mark.slow) for speed in (0.5, 1.0))]
 posix = pytest.mark.skipif(not hasattr(os, "openpty"), reason="needs pseudo terminals")
 
 
@@ -85,7 +87,7 @@ def playing(path: Path, target: Outlet, *, speed: float | None, began: list[floa
     try:
         yield failed
     finally:
-        thread.join(30)
+        thread.join(TIMEOUT_S)
         assert not thread.is_alive()
 
 
@@ -117,7 +119,7 @@ def until_the_end(read: Callable[[], bytes]) -> Iterator[bytes]:
             yield data
 
 
-@pytest.mark.parametrize("speed", [0.5, 1.0, 10.0, None])
+@pytest.mark.parametrize("speed", SPEEDS)
 @pytest.mark.parametrize("kind", [pytest.param("pty", marks=posix), "tcp"])
 def test_a_stream_comes_out_as_it_went_in_at_every_speed(stream: Path, kind: str, speed: float | None) -> None:
     target = PtyOutlet() if kind == "pty" else TcpOutlet("127.0.0.1", 0, sole=True)
@@ -129,12 +131,12 @@ def test_a_stream_comes_out_as_it_went_in_at_every_speed(stream: Path, kind: str
     assert sensor.decode(received).raw.tobytes() == sensor.decode(content(stream)).raw.tobytes()
 
 
-@pytest.mark.parametrize("speed", [0.5, 1.0, 10.0, None])
+@pytest.mark.parametrize("speed", SPEEDS)
 def test_datagrams_come_out_as_they_went_in_at_every_speed(datagrams: Path, speed: float | None) -> None:
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as receiver:
         receiver.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 1 << 20)
         receiver.bind(("127.0.0.1", 0))
-        receiver.settimeout(TIMEOUT_S * LASTS * 2)
+        receiver.settimeout(TIMEOUT_S)
         with playing(datagrams, UdpOutlet(ports=receiver.getsockname()[1:]), speed=speed) as failed:
             received = [receiver.recv(65536) for _ in range(100)]
     assert not failed
@@ -173,7 +175,7 @@ def test_datagrams_go_to_the_ports_of_then(datagrams: Path) -> None:
 
 
 @posix
-@pytest.mark.parametrize("speed", [1.0, 2.0])
+@pytest.mark.parametrize("speed", [2.0, pytest.param(1.0, marks=pytest.mark.slow)])
 def test_arrivals_keep_the_times_of_then(stream: Path, speed: float) -> None:
     target, began, arrived = PtyOutlet(), list[float](), list[tuple[float, int]]()
     with playing(stream, target, speed=speed, began=began):
@@ -187,7 +189,6 @@ def test_arrivals_keep_the_times_of_then(stream: Path, speed: float) -> None:
     due = [(size - 100) / (total - 100) * LASTS / speed for _, size in arrived[:-1]]
     late = [at - began[0] - when for (at, _), when in zip(arrived[:-1], due, strict=True)]
     assert min(late) >= 0  # nothing before its time; how late, depends on the machine
-    assert arrived[-1][0] - began[0] < LASTS / speed * TIMEOUT_S
 
 
 class Clock:

@@ -13,7 +13,8 @@ import pytest
 
 import lidarspec as ls
 from lidarspec.errors import WireError
-from lidarspec.transports.hexadecimal import BLOCK, HexText, unhexed
+from lidarspec.transports import hexadecimal
+from lidarspec.transports.hexadecimal import HexText, unhexed
 from lidarspec.transports.open_url import transport
 from tests.cli.running import ran
 
@@ -41,13 +42,15 @@ def test_bytes_are_read_as_people_print_them(text: str, tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("form", ["8b135a", "8B 13 5a ", "0x8B,0x13,0x5A,", "8b:13:5a:", r"\x8b\x13\x5a", "  8b 135a\t"])
-def test_a_line_without_end_is_read_in_pieces(form: str, tmp_path: Path) -> None:
-    line = form * (3 * BLOCK // len(form))
-    (tmp_path / "a.hex").write_text(f"0000: {line}# {line}\n{line}\n{line[: BLOCK // len(form) * len(form)]}", encoding="ascii")
+def test_a_line_without_end_is_read_in_pieces(form: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    block = 1 << 13
+    monkeypatch.setattr(hexadecimal, "BLOCK", block)
+    line = form * (3 * block // len(form))
+    (tmp_path / "a.hex").write_text(f"0000: {line}# {line}\n{line}\n{line[: block // len(form) * len(form)]}", encoding="ascii")
     with contextlib.closing(transport(tmp_path / "a.hex")) as opened:
         found = [chunk.data for chunk in opened.chunks()]
-    assert b"".join(found) == unhexed(line) * 2 + unhexed(form) * (BLOCK // len(form))
-    assert max(map(len, found)) <= BLOCK
+    assert b"".join(found) == unhexed(line) * 2 + unhexed(form) * (block // len(form))
+    assert max(map(len, found)) <= block
 
 
 def test_a_single_digit_is_a_byte_where_it_says_so_alone() -> None:

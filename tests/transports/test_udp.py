@@ -11,10 +11,10 @@ import pytest
 import lidarspec as ls
 from lidarspec.errors import SourceError, UsageError
 from lidarspec.spec import Chunk
-from lidarspec.transports.base import origin
+from lidarspec.transports.base import HostClock, origin
 from lidarspec.transports.open_url import transport
 from lidarspec.transports.protocol import Origin, endpoint
-from lidarspec.transports.udp import BUFFER, UdpTransport, _Socket, shortfall
+from lidarspec.transports.udp import BUFFER, UdpTransport, _order_times, _Socket, shortfall
 from tests.lines import free_port, udp, until
 from tests.shapes import SHAPES
 
@@ -138,10 +138,10 @@ def test_without_recvmmsg_datagrams_come_one_by_one() -> None:
     with udp() as sender, udp() as receiver:
         receiver.setblocking(False)
         one = _Socket(receiver, None)
-        assert list(one.datagrams(7)) == []
+        assert list(one.datagrams(7, 0)) == []
         for data in (b"a", b"", bytes(65_507)):
             sender.sendto(data, receiver.getsockname())
-        assert list(one.datagrams(7)) == [(data, sender.getsockname(), 7) for data in (b"a", b"", bytes(65_507))]
+        assert list(one.datagrams(7, 0)) == [(data, sender.getsockname(), 7) for data in (b"a", b"", bytes(65_507))]
 
 
 @LINUX
@@ -169,6 +169,26 @@ def test_the_kernel_says_when_a_datagram_came() -> None:
         (chunk,) = one.read(1.0)
     assert one.clock.now() - (chunk.at or 0) >= 400_000_000
     one.close()
+
+
+def test_the_times_of_both_clocks_are_of_one_moment_though_the_thread_is_held_up() -> None:
+    pauses = iter([0.0, 0.05, 0.05, 0.0])
+
+    def read_wall_clock() -> int:
+        time.sleep(next(pauses, 0.0))
+        return time.time_ns()
+
+    clock = HostClock(read_wall_clock)
+    now, wall = clock.now_and_wall()
+    later, later_wall = HostClock().now_and_wall()
+    assert abs((later_wall - wall) - (later - now)) < 10_000_000
+
+
+def test_a_datagram_arrives_no_later_than_the_one_queued_behind_it() -> None:
+    times = [5, 9, 9, 7, 8, 6, 10]
+    chunks = [Chunk(b"", at) for at in times]
+    _order_times(chunks, 1)
+    assert [chunk.at for chunk in chunks] == [5, 6, 6, 6, 6, 6, 10]
 
 
 @LINUX
