@@ -183,10 +183,12 @@ def _spent(seconds: float) -> str:
 @click.version_option(__version__, prog_name="lidarspec", message="%(prog)s %(version)s")
 @click.pass_context
 def main(ctx: click.Context) -> None:
-    """Every lidar's wire protocol written down once: parse, build, explain and convert what sensors send.
+    """Read, record, simulate and explain lidars, each from one description of its wire protocol.
 
-    SOURCE is a file (.pcap, .pcapng, .bin, .hex) or - for standard input. Exit codes: 0 ok, 1 findings, 2 usage,
-    3 source cannot be opened, 4 no valid data, 5 device refused, 130 interrupted.
+    SOURCE is a serial port (/dev/ttyUSB0, COM4), a socket (udp://:2368, tcp://HOST:PORT), a simulated sensor (sim:ID),
+    a file (.lsr, .pcap, .pcapng, .bin, .hex) or - for standard input.
+
+    Exit codes: 0 ok, 1 findings, 2 usage, 3 source cannot be opened, 4 no valid data, 5 device refused, 130 interrupted.
     """
     if ctx.invoked_subcommand is None:
         from lidarspec.cli.sensors import guide

@@ -36,31 +36,34 @@ PACKETS = 32
 
 
 def guide() -> str:
-    """What is installed and connected here, and what to type; in fifteen lines."""
+    """Return what is installed and connected, and the first commands to type."""
     known = registry().sensors()
     ports = [port.path for port in serial_ports()]
     named = list(devices())
     source = (named or ports or ["sim:" + next(iter(known), "ID")])[0]
     vendors = {sensor.vendor for sensor in known.values()}
-    return "\n".join(
-        [
-            f"lidarspec {__version__}",
-            f"{len(known)} sensors of {len(vendors)} vendors" if vendors else NO_SENSORS,
-            f"serial ports: {', '.join(ports) or 'none'}",
-            *([f"devices of {FILE}: {', '.join(named)}"] if named else []),
-            "",
-            "  lidarspec demo                          a simulated sensor, drawn",
-            "  lidarspec sensors                       what is installed, how far proven",
-            "  lidarspec detect                        which one sends, on which port",
-            f"  lidarspec view {source:<25}it at work, drawn here",
-            f"  lidarspec record {source + ' -o a.lsr':<23}all that it sends, into a file",
-            "  lidarspec convert a.pcap points.csv     a capture into points",
-            "  lidarspec explain 54 2c 68 08 ...       every byte of a frame",
-            "  lidarspec doctor                        why nothing comes",
-            "",
-            "lidarspec help: every verb; lidarspec help VERB: its options",
-        ]
-    )
+    lines = [
+        f"lidarspec {__version__}",
+        f"{len(known)} sensors of {len(vendors)} vendors" if vendors else NO_SENSORS,
+        f"serial ports: {', '.join(ports) or 'none'}",
+    ]
+    if named:
+        lines.append(f"devices of {FILE}: {', '.join(named)}")
+    commands = {
+        "demo": "simulate a sensor, and draw it",
+        "sensors": "list the installed sensors",
+        "detect": "find the sensor that sends",
+        f"view {source}": "draw its points",
+        f"record {source} -o a.lsr -t 10s": "record it for 10 s",
+        "convert a.lsr points.csv": "write the points to a file",
+        "explain a.lsr -n 1": "name every byte of a frame",
+        "doctor": "find out why no data arrives",
+    }
+    width = max(len(command) for command in commands)
+    lines.append("")
+    lines += [f"  lidarspec {command:<{width}}  {text}" for command, text in commands.items()]
+    lines += ["", "lidarspec help: every verb; lidarspec help VERB: its options"]
+    return "\n".join(lines)
 
 
 @click.command()

@@ -100,7 +100,9 @@ class Line:
         stream: a byte stream; else datagrams.
 
     Attributes:
-        sent, intact, lost: packets that were sent, that came through unharmed, and that were lost whole.
+        sent: number of packets given to `carry`.
+        intact: packets of which every byte arrives, in order and with nothing between.
+        lost: packets of which no byte arrives.
 
     Raises:
         UsageError: for reordering on a byte stream, which has no such fault.
@@ -128,7 +130,8 @@ class Line:
                 self.lost += 1
             else:
                 harmed = self._harmed(data)
-                self.intact += harmed == data
+                if data in harmed:  # a byte inserted after the frame leaves it whole
+                    self.intact += 1
                 depth = self._faults.reorder
                 delay = self._source.randint(1, depth) if depth and self._source.random() < LATE else 0
                 heapq.heappush(self._late, (self._number + delay, self._number, name, harmed))

@@ -38,6 +38,13 @@ def ran(*words: object, code: int = 0, given: bytes | None = None) -> Result:
     return result
 
 
+def ran_with_any_code(*words: object) -> int:
+    """Run a command in this process, and return its exit code."""
+    result = CliRunner(**APART).invoke(main, [str(word) for word in words])
+    assert "Traceback" not in result.stdout + result.stderr
+    return result.exit_code
+
+
 def printed(*words: object) -> Any:
     """What ``--json`` prints."""
     return json.loads(ran(*words, "--json").stdout)

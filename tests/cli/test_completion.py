@@ -13,7 +13,7 @@ import pytest
 import lidarspec as ls
 from lidarspec.cli.root import VERBS
 from lidarspec.plugins import Registry
-from tests.cli.running import ran
+from tests.cli.running import ran, ran_with_any_code
 
 SETTINGS = '[device.front]\nsource = "sim:slamtec-rplidar-s2"\nsensor = "slamtec-rplidar-s2"\n'
 
@@ -80,9 +80,26 @@ def test_the_command_alone_is_a_guide_to_what_is_here(folder: Path) -> None:
     assert all(len(line) <= 80 for line in lines if not line.startswith("serial ports"))
     assert lines[1].startswith(f"{len(ls.sensors())} sensors of ")
     assert "devices of lidarspec.toml: front" in lines
-    commands = [line.split()[1] for line in lines if line.startswith("  lidarspec ")]
-    assert set(commands) <= set(VERBS)
-    assert "  lidarspec view front" in "\n".join(lines)
+    commands = guide_commands(lines)
+    assert {command.split()[0] for command in commands} <= set(VERBS)
+    assert "view front" in commands
+
+
+def guide_commands(lines: list[str]) -> list[str]:
+    """Return the commands that the guide prints, without the name of the program."""
+    return [line.removeprefix("  lidarspec ").partition("  ")[0] for line in lines if line.startswith("  lidarspec ")]
+
+
+@pytest.mark.slow
+def test_every_command_of_the_guide_runs(folder: Path) -> None:
+    for command in guide_commands(ran().stdout.splitlines()):
+        words = command.replace("10s", "500ms").split()
+        if words[0] == "view":
+            words.append("--once")
+        code = ran_with_any_code(*words)
+        allowed = {"detect": {0, 4, 5}, "doctor": {0, 1}}.get(words[0], {0})  # by what is attached
+        assert code in allowed, command
+    assert (folder / "points.csv").stat().st_size > 10_000
 
 
 def test_the_guide_without_sensors_says_what_to_install(bare_registry: Registry) -> None:

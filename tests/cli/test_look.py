@@ -109,7 +109,7 @@ def test_demo_counts_what_the_line_did(sensor: str) -> None:
     found = printed("demo", "-s", sensor, "-n", 3, "--errors", 0.005)
     assert found["rate_hz"] == pytest.approx(10, rel=0.1)
     under_way = found["intact"] - sum(found["stats"]["frames"].values())
-    assert -10 <= under_way < 0.5 * found["sent"]
+    assert 0 <= under_way < 0.5 * found["sent"]
     assert found["intact"] < found["sent"]
     assert found["same_when_replayed"]
     clean = printed("demo", "-s", sensor, "-n", 1, "--errors", 0)

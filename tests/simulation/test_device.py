@@ -200,7 +200,8 @@ def test_damaged_bytes_are_as_many_as_asked_for_and_the_sound_frames_come_throug
     line, stats = device.lines["data"], STL.decode(data).stats
     assert line.sent == device.sent["data"] == pytest.approx(5400, abs=20)
     assert line.intact / line.sent == pytest.approx((1 - 0.002) ** 47, abs=0.02)
-    assert line.intact - 5 <= stats.frames["data"] <= line.intact + 5
+    chance_matches = stats.frames["data"] - line.intact  # damaged, with a CRC-8 that matches
+    assert 0 <= chance_matches <= 2
 
 
 def test_lost_packets_are_missing_and_reordered_ones_are_late() -> None:
