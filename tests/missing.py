@@ -16,7 +16,7 @@ MISSING = (
     (
         r"kaitaistruct|crccheck|velodyne.decoder|[Nn]umba|rosbags|mcap|foxglove|pyarrow|duckdb|laspy|pandas|polars|pye57|zarr|zstd|rerun|matplotlib|anywidget|nbclient|playwright|starlette|uvicorn|websockets",
         "Python packages",
-        "pip install -e '.[dev]'",
+        "make test-all, which installs them",
     ),
     (r"Chromium", "Chromium", "apt-get install chromium"),
     (r"open3d", "Open3D", "pip install open3d"),
