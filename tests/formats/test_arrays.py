@@ -7,12 +7,14 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from lidarspec import simulate
 from lidarspec.formats import arrays as ours, write
-from lidarspec.simulation.simulator import simulate
 from tests.formats.test_formats import COLUMNS, scan
+from tests.libraries import Library, needs
 from tests.shapes import SHAPES
 
-zarr = pytest.importorskip("zarr")
+pytestmark = [pytest.mark.slow, needs("zarr")]
+zarr = Library("zarr")
 
 
 @pytest.mark.parametrize("every_point", [False, True])

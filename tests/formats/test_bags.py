@@ -13,15 +13,16 @@ import numpy as np
 import pytest
 
 import lidarspec as ls
-from lidarspec import Scan, SourceError
+from lidarspec import Scan, SourceError, simulate
 from lidarspec.errors import LibraryError, UsageError
 from lidarspec.formats import write
-from lidarspec.simulation.simulator import simulate
 from tests.formats.test_formats import scan
+from tests.libraries import Library, needs
 from tests.shapes import SHAPES
 
-reading = pytest.importorskip("rosbags.highlevel", reason="rosbags is not installed")
-mcap = pytest.importorskip("mcap.reader", reason="mcap is not installed")
+pytestmark = [pytest.mark.slow, needs("rosbags", "mcap")]
+reading = Library("rosbags.highlevel")
+mcap = Library("mcap.reader")
 SUFFIXES = ["mcap", "bag", "rosbag2", "db3"]
 TYPES = {1: "i1", 2: "u1", 3: "<i2", 4: "<u2", 5: "<i4", 6: "<u4", 7: "<f4", 8: "<f8"}
 

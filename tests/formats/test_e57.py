@@ -8,13 +8,15 @@ from typing import Any
 import numpy as np
 import pytest
 
+from lidarspec import simulate
 from lidarspec.formats import write
-from lidarspec.simulation.simulator import simulate
 from tests.formats.test_formats import scan
 from tests.formats.test_las import with_points
+from tests.libraries import Library, needs
 from tests.shapes import SHAPES
 
-pye57 = pytest.importorskip("pye57")
+pytestmark = [pytest.mark.slow, needs("pye57")]
+pye57 = Library("pye57")
 
 
 def field(file: Any, number: int, name: str, dtype: Any) -> np.ndarray:

@@ -14,14 +14,13 @@ import numpy as np
 import pytest
 
 import lidarspec as ls
-from lidarspec import PointCloud, Scan, SourceError
+from lidarspec import PointCloud, Scan, SourceError, simulate
 from lidarspec.errors import LibraryError, ReplyTimeout, UnknownFormat
 from lidarspec.formats import arrays, format_of, formats, tables, write
-from lidarspec.simulation.simulator import simulate
+from tests.libraries import needs
 from tests.recording.test_recordings import file_size_limit
 from tests.shapes import SHAPES
 
-BUILT_IN = sorted(f"a{suffix}" for suffix in formats())
 #: the library and the extra that a format takes.
 EXTRAS = {
     **dict.fromkeys(("a.parquet", "a.arrow", "a.feather"), ("pyarrow", "arrow")),
@@ -31,6 +30,17 @@ EXTRAS = {
     "a.rrd": ("rerun", "rerun"),
     "a.zarr": ("zarr", "zarr"),
 }
+#: the libraries that built-in formats take, by suffix.
+LIBRARIES = {
+    **{name.removeprefix("a"): (library.partition(".")[0],) for name, (library, _) in EXTRAS.items()},
+    **dict.fromkeys((".mcap", ".bag", ".rosbag2", ".db3"), ("rosbags", "mcap")),
+    ".lzf.pcd": ("lzf",),
+}
+#: every built-in format; those that take a library of others are left to `make test-all`.
+BUILT_IN = [
+    pytest.param(f"a{suffix}", marks=[pytest.mark.slow, needs(*LIBRARIES[suffix])] if suffix in LIBRARIES else ())
+    for suffix in sorted(formats())
+]
 COLUMNS = ["x", "y", "z", "range", "azimuth", "elevation", "intensity", "time"]
 
 
@@ -51,12 +61,6 @@ def scan(number: int, points: int = 5, *, intensity: bool = True) -> Scan:
         stamp_ns=10**18 + number,
     )
     return Scan(cloud, 10.0 + number, number > 0, ls.sensor("ldrobot-stl27l"))
-
-
-@pytest.fixture(autouse=True)
-def _needs_its_library(request: pytest.FixtureRequest) -> None:
-    if request.node.name.partition("[")[2] and (needed := EXTRAS.get(request.node.callspec.params.get("name"))):
-        pytest.importorskip(needed[0])
 
 
 def rows(path: Path) -> tuple[list[str], np.ndarray]:
@@ -131,10 +135,12 @@ def test_one_scan_is_held_at_a_time(tmp_path: Path, name: str) -> None:
     assert most <= 2
 
 
-@pytest.mark.parametrize(
-    ("name", "every_point"),
-    [*((name, True) for name in BUILT_IN if name not in ("a.csv", "a.csv.gz", "a.xyz")), ("a.npz", False), ("a.ply", False)],
-)
+BINARY = [case for case in BUILT_IN if case.values[0] not in ("a.csv", "a.csv.gz", "a.xyz")]
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("every_point", [False, True])
+@pytest.mark.parametrize("name", BINARY)
 def test_the_memory_does_not_grow_with_the_number_of_scans(
     tmp_path: Path, name: str, every_point: bool, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -208,8 +214,6 @@ def test_a_plugin_adds_a_format_and_takes_none_away(tmp_path: Path) -> None:
 from pathlib import Path
 import lidarspec as ls
 from lidarspec.formats import format_of, formats, write
-from lidarspec.simulation.simulator import simulate
-from tests.shapes import SHAPES
 from lidarspec.spec import hookimpl
 from lidarspec.plugins import registry
 from lidarspec.errors import UnknownFormat

@@ -8,15 +8,15 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from lidarspec import Scan
+from lidarspec import Scan, simulate
 from lidarspec.errors import UsageError
 from lidarspec.formats import write
-from lidarspec.simulation.simulator import simulate
 from tests.formats.test_formats import scan
+from tests.libraries import Library, needs
 from tests.shapes import SHAPES
 
-laspy = pytest.importorskip("laspy")
-pytest.importorskip("lazrs")
+pytestmark = [pytest.mark.slow, needs("laspy", "lazrs")]
+laspy = Library("laspy")
 
 
 def with_points(one: Scan, **columns: object) -> Scan:

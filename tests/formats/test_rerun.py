@@ -14,14 +14,16 @@ import numpy as np
 import pytest
 
 import lidarspec as ls
+from lidarspec import simulate
 from lidarspec.formats import write
 from lidarspec.points.cloud import Mount
 from lidarspec.points.look import look, shade
-from lidarspec.simulation.simulator import simulate
 from tests.cli.running import ran
 from tests.formats.test_formats import scan
+from tests.libraries import Library, needs
 
-reading = pytest.importorskip("rerun.chunk", reason="rerun-sdk is not installed")
+pytestmark = [pytest.mark.slow, needs("rerun")]
+reading = Library("rerun.chunk")
 
 
 def logged(path: Path) -> dict[str, dict[str, list[Any]]]:

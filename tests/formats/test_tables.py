@@ -13,20 +13,33 @@ from typing import Any
 import numpy as np
 import pytest
 
+from lidarspec import simulate
 from lidarspec.errors import UsageError
 from lidarspec.formats import tables, targets, write
-from lidarspec.simulation.simulator import simulate
 from tests.formats.test_formats import COLUMNS, scan
+from tests.libraries import Library, needs
 from tests.shapes import SHAPES
 
-arrow = pytest.importorskip("pyarrow")
-ipc, feather, parquet = (pytest.importorskip(f"pyarrow.{name}") for name in ("ipc", "feather", "parquet"))
+pytestmark = [pytest.mark.slow, needs("pyarrow")]
+arrow = Library("pyarrow")
+ipc = Library("pyarrow.ipc")
+feather = Library("pyarrow.feather")
+parquet = Library("pyarrow.parquet")
 
-READERS: dict[str, Callable[[Path], Any]] = {
-    "a.parquet": parquet.read_table,
-    "a.arrow": lambda path: ipc.open_file(arrow.memory_map(str(path))).read_all(),
-    "a.feather": feather.read_table,
-}
+
+def read_parquet(path: Path) -> Any:
+    return parquet.read_table(path)
+
+
+def read_arrow(path: Path) -> Any:
+    return ipc.open_file(arrow.memory_map(str(path))).read_all()
+
+
+def read_feather(path: Path) -> Any:
+    return feather.read_table(path)
+
+
+READERS: dict[str, Callable[[Path], Any]] = {"a.parquet": read_parquet, "a.arrow": read_arrow, "a.feather": read_feather}
 
 
 @pytest.mark.parametrize("every_point", [False, True])

@@ -4,24 +4,21 @@ from __future__ import annotations
 
 import dataclasses
 import pickle
-from importlib.util import find_spec
 
 import numpy as np
 import pytest
 from construct import Array, BitsInteger, BitStruct, ByteSwapped, Const, Int16sl, Int16ul, Int32ub, Struct
 
 import lidarspec
-from lidarspec import PointCloud, Sensor, SpecError
+from lidarspec import PointCloud, Sensor, SpecError, simulate
 from lidarspec.errors import UnknownName
 from lidarspec.packets.packets import Packets
 from lidarspec.points.cloud import LazyCloud, Mount
 from lidarspec.points.evaluate import evaluated
-from lidarspec.points.numpy_plan import describe
 from lidarspec.points.plain import evaluate
-from lidarspec.points.plan import Plan, plan_for
-from lidarspec.simulation.simulator import simulate
 from lidarspec.spec import Cartesian, Extra, Fields, Frame, Polar, Scaled, along, take
 from lidarspec.testing.agreement import assert_same_points, assert_well_formed
+from tests.points.backends import BACKENDS, EVERY_BACKEND
 from tests.shapes import SHAPES
 
 SENSOR = SHAPES["shape-extras"]
@@ -33,7 +30,6 @@ KINDS = {
     "confidence": ("f4", "1"),
     "strong": ("b1", ""),
 }
-COMPILED = pytest.mark.skipif(find_spec("numba") is None, reason="the fused back end needs Numba: pip install 'lidarspec[jit]'")
 
 
 def packets(number: int = 40, backend: str = "numpy") -> Packets:
@@ -41,7 +37,7 @@ def packets(number: int = 40, backend: str = "numpy") -> Packets:
     return SENSOR.decode([SENSOR.example("data", seed=seed) for seed in range(number)], backend=backend)
 
 
-@pytest.mark.parametrize("backend", ["numpy", pytest.param("jit", marks=COMPILED), "construct"])
+@EVERY_BACKEND
 def test_columns_have_the_values_types_and_units_of_the_plain_evaluation(backend: str) -> None:
     read = packets(backend=backend)
     found, plain = evaluated(read).cloud, evaluate(read).cloud
@@ -149,7 +145,7 @@ def test_types_and_units_can_be_declared_and_low_values_are_spread() -> None:
 
 def test_points_in_parts_have_them_too() -> None:
     sensor = SHAPES["shape-segments"]
-    read = sensor.decode(simulate(sensor, 30))
+    read = sensor.decode(simulate(sensor, 8))
     cloud = read.points()
     assert cloud.extra["signal"].dtype == np.uint8
     assert dict(cloud.units) == {"signal": "", "step": "deg", "share": ""}
@@ -183,10 +179,10 @@ def words() -> Sensor:
     return dataclasses.replace(SENSOR, frames={"data": Frame(struct, data=True)}, points=points, clock=None, sequence=None, simulation=None)
 
 
-@pytest.mark.parametrize("backend", ["numpy", pytest.param("jit", marks=COMPILED)])
+@BACKENDS
 @pytest.mark.parametrize("sensor", [words(), SENSOR, SHAPES["shape-segments"], SHAPES["shape-bits"]], ids=lambda sensor: sensor.id)
 def test_columns_that_are_read_together_are_those_that_are_read_one_by_one(sensor: Sensor, backend: str) -> None:
-    read = sensor.decode([sensor.example(sensor.data_frame, seed=seed) for seed in range(30)], backend=backend).with_points
+    read = sensor.decode([sensor.example(sensor.data_frame, seed=seed) for seed in range(9)], backend=backend).with_points
     plain = evaluate(read).cloud
     names = [*plain.columns, "valid"]
     for which in (..., slice(5, len(plain) - 5)):
@@ -211,12 +207,3 @@ def test_asking_whether_there_is_a_column_makes_none() -> None:
     assert "velocity" in cloud.extra
     assert "speed" not in cloud.extra
     assert not any(cloud.source.holds(name) for name in cloud.extra)
-
-
-def test_directions_and_places_that_are_looked_up_are_multiplied_in_their_tables() -> None:
-    read = words().decode([words().example("data", seed=seed) for seed in range(3)])
-    plan = plan_for(read.sensor.points_of("data"), read.batch(), read.table.groups[0])  # type: ignore[attr-defined]
-    assert isinstance(plan, Plan)
-    steps = describe(plan)
-    assert sum("rows of a table of 80 x 8" in step for step in steps) == 3  # of x, of y, and where x begins
-    assert not any("the same in every packet" in step for step in steps[: next(at for at, step in enumerate(steps) if "-> x" in step)])

@@ -4,25 +4,21 @@ from __future__ import annotations
 
 import dataclasses
 import itertools
-from importlib.util import find_spec
 from typing import Any
 
 import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from lidarspec import PointCloud, Sensor
+from lidarspec import PointCloud, Sensor, simulate
 from lidarspec.points.cloud import LazyCloud
 from lidarspec.points.evaluate import evaluated
 from lidarspec.points.plain import evaluate
-from lidarspec.simulation.simulator import simulate
 from lidarspec.spec import Cartesian
 from lidarspec.testing.agreement import assert_same_points, assert_well_formed
+from tests.points.backends import BACKENDS
 from tests.shapes import SHAPES
 from tests.shapes.coordinates import POINTS, SENSORS
-
-COMPILED = pytest.mark.skipif(find_spec("numba") is None, reason="the fused back end needs Numba: pip install 'lidarspec[jit]'")
-engines = pytest.mark.parametrize("backend", ["numpy", pytest.param("jit", marks=COMPILED)])
 
 #: zeros of both signs, no number, too large for float32 or a sum, and the smallest of all.
 ODD = [0.0, -0.0, np.nan, np.inf, -np.inf, 3.4e38, -1.0, 1.5, 1e-45, -1e-38, 0.1, 7e9]
@@ -59,7 +55,7 @@ def moved(f: Any) -> Cartesian:
     )
 
 
-@engines
+@BACKENDS
 @pytest.mark.parametrize("name", [sensor.id for sensor in SENSORS])
 @pytest.mark.parametrize("points", [None, moved])
 def test_coordinates_are_the_same_bit_by_bit(name: str, points: Any, backend: str) -> None:
@@ -76,7 +72,7 @@ def test_coordinates_are_the_same_bit_by_bit(name: str, points: Any, backend: st
     assert 0.2 < found.valid.mean() < 0.9
 
 
-@engines
+@BACKENDS
 def test_a_point_is_where_its_coordinates_say(backend: str) -> None:
     sensor = SHAPES["shape-millimetres"]
     given = [(3000, 4000, -12000, 0), (0, 0, 0, 0), (0, -2000, 0, 200), (-1500, 0, 0, 199)]
@@ -91,7 +87,7 @@ def test_a_point_is_where_its_coordinates_say(backend: str) -> None:
     assert cloud.valid.tolist() == [True, False, False, True]
 
 
-@engines
+@BACKENDS
 @pytest.mark.parametrize("columns", [(1, 0, 0), (0, 1, -2), (0, 0, 1)])
 def test_coordinates_may_lie_in_a_plane_and_be_turned(columns: tuple[int, int, int], backend: str) -> None:
     """With the vendor's axes, too: x right, y ahead."""
@@ -119,7 +115,7 @@ def scaled(backend: str, **values: Any) -> tuple[PointCloud, PointCloud]:
     return evaluated(packets).cloud, evaluate(packets).cloud
 
 
-@engines
+@BACKENDS
 def test_floating_point_fields_are_planned(backend: str) -> None:
     for values in ({}, dict(scale=0.3, start=0.0, tilt=-0.7), dict(strengths=[*ODD[:6]]), dict(strengths=[*ODD[6:]])):
         found, plain = scaled(backend, **values)
@@ -132,7 +128,7 @@ def test_floating_point_fields_are_planned(backend: str) -> None:
     )
 
 
-@engines
+@BACKENDS
 @pytest.mark.parametrize("number", [np.nan, np.inf, -np.inf, 1e-45, 3e38, -1.0])
 def test_a_batch_whose_floats_a_plan_could_lose_is_evaluated_plainly(number: float, backend: str) -> None:
     found, plain = scaled(backend, scale=number)
@@ -145,7 +141,7 @@ def test_a_batch_whose_floats_a_plan_could_lose_is_evaluated_plainly(number: flo
     assert_well_formed(found)
 
 
-@engines
+@BACKENDS
 def test_floats_at_random(backend: str) -> None:
     shape, random = SHAPES["shape-numbers"], np.random.default_rng(5)
     for odd in (False, True):

@@ -17,9 +17,9 @@ import pytest
 from lidarspec.points.numba_kernels import cache
 from lidarspec.points.numba_kernels.kernels import _module_name, compiled_before, function_of
 from lidarspec.points.numba_kernels.source import HEAD
+from tests.points.backends import COMPILED
 
-pytest.importorskip("numba", reason="the fused back end needs Numba: pip install 'lidarspec[jit]'")
-pytestmark = pytest.mark.skipif(sys.platform == "win32", reason="folders of a user are the user's alone there")
+pytestmark = [COMPILED, pytest.mark.skipif(sys.platform == "win32", reason="folders of a user are the user's alone there")]
 
 SOURCE = HEAD + "@compiled(KEPT, (INTEGER,))\ndef kernel(number):\n    return number + 1\n"
 ROOT = pytest.mark.skipif(not hasattr(os, "geteuid") or os.geteuid() != 0, reason="only root can give files away")
@@ -59,6 +59,7 @@ def test_a_kernel_is_read_in_the_next_run(folder: Path) -> None:
     assert {stat.S_IMODE(path.stat().st_mode) for path in folder.iterdir()} == {0o600}
 
 
+@pytest.mark.slow
 def test_names_tell_nothing_without_the_key(folder: Path) -> None:
     _is_read()
     name = _file(folder).name
@@ -90,14 +91,23 @@ DAMAGE: dict[str, Callable[[Path], object]] = {
 }
 
 
-@pytest.mark.parametrize("name", ["kernel", "key"])
-@pytest.mark.parametrize("what", DAMAGE)
+#: the damage that would run code of others is tried in the quick tier.
+QUICK = ("not the user's bytes", "kernel")
+CASES = [
+    pytest.param(what, name, marks=() if (what, name) == QUICK else pytest.mark.slow, id=f"{name} {what}")
+    for what in DAMAGE
+    for name in ("kernel", "key")
+]
+
+
+@pytest.mark.parametrize(("what", "name"), CASES)
 def test_a_damaged_file_is_replaced(folder: Path, what: str, name: str) -> None:
     _is_read()
     DAMAGE[what](folder / "key" if name == "key" else _file(folder))
     assert [_is_read(), _is_read()] == [False, True]
 
 
+@pytest.mark.slow
 @ROOT
 def test_a_file_of_another_user_is_not_read(folder: Path) -> None:
     _is_read()
@@ -105,6 +115,7 @@ def test_a_file_of_another_user_is_not_read(folder: Path) -> None:
     assert [_is_read(), _is_read()] == [False, True]
 
 
+@pytest.mark.slow
 def test_a_folder_that_is_open_to_others_is_not_used_and_that_is_said_once(folder: Path) -> None:
     _is_read()
     folder.chmod(0o777)
@@ -115,6 +126,7 @@ def test_a_folder_that_is_open_to_others_is_not_used_and_that_is_said_once(folde
     assert not compiled_before(SOURCE)
 
 
+@pytest.mark.slow
 @ROOT
 def test_a_folder_of_another_user_is_not_used(folder: Path) -> None:
     _is_read()
@@ -131,6 +143,7 @@ print(function_of({source!r})(41))
 """
 
 
+@pytest.mark.slow
 def test_a_full_disk_means_compiling_again_and_leaves_nothing_behind(folder: Path) -> None:
     command = [sys.executable, "-B", "-c", FULL.format(source=SOURCE)]  # or Python itself keeps half a module
     done = subprocess.run(command, capture_output=True, text=True, check=False)

@@ -16,13 +16,13 @@ import pytest
 from construct import Bytes, Int8ub, Struct, this
 
 import lidarspec
-from lidarspec import Packets, UsageError
+from lidarspec import Packets, Sensor, UsageError, simulate
 from lidarspec.points.evaluate import evaluated
 from lidarspec.points.numba_kernels import checksums as kernelsums
 from lidarspec.points.numba_kernels.source import written
 from lidarspec.points.plain import evaluate
 from lidarspec.points.plan import Plan, plan_for
-from lidarspec.simulation.simulator import opening, simulate
+from lidarspec.simulation.simulator import opening
 from lidarspec.spec import Checksum, Checksummed, Crc, Fields, Polar, WordXor, Xor
 from lidarspec.spec.links import is_datagram
 from lidarspec.testing.agreement import assert_same_points
@@ -31,12 +31,15 @@ from lidarspec.wire.frame_table import Rows
 from lidarspec.wire.layout import Seal
 from lidarspec.wire.row_checksums import batch
 from tests.engine import against_construct
+from tests.installed import sensor_modules, sensors_in
+from tests.points.backends import COMPILED
 from tests.shapes import SHAPES
 
-pytest.importorskip("numba", reason="the fused back end needs Numba: pip install 'lidarspec[jit]'")
+pytestmark = COMPILED
 
-SHAPED = {name: sensor for name, sensor in SHAPES.items() if sensor.frames}
-SENSORS = {**lidarspec.sensors(), **SHAPED}
+#: shapes of which kernels are compiled in the quick tier: one of a fixed size, and one of a variable count.
+QUICK = ("shape-bits", "shape-count")
+SHAPED = [pytest.param(name, marks=() if name in QUICK else pytest.mark.slow) for name, sensor in SHAPES.items() if sensor.frames]
 ULPS = 6
 WIDE = [
     Crc(64, 0x42F0E1EBA9EA3693, init=(1 << 64) - 1, refin=True, refout=True, xorout=(1 << 64) - 1),
@@ -46,19 +49,24 @@ WIDE = [
 MANY = 16
 
 
+def sensor_of(name: str) -> Sensor:
+    """Return a shape or an installed sensor."""
+    return SHAPES[name] if name in SHAPES else lidarspec.sensor(name)
+
+
 @functools.cache
 def frames_of(name: str) -> list[bytes]:
-    sensor = SENSORS[name]
+    sensor = sensor_of(name)
     return [sensor.example(sensor.data_frame, seed=seed) for seed in range(MANY)]
 
 
 def packets_of(name: str, number: int) -> Packets:
-    sensor, frames = SENSORS[name], frames_of(name)[:number]
+    sensor, frames = sensor_of(name), frames_of(name)[:number]
     data: Any = frames if is_datagram(sensor.links.get("data")) else b"".join(frames)
     return sensor.decode(data, backend="jit").with_points
 
 
-@pytest.mark.parametrize("name", list(SHAPED))
+@pytest.mark.parametrize("name", SHAPED)
 def test_kernels_give_what_the_plain_evaluation_gives(name: str) -> None:
     for number in (1, 7, MANY):
         packets = packets_of(name, number)
@@ -68,48 +76,61 @@ def test_kernels_give_what_the_plain_evaluation_gives(name: str) -> None:
             assert_same_points(one.cloud, other.cloud, ulps=ULPS)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", [*SHAPED, "ldrobot-stl27l", "velodyne-vlp16"])
 def test_every_column_of_damaged_and_mixed_streams(name: str) -> None:
-    sensor = SENSORS[name]
+    sensor = sensor_of(name)
     packets = sensor.decode(Subject(sensor).stream(), backend="jit").with_points
     if len(packets):
         assert_same_points(evaluated(packets).cloud, evaluate(packets).cloud, ulps=ULPS)
 
 
-#: (sensor, answer): each frame with the points that are made of it, whichever sensors have both.
-ANSWERS = list(
-    {
-        (id(frame), sensor.points_of(answer)): (name, answer)
-        for name, sensor in lidarspec.sensors().items()
-        for answer, frame in sensor.frames.items()
-        if frame.data and not isinstance(frame.points, Mapping)
-    }.values()
-)
-#: makers of sensors, of whose formats one is compiled.
-MAKERS = {name.partition("-")[0]: (name, answer) for name, answer in ANSWERS}
+def answers_in(module: str) -> list[tuple[Sensor, str]]:
+    """Load each frame with its points of a module's sensors once, whichever sensors share both."""
+    answers: dict[tuple[int, object], tuple[Sensor, str]] = {}
+    for sensor in sensors_in(module):
+        for answer, frame in sensor.frames.items():
+            if frame.data and not isinstance(frame.points, Mapping):
+                answers[id(frame), sensor.points_of(answer)] = (sensor, answer)
+    return list(answers.values())
 
 
-def simulated(name: str, answer: str, backend: str) -> Packets:
-    sensor = SENSORS[name] if answer == SENSORS[name].data_frame else SENSORS[name].configure(answer=answer)
-    frames = simulate(sensor, 2 * MANY)
-    return sensor.decode(frames if is_datagram(sensor.links.get("data")) else opening(sensor) + b"".join(frames), backend=backend)
+def simulated(sensor: Sensor, answer: str, backend: str) -> Packets:
+    configured = sensor if answer == sensor.data_frame else sensor.configure(answer=answer)
+    frames = simulate(configured, 2 * MANY)
+    data: Any = frames
+    if not is_datagram(configured.links.get("data")):
+        data = opening(configured) + b"".join(frames)
+    return configured.decode(data, backend=backend)
 
 
-@pytest.mark.parametrize(("name", "answer"), ANSWERS)
-def test_all_sensors_of_this_repository_have_a_kernel(name: str, answer: str) -> None:
-    made = plan(simulated(name, answer, "numpy"))
-    assert "def kernel(" in written(made, tuple(made.expressions), made.varying).source
+@pytest.mark.slow
+@pytest.mark.parametrize("module", sensor_modules())
+def test_every_installed_sensor_has_a_kernel(module: str) -> None:
+    for sensor, answer in answers_in(module):
+        made = plan(simulated(sensor, answer, "numpy"))
+        assert "def kernel(" in written(made, tuple(made.expressions), made.varying).source, sensor.id
 
 
-@pytest.mark.parametrize(
-    ("name", "answer"), [pytest.param(*one, marks=() if one in MAKERS.values() else pytest.mark.soak) for one in ANSWERS]
-)
-def test_kernels_of_sensors_give_what_the_plain_evaluation_gives(name: str, answer: str) -> None:
-    packets = simulated(name, answer, "jit")
+@pytest.mark.slow
+@pytest.mark.parametrize("module", sensor_modules())
+def test_kernels_of_one_sensor_of_each_vendor_give_the_plain_points(module: str) -> None:
+    assert_kernel_gives_the_plain_points(*answers_in(module)[-1])
+
+
+@pytest.mark.soak
+@pytest.mark.parametrize("module", sensor_modules())
+def test_kernels_of_every_sensor_give_the_plain_points(module: str) -> None:
+    for sensor, answer in answers_in(module):
+        assert_kernel_gives_the_plain_points(sensor, answer)
+
+
+def assert_kernel_gives_the_plain_points(sensor: Sensor, answer: str) -> None:
+    packets = simulated(sensor, answer, "jit")
     cloud = packets.points()
     assert_same_points(cloud, evaluate(packets).cloud, ulps=ULPS)
-    assert cloud.valid.any()
-    assert any(kernel.is_ready for kernel in plan(packets).kernels.values())
+    assert cloud.valid.any(), sensor.id
+    assert any(kernel.is_ready for kernel in plan(packets).kernels.values()), sensor.id
 
 
 def plan(packets: Packets) -> Plan:
@@ -119,8 +140,9 @@ def plan(packets: Packets) -> Plan:
     return found
 
 
+@pytest.mark.slow
 def test_any_number_of_threads_gives_the_same(monkeypatch: pytest.MonkeyPatch) -> None:
-    sensor = SENSORS["velodyne-vlp16"]
+    sensor = lidarspec.sensor("velodyne-vlp16")
     rows = np.tile(np.frombuffer(b"".join(frames_of("velodyne-vlp16")), np.uint8).reshape(MANY, -1), (40, 1))
     alone = sensor.decode(rows, backend="jit").points()
     for number in ("2", "3"):
@@ -133,9 +155,10 @@ def test_any_number_of_threads_gives_the_same(monkeypatch: pytest.MonkeyPatch) -
         len(sensor.decode(rows, backend="jit").points().x)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("compiled", [False, True])
 def test_it_is_chosen_by_itself_once_enough_points_were_made(compiled: bool, monkeypatch: pytest.MonkeyPatch) -> None:
-    sensor = dataclasses.replace(SENSORS["ldrobot-stl27l"], points=functools.partial(points_of_another_kind))
+    sensor = dataclasses.replace(lidarspec.sensor("ldrobot-stl27l"), points=functools.partial(points_of_another_kind))
     packets = sensor.decode(b"".join(frames_of("ldrobot-stl27l")))
     enough = 3 * 12 * len(packets)
     monkeypatch.setattr("lidarspec.points.numba_kernels.kernels.WARM", enough if compiled else 0)
@@ -165,6 +188,7 @@ print(bool(sys.modules.get("numba")), len(x))
 """
 
 
+@pytest.mark.slow
 def test_the_environment_names_the_default_and_nothing_else_imports_numba() -> None:
     assert run(DECODING).stdout.split() == ["False", "36"]
     assert run(DECODING, LIDARSPEC_BACKEND="jit").stdout.split() == ["True", "36"]
@@ -172,6 +196,7 @@ def test_the_environment_names_the_default_and_nothing_else_imports_numba() -> N
     assert "LIDARSPEC_BACKEND is one of auto, numpy, jit, construct, not 'fast'" in wrong.stderr
 
 
+@pytest.mark.slow
 def test_kernels_are_kept_between_runs_and_done_without_where_they_cannot_be(tmp_path: Path) -> None:
     code = DECODING + "print(any(m.kernel.stats.cache_hits for name, m in sys.modules.items() if name.startswith('lidarspec_kernel_')))"
     for is_read in ("False", "True"):
@@ -184,6 +209,7 @@ def test_kernels_are_kept_between_runs_and_done_without_where_they_cannot_be(tmp
     assert done.stderr.count("UserWarning: compiled code is not kept between runs: ") == 1
 
 
+@pytest.mark.slow
 def test_without_numba_asking_for_it_is_an_error_and_nothing_else_is() -> None:
     hidden = "import sys; sys.modules['numba'] = None\n"
     assert run(hidden + DECODING).stdout.split() == ["False", "36"]
@@ -191,6 +217,7 @@ def test_without_numba_asking_for_it_is_an_error_and_nothing_else_is() -> None:
     assert "UsageError: backend 'jit' needs Numba: pip install 'lidarspec[jit]' (" in asked.stderr
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "algorithm", [Crc(8, 0x4D), Crc(16, 0x1021, init=0xFFFF), Crc(13, 0x1CF5, refin=True, refout=True), Xor(), WordXor(8, (1, 2)), *WIDE]
 )
@@ -204,6 +231,7 @@ def test_compiled_checksums_are_those_of_the_algorithm(algorithm: Checksum, span
     np.testing.assert_array_equal(found, batch(algorithm, covered), strict=True)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("algorithm", [Crc(16, 0x1021, init=0xFFFF), *WIDE])
 def test_crcs_over_long_rows_are_those_of_the_algorithm(algorithm: Crc) -> None:
     rows = np.random.default_rng(1).integers(0, 256, (19, 2000), dtype=np.uint8)
@@ -214,12 +242,13 @@ def test_crcs_over_long_rows_are_those_of_the_algorithm(algorithm: Crc) -> None:
     assert found.tolist() == [algorithm(row.tobytes()) for row in covered]
 
 
+@pytest.mark.slow
 def test_checksums_are_compiled_for_the_decoder_that_asks_and_no_other(monkeypatch: pytest.MonkeyPatch) -> None:
     asked: list[int] = []
     monkeypatch.setattr(kernelsums, "checksums", lambda seal, rows: asked.append(len(rows)))
     for name in ("ldrobot-stl27l", "shape-count"):
         data = b"".join(frames_of(name))
-        compiled, plain = (SENSORS[name].decoder(backend=backend) for backend in ("jit", "numpy"))
+        compiled, plain = (sensor_of(name).decoder(backend=backend) for backend in ("jit", "numpy"))
         before = len(asked)
         assert compiled.feed(data)
         assert len(asked) > before
@@ -228,14 +257,16 @@ def test_checksums_are_compiled_for_the_decoder_that_asks_and_no_other(monkeypat
         assert len(asked) == before
 
 
+@pytest.mark.slow
 def test_streams_are_cut_alike() -> None:
-    sensor = SENSORS["ldrobot-stl27l"]
+    sensor = lidarspec.sensor("ldrobot-stl27l")
     data = b"".join(b"".join(frames_of("ldrobot-stl27l")) + b"T,T" for _ in range(400))
     one, other = (sensor.decode(data, backend=backend) for backend in ("numpy", "jit"))
     np.testing.assert_array_equal(one.offset, other.offset)
     assert one.stats == other.stats
 
 
+@pytest.mark.slow
 def test_a_checksum_over_no_bytes_is_right_where_it_is_that_of_none() -> None:
     part = Checksummed(Struct("text" / Bytes(this._.size % 3), "sum" / Int8ub), "sum", Crc(8, 0x4D))
     sensor = against_construct.sensor(Struct("size" / Int8ub, "part" / part))

@@ -8,17 +8,16 @@ from typing import Any
 import numpy as np
 import pytest
 
-from lidarspec import PointCloud, UsageError
+from lidarspec import PointCloud, UsageError, simulate
 from lidarspec.points.evaluate import evaluated
 from lidarspec.points.plain import evaluate
-from lidarspec.simulation.simulator import simulate
 from lidarspec.spec import Fields, Polar, stack
 from lidarspec.testing.agreement import assert_same_points
+from tests.points.backends import EVERY_BACKEND
 from tests.shapes import SHAPES
 from tests.shapes.columns import AZIMUTHS, COLUMNS, PIXELS, TURN
 
 SENSOR = SHAPES["shape-columns"]
-ENGINES = pytest.mark.parametrize("engine", ["construct", "numpy", "jit"])
 
 
 def frame(first: int, **of_all: Any) -> bytes:
@@ -30,13 +29,13 @@ def frame(first: int, **of_all: Any) -> bytes:
     )
 
 
-def cloud_of(*frames: bytes, points: Any = SENSOR.points, engine: str = "auto") -> PointCloud:
-    return replace(SENSOR, points=points).decode(list(frames), backend=engine).points()
+def cloud_of(*frames: bytes, points: Any = SENSOR.points, backend: str = "auto") -> PointCloud:
+    return replace(SENSOR, points=points).decode(list(frames), backend=backend).points()
 
 
-@ENGINES
-def test_what_is_along_which_array(engine: str) -> None:
-    cloud = cloud_of(frame(16), engine=engine)
+@EVERY_BACKEND
+def test_what_is_along_which_array(backend: str) -> None:
+    cloud = cloud_of(frame(16), backend=backend)
     assert cloud.shape == (COLUMNS, PIXELS)
     at = 5 * PIXELS + 7
     assert cloud.range[at] == np.float32(1.07)
@@ -53,9 +52,9 @@ def two_returns(f: Fields) -> Polar:
     )
 
 
-@ENGINES
-def test_the_shape_is_columns_and_rows_for_two_returns_too(engine: str) -> None:
-    cloud = cloud_of(frame(0), frame(32), points=two_returns, engine=engine)
+@EVERY_BACKEND
+def test_the_shape_is_columns_and_rows_for_two_returns_too(backend: str) -> None:
+    cloud = cloud_of(frame(0), frame(32), points=two_returns, backend=backend)
     assert cloud.shape == (2 * COLUMNS, PIXELS)
     assert cloud.range.reshape(*cloud.shape, -1)[20, 3].tolist() == pytest.approx([1.03, 2.03])
     half = cloud[COLUMNS * PIXELS * 2 :]
@@ -74,9 +73,9 @@ def test_rows_of_tables_are_looked_at_where_they_are_or_gathered() -> None:
         assert_same_points(evaluated(read).cloud, evaluate(read).cloud)
 
 
-@ENGINES
-def test_lost_columns_leave_gaps_in_the_place_of_their_numbers(engine: str) -> None:
-    cloud = cloud_of(frame(48), frame(16), engine=engine).organised(TURN)
+@EVERY_BACKEND
+def test_lost_columns_leave_gaps_in_the_place_of_their_numbers(backend: str) -> None:
+    cloud = cloud_of(frame(48), frame(16), backend=backend).organised(TURN)
     assert (cloud.shape, len(cloud)) == ((TURN, PIXELS), TURN * PIXELS)
     valid = cloud.valid.reshape(TURN, PIXELS)
     assert valid.all(axis=1).nonzero()[0].tolist() == [*range(16, 32), *range(48, 64)]

@@ -9,9 +9,8 @@ import numpy as np
 import pytest
 
 import lidarspec as ls
-from lidarspec import Scan
+from lidarspec import Scan, simulate
 from lidarspec.errors import LibraryError
-from lidarspec.simulation.simulator import simulate
 from tests.shapes import SHAPES
 
 
@@ -50,6 +49,7 @@ def test_every_column_goes_over_dlpack(scan: Scan) -> None:
         assert np.shares_memory(np.from_dlpack(column), column), name
 
 
+@pytest.mark.slow
 def test_arrow_takes_columns_without_a_copy_and_knows_their_units(scan: Scan) -> None:
     arrow, cloud = pytest.importorskip("pyarrow"), scan.points
     table = arrow.table(scan)
@@ -65,6 +65,7 @@ def test_arrow_takes_columns_without_a_copy_and_knows_their_units(scan: Scan) ->
     assert b"sensor" not in cloud.to_arrow().schema.metadata
 
 
+@pytest.mark.slow
 def test_duckdb_asks_a_cloud_and_a_scan(scan: Scan) -> None:
     duckdb = pytest.importorskip("duckdb")
     pytest.importorskip("pyarrow")
@@ -75,6 +76,7 @@ def test_duckdb_asks_a_cloud_and_a_scan(scan: Scan) -> None:
     assert duckdb.sql("select count(*) from scan").fetchall() == [(len(scan),)]
 
 
+@pytest.mark.slow
 def test_data_frames_share_the_columns(scan: Scan) -> None:
     pandas, polars, cloud = pytest.importorskip("pandas"), pytest.importorskip("polars"), scan.points
     frame, polar = cloud.to_pandas(), cloud.to_polars()

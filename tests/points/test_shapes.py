@@ -10,9 +10,8 @@ import numpy as np
 import pytest
 from construct import Array, Const, ConstructError, Int8ub, Int16ub, Int16ul, Rebuild, Struct, this
 
-from lidarspec import PointCloud, Sensor, SpecError, UsageError
+from lidarspec import PointCloud, Sensor, SpecError, UsageError, simulate
 from lidarspec.errors import OutOfRange, PluginError
-from lidarspec.simulation.simulator import simulate
 from lidarspec.spec import Checksummed, Frame, Polar, Scaled, Simulation, Sum, Xor, along, spread, steps, wrap
 from lidarspec.testing.agreement import assert_same_points
 from tests.engine import against_construct

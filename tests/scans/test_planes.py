@@ -10,10 +10,9 @@ import numpy as np
 import pytest
 
 import lidarspec as ls
-from lidarspec import LaserScan, Scan, UsageError
+from lidarspec import LaserScan, Scan, UsageError, simulate
 from lidarspec.points.cloud import Mount
 from lidarspec.scans.planes import Planes
-from lidarspec.simulation.simulator import simulate
 
 
 def simulated(name: str, packets: int = 1000) -> list[Scan]:
@@ -98,7 +97,7 @@ def test_a_ring_or_a_layer_of_a_sensor_of_several_is_planar() -> None:
     (layer, *_) = planar(Planes(1800, heights=(-0.1, 0.1)), scans)
     inside = scan.points[np.abs(scan.points.z) <= 0.1]
     np.testing.assert_allclose(layer.ranges.min(), np.hypot(inside.x, inside.y).min(), rtol=1e-6)
-    with pytest.raises(UsageError, match="ring 16 is asked for, and its points have 0 to 15"):
+    with pytest.raises(UsageError, match="ring 16"):
         Planes(ring=16).scan(scan)
-    with pytest.raises(UsageError, match="ring 1 is asked for, and its points have none"):
+    with pytest.raises(UsageError, match="ring 1 "):
         Planes(ring=1).scan(simulated("ldrobot-stl27l")[0])

@@ -10,16 +10,18 @@ import numpy as np
 import pytest
 
 import lidarspec as ls
-from lidarspec import Scan, Sensor
+from lidarspec import Scan, Sensor, simulate
 from lidarspec.packets.stream import PacketStream
 from lidarspec.scans.scans import ScanStream
-from lidarspec.simulation.simulator import simulate
 from lidarspec.spec import Fields, Polar, following
 from lidarspec.spec.description import with_frames
 from tests.shapes import segments
 
-#: frames, and about how many points of each scan are looked at.
-FRAMES, POINTS = 200, 25
+FRAMES = 200
+#: points of each scan that are explained, about.
+POINTS_PER_SCAN = 12
+#: sensors of which many points are explained.
+LARGE = [pytest.param(name, marks=pytest.mark.slow) for name in ("robosense-airy", "velodyne-vlp16")]
 
 
 def waiting_points(f: Fields) -> Polar:
@@ -49,14 +51,14 @@ def scans_of(sensor: Sensor, frames: list[bytes], together: int) -> tuple[list[S
 
 
 @pytest.mark.parametrize("together", [1, 3, FRAMES])
-@pytest.mark.parametrize("name", ["parts", "waiting parts", "ldrobot-stl27l", "robosense-airy", "velodyne-vlp16"])
+@pytest.mark.parametrize("name", ["parts", "waiting parts", "ldrobot-stl27l", *LARGE])
 def test_each_point_leads_to_its_frame_and_row(name: str, together: int) -> None:
     known = segments.SENSOR if name in ("parts", "waiting parts") else ls.sensor(name)
     sensor, frames = waiting() if name == "waiting parts" else known, list(simulate(known, FRAMES))
     scans, offsets = scans_of(sensor, frames, together)
     seen = 0
     for scan in scans:
-        for index in range(0, len(scan), len(scan) // POINTS | 1):
+        for index in range(0, len(scan), len(scan) // POINTS_PER_SCAN | 1):
             place = scan.provenance(index)
             assert place.data == frames[offsets.index(place.offset)]
             explanation = ls.explain(place.data, sensor, place.frame)

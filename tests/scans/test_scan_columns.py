@@ -16,7 +16,7 @@ import numpy as np
 import pytest
 
 import lidarspec as ls
-from lidarspec import Decoder, Packets, PointCloud, Scan, Sensor
+from lidarspec import Decoder, Packets, PointCloud, Scan, Sensor, simulate
 from lidarspec.captures.ip import ETHERNET
 from lidarspec.captures.pcap import Datagram, datagram_record
 from lidarspec.captures.records import capture_head
@@ -25,14 +25,14 @@ from lidarspec.packets.stream import PacketStream
 from lidarspec.points import lazy_columns
 from lidarspec.points.cloud import COLUMNS
 from lidarspec.scans.scans import ScanStream, scans_of
-from lidarspec.simulation.simulator import simulate
 from lidarspec.spec import OnChange, OnWrap, Udp
 from lidarspec.wire.frame_table import Rows
 from tests.broken import points_fail, sound
+from tests.points.backends import BACKENDS, KERNELS
+from tests.representatives import REPRESENTATIVES
 from tests.shapes import SHAPES
 
-BACKENDS = ["numpy", "jit"]
-SENSORS = {**ls.sensors(), **{name: sensor for name, sensor in SHAPES.items() if sensor.frames}}
+SHAPED = [name for name, sensor in SHAPES.items() if sensor.frames]
 
 
 @functools.cache
@@ -41,8 +41,6 @@ def frames_of(name: str, number: int) -> list[bytes]:
 
 
 def packets_of(name: str, number: int, backend: str) -> Packets:
-    if backend == "jit":
-        pytest.importorskip("numba")
     return ls.sensor(name).decode(frames_of(name, number), backend=backend)
 
 
@@ -68,9 +66,9 @@ def assert_cut_from(scans: list[Scan], whole: PointCloud, names: tuple[str, ...]
     assert start == len(whole)
 
 
-@pytest.mark.parametrize("backend", BACKENDS)
+@BACKENDS
 @pytest.mark.parametrize("least", [0, 1 << 14, 1 << 30])
-@pytest.mark.parametrize("name", ["velodyne-vlp16", "robosense-m1", "hesai-xt32"])
+@pytest.mark.parametrize("name", ["velodyne-vlp16", "robosense-m1", pytest.param("hesai-xt32", marks=pytest.mark.slow)])
 def test_scans_are_the_points_of_the_whole_cut(name: str, least: int, backend: str, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(lazy_columns, "LEAST", least)
     monkeypatch.setattr(lazy_columns, "SHARED", 5000)
@@ -139,8 +137,9 @@ def small_scans() -> Sensor:
     )
 
 
-@pytest.mark.parametrize("sensor", [ls.sensor("velodyne-vlp16"), small_scans()], ids=["large", "small"])
-def test_packets_go_with_the_last_scan_that_is_made_of_them(sensor: Sensor) -> None:
+@pytest.mark.parametrize("size", ["large", "small"])
+def test_packets_go_with_the_last_scan_that_is_made_of_them(size: str) -> None:
+    sensor = ls.sensor("velodyne-vlp16") if size == "large" else small_scans()
     waiting = batches(sensor.decode(simulate(ls.sensor("velodyne-vlp16"), 700)), 350)
     known = [weakref.ref(packets) for packets in waiting]
     gc.collect()
@@ -182,12 +181,21 @@ def test_a_sensor_that_turns_back_and_forth_is_cut_alike_in_any_batches() -> Non
         assert [len(scan) for scan in scans_of(sensor, batches(packets, *sizes))] == whole
 
 
-@pytest.mark.parametrize(("name", "backend"), [*((name, "numpy") for name in SENSORS), ("robosense-m1", "jit"), ("velodyne-vlp16", "jit")])
-def test_packets_that_stay_where_they_were_read_give_the_same_points(name: str, backend: str) -> None:
-    if backend == "jit":
-        pytest.importorskip("numba")
-    sensor = SENSORS[name]
-    frames = [sensor.example(sensor.data_frame, seed=seed) for seed in range(8)]
+@pytest.mark.parametrize("name", SHAPED)
+def test_packets_that_stay_where_they_were_read_give_the_same_points(name: str) -> None:
+    assert_place_of_packets_does_not_matter(SHAPES[name], "numpy")
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("backend", ["numpy", KERNELS])
+@pytest.mark.parametrize("name", REPRESENTATIVES)
+def test_packets_of_a_sensor_that_stay_where_they_were_read_give_the_same_points(name: str, backend: str) -> None:
+    assert_place_of_packets_does_not_matter(ls.sensor(name), backend)
+
+
+def assert_place_of_packets_does_not_matter(sensor: Sensor, backend: str) -> None:
+    """Fail unless packets in one buffer and packets apart from each other have the same points."""
+    frames = [sensor.example(sensor.data_frame, seed=seed) for seed in range(5)]
     size = Counter(map(len, frames)).most_common(1)[0][0]
     rows = np.stack([np.frombuffer(frame, np.uint8) for frame in frames if len(frame) == size])
     apart = np.full((len(rows), size + 1), 0xFF, np.uint8)

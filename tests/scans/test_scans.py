@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import itertools
 import random
 import tracemalloc
@@ -11,16 +12,20 @@ import numpy as np
 import pytest
 
 import lidarspec as ls
-from lidarspec import Scan
+from lidarspec import Scan, simulate
 from lidarspec.framing.results import Frames
 from lidarspec.packets.stream import PacketStream
 from lidarspec.scans.scans import ScanStream
 from lidarspec.simulation.scenes import Room
-from lidarspec.simulation.simulator import opening, simulate, simulation
+from lidarspec.simulation.simulator import opening, simulation
 from tests.shapes import SHAPES
 
 #: a rotor that is blocked, or the start of a scan that does not come: seconds of the longest scan, twice the slowest turn.
 BLOCKED = {"ldrobot-ld06": 0.4, "velodyne-vlp16": 0.4, "slamtec-rplidar-a1": 2.0, "cspc-m1c1-mini": 1.0}
+#: one sensor for each way to cut scans: where an angle wraps, in a stream and in datagrams, and where a counter starts again.
+CUT_BY = ("ldrobot-ld06", "velodyne-vlp16", "robosense-m1")
+#: sensors whose scans are cut in one of these ways.
+RELATED = ("velodyne-hdl32e", "hesai-pandar40p", "robosense-helios16p")
 #: from one packet of a VLP-16 to the next.
 PACKET_NS = 1_327_104
 
@@ -64,6 +69,7 @@ def test_a_scan_ends_though_the_rotor_is_blocked(name: str) -> None:
     assert f"within {longest:g} s" in reading.stats.unended
 
 
+@pytest.mark.slow
 def test_ten_minutes_of_a_blocked_rotor_keep_no_more_than_one_scan() -> None:
     reading, number = Reading("velodyne-vlp16"), 4096
     frames = simulation(reading.sensor, "data", blocked=True).block(0, number, Room()).frames
@@ -105,16 +111,19 @@ def test_scans_of_data_without_an_end_are_warned_of() -> None:
         assert len(list(sensor.scans(b"".join(frames)))) == 7
 
 
+@functools.cache
+def simulated(name: str, number: int) -> list[bytes]:
+    return simulate(ls.sensor(name), number)
+
+
 def scans_without(name: str, lost: Collection[int], number: int = 4000) -> list[Scan]:
     """The scans of simulated frames some of which are missing."""
     sensor = ls.sensor(name)
-    frames = [frame for place, frame in enumerate(simulate(sensor, number)) if place not in lost]
+    frames = [frame for place, frame in enumerate(simulated(name, number)) if place not in lost]
     return list(sensor.scans(frames if sensor.datagrams else b"".join([opening(sensor), *frames])))
 
 
-@pytest.mark.parametrize(
-    "name", ["velodyne-vlp16", "velodyne-hdl32e", "hesai-pandar40p", "ldrobot-ld06", "robosense-m1", "robosense-helios16p"]
-)
+@pytest.mark.parametrize("name", [*CUT_BY, *(pytest.param(name, marks=pytest.mark.slow) for name in RELATED)])
 def test_a_scan_is_complete_where_nothing_is_missing_and_only_there(name: str) -> None:
     sound = scans_without(name, ())
     assert [scan.complete for scan in sound] == [False, *[True] * (len(sound) - 2), False]
@@ -129,9 +138,9 @@ def test_a_scan_is_complete_where_nothing_is_missing_and_only_there(name: str) -
         assert np.isfinite(scans[2].rate_hz)
 
 
-@pytest.mark.parametrize("name", ["ldrobot-ld06", "velodyne-vlp16", "robosense-m1"])
-@pytest.mark.parametrize("turns", [0.6, 0.9, 1.0, 1.1, 1.7, 2.0, 3.4])
-@pytest.mark.parametrize("after", [0.0, 0.3, 0.9])
+@pytest.mark.parametrize("name", CUT_BY)
+@pytest.mark.parametrize("turns", [0.6, 1.0, 2.0, *(pytest.param(turns, marks=pytest.mark.slow) for turns in (0.9, 1.1, 1.7, 3.4))])
+@pytest.mark.parametrize("after", [0.0, 0.9, pytest.param(0.3, marks=pytest.mark.slow)])
 def test_no_two_turns_are_one_scan_whatever_is_missing(name: str, turns: float, after: float) -> None:
     sound = scans_without(name, ())
     turn = round(len(sound[2]) * 4000 / sum(map(len, sound)))
@@ -186,12 +195,12 @@ def test_a_frame_without_parts_that_have_points_leaves_no_gap(size: int) -> None
     assert [scan.complete for scan in scans_of_pieces("shape-tags", cut_off, size)] == [False, False, True, False]
 
 
-@pytest.mark.parametrize("kind", ["node", "express", "hq"])
+@pytest.mark.parametrize("kind", ["node", *(pytest.param(kind, marks=pytest.mark.slow) for kind in ("express", "hq"))])
 def test_false_and_missing_nodes_make_a_scan_incomplete(kind: str) -> None:
     sensor = ls.sensor("slamtec-rplidar-a1").configure(answer=kind)
     sound, draw = opening(sensor) + b"".join(simulate(sensor, 3000 if kind == "node" else 300)), random.Random(5)
     whole = {len(scan) for scan in sensor.scans(sound) if scan.complete}
-    for _ in range(20):
+    for _ in range(8):
         data, place = bytearray(sound), draw.randrange(len(sound) // 3, len(sound) // 2)
         if draw.random() < 0.5:
             del data[place]
@@ -210,7 +219,7 @@ def test_a_datagram_of_others_takes_nothing_from_a_scan() -> None:
     ]
 
 
-@pytest.mark.parametrize("name", ["ldrobot-ld06", "velodyne-vlp16", "cspc-m1c1-mini", "robosense-m1"])
+@pytest.mark.parametrize("name", [*CUT_BY, "cspc-m1c1-mini"])
 def test_pieces_do_not_matter_where_packets_are_missing(name: str) -> None:
     sensor, draw = ls.sensor(name), random.Random(2)
     frames = simulate(sensor, 2500)

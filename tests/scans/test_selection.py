@@ -13,8 +13,7 @@ import numpy as np
 import pytest
 
 import lidarspec as ls
-from lidarspec import Scan, Selection, UsageError
-from lidarspec.simulation.simulator import simulate
+from lidarspec import Scan, Selection, UsageError, simulate
 from tests.cli.running import ran
 
 ID, SECONDS = "ldrobot-stl27l", 40

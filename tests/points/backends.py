@@ -1,0 +1,20 @@
+"""Parameters for tests that compute points in several ways.
+
+Compiling a kernel takes seconds of processor time, so the quick tier compiles only those of
+`test_numba_kernels`; every other test asks for kernels in `make test-all`.
+"""
+
+from __future__ import annotations
+
+from importlib.util import find_spec
+
+import pytest
+
+NO_NUMBA = "the fused back end needs Numba: pip install 'lidarspec[jit]'"
+COMPILED = pytest.mark.skipif(find_spec("numba") is None, reason=NO_NUMBA)
+KERNELS = pytest.param("jit", marks=[COMPILED, pytest.mark.slow])
+
+#: plans and kernels, which are compared with the plain evaluation.
+BACKENDS = pytest.mark.parametrize("backend", ["numpy", KERNELS])
+#: those, and the plain evaluation itself.
+EVERY_BACKEND = pytest.mark.parametrize("backend", ["construct", "numpy", KERNELS])
