@@ -5,7 +5,7 @@ from __future__ import annotations
 import functools
 import shutil
 import subprocess
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from pathlib import Path
 
 import pytest
@@ -18,7 +18,12 @@ from lidarspec.exports import export
 from lidarspec.spec import Udp
 
 TSHARK = shutil.which("tshark")
-needs_tshark = pytest.mark.skipif(TSHARK is None, reason="tshark is not installed")
+_needs_tshark = pytest.mark.skipif(TSHARK is None, reason="tshark is not installed")
+
+
+def judged(test: Callable[..., None]) -> Callable[..., None]:
+    """Mark a test that runs tshark: left to `make test-all`, and skipped if tshark is not installed."""
+    return pytest.mark.slow(_needs_tshark(test))  # type: ignore[no-any-return]
 
 
 def tshark(capture: Path, *arguments: str, scripts: Iterable[Path] = ()) -> str:

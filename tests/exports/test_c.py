@@ -15,12 +15,13 @@ from typing import Any
 
 import pytest
 
+import lidarspec
 from lidarspec import Sensor, WireError
 from lidarspec.exports import Refused, beginning, export
 from lidarspec.framing.frame_engine import codec
 from lidarspec.testing import subject as material
 from lidarspec.wire.schema import Schema
-from tests.exports.trees import DISTINCT, EVERY, in_forms, values
+from tests.exports.trees import SHAPED, distinct_sensors, recoded, values
 
 GCC = shutil.which("gcc")
 needs_gcc = pytest.mark.skipif(GCC is None, reason="gcc is not installed")
@@ -28,19 +29,22 @@ STRICT = ["-std=c99", "-Wall", "-Wextra", "-Werror", "-pedantic"]
 SANITIZED = ("-fsanitize=address,undefined", "-fno-sanitize-recover=all")
 #: fields of these names get an underscore, since functions of the whole frame have them.
 OWN = ("frame_length", "is_frame")
-#: what C cannot say, with the reason.
+#: the reason of the refusal of parts that C cannot say.
 _PARTS = "parts of sizes of their own"
+#: the shapes that C cannot say, with the reason.
 REFUSED = {
     "shape-text": "Decimal is Python code",
     "shape-segments": f"segments: {_PARTS}",
     "shape-tags": f"tags: {_PARTS}",
     "shape-channels": f"channels: {_PARTS}",
+    **recoded(SHAPED.values()),
+}
+#: the installed sensors that C cannot say, with the reason.
+REFUSED_INSTALLED = {
     **dict.fromkeys(("livox-mid360", "livox-hap"), f"parameters: {_PARTS}"),
     "ti-iwr6843": f"tlvs: {_PARTS}",
     **dict.fromkeys(("sick-multiscan136", "sick-picoscan150"), f"modules: {_PARTS}"),
-    **in_forms(EVERY),
 }
-SENSORS = {name: sensor for name, sensor in DISTINCT.items() if name not in REFUSED}
 
 _MAIN = """\
 #include <stdio.h>
@@ -72,12 +76,42 @@ int main(void)
 """
 
 
+@functools.cache
+def subjects() -> dict[str, Sensor]:
+    """Load every sensor that C can say, one for each set of frames, by id."""
+    refused = {*REFUSED, *REFUSED_INSTALLED}
+    sensors = distinct_sensors()
+    return {name: sensor for name, sensor in sensors.items() if name not in refused and name not in recoded([sensor])}
+
+
+@pytest.mark.parametrize("name", [name for name in SHAPED if name not in REFUSED])
+def test_a_header_has_a_function_for_every_field(name: str) -> None:
+    sensor = SHAPED[name]
+    text = export(sensor, "c")
+    for frame in sensor.frames:
+        prefix = f"{_word(beginning(sensor))}_{frame}"
+        assert f" {prefix}_is_frame(" in text
+        for path in codec(sensor.frames[frame]).schema.fields:
+            assert f" {prefix}_{_word(path)}{'_' * (path in OWN)}(" in text, path
+
+
 def test_what_only_python_can_decide_is_refused_with_the_reason() -> None:
     for name, reason in REFUSED.items():
         with pytest.raises(Refused, match=reason):
-            export(EVERY[name], "c")
+            export(SHAPED[name], "c")
 
 
+@pytest.mark.slow
+def test_installed_sensors_that_c_cannot_say_are_refused_with_the_reason() -> None:
+    for name, reason in REFUSED_INSTALLED.items():
+        with pytest.raises(Refused, match=reason):
+            export(lidarspec.sensor(name), "c")
+    for name, reason in recoded(distinct_sensors().values()).items():
+        with pytest.raises(Refused, match=reason):
+            export(distinct_sensors()[name], "c")
+
+
+@pytest.mark.slow
 @needs_gcc
 def test_every_header_compiles_without_a_warning(tmp_path: Path) -> None:
     source = tmp_path / "all.c"
@@ -85,14 +119,16 @@ def test_every_header_compiles_without_a_warning(tmp_path: Path) -> None:
     _compile(source, tmp_path / "all", *STRICT, "-fsyntax-only")
 
 
+@pytest.mark.slow
 @needs_gcc
 def test_an_id_that_begins_with_a_digit_makes_names_all_the_same(tmp_path: Path) -> None:
-    (tmp_path / "it.h").write_text(export(replace(SENSORS["shape-count"], id="3acme-x1"), "c"))
+    (tmp_path / "it.h").write_text(export(replace(SHAPED["shape-count"], id="3acme-x1"), "c"))
     (tmp_path / "it.c").write_text('#include "it.h"\nint main(void) { return lidar_3acme_x1_data_count((const uint8_t *)"abc") != 99; }\n')
     subprocess.run([str(GCC), *STRICT, "-o", "it", "it.c"], cwd=tmp_path, check=True)
     subprocess.run([tmp_path / "it"], check=True)
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(shutil.which("g++") is None, reason="g++ is not installed")
 def test_every_header_is_cplusplus_too(tmp_path: Path) -> None:
     source = tmp_path / "all.cpp"
@@ -108,10 +144,10 @@ def reader(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFact
     """A program that prints all fields of the frames it is given; checked, it stops at the first byte read outside them."""
     folder = tmp_path_factory.mktemp("c")
     source, program = folder / "reader.c", folder / "reader"
-    dumps = [_dump(sensor, name) for sensor in SENSORS.values() for name in sensor.frames]
+    dumps = [_dump(sensor, name) for sensor in subjects().values() for name in sensor.frames]
     calls = [
         f'        if (!strcmp(name, "{sensor.id}:{name}")) dump_{_word(beginning(sensor))}_{name}(p, n);\n'
-        for sensor in SENSORS.values()
+        for sensor in subjects().values()
         for name in sensor.frames
     ]
     source.write_text(_MAIN % (_included(folder), "\n".join(dumps), "".join(calls)))
@@ -119,9 +155,10 @@ def reader(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFact
     return program
 
 
+@pytest.mark.slow
 @needs_gcc
 def test_every_field_reads_as_lidarspec_reads_it(reader: Path) -> None:
-    frames = [(sensor, name, data) for sensor in SENSORS.values() for name in sensor.frames for data in _examples(sensor, name)]
+    frames = [(sensor, name, data) for sensor in subjects().values() for name in sensor.frames for data in _examples(sensor, name)]
     for (sensor, name, data), (is_frame, length, found) in zip(frames, _read(reader, frames), strict=True):
         assert (is_frame, length) == (1, len(data)), f"{sensor.id} {name}"
         wanted = values(sensor.parse(data, frame=name))
@@ -131,11 +168,12 @@ def test_every_field_reads_as_lidarspec_reads_it(reader: Path) -> None:
             assert all(map(_same, found[path], numbers)), f"{sensor.id} {name} {path}"
 
 
+@pytest.mark.slow
 @needs_gcc
 def test_damaged_frames_are_none_of_either_s(reader: Path) -> None:
     source = random.Random(1)
     frames = []
-    for sensor in SENSORS.values():
+    for sensor in subjects().values():
         for name in sensor.frames:
             data = sensor.example(name, seed=1)
             frames += [(sensor, name, material.mutated(data, source)) for _ in range(12)]
@@ -147,6 +185,7 @@ def test_damaged_frames_are_none_of_either_s(reader: Path) -> None:
         assert (is_frame == 1 and length == len(data)) == wanted, f"{sensor.id} {name} {data.hex()}"
 
 
+@pytest.mark.slow
 @needs_gcc
 def test_scaling(tmp_path: Path) -> None:
     calls = {
@@ -166,9 +205,9 @@ def test_scaling(tmp_path: Path) -> None:
 
 
 def _included(folder: Path) -> str:
-    for sensor in SENSORS.values():
+    for sensor in subjects().values():
         (folder / f"{sensor.id}.h").write_text(export(sensor, "c"))
-    return "".join(f'#include "{name}.h"\n' for name in SENSORS)
+    return "".join(f'#include "{name}.h"\n' for name in subjects())
 
 
 def _compile(source: Path, program: Path, *options: str) -> None:
@@ -213,7 +252,7 @@ def _printed(table: Schema, path: str, prefix: str, text: str) -> Iterator[str]:
 @functools.cache
 def export_of(name: str) -> str:
     """The header of a sensor, made once."""
-    return export(EVERY[name], "c")
+    return export(subjects()[name], "c")
 
 
 def _examples(sensor: Sensor, name: str) -> list[bytes]:

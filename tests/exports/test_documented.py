@@ -12,7 +12,7 @@ import lidarspec
 from lidarspec.exports import export
 from tests.cli.running import EXAMPLE
 from tests.docs.pages import blocks
-from tests.exports.sharks import captured, needs_tshark, tshark, written
+from tests.exports.sharks import captured, judged, tshark, written
 
 PAGE, NAME = "how-to/export.md", "ldrobot-stl27l"
 
@@ -22,7 +22,7 @@ def first(language: str) -> str:
     return next(block.text for block in blocks(PAGE) if block.language == language)
 
 
-@needs_tshark
+@judged
 def test_the_frame_on_the_page_is_what_tshark_prints(tmp_path: Path) -> None:
     sensor = lidarspec.sensor(NAME)
     printed = tshark(captured(sensor, [EXAMPLE], tmp_path / "it.pcap"), "-V", scripts=[written(sensor, tmp_path)])
@@ -31,6 +31,7 @@ def test_the_frame_on_the_page_is_what_tshark_prints(tmp_path: Path) -> None:
         assert line in lines, line  # in this order, some of the points left out
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(shutil.which("gcc") is None, reason="gcc is not installed")
 def test_the_program_on_the_page_runs(tmp_path: Path) -> None:
     (tmp_path / "stl27l.h").write_text(export(lidarspec.sensor(NAME), "c"))

@@ -2,29 +2,41 @@
 
 from __future__ import annotations
 
+import functools
+import re
 from pathlib import Path
 from typing import Any
 
 import pytest
 from construct import Array, Bytes, BytesInteger, Const, Float16b, If, IfThenElse, Int8ul, Int16ul, Int24sb, Struct, this
 
-import lidarspec as ls
 from lidarspec import Sensor
 from lidarspec.exports import Refused, export
-from lidarspec.exports.ksy import yaml
+from lidarspec.exports.ksy import identifier, yaml
 from lidarspec.spec import Every, Frame, Polar, Serial
-from tests.exports import kaitai
-from tests.exports.trees import in_forms
-from tests.shapes import SHAPES
+from lidarspec.wire.schema import schema
+from tests.exports import kaitai, trees
+from tests.exports.trees import distinct_sensors, recoded
 
-SENSORS = {**ls.sensors(), **SHAPES}
-#: what Kaitai cannot say, and why.
-REFUSED = (
-    {"shape-text": "Decimal is Python code"}
-    | dict.fromkeys(("shape-tags", "livox-mid360", "livox-hap", "ti-iwr6843"), "told apart by their constants")
-    | in_forms(SENSORS)
-)
-SPOKEN = [name for name, sensor in SENSORS.items() if name not in REFUSED and sensor.frames]
+#: the shapes that are exported; of oddities there are own ones below.
+SHAPED = {name: sensor for name, sensor in trees.SHAPED.items() if name != "shape-oddities"}
+_CONSTANTS = "told apart by their constants"
+#: the shapes that Kaitai cannot say, and why.
+REFUSED = {
+    "shape-text": "Decimal is Python code",
+    "shape-tags": _CONSTANTS,
+    **recoded(SHAPED.values()),
+}
+#: the installed sensors that Kaitai cannot say, and why.
+REFUSED_INSTALLED = dict.fromkeys(("livox-mid360", "livox-hap", "ti-iwr6843"), _CONSTANTS)
+
+
+@functools.cache
+def subjects() -> dict[str, Sensor]:
+    """Load every sensor that Kaitai can say, one for each set of frames, by id."""
+    sensors = distinct_sensors()
+    refused = {*REFUSED, *REFUSED_INSTALLED, *recoded(sensors.values()), "shape-oddities"}
+    return {name: sensor for name, sensor in sensors.items() if name not in refused}
 
 
 def made(*fields: Any, case: str = "odd") -> Sensor:
@@ -60,37 +72,49 @@ UNUSUAL = {case: made(*fields, case=case) for case, fields in ODD.items()}
 def compiled(tmp_path_factory: pytest.TempPathFactory) -> Path:
     pytest.importorskip("kaitaistruct", reason="Kaitai's runtime is not installed: pip install kaitaistruct")
     folder = tmp_path_factory.mktemp("ksy")
-    kaitai.compile_all([*(SENSORS[name] for name in SPOKEN), *UNUSUAL.values()], folder)
+    kaitai.compile_all([*subjects().values(), *UNUSUAL.values()], folder)
     return folder
 
 
-@pytest.mark.parametrize("name", SPOKEN)
-def test_kaitai_reads_the_values_that_lidarspec_reads(compiled: Path, name: str) -> None:
-    sensor = SENSORS[name]
-    found = kaitai.module(sensor, compiled)
-    for frame in sensor.frames:
-        for seed in range(2):
-            data = sensor.example(frame, seed=seed)
-            read = kaitai.reader(found, sensor, frame).from_bytes(data)
-            assert kaitai.differences(sensor.parse(data, frame), read) == []
-            assert read._io.is_eof()
+@pytest.mark.slow
+def test_kaitai_reads_the_values_that_lidarspec_reads(compiled: Path) -> None:
+    for sensor in subjects().values():
+        found = kaitai.module(sensor, compiled)
+        for frame in sensor.frames:
+            for seed in range(2):
+                data = sensor.example(frame, seed=seed)
+                read = kaitai.reader(found, sensor, frame).from_bytes(data)
+                assert kaitai.differences(sensor.parse(data, frame), read) == [], f"{sensor.id} {frame}"
+                assert read._io.is_eof(), f"{sensor.id} {frame}"
 
 
+@pytest.mark.parametrize("name", [name for name in SHAPED if name not in REFUSED])
+def test_a_spec_has_a_type_for_every_frame_and_an_id_for_every_field(name: str) -> None:
+    text = export(SHAPED[name], "ksy")
+    for frame, value in SHAPED[name].frames.items():
+        assert f"  {identifier(frame)}:\n" in text
+        for field in schema(value.tree).fields.values():
+            assert re.search(rf"\b{identifier(field.name)}\b", text), field.path
+
+
+@pytest.mark.slow
 def test_physical_values_are_instances(compiled: Path) -> None:
-    sensor = SENSORS["ldrobot-stl27l"]
+    sensor = subjects()["ldrobot-stl27l"]
     data = sensor.example("data", seed=1)
     read = kaitai.reader(kaitai.module(sensor, compiled), sensor, "data").from_bytes(data)
     assert read.start_angle_deg == pytest.approx(sensor.decode(data)["start_angle"][0])
     assert read.points[3].distance_m == pytest.approx(sensor.decode(data)["points.distance"][0, 3])
 
 
+@pytest.mark.slow
 def test_wrong_constants_are_noticed(compiled: Path) -> None:
-    sensor = SENSORS["ldrobot-stl27l"]
+    sensor = subjects()["ldrobot-stl27l"]
     data = sensor.example("data")
     with pytest.raises(Exception, match="not equal"):
         kaitai.reader(kaitai.module(sensor, compiled), sensor, "data").from_bytes(b"\x00" + data[1:])
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("case", list(UNUSUAL))
 def test_unusual_structs_are_read_alike(compiled: Path, case: str) -> None:
     sensor = UNUSUAL[case]
@@ -103,7 +127,14 @@ def test_unusual_structs_are_read_alike(compiled: Path, case: str) -> None:
 @pytest.mark.parametrize("name", list(REFUSED))
 def test_what_kaitai_cannot_say_is_refused_with_the_reason(name: str) -> None:
     with pytest.raises(Refused, match=REFUSED[name]):
-        export(SENSORS[name], "ksy")
+        export(SHAPED[name], "ksy")
+
+
+@pytest.mark.slow
+def test_installed_sensors_that_kaitai_cannot_say_are_refused_with_the_reason() -> None:
+    for name, reason in (REFUSED_INSTALLED | recoded(distinct_sensors().values())).items():
+        with pytest.raises(Refused, match=reason):
+            export(distinct_sensors()[name], "ksy")
 
 
 def test_other_refusals_have_reasons_too() -> None:

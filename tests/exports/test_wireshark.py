@@ -17,19 +17,15 @@ from lidarspec.framing.frame_engine import codec
 from lidarspec.testing import subject as material
 from lidarspec.testing.subject import Subject
 from tests import made_captures as made
-from tests.exports.sharks import captured, columns, dissector, needs_tshark, tshark, written
-from tests.exports.trees import DISTINCT, EVERY, in_forms, values
+from tests.exports.sharks import captured, columns, dissector, judged, tshark, written
+from tests.exports.trees import SHAPED, distinct_sensors, is_recoded, recoded, values
+from tests.installed import distinct_sensors_in, sensor_modules
 
-#: what Wireshark cannot be told, with the reason.
-REFUSED = {
-    "shape-text": "Decimal is Python code",
-    **in_forms(EVERY),
-}
-#: what every run tries; the other shapes, and sensors that share the frames of one of these, are for the long one.
-FEW = {*lidarspec.sensors(), "shape-oddities", "shape-options", "shape-segments", "shape-tags", "shape-channels"} & set(DISTINCT)
-SENSORS = [
-    pytest.param(sensor, id=name, marks=() if name in FEW else pytest.mark.soak) for name, sensor in EVERY.items() if name not in REFUSED
-]
+#: the shapes that Wireshark cannot be told, with the reason.
+REFUSED = {"shape-text": "Decimal is Python code", **recoded(SHAPED.values())}
+#: the shapes that tshark reads in `make test-all`; the others are for the long run.
+FEW = {"shape-oddities", "shape-options", "shape-segments", "shape-tags", "shape-channels"}
+READ = [pytest.param(name, marks=() if name in FEW else pytest.mark.soak) for name in SHAPED if name not in REFUSED]
 
 CAPTURES = [
     ("velodyne-vlp16", "velodyne/vlp16_old_firmware/vlp-16-test-90deg-1-50-frames.pcap"),
@@ -44,17 +40,45 @@ LATER, LONG = {"velodyne-hdl32e", "hesai-xt32", "hesai-qt64"}, pytest.mark.soak
 #: what is said of a frame that may be of another type, too.
 UNSURE = "what tells them is not in these bytes"
 
-pytestmark = needs_tshark
+
+@pytest.mark.parametrize("name", [name for name in SHAPED if name not in REFUSED])
+def test_a_dissector_has_a_field_for_every_field_of_every_frame(name: str) -> None:
+    sensor = SHAPED[name]
+    text = dissector(sensor)
+    for frame, value in sensor.frames.items():
+        for path in codec(value).schema.fields:
+            assert f"{name.replace('-', '_')}.{frame}.{path}" in text, path
 
 
 def test_what_only_python_can_decide_is_refused_with_the_reason() -> None:
     for name, reason in REFUSED.items():
         with pytest.raises(Refused, match=reason):
-            export(EVERY[name], "wireshark")
+            export(SHAPED[name], "wireshark")
 
 
-@pytest.mark.parametrize("sensor", SENSORS)
-def test_every_field_reads_as_lidarspec_reads_it(sensor: Sensor, tmp_path: Path) -> None:
+@pytest.mark.slow
+def test_installed_sensors_that_wireshark_cannot_be_told_are_refused_with_the_reason() -> None:
+    for name, reason in recoded(distinct_sensors().values()).items():
+        with pytest.raises(Refused, match=reason):
+            export(distinct_sensors()[name], "wireshark")
+
+
+@judged
+@pytest.mark.parametrize("name", READ)
+def test_every_field_of_a_shape_reads_as_lidarspec_reads_it(name: str, tmp_path: Path) -> None:
+    assert_fields_are_read(SHAPED[name], tmp_path)
+
+
+@judged
+@pytest.mark.parametrize("module", sensor_modules())
+def test_every_field_of_an_installed_sensor_reads_as_lidarspec_reads_it(module: str, tmp_path: Path) -> None:
+    for sensor in distinct_sensors_in(module):
+        if not is_recoded(sensor):
+            assert_fields_are_read(sensor, tmp_path)
+
+
+def assert_fields_are_read(sensor: Sensor, tmp_path: Path) -> None:
+    """Fail unless tshark reads every frame of a sensor as lidarspec does."""
     outgoing = [(name, sensor.example(name, seed=seed)) for seed in range(3) for name in sensor.frames if name not in sensor.incoming]
     frames = [(_answer(sensor, name, data), data) for name, data in [*Subject(sensor).conversation(), *outgoing]]
     capture = captured(sensor, [data for _, data in frames], tmp_path / "frames.pcap")
@@ -106,6 +130,7 @@ def _same(text: str, value: Any) -> bool:
     return int(text, 0) == int(value)
 
 
+@judged
 def test_physical_values_are_fields_too(tmp_path: Path) -> None:
     sensor = lidarspec.sensor("ldrobot-stl27l")
     frame = sensor.build("data", sensor.parse(sensor.example("data")), units=False, start_angle=32427)
@@ -117,9 +142,10 @@ def test_physical_values_are_fields_too(tmp_path: Path) -> None:
     assert "start_angle: 32427 (324.27 deg)" in tshark(capture, "-V", scripts=[script])
 
 
+@judged
 @pytest.mark.parametrize("name", ["ldrobot-stl27l", "shape-nested", "shape-twice", "shape-nibbles", "shape-oddities"])
 def test_a_wrong_checksum_is_marked(name: str, tmp_path: Path) -> None:
-    sensor = EVERY[name]
+    sensor = SHAPED.get(name) or lidarspec.sensor(name)
     sealed = [kind for kind in sensor.incoming if material.seals(sensor, kind, sensor.example(kind))]
     frames = []
     for kind in sealed:
@@ -146,6 +172,7 @@ def _only_the_checksum(sensor: Sensor, kind: str, data: bytes) -> bool:
     return False
 
 
+@judged
 def test_frames_one_after_another_and_bytes_between_them(tmp_path: Path) -> None:
     sensor = lidarspec.sensor("ldrobot-stl27l")
     frames = [sensor.example("data", seed=seed) for seed in range(3)]
@@ -159,8 +186,9 @@ def test_frames_one_after_another_and_bytes_between_them(tmp_path: Path) -> None
     assert second == [[]] * 5
 
 
+@judged
 def test_a_frame_that_waits_for_another_is_told_by_it(tmp_path: Path) -> None:
-    sensor = EVERY["shape-modes"]
+    sensor = SHAPED["shape-modes"]
     frames = [(name, sensor.example(name, seed=1)) for name in ("begin_express", "express", "express", "begin_plain", "plain")]
     capture, script = captured(sensor, [data for _, data in frames], tmp_path / "it.pcap"), written(sensor, tmp_path)
     assert_shown(sensor, capture, script, frames)
@@ -169,6 +197,7 @@ def test_a_frame_that_waits_for_another_is_told_by_it(tmp_path: Path) -> None:
     assert kinds == [name for name, _ in frames]
 
 
+@judged
 def test_frames_that_nothing_announced_are_said_to_be_unsure(tmp_path: Path) -> None:
     sensor = lidarspec.sensor("slamtec-rplidar-t1")
     capsule, announcement = sensor.example("dense", seed=1), sensor.example("dense_descriptor", seed=1)
@@ -179,6 +208,7 @@ def test_frames_that_nothing_announced_are_said_to_be_unsure(tmp_path: Path) -> 
     assert behind == [["dense"], []]
 
 
+@judged
 def test_frames_of_one_size_are_told_by_their_conditions(tmp_path: Path) -> None:
     sensor = lidarspec.sensor("robosense-m1")
     names = ["difop_guide", "difop", "difop_other", "difop_fov"]
@@ -187,6 +217,7 @@ def test_frames_of_one_size_are_told_by_their_conditions(tmp_path: Path) -> None
     assert list(shown) == [[[name], []] for name in names]
 
 
+@judged
 def test_two_dissectors_share_ports_and_link_types(tmp_path: Path) -> None:
     sensors = [lidarspec.sensor(name) for name in ("velodyne-vlp16", "hesai-xt32", "ldrobot-stl27l", "cspc-m1c1-mini")]
     scripts = [written(sensor, tmp_path) for sensor in sensors]
@@ -195,6 +226,7 @@ def test_two_dissectors_share_ports_and_link_types(tmp_path: Path) -> None:
         assert f"{sensor.vendor} {sensor.model}" in tshark(capture, "-T", "fields", "-e", "_ws.col.Protocol", scripts=scripts)
 
 
+@judged
 @pytest.mark.parametrize(("name", "path"), [pytest.param(*case, id=case[0], marks=LONG if case[0] in LATER else ()) for case in CAPTURES])
 def test_real_captures(name: str, path: str, tmp_path: Path) -> None:
     capture = made.CAPTURES / path
@@ -212,6 +244,7 @@ def test_real_captures(name: str, path: str, tmp_path: Path) -> None:
     assert {name for name, _ in frames} <= set(shown.split())
 
 
+@judged
 @pytest.mark.parametrize(("name", "path"), [("ldrobot-ld06", "ldrobot/ld06_3_consecutive_frames.bin")])
 def test_a_real_serial_recording(name: str, path: str, tmp_path: Path) -> None:
     source = made.CAPTURES / path

@@ -2,23 +2,38 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+import functools
+from collections.abc import Iterable
 from typing import Any
 
 from construct import EnumIntegerString
 
 from lidarspec import Sensor
-from tests import all_sensors
 from tests.exports import oddities
+from tests.installed import distinct_sensors_in, sensor_modules
+from tests.shapes import SHAPES
 
-EVERY = {**all_sensors.EVERY, oddities.SENSOR.id: oddities.SENSOR}
-DISTINCT = all_sensors.distinct(EVERY)
+#: the invented sensors that have frames, by id.
+SHAPED = {sensor.id: sensor for sensor in (*SHAPES.values(), oddities.SENSOR) if sensor.frames}
+#: the reason of every refusal of a frame that stands on the wire in a form of its own.
+RECODED = "no other language recodes"
 
 
-def in_forms(sensors: Mapping[str, Sensor]) -> dict[str, str]:
-    """Those of them that no other language reads, since they stand on the wire in a form of their own, with the reason."""
-    formed = (name for name, sensor in sensors.items() if any(frame.wire is not None for frame in sensor.frames.values()))
-    return dict.fromkeys(formed, "no other language recodes")
+@functools.cache
+def distinct_sensors() -> dict[str, Sensor]:
+    """Load one sensor for each set of frames, shapes and installed ones, by id."""
+    installed = [sensor for module in sensor_modules() for sensor in distinct_sensors_in(module)]
+    return {**SHAPED, **{sensor.id: sensor for sensor in installed}}
+
+
+def is_recoded(sensor: Sensor) -> bool:
+    """Return whether a frame stands on the wire in a form that no other language reads."""
+    return any(frame.wire is not None for frame in sensor.frames.values())
+
+
+def recoded(sensors: Iterable[Sensor]) -> dict[str, str]:
+    """Return the reason of the refusal, by id, of those sensors that are recoded."""
+    return {sensor.id: RECODED for sensor in sensors if is_recoded(sensor)}
 
 
 def number(value: Any) -> Any:
