@@ -92,7 +92,7 @@ def test_a_header_has_a_function_for_every_field(name: str) -> None:
         prefix = f"{_word(beginning(sensor))}_{frame}"
         assert f" {prefix}_is_frame(" in text
         for path in codec(sensor.frames[frame]).schema.fields:
-            assert f" {prefix}_{_word(path)}{'_' * (path in OWN)}(" in text, path
+            assert re.search(rf"\b{prefix}_{_word(path)}{'_' * (path in OWN)}\(", text), path
 
 
 def test_what_only_python_can_decide_is_refused_with_the_reason() -> None:

@@ -22,7 +22,11 @@ from tests.exports.trees import SHAPED, distinct_sensors, is_recoded, recoded, v
 from tests.installed import distinct_sensors_in, sensor_modules
 
 #: the shapes that Wireshark cannot be told, with the reason.
-REFUSED = {"shape-text": "Decimal is Python code", **recoded(SHAPED.values())}
+REFUSED = {
+    "shape-text": "Decimal is Python code",
+    "shape-fragments": "messages in several datagrams",
+    **recoded(SHAPED.values()),
+}
 #: the shapes that tshark reads in `make test-all`; the others are for the long run.
 FEW = {"shape-oddities", "shape-options", "shape-segments", "shape-tags", "shape-channels"}
 READ = [pytest.param(name, marks=() if name in FEW else pytest.mark.soak) for name in SHAPED if name not in REFUSED]
