@@ -143,6 +143,7 @@ def test_types_and_units_can_be_declared_and_low_values_are_spread() -> None:
     assert_well_formed(found)
 
 
+@pytest.mark.slow
 def test_points_in_parts_have_them_too() -> None:
     sensor = SHAPES["shape-segments"]
     read = sensor.decode(simulate(sensor, 8))

@@ -102,7 +102,7 @@ def test_plausible_frames_are_found_around_the_lengths_of_the_sweep() -> None:
     sensor = replace(
         shape, frames={"data": plain}, simulation=Simulation(lambda i: dict(length=7 + 3 * (i % 9), size=2 + 3 * (i % 9), angle=7.0))
     )
-    assert len({len(sensor.example("data", seed=seed)) for seed in range(20)}) > 3
+    assert len({len(sensor.example("data", seed=seed)) for seed in range(8)}) > 2
 
 
 @both

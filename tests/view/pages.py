@@ -9,6 +9,7 @@ import time
 from collections import deque
 from collections.abc import Callable
 from functools import partial
+from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
@@ -24,11 +25,13 @@ from lidarspec.transports.open_url import is_live
 from lidarspec.transports.serving import write_file
 from lidarspec.view.feed import LOOK
 from lidarspec.view.live import Switch
+from tests.libraries import Library
 from tests.view.messages import parsed
 
-pytest.importorskip("starlette", reason="starlette is not installed (the extra web)")
-pytest.importorskip("uvicorn", reason="uvicorn is not installed (the extra web)")
-client = pytest.importorskip("websockets.sync.client", reason="websockets is not installed (the extra web)")
+for library in ("starlette", "uvicorn", "websockets"):
+    if find_spec(library) is None:
+        pytest.skip(f"{library} is not installed (the extra web)", allow_module_level=True)
+client = Library("websockets.sync.client")
 
 #: seconds that anything may take; many times what it does.
 DEADLINE = 30.0

@@ -42,7 +42,7 @@ def agree(page: Page, header: dict[str, Any], columns: dict[str, np.ndarray], sp
     ), (frame["value"], ranges[index])
 
 
-@pytest.mark.parametrize("sensor", [known for known in SENSORS if known in ls.sensors()])
+@pytest.mark.parametrize("sensor", [FLAT, *(pytest.param(name, marks=pytest.mark.slow) for name in SENSORS[1:])])
 def test_a_point_leads_to_its_frame_and_its_field(tmp_path: Path, sensor: str) -> None:
     """While newer scans arrive."""
     with Station(f"sim:{sensor}", tmp_path) as station, station.page() as page:
@@ -55,6 +55,7 @@ def test_a_point_leads_to_its_frame_and_its_field(tmp_path: Path, sensor: str) -
             agree(page, header, columns, spot, shown.scan)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("sensor", "suffix", "to"), [(FLAT, ".lsr", 15), (FLAT, ".bin", 3), (SOLID, ".pcap", 3)])
 def test_a_point_of_a_file_leads_to_its_frame(tmp_path: Path, sensor: str, suffix: str, to: int) -> None:
     """Also where what lies before it was passed over without being read, so that the same bytes stand elsewhere in the input."""
@@ -72,6 +73,7 @@ def test_a_point_of_a_file_leads_to_its_frame(tmp_path: Path, sensor: str, suffi
             agree(page, header, columns, spot, shown.scan)
 
 
+@pytest.mark.slow
 def test_lost_and_reordered_packets_do_not_mislead(tmp_path: Path) -> None:
     with Station(f"sim:{SOLID}?loss=0.05&reorder=3", tmp_path) as station, station.page() as page:
         page.state(lambda state: state["figures"] and state["figures"]["lost"])
@@ -82,6 +84,7 @@ def test_lost_and_reordered_packets_do_not_mislead(tmp_path: Path) -> None:
             agree(page, header, columns, spot, shown.scan)
 
 
+@pytest.mark.slow
 def test_a_point_leads_to_its_frame_where_the_newest_bytes_are_gone(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("lidarspec.view.backlog.BYTES", 1)
     with Station(f"sim:{SOLID}", tmp_path) as station, station.page() as page:
@@ -92,6 +95,7 @@ def test_a_point_leads_to_its_frame_where_the_newest_bytes_are_gone(tmp_path: Pa
         assert page.asked("frame", number=0) == {"is": "gone", "what": "frame 0"}
 
 
+@pytest.mark.slow
 def test_points_that_are_not_shown_are_gone(tmp_path: Path) -> None:
     with Station(f"sim:{FLAT}", tmp_path) as station, station.page() as page:
         header, _ = page.scan()
@@ -111,6 +115,7 @@ def test_frames_follow_one_another_by_number(tmp_path: Path) -> None:
         assert page.asked("frame", number=10**6)["is"] == "gone"
 
 
+@pytest.mark.slow
 def test_the_newest_frame_is_sent_while_it_is_watched(tmp_path: Path) -> None:
     with Station(f"sim:{FLAT}", tmp_path) as station, station.page() as page:
         page.say("watch", frames=True)
@@ -125,6 +130,7 @@ def test_the_newest_frame_is_sent_while_it_is_watched(tmp_path: Path) -> None:
             page.heard(lambda message: isinstance(message, dict) and message["is"] == "frame", within=1.5)
 
 
+@pytest.mark.slow
 def test_paused_bytes_stand_still(tmp_path: Path) -> None:
     with Station(f"sim:{FLAT}", tmp_path) as station, station.page() as page:
         page.scan()
@@ -138,6 +144,7 @@ def test_paused_bytes_stand_still(tmp_path: Path) -> None:
         assert page.asked("frame", number=last["number"] + 1)["is"] == "gone"
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("source", "what"), [(f"sim:{FLAT}?errors=0.0002", "flipped"), (f"sim:{SOLID}?errors=0.0001", "bit")])
 def test_damaged_frames_are_listed_and_explained(tmp_path: Path, source: str, what: str) -> None:
     with Station(source, tmp_path) as station, station.page() as page:
@@ -177,6 +184,7 @@ def test_what_is_damaged_in_a_file_is_what_explain_finds(tmp_path: Path) -> None
         assert station.broadcast.backlog.damaged == len(gaps) > 10
 
 
+@pytest.mark.slow
 def test_nothing_is_listed_where_nothing_is_damaged(tmp_path: Path) -> None:
     with Station(f"sim:{SOLID}?loss=0.05", tmp_path) as station, station.page() as page:
         state = page.state(lambda state: state["figures"] and state["figures"]["lost"])

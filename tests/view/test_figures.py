@@ -13,16 +13,16 @@ import numpy as np
 import pytest
 
 import lidarspec as ls
-from lidarspec import Scan
+from lidarspec import Scan, simulate
 from lidarspec.errors import UsageError
 from lidarspec.points.look import look
-from lidarspec.simulation.simulator import simulate
 from lidarspec.view.feed import Feed
 from tests.cli.running import ran
 from tests.formats.test_formats import scan
+from tests.libraries import Library, needs
 
-pytest.importorskip("matplotlib", reason="matplotlib is not installed")
-figures = pytest.importorskip("lidarspec.view.figures")
+pytestmark = [pytest.mark.slow, needs("matplotlib")]
+figures = Library("lidarspec.view.figures")
 
 
 def simulated(name: str, packets: int) -> Scan:

@@ -9,10 +9,9 @@ import numpy as np
 import pytest
 
 import lidarspec as ls
-from lidarspec import Decoder, Packets
+from lidarspec import Decoder, Packets, simulate
 from lidarspec.packets.stream import PacketStream
 from lidarspec.scans.scans import ScanStream
-from lidarspec.simulation.simulator import simulate
 from lidarspec.view.feed import Meter
 
 ID = "ldrobot-stl27l"

@@ -86,7 +86,13 @@ def test_packets_are_a_table_with_units_and_times() -> None:
     assert len(cells(str(some.take([])._repr_html_()))) == 1
 
 
-@pytest.mark.parametrize("sensor_id", ["robosense-m1", "ouster-os1", "sick-tim571", "slamtec-rplidar-a1", "ti-iwr6843", "velodyne-vls128"])
+#: sensors with long tables: deep, of many frames, of text, of parts.
+LONG = ("ouster-os1", "sick-tim571", "ti-iwr6843", "velodyne-vls128")
+
+
+@pytest.mark.parametrize(
+    "sensor_id", ["robosense-m1", "slamtec-rplidar-a1", *(pytest.param(name, marks=pytest.mark.slow) for name in LONG)]
+)
 def test_tables_and_diagrams_are_bounded(sensor_id: str) -> None:
     sensor = ls.sensor(sensor_id)
     some, frame = packets(sensor, 4), sensor.example(sensor.data_frame)
@@ -132,6 +138,7 @@ def test_a_frame_that_no_export_draws_says_why() -> None:
     assert "<svg" in html
 
 
+@pytest.mark.slow
 def test_nothing_that_draws_is_imported_before_a_notebook_asks() -> None:
     script = (
         "import sys, lidarspec as ls; s = ls.sensor('ldrobot-stl27l'); scans = list(s.scans(s.example('data')))\n"
@@ -141,6 +148,7 @@ def test_nothing_that_draws_is_imported_before_a_notebook_asks() -> None:
     subprocess.run([sys.executable, "-c", script], check=True)
 
 
+@pytest.mark.slow
 def test_pictures_and_tables_are_readable_on_light_and_dark_pages(browser: Any) -> None:
     scan = next(ls.sensor("ldrobot-stl27l").scans(ls.sensor("ldrobot-stl27l").example("data")))
     explained = ls.explain(ls.sensor("ldrobot-stl27l").example("data"), ls.sensor("ldrobot-stl27l"))

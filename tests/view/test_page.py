@@ -23,6 +23,8 @@ from lidarspec.transports.protocol import Chunk
 from tests.view.browser import FLAGS, installed
 from tests.view.visits import PATIENCE, Visit, served
 
+pytestmark = pytest.mark.slow
+
 #: packets a second of the planar sensor.
 RATE = 1800
 

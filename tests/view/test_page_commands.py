@@ -12,6 +12,7 @@ from lidarspec.explaining.assignments import arguments
 from lidarspec.simulation.device import SimulatedDevice
 from lidarspec.transports.outlets import simulated_outlet
 from lidarspec.transports.serving import Served
+from tests.installed import sensor_modules, sensors_in
 from tests.view.pages import FLAT, Page, Station, recorded
 
 STREAM, TEXT = "slamtec-rplidar-a1", "hokuyo-urg04lx"
@@ -35,6 +36,7 @@ def test_the_commands_of_the_spec_are_forms(tmp_path: Path) -> None:
         assert "starts the data" in named["start"]["text"]
 
 
+@pytest.mark.slow
 def test_arguments_that_are_no_numbers_say_what_they_take(tmp_path: Path) -> None:
     with Station(f"sim:{TEXT}", tmp_path) as station, station.page() as page:
         (value,) = forms(page)["set_baud"]["arguments"]
@@ -52,15 +54,21 @@ def test_the_bytes_are_seen_before_they_are_sent(tmp_path: Path) -> None:
         assert station.broadcast.device.stats.frames.get("reply", 0) == 0  # nothing was sent
 
 
-@pytest.mark.parametrize(
-    ("command", "words"), [("set_speed", {"speed": "1e6"}), ("set_speed", {}), ("set_speed", {"sped": "6"}), ("dance", {})]
-)
-@pytest.mark.parametrize("word", ["compose", "send"])
-def test_what_the_sensor_does_not_take_is_refused(tmp_path: Path, word: str, command: str, words: dict[str, str]) -> None:
+WRONG_ARGUMENTS: list[tuple[str, dict[str, str]]] = [
+    ("set_speed", {"speed": "1e6"}),
+    ("set_speed", {}),
+    ("set_speed", {"sped": "6"}),
+    ("dance", {}),
+]
+
+
+def test_what_the_sensor_does_not_take_is_refused(tmp_path: Path) -> None:
     with Station(f"sim:{SPINNING}", tmp_path) as station, station.page() as page:
-        refused = page.asked(word, command=command, arguments=words)
-        assert (refused["is"], refused["of"], refused["command"]) == ("refused", word, command)
-        assert command in refused["text"]
+        for command, words in WRONG_ARGUMENTS:
+            for word in ("compose", "send"):
+                refused = page.asked(word, command=command, arguments=words)
+                assert (refused["is"], refused["of"], refused["command"]) == ("refused", word, command)
+                assert command in refused["text"]
 
 
 def test_a_reply_is_told_in_words_while_the_picture_goes_on(tmp_path: Path) -> None:
@@ -73,6 +81,7 @@ def test_a_reply_is_told_in_words_while_the_picture_goes_on(tmp_path: Path) -> N
         assert page.scan()[0]["scan"] > first["scan"]
 
 
+@pytest.mark.slow
 def test_a_command_without_an_answer_is_sent(tmp_path: Path) -> None:
     """The rotor stops, and with it the data."""
     with Station(f"sim:{STREAM}", tmp_path) as station, station.page() as page:
@@ -83,6 +92,7 @@ def test_a_command_without_an_answer_is_sent(tmp_path: Path) -> None:
         page.scan()
 
 
+@pytest.mark.slow
 def test_a_real_device_takes_commands_only_with_control(tmp_path: Path) -> None:
     sensor = ls.sensor(ANSWERING)
     with Served(SimulatedDevice(sensor), simulated_outlet(sensor, "tcp://127.0.0.1:0"), patient=True) as served:
@@ -97,7 +107,7 @@ def test_a_real_device_takes_commands_only_with_control(tmp_path: Path) -> None:
             assert page.asked("send", command="get_version", arguments={})["is"] == "replied"
 
 
-@pytest.mark.parametrize("sensor", [FLAT, STREAM])
+@pytest.mark.parametrize("sensor", [FLAT, pytest.param(STREAM, marks=pytest.mark.slow)])
 def test_a_file_takes_no_commands(tmp_path: Path, sensor: str) -> None:
     with Station(recorded(tmp_path, sensor), tmp_path, control=True) as station, station.page() as page:
         hello = page.until("hello")
@@ -107,11 +117,16 @@ def test_a_file_takes_no_commands(tmp_path: Path, sensor: str) -> None:
             assert page.asked("send", command=name, arguments={})["is"] == "refused"
 
 
-@pytest.mark.parametrize("sensor", sorted(name for name, known in ls.sensors().items() if known.commands))
-def test_every_command_of_every_sensor_has_a_form(sensor: str) -> None:
+KEYS_OF_AN_ARGUMENT = {"name", "text", "unit", "low", "high", "choices", "default"}
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("module", sensor_modules())
+def test_every_command_of_every_sensor_has_a_form(module: str) -> None:
     from lidarspec.view.answers import form
 
-    for name in ls.sensor(sensor).commands:
-        told = form(ls.sensor(sensor), name)
-        assert told["name"] == name
-        assert all({"name", "text", "unit", "low", "high", "choices", "default"} == argument.keys() for argument in told["arguments"])
+    for sensor in sensors_in(module):
+        for name in sensor.commands:
+            described = form(sensor, name)
+            assert described["name"] == name, sensor.id
+            assert all(argument.keys() == KEYS_OF_AN_ARGUMENT for argument in described["arguments"]), sensor.id

@@ -15,6 +15,8 @@ from lidarspec.simulation.scenes import Room
 from lidarspec.testing.fixtures import virtual_port
 from tests.view.visits import Visit, served
 
+pytestmark = pytest.mark.slow
+
 #: what a PNG begins with.
 SIGNATURE = b"\x89PNG\r\n\x1a\n"
 

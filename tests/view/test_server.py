@@ -16,7 +16,7 @@ from lidarspec.scans.selection import Selection
 from tests.view.pages import DEADLINE, FLAT, SOLID, Station, answered, handshake, masked, recorded
 
 
-@pytest.mark.parametrize(("sensor", "planar"), [(FLAT, True), (SOLID, False)])
+@pytest.mark.parametrize(("sensor", "planar"), [(FLAT, True), pytest.param(SOLID, False, marks=pytest.mark.slow)])
 def test_a_page_is_told_what_it_shows(tmp_path: Path, sensor: str, planar: bool) -> None:
     with Station(f"sim:{sensor}", tmp_path) as station, station.page() as page:
         hello = page.until("hello")
@@ -30,6 +30,7 @@ def test_a_page_is_told_what_it_shows(tmp_path: Path, sensor: str, planar: bool)
         assert {"lost", "disconnects", "latency_s", "jitter_s", "loss_rate", "at"} <= state["figures"].keys()
 
 
+@pytest.mark.slow
 def test_the_figures_of_the_last_minute_are_told_to_who_comes_later(tmp_path: Path) -> None:
     with Station(f"sim:{FLAT}", tmp_path) as station, station.page() as first:
         first.state(lambda state: state["figures"])
@@ -62,6 +63,7 @@ def test_a_scan_is_sent_only_where_one_was_asked_for(tmp_path: Path) -> None:
         assert 90 < header["points"] <= 100 < header["of"]
 
 
+@pytest.mark.slow
 def test_one_scan_is_made_once_for_pages_that_ask_alike(tmp_path: Path) -> None:
     path = recorded(tmp_path)
     with Station(path, tmp_path) as station, station.page() as one, station.page() as other:
@@ -74,6 +76,7 @@ def test_one_scan_is_made_once_for_pages_that_ask_alike(tmp_path: Path) -> None:
         assert shown.message(1 << 20) is shown.message(1 << 20)
 
 
+@pytest.mark.slow
 def test_ten_pages_see_one_source(tmp_path: Path) -> None:
     with Station(f"sim:{SOLID}", tmp_path) as station, contextlib.ExitStack() as opened:
         pages = [opened.enter_context(station.page()) for _ in range(10)]
@@ -87,6 +90,7 @@ def test_ten_pages_see_one_source(tmp_path: Path) -> None:
     assert station.said[-1].endswith("0 open")
 
 
+@pytest.mark.slow
 def test_a_page_that_goes_and_one_that_comes_are_told_of(tmp_path: Path) -> None:
     with Station(f"sim:{FLAT}", tmp_path) as station:
         with station.page() as page:
@@ -96,6 +100,7 @@ def test_a_page_that_goes_and_one_that_comes_are_told_of(tmp_path: Path) -> None
             assert station.said == ["page 1 opened by 127.0.0.1; 1 open", "page 1 closed; 0 open", "page 2 opened by 127.0.0.1; 1 open"]
 
 
+@pytest.mark.slow
 def test_a_live_source_that_a_page_pauses_goes_on_for_the_others(tmp_path: Path) -> None:
     with Station(f"sim:{FLAT}", tmp_path) as station, station.page() as paused, station.page() as other:
         header, columns = paused.scan()
@@ -115,6 +120,7 @@ def test_a_live_source_that_a_page_pauses_goes_on_for_the_others(tmp_path: Path)
         assert paused.heard(lambda message: isinstance(message, tuple))[0]["scan"] >= first["scan"] + 5
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("word", ["step", "seek", "speed"])
 def test_a_live_source_cannot_be_moved_through(tmp_path: Path, word: str) -> None:
     with Station(f"sim:{FLAT}", tmp_path) as station, station.page() as page:
@@ -123,7 +129,7 @@ def test_a_live_source_cannot_be_moved_through(tmp_path: Path, word: str) -> Non
         assert f"sim:{FLAT}" in refused["text"]
 
 
-@pytest.mark.parametrize("suffix", [".lsr", ".pcap"])
+@pytest.mark.parametrize("suffix", [".lsr", pytest.param(".pcap", marks=pytest.mark.slow)])
 def test_a_file_is_paused_stepped_and_moved_through(tmp_path: Path, suffix: str) -> None:
     sensor = FLAT if suffix == ".lsr" else SOLID
     path = recorded(tmp_path, sensor, suffix=suffix)
@@ -149,6 +155,7 @@ def test_a_file_is_paused_stepped_and_moved_through(tmp_path: Path, suffix: str)
         page.scan_at(0.0)
 
 
+@pytest.mark.slow
 def test_a_file_is_played_at_its_speed_and_at_another(tmp_path: Path) -> None:
     """Two stretches, compared with each other and with the clock."""
     with Station(recorded(tmp_path, seconds=20), tmp_path) as station, station.page() as page:
@@ -169,6 +176,7 @@ def test_a_file_is_played_at_its_speed_and_at_another(tmp_path: Path) -> None:
         assert page.asked("speed", times=0)["is"] == "refused"
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("sensor", "suffix"), [(FLAT, ".bin"), (FLAT, ".lsr"), (SOLID, ".pcap")])
 def test_a_file_is_read_as_it_is_played(tmp_path: Path, sensor: str, suffix: str) -> None:
     """Figures, bytes and damaged frames are those of the scans that are shown, and not of the rest of the file."""
@@ -181,6 +189,7 @@ def test_a_file_is_read_as_it_is_played(tmp_path: Path, sensor: str, suffix: str
         assert header["position"] < 3
 
 
+@pytest.mark.slow
 def test_a_file_ends_and_is_played_again(tmp_path: Path) -> None:
     path = recorded(tmp_path, seconds=1)
     with Station(path, tmp_path) as station, station.page() as page:
@@ -192,6 +201,7 @@ def test_a_file_ends_and_is_played_again(tmp_path: Path) -> None:
         assert page.until("ended")
 
 
+@pytest.mark.slow
 def test_behind_the_end_of_a_file_is_its_end(tmp_path: Path) -> None:
     with Station(recorded(tmp_path, seconds=1), tmp_path) as station, station.page() as page:
         page.say("seek", to=100)
@@ -201,6 +211,7 @@ def test_behind_the_end_of_a_file_is_its_end(tmp_path: Path) -> None:
         assert station.failure is None
 
 
+@pytest.mark.slow
 def test_what_is_selected_of_a_file_is_not_moved_through(tmp_path: Path) -> None:
     path = recorded(tmp_path)
     with Station(path, tmp_path, select=Selection(times=(1.0, 2.0))) as station, station.page() as page:
@@ -215,30 +226,30 @@ def test_a_failing_source_is_told_of(tmp_path: Path) -> None:
     assert isinstance(station.failure, UsageError)
 
 
-@pytest.mark.parametrize(
-    "message",
-    [
-        "{",
-        "[" * 5000,
-        "17",
-        '{"do":"dance"}',
-        '{"do":["next"]}',
-        '{"do":"next"}',
-        '{"do":"next","most":-1}',
-        '{"do":"next","most":1e400}',
-        '{"do":"next","most":true}',
-        '{"do":"frame","point":{"scan":"1","index":0}}',
-        '{"do":"frame","number":null}',
-        '{"do":"compose","command":7}',
-        '{"do":"send","command":"x","arguments":{"a":1}}',
-    ],
+NONSENSE = (
+    "{",
+    "[" * 5000,
+    "17",
+    '{"do":"dance"}',
+    '{"do":["next"]}',
+    '{"do":"next"}',
+    '{"do":"next","most":-1}',
+    '{"do":"next","most":1e400}',
+    '{"do":"next","most":true}',
+    '{"do":"frame","point":{"scan":"1","index":0}}',
+    '{"do":"frame","number":null}',
+    '{"do":"compose","command":7}',
+    '{"do":"send","command":"x","arguments":{"a":1}}',
 )
-def test_nonsense_is_refused_with_a_word_and_ends_nothing(tmp_path: Path, message: str) -> None:
+
+
+def test_nonsense_is_refused_with_a_word_and_ends_nothing(tmp_path: Path) -> None:
     with Station(f"sim:{FLAT}", tmp_path) as station, station.page() as page:
-        page.socket.send(message)
-        assert page.until("refused")["text"]
-        page.socket.send(message.encode())  # as a binary message
-        assert page.until("refused")["text"]
+        for message in NONSENSE:
+            page.socket.send(message)
+            assert page.until("refused")["text"], message
+            page.socket.send(message.encode())  # as a binary message
+            assert page.until("refused")["text"], message
         assert page.scan()[1]["x"].size
 
 
@@ -279,12 +290,14 @@ def test_a_recording_is_switched_on_and_off(tmp_path: Path) -> None:
         assert sum(scan.whole for scan in again.scans()) > 1
 
 
+@pytest.mark.slow
 def test_a_file_is_not_recorded(tmp_path: Path) -> None:
     with Station(recorded(tmp_path), tmp_path) as station, station.page() as page:
         assert not page.until("hello")["records"]
         assert "file" in page.asked("record")["text"]
 
 
+@pytest.mark.slow
 def test_a_page_that_takes_nothing_is_dropped_and_a_recording_loses_nothing(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """It asks for scan after scan and reads none of them, until its window is full."""
     monkeypatch.setattr("lidarspec.view.server.STALLED", 2.0)

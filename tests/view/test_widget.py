@@ -14,8 +14,9 @@ import pytest
 
 from lidarspec.view import widget
 from tests.cli.running import ran
+from tests.libraries import needs
 
-pytest.importorskip("anywidget", reason="anywidget is not installed")
+pytestmark = [pytest.mark.slow, needs("anywidget")]
 #: what a notebook's front end is to a widget of anywidget's: a model that sends and hears, and an element to render into.
 CELL = """async (esm) => {
     const heard = new Set();

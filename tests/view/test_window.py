@@ -12,7 +12,7 @@ from pathlib import Path
 import pytest
 
 import lidarspec as ls
-from lidarspec.simulation.simulator import simulate
+from lidarspec import simulate
 
 if os.name == "posix":
     from tests.view.terminal import Terminal
@@ -43,6 +43,7 @@ def test_a_sensor_is_drawn_and_q_leaves_the_terminal_clean(tmp_path: Path) -> No
         assert terminal.is_clean()
 
 
+@pytest.mark.slow
 def test_keys_do_what_the_help_says(tmp_path: Path) -> None:
     with Terminal(*LIVE, cwd=tmp_path) as terminal:
         terminal.wait_for("6 m")
@@ -68,6 +69,7 @@ def test_keys_do_what_the_help_says(tmp_path: Path) -> None:
         assert sum(len(packets) for packets in device.packets()) > 100
 
 
+@pytest.mark.slow
 def test_a_paused_picture_stands_while_the_sensor_goes_on(tmp_path: Path) -> None:
     with Terminal("view", "sim:ldrobot-stl27l", *SENSOR, cwd=tmp_path) as terminal:
         terminal.wait_for("Hz")
@@ -84,6 +86,7 @@ def test_a_paused_picture_stands_while_the_sensor_goes_on(tmp_path: Path) -> Non
         assert terminal.ended() == 0
 
 
+@pytest.mark.slow
 def test_a_file_is_played_at_its_own_speed_and_stays_at_its_end(capture: Path) -> None:
     with Terminal("view", capture, *SENSOR) as terminal:
         terminal.wait_for("▶ playing")
@@ -95,6 +98,7 @@ def test_a_file_is_played_at_its_own_speed_and_stays_at_its_end(capture: Path) -
         assert terminal.is_clean()
 
 
+@pytest.mark.slow
 def test_the_picture_follows_the_window(tmp_path: Path) -> None:
     with Terminal(*LIVE, cwd=tmp_path) as terminal:
         terminal.wait_for("q quit")
@@ -111,7 +115,10 @@ def test_the_picture_follows_the_window(tmp_path: Path) -> None:
         assert terminal.ended() == 0
 
 
-@pytest.mark.parametrize(("end", "code"), [("\x03", 130), (signal.SIGTERM, 143), (signal.SIGHUP, 129)])
+@pytest.mark.parametrize(
+    ("end", "code"),
+    [("\x03", 130), *(pytest.param(*case, marks=pytest.mark.slow) for case in ((signal.SIGTERM, 143), (signal.SIGHUP, 129)))],
+)
 def test_whatever_ends_it_leaves_the_terminal_clean(tmp_path: Path, end: str | signal.Signals, code: int) -> None:
     with Terminal(*LIVE, cwd=tmp_path) as terminal:
         terminal.wait_for("live")
@@ -121,6 +128,7 @@ def test_whatever_ends_it_leaves_the_terminal_clean(tmp_path: Path, end: str | s
         assert "Traceback" not in terminal.raw
 
 
+@pytest.mark.slow
 def test_a_failure_is_told_on_a_clean_terminal(tmp_path: Path) -> None:
     (tmp_path / "failing.py").write_text(_FAILING, encoding="utf-8")
     (tmp_path / "raw.bin").write_bytes(b"".join(simulate(ls.sensor("ldrobot-stl27l"), 2000)))
@@ -149,6 +157,7 @@ def lidarspec_sensors():
 """
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(shutil.which("bash") is None, reason="needs a shell with job control")
 def test_it_can_be_suspended(tmp_path: Path) -> None:
     with Terminal(program=["bash", "--norc", "--noediting", "-i"], cwd=tmp_path, PS1="shell> ") as terminal:
@@ -166,6 +175,7 @@ def test_it_can_be_suspended(tmp_path: Path) -> None:
         assert terminal.modes == {"25", "7"}
 
 
+@pytest.mark.slow
 def test_without_colours_none_are_sent(capture: Path) -> None:
     with Terminal("view", capture, *SENSOR, NO_COLOR="1") as terminal:
         terminal.wait_for("playing")
