@@ -41,6 +41,7 @@ def headings(page: str) -> set[str]:
 FOLLOWED = [page for page in PAGES if any(block.language in ("sh", "python") for block in pages.blocks(page))]
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(os.name == "nt", reason="shell blocks are for bash, and some use a pseudo-terminal")
 @pytest.mark.parametrize("page", FOLLOWED)
 def test_a_page_can_be_followed_to_its_end(page: str, tmp_path: Path) -> None:
@@ -176,6 +177,7 @@ def test_what_contributing_says_to_open_is_there(module: str, name: str) -> None
     assert operator.attrgetter(name)(importlib.import_module(f"lidarspec.{module}"))
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(os.name == "nt", reason="there are no pseudo-terminals")
 def test_a_byte_goes_the_way_that_contributing_says() -> None:
     passed: set[tuple[str, str]] = set()

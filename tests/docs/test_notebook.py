@@ -11,11 +11,11 @@ from typing import Any
 import pytest
 
 from tests.docs.pages import DOCS
+from tests.libraries import Library, needs
 
-nbclient = pytest.importorskip("nbclient", reason="nbclient is not installed")
-nbformat = pytest.importorskip("nbformat", reason="nbclient is not installed")
-for needed in ("ipykernel", "matplotlib", "pandas", "pyarrow"):
-    pytest.importorskip(needed, reason=f"{needed} is not installed")
+pytestmark = [pytest.mark.slow, needs("nbclient", "nbformat", "ipykernel", "matplotlib", "pandas", "pyarrow")]
+nbclient = Library("nbclient")
+nbformat = Library("nbformat")
 PAGE = DOCS / "how-to" / "notebook.ipynb"
 
 

@@ -23,6 +23,7 @@ def made(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
+@pytest.mark.slow
 def test_the_script_makes_the_same_pictures_again(made: Path) -> None:
     assert sorted(path.name for path in made.iterdir()) == sorted(NAMES)
     for name in NAMES:

@@ -31,6 +31,7 @@ def test_explain_prints_what_the_page_shows() -> None:
     assert ran(*command.split()).stdout == text
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("verb", ["detect", "doctor", "stats"])
 def test_the_columns_are_those_of_the_page(verb: str, tmp_path: Path) -> None:
     command, text = next((command, text) for command, text in screens().items() if command.startswith(f"{verb} /dev/ttyUSB0"))
