@@ -16,7 +16,7 @@ from tests.view.pages import FLAT, SOLID, Page, Station, recorded
 #: a byte stream, datagrams, points that wait for the next packet, parts of a frame, text on the wire, messages of several datagrams.
 SENSORS = (FLAT, SOLID, "slamtec-rplidar-a1", "sick-multiscan136", "hokuyo-ust10lx", "robosense-airy", "livox-mid360", "velodyne-vlp16")
 #: points of a scan that are asked for.
-ASKED = 25
+ASKED = 8
 
 
 def agree(page: Page, header: dict[str, Any], columns: dict[str, np.ndarray], spot: int, scan: ls.Scan) -> None:

@@ -125,7 +125,7 @@ def test_markup_that_a_device_sends_stays_text(tmp_path: Path) -> None:
     markup, sensor = "<script>alert(1)<!--", ls.sensor("hokuyo-ust10lx")
     told = sensor.parse(sensor.example("parameters"), "parameters")
     told["model"]["text"] = markup.encode()
-    path = recorded(tmp_path, sensor.id, suffix=".bin").rename(tmp_path / "<img src=x>.bin")
+    path = recorded(tmp_path, sensor.id, seconds=1.0, suffix=".bin").rename(tmp_path / "<img src=x>.bin")
     path.write_bytes(sensor.build("parameters", told) + path.read_bytes())
     with Station(path, tmp_path, sensor) as station, station.page() as page:
         assert page.until("hello")["source"].endswith("<img src=x>.bin")
