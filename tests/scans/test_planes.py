@@ -40,7 +40,11 @@ def test_a_sensor_that_looks_one_way_has_one_beam() -> None:
             assert one.angle_min == one.angle_max == 0
 
 
-@pytest.mark.parametrize("name", ["ldrobot-stl27l", "hokuyo-utm30lx", "sick-tim571"])
+#: sensors that send text, and do not see the whole turn.
+TEXT = [pytest.param(name, marks=pytest.mark.slow) for name in ("hokuyo-utm30lx", "sick-tim571")]
+
+
+@pytest.mark.parametrize("name", ["ldrobot-stl27l", *TEXT])
 def test_each_beam_is_as_late_as_its_points(name: str) -> None:
     """Within three beams, and two steps of a clock that counts in ms."""
     scans = simulated(name)

@@ -228,7 +228,7 @@ def test_a_number_of_sectors_that_is_none_is_refused_by_name(number: Any) -> Non
     assert scan.to_bins(np.int32(4)).shape == (4,)
 
 
-@pytest.mark.parametrize("backend", ["numpy", "construct"])
+@pytest.mark.parametrize("backend", ["numpy", pytest.param("construct", marks=pytest.mark.slow)])
 def test_a_scan_with_gaps_is_not_complete_and_one_whose_packets_are_mostly_lost_not_whole(backend: str) -> None:
     sensor = ls.sensor("cspc-m1c1-mini")
     frames = simulate(sensor, 1500)
