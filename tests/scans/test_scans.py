@@ -166,11 +166,16 @@ def scans_of_pieces(name: str, frames: list[bytes], size: int) -> list[Scan]:
     return [scan for piece in pieces for scan in stream.add(piece)] + stream.finish()
 
 
+@functools.cache
+def segments() -> list[bytes]:
+    return simulate(SHAPES["shape-segments"], 100)
+
+
 @pytest.mark.parametrize("size", [1, 7, 100])
 @pytest.mark.parametrize(("lost", "whole", "complete"), [(0, True, True), (3, True, False), (10, True, False), (11, False, False)])
 def test_a_frame_of_parts_counts_once(lost: int, whole: bool, complete: bool, size: int) -> None:
     """A turn is 20 frames, with 30 parts: it is whole where at least as many frames are there as are missing."""
-    frames = [frame for place, frame in enumerate(simulate(SHAPES["shape-segments"], 100)) if not 24 <= place < 24 + lost]
+    frames = [frame for place, frame in enumerate(segments()) if not 24 <= place < 24 + lost]
     assert SHAPES["shape-segments"].decode(frames).stats.lost == lost
     scans = scans_of_pieces("shape-segments", frames, size)
     ends = (False, False)
