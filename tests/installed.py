@@ -2,9 +2,18 @@
 
 from __future__ import annotations
 
+import os
 from importlib.metadata import entry_points
 
+import pytest
+
+import lidarspec
 from lidarspec import Sensor
+from lidarspec.testing import assert_conformance
+from tests.representatives import REPRESENTATIVES
+
+#: examples of each frame type in a conformance test: few, and as many as there is time for in `make test-long`.
+CONFORMANCE_EXAMPLES = int(os.environ.get("LIDARSPEC_EXAMPLES", "4"))
 
 _GROUP = "lidarspec.sensors"
 
@@ -16,8 +25,6 @@ def sensor_modules() -> list[str]:
 
 def sensors_in(module: str) -> list[Sensor]:
     """Load the sensors of a module, in the order of their ids."""
-    import lidarspec
-
     names = [entry.name for entry in entry_points(group=_GROUP) if entry.module == module]
     sensors = {sensor.id: sensor for sensor in map(lidarspec.sensor, names)}
     return [sensors[sensor_id] for sensor_id in sorted(sensors)]
@@ -29,3 +36,41 @@ def distinct_sensors_in(module: str) -> list[Sensor]:
     for sensor in sensors_in(module):
         distinct.setdefault(tuple(map(id, sensor.frames.values())), sensor)
     return list(distinct.values())
+
+
+def conformance_cases(distribution: str) -> list[object]:
+    """Return the parameters of a distribution's conformance test: one id of each sensor.
+
+    Only representatives are tested in the quick tier.
+    """
+    return [pytest.param(name, marks=() if name in REPRESENTATIVES else pytest.mark.slow) for name in _sensor_ids(distribution)]
+
+
+def assert_installed_conformance(distribution: str, sensor_id: str) -> None:
+    """Fail with every finding of `lidarspec check` for an installed sensor.
+
+    Frames and functions that it shares with a sensor before it in its distribution are tested there.
+    """
+    ids = _sensor_ids(distribution)
+    before = [lidarspec.sensor(name) for name in ids[: ids.index(sensor_id)]]
+    assert_conformance(sensor_id, examples=CONFORMANCE_EXAMPLES, tested=before)
+
+
+def _sensor_ids(distribution: str) -> list[str]:
+    """Return a name of each sensor of a distribution, representatives first."""
+    names: dict[str, list[str]] = {}
+    for entry in entry_points(group=_GROUP):
+        if entry.dist is not None and entry.dist.name == distribution:
+            names.setdefault(entry.value, []).append(entry.name)
+    vendor = distribution.removeprefix("lidarspec-")
+    return sorted((_full_name(vendor, entries) for entries in names.values()), key=_rank)
+
+
+def _full_name(vendor: str, names: list[str]) -> str:
+    """Return the name of a sensor that is its id, or else an alias that begins with the vendor."""
+    full = [name for name in names if name.startswith(f"{vendor}-")]
+    return min(full or names, key=_rank)
+
+
+def _rank(name: str) -> tuple[bool, str]:
+    return name not in REPRESENTATIVES, name

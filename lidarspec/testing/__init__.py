@@ -8,7 +8,7 @@
 In: a sensor. Out: passed tests, or findings with place, reason and what to write. Modules in reading order:
 
 * `properties`: the table of properties that every sensor must have.
-* `conformance`: the same properties as a class of tests for pytest.
+* `conformance`: everything that `check` checks, as one test for pytest.
 * `findings`: the rules, and how a property says that it does not hold.
 * `subject`: a sensor under test, and what it is fed.
 * `declared`: what shows in the declaration alone.
@@ -30,9 +30,9 @@ from typing import TYPE_CHECKING, Any
 from lidarspec.libraries import import_library
 
 if TYPE_CHECKING:
-    from lidarspec.testing.conformance import SensorConformance
+    from lidarspec.testing.conformance import SensorConformance, assert_conformance
 
-__all__ = ["SensorConformance"]
+__all__ = ["SensorConformance", "assert_conformance"]
 
 
 def __getattr__(name: str) -> Any:
@@ -42,6 +42,6 @@ def __getattr__(name: str) -> Any:
     pytest = import_library("pytest", "testing")
     if "lidarspec.testing.agreement" not in sys.modules:  # pytest warns of one that is
         pytest.register_assert_rewrite("lidarspec.testing.agreement")
-    from lidarspec.testing.conformance import SensorConformance
+    from lidarspec.testing import conformance
 
-    return SensorConformance
+    return getattr(conformance, name)

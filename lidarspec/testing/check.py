@@ -15,7 +15,7 @@ import importlib.util
 import inspect
 import re
 import traceback
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
@@ -434,14 +434,23 @@ class Report:
 
 
 def reports(
-    target: Target, name: str, *, examples: int = EXAMPLES, vectors: Path | None = None, watch: Callable[[str], None] | None = None
+    target: Target,
+    name: str,
+    *,
+    examples: int = EXAMPLES,
+    strategies: Mapping[str, Any] | None = None,
+    vectors: Path | None = None,
+    tested: Sequence[Sensor] = (),
+    watch: Callable[[str], None] | None = None,
 ) -> Iterator[Report]:
     """A report of the text and the loading of a target, where there is something to say, and one of each of its sensors.
 
     Args:
         name: what was asked for.
         examples: of each frame type, for each property.
+        strategies: "frame.field" -> how its raw value is drawn, for fields of which no valid value can be derived.
         vectors: golden vectors; by default those that the target has.
+        tested: related models that are tested too: what they share with a sensor is not tested again.
         watch: is told what is looked at.
     """
     trees = {str(file): ast.parse(file.read_text(encoding="utf-8"), str(file)) for file in target.files}
@@ -452,7 +461,8 @@ def reports(
     if mistakes and not single:
         yield Report(name, mistakes)
     for sensor in target.sensors:
-        subject = Subject(sensor, examples, vectors=vectors or target.vectors, family=() if vectors and single else target.family)
+        family = () if vectors and single else target.family
+        subject = Subject(sensor, examples, strategies or {}, vectors or target.vectors, family, tested)
         yield _report(subject, places, mistakes if single else [], watch or (lambda text: None))
 
 
@@ -487,7 +497,7 @@ def _report(subject: Subject, places: Places, mistakes: list[Finding], watch: Ca
             report.skipped[ELSE] = "nothing can be tried before what is found is mended"
             break
     distinct = list({(finding.code, finding.path): finding for finding in reversed(report.findings)}.values())[::-1]
-    left = left_over(distinct, sensor, whole=ELSE not in report.skipped)
+    left = left_over(distinct, sensor, whole=ELSE not in report.skipped and not subject.tested)
     report.findings = [places.placed(finding, sensor) for finding in left]
     report.measured = subject.measured
     report.picture = subject.picture and {**dict(sorted(subject.picture.items())), **dict(_beside(subject))}

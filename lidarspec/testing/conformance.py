@@ -1,78 +1,81 @@
-"""`SensorConformance`: the table of properties as a class of tests for pytest.
+"""Conformance of a sensor as a test for pytest: everything that `lidarspec check` checks.
 
-Derive a class from it, name the sensor, and let pytest collect it.
+Derive a class from `SensorConformance` and name the sensor, or call `assert_conformance` in a test of
+your own. Either way it is one test, and its failure lists all findings.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, ClassVar
 
 import pytest
 
-from lidarspec.plugins import sensor as named_sensor
 from lidarspec.spec.sensor import Sensor
-from lidarspec.testing.declared import declared
-from lidarspec.testing.findings import left_over
-from lidarspec.testing.properties import PROPERTIES, Property
-from lidarspec.testing.subject import EXAMPLES, Subject
+from lidarspec.testing.check import Report, Target, reports, target
+from lidarspec.testing.subject import EXAMPLES
 
-_SUBJECTS: dict[type, Subject] = {}
+
+def assert_conformance(
+    sensor: str | Path | Sensor,
+    *,
+    examples: int = EXAMPLES,
+    strategies: Mapping[str, Any] | None = None,
+    vectors: str | Path | None = None,
+    tested: Sequence[Sensor] = (),
+) -> list[Report]:
+    """Fail with every finding of `lidarspec check`; return its reports.
+
+    Args:
+        sensor: an id, a `Sensor`, or a file that describes one.
+        examples: how many examples of each frame type a property tries.
+        strategies: "frame.field" -> a hypothesis strategy of its raw value, or a function of
+            `random.Random`, for fields of which no valid value can be derived.
+        vectors: a file of golden vectors; by default those that `check` finds.
+        tested: related models that are tested too: frames and functions that they share with the
+            sensor are not tested again.
+    """
+    __tracebackhide__ = True
+    found = Target([sensor]) if isinstance(sensor, Sensor) else target(sensor)
+    made = list(
+        reports(
+            found,
+            str(sensor),
+            examples=examples,
+            strategies=strategies,
+            vectors=Path(vectors) if vectors else None,
+            tested=tested,
+        )
+    )
+    findings = [finding for report in made for finding in report.findings]
+    if findings:
+        pytest.fail("\n\n".join(map(str, findings)), pytrace=False)
+    return made
 
 
 class SensorConformance:
-    """What holds for every sensor: a test for each property in `lidarspec.testing.properties`.
+    """Base class of a test that a sensor conforms.
 
     Attributes:
         sensor: an id, a `Sensor`, or a file that describes one.
-        examples: how many examples of each frame type a property tries; LIDARSPEC_EXAMPLES says it for all classes.
-        strategies: "frame.field" -> a hypothesis strategy of its raw value, or a function of `random.Random`, for what cannot be derived.
-        vectors: a file of golden vectors, beside the test's own file where it is no absolute path.
-        elsewhere: frame types that the class of a relative tries, which has the same ones.
+        examples: how many examples of each frame type a property tries; the default is 40, or
+            LIDARSPEC_EXAMPLES.
+        strategies: "frame.field" -> a hypothesis strategy of its raw value, or a function of
+            `random.Random`, for fields of which no valid value can be derived.
+        vectors: a file of golden vectors, relative to the file of the test; by default those that
+            `lidarspec check` finds.
     """
 
     sensor: ClassVar[str | Path | Sensor] = ""
     examples: ClassVar[int] = EXAMPLES
     strategies: ClassVar[Mapping[str, Any]] = {}
     vectors: ClassVar[str | Path | None] = None
-    elsewhere: ClassVar[Collection[str]] = ()
 
-    @pytest.fixture
-    def subject(self, request: pytest.FixtureRequest) -> Subject:
-        """The sensor under test, with its examples; one for all tests of the class."""
-        kind = type(self)
-        if kind not in _SUBJECTS:
-            sensor = self.sensor if isinstance(self.sensor, Sensor) else named_sensor(self.sensor)
-            vectors = Path(request.path).parent / self.vectors if self.vectors else None
-            _SUBJECTS[kind] = Subject(sensor, self.examples, self.strategies, vectors, elsewhere=self.elsewhere)
-        return _SUBJECTS[kind]
-
-    def test_the_declaration_is_sound(self, subject: Subject) -> None:
-        """Units, sources, lengths, sync patterns, coverage and plausibility, as `lidarspec check` reads them off."""
-        _hold(left_over(declared(subject), subject.sensor, whole=False))
-
-
-def _test(one: Property) -> Callable[..., None]:
-    def test(self: SensorConformance, subject: Subject, record_property: Callable[[str, object], None]) -> None:
-        reason = one.lacks(subject)
-        if reason:
-            pytest.skip(reason)
-        found = one.findings(subject)
-        for name, value in (subject.measured | subject.picture).items():
-            record_property(name, value)
-        _hold(left_over(found, subject.sensor, whole=False))
-
-    test.__name__, test.__doc__ = f"test_{one.name}", one.function.__doc__
-    return test
-
-
-def _hold(findings: list[Any]) -> None:
-    """Fail with every finding in words."""
-    __tracebackhide__ = True
-    if findings:
-        pytest.fail("\n".join(map(str, findings)), pytrace=False)
-
-
-for _one in PROPERTIES:
-    setattr(SensorConformance, f"test_{_one.name}", _test(_one))
+    def test_conformance(self, request: pytest.FixtureRequest, record_property: Callable[[str, object], None]) -> None:
+        """The sensor conforms: its declaration is sound, and every property holds."""
+        __tracebackhide__ = True
+        vectors = request.path.parent / self.vectors if self.vectors else None
+        for report in assert_conformance(self.sensor, examples=self.examples, strategies=self.strategies, vectors=vectors):
+            for name, value in (report.measured | report.picture).items():
+                record_property(name, value)

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import os
 import random
-from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -126,7 +126,7 @@ class Subject:
         strategies: "frame.field" -> how its raw value is drawn: a hypothesis strategy, or a function of `random.Random`.
         vectors: the file of golden vectors, None where there is none.
         family: the ids of the sensors that share that file; none where it is this sensor's alone.
-        elsewhere: frame types that are tried with a relative which has them too, and are not tried one by one again.
+        tested: related models that are tested too; frame types that they share are not tested one by one again.
         measured: what was measured of frames, in words, by what it is of.
         picture: what was measured of points, likewise: to be held against the manual.
     """
@@ -136,7 +136,7 @@ class Subject:
     strategies: Mapping[str, Any] = field(default_factory=dict)
     vectors: Path | None = None
     family: tuple[str, ...] = ()
-    elsewhere: Collection[str] = ()
+    tested: Sequence[Sensor] = ()
     measured: dict[str, str] = field(default_factory=dict)
     picture: dict[str, str] = field(default_factory=dict)
     _known: dict[tuple[str, int], bytes] = field(default_factory=dict, repr=False)
@@ -144,8 +144,9 @@ class Subject:
 
     @property
     def frames(self) -> dict[str, Frame]:
-        """The frame types that are tried one by one."""
-        return {name: frame for name, frame in self.sensor.frames.items() if name not in self.elsewhere}
+        """The frame types that are tested one by one."""
+        tested = {id(frame) for sensor in self.tested for frame in sensor.frames.values()}
+        return {name: frame for name, frame in self.sensor.frames.items() if id(frame) not in tested}
 
     def fields(self, frame: str) -> Mapping[str, FieldInfo]:
         """The fields of a frame type, by path."""

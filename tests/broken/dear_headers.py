@@ -1,4 +1,4 @@
-"""A layout that Python makes of a number with some billion values: each false header is a new one."""
+"""A count that Python computes from a number with some billion values: it is computed for each false header."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from tests.broken import sound
 
 
 def digits(this):
-    return sum(map(int, f"{this.serial:010000}")) % 3
+    return sum(int(digit) for digit in f"{this.serial:010000}") % 3
 
 
 @hookimpl

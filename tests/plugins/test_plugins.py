@@ -206,6 +206,7 @@ class TestStranger(SensorConformance):
     """The stranger's sensor straight from its file."""
 
     sensor = STRANGER
+    examples = 4
 
 
 def test_the_stranger_uses_state_look_ahead_and_its_calibration_file(tmp_path: Path) -> None:

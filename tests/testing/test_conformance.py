@@ -1,49 +1,41 @@
-"""The test kit over every sensor there is: those installed, and the invented shapes."""
+"""The test kit over the invented shapes, and the frames that only construct can read."""
 
 from __future__ import annotations
 
-import os
+import pytest
 
-from lidarspec import Sensor
+import lidarspec as ls
 from lidarspec.framing.frame_engine import InterpretedCodec, codec
-from lidarspec.testing import SensorConformance, agreement, hostile
-from lidarspec.testing.check import target
-from lidarspec.testing.properties import PROPERTIES
-from tests.all_sensors import DISTINCT, EVERY, FRAMES
+from lidarspec.testing import assert_conformance
+from tests.installed import CONFORMANCE_EXAMPLES
 from tests.shapes import SHAPES
 
-#: a third of what the kit takes where nothing is said: `make test-long` tries as many as one has time for.
-EXAMPLES = int(os.environ.get("LIDARSPEC_EXAMPLES", "12"))
-#: frames that construct alone can read.
-REFUSED = {"shape-text data"} | {
-    f"{name} {told}" for name in EVERY if name.startswith("hokuyo-") for told in ("version", "parameters", "state")
-}
-#: what is left out for a relative: what holds for the frames is tried on one sensor of those that share them.
-OF_FRAMES = {f"test_{one.name}": None for one in PROPERTIES if one.each == "frame" or one.function.__module__ == hostile.__name__}
-#: and what is left out besides where the same functions read them.
-OF_READING = {f"test_{one.name}": None for one in PROPERTIES if one.function.__module__ == agreement.__name__}
-READING = ("data_frame", "points", "clock", "sequence", "scan", "state")
+#: frames that only construct can read: they lack a fast path, see `lidarspec show`.
+INTERPRETED = {"shape-text data"}
+INTERPRETED_OF_HOKUYO = ("version", "parameters", "state")
 
 
-def _shared(sensor: Sensor) -> dict[str, None]:
-    """The tests that a relative has in common with the sensor that is tried for those of its frames."""
-    if sensor.id in DISTINCT:
-        return {}
-    tried = next(other for other in DISTINCT.values() if list(other.frames.values()) == list(sensor.frames.values()))
-    return OF_FRAMES | (OF_READING if all(getattr(sensor, name) == getattr(tried, name) for name in READING) else {})
+@pytest.mark.parametrize("name", SHAPES)
+def test_shape_conforms(name: str) -> None:
+    assert_conformance(SHAPES[name], examples=CONFORMANCE_EXAMPLES)
 
 
-def _tests(sensor: Sensor) -> type[SensorConformance]:
-    """The test class of one sensor."""
-    vectors = None if sensor.id in SHAPES else target(sensor.id).vectors
-    elsewhere = [name for name in sensor.frames if (sensor.id, name) not in FRAMES]
-    values = {"sensor": sensor, "examples": EXAMPLES, "vectors": vectors, "elsewhere": elsewhere, "__module__": __name__, **_shared(sensor)}
-    return type(f"Test_{sensor.id.replace('-', '_')}", (SensorConformance,), values)
+def _interpreted(sensors: dict[str, ls.Sensor]) -> set[str]:
+    return {
+        f"{sensor_id} {name}"
+        for sensor_id, sensor in sensors.items()
+        for name, frame in sensor.frames.items()
+        if isinstance(codec(frame), InterpretedCodec)
+    }
 
 
-globals().update({case.__name__: case for case in map(_tests, EVERY.values())})
+def test_frames_of_shapes_compile_except_those_named_here() -> None:
+    assert _interpreted(SHAPES) == INTERPRETED
 
 
-def test_every_frame_compiles_except_those_refused_by_name() -> None:
-    engines = {f"{name} {frame}": codec(value) for name, sensor in EVERY.items() for frame, value in sensor.frames.items()}
-    assert {name for name, engine in engines.items() if isinstance(engine, InterpretedCodec)} == REFUSED
+@pytest.mark.slow
+def test_frames_of_installed_sensors_compile_except_those_named_here() -> None:
+    sensors = dict(ls.sensors())
+    assert _interpreted(sensors) == {
+        f"{sensor_id} {name}" for sensor_id in sensors if sensor_id.startswith("hokuyo-") for name in INTERPRETED_OF_HOKUYO
+    }

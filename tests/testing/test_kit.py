@@ -75,9 +75,7 @@ def test_an_authors_tests_run_with_the_kits_fixtures(tmp_path: Path) -> None:
     (tmp_path / "test_mine.py").write_text(AUTHOR.format(sensor=str(STRANGER)), encoding="utf-8")
     done = run(tmp_path, "-m", "pytest", "-q", "-rs", "-p", "no:cacheprovider", "--strict-markers", ".")
     assert "which sensor? mark the test with" in done.stdout
-    assert "there is no file of golden vectors" in done.stdout
-    assert "it has no commands with a documented reply" in done.stdout
-    assert "1 error" in done.stdout, done.stdout
+    assert "5 passed, 1 error" in done.stdout, done.stdout
     assert "failed" not in done.stdout, done.stdout
 
 
