@@ -41,11 +41,6 @@ def distribution(place: Path, name: str, version: str, entries: str, kind: str =
     (folder / ("METADATA" if kind == "dist-info" else "PKG-INFO")).write_text(header, encoding="utf-8")
 
 
-@pytest.mark.parametrize("group", ["lidarspec", "console_scripts", "pytest11", "nobody.has.this"])
-def test_what_is_installed_is_what_importlib_metadata_finds(group: str) -> None:
-    assert entry_points(group) == by_metadata(group)
-
-
 @pytest.mark.parametrize("zipped", [False, True])
 def test_odd_installations_are_read_as_importlib_metadata_reads_them(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, zipped: bool) -> None:
     first, second, other = tmp_path / "first", tmp_path / "second", tmp_path / "other.zip"
@@ -350,26 +345,39 @@ def test_a_plugin_that_takes_long_is_named_while_it_does(tmp_path: Path, monkeyp
     assert told == ["slow-lidars: slow_lidars has been loading for 0.01 s; next: lidarspec plugins"]
 
 
+#: plugins that do odd things when they are loaded: code, error and remark.
 ODD = {
-    "hangs": ("import time\ntime.sleep(600)", "it hangs: not loaded after 3 s", ""),
     "ends": ("import os\nos._exit(7)", "it ends the process, with code 7", ""),
     "exits": ("import sys\nsys.exit('leaving')", "SystemExit: leaving", ""),
-    "prints": ("import sys\nprint('hello')\nprint('\\x1b[2J', file=sys.stderr)", "", r"it prints 'hello \x1b[2J'"),
-    "threads": ("import threading\nthreading.Thread(target=threading.Event().wait, name='mine').start()", "", "it leaves a thread: mine"),
+    "prints": (
+        "import sys\nprint('hello')\nprint('\\x1b[2J', file=sys.stderr)",
+        "",
+        r"it prints 'hello \x1b[2J'",
+    ),
+    "threads": (
+        "import threading\nthreading.Thread(target=threading.Event().wait, name='mine').start()",
+        "",
+        "it leaves a thread: mine",
+    ),
 }
+HANGING = {"hangs": ("import time\ntime.sleep(600)", "it hangs: not loaded after 0.5 s", "")}
 
 
-def test_each_plugin_is_tried_in_a_process_of_its_own(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    for name, (code, _, _) in ODD.items():
+@pytest.mark.slow
+@pytest.mark.parametrize(("plugins", "limit_s"), [(ODD, 600), (HANGING, 0.5)], ids=["odd", "hanging"])
+def test_each_plugin_is_tried_in_a_process_of_its_own(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, plugins: dict[str, tuple[str, str, str]], limit_s: float
+) -> None:
+    for name, (code, _, _) in plugins.items():
         (tmp_path / f"odd_{name}.py").write_text(code, encoding="utf-8")
         distribution(tmp_path, f"odd_{name}", "1", f"[lidarspec]\n{name} = odd_{name}\n")
     monkeypatch.syspath_prepend(tmp_path)
-    monkeypatch.setattr("lidarspec.plugins.LIMIT", 3)
+    monkeypatch.setattr("lidarspec.plugins.LIMIT", limit_s)
     entries = entry_points("lidarspec")
     monkeypatch.setattr("lidarspec.plugins.entry_points", lambda group: entries if group == "lidarspec" else [])
     monkeypatch.setattr(threading.Thread, "start", lambda thread: None if thread.name == "mine" else START(thread))  # not here too
     found = {plugin.distribution.removeprefix("odd_"): (plugin.error, plugin.remark) for plugin in tried()}
-    assert found == {name: (error, remark) for name, (_, error, remark) in ODD.items()}
+    assert found == {name: (error, remark) for name, (_, error, remark) in plugins.items()}
 
 
 START = threading.Thread.start

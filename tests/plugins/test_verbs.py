@@ -61,6 +61,7 @@ def test_a_verb_is_listed_without_being_loaded_and_runs(site: Path) -> None:
     assert "The points that a sensor sends" in ran(site, "read", "--help").stdout  # ours comes first
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("verb", "reason"),
     [
@@ -77,6 +78,7 @@ def test_a_verb_that_cannot_be_loaded_is_named_with_its_distribution(site: Path,
     assert ran(site, "sensors").returncode == 0
 
 
+@pytest.mark.slow
 def test_plugins_with_verbs_are_among_the_plugins(site: Path) -> None:
     found = json.loads(ran(site, "plugins", "--json").stdout)
     errors = {one["entry_point"]: one["error"] for one in found if one["distribution"] == "acme-survey"}

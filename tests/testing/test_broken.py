@@ -107,6 +107,21 @@ DECLARED = {
     "by_vectors/mirrored": {"LS709"},
 }
 EVERY = USUAL | CONSTRUCT | PLUGGY | DECLARED
+#: those of the quick tier: what keeps a plugin from being loaded, and one of each kind of property.
+QUICK = {
+    *PLUGGY,
+    "by_vectors/wrong_order",
+    "by_vectors/wrong_span",
+    "dear_headers",
+    "degrees",
+    "lambda_raises",
+    "missing_unit",
+    "no_wrap",
+    "shadowed_name",
+    "short_write",
+    "silent_command",
+    "wall_clock",
+}
 #: mistakes in a module's own text: the line that is named has these words.
 LINES = {
     "shadowed_name": "items",
@@ -130,7 +145,7 @@ def found(name: str) -> list[Finding]:
     return [finding for report in reports(target(file), str(file), examples=4) for finding in report.findings]
 
 
-@pytest.mark.parametrize("name", EVERY)
+@pytest.mark.parametrize("name", [pytest.param(name, marks=() if name in QUICK else pytest.mark.slow) for name in EVERY])
 def test_the_mistake_is_named_and_no_other(name: str) -> None:
     findings = found(name)
     assert {finding.code for finding in findings} == EVERY[name], "\n".join(map(str, findings))
@@ -140,7 +155,7 @@ def test_the_mistake_is_named_and_no_other(name: str) -> None:
         assert any(LINES[name] in Path(spot.file).read_text(encoding="utf-8").splitlines()[spot.line - 1] for spot in spots)
 
 
-@pytest.mark.parametrize("name", ["sound", "by_vectors/sound"])
+@pytest.mark.parametrize("name", ["sound", pytest.param("by_vectors/sound", marks=pytest.mark.slow)])
 def test_without_a_mistake_nothing_is_found(name: str) -> None:
     assert found(name) == []
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
+import pytest
 
 import lidarspec as ls
 from lidarspec.discovery.detect import verdict
@@ -36,6 +37,7 @@ def test_a_packet_whose_lengths_disagree_is_none() -> None:
     assert decoded(DELTA_2A, bytes(data)).stats.frames == {}
 
 
+@pytest.mark.slow
 def test_a_2g_is_told_by_where_its_packets_start_and_the_others_not_at_all() -> None:
     assert verdict(Heard("", tuple(simulate(DELTA_2G, 60)))).sensor is DELTA_2G
     found = verdict(Heard("", tuple(simulate(DELTA_2A, 60))))

@@ -355,6 +355,7 @@ def on_free_ports(sensor: ls.Sensor, said: bytes) -> ls.Sensor:
     return dataclasses.replace(sensor, links=links, commands=patient, simulation=dataclasses.replace(sensor.simulation, answers=answers))
 
 
+@pytest.mark.slow
 def test_a_unit_is_asked_for_its_angles_when_it_is_opened(tmp_path: Path) -> None:
     said = "Laser id,Elevation,Azimuth\n" + "".join(f"{i},{16.5 - i},0.25\n" for i in range(1, 33))
     unit, file = on_free_ports(XT32, said.encode()), angles(tmp_path / "own.csv", 32)
@@ -373,6 +374,7 @@ def test_a_unit_is_asked_for_its_angles_when_it_is_opened(tmp_path: Path) -> Non
             assert any("refuses connections" in said and "it is read as it stands" in said for said in device.warnings)
 
 
+@pytest.mark.slow
 def test_a_unit_that_does_not_say_its_angles_is_read_all_the_same() -> None:
     unit = on_free_ports(XT16, b"")
     refusing = {"get_calibration": [("answer", {"result": 5, "payload": b""})]}
@@ -438,6 +440,7 @@ def test_channels_have_the_further_bytes_that_the_header_says() -> None:
     np.testing.assert_array_equal(packets.points().range[:256], packets.points().range[256:])
 
 
+@pytest.mark.slow
 def test_a_bad_network_does_not_damage_what_a_unit_says_of_its_angles() -> None:
     unit = on_free_ports(XT32, TABLE_32.told())
     data = f"udp://127.0.0.1:{unit.links['data'].ports[0]}"

@@ -19,6 +19,8 @@ from lidarspec import PointCloud, Sensor
 from lidarspec.captures.pcap import CaptureReader
 from tests.evidence import capture, decoded
 
+pytestmark = pytest.mark.slow  # captures of many megabytes
+
 PUBLISHED = {"40p": "hesai-pandar40p", "xt32": "hesai-xt32", "qt64": "hesai-qt64"}
 TURN = {"40p": 2, "xt32": 3, "qt64": 2}  # which turn of the capture was published
 REACH = 0.002

@@ -197,6 +197,7 @@ def test_implausible_bytes_are_no_frames(data: bytes) -> None:
     assert (packets.stats.frames, packets.stats.bytes_skipped) == ({}, len(data))
 
 
+@pytest.mark.slow
 def test_the_clock_runs_on_over_100_wraps() -> None:
     # 9.7 s apart, so that every part of the 30 s is met: 320 frames pass 30 s 103 times.
     milliseconds = np.arange(320) * 9_700

@@ -142,6 +142,7 @@ def test_what_an_imu_feels_is_in_si(sensor: ls.Sensor) -> None:
     assert felt.imu().angular_velocity[0].tolist() == pytest.approx([first[f"gyro_{axis}"] for axis in "xyz"], nan_ok=True)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", [MID360.id, HAP.id, *FIRST])
 def test_a_model_is_not_taken_for_a_relative(name: str) -> None:
     found = verdict(Heard("a wire", tuple(ls.simulate(ls.sensor(name), 40)), datagrams=True))
@@ -150,6 +151,7 @@ def test_a_model_is_not_taken_for_a_relative(name: str) -> None:
     assert told == ({name} if name in (MID360.id, HAP.id) else set(same_pace))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", FIRST)
 def test_what_it_broadcasts_names_the_model(name: str) -> None:
     sensor = ls.sensor(name)
@@ -159,6 +161,7 @@ def test_what_it_broadcasts_names_the_model(name: str) -> None:
     assert [one.sensor.id for one in found.alike] == [name]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", [MID360.id, HAP.id, MID40.id])
 def test_a_simulated_one_is_opened_started_and_read(name: str) -> None:
     with ls.open(f"sim:{name}") as device:

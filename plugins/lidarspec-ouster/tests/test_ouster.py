@@ -78,6 +78,7 @@ def test_every_field_has_the_digest_of_the_vendor(name: str) -> None:
     assert len(names) == (5 if legacy else 9)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("backend", ("numpy", "jit") if importlib.util.find_spec("numba") else ("numpy",))
 @pytest.mark.parametrize("name", CAPTURES)
 def test_points_are_those_of_the_vendor(name: str, backend: str) -> None:
@@ -91,6 +92,7 @@ def test_points_are_those_of_the_vendor(name: str, backend: str) -> None:
     np.testing.assert_allclose(points[valid], xyz[valid], rtol=0, atol=1e-5)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", CAPTURES)
 def test_a_capture_is_read_whole(name: str) -> None:
     sensor, data = unit(name)
@@ -177,6 +179,7 @@ def test_lost_and_invalid_columns_leave_gaps() -> None:
     assert valid[sorted(set(range(512)) - missing)].all()
 
 
+@pytest.mark.slow
 def test_packets_alone_tell_their_layout() -> None:
     for name, (_, layout) in CAPTURES.items():
         found = verdicts(capture(f"ouster/{name}.pcap"))[0]
@@ -196,6 +199,7 @@ def test_what_only_has_the_length_is_not_recognised(data: bytes) -> None:
     assert recognise([data]) == {}
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("profile", PROFILES)
 def test_every_profile_is_simulated_and_read(profile: str) -> None:
     sensor = OS2.configure(rows=16, turn=512, profile=profile)
@@ -206,6 +210,7 @@ def test_every_profile_is_simulated_and_read(profile: str) -> None:
     assert cloud.valid.all()
 
 
+@pytest.mark.slow
 def test_metadata_are_learned_from_the_web_server_of_a_simulated_sensor() -> None:
     with ls.open("sim:ouster-os1") as device:
         assert not device.latest(timeout=30).points.nominal

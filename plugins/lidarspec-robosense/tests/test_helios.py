@@ -229,6 +229,7 @@ def test_a_file_is_read_with_the_first_device_information_from_its_start() -> No
     assert_same_points(scans[2].points, list(SENSOR.scans(data))[2].points)
 
 
+@pytest.mark.slow
 def test_the_capture_is_the_same_on_both_paths_and_built_again() -> None:
     data = datagrams()
     some = [*data[:12], data[DIFOP_AT], *data[730:]]
@@ -248,6 +249,7 @@ def test_packets_taken_out_are_lost_and_late_ones_come_in_their_place() -> None:
         assert_same_points(one.points, other.points)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("number", range(4))
 def test_published_point_clouds(number: int) -> None:
     """nebula's: its azimuths are cut off at 0.01 degrees, and the last block of each packet takes the step of the speed."""
@@ -274,6 +276,7 @@ def _nearest(scan: ls.PointCloud, published: Any) -> tuple[Any, Any]:
     return distance, degrees
 
 
+@pytest.mark.slow
 def test_a_packet_that_names_another_model_is_told_of(tmp_path: Path) -> None:
     """Lidar type 6 is a Helios-5515: what is read as a 16P all the same is told of."""
     path, frames = tmp_path / "other.bin", simulate(SENSOR, 100)

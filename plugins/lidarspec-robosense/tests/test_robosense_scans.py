@@ -63,6 +63,7 @@ def test_frames_are_cut_where_the_vendors_driver_cuts(name: str) -> None:
     assert [numbers(scan) for scan in scans] == wanted
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("last", [630, 1260])
 def test_frames_of_single_and_dual_return(last: int) -> None:
     packets = decoded(SENSOR, frames(2, last=last)[last - 20 : last + 10])
@@ -129,6 +130,7 @@ def test_no_point_is_left_over_from_the_scan_before() -> None:
         assert later.stamp_ns - earlier.stamp_ns == 100_000_000
 
 
+@pytest.mark.slow
 def test_packets_fed_one_by_one_give_the_same_scans() -> None:
     data = shuffled(frames(2), 4)
     decoder = SENSOR.decoder()

@@ -98,6 +98,7 @@ def test_the_date_is_taken_for_utc() -> None:
     assert packets.time_ns.tolist() == [int(moment.timestamp()) * 10**9 + 273_546_000]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "sensor", [sensor for sensor in ls.sensors().values() if sensor.vendor == "RoboSense"], ids=lambda sensor: sensor.id
 )
@@ -105,6 +106,7 @@ def test_every_model_is_told_from_the_others(sensor: ls.Sensor) -> None:
     assert verdict(Heard("", tuple(simulate(sensor, 20)), datagrams=True)).sensor is sensor
 
 
+@pytest.mark.slow
 def test_a_helios_of_16_lasers_and_one_of_32_are_told_apart_with_dual_return_too() -> None:
     """They have one type byte, and 16 lasers with two returns are as quick as 32 with one: what is there twice tells."""
     small, large = ls.sensor("robosense-helios16p"), ls.sensor("robosense-helios32")

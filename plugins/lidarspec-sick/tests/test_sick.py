@@ -28,6 +28,7 @@ def telegrams() -> list[bytes]:
     return found
 
 
+@pytest.mark.slow
 def test_every_scan_of_a_tim871s_is_read() -> None:
     data = capture("sick/20210113_tim871s_elephant.tcpstream.bin").read_bytes()
     packets = TIM871S.decode(data)
@@ -63,6 +64,7 @@ def test_a_telegram_without_strengths_beside_one_that_has_them() -> None:
     np.testing.assert_array_equal(cloud.range[271:], cloud.range[:271])
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("cola", ["A", "B"])
 @pytest.mark.parametrize(("name", "echoes"), [("sick-lms111", 2), ("sick-lms511", 3), ("sick-lms511", 5), ("sick-mrs1104", 3)])
 def test_any_number_of_echoes_is_read_with_their_strengths(name: str, echoes: int, cola: str) -> None:

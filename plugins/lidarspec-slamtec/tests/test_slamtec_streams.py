@@ -41,6 +41,7 @@ def test_a_descriptor_switches_to_its_own_frames_alone(answer: str) -> None:
 
 
 # Of 781 bytes, 1 % of damage leaves nothing whole; so HQ capsules are tried with less, too.
+@pytest.mark.slow
 @pytest.mark.parametrize(("answer", "rate"), [*((answer, 0.01) for answer in ANSWERS), ("hq", 0.001)])
 def test_a_damaged_stream_equals_the_oracle(answer: str, rate: float) -> None:
     number = {("hq", 0.001): 16, ("hq", 0.01): 6, ("ultra_dense", 0.01): 60}.get((answer, rate), 30)
@@ -65,6 +66,7 @@ def test_a_conversation_with_several_answers_equals_the_oracle() -> None:
     assert [(item.frame, item.offset, item.data) for item in A1.split(data)] == Oracle(A1, data).frames()
 
 
+@pytest.mark.slow
 def test_false_nodes_are_as_rare_as_documented() -> None:
     noise = random.Random(8).randbytes(1 << 17)
     alone = nodes_in(believing(1), noise)

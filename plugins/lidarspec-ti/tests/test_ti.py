@@ -58,6 +58,7 @@ def test_each_frame_is_a_scan_and_is_known_by_its_own() -> None:
     assert [one.sensor.id for one in verdict(Heard("a wire", (wire,), datagrams=False)).alike] == ["ti-iwr6843"]
 
 
+@pytest.mark.slow
 def test_it_sends_by_itself_on_a_serial_port() -> None:
     with ls.open("sim:iwr6843") as device:
         assert device.latest(timeout=30).points.valid.any()

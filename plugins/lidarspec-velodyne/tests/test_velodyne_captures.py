@@ -15,6 +15,8 @@ import lidarspec as ls
 from lidarspec.captures.pcap import CaptureReader
 from tests.evidence import capture, decoded
 
+pytestmark = pytest.mark.slow  # captures of many megabytes
+
 VLP16, HDL32E = ls.sensor("velodyne-vlp16"), ls.sensor("velodyne-hdl32e")
 DUAL = "velodyne/vlp16_dual/packets.derived.pcap"
 OLD = "velodyne/vlp16_old_firmware/vlp-16-test-90deg-1-50-frames.pcap"

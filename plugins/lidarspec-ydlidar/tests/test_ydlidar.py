@@ -100,6 +100,7 @@ def test_packets_of_a_tmini_pro() -> None:
     assert packets["fsa.angle"].tolist() == [one["fsa_deg"] for one in right]
 
 
+@pytest.mark.slow
 def test_a_tmini_is_told_from_other_makes_and_models_by_what_its_packets_say_of_its_state() -> None:
     tminis = {"ydlidar-tmini", "ydlidar-tmini-plus", "ydlidar-tmini-pro"}
     heard = Heard("", (capture("ydlidar/packets_checksum_ok_concat.bin").read_bytes(),))
