@@ -1,4 +1,4 @@
-"""A place of their own for the tests: no settings, kernels or variables of the user's, and at the end what was left out for want of a tool.
+"""Isolate the tests from settings, kernels and variables of the user; list at the end which tools were missing.
 
 Ctrl-C reaches the programs that tests start, also in the background of a shell, where it is ignored and that is inherited.
 """
@@ -12,7 +12,7 @@ from collections.abc import Iterator
 
 import pytest
 
-from tests.missing import told
+from tests.missing import describe_missing
 
 #: plugins whose tests need an environment of their own: `make test-ros2`.
 collect_ignore = ["plugins/lidarspec-ros2"]
@@ -25,8 +25,8 @@ CHANGING = ("LIDARSPEC_BACKEND", "LIDARSPEC_THREADS", "LIDARSPEC_DEBUG", "LIDARS
 
 
 @pytest.fixture(autouse=True, scope="session")
-def _alone(tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:
-    """A working directory in which no `lidarspec.toml` is found, in itself or above, and folders for settings and kernels."""
+def _isolated(tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:
+    """Run in a directory with no `lidarspec.toml` in it or above, with own folders for settings and kernels."""
     base = tmp_path_factory.getbasetemp()
     (base / "lidarspec.toml").touch()  # the nearest one counts, and none above it is looked at
     here = base / "here"
@@ -47,14 +47,14 @@ def _alone(tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:
 
 
 @pytest.fixture(autouse=True, scope="module")
-def _kept() -> None:
-    """What stands when a module's first test begins stays: the garbage collector need not go through it again and again."""
+def _frozen() -> None:
+    """Exempt everything that exists before a module's first test from garbage collection, which saves time."""
     gc.collect(1)
     gc.freeze()
 
 
 def pytest_terminal_summary(terminalreporter: pytest.TerminalReporter) -> None:
-    """Say which tests were left out for want of a tool or a capture, and where that is had."""
+    """Print which tests were skipped because a tool or a capture is missing, and how to get it."""
     skipped = [report for report in terminalreporter.stats.get("skipped", []) if isinstance(report.longrepr, tuple)]
-    for line in told((report.nodeid, report.longrepr[2]) for report in skipped):
+    for line in describe_missing((report.nodeid, report.longrepr[2]) for report in skipped):
         terminalreporter.write_line(line)

@@ -1,4 +1,4 @@
-"""What tests are skipped for that can be had: tools, packages, captures. The reasons of the skips are matched to where it is had."""
+"""Tools, packages and captures that skipped tests need, found by the reasons of the skips, and how to get them."""
 
 from __future__ import annotations
 
@@ -28,8 +28,8 @@ MISSING = (
 )
 
 
-def told(skipped: Iterable[tuple[str, str]]) -> list[str]:
-    """A line for each thing that is missing: how many tests were skipped for it, in which files, and how to get it.
+def describe_missing(skipped: Iterable[tuple[str, str]]) -> list[str]:
+    """Return a line for each missing thing: how many tests were skipped, in which files, and how to get it.
 
     Args:
         skipped: (node id, reason) of each test that was skipped.

@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-from tests.missing import told
+from tests.missing import describe_missing
 
 HESAI = "plugins/lidarspec-hesai/tests/test_hesai.py"
 
 
-def test_what_is_missing_is_told_once_with_its_files_and_its_remedy() -> None:
+def test_each_missing_tool_is_named_once_with_its_files_and_its_remedy() -> None:
     skipped = [
         ("tests/exports/test_opens.py::test_a", "Skipped: tshark is not installed"),
         ("tests/exports/test_wireshark.py::test_b[x]", "Skipped: tshark is not installed"),
@@ -15,7 +15,7 @@ def test_what_is_missing_is_told_once_with_its_files_and_its_remedy() -> None:
         (f"{HESAI}::test_c", "Skipped: a.pcap is not here: set LIDARSPEC_CAPTURES to the folder of captures"),
         ("tests/testing/test_conformance.py::Test_x::test_vectors_hold", "Skipped: there is no file of golden vectors"),
     ]
-    tools, captures = told(skipped)
+    tools, captures = describe_missing(skipped)
     files = "exports/test_opens.py, exports/test_wireshark.py"
     assert tools == f"not run without tshark: 3 tests ({files}); to have them: apt-get install tshark"
     start = f"not run without captures and vectors: 1 tests ({HESAI}); to have them: LIDARSPEC_CAPTURES="
