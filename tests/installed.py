@@ -31,10 +31,10 @@ def sensors_in(module: str) -> list[Sensor]:
 
 
 def distinct_sensors_in(module: str) -> list[Sensor]:
-    """Load the sensors of a module; of models that share all frames only the first."""
+    """Load the sensors of a module; of models that share all frames only the last."""
     distinct: dict[tuple[int, ...], Sensor] = {}
     for sensor in sensors_in(module):
-        distinct.setdefault(tuple(map(id, sensor.frames.values())), sensor)
+        distinct[tuple(map(id, sensor.frames.values()))] = sensor
     return list(distinct.values())
 
 

@@ -21,7 +21,7 @@ from lidarspec.exports import Refused, beginning, export
 from lidarspec.framing.frame_engine import codec
 from lidarspec.testing import subject as material
 from lidarspec.wire.schema import Schema
-from tests.exports.trees import SHAPED, distinct_sensors, recoded, values
+from tests.exports.trees import SHAPED, distinct_sensors, installed_sensors, recoded, values
 
 GCC = shutil.which("gcc")
 needs_gcc = pytest.mark.skipif(GCC is None, reason="gcc is not installed")
@@ -106,9 +106,9 @@ def test_installed_sensors_that_c_cannot_say_are_refused_with_the_reason() -> No
     for name, reason in REFUSED_INSTALLED.items():
         with pytest.raises(Refused, match=reason):
             export(lidarspec.sensor(name), "c")
-    for name, reason in recoded(distinct_sensors().values()).items():
+    for name, reason in recoded(installed_sensors().values()).items():
         with pytest.raises(Refused, match=reason):
-            export(distinct_sensors()[name], "c")
+            export(installed_sensors()[name], "c")
 
 
 @pytest.mark.slow

@@ -24,7 +24,7 @@ from lidarspec.wire.schema import schema
 from tests.broken import sound
 from tests.cli.running import ran
 from tests.exports.json_decoder import Decoder
-from tests.exports.trees import distinct_sensors, is_recoded, number
+from tests.exports.trees import installed_sensors, is_recoded, number
 from tests.shapes import SHAPES
 
 SHAPED = [name for name, sensor in SHAPES.items() if sensor.frames]
@@ -37,7 +37,7 @@ NAMED = {"links", "frames", "commands", "values", "args", "matches", "lines", "l
 
 def installed() -> list[Sensor]:
     """Load the installed sensors that other languages can read, one for each set of frames."""
-    return [sensor for sensor in distinct_sensors().values() if sensor.id not in SHAPES and not is_recoded(sensor)]
+    return [sensor for sensor in installed_sensors().values() if not is_recoded(sensor)]
 
 
 @pytest.mark.parametrize("name", SPOKEN)
@@ -139,7 +139,7 @@ def test_pages_have_every_frame_command_and_field(name: str) -> None:
 
 @pytest.mark.slow
 def test_pages_of_installed_sensors_have_every_frame_command_and_field() -> None:
-    for sensor in distinct_sensors().values():
+    for sensor in installed_sensors().values():
         assert_page_is_complete(sensor)
 
 

@@ -18,7 +18,7 @@ from lidarspec.testing import subject as material
 from lidarspec.testing.subject import Subject
 from tests import made_captures as made
 from tests.exports.sharks import captured, columns, dissector, judged, tshark, written
-from tests.exports.trees import SHAPED, distinct_sensors, is_recoded, recoded, values
+from tests.exports.trees import SHAPED, installed_sensors, is_recoded, recoded, values
 from tests.installed import distinct_sensors_in, sensor_modules
 
 #: the shapes that Wireshark cannot be told, with the reason.
@@ -62,9 +62,9 @@ def test_what_only_python_can_decide_is_refused_with_the_reason() -> None:
 
 @pytest.mark.slow
 def test_installed_sensors_that_wireshark_cannot_be_told_are_refused_with_the_reason() -> None:
-    for name, reason in recoded(distinct_sensors().values()).items():
+    for name, reason in recoded(installed_sensors().values()).items():
         with pytest.raises(Refused, match=reason):
-            export(distinct_sensors()[name], "wireshark")
+            export(installed_sensors()[name], "wireshark")
 
 
 @judged

@@ -20,10 +20,14 @@ RECODED = "no other language recodes"
 
 
 @functools.cache
+def installed_sensors() -> dict[str, Sensor]:
+    """Load one installed sensor for each set of frames, by id."""
+    return {sensor.id: sensor for module in sensor_modules() for sensor in distinct_sensors_in(module)}
+
+
 def distinct_sensors() -> dict[str, Sensor]:
     """Load one sensor for each set of frames, shapes and installed ones, by id."""
-    installed = [sensor for module in sensor_modules() for sensor in distinct_sensors_in(module)]
-    return {**SHAPED, **{sensor.id: sensor for sensor in installed}}
+    return {**SHAPED, **installed_sensors()}
 
 
 def is_recoded(sensor: Sensor) -> bool:
