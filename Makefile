@@ -107,7 +107,7 @@ reference: $(USERS)
 	@$(BIN)/python docs/reference_pages.py
 	@$(BIN)/python docs/command_pages.py
 
-# The libraries to compare with bring old versions of others along, so they have an environment of their own.
+# The libraries to compare with have an environment of their own, and some of them another one within it.
 bench:
 	@$(MAKE) --no-print-directory VENV=$(VENV)-bench bench-here
 
@@ -154,9 +154,9 @@ $(WRITERS): $(USERS)
 	@$(INSTALL) '$(CORE)[docs]'
 	@touch $@
 
-$(PEERS): $(USERS)
-	@echo "installing what lidarspec is measured beside into $(VENV), this once"
-	@$(PIP) install --quiet --editable '.[bench]' || echo "not all of it can be installed here; the table says what is missing" >&2
+$(PEERS): $(USERS) benchmarks/environments.py
+	@echo "installing the libraries that lidarspec is compared with into $(VENV), once"
+	@$(BIN)/python benchmarks/environments.py
 	@touch $@
 
 $(ROBOTS): $(USERS) $(ROS2)/pyproject.toml

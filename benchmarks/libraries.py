@@ -1,9 +1,11 @@
-"""What a user would install instead: the libraries for one format each. One that is not installed is said to be missing."""
+"""The libraries for one format each that a user would install instead.
+
+Nothing of lidarspec is imported here: a worker in another environment (`remote`) runs these too.
+"""
 
 from __future__ import annotations
 
 import importlib
-import importlib.metadata
 import json
 import warnings
 from collections.abc import Sequence
@@ -13,35 +15,23 @@ from typing import Any
 import numpy as np
 from measure import Contender
 
-#: the distributions.
-LIBRARIES = ("dpkt", "velodyne-decoder", "ouster-sdk", "lds2d", "rplidar", "pyarrow")
-
 
 class Missing(Exception):
-    """A library that is not installed."""
+    """A library that is not installed, or that cannot be imported."""
 
 
 def library(module: str) -> Any:
-    """The module of a library.
+    """Import a module of a library.
 
     Raises:
-        Missing: where it is not installed.
+        Missing: if it cannot be imported.
     """
     try:
         return importlib.import_module(module)
+    except ModuleNotFoundError as error:
+        raise Missing("not installed") from error
     except ImportError as error:
-        raise Missing(module) from error
-
-
-def versions() -> dict[str, str]:
-    """The version of each library, or "not installed"."""
-    found = {}
-    for name in ("construct", "numpy", *LIBRARIES):
-        try:
-            found[name] = importlib.metadata.version(name)
-        except importlib.metadata.PackageNotFoundError:
-            found[name] = "not installed"
-    return found
+        raise Missing(f"cannot be imported: {error}") from error
 
 
 #: models of velodyne-decoder: its name of the model, packets a second.

@@ -8,7 +8,7 @@ import time
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from statistics import median
-from typing import Any
+from typing import Any, Protocol
 
 import numpy as np
 
@@ -16,7 +16,19 @@ import numpy as np
 COPIED = 1 << 26
 
 
-@dataclass(frozen=True)
+Clock = Callable[[], float]
+
+
+class Timed(Protocol):
+    """A contender, in this process or in another one."""
+
+    amount: int
+
+    def seconds(self, repeats: int, clock: Clock) -> float:
+        """Return the mean seconds of one of several runs in a row."""
+
+
+@dataclass
 class Contender:
     """Something that does a work, or a part of it.
 
@@ -30,15 +42,24 @@ class Contender:
     amount: int
     after: Callable[[], None] | None = None
 
+    def seconds(self, repeats: int, clock: Clock) -> float:
+        """Return the mean seconds of one of several runs in a row."""
+        start = clock()
+        for _ in range(repeats):
+            self.run()
+        elapsed = max(clock() - start, LEAST_STEP)
+        if self.after:
+            self.after()
+        return elapsed / repeats
+
 
 Rates = dict[str, list[float]]
-Clock = Callable[[], float]
 
 #: seconds; no clock steps by less.
 LEAST_STEP = 1e-6
 
 
-def raced(contenders: Mapping[str, Contender], runs: int, least: float, clock: Clock = time.perf_counter) -> Rates:
+def raced(contenders: Mapping[str, Timed], runs: int, least: float, clock: Clock = time.perf_counter) -> Rates:
     """Seconds for each of the amount, by contender, one figure for each run.
 
     Args:
@@ -48,24 +69,13 @@ def raced(contenders: Mapping[str, Contender], runs: int, least: float, clock: C
     found: Rates = {name: [] for name in contenders}
     for _ in range(runs):
         for name, contender in contenders.items():
-            found[name].append(_seconds(contender, repeats[name], clock) / contender.amount)
+            found[name].append(contender.seconds(repeats[name], clock) / contender.amount)
     return found
 
 
-def _repeats(contender: Contender, least: float, clock: Clock) -> int:
-    contender.run()
-    return max(1, math.ceil(least / _seconds(contender, 1, clock)))
-
-
-def _seconds(contender: Contender, repeats: int, clock: Clock) -> float:
-    """The mean time of one of several runs in a row."""
-    start = clock()
-    for _ in range(repeats):
-        contender.run()
-    took = max(clock() - start, LEAST_STEP)
-    if contender.after:
-        contender.after()
-    return took / repeats
+def _repeats(contender: Timed, least: float, clock: Clock) -> int:
+    contender.seconds(1, clock)
+    return max(1, math.ceil(least / contender.seconds(1, clock)))
 
 
 def cpu_seconds() -> float:

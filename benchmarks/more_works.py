@@ -15,7 +15,7 @@ import libraries
 from inputs import Inputs
 from measure import Contender, Rates, times
 from peers import STRUCTS
-from works import FEW, Facts, Others, Work, beside_construct, columns, points_of
+from works import FEW, Facts, Others, Work, beside_construct, beside_ouster_sdk, columns, points_of
 
 import lidarspec as ls
 from lidarspec.captures.bulk import CaptureBatches
@@ -78,7 +78,7 @@ def payloads(inputs: Inputs) -> Work:
     path, packets = inputs.capture("m1"), len(inputs.frames("m1"))
     others: Others = {
         "dpkt": lambda: libraries.dpkt_payloads(path, packets),
-        "ouster-sdk": lambda: libraries.ouster_payloads(path, packets),
+        "ouster-sdk": lambda: beside_ouster_sdk(libraries.ouster_payloads, path, packets),
         "our own objects": lambda: Contender(lambda: one_by_one_of(path), packets),
         "by hand": lambda: Contender(lambda: by_hand.payloads(path).size, packets),
     }

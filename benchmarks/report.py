@@ -52,7 +52,7 @@ def _cells(row: Mapping[str, Any]) -> list[str]:
 
 def _more(row: Mapping[str, Any]) -> list[str]:
     others = [f"{name} {_figure(ratio)}" for name, ratio in row["times"].items() if name not in COLUMNS and name not in INNER]
-    missing = [f"{name} not installed" for name in row["not_installed"]]
+    missing = [f"{name}: {reason}" for name, reason in row["not_installed"].items()]
     return [*others, *missing, *(f"{_figure(value)} {name}" for name, value in row["facts"].items())]
 
 

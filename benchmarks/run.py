@@ -15,12 +15,14 @@ from pathlib import Path
 from statistics import median
 from typing import Any
 
+from environments import NOT_INSTALLED, find_version, read_failures
 from formats import CONVERSIONS
 from inputs import Inputs
-from libraries import Missing, versions
+from libraries import Missing
 from live_works import ON_LINES
 from measure import Clock, Contender, Rates, cpu_seconds, memcpy, raced, times
 from more_works import ELSEWHERE
+from remote import RemoteContender
 from report import shown
 from works import ON_BYTES, Work
 
@@ -28,6 +30,8 @@ import lidarspec as ls
 from lidarspec.framing.decoder import BACKENDS
 
 WORKS = {**ON_BYTES, **ELSEWHERE, **ON_LINES, **CONVERSIONS}
+#: distributions whose versions are shown.
+LIBRARIES = ("construct", "numpy", "numba", "pyarrow", "dpkt", "velodyne-decoder", "ouster-sdk", "lds2d", "rplidar")
 LEAST_RUNS = 5
 RUNS = 7
 LEAST_SECONDS = 0.05  # of a run
@@ -52,11 +56,14 @@ def working() -> list[str]:
 def rows(name: str, work: Work, backends: list[str], copy: Contender, *, runs: int, least: float, clock: Clock) -> Iterator[dict[str, Any]]:
     """The lines of a work, one for each back end, all measured in turn."""
     chosen = backends if work.has_backends else [""]
-    others, missing = work.present()
+    others, missing = work.prepare_others()
     runs, least = (1, 0.0) if work.after else (runs, least)
     ours = {backend: {"ours": Contender(work.ours(backend), work.amount, work.after), **work.own(backend)} for backend in chosen}
     by_backend = {f"{own} {backend}": contender for backend, owns in ours.items() for own, contender in owns.items()}
     rates = raced({"memcpy": copy, **by_backend, **others}, runs, least, clock)
+    for other in others.values():
+        if isinstance(other, RemoteContender):
+            other.close()
     for backend in chosen:
         mine: Rates = {**rates, **{own: rates[f"{own} {backend}"] for own in ours[backend]}}
         yield {
@@ -86,6 +93,13 @@ def figures(work: Work, rates: Rates, others: list[str], backend: str) -> dict[s
     }
 
 
+def versions() -> dict[str, str]:
+    """Return the version of each library, or that it is not installed, and why."""
+    found = {name: find_version(name) for name in LIBRARIES}
+    extras = {name: f"{NOT_INSTALLED} ({reason})" for name, reason in read_failures().items()}
+    return {**extras, **found}
+
+
 def record(found: list[dict[str, Any]], *, quick: bool, cpu: bool) -> dict[str, Any]:
     """What `--json` writes."""
     machine = {"python": platform.python_version(), "machine": platform.machine(), "system": platform.system(), "cores": os.cpu_count()}
@@ -95,7 +109,13 @@ def record(found: list[dict[str, Any]], *, quick: bool, cpu: bool) -> dict[str, 
 def arguments() -> argparse.Namespace:
     """The command line."""
     parser = argparse.ArgumentParser(prog="make bench", description=__doc__)
-    parser.add_argument("--only", metavar="NAME", action="append", help=f"works whose names begin so: {', '.join(WORKS)}")
+    names = ", ".join(WORKS)
+    parser.add_argument(
+        "--only",
+        metavar="NAME",
+        action="append",
+        help=f"works whose names begin with NAME; default: all but those with `to-`; there are: {names}",
+    )
     parser.add_argument("--json", metavar="FILE", type=Path, help="write the figures to a file as well")
     parser.add_argument(
         "--runs", metavar="N", type=int, default=RUNS, help=f"runs of each contender, {LEAST_RUNS} or more; default: {RUNS}"
@@ -109,7 +129,10 @@ def arguments() -> argparse.Namespace:
     if given.runs < LEAST_RUNS:
         parser.error(f"--runs is {LEAST_RUNS} or more")
     given.size = 1_000_000 * (given.size or (QUICK_SIZE if given.quick else SIZE))
-    given.works = [name for name in WORKS if not given.only or name.startswith(tuple(given.only))]
+    if given.only:
+        given.works = [name for name in WORKS if name.startswith(tuple(given.only))]
+    else:
+        given.works = [name for name in WORKS if name not in CONVERSIONS]
     if not given.works:
         parser.error(f"no work begins so; there are {', '.join(WORKS)}")
     return given

@@ -13,10 +13,12 @@ import by_hand_serial
 import fixed
 import libraries
 import numpy as np
+from environments import read_failures, separate_python
 from inputs import Inputs
 from libraries import Missing
-from measure import Contender, Rates, times
+from measure import Contender, Rates, Timed, times
 from peers import construct_on
+from remote import prepare_in
 
 import lidarspec as ls
 from lidarspec.packets.packets import Packets
@@ -24,7 +26,7 @@ from lidarspec.points.plain import evaluate
 from lidarspec.simulation.simulator import opening
 from lidarspec_ouster import nominal
 
-Others = dict[str, Callable[[], Contender]]
+Others = dict[str, Callable[[], Timed]]
 Facts = dict[str, float]
 
 #: frames that construct parses in one run.
@@ -63,16 +65,17 @@ class Work:
     has_backends: bool = True
     after: Callable[[], None] | None = None
 
-    def present(self) -> tuple[dict[str, Contender], list[str]]:
-        """The others that are installed, and the names of those that are not."""
-        found: dict[str, Contender] = {}
-        missing = []
-        for name, made in self.others.items():
+    def prepare_others(self) -> tuple[dict[str, Timed], dict[str, str]]:
+        """Prepare the others; return them, and the reason for each that is missing."""
+        contenders: dict[str, Timed] = {}
+        missing: dict[str, str] = {}
+        for name, prepare in self.others.items():
             try:
-                found[name] = made()
-            except Missing:
-                missing.append(name)
-        return found, missing
+                contenders[name] = prepare()
+            except Missing as error:
+                reason = read_failures().get(name)
+                missing[name] = f"{error} ({reason})" if reason else str(error)
+        return contenders, missing
 
 
 def columns(cloud: ls.PointCloud) -> tuple[Any, ...]:
@@ -173,6 +176,11 @@ def velodyne(inputs: Inputs, key: str, title: str) -> Work:
     return Work(title, "points", points, rows.size, lambda backend: points_of(sensor, rows, backend), others)
 
 
+def beside_ouster_sdk(prepare: Callable[..., Contender], *arguments: Any) -> Timed:
+    """Prepare a contender that uses ouster-sdk."""
+    return prepare_in(separate_python("ouster-sdk"), prepare, *arguments)
+
+
 def ouster(inputs: Inputs) -> Work:
     """Every field and the coordinates, beside the vendor's own library; without CRCs, which that does not check."""
     sensor, rows = inputs.sensor("ouster"), inputs.array("ouster").copy()
@@ -191,7 +199,10 @@ def ouster(inputs: Inputs) -> Work:
         points,
         rows.size,
         lambda backend: lambda: ours(backend),
-        {"ouster-sdk": lambda: libraries.ouster_scans(frames, metadata, points), "plain": lambda: Contender(plainly(sensor, rows), points)},
+        {
+            "ouster-sdk": lambda: beside_ouster_sdk(libraries.ouster_scans, frames, metadata, points),
+            "plain": lambda: Contender(plainly(sensor, rows), points),
+        },
     )
 
 
