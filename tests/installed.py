@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import functools
 import os
-from importlib.metadata import entry_points
+from importlib.metadata import EntryPoint, entry_points
 
 import pytest
 
@@ -12,20 +13,27 @@ from lidarspec import Sensor
 from lidarspec.testing import assert_conformance
 from tests.representatives import REPRESENTATIVES
 
+#: sensors whose conformance is tested in the quick tier: frames of fixed length, and of variable length.
+QUICK = ("ldrobot-stl27l", "cspc-m1c1-mini")
 #: examples of each frame type in a conformance test: few, and as many as there is time for in `make test-long`.
 CONFORMANCE_EXAMPLES = int(os.environ.get("LIDARSPEC_EXAMPLES", "4"))
 
 _GROUP = "lidarspec.sensors"
 
 
+@functools.cache
+def _entry_points() -> list[EntryPoint]:
+    return list(entry_points(group=_GROUP))
+
+
 def sensor_modules() -> list[str]:
     """Return the names of all modules with sensors, from entry points; nothing is imported."""
-    return sorted({entry.module for entry in entry_points(group=_GROUP)})
+    return sorted({entry.module for entry in _entry_points()})
 
 
 def sensors_in(module: str) -> list[Sensor]:
     """Load the sensors of a module, in the order of their ids."""
-    names = [entry.name for entry in entry_points(group=_GROUP) if entry.module == module]
+    names = [entry.name for entry in _entry_points() if entry.module == module]
     sensors = {sensor.id: sensor for sensor in map(lidarspec.sensor, names)}
     return [sensors[sensor_id] for sensor_id in sorted(sensors)]
 
@@ -41,9 +49,9 @@ def distinct_sensors_in(module: str) -> list[Sensor]:
 def conformance_cases(distribution: str) -> list[object]:
     """Return the parameters of a distribution's conformance test: one id of each sensor.
 
-    Only representatives are tested in the quick tier.
+    Only `QUICK` ones are tested in the quick tier.
     """
-    return [pytest.param(name, marks=() if name in REPRESENTATIVES else pytest.mark.slow) for name in _sensor_ids(distribution)]
+    return [pytest.param(name, marks=() if name in QUICK else pytest.mark.slow) for name in sensor_ids(distribution)]
 
 
 def assert_installed_conformance(distribution: str, sensor_id: str) -> None:
@@ -51,15 +59,15 @@ def assert_installed_conformance(distribution: str, sensor_id: str) -> None:
 
     Frames and functions that it shares with a sensor before it in its distribution are tested there.
     """
-    ids = _sensor_ids(distribution)
+    ids = sensor_ids(distribution)
     before = [lidarspec.sensor(name) for name in ids[: ids.index(sensor_id)]]
     assert_conformance(sensor_id, examples=CONFORMANCE_EXAMPLES, tested=before)
 
 
-def _sensor_ids(distribution: str) -> list[str]:
+def sensor_ids(distribution: str) -> list[str]:
     """Return a name of each sensor of a distribution, representatives first."""
     names: dict[str, list[str]] = {}
-    for entry in entry_points(group=_GROUP):
+    for entry in _entry_points():
         if entry.dist is not None and entry.dist.name == distribution:
             names.setdefault(entry.value, []).append(entry.name)
     vendor = distribution.removeprefix("lidarspec-")

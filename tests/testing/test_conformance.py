@@ -14,8 +14,28 @@ from tests.shapes import SHAPES
 INTERPRETED = {"shape-text data"}
 INTERPRETED_OF_HOKUYO = ("version", "parameters", "state")
 
+#: shapes whose examples are long, or that construct reads: over one second of processor time each.
+COSTLY = {
+    "shape-channels",
+    "shape-columns",
+    "shape-conversation",
+    "shape-escaped",
+    "shape-fragments",
+    "shape-joined",
+    "shape-lines",
+    "shape-measured",
+    "shape-modes",
+    "shape-options",
+    "shape-segments",
+    "shape-sized",
+    "shape-tags",
+    "shape-text",
+    "shape-tokens",
+}
+CASES = [pytest.param(name, marks=pytest.mark.slow if name in COSTLY else ()) for name in SHAPES]
 
-@pytest.mark.parametrize("name", SHAPES)
+
+@pytest.mark.parametrize("name", CASES)
 def test_shape_conforms(name: str) -> None:
     assert_conformance(SHAPES[name], examples=CONFORMANCE_EXAMPLES)
 

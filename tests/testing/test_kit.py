@@ -71,6 +71,7 @@ def codes(sensor: Sensor) -> set[str]:
     return {finding.code for report in reports(Target([sensor]), sensor.id, examples=6) for finding in report.findings}
 
 
+@pytest.mark.slow
 def test_an_authors_tests_run_with_the_kits_fixtures(tmp_path: Path) -> None:
     (tmp_path / "test_mine.py").write_text(AUTHOR.format(sensor=str(STRANGER)), encoding="utf-8")
     done = run(tmp_path, "-m", "pytest", "-q", "-rs", "-p", "no:cacheprovider", "--strict-markers", ".")

@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 
 import lidarspec as ls
+from lidarspec import simulate
 from lidarspec.discovery.detect import verdict
 from lidarspec.discovery.listen import Heard
-from lidarspec.simulation.simulator import simulate
 from tests.evidence import clockwise, decoded, vector_bytes, vectors
 
 FILE = "vectors_serial2d.json"

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 import lidarspec as ls
-from lidarspec.simulation.simulator import simulate
+from lidarspec import simulate
 from tests.evidence import decoded, vector_bytes, vectors
 
 VISTA = ls.sensor("cepton-vista")

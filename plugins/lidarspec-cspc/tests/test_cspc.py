@@ -10,8 +10,8 @@ import numpy as np
 import pytest
 
 import lidarspec as ls
+from lidarspec import simulate
 from lidarspec.discovery.detect import Heard, verdict
-from lidarspec.simulation.simulator import simulate
 from lidarspec.testing.agreement import assert_same_points
 from tests.evidence import assert_points, clockwise, decoded, vector_bytes, vectors
 

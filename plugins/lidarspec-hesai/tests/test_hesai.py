@@ -14,9 +14,9 @@ import numpy as np
 import pytest
 
 import lidarspec as ls
+from lidarspec import simulate
 from lidarspec.discovery.detect import Heard, verdict
 from lidarspec.simulation.faults import Faults
-from lidarspec.simulation.simulator import simulate
 from lidarspec.spec import Learned, Tcp, Udp
 from lidarspec.testing.agreement import assert_same_points
 from lidarspec.testing.fixtures import virtual_port

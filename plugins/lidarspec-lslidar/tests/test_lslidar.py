@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 import lidarspec as ls
-from lidarspec.simulation.simulator import simulate
+from lidarspec import simulate
 from tests.evidence import clockwise, decoded, vector_bytes, vectors
 
 N10, N10P, M10P, C16 = (ls.sensor(f"lslidar-{name}") for name in ("n10", "n10p", "m10p", "c16"))

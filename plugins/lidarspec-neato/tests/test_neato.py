@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 import lidarspec as ls
-from lidarspec.simulation.simulator import simulate
+from lidarspec import simulate
 from tests.evidence import decoded, vector_bytes, vectors
 
 FILE = "vectors_serial2d.json"

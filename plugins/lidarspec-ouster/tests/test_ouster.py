@@ -14,9 +14,9 @@ import numpy as np
 import pytest
 
 import lidarspec as ls
+from lidarspec import simulate
 from lidarspec.captures.pcap import CaptureReader
 from lidarspec.discovery.detect import verdicts
-from lidarspec.simulation.simulator import simulate
 from lidarspec.spec import Learned
 from lidarspec_ouster import nominal
 from lidarspec_ouster.metadata import read

@@ -11,9 +11,9 @@ import numpy as np
 import pytest
 
 import lidarspec as ls
+from lidarspec import simulate
 from lidarspec.captures.pcap import CaptureReader
 from lidarspec.packets.stream import PacketStream
-from lidarspec.simulation.simulator import simulate
 from lidarspec.testing.agreement import assert_same_points
 from tests.evidence import assert_points, capture, clockwise, decoded, vector_bytes, vectors
 

@@ -10,10 +10,11 @@ import numpy as np
 import pytest
 
 import lidarspec as ls
+from lidarspec import simulate
 from lidarspec.discovery.detect import verdict
 from lidarspec.discovery.listen import Heard
-from lidarspec.simulation.simulator import simulate
 from tests.evidence import assert_points, decoded, vector_bytes, vectors
+from tests.installed import sensor_ids
 
 FILE = "vectors_udp3d.json"
 RS32, RS16, BPEARL = (ls.sensor(f"robosense-{model}") for model in ("rs32", "rs16", "bpearl"))
@@ -99,10 +100,9 @@ def test_the_date_is_taken_for_utc() -> None:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(
-    "sensor", [sensor for sensor in ls.sensors().values() if sensor.vendor == "RoboSense"], ids=lambda sensor: sensor.id
-)
-def test_every_model_is_told_from_the_others(sensor: ls.Sensor) -> None:
+@pytest.mark.parametrize("sensor_id", sensor_ids("lidarspec-robosense"))
+def test_every_model_is_told_from_the_others(sensor_id: str) -> None:
+    sensor = ls.sensor(sensor_id)
     assert verdict(Heard("", tuple(simulate(sensor, 20)), datagrams=True)).sensor is sensor
 
 

@@ -26,8 +26,8 @@ from rosgraph_msgs.msg import Clock
 from sensor_msgs.msg import LaserScan, PointCloud2
 
 import lidarspec as ls
+from lidarspec import simulate
 from lidarspec.formats.messages import SCAN
-from lidarspec.simulation.simulator import simulate
 from lidarspec_ros2.parameters import PARAMETERS, Settings
 from lidarspec_ros2.topics import transform
 

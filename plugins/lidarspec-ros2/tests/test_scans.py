@@ -18,11 +18,11 @@ from sensor_msgs.msg import Imu, LaserScan, PointCloud2
 from std_msgs.msg import Header, UInt8MultiArray
 
 import lidarspec as ls
+from lidarspec import simulate
 from lidarspec.formats.messages import CLOUD, SCAN, Messages
 from lidarspec.packets.imu import ImuSamples
 from lidarspec.recording.recorders import Recorder
 from lidarspec.scans.planes import Planes
-from lidarspec.simulation.simulator import simulate
 from lidarspec.transports.bags import RAW, raw_chunk
 from lidarspec.transports.protocol import Chunk
 

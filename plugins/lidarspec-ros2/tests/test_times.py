@@ -17,8 +17,8 @@ from rosgraph_msgs.msg import Clock
 from sensor_msgs.msg import Imu, LaserScan, PointCloud2
 
 import lidarspec as ls
+from lidarspec import simulate
 from lidarspec.recording.recorders import Recorder
-from lidarspec.simulation.simulator import simulate
 from lidarspec.transports.protocol import Chunk
 
 BEGAN, SECOND, LATEST = 1_767_225_600_000_000_000, 1_000_000_000, 5_000_000

@@ -10,7 +10,7 @@ import pytest
 
 import lidarspec as ls
 import lidarspec_seyond
-from lidarspec.simulation.simulator import simulate
+from lidarspec import simulate
 from tests.evidence import assert_points, decoded
 
 FALCON = ls.sensor("seyond-falcon")

@@ -7,7 +7,7 @@ import random
 import numpy as np
 import pytest
 
-from lidarspec.simulation.simulator import simulate
+from lidarspec import simulate
 from lidarspec.spec import Polar
 from lidarspec_slamtec.capsules import ultra_codes
 from tests.engine.oracle import Oracle

@@ -11,9 +11,9 @@ import numpy as np
 import pytest
 
 import lidarspec as ls
+from lidarspec import simulate
 from lidarspec.errors import UnknownOption
 from lidarspec.packets.stream import PacketStream
-from lidarspec.simulation.simulator import simulate
 from tests.calibration_files import write_velodyne_xml
 from tests.evidence import assert_points, clockwise, decoded, vector_bytes, vectors
 
