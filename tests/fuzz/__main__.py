@@ -63,9 +63,10 @@ def main() -> int:
 
 def listed(folder: Path, only: list[str] | None) -> dict[str, float]:
     """The targets that are asked for, and what an input of each costs."""
+    from tests.every_sensor import every_sensor
     from tests.fuzz.targets import targets
 
-    known = targets(folder)
+    known = targets(folder, every_sensor().values())
     found = {name: target.cost for name, target in known.items() if not only or name.startswith(tuple(only))}
     if not found:
         sys.exit(f"no target begins so; there are {', '.join(known)}")
@@ -183,6 +184,7 @@ def child(given: argparse.Namespace) -> int:
         atheris.instrument_imports(include=["lidarspec"]) if atheris else contextlib.nullcontext(),
     ):
         os.environ.update(XDG_CONFIG_HOME=f"{scratch}/settings", LIDARSPEC_CACHE=str(given.folder / "kernels"))
+        from tests.every_sensor import every_sensor
         from tests.fuzz.campaign import Job, guided, seeded
         from tests.fuzz.targets import targets
 
@@ -191,7 +193,7 @@ def child(given: argparse.Namespace) -> int:
         place.mkdir()
         (Path(scratch) / "lidarspec.toml").touch()
         os.chdir(place)
-        known = targets(place)
+        known = targets(place, every_sensor().values())
         if given.again:
             name = next(name for name in known if slug(name) == given.again.parent.name)
             known[name].run(given.again.read_bytes())

@@ -13,7 +13,7 @@ import re
 import struct
 import tempfile
 import zlib
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Collection, Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -34,10 +34,9 @@ from lidarspec.testing.vectors import vectors_hold
 from lidarspec.transports.hexadecimal import unhexed
 from lidarspec.transports.open_url import is_port, live_address
 from lidarspec.wire.layout import Layout
-from lidarspec_hesai import at128
 from tests import made_captures as made
-from tests.all_sensors import DISTINCT, EVERY, FRAMES
 from tests.calibration_files import write_velodyne_xml
+from tests.every_sensor import distinct_frames, distinct_sensors
 from tests.fuzz.words import HOSTILE, commanded, spoken
 from tests.shapes import SHAPES
 from tests.transports import test_bags
@@ -114,16 +113,17 @@ SHARES = {
 }
 
 
-def targets(folder: Path) -> dict[str, Target]:
-    """Every target by name.
+def targets(folder: Path, sensors: Collection[Sensor]) -> dict[str, Target]:
+    """Return the targets by name.
 
     Args:
         folder: an empty one of their own, which is also the working directory while they run.
+        sensors: those whose frames, streams and calibration files are read.
     """
-    found = [_frame(EVERY[sensor], name) for sensor, name in FRAMES]
-    found += [_stream(sensor) for sensor in DISTINCT.values()]
+    found = [_frame(sensor, name) for sensor, name in distinct_frames(sensors)]
+    found += [_stream(sensor) for sensor in distinct_sensors(sensors)]
     found += [_capture(), _file(folder), _recording(folder), _settings(folder), _scene(folder), _vectors(folder)]
-    found += [_calibration(sensor, option, folder) for sensor in ls.sensors().values() for option in sensor.configure.files]
+    found += [_calibration(sensor, option, folder) for sensor in sensors if sensor.id not in SHAPES for option in sensor.configure.files]
     text = [word.encode() for word in HOSTILE]
     printed = [b"54 2c", b"0: {0x54, 0x2C}; // one", b"0000  54 2c  T,\n0002", b"[12:00:01.5] 54 /* */"]
     printed += [b"(1.5) can0 044#1122", b"time,value\n1,0x54"]
@@ -427,6 +427,8 @@ def _calibration(sensor: Sensor, option: str, folder: Path) -> Target:
         if option == "metadata":
             return [_metadata(rows) for rows in (16, 32)]
         if sensor.id == "hesai-at128" and option == "calibration":
+            from lidarspec_hesai import at128
+
             return [at128.TABLE.told()]
         if sensor.id.startswith("velodyne-hdl64e"):
             return [write_velodyne_xml(folder / "db.xml").read_bytes()]

@@ -10,13 +10,19 @@ from pathlib import Path
 
 import pytest
 
+import lidarspec as ls
+from tests.every_sensor import every_sensor
 from tests.fuzz import trial
 from tests.fuzz.__main__ import ROOT, spread
 from tests.fuzz.campaign import Job, keep, seeded
 from tests.fuzz.targets import SHARES, Target, targets
+from tests.shapes import SHAPES
 
-#: mutations of each target that the test suite reads.
-FEW = 4
+#: mutated inputs that the quick tier reads, in all; and at least so many for each target.
+INPUTS = 8000
+LEAST = 2
+#: of the streams, whose examples take longest to make, the quick tier reads one in so many.
+STREAMS = 5
 
 
 @pytest.fixture(scope="module")
@@ -25,32 +31,48 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.fixture(scope="module")
-def every(folder: Path) -> dict[str, Target]:
-    """All targets, which take most of the time of these tests to make."""
-    return targets(folder)
+def few(folder: Path) -> dict[str, Target]:
+    """The targets of the shapes, and the calibration files of a sensor."""
+    return targets(folder, [*SHAPES.values(), ls.sensor("hesai-xt16")])
 
 
 @pytest.fixture
-def known(folder: Path, every: dict[str, Target], monkeypatch: pytest.MonkeyPatch) -> dict[str, Target]:
+def known(folder: Path, few: dict[str, Target], monkeypatch: pytest.MonkeyPatch) -> dict[str, Target]:
     monkeypatch.chdir(folder)
-    return every
+    return few
+
+
+def read_neighbours(target: Target, number: int) -> None:
+    """Read the examples of a target and mutations of them; an exception that is not documented fails."""
+    source = random.Random(f"{target.name} few")
+    examples = target.examples()
+    valid = 0
+    inputs = [*examples[: 1 if target.group == "stream" else None]]
+    inputs += [target.mutation(source.choice(examples), source.choice(examples), source) for _ in range(number)]
+    for data in inputs:
+        with warnings.catch_warnings(action="ignore"):
+            try:
+                target.run(data)
+                valid += 1
+            except target.documented:
+                pass
+    assert valid, f"no example of {target.name} is valid"
 
 
 @pytest.mark.parametrize("group", SHARES)
 def test_neighbours_of_valid_input_do_no_harm(known: dict[str, Target], group: str) -> None:
+    shares = spread({target.name: target.cost for target in known.values()}, INPUTS)
     mine = [target for target in known.values() if target.group == group]
     assert mine
-    for target in mine:
-        source, examples, read = random.Random(f"{target.name} few"), target.examples(), 0
-        neighbours = [target.mutation(source.choice(examples), source.choice(examples), source) for _ in range(FEW)]
-        for data in (*examples[: 1 if group == "stream" else None], *neighbours):
-            with warnings.catch_warnings(action="ignore"):
-                try:
-                    target.run(data)
-                    read += 1
-                except target.documented:
-                    pass
-        assert read, f"no example of {target.name} is valid"
+    for target in mine[:: STREAMS if group == "stream" else None]:
+        read_neighbours(target, max(LEAST, shares[target.name]))
+
+
+@pytest.mark.slow
+def test_neighbours_of_valid_input_of_every_sensor_do_no_harm(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(folder)
+    for target in targets(folder, every_sensor().values()).values():
+        read_neighbours(target, LEAST)
 
 
 def raising(data: bytes) -> None:
@@ -82,13 +104,14 @@ def test_harm_is_found_and_kept_for_another_look(run: object, what: str, tmp_pat
 
 def test_an_input_that_reaches_new_lines_is_mutated_further(known: dict[str, Target], tmp_path: Path) -> None:
     job = Job(known["frame shape-count data"], tmp_path / "kept", seed=1)
-    seeded(job, 300)
-    assert job.inputs == 300
+    seeded(job, 100)
+    assert job.inputs == 100
     assert job.lines > 50
     assert len(list(job.corpus.iterdir())) > 0
     assert not job.findings
 
 
+@pytest.mark.slow
 def test_a_run_spreads_its_inputs_reports_them_and_goes_on_where_it_stopped(tmp_path: Path) -> None:
     assert spread({"frame a": 100.0, "frame b": 300.0, "hex": 1.0}, 1000) == {"frame a": 690, "frame b": 230, "hex": 81}
     words = [

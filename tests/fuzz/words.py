@@ -13,6 +13,7 @@ from click.testing import CliRunner
 
 import lidarspec as ls
 from lidarspec.cli.root import VERBS, main
+from tests.representatives import REPRESENTATIVES
 
 #: text that makes trouble where a name, number, path or hex is taken.
 HOSTILE = (
@@ -142,11 +143,10 @@ def _value(name: str, kind: int, choice: int) -> str:
 
 @functools.cache
 def _known(name: str) -> tuple[str, ...]:
-    sensors = tuple(ls.sensors())
-    frames = tuple({frame for sensor in ls.sensors().values() for frame in sensor.frames})
+    frames = tuple({frame for sensor in REPRESENTATIVES for frame in ls.sensor(sensor).frames})
     return {
         "verb": tuple(VERBS),
-        "sensor_id": sensors,
+        "sensor_id": REPRESENTATIVES,
         "frame": frames,
         "kind": ("wireshark", "c", "ksy", "md", "svg", "json", "pyi"),
         "assignments": (

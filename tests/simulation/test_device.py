@@ -21,8 +21,19 @@ from lidarspec.testing.commands import the_simulated_sensor_answers
 from lidarspec.testing.subject import Subject
 from tests.broken import sound
 
-MINI, STL, A1 = ls.sensor("cspc-m1c1-mini"), ls.sensor("ldrobot-stl27l"), ls.sensor("slamtec-rplidar-a1")
 MS = SECOND // 1000
+
+
+def mini() -> Sensor:
+    return ls.sensor("cspc-m1c1-mini")
+
+
+def stl() -> Sensor:
+    return ls.sensor("ldrobot-stl27l")
+
+
+def a1() -> Sensor:
+    return ls.sensor("slamtec-rplidar-a1")
 
 
 def on(sensor: Sensor, **options: object) -> SimulatedDevice:
@@ -43,7 +54,7 @@ def passing(device: SimulatedDevice, start: int, end: int, step: int = 10 * MS) 
 
 
 def test_the_m1c1_mini_starts_as_its_manual_says() -> None:
-    device = on(MINI)
+    device = on(mini())
     assert passing(device, 0, 2 * SECOND) == b""
     assert asked(device, "start", 2 * SECOND) == bytes.fromhex("A55A 50 07 03 000000000000 AB")
     settling = passing(device, 2 * SECOND, 3 * SECOND)
@@ -52,7 +63,7 @@ def test_the_m1c1_mini_starts_as_its_manual_says() -> None:
     rest = passing(device, 3 * SECOND, 4 * SECOND)
     information = bytes.fromhex("A55A 1400 0304 01 4D3143315F4D696E69000000 0C00 00 01 000000 04")
     assert rest.startswith(information + bytes.fromhex("A55A 0000 8001 81") + b"\xaa\x55")
-    assert [item.frame for item in MINI.split(rest)[:3]] == ["info", "scan_start", "data"]
+    assert [item.frame for item in mini().split(rest)[:3]] == ["info", "scan_start", "data"]
     stop = asked(device, "stop", 4 * SECOND)
     assert stop == bytes.fromhex("A55A 55 07 00000000000000 AD")
     assert passing(device, 4 * SECOND, 5 * SECOND) == b""
@@ -68,7 +79,7 @@ def test_a_captured_start_of_a_coin_d4_comes_out_byte_for_byte_up_to_its_points(
 
 
 def test_commands_without_an_answer_get_none_and_noise_is_ignored() -> None:
-    device = on(MINI)
+    device = on(mini())
     assert asked(device, "low_exposure", 0) == b""
     device.receive(b"\x00\xaa\x55garbage", 0)
     assert asked(device, "get_version", SECOND)[2] == 0xFC ^ 0xA0
@@ -82,28 +93,28 @@ def test_answers_stand_in_the_form_of_their_frames() -> None:
 
 
 def test_half_a_command_is_forgotten_when_the_line_falls_silent() -> None:
-    device = on(A1)
+    device = on(a1())
     device.receive(b"\xa5\xa5\xff", 0)  # the beginning of a request with a long payload
-    device.receive(A1.command("get_info"), 10 * MS)
+    device.receive(a1().command("get_info"), 10 * MS)
     assert device.outgoing(10 * MS) == []
-    assert A1.parse(asked(device, "get_health", 200 * MS)).status == 0
+    assert a1().parse(asked(device, "get_health", 200 * MS)).status == 0
 
 
 def test_an_rplidar_says_what_it_is_and_scans_in_the_mode_that_is_asked_for() -> None:
-    device = on(A1)
-    info = A1.parse(asked(device, "get_info", 0))
+    device = on(a1())
+    info = a1().parse(asked(device, "get_info", 0))
     assert (info.model, info.firmware_major, info.firmware_minor, info.hardware) == (0x18, 1, 29, 7)
-    assert A1.parse(asked(device, "get_mode_count", 0)).value.mode_count == 4
-    assert A1.parse(asked(device, "get_us_per_sample", 0, mode=3)).value.us_per_sample == 127 * 256
-    assert bytes(A1.parse(asked(device, "get_mode_name", 0, mode=3)).value.data) == b"Sensitivity\0"
+    assert a1().parse(asked(device, "get_mode_count", 0)).value.mode_count == 4
+    assert a1().parse(asked(device, "get_us_per_sample", 0, mode=3)).value.us_per_sample == 127 * 256
+    assert bytes(a1().parse(asked(device, "get_mode_name", 0, mode=3)).value.data) == b"Sensitivity\0"
     assert asked(device, "get_mode_name", 0, mode=9) == b""
-    types = [A1.parse(asked(device, "get_answer_type", 0, mode=mode)).value.answer_type for mode in range(4)]
+    types = [a1().parse(asked(device, "get_answer_type", 0, mode=mode)).value.answer_type for mode in range(4)]
     kinds = {}
     for mode, kind in enumerate(types):
         started = asked(device, "express_scan", mode * SECOND, mode=mode) if mode else asked(device, "scan", 0)
         started += passing(device, mode * SECOND, mode * SECOND + SECOND // 2)
-        assert A1.parse(started[:7])["type"] == kind
-        found = A1.decode(started).stats
+        assert a1().parse(started[:7])["type"] == kind
+        found = a1().decode(started).stats
         assert found.bytes_skipped == 0
         kinds[mode] = sorted(found.frames)
         passing(device, mode * SECOND + SECOND // 2, (mode + 1) * SECOND)
@@ -116,12 +127,12 @@ def test_an_rplidar_says_what_it_is_and_scans_in_the_mode_that_is_asked_for() ->
     assert b"\xa5\x5a\x14" not in asked(device, "get_info", 5 * SECOND)  # answered only while it does not scan
     assert device.heard[-1] == "get_info"
     assert asked(device, "stop", 5 * SECOND).count(b"\xa5\x5a") == 0
-    assert A1.parse(asked(device, "get_info", 5 * SECOND)).hardware == 7
+    assert a1().parse(asked(device, "get_info", 5 * SECOND)).hardware == 7
     assert passing(device, 5 * SECOND, 6 * SECOND) == b""
 
 
 def test_a_scan_mode_that_is_not_there_starts_nothing() -> None:
-    device = on(A1)
+    device = on(a1())
     assert asked(device, "express_scan", 0, mode=9) + passing(device, 0, SECOND) == b""
 
 
@@ -136,8 +147,18 @@ def test_other_frames_come_at_their_own_rate_with_the_defaults_of_the_spec() -> 
     assert np.array_equal(helios.decode([data for data in out if data[:2] != b"\xa5\xff"]).points().xyz, packets.points().xyz)
 
 
-@pytest.mark.parametrize("name", ["ldrobot-stl27l", "cspc-m1c1-mini", "velodyne-vlp16", "slamtec-rplidar-s2"])
-@pytest.mark.parametrize("rate", [0.5, 1.0, 4.0])
+@pytest.mark.parametrize(
+    ("name", "rate"),
+    [
+        ("ldrobot-stl27l", 0.5),
+        pytest.param("ldrobot-stl27l", 4.0, marks=pytest.mark.slow),
+        pytest.param("cspc-m1c1-mini", 1.0, marks=pytest.mark.slow),
+        ("velodyne-vlp16", 0.5),
+        pytest.param("velodyne-vlp16", 4.0, marks=pytest.mark.slow),
+        ("slamtec-rplidar-s2", 0.5),
+        pytest.param("slamtec-rplidar-s2", 1.0, marks=pytest.mark.slow),
+    ],
+)
 def test_the_pace_does_not_depend_on_how_often_it_is_asked(name: str, rate: float) -> None:
     sensor, numbers, streams = ls.sensor(name), [], []
     for step in (3 * MS, 50 * MS):
@@ -156,17 +177,17 @@ def test_the_pace_does_not_depend_on_how_often_it_is_asked(name: str, rate: floa
 
 
 def test_a_deadline_is_when_something_comes() -> None:
-    device = on(STL)
+    device = on(stl())
     for _ in range(50):
         due = device.deadline
         assert due is not None
         assert device.outgoing(due - 1) == []
         assert device.outgoing(due) != []
-    assert on(MINI).deadline is None
+    assert on(mini()).deadline is None
 
 
 def test_a_device_that_nobody_asked_for_long_does_not_flood() -> None:
-    device = on(STL)
+    device = on(stl())
     device.outgoing(0)
     device.outgoing(3600 * SECOND)
     assert 1700 < device.sent["data"] < 1900
@@ -175,10 +196,10 @@ def test_a_device_that_nobody_asked_for_long_does_not_flood() -> None:
 
 
 def test_without_a_pace_it_gives_data_whenever_it_is_asked() -> None:
-    device = on(MINI, rate=math.inf)
-    device.receive(MINI.command("start"), 0)
-    out = b"".join(data for _ in range(50) for _, data in device.outgoing(0))
-    assert len([scan for scan in MINI.scans(out) if scan.complete]) > 40
+    device = on(mini(), rate=math.inf)
+    device.receive(mini().command("start"), 0)
+    out = b"".join(data for _ in range(12) for _, data in device.outgoing(0))
+    assert len([scan for scan in mini().scans(out) if scan.complete]) > 8
     assert out[:27].count(b"\xa5\x5a") == 1
 
 
@@ -195,9 +216,9 @@ def test_the_same_seed_does_the_same_harm(name: str) -> None:
 
 
 def test_damaged_bytes_are_as_many_as_asked_for_and_the_sound_frames_come_through() -> None:
-    device = on(STL, faults=Faults(errors=0.002))
+    device = on(stl(), faults=Faults(errors=0.002))
     data = passing(device, 0, 3 * SECOND)
-    line, stats = device.lines["data"], STL.decode(data).stats
+    line, stats = device.lines["data"], stl().decode(data).stats
     assert line.sent == device.sent["data"] == pytest.approx(5400, abs=20)
     assert line.intact / line.sent == pytest.approx((1 - 0.002) ** 47, abs=0.02)
     chance_matches = stats.frames["data"] - line.intact  # damaged, with a CRC-8 that matches
@@ -207,7 +228,7 @@ def test_damaged_bytes_are_as_many_as_asked_for_and_the_sound_frames_come_throug
 def test_lost_packets_are_missing_and_reordered_ones_are_late() -> None:
     m1 = ls.sensor("robosense-m1")
     clean, harmed = on(m1), on(m1, faults=Faults(loss=0.01, reorder=5))
-    sound, out = ([data for now in range(0, SECOND, 2 * MS) for _, data in device.outgoing(now)] for device in (clean, harmed))
+    sound, out = ([data for now in range(0, SECOND // 2, 2 * MS) for _, data in device.outgoing(now)] for device in (clean, harmed))
     line, places = harmed.lines["data"], {data: place for place, data in enumerate(sound)}
     assert 0.005 < line.lost / line.sent < 0.02
     order = [places[data] for data in out]
@@ -216,7 +237,7 @@ def test_lost_packets_are_missing_and_reordered_ones_are_late() -> None:
     assert 0.03 < np.mean(np.array(late) > 0) < 0.12
     stats = m1.decode(out).stats
     assert stats.lost == pytest.approx(line.lost, abs=8)
-    assert stats.late > 100
+    assert stats.late > 50
 
 
 def test_damage_in_datagrams_keeps_their_length() -> None:
@@ -233,13 +254,13 @@ def test_every_byte_of_a_line_can_be_damaged() -> None:
 
 
 def test_the_plug_is_pulled_and_put_in_again() -> None:
-    device = on(MINI, faults=Faults(unplug=3.0, absent=1.0))
-    device.receive(MINI.command("start"), 0)
+    device = on(mini(), faults=Faults(unplug=3.0, absent=1.0))
+    device.receive(mini().command("start"), 0)
     assert passing(device, 0, 3 * SECOND)
     assert device.outgoing(3 * SECOND) == []
     assert not device.present
     assert device.deadline == 4 * SECOND
-    device.receive(MINI.command("start"), 3 * SECOND + SECOND // 2)
+    device.receive(mini().command("start"), 3 * SECOND + SECOND // 2)
     assert passing(device, 3 * SECOND, 6 * SECOND) == b""
     assert device.present
     assert asked(device, "start", 6 * SECOND + 10 * MS)
@@ -248,11 +269,11 @@ def test_the_plug_is_pulled_and_put_in_again() -> None:
 
 
 def test_a_start_begins_anew() -> None:
-    device = on(A1)
+    device = on(a1())
     first = asked(device, "scan", 0) + passing(device, 0, SECOND)
     again = asked(device, "scan", SECOND) + passing(device, SECOND, 2 * SECOND)
     assert again[:7] == first[:7]
-    assert A1.decode(first + again).stats.bytes_skipped == 0
+    assert a1().decode(first + again).stats.bytes_skipped == 0
 
 
 @pytest.mark.parametrize(
@@ -276,7 +297,7 @@ def test_faults_by_text() -> None:
     assert faults_of(asked_for) == Faults(0.01, 0.02, 4, 30.0, 0.5)
     assert (duration("2min"), duration("1.5h"), duration("7"), duration("20us")) == (120, 5400, 7, pytest.approx(20e-6))
     with pytest.raises(UsageError, match="keep their order"):
-        on(STL, faults=Faults(reorder=2))
+        on(stl(), faults=Faults(reorder=2))
 
 
 @pytest.mark.parametrize("told", [{"echoes": ("key", "mode", "rates")}, {"matches": {"key": b"abc", "mode": "fast", "rates": [20, 30]}}])

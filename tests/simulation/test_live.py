@@ -29,11 +29,19 @@ from lidarspec.testing.fixtures import virtual_port
 from lidarspec.transports.outlets import simulated_outlet
 from lidarspec.transports.serving import Served, Turns, write_file
 from lidarspec.view.screen import Keyboard
-from tests.lines import TIMEOUT_S, free_port, until
+from tests.lines import TIMEOUT_S, free_port, read_until, until
 from tests.simulation.test_simulator import off
 
 posix = pytest.mark.skipif(os.name != "posix", reason="pseudo terminals are POSIX")
-STL, VLP, A1 = ls.sensor("ldrobot-stl27l"), ls.sensor("velodyne-vlp16"), "slamtec-rplidar-a1"
+A1 = "slamtec-rplidar-a1"
+
+
+def stl() -> ls.Sensor:
+    return ls.sensor("ldrobot-stl27l")
+
+
+def vlp() -> ls.Sensor:
+    return ls.sensor("velodyne-vlp16")
 
 
 def scans(device: ls.Device, number: int) -> list[ls.Scan]:
@@ -48,9 +56,9 @@ def scans(device: ls.Device, number: int) -> list[ls.Scan]:
     raise AssertionError("the device ended")
 
 
-@pytest.mark.parametrize("name", ["ldrobot-stl27l", "cspc-m1c1-mini", "slamtec-rplidar-a1", "robosense-helios16p", "hesai-qt64"])
+@pytest.mark.parametrize("name", ["ldrobot-stl27l", "cspc-m1c1-mini", "slamtec-rplidar-a1", "velodyne-vlp16"])
 def test_a_simulated_sensor_is_a_source_that_needs_no_other_word(name: str) -> None:
-    with ls.open(f"sim:{name}?rate=4") as device:
+    with ls.open(f"sim:{name}?rate=max") as device:
         assert device.sensor.id == name
         found = scans(device, 3)
         assert device.stats.bad_checksum == device.stats.lost == device.stats.queue_dropped == 0
@@ -66,20 +74,20 @@ def test_a_sensor_that_is_not_started_keeps_silent() -> None:
 
 
 def test_an_rplidar_is_opened_in_the_scan_mode_that_it_is_configured_for() -> None:
-    with ls.open("sim:slamtec-rplidar-a1?rate=4", ls.sensor("slamtec-rplidar-a1").configure(mode=3)) as device:
+    with ls.open("sim:slamtec-rplidar-a1?rate=max", ls.sensor("slamtec-rplidar-a1").configure(mode=3)) as device:
         assert scans(device, 2)
         assert set(device.stats.frames) == {"ultra", "ultra_descriptor"}
 
 
 def test_faults_of_a_source_are_seen_and_counted() -> None:
-    with ls.open("sim:velodyne-vlp16?rate=5&loss=0.05&seed=3") as device:
+    with ls.open("sim:velodyne-vlp16?rate=max&loss=0.05&seed=3") as device:
         found = scans(device, 3)
     assert sum(map(len, found)) < 0.99 * 3 * 75.35 * 384
-    with ls.open("sim:hesai-xt32?rate=2&loss=0.02&reorder=4") as device:
+    with ls.open("sim:hesai-xt32?rate=max&loss=0.02&reorder=4") as device:
         scans(device, 3)
         assert device.stats.lost > 0
         assert device.stats.late > 0
-    with ls.open("sim:ldrobot-stl27l?rate=3&errors=0.005") as device:
+    with ls.open("sim:ldrobot-stl27l?rate=max&errors=0.005") as device:
         scans(device, 3)
         assert device.stats.bad_checksum > 0
 
@@ -88,7 +96,7 @@ def test_as_fast_as_possible_nothing_is_dropped_and_two_runs_are_the_same() -> N
     runs = []
     for _ in range(2):
         with ls.open("sim:robosense-m1?rate=max&seed=2") as device:
-            runs.append(list(itertools.islice(device.scans(), 4)))
+            runs.append(list(itertools.islice(device.scans(), 2)))
             assert device.stats.queue_dropped == device.stats.lost == 0
     for first, second in zip(*runs, strict=True):
         assert np.array_equal(first.points.xyz, second.points.xyz, equal_nan=True)
@@ -97,10 +105,7 @@ def test_as_fast_as_possible_nothing_is_dropped_and_two_runs_are_the_same() -> N
 def test_an_unplugged_source_comes_back() -> None:
     with ls.open("sim:cspc-m1c1-mini?rate=3&unplug=1s&absent=200ms") as device:
         scans(device, 2)
-        deadline = time.monotonic() + TIMEOUT_S
-        while device.stats.disconnects == 0:
-            assert time.monotonic() < deadline
-            next(iter(device.packets(wait=0.05)))
+        read_until(device, lambda: device.stats.disconnects)
         assert scans(device, 1)
         assert device.stats.frames["ack"] >= 2
 
@@ -108,7 +113,7 @@ def test_an_unplugged_source_comes_back() -> None:
 def test_a_scene_is_seen(tmp_path: Path) -> None:
     path = tmp_path / "box.toml"
     path.write_text("[[box]]\nlow = [2, -1, -1]\nhigh = [3, 1, 1]\n")
-    with ls.open(f"sim:ldrobot-stl27l?rate=4&scene={path}") as device:
+    with ls.open(f"sim:ldrobot-stl27l?rate=max&scene={path}") as device:
         points = scans(device, 1)[0].points
     assert points.x[points.valid].min() == pytest.approx(2, abs=0.001)
     assert 0.1 < points.valid.mean() < 0.2
@@ -141,11 +146,8 @@ def test_on_a_serial_port_nothing_is_lost_and_every_command_is_answered(name: st
             found = scans(device, 2)
             assert device.stats.bad_checksum == 0
             assert device.stats.bytes_skipped == device.stats.bytes_filler
-        deadline = time.monotonic() + TIMEOUT_S
         wanted = [command for command in (*sensor.on_open, *sensor.on_close) if sensor.commands[command].frame]
-        while port.device.heard != wanted and time.monotonic() < deadline:
-            time.sleep(0.01)
-        assert port.device.heard == wanted
+        until(lambda: port.device.heard == wanted)
     for scan in found:
         assert scan.points.valid.mean() > 0.98
         assert off(room, scan.points.xyz[scan.points.valid].astype(np.float64)).max() < 0.0006
@@ -153,9 +155,9 @@ def test_on_a_serial_port_nothing_is_lost_and_every_command_is_answered(name: st
 
 @posix
 def test_what_is_sent_while_nobody_listens_is_lost_as_on_a_wire() -> None:
-    with virtual_port(STL) as port:
+    with virtual_port(stl()) as port:
         for _ in range(3):
-            with ls.open(port.path, STL) as device:
+            with ls.open(port.path, stl()) as device:
                 first = next(packets for packets in device.packets() if len(packets))
                 sent = port.device.sent["data"]
                 assert abs(int(first["timestamp"][0] * 1800) - sent) < 0.5 * 1800
@@ -166,9 +168,9 @@ def test_what_is_sent_while_nobody_listens_is_lost_as_on_a_wire() -> None:
 @posix
 def test_the_port_goes_away_with_its_plug_and_the_link_leads_to_the_new_one(tmp_path: Path) -> None:
     link = tmp_path / "ttyLIDAR"
-    with virtual_port(STL, link=link) as port:
+    with virtual_port(stl(), link=link) as port:
         before = os.readlink(link)
-        with ls.open(str(link), STL) as device:
+        with ls.open(str(link), stl()) as device:
             scans(device, 1)
             port.unplug()
             assert not link.is_symlink()
@@ -185,11 +187,11 @@ def test_a_link_stands_on_no_file_of_somebody_else(tmp_path: Path) -> None:
     taken = tmp_path / "notes"
     taken.write_text("mine")
     with pytest.raises(SourceError, match="File exists"):
-        simulated_outlet(STL, "pty", taken)
+        simulated_outlet(stl(), "pty", taken)
     assert taken.read_text() == "mine"
     stale = tmp_path / "ttyOLD"
     stale.symlink_to("/dev/pts/does-not-exist")
-    simulated_outlet(STL, "pty", stale).close()
+    simulated_outlet(stl(), "pty", stale).close()
     assert not stale.is_symlink()
 
 
@@ -199,7 +201,7 @@ def test_datagrams_go_to_the_declared_ports_by_their_kind_unless_one_is_named() 
         receiver.bind(("127.0.0.1", 0))
         receiver.settimeout(TIMEOUT_S)
     ports = [receiver.getsockname()[1] for receiver in receivers]
-    sensor = dataclasses.replace(VLP, links={"data": Udp(*ports)})
+    sensor = dataclasses.replace(vlp(), links={"data": Udp(*ports)})
     with virtual_port(sensor, to="udp://") as port:
         assert port.path == f"udp://127.0.0.1?port={ports[0]},{ports[1]}"
         assert [{len(receiver.recv(2000)) for _ in range(20)} for receiver in receivers] == [{1206}, {512}]
@@ -217,55 +219,65 @@ def test_over_udp_all_packets_arrive() -> None:
 
 
 def test_over_tcp_several_listen_and_a_slow_one_holds_nobody_up() -> None:
-    with virtual_port(STL, to="tcp://127.0.0.1:0") as port:
+    with virtual_port(stl(), to="tcp://127.0.0.1:0") as port:
         address = port.path.removeprefix("tcp://").split(":")
-        with socket.create_connection((address[0], int(address[1]))), ls.open(port.path, STL) as device, ls.open(port.path, STL) as other:
+        with (
+            socket.create_connection((address[0], int(address[1]))),
+            ls.open(port.path, stl()) as device,
+            ls.open(port.path, stl()) as other,
+        ):
             assert scans(device, 2)
             assert scans(other, 2)
         with pytest.raises(SourceError, match="in use"):
-            simulated_outlet(STL, port.path)
+            simulated_outlet(stl(), port.path)
         port.unplug()
         with pytest.raises(SourceError):
-            ls.open(port.path, STL)
+            ls.open(port.path, stl())
         port.plug()
-        with ls.open(port.path, STL) as device:
+        with ls.open(port.path, stl()) as device:
             assert scans(device, 1)
 
 
 @pytest.mark.parametrize(
-    ("name", "suffix"), [("ldrobot-stl27l", "bin"), ("cspc-m1c1-mini", "lsr"), ("slamtec-rplidar-a1", "bin"), ("robosense-m1", "pcap")]
+    ("name", "suffix", "seconds"),
+    [
+        ("ldrobot-stl27l", "bin", 0.3),
+        ("cspc-m1c1-mini", "lsr", 1.5),
+        pytest.param("slamtec-rplidar-a1", "bin", 1.5, marks=pytest.mark.slow),
+        ("robosense-m1", "pcap", 0.1),
+    ],
 )
-def test_a_file_holds_what_the_sensor_would_have_sent(name: str, suffix: str, tmp_path: Path) -> None:
+def test_a_file_holds_what_the_sensor_would_have_sent(name: str, suffix: str, seconds: float, tmp_path: Path) -> None:
     path, device = tmp_path / f"made.{suffix}", SimulatedDevice(ls.sensor(name), scene=Room())
-    written = write_file(device, path, 1.5)
+    written = write_file(device, path, seconds)
     assert written > 3000
     with ls.open(path, name) as opened:
         number = sum(map(len, opened.packets()))
         assert opened.stats.frames == dict(device.sent)
     assert number == device.sent.most_common(1)[0][1]
     again = SimulatedDevice(ls.sensor(name), scene=Room())
-    write_file(again, tmp_path / f"again.{suffix}", 1.5)
+    write_file(again, tmp_path / f"again.{suffix}", seconds)
     if suffix == "bin":
         assert path.read_bytes() == (tmp_path / f"again.{suffix}").read_bytes()
 
 
 def test_a_destination_that_cannot_carry_the_sensor_is_refused(tmp_path: Path) -> None:
     for sensor, place, said in (
-        (STL, "udp://", "no datagrams"),
-        (VLP, "pty", "datagrams, which a serial port cannot carry"),
-        (VLP, "tcp://", "declares no TCP port"),
-        (STL, "http://localhost", "no destination"),
-        (VLP, "udp://?rate=3", "unknown option"),
-        (VLP, "udp://127.0.0.1:99999", "a port is a number"),
+        (stl(), "udp://", "no datagrams"),
+        (vlp(), "pty", "datagrams, which a serial port cannot carry"),
+        (vlp(), "tcp://", "declares no TCP port"),
+        (stl(), "http://localhost", "no destination"),
+        (vlp(), "udp://?rate=3", "unknown option"),
+        (vlp(), "udp://127.0.0.1:99999", "a port is a number"),
     ):
         with pytest.raises(UsageError, match=said):
             simulated_outlet(sensor, place)
     with pytest.raises(UsageError, match="goes with pty alone"):
-        simulated_outlet(VLP, "udp://", tmp_path / "link")
+        simulated_outlet(vlp(), "udp://", tmp_path / "link")
     with pytest.raises(UnknownFormat):
-        write_file(SimulatedDevice(STL), tmp_path / "made.csv", 1)
+        write_file(SimulatedDevice(stl()), tmp_path / "made.csv", 1)
     with pytest.raises(SourceError):
-        simulated_outlet(VLP, "udp://no-such-host.invalid")
+        simulated_outlet(vlp(), "udp://no-such-host.invalid")
 
 
 @posix
@@ -277,8 +289,8 @@ def test_what_goes_wrong_in_the_thread_of_a_port_is_raised_at_its_end() -> None:
             tried.set()
             raise ZeroDivisionError
 
-    port = Served(Broken(STL, faults=Faults()), simulated_outlet(STL, "pty"))
-    assert tried.wait(10)
+    port = Served(Broken(stl(), faults=Faults()), simulated_outlet(stl(), "pty"))
+    assert tried.wait(TIMEOUT_S)
     with pytest.raises(ZeroDivisionError):
         port.close()
 
@@ -321,9 +333,9 @@ def test_keys_come_over_any_descriptor() -> None:
 
 @posix
 def test_many_simulators_take_turns_and_end() -> None:
-    """Of 50 in one process, more than it can keep up with, each is heard, and all end in no time."""
-    ports = [Served(SimulatedDevice(STL), simulated_outlet(STL, "pty")) for _ in range(50)]
-    until(lambda: all(port.device.sent["data"] for port in ports), 60)
+    """Of as many in one process as it can hardly keep up with, each sends, and all end."""
+    ports = [Served(SimulatedDevice(stl()), simulated_outlet(stl(), "pty")) for _ in range(12)]
+    until(lambda: all(port.device.sent["data"] for port in ports))
 
     def end() -> None:
         for port in ports:
@@ -331,7 +343,7 @@ def test_many_simulators_take_turns_and_end() -> None:
 
     ending = threading.Thread(target=end, daemon=True)
     ending.start()
-    until(lambda: not ending.is_alive(), 20)
+    until(lambda: not ending.is_alive())
 
 
 def test_turns_come_in_the_order_of_asking_and_nobody_waits_who_is_to_end() -> None:
@@ -360,9 +372,10 @@ PAGE = (Path(__file__).parents[2] / "docs" / "how-to" / "simulate.md").read_text
 
 
 @posix
+@pytest.mark.slow
 @pytest.mark.parametrize("block", re.findall(r"```python\n(.*?)```", PAGE, flags=re.DOTALL))
 def test_the_programs_on_the_page_run_as_they_stand(block: str) -> None:
-    done = subprocess.run([sys.executable, "-c", block], capture_output=True, text=True, check=False, timeout=120)
+    done = subprocess.run([sys.executable, "-c", block], capture_output=True, text=True, check=False, timeout=10 * TIMEOUT_S)
     assert done.returncode == 0, done.stderr
 
 

@@ -30,11 +30,11 @@ from lidarspec.spec import Serial
 from lidarspec.testing import subject as material
 from lidarspec.testing.subject import Subject
 from tests import made_captures as made
-from tests.all_sensors import EVERY, FRAMES, STREAMS
 from tests.engine.oracle import Oracle
 from tests.engine.streams import Books, clean, damaged, decoded, worst
 from tests.engine.test_limits import fed, garbage, peak
 from tests.engine.test_linear_time import seconds
+from tests.every_sensor import distinct_frames, every_sensor, stream_sensors
 from tests.lines import free_port
 
 ROOT = Path(__file__).parents[2]
@@ -50,6 +50,11 @@ class Figure:
     kept: bool
 
 
+def streams() -> dict[str, Sensor]:
+    """Return the sensors and shapes that send a stream of bytes, each set of frames once, by id."""
+    return {sensor.id: sensor for sensor in stream_sensors(every_sensor().values())}
+
+
 def installed(sensors: dict[str, Sensor]) -> dict[str, Sensor]:
     """Those that are no invented shapes."""
     return {name: sensor for name, sensor in sensors.items() if name in ls.sensors()}
@@ -58,7 +63,7 @@ def installed(sensors: dict[str, Sensor]) -> dict[str, Sensor]:
 def splits(share: float) -> Figure:
     """P1: two-way splits at every byte, and random ones, against the whole."""
     tried = differing = 0
-    for sensor in STREAMS.values():
+    for sensor in streams().values():
         subject = Subject(sensor)
         data, source = clean(subject, length=max(int(1000 * share), 300)), subject.source("soak")
         books = Books(sensor).feed(data)
@@ -70,13 +75,13 @@ def splits(share: float) -> Figure:
                 books.feed(part)
             tried += 1
             differing += books.finish() != whole or books.decoder.stats != stats
-    return Figure(f"{tried:,} splits of the streams of {len(STREAMS)} sensors and shapes: {differing} differ", not differing)
+    return Figure(f"{tried:,} splits of the streams of {len(streams())} sensors and shapes: {differing} differ", not differing)
 
 
 def recovered(share: float) -> Figure:
     """P2: the frames of the engine against those of the oracle, whatever is damaged."""
     frames = missed = extra = 0
-    for sensor, seed in itertools.product(STREAMS.values(), range(max(int(3 * share), 1))):
+    for sensor, seed in itertools.product(streams().values(), range(max(int(3 * share), 1))):
         data = clean(Subject(sensor), seed=seed, length=int(2000 * share) + 200)[:4000]
         for rate, burst in itertools.product(RATES, BURSTS) if share == 1 else [(1e-3, 1)]:
             noisy = damaged(data, rate, seed, burst=burst)
@@ -107,7 +112,7 @@ def bounded(share: float) -> Figure:
     """P4: what a decoder holds while garbage goes through it, beyond the input."""
     size = int(50 * share) + 1
     data, held = garbage(1 << 20), {}
-    for name, sensor in few(installed(STREAMS), share):
+    for name, sensor in few(installed(streams()), share):
         fed(sensor, data, chunk=1 << 16)  # what is made once, and for all decoders
         held[name] = peak(lambda sensor=sensor: fed(sensor, data, size, 1 << 16))
     most = max(held, key=lambda name: held[name])
@@ -117,7 +122,7 @@ def bounded(share: float) -> Figure:
 def linear(share: float) -> Figure:
     """P5: twice the input, how many times the seconds."""
     length, ratios = int(400_000 * share) + 20_000, {}
-    for name, sensor in few(installed(STREAMS), share):
+    for name, sensor in few(installed(streams()), share):
         for what, data in (("garbage", garbage(length)), ("worst stream", worst(sensor, length))):
             half, whole = (min(seconds(sensor, data[:size]) for _ in range(5)) for size in (length // 2, length))
             ratios[f"{name}, {what}"] = whole / max(half, 1e-3)
@@ -128,7 +133,7 @@ def linear(share: float) -> Figure:
 def delay(share: float) -> Figure:
     """P6: bytes that come after a frame's last one before it is out, by the longest frame."""
     worst_share = 0.0
-    for _, sensor in few(STREAMS, share):
+    for _, sensor in few(streams(), share):
         data = Subject(sensor).stream(rounds=3)[: int(20_000 * share) + 3000]
         bound = max(frame.max_length * frame.confirm for frame in sensor.frames.values() if frame.direction == "in")
         decoder = sensor.decoder()
@@ -141,15 +146,15 @@ def delay(share: float) -> Figure:
 def round_trips(share: float) -> Figure:
     """P7: frames that are parsed and built again."""
     tried = lost = 0
-    for name, kind in FRAMES:
-        sensor = EVERY[name]
+    frames = distinct_frames(every_sensor().values())
+    for sensor, kind in frames:
         until_then = time.monotonic() + 3 * share + 0.01
         for seed in range(10_000):
             data = sensor.example(kind, seed=seed)
             tried, lost = tried + 1, lost + (sensor.build(kind, sensor.parse(data, frame=kind)) != data)
             if time.monotonic() > until_then:
                 break
-    return Figure(f"{tried:,} frames of {len(FRAMES)} types: {lost} come back as other bytes", not lost)
+    return Figure(f"{tried:,} frames of {len(frames)} types: {lost} come back as other bytes", not lost)
 
 
 def in_any_order(share: float) -> Figure:
@@ -199,7 +204,7 @@ def blocked(share: float) -> Figure:
 def slowest(share: float) -> Figure:
     """P20: frame types in turn, with the frames that announce them, against the line's rate; and what is kept of them."""
     rates, held = {}, {}
-    for name, sensor in few(installed(STREAMS), share):
+    for name, sensor in few(installed(streams()), share):
         line = next((link.baud / 10 for link in sensor.links.values() if isinstance(link, Serial)), None)
         data = (Subject(sensor).stream(rounds=2) * 200)[: int(120_000 * share) + 4000]
         sensor.decoder().feed(data[:16_000])  # what is made once, and for all decoders

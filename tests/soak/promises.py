@@ -74,7 +74,7 @@ EVERY = (
         "P14",
         "hostile captures take no memory, and move on or stop",
         (HOSTILE, "tests/captures/test_memory.py"),
-        "10,000 mutations of each format: no exception but SourceError; a capture of 1 GB below 200 MB",
+        "20,000 mutations of each format: no exception but SourceError; a capture of 1 GB below 200 MB",
     ),
     Promise(
         "P15",

@@ -10,6 +10,7 @@ from tests.soak import __main__ as soak
 from tests.soak.figures import ROOT, Figure
 from tests.soak.promises import EVERY, Promise
 
+#: measured with a small effort in the slow tier; the other tests hold the promises.
 QUICK = ("P4", "P6", "P20", "P23")
 BY_NAME = {promise.name: promise for promise in EVERY}
 
@@ -21,6 +22,7 @@ def test_each_promise_is_held_by_something_that_is_there() -> None:
         assert all((ROOT / test.partition("::")[0]).exists() for test in promise.tests)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", QUICK)
 def test_what_is_promised_is_measured(name: str) -> None:
     figure = soak.held(BY_NAME[name], 0.01, tests=False)
@@ -28,6 +30,7 @@ def test_what_is_promised_is_measured(name: str) -> None:
     assert any(letter.isdigit() for letter in figure.words)
 
 
+@pytest.mark.slow
 def test_a_promise_that_is_not_kept_says_so(tmp_path: Path) -> None:
     (tmp_path / "test_promised.py").write_text("def test_kept(): pass\ndef test_broken(): assert False\n")
     figure = soak.held(Promise("P0", "", (str(tmp_path / "test_promised.py"),), "all is well"), 0.01)
