@@ -112,7 +112,6 @@ QUICK = {
     *PLUGGY,
     "by_vectors/wrong_order",
     "by_vectors/wrong_span",
-    "dear_headers",
     "degrees",
     "lambda_raises",
     "missing_unit",

@@ -25,10 +25,11 @@ from lidarspec.testing.declared import declared
 from lidarspec.testing.findings import Violation, left_over
 from lidarspec.testing.frames import values_in_units_build_the_same_bytes, values_survive_building_and_parsing
 from lidarspec.testing.geometry import the_points_turn_as_the_axes_do
+from lidarspec.testing.hostile import MAX_CALLS_PER_BYTE, calls_per_byte, streams
 from lidarspec.testing.properties import PROPERTIES
 from lidarspec.testing.subject import Subject
 from lidarspec.testing.vectors import vectors_hold
-from tests.broken import sound
+from tests.broken import dear_headers, sound
 
 AUTHOR = """
 import lidarspec as ls
@@ -91,6 +92,14 @@ def test_the_plugin_loads_nothing_of_the_engine(tmp_path: Path) -> None:
     words = ["-m", "pytest", "-q", "-p", "no:cacheprovider", "-p", "lidarspec", "."]  # by its name as an entry point
     done = run(tmp_path, *words, PYTEST_DISABLE_PLUGIN_AUTOLOAD="1")  # other libraries' plugins load what they like
     assert done.returncode == 0, done.stdout
+
+
+def test_cost_of_a_stream_is_counted_in_function_calls() -> None:
+    (dear,) = dear_headers.lidarspec_sensors()
+    heads = "heads of frames"
+    for sensor, is_dear in ((dear, True), (sound.sensor(), False)):
+        stream = streams(Subject(sensor), length=1500)[heads]
+        assert (calls_per_byte(sensor, stream) > MAX_CALLS_PER_BYTE) == is_dear
 
 
 def rare(f: object) -> object:
