@@ -13,8 +13,6 @@ from contextlib import contextmanager
 from types import MappingProxyType
 from typing import Any, TypeVar
 
-NO_SENSORS = "no sensor is installed: pip install 'lidarspec[all]'"
-
 
 class LidarSpecError(Exception):
     """The base of every exception that lidarspec raises on purpose; any other one that leaves it is a bug."""
@@ -246,9 +244,28 @@ class UnknownName(UsageError):
 
 
 class UnknownSensor(UnknownName):
-    """No installed sensor has this id or alias."""
+    """No installed sensor has this id or alias.
+
+    Attributes:
+        distribution: the distribution that has it, if that is known and not installed, else "".
+    """
 
     what = "sensor"
+
+    def __init__(
+        self,
+        name: str,
+        known: Iterable[str] = (),
+        *,
+        place: str = "",
+        hint: str = "",
+        aliases: Mapping[str, str] = MappingProxyType({}),
+        distribution: str = "",
+    ) -> None:
+        self.distribution = distribution
+        if distribution:
+            hint = f": it comes with {distribution}, which is not installed"
+        super().__init__(name, known, place=place, hint=hint, aliases=aliases)
 
 
 class UnknownFrame(UnknownName):

@@ -32,11 +32,12 @@ from zlib import crc32
 import pluggy
 
 from lidarspec.entry_points import GROUP, SENSORS, VERBS, EntryPoint, entry_points, normal
-from lidarspec.errors import NO_SENSORS, LidarSpecError, SourceError, SpecError, UnknownSensor, UsageError, suggest
+from lidarspec.errors import LidarSpecError, SourceError, SpecError, UnknownSensor, UsageError, suggest
+from lidarspec.known_sensors import KnownLink, KnownSensor, known_sensors, unknown_sensor
 from lidarspec.spec.checksums import Checksum
 from lidarspec.spec.construct_layer import prepare, seals
 from lidarspec.spec.description import Frame
-from lidarspec.spec.links import Link
+from lidarspec.spec.links import Http, Link, Serial, Tcp, Udp
 from lidarspec.spec.results import Points
 from lidarspec.spec.sensor import Sensor
 from lidarspec.trust import document, own_settings
@@ -292,13 +293,64 @@ class Registry:
 
     def __contains__(self, name: str) -> bool:
         """Whether there is a sensor of this id or alias."""
+        if self.find(name) is not None:
+            return True
         self._load_all()
-        return self._holder(name) is not None and self._find(name) is not None
+        return self.find(name) is not None
+
+    def find(self, name: str) -> Sensor | None:
+        """Return the sensor with an id or alias, else None; only the plugin whose entry point has this name is loaded."""
+        if self._holder(name) is None or self._find(name) is None:
+            return None
+        return self.sensor(name)
 
     def sensors(self) -> dict[str, Sensor]:
         """Every sensor by id, sorted, with its hooks applied; those whose id several claim, and nobody owns, are left out."""
         self._load_all()
         return {name: self.sensor(name) for name in sorted(self._found())}
+
+    @property
+    def failures(self) -> list[Plugin]:
+        """The plugins loaded so far that failed, or lost a name to another."""
+        offered = [
+            self._together([entry for entry in entries if entry in self._tried])
+            for entries in self._offered.values()
+            if any(entry in self._tried for entry in entries)
+        ]
+        return [plugin for plugin in map(self._judged, (*self._modules, *offered)) if plugin.error]
+
+    def list_sensors(self) -> list[KnownSensor]:
+        """Return a row for each installed sensor, sorted by id; only plugins that the table does not describe are loaded."""
+        described = [row for row in known_sensors() if self._is_offered(row)]
+        names = {(row.distribution, name) for row in described for name in row.names}
+        for entries in self._offered.values():
+            for entry in entries:
+                if (entry.distribution, entry.name) not in names:
+                    self._load(entry)
+        rows = {row.id: row for row in described if self._has_name(row.distribution, row.id)}
+        for name, sensor in self._found().items():
+            home = self._holder(name)
+            if name not in rows and home is not None:
+                rows[name] = summarize(sensor, home[0], self._version(home[0]))
+        return [rows[name] for name in sorted(rows)]
+
+    def _is_offered(self, row: KnownSensor) -> bool:
+        """Return whether this version of the distribution is installed, and its entry points name the sensor as the row does."""
+        names: dict[str, set[str]] = {}
+        for (distribution, _), entries in self._offered.items():
+            for entry in entries:
+                if distribution == row.distribution and entry.version == row.version:
+                    names.setdefault(entry.value, set()).add(entry.name)
+        return row.names in names.values()
+
+    def _has_name(self, distribution: str, name: str) -> bool:
+        home = self._holder(name)
+        return home is not None and home[0] == distribution
+
+    def _version(self, distribution: str) -> str:
+        versions = (entry.version for entries in self._offered.values() for entry in entries if entry.distribution == distribution)
+        loaded = (plugin.version for plugin in self._modules if plugin.distribution == distribution)
+        return next(versions, None) or next(loaded, "")
 
     def sensor(self, name: str) -> Sensor:
         """One sensor by id or alias, in capitals and with other hyphens too, with its hooks applied.
@@ -319,7 +371,7 @@ class Registry:
         if found is None:
             known = self._found()
             aliases = {alias: one.id for one in known.values() for alias in one.aliases}
-            raise UnknownSensor(name, known, hint="" if known else f"; {NO_SENSORS}", aliases=aliases)
+            raise unknown_sensor(name, known, aliases)
         if name not in self._ready:
             self._ready[name] = self.hooked(found)
         return self._ready[name]
@@ -366,6 +418,31 @@ class Registry:
         for name in (sensor.id, *sensor.aliases):
             if sum(name in (s.id, *s.aliases) for s in own) > 1:
                 raise SpecError("another sensor has this id already: one of the same plugin", sensor=name)
+
+
+def summarize(sensor: Sensor, distribution: str, version: str) -> KnownSensor:
+    """Return the row of a sensor, without its signatures."""
+    return KnownSensor(
+        sensor.id,
+        sensor.vendor,
+        sensor.model,
+        sensor.status,
+        distribution,
+        version,
+        sensor.aliases,
+        {name: _summarize_link(link) for name, link in sensor.links.items()},
+    )
+
+
+def _summarize_link(link: Link) -> KnownLink:
+    kind = type(link).__name__.lower()
+    if isinstance(link, Serial):
+        return KnownLink(kind, link.bauds)
+    if isinstance(link, Udp):
+        return KnownLink(kind, link.ports or (link.broadcast,))
+    if isinstance(link, Tcp | Http):
+        return KnownLink(kind, (link.port,))
+    return KnownLink(kind)
 
 
 def _is_vendor(distribution: str, names: Iterable[str]) -> bool:

@@ -17,7 +17,7 @@ from pathlib import Path
 #: the stations on the way of a byte, bottom to top; a module that is named stands on its own floor, else on that of its package. Imports
 #: go down or stay, wherever in a module they stand and for types alike.
 FLOORS = (
-    "_version display errors libraries trust stores entry_points",
+    "_version display errors libraries trust stores entry_points known_sensors",
     "transports.protocol",  # what a source is, as values that plugins give too
     "spec",
     "wire",

@@ -13,7 +13,7 @@ from lidarspec.cli.options import output_option
 from lidarspec.cli.output import Progress, emit, emit_json
 from lidarspec.cli.terminal import note, say
 from lidarspec.discovery.draft import Link, Names, captured, draft, invented, joining, write
-from lidarspec.discovery.listen import beginning
+from lidarspec.discovery.heard import beginning
 from lidarspec.errors import UsageError, WireError, suggest
 from lidarspec.exports import EXPORTS, Refused, export as exported, narrowed
 from lidarspec.libraries import import_library

@@ -10,6 +10,7 @@ import click
 
 from lidarspec import errors
 from lidarspec.cli.terminal import note, voice
+from lidarspec.known_sensors import no_sensors
 
 FINDINGS, USAGE, SOURCE, NO_DATA, DEVICE, INTERRUPTED = 1, 2, 3, 4, 5, 130
 
@@ -38,12 +39,11 @@ def report(error: Exception, verb: str) -> int:
         return code
     message = _message(error)
     note(message)
-    if errors.NO_SENSORS in message:
-        return code
     if _lacks_sensors(error):
-        note(f"  {errors.NO_SENSORS}")
+        note(f"  {no_sensors()}")
         return code
-    errors.suggest(error, _following(error, command, verb))
+    if not errors.suggestion(error):
+        errors.suggest(error, _following(error, command, verb))
     for remark in error.__notes__:
         note(f"  {remark}")
     return code
@@ -51,7 +51,8 @@ def report(error: Exception, verb: str) -> int:
 
 def _lacks_sensors(error: Exception) -> bool:
     """Whether bytes or a device are nobody's because no sensor is installed."""
-    named = str(getattr(error, "sensor", "")) or " -s " in errors.suggestion(error)
+    suggestion = errors.suggestion(error)
+    named = str(getattr(error, "sensor", "")) or " -s " in suggestion or suggestion.startswith("pip install")
     if named or not isinstance(error, errors.WireError | errors.CommandError):
         return False
     from lidarspec.plugins import sensors

@@ -21,7 +21,9 @@ from lidarspec.discovery.doctor import computer, examined
 from lidarspec.discovery.listen import LISTEN, Heard, everywhere, hear, probe, started_first, udp_ports
 from lidarspec.discovery.periods import Structure, cut, structure
 from lidarspec.discovery.samples import Match
-from lidarspec.errors import NO_SENSORS, SourceError, UsageError, WireError, suggest
+from lidarspec.discovery.uninstalled import describe, install_commands, recognize
+from lidarspec.errors import SourceError, UsageError, WireError, suggest
+from lidarspec.known_sensors import KnownSensor, find_known_sensor, install_command, no_sensors
 from lidarspec.plugins import sensor as named_sensor, sensors
 from lidarspec.spec.links import Serial, Udp
 from lidarspec.spec.sensor import Sensor
@@ -53,7 +55,7 @@ def ports(as_json: bool, output: str | None) -> None:
     emit(table(["port", "what it is", "state", "lasting name"], rows, output), output)
     if not serial:
         note("there is no serial port; one that should be here: is it plugged in?")
-    note(f"next: lidarspec detect{f' {serial[0].path}' if len(serial) == 1 else ''}" if sensors() else NO_SENSORS)
+    note(f"next: lidarspec detect{f' {serial[0].path}' if len(serial) == 1 else ''}" if sensors() else no_sensors())
 
 
 def _senders(port: int) -> list[str]:
@@ -250,8 +252,9 @@ def _place(heard: Heard) -> str:
 
 
 def _conclusions(source: str | None, found: Sequence[Verdict], unknown: Structure | None, *, start: bool) -> Iterator[str]:
-    if not sensors():
-        yield NO_SENSORS
+    missing = _missing(found)
+    if not sensors() and not missing:
+        yield no_sensors()
     yield from dict.fromkeys(warning for one in found for warning in one.heard.warnings)
     for one in found:
         if one.heard.failure is not None:
@@ -265,7 +268,12 @@ def _conclusions(source: str | None, found: Sequence[Verdict], unknown: Structur
             yield f"next: lidarspec {_verb(one)} {_again(one)} {chosen(one.alike[0].sensor)}"
         elif one.others:
             yield f"{_place(one.heard)}: {others_named(one)}"
-            yield f"next: lidarspec new {next(iter(one.others))} --from-capture {quote(one.heard.source)}"
+            relative = next(iter(one.others))
+            known = find_known_sensor(relative)
+            if known is not None:
+                yield f"next: {install_command(known.distribution)}"
+            else:
+                yield f"next: lidarspec new {relative} --from-capture {quote(one.heard.source)}"
     if any(one.scores for one in found):
         return
     size = sum(one.heard.size for one in found)
@@ -273,6 +281,10 @@ def _conclusions(source: str | None, found: Sequence[Verdict], unknown: Structur
         yield f"{_place(one.heard)}: {one.fault}"
         yield f"next: lidarspec crc {quote(one.heard.source)}"
     if faulty:
+        return
+    if missing:
+        yield describe(missing)
+        yield f"next: {install_commands(missing)}"
         return
     if size:
         yield f"{size} bytes, and no frame of an installed sensor" + ("" if unknown else "; nor can frames of one kind be seen in them")
@@ -289,6 +301,14 @@ def _conclusions(source: str | None, found: Sequence[Verdict], unknown: Structur
         yield f"next: lidarspec detect {source or ''}".rstrip() + " --start"
     else:
         yield f"next: lidarspec doctor {quote(source) if source else ''}".rstrip()
+
+
+def _missing(found: Sequence[Verdict]) -> list[KnownSensor]:
+    """Return the sensors that are not installed and may have sent the most of the bytes, if no installed one fits."""
+    if any(one.scores or one.fault for one in found):
+        return []
+    largest = max((one.heard for one in found), key=lambda heard: heard.size, default=None)
+    return recognize(largest) if largest is not None and largest.size else []
 
 
 def _verb(one: Verdict) -> str:
@@ -382,6 +402,6 @@ def doctor(source: str | None, sensor_id: str | Sensor | None, duration: float, 
         lines = [f"{'ok   ' if one.ok else 'wrong'}  {one.text}" + (f"\n       next: {one.mend}" if one.mend else "") for one in found]
         emit("\n".join(lines) or "nothing is wrong with the ports of this computer", output)
     if sensor is None and not sensors():
-        note(NO_SENSORS)
+        note(no_sensors())
     if any(not finding.ok for finding in found):
         raise click.exceptions.Exit(FINDINGS)

@@ -14,8 +14,7 @@ from lidarspec.cli.inputs import nearest_fault, no_frame, opened
 from lidarspec.cli.options import OFFSET, count_option, output_options, selecting, sensor_option
 from lidarspec.cli.output import emit_json, emit_json_list, emit_lines, emit_parts, table
 from lidarspec.cli.terminal import note
-from lidarspec.discovery.detect import fitting
-from lidarspec.discovery.listen import Heard
+from lidarspec.discovery.heard import Heard
 from lidarspec.errors import UsageError, WireError, suggest
 from lidarspec.explaining.explanation import Explanation, values
 from lidarspec.explaining.listing import LINED, Line, told
@@ -295,6 +294,8 @@ def _sensor(given: Heard, sensor_id: str | Sensor | None, *, damaged: bool = Fal
     """The sensor named, or the one whose bytes these are, and the ids of all whose bytes they could be."""
     if sensor_id is not None:
         return named_sensor(sensor_id), []
+    from lidarspec.discovery.detect import fitting  # with all that detecting a sensor takes, which a named one does not need
+
     found = fitting(given.chunks, datagrams=given.datagrams)
     if found:
         fits = [sensor.id for sensor in found]

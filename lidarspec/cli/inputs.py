@@ -1,4 +1,7 @@
-"""What verbs are given: bytes as text, files, live sources; and what is said where nothing of use comes."""
+"""What verbs are given: bytes as text, files, live sources; and what is said where nothing of use comes.
+
+Sources, files and the search for a sensor are imported by the functions that need them: the bytes of a named sensor need none of them.
+"""
 
 from __future__ import annotations
 
@@ -14,25 +17,25 @@ from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from pathlib import Path
 from shlex import quote
+from typing import TYPE_CHECKING
 
 import click
 
 from lidarspec.cli.failures import FINDINGS
 from lidarspec.cli.terminal import note
-from lidarspec.device.device import Device
-from lidarspec.device.settings import named
-from lidarspec.discovery.detect import chosen, nearest, never_right, verdict
-from lidarspec.discovery.listen import LOOKED_AT, Heard, beginning, leading
+from lidarspec.discovery.heard import LOOKED_AT, Heard, beginning, leading
 from lidarspec.errors import CommandError, LidarSpecError, SourceError, UsageError, WireError, suggest, system_errors
 from lidarspec.plugins import sensors
 from lidarspec.scans.scans import Scan
 from lidarspec.scans.selection import Selection, Times, received
 from lidarspec.spec.sensor import Sensor
-from lidarspec.transports.files import FileTransport
 from lidarspec.transports.hexadecimal import hex_chunks, is_hexadecimal, unhexed
-from lidarspec.transports.open_url import is_port, live_address, transport
 from lidarspec.transports.protocol import Chunk, no_bytes
 from lidarspec.wire.parse import parse_typed
+
+if TYPE_CHECKING:
+    from lidarspec.device.device import Device
+    from lidarspec.transports.files import FileTransport
 
 #: longest hexadecimal text that is repeated in the next command, and of other text in a message.
 REPEATED, QUOTED = 400, 64
@@ -56,7 +59,7 @@ def opened(words: Sequence[str], times: Times = (None, None)) -> Iterator[tuple[
         SourceError: for a file that cannot be read.
     """
     text = " ".join(words)
-    if text == "-" or (len(words) == 1 and os.path.exists(text) and not is_port(text)):
+    if text == "-" or (len(words) == 1 and _is_file(text)):
         reading = _file(text, times)
     else:
         try:
@@ -64,6 +67,8 @@ def opened(words: Sequence[str], times: Times = (None, None)) -> Iterator[tuple[
                 raise ValueError("there are no digits")
             reading = _beginning(text if len(text) <= REPEATED else "-", iter([Chunk(data)]), datagrams=False)
         except ValueError as error:
+            from lidarspec.device.settings import named
+
             if (device := named(text)) is None:
                 raise _no_bytes(words, error) from None
             reading = opened([device.source], times)
@@ -71,8 +76,19 @@ def opened(words: Sequence[str], times: Times = (None, None)) -> Iterator[tuple[
         yield given
 
 
+def _is_file(text: str) -> bool:
+    if not os.path.exists(text):
+        return False
+    from lidarspec.transports.open_url import is_port
+
+    return not is_port(text)
+
+
 @contextlib.contextmanager
 def _file(path: str, times: Times) -> Iterator[tuple[Heard, Iterator[Chunk]]]:
+    from lidarspec.transports.files import FileTransport
+    from lidarspec.transports.open_url import transport
+
     with contextlib.closing(transport(path)) as file:
         chunks = _standard_input(file) if path == "-" and type(file) is FileTransport else received(file, times, path)
         with _beginning(path, chunks, datagrams=file.datagrams, warnings=file.warnings) as given:
@@ -125,6 +141,8 @@ def read(words: Sequence[str]) -> Heard:
 
 def _no_bytes(words: Sequence[str], error: ValueError) -> LidarSpecError:
     """Why words are neither a file nor hexadecimal digits."""
+    from lidarspec.transports.open_url import live_address
+
     text = " ".join(words)
     if len(words) == 1 and live_address(text) is not None:
         return suggest(UsageError(f"{text} is live: this takes bytes or a file"), f"lidarspec read {quote(text)} --packets")
@@ -162,6 +180,8 @@ def _read_for(given: str | Path | Sensor | None) -> Iterator[str | int]:
         return
     word = str(given or "")
     yield from [0] if word == "-" else [word, word.partition("?")[0], word.rpartition(":")[0], word.partition("=")[2]]
+    from lidarspec.device.settings import named
+
     with contextlib.suppress(LidarSpecError):  # settings that are wrong are told of where a name is looked up
         known = named(word)
         yield from (known.source.partition("?")[0], *map(str, known.options.values())) if known else ()
@@ -188,6 +208,9 @@ def no_frame(sensor: Sensor, given: Heard) -> WireError:
 
 def nearest_fault(given: Heard) -> WireError:
     """No sensor fits: what the one that came farthest says, with its id, or that none came far."""
+    from lidarspec.discovery.detect import nearest
+    from lidarspec.discovery.uninstalled import suggest_installation
+
     if not given.data:
         return suggest(WireError(no_bytes(given.source, given.warnings)), "lidarspec sensors")
     if (fault := _never_right(given)) is not None:
@@ -195,12 +218,15 @@ def nearest_fault(given: Heard) -> WireError:
     best = nearest(given.data)
     if best is None:
         text = f"no frame of any of the {len(sensors())} installed sensors" if sensors() else "no frame of an installed sensor"
-        return suggest(WireError(text, data=given.data[:QUOTED]), "lidarspec sensors")
+        error = suggest_installation(WireError(text, data=given.data[:QUOTED]), given)
+        return suggest(error, "lidarspec sensors")
     return suggest(best, f"lidarspec explain {quote(given.source)} -s {best.sensor}")
 
 
 def _never_right(given: Heard) -> WireError | None:
     """That the input is frames of a sensor whose checksums are never right; None where it is not."""
+    from lidarspec.discovery.detect import never_right
+
     fault = never_right(given.chunks, datagrams=given.datagrams)
     return suggest(WireError(f"{given.source}: {fault}"), f"lidarspec crc {quote(given.source)}") if fault else None
 
@@ -249,6 +275,8 @@ def conclude(device: Device) -> None:
 
 def again(source: str) -> Heard | None:
     """The beginning of a file once more; None for what can be read only once."""
+    from lidarspec.transports.open_url import transport
+
     if not Path(source.partition("?")[0]).is_file():
         return None
     with contextlib.closing(transport(source)) as file:
@@ -261,6 +289,8 @@ def again(source: str) -> Heard | None:
 
 def fits_instead(sensor: Sensor, source: str) -> tuple[str, str] | None:
     """What a file holds that has no data frame of a sensor, and the options with which it is read; None where nothing fits."""
+    from lidarspec.discovery.detect import chosen, verdict
+
     given = again(source)
     found = verdict(given).scores if given is not None else ()
     own = next((score.sensor.options for score in found if score.sensor.id == sensor.id), None)

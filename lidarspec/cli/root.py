@@ -20,6 +20,7 @@ from lidarspec.cli.failures import INTERRUPTED, report
 from lidarspec.cli.terminal import note, say, silence, streams, voice
 from lidarspec.entry_points import VERBS as PLUGGED, EntryPoint, entry_points
 from lidarspec.errors import did_you_mean, suggest
+from lidarspec.known_sensors import install_command
 
 #: group -> verb -> (module, what it does); the texts are those of the verbs' own help.
 GROUPS = {
@@ -62,7 +63,7 @@ GROUPS = {
 }
 VERBS = {verb: place for verbs in GROUPS.values() for verb, place in verbs.items()}
 #: verbs of plugins that are installed only where somebody asks for them.
-ELSEWHERE = {"ros2": "lidarspec-ros2[ros2]"}
+ELSEWHERE = {"ros2": "lidarspec-ros2"}
 
 
 def _spoken(loudness: int, *names: str, help: str) -> click.Option:
@@ -115,7 +116,7 @@ class Verbs(click.Group):
         if args[0] not in VERBS and args[0] not in added() and not ctx.resilient_parsing:
             if args[0] in ELSEWHERE:
                 error = click.UsageError(f"the verb {args[0]!r} comes with a plugin that is not installed", ctx)
-                raise suggest(error, f"pip install '{ELSEWHERE[args[0]]}'")
+                raise suggest(error, install_command(ELSEWHERE[args[0]], extra=args[0]))
             raise click.UsageError(f"unknown verb {args[0]!r}{did_you_mean(args[0], self.list_commands(ctx))}", ctx)
         return super().resolve_command(ctx, args)
 

@@ -1,9 +1,12 @@
-"""The verbs that look at what is installed, and the one that says what is believed beside it."""
+"""The verbs that look at what is installed, and the one that says what is believed beside it.
+
+`sensors` and `show` are typed often and need little of the package: each function imports what the other verbs do not need.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import click
 
@@ -12,24 +15,14 @@ from lidarspec.cli.failures import FINDINGS
 from lidarspec.cli.options import output_options
 from lidarspec.cli.output import emit, emit_json, table
 from lidarspec.cli.terminal import note, say
-from lidarspec.device.settings import devices
-from lidarspec.errors import NO_SENSORS, SpecError
-from lidarspec.explaining.wording import asked
-from lidarspec.exports.json import facts, link_data
-from lidarspec.framing.results import Counters, Found, packed
-from lidarspec.packets.stream import PacketStream
-from lidarspec.plugins import Plugin, registry, sensor as named_sensor, tried
-from lidarspec.points.numpy_plan import describe
-from lidarspec.points.plan import Plan, plan_for
-from lidarspec.simulation.frame_maker import FrameMaker
-from lidarspec.spec.description import Frame
-from lidarspec.spec.links import Http, Link, Serial, Tcp, Udp
+from lidarspec.errors import SpecError
+from lidarspec.known_sensors import KnownLink, no_sensors
+from lidarspec.plugins import Plugin, registry, sensor as named_sensor, summarize, tried
 from lidarspec.spec.sensor import Sensor
-from lidarspec.transports.ports import serial_ports
 from lidarspec.trust import FILE, TRUSTED, trust as trusted, user_folder
-from lidarspec.wire.frame_table import Rows
-from lidarspec.wire.schema import schema
-from lidarspec.wire.wire_table import frame_size, wire_table
+
+if TYPE_CHECKING:
+    from lidarspec.spec.description import Frame
 
 #: packets that a plan is shown for: as many as a turn may take, since some of them are shorter.
 PACKETS = 32
@@ -37,14 +30,18 @@ PACKETS = 32
 
 def guide() -> str:
     """Return what is installed and connected, and the first commands to type."""
-    known = registry().sensors()
+    from lidarspec.device.settings import devices
+    from lidarspec.transports.ports import serial_ports
+
+    known = registry().list_sensors()
     ports = [port.path for port in serial_ports()]
     named = list(devices())
-    source = (named or ports or ["sim:" + next(iter(known), "ID")])[0]
-    vendors = {sensor.vendor for sensor in known.values()}
+    example = known[0].id if known else "ID"
+    source = (named or ports or [f"sim:{example}"])[0]
+    vendors = {sensor.vendor for sensor in known}
     lines = [
         f"lidarspec {__version__}",
-        f"{len(known)} sensors of {len(vendors)} vendors" if vendors else NO_SENSORS,
+        f"{len(known)} sensors of {len(vendors)} vendors" if vendors else no_sensors(),
         f"serial ports: {', '.join(ports) or 'none'}",
     ]
     if named:
@@ -70,16 +67,17 @@ def guide() -> str:
 @output_options
 def sensors(as_json: bool, output: str | None) -> None:
     """The installed sensors, and how far each is proven."""
-    known = registry().sensors()
-    homes = {name: plugin.distribution for plugin in registry().plugins for name in plugin.sensors}
+    known = registry().list_sensors()
     if as_json:
-        emit_json([_facts(sensor) | {"distribution": homes.get(name, "")} for name, sensor in known.items()], output)
+        homes = {row.id: row.distribution for row in known}
+        loaded = registry().sensors()
+        emit_json([_facts(sensor) | {"distribution": homes.get(name, "")} for name, sensor in loaded.items()], output)
     elif known:
-        rows = [[s.id, f"{s.vendor} {s.model}", _links(s), s.status, homes.get(name, "")] for name, s in known.items()]
+        rows = [[row.id, f"{row.vendor} {row.model}", _links(row.links), row.status, row.distribution] for row in known]
         emit(table(["id", "device", "link", "status", "distribution"], rows, output), output)
     if not known:
-        note(NO_SENSORS)
-    broken = [plugin for plugin in registry().plugins if plugin.error]
+        note(no_sensors())
+    broken = registry().failures
     if broken:
         note(f"{len(broken)} plugin{'s' * (len(broken) > 1)} could not be loaded; next: lidarspec plugins")
 
@@ -90,6 +88,8 @@ def sensors(as_json: bool, output: str | None) -> None:
 @output_options
 def show(sensor_id: str, as_plan: bool, as_json: bool, output: str | None) -> None:
     """What a sensor is, and the wire table of each of its frames."""
+    from lidarspec.wire.wire_table import frame_size, wire_table
+
     sensor = named_sensor(sensor_id)
     if as_plan:
         plans = {name: _plan(sensor, name) for name in sensor.data_frames}
@@ -101,9 +101,10 @@ def show(sensor_id: str, as_plan: bool, as_json: bool, output: str | None) -> No
         emit_json({**_facts(sensor), "frames": frames, "commands": commands}, output)
         return
     low, high = sensor.range_limits
+    links = _links(summarize(sensor, distribution="", version="").links)
     parts = [
         f"{sensor.id}: {sensor.vendor} {sensor.model}" + (f", also {', '.join(sensor.aliases)}" if sensor.aliases else ""),
-        f"  link    {_links(sensor)}\n  range   {low:g} .. {high:g} m\n  status  {sensor.status}\n  source  {sensor.source}",
+        f"  link    {links}\n  range   {low:g} .. {high:g} m\n  status  {sensor.status}\n  source  {sensor.source}",
     ]
     units = {role: _unit(sensor, path) for role, path in sensor.info.items()}
     parts += [f"  says    {', '.join(f'{role} ({path}{units[role]})' for role, path in sensor.info.items())}"] if sensor.info else []
@@ -118,6 +119,8 @@ def show(sensor_id: str, as_plan: bool, as_json: bool, output: str | None) -> No
 
 def _unit(sensor: Sensor, path: str) -> str:
     """The unit of a field, as "frame.path", behind a comma."""
+    from lidarspec.wire.schema import schema
+
     frame, _, field = path.partition(".")
     unit = schema(sensor.frames[frame].tree).named[field].unit if frame in sensor.frames else ""
     return f", {unit}" if unit else ""
@@ -125,6 +128,13 @@ def _unit(sensor: Sensor, path: str) -> str:
 
 def _plan(sensor: Sensor, frame: str) -> list[str]:
     """The plan of a data frame in lines, or why there is none."""
+    from lidarspec.framing.results import Counters, Found, packed
+    from lidarspec.packets.stream import PacketStream
+    from lidarspec.points.numpy_plan import describe
+    from lidarspec.points.plan import Plan, plan_for
+    from lidarspec.simulation.frame_maker import FrameMaker
+    from lidarspec.wire.frame_table import Rows
+
     try:
         made, sweep = FrameMaker(sensor, frame), sensor.simulation_of(frame).sweep
     except SpecError as error:
@@ -152,7 +162,7 @@ def plugins(ctx: click.Context, as_json: bool, output: str | None) -> None:
     if as_json:
         emit_json([{**vars(plugin), "sensors": list(plugin.sensors)} for plugin in found], output)
     else:
-        emit(table(["distribution", "version", "entry point", "sensors"], rows, output) if rows else NO_SENSORS, output)
+        emit(table(["distribution", "version", "entry point", "sensors"], rows, output) if rows else no_sensors(), output)
     if any(plugin.error or plugin.remark for plugin in found):
         ctx.exit(FINDINGS)
 
@@ -176,6 +186,8 @@ def trust(folder: str) -> None:
 
 def _facts(sensor: Sensor) -> dict[str, Any]:
     """What is known of a sensor, for JSON."""
+    from lidarspec.exports.json import facts, link_data
+
     return {
         **facts(sensor, "id", "vendor", "model", "status", "source", "aliases"),
         "links": {name: link_data(link) for name, link in sensor.links.items()},
@@ -187,6 +199,9 @@ def _facts(sensor: Sensor) -> dict[str, Any]:
 
 
 def _frame(frame: Frame) -> dict[str, Any]:
+    from lidarspec.exports.json import facts
+    from lidarspec.wire.wire_table import frame_size, wire_table
+
     rows = [vars(row) for row in wire_table(frame)]
     return {**facts(frame, "direction", "data"), "size": frame_size(frame), "max_length": frame.max_length, "rows": rows}
 
@@ -205,18 +220,18 @@ def _command(sensor: Sensor, name: str) -> Mapping[str, Any]:
 
 
 def _command_text(sensor: Sensor, name: str) -> str:
+    from lidarspec.explaining.wording import asked
+
     command = _command(sensor, name)
     args = "".join(f" {name}={asked(argument.kind)}" for name, argument in sensor.commands[name].arguments.items())
     answer = f", answered by {command['reply']}{' while it is stopped' if command['only_stopped'] else ''}" if command["reply"] else ""
     return f"{args}{': ' if command['hex'] else ''}{command['hex']}{answer}"
 
 
-def _links(sensor: Sensor) -> str:
-    return ", ".join(_link_text(link) for link in sensor.links.values())
+def _links(links: Mapping[str, KnownLink]) -> str:
+    return ", ".join(_link_text(link) for link in links.values())
 
 
-def _link_text(link: Link) -> str:
-    if isinstance(link, Serial):
-        return f"serial {'/'.join(str(baud) for baud in link.bauds)} baud"
-    ports = link.ports or (link.broadcast,) if isinstance(link, Udp) else (link.port,) if isinstance(link, Tcp | Http) else ()
-    return f"{type(link).__name__.lower()} {'/'.join(map(str, ports))}".strip()
+def _link_text(link: KnownLink) -> str:
+    unit = "baud" if link.kind == "serial" else ""
+    return f"{link.kind} {'/'.join(map(str, link.numbers))} {unit}".strip()

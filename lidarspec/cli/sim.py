@@ -7,10 +7,10 @@ import shutil
 import time
 from collections.abc import Callable, Mapping
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import click
 import numpy as np
-from rich.text import Text
 
 from lidarspec.cli.failures import FINDINGS
 from lidarspec.cli.options import DURATION, SHARE, configuring, count_option, sensor_option
@@ -18,7 +18,8 @@ from lidarspec.cli.output import Progress, drawn, emit_json, size
 from lidarspec.cli.terminal import ended_by_terminate, note, say
 from lidarspec.device.demo import Demonstration, demonstrate
 from lidarspec.discovery.detect import chosen
-from lidarspec.errors import NO_SENSORS, UsageError, suggest
+from lidarspec.errors import UsageError, suggest
+from lidarspec.known_sensors import no_sensors
 from lidarspec.plugins import registry, sensor as named_sensor
 from lidarspec.points.look import look
 from lidarspec.recording.recorders import SUFFIXES
@@ -33,6 +34,9 @@ from lidarspec.transports.outlets import HERE, Outlet, has_terminals, simulated_
 from lidarspec.transports.serving import serve, write_file
 from lidarspec.transports.simulated import rate_of
 from lidarspec.view.polar import picture
+
+if TYPE_CHECKING:
+    from rich.text import Text
 
 #: seconds that go into a file where nobody says how many.
 IN_A_FILE = 10.0
@@ -156,7 +160,7 @@ def demo(sensor_id: str | Sensor | None, count: int, errors: float, as_json: boo
     simulated = (one for one in registry().sensors().values() if any(one.simulation_of(name).sweep for name in one.data_frames))
     sensor = named_sensor(sensor_id) if sensor_id else next(simulated, None)
     if sensor is None:
-        raise UsageError(NO_SENSORS)
+        raise UsageError(no_sensors())
     result = demonstrate(sensor, turns=count, errors=errors)
     whole = [scan for scan in result.scans if scan.whole]
     if as_json:

@@ -25,13 +25,15 @@ from numpy.typing import NDArray
 from lidarspec.columns.columns import Fields
 from lidarspec.device.settings import named
 from lidarspec.discovery.checksum_search import search
-from lidarspec.discovery.listen import Heard, hear
+from lidarspec.discovery.heard import Heard
+from lidarspec.discovery.listen import hear
+from lidarspec.discovery.uninstalled import suggest_installation
 from lidarspec.errors import CommandError, LidarSpecError, UsageError, WireError, suggest
 from lidarspec.framing.decoder import Decoder
 from lidarspec.framing.frame_engine import codec
 from lidarspec.framing.results import VALID, Found
 from lidarspec.packets.packets import Packets
-from lidarspec.plugins import sensors
+from lidarspec.plugins import registry, sensor as named_sensor, sensors
 from lidarspec.simulation.simulator import simulate
 from lidarspec.spec.description import Relative
 from lidarspec.spec.links import Serial
@@ -41,7 +43,6 @@ from lidarspec.transports.base import data_link
 from lidarspec.transports.files import RecordingTransport
 from lidarspec.transports.open_url import live_address, resolved, transport
 from lidarspec.transports.protocol import no_bytes
-from lidarspec.transports.simulated import SimulatedTransport
 from lidarspec.wire.layout import Bytes2D, Seal, Sums
 from lidarspec.wire.parse import parse_typed
 from lidarspec.wire.schema import schema
@@ -87,15 +88,17 @@ def told_apart(candidates: Sequence[Sensor], found: Mapping[str, Sequence[Found]
         return Told(spoken_for, {})
     reasons = {name: why for seen in shown.values() for name, why in seen.items()}
     told = {name: text for sensor in left for name, text in sensor.relatives.items() if isinstance(text, str) and name not in ids}
+    installed = registry()
     return Told(
-        {sensor.id: reasons.get(sensor.id, "") for sensor in left}, {name: text for name, text in told.items() if name not in sensors()}
+        {sensor.id: reasons.get(sensor.id, "") for sensor in left},
+        {name: text for name, text in told.items() if installed.find(name) is None},
     )
 
 
 def contradiction(sensor: Sensor, found: Sequence[Found]) -> str:
     """That these frames are those of relatives and not the sensor's, with what says so, or name another model; "" where nothing does."""
-    known = sensors()
-    alike = [sensor, *(known[name] for name in sensor.relatives if name in known)]
+    relatives = map(registry().find, sensor.relatives)  # loads their plugins alone
+    alike = [sensor, *(relative for relative in relatives if relative is not None)]
     told = told_apart(alike, {one.id: found for one in alike})
     if sensor.id not in told.alike:
         return "the frames are those of " + " or ".join(f"{name} ({why})" for name, why in (told.alike or told.others).items())
@@ -429,6 +432,8 @@ def declared(source: str | Path) -> Sensor | None:
         return configured
     if str(source) == "-":
         raise UsageError("name the sensor with -s: standard input can be read only once")
+    if (simulated := simulated_sensor(source)) is not None:
+        return simulated
     address = live_address(source)
     if address is not None and address.scheme != "sim":
         return None
@@ -436,7 +441,15 @@ def declared(source: str | Path) -> Sensor | None:
     opened.close()
     if isinstance(opened, RecordingTransport) and opened.header.sensor:
         return opened.known_sensor()
-    return opened.sensor if isinstance(opened, SimulatedTransport) else None
+    return None
+
+
+def simulated_sensor(source: str | Path) -> Sensor | None:
+    """Return the sensor that a source simulates, as in "sim:ID"; None for any other source. Nothing is opened."""
+    address = live_address(source)
+    if address is None or address.scheme != "sim" or not address.place:
+        return None
+    return named_sensor(address.place)
 
 
 def _nothing(source: str, found: Sequence[Verdict]) -> Exception:
@@ -445,7 +458,8 @@ def _nothing(source: str, found: Sequence[Verdict]) -> Exception:
     if fault := next((one.fault for one in found if one.fault), ""):
         return suggest(WireError(f"{source}: {fault}"), f"lidarspec crc {quote(str(source))}")
     if heard.size:
-        return WireError(f"{source}: no installed sensor's frames are in it", data=heard.chunks[0][:SHOWN])
+        error = WireError(f"{source}: no installed sensor's frames are in it", data=heard.chunks[0][:SHOWN])
+        return suggest_installation(error, heard)
     if live_address(source) is None:
         return WireError(no_bytes(source, heard.warnings))
     why = heard.warnings[0] if heard.warnings else f"{source}: nothing comes; a sensor that has to be started first is named with -s"

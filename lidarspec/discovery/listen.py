@@ -6,14 +6,14 @@ Some sensors keep silent until they are started: `probe` sends their start comma
 from __future__ import annotations
 
 import contextlib
-import itertools
 import os
 import time
-from collections.abc import Callable, Iterable, Iterator, Sequence
-from dataclasses import dataclass, field, replace
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import replace
 from pathlib import Path
 
 from lidarspec.device.session import Pending, Session
+from lidarspec.discovery.heard import LOOKED_AT, Heard, beginning
 from lidarspec.errors import LidarSpecError, SourceError, UsageError
 from lidarspec.framing.decoder import Decoder
 from lidarspec.plugins import sensors
@@ -21,10 +21,10 @@ from lidarspec.spec.links import Serial, Udp
 from lidarspec.spec.sensor import Sensor
 from lidarspec.transports.base import data_link, with_option
 from lidarspec.transports.open_url import live, live_address, transport
-from lidarspec.transports.protocol import Chunk, Disconnected, LiveTransport, Transport, endpoint, sender_names
+from lidarspec.transports.protocol import Chunk, Disconnected, LiveTransport, endpoint, sender_names
 
-#: bytes and datagrams that are looked at; of a live source, bytes that are enough.
-LOOKED_AT, DATAGRAMS, PLENTY = 1 << 17, 400, 1 << 14
+#: datagrams that are looked at; of a live source, bytes that are enough.
+DATAGRAMS, PLENTY = 400, 1 << 14
 #: seconds to listen for, and between two looks.
 LISTEN, LOOK = 1.2, 0.1
 #: seconds to wait for data: of a device that has answered, and a motor may have to come up; and of one that has not.
@@ -33,39 +33,6 @@ ANSWERED, UNANSWERED = 4.0, 1.0
 TURN = 0.05
 #: seconds for the commands that stop it again.
 STOPPING = 2.0
-
-
-@dataclass(frozen=True)
-class Heard:
-    """What came from one source, of one sender.
-
-    Attributes:
-        source: how to open it again.
-        chunks: datagrams, or pieces of a stream.
-        datagrams: whether they are datagrams.
-        baud: at which a serial port was read; None for another source, and for a port that has no baud rate.
-        sender: address of the sender, where there are several.
-        failure: why it could not be opened.
-        warnings: what is to be said of the source, once it was read to its end.
-    """
-
-    source: str
-    chunks: tuple[bytes, ...] = ()
-    datagrams: bool = False
-    baud: int | None = None
-    sender: str = ""
-    failure: SourceError | None = field(default=None, compare=False)
-    warnings: tuple[str, ...] = ()
-
-    @property
-    def size(self) -> int:
-        """The number of bytes."""
-        return sum(map(len, self.chunks))
-
-    @property
-    def data(self) -> bytes:
-        """All bytes in order."""
-        return b"".join(self.chunks)
 
 
 def bauds() -> list[int]:
@@ -124,11 +91,13 @@ def _strangers(opened: LiveTransport) -> tuple[str, ...]:
 def _by_sender(heard: Heard, chunks: Sequence[Chunk]) -> Iterator[Heard]:
     """What was heard, of each sender; of a single one without a name."""
     names = sender_names((chunk.sender, chunk.receiver) for chunk in chunks)
-    by_sender: dict[str, list[bytes]] = {name: [] for name in names.values()} or {"": []}
+    by_sender: dict[str, list[Chunk]] = {name: [] for name in names.values()} or {"": []}
     for chunk in chunks:
-        by_sender[names[chunk.sender]].append(chunk.data)
-    for sender, data in by_sender.items():
-        yield replace(heard, chunks=tuple(data), sender=sender if len(by_sender) > 1 else "")
+        by_sender[names[chunk.sender]].append(chunk)
+    for sender, sent in by_sender.items():
+        ports = frozenset(chunk.receiver[1] for chunk in sent if chunk.receiver is not None)
+        data = tuple(chunk.data for chunk in sent)
+        yield replace(heard, chunks=data, sender=sender if len(by_sender) > 1 else "", ports=ports)
 
 
 def heard_as(source: str | Path, sensor: Sensor, seconds: float) -> list[Heard]:
@@ -140,22 +109,6 @@ def heard_as(source: str | Path, sensor: Sensor, seconds: float) -> list[Heard]:
             chunks += opened.read(min(left, LOOK))
     baud = None if address is not None and has_no_baud(address.place) else opened.baud
     return list(_by_sender(Heard(str(source), (), opened.datagrams, baud), chunks)) if chunks else []
-
-
-def beginning(opened: Transport, most: int, *, number: int | None = None) -> list[Chunk]:
-    """The beginning of a file: what holds `most` bytes, or `number` chunks if these are fewer."""
-    return [replace(chunk, data=chunk.data[:most]) for chunk in leading(itertools.islice(opened.chunks(), number), most)]
-
-
-def leading(chunks: Iterable[Chunk], most: int) -> list[Chunk]:
-    """The first chunks, up to the one with which there are so many bytes."""
-    found, size = list[Chunk](), 0
-    for chunk in chunks:
-        found.append(chunk)
-        size += len(chunk.data)
-        if size >= most:
-            break
-    return found
 
 
 def _listened(opened: LiveTransport, seconds: float) -> list[Chunk]:

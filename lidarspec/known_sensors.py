@@ -1,0 +1,141 @@
+"""The sensors of this project's distributions, installed or not, read from a table.
+
+`known_sensors.json` is generated from the plugins by `make known-sensors` and is the only place in the core that names sensors. It
+serves two purposes: a sensor that is not installed can be named with its distribution, and the installed ones can be listed without
+loading their plugins. A row describes one version of a distribution; `plugins` uses it only if that version is installed and its entry
+points name the sensor as the row does.
+"""
+
+from __future__ import annotations
+
+import functools
+import os
+import re
+from collections.abc import Iterable, Mapping
+from typing import Any, NamedTuple
+
+from lidarspec.errors import UnknownSensor, suggest
+
+#: stands for the vendor in an install command that is valid for every vendor.
+ANY_DISTRIBUTION = "lidarspec-VENDOR"
+_REPOSITORY = "https://github.com/lidarspec/lidarspec"
+_PREFIX = "lidarspec-"
+
+
+class KnownLink(NamedTuple):
+    """A link of a sensor: its kind, "serial", "udp", "tcp" or another, and its bauds or ports, the most likely first."""
+
+    kind: str
+    numbers: tuple[int, ...] = ()
+
+
+class Signature(NamedTuple):
+    """The constant bytes that a data frame begins with, and its size.
+
+    Attributes:
+        sync: hexadecimal digits of each byte, ".." for a byte that is not constant, separated by spaces.
+        size: the size of the frame in bytes; 0 if it varies.
+    """
+
+    sync: str
+    size: int
+
+
+class KnownSensor(NamedTuple):
+    """A row of the table.
+
+    Attributes:
+        signatures: those of its data frames.
+    """
+
+    id: str
+    vendor: str
+    model: str
+    status: str
+    distribution: str
+    version: str
+    aliases: tuple[str, ...] = ()
+    links: Mapping[str, KnownLink] = {}
+    signatures: tuple[Signature, ...] = ()
+
+    @property
+    def names(self) -> frozenset[str]:
+        """The id and the aliases."""
+        return frozenset((self.id, *self.aliases))
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return the row as JSON data."""
+        return {
+            **self._asdict(),
+            "aliases": list(self.aliases),
+            "links": {name: [link.kind, *link.numbers] for name, link in self.links.items()},
+            "signatures": [list(signature) for signature in self.signatures],
+        }
+
+    @classmethod
+    def from_dict(cls, row: Mapping[str, Any]) -> KnownSensor:
+        """Return the row that `to_dict` wrote."""
+        links = {name: KnownLink(kind, tuple(numbers)) for name, (kind, *numbers) in row["links"].items()}
+        signatures = tuple(Signature(sync, size) for sync, size in row["signatures"])
+        given = {**row, "aliases": tuple(row["aliases"]), "links": links, "signatures": signatures}
+        return cls(**given)
+
+
+@functools.cache
+def known_sensors() -> tuple[KnownSensor, ...]:
+    """Return the rows of the table, sorted by id."""
+    import json
+
+    with open(os.path.join(os.path.dirname(__file__), "known_sensors.json"), encoding="utf-8") as file:
+        return tuple(KnownSensor.from_dict(row) for row in json.load(file))
+
+
+def find_known_sensor(name: str) -> KnownSensor | None:
+    """Return the row with an id or alias, whatever its case and hyphens, else None."""
+    letters = _letters(name)
+    return next((row for row in known_sensors() if any(_letters(known) == letters for known in row.names)), None)
+
+
+def _letters(name: str) -> str:
+    return re.sub(r"[\W_]", "", name).lower()
+
+
+def install_command(*distributions: str, extra: str = "") -> str:
+    """Return the command that installs distributions of this project.
+
+    No package index has them yet. If lidarspec runs from a checkout, the command names folders of it, else the repository.
+    """
+    extras = f"[{extra}]" if extra else ""
+    plugins = os.path.join(os.path.dirname(os.path.dirname(os.path.abspath(__file__))), "plugins")
+    if os.path.isdir(plugins):
+        sources = [os.path.join(plugins, name) + extras for name in distributions]
+    else:
+        sources = [f"{name}{extras} @ git+{_REPOSITORY}#subdirectory=plugins/{name}" for name in distributions]
+    return " ".join(["pip install", *map(_quote, sources)])
+
+
+def _quote(word: str) -> str:
+    return word if re.fullmatch(r"[\w./:+-]+", word) else f"'{word}'"
+
+
+def no_sensors() -> str:
+    """Return the text for an environment without any sensor: how to install those of a vendor, and the vendors."""
+    vendors = sorted({row.distribution.removeprefix(_PREFIX) for row in known_sensors()})
+    return f"no sensor is installed: {install_command(ANY_DISTRIBUTION)}\n  vendors: {', '.join(vendors)}"
+
+
+def unknown_sensor(name: str, installed: Iterable[str], aliases: Mapping[str, str]) -> UnknownSensor:
+    """Return the error for a sensor that is not installed, with the command that installs it if the table has it.
+
+    Args:
+        name: an id or alias.
+        installed: the ids of the installed sensors.
+        aliases: other names of the installed sensors, by alias.
+    """
+    row = find_known_sensor(name)
+    if row is not None:
+        return suggest(UnknownSensor(name, distribution=row.distribution), install_command(row.distribution))
+    installed = tuple(installed)
+    if not installed:
+        return suggest(UnknownSensor(name, hint="; no sensor is installed"), install_command(ANY_DISTRIBUTION))
+    return UnknownSensor(name, installed, aliases=aliases)

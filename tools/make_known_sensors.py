@@ -1,0 +1,28 @@
+"""Write `lidarspec/known_sensors.json` from the plugins in `plugins/`: `make known-sensors`, which installs all of them first."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+from lidarspec.discovery.uninstalled import signatures
+from lidarspec.plugins import registry, summarize
+
+ROOT = Path(__file__).resolve().parents[1]
+TABLE = ROOT / "lidarspec" / "known_sensors.json"
+
+
+def table() -> str:
+    """Return the table as JSON, one sensor in each line; sensors of other projects are left out."""
+    own = {folder.name for folder in (ROOT / "plugins").iterdir()}
+    homes = {name: plugin for plugin in registry().plugins for name in plugin.sensors if plugin.distribution in own}
+    rows = []
+    for name, sensor in registry().sensors().items():
+        if name in homes:
+            row = summarize(sensor, homes[name].distribution, homes[name].version)
+            rows.append(json.dumps(row._replace(signatures=signatures(sensor)).to_dict(), ensure_ascii=False))
+    return "[\n" + ",\n".join(rows) + "\n]\n"
+
+
+if __name__ == "__main__":
+    TABLE.write_text(table(), encoding="utf-8")
