@@ -96,15 +96,20 @@ def _listed(place: str) -> list[str]:
 
 def _declared(folder: str, group: str) -> Iterator[EntryPoint]:
     """The entry points of a group that one distribution declares; where not all can be read, one that says so among the modules."""
-    section, text = "", _text(folder, "entry_points.txt")
-    if "\ufffd" in text and group == GROUP:
-        yield EntryPoint("entry_points.txt", "", *_name_and_version(folder))
+    text = _text(folder, "entry_points.txt")
+    is_damaged = "\ufffd" in text and group == GROUP
+    if not is_damaged and f"[{group}]" not in text:
+        return
+    name_and_version = _name_and_version(folder)
+    if is_damaged:
+        yield EntryPoint("entry_points.txt", "", *name_and_version)
+    section = ""
     for line in map(str.strip, text.splitlines()):
         if line.startswith("[") and line.endswith("]"):
             section = line[1:-1]
         elif section == group and line and not line.startswith("#"):
             name, _, value = line.partition("=")
-            yield EntryPoint(name.strip(), value.strip(), *_name_and_version(folder))
+            yield EntryPoint(name.strip(), value.strip(), *name_and_version)
 
 
 def _name_and_version(folder: str) -> tuple[str, str]:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import itertools
 import json
+import os
 import shutil
 import sys
 import textwrap
@@ -14,15 +15,13 @@ from pathlib import Path
 from textwrap import indent
 from typing import TYPE_CHECKING, Any
 
-from rich.console import Console
-from rich.text import Text
-
 from lidarspec.cli.terminal import note, say, voice
 from lidarspec.errors import printable, system_errors
 from lidarspec.explaining.listing import Line, folded, text as plain_text
 
 if TYPE_CHECKING:
     from rich.progress import Progress as Bar
+    from rich.text import Text
 
 #: seconds between two lines.
 PERIOD = 0.2
@@ -93,6 +92,7 @@ class Progress(contextlib.AbstractContextManager["Progress"]):
 
 def _bar(*, is_measured: bool) -> Bar:
     """A line of text, with a bar behind it where it is measured how far it is."""
+    from rich.console import Console
     from rich.progress import BarColumn, Progress as Bar, TaskProgressColumn, TextColumn, TimeRemainingColumn
     from rich.table import Column
 
@@ -139,8 +139,14 @@ def emit_lines(lines: Iterable[Line], output: str | None) -> None:
 
     NO_COLOR and FORCE_COLOR are obeyed; what goes through a pipe in colours is not folded.
     """
+    may_be_coloured = sys.stdout.isatty() or "FORCE_COLOR" in os.environ
+    if output is not None or not may_be_coloured:
+        emit_parts(map(plain_text, lines), output)
+        return
+    from rich.console import Console  # only for colours: importing it takes a third of the time of this verb
+
     console = Console()
-    if output is not None or not console.is_terminal:
+    if not console.is_terminal:
         emit_parts(map(plain_text, lines), output)
         return
     width = console.width if sys.stdout.isatty() else None
@@ -148,6 +154,8 @@ def emit_lines(lines: Iterable[Line], output: str | None) -> None:
 
 
 def _coloured(line: Line, width: int | None) -> str:
+    from rich.text import Text
+
     drawing = Text()
     for span in line if width is None else folded(line, width):
         drawing.append(printable(span.text), STYLES.get(span.role))
@@ -215,6 +223,8 @@ def _folded(line: Sequence[str], widths: Sequence[int], room: int) -> Iterator[s
 
 def drawn(what: Text) -> str:
     """What rich draws, as text to echo in colour; rich itself would end the process on a closed pipe."""
+    from rich.console import Console
+
     console = Console()
     with console.capture() as captured:
         console.print(what, soft_wrap=True, highlight=False)

@@ -19,7 +19,7 @@ from lidarspec.device.arrivals import Arrival, FileInput, Input
 from lidarspec.device.live_input import PERIOD, LiveInput
 from lidarspec.device.session import Reply
 from lidarspec.device.settings import named
-from lidarspec.discovery.detect import contradiction, detected, said
+from lidarspec.discovery.detect import contradiction, detected, said, simulated_sensor
 from lidarspec.errors import SourceError, SourceTimeout, UsageError, suggest
 from lidarspec.framing.decoder import Decoder, Witness
 from lidarspec.framing.results import Counters, Found, Frames
@@ -471,7 +471,9 @@ class Device(Closing):
     def _doubts(self) -> list[str]:
         """That the first frames are another sensor's, or name another model: found out once, when there are enough of them."""
         if self._another is None and (len(self._first) >= EXAMINED or self._input.ended):
-            self._another = contradiction(self.sensor, self._first)
+            simulated = simulated_sensor(self.source)
+            is_certain = simulated is not None and simulated.id == self.sensor.id
+            self._another = "" if is_certain else contradiction(self.sensor, self._first)
         if not self._another:
             return []
         text = f"{self.source}: read as {self.sensor.id}, and {self._another}"

@@ -5,11 +5,13 @@ from __future__ import annotations
 import math
 import re
 from dataclasses import dataclass
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 from lidarspec.errors import WireError
-from lidarspec.points.cloud import PointCloud
 from lidarspec.spec.arguments import Range, Taken
+
+if TYPE_CHECKING:
+    from lidarspec.points.cloud import PointCloud
 
 #: bytes in a line of a hexdump, and lines before the marked one.
 DUMPED, BEFORE = 16, 2

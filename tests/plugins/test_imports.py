@@ -20,6 +20,7 @@ ALLOWED = {
         "display",
         "entry_points",
         "errors",
+        "known_sensors",
         "plugins",
         "spec",
         "spec.arguments",
