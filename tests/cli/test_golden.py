@@ -43,8 +43,10 @@ START_NS = 1_700_000_000 * 10**9
 FRAME_PERIOD_NS = 555_556
 STL = "ldrobot-stl27l"
 TEXT = b"these are the minutes of a meeting, and no lidar was there\n"
+CHECKOUT = Path(__file__).parents[2]
 #: what differs from one machine or run to the next, and its replacement.
 VARIABLE_TEXTS = (
+    (re.compile(re.escape(str(CHECKOUT))), "CHECKOUT"),
     (re.compile(re.escape(ls.__version__)), "VERSION"),
     (re.compile(r"\d+ installed sensors"), "N installed sensors"),
     (re.compile(r"(?<=recorded  )\d{4}-\S+"), "TIME"),
