@@ -8,6 +8,7 @@ import sys
 import tracemalloc
 import weakref
 from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -239,6 +240,7 @@ except UnknownFormat as error:
     assert (tmp_path / "a.count").read_text(encoding="utf-8") == "3 scans, True"
 
 
+@pytest.mark.slow
 def test_a_plugin_whose_hook_fails_is_a_spec_error() -> None:
     script = """
 import lidarspec as ls
@@ -285,3 +287,12 @@ def test_further_columns_are_written_under_their_names_in_their_types(tmp_path: 
         assert found["signal"].dtype == np.uint32
     for key in scans[0].points.extra:
         np.testing.assert_allclose(found[key], np.concatenate([one.points.extra[key] for one in scans]), rtol=5.1e-7)
+
+
+def test_text_keeps_the_digits_of_double_columns(tmp_path: Path) -> None:
+    precise = np.arange(5) / 3 + 1e6
+    one = scan(0)
+    with_column = replace(one, points=replace(one.points, extra={"precise": precise}))
+    write(tmp_path / "a.csv", [with_column], every_point=True)
+    header, values = rows(tmp_path / "a.csv")
+    np.testing.assert_allclose(values[:, header.index("precise")], precise, rtol=1e-14)

@@ -37,8 +37,8 @@ from tests.shapes import SHAPES
 
 pytestmark = COMPILED
 
-#: the shape of which a kernel is compiled in the quick tier; it has arrays of a variable length.
-QUICK = "shape-count"
+#: the shape of which a kernel is compiled in the quick tier.
+QUICK = "shape-middle"
 SHAPED = [pytest.param(name, marks=() if name == QUICK else pytest.mark.slow) for name, sensor in SHAPES.items() if sensor.frames]
 ULPS = 6
 WIDE = [

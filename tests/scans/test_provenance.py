@@ -19,6 +19,8 @@ from lidarspec.spec.description import with_frames
 from tests.shapes import segments
 
 FRAMES = 200
+#: frames with parts, of which 20 are a turn.
+FRAMES_OF_PARTS = 65
 #: points of all scans that are explained, about.
 POINTS = 24
 #: sensors of which many points are explained.
@@ -39,7 +41,7 @@ def waiting() -> Sensor:
 
 @functools.cache
 def frames_of(sensor: Sensor) -> list[bytes]:
-    return simulate(sensor, FRAMES)
+    return simulate(sensor, FRAMES_OF_PARTS if sensor.id == segments.SENSOR.id else FRAMES)
 
 
 def scans_of(sensor: Sensor, frames: list[bytes], together: int) -> tuple[list[Scan], list[int]]:
@@ -56,7 +58,7 @@ def scans_of(sensor: Sensor, frames: list[bytes], together: int) -> tuple[list[S
     return scans + stream.finish(), offsets
 
 
-@pytest.mark.parametrize("together", [1, 3, FRAMES])
+@pytest.mark.parametrize("together", [1, FRAMES, pytest.param(3, marks=pytest.mark.slow)])
 @pytest.mark.parametrize("name", ["parts", "waiting parts", "ldrobot-stl27l", *LARGE])
 def test_each_point_leads_to_its_frame_and_row(name: str, together: int) -> None:
     known = segments.SENSOR if name in ("parts", "waiting parts") else ls.sensor(name)

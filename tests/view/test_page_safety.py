@@ -120,6 +120,7 @@ def test_a_port_that_is_taken_is_told_of(tmp_path: Path) -> None:
         Station(f"sim:{FLAT}", tmp_path, port=station.port)
 
 
+@pytest.mark.slow
 def test_markup_that_a_device_sends_stays_text(tmp_path: Path) -> None:
     """The model in an answer of a hostile device, and the name of a file."""
     markup, sensor = "<script>alert(1)<!--", ls.sensor("hokuyo-ust10lx")
