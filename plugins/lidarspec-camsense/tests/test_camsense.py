@@ -41,6 +41,7 @@ def test_a_packet_is_what_it_is_published_as(name: str) -> None:
     assert cloud.intensity.tolist() == expected.get("intensity", cloud.intensity.tolist())
 
 
+@pytest.mark.slow
 def test_packets_of_an_lds08rr_are_told_from_those_of_an_x1() -> None:
     expected = json.loads(capture("camsense/packets.json").read_text())
     data = b"".join(bytes.fromhex(one["hex"]) for one in expected)
