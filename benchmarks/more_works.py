@@ -12,7 +12,7 @@ from typing import Any
 
 import by_hand
 import libraries
-from inputs import Inputs
+from inputs import QUICKER, Inputs
 from measure import Contender, Rates, times
 from peers import STRUCTS
 from works import FEW, Facts, Others, Work, beside_construct, beside_ouster_sdk, columns, points_of
@@ -161,8 +161,9 @@ def hostile(inputs: Inputs) -> Work:
     """Finding the frames of streams that cost most, of each family on its fastest serial line, against the rate of that line."""
     families = {tuple(sensor.frames): sensor for sensor in sorted(ls.sensors().values(), key=line_rate) if line_rate(sensor)}
     tasks: dict[str, tuple[ls.Sensor, list[bytes]]] = {}
+    length = HOSTILE // QUICKER if inputs.is_quick else HOSTILE
     for sensor in families.values():
-        for name, parts in streams(Subject(sensor), length=HOSTILE).items():
+        for name, parts in streams(Subject(sensor), length=length).items():
             tasks[f"{name} of {sensor.id}"] = sensor, parts
 
     def finding(sensor: ls.Sensor, parts: list[bytes]) -> Callable[[], Any]:
