@@ -111,15 +111,11 @@ EVERY = USUAL | CONSTRUCT | PLUGGY | DECLARED
 QUICK = {
     *PLUGGY,
     "by_vectors/wrong_order",
-    "by_vectors/wrong_span",
-    "degrees",
     "lambda_raises",
-    "missing_unit",
     "no_wrap",
     "shadowed_name",
     "short_write",
     "silent_command",
-    "wall_clock",
 }
 #: mistakes in a module's own text: the line that is named has these words.
 LINES = {

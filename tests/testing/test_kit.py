@@ -128,6 +128,7 @@ class Lossy(Sensor):
         return super().build(frame, value, units=units, **values)
 
 
+@pytest.mark.slow
 def test_a_failing_edit_shrinks_to_the_field_at_fault() -> None:
     with pytest.raises(Violation) as found:
         values_survive_building_and_parsing(Subject(sound.sensor(kind=Lossy), 80), "data")
