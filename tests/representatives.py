@@ -4,6 +4,11 @@ A promise about the engine is proved on the shapes of `tests.shapes` and, where 
 sensor is proved in the `tests` folder of its plugin. Ids only: a sensor is loaded when a test needs it.
 """
 
+from __future__ import annotations
+
+import lidarspec as ls
+from tests.shapes import SHAPES
+
 REPRESENTATIVES = (
     "ldrobot-stl27l",  # serial, fixed frames, CRC-8, interpolated angles
     "cspc-m1c1-mini",  # variable count, XOR over words, an angle that depends on range
@@ -16,3 +21,13 @@ REPRESENTATIVES = (
     "sick-multiscan136",  # segments of variable shape in long datagrams
     "hokuyo-ust10lx",  # text frames, characters of six bits
 )
+
+#: The representatives that send a stream of bytes; the others send datagrams.
+STREAM_REPRESENTATIVES = ("ldrobot-stl27l", "cspc-m1c1-mini", "slamtec-rplidar-a1", "hokuyo-ust10lx")
+
+
+def load_sensor(sensor_id: str) -> ls.Sensor:
+    """Return the shape or the installed sensor of this id."""
+    if sensor_id in SHAPES:
+        return SHAPES[sensor_id]
+    return ls.sensor(sensor_id)

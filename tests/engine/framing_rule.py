@@ -1,6 +1,8 @@
-"""The framing rule as functions of a sensor that fail where it is broken: against the oracle, and for whatever has broken other parsers.
+"""The framing rule as functions of a sensor that fail if it is broken.
 
-They are functions, not tests, so that parsers with a mistake put in on purpose can be held to them too, and be caught.
+Each function compares the decoder with the oracle, or with itself on other input, on data that has broken other parsers. They are
+functions, not tests, so that parsers with a planted mistake are held to them too. `length` is the size of the streams in bytes: the
+quick tier uses short streams, the slow one `streams.LENGTH`.
 """
 
 from __future__ import annotations
@@ -12,30 +14,41 @@ from lidarspec.testing.subject import Subject
 from tests.engine.oracle import Cut, Oracle
 from tests.engine.streams import LENGTH, Books, clean, damaged, decoded, longest_example
 
-RATES = (0.0, 1e-4, 1e-3, 5e-3)  # the first that damages anything damages one run
-BURSTS = (8, 16, 64)
+ERROR_RATES = (0.0, 1e-4, 1e-3, 5e-3)
+BURST_BYTES = (8, 16, 64)
+RANDOM_SPLITS = 20
 
 
-def hold(subject: Subject, data: bytes, what: str) -> None:
-    """Fail unless the decoder finds in a stream what the oracle finds."""
-    found, wanted = decoded(subject.sensor, data), Oracle(subject.sensor, data).frames()
-    missed, extra = [cut for cut in wanted if cut not in found], [cut for cut in found if cut not in wanted]
-    assert found == wanted, f"{what}: missed {[cut[:2] for cut in missed]}, found besides {[cut[:2] for cut in extra]}"
+def assert_like_oracle(subject: Subject, data: bytes, description: str) -> None:
+    """Fail unless the decoder finds the same frames in a stream as the oracle."""
+    frames = decoded(subject.sensor, data)
+    expected = Oracle(subject.sensor, data).frames()
+    missed = [cut[:2] for cut in expected if cut not in frames]
+    extra = [cut[:2] for cut in frames if cut not in expected]
+    assert frames == expected, f"{description}: missed {missed}, extra {extra}"
 
 
-def any_split_gives_the_same(subject: Subject) -> None:
-    """Every 2-way split, byte by byte, and random splits give the same frames and counters."""
-    sensor, source = subject.sensor, subject.source("splits")
+def any_split_gives_the_same(subject: Subject, length: int = LENGTH) -> None:
+    """Check that every 2-way split, single bytes and random splits give the same frames and counters."""
+    sensor = subject.sensor
+    source = subject.source("splits")
     data = material.mutated(subject.stream(rounds=1), source) + subject.stream(seed=1, rounds=1)
-    splits = [[data[:spot], data[spot:]] for spot in material.places(len(data), source)]
-    splits += [list(material.pieces(data, source)) for _ in range(20)]
-    _same_in_pieces(sensor, data, [*splits, [data[spot : spot + 1] for spot in range(len(data))]])
+    data = data[: max(length // 2, 2 * _longest_frame(sensor))]
+    splits = [[data[:offset], data[offset:]] for offset in material.places(len(data), source)]
+    splits += [list(material.pieces(data, source)) for _ in range(RANDOM_SPLITS)]
+    splits.append([data[offset : offset + 1] for offset in range(len(data))])
+    _assert_same_in_pieces(sensor, data, splits)
 
 
-def _same_in_pieces(sensor: Sensor, data: bytes, splits: list[list[bytes]]) -> None:
+def _longest_frame(sensor: Sensor) -> int:
+    return max(len(sensor.example(name)) for name in sensor.incoming)
+
+
+def _assert_same_in_pieces(sensor: Sensor, data: bytes, splits: list[list[bytes]]) -> None:
     """Fail unless each split of a stream gives the frames and counters of the whole."""
     books = Books(sensor).feed(data)
-    expected, whole = books.finish(), books.decoder
+    expected = books.finish()
+    whole = books.decoder
     for split in splits:
         parts = Books(sensor)
         for chunk in split:
@@ -45,76 +58,84 @@ def _same_in_pieces(sensor: Sensor, data: bytes, splits: list[list[bytes]]) -> N
 
 
 def every_recoverable_frame_is_recovered(subject: Subject, length: int = LENGTH) -> None:
-    """At every byte error rate, single and in bursts, the frames are those of the oracle."""
-    for rate in RATES:
-        hold(subject, damaged(_part(subject, length, f"{rate:g}"), rate, 1), f"of the bytes {rate:g} damaged")
-    for burst in BURSTS:
-        hold(subject, damaged(_part(subject, length, f"{burst}"), 0.05, 2, burst=burst), f"bursts of {burst} damaged bytes")
+    """Check the frames against the oracle at every byte error rate, single bytes and bursts."""
+    for rate in ERROR_RATES:
+        data = damaged(_part(subject, length, f"{rate:g}"), rate, 1)
+        assert_like_oracle(subject, data, f"error rate {rate:g}")
+    for burst in BURST_BYTES:
+        data = damaged(_part(subject, length, f"{burst}"), 0.05, 2, burst=burst)
+        assert_like_oracle(subject, data, f"bursts of {burst} bytes")
 
 
 def _part(subject: Subject, length: int, purpose: str) -> bytes:
-    """So many bytes of a conversation, which begins anywhere in it: one round of a sensor with many frame types is long."""
+    """Return part of a conversation, from a random offset: one round of a sensor with many frame types is long."""
     data = clean(subject, length=length)
     start = subject.source(purpose).randrange(max(len(data) - length, 1))
     return data[start : start + length]
 
 
-def a_claimed_length_is_not_believed(subject: Subject) -> None:
-    """The head of a frame in front of frames, and a frame with a bad end, cost none of those behind."""
-    whole = subject.stream(rounds=1)
+def a_claimed_length_costs_no_frame(subject: Subject, length: int = LENGTH) -> None:
+    """Check that neither the head of a frame nor a frame with a bad end costs one of the frames behind it."""
+    whole = subject.stream(rounds=1)[:length]
+    heads = 50 if length >= LENGTH else 12
     for frame in dict(subject.conversation(rounds=1)).values():
-        hold(subject, frame[:-1] + bytes([frame[-1] ^ 1]) + whole, "behind a frame with a damaged end")
-        for end in range(1, min(len(frame), 50)):
-            hold(subject, frame[:end] + whole, f"behind the first {end} bytes of a frame")
+        assert_like_oracle(subject, frame[:-1] + bytes([frame[-1] ^ 1]) + whole, "behind a frame with a damaged end")
+        for end in range(1, min(len(frame), heads)):
+            assert_like_oracle(subject, frame[:end] + whole, f"behind the first {end} bytes of a frame")
 
 
-def the_start_of_a_header_is_looked_for_at_every_byte(subject: Subject) -> None:
-    """Stray bytes and repeated first bytes between frames cost none of them."""
-    frames = subject.conversation()
+def a_header_may_start_at_every_byte(subject: Subject, length: int = LENGTH) -> None:
+    """Check that stray bytes and repeated first bytes between frames cost none of them."""
+    frames = subject.conversation(rounds=3 if length >= LENGTH else 1)
     first = frames[0][1][:1]
     for stray in (b"\xfe", b"\xff", b"\x00", *(first * number for number in range(1, 5))):
-        hold(subject, b"".join(stray + frame for _, frame in frames), f"with {stray.hex(' ')} before each frame")
+        data = b"".join(stray + frame for _, frame in frames)
+        assert_like_oracle(subject, data, f"{stray.hex(' ')} before each frame")
 
 
-def noise_is_cut_as_the_rule_says(subject: Subject) -> None:
-    """Constant lines, and noise made of headers, give the frames of the oracle and no others."""
+def noise_is_cut_by_the_rule(subject: Subject, length: int = LENGTH) -> None:
+    """Check constant lines, and noise made of headers, against the oracle."""
     source = subject.source("noise")
-    whole = subject.stream(rounds=1)
+    whole = subject.stream(rounds=1)[:length]
+    idle_bytes = length // 5
     for byte in (b"\x00", b"\xff"):
-        hold(subject, byte * 300 + whole + byte * 300, f"between 300 bytes {byte.hex()}")
-    for head in sorted({frame[:size] for _, frame in subject.conversation(rounds=1) for size in (1, 2, 3, 4)}):
-        hold(subject, head * (200 // len(head)), f"headers of {len(head)} bytes alone")
-    heads = [data[: source.randint(1, 6)] for _, data in subject.conversation(rounds=2)] + [b"\x00", b"\xff", b"\xfe"]
-    data = b"".join(source.choices([*heads, whole], [*[9] * len(heads), 2 * len(heads)], k=60))[:6000]
-    hold(subject, data, "noise made of headers")
+        assert_like_oracle(subject, byte * idle_bytes + whole + byte * idle_bytes, f"between {idle_bytes} bytes {byte.hex()}")
+    starts = {frame[:size] for _, frame in subject.conversation(rounds=1) for size in (1, 2, 3, 4)}
+    for start in sorted(starts):
+        assert_like_oracle(subject, start * (length // 8 // len(start)), f"headers of {len(start)} bytes alone")
+    heads = [frame[: source.randint(1, 6)] for _, frame in subject.conversation(rounds=2)] + [b"\x00", b"\xff", b"\xfe"]
+    weights = [*[9] * len(heads), 2 * len(heads)]
+    data = b"".join(source.choices([*heads, whole], weights, k=60))[: 2 * length]
+    assert_like_oracle(subject, data, "noise made of headers")
 
 
-def what_is_looked_for_may_change_with_every_frame(subject: Subject, length: int = LENGTH) -> None:
-    """Announcements in any order, frames behind their own and behind others', whole, cut off and damaged, in one piece and in many."""
-    sensor, source = subject.sensor, subject.source("changes")
-    named = sorted({frame.after for frame in sensor.incoming.values() if frame.after})
-    parts, size = list[bytes](), 0
-    while named and size < length:
-        name = source.choice([*sensor.incoming, *named, *named])
+def announcements_may_change_with_every_frame(subject: Subject, length: int = LENGTH) -> None:
+    """Check announcements in any order, frames behind their own and behind others', whole, cut off and damaged."""
+    sensor = subject.sensor
+    source = subject.source("changes")
+    announcing = sorted({frame.after for frame in sensor.incoming.values() if frame.after})
+    if not announcing:
+        return
+    data = b""
+    while len(data) < length:
+        name = source.choice([*sensor.incoming, *announcing, *announcing])
         frame = subject.example(name, seed=source.randrange(6)) * source.choice((1, sensor.frames[name].confirm))
-        parts.append(source.choice((frame, frame, frame[: source.randint(1, 5)], material.mutated(frame, source))))
-        size += len(parts[-1])
-    data = b"".join(parts)
-    hold(subject, data, "announcements in any order")
-    _same_in_pieces(sensor, data, [list(material.pieces(data, source)) for _ in range(10)])
+        data += source.choice((frame, frame, frame[: source.randint(1, 5)], material.mutated(frame, source)))
+    assert_like_oracle(subject, data, "announcements in any order")
+    _assert_same_in_pieces(sensor, data, [list(material.pieces(data, source)) for _ in range(10)])
 
 
-def the_longest_frame_is_a_frame(subject: Subject) -> None:
-    """The longest of many examples is found in a stream."""
+def the_longest_frame_is_a_frame(subject: Subject, length: int = LENGTH) -> None:
+    """Check that the longest of many examples is found in a stream."""
     for name in subject.sensor.incoming:
         frame = subject.sensor.frames[name]
         if frame.after is None and frame.confirm == 1:
             longest = longest_example(subject, name)
-            hold(subject, longest * 2, f"a {name} frame of {len(longest)} bytes")
+            assert_like_oracle(subject, longest * 2, f"a {name} frame of {len(longest)} bytes")
 
 
-def idle_gives_up_what_waits(subject: Subject) -> None:
-    """What waits when the line falls silent is given up, looked at again, and never joined to what comes later."""
+def idle_gives_up_pending_bytes(subject: Subject, length: int = LENGTH) -> None:
+    """Check that pending bytes are given up when the line falls silent, and never joined to later ones."""
     frames = subject.conversation(rounds=2)
     whole = b"".join(data for _, data in frames)
     _, last = frames[-1]
@@ -122,14 +143,15 @@ def idle_gives_up_what_waits(subject: Subject) -> None:
         books = Books(subject.sensor).feed(whole + last[:end])
         books.finish()
         assert books.decoder.stats.pending == 0
-        known = len(books.found)
+        count = len(books.found)
         books.feed(last[end:])
-        assert last not in [data for _, _, data in books.finish()[known:]], f"its first {end} bytes came before the line fell silent"
+        later = [data for _, _, data in books.finish()[count:]]
+        assert last not in later, f"its first {end} bytes came before the line fell silent"
 
 
-def decoders_do_not_know_of_each_other(subject: Subject) -> None:
-    """Two decoders fed in turn give what each gives alone."""
-    inputs = [damaged(clean(subject, seed=seed, length=1000), 1e-3, seed) for seed in (3, 4)]
+def decoders_are_independent(subject: Subject, length: int = LENGTH) -> None:
+    """Check that two decoders fed in turn give what each gives alone."""
+    inputs = [damaged(clean(subject, seed=seed, length=length), 1e-3, seed) for seed in (3, 4)]
     alone = []
     for data in inputs:
         decoder = subject.sensor.decoder()
@@ -147,11 +169,11 @@ def decoders_do_not_know_of_each_other(subject: Subject) -> None:
 RULES = (
     any_split_gives_the_same,
     every_recoverable_frame_is_recovered,
-    a_claimed_length_is_not_believed,
-    the_start_of_a_header_is_looked_for_at_every_byte,
-    noise_is_cut_as_the_rule_says,
-    what_is_looked_for_may_change_with_every_frame,
+    a_claimed_length_costs_no_frame,
+    a_header_may_start_at_every_byte,
+    noise_is_cut_by_the_rule,
+    announcements_may_change_with_every_frame,
     the_longest_frame_is_a_frame,
-    idle_gives_up_what_waits,
-    decoders_do_not_know_of_each_other,
+    idle_gives_up_pending_bytes,
+    decoders_are_independent,
 )

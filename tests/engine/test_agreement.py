@@ -7,48 +7,60 @@ import re
 import pytest
 
 from lidarspec import Sensor, WireError
-from lidarspec.framing.frame_engine import CompiledCodec, codec
-from tests.all_sensors import DISTINCT
+from lidarspec.framing.frame_engine import codec
 from tests.broken import sound
-from tests.engine.engines import clean_and_damaged_input_read_alike, values_at_the_edges_read_alike
+from tests.engine.engines import assert_damaged_input_reads_alike, assert_edge_values_read_alike, is_compiled
 from tests.engine.mutants import Indexless
+from tests.representatives import REPRESENTATIVES, load_sensor
 from tests.shapes import SHAPES
 
-COMPILED = {
-    name: sensor for name, sensor in SHAPES.items() if all(isinstance(codec(frame), CompiledCodec) for frame in sensor.frames.values())
-}
+COMPILED_SHAPES = [name for name, sensor in SHAPES.items() if all(map(is_compiled, sensor.frames.values()))]
 
 
-@pytest.mark.parametrize("sensor", COMPILED.values(), ids=COMPILED)
-def test_clean_and_damaged_input_reads_alike(sensor: Sensor) -> None:
-    clean_and_damaged_input_read_alike(sensor)
+@pytest.mark.parametrize("name", COMPILED_SHAPES)
+def test_damaged_input_reads_alike(name: str) -> None:
+    assert_damaged_input_reads_alike(SHAPES[name])
 
 
-@pytest.mark.parametrize("sensor", DISTINCT.values(), ids=DISTINCT)
-def test_values_at_the_edges_read_alike(sensor: Sensor) -> None:
-    values_at_the_edges_read_alike(sensor)
+@pytest.mark.parametrize("name", SHAPES)
+def test_values_at_the_edges_read_alike(name: str) -> None:
+    assert_edge_values_read_alike(SHAPES[name])
 
 
-def faults_in_arrays(sensor: Sensor, name: str) -> tuple[list[str], list[str]]:
-    """The paths of the faults within arrays that a frame cut short has, those with an index and those without."""
-    told: tuple[list[str], list[str]] = ([], [])
-    schema, data = codec(sensor.frames[name]).schema, sensor.example(name, seed=2)
+@pytest.mark.slow
+@pytest.mark.parametrize("name", [*COMPILED_SHAPES, *REPRESENTATIVES])
+def test_much_damaged_input_reads_alike(name: str) -> None:
+    assert_damaged_input_reads_alike(load_sensor(name), count=6)
+    assert_edge_values_read_alike(load_sensor(name), count=8)
+
+
+def fault_paths_in_arrays(sensor: Sensor, name: str) -> tuple[list[str], list[str]]:
+    """Return the paths of faults within arrays in a frame cut short: with an index, and without one."""
+    indexed, unindexed = list[str](), list[str]()
+    schema = codec(sensor.frames[name]).schema
+    data = sensor.example(name, seed=2)
     for end in range(len(data)):
         with pytest.raises(WireError) as caught:
             sensor.parse(data[:end], frame=name)
         path = re.sub(r"\[\d+\]", "", caught.value.path)
         info = schema.fields.get(path)
-        if info is not None and path not in schema.arrays and len(info.axes) > (info.kind == "bytes"):
-            told["[" not in caught.value.path].append(caught.value.path)
-    return told
+        if info is None or path in schema.arrays or len(info.axes) <= (info.kind == "bytes"):
+            continue
+        paths = indexed if "[" in caught.value.path else unindexed
+        paths.append(caught.value.path)
+    return indexed, unindexed
 
 
-@pytest.mark.parametrize("sensor", SHAPES.values(), ids=SHAPES)
-def test_a_fault_within_an_array_says_which_element_it_is_in(sensor: Sensor) -> None:
-    for name in sensor.frames:
-        assert faults_in_arrays(sensor, name)[1] == []
+@pytest.mark.parametrize("name", SHAPES)
+def test_a_fault_within_an_array_has_the_index_of_its_element(name: str) -> None:
+    sensor = SHAPES[name]
+    for frame in sensor.frames:
+        _, unindexed = fault_paths_in_arrays(sensor, frame)
+        assert unindexed == []
 
 
 def test_a_fault_without_the_index_of_its_element_is_caught() -> None:
-    assert faults_in_arrays(sound.sensor(), "data")[0]
-    assert faults_in_arrays(sound.sensor(kind=Indexless), "data")[1]
+    indexed, _ = fault_paths_in_arrays(sound.sensor(), "data")
+    _, unindexed = fault_paths_in_arrays(sound.sensor(kind=Indexless), "data")
+    assert indexed
+    assert unindexed

@@ -1,4 +1,4 @@
-"""The framing rule on the invented shapes, and against the oracle on every sensor; parsers with a mistake put in on purpose are caught."""
+"""The framing rule (P1, P2, P18) on the shapes and against an oracle; parsers with a planted mistake are caught."""
 
 from __future__ import annotations
 
@@ -6,50 +6,71 @@ from collections.abc import Callable
 
 import pytest
 
-import lidarspec
-from lidarspec import Sensor
 from lidarspec.testing.subject import Subject
-from tests.all_sensors import STREAMS, streams
 from tests.engine import framing_rule as rule, mutants
+from tests.installed import distinct_sensors_in, sensor_modules
+from tests.representatives import STREAM_REPRESENTATIVES, load_sensor
 from tests.shapes import SHAPES
 
-SHAPED = streams(SHAPES)
-INSTALLED = {name: sensor for name, sensor in STREAMS.items() if name not in SHAPES}
-#: bytes of a stream for a sensor whose mechanisms the shapes have one by one.
-FEW = 800
+STREAM_SHAPES = [name for name, sensor in SHAPES.items() if not sensor.datagrams]
+#: Bytes of a stream in the quick tier.
+QUICK_LENGTH = 400
 
 MUTANTS = {
     mutants.PartialHeaderDropped: rule.any_split_gives_the_same,
-    mutants.ClaimedLengthSkipped: rule.a_claimed_length_is_not_believed,
-    mutants.MismatchingByteLost: rule.the_start_of_a_header_is_looked_for_at_every_byte,
+    mutants.ClaimedLengthSkipped: rule.a_claimed_length_costs_no_frame,
+    mutants.MismatchingByteLost: rule.a_header_may_start_at_every_byte,
     mutants.LongestRefused: rule.the_longest_frame_is_a_frame,
-    mutants.BufferOfTheClass: rule.decoders_do_not_know_of_each_other,
-    mutants.HeldOverSilence: rule.idle_gives_up_what_waits,
+    mutants.BufferOfTheClass: rule.decoders_are_independent,
+    mutants.HeldOverSilence: rule.idle_gives_up_pending_bytes,
     mutants.ExceptionSwallowed: rule.any_split_gives_the_same,
 }
 
-
-@pytest.mark.parametrize("holds", rule.RULES, ids=lambda holds: holds.__name__)
-@pytest.mark.parametrize("sensor", SHAPED.values(), ids=SHAPED)
-def test_the_rule_holds_on_every_shape(sensor: Sensor, holds: Callable[[Subject], None]) -> None:
-    holds(Subject(sensor))
+each_rule = pytest.mark.parametrize("holds", rule.RULES, ids=lambda holds: holds.__name__)
 
 
-@pytest.mark.parametrize("sensor", INSTALLED.values(), ids=INSTALLED)
-def test_every_recoverable_frame_of_every_sensor_is_recovered(sensor: Sensor) -> None:
-    rule.every_recoverable_frame_is_recovered(Subject(sensor), FEW)
+@each_rule
+@pytest.mark.parametrize("name", STREAM_SHAPES)
+def test_the_rule_holds_on_every_shape(name: str, holds: Callable[[Subject, int], None]) -> None:
+    holds(Subject(SHAPES[name]), QUICK_LENGTH)
 
 
-def test_what_a_sensor_announces_may_change_with_every_frame() -> None:
-    rule.what_is_looked_for_may_change_with_every_frame(Subject(lidarspec.sensors()["slamtec-rplidar-s2"]), 4000)
+@pytest.mark.slow
+@pytest.mark.parametrize("name", STREAM_SHAPES)
+def test_the_rule_holds_on_long_streams_of_every_shape(name: str) -> None:
+    for holds in rule.RULES:
+        holds(Subject(SHAPES[name]))
 
 
-@pytest.mark.parametrize("holds", rule.RULES, ids=lambda holds: holds.__name__)
-def test_a_parser_without_a_mistake_keeps_the_rule(holds: Callable[[Subject], None]) -> None:
-    holds(Subject(mutants.read_by(mutants.Parser)))
+@pytest.mark.parametrize("name", STREAM_REPRESENTATIVES)
+def test_every_recoverable_frame_of_a_representative_is_recovered(name: str) -> None:
+    sensor = load_sensor(name)
+    longest = len(sensor.example(sensor.data_frame))
+    rule.every_recoverable_frame_is_recovered(Subject(sensor), max(2 * QUICK_LENGTH, 5 * longest // 2))
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("module", sensor_modules())
+def test_every_recoverable_frame_of_every_sensor_is_recovered(module: str) -> None:
+    for sensor in distinct_sensors_in(module):
+        if not sensor.datagrams:
+            rule.every_recoverable_frame_is_recovered(Subject(sensor), 2 * QUICK_LENGTH)
+
+
+def test_representatives_that_send_streams_are_known() -> None:
+    assert not any(load_sensor(name).datagrams for name in STREAM_REPRESENTATIVES)
+
+
+def test_an_announcement_may_change_with_every_frame_of_a_representative() -> None:
+    rule.announcements_may_change_with_every_frame(Subject(load_sensor("slamtec-rplidar-a1")), 1500)
+
+
+@each_rule
+def test_a_parser_without_a_mistake_keeps_the_rule(holds: Callable[[Subject, int], None]) -> None:
+    holds(Subject(mutants.read_by(mutants.Parser)), QUICK_LENGTH)
 
 
 @pytest.mark.parametrize("parser", MUTANTS, ids=lambda parser: parser.__name__)
 def test_a_parser_with_a_mistake_is_caught(parser: type[mutants.Parser]) -> None:
     with pytest.raises(AssertionError):
-        MUTANTS[parser](Subject(mutants.read_by(parser)))
+        MUTANTS[parser](Subject(mutants.read_by(parser)), QUICK_LENGTH)

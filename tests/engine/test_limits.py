@@ -1,4 +1,4 @@
-"""Bounds that hold on any input: memory, and how long a frame is kept back."""
+"""Bounds that hold on any input: memory (P4), and how long a frame is kept back (P6)."""
 
 from __future__ import annotations
 
@@ -7,28 +7,19 @@ import random
 import numpy as np
 import pytest
 
-import lidarspec
 from lidarspec import Sensor
-from lidarspec.framing.frame_engine import CompiledCodec, codec
 from lidarspec.testing import subject as material
 from lidarspec.testing.subject import Subject
-from tests.all_sensors import STREAMS
+from tests.engine.engines import is_compiled
 from tests.engine.streams import MEGABYTE, peak, worst
+from tests.installed import distinct_sensors_in, sensor_modules
+from tests.representatives import STREAM_REPRESENTATIVES, load_sensor
 from tests.shapes import SHAPES
 
-COMPILED = {name: sensor for name, sensor in STREAMS.items() if isinstance(codec(sensor.frames[sensor.data_frame]), CompiledCodec)}
-
-#: installed sensors whose memory is measured in every run, one of each way to make frames: of one size, counted, announced, masked, text.
-MEASURED = ("ldrobot-stl27l", "cspc-m1c1-mini", "slamtec-rplidar-t1", "ydlidar-x4", "sick-lms511", "quanergy-m8")
-each_stream = pytest.mark.parametrize("sensor", STREAMS.values(), ids=STREAMS)
-
-
-def of_each_kind(sensors: dict[str, Sensor]) -> pytest.MarkDecorator:
-    """The shapes and some installed sensors; the others in the long run."""
-    marked = [
-        pytest.param(sensor, id=name, marks=() if name in (*SHAPES, *MEASURED) else pytest.mark.soak) for name, sensor in sensors.items()
-    ]
-    return pytest.mark.parametrize("sensor", marked)
+STREAM_SHAPES = [name for name, sensor in SHAPES.items() if not sensor.datagrams]
+STREAMS = (*STREAM_SHAPES, *STREAM_REPRESENTATIVES)
+#: Sensors whose peak memory is measured in the quick tier, one of each way to make frames: of one size, counted, announced, text.
+MEASURED = ("shape-middle", "shape-count", "shape-modes", "shape-tokens", "ldrobot-stl27l", "cspc-m1c1-mini", "slamtec-rplidar-a1")
 
 
 def garbage(length: int, seed: int = 0) -> bytes:
@@ -43,44 +34,60 @@ def fed(sensor: Sensor, data: bytes, times: int = 1, chunk: int = 4096) -> None:
     decoder.finish()
 
 
-@each_stream
-def test_a_decoder_holds_less_than_its_longest_frame(sensor: Sensor) -> None:
-    bound = max(frame.max_length * frame.confirm for frame in sensor.frames.values() if frame.direction == "in")
-    for data in (garbage(8_000), worst(sensor, 8_000), Subject(sensor).stream(rounds=1)):
-        decoder, source = sensor.decoder(), random.Random(1)
-        for chunk in material.pieces(data, source):
+def pending_bound(sensor: Sensor) -> int:
+    """Return the bytes below which the pending ones stay: the longest frame, times the run of a weak one."""
+    return max(frame.max_length * frame.confirm for frame in sensor.incoming.values())
+
+
+@pytest.mark.parametrize("name", STREAMS)
+def test_a_decoder_holds_less_than_its_longest_frame(name: str) -> None:
+    sensor = load_sensor(name)
+    for data in (garbage(4_000), worst(sensor, 4_000), Subject(sensor).stream(rounds=1)[:20_000]):
+        decoder = sensor.decoder()
+        for chunk in material.pieces(data, random.Random(1)):
             decoder.feed(chunk)
-            assert decoder.stats.pending < bound
+            assert decoder.stats.pending < pending_bound(sensor)
 
 
-@of_each_kind(STREAMS)
-def test_garbage_takes_no_memory(sensor: Sensor) -> None:
-    data = garbage(MEGABYTE // 8)
-    fed(sensor, data)  # what is imported and made once, for all decoders
-    assert peak(lambda: fed(sensor, data)) < MEGABYTE // 2
+@pytest.mark.parametrize("name", MEASURED)
+def test_garbage_and_the_worst_stream_take_little_memory(name: str) -> None:
+    sensor = load_sensor(name)
+    assert_takes_little_memory(sensor, garbage(MEGABYTE // 8), MEGABYTE // 2)
+    assert_takes_little_memory(sensor, worst(sensor, MEGABYTE // 32), MEGABYTE)
 
 
-@pytest.mark.parametrize("sensor", [lidarspec.sensor("ldrobot-stl27l"), SHAPES["shape-count"]], ids=lambda sensor: sensor.id)
-def test_fifty_megabytes_of_garbage_take_no_memory(sensor: Sensor) -> None:
+def assert_takes_little_memory(sensor: Sensor, data: bytes, bound: int) -> None:
+    fed(sensor, data[:8192])  # imports and tables that are made once
+    assert peak(lambda: fed(sensor, data)) < bound
+
+
+@pytest.mark.soak
+@pytest.mark.parametrize("module", ["", *sensor_modules()])
+def test_garbage_and_the_worst_stream_take_little_memory_on_every_sensor(module: str) -> None:
+    for sensor in distinct_sensors_in(module) if module else SHAPES.values():
+        if sensor.datagrams:
+            continue
+        assert_takes_little_memory(sensor, garbage(MEGABYTE // 8), MEGABYTE // 2)
+        if is_compiled(sensor.frames[sensor.data_frame]):
+            assert_takes_little_memory(sensor, worst(sensor, MEGABYTE // 16), MEGABYTE)
+
+
+@pytest.mark.parametrize("times", [4, pytest.param(50, marks=pytest.mark.slow)])
+@pytest.mark.parametrize("name", ["ldrobot-stl27l", "shape-count"])
+def test_megabytes_of_garbage_take_no_memory(name: str, times: int) -> None:
+    sensor = load_sensor(name)
     data = garbage(MEGABYTE)
-    assert peak(lambda: fed(sensor, data, times=50, chunk=MEGABYTE)) < MEGABYTE
+    assert peak(lambda: fed(sensor, data, times=times, chunk=MEGABYTE)) < MEGABYTE
 
 
-@of_each_kind(COMPILED)
-def test_the_worst_stream_takes_little_memory(sensor: Sensor) -> None:
-    data = worst(sensor, MEGABYTE // 16)
-    fed(sensor, data[:8192])
-    assert peak(lambda: fed(sensor, data)) < MEGABYTE
-
-
-@each_stream
-def test_a_frame_is_out_before_one_longest_frame_more_has_come(sensor: Sensor) -> None:
-    """The first frame found by an endless stream, in pieces of two percent of it: how many bytes after its own last one."""
-    frames = Subject(sensor).conversation(rounds=3)
-    data = b"".join(part for _, part in frames)
-    bound = max(frame.max_length * frame.confirm for frame in sensor.frames.values() if frame.direction == "in")
+@pytest.mark.parametrize("name", STREAMS)
+def test_a_frame_is_out_before_one_longest_frame_more_has_come(name: str) -> None:
+    """Feed pieces of two percent of the longest frame, and see how many bytes after its own last one each frame is out."""
+    sensor = load_sensor(name)
+    data = b"".join(part for _, part in Subject(sensor).conversation(rounds=1))
+    bound = pending_bound(sensor)
     decoder = sensor.decoder()
     step = max(bound // 50, 1)
-    for spot in range(0, len(data), step):
-        for found in decoder.feed(data[spot : spot + step]):
-            assert spot + 1 - (found.offset + len(found.data)) < bound
+    for offset in range(0, len(data), step):
+        for found in decoder.feed(data[offset : offset + step]):
+            assert offset + 1 - (found.offset + len(found.data)) < bound

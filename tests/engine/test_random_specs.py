@@ -7,14 +7,15 @@ import importlib.util
 import io
 from collections.abc import Sequence
 from random import Random
+from typing import Any
 
 import construct
 import pytest
 from construct import Construct
 
 from lidarspec import Sensor, SpecError
-from lidarspec.framing.frame_engine import CompiledCodec, codec
 from tests.engine.against_construct import BACKENDS, agree, clouds_agree, expected, sensor
+from tests.engine.engines import is_compiled
 from tests.engine.random_specs import made, spec
 
 LONGEST = 150
@@ -68,19 +69,24 @@ def tried(number: int, *, interpreted: bool = False, backends: Sequence[str] = (
     try:
         some = frames(ours, struct, number)
         agree(struct, some, max_length=LONGEST, kept="Rebuild" not in text)
-        if isinstance(codec(ours.frames["data"]), CompiledCodec):
+        if is_compiled(ours.frames["data"]):
             clouds_agree(struct, some, max_length=LONGEST, backends=backends)
     except BaseException as error:
         error.add_note(text)
         raise
 
 
-@pytest.mark.parametrize("number", range(35))
+def numbers(quick: int, whole: int) -> list[Any]:
+    """Return the numbers of specs, of which the first few are in the quick tier."""
+    return [pytest.param(number, marks=() if number < quick else pytest.mark.slow) for number in range(whole)]
+
+
+@pytest.mark.parametrize("number", numbers(12, 35))
 def test_what_construct_reads_is_what_we_read(number: int) -> None:
     tried(number)
 
 
-@pytest.mark.parametrize("number", range(15))
+@pytest.mark.parametrize("number", numbers(5, 15))
 def test_what_construct_alone_can_read_is_read_alike(number: int) -> None:
     tried(number, interpreted=True)
 
@@ -97,7 +103,7 @@ def test_most_random_specs_are_compiled_and_have_frames() -> None:
     """Else the tests above would try little."""
     structs = [struct for struct in (made(spec(number)) for number in range(65)) if declared(struct) is not None]
     sensors = [sensor(struct, max_length=LONGEST) for struct in structs]
-    assert sum(isinstance(codec(one.frames["data"]), CompiledCodec) for one in sensors) > 50
+    assert sum(is_compiled(one.frames["data"]) for one in sensors) > 50
     valid = [
         sum(expected(struct, data) is not None for data in frames(one, struct, 0)) for one, struct in zip(sensors, structs, strict=True)
     ]

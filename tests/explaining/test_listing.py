@@ -10,8 +10,9 @@ import lidarspec as ls
 from lidarspec.explaining.explanation import explain
 from lidarspec.explaining.listing import folded, parents, text, told
 from lidarspec.explaining.wording import Span, bit_picture
-from tests.all_sensors import EVERY as SENSORS, FRAMES
 from tests.cli.running import EXAMPLE, printed, process, ran
+from tests.representatives import REPRESENTATIVES, load_sensor
+from tests.shapes import SHAPES
 
 STL = ls.sensor("ldrobot-stl27l")
 M1C1 = bytes.fromhex("aa55 00 02 0105 0106 0000 2c2b0a 38570a".replace(" ", ""))
@@ -19,7 +20,7 @@ DAMAGED = EXAMPLE[:-1] + b"\x51"
 
 
 def lines(sensor: str, data: bytes, frame: str | None = None) -> list[str]:
-    return str(explain(data, SENSORS[sensor], frame)).splitlines()
+    return str(explain(data, load_sensor(sensor), frame)).splitlines()
 
 
 def test_parts_are_indented_below_what_holds_them() -> None:
@@ -41,16 +42,19 @@ def test_bit_fields_are_drawn_in_the_first_element_and_on_request_in_all() -> No
     assert sum(text(line).startswith("000d") for line in found.lines(every=True)) == 4
 
 
-@pytest.mark.parametrize(("sensor", "frame"), FRAMES)
-def test_pictures_show_every_bit_of_a_block_once(sensor: str, frame: str) -> None:
-    for row in explain(SENSORS[sensor].example(frame), SENSORS[sensor], frame).rows:
-        shown = [bytearray(len(row.data)) for _ in range(2)]
-        for value in row.values:
-            assert value.masks or value.raw == b""
-            for place, mask in enumerate(value.masks, value.start - row.offset):
-                assert not shown[0][place] & mask
-                shown[0][place] |= mask
-        assert shown[0] == (b"\0" if row.path in ("(start)", "(end)") else b"\xff") * len(row.data)
+@pytest.mark.parametrize("name", [*SHAPES, *REPRESENTATIVES])
+def test_pictures_show_every_bit_of_a_block_once(name: str) -> None:
+    sensor = load_sensor(name)
+    for frame in sensor.frames:
+        for row in explain(sensor.example(frame), sensor, frame).rows:
+            shown = bytearray(len(row.data))
+            for value in row.values:
+                assert value.masks or value.raw == b""
+                for index, mask in enumerate(value.masks, value.start - row.offset):
+                    assert not shown[index] & mask
+                    shown[index] |= mask
+            is_mark = row.path in ("(start)", "(end)")
+            assert shown == (b"\0" if is_mark else b"\xff") * len(row.data)
 
 
 def test_a_picture_has_dots_for_other_bits() -> None:
@@ -79,14 +83,16 @@ def test_fields_that_one_frame_alone_has_are_told_together() -> None:
     assert "      samples[1].distance to samples[2].exposure  in the second frame alone" in shown
 
 
-@pytest.mark.parametrize(("sensor", "frame"), FRAMES)
-def test_differences_count_every_bit_of_frames_of_one_layout(sensor: str, frame: str) -> None:
-    data = SENSORS[sensor].example(frame, seed=3)
-    other = bytearray(data)
-    other[-1] ^= 0x41
-    first, second = (explain(bytes(part), SENSORS[sensor], frame) for part in (data, other))
-    if second.rows[-1].values and [row.path for row in first.rows] == [row.path for row in second.rows]:
-        assert sum(mask.bit_count() for part in first.differences(second) for mask in part.masks) == 2
+@pytest.mark.parametrize("name", SHAPES)
+def test_differences_count_every_bit_of_frames_of_one_layout(name: str) -> None:
+    sensor = load_sensor(name)
+    for frame in sensor.frames:
+        data = sensor.example(frame, seed=3)
+        other = data[:-1] + bytes([data[-1] ^ 0x41])
+        first = explain(data, sensor, frame)
+        second = explain(other, sensor, frame)
+        if second.rows[-1].values and [row.path for row in first.rows] == [row.path for row in second.rows]:
+            assert sum(mask.bit_count() for part in first.differences(second) for mask in part.masks) == 2
 
 
 def test_the_verb_compares_with_another_frame_or_the_next() -> None:

@@ -12,7 +12,7 @@ import lidarspec as ls
 from lidarspec.errors import UnknownFrame
 from lidarspec.explaining.pieces import NEAREST, explained, pieces
 from lidarspec.transports.protocol import Chunk
-from tests.all_sensors import EVERY as SENSORS
+from tests.representatives import load_sensor
 
 STL = ls.sensor("ldrobot-stl27l")
 FRAMES = ls.simulate(STL, 40)
@@ -67,9 +67,10 @@ def test_a_damaged_datagram_is_one_piece_whatever_is_in_it() -> None:
     assert [size for _, size, _ in told([packets[0], b"abc", b"defg", packets[2]], sensor=sensor, datagrams=True)] == [3, 4]
 
 
-@pytest.mark.parametrize("sensor", ["shape-count", "shape-ahead", "cspc-coin-d4", "slamtec-rplidar-a1"])
+@pytest.mark.parametrize("sensor", ["shape-count", "shape-ahead", "cspc-m1c1-mini", "slamtec-rplidar-a1"])
 def test_every_byte_of_a_damaged_stream_is_in_one_piece(sensor: str) -> None:
-    value, chance = SENSORS[sensor], random.Random(4)
+    value = load_sensor(sensor)
+    chance = random.Random(4)
     stream = bytearray(b"".join(value.example(value.data_frame, seed=seed) for seed in range(12)))
     for _ in range(9):
         place = chance.randrange(len(stream))

@@ -15,9 +15,9 @@ from construct import Const, Int8ul, Int16ub, Struct
 from numpy.typing import NDArray
 
 import lidarspec
-from lidarspec import Counters, Sensor
+from lidarspec import Counters
 from lidarspec.columns.columns import Batch
-from lidarspec.framing.frame_engine import CompiledCodec, codec
+from lidarspec.framing.frame_engine import codec
 from lidarspec.framing.results import Frames
 from lidarspec.packets.clocks import Unwrapper, clock_ns
 from lidarspec.packets.packets import joined
@@ -25,16 +25,18 @@ from lidarspec.packets.stream import PacketStream
 from lidarspec.spec import Fields, Frame
 from lidarspec.wire.arrays import repeated
 from lidarspec.wire.frame_table import Rows
-from tests.all_sensors import DISTINCT
+from tests.engine.engines import is_compiled
+from tests.representatives import REPRESENTATIVES, load_sensor
 from tests.shapes import SHAPES
 
-each_sensor = pytest.mark.parametrize("sensor", DISTINCT.values(), ids=DISTINCT)
+each_sensor = pytest.mark.parametrize("name", [*SHAPES, *REPRESENTATIVES])
 EXAMPLES = 20
 
 
 @functools.cache
-def damaged(sensor: Sensor) -> NDArray[np.uint8]:
-    """Frames of one length, (n, size), with a byte changed in every fifth, at places all over the frame."""
+def damaged(name: str) -> NDArray[np.uint8]:
+    """Return frames of one length, (n, size), with a byte changed in every fifth, at places all over the frame."""
+    sensor = load_sensor(name)
     frames = [sensor.example(sensor.data_frame, seed=seed) for seed in range(EXAMPLES)]
     size = max(map(len, frames), key=[len(frame) for frame in frames].count)
     rows = np.frombuffer(b"".join(frame for frame in frames if len(frame) == size), np.uint8).reshape(-1, size).copy()
@@ -49,8 +51,9 @@ def facts(spans: Frames) -> list[tuple[str, int, bytes, int]]:
 
 @each_sensor
 @pytest.mark.parametrize("distance", ["none", "even", "uneven"])
-def test_datagrams_in_one_buffer_are_those_one_after_another(sensor: Sensor, distance: str) -> None:
-    rows = damaged(sensor)
+def test_datagrams_in_one_buffer_are_those_one_after_another(name: str, distance: str) -> None:
+    sensor = load_sensor(name)
+    rows = damaged(name)
     count, size = rows.shape
     one_by_one, together = sensor.decoder(stream=False), sensor.decoder(stream=False)
     wanted = [(f.frame, f.offset, f.data, f.gap) for row in rows for f in one_by_one.feed(row.tobytes())]
@@ -65,18 +68,20 @@ def test_datagrams_in_one_buffer_are_those_one_after_another(sensor: Sensor, dis
 
 
 @each_sensor
-def test_the_rows_of_an_array_are_those_datagrams(sensor: Sensor) -> None:
-    rows = damaged(sensor)
+def test_the_rows_of_an_array_are_those_datagrams(name: str) -> None:
+    sensor = load_sensor(name)
+    rows = damaged(name)
     array, listed = sensor.decode(rows), sensor.decode([row.tobytes() for row in rows])
     assert array.stats == listed.stats
     assert array.raw.tobytes() == listed.raw.tobytes()
-    for name in ("offset", "time_ns", "host_ns", "index", "breaks"):
-        np.testing.assert_array_equal(getattr(array, name), getattr(listed, name))
+    for column in ("offset", "time_ns", "host_ns", "index", "breaks"):
+        np.testing.assert_array_equal(getattr(array, column), getattr(listed, column))
 
 
 @each_sensor
-def test_arrays_of_sound_frames_alone_and_with_damaged_ones_in_turn(sensor: Sensor) -> None:
-    mixed = damaged(sensor)
+def test_arrays_of_sound_frames_alone_and_with_damaged_ones_in_turn(name: str) -> None:
+    sensor = load_sensor(name)
+    mixed = damaged(name)
     judge = sensor.decoder(stream=False)
     sound = np.array([row for row in mixed if judge.feed(row.tobytes())]).reshape(-1, mixed.shape[1])
     arrays = [sound, mixed, sound, sound, mixed[:1], sound[:1], mixed[-1:], sound[::-1], mixed[:0]]
@@ -85,15 +90,15 @@ def test_arrays_of_sound_frames_alone_and_with_damaged_ones_in_turn(sensor: Sens
     listed = [one_by_one.datagrams([row.tobytes()]) for array in arrays for row in array]
     assert [fact for spans in found for fact in facts(spans)] == [fact for spans in listed for fact in facts(spans)]
     assert together.stats == one_by_one.stats
-    assert not len(sound) or (found[5].layout is not None) == isinstance(codec(sensor.frames[sensor.data_frame]), CompiledCodec)
+    assert not len(sound) or (found[5].layout is not None) == is_compiled(sensor.frames[sensor.data_frame])
     streams = [PacketStream(sensor, sensor.data_frame, Counters()) for _ in range(3)]
     whole, wanted = streams[0].add(found, whole=True), streams[1].add(listed, whole=True)
     parts = joined([streams[2].add([spans], whole=True) for spans in found])
     for packets in (whole, parts):
         assert packets.raw.tobytes() == wanted.raw.tobytes()
-        for name in ("offset", "time_ns", "host_ns", "index", "breaks"):
-            assert getattr(packets, name).dtype == getattr(wanted, name).dtype
-            np.testing.assert_array_equal(getattr(packets, name), getattr(wanted, name))
+        for column in ("offset", "time_ns", "host_ns", "index", "breaks"):
+            assert getattr(packets, column).dtype == getattr(wanted, column).dtype
+            np.testing.assert_array_equal(getattr(packets, column), getattr(wanted, column))
 
 
 def test_a_large_array_is_not_copied() -> None:

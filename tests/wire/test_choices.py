@@ -33,6 +33,7 @@ from lidarspec.framing.frame_engine import CompiledCodec, codec
 from lidarspec.spec import Scaled
 from lidarspec.spec.tree import Select, nodes
 from tests.engine.against_construct import BACKENDS, agree, sensor
+from tests.engine.engines import is_compiled
 
 KIND = Enum(Int8ub, idle=1, busy=2, lost=7)
 FLAGS = BitStruct("low" / BitsInteger(5), "kind" / Enum(BitsInteger(3), idle=1, busy=2))
@@ -61,7 +62,7 @@ CHOICES: dict[str, Any] = {
 def test_named_values_choose_as_in_construct(name: str) -> None:
     struct, source = CHOICES[name], random.Random(name)
     ours = sensor(struct)
-    assert isinstance(codec(ours.frames["data"]), CompiledCodec)
+    assert is_compiled(ours.frames["data"])
     frames = {bytes([head, *source.randbytes(size)]) for head in (*range(10), 0x21, 0x22, 255) for size in range(1, 6) for _ in range(3)}
     examples = {ours.example("data", seed=seed) for seed in range(20)}
     assert agree(struct, sorted(frames | examples)) > len(examples) / 2

@@ -12,50 +12,58 @@ from lidarspec.framing.frame_engine import CompiledCodec, codec
 from lidarspec.spec import Frame
 from lidarspec.wire.layout import Layout
 from lidarspec.wire.wire_table import INDICES, Extent, WireRow, frame_size, wire_table
-from tests.all_sensors import EVERY as SENSORS, FRAMES as EVERY_FRAME
+from tests.representatives import REPRESENTATIVES, load_sensor
 from tests.shapes import SHAPES
 
-FRAMES = [(sensor, name) for sensor, name in EVERY_FRAME if isinstance(codec(SENSORS[sensor].frames[name]), CompiledCodec)]
+#: Types of rows that stand for no field.
+NO_FIELDS = ("array", "parts", "check", "no frame")
+each_sensor = pytest.mark.parametrize("name", [*SHAPES, *REPRESENTATIVES])
 
 
 def evaluated(formula: str, names: dict[str, object]) -> int:
     return int(eval(formula, {"__builtins__": {}}, names))
 
 
-@pytest.mark.parametrize(("sensor", "frame"), FRAMES)
-def test_offsets_are_those_of_the_layout(sensor: str, frame: str) -> None:
-    value = SENSORS[sensor]
-    data = value.example(frame, seed=2)
-    engine = codec(value.frames[frame])
-    assert isinstance(engine, CompiledCodec)
+@each_sensor
+def test_offsets_are_those_of_the_layout(name: str) -> None:
+    sensor = load_sensor(name)
+    for frame in sensor.frames:
+        engine = codec(sensor.frames[frame])
+        if isinstance(engine, CompiledCodec):
+            assert_offsets_are_those_of_the_layout(sensor, frame, engine)
+
+
+def assert_offsets_are_those_of_the_layout(sensor: ls.Sensor, frame: str, engine: CompiledCodec) -> None:
+    data = sensor.example(frame, seed=2)
     layout = engine.tree.layout(data)
     assert isinstance(layout, Layout)
-    names = dict(value.parse(data, frame))
-    if "(" not in frame_size(value.frames[frame]).replace("*(", ""):
-        assert evaluated(frame_size(value.frames[frame]), names) == len(data)
+    values = dict(sensor.parse(data, frame))
+    size = frame_size(sensor.frames[frame])
+    if "(" not in size.replace("*(", ""):
+        assert evaluated(size, values) == len(data)
     checked = 0
-    for row in wire_table(value.frames[frame]):
+    for row in wire_table(sensor.frames[frame]):
         leaf = layout.leaves.get(re.sub(r"\[\w\]", "", row.field))
         if leaf is None or row.type == "array" or "size(" in row.offset or "?" in row.offset or 0 in leaf.shape:
             continue
-        origin = evaluated(row.offset, {**names, **dict.fromkeys(INDICES, 0)})
+        names = {**values, **dict.fromkeys(INDICES, 0)}
+        origin = evaluated(row.offset, names)
         assert origin == leaf.offset, row
         for index, stride in zip(INDICES, leaf.strides, strict=False):
             if f"[{index}]" in row.field:
-                assert evaluated(row.offset, {**names, **dict.fromkeys(INDICES, 0), index: 1}) == origin + stride, row
+                assert evaluated(row.offset, {**names, index: 1}) == origin + stride, row
         checked += 1
     assert checked
 
 
-@pytest.mark.parametrize(("sensor", "frame"), FRAMES)
-def test_every_field_has_a_row(sensor: str, frame: str) -> None:
-    fields = set(codec(SENSORS[sensor].frames[frame]).schema.all_fields)
-    rows = {
-        re.sub(r"\[\w\]", "", row.field)
-        for row in wire_table(SENSORS[sensor].frames[frame])
-        if row.type not in ("array", "parts", "check", "no frame")
-    }
-    assert rows - {"(constant)"} == fields
+@each_sensor
+def test_every_field_has_a_row(name: str) -> None:
+    for frame in load_sensor(name).frames.values():
+        engine = codec(frame)
+        if not isinstance(engine, CompiledCodec):
+            continue
+        rows = {re.sub(r"\[\w\]", "", row.field) for row in wire_table(frame) if row.type not in NO_FIELDS}
+        assert rows - {"(constant)"} == set(engine.schema.all_fields)
 
 
 def test_rows_tell_type_unit_and_meaning() -> None:

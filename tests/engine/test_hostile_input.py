@@ -1,0 +1,56 @@
+"""Hostile input raises only documented exceptions (P3): 20,000 mutated inputs in sum, on shapes and representatives.
+
+Parsing one frame raises `WireError` alone; decoding raises on nothing. `tests.fuzz` does the same a million times and longer.
+"""
+
+from __future__ import annotations
+
+import contextlib
+
+import pytest
+
+from lidarspec import WireError
+from lidarspec.testing import subject as material
+from lidarspec.testing.subject import Subject
+from tests.representatives import REPRESENTATIVES, load_sensor
+from tests.shapes import SHAPES
+
+#: Mutated inputs of each sensor; long frames take their time.
+SHAPE_FRAMES = 360
+REPRESENTATIVE_FRAMES = 100
+DECODED_FRAMES = 60
+SEEDS = 3
+
+each_sensor = pytest.mark.parametrize("name", [*SHAPES, *REPRESENTATIVES])
+
+
+@each_sensor
+def test_a_mutated_frame_is_parsed_or_is_a_wire_error(name: str) -> None:
+    sensor = load_sensor(name)
+    subject = Subject(sensor)
+    source = subject.source("hostile frames")
+    examples = [(frame, subject.example(frame, seed=seed)) for frame in sensor.frames for seed in range(SEEDS)]
+    for _ in range(SHAPE_FRAMES if name in SHAPES else REPRESENTATIVE_FRAMES):
+        frame, data = source.choice(examples)
+        mutated = material.mutated(data, source)
+        with contextlib.suppress(WireError):
+            sensor.parse(mutated, frame=frame, verify=source.random() < 0.7)
+
+
+@each_sensor
+def test_decoding_mutated_frames_raises_nothing(name: str) -> None:
+    sensor = load_sensor(name)
+    subject = Subject(sensor)
+    source = subject.source("hostile streams")
+    frames = subject.conversation(rounds=1)
+    mutated = [(frame, material.mutated(data, source)) for frame, data in source.choices(frames, k=DECODED_FRAMES)]
+    packets = sensor.decode(material.delivery(sensor, mutated))
+    packets.points()
+    assert packets.stats.plugin_errors == 0
+    assert packets.stats.bytes_in == sum(len(data) for _, data in mutated)
+
+
+def test_twenty_thousand_inputs_are_tried() -> None:
+    of_shapes = len(SHAPES) * (SHAPE_FRAMES + DECODED_FRAMES)
+    of_representatives = len(REPRESENTATIVES) * (REPRESENTATIVE_FRAMES + DECODED_FRAMES)
+    assert of_shapes + of_representatives >= 20_000
