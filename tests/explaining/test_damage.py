@@ -7,8 +7,8 @@ import re
 import pytest
 
 import lidarspec as ls
+from lidarspec import explain
 from lidarspec.explaining.damage import Change, changes
-from lidarspec.explaining.explanation import explain
 from tests.cli.running import EXAMPLE
 from tests.shapes import SHAPES
 

@@ -36,10 +36,10 @@ from tests.representatives import REPRESENTATIVES, load_sensor
 from tests.shapes import SHAPES
 
 EXAMPLE = bytes.fromhex("542c6808ab7ee000e4dc00e2d900e5d500e3d300e4d000e9cd00e4ca00e2c700e9c500e5c200e5c000e5be823a1a50")
-#: Frames of shapes up to this length are cut at every byte.
-SMALL_BYTES = 50
+#: Shapes whose frames are cut at every byte.
+CUT_AT_EVERY_BYTE = ("shape-count", "shape-bits", "shape-nested", "shape-text")
 
-#: Sensors whose points follow from frames before the data.
+#: Sensors whose points follow from earlier frames.
 WITHOUT_POINTS = ()
 each_sensor = pytest.mark.parametrize("name", [*SHAPES, *REPRESENTATIVES])
 
@@ -76,10 +76,7 @@ def test_a_truncated_frame_is_explained_as_far_as_it_goes(name: str) -> None:
     for frame in sensor.frames:
         whole = explained(name, frame)
         data = whole.data
-        ends = {0, len(data) // 2, len(data) - 1}
-        if name in SHAPES and len(data) <= SMALL_BYTES:
-            ends = set(range(len(data)))
-        for end in ends:
+        for end in range(len(data)) if name in CUT_AT_EVERY_BYTE else (0, len(data) // 2, len(data) - 1):
             found = explain(data[:end], sensor, frame)
             assert bytes_of_rows(found) == data[:end]
             assert found.fault is not None
@@ -289,9 +286,9 @@ def test_look_ahead_and_implausible_frames_are_told() -> None:
 
 
 def test_bytes_that_begin_like_no_frame_are_refused() -> None:
-    with pytest.raises(WireError, match="no frame type fits"):
+    with pytest.raises(WireError, match="robosense-m1"):
         explain(b"hello, world", ls.sensor("robosense-m1"))
-    with pytest.raises(UnknownFrame, match="did you mean 'data'"):
+    with pytest.raises(UnknownFrame, match="'data'"):
         explain(b"", ls.sensor("robosense-m1"), "dat")
 
 

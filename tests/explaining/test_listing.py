@@ -7,7 +7,7 @@ import re
 import pytest
 
 import lidarspec as ls
-from lidarspec.explaining.explanation import explain
+from lidarspec import explain
 from lidarspec.explaining.listing import folded, parents, text, told
 from lidarspec.explaining.wording import Span, bit_picture
 from tests.cli.running import EXAMPLE, printed, process, ran

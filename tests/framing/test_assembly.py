@@ -14,7 +14,6 @@ from construct import Bytes, Const, Int8ub, Int16ub, Int32ub, Struct, VarInt, th
 import lidarspec as ls
 from lidarspec import Sensor, SpecError
 from lidarspec.explaining.pieces import pieces
-from lidarspec.exports import Refused
 from lidarspec.framing.assembly import PATIENCE, WAITING
 from lidarspec.spec import Assembled, Chunk, Udp
 from tests.shapes.fragments import FRAGMENT, SENSOR
@@ -131,19 +130,19 @@ def test_fragments_by_their_place_in_bytes_are_joined() -> None:
 
 
 def test_what_a_fragment_has_to_say_is_there_when_it_is_declared() -> None:
-    with pytest.raises(SpecError, match=r"links\.data\.assembled: the fragment has no field 'number'"):
+    with pytest.raises(SpecError, match=r"links\.data\.assembled: .*'number'"):
         by_bytes(key="number")
-    with pytest.raises(SpecError, match="pieces of a stream, not both"):
+    with pytest.raises(SpecError, match="stream"):
         Udp(7780, stream=True, assembled=Assembled(FRAGMENT, key="message", index="index", count="count"))
     odd = Assembled(Struct("a" / VarInt, "b" / Int8ub), key="a", index="b", count="b")
-    with pytest.raises(SpecError, match="VarInt has no fixed place"):
+    with pytest.raises(SpecError, match="VarInt"):
         dataclasses.replace(SENSOR, links={"data": Udp(7780, assembled=odd)}).decoder()
 
 
 def test_exports_and_explain_know_of_messages_in_fragments() -> None:
     rule = json.loads(ls.export(SENSOR, "json"))["links"]["data"]["assembled"]
     assert (rule["keys"], rule["index"], rule["fragment"]["kind"]) == (["message"], "index", "struct")
-    with pytest.raises(Refused, match="messages in several datagrams, which the dissector does not join"):
+    with pytest.raises(ls.UsageError, match="several datagrams"):
         ls.export(SENSOR, "wireshark")
     found = list(pieces(SENSOR, [Chunk(part, 0) for number in range(3) for part in fragments(number)], datagrams=True))
     assert [(piece.frame, piece.data) for piece in found] == [("data", message(number)) for number in range(3)]

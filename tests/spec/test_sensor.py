@@ -29,25 +29,25 @@ def configure(
 
 
 @pytest.mark.parametrize(
-    ("options", "told"),
+    ("options", "named"),
     [
-        ({"file": 1}, "file is a path or a text, not 1"),
-        ({"file": True}, "file is a path or a text, not True"),
-        ({"file": ["a"]}, r"file is a path or a text, not \['a'\]"),
-        ({"turned": "1"}, "turned is a number, not '1'"),
-        ({"turned": True}, "turned is a number, not True"),
-        ({"mode": 1.5}, "mode is a whole number, not 1.5"),
-        ({"upside": 1}, "upside is true or false, not 1"),
+        ({"file": 1}, "file .*1"),
+        ({"file": True}, "file .*True"),
+        ({"file": ["a"]}, r"file .*\['a'\]"),
+        ({"turned": "1"}, "turned .*'1'"),
+        ({"turned": True}, "turned .*True"),
+        ({"mode": 1.5}, "mode .*1.5"),
+        ({"upside": 1}, "upside .*1"),
         ({"file": None, "turned": 1, "mode": np.int64(3), "upside": True, "kind": 3, "plain": [1]}, ""),
         ({"file": Path("a"), "turned": np.float32(1), "mode": None}, ""),
     ],
 )
-def test_an_option_is_of_the_type_that_its_parameter_declares(options: dict[str, Any], told: str) -> None:
+def test_an_option_is_of_the_type_that_its_parameter_declares(options: dict[str, Any], named: str) -> None:
     sensor = dataclasses.replace(SHAPES["shape-count"], configure=configure)
-    if not told:
+    if not named:
         assert sensor.configure(**options).options == options
         return
-    with pytest.raises(ls.UsageError, match=f"shape-count: {told}"):
+    with pytest.raises(ls.UsageError, match=f"shape-count: {named}"):
         sensor.configure(**options)
 
 
@@ -62,5 +62,5 @@ def test_on_the_command_line_a_digit_can_be_the_name_of_a_file(tmp_path: Path, m
 
 def test_what_a_sensors_own_function_does_not_foresee_is_the_plugins_fault(tmp_path: Path) -> None:
     (tmp_path / "heads.json").write_text("{nonsense", encoding="utf-8")
-    with pytest.raises(PluginError, match="shape-headed: configure: JSONDecodeError"):
+    with pytest.raises(PluginError, match=r"shape-headed: .*JSONDecodeError"):
         SHAPES["shape-headed"].configure(calibration=tmp_path / "heads.json")

@@ -63,12 +63,14 @@ def test_what_is_not_allowed_is_counted_shown_and_not_built(backend: str) -> Non
     assert packets["b"].tolist() == [2, 3]
     assert (packets.stats.implausible, packets.stats.bytes_skipped) == (4, 4)
     assert ours.parse(b"\3\x09", verify=False).a == 3
-    with pytest.raises(WireError, match="a at byte 0: value 3, expected 1, 2"):
+    with pytest.raises(WireError) as fault:
         ours.parse(b"\3\4")
-    with pytest.raises(WireError, match="ok: check failed"):
+    assert (fault.value.path, fault.value.offset) == ("a", 0)
+    with pytest.raises(WireError) as fault:
         ours.parse(b"\1\x09")
+    assert fault.value.path == "ok"
     for values in (dict(a=3, b=1), dict(a=1, b=9)):
-        with pytest.raises(UsageError, match=r"a: expected 1, 2, got 3|ok: check failed"):
+        with pytest.raises(UsageError, match=r"a: |ok: "):
             ours.build("data", **values)
 
 
@@ -84,8 +86,9 @@ def test_a_mapping_is_names_of_all_values_that_there_are() -> None:
     assert [ours.parse(data).a for data in (b"\5\7", b"\xff")] == ["low", "high"]
     assert [ours.build("data", a=name, b=[7] * (name == "low")) for name in ("low", "high")] == [b"\5\7", b"\xff"]
     assert ours.decode([b"\5\7", b"\xff", b"\6"])["a"].tolist() == [5, 255]
-    with pytest.raises(WireError, match="a at byte 0: value 6, expected 5, 255"):
+    with pytest.raises(WireError) as fault:
         ours.parse(b"\6")
+    assert (fault.value.path, fault.value.offset) == ("a", 0)
 
 
 def test_parts_meet_their_own_conditions() -> None:

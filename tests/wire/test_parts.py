@@ -63,7 +63,7 @@ def test_a_part_is_a_packet_without_padding_and_knows_its_frame() -> None:
     assert packets.points().range.tolist() == pytest.approx([0.01, 0.02, 0.03, 0.04])
     with pytest.raises(UsageError, match=r"tags\.points"):
         packets.parts("tags")
-    with pytest.raises(UsageError, match="did you mean 'tags'"):
+    with pytest.raises(UsageError, match="tags"):
         packets.parts("tag")
 
 
@@ -107,28 +107,31 @@ def test_frames_are_what_construct_takes_for_frames(name: str) -> None:
     against_construct.agree(struct, [*damaged, *(data[:-1] for data in whole), *(data + b"\0" for data in whole)], kept=False)
 
 
-def test_what_parts_cannot_be_is_said_where_they_are_declared() -> None:
-    with pytest.raises(SpecError, match="count=, within=, and size= with following="):
+def test_invalid_parts_are_refused_when_they_are_declared() -> None:
+    with pytest.raises(SpecError, match="count="):
         Parts(FOUR, this.count, within=this.size)
-    with pytest.raises(SpecError, match="count=, within="):
+    with pytest.raises(SpecError, match="count="):
         Parts(FOUR, size=this.size)
-    with pytest.raises(SpecError, match="a part is a Struct"):
+    with pytest.raises(SpecError, match="Struct"):
         Parts(Int8ub, this.count)
-    with pytest.raises(SpecError, match="'frame', which is the frame around it"):
+    with pytest.raises(SpecError, match="'frame'"):
         Frame(Struct("parts" / Parts(Struct("frame" / Int8ub), count=2)), max_length=9)
-    with pytest.raises(SpecError, match="points stand in parts of one kind"):
+    with pytest.raises(SpecError, match="points"):
         Frame(Struct("parts" / Parts(FOUR, count=2)), max_length=9, points={})
 
 
-def test_a_wrong_part_is_told_with_its_place() -> None:
+def test_a_wrong_part_is_reported_with_its_place() -> None:
     data = CHANNELS.build("data", wide=0, azimuth=100, channels=[dict(ring=3, distances=[1, 2]), dict(ring=4, distances=[])])
-    with pytest.raises(WireError, match=r"channels\[1\].check at byte 14: checksum 0x05, expected 0x04"):
+    with pytest.raises(WireError) as fault:
         CHANNELS.parse(data[:-1] + b"\x05")
-    with pytest.raises(UsageError, match=r"tags\[0\].points\[0\].distance = 70000"):
+    assert (fault.value.path, fault.value.offset) == ("channels[1].check", 14)
+    assert "0x05, expected 0x04" in fault.value.reason
+    with pytest.raises(UsageError, match=r"tags\[0\].points\[0\].distance.*70000"):
         tags(dict(type=1, points=[pair(70_000, 0)]))
     assert CHANNELS.decode(data[:-1] + b"\x05" + data).stats.bad_checksum == 1
-    with pytest.raises(WireError, match=r"parts\[0\] at byte 1: constant none of these, expected one of four, sealed"):
+    with pytest.raises(WireError) as fault:
         against_construct.sensor(COUNTED).parse(bytes.fromhex("01 09 00 09"))
+    assert (fault.value.path, fault.value.offset) == ("parts[0]", 1)
 
 
 def test_a_part_of_no_kind_is_counted_alike_by_both_engines() -> None:
