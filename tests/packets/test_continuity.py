@@ -14,6 +14,7 @@ import lidarspec as ls
 from lidarspec import Counters, Packets, Sensor, simulate
 from lidarspec.packets.stream import PacketStream
 from lidarspec.spec import Clock
+from tests.representatives import load_sensor
 
 #: sensors without a counter, and what tells their packets apart.
 UNCOUNTED = ["velodyne-vlp16", "velodyne-hdl32e", "hesai-pandar40p"]
@@ -101,6 +102,29 @@ def test_order_and_identity_are_those_of_the_clock_where_nothing_is_counted(
     assert (late > 0) == (disturbed is swapped)
     for scan, same in itertools.zip_longest(sensor.scans(changed), sensor.scans(frames)):
         assert (len(scan), scan.complete, scan.stamp_ns) == (len(same), same.complete, same.stamp_ns)
+        for column in scan.points.columns:
+            np.testing.assert_array_equal(getattr(scan.points, column), getattr(same.points, column))
+
+
+def doubled_and_displaced(frames: list[bytes], draw: random.Random) -> list[bytes]:
+    """Return the frames with every tenth twice, and each up to three places from where it was."""
+    doubled = [frame for frame in frames for _ in range(2 if draw.random() < 0.1 else 1)]
+    order = sorted(range(len(doubled)), key=lambda index: index + draw.uniform(0, 3))
+    return [doubled[index] for index in order]
+
+
+@pytest.mark.parametrize("name", ["shape-headed", "shape-extras", "shape-paced", "velodyne-vlp16", "robosense-m1"])
+def test_packets_both_doubled_and_displaced_make_the_same_scans(name: str) -> None:
+    """P17."""
+    sensor = load_sensor(name)
+    frames = simulate(sensor, 300)
+    changed = doubled_and_displaced(frames, random.Random(name))
+    packets = sensor.decode(changed)
+    lost, late, duplicates = counted(packets)
+    assert (lost, duplicates) == (0, len(changed) - len(frames))
+    assert late > 0
+    for scan, same in itertools.zip_longest(sensor.scans(changed), sensor.scans(frames)):
+        assert (len(scan), scan.complete) == (len(same), same.complete)
         for column in scan.points.columns:
             np.testing.assert_array_equal(getattr(scan.points, column), getattr(same.points, column))
 

@@ -35,6 +35,7 @@ from tests.shapes import (
     numbers,
     options,
     outer,
+    paced,
     remarks,
     scales,
     segments,
@@ -90,6 +91,7 @@ _MODULES = (
     lines,
     joined,
     escaped,
+    paced,
 )
 
 SHAPES: dict[str, Sensor] = {sensor.id: sensor for sensor in (*(module.SENSOR for module in _MODULES), *coordinates.SENSORS)}

@@ -9,6 +9,7 @@ import random
 import re
 import tracemalloc
 import zlib
+from collections.abc import Collection, Iterable
 from itertools import product
 from operator import methodcaller
 from pathlib import Path
@@ -56,7 +57,29 @@ ALGORITHMS: list[Checksum] = [
     Fold15(),
     *(ZeroPadded(inner, to) for inner, to in [(CRC32, 4), (Crc(16, 0x1021, order="big"), 3), (Fold15(), 8)]),
 ]
+#: Algorithms tried at length in the quick tier: of each kind, and CRCs of few bits, of whole bytes, reflected and not.
+QUICK_ALGORITHMS = [
+    CRC8_LDROBOT,
+    CRC16_MODBUS,
+    CRC32,
+    Crc(64, 0x42F0E1EBA9EA3693, init=2**64 - 1, refin=True, refout=True, xorout=2**64 - 1),
+    Crc(12, 0x80F, init=0x5A3, refin=True, xorout=0x0F1),
+    Crc(3, 0x3, xorout=0x7),
+    Xor(),
+    Sum(8),
+    Sum(20),
+    M1C1,
+    WordXor(3, (2, 1)),
+    Fold15(),
+    ZeroPadded(CRC32, 4),
+]
+QUICK_WIDTHS = (1, 3, 7, 8, 12, 16, 31, 32, 64)
 name_of = methodcaller("describe")
+
+
+def slow_unless(values: Iterable[Any], quick: Collection[Any]) -> list[Any]:
+    """Return parameters of which those that are not in `quick` are left to the slow tier."""
+    return [pytest.param(value, marks=() if value in quick else pytest.mark.slow) for value in values]
 
 
 def bitwise_crc(crc: Crc, data: bytes) -> int:
@@ -102,10 +125,10 @@ def test_rows_of_the_polynomial_of_zlib_agree_with_the_bitwise_oracle(length: in
     crc = Crc(32, 0x04C11DB7, 0x12345678, True, refout, 0x9ABCDEF0)
     wide = random_rows(200, length + 9)
     for rows in (wide[:, 4:-5], np.asfortranarray(wide[:, 4:-5])):
-        assert batch(crc, rows).tolist() == [bitwise_crc(crc, row.tobytes()) for row in rows]
+        assert batch(crc, rows)[::13].tolist() == [bitwise_crc(crc, row.tobytes()) for row in rows[::13]]
 
 
-@pytest.mark.parametrize("width", range(1, 65))
+@pytest.mark.parametrize("width", slow_unless(range(1, 65), QUICK_WIDTHS))
 def test_every_width_agrees_with_the_bitwise_oracle(width: int) -> None:
     rng, top = random.Random(width), 2**width - 1
     for refin, refout in product((False, True), repeat=2):
@@ -134,7 +157,7 @@ def test_agrees_with_crccheck() -> None:
         assert batch(crc, rows).tolist() == [other.calc(row.tobytes()) for row in rows], other
 
 
-@pytest.mark.parametrize("algorithm", ALGORITHMS, ids=name_of)
+@pytest.mark.parametrize("algorithm", slow_unless(ALGORITHMS, QUICK_ALGORITHMS), ids=name_of)
 class TestBatch:
     """A batch gives what its rows give one by one, whichever way it is computed."""
 
