@@ -62,7 +62,7 @@ def inverted(data: bytes) -> bytes:
 
 
 TEXT = NullTerminated(GreedyBytes)
-COUNTED = [bytes([count, *range(1, 1 + size)]) for count in range(4) for size in range(15)]
+COUNTED = [bytes([count, *range(1, 1 + size)]) for count in range(4) for size in range(0, 15, 1 + count % 2)]
 
 COMPILED: dict[str, Any] = {
     "counted": Array(this.k, Bytes(3)),
@@ -128,11 +128,11 @@ def test_they_are_read_and_built_as_in_construct(name: str) -> None:
 def test_such_a_frame_keeps_every_promise(name: str) -> None:
     fields: Any = {**COMPILED, **INTERPRETED}[name]
     inner = Struct("magic" / Const(b"\xf1\x5a"), "k" / Int8ub, "y" / If(this.k > 2, Int8ub), "v" / fields, "end" / Const(b"\xe1\x77"))
-    subject = Subject(sensor(inner), 12)
+    subject = Subject(sensor(inner), 6)
     found = [finding for one in PROPERTIES if one.name in HELD and not one.lacks(subject) for finding in one.findings(subject)]
     assert not found, found
-    assert_edge_values_read_alike(subject.sensor)
-    assert_damaged_input_reads_alike(subject.sensor)
+    assert_edge_values_read_alike(subject.sensor, count=3)
+    assert_damaged_input_reads_alike(subject.sensor, count=1)
 
 
 def test_numbers_are_taken_for_a_byte_string_and_nothing_else() -> None:
