@@ -45,10 +45,10 @@ def test_sensors_without_a_counter_are_known() -> None:
         assert sequence is None or sequence.field not in str(ls.sensor(name).frames["data"])
 
 
-@pytest.mark.parametrize("name", [*UNCOUNTED, "ldrobot-ld06", "hesai-xt32", "robosense-m1"])
-@pytest.mark.parametrize("lost", [1, 2, 50])
+@pytest.mark.parametrize("name", ["shape-paced", *UNCOUNTED, "ldrobot-ld06", "robosense-m1"])
+@pytest.mark.parametrize("lost", [1, 50])
 def test_a_gap_of_the_clock_is_a_loss_where_nothing_is_counted(name: str, lost: int) -> None:
-    sensor = ls.sensor(name)
+    sensor = load_sensor(name)
     frames = simulate(sensor, 600)
     packets = decoded(sensor, frames[:250] + frames[250 + lost :])
     assert counted(packets) == (lost, 0, 0)
@@ -162,7 +162,7 @@ def test_a_counter_that_jumps_without_the_clock_is_damage_and_no_loss(counter: i
 
 def test_a_counter_that_starts_again_while_the_clock_goes_on_is_followed() -> None:
     sensor = ls.sensor("robosense-helios16p")
-    frames = simulate(sensor, 200) + [helios(number, number - 200) for number in range(200, 300) if number not in (250, 251)]
+    frames = simulate(sensor, 200) + [helios(number, number - 200) for number in range(200, 230) if number not in (210, 211)]
     assert counted(sensor.decode(frames)) == (2, 0, 0)
 
 
@@ -204,17 +204,18 @@ def test_a_clock_that_does_not_advance_evenly_says_nothing() -> None:
     assert counted(sensor.decode(frames)) == (0, 0, 0)
 
 
-@pytest.mark.parametrize("name", [*UNCOUNTED, "robosense-m1", "robosense-helios16p"])
-@pytest.mark.parametrize("seed", range(3))
+@pytest.mark.parametrize("name", ["shape-paced", "shape-headed", "velodyne-vlp16", "robosense-m1"])
+@pytest.mark.parametrize("seed", [0, 2])
 def test_pieces_do_not_matter(name: str, seed: int) -> None:
-    sensor, draw = ls.sensor(name), random.Random(seed)
-    frames = [frame for frame in simulate(sensor, 700) if draw.random() > 0.02 * seed]
-    for _ in range(20):
+    sensor = load_sensor(name)
+    draw = random.Random(seed)
+    frames = [frame for frame in simulate(sensor, 200) if draw.random() > 0.02 * seed]
+    for _ in range(10):
         spot = draw.randrange(20, len(frames) - 20)
         frames.insert(spot + draw.randint(0, 5), frames.pop(spot))
         frames.insert(draw.randrange(len(frames)), frames[spot])
     index, stats = in_pieces(sensor, frames, len(frames))
-    for size in (1, 7, 64, 333):
+    for size in (1, 7, 64):
         other, others = in_pieces(sensor, frames, size)
         assert np.array_equal(other, index)
         assert others == stats
