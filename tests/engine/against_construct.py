@@ -71,14 +71,15 @@ def agree(struct: Construct, frames: Iterable[bytes], *, max_length: int = 200, 
     Args:
         kept: whether what is built of what was read has to be the same bytes, as it is not where `Rebuild` fills in another value.
     """
-    ours, whole = sensor(struct, max_length=max_length), list[tuple[bytes, Any]]()
+    ours = sensor(struct, max_length=max_length)
+    whole = list[tuple[bytes, Any]]()
+    invalid = list[bytes]()
     for data in frames:
         wanted = expected(struct, data, max_length=max_length)
         if wanted is None:
             with pytest.raises(WireError):
                 ours.parse(data)
-            for backend in BACKENDS:
-                assert len(ours.decode([data], backend=backend)) == 0, data.hex()
+            invalid.append(data)
             continue
         if not data:
             continue  # a frame without a byte has no place in any input
@@ -88,6 +89,8 @@ def agree(struct: Construct, frames: Iterable[bytes], *, max_length: int = 200, 
         if kept:
             assert ours.build("data", found) == data
     for backend in BACKENDS:
+        accepted = ours.decode(invalid, backend=backend)
+        assert len(accepted) == 0, f"{backend}: frame at byte {accepted.offset[0]} of {b''.join(invalid).hex()}"
         packets = ours.decode([data for data, _ in whole], backend=backend)
         assert len(packets) == len(whole), backend
         assert packets.stats.plugin_errors == 0, packets.stats.tracebacks

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import dataclasses
+import functools
 from pathlib import Path
 from typing import Any
 
@@ -24,8 +25,9 @@ SENSOR = SHAPES["shape-inertia"]
 AT_REST = [0, 0, 9.80665]
 
 
+@functools.cache
 def sent(shake: float = 0.0, sensor: ls.Sensor = SENSOR) -> list[bytes]:
-    """The datagrams of two seconds of a simulated sensor."""
+    """Return the datagrams of two seconds of a simulated sensor."""
     device = SimulatedDevice(sensor, rate=float("inf"), faults=Faults(shake=shake))
     device.start(0)
     return [data for _ in range(8) for _, data in device.outgoing(0)]

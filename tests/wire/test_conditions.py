@@ -33,7 +33,7 @@ from lidarspec.spec import Frame, Parts, Simulation
 from tests.engine.against_construct import BACKENDS, agree, sensor
 from tests.engine.engines import interpreted_reason, is_compiled
 
-FIRST_BYTES = (0, 1, 3, 5, 6, 10, 19, 20, 50, 51, 60, 128, 240, 255)
+FIRST_BYTES = (0, 1, 5, 6, 10, 20, 51, 255)
 ANY = [bytes([first, second, third]) for first in FIRST_BYTES for second in (0, 1, 2, 9, 128, 255) for third in (0, 3, 200)]
 CONDITIONS: dict[str, Any] = {
     "one of": Struct("a" / OneOf(Int8ub, [5, 10, 255]), "b" / Int16ub),
