@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-import json
 import pickle
 import random
 import re
@@ -12,7 +11,6 @@ import zlib
 from collections.abc import Collection, Iterable
 from itertools import product
 from operator import methodcaller
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -24,8 +22,9 @@ from lidarspec import SpecError
 from lidarspec.spec import Checksum, Checksummed, Crc, Fold15, Sum, WordXor, Xor, ZeroPadded
 from lidarspec.wire.row_checksums import batch, over
 from tests.engine import against_construct
+from tests.evidence import vector_bytes
 
-VECTORS = Path(__file__).parents[3] / "shared" / "protocols" / "vectors_serial2d.json"
+VECTORS = "vectors_serial2d.json"
 
 CRC8_LDROBOT = Crc(8, 0x4D)
 CRC16_MODBUS = Crc(16, 0x8005, init=0xFFFF, refin=True, refout=True)
@@ -252,12 +251,6 @@ VECTOR_FRAMES = [
 ]
 
 
-def vectors() -> dict[str, bytes]:
-    if not VECTORS.exists():
-        pytest.skip("the protocol vectors are not beside the project: ../shared/protocols/vectors_serial2d.json")
-    return {entry["id"]: bytes.fromhex(entry["hex"]) for entry in json.loads(VECTORS.read_text(encoding="utf-8"))}
-
-
 def stored_and_computed(algorithm: Checksum, at: int, frame: bytes) -> tuple[int, int]:
     start = at % len(frame)
     end = start + (algorithm.width + 7) // 8
@@ -271,17 +264,19 @@ def test_frames_of_the_fact_sheets() -> None:
 
 
 def test_frames_of_the_vectors() -> None:
-    frames = vectors()
     for algorithm, at, names in VECTOR_FRAMES:
         for name in names.split():
-            stored, computed = stored_and_computed(algorithm, at, frames[name])
+            stored, computed = stored_and_computed(algorithm, at, vector_bytes(VECTORS, name))
             assert computed == stored, name
-    misprints = (Sum(16), 4, frames["cspc_info_as_printed"]), (CRC8_LDROBOT, -1, frames["ld_manual_table_variant"])
+    misprints = (
+        (Sum(16), 4, vector_bytes(VECTORS, "cspc_info_as_printed")),
+        (CRC8_LDROBOT, -1, vector_bytes(VECTORS, "ld_manual_table_variant")),
+    )
     assert [stored_and_computed(*misprint) for misprint in misprints] == [(0x0402, 0x0403), (0x50, 0xD0)]
 
 
 def test_coin_d4_packets_of_a_capture() -> None:
-    packets = np.frombuffer(vectors()["coin_d4_startup_capture"][62:], np.uint8).reshape(2, 85)
+    packets = np.frombuffer(vector_bytes(VECTORS, "coin_d4_startup_capture")[62:], np.uint8).reshape(2, 85)
     stored, covered = packets[:, 8] + 256 * packets[:, 9].astype(int), np.delete(packets, [8, 9], axis=1)
     assert batch(M1C1, covered).tolist() == stored.tolist() != WordXor().batch(covered).tolist()
 
