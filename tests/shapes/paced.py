@@ -6,7 +6,7 @@ from functools import partial
 from typing import Any
 
 import numpy as np
-from construct import Array, Const, Default, Int8ub, Int16ub, Int24ub, Int32ub, Struct
+from construct import Array, Const, Default, Int8ub, Int16ub, Int24ub, Struct
 
 from lidarspec import Sensor
 from lidarspec.spec import Clock, Fields, Frame, OnFlag, Polar, Scaled, Simulation, Udp
@@ -21,7 +21,7 @@ SLOW_MODE = 2
 SCAN_START = 7
 TURN_S = 60.0
 
-TIME: dict[str, Any] = {"seconds": Scaled(Int8ub, 1, "s"), "micros": Scaled(Int32ub, 1e-6, "s")}
+TIME: dict[str, Any] = {"seconds": Scaled(Int8ub, 1, "s"), "micros": Scaled(Int24ub, 1e-6, "s")}
 DATA = Struct(
     "magic" / Const(b"\xbe\xa7\x01"),
     "mode" / Int8ub * "1 fast, 2 slow",
@@ -46,12 +46,8 @@ def unix_time(f: Fields) -> Any:
     return f.minutes * 60.0 + f.seconds + f.micros
 
 
-def plausible_time(f: Fields, turn_s: float) -> Any:
-    return (f.seconds < turn_s) & (f.micros < 1)
-
-
 def plausible(f: Fields, turn_s: float) -> Any:
-    return plausible_time(f, turn_s) & (f.azimuth < 360)
+    return (f.seconds < turn_s) & (f.micros < 1) & (f.azimuth < 360)
 
 
 def points(f: Fields, step_deg: float) -> Polar:
@@ -76,7 +72,7 @@ SENSOR = Sensor(
     model="Paced",
     frames={
         "data": Frame(DATA, data=True, plausible=partial(plausible, turn_s=TURN_S)),
-        "position": Frame(POSITION, plausible=partial(plausible_time, turn_s=TURN_S)),
+        "position": Frame(POSITION),
     },
     points=partial(points, step_deg=3.0),
     scan=OnFlag("start", value=SCAN_START),

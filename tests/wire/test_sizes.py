@@ -168,9 +168,10 @@ def test_both_engines_hold_frames_to_their_lengths(name: str) -> None:
     ours, source = declared(name), random.Random(name)
     codecs = codec(ours.frames["data"]), codec(ours.frames["data"], interpreted=True)
     refused = 0
-    for seed in range(8):
-        for _ in range(24):
-            data = bytearray(ours.example("data", seed=seed))
+    for seed in range(4):
+        example = ours.example("data", seed=seed)
+        for _ in range(12):
+            data = bytearray(example)
             data[source.randrange(2, len(data))] ^= 1 << source.randrange(8)
             row = np.frombuffer(bytes(data) + bytes(40), np.uint8)
             found = [each.survey(row, np.zeros(1, np.intp)) for each in codecs]
