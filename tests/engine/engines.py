@@ -32,7 +32,7 @@ def assert_damaged_input_reads_alike(sensor: Sensor, count: int = DAMAGED_CONVER
     """Fail unless a conversation, and `count` with damaged frames in them, give the same on both engines."""
     subject = Subject(sensor)
     source = subject.source("agree")
-    frames = subject.conversation(rounds=2)
+    frames = subject.conversation(rounds=1)
     assert_backends_agree(sensor, material.delivery(sensor, frames))
     for _ in range(count):
         noisy = [(name, material.mutated(data, source) if source.random() < 0.4 else data) for name, data in frames]

@@ -14,7 +14,7 @@ from tests.shapes import SHAPES
 
 STREAM_SHAPES = [name for name, sensor in SHAPES.items() if not sensor.datagrams]
 #: Bytes of a stream in the quick tier.
-QUICK_LENGTH = 400
+QUICK_LENGTH = 300
 
 MUTANTS = {
     mutants.PartialHeaderDropped: rule.any_split_gives_the_same,
