@@ -13,6 +13,25 @@ from tests.representatives import STREAM_REPRESENTATIVES, load_sensor
 from tests.shapes import SHAPES
 
 STREAM_SHAPES = [name for name, sensor in SHAPES.items() if not sensor.datagrams]
+#: Shapes that differ in how their frames are found; the others differ in what is in them.
+FRAMING_SHAPES = (
+    "shape-count",
+    "shape-bits",
+    "shape-middle",
+    "shape-weak",
+    "shape-twins",
+    "shape-modes",
+    "shape-text",
+    "shape-commands",
+    "shape-options",
+    "shape-measured",
+    "shape-tags",
+    "shape-tokens",
+    "shape-lines",
+    "shape-escaped",
+)
+#: Rules that every shape is held to in the quick tier.
+QUICK_RULES = (rule.any_split_gives_the_same, rule.every_recoverable_frame_is_recovered, rule.idle_gives_up_pending_bytes)
 #: Bytes of a stream in the quick tier.
 QUICK_LENGTH = 300
 
@@ -29,10 +48,10 @@ MUTANTS = {
 each_rule = pytest.mark.parametrize("holds", rule.RULES, ids=lambda holds: holds.__name__)
 
 
-@each_rule
 @pytest.mark.parametrize("name", STREAM_SHAPES)
-def test_the_rule_holds_on_every_shape(name: str, holds: Callable[[Subject, int], None]) -> None:
-    holds(Subject(SHAPES[name]), QUICK_LENGTH)
+def test_the_rule_holds_on_every_shape(name: str) -> None:
+    for holds in rule.RULES if name in FRAMING_SHAPES else QUICK_RULES:
+        holds(Subject(SHAPES[name]), QUICK_LENGTH)
 
 
 @pytest.mark.slow
