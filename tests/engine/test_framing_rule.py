@@ -8,6 +8,7 @@ import pytest
 
 from lidarspec.testing.subject import Subject
 from tests.engine import framing_rule as rule, mutants
+from tests.engine.streams import LENGTH
 from tests.installed import distinct_sensors_in, sensor_modules
 from tests.representatives import STREAM_REPRESENTATIVES, load_sensor
 from tests.shapes import SHAPES
@@ -58,7 +59,7 @@ def test_the_rule_holds_on_every_shape(name: str) -> None:
 @pytest.mark.parametrize("name", STREAM_SHAPES)
 def test_the_rule_holds_on_long_streams_of_every_shape(name: str) -> None:
     for holds in rule.RULES:
-        holds(Subject(SHAPES[name]))
+        holds(Subject(SHAPES[name]), LENGTH)
 
 
 @pytest.mark.parametrize("name", STREAM_REPRESENTATIVES)
@@ -92,4 +93,4 @@ def test_a_parser_without_a_mistake_keeps_the_rule(holds: Callable[[Subject, int
 @pytest.mark.parametrize("parser", MUTANTS, ids=lambda parser: parser.__name__)
 def test_a_parser_with_a_mistake_is_caught(parser: type[mutants.Parser]) -> None:
     with pytest.raises(AssertionError):
-        MUTANTS[parser](Subject(mutants.read_by(parser)), QUICK_LENGTH)
+        MUTANTS[parser](Subject(mutants.read_by(parser)), LENGTH)

@@ -48,7 +48,7 @@ def test_datagrams_of_any_size_raise_on_nothing(sensor: Sensor) -> None:
 
 @pytest.mark.parametrize("sensor", [sensor for sensor in SHAPES.values() if sensor.datagrams], ids=lambda sensor: sensor.id)
 def test_each_datagram_is_judged_by_its_own_bytes_alone(sensor: Sensor) -> None:
-    streams = hostile.streams(Subject(sensor), length=3000)
+    streams = hostile.streams(Subject(sensor), length=1000)
     datagrams = [*streams["heads of frames"], *streams["random headers"], *streams["damaged frames"]]
     together, each = sensor.decoder(stream=False), sensor.decoder(stream=False)
     found = together.datagrams(datagrams)
