@@ -16,9 +16,9 @@ from tests.representatives import REPRESENTATIVES, load_sensor
 from tests.shapes import SHAPES
 
 #: Mutated inputs of each sensor; long frames take their time.
-SHAPE_FRAMES = 360
-REPRESENTATIVE_FRAMES = 100
-DECODED_FRAMES = 60
+SHAPE_FRAMES = 170
+REPRESENTATIVE_FRAMES = 60
+DECODED_FRAMES = 260
 SEEDS = 3
 
 each_sensor = pytest.mark.parametrize("name", [*SHAPES, *REPRESENTATIVES])
