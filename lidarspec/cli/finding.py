@@ -18,7 +18,8 @@ from lidarspec.cli.terminal import note
 from lidarspec.discovery.checksum_search import search
 from lidarspec.discovery.detect import Verdict, best, chosen, names, others_named, verdict, verdicts
 from lidarspec.discovery.doctor import computer, examined
-from lidarspec.discovery.listen import LISTEN, Heard, everywhere, hear, probe, started_first, udp_ports
+from lidarspec.discovery.heard import Heard
+from lidarspec.discovery.listen import LISTEN, everywhere, hear, probe, started_first, udp_ports
 from lidarspec.discovery.periods import Structure, cut, structure
 from lidarspec.discovery.samples import Match
 from lidarspec.discovery.uninstalled import describe, install_commands, recognize

@@ -7,7 +7,7 @@ import pytest
 
 import lidarspec as ls
 from lidarspec.discovery.detect import verdict
-from lidarspec.discovery.listen import Heard
+from lidarspec.discovery.heard import Heard
 from lidarspec.simulation.device import SimulatedDevice
 from tests.evidence import decoded, vector_bytes
 

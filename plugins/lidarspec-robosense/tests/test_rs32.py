@@ -12,7 +12,7 @@ import pytest
 import lidarspec as ls
 from lidarspec import simulate
 from lidarspec.discovery.detect import verdict
-from lidarspec.discovery.listen import Heard
+from lidarspec.discovery.heard import Heard
 from tests.evidence import assert_points, decoded, vector_bytes, vectors
 from tests.installed import sensor_ids
 

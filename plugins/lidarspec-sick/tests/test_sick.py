@@ -10,7 +10,7 @@ import pytest
 
 import lidarspec as ls
 from lidarspec.discovery.detect import verdict
-from lidarspec.discovery.listen import Heard
+from lidarspec.discovery.heard import Heard
 from lidarspec.errors import CommandError, UsageError
 from tests.evidence import capture, decoded, vector_bytes, vectors
 

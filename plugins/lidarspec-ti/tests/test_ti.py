@@ -9,7 +9,7 @@ import pytest
 
 import lidarspec as ls
 from lidarspec.discovery.detect import verdict
-from lidarspec.discovery.listen import Heard
+from lidarspec.discovery.heard import Heard
 from tests.evidence import decoded
 
 RADAR = ls.sensor("ti-iwr6843")

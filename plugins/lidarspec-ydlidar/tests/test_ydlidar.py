@@ -10,7 +10,7 @@ import pytest
 import lidarspec as ls
 from lidarspec import simulate
 from lidarspec.discovery.detect import contradiction, verdict
-from lidarspec.discovery.listen import Heard
+from lidarspec.discovery.heard import Heard
 from tests.evidence import capture, clockwise, decoded, vector_bytes, vectors
 
 FILE = "vectors_serial2d.json"
