@@ -15,7 +15,7 @@ from lidarspec.libraries import EXTRAS, import_library, release_numbers
 
 ROOT = Path(__file__).parents[1]
 #: extras that install sensors or tools, and no library that lidarspec imports.
-TOOL_EXTRAS = {"all", "bench", "dev", "docs"}
+TOOL_EXTRAS = {"all", "bench", "dev", "docs", "test"}
 REQUIREMENT = re.compile(r"([\w.-]+)(?:\[[\w,]+\])?>=([\w.]+)")
 IMPORT_CALL = re.compile(r'import_library\("([\w.]+)", "(\w+)"\)')
 

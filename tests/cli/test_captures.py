@@ -95,6 +95,7 @@ def test_what_is_beside_the_datagrams_is_said_where_it_is_the_most(tmp_path: Pat
     assert f"{cut}: 3 packets were cut by the capture's snap length" in ran("view", cut, "-s", M1, code=4).stderr
 
 
+@pytest.mark.slow
 def test_senders_of_one_address_are_told_apart_by_their_ports(tmp_path: Path) -> None:
     path = capture(tmp_path / "two.pcap", *records(40, ("10.0.0.1", 40001), ("10.0.0.1", 40002)))
     recording = tmp_path / "two.lsr"
@@ -111,6 +112,7 @@ def test_senders_of_one_address_are_told_apart_by_their_ports(tmp_path: Path) ->
     assert "2 senders were recorded" in ran("replay", recording, "--to", "udp://127.0.0.1:9", "--speed", "max").stderr
 
 
+@pytest.mark.slow
 def test_a_sensor_that_sends_from_several_ports_to_several_is_one_sender(tmp_path: Path) -> None:
     data = records(20, ("10.0.0.1", 6699))
     status = [datagram_record(Datagram(b"status", 10**18, ("10.0.0.1", 7788), ("10.0.0.2", 7788))) for _ in range(20)]
@@ -155,6 +157,7 @@ def test_files_of_other_kinds_are_named_and_not_taken_for_bytes(name: str, tmp_p
         assert f"next: tar -xf {path}" in said
 
 
+@pytest.mark.slow
 def test_standard_input_is_no_way_around_it(tmp_path: Path) -> None:
     packed = container("tar", tmp_path / "other.tar").read_bytes()
     for words in (("convert", "-", tmp_path / "out.csv"), ("parse", "-")):
@@ -167,6 +170,7 @@ def recorded(path: Path) -> list[Record]:
         return list(recording)
 
 
+@pytest.mark.slow
 def test_captures_and_recordings_on_standard_input_are_read_as_from_files(tmp_path: Path) -> None:
     path, recording, copy = capture(tmp_path / "it.pcap", *records(40)), tmp_path / "it.lsr", tmp_path / "copy.lsr"
     blocks = tmp_path / "it.pcapng"

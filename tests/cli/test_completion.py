@@ -61,6 +61,7 @@ def test_what_can_stand_there_is_offered(words: str, offered: set[str], folder: 
     assert {line.removeprefix("plain,").replace("file,", "file ") for line in lines if line} == offered
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(shutil.which("bash") is None, reason="bash is not installed")
 def test_bash_takes_what_is_printed(folder: Path) -> None:
     script = """eval "$(_LIDARSPEC_COMPLETE=bash_source lidarspec)"

@@ -21,7 +21,7 @@ import lidarspec as ls
 from lidarspec.captures.records import WRITINGS
 from lidarspec.simulation.simulator import simulate
 from lidarspec.transports.open_url import transport
-from tests.cli.running import COIN_D4, EXAMPLE, LD06, printed, process, ran
+from tests.cli.running import COIN_D4, EXAMPLE, LD06, printed, ran
 from tests.evidence import capture
 from tests.shapes import SHAPES
 
@@ -37,9 +37,7 @@ def read(path: Path) -> Mapping[str, np.ndarray]:
 
 def test_the_coin_d4_dump(tmp_path: Path) -> None:
     target = tmp_path / "out.csv"
-    done = process("convert", capture(COIN_D4), target, "-s", "cspc-coin-d4")
-    assert done.returncode == 0
-    assert done.stdout == b""
+    assert ran("convert", capture(COIN_D4), target, "-s", "cspc-coin-d4").stdout == ""
     packets = json.loads(capture(COIN_D4.replace("_partial.bin", "_expected.json")).read_text(encoding="utf-8"))
     angle = np.concatenate([np.linspace(packet["fsa_deg"], packet["lsa_deg"], 25) for packet in packets])
     rounded, distance = np.array([pair for packet in packets for pair in packet["lds2d_angle_dist"]]).T
@@ -104,7 +102,7 @@ def test_hexadecimal_text_and_standard_input_are_read(tmp_path: Path) -> None:
     text.write_text("\n".join([EXAMPLE[:20].hex(" "), EXAMPLE[20:].hex(" ")]), encoding="ascii")
     ran("convert", text, target, "-s", "ldrobot-stl27l")
     first = target.read_bytes()
-    assert process("convert", "-", target, "--force", "-s", "ldrobot-stl27l", given=EXAMPLE).returncode == 0
+    ran("convert", "-", target, "--force", "-s", "ldrobot-stl27l", given=EXAMPLE)
     assert target.read_bytes() == first
     assert len(read(target)["x"]) == 12
 
@@ -234,6 +232,7 @@ def test_files_for_each_scan_are_overwritten_when_it_is_asked_for_alone(tmp_path
     assert files[0].exists()
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(not hasattr(os, "openpty"), reason="needs pseudo terminals")
 def test_a_terminal_shows_how_far_it_is(tmp_path: Path) -> None:
     from tests.view.terminal import Terminal
@@ -262,6 +261,7 @@ def test_how_far_a_file_was_read_is_known_where_it_is_stored(tmp_path: Path) -> 
         assert device.place is None
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["velodyne-vlp16", "ldrobot-stl27l"])
 def test_packets_go_from_container_to_container_as_they_are(name: str, tmp_path: Path) -> None:
     files = [tmp_path / f"drive.{suffix}" for suffix in ("pcap", "pcapng", "lsr", "pcap.pcap")]

@@ -27,6 +27,7 @@ def test_one_frame_with_spaces_is_one_frame() -> None:
     assert "1 frame was found" in ran("crc", *(f"{byte:02x}" for byte in EXAMPLE), code=1).stderr
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "words", [("frames.hex",), ("raw.bin",), ("raw.bin", "--period", "47"), ("cut.bin", "--period", "47", "--offset", "5")]
 )
@@ -50,6 +51,7 @@ def test_a_checksum_without_a_name_comes_as_a_class() -> None:
     assert "    class Check(Checksum):" in text
 
 
+@pytest.mark.slow
 def test_few_frames_are_weak() -> None:
     assert "this may be chance: give more frames" in ran("crc", *(frame.hex() for frame in FRAMES[:2])).stderr
 
@@ -65,6 +67,7 @@ def test_none_is_found_and_nothing_is_no_input(tmp_path: Path) -> None:
     assert "--period BYTES" in found.stderr
 
 
+@pytest.mark.slow
 def test_many_frames_prove_more_than_a_float_can_hold() -> None:
     frames = simulate(ls.sensor("ldrobot-stl27l"), 250)
     assert "one wrong guess in 1e+" in ran("crc", *(frame.hex() for frame in frames)).stdout

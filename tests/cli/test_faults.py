@@ -82,13 +82,6 @@ def test_doctor_says_the_same_as_a_finding(folder: Path, place: Place, told: str
     assert any(told in line for line in wrong), result.stdout
 
 
-@pytest.mark.parametrize("verb", ["parse", "explain"])
-@pytest.mark.parametrize("source", ["/dev/ttyUSB99", "udp://:2368", "tcp://127.0.0.1:9", SIM])
-def test_bytes_of_live_sources_are_read_by_another_verb(verb: str, source: str) -> None:
-    result = ran(verb, source, code=2)
-    assert result.stderr == f"{source} is live: this takes bytes or a file\n  next: lidarspec read {source} --packets\n"
-
-
 def test_hexadecimal_digits_with_colons_are_no_address() -> None:
     assert "ldrobot-stl27l data, 47 bytes" in ran("parse", EXAMPLE.hex(":"), *STL).stdout
     assert "lsn is cut off" in ran("parse", "aa:55:00", "-s", "cspc-m1c1-mini", code=4).stderr
@@ -145,6 +138,7 @@ def seen_by_a_shell(code: int) -> int:
     return code if code >= 0 else 128 - code
 
 
+@pytest.mark.slow
 def test_an_interrupt_ends_every_verb_with_130(worked: list[tuple[str, Terminal]], tmp_path: Path) -> None:
     for _, terminal in worked:
         terminal.loaded()
@@ -167,6 +161,7 @@ PRINTING: tuple[tuple[str, ...], ...] = (
 )
 
 
+@pytest.mark.slow
 def test_a_closed_pipe_ends_every_verb_quietly(tmp_path: Path) -> None:
     running = {words: _started(words, tmp_path) for words in PRINTING}
     ends = {}

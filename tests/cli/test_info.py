@@ -27,6 +27,7 @@ def frames() -> list[bytes]:
     return packets[:150] + packets[151:]
 
 
+@pytest.mark.slow
 def test_a_capture_of_two_sensors_of_which_one_lost_a_packet(frames: list[bytes], tmp_path: Path) -> None:
     path, senders = tmp_path / "drive.pcap", [("10.0.0.1", 2368), ("10.0.0.2", 2368)]
     datagrams = [
@@ -72,6 +73,7 @@ def test_of_a_long_recording_the_beginning_and_the_end_are_read(tmp_path: Path) 
     assert "what is counted is of its beginning" in text
 
 
+@pytest.mark.slow
 def test_a_capture_of_a_byte_stream_is_called_so(tmp_path: Path) -> None:
     ran("sim", "ldrobot-stl27l", "--to", tmp_path / "line.pcap", "-t", "1s")
     told = printed("info", tmp_path / "line.pcap")
@@ -89,12 +91,3 @@ def test_a_file_without_times_and_one_of_nobody(tmp_path: Path) -> None:
     assert "it does not say when its bytes arrived" in ran("info", raw).stdout
     assert "none that is installed sends such bytes" in ran("info", noise, code=4).stdout
     ran("info", empty, code=4)
-
-
-@pytest.mark.parametrize(
-    ("words", "code", "said"), [("-", 2, "- is no file"), ("udp://", 2, "udp:// is no file"), ("none.pcap", 3, "No such file")]
-)
-def test_what_is_no_file_is_said(words: str, code: int, said: str) -> None:
-    failed = ran("info", words, code=code)
-    assert said in failed.stderr
-    assert "  next: lidarspec " in failed.stderr

@@ -81,6 +81,7 @@ class TestDetect:
         alike = {f"ldrobot-{name}" for name in ("stl27l", "ld06", "ld14", "ld14p", "ld20", "stl06p")}
         assert {fit["sensor"] for fit in told["sources"][0]["fits"]} == alike
 
+    @pytest.mark.slow
     def test_a_silent_port_and_starting_it(self) -> None:
         with virtual_port("cspc-m1c1-mini") as made:
             found = ran("detect", made.path, "-t", "300ms", code=5)
@@ -88,6 +89,7 @@ class TestDetect:
             assert f"next: lidarspec detect {made.path} --start" in found.stderr
             assert "info.model says M1C1_Mini" in ran("detect", made.path, "-t", "300ms", "--start").stdout
 
+    @pytest.mark.slow
     def test_unknown_bytes_are_taken_apart(self, tmp_path: Path) -> None:
         source = random.Random(3)
         bodies = [b"\x99\x88\x77" + bytes([index]) + source.randbytes(20) for index in range(60)]
@@ -120,6 +122,7 @@ class TestDetect:
         assert "slamtec-rplidar-t1 send the same frames" in found.stderr
         assert found.stdout.count("perhaps") == 9
 
+    @pytest.mark.slow
     def test_all_udp_ports_without_a_source(self) -> None:
         with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as sender:
             frames = simulate(ls.sensor("robosense-m1"), 40)
@@ -193,6 +196,7 @@ class TestDoctor:
             assert f"next: lidarspec send {made.path} start -s cspc-m1c1-mini" in found
             assert "--start" in ran("doctor", made.path, "-t", "300ms", code=1).stdout
 
+    @pytest.mark.slow
     def test_a_missing_port_and_one_in_use(self) -> None:
         assert self._told("/dev/ttyNONE7") == [
             {"ok": False, "text": "/dev/ttyNONE7: no such port; it is not plugged in, or its driver is missing", "mend": "lidarspec ports"}
@@ -207,6 +211,7 @@ class TestDoctor:
                 other.stdin.close()
         assert f"(process {other.pid})" in texts[f"kill {other.pid}"]
 
+    @pytest.mark.slow
     def test_bytes_of_nobody(self, tmp_path: Path) -> None:
         source = random.Random(8)
         with port(tmp_path) as made, working(lambda stop: paced(made.offer, [source.randbytes(90) for _ in range(40)], 200, stop)):
@@ -221,6 +226,7 @@ class TestDoctor:
             os.chmod(os.path.realpath(made.name), 0)
             assert any("may not open it" in finding["text"] for finding in self._told(made.name))
 
+    @pytest.mark.slow
     def test_udp_with_and_without_packets(self) -> None:
         with udp() as free:
             number = free.getsockname()[1]
@@ -239,6 +245,7 @@ class TestDoctor:
                 r"nothing came from the sender that is asked for, and \d+ datagrams came from others, such as 127.0.0.1:", said
             )
 
+    @pytest.mark.slow
     def test_files(self, tmp_path: Path) -> None:
         (tmp_path / "empty.bin").write_bytes(b"")
         assert not self._told(tmp_path / "empty.bin")[0]["ok"]
@@ -246,6 +253,7 @@ class TestDoctor:
         (tmp_path / "good.bin").write_bytes(b"".join(simulate(ls.sensor("ldrobot-stl27l"), 30)))
         assert self._told(tmp_path / "good.bin")[0]["ok"]
 
+    @pytest.mark.slow
     def test_the_whole_computer(self) -> None:
         assert process("doctor").returncode in (0, 1)
 

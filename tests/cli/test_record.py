@@ -22,7 +22,7 @@ import lidarspec as ls
 from lidarspec.recording.format import Recording
 from lidarspec.recording.recorders import Recorder
 from lidarspec.spec import Chunk
-from tests.cli.running import printed, process, ran
+from tests.cli.running import printed, ran
 from tests.lines import SLACK, port
 
 STREAM, DATAGRAMS = "ldrobot-stl27l", "velodyne-vlp16"
@@ -144,6 +144,7 @@ def test_recorded_replayed_and_recorded_again_it_is_the_same(stream: Path, tmp_p
         assert [p.raw.tobytes() for p in one.packets()] == [p.raw.tobytes() for p in other.packets()]
 
 
+@pytest.mark.slow
 def test_datagrams_recorded_from_a_socket_as_capture_and_recording(
     datagrams: Path, tmp_path: Path, started: Callable[..., Running]
 ) -> None:
@@ -185,6 +186,7 @@ def received_so_far(path: Path) -> int:
         return 0
 
 
+@pytest.mark.slow
 @posix
 def test_without_a_sensor_bytes_are_recorded_as_they_come(tmp_path: Path, started: Callable[..., Running]) -> None:
     with port(tmp_path) as line:
@@ -216,8 +218,7 @@ def test_the_bytes_of_a_stream_can_be_taken_out(stream: Path, tmp_path: Path) ->
 
 def test_standard_input_gets_the_times_of_its_arrival(tmp_path: Path) -> None:
     before = time.time_ns()
-    done = process("record", "-", "-o", "it.lsr", given=b"abc", cwd=tmp_path)
-    assert done.returncode == 0, done.stderr
+    ran("record", "-", "-o", tmp_path / "it.lsr", given=b"abc")
     with Recording(tmp_path / "it.lsr") as recording:
         assert [(item.data, before <= (item.at or 0) <= time.time_ns()) for item in recording] == [(b"abc", True)]
 
@@ -314,6 +315,7 @@ def test_a_replay_sums_up_with_a_digest(datagrams: Path) -> None:
     assert (found["chunks"], found["bytes"], found["sha256"]) == (30, 36180, hashlib.sha256(received(datagrams)).hexdigest())
 
 
+@pytest.mark.slow
 @posix
 def test_a_loop_serves_one_reader_after_another_until_ctrl_c(stream: Path, tmp_path: Path, started: Callable[..., Running]) -> None:
     player = started("replay", stream, "--loop")

@@ -66,6 +66,7 @@ def test_messages_have_the_beams_and_the_frame(tmp_path: Path) -> None:
     assert planar[0].header.stamp.sec > 10**9
 
 
+@pytest.mark.slow
 def test_every_verb_takes_the_same_slice(drive: Path, tmp_path: Path) -> None:
     rows = [json.loads(line) for line in ran("read", drive, "--slice", "1s:1.1s", "--columns", "x", "--json").stdout.splitlines()]
     assert {row["scan"] for row in rows} == {0}
@@ -86,32 +87,6 @@ def test_every_verb_takes_the_same_slice(drive: Path, tmp_path: Path) -> None:
         records = list(whole)
         first = records[0].at or 0
         assert list(part) == [record for record in records if 5 * 10**8 <= (record.at or 0) - first < 10**9]
-
-
-@pytest.mark.parametrize(
-    ("words", "said"),
-    [
-        ("--slice 100s:", "has scans from 0 s to 2.000 s (20"),
-        ("--slice 2016-01-01T00:00:00Z:2016-01-02T00:00:00Z", "and nothing of that is asked for"),
-        ("--slice 2016-01-01:2016-01-02T00:00:00+01:00", "and nothing of that is asked for"),
-        ("--scans 50:", "has 21 scans, from 0 to 20, and none of them is asked for"),
-        ("--scans -3:", "a scan is counted from the first one"),
-        ("--scans 5", "'5' is no slice of whole numbers, such as 5:10, 5: or :10"),
-        ("--slice 5", "'5' is no slice of time, such as 10s:20s"),
-        ("--slice 5s:3s", "from 5.0 up to 3.0 there is nothing"),
-        ("--slice 5s:2016-01-02", "is no slice of time"),
-        ("--range 3kg:", "is no span of distances, such as 0.5m:30m"),
-        ("--columns x,colour", "unknown name 'colour' (known: azimuth, elevation"),
-        ("--beams 450", ".csv has no place for --beams; those that have are .mcap, .foxglove.mcap, .bag"),
-        ("--organized", ".csv has no place for --organized; those that have are .npz, .npy, .pcd"),
-        ("--calibration unit.xml", "name the sensor with -s"),
-    ],
-)
-def test_what_cannot_be_selected_is_said_and_nothing_is_written(drive: Path, tmp_path: Path, words: str, said: str) -> None:
-    failed = ran("convert", drive, tmp_path / "out.csv", *words.split(), code=2)
-    assert said in failed.stderr
-    assert "  next: " in failed.stderr
-    assert not list(tmp_path.iterdir())
 
 
 def test_organised_points_of_several_scans_and_of_none(drive: Path, tmp_path: Path) -> None:

@@ -34,7 +34,7 @@ def begun(*words: object) -> tuple[subprocess.Popen[str], str]:
 
 
 @posix
-@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+@pytest.mark.parametrize("number", [signal.SIGINT, pytest.param(signal.SIGTERM, marks=pytest.mark.slow)])
 def test_it_is_read_by_another_program_and_ends_cleanly(number: signal.Signals, tmp_path: Path) -> None:
     link = tmp_path / "ttyLIDAR"
     running, where = begun("cspc-m1c1-mini", "--link", link, "--rate", "3")
@@ -91,12 +91,12 @@ def test_datagrams_for_another_computer_are_read_there_at_every_interface() -> N
 
 def test_a_file_is_written_at_once_and_can_be_read(tmp_path: Path) -> None:
     path, began = tmp_path / "made.lsr", time.monotonic()
-    result = ran("sim", STL, "--to", path, "-t", "20s", "--errors", "0.1%", "--seed", "3")
-    assert time.monotonic() - began < 20
+    result = ran("sim", STL, "--to", path, "-t", "5s", "--errors", "0.1%", "--seed", "3")
+    assert time.monotonic() - began < 5
     assert result.stdout == f"{path}\n"
-    assert "36000 data frames sent" in result.stderr or "36001 data frames sent" in result.stderr
+    assert "9000 data frames sent" in result.stderr or "9001 data frames sent" in result.stderr
     with ls.open(path) as device:
-        assert len([scan for scan in device.scans() if scan.whole]) in (198, 199, 200)
+        assert len([scan for scan in device.scans() if scan.whole]) in (48, 49, 50)
         assert device.stats.bad_checksum > 0
     assert "exists" in ran("sim", STL, "--to", path, code=2).stderr
     ran("sim", STL, "--to", path, "-t", "1s", "--force")
@@ -108,28 +108,6 @@ def test_the_plug_is_pulled_and_said_to_be(tmp_path: Path) -> None:
         "unplugged",
         "plugged in again, udp://127.0.0.1:2998",
     ]
-
-
-@pytest.mark.parametrize(
-    ("words", "code", "said"),
-    [
-        (("ldrobot-stl27",), 2, "did you mean 'ldrobot-stl27l'"),
-        ((STL, "--to", "udp://"), 2, "lidarspec sim ldrobot-stl27l --to pty"),
-        (("hesai-xt32", "--to", "pty"), 2, "lidarspec sim hesai-xt32 --to udp://127.0.0.1"),
-        ((STL, "--to", "made.csv"), 2, "is no place: pty, udp://HOST:PORT"),
-        ((STL, "--rate", "0.0x"), 2, "rate is a number above 0"),
-        ((STL, "--errors", "3"), 2, "is no share"),
-        ((STL, "--reorder", "3"), 2, "keep their order"),
-        ((STL, "--scene", "no.toml"), 3, "No such file"),
-        ((STL, "--to", "made.bin", "--link", "x"), 2, "goes with --to pty"),
-        ((STL, "--to", "tcp://256.0.0.1:99"), 3, "cannot listen there"),
-        ((), 2, "Missing argument 'SENSOR'"),
-    ],
-)
-def test_what_cannot_be_done_is_said_in_a_line_with_its_code(words: tuple[str, ...], code: int, said: str) -> None:
-    result = ran("sim", *words, code=code)
-    assert said in result.stderr
-    assert result.stdout == ""
 
 
 @posix

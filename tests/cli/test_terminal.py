@@ -90,6 +90,7 @@ def shell(command: str, stderr: int = subprocess.PIPE) -> subprocess.CompletedPr
     return subprocess.run(["sh", "-c", command], stdout=subprocess.PIPE, stderr=stderr, check=False, timeout=120)
 
 
+@pytest.mark.slow
 @posix
 @pytest.mark.parametrize("lost", ["2>&-", "2>/dev/full", ""])
 def test_a_lost_stderr_is_no_reason_to_stop(folder: Path, lost: str) -> None:

@@ -9,7 +9,7 @@ import socket
 import subprocess
 import sys
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
@@ -50,7 +50,7 @@ def ended(running: subprocess.Popen[str], by: signal.Signals | None = None) -> t
     return running.returncode, out, err.splitlines()
 
 
-@pytest.mark.parametrize("by", [signal.SIGINT, signal.SIGTERM])
+@pytest.mark.parametrize("by", [signal.SIGINT, pytest.param(signal.SIGTERM, marks=pytest.mark.slow)])
 def test_it_prints_its_link_and_ends_when_it_is_told_to(tmp_path: Path, by: signal.Signals) -> None:
     with served(tmp_path, f"sim:{FLAT}") as (running, link), Page(link) as page:
         assert link.startswith("http://127.0.0.1:")
@@ -63,11 +63,13 @@ def test_it_prints_its_link_and_ends_when_it_is_told_to(tmp_path: Path, by: sign
         socket.create_connection(("127.0.0.1", int(link.rpartition(":")[2].strip("/"))), 1)
 
 
+@pytest.mark.slow
 def test_it_ends_after_its_time(tmp_path: Path) -> None:
     with served(tmp_path, f"sim:{FLAT}", "-t", "1s") as (running, _):
         assert ended(running) == (0, "", [])
 
 
+@pytest.mark.slow
 def test_a_file_that_has_ended_is_still_shown(tmp_path: Path) -> None:
     with served(tmp_path, recorded(tmp_path, seconds=1)) as (running, link), Page(link) as page:
         page.until("ended")
@@ -75,6 +77,7 @@ def test_a_file_that_has_ended_is_still_shown(tmp_path: Path) -> None:
         assert running.poll() is None
 
 
+@pytest.mark.slow
 def test_a_recording_is_told_of_at_the_end(tmp_path: Path) -> None:
     with served(tmp_path, f"sim:{FLAT}") as (running, link), Page(link) as page:
         page.say("record")
@@ -84,6 +87,7 @@ def test_a_recording_is_told_of_at_the_end(tmp_path: Path) -> None:
     assert "bytes" in ran("info", tmp_path / name).stdout
 
 
+@pytest.mark.slow
 def test_a_port_that_is_taken_is_one_clear_line(tmp_path: Path) -> None:
     with socket.create_server(("127.0.0.1", 0)) as taken:
         port = taken.getsockname()[1]
@@ -93,6 +97,7 @@ def test_a_port_that_is_taken_is_one_clear_line(tmp_path: Path) -> None:
     assert lines[0] == f"no page can be served at 127.0.0.1:{port}: Address already in use"
 
 
+@pytest.mark.slow
 def test_another_address_has_a_token(tmp_path: Path) -> None:
     with served(tmp_path, f"sim:{FLAT}", "--address", "0.0.0.0") as (_, link):
         assert "/?token=" in link
@@ -101,6 +106,7 @@ def test_another_address_has_a_token(tmp_path: Path) -> None:
             assert page.scan()[1]["x"].size
 
 
+@pytest.mark.slow
 def test_a_source_that_fails_ends_it_with_its_code(tmp_path: Path) -> None:
     with served(tmp_path, recorded(tmp_path), "--slice", "100:200") as (running, _):
         code, _, lines = ended(running)
@@ -108,28 +114,14 @@ def test_a_source_that_fails_ends_it_with_its_code(tmp_path: Path) -> None:
     assert "nothing of that is asked for" in lines[0]
 
 
-@pytest.mark.parametrize(
-    ("words", "text"),
-    [
-        (["--open"], "add --web"),
-        (["--control"], "add --web"),
-        (["--address", "127.0.0.1"], "add --web"),
-        (["--web", "--address", "127.0.0.1:http"], "--address is HOST or HOST:PORT, not 127.0.0.1:http"),
-        (["--web", "--once"], "--once"),
-    ],
-)
-def test_options_that_do_not_fit_are_refused(words: Sequence[str], text: str) -> None:
-    assert text in ran("view", f"sim:{FLAT}", *words, code=2).stderr
-
-
 @pytest.mark.parametrize("missing", ["uvicorn", "starlette", "websockets"])
-def test_without_the_extra_it_says_how_to_get_it(missing: str) -> None:
-    program = f"import sys; sys.modules[{missing!r}] = None; from lidarspec.cli import main; sys.exit(main())"
-    done = subprocess.run([sys.executable, "-c", program, "view", f"sim:{FLAT}", "--web"], capture_output=True, text=True, check=False)
-    assert done.returncode == 2
-    assert done.stderr.splitlines()[-1].strip() == "next: pip install 'lidarspec[web]'"
+def test_without_the_extra_it_says_how_to_get_it(missing: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, missing, None)
+    result = ran("view", f"sim:{FLAT}", "--web", code=2)
+    assert result.stderr.endswith("next: pip install 'lidarspec[web]'\n")
 
 
+@pytest.mark.slow
 def test_a_port_that_vanishes_and_comes_back_goes_on(tmp_path: Path) -> None:
     """The simulator on a pty is ended and begun anew, behind the same link."""
     port = tmp_path / "port"
@@ -161,5 +153,6 @@ def test_a_port_that_vanishes_and_comes_back_goes_on(tmp_path: Path) -> None:
         sim.wait(DEADLINE)
 
 
+@pytest.mark.slow
 def test_the_terminal_window_is_as_it_was() -> None:
     assert b"colours" in process("view", f"sim:{FLAT}", "--once").stdout
