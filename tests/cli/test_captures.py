@@ -37,7 +37,7 @@ def capture(path: Path, *records: bytes, link: int = ETHERNET) -> Path:
     return path
 
 
-@pytest.mark.parametrize("verb", ["convert", "read", "stats", "plot"])
+@pytest.mark.parametrize("verb", ["convert", pytest.param("read", marks=pytest.mark.slow), "stats", "plot"])
 def test_a_damaged_capture_is_read_on_and_said_to_be_damaged(verb: str, tmp_path: Path) -> None:
     some = records(1300)
     some[700] = some[700][:10] + b"\x7f" + some[700][11:]

@@ -16,7 +16,10 @@ from tests.cli.running import ran
 ROOT = Path(__file__).resolve().parents[2]
 STRANGER = ROOT / "tests" / "shapes" / "stranger" / "acme_lidars.py"
 
-LDROBOT = [name for name in ls.sensors() if name.startswith("ldrobot-")]
+
+def ldrobot_ids() -> list[str]:
+    """Return the ids of one distribution."""
+    return [name for name in ls.sensors() if name.startswith("ldrobot-")]
 
 
 @pytest.mark.slow
@@ -27,6 +30,7 @@ def test_a_clean_file_says_so() -> None:
     assert "skipped   vectors_hold: there is no file of golden vectors" in done.output
 
 
+@pytest.mark.slow
 def test_a_finding_says_what_where_why_and_what_to_write(tmp_path: Path) -> None:
     file = tmp_path / "mine.py"
     text = STRANGER.read_text(encoding="utf-8")
@@ -52,7 +56,7 @@ def test_json_has_the_same(tmp_path: Path) -> None:
 @pytest.mark.slow
 def test_a_distribution_is_checked_with_all_of_its_sensors() -> None:
     found = json.loads(ran("check", "lidarspec-ldrobot", "--max-examples", "3", "--json").stdout)
-    assert sorted(report["name"] for report in found) == LDROBOT
+    assert sorted(report["name"] for report in found) == ldrobot_ids()
 
 
 @pytest.mark.slow
@@ -100,7 +104,7 @@ def test_vectors_of_a_distribution_with_several_sensors_are_looked_at() -> None:
 @pytest.mark.slow
 def test_a_distribution_is_checked_by_its_folder(tmp_path: Path) -> None:
     found = json.loads(ran("check", ROOT / "plugins" / "lidarspec-ldrobot", "--max-examples", "3", "--json").stdout)
-    assert sorted(report["name"] for report in found) == LDROBOT
+    assert sorted(report["name"] for report in found) == ldrobot_ids()
     (tmp_path / "pyproject.toml").write_text('[project]\nname = "lidarspec-nobody-has"\n', encoding="utf-8")
     assert f"lidarspec-nobody-has is not installed, or has no sensors: pip install -e {tmp_path}" in ran("check", tmp_path, code=3).stderr
 

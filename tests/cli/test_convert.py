@@ -21,7 +21,7 @@ import lidarspec as ls
 from lidarspec.captures.records import WRITINGS
 from lidarspec.simulation.simulator import simulate
 from lidarspec.transports.open_url import transport
-from tests.cli.running import COIN_D4, EXAMPLE, LD06, printed, ran
+from tests.cli.running import COIN_D4, EXAMPLE, LD06, printed, process, ran
 from tests.evidence import capture
 from tests.shapes import SHAPES
 
@@ -97,12 +97,13 @@ def test_json_sums_up(tmp_path: Path) -> None:
     assert found["stats"]["bytes_in"] == 396
 
 
+@pytest.mark.slow  # a process, since convert asks for the descriptor of standard input
 def test_hexadecimal_text_and_standard_input_are_read(tmp_path: Path) -> None:
     text, target = tmp_path / "in.hex", tmp_path / "out.csv"
     text.write_text("\n".join([EXAMPLE[:20].hex(" "), EXAMPLE[20:].hex(" ")]), encoding="ascii")
     ran("convert", text, target, "-s", "ldrobot-stl27l")
     first = target.read_bytes()
-    ran("convert", "-", target, "--force", "-s", "ldrobot-stl27l", given=EXAMPLE)
+    assert process("convert", "-", target, "--force", "-s", "ldrobot-stl27l", given=EXAMPLE).returncode == 0
     assert target.read_bytes() == first
     assert len(read(target)["x"]) == 12
 
@@ -190,6 +191,7 @@ def test_the_input_is_never_overwritten_by_whatever_name(tmp_path: Path, words: 
     assert source.read_bytes() == EXAMPLE
 
 
+@pytest.mark.slow
 def test_files_of_options_and_standard_input_are_inputs_too(tmp_path: Path) -> None:
     source, angles = tmp_path / "in.bin", tmp_path / "angles.csv"
     source.write_bytes(EXAMPLE)

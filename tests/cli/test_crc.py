@@ -15,6 +15,7 @@ FRAMES = simulate(ls.sensor("ldrobot-stl27l"), 20)
 PASTE = "Crc(width=8, poly=0x4D)"
 
 
+@pytest.mark.slow
 def test_words() -> None:
     told = printed("crc", *(frame.hex() for frame in FRAMES))
     best = told["matches"][0]

@@ -89,7 +89,7 @@ def test_hexadecimal_digits_with_colons_are_no_address() -> None:
 
 @pytest.mark.parametrize("words", [("replay", "kept.lsr"), ("sim", "ldrobot-stl27l", *BRIEF)])
 def test_an_address_in_use_cannot_be_played_to(folder: Path, words: tuple[str, ...]) -> None:
-    ran("record", SIM, *STL, *BRIEF, "-o", "kept.lsr")
+    ran("record", SIM, *STL, "-n", "20", "-o", "kept.lsr")
     with refused() as source:
         result = ran(*words, "--to", source, code=3)
     number = source.rpartition(":")[2]

@@ -152,6 +152,7 @@ def test_explain_takes_one_frame_type_out_of_a_stream() -> None:
     assert "has no scan_start frame" in said
 
 
+@pytest.mark.slow
 def test_explain_answers_while_its_input_goes_on_and_stops_with_its_reader() -> None:
     command = [sys.executable, "-m", "lidarspec", "explain", "-", *SENSOR]
     with subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=subprocess.PIPE) as running:

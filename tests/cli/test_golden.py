@@ -49,6 +49,7 @@ VARIABLE_TEXTS = (
     (re.compile(re.escape(str(CHECKOUT))), "CHECKOUT"),
     (re.compile(re.escape(ls.__version__)), "VERSION"),
     (re.compile(r"\d+ installed sensors"), "N installed sensors"),
+    (re.compile(r" in \d+\.\d s\b"), " in SECONDS"),
     (re.compile(r"(?<=recorded  )\d{4}-\S+"), "TIME"),
 )
 

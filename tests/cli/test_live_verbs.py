@@ -47,6 +47,7 @@ def test_no_permission_is_said(capture: Path, tmp_path: Path, words: tuple[str, 
     assert f"{path}: Permission denied" in result.stderr
 
 
+@pytest.mark.slow
 @posix
 @pytest.mark.parametrize("words", [("stats",), ("read",)])
 def test_an_interrupt_ends_with_130(words: tuple[str, ...]) -> None:
@@ -132,6 +133,10 @@ def test_view_prints_one_picture_where_there_is_no_terminal(capture: Path) -> No
     assert told.endswith("colours: range 0 to 6 m")
     assert "0° forward" in picture[0]
     assert "\x1b" not in result.stdout
+
+
+@pytest.mark.slow
+def test_view_draws_in_ascii_where_that_is_the_encoding(capture: Path) -> None:
     plain = subprocess.run(
         [sys.executable, "-m", "lidarspec", "view", str(capture), *SENSOR], capture_output=True, check=True,
         env={**os.environ, "PYTHONIOENCODING": "ascii"},

@@ -70,6 +70,7 @@ class TestSend:
 
 
 class TestDetect:
+    @pytest.mark.slow
     def test_a_port(self) -> None:
         with virtual_port("ldrobot-stl27l") as made:
             found = ran("detect", made.path)
@@ -162,12 +163,14 @@ class TestDoctor:
         assert result.returncode == int(not all(finding["ok"] for finding in found))
         return found
 
+    @pytest.mark.slow
     def test_a_sensor_that_is_well(self) -> None:
         with virtual_port("ldrobot-stl27l") as made:
             found = ran("doctor", made.path, "-s", "ldrobot-stl27l", "-t", "500ms")
         assert "wrong" not in found.stdout
         assert "ldrobot-stl27l sends: " in found.stdout
 
+    @pytest.mark.slow
     def test_another_sensor_than_thought(self) -> None:
         with virtual_port("ldrobot-stl27l") as made:
             found = ran("doctor", made.path, "-s", "cspc-coin-d4", "-t", "300ms", code=1).stdout

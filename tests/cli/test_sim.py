@@ -96,7 +96,7 @@ def test_a_file_is_written_at_once_and_can_be_read(tmp_path: Path) -> None:
     assert result.stdout == f"{path}\n"
     assert "9000 data frames sent" in result.stderr or "9001 data frames sent" in result.stderr
     with ls.open(path) as device:
-        assert len([scan for scan in device.scans() if scan.whole]) in (48, 49, 50)
+        assert len([scan for scan in device.scans() if scan.whole]) in range(46, 51)
         assert device.stats.bad_checksum > 0
     assert "exists" in ran("sim", STL, "--to", path, code=2).stderr
     ran("sim", STL, "--to", path, "-t", "1s", "--force")
@@ -110,6 +110,7 @@ def test_the_plug_is_pulled_and_said_to_be(tmp_path: Path) -> None:
     ]
 
 
+@pytest.mark.slow
 @posix
 def test_a_link_that_stands_already_is_the_systems_fault(tmp_path: Path) -> None:
     taken = tmp_path / "taken"

@@ -106,6 +106,7 @@ def test_a_lost_stderr_is_no_reason_to_stop(folder: Path, lost: str) -> None:
         assert sum(map(len, device.packets())) >= 200
 
 
+@pytest.mark.slow
 @posix
 def test_data_that_cannot_be_printed_are_a_failure(folder: Path) -> None:
     (folder / "x.bin").write_bytes(EXAMPLE)
@@ -115,6 +116,7 @@ def test_data_that_cannot_be_printed_are_a_failure(folder: Path) -> None:
     assert not shell("lidarspec sensors | true").stderr
 
 
+@pytest.mark.slow
 def test_warnings_are_remarks(folder: Path) -> None:
     (folder / "acme.py").write_text("import warnings\nwarnings.warn('the plugin is young')" + PLUGIN)
     assert process("show", "./acme.py").stderr == b"the plugin is young\n"
