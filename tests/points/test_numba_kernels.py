@@ -115,7 +115,8 @@ def test_every_installed_sensor_has_a_kernel(module: str) -> None:
 @pytest.mark.slow
 @pytest.mark.parametrize("module", sensor_modules())
 def test_kernels_of_one_sensor_of_each_vendor_give_the_plain_points(module: str) -> None:
-    assert_kernel_gives_the_plain_points(*answers_in(module)[-1])
+    for sensor, answer in answers_in(module)[-1:]:  # none, if points are declared for parts alone
+        assert_kernel_gives_the_plain_points(sensor, answer)
 
 
 @pytest.mark.soak
