@@ -136,6 +136,7 @@ def test_a_failing_edit_shrinks_to_the_field_at_fault() -> None:
     assert found.value.what == "-101 is written, and 101 is read"
 
 
+@pytest.mark.slow
 def test_an_edit_is_read_back_beside_integers_that_cannot_be_edited() -> None:
     frame = sound.frame(sound.sealed(revision=Const(3, Int8ul)), max_length=sound.SIZE + 1)
     with pytest.raises(Violation, match="-101 is written, and 101 is read"):
