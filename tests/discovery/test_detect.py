@@ -13,15 +13,16 @@ from pathlib import Path
 import pytest
 
 import lidarspec as ls
-from lidarspec import CommandError, SourceError, UsageError, WireError
+from lidarspec import CommandError, SourceError, UsageError, WireError, simulate
+from lidarspec.discovery import detect, listen
 from lidarspec.discovery.detect import detected, fitting, scores, verdict, verdicts
 from lidarspec.discovery.listen import Heard, bauds, hear, probe, started_first, udp_ports
 from lidarspec.discovery.periods import structure
-from lidarspec.simulation.simulator import simulate
 from lidarspec.spec import Crc
 from lidarspec.testing.fixtures import virtual_port
 from tests.evidence import capture
 from tests.lines import Port, port, working
+from tests.representatives import REPRESENTATIVES
 
 CAPTURED = {
     "cspc/coin_d4_ludovatech_issue2_partial.bin": "cspc-coin-d4",
@@ -53,6 +54,25 @@ ALIKE = {
 }
 
 
+#: the representatives, and related models that only a checksum, clock or name tells apart.
+FEW = (*REPRESENTATIVES, *(f"ldrobot-{name}" for name in ("ld06", "ld14", "ld14p", "ld20", "stl06p")), "velodyne-hdl32e", "hesai-xt32")
+
+
+@pytest.fixture
+def few_installed(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Let detection know few sensors: each of them costs time."""
+    few = {name: ls.sensor(name) for name in FEW}
+    for module in (detect, listen):
+        monkeypatch.setattr(module, "sensors", lambda: few)
+
+
+@pytest.mark.usefixtures("few_installed")
+@pytest.mark.parametrize("name", ["ldrobot/ld06_3_consecutive_frames.bin", "velodyne/hdl32e/sample_velodyne_hdl32.pcap"])
+def test_a_capture_is_its_sensors_among_a_few(name: str) -> None:
+    assert detected(capture(name)).id == CAPTURED[name]
+
+
+@pytest.mark.slow
 @pytest.mark.parametrize("name", CAPTURED)
 def test_every_capture_is_its_sensors(name: str) -> None:
     assert detected(capture(name)).id == CAPTURED[name]
@@ -64,6 +84,7 @@ def test_no_capture_is_left_out() -> None:
     assert there == {*CAPTURED, *ALIKE}
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", [name for name in ALIKE if name.startswith("sick/")])
 def test_captures_of_others_are_nobodys(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
     theirs = {sensor.vendor for sensor in map(ls.sensor, ALIKE[name])}
@@ -73,6 +94,7 @@ def test_captures_of_others_are_nobodys(name: str, monkeypatch: pytest.MonkeyPat
         detected(capture(name))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ALIKE)
 def test_the_same_frames_without_a_difference_are_said_to_be_the_same(name: str) -> None:
     for found in (one for one in verdicts(capture(name)) if one.scores):  # an IMU sends on a port of its own
@@ -82,7 +104,8 @@ def test_the_same_frames_without_a_difference_are_said_to_be_the_same(name: str)
         detected(capture(name))
 
 
-@pytest.mark.parametrize("name", ["ldrobot-stl27l", "ldrobot-ld06", "ldrobot-stl06p", "ldrobot-ld14", "velodyne-vlp16", "velodyne-hdl32e"])
+@pytest.mark.usefixtures("few_installed")
+@pytest.mark.parametrize("name", ["ldrobot-stl27l", "ldrobot-ld06", "velodyne-vlp16", "velodyne-hdl32e"])
 def test_clocks_tell_twins_apart(name: str) -> None:
     sensor = ls.sensor(name)
     data = simulate(sensor, 60, start=7)
@@ -102,6 +125,7 @@ def swapped(data: list[bytes]) -> list[bytes]:
     return [data[i ^ 1] for i in range(len(data) & ~1)]
 
 
+@pytest.mark.usefixtures("few_installed")
 @pytest.mark.parametrize(
     "as_it_comes",
     [
@@ -116,17 +140,20 @@ def test_a_network_does_not_change_what_the_clock_says(as_it_comes: Callable[[li
     assert (found.sensor and found.sensor.id, found.alike[0].why) == ("velodyne-vlp16", "its clock advances by 1.33 ms a packet")
 
 
+@pytest.mark.usefixtures("few_installed")
 def test_the_pace_of_a_clock_is_that_of_the_mode_that_the_packets_name() -> None:
     dual = old_firmware(60, period=6 * 110.592e-6, mode=0x39)
     assert (found := verdict(Heard("", tuple(dual), datagrams=True)).sensor) is not None
     assert found.id == "velodyne-vlp16"
 
 
+@pytest.mark.slow
 def test_a_name_that_is_not_to_be_trusted_tells_nothing() -> None:
     found = verdict(Heard("", tuple(old_firmware(2)), datagrams=True))
     assert (found.sensor, {score.sensor.id for score in found.alike}) == (None, {"velodyne-hdl32e", "velodyne-vlp16"})
 
 
+@pytest.mark.slow
 def test_relatives_that_are_not_installed_are_recognised(tmp_path: Path) -> None:
     xt32 = ls.sensor("hesai-xt32")
     xt32m = [xt32.build("data", xt32.parse(packet), block_count=6, blocks=xt32.parse(packet).blocks[:6]) for packet in simulate(xt32, 5)]
@@ -139,6 +166,7 @@ def test_relatives_that_are_not_installed_are_recognised(tmp_path: Path) -> None
         detected(tmp_path / "one.bin")
 
 
+@pytest.mark.slow
 def test_a_relative_that_only_its_start_would_tell_leaves_a_doubt() -> None:
     sensor = ls.sensor("cspc-coin-d4")
     data = b"".join(simulate(sensor, 60))
@@ -149,6 +177,7 @@ def test_a_relative_that_only_its_start_would_tell_leaves_a_doubt() -> None:
     assert verdict(Heard("", (named + data,))).sensor is sensor
 
 
+@pytest.mark.slow
 def test_a_baud_rate_decides_where_the_bytes_do_not() -> None:
     sensor = ls.sensor("slamtec-rplidar-s2")
     data = (sensor.build("scan_descriptor"), *simulate(sensor, 300))
@@ -161,11 +190,13 @@ def test_a_baud_rate_decides_where_the_bytes_do_not() -> None:
     assert (found.sensor and found.sensor.id, found.alike[0].why) == ("slamtec-rplidar-s3", "info.model says RPLIDAR S3")
 
 
+@pytest.mark.usefixtures("few_installed")
 def test_a_scan_that_is_met_in_its_middle_is_known_all_the_same() -> None:
     sensor = ls.sensor("slamtec-rplidar-a1")
     assert "slamtec-rplidar-a1" in {score.sensor.id for score in scores([b"".join(simulate(sensor, 300))], datagrams=False)}
 
 
+@pytest.mark.slow
 def test_the_middle_of_a_scan_is_read_with_the_answer_that_began_it() -> None:
     data = b"".join(simulate(ls.sensor("slamtec-rplidar-a1"), 300))
     found = verdict(Heard("", (data,)))
@@ -173,6 +204,7 @@ def test_the_middle_of_a_scan_is_read_with_the_answer_that_began_it() -> None:
     assert len(found.alike[0].sensor.decode(data)) == 300
 
 
+@pytest.mark.usefixtures("few_installed")
 def test_what_is_no_fit_for_one_question_is_none_for_another() -> None:
     packed = gzip.compress(b"".join(b"%d\n" % number for number in range(40_000)))
     assert scores([packed], datagrams=False)
@@ -186,6 +218,7 @@ def firmware_bug(number: int) -> list[bytes]:
     return [frame[:46] + bytes([crc(frame[1:46])]) for frame in simulate(ls.sensor("ldrobot-stl27l"), number)]
 
 
+@pytest.mark.usefixtures("few_installed")
 def test_frames_whose_checksums_are_never_right_are_found_and_answered(tmp_path: Path) -> None:
     data, path = b"".join(firmware_bug(60)), tmp_path / "bug.bin"
     found = verdict(Heard("", (data,)))
@@ -202,11 +235,13 @@ def test_frames_whose_checksums_are_never_right_are_found_and_answered(tmp_path:
     assert "no other checksum fits either" in verdict(Heard("", (b"".join(sealed_by_chance[:12]),))).fault
 
 
+@pytest.mark.usefixtures("few_installed")
 def test_a_wrong_checksum_now_and_then_is_damage_and_no_bug() -> None:
     good, bad = simulate(ls.sensor("ldrobot-stl27l"), 60), firmware_bug(60)
     assert verdict(Heard("", (b"".join(bad[:58] + good[58:]),))).fault == ""
 
 
+@pytest.mark.usefixtures("few_installed")
 def test_chance_frames_in_much_noise_are_no_fit() -> None:
     noise = random.Random(4).randbytes(40_000)
     data = noise[:20_000] + simulate(ls.sensor("ldrobot-stl27l"), 1)[0] + noise[20_000:]
@@ -214,6 +249,7 @@ def test_chance_frames_in_much_noise_are_no_fit() -> None:
     assert verdict(Heard("", (data,))).scores == ()
 
 
+@pytest.mark.usefixtures("few_installed")
 def test_damage_does_not_hide_a_sensor() -> None:
     source, data = random.Random(5), bytearray(b"".join(simulate(ls.sensor("ldrobot-stl27l"), 300)))
     for _ in range(len(data) // 100):
@@ -224,6 +260,7 @@ def test_damage_does_not_hide_a_sensor() -> None:
     assert 0.4 < found.scores[0].share < 0.8
 
 
+@pytest.mark.usefixtures("few_installed")
 @pytest.mark.parametrize("name", ["ldrobot-stl27l", "ldrobot-ld06"])
 def test_a_simulated_port_is_its_sensors(name: str) -> None:
     with virtual_port(name) as made:
@@ -231,6 +268,7 @@ def test_a_simulated_port_is_its_sensors(name: str) -> None:
         assert detected(f"serial://{made.path}?baud=230400").id == name
 
 
+@pytest.mark.usefixtures("few_installed")
 def test_a_sensor_that_has_to_be_started_first() -> None:
     assert {"cspc-m1c1-mini", "slamtec-rplidar-a1"} <= {sensor.id for sensor in started_first()}
     with virtual_port("cspc-m1c1-mini") as made:
@@ -244,6 +282,7 @@ def test_a_sensor_that_has_to_be_started_first() -> None:
         assert made.device.heard[-1] == "stop"
 
 
+@pytest.mark.usefixtures("few_installed")
 def test_udp_datagrams_of_two_senders_are_told_apart() -> None:
     vlp, xt = simulate(ls.sensor("velodyne-vlp16"), 40), simulate(ls.sensor("hesai-xt32"), 40)
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as first, socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as second:
@@ -268,6 +307,7 @@ def test_udp_datagrams_of_two_senders_are_told_apart() -> None:
     assert found == {"127.0.0.1": "velodyne-vlp16", "127.0.0.2": "hesai-xt32"}
 
 
+@pytest.mark.usefixtures("few_installed")
 def test_bytes_at_the_wrong_rate_fit_nobody(tmp_path: Path) -> None:
     source = random.Random(6)
     with port(tmp_path) as made, working(lambda stop: _noise(made, source, stop)) as stop:

@@ -96,7 +96,16 @@ def test_blocks_with_a_big_endian_angle_among_packets_of_another_kind() -> None:
     assert rising(found) == {"angle_2": (2, "big", 36_000), "counter_14": (2, "big", 0), "rising_26": (4, "big", 0)}
 
 
-@pytest.mark.parametrize(("name", "least"), [(LD06, 1.0), (COIN_D4, 0.85), (VLP16, 1.0), (VLP16_RAW, 1.0), (HELIOS, 0.998)])
+@pytest.mark.parametrize(
+    ("name", "least"),
+    [
+        (LD06, 1.0),
+        (COIN_D4, 0.85),
+        pytest.param(VLP16, 1.0, marks=pytest.mark.slow),
+        pytest.param(VLP16_RAW, 1.0, marks=pytest.mark.slow),
+        pytest.param(HELIOS, 0.998, marks=pytest.mark.slow),
+    ],
+)
 def test_the_draft_reads_the_capture_that_it_came_from(tmp_path: Path, name: str, least: float) -> None:
     sensor = module(tmp_path, capture(name))
     assert share(sensor, capture(name)) >= least
@@ -126,6 +135,7 @@ def test_the_evidence_stands_beside_each_field(tmp_path: Path) -> None:
     assert len(list(sensor.scans((tmp_path / "some.bin").read_bytes()))) == 3
 
 
+@pytest.mark.slow
 def test_a_draft_is_written_as_the_projects_own_sensors_are(tmp_path: Path) -> None:
     """With everything that a draft can have: blocks, a count, a class for the checksum, angles, a counter."""
     sources = {
@@ -168,7 +178,12 @@ SEALED = [
 
 @pytest.mark.parametrize(
     ("checksum", "skip", "order", "vary"),
-    [*((*one, 0) for one in SEALED), *((*one, 3) for one in SEALED[:3])],
+    [
+        (*SEALED[0], 0),
+        (*SEALED[1], 3),
+        *(pytest.param(*one, 0, marks=pytest.mark.slow) for one in SEALED[1:]),
+        *(pytest.param(*one, 3, marks=pytest.mark.slow) for one in (SEALED[0], SEALED[2])),
+    ],
     ids=lambda value: value.describe() if isinstance(value, Checksum) else str(value),
 )
 def test_made_frames_are_drafted_to_a_module_that_reads_them(tmp_path: Path, checksum: Checksum, skip: int, order: str, vary: int) -> None:
