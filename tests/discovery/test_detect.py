@@ -21,7 +21,7 @@ from lidarspec.discovery.periods import structure
 from lidarspec.spec import Crc
 from lidarspec.testing.fixtures import virtual_port
 from tests.evidence import capture
-from tests.lines import Port, port, working
+from tests.lines import TIMEOUT_S, Port, port, until, working
 from tests.representatives import REPRESENTATIVES
 
 CAPTURED = {
@@ -61,9 +61,15 @@ FEW = (*REPRESENTATIVES, *(f"ldrobot-{name}" for name in ("ld06", "ld14", "ld14p
 @pytest.fixture
 def few_installed(monkeypatch: pytest.MonkeyPatch) -> None:
     """Let detection know few sensors: each of them costs time."""
-    few = {name: ls.sensor(name) for name in FEW}
+    few = {name: ls.sensor(name) for name in sorted(FEW)}
     for module in (detect, listen):
         monkeypatch.setattr(module, "sensors", lambda: few)
+
+
+@pytest.fixture
+def patient(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Listen until enough has come, however slow the machine is."""
+    monkeypatch.setitem(listen.hear.__kwdefaults__, "seconds", TIMEOUT_S)
 
 
 @pytest.mark.usefixtures("few_installed")
@@ -260,7 +266,7 @@ def test_damage_does_not_hide_a_sensor() -> None:
     assert 0.4 < found.scores[0].share < 0.8
 
 
-@pytest.mark.usefixtures("few_installed")
+@pytest.mark.usefixtures("few_installed", "patient")
 @pytest.mark.parametrize("name", ["ldrobot-stl27l", "ldrobot-ld06"])
 def test_a_simulated_port_is_its_sensors(name: str) -> None:
     with virtual_port(name) as made:
@@ -279,10 +285,10 @@ def test_a_sensor_that_has_to_be_started_first() -> None:
         heard = next(heard for heard in probe(made.path) if heard.size)
         found = verdict(heard)
         assert (found.sensor and found.sensor.id, found.alike[0].why) == ("cspc-m1c1-mini", "info.model says M1C1_Mini")
-        assert made.device.heard[-1] == "stop"
+        until(lambda: made.device.heard[-1] == "stop")
 
 
-@pytest.mark.usefixtures("few_installed")
+@pytest.mark.usefixtures("few_installed", "patient")
 def test_udp_datagrams_of_two_senders_are_told_apart() -> None:
     vlp, xt = simulate(ls.sensor("velodyne-vlp16"), 40), simulate(ls.sensor("hesai-xt32"), 40)
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as first, socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as second:
@@ -307,7 +313,7 @@ def test_udp_datagrams_of_two_senders_are_told_apart() -> None:
     assert found == {"127.0.0.1": "velodyne-vlp16", "127.0.0.2": "hesai-xt32"}
 
 
-@pytest.mark.usefixtures("few_installed")
+@pytest.mark.usefixtures("few_installed", "patient")
 def test_bytes_at_the_wrong_rate_fit_nobody(tmp_path: Path) -> None:
     source = random.Random(6)
     with port(tmp_path) as made, working(lambda stop: _noise(made, source, stop)) as stop:

@@ -79,7 +79,9 @@ def test_a_count_that_only_the_frame_cut_off_gives_away() -> None:
     assert rising(found) == {"rising_4": (2, "little", 0), "rising_6": (2, "little", 0)}
 
 
-@pytest.mark.parametrize(("name", "frames", "clock"), [(VLP16, 603, "rising_1200"), (VLP16_RAW, 1000, "rising_1200")])
+@pytest.mark.parametrize(
+    ("name", "frames", "clock"), [(VLP16, 603, "rising_1200"), pytest.param(VLP16_RAW, 1000, "rising_1200", marks=pytest.mark.slow)]
+)
 def test_blocks_with_a_little_endian_angle_and_no_checksum(name: str, frames: int, clock: str) -> None:
     found = drafted(name)
     assert (found.sync, found.size, len(found.frames), found.seal) == (b"\xff\xee", 1206, frames, None)
@@ -88,6 +90,7 @@ def test_blocks_with_a_little_endian_angle_and_no_checksum(name: str, frames: in
     assert rising(found) == {"angle_2": (2, "little", 36_000), clock: (4, "little", 0)}
 
 
+@pytest.mark.slow
 def test_blocks_with_a_big_endian_angle_among_packets_of_another_kind() -> None:
     found = drafted(HELIOS)
     assert (found.sync, found.size, len(found.frames), found.seal) == (b"\x55\xaa\x05\x5a", 1248, 750, None)
