@@ -224,6 +224,7 @@ def firmware_bug(number: int) -> list[bytes]:
     return [frame[:46] + bytes([crc(frame[1:46])]) for frame in simulate(ls.sensor("ldrobot-stl27l"), number)]
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("few_installed")
 def test_frames_whose_checksums_are_never_right_are_found_and_answered(tmp_path: Path) -> None:
     data, path = b"".join(firmware_bug(60)), tmp_path / "bug.bin"
