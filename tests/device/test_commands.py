@@ -249,7 +249,7 @@ print("open", flush=True)
     "rest",
     [
         pytest.param("with device: list(device.scans())", id="interrupt in with"),
-        pytest.param("sys.exit(3)", id="exit"),
+        pytest.param("sys.exit(3)", id="exit", marks=pytest.mark.slow),
         pytest.param("with device: 1 / 0", id="exception in with", marks=pytest.mark.slow),
         pytest.param("1 / 0", id="exception", marks=pytest.mark.slow),
         pytest.param("del device", id="garbage", marks=pytest.mark.slow),

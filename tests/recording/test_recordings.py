@@ -280,7 +280,7 @@ def killed(path: Path, after: float) -> int:
 
 
 @pytest.mark.skipif(sys.platform == "win32", reason="there is no SIGKILL")
-@pytest.mark.parametrize("times", [2, pytest.param(100, marks=pytest.mark.soak)])
+@pytest.mark.parametrize("times", [1, pytest.param(5, marks=pytest.mark.slow), pytest.param(100, marks=pytest.mark.soak)])
 def test_kill_9_loses_no_acknowledged_record(tmp_path: Path, times: int) -> None:
     source = random.Random(times)
     for attempt in range(times):

@@ -127,7 +127,8 @@ def test_packets_come_back_as_they_were_recorded(tmp_path: Path, kind: str, msgt
     assert [chunk.at for chunk in chunks] == stamps
 
 
-@pytest.mark.parametrize("kind", ["bag", pytest.param("folder", marks=pytest.mark.slow)])
+@pytest.mark.slow
+@pytest.mark.parametrize("kind", ["bag", "folder"])
 def test_a_log_is_converted_as_a_capture_is(tmp_path: Path, kind: str) -> None:
     sent = packets(30)
     (tmp_path / "raw.bin").write_bytes(b"".join(sent))
