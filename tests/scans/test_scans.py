@@ -175,7 +175,7 @@ def segments() -> list[bytes]:
     return simulate(SHAPES["shape-segments"], 100)
 
 
-@pytest.mark.parametrize("size", [1, 7, 100])
+@pytest.mark.parametrize("size", [7, 100, pytest.param(1, marks=pytest.mark.slow)])
 @pytest.mark.parametrize(("lost", "whole", "complete"), [(0, True, True), (3, True, False), (10, True, False), (11, False, False)])
 def test_a_frame_of_parts_counts_once(lost: int, whole: bool, complete: bool, size: int) -> None:
     """A turn is 20 frames, with 30 parts: it is whole where at least as many frames are there as are missing."""
