@@ -53,6 +53,12 @@ def test_readings_run_on_over_a_hundred_turns_also_when_late() -> None:
     assert (found - found[0] == true - true[0]).all()
 
 
+def test_a_late_reading_from_before_the_wrap_goes_back() -> None:
+    clock = Unwrapper(30.0)
+    found = clock.push(times(29, 1, 29.5, 2), np.zeros(4, np.int64))
+    assert ((found - found[0]) / SECOND).tolist() == [0, 2, 0.5, 3]
+
+
 def test_a_clock_in_an_array_is_refused_before_any_bytes() -> None:
     frame = Struct("b" / Array(2, Struct("t" / Scaled(Int16ul, 0.001, "s"), "d" / Int8ub)))
     refused = dataclasses.replace(sensor(frame), clock=Clock("b.t"))
