@@ -44,6 +44,7 @@ def test_decoding_mutated_frames_raises_nothing(name: str) -> None:
     source = subject.source("hostile streams")
     frames = subject.conversation(rounds=1)
     mutated = [(frame, material.mutated(data, source)) for frame, data in source.choices(frames, k=DECODED_FRAMES)]
+    mutated += frames
     packets = sensor.decode(material.delivery(sensor, mutated))
     packets.points()
     assert packets.stats.plugin_errors == 0
