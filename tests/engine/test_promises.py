@@ -32,7 +32,6 @@ STAMPED = {
     ("recording/recorders.py", "datetime.now"),
     ("recording/recorders.py", "time.time_ns"),
     ("transports/serving.py", "time.time_ns"),
-    ("transports/udp.py", "time.time_ns"),
 }
 
 
