@@ -330,7 +330,22 @@ def aligned(values: tuple[Any, ...], batch: Batch) -> tuple[list[NDArray[Any]], 
             arrays.append(value.lined_up(names))
         else:
             arrays.append(_placed(np.asarray(value), axes, lengths, batch.table))
+    if not len(batch):
+        arrays = _cut_to_shortest(arrays)
     return arrays, tuple(axes), min((column.ready for column in columns), default=len(batch))
+
+
+def _cut_to_shortest(arrays: list[NDArray[Any]]) -> list[NDArray[Any]]:
+    """Return arrays that broadcast: along each axis all have length 1 or that of the shortest.
+
+    Without packets an array of variable length is empty, but a plugin's own table for it is not.
+    """
+    depth = max(array.ndim for array in arrays)
+    shortest: list[int | None] = [None] * depth
+    for place in range(depth):
+        lengths = [array.shape[place - depth] for array in arrays if array.ndim >= depth - place]
+        shortest[place] = min((length for length in lengths if length != 1), default=None)
+    return [array[tuple(slice(shortest[place]) for place in range(depth - array.ndim, depth))] for array in arrays]
 
 
 def _met(known: str | None, name: str | None) -> str | None:
