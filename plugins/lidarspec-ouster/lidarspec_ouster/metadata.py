@@ -21,11 +21,15 @@ from lidarspec_ouster.packets import COLUMNS, PROFILES
 
 Table = NDArray[np.float64]
 
-#: sections of newer metadata, and of older ones.
-SECTIONS = ("sensor_info", "lidar_data_format", "data_format", "beam_intrinsics", "lidar_intrinsics", "imu_intrinsics", "config_params")
 #: the most of each that a sensor has: pixels of a column, columns of a turn.
 ROWS, TURN = 256, 4096
 STILL = tuple(np.eye(4).ravel())
+# Stands in where metadata lack it, as in ouster-sdk (metadata.cpp): half a turn, and 36.18 mm up.
+LIDAR_TO_SENSOR = (-1.0, 0.0, 0.0, 0.0, 0.0, -1.0, 0.0, 0.0, 0.0, 0.0, 1.0, 36.18, 0.0, 0.0, 0.0, 1.0)
+# Millimetres from the axis of rotation to where beams leave, by the beginning of the product line; others, the first
+# generation of the OS1 among them, have the last one (ouster-sdk, sensor_info.cpp).
+BEAM_ORIGINS_MM = {"OS-0-": 27.67, "OS-1-": 15.806, "OS-2-": 13.762}
+BEAM_ORIGIN_GENERATION_1_MM = 12.163
 
 
 @dataclass(frozen=True, eq=False)
@@ -43,7 +47,7 @@ class Unit:
         beam, lidar, imu: (4, 4), millimetres: where the beams leave in the lidar, the lidar in the sensor, and the IMU in it.
         samples: of an IMU packet; 0 for those of LEGACY.
         product, serial: as the metadata have them, "" where they do not.
-        nominal: whether this is the model and not a unit.
+        nominal: whether values of the model stand in for those of the unit.
     """
 
     profile: str
@@ -120,10 +124,29 @@ def read(metadata: str | Path | Learned) -> Unit:
         raise UsageError(f"{name}: no metadata of an Ouster sensor: {error}") from error
     if not isinstance(data, dict):
         raise UsageError(f"{name}: no metadata of an Ouster sensor: a {type(data).__name__}, not an object")
-    flat: dict[str, Any] = dict(data)
-    for section in SECTIONS:
-        flat |= data[section] if isinstance(data.get(section), dict) else {}
-    return Facts(name, flat).unit()
+    return Facts(name, flattened(data)).unit()
+
+
+def flattened(data: dict[str, Any]) -> dict[str, Any]:
+    """Return the keys of all sections together.
+
+    Firmware differs in the section that holds a key: `imu_measurements_per_packet` stands in `lidar_data_format` or in
+    `imu_data_format`. What the sensor reports of itself takes precedence over `config_params`, the user's settings.
+    """
+    sections = [section for name, section in data.items() if isinstance(section, dict) and name != "config_params"]
+    settings = data.get("config_params")
+    keys = dict(settings) if isinstance(settings, dict) else {}
+    for section in (data, *sections):
+        keys |= section
+    return keys
+
+
+def usual_beam_origin_mm(product: str) -> float:
+    """Return how far from the axis the beams of a product line leave, in millimetres."""
+    for prefix, distance_mm in BEAM_ORIGINS_MM.items():
+        if product.startswith(prefix):
+            return distance_mm
+    return BEAM_ORIGIN_GENERATION_1_MM
 
 
 @dataclass(frozen=True)
@@ -149,10 +172,13 @@ class Facts:
         if width % columns:
             raise self._fault("columns_per_frame", f"{width} is no multiple of {columns} columns in a packet")
         first, last = map(int, self._numbers("column_window", 2, (0, width - 1)))
+        product = str(self.data.get("prod_line", ""))
+        is_nominal = "lidar_to_sensor_transform" not in self.data
         beam = self._transform("beam_to_lidar_transform", None)
         if beam is None:
+            is_nominal = is_nominal or "lidar_origin_to_beam_origin_mm" not in self.data
             beam = np.eye(4)
-            beam[0, 3] = self._numbers("lidar_origin_to_beam_origin_mm", 1)[0]
+            beam[0, 3] = self._numbers("lidar_origin_to_beam_origin_mm", 1, (usual_beam_origin_mm(product),))[0]
         measured = self.data.get("udp_profile_imu", "LEGACY") == "ACCEL32_GYRO32_NMEA"
         return Unit(
             profile=self._profile(),
@@ -164,11 +190,12 @@ class Facts:
             azimuth=self._numbers("beam_azimuth_angles", rows),
             shifts=self._numbers("pixel_shift_by_row", rows, (0,) * rows).astype(np.int64),
             beam=beam,
-            lidar=self._transform("lidar_to_sensor_transform", STILL),
+            lidar=self._transform("lidar_to_sensor_transform", LIDAR_TO_SENSOR),
             imu=self._transform("imu_to_sensor_transform", STILL),
             samples=self._whole("imu_measurements_per_packet", ROWS, None) if measured else 0,
-            product=str(self.data.get("prod_line", "")),
+            product=product,
             serial=str(self.data.get("prod_sn", "")),
+            nominal=is_nominal,
         )
 
     def _profile(self) -> str:

@@ -156,16 +156,17 @@ LEGACY_IMU = Struct(
     "timestamp" / TIME,
     "acceleration_timestamp" / TIME,
     "gyro_timestamp" / TIME,
-    *(f"acceleration_{axis}" / Scaled(Float32l, GRAVITY, "m/s2") * "in g" for axis in AXES),
+    *(f"acceleration_{axis}" / Scaled(Float32l, GRAVITY, "m/s2") * "sent in units of g" for axis in AXES),
     *(f"gyro_{axis}" / Scaled(Float32l, 1, "deg/s") for axis in AXES),
 )
-#: of a packet with NMEA; that its units are those of the older one is assumed from the SDK's remarks.
+# One measurement of an ACCEL32_GYRO32_NMEA packet. Captured values are multiples of 9.80665/2048 and of
+# (pi/180)/16.4: the sensor sends m/s2 and rad/s, and ouster-sdk hands them out unchanged.
 SAMPLE = Struct(
     "timestamp" / TIME,
     "measurement_id" / Int16ul,
     "status" / Int16ul,
-    *(f"acceleration_{axis}" / Scaled(Float32l, GRAVITY, "m/s2") * "in g" for axis in AXES),
-    *(f"gyro_{axis}" / Scaled(Float32l, 1, "deg/s") for axis in AXES),
+    *(f"acceleration_{axis}" / Scaled(Float32l, 1, "m/s2") for axis in AXES),
+    *(f"gyro_{axis}" / Scaled(Float32l, 1, "rad/s") for axis in AXES),
 )
 Rotation = tuple[tuple[float, float, float], ...]
 
@@ -189,11 +190,22 @@ def sampled(samples: int, i: int) -> dict[str, Any]:
 
 
 def feel(f: Fields, path: str, turned: Rotation) -> Imu:
-    """What the IMU felt, in the axes of the sensor."""
-    values = getattr(f, path) if path else f
-    force, rate = ([getattr(values, f"{name}_{axis}") for axis in AXES] for name in ("acceleration", "gyro"))
-    time = (values.timestamp - values[0].timestamp) * 1e-9 if path else 0
-    return Imu(rotated(turned, map(np.deg2rad, rate)), rotated(turned, force), time)
+    """Return the IMU measurements in the axes of the sensor: rad/s, m/s2 and seconds.
+
+    Args:
+        path: array of measurements in an ACCEL32_GYRO32_NMEA packet; "" for the single one of a LEGACY packet.
+        turned: rotation from the IMU to the sensor.
+    """
+    if path:
+        values = getattr(f, path)
+        time = (values.timestamp - values[0].timestamp) * 1e-9
+        rates = [getattr(values, f"gyro_{axis}") for axis in AXES]
+    else:
+        values = f
+        time = 0
+        rates = [np.deg2rad(getattr(values, f"gyro_{axis}")) for axis in AXES]
+    accelerations = [getattr(values, f"acceleration_{axis}") for axis in AXES]
+    return Imu(rotated(turned, rates), rotated(turned, accelerations), time)
 
 
 def rotated(turned: Rotation, vector: Any) -> tuple[Any, ...]:

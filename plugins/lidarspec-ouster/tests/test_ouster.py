@@ -233,6 +233,43 @@ def test_older_and_newer_metadata_say_the_same(tmp_path: Path) -> None:
     )
 
 
+def test_keys_are_read_from_whichever_section_has_them(tmp_path: Path) -> None:
+    unit = dataclasses.replace(nominal("OS1", 16, 512, "RNG15_RFL8_NIR8"), samples=8)
+    data = json.loads(unit.told())
+    data["imu_data_format"] = {"imu_measurements_per_packet": data["lidar_data_format"].pop("imu_measurements_per_packet")}
+    (tmp_path / "unit.json").write_text(json.dumps(data))
+    assert read(tmp_path / "unit.json").samples == 8
+
+
+@pytest.mark.parametrize(
+    ("product", "distance_mm"), [("OS-0-128", 27.67), ("OS-1-64", 15.806), ("OS-2-32-U0", 13.762), ("", 12.163), ("OS1", 12.163)]
+)
+def test_missing_offsets_are_those_of_the_model_and_nominal(tmp_path: Path, product: str, distance_mm: float) -> None:
+    """The values that ouster-sdk takes (sensor_info.cpp, metadata.cpp)."""
+    data = json.loads(nominal("OS1", 16, 512, "LEGACY").told())
+    data["sensor_info"]["prod_line"] = product
+    del data["beam_intrinsics"]["beam_to_lidar_transform"]
+    del data["lidar_intrinsics"]
+    (tmp_path / "unit.json").write_text(json.dumps(data))
+    unit = read(tmp_path / "unit.json")
+    assert unit.nominal
+    assert unit.beam[0, 3] == distance_mm
+    assert unit.lidar.tolist() == [[-1, 0, 0, 0], [0, -1, 0, 0], [0, 0, 1, 36.18], [0, 0, 0, 1]]
+
+
+def test_imu_measurements_come_in_si_units() -> None:
+    """Captured values of ACCEL32_GYRO32_NMEA are multiples of 9.80665/2048 and (pi/180)/16.4."""
+    unit = dataclasses.replace(nominal("OS1", 16, 512, "RNG15_RFL8_NIR8"), samples=2)
+    sensor = OS1.configure(metadata=Learned(unit.told()))
+    gravity, rate = 2048 * 9.80665 / 2048, 164 * np.deg2rad(1) / 16.4
+    measurement = {f"{name}_{axis}": 0.0 for name in ("acceleration", "gyro") for axis in "xyz"}
+    measurement |= {"timestamp": 0, "measurement_id": 0, "status": 0, "acceleration_z": gravity, "gyro_x": rate}
+    values = sensor.parse(sensor.example("imu"), "imu")
+    samples = sensor.decode([sensor.build("imu", {**values, "samples": [measurement] * 2})], "imu").imu()
+    np.testing.assert_allclose(samples.linear_acceleration, [[0, 0, 9.80665]] * 2, atol=1e-5)
+    np.testing.assert_allclose(samples.angular_velocity, [[np.deg2rad(10), 0, 0]] * 2, atol=1e-6)
+
+
 @pytest.mark.parametrize(
     ("change", "message"),
     [
