@@ -2,7 +2,7 @@
 
 Source: SICK Telegram Listing LiDAR sensors 8014631 and the tables of LMDscandata in the operating instructions 8023198 (LMS4000), with the
 values below 16 that are no distances; 8020494 (MRS1000) for the layers; sick_scan_xd for where angles count from. A telegram has
-one layer. Its channels of 16 bits are DIST1 to DISTn and, where they are asked for, RSSI1 to RSSIn; RSSI1 can come in 8 bits instead.
+one layer. Its channels of 16 bits are DIST1 to DISTn; RSSI1 to RSSIn follow if they are asked for, in 16 bits or in 8.
 Telegrams with channels of other kinds (ANGL, VANG, QLTY) are not read. A third of a degree is 0.3333 on the wire, and is left so.
 """
 
@@ -37,8 +37,11 @@ def text(*parts: Construct, max_length: int = 200, **more: Any) -> Frame:
     return Frame(Struct(*parts), wire=Tokens(start=b"\x02", sep=b" ", end=b"\x03", base=16), max_length=max_length, **more)
 
 
-def channel(content: str, values: Construct, *, first: bool = False) -> Construct:
-    """A channel of this content; all have as many values as the first one."""
+def channel(content: str, values: Construct, *, first: bool = False, name: str = "") -> Construct:
+    """Return a channel of this content, a field called `name`, by default after the content.
+
+    All channels have as many values as the first one.
+    """
     count = this.count if first else this._.dist1.count
     struct = Struct(
         "content" / Const(content.encode()),
@@ -49,7 +52,7 @@ def channel(content: str, values: Construct, *, first: bool = False) -> Construc
         "count" / (Int16ub if first else Rebuild(Int16ub, count)),
         "samples" / Array(count, values),
     )
-    return content.lower() / struct
+    return (name or content.lower()) / struct
 
 
 def optional(name: str, *parts: Construct) -> tuple[Construct, Construct]:
@@ -61,6 +64,7 @@ def scan(echoes: int) -> list[Construct]:
     """What stands behind the name of a telegram with so many echoes of each beam."""
     others = [channel(f"DIST{number}", DISTANCE) for number in range(2, echoes + 1)]
     strengths = [channel(f"RSSI{number}", Int16ub) for number in range(1, echoes + 1)]
+    strengths8 = [channel(f"RSSI{number}", Int8ub, name=f"rssi{number}_8bit") for number in range(1, echoes + 1)]
     named = ("length" / Int8ub, "text" / Bytes(this.length))
     return [
         "version" / Int16ub,
@@ -83,7 +87,7 @@ def scan(echoes: int) -> list[Construct]:
         *others,
         *(part.name / If(this.channels == 2 * echoes, part.subcon) for part in strengths),
         "channels8" / Int16ub * "of 8 bits",
-        "rssi" / If(this.channels8 == 1, channel("RSSI1", Int8ub).subcon),
+        *(part.name / If(this.channels8 == echoes, part.subcon) for part in strengths8),
         *optional("position", *(axis / Float32b for axis in ("x", "y", "z", "rx", "ry", "rz")), "rotation" / Int8ub, "named" / Int8ub),
         *optional("name", *named),
         *optional("comment", *named),
@@ -94,11 +98,13 @@ def scan(echoes: int) -> list[Construct]:
 
 def plausible(f: Fields, echoes: int) -> Any:
     """There are beams, and all channels are as long as the first one."""
-    first, held = f.dist1.count, (f.dist1.step > 0) & (f.dist1.count > 0)
+    count = f.dist1.count
+    held = (f.dist1.step > 0) & (count > 0)
     for number in range(1, echoes + 1):
-        held = held & (getattr(f, f"dist{number}").count == first)
-        held = held & ((f.channels != 2 * echoes) | (getattr(f, f"rssi{number}").count == first))
-    return held & ((f.channels8 != 1) | (f.rssi.count == first))
+        held = held & (getattr(f, f"dist{number}").count == count)
+        held = held & ((f.channels != 2 * echoes) | (getattr(f, f"rssi{number}").count == count))
+        held = held & ((f.channels8 != echoes) | (getattr(f, f"rssi{number}_8bit").count == count))
+    return held
 
 
 def points(f: Fields, echoes: int) -> Polar:
@@ -106,12 +112,13 @@ def points(f: Fields, echoes: int) -> Polar:
     first = f.dist1
     distances = [getattr(f, f"dist{number}") for number in range(1, echoes + 1)]
     strengths = [getattr(f, f"rssi{number}") for number in range(1, echoes + 1)]
+    strengths8 = [getattr(f, f"rssi{number}_8bit") for number in range(1, echoes + 1)]
     ranges = [(one.samples * one.scale + one.offset * 0.001).on("dist1.samples") for one in distances]
     missing = [(one.samples < LEAST).on("dist1.samples") for one in distances]
-    intensity = [(one.samples * one.scale + one.offset).on("dist1.samples") for one in strengths]
-    if echoes == 1:
-        in_bytes = (f.rssi.samples * f.rssi.scale + f.rssi.offset).on("dist1.samples")
-        intensity = [np.where(f.channels8 == 1, in_bytes, intensity[0])]
+    intensity = [
+        np.where(f.channels8 == echoes, scaled_intensity(narrow), scaled_intensity(wide))
+        for narrow, wide in zip(strengths8, strengths, strict=True)
+    ]
     number = first.samples.index
     return Polar(
         range=ranges[0] if echoes == 1 else stack(*ranges),
@@ -122,6 +129,11 @@ def points(f: Fields, echoes: int) -> Polar:
         invalid=missing[0] if echoes == 1 else stack(*missing),
         return_index=None if echoes == 1 else np.arange(echoes),
     )
+
+
+def scaled_intensity(channel: Fields) -> Any:
+    """Return the values of an RSSI channel, on the axis of the first channel's samples."""
+    return (channel.samples * channel.scale + channel.offset).on("dist1.samples")
 
 
 @cache

@@ -14,6 +14,7 @@ from lidarspec.discovery.heard import Heard
 from lidarspec.errors import CommandError, UsageError
 from tests.evidence import capture, decoded, vector_bytes, vectors
 
+LMS511 = ls.sensor("sick-lms511")
 TIM871S, TIM551 = ls.sensor("sick-tim871s"), ls.sensor("sick-tim551")
 MRS1104, MULTISCAN = ls.sensor("sick-mrs1104"), ls.sensor("sick-multiscan136")
 
@@ -57,7 +58,7 @@ def test_a_telegram_in_text_is_read_and_built_again() -> None:
 def test_a_telegram_without_strengths_beside_one_that_has_them() -> None:
     data = vector_bytes("vectors_serial2d.json", "sick_tim_sra")
     values = TIM551.parse(data)
-    bare = TIM551.build("text", {**values, "channels8": 0, "rssi": None})
+    bare = TIM551.build("text", {**values, "channels8": 0, "rssi1_8bit": None})
     cloud = decoded(TIM551, data + bare).points()
     assert cloud.intensity is not None
     assert cloud.intensity[271:].tolist() == [0] * 271
@@ -86,6 +87,33 @@ def test_any_number_of_echoes_is_read_with_their_strengths(name: str, echoes: in
     assert cloud.return_index[:echoes].tolist() == list(range(echoes))
     with pytest.raises(UsageError, match="echoes is a number from 1 to"):
         sensor.configure(echoes=6)
+
+
+@pytest.mark.parametrize("cola", ["A", "B"])
+@pytest.mark.parametrize("bits", [0, 8, 16])
+@pytest.mark.parametrize("echoes", [1, 2, 3, 4, 5])
+def test_strengths_come_in_8_or_16_bits_or_not_at_all(echoes: int, bits: int, cola: str) -> None:
+    sensor = LMS511.configure(cola=cola, echoes=echoes)
+    frame = sensor.data_frames[0] if echoes == 1 else {"A": "echoes_text", "B": "echoes"}[cola]
+    channel = {"scale": 1.0, "offset": 0.0, "start": -50_000, "step": 5000, "count": 2}
+    values = sensor.parse(sensor.example(frame), frame)
+    for number in range(1, echoes + 1):
+        values[f"dist{number}"] = {**channel, "samples": [1000 * number, 1000 * number + 1]}
+        strengths = {**channel, "samples": [10 * number, 10 * number + 1]}
+        values[f"rssi{number}"] = strengths if bits == 16 else None
+        values[f"rssi{number}_8bit"] = strengths if bits == 8 else None
+    for name in ("position", "name", "comment", "date", "event"):
+        values |= {f"has_{name}": 0, name: None}
+    values |= {"channels": echoes * (2 if bits == 16 else 1), "channels8": echoes if bits == 8 else 0}
+    values |= {"encoder_count": 0, "encoders": [], "scan_rate": 5000, "beam_rate": 360}
+    data = sensor.build(frame, values)
+    assert sensor.build(frame, sensor.parse(data, frame)) == data
+    packets = sensor.decode(data * 2, frame)
+    assert dict(packets.stats.frames) == {frame: 2}
+    cloud = packets.points()
+    np.testing.assert_allclose(cloud.range[:echoes], np.arange(1, echoes + 1))
+    assert cloud.intensity is not None
+    assert cloud.intensity[:echoes].tolist() == [10 * number if bits else 0 for number in range(1, echoes + 1)]
 
 
 @pytest.mark.parametrize("cola", ["A", "B"])
