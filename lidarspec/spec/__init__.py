@@ -60,6 +60,7 @@ if TYPE_CHECKING:
     )
     from lidarspec.spec.vocabulary import (
         along as along,
+        between_blocks as between_blocks,
         following as following,
         last as last,
         previous as previous,
@@ -100,7 +101,7 @@ _NAMES = {
     "spec.timing": ("Clock", "Sequence", "OnWrap", "OnFlag", "OnChange", "OnJump", "OnRewind", "Every"),
     "columns.columns": ("Fields", "Column"),
     "spec.results": ("Points", "Polar", "Cartesian", "Extra", "Imu"),
-    "spec.vocabulary": ("along", "spread", "wrap", "following", "previous", "last", "running", "stack", "steps", "take"),
+    "spec.vocabulary": ("along", "spread", "wrap", "following", "previous", "between_blocks", "last", "running", "stack", "steps", "take"),
     "spec.wire_forms": ("Tokens", "Lines", "SixBits", "Echoes", "Scip", "Escaped", "WireForm", "Reading", "Slot", "Unescaped"),
     "plugins": ("hookimpl",),
     "transports.protocol": ("Format", "Transport", "LiveTransport", "Chunk", "Disconnected"),

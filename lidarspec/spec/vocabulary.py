@@ -170,6 +170,26 @@ def last(a: Array, where: Array | None = None) -> Array:
     return np.where(spots >= 0, values.ravel()[spots], np.nan).reshape(values.shape)
 
 
+def between_blocks(azimuth: Array, ahead: Array, *, limit: float, full: float = 360.0) -> Array:
+    """Return how far a rotor turns from each block to the next one.
+
+    A step of `limit` or more is a loss or a masked sector: the last good step in stream order is taken instead.
+
+    Args:
+        azimuth: azimuth of each block, in the unit of `full`.
+        ahead: azimuth of the next block that does not share it, such as ``following(azimuth)``.
+        limit: steps have to be smaller than this: what the sensor turns in this time at its fastest.
+        full: the whole circle in the unit of `azimuth`.
+
+    Returns:
+        float64, the shape of `azimuth`; the shorter way round, so negative where readings jitter; nan before the
+        first good step.
+    """
+    step = ahead - azimuth
+    step = step - full * np.rint(step / full)
+    return last(np.where(np.abs(step) < limit, step, np.nan))
+
+
 def stack(*columns: Array) -> Array:
     """Several columns side by side as a new innermost axis: (n, b) each gives (n, b, k)."""
     return _applied(side_by_side, *columns)

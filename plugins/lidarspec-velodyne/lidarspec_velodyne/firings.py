@@ -7,8 +7,8 @@ next one is two blocks on.
 Where nothing follows, or what follows is further than the sensor can have turned (packets carry no sequence, so this is
 how a loss shows; a sector masked in the sensor's settings looks the same), the rule for the last block decides:
 
-* "previous", the default: the step from the block before is used again, as ros-drivers and nebula do for the last block
-  of every packet; velodyne_decoder takes the mean of the packet. On real packets these differ by up to 0.04 degrees.
+* "previous", the default: the last good step is used again, as ros-drivers and nebula do for the last block of every
+  packet; velodyne_decoder takes the mean of the packet. On real packets these differ by up to 0.04 degrees.
 * "invalid": these firings have no direction, and their points are not valid.
 
 Source: ros-drivers/velodyne rawdata.cc (azimuths); velodyne_decoder packet_decoder.cpp and calib_db.cpp (firing times,
@@ -26,7 +26,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lidarspec import UsageError
-from lidarspec.spec import Fields, Polar, Sensor, following, previous
+from lidarspec.spec import Fields, Polar, Sensor, between_blocks, following
 from lidarspec_velodyne.frames import BLOCKS, DUAL, HOUR, STRONGEST, TURN
 
 LAST_BLOCK = ("previous", "invalid")
@@ -95,12 +95,13 @@ def points(f: Fields, model: Firings, last_block: str = "previous") -> Polar:
 
 def _step(f: Fields, dual: Any, model: Firings, last_block: str) -> Any:
     """Degrees that the sensor turns from the azimuth of each block to the next one, (n, blocks, 1)."""
-    azimuth, one, two = f.blocks.azimuth, model.sharing, 2 * model.sharing
-    ahead = difference(azimuth, np.where(dual, following(azimuth, two), following(azimuth, one)))
-    unknown = np.nan
+    azimuth = f.blocks.azimuth
+    ahead = np.where(dual, following(azimuth, 2 * model.sharing), following(azimuth, model.sharing))
+    limit = FASTEST * model.period * JITTER
     if last_block == "previous":
-        unknown = difference(np.where(dual, previous(azimuth, two), previous(azimuth, one)), azimuth)
-    return np.where(np.abs(ahead) < FASTEST * model.period * JITTER, ahead, unknown)
+        return between_blocks(azimuth, ahead, limit=limit)
+    step = difference(azimuth, ahead)
+    return np.where(np.abs(step) < limit, step, np.nan)
 
 
 def difference(start: Any, end: Any) -> Any:

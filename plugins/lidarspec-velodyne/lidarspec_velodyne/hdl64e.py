@@ -25,8 +25,8 @@ import numpy as np
 from construct import Array, Int8ul, Int16ub, Int16ul, Int32ul, Struct
 
 from lidarspec import UsageError
-from lidarspec.spec import Clock, Fields, Frame, OnWrap, Polar, Scaled, Sensor, Simulation, Udp, following, previous
-from lidarspec_velodyne.firings import FASTEST, JITTER, difference
+from lidarspec.spec import Clock, Fields, Frame, OnWrap, Polar, Scaled, Sensor, Simulation, Udp, between_blocks, following
+from lidarspec_velodyne.firings import FASTEST, JITTER
 from lidarspec_velodyne.frames import BLOCKS, HOUR, SLOTS, TURN
 
 UPPER, LOWER = 0xFFEE, 0xFFDD
@@ -162,9 +162,8 @@ def dual(f: Fields) -> Any:
 def points(f: Fields, unit: Unit) -> Polar:
     """Lasers beside the axis of rotation, each from a place of its own."""
     azimuth, block, twice = f.blocks.azimuth, f.blocks.index, dual(f)
-    ahead = difference(azimuth, np.where(twice, following(azimuth, 4), following(azimuth, 2)))
-    behind = difference(np.where(twice, previous(azimuth, 4), previous(azimuth, 2)), azimuth)
-    step = np.where(np.abs(ahead) < FASTEST * unit.period * JITTER, ahead, behind)
+    ahead = np.where(twice, following(azimuth, 4), following(azimuth, 2))
+    step = between_blocks(azimuth, ahead, limit=FASTEST * unit.period * JITTER)
     turned = np.deg2rad(azimuth + step * (unit.delay / unit.period) - unit.of_blocks(unit.offset))
     elevation = np.deg2rad(unit.of_blocks(unit.vertical))
     height, aside = unit.of_blocks(unit.height), unit.of_blocks(unit.aside)

@@ -247,6 +247,18 @@ def test_the_sector_that_is_masked_is_not_bridged() -> None:
     assert clockwise(decoded(VLP16, [masked]).points())[spot(5, 16)] == pytest.approx(91.2, abs=1e-4)
 
 
+@pytest.mark.parametrize("jump_deg", [20, 116, 200, 350])
+def test_a_lone_block_behind_a_masked_sector_turns_as_the_sensor_does(jump_deg: int) -> None:
+    """The last block of the packet is alone: the step to it is no turn, and none follows it."""
+    starts = steps(10_000)
+    starts[-1] = (starts[-2] + 100 * jump_deg) % 36_000
+    cells = {(block, slot): (500, 1) for block in range(12) for slot in range(32)}
+    cloud = VLP16.decode([packet(starts, cells)]).points()
+    first, last = clockwise(cloud)[[spot(11, 0), spot(11, 31)]]
+    within = 0.4 * (55.296 + 15 * 2.304) / 110.592  # degrees from laser 0 to laser 31, at 0.4 degrees from block to block
+    assert (last - first) % 360 == pytest.approx(within, abs=1e-4)
+
+
 def test_an_azimuth_that_falls_back_is_no_turn() -> None:
     stuck = packet([1000, 999, *steps(1000, 0)[2:]], {(0, 16): (500, 1)})
     assert clockwise(decoded(VLP16, [stuck]).points())[spot(0, 16)] == pytest.approx(9.995, abs=1e-4)
