@@ -28,6 +28,7 @@ from lidarspec.errors import LidarSpecError, UsageError, did_you_mean, suggest
 from lidarspec.plugins import names_file, sensor as named_sensor
 from lidarspec.points.cloud import Mount
 from lidarspec.spec.sensor import Sensor
+from lidarspec.stores import is_stored
 from lidarspec.trust import FILE, beside, document, foreign, is_trusted, own_settings
 
 #: what can be a name: nothing that has a suffix, a scheme or a folder, and no port of a system that calls them by letters.
@@ -88,6 +89,8 @@ class Named:
         folder, file, reason = Path(self.file).parent, self.source.partition("?")[0], ""
         if self.sensor is not None and names_file(self.sensor):
             reason = f"sensor {self.sensor!r} is Python, which would run"
+        elif is_stored(self.source):
+            reason = f"source {self.source!r} is a URL, which would be contacted or lead outside {folder}"
         elif os.path.isfile(file):
             try:
                 beside(folder, os.path.abspath(file))
