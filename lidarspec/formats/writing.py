@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import contextlib
 import os
+import re
 import shutil
 import tempfile
 from collections.abc import Callable, Iterable, Iterator
@@ -18,11 +19,16 @@ from typing import IO, Any, TypeVar
 import numpy as np
 from numpy.typing import DTypeLike, NDArray
 
-from lidarspec.errors import SourceError, system_errors
+from lidarspec.errors import SourceError, UsageError, suggest, system_errors
 from lidarspec.points.cloud import COLUMNS, PointCloud, source_of
 from lidarspec.scans.scans import Scan
 from lidarspec.stores import take_away
 
+# Files that a written folder holds, by its suffix: an existing folder with any other file is not replaced.
+FOLDER_FILES = {
+    ".zarr": re.compile(r"(.+/)?(zarr\.json|\.z(group|attrs|array|metadata)|(c/)?\d+([./]\d+)*)"),
+    ".rosbag2": re.compile(r"metadata\.yaml|[^/]+\.(mcap|db3(-wal|-shm)?)"),
+}
 #: ns since 1970 of the GPS epoch, 1980-01-06, for a clock that leaves out leap seconds, with those that there are since 2017.
 GPS_EPOCH = (315_964_800 - 18) * 10**9
 _Piece = TypeVar("_Piece")
@@ -34,7 +40,9 @@ def replacing(path: Path) -> Iterator[Path]:
 
     Raises:
         SourceError: where it cannot be written.
+        UsageError: if the path is a folder that holds files of other kinds.
     """
+    refuse_foreign_files(path)
     part = path.with_name(f".{os.getpid()}.{path.name}")
     try:
         with contextlib.suppress(SourceError):
@@ -42,11 +50,28 @@ def replacing(path: Path) -> Iterator[Path]:
         with system_errors(path):
             yield part
             if path.is_dir() and part.is_dir():
+                refuse_foreign_files(path)
                 take_away(path)
             os.replace(part, path)
     finally:
         with contextlib.suppress(SourceError):
             take_away(part)
+
+
+def refuse_foreign_files(folder: Path) -> None:
+    """Raise if replacing a folder would delete files that its format does not write.
+
+    Raises:
+        UsageError: with the first such file.
+    """
+    if not folder.is_dir():
+        return
+    pattern = FOLDER_FILES.get(folder.suffix.lower())
+    for path in sorted(folder.rglob("*")):
+        name = path.relative_to(folder).as_posix()
+        if path.is_symlink() or (path.is_file() and not (pattern and pattern.fullmatch(name))):
+            error = UsageError(f"{folder} holds other files, such as {name}, which would be deleted")
+            raise suggest(error, "choose another output, or move these files away")
 
 
 @contextlib.contextmanager
