@@ -238,7 +238,7 @@ class Manifest:
         try:
             record = json.loads(line)
             self._records.setdefault((record["source"], record["target"]), {})[record["piece"]] = record
-        except (ValueError, KeyError, TypeError):
+        except (ValueError, KeyError, TypeError, RecursionError):
             return False
         return True
 

@@ -91,11 +91,11 @@ class BagTransport(Transport):
             self._log.open()
             undo.callback(self._log.close)
             self._layouts = {link.id: layouts for link in self._log.connections if (layouts := _layouts(link))}
+            carrying = [link for link in self._log.connections if link.id in self._layouts]
+            self._links = [link for link in carrying if sender in (None, link.topic, _namespace(link.topic))]
+            self.datagrams = not any(self._streams(link) for link in self._links)
+            self.foreign = sum(link.msgcount for link in carrying) - sum(link.msgcount for link in self._links)
             undo.pop_all()
-        carrying = [link for link in self._log.connections if link.id in self._layouts]
-        self._links = [link for link in carrying if sender in (None, link.topic, _namespace(link.topic))]
-        self.datagrams = not any(self._streams(link) for link in self._links)
-        self.foreign = sum(link.msgcount for link in carrying) - sum(link.msgcount for link in self._links)
         if not self._links:
             named = "; ".join(f"{link.topic} has {link.msgtype}" for link in (carrying or self._log.connections)[:NAMED]) or "it is empty"
             self.warnings.append(f"{path} is {log.what} without packets{f' of {sender}' if sender else ''}: {named}")
