@@ -10,6 +10,9 @@ ARGS ?=
 INPUTS ?= 1000000
 SEED ?= 0
 
+# Python writes bytecode whatever the user's shell says: without it, each process of the tests compiles every library again.
+unexport PYTHONDONTWRITEBYTECODE
+
 BIN := $(VENV)/$(if $(filter Windows_NT,$(OS)),Scripts,bin)
 PIP := $(BIN)/python -m pip --disable-pip-version-check
 # uv, if it is on PATH, installs faster than pip.

@@ -26,6 +26,20 @@ def _entry_points() -> list[EntryPoint]:
     return list(entry_points(group=_GROUP))
 
 
+@functools.cache
+def _entry_points_by_distribution() -> dict[str, list[EntryPoint]]:
+    """Return the entry points by the name of their distribution, which takes reading its metadata."""
+    found: dict[str, list[EntryPoint]] = {}
+    names: dict[int, str] = {}
+    for entry in _entry_points():
+        if entry.dist is not None:
+            key = id(entry.dist)
+            if key not in names:
+                names[key] = entry.dist.name
+            found.setdefault(names[key], []).append(entry)
+    return found
+
+
 def sensor_modules() -> list[str]:
     """Return the names of all modules with sensors, from entry points; nothing is imported."""
     return sorted({entry.module for entry in _entry_points()})
@@ -67,9 +81,8 @@ def assert_installed_conformance(distribution: str, sensor_id: str) -> None:
 def sensor_ids(distribution: str) -> list[str]:
     """Return a name of each sensor of a distribution, representatives first."""
     names: dict[str, list[str]] = {}
-    for entry in _entry_points():
-        if entry.dist is not None and entry.dist.name == distribution:
-            names.setdefault(entry.value, []).append(entry.name)
+    for entry in _entry_points_by_distribution()[distribution]:
+        names.setdefault(entry.value, []).append(entry.name)
     vendor = distribution.removeprefix("lidarspec-")
     return sorted((_full_name(vendor, entries) for entries in names.values()), key=_rank)
 

@@ -16,10 +16,15 @@ def needs(*packages: str) -> pytest.MarkDecorator:
 
 
 class Library:
-    """A module that is imported when one of its names is first asked for."""
+    """A module that is imported when one of its public names is first asked for.
+
+    pytest asks every object of a test module for names such as `__wrapped__`: these import nothing.
+    """
 
     def __init__(self, name: str) -> None:
         self._name = name
 
     def __getattr__(self, attribute: str) -> Any:
+        if attribute.startswith("_") or attribute == "pytestmark":
+            raise AttributeError(attribute)
         return getattr(importlib.import_module(self._name), attribute)

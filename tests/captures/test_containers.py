@@ -113,6 +113,7 @@ def test_verbs_take_compressed_files_and_pipes() -> None:
     assert (refused.returncode, b"give its file, not a pipe" in refused.stderr) == (3, True)
 
 
+@pytest.mark.slow
 def test_one_file_of_an_archive_is_named_where_several_are_captures() -> None:
     Path("one.zip").write_bytes(zipped(capture(), "read.md", "__MACOSX/drives/a.pcap", "drives/a.pcap", "notes.md"))
     assert len(read("one.zip")) == 40

@@ -50,6 +50,7 @@ def written(path: Path, megabytes: int) -> int:
     return len(frames) * times
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(sys.platform != "linux", reason="reads /proc")
 @pytest.mark.parametrize("megabytes", [60, pytest.param(1024, marks=pytest.mark.soak)])
 def test_a_capture_of_any_length_is_decoded_below_200_mb(megabytes: int, tmp_path: Path) -> None:

@@ -74,6 +74,7 @@ def test_a_broken_source_ends_in_one_line_and_its_code(folder: Path, verb: str, 
     assert os.listdir(folder) == (["all.lsr"] if kept else [])
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("place", "told"), [(place, told) for place, _, told in BROKEN if place is not forbidden])
 def test_doctor_says_the_same_as_a_finding(folder: Path, place: Place, told: str) -> None:
     with place() as source:

@@ -194,6 +194,16 @@ def test_a_project_names_no_files_elsewhere_until_its_folder_is_allowed(folder: 
     assert "lidarspec trust" not in said
 
 
+@pytest.mark.parametrize(
+    "url", ["file:///etc/hostname", "http://127.0.0.1:9/drive.pcap", "ftp://127.0.0.1:9/drive.pcap", "s3://bucket/drive.pcap"]
+)
+def test_urls_of_a_project_need_a_trusted_folder(folder: Path, url: str) -> None:
+    (folder / "lidarspec.toml").write_text(f'[device.front]\nsource = "{url}"\n', encoding="utf-8")
+    with pytest.raises(ls.UsageError, match=url):
+        ls.open("front")
+    assert f"next: lidarspec trust {folder}" in ran("stats", "front", code=2).stderr
+
+
 def test_only_a_folder_of_ones_own_can_be_allowed(folder: Path) -> None:
     folder.chmod(0o777)
     said = ran("trust", folder, code=2).stderr

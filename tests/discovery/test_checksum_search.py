@@ -173,6 +173,7 @@ def test_an_xor_in_two_nibbles() -> None:
     assert "low nibbles" in match.remarks[0]
 
 
+@pytest.mark.slow
 def test_damaged_frames_do_not_hide_it() -> None:
     frames = sealed(Crc(8, 0x4D), 60, 44)
     damaged = [bytes([*frame[:9], frame[9] ^ 0x40, *frame[10:]]) if index % 5 == 0 else frame for index, frame in enumerate(frames)]
@@ -180,6 +181,7 @@ def test_damaged_frames_do_not_hide_it() -> None:
     assert (match.algorithm, match.right, match.total) == (Crc(8, 0x4D), 48, 60)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("length", [20, 300])
 def test_random_bytes_have_none(length: int) -> None:
     source = random.Random(length)

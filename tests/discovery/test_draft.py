@@ -79,6 +79,7 @@ def test_a_count_that_only_the_frame_cut_off_gives_away() -> None:
     assert rising(found) == {"rising_4": (2, "little", 0), "rising_6": (2, "little", 0)}
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("name", "frames", "clock"), [(VLP16, 603, "rising_1200"), pytest.param(VLP16_RAW, 1000, "rising_1200", marks=pytest.mark.slow)]
 )
@@ -99,6 +100,7 @@ def test_blocks_with_a_big_endian_angle_among_packets_of_another_kind() -> None:
     assert rising(found) == {"angle_2": (2, "big", 36_000), "counter_14": (2, "big", 0), "rising_26": (4, "big", 0)}
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("name", "least"),
     [
@@ -126,6 +128,7 @@ def transport_data(name: str) -> bytes | list[bytes]:
     return chunks if opened.datagrams else b"".join(chunks)
 
 
+@pytest.mark.slow
 def test_the_evidence_stands_beside_each_field(tmp_path: Path) -> None:
     (tmp_path / "some.bin").write_bytes(b"".join(simulate(ls.sensor("ldrobot-stl27l"), 400)))
     sensor = module(tmp_path, tmp_path / "some.bin")
@@ -211,6 +214,7 @@ def test_an_index_that_starts_again_is_a_counter_with_its_limits(tmp_path: Path)
     assert sensor.decode(data[: 22 * 50] + data[22 * 53 :]).stats.lost == 3
 
 
+@pytest.mark.slow
 def test_turns_of_an_index_are_not_taken_for_one_frame(tmp_path: Path) -> None:
     """Ninety packets a turn that begin with one constant byte, over a scene that stands still: the format of old vacuum cleaners."""
     rows = [np.array([1500 + 40 * (i % 90) + j for j in range(8)], "<u2").tobytes() for i in range(900)]
@@ -223,6 +227,7 @@ def test_turns_of_an_index_are_not_taken_for_one_frame(tmp_path: Path) -> None:
     assert [(one.name, one.first, one.circle) for one in found.candidates if one.kind == "counter"] == [("counter_1", 0xA0, 0xFA)]
 
 
+@pytest.mark.slow
 def test_a_length_in_bytes_with_short_frames_of_another_kind_between(tmp_path: Path) -> None:
     """A header of fields, then samples of three bytes, and a big-endian sum; now and then a frame of eleven bytes."""
     source = random.Random(7)
@@ -296,12 +301,14 @@ def test_fields_alike_at_equal_distances_are_an_array() -> None:
     assert "lies between" not in struct
 
 
+@pytest.mark.slow
 def test_the_counter_that_never_jumps_is_taken_and_the_others_are_offered() -> None:
     draw = random.Random(1)
     frames = [b"\x0f\x55" + bytes([(i + i // 50 * 3) % 256, 0]) + i.to_bytes(2, "little") + draw.randbytes(10) for i in range(200)]
     assert 'sequence=Sequence("counter_4"),  # a jump in it is a loss; or counter_2' in written(frames)["arguments"]
 
 
+@pytest.mark.slow
 def test_other_checksums_that_fit_and_other_angles_are_offered() -> None:
     text = written(simulate(ls.sensor("ldrobot-ld06"), 300))
     assert "# or Crc(width=8, poly=0x4D, xorout=0x18) at byte 46 over all other bytes but the first 1" in text["struct"]

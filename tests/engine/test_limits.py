@@ -18,6 +18,8 @@ from tests.shapes import SHAPES
 
 STREAM_SHAPES = [name for name, sensor in SHAPES.items() if not sensor.datagrams]
 STREAMS = (*STREAM_SHAPES, *STREAM_REPRESENTATIVES)
+#: Sensors of which a stream of some frames takes seconds.
+LONG_FRAMES = ("shape-joined", "shape-channels", "hokuyo-ust10lx")
 #: Sensors whose peak memory is measured in the quick tier, one of each way to make frames: of one size, counted, announced, text.
 MEASURED = ("shape-middle", "shape-count", "shape-modes", "shape-tokens", "ldrobot-stl27l", "cspc-m1c1-mini", "slamtec-rplidar-a1")
 
@@ -39,7 +41,7 @@ def pending_bound(sensor: Sensor) -> int:
     return max(frame.max_length * frame.confirm for frame in sensor.incoming.values())
 
 
-@pytest.mark.parametrize("name", STREAMS)
+@pytest.mark.parametrize("name", [pytest.param(name, marks=pytest.mark.slow if name in LONG_FRAMES else ()) for name in STREAMS])
 def test_a_decoder_holds_less_than_its_longest_frame(name: str) -> None:
     sensor = load_sensor(name)
     for data in (garbage(4_000), worst(sensor, 4_000), Subject(sensor).stream(rounds=1)[:20_000]):

@@ -50,7 +50,7 @@ def facts(spans: Frames) -> list[tuple[str, int, bytes, int]]:
 
 
 @each_sensor
-@pytest.mark.parametrize("distance", ["none", "even", "uneven"])
+@pytest.mark.parametrize("distance", ["uneven", *(pytest.param(name, marks=pytest.mark.slow) for name in ("none", "even"))])
 def test_datagrams_in_one_buffer_are_those_one_after_another(name: str, distance: str) -> None:
     sensor = load_sensor(name)
     rows = damaged(name)
@@ -170,3 +170,10 @@ def test_plausible_frames_of_an_array_are_those_that_the_function_says(plausible
     columns = SimpleNamespace(mode=rows[:, 1].astype(float), angle=rows[:, 2] * 256.0 + rows[:, 3])
     wanted = np.flatnonzero(np.broadcast_to(plausible(columns), len(rows)))
     assert sensor.decode(rows).offset.tolist() == (4 * wanted).tolist()
+
+
+@each_sensor
+def test_no_datagrams_have_no_points(name: str) -> None:
+    sensor = load_sensor(name)
+    if sensor.data_frame is not None:
+        assert len(sensor.decode([]).points()) == 0

@@ -88,6 +88,7 @@ def test_idle_between_chunks_is_the_rule_on_each_part(sensor: Sensor) -> None:
     assert books.found == expected
 
 
+@pytest.mark.slow
 def test_decoders_in_threads_do_not_know_of_each_other() -> None:
     work = [(sensor, damaged(conversation(sensor, length=600), 5e-3, 1)[:1200]) for sensor in STREAMS.values()]
     alone = [decoded(*item) for item in work]

@@ -119,6 +119,7 @@ def test_the_install_command_names_a_folder_of_the_checkout_else_the_repository(
     assert install_command("lidarspec-ouster").endswith("#subdirectory=plugins/lidarspec-ouster'")
 
 
+@pytest.mark.slow
 def test_with_one_plugin_verbs_name_the_distribution_to_install(one_plugin: Path, tmp_path: Path) -> None:
     vlp16 = ls.sensor("velodyne-vlp16")
     datagrams = [bytes(frame) for frame in ls.simulate(vlp16, 20)]

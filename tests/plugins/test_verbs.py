@@ -49,6 +49,7 @@ def ran(site: Path, *words: str) -> subprocess.CompletedProcess[str]:
     return subprocess.run(command, env=environment, capture_output=True, text=True, timeout=60, check=False)
 
 
+@pytest.mark.slow
 def test_a_verb_is_listed_without_being_loaded_and_runs(site: Path) -> None:
     listed = ran(site, "--help")
     assert "loaded" not in listed.stderr

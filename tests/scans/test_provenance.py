@@ -58,7 +58,7 @@ def scans_of(sensor: Sensor, frames: list[bytes], together: int) -> tuple[list[S
     return scans + stream.finish(), offsets
 
 
-@pytest.mark.parametrize("together", [1, FRAMES, pytest.param(3, marks=pytest.mark.slow)])
+@pytest.mark.parametrize("together", [3, FRAMES, pytest.param(1, marks=pytest.mark.slow)])
 @pytest.mark.parametrize("name", ["parts", "waiting parts", "ldrobot-stl27l", *LARGE])
 def test_each_point_leads_to_its_frame_and_row(name: str, together: int) -> None:
     known = segments.SENSOR if name in ("parts", "waiting parts") else ls.sensor(name)

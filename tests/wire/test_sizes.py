@@ -168,7 +168,7 @@ def test_both_engines_hold_frames_to_their_lengths(name: str) -> None:
     ours, source = declared(name), random.Random(name)
     codecs = codec(ours.frames["data"]), codec(ours.frames["data"], interpreted=True)
     refused = 0
-    for seed in range(4):
+    for seed in range(8):
         example = ours.example("data", seed=seed)
         for _ in range(12):
             data = bytearray(example)

@@ -56,7 +56,7 @@ def test_characters_of_six_bits_are_those_of_the_specification() -> None:
     data = made.build("data", two=1234, three=5432, four=16_000_000)
     assert data.startswith(b"MD\nCB1Dhm2@0")
     assert made.parse(data).three == 5432
-    with pytest.raises(UsageError, match="4096"):
+    with pytest.raises(UsageError):
         made.build("data", two=4096, three=0, four=0)
     with pytest.raises(WireError, match="check"):
         made.parse(data.replace(b"1Dh", b"1Di"))
