@@ -29,7 +29,7 @@ BEGIN, END = "<!-- made by make reference -->", "<!-- until here -->"
 
 def context(verb: str) -> click.Context:
     """The verb as it is invoked; of "" the command itself."""
-    top = click.Context(root, info_name="lidarspec")
+    top = click.Context(root, info_name="lidarspec", **root.context_settings)
     command = root.get_command(top, verb)
     return click.Context(command, info_name=verb, parent=top) if command else top
 
