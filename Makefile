@@ -168,7 +168,7 @@ $(PEERS): $(USERS) benchmarks/environments.py
 
 $(ROBOTS): $(USERS) $(ROS2)/pyproject.toml
 	@echo "installing ROS 2 into $(VENV)"
-	@$(INSTALL) --no-build-isolation '$(CORE)[testing]' --editable '$(ROS2)$(if $(AMENT_PREFIX_PATH),,[ros2])'
+	@$(INSTALL) '$(CORE)[testing]' --editable '$(ROS2)$(if $(AMENT_PREFIX_PATH),,[ros2])'
 	@touch $@
 
 $(MODULES): $(PAGE)/package-lock.json $(PAGE)/package.json
