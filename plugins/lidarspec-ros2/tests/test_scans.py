@@ -87,7 +87,7 @@ def test_messages_are_what_the_library_makes_of_the_same_bytes(
     assert len({np.asarray(content["ranges" if kind == SCAN else "data"]).tobytes() for content in wanted}) > 1
 
 
-@pytest.mark.slow  # packets and IMU messages of one moment are often not both received
+@pytest.mark.soak  # packets and IMU messages of one moment are often not both received
 def test_what_an_imu_felt_is_what_the_library_makes_of_the_same_bytes(run: Callable[..., Any], client: Client, tmp_path: Path) -> None:
     packets = client.listen("packets", UInt8MultiArray)
     received = client.listen("imu", Imu)
