@@ -1,4 +1,4 @@
-"""What verbs are given: bytes as text, files, live sources; and what is said where nothing of use comes.
+"""Read the input of verbs, bytes as text, files and live sources, and explain input without a frame.
 
 Sources, files and the search for a sensor are imported by the functions that need them: the bytes of a named sensor need none of them.
 """

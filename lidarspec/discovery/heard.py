@@ -15,7 +15,7 @@ LOOKED_AT = 1 << 17
 
 @dataclass(frozen=True)
 class Heard:
-    """What came from one source, of one sender.
+    """Bytes that one sender of a source sent.
 
     Attributes:
         source: how to open it again.

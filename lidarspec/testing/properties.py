@@ -80,7 +80,7 @@ class Property:
         return any(wanted == [getattr(sensor, name) for name in self.depends_on] for sensor in subject.tested)
 
     def findings(self, subject: Subject) -> list[Finding]:
-        """What does not hold."""
+        """Return the findings of every case that fails."""
         found = []
         for case in self.cases(subject):
             try:

@@ -1,4 +1,4 @@
-"""What verbs load: one sensor loads one plugin, and no verb imports the parts that it does not use. Modules are counted, not seconds."""
+"""One sensor loads one plugin, and no verb imports parts that it does not use: modules are counted, not seconds."""
 
 from __future__ import annotations
 

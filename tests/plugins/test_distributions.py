@@ -95,7 +95,7 @@ def site(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture(scope="module")
 def seen(site: Path) -> dict[str, Any]:
-    """What a program sees that runs with these plugins installed."""
+    """Output of a program that runs with these plugins installed."""
     code = f"FRAME = {FRAME!r}\n{LOOK}{WORK}\nprint(json.dumps([plugins, good, sorted(sensors), report]))"
     done = python(site, "-c", code)
     assert done.returncode == 0, done.stderr

@@ -1,4 +1,4 @@
-"""Where each rule ends a scan: sequences of one value, and the scans that follow from them by hand."""
+"""Each cut rule on sequences of one value, compared with scans worked out by hand."""
 
 from __future__ import annotations
 

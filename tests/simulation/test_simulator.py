@@ -1,4 +1,4 @@
-"""What a simulated sensor measures is where the scene is; each sensor's own conformance tests check the same."""
+"""Simulated sensors measure the scene; each sensor's conformance tests check the same."""
 
 from __future__ import annotations
 

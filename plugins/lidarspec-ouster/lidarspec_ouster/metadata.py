@@ -124,11 +124,11 @@ def read(metadata: str | Path | Learned) -> Unit:
         raise UsageError(f"{name}: no metadata of an Ouster sensor: {error}") from error
     if not isinstance(data, dict):
         raise UsageError(f"{name}: no metadata of an Ouster sensor: a {type(data).__name__}, not an object")
-    return Facts(name, flattened(data)).unit()
+    return Facts(name, merge_sections(data)).unit()
 
 
-def flattened(data: dict[str, Any]) -> dict[str, Any]:
-    """Return the keys of all sections together.
+def merge_sections(data: dict[str, Any]) -> dict[str, Any]:
+    """Return the keys of all sections in one mapping.
 
     Firmware differs in the section that holds a key: `imu_measurements_per_packet` stands in `lidar_data_format` or in
     `imu_data_format`. What the sensor reports of itself takes precedence over `config_params`, the user's settings.

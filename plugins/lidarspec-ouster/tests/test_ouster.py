@@ -261,7 +261,8 @@ def test_imu_measurements_come_in_si_units() -> None:
     """Captured values of ACCEL32_GYRO32_NMEA are multiples of 9.80665/2048 and (pi/180)/16.4."""
     unit = dataclasses.replace(nominal("OS1", 16, 512, "RNG15_RFL8_NIR8"), samples=2)
     sensor = OS1.configure(metadata=Learned(unit.told()))
-    gravity, rate = 2048 * 9.80665 / 2048, 164 * np.deg2rad(1) / 16.4
+    gravity = 2048 * 9.80665 / 2048
+    rate = 164 * np.deg2rad(1) / 16.4
     measurement = {f"{name}_{axis}": 0.0 for name in ("acceleration", "gyro") for axis in "xyz"}
     measurement |= {"timestamp": 0, "measurement_id": 0, "status": 0, "acceleration_z": gravity, "gyro_x": rate}
     values = sensor.parse(sensor.example("imu"), "imu")
