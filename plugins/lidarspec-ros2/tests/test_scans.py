@@ -87,11 +87,12 @@ def test_messages_are_what_the_library_makes_of_the_same_bytes(
     assert len({np.asarray(content["ranges" if kind == SCAN else "data"]).tobytes() for content in wanted}) > 1
 
 
-@pytest.mark.soak  # packets and IMU messages of one moment are often not both received
 def test_what_an_imu_felt_is_what_the_library_makes_of_the_same_bytes(run: Callable[..., Any], client: Client, tmp_path: Path) -> None:
     packets = client.listen("packets", UInt8MultiArray)
     received = client.listen("imu", Imu)
-    run("sim:livox-mid360?shake=0.5&seed=3", "-s", "livox-mid360", ros=given(publish_packets=True, qos="reliable", frame_id="head"))
+    # A quarter of the sensor's rate: this process cannot take 2,000 packets a second on every computer.
+    source = "sim:livox-mid360?shake=0.5&seed=3&rate=0.25"
+    run(source, "-s", "livox-mid360", ros=given(publish_packets=True, qos="reliable", frame_id="head"))
     client.until(lambda: packets)  # the topic may be found later than that of the IMU
     first = len(received)
     client.until(lambda: len(received) > first + 400)
