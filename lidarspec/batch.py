@@ -220,10 +220,9 @@ class Manifest:
     def __init__(self, folder: str) -> None:
         self.path = f"{folder.rstrip('/')}/{MANIFEST}"
         self._records: dict[tuple[str, str], dict[int, Record]] = {}
-        self._lines, self._due = list[str](), 0.0
+        self._due = 0.0
         self._is_stored = is_stored(folder)
-        with contextlib.suppress(SourceError), contextlib.closing(file_of(self.path)) as file:
-            self._lines = [line for line in file.read().decode(errors="replace").splitlines() if self._known(line)]
+        self._lines = [line for number, line in enumerate(self._read_lines(), 1) if self._known(line, number)]
         self._outputs = files_in(folder)
         self.is_new = not self.has(self.path)
         if not self._is_stored:
@@ -233,13 +232,27 @@ class Manifest:
                 if self._file.tell():  # lest a line that was cut off take the next one with it
                     self._file.write("\n")
 
-    def _known(self, line: str) -> bool:
-        """Whether a line is whole, which is then remembered."""
+    def _read_lines(self) -> list[str]:
+        """Return the lines of an existing manifest, none if there is no manifest."""
+        try:
+            with contextlib.closing(file_of(self.path)) as file:
+                return file.read().decode(errors="replace").splitlines()
+        except SourceError:
+            return []
+
+    def _known(self, line: str, number: int) -> bool:
+        """Remember the record of a line; return False for one that a killed run left incomplete.
+
+        Raises:
+            SourceError: if the line nests more deeply than any record does: no run of ours wrote it.
+        """
         try:
             record = json.loads(line)
             self._records.setdefault((record["source"], record["target"]), {})[record["piece"]] = record
-        except (ValueError, KeyError, TypeError, RecursionError):
+        except (ValueError, KeyError, TypeError):
             return False
+        except RecursionError:
+            raise SourceError(f"{self.path}: line {number}: brackets are nested too deeply") from None
         return True
 
     def has(self, path: str) -> bool:

@@ -430,8 +430,13 @@ def summarize(sensor: Sensor, distribution: str, version: str) -> KnownSensor:
         distribution,
         version,
         sensor.aliases,
-        {name: _summarize_link(link) for name, link in sensor.links.items()},
+        summarize_links(sensor),
     )
+
+
+def summarize_links(sensor: Sensor) -> dict[str, KnownLink]:
+    """Return the links of a sensor by name, each with its kind and its bauds or ports."""
+    return {name: _summarize_link(link) for name, link in sensor.links.items()}
 
 
 def _summarize_link(link: Link) -> KnownLink:

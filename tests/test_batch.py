@@ -193,6 +193,15 @@ def test_a_store_is_read_and_written_as_a_folder_is(drives: Path, tmp_path: Path
     assert "packets" in result.stdout
 
 
+def test_a_hostile_manifest_is_a_source_error_with_its_line(drives: Path, tmp_path: Path) -> None:
+    out = tmp_path / "out"
+    out.mkdir()
+    (out / batch.MANIFEST).write_text('{"cut off": \n' + "[" * 200_000 + "\n")
+    said = ran("convert", drives / "*.bin", out, "-s", SENSOR, "--to", "csv", code=3).stderr
+    assert f"{batch.MANIFEST}: line 2" in said
+    assert [path.name for path in out.iterdir()] == [batch.MANIFEST]
+
+
 def test_wrong_input_is_one_line_and_leaves_nothing(drives: Path, tmp_path: Path) -> None:
     out, source = tmp_path / "out", drives / "*.bin"
     assert "there is no such file" in ran("convert", drives / "*.lsr", out, "--to", "parquet", code=3).stderr

@@ -17,7 +17,7 @@ from lidarspec.cli.output import emit, emit_json, table
 from lidarspec.cli.terminal import note, say
 from lidarspec.errors import SpecError
 from lidarspec.known_sensors import KnownLink, no_sensors
-from lidarspec.plugins import Plugin, registry, sensor as named_sensor, summarize, tried
+from lidarspec.plugins import Plugin, registry, sensor as named_sensor, summarize_links, tried
 from lidarspec.spec.sensor import Sensor
 from lidarspec.trust import FILE, TRUSTED, trust as trusted, user_folder
 
@@ -101,7 +101,7 @@ def show(sensor_id: str, as_plan: bool, as_json: bool, output: str | None) -> No
         emit_json({**_facts(sensor), "frames": frames, "commands": commands}, output)
         return
     low, high = sensor.range_limits
-    links = _links(summarize(sensor, distribution="", version="").links)
+    links = _links(summarize_links(sensor))
     parts = [
         f"{sensor.id}: {sensor.vendor} {sensor.model}" + (f", also {', '.join(sensor.aliases)}" if sensor.aliases else ""),
         f"  link    {links}\n  range   {low:g} .. {high:g} m\n  status  {sensor.status}\n  source  {sensor.source}",

@@ -16,6 +16,7 @@ is that of one array alone; only one that has as many axes as the arrays that ar
 
 from __future__ import annotations
 
+import itertools
 import math
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
@@ -340,12 +341,11 @@ def _cut_to_shortest(arrays: list[NDArray[Any]]) -> list[NDArray[Any]]:
 
     Without packets an array of variable length is empty, but a plugin's own table for it is not.
     """
-    depth = max(array.ndim for array in arrays)
-    shortest: list[int | None] = [None] * depth
-    for place in range(depth):
-        lengths = [array.shape[place - depth] for array in arrays if array.ndim >= depth - place]
-        shortest[place] = min((length for length in lengths if length != 1), default=None)
-    return [array[tuple(slice(shortest[place]) for place in range(depth - array.ndim, depth))] for array in arrays]
+    reversed_shapes = [array.shape[::-1] for array in arrays]
+    shortest = [
+        min((length for length in lengths if length != 1), default=1) for lengths in itertools.zip_longest(*reversed_shapes, fillvalue=1)
+    ]
+    return [array[tuple(slice(shortest[place]) for place in reversed(range(array.ndim)))] for array in arrays]
 
 
 def _met(known: str | None, name: str | None) -> str | None:

@@ -190,6 +190,30 @@ def test_a_damaged_log_is_a_source_error_and_no_other(tmp_path: Path, kind: str,
             read(path)
 
 
+@pytest.mark.parametrize("suffix", ["mcap", "bag", "db3"])
+def test_damage_in_a_log_of_our_own_packets_is_a_source_error(tmp_path: Path, suffix: str) -> None:
+    """Opening such a log reads its first message, which says whether it holds datagrams."""
+    source = tmp_path / "it.pcap"
+    ends = ("192.168.1.201", 2368), ("192.168.1.77", 2368)
+    records = [datagram_record(Datagram(data, START + STEP * number, *ends)) for number, data in enumerate(packets(20))]
+    source.write_bytes(capture_head(ETHERNET) + b"".join(records))
+    log = tmp_path / f"out.{suffix}"
+    ran("convert", "--packets", source, log, "-s", "velodyne-vlp16")
+    whole = log.read_bytes()
+    random = np.random.default_rng(2)
+    failed = 0
+    for _ in range(40):
+        data = bytearray(whole)
+        for offset in random.integers(16, len(data), 400):
+            data[offset] = random.integers(256)
+        log.write_bytes(data)
+        try:
+            read(log)
+        except SourceError:
+            failed += 1
+    assert failed
+
+
 def test_packets_are_the_same_through_every_container(tmp_path: Path) -> None:
     sent = packets(40)
     source = tmp_path / "it.pcap"
