@@ -14,6 +14,7 @@ import re
 from collections.abc import Iterable, Mapping
 from typing import Any, NamedTuple
 
+from lidarspec.entry_points import GROUP, SENSORS, EntryPoint, entry_points
 from lidarspec.errors import UnknownSensor, suggest
 
 #: stands for the vendor in an install command that is valid for every vendor.
@@ -88,6 +89,28 @@ def known_sensors() -> tuple[KnownSensor, ...]:
 
     with open(os.path.join(os.path.dirname(__file__), "known_sensors.json"), encoding="utf-8") as file:
         return tuple(KnownSensor.from_dict(row) for row in json.load(file))
+
+
+def describe_entry_points(entries: Iterable[EntryPoint]) -> list[KnownSensor]:
+    """Return the rows whose distribution is installed in the version of the row, with entry points of exactly its names."""
+    offered: dict[tuple[str, str], dict[str, set[str]]] = {}
+    for entry in entries:
+        names = offered.setdefault((entry.distribution, entry.version), {})
+        names.setdefault(entry.value, set()).add(entry.name)
+    return [row for row in known_sensors() if row.names in offered.get((row.distribution, row.version), {}).values()]
+
+
+def list_described_sensors() -> list[KnownSensor] | None:
+    """Return a row for each installed sensor, sorted by id; None if the table does not describe all of them.
+
+    Then plugins have to be loaded: one that has hooks, is not of this project, or has a name that another one has too.
+    """
+    if entry_points(GROUP):
+        return None
+    entries = entry_points(SENSORS)
+    rows = describe_entry_points(entries)
+    described = {name for row in rows for name in row.names}
+    return rows if len(described) == len(entries) else None
 
 
 def find_known_sensor(name: str) -> KnownSensor | None:

@@ -16,6 +16,7 @@ import functools
 import importlib
 import importlib.util
 import inspect
+import itertools
 import os
 import re
 import sys
@@ -33,7 +34,7 @@ import pluggy
 
 from lidarspec.entry_points import GROUP, SENSORS, VERBS, EntryPoint, entry_points, normal
 from lidarspec.errors import LidarSpecError, SourceError, SpecError, UnknownSensor, UsageError, suggest
-from lidarspec.known_sensors import KnownLink, KnownSensor, known_sensors, unknown_sensor
+from lidarspec.known_sensors import KnownLink, KnownSensor, describe_entry_points, unknown_sensor
 from lidarspec.spec.checksums import Checksum
 from lidarspec.spec.construct_layer import prepare, seals
 from lidarspec.spec.description import Frame
@@ -321,7 +322,7 @@ class Registry:
 
     def list_sensors(self) -> list[KnownSensor]:
         """Return a row for each installed sensor, sorted by id; only plugins that the table does not describe are loaded."""
-        described = [row for row in known_sensors() if self._is_offered(row)]
+        described = describe_entry_points(itertools.chain.from_iterable(self._offered.values()))
         names = {(row.distribution, name) for row in described for name in row.names}
         for entries in self._offered.values():
             for entry in entries:
@@ -333,15 +334,6 @@ class Registry:
             if name not in rows and home is not None:
                 rows[name] = summarize(sensor, home[0], self._version(home[0]))
         return [rows[name] for name in sorted(rows)]
-
-    def _is_offered(self, row: KnownSensor) -> bool:
-        """Return whether this version of the distribution is installed, and its entry points name the sensor as the row does."""
-        names: dict[str, set[str]] = {}
-        for (distribution, _), entries in self._offered.items():
-            for entry in entries:
-                if distribution == row.distribution and entry.version == row.version:
-                    names.setdefault(entry.value, set()).add(entry.name)
-        return row.names in names.values()
 
     def _has_name(self, distribution: str, name: str) -> bool:
         home = self._holder(name)

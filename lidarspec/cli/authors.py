@@ -9,8 +9,7 @@ from shlex import quote
 import click
 
 from lidarspec.cli.failures import FINDINGS
-from lidarspec.cli.options import output_option
-from lidarspec.cli.output import Progress, emit, emit_json
+from lidarspec.cli.output import Progress, emit, emit_json, output_option
 from lidarspec.cli.terminal import note, say
 from lidarspec.discovery.draft import Link, Names, captured, draft, invented, joining, write
 from lidarspec.discovery.heard import beginning

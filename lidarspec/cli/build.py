@@ -11,8 +11,9 @@ from typing import Any, Literal
 import click
 
 from lidarspec.cli.frames import listing, plain
-from lidarspec.cli.options import DURATION, output_options, sensor_option
-from lidarspec.cli.output import emit, emit_json, emit_lines, table
+from lidarspec.cli.listing import emit_lines
+from lidarspec.cli.options import DURATION, sensor_option
+from lidarspec.cli.output import emit, emit_json, output_options, table
 from lidarspec.cli.terminal import note
 from lidarspec.device.device import Device, open as open_device
 from lidarspec.device.session import Reply

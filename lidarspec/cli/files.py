@@ -29,8 +29,8 @@ from lidarspec.cli.inputs import (
     refuse_overwriting,
     scans_of,
 )
-from lidarspec.cli.options import BYTES, DURATION, colour_option, count_option, output_options, points_option, selecting, sensor_option
-from lidarspec.cli.output import Progress, emit, emit_json, size
+from lidarspec.cli.options import BYTES, DURATION, colour_option, count_option, points_option, selecting, sensor_option
+from lidarspec.cli.output import Progress, emit, emit_json, output_options, size
 from lidarspec.cli.terminal import note
 from lidarspec.device.device import Device, open as open_device
 from lidarspec.device.source_recording import recorder_like

@@ -12,8 +12,8 @@ import click
 
 from lidarspec.cli.failures import DEVICE, FINDINGS, NO_DATA
 from lidarspec.cli.inputs import read
-from lidarspec.cli.options import DURATION, output_options, sensor_option
-from lidarspec.cli.output import emit, emit_json, table
+from lidarspec.cli.options import DURATION, sensor_option
+from lidarspec.cli.output import emit, emit_json, output_options, table
 from lidarspec.cli.terminal import note
 from lidarspec.discovery.checksum_search import search
 from lidarspec.discovery.detect import Verdict, best, chosen, names, others_named, verdict, verdicts

@@ -11,8 +11,9 @@ import click
 
 from lidarspec.cli.failures import FINDINGS
 from lidarspec.cli.inputs import nearest_fault, no_frame, opened
-from lidarspec.cli.options import OFFSET, count_option, output_options, selecting, sensor_option
-from lidarspec.cli.output import emit_json, emit_json_list, emit_lines, emit_parts, table
+from lidarspec.cli.listing import emit_lines
+from lidarspec.cli.options import OFFSET, count_option, selecting, sensor_option
+from lidarspec.cli.output import emit_json, emit_json_list, emit_parts, output_options, table
 from lidarspec.cli.terminal import note
 from lidarspec.discovery.heard import Heard
 from lidarspec.errors import UsageError, WireError, suggest

@@ -93,26 +93,6 @@ def colour_option(function: Function) -> Function:
     return click.option("--colour", "--color", "ramp", metavar="COLUMN", default="range", show_default=True, help=told)(function)
 
 
-def output_options(function: Function) -> Function:
-    """``--json`` and ``-o/--output``, for verbs that print."""
-    return click.option("--json", "as_json", is_flag=True, help="Print JSON.")(output_option(function))
-
-
-def output_option(function: Function) -> Function:
-    """``-o/--output``; a file that the verb is given to read is refused."""
-
-    @functools.wraps(function)
-    def checked(*args: Any, output: str | None, **others: Any) -> Any:
-        if output is not None:
-            from lidarspec.cli.inputs import refuse_overwriting
-
-            words = [word for value in others.values() for word in (value if isinstance(value, tuple) else [value])]
-            refuse_overwriting(output, *(word for word in words if isinstance(word, str | Sensor)))
-        return function(*args, output=output, **others)
-
-    return click.option("-o", "--output", metavar="FILE", help="Write to a file instead of standard output.")(checked)  # type: ignore[return-value]
-
-
 class Number(click.ParamType):  # type: ignore[type-arg]  # older versions of click have no types
     """A number, or two, written in a way of their own.
 

@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import contextlib
+import functools
 import itertools
 import json
-import os
 import shutil
 import sys
 import textwrap
@@ -13,32 +13,44 @@ import time
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from pathlib import Path
 from textwrap import indent
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, TypeVar
+
+import click
 
 from lidarspec.cli.terminal import note, say, voice
 from lidarspec.errors import printable, system_errors
-from lidarspec.explaining.listing import Line, folded, text as plain_text
 
 if TYPE_CHECKING:
     from rich.progress import Progress as Bar
     from rich.text import Text
 
+Function = TypeVar("Function", bound=Callable[..., Any])
+
 #: seconds between two lines.
 PERIOD = 0.2
 #: blanks between columns of a table; those before prose below its row; the least width of prose beside it.
 GAP, HANGING, PROSE = 2, 6, 24
-#: the colours of what stands in a line, by its role.
-STYLES = {
-    "title": "bold",
-    "offset": "dim",
-    "hex": "cyan",
-    "bits": "yellow",
-    "docs": "dim",
-    "good": "green",
-    "bad": "bold red",
-    "point": "magenta",
-    "note": "bold yellow",
-}
+
+
+def output_options(function: Function) -> Function:
+    """Add ``--json`` and ``-o/--output`` to a verb that prints."""
+    return click.option("--json", "as_json", is_flag=True, help="Print JSON.")(output_option(function))
+
+
+def output_option(function: Function) -> Function:
+    """Add ``-o/--output`` to a verb; a file that the verb reads is refused."""
+
+    @functools.wraps(function)
+    def checked(*args: Any, output: str | None, **others: Any) -> Any:
+        if output is not None:
+            from lidarspec.cli.inputs import refuse_overwriting
+            from lidarspec.spec.sensor import Sensor
+
+            words = [word for value in others.values() for word in (value if isinstance(value, tuple) else [value])]
+            refuse_overwriting(output, *(word for word in words if isinstance(word, str | Sensor)))
+        return function(*args, output=output, **others)
+
+    return click.option("-o", "--output", metavar="FILE", help="Write to a file instead of standard output.")(checked)  # type: ignore[return-value]
 
 
 class Progress(contextlib.AbstractContextManager["Progress"]):
@@ -132,34 +144,6 @@ def emit_parts(parts: Iterable[str | bytes], output: str | None, *, colour: bool
     with system_errors(output), replacing(path) if is_replaced else contextlib.nullcontext(path) as written, written.open("wb") as file:
         for part in parts:
             file.write(part if isinstance(part, bytes) else f"{part}\n".encode())
-
-
-def emit_lines(lines: Iterable[Line], output: str | None) -> None:
-    """Lines with roles, as they are made: in colours on a terminal, and folded to its width; as plain text anywhere else.
-
-    NO_COLOR and FORCE_COLOR are obeyed; what goes through a pipe in colours is not folded.
-    """
-    may_be_coloured = sys.stdout.isatty() or "FORCE_COLOR" in os.environ
-    if output is not None or not may_be_coloured:
-        emit_parts(map(plain_text, lines), output)
-        return
-    from rich.console import Console  # only for colours: importing it takes a third of the time of this verb
-
-    console = Console()
-    if not console.is_terminal:
-        emit_parts(map(plain_text, lines), output)
-        return
-    width = console.width if sys.stdout.isatty() else None
-    emit_parts((_coloured(line, width) for line in lines), output, colour=True)
-
-
-def _coloured(line: Line, width: int | None) -> str:
-    from rich.text import Text
-
-    drawing = Text()
-    for span in line if width is None else folded(line, width):
-        drawing.append(printable(span.text), STYLES.get(span.role))
-    return drawn(drawing)
 
 
 def emit_json(value: Any, output: str | None) -> None:

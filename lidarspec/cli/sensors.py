@@ -5,6 +5,7 @@
 
 from __future__ import annotations
 
+import sys
 from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any
 
@@ -12,20 +13,30 @@ import click
 
 from lidarspec._version import __version__
 from lidarspec.cli.failures import FINDINGS
-from lidarspec.cli.options import output_options
-from lidarspec.cli.output import emit, emit_json, table
+from lidarspec.cli.output import emit, emit_json, output_options, table
 from lidarspec.cli.terminal import note, say
 from lidarspec.errors import SpecError
-from lidarspec.known_sensors import KnownLink, no_sensors
-from lidarspec.plugins import Plugin, registry, sensor as named_sensor, summarize_links, tried
-from lidarspec.spec.sensor import Sensor
+from lidarspec.known_sensors import KnownLink, KnownSensor, list_described_sensors, no_sensors
 from lidarspec.trust import FILE, TRUSTED, trust as trusted, user_folder
 
 if TYPE_CHECKING:
+    from lidarspec.plugins import Plugin
     from lidarspec.spec.description import Frame
+    from lidarspec.spec.sensor import Sensor
 
 #: packets that a plan is shown for: as many as a turn may take, since some of them are shorter.
 PACKETS = 32
+
+
+def list_sensors() -> tuple[list[KnownSensor], list[Plugin]]:
+    """Return a row for each installed sensor, and the plugins that failed to load; most need not be loaded."""
+    is_fresh = "lidarspec.plugins" not in sys.modules  # else the program may have registered sensors of its own
+    rows = list_described_sensors() if is_fresh else None
+    if rows is not None:
+        return rows, []
+    from lidarspec.plugins import registry
+
+    return registry().list_sensors(), registry().failures
 
 
 def guide() -> str:
@@ -33,7 +44,7 @@ def guide() -> str:
     from lidarspec.device.settings import devices
     from lidarspec.transports.ports import serial_ports
 
-    known = registry().list_sensors()
+    known, _ = list_sensors()
     ports = [port.path for port in serial_ports()]
     named = list(devices())
     example = known[0].id if known else "ID"
@@ -67,17 +78,19 @@ def guide() -> str:
 @output_options
 def sensors(as_json: bool, output: str | None) -> None:
     """The installed sensors, and how far each is proven."""
-    known = registry().list_sensors()
+    known, broken = list_sensors()
     if as_json:
+        from lidarspec.plugins import registry
+
         homes = {row.id: row.distribution for row in known}
         loaded = registry().sensors()
+        broken = registry().failures
         emit_json([_facts(sensor) | {"distribution": homes.get(name, "")} for name, sensor in loaded.items()], output)
     elif known:
         rows = [[row.id, f"{row.vendor} {row.model}", _links(row.links), row.status, row.distribution] for row in known]
         emit(table(["id", "device", "link", "status", "distribution"], rows, output), output)
     if not known:
         note(no_sensors())
-    broken = registry().failures
     if broken:
         note(f"{len(broken)} plugin{'s' * (len(broken) > 1)} could not be loaded; next: lidarspec plugins")
 
@@ -88,6 +101,7 @@ def sensors(as_json: bool, output: str | None) -> None:
 @output_options
 def show(sensor_id: str, as_plan: bool, as_json: bool, output: str | None) -> None:
     """What a sensor is, and the wire table of each of its frames."""
+    from lidarspec.plugins import sensor as named_sensor, summarize_links
     from lidarspec.wire.wire_table import frame_size, wire_table
 
     sensor = named_sensor(sensor_id)
@@ -157,6 +171,8 @@ def plugins(ctx: click.Context, as_json: bool, output: str | None) -> None:
 
     Each is loaded in a process of its own first, so that one that hangs or ends the program is named. Exit code 1 where something is wrong.
     """
+    from lidarspec.plugins import tried
+
     found = tried()
     rows = [[p.distribution, p.version, p.entry_point, _told(p)] for p in found]
     if as_json:

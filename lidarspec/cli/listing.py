@@ -1,0 +1,52 @@
+"""Print the lines of an explanation, in colours on a terminal."""
+
+from __future__ import annotations
+
+import os
+import sys
+from collections.abc import Iterable
+
+from lidarspec.cli.output import drawn, emit_parts
+from lidarspec.errors import printable
+from lidarspec.explaining.listing import Line, folded, text as plain_text
+
+#: the colours of what stands in a line, by its role.
+STYLES = {
+    "title": "bold",
+    "offset": "dim",
+    "hex": "cyan",
+    "bits": "yellow",
+    "docs": "dim",
+    "good": "green",
+    "bad": "bold red",
+    "point": "magenta",
+    "note": "bold yellow",
+}
+
+
+def emit_lines(lines: Iterable[Line], output: str | None) -> None:
+    """Print lines as they are made: coloured and folded to its width on a terminal, else as plain text.
+
+    NO_COLOR and FORCE_COLOR are obeyed; coloured output into a pipe is not folded.
+    """
+    may_be_coloured = sys.stdout.isatty() or "FORCE_COLOR" in os.environ
+    if output is not None or not may_be_coloured:
+        emit_parts(map(plain_text, lines), output)
+        return
+    from rich.console import Console  # only for colours: importing it takes a third of the time of this verb
+
+    console = Console()
+    if not console.is_terminal:
+        emit_parts(map(plain_text, lines), output)
+        return
+    width = console.width if sys.stdout.isatty() else None
+    emit_parts((_colour(line, width) for line in lines), output, colour=True)
+
+
+def _colour(line: Line, width: int | None) -> str:
+    from rich.text import Text
+
+    drawing = Text()
+    for span in line if width is None else folded(line, width):
+        drawing.append(printable(span.text), STYLES.get(span.role))
+    return drawn(drawing)
