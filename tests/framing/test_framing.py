@@ -7,16 +7,17 @@ from concurrent.futures import ThreadPoolExecutor
 from typing import Any
 
 import pytest
-from construct import Array, Byte, Const, Int8ub, Struct, this
+from construct import Array, Byte, Const, Int8ub, Int16ub, Struct, this
 
 import lidarspec as ls
 import lidarspec.spec
 from lidarspec import Sensor
 from lidarspec.framing.frame_engine import CompiledCodec, codec
-from lidarspec.spec import Frame
+from lidarspec.spec import Checksummed, Frame, Sum
 from lidarspec.testing import hostile
 from lidarspec.testing.agreement import assert_backends_agree
 from lidarspec.testing.subject import Subject
+from tests.engine import against_construct
 from tests.engine.oracle import Oracle
 from tests.engine.streams import Books, damaged, decoded
 from tests.shapes import SHAPES
@@ -236,3 +237,17 @@ def test_a_line_says_what_things_are() -> None:
 def test_completion_offers_public_names_alone() -> None:
     for module in (ls, ls.spec):
         assert dir(module) == sorted(module.__all__)
+
+
+def test_a_frame_that_begins_with_a_free_byte_may_be_cut_anywhere() -> None:
+    """The sync bytes come second: where only the free byte has arrived, a frame may begin."""
+    struct = Struct("free" / Int8ub, "magic" / Const(b"\x55\xaa"), "value" / Int16ub, "sum" / Int8ub)
+    made = against_construct.sensor(Checksummed(struct, field="sum", algorithm=Sum(8)))
+    frames = [made.build("data", free=37 * number % 256, value=999 * number % 65_536) for number in range(12)]
+    data = b"\x01\x02".join(frames)
+    whole = [(found.offset, found.data) for found in made.split(data)]
+    assert [frame for _, frame in whole] == frames
+    for cut in range(1, len(data)):
+        decoder = made.decoder(stream=True)
+        found = decoder.feed(data[:cut]) + decoder.feed(data[cut:]) + decoder.finish()
+        assert [(one.offset, one.data) for one in found] == whole
