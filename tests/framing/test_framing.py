@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import random
 from concurrent.futures import ThreadPoolExecutor
 from typing import Any
@@ -251,3 +252,13 @@ def test_a_frame_that_begins_with_a_free_byte_may_be_cut_anywhere() -> None:
         decoder = made.decoder(stream=True)
         found = decoder.feed(data[:cut]) + decoder.feed(data[cut:]) + decoder.finish()
         assert [(one.offset, one.data) for one in found] == whole
+
+
+@pytest.mark.parametrize("confirm", [2, 3])
+def test_a_weak_frame_counts_in_runs_of_the_declared_length(confirm: int) -> None:
+    weak = SHAPES["shape-weak"]
+    frames = {"data": dataclasses.replace(weak.frames["data"], confirm=confirm)}
+    sensor = dataclasses.replace(weak, frames=frames)
+    frame = weak.example("data")
+    assert sensor.split(frame * (confirm - 1)) == []
+    assert [found.data for found in sensor.split(frame * confirm)] == [frame] * confirm
