@@ -8,6 +8,7 @@ order:
 * `options`, `inputs`: words as arguments: what verbs share, and where bytes come from.
 * `terminal`, `output`, `failures`: what is printed, and where it is lost; results as text, tables or JSON; failures as one message
   and an exit code.
+* `listing`: the lines of an explanation, in colours.
 * `sensors`, `frames`, `build`: what is installed, what a frame says, a frame out of values.
 * `read`, `view`: a sensor at work: rows and figures, a picture.
 * `recordings`, `files`: into a file and out again; from file to file.
