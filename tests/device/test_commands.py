@@ -375,7 +375,7 @@ def test_a_sensor_that_nothing_was_heard_of_cannot_be_sent_to() -> None:
 
 
 def test_an_unknown_control_address_is_asked_for() -> None:
-    commands = {"start": dataclasses.replace(SENSOR.commands["start"], link="control")}
+    commands = {"start": dataclasses.replace(SENSOR.commands["start"], link="control", timeout=0.2, retries=0)}
     links: dict[str, Udp | Tcp] = {"data": Udp(7009), "control": Tcp(7010)}
     sensor = dataclasses.replace(SENSOR, links=links, commands=commands, on_close=())
     with pytest.raises((SourceError, CommandError), match="nobody knows the address of the control link"):
