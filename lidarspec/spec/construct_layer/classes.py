@@ -122,11 +122,15 @@ class MarkedStruct(Struct):  # type: ignore[misc]
         return inner
 
     def _inner(self, stream: Any, context: Any, *, is_parsing: bool) -> Container:
-        """What its members' expressions see; `_marks`: where members stand; `_sizings`: what has to say how long any of them are."""
+        """The context of the members' expressions.
+
+        `_marks` holds (start, end) by name, `_sizings` (sizing, path, offset, value) of each field that states a length.
+        """
         inner = Container(_=context, _params=context._params, _root=None, _parsing=is_parsing, _building=not is_parsing, _sizing=False)
         inner._subcons, inner._io, inner._index = self._subcons, stream, context.get("_index", None)
         inner._root = context.get("_root", None) or inner
-        inner._marks, inner._sizings = dict[str, tuple[int, int]](), list[tuple[Sizing, str, int, Any]]()
+        inner._marks = {}
+        inner._sizings = []
         return inner
 
 
