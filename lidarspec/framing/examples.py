@@ -31,9 +31,13 @@ from lidarspec.wire.parts import Measure
 from lidarspec.wire.schema import schema
 from lidarspec.wire.slots import recoder
 
-#: random frames made at once, and how often, before a sensor's own `sweep` has to help.
-BATCH, TRIES = 64, 40
-#: those of a wire form, which are written one slot after another.
+#: How often random frames are made, and how often where a sensor's own `sweep` helps if none is plausible.
+TRIES = 40
+TRIES_BEFORE_SWEEP = 8
+#: Random frames of the first try, and at most of a later one; each try makes four times as many.
+FIRST_BATCH = 1
+LARGEST_BATCH = 64
+#: At most so many of a wire form, which are written one slot after another.
 WRITTEN = 8
 #: random headers of which one at least gives a frame.
 HEADERS = 400
@@ -50,11 +54,11 @@ def example(sensor: Spec, frame: str, *, seed: int = 0) -> bytes:
     """
     if frame not in sensor.frames:
         raise UnknownFrame(frame, sensor.frames, place=sensor.id)
-    return examples(sensor, frame, random.Random(f"{sensor.id} {frame} {seed}"))[0]
+    return random_frame(sensor, frame, random.Random(f"{sensor.id} {frame} {seed}"))
 
 
-def examples(sensor: Spec, frame: str, source: random.Random, drawn: Drawn = NOTHING) -> list[bytes]:
-    """Some valid frames of one random header, at least one: what `example` picks from, for tests that need many.
+def random_frame(sensor: Spec, frame: str, source: random.Random, drawn: Drawn = NOTHING) -> bytes:
+    """Return a valid frame with a random header and random content.
 
     Args:
         drawn: field path -> what draws its raw value, for what random values never make.
@@ -62,9 +66,10 @@ def examples(sensor: Spec, frame: str, source: random.Random, drawn: Drawn = NOT
     known = codec(sensor.frames[frame])
     engine = known.compiled
     if engine is None or engine.schema.parts:
-        return [_interpreted(sensor, frame, known, source, drawn)]
-    number = BATCH if recoder(engine.frame) is None else WRITTEN
-    for _ in range(TRIES):
+        return _interpreted(sensor, frame, known, source, drawn)
+    largest = LARGEST_BATCH if recoder(engine.frame) is None else WRITTEN
+    for attempt in range(TRIES if _sweep(sensor, frame) is None else TRIES_BEFORE_SWEEP):
+        number = min(FIRST_BATCH << 2 * attempt, largest)
         layout, chosen = header(engine, source, drawn)
         rows = _random(engine, layout, number, source)
         for path, draw in drawn.items():
@@ -74,8 +79,8 @@ def examples(sensor: Spec, frame: str, source: random.Random, drawn: Drawn = NOT
                 leaf.store(rows, np.array([draw(source) for _ in range(count)]).reshape(number, *leaf.shape))
         found = _plausible(sensor, frame, layout, _headed(rows, layout, chosen))
         if found:
-            return found
-    return [_swept(sensor, frame, engine, source)]
+            return found[0]
+    return _swept(sensor, frame, engine, source)
 
 
 def header(engine: CompiledCodec, source: random.Random, drawn: Drawn = NOTHING) -> tuple[Layout, dict[str, int]]:
@@ -139,7 +144,7 @@ def _random(engine: CompiledCodec, layout: Layout, number: int, source: random.R
 
 def _interpreted(sensor: Spec, frame: str, engine: Codec, source: random.Random, drawn: Drawn) -> bytes:
     """A frame that construct alone can read, or one of parts."""
-    for _ in range(BATCH * TRIES):
+    for _ in range(LARGEST_BATCH * TRIES):
         try:
             data = build(sensor, frame, _left_open(random_value(engine.frame.prepared, source, drawn), engine.frame.tree), {})
         except (UsageError, Fault):  # what was drawn goes not together; something else may
@@ -199,9 +204,14 @@ def _sent(sensor: Spec, frame: str, layout: Layout, rows: NDArray[np.uint8]) -> 
     return [data for data in recoding.written(rows, layout) if data is not None]
 
 
+def _sweep(sensor: Spec, frame: str) -> Callable[[int], Mapping[str, Any]] | None:
+    """Return the function of a packet number that gives its values, if the sensor declares one for this frame."""
+    return None if sensor.simulation is None else sensor.simulation_of(frame).sweep
+
+
 def _swept(sensor: Spec, frame: str, engine: CompiledCodec, source: random.Random) -> bytes:
     """A frame around the values that the sensor's `sweep` declares, where random ones are never plausible."""
-    sweep = sensor.simulation_of(frame).sweep
+    sweep = _sweep(sensor, frame)
     if sweep is None:
         raise SpecError("no random frame passes `plausible`, and there is no `sweep` to start from", path=frame, sensor=sensor.id)
     for _ in range(TRIES):

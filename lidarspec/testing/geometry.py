@@ -23,7 +23,7 @@ from numpy.typing import NDArray
 from lidarspec.columns.columns import Fields, aligned, unpadded
 from lidarspec.columns.graph import Node, sample_of, trace, traverse
 from lidarspec.errors import LidarSpecError, SpecError, UsageError
-from lidarspec.framing.examples import examples, header
+from lidarspec.framing.examples import header, random_frame
 from lidarspec.framing.frame_engine import CompiledCodec, codec
 from lidarspec.packets.packets import Packets
 from lidarspec.points.cloud import PointCloud
@@ -177,11 +177,11 @@ def a_single_point_has_a_direction(subject: Subject, name: str) -> None:
     counts = [path for path in header(engine, source)[1] if engine.schema.fields[path].const is None]
     for path in counts:
         try:
-            single = examples(subject.sensor, name, source, {**subject.drawers(name), path: lambda _: 1})
+            single = random_frame(subject.sensor, name, source, {**subject.drawers(name), path: lambda _: 1})
         except SpecError:
             continue
         try:
-            cloud = read(subject, name, (single * 3)[: max(3, subject.sensor.frames[name].confirm)]).points()
+            cloud = read(subject, name, [single] * max(3, subject.sensor.frames[name].confirm)).points()
         except SpecError as error:
             raise Violation("LS503", f"with {path} = 1: {error.reason}", f"{name}.{path}") from error
         unknown = bool(len(cloud)) and bool(np.isnan(cloud.azimuth).all())

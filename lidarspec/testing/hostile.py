@@ -19,7 +19,7 @@ import tracemalloc
 from collections.abc import Callable
 
 from lidarspec.errors import SpecError
-from lidarspec.framing.examples import examples
+from lidarspec.framing.examples import random_frame
 from lidarspec.framing.frame_engine import CompiledCodec, codec
 from lidarspec.framing.results import Frames
 from lidarspec.spec.sensor import Sensor
@@ -169,5 +169,5 @@ def _of_random_header(subject: Subject, name: str, seed: int) -> bytes:
     engine = codec(subject.sensor.frames[name])
     if isinstance(engine, CompiledCodec) and engine.size is None:
         with contextlib.suppress(SpecError):
-            return examples(subject.sensor, name, subject.source(f"header {seed} of {name}"), subject.drawers(name))[0]
+            return random_frame(subject.sensor, name, subject.source(f"header {seed} of {name}"), subject.drawers(name))
     return b""

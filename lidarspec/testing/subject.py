@@ -13,7 +13,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from lidarspec.framing.examples import examples
+from lidarspec.framing.examples import random_frame
 from lidarspec.framing.frame_engine import codec
 from lidarspec.spec import Frame, Sensor
 from lidarspec.spec.tree import FieldInfo, Sealed, nodes
@@ -166,7 +166,7 @@ class Subject:
         """The bytes of a valid frame with seeded content, drawn by the author's strategies where there are some."""
         if (frame, seed) not in self._known:
             drawn, source = self.drawers(frame), random.Random(f"{self.sensor.id} {frame} {seed}")
-            example = examples(self.sensor, frame, source, drawn)[0] if drawn else self.sensor.example(frame, seed=seed)
+            example = random_frame(self.sensor, frame, source, drawn) if drawn else self.sensor.example(frame, seed=seed)
             self._known[frame, seed] = example
         return self._known[frame, seed]
 

@@ -57,6 +57,7 @@ class TestSend:
         assert "no ack frame came within 0.2 s" in found.stderr
         assert f"next: lidarspec doctor {made.name} -s cspc-m1c1-mini" in found.stderr
 
+    @pytest.mark.slow
     def test_what_cannot_be_sent_to(self, tmp_path: Path) -> None:
         ran("send", "/dev/ttyNONE7", "start", "-s", "cspc-m1c1-mini", code=3)
         (tmp_path / "raw.bin").write_bytes(b"".join(simulate(ls.sensor("ldrobot-stl27l"), 9)))

@@ -161,6 +161,7 @@ def test_datagrams_recorded_from_a_socket_as_capture_and_recording(
         assert before == after
 
 
+@pytest.mark.slow
 @posix
 def test_ctrl_c_ends_a_recording_properly(tmp_path: Path, started: Callable[..., Running]) -> None:
     data = b"".join(frames(STREAM, 20))

@@ -63,7 +63,7 @@ def test_explain_of_a_named_sensor_loads_one_plugin_and_no_source() -> None:
     assert not unused & modules
 
 
-@pytest.mark.parametrize("source", ["file", "simulation"])
+@pytest.mark.parametrize("source", ["file", pytest.param("simulation", marks=pytest.mark.slow)])
 def test_reading_a_named_sensor_loads_no_plugin_but_that_of_its_relatives(source: str, tmp_path: Path) -> None:
     stream = tmp_path / "line.bin"
     stream.write_bytes(b"".join(map(bytes, ls.simulate(ls.sensor(SENSOR), FRAMES))))

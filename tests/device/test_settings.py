@@ -109,7 +109,7 @@ def test_the_users_own_file_comes_first_and_the_nearest_one_adds_to_it(folder: P
     project = folder / "lidarspec.toml"
     with pytest.warns(UserWarning, match=f"front: the device of {user}, not that of {project}"):
         assert settings.named("front") == found["front"]
-    said = ran("stats", "front", "-n", "1").stderr
+    said = ran("stats", "front", "-s", SENSOR, "-n", "1").stderr
     assert said.count(f"front: the device of {user}, not that of {project}") == 1
     (folder / "deep" / "lidarspec.toml").write_text("", encoding="utf-8")
     assert list(settings.devices()) == ["front", "desk"]

@@ -131,6 +131,7 @@ def swapped(data: list[bytes]) -> list[bytes]:
     return [data[i ^ 1] for i in range(len(data) & ~1)]
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("few_installed")
 @pytest.mark.parametrize(
     "as_it_comes",
@@ -268,13 +269,14 @@ def test_damage_does_not_hide_a_sensor() -> None:
 
 
 @pytest.mark.usefixtures("few_installed", "patient")
-@pytest.mark.parametrize("name", ["ldrobot-stl27l", "ldrobot-ld06"])
+@pytest.mark.parametrize("name", ["ldrobot-stl27l", pytest.param("ldrobot-ld06", marks=pytest.mark.slow)])
 def test_a_simulated_port_is_its_sensors(name: str) -> None:
     with virtual_port(name) as made:
         assert detected(made.path).id == name
         assert detected(f"serial://{made.path}?baud=230400").id == name
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("few_installed")
 def test_a_sensor_that_has_to_be_started_first() -> None:
     assert {"cspc-m1c1-mini", "slamtec-rplidar-a1"} <= {sensor.id for sensor in started_first()}
@@ -314,6 +316,7 @@ def test_udp_datagrams_of_two_senders_are_told_apart() -> None:
     assert found == {"127.0.0.1": "velodyne-vlp16", "127.0.0.2": "hesai-xt32"}
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("few_installed", "patient")
 def test_bytes_at_the_wrong_rate_fit_nobody(tmp_path: Path) -> None:
     source = random.Random(6)
@@ -354,6 +357,7 @@ def test_a_pseudo_terminal_is_listened_to_once() -> None:
 class TestStructure:
     """What unknown bytes are made of."""
 
+    @pytest.mark.slow
     def test_frames_of_one_length(self) -> None:
         data = b"".join(simulate(ls.sensor("ldrobot-stl27l"), 60))[13:]
         found = structure([data[:1000], data[1000:]], datagrams=False)
@@ -367,6 +371,7 @@ class TestStructure:
         assert (found.sync, found.period, str(found.length)) == (b"\xaa\x55", None, "10 + 3 x byte at 3")
         assert found.checksums[0].paste == "WordXor(head=8, groups=(1, 2))"
 
+    @pytest.mark.slow
     def test_long_frames_with_shorter_ones_in_them(self) -> None:
         found = structure([b"".join(simulate(ls.sensor("robosense-m1"), 60))], datagrams=False)
         assert found is not None

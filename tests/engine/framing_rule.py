@@ -17,7 +17,7 @@ from tests.engine.streams import LENGTH, MANY_HEADERS, Books, clean, damaged, de
 ERROR_RATES = (0.0, 1e-4, 1e-3, 5e-3)
 BURST_BYTES = (8, 16, 64)
 #: Offsets at which a short stream is split in two.
-QUICK_SPLITS = 30
+QUICK_SPLITS = 16
 
 
 def assert_like_oracle(subject: Subject, data: bytes, description: str) -> None:

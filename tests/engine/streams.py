@@ -9,7 +9,7 @@ import tracemalloc
 from collections.abc import Callable
 
 from lidarspec import Counters, Sensor, SpecError
-from lidarspec.framing.examples import examples, header
+from lidarspec.framing.examples import header, random_frame
 from lidarspec.framing.frame_engine import CompiledCodec, codec
 from lidarspec.testing import subject as material
 from lidarspec.testing.agreement import cuts
@@ -69,7 +69,7 @@ def longest_example(subject: Subject, name: str, headers: int = MANY_HEADERS) ->
         with contextlib.suppress(SpecError):
             _, longest = max((header(engine, source, subject.drawers(name)) for _ in range(headers)), key=lambda chosen: chosen[0].size)
             drawn = {path: (lambda _, value=value: value) for path, value in longest.items()}
-            found += examples(subject.sensor, name, source, subject.drawers(name) | drawn)
+            found.append(random_frame(subject.sensor, name, source, subject.drawers(name) | drawn))
     return max(found, key=len)
 
 

@@ -35,7 +35,7 @@ def test_much_damaged_input_reads_alike(name: str) -> None:
 
 
 #: Places at which a frame is cut.
-MAX_CUTS = 40
+MAX_CUTS = 20
 
 
 def fault_paths_in_arrays(sensor: Sensor, name: str) -> tuple[list[str], list[str]]:

@@ -16,10 +16,10 @@ from tests.representatives import REPRESENTATIVES, load_sensor
 from tests.shapes import SHAPES
 
 #: Mutated inputs of each sensor; long frames take their time.
-SHAPE_FRAMES = 170
-REPRESENTATIVE_FRAMES = 60
-DECODED_FRAMES = 260
-SEEDS = 3
+SHAPE_FRAMES = 60
+REPRESENTATIVE_FRAMES = 20
+DECODED_FRAMES = 340
+SEEDS = 2
 
 each_sensor = pytest.mark.parametrize("name", [*SHAPES, *REPRESENTATIVES])
 

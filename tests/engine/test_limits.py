@@ -44,7 +44,7 @@ def pending_bound(sensor: Sensor) -> int:
 @pytest.mark.parametrize("name", [pytest.param(name, marks=pytest.mark.slow if name in LONG_FRAMES else ()) for name in STREAMS])
 def test_a_decoder_holds_less_than_its_longest_frame(name: str) -> None:
     sensor = load_sensor(name)
-    for data in (garbage(4_000), worst(sensor, 4_000), Subject(sensor).stream(rounds=1)[:20_000]):
+    for data in (garbage(2_000), worst(sensor, 2_000), Subject(sensor).stream(rounds=1)[:6_000]):
         decoder = sensor.decoder()
         for chunk in material.pieces(data, random.Random(1)):
             decoder.feed(chunk)

@@ -74,6 +74,6 @@ def test_damage_that_one_bit_explains_is_told_with_the_field() -> None:
 
 def test_where_any_bit_may_have_flipped_only_that_is_told() -> None:
     sensor = ls.sensor("cspc-m1c1-mini")
-    data = sensor.example("data", seed=2)
+    data = max((sensor.example("data", seed=seed) for seed in range(9)), key=len)
     (note,) = explain(flipped(20, 2).mended(data), sensor, "data").notes
     assert re.fullmatch(r"one flipped bit would explain it, but in any of \d+ places, so that nothing can be said of where", note)

@@ -30,7 +30,7 @@ from tests.representatives import REPRESENTATIVES, load_sensor
 from tests.shapes import SHAPES
 
 each_sensor = pytest.mark.parametrize("name", [*SHAPES, *REPRESENTATIVES])
-EXAMPLES = 15
+EXAMPLES = 10
 
 
 @functools.cache

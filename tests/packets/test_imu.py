@@ -62,6 +62,7 @@ def test_both_engines_and_single_packets_read_alike(frame: str) -> None:
             np.testing.assert_array_equal(getattr(bulk, name), getattr(other, name))
 
 
+@pytest.mark.slow
 def test_a_simulated_sensor_is_at_rest_and_shakes_when_asked() -> None:
     for frame, number in (("imu", 2 * RATE), ("data", 400 * SAMPLES)):
         found = SENSOR.decode(sent(), frame).imu()

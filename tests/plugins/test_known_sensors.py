@@ -131,6 +131,7 @@ def test_with_one_plugin_verbs_name_the_distribution_to_install(one_plugin: Path
     assert "lidarspec-velodyne" in run(one_plugin, "read", capture, code=4).stderr
 
 
+@pytest.mark.slow
 def test_with_one_plugin_a_serial_stream_is_recognized(one_plugin: Path, tmp_path: Path) -> None:
     stream = tmp_path / "line.bin"
     stream.write_bytes(b"".join(bytes(frame) for frame in ls.simulate(ls.sensor("cspc-m1c1-mini"), 100)))

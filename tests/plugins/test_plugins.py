@@ -34,6 +34,7 @@ def test_sensor_of_a_foreign_distribution_is_found_and_decodes(tmp_path: Path, m
         assert lidarspec.sensor("ldrobot-stl27l").id == "ldrobot-stl27l"
 
 
+@pytest.mark.slow
 class TestStranger(SensorConformance):
     """The stranger's sensor straight from its file."""
 

@@ -57,6 +57,7 @@ def assert_same(some: list[Scan], others: list[Scan]) -> None:
             np.testing.assert_allclose(column, other.points.columns[name], rtol=0, atol=1e-12 if name == "time" else 0)
 
 
+@pytest.mark.slow
 def test_the_same_is_selected_wherever_scans_come_from(recordings: dict[str, Path], every: list[Scan]) -> None:
     select = Selection(scans=(3, 20), every=4, columns=("x", "y"))
     wanted = list(scans(recordings["pcap"], select))

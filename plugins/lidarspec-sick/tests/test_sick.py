@@ -91,7 +91,7 @@ def test_any_number_of_echoes_is_read_with_their_strengths(name: str, echoes: in
 
 @pytest.mark.parametrize("cola", ["A", "B"])
 @pytest.mark.parametrize("bits", [0, 8, 16])
-@pytest.mark.parametrize("echoes", [1, 2, 3, 4, 5])
+@pytest.mark.parametrize("echoes", [1, 2, *(pytest.param(echoes, marks=pytest.mark.slow) for echoes in (3, 4, 5))])
 def test_strengths_come_in_8_or_16_bits_or_not_at_all(echoes: int, bits: int, cola: str) -> None:
     sensor = LMS511.configure(cola=cola, echoes=echoes)
     frame = sensor.data_frames[0] if echoes == 1 else {"A": "echoes_text", "B": "echoes"}[cola]
