@@ -19,7 +19,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from lidarspec.columns.columns import Batch, Column, Fields, unpadded
+from lidarspec.columns.columns import Batch, Fields
 from lidarspec.columns.graph import Expression, Traced, conjuncts, sample_of, trace
 from lidarspec.errors import PluginError
 from lidarspec.framing.results import CHECKSUM, CONSTANT, IMPLAUSIBLE, LENGTH, PLUGIN, VALID
@@ -141,24 +141,21 @@ def intactness(seal: Seal, errors: list[PluginError], sums: Sums | None, rows: B
 
 
 def plausibility(frame: Frame, table: Table, errors: list[PluginError]) -> NDArray[np.uint8]:
-    """`VALID`, `IMPLAUSIBLE` or `PLUGIN` for each frame of a table, (n,), by the frame's own test."""
+    """`VALID`, `IMPLAUSIBLE` or `PLUGIN` for each frame of a table, (n,), by the frame's own test.
+
+    The frames are of one layout, so that no array is padded.
+    """
     assert frame.plausible is not None
     batch = Batch(table, np.zeros(len(table), np.bool_))
     try:
         with np.errstate(all="ignore"):
             answer = frame.plausible(Fields(batch))
         array = np.broadcast_to(np.asarray(answer), (len(table), *np.shape(answer)[1:])) if np.ndim(answer) else np.full(len(table), answer)
-        return np.where(_all(array, answer, batch), VALID, IMPLAUSIBLE).astype(np.uint8)
+        holds = array.reshape(len(array), math.prod(array.shape[1:])).astype(np.bool_).all(axis=1)
+        return np.where(holds, VALID, IMPLAUSIBLE).astype(np.uint8)
     except Exception as error:
         errors.append(PluginError.of(error, "plausible", function=frame.plausible))
         return np.full(len(table), PLUGIN, np.uint8)
-
-
-def _all(array: NDArray[Any], answer: Any, batch: Batch) -> NDArray[np.bool_]:
-    """Whether a condition holds everywhere in each frame, padding left out."""
-    flat = array.reshape(len(array), math.prod(array.shape[1:])).astype(np.bool_)
-    mask = unpadded(answer.axes, array.shape, batch) if isinstance(answer, Column) else None
-    return np.asarray((flat if mask is None else flat | ~mask).all(axis=1))
 
 
 class Conditions:
