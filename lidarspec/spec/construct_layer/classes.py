@@ -87,15 +87,20 @@ class MarkedStruct(Struct):  # type: ignore[misc]
     """A Struct whose parsed container holds, under ``_marks``, the (start, end) of each member in the stream."""
 
     def _parse(self, stream: Any, context: Any, path: str) -> Any:
-        obj, inner = Container(), self._inner(stream, context, is_parsing=True)
+        obj = Container()
+        inner = self._inner(stream, context, is_parsing=True)
+        marks = inner._marks
+        trail = context._params.get("_trail")
         for con in self.subcons:
             start = stream.tell()
             value = con._parsereport(stream, inner, path)
-            note(context, f"{path} -> {con.name or UNNAMED}", start, stream.tell(), value)
+            end = stream.tell()
+            if trail is not None:
+                trail.append(Seen(f"{path} -> {con.name or UNNAMED}", start, end, value))
             if con.name:
                 obj[con.name] = inner[con.name] = value
-                inner._marks[con.name] = (start, stream.tell())
-        obj["_marks"] = inner._marks
+                marks[con.name] = (start, end)
+        obj["_marks"] = marks
         for sizing, place, spot, value in inner._sizings if verifying(context, "lengths") else ():
             expected = sizing.value(obj)
             if value != expected:
@@ -111,12 +116,13 @@ class MarkedStruct(Struct):  # type: ignore[misc]
                 raise Mismatch(f"{path} -> {con.name}", 0, "a value", "none", "missing")
         inner = self._inner(stream, context, is_parsing=False)
         inner.update({name: value for name, value in obj.items() if name != "_marks"})
+        marks = inner._marks
         for con in self.subcons:
             start = stream.tell()
             value = con._build(obj.get(con.name), stream, inner, path)
             if con.name:
                 inner[con.name] = value
-                inner._marks[con.name] = (start, stream.tell())
+                marks[con.name] = (start, stream.tell())
         for sizing, place, _, _ in inner._sizings:
             context._params["_sizes"][place] = sizing.value(inner)
         return inner
@@ -146,11 +152,15 @@ class IndexedArray(Array):  # type: ignore[misc]
     def _parse(self, stream: Any, context: Any, path: str) -> Any:
         count = bounded(construct.evaluate(self.count, context), self.limit, "count", path)
         found = construct.ListContainer()
+        trail = context._params.get("_trail")
         for index in range(count):
             context._index = index
             start = stream.tell()
-            found.append(self.subcon._parsereport(stream, context, f"{path}[{index}]"))
-            note(context, f"{path}[{index}]", start, stream.tell(), found[-1])
+            place = f"{path}[{index}]"
+            element = self.subcon._parsereport(stream, context, place)
+            found.append(element)
+            if trail is not None:
+                trail.append(Seen(place, start, stream.tell(), element))
             if stream.tell() == start and not self.in_bits:
                 context._params["_empty"] = bounded(context._params.get("_empty", 0) + 1, self.limit, "count", path)
         return found
