@@ -6,8 +6,8 @@ import shutil
 
 import pytest
 
-#: without a display, without the sandbox that root has not, and with WebGL in software.
-FLAGS = ("--no-sandbox", "--use-angle=swiftshader", "--enable-unsafe-swiftshader")
+#: Without the sandbox that root lacks. WebGL is drawn in software, and the page around it without WebGL, which costs less.
+FLAGS = ("--no-sandbox", "--use-angle=swiftshader", "--enable-unsafe-swiftshader", "--disable-gpu-compositing")
 
 
 def installed() -> str:
