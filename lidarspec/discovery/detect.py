@@ -325,8 +325,12 @@ def _score(sensor: Sensor, chunks: Sequence[bytes], *, datagrams: bool, sums: Su
     if sensor.recognise is not None and datagrams and (options := sensor.recognise(tuple(chunks))):
         sensor = sensor.configure(**options)
     decoder = Decoder(sensor, stream=not datagrams, sums=sums)
-    pieces = chunks if datagrams else [b"".join(chunks)]  # many small chunks take far longer
-    items = [item for piece in pieces for item in decoder.feed(piece)] + decoder.finish()
+    # All at once: chunk by chunk takes ten times as long.
+    if datagrams:
+        items = decoder.datagrams(chunks).found()
+    else:
+        items = decoder.feed(b"".join(chunks))
+    items += decoder.finish()
     number = sum(decoder.stats.frames.get(name, 0) for name in sensor.data_frames)
     return Score(sensor, 1 - decoder.stats.bytes_skipped / decoder.stats.bytes_in, number, tuple(items)) if number else None
 
