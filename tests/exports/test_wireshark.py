@@ -19,7 +19,7 @@ from lidarspec.testing.subject import Subject
 from tests import made_captures as made
 from tests.exports.sharks import captured, columns, dissector, judged, tshark, written
 from tests.exports.trees import SHAPED, installed_sensors, is_recoded, recoded, values
-from tests.installed import distinct_sensors_in, sensor_modules
+from tests.installed import distinct_sensors_in, families_in, sensor_modules
 
 #: the shapes that Wireshark cannot be told, with the reason.
 REFUSED = {
@@ -75,7 +75,16 @@ def test_every_field_of_a_shape_reads_as_lidarspec_reads_it(name: str, tmp_path:
 
 @judged
 @pytest.mark.parametrize("module", sensor_modules())
-def test_every_field_of_an_installed_sensor_reads_as_lidarspec_reads_it(module: str, tmp_path: Path) -> None:
+def test_every_field_of_every_family_reads_as_lidarspec_reads_it(module: str, tmp_path: Path) -> None:
+    for sensor in families_in(module):
+        if not is_recoded(sensor):
+            assert_fields_are_read(sensor, tmp_path)
+
+
+@judged
+@pytest.mark.soak
+@pytest.mark.parametrize("module", sensor_modules())
+def test_every_field_of_every_sensor_reads_as_lidarspec_reads_it(module: str, tmp_path: Path) -> None:
     for sensor in distinct_sensors_in(module):
         if not is_recoded(sensor):
             assert_fields_are_read(sensor, tmp_path)

@@ -23,7 +23,7 @@ from lidarspec.wire.frame_table import Rows
 from tests.broken import sound
 from tests.engine.against_construct import clouds_agree, sensor
 from tests.engine.random_specs import made
-from tests.installed import distinct_sensors_in, sensor_modules
+from tests.installed import distinct_sensors_in, families_in, sensor_modules
 from tests.points.backends import BACKENDS
 from tests.shapes import SHAPES
 
@@ -47,7 +47,7 @@ def packets_of(sensor: Sensor, number: int) -> Packets:
     return sensor.decode(frames if is_datagram(sensor.links.get("data")) else b"".join(frames)).with_points
 
 
-@pytest.mark.parametrize("number", [1, 4, pytest.param(40, marks=pytest.mark.slow)])
+@pytest.mark.parametrize("number", [1, 4, pytest.param(12, marks=pytest.mark.slow)])
 @pytest.mark.parametrize("name", SHAPED)
 def test_a_plan_gives_what_the_plain_evaluation_gives(name: str, number: int) -> None:
     assert_planned_points_are_the_plain_ones(packets_of(SHAPES[name], number))
@@ -55,8 +55,19 @@ def test_a_plan_gives_what_the_plain_evaluation_gives(name: str, number: int) ->
 
 @pytest.mark.slow
 @pytest.mark.parametrize("module", sensor_modules())
+def test_every_family_of_sensors_has_a_plan(module: str) -> None:
+    assert_sensors_have_a_plan(families_in(module))
+
+
+@pytest.mark.soak
+@pytest.mark.parametrize("module", sensor_modules())
 def test_every_installed_sensor_has_a_plan(module: str) -> None:
-    for installed in distinct_sensors_in(module):
+    assert_sensors_have_a_plan(distinct_sensors_in(module))
+
+
+def assert_sensors_have_a_plan(sensors: list[Sensor]) -> None:
+    """Fail unless points of each sensor are planned, and are those of the plain evaluation."""
+    for installed in sensors:
         packets = packets_of(installed, 5)
         if packets.points().valid.any():  # headers of random counts may leave none
             assert isinstance(plan(packets), Plan), f"{installed.id}: {plan(packets)}"
