@@ -28,11 +28,13 @@ from lidarspec.scans.scans import ScanStream, scans_of
 from lidarspec.spec import OnChange, OnWrap, Udp
 from lidarspec.wire.frame_table import Rows
 from tests.broken import points_fail, sound
-from tests.points.backends import BACKENDS, KERNELS
+from tests.points.backends import BACKENDS, COMPILED
 from tests.representatives import REPRESENTATIVES
 from tests.shapes import SHAPES
 
 SHAPED = [name for name, sensor in SHAPES.items() if sensor.frames]
+#: Sensors whose kernels are compiled: a stream, datagrams, Cartesian points.
+COMPILED_CASES = [pytest.param(name, "jit", marks=COMPILED) for name in ("ldrobot-stl27l", "velodyne-vlp16", "livox-mid360")]
 
 
 @functools.cache
@@ -187,8 +189,7 @@ def test_packets_that_stay_where_they_were_read_give_the_same_points(name: str) 
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("backend", ["numpy", KERNELS])
-@pytest.mark.parametrize("name", REPRESENTATIVES)
+@pytest.mark.parametrize(("name", "backend"), [*((name, "numpy") for name in REPRESENTATIVES), *COMPILED_CASES])
 def test_packets_of_a_sensor_that_stay_where_they_were_read_give_the_same_points(name: str, backend: str) -> None:
     assert_place_of_packets_does_not_matter(ls.sensor(name), backend)
 
@@ -228,7 +229,7 @@ def test_a_number_of_sectors_that_is_none_is_refused_by_name(number: Any) -> Non
     assert scan.to_bins(np.int32(4)).shape == (4,)
 
 
-@pytest.mark.parametrize("backend", ["numpy", pytest.param("construct", marks=pytest.mark.slow)])
+@pytest.mark.parametrize("backend", ["numpy", pytest.param("construct", marks=pytest.mark.soak)])
 def test_a_scan_with_gaps_is_not_complete_and_one_whose_packets_are_mostly_lost_not_whole(backend: str) -> None:
     sensor = ls.sensor("cspc-m1c1-mini")
     frames = simulate(sensor, 1500)
