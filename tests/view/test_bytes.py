@@ -15,8 +15,12 @@ from tests.view.pages import FLAT, SOLID, Page, Station, recorded
 
 #: a byte stream, datagrams, points that wait for the next packet, parts of a frame, text on the wire, messages of several datagrams.
 SENSORS = (FLAT, SOLID, "slamtec-rplidar-a1", "sick-multiscan136", "hokuyo-ust10lx", "robosense-airy", "livox-mid360", "velodyne-vlp16")
+#: How fast sensors of many points are simulated: simulating some of them at full speed takes a whole processor.
+SLOWLY = "rate=0.3"
 #: points of a scan that are asked for.
 ASKED = 8
+#: The same of sensors whose frames take long to explain.
+ASKED_OF_LONG_FRAMES = 3
 
 
 def agree(page: Page, header: dict[str, Any], columns: dict[str, np.ndarray], spot: int, scan: ls.Scan) -> None:
@@ -45,13 +49,15 @@ def agree(page: Page, header: dict[str, Any], columns: dict[str, np.ndarray], sp
 @pytest.mark.parametrize("sensor", [FLAT, *(pytest.param(name, marks=pytest.mark.slow) for name in SENSORS[1:])])
 def test_a_point_leads_to_its_frame_and_its_field(tmp_path: Path, sensor: str) -> None:
     """While newer scans arrive."""
-    with Station(f"sim:{sensor}", tmp_path) as station, station.page() as page:
+    source = f"sim:{sensor}" if sensor == FLAT else f"sim:{sensor}?{SLOWLY}"
+    with Station(source, tmp_path) as station, station.page() as page:
         page.scan()
         header, columns = page.scan()
         shown = station.broadcast.numbered(header["scan"])
         assert shown is not None
         assert page.scan()[0]["scan"] > header["scan"]
-        for spot in range(0, header["points"], max(header["points"] // ASKED, 1)):
+        asked = ASKED if sensor == FLAT else ASKED_OF_LONG_FRAMES
+        for spot in range(0, header["points"], max(header["points"] // asked, 1)):
             agree(page, header, columns, spot, shown.scan)
 
 
@@ -69,13 +75,13 @@ def test_a_point_of_a_file_leads_to_its_frame(tmp_path: Path, sensor: str, suffi
         assert page.asked("frame", number=0)["is"] == "gone"  # of what was read before
         shown = station.broadcast.numbered(header["scan"])
         assert shown is not None
-        for spot in range(0, header["points"], header["points"] // ASKED):
+        for spot in range(0, header["points"], header["points"] // ASKED_OF_LONG_FRAMES):
             agree(page, header, columns, spot, shown.scan)
 
 
 @pytest.mark.slow
 def test_lost_and_reordered_packets_do_not_mislead(tmp_path: Path) -> None:
-    with Station(f"sim:{SOLID}?loss=0.05&reorder=3", tmp_path) as station, station.page() as page:
+    with Station(f"sim:{SOLID}?loss=0.05&reorder=3&{SLOWLY}", tmp_path) as station, station.page() as page:
         page.state(lambda state: state["figures"] and state["figures"]["lost"])
         header, columns = page.scan()
         shown = station.broadcast.numbered(header["scan"])
@@ -87,7 +93,7 @@ def test_lost_and_reordered_packets_do_not_mislead(tmp_path: Path) -> None:
 @pytest.mark.slow
 def test_a_point_leads_to_its_frame_where_the_newest_bytes_are_gone(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("lidarspec.view.backlog.BYTES", 1)
-    with Station(f"sim:{SOLID}", tmp_path) as station, station.page() as page:
+    with Station(f"sim:{SOLID}?{SLOWLY}", tmp_path) as station, station.page() as page:
         header, columns = page.scan()
         shown = station.broadcast.numbered(header["scan"])
         assert shown is not None
@@ -145,7 +151,7 @@ def test_paused_bytes_stand_still(tmp_path: Path) -> None:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(("source", "what"), [(f"sim:{FLAT}?errors=0.0002", "flipped"), (f"sim:{SOLID}?errors=0.0001", "bit")])
+@pytest.mark.parametrize(("source", "what"), [(f"sim:{FLAT}?errors=0.0002", "flipped"), (f"sim:{SOLID}?errors=0.0001&{SLOWLY}", "bit")])
 def test_damaged_frames_are_listed_and_explained(tmp_path: Path, source: str, what: str) -> None:
     with Station(source, tmp_path) as station, station.page() as page:
         listed: list[dict[str, Any]] = []
@@ -186,7 +192,7 @@ def test_what_is_damaged_in_a_file_is_what_explain_finds(tmp_path: Path) -> None
 
 @pytest.mark.slow
 def test_nothing_is_listed_where_nothing_is_damaged(tmp_path: Path) -> None:
-    with Station(f"sim:{SOLID}?loss=0.05", tmp_path) as station, station.page() as page:
+    with Station(f"sim:{SOLID}?loss=0.05&{SLOWLY}", tmp_path) as station, station.page() as page:
         state = page.state(lambda state: state["figures"] and state["figures"]["lost"])
         assert state["damaged"] == {"total": 0, "newest": []}
         assert page.asked("frame", damaged=0) == {"is": "gone", "what": "damaged piece 0"}

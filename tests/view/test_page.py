@@ -31,7 +31,8 @@ RATE = 1800
 
 @pytest.fixture(scope="module")
 def m1(browser: Any) -> Iterator[Visit]:
-    with served("sim:robosense-m1") as link:
+    """A sensor of many points, slowed down to three scans a second."""
+    with served("sim:robosense-m1?rate=0.3") as link:
         visit = Visit(browser, link)
         yield visit
         visit.context.close()
