@@ -218,7 +218,7 @@ FORMS = ["pcap", "pcapng"]
 
 
 @pytest.mark.parametrize("form", FORMS)
-@pytest.mark.parametrize("number", [3, pytest.param(20, marks=pytest.mark.slow)])
+@pytest.mark.parametrize("number", [3, pytest.param(12, marks=pytest.mark.slow)])
 def test_truncated_at_every_byte(form: str, number: int) -> None:
     records = parts(form, number)
     capture = b"".join(records)
@@ -229,7 +229,7 @@ def test_truncated_at_every_byte(form: str, number: int) -> None:
 
 
 @pytest.mark.parametrize("form", FORMS)
-@pytest.mark.parametrize("inputs", [200, pytest.param(3000, marks=pytest.mark.slow)])
+@pytest.mark.parametrize("inputs", [200, pytest.param(1000, marks=pytest.mark.slow)])
 def test_mutations_give_the_same_as_one_by_one(form: str, inputs: int) -> None:
     draw = random.Random(16)
     capture = b"".join(parts(form, 10))

@@ -42,7 +42,7 @@ def is_steady(frames: Frames) -> bool:
 
 
 @pytest.mark.parametrize("name", [pytest.param(name, marks=() if name in QUICK_STREAMS else pytest.mark.slow) for name in STREAMS])
-@pytest.mark.parametrize("rate", [0.0, pytest.param(1e-3, marks=pytest.mark.slow), 5e-3])
+@pytest.mark.parametrize("rate", [0.0, pytest.param(1e-3, marks=pytest.mark.soak), 5e-3])
 def test_pieces_of_a_few_frames_give_what_the_whole_gives(name: str, rate: float) -> None:
     sensor = STREAMS[name]
     size = min(frame.max_length for frame in sensor.incoming.values())

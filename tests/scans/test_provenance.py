@@ -23,8 +23,11 @@ FRAMES = 200
 FRAMES_OF_PARTS = 65
 #: points of all scans that are explained, about.
 POINTS = 24
-#: sensors of which many points are explained.
-LARGE = [pytest.param(name, marks=pytest.mark.slow) for name in ("robosense-airy", "velodyne-vlp16")]
+#: The same of sensors whose frames take long to explain.
+POINTS_OF_LARGE = 12
+#: Sensors with long frames.
+LARGE = ("robosense-airy", "velodyne-vlp16")
+NAMES = ("parts", "waiting parts", "ldrobot-stl27l", *(pytest.param(name, marks=pytest.mark.slow) for name in LARGE))
 
 
 def waiting_points(f: Fields) -> Polar:
@@ -59,14 +62,14 @@ def scans_of(sensor: Sensor, frames: list[bytes], together: int) -> tuple[list[S
 
 
 @pytest.mark.parametrize("together", [3, FRAMES, pytest.param(1, marks=pytest.mark.slow)])
-@pytest.mark.parametrize("name", ["parts", "waiting parts", "ldrobot-stl27l", *LARGE])
+@pytest.mark.parametrize("name", NAMES)
 def test_each_point_leads_to_its_frame_and_row(name: str, together: int) -> None:
     known = segments.SENSOR if name in ("parts", "waiting parts") else ls.sensor(name)
     sensor, frames = waiting() if name == "waiting parts" else known, frames_of(known)
     scans, offsets = scans_of(sensor, frames, together)
     seen = 0
     explain = functools.cache(lambda data, frame: ls.explain(data, sensor, frame))
-    points_per_scan = math.ceil(POINTS / len(scans))
+    points_per_scan = math.ceil((POINTS_OF_LARGE if name in LARGE else POINTS) / len(scans))
     for scan in scans:
         for index in range(0, len(scan), len(scan) // points_per_scan | 1):
             place = scan.provenance(index)
