@@ -21,7 +21,7 @@ from lidarspec.exports import Refused, beginning, export
 from lidarspec.framing.frame_engine import codec
 from lidarspec.testing import subject as material
 from lidarspec.wire.schema import Schema
-from tests.exports.trees import SHAPED, distinct_sensors, installed_sensors, recoded, values
+from tests.exports.trees import SHAPED, distinct_frames, distinct_sensors, installed_sensors, recoded, values
 
 GCC = shutil.which("gcc")
 needs_gcc = pytest.mark.skipif(GCC is None, reason="gcc is not installed")
@@ -158,7 +158,7 @@ def reader(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFact
 @pytest.mark.slow
 @needs_gcc
 def test_every_field_reads_as_lidarspec_reads_it(reader: Path) -> None:
-    frames = [(sensor, name, data) for sensor in subjects().values() for name in sensor.frames for data in _examples(sensor, name)]
+    frames = [(sensor, name, data) for sensor, name in distinct_frames(subjects().values()) for data in _examples(sensor, name)]
     for (sensor, name, data), (is_frame, length, found) in zip(frames, _read(reader, frames), strict=True):
         assert (is_frame, length) == (1, len(data)), f"{sensor.id} {name}"
         wanted = values(sensor.parse(data, frame=name))
@@ -173,11 +173,10 @@ def test_every_field_reads_as_lidarspec_reads_it(reader: Path) -> None:
 def test_damaged_frames_are_none_of_either_s(reader: Path) -> None:
     source = random.Random(1)
     frames = []
-    for sensor in subjects().values():
-        for name in sensor.frames:
-            data = sensor.example(name, seed=1)
-            frames += [(sensor, name, material.mutated(data, source)) for _ in range(12)]
-            frames += [(sensor, name, data[:cut]) for cut in {1, len(data) // 2, len(data) - 1}]
+    for sensor, name in distinct_frames(subjects().values()):
+        data = sensor.example(name, seed=1)
+        frames += [(sensor, name, material.mutated(data, source)) for _ in range(12)]
+        frames += [(sensor, name, data[:cut]) for cut in {1, len(data) // 2, len(data) - 1}]
     verdicts = [_is_frame(sensor, name, data) for sensor, name, data in frames]
     assert {True, False} <= set(verdicts)
     for (sensor, name, data), wanted, (is_frame, length, _) in zip(frames, verdicts, _read(reader, frames), strict=True):

@@ -30,6 +30,15 @@ def distinct_sensors() -> dict[str, Sensor]:
     return {**SHAPED, **installed_sensors()}
 
 
+def distinct_frames(sensors: Iterable[Sensor]) -> list[tuple[Sensor, str]]:
+    """Return each frame type of these sensors once, with the first sensor that has it."""
+    frames: dict[int, tuple[Sensor, str]] = {}
+    for sensor in sensors:
+        for name, frame in sensor.frames.items():
+            frames.setdefault(id(frame), (sensor, name))
+    return list(frames.values())
+
+
 def is_recoded(sensor: Sensor) -> bool:
     """Return whether a frame stands on the wire in a form that no other language reads."""
     return any(frame.wire is not None for frame in sensor.frames.values())
