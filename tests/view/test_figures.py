@@ -88,7 +88,7 @@ def test_ranges_stand_at_their_time() -> None:
 
 def test_a_long_source_is_held_in_part() -> None:
     peaks = []
-    for number in (900, 3600):
+    for number in (900, 1800):
         tracemalloc.start()
         figure = figures.of_ranges((at_range(index, 2.0) for index in range(number)), "title")
         peaks.append(tracemalloc.get_traced_memory()[1])

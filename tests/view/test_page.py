@@ -238,11 +238,12 @@ def test_text_of_the_sensor_is_never_part_of_the_page(browser: Any, tmp_path: Pa
 def test_a_page_whose_server_is_gone_connects_again(browser: Any) -> None:
     with socket.create_server(("127.0.0.1", 0)) as free:
         port = free.getsockname()[1]
-    with served("sim:ldrobot-stl27l", address=f"127.0.0.1:{port}") as link:
+    source = "sim:ldrobot-stl27l?rate=0.5"
+    with served(source, address=f"127.0.0.1:{port}") as link:
         visit = Visit(browser, link)
     visit.until(lambda: "connection is lost" in visit.text("#notice"), "nothing is said of it")
     assert visit.text("#status") == "no server"
-    with served("sim:ldrobot-stl27l", address=f"127.0.0.1:{port}"):
+    with served(source, address=f"127.0.0.1:{port}"):
         visit.until(lambda: visit.text("#status") == "streaming", "it does not connect again")
         assert not visit.page.locator("#notice").is_visible()
         asked = len(visit.asked_for("next"))
@@ -252,7 +253,7 @@ def test_a_page_whose_server_is_gone_connects_again(browser: Any) -> None:
 
 def test_a_hidden_page_asks_for_nothing(tmp_path: Path) -> None:
     """Without playwright, which keeps every page visible: tabs of one window, by the browser's own protocol."""
-    with served("sim:ldrobot-stl27l") as link, tabs(link, tmp_path) as (evaluated, turned):
+    with served("sim:ldrobot-stl27l?rate=0.5") as link, tabs(link, tmp_path) as (evaluated, turned):
         newest = "globalThis.lidarspec?.picture?.scan?.scan ?? 0"
 
         def goes_on() -> bool:
