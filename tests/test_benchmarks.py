@@ -57,7 +57,7 @@ for key, (_, fixed, is_stream) in FIXED.items():
 
 def measured(folder: Path, *options: str) -> list[dict[str, Any]]:
     record = folder / "record.json"
-    command = [sys.executable, str(RUN), "--quick", "--runs", "2", "--json", str(record), *options]
+    command = [sys.executable, str(RUN), "--quick", "--runs", "5", "--json", str(record), *options]
     done = subprocess.run(command, capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stderr
     rows: list[dict[str, Any]] = json.loads(record.read_text(encoding="utf-8"))["rows"]
@@ -68,7 +68,7 @@ def measured(folder: Path, *options: str) -> list[dict[str, Any]]:
 def test_single_frames_are_measured_beside_construct(tmp_path: Path) -> None:
     rows = measured(tmp_path, "--only", "parse")
     assert {row["work"] for row in rows} == {f"parse-{key}" for key in ("stl27l", "m1c1", "vlp16", "xt32", "m1")}
-    assert {(row["unit"], row["runs"]) for row in rows} == {("frames", 2)}
+    assert {(row["unit"], row["runs"]) for row in rows} == {("frames", 5)}
     for row in rows:
         assert set(row["times"]) == {"construct", "compiled"}
         assert row["million_per_s"] == pytest.approx(row["amount"] / row["seconds"] / 1e6)
