@@ -78,7 +78,7 @@ def test_one_scan_is_made_once_for_pages_that_ask_alike(tmp_path: Path) -> None:
 
 @pytest.mark.slow
 def test_ten_pages_see_one_source(tmp_path: Path) -> None:
-    with Station(f"sim:{SOLID}", tmp_path) as station, contextlib.ExitStack() as opened:
+    with Station(f"sim:{SOLID}?rate=0.3", tmp_path) as station, contextlib.ExitStack() as opened:
         pages = [opened.enter_context(station.page()) for _ in range(10)]
         for page in pages:
             page.say("next", most=5000)
