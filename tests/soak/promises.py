@@ -105,7 +105,15 @@ EVERY = (
     Promise(
         "",
         "the other long tests: exports, engines and points agree on what is drawn at random",
-        ("tests/exports", "tests/engine/test_random_specs.py", "tests/points", "tests/cli/test_new.py"),
+        (
+            "tests/exports",
+            "tests/engine/test_random_specs.py",
+            "tests/engine/test_agreement.py",
+            "tests/framing/test_steady.py",
+            "tests/points",
+            "tests/scans/test_scan_columns.py",
+            "tests/cli/test_new.py",
+        ),
         "thousands of specs, 60 points functions",
     ),
 )
