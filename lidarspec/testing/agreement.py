@@ -29,9 +29,9 @@ from lidarspec.testing.subject import MANY, Subject
 
 #: units in the last place by which coordinates of two evaluations may differ, at the size of the range.
 ULPS = 4
-#: how often the canary cuts a stream, and how often it damages one.
-CUTS, DAMAGED = 8, 1
-#: streams up to this length are also fed byte by byte.
+#: how often the canary cuts a stream with the usual number of examples and at least, and how often it damages one.
+CUTS, LEAST_CUTS, DAMAGED = 8, 2, 1
+#: streams up to this length are also fed byte by byte, with the usual number of examples.
 SHORT_STREAM = 4000
 
 
@@ -222,8 +222,9 @@ def _cut_anywhere(subject: Subject, data: bytes) -> None:
     sensor, source = subject.sensor, subject.source("cuts")
     whole = sensor.decoder()
     expected = cuts(whole.feed(data) + whole.finish())
-    splits = [list(material.pieces(data, source)) for _ in range(CUTS if len(sensor.frames) <= MANY else CUTS // 4)]
-    splits += [[data[spot : spot + 1] for spot in range(len(data))]] if len(data) <= SHORT_STREAM else []
+    rounds = CUTS if len(sensor.frames) <= MANY else CUTS // 4
+    splits = [list(material.pieces(data, source)) for _ in range(subject.scale_rounds(rounds, LEAST_CUTS))]
+    splits += [[data[spot : spot + 1] for spot in range(len(data))]] if len(data) <= subject.scale_rounds(SHORT_STREAM) else []
     for split in splits:
         decoder = sensor.decoder()
         found = cuts([frame for chunk in split for frame in decoder.feed(chunk)] + decoder.finish())

@@ -26,10 +26,12 @@ from lidarspec.testing.findings import Violation, require
 from lidarspec.testing.subject import MANY, Subject
 from lidarspec.wire.layout import Layout
 
-#: values that each byte of a frame is changed to where construct alone reads it.
+#: values that each byte of a frame is changed to where construct alone reads it, with the usual number of examples.
 CHANGES = 8
 #: example frames that edits begin with, and the most edits at once.
 BASES, MOST = 8, 3
+#: places at which a frame is cut short, at least.
+LEAST_CUTS = 12
 #: frames of which every bit is flipped.
 SAMPLES = 3
 
@@ -69,7 +71,7 @@ def every_raw_value_survives(subject: Subject, name: str) -> None:
     sensor, source, engine = subject.sensor, subject.source(f"raw {name}"), codec(subject.sensor.frames[name])
     if isinstance(engine, CompiledCodec):
         return
-    rounds, changes = (3, CHANGES) if isinstance(engine, InterpretedCodec) else (1, 1)  # what has a wire form is compiled behind it
+    rounds, changes = (3, subject.scale_rounds(CHANGES)) if isinstance(engine, InterpretedCodec) else (1, 1)  # what has a wire form is compiled behind it
     sealed = material.seals(sensor, name, b"")
     follows = {info.path for info in engine.schema.fields.values() if info.rebuilt is not None or info.held}
     plain = [subject.example(name, seed=seed) for seed in range(rounds)]
@@ -183,12 +185,12 @@ def values_survive_building_and_parsing(subject: Subject, name: str) -> None:
     from hypothesis import HealthCheck, given, seed, settings, strategies as st
 
     sensor, fields = subject.sensor, subject.fields(name)
-    bases = [sensor.parse(subject.example(name, seed=number), frame=name) for number in range(BASES)]
+    number = len(subject.seeds(sensor.frames[name]))
+    bases = [sensor.parse(subject.example(name, seed=base), frame=name) for base in range(min(BASES, number))]
     if not any(free(fields.get(path)) for base in bases for _, _, path in material.integers(base)):
         return
     values = {path: _values(info, subject.strategies.get(f"{name}.{path}"), st) for path, info in fields.items() if free(info)}
 
-    number = len(subject.seeds(sensor.frames[name]))
     quiet: dict[str, Any] = {"deadline": None, "database": None, "print_blob": False, "suppress_health_check": list(HealthCheck)}
 
     @seed(0)
@@ -248,7 +250,8 @@ def free(info: FieldInfo | None) -> bool:
 def a_truncated_frame_is_a_wire_error(subject: Subject, name: str) -> None:
     """A frame that is cut short at any byte is a `WireError` with its place."""
     data = subject.example(name, seed=2)
-    for end in material.places(len(data), subject.source("cut")):
+    spots = subject.scale_rounds(material.SPOTS, LEAST_CUTS)
+    for end in material.places(len(data), subject.source("cut"), spots):
         try:
             subject.sensor.parse(data[:end], frame=name)
         except WireError as error:

@@ -28,11 +28,12 @@ def delivery(sensor: Sensor, frames: list[tuple[str, bytes]]) -> Any:
     return parts if sensor.datagrams else b"".join(parts)
 
 
-def places(length: int, source: random.Random) -> list[int]:
+def places(length: int, source: random.Random, spots: int = SPOTS) -> list[int]:
     """Where to cut so many bytes: everywhere if they are few, else at the ends and at random."""
-    if length <= SHORT:
+    if length <= SHORT * spots // SPOTS:
         return list(range(length))
-    return sorted({0, 1, 2, 3, length - 2, length - 1, *source.sample(range(length), SPOTS)})
+    ends = {0, 1, 2, 3, length - 2, length - 1} & set(range(length))
+    return sorted({*ends, *source.sample(range(length), min(spots, length))})
 
 
 def pieces(data: bytes, source: random.Random) -> Iterator[bytes]:
@@ -108,8 +109,9 @@ def seals(sensor: Sensor, name: str, data: bytes) -> set[str]:
     return {leaf.info.path for seal in getattr(found, "seals", ()) for leaf in seal.leaves}
 
 
-#: examples of each frame type that a property tries.
-EXAMPLES = int(os.environ.get("LIDARSPEC_EXAMPLES", "40"))
+#: examples of each frame type that a property tries, and those for which numbers of rounds are stated.
+USUAL_EXAMPLES = 40
+EXAMPLES = int(os.environ.get("LIDARSPEC_EXAMPLES", USUAL_EXAMPLES))
 #: sensors with more frame types than this are tried with less of each.
 MANY = 8
 #: values that are drawn from a hypothesis strategy.
@@ -162,6 +164,10 @@ class Subject:
         few *= 2 if len(self.sensor.frames) > MANY else 1
         return range(max(int(self.examples * share) // few, 3))
 
+    def scale_rounds(self, rounds: int, least: int = 1) -> int:
+        """Return a number of rounds that is meant for the usual number of examples, scaled to `examples`."""
+        return max(rounds * self.examples // USUAL_EXAMPLES, least)
+
     def example(self, frame: str, *, seed: int = 0) -> bytes:
         """The bytes of a valid frame with seeded content, drawn by the author's strategies where there are some."""
         if (frame, seed) not in self._known:
@@ -182,10 +188,11 @@ class Subject:
         frames: list[tuple[str, bytes]] = []
         for turn in range(rounds):
             for name in self.sensor.incoming:
-                frame, first = self.sensor.frames[name], seed * 1000 + turn * 10
+                frame = self.sensor.frames[name]
+                number = frame.confirm + 2 if frame.data or frame.confirm > 1 else 1
+                first = seed * 1000 + turn * number  # the lowest seeds, whose examples other properties use as well
                 if frame.after is not None:
                     frames.append((frame.after, self.example(frame.after, seed=first)))
-                number = frame.confirm + 2 if frame.data or frame.confirm > 1 else 1
                 frames += [(name, self.example(name, seed=first + index)) for index in range(number)]
         return frames
 
