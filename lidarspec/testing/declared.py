@@ -29,6 +29,8 @@ from lidarspec.wire.schema import without_indices
 MEASURES = frozenset(["distance", "range", "radius", "angle", "azimuth", "elevation", "temperature", "voltage", "timestamp"])
 #: share of the places in a payload at which a sync pattern may stand by chance.
 COMMON = 1 / 200
+#: example frames in whose payloads the sync pattern is counted, with the usual number of examples.
+SYNC_EXAMPLES = 12
 #: bits of constants and checksums below which noise makes a frame every few megabytes, on a stream and in a datagram.
 WEAK, WEAK_DATAGRAM = 24, 8
 #: how many times the length of the longest random frame a longest length may be.
@@ -209,7 +211,8 @@ def _sync(subject: Subject, name: str, frame: Frame, engine: CompiledCodec) -> F
     if not engine.prefix:
         yield "LS204", "it has no constant bytes, and every byte is a candidate", name
         return
-    data = np.frombuffer(b"".join(subject.example(name, seed=seed)[max(engine.prefix) + 1 :] for seed in range(12)), np.uint8)
+    seeds = range(subject.scale_rounds(SYNC_EXAMPLES, least=4))
+    data = np.frombuffer(b"".join(subject.example(name, seed=seed)[max(engine.prefix) + 1 :] for seed in seeds), np.uint8)
     reach = max(engine.prefix) + 1
     if len(data) < 4 * reach:
         return

@@ -30,8 +30,8 @@ from lidarspec.wire.layout import Layout
 CHANGES = 8
 #: example frames that edits begin with, and the most edits at once.
 BASES, MOST = 8, 3
-#: places at which a frame is cut short, at least.
-LEAST_CUTS = 12
+#: places at which a frame is cut short or changed, at least.
+LEAST_SPOTS = 12
 #: frames of which every bit is flipped.
 SAMPLES = 3
 
@@ -71,11 +71,17 @@ def every_raw_value_survives(subject: Subject, name: str) -> None:
     sensor, source, engine = subject.sensor, subject.source(f"raw {name}"), codec(subject.sensor.frames[name])
     if isinstance(engine, CompiledCodec):
         return
-    rounds, changes = (3, subject.scale_rounds(CHANGES)) if isinstance(engine, InterpretedCodec) else (1, 1)  # what has a wire form is compiled behind it
+    if isinstance(engine, InterpretedCodec):
+        rounds = 3
+        changes = subject.scale_rounds(CHANGES)
+    else:  # a frame with a wire form is compiled behind it
+        rounds = 1
+        changes = 1
     sealed = material.seals(sensor, name, b"")
     follows = {info.path for info in engine.schema.fields.values() if info.rebuilt is not None or info.held}
     plain = [subject.example(name, seed=seed) for seed in range(rounds)]
-    for example, spot in ((one, spot) for one in plain for spot in material.places(len(one), source) for _ in range(changes)):
+    spots = subject.scale_rounds(material.SPOTS, LEAST_SPOTS)
+    for example, spot in ((one, spot) for one in plain for spot in material.places(len(one), source, spots) for _ in range(changes)):
         data = bytearray(example)
         data[spot] = source.randrange(256)
         try:
@@ -250,7 +256,7 @@ def free(info: FieldInfo | None) -> bool:
 def a_truncated_frame_is_a_wire_error(subject: Subject, name: str) -> None:
     """A frame that is cut short at any byte is a `WireError` with its place."""
     data = subject.example(name, seed=2)
-    spots = subject.scale_rounds(material.SPOTS, LEAST_CUTS)
+    spots = subject.scale_rounds(material.SPOTS, LEAST_SPOTS)
     for end in material.places(len(data), subject.source("cut"), spots):
         try:
             subject.sensor.parse(data[:end], frame=name)

@@ -44,16 +44,20 @@ from lidarspec.testing.frames import acceptable
 from lidarspec.testing.subject import Subject
 from lidarspec.wire.frame_table import Rows
 
-#: packets along the sweep whose directions are looked at, and packets in the room of a scene.
-PACKETS, SCENE_PACKETS = 400, 200
+#: packets along the sweep whose directions are looked at.
+PACKETS = 400
+#: packets in the room of a scene, of short frames and of frames longer than `LONG_FRAME_BYTES`.
+SCENE_PACKETS = 200
+LONG_SCENE_PACKETS = 50
+LONG_FRAME_BYTES = 1500
 #: radians beyond which an azimuth along a sweep, or a drawn one, can only be degrees.
 TURNS, DRAWN = 4 * np.pi, 15 * np.pi
 #: share of the steps that go one way where a sensor rotates, and the step against it that is too much, radians and medians.
 ONE_WAY, BACK, MEDIANS = 0.8, np.deg2rad(1.5), 4
 #: raw steps by which an angle is moved to see whether the points move with it.
 SMALL = 4
-#: seeds of the examples that values are put into, until one has points.
-BASES = range(1, 9)
+#: examples that values are put into, until one has points, with the usual number of examples.
+BASES = 8
 #: radians from point to point above which they turn.
 SEEN = 1e-5
 #: share of a direction along one of two axes from which on it is that axis's.
@@ -62,16 +66,19 @@ ALONG = 0.9
 EXACT, UNTOLD = 2e-6, 0.004
 
 
-def swept(subject: Subject, name: str, packets: int, start: int = 0) -> list[bytes]:
-    """Packets along the sensor's `sweep`; none where it declares none, or the frame type is not compiled."""
+def swept(subject: Subject, name: str, packets: int) -> list[bytes]:
+    """Return the first packets along the sensor's `sweep`, none if it declares none or the frame type is not compiled."""
     sweep = subject.sensor.simulation_of(name).sweep
     if sweep is None:
         return []
+    made = subject.swept.setdefault(name, [])
     try:
-        maker = FrameMaker(subject.sensor, name)
-        return maker.sealed(maker.table([sweep(start + index) for index in range(packets)]))
+        if len(made) < packets:
+            maker = FrameMaker(subject.sensor, name)
+            made += maker.sealed(maker.table([sweep(number) for number in range(len(made), packets)]))
     except LidarSpecError:
         return []
+    return made[:packets]
 
 
 def read(subject: Subject, name: str, frames: list[bytes], *, by_clock: bool = True) -> Packets:
@@ -270,7 +277,7 @@ def angles_are_in_order(subject: Subject, name: str) -> None:
 
 def counters_run_on(subject: Subject, name: str) -> None:
     """Along the sweep no packet counts as lost, late or doubled, and time does not run back."""
-    frames = swept(subject, name, 700 if subject.sensor.frames[name].max_length <= 1500 else 260)
+    frames = swept(subject, name, 700 if subject.sensor.frames[name].max_length <= LONG_FRAME_BYTES else 260)
     if not frames or name != subject.sensor.data_frame:
         return
     packets = read(subject, name, frames)
@@ -306,7 +313,7 @@ def _with_values(subject: Subject, name: str, path: str, values: tuple[int, ...]
     Raises:
         SpecError: where `points` fails on them.
     """
-    for seed in BASES:
+    for seed in range(1, 1 + subject.scale_rounds(BASES, least=4)):
         frames = list(itertools.takewhile(bool, (_with(subject, name, path, value, seed) for value in values)))
         if len(frames) < len(values):
             continue
@@ -361,8 +368,9 @@ def a_simulated_scene_comes_back(subject: Subject, name: str) -> None:
     """Packets simulated in a room decode to points on its walls, within the steps of the format."""
     room = furnished(len(subject.sensor.id))
     room = Room(room.walls, room.boxes)
+    is_long = subject.sensor.frames[name].max_length > LONG_FRAME_BYTES
     try:
-        block = simulation(subject.sensor, name).block(5, SCENE_PACKETS, room)
+        block = simulation(subject.sensor, name).block(5, LONG_SCENE_PACKETS if is_long else SCENE_PACKETS, room)
     except UsageError:
         return
     except LidarSpecError as error:

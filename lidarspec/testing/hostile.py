@@ -26,8 +26,8 @@ from lidarspec.spec.sensor import Sensor
 from lidarspec.testing.findings import require
 from lidarspec.testing.subject import Subject
 
-#: bytes of a stream, and how many of each kind are tried.
-LENGTH, TRIES = 12_000, 2
+#: bytes of a stream.
+LENGTH = 12_000
 #: function calls that a stream may take per byte. The engine needs up to 16 for the sensors that exist, and 40 where construct
 #: reads every frame.
 MAX_CALLS_PER_BYTE = 100
@@ -41,12 +41,16 @@ ANNOUNCED = 40
 
 def no_stream_costs_much_more_than_frames(subject: Subject) -> None:
     """No stream takes more than 100 function calls for each of its bytes, or is kept in more than 64 bytes of memory."""
-    tries = [streams(subject, seed) for seed in range(TRIES)]  # what is remembered of one does not help with the next
-    calls = {name: min(calls_per_byte(subject.sensor, made[name]) for made in tries) for name in tries[0]}
+    first = streams(subject)
+    calls = {name: calls_per_byte(subject.sensor, parts) for name, parts in first.items()}
+    dear = [name for name in calls if calls[name] >= MAX_CALLS_PER_BYTE]
+    if dear:  # a second stream does not pay for layouts that the engine remembers, and its own layouts are others
+        second = streams(subject, seed=1)
+        calls |= {name: min(calls[name], calls_per_byte(subject.sensor, second[name])) for name in dear}
     name = max(calls, key=lambda name: calls[name])
     subject.measured["the dearest stream"] = f"{name}, {calls[name]:.1f} calls a byte"
     require(calls[name] < MAX_CALLS_PER_BYTE, "LS416", f"{name}: {calls[name]:.0f} function calls for each byte")
-    held, name = max((kept(subject.sensor, tries[0][name]) / LENGTH, name) for name in calls if name != SMOOTH)
+    held, name = max((kept(subject.sensor, first[name]) / LENGTH, name) for name in calls if name != SMOOTH)
     require(held < MAX_KEPT_PER_BYTE, "LS416", f"{name}: {held:.0f} bytes are kept for each byte")
 
 
@@ -84,11 +88,17 @@ def calls_per_byte(sensor: Sensor, parts: list[bytes]) -> float:
 
 
 def kept(sensor: Sensor, parts: list[bytes]) -> int:
-    """Bytes that the frames of a stream are kept in, beside its own: the fewer of two tries, since the first makes what is remembered."""
+    """Return how many bytes the frames of a stream take, apart from its own bytes.
+
+    If these are too many, the stream is read again, because layouts that the engine remembers count only the first time.
+    """
     gc.freeze()  # collections are to look at what is made from here on, and at nothing else
     tracemalloc.start()
     try:
-        return min(_held(sensor, parts) for _ in range(2))
+        held = _held(sensor, parts)
+        if held >= MAX_KEPT_PER_BYTE * LENGTH:
+            held = min(held, _held(sensor, parts))
+        return held
     finally:
         tracemalloc.stop()
         gc.unfreeze()

@@ -131,6 +131,7 @@ class Subject:
         tested: related models that are tested too; frame types that they share are not tested one by one again.
         measured: what was measured of frames, in words, by what it is of.
         picture: what was measured of points, likewise: to be held against the manual.
+        swept: packets along the `sweep` of each data frame, as far as a property needed them.
     """
 
     sensor: Sensor
@@ -141,6 +142,7 @@ class Subject:
     tested: Sequence[Sensor] = ()
     measured: dict[str, str] = field(default_factory=dict)
     picture: dict[str, str] = field(default_factory=dict)
+    swept: dict[str, list[bytes]] = field(default_factory=dict, repr=False)
     _known: dict[tuple[str, int], bytes] = field(default_factory=dict, repr=False)
     _drawers: dict[str, dict[str, Callable[[random.Random], int]]] = field(default_factory=dict, repr=False)
 
@@ -183,10 +185,10 @@ class Subject:
             self._drawers[frame] = {path: _pooled(how) if hasattr(how, "example") else how for path, how in mine.items()}
         return self._drawers[frame]
 
-    def conversation(self, *, seed: int = 0, rounds: int = 3) -> list[tuple[str, bytes]]:
+    def conversation(self, *, seed: int = 0, rounds: int | None = None) -> list[tuple[str, bytes]]:
         """Frames of all incoming types as the sensor could send them: (type, bytes), each where it is looked for and believed."""
         frames: list[tuple[str, bytes]] = []
-        for turn in range(rounds):
+        for turn in range(self.scale_rounds(3, least=2) if rounds is None else rounds):
             for name in self.sensor.incoming:
                 frame = self.sensor.frames[name]
                 number = frame.confirm + 2 if frame.data or frame.confirm > 1 else 1
@@ -196,7 +198,7 @@ class Subject:
                 frames += [(name, self.example(name, seed=first + index)) for index in range(number)]
         return frames
 
-    def stream(self, *, seed: int = 0, rounds: int = 3) -> bytes:
+    def stream(self, *, seed: int = 0, rounds: int | None = None) -> bytes:
         """The bytes of a conversation."""
         return b"".join(data for _, data in self.conversation(seed=seed, rounds=rounds))
 

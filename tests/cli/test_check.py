@@ -54,12 +54,6 @@ def test_json_has_the_same(tmp_path: Path) -> None:
 
 
 @pytest.mark.slow
-def test_a_distribution_is_checked_with_all_of_its_sensors() -> None:
-    found = json.loads(ran("check", "lidarspec-ldrobot", "--max-examples", "3", "--json").stdout)
-    assert sorted(report["name"] for report in found) == ldrobot_ids()
-
-
-@pytest.mark.slow
 def test_what_was_measured_stands_beside_what_it_is_held_against() -> None:
     lines = ran("check", "ldrobot-stl27l", "--max-examples", "3").output.splitlines()
     assert lines == [
@@ -94,17 +88,15 @@ def test_a_file_with_the_id_of_an_installed_sensor_is_told_whose_it_is(tmp_path:
 
 
 @pytest.mark.slow
-def test_vectors_of_a_distribution_with_several_sensors_are_looked_at() -> None:
-    folder = ROOT / "plugins" / "lidarspec-ldrobot"
-    for name in ("ldrobot-ld06", "lidarspec-ldrobot", folder):
-        for report in json.loads(ran("check", name, "--max-examples", "3", "--json").stdout):
-            assert not {"vectors_hold", "every_data_field_is_pinned_down"} & report["skipped"].keys()
+@pytest.mark.parametrize("name", ["ldrobot-ld06", "lidarspec-ldrobot", ROOT / "plugins" / "lidarspec-ldrobot"])
+def test_a_sensor_or_all_of_a_distribution_are_checked_with_their_vectors(name: str | Path) -> None:
+    reports = json.loads(ran("check", name, "--max-examples", "3", "--json").stdout)
+    assert sorted(report["name"] for report in reports) == ([name] if name == "ldrobot-ld06" else ldrobot_ids())
+    for report in reports:
+        assert not {"vectors_hold", "every_data_field_is_pinned_down"} & report["skipped"].keys()
 
 
-@pytest.mark.slow
-def test_a_distribution_is_checked_by_its_folder(tmp_path: Path) -> None:
-    found = json.loads(ran("check", ROOT / "plugins" / "lidarspec-ldrobot", "--max-examples", "3", "--json").stdout)
-    assert sorted(report["name"] for report in found) == ldrobot_ids()
+def test_a_folder_of_a_distribution_that_is_not_installed_is_named(tmp_path: Path) -> None:
     (tmp_path / "pyproject.toml").write_text('[project]\nname = "lidarspec-nobody-has"\n', encoding="utf-8")
     assert f"lidarspec-nobody-has is not installed, or has no sensors: pip install -e {tmp_path}" in ran("check", tmp_path, code=3).stderr
 

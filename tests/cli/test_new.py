@@ -35,7 +35,7 @@ def installed(folder: Path) -> dict[str, str]:
     header = f"Metadata-Version: 2.1\nName: {project['name']}\nVersion: {project['version']}\n"
     (about / "METADATA").write_text(header, encoding="utf-8")
     paths = [str(folder), *filter(None, [os.environ.get("PYTHONPATH")])]
-    return {**os.environ, "PYTHONPATH": os.pathsep.join(paths), "LIDARSPEC_EXAMPLES": "8"}
+    return {**os.environ, "PYTHONPATH": os.pathsep.join(paths), "LIDARSPEC_EXAMPLES": "4"}
 
 
 def run(folder: Path, *words: object, code: int = 0) -> str:

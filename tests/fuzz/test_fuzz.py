@@ -11,11 +11,11 @@ from pathlib import Path
 import pytest
 
 import lidarspec as ls
-from tests.every_sensor import every_sensor
 from tests.fuzz import trial
 from tests.fuzz.__main__ import ROOT, spread
 from tests.fuzz.campaign import Job, keep, seeded
 from tests.fuzz.targets import SHARES, Target, targets
+from tests.representatives import REPRESENTATIVES
 from tests.shapes import SHAPES
 
 #: mutated inputs that the quick tier reads, in all; and at least so many for each target.
@@ -69,9 +69,9 @@ def test_neighbours_of_valid_input_do_no_harm(known: dict[str, Target], group: s
 
 
 @pytest.mark.slow
-def test_neighbours_of_valid_input_of_every_sensor_do_no_harm(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_neighbours_of_valid_input_of_sensors_do_no_harm(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(folder)
-    for target in targets(folder, every_sensor().values()).values():
+    for target in targets(folder, [ls.sensor(name) for name in REPRESENTATIVES]).values():
         read_neighbours(target, LEAST)
 
 
