@@ -95,6 +95,12 @@ def traced(subject: Subject, name: str) -> Any:
     Raises:
         Untraceable: where it cannot be traced, with the reason.
     """
+    if name not in subject.traced:
+        subject.traced[name] = _trace_points(subject, name)
+    return subject.traced[name]
+
+
+def _trace_points(subject: Subject, name: str) -> Any:
     few = [subject.example(name, seed=seed) for seed in (range(8) if subject.sensor.parts_with("points", name) else (0,))]
     packets = read(subject, name, few * subject.sensor.frames[name].confirm).with_points
     if not isinstance(packets.table, Rows) or not packets.table.groups:

@@ -131,6 +131,7 @@ class Subject:
         tested: related models that are tested too; frame types that they share are not tested one by one again.
         measured: what was measured of frames, in words, by what it is of.
         picture: what was measured of points, likewise: to be held against the manual.
+        traced: what `points` returns for traced columns of each data frame, as far as it could be traced.
         swept: packets along the `sweep` of each data frame, as far as a property needed them.
     """
 
@@ -142,6 +143,7 @@ class Subject:
     tested: Sequence[Sensor] = ()
     measured: dict[str, str] = field(default_factory=dict)
     picture: dict[str, str] = field(default_factory=dict)
+    traced: dict[str, Any] = field(default_factory=dict, repr=False)
     swept: dict[str, list[bytes]] = field(default_factory=dict, repr=False)
     _known: dict[tuple[str, int], bytes] = field(default_factory=dict, repr=False)
     _drawers: dict[str, dict[str, Callable[[random.Random], int]]] = field(default_factory=dict, repr=False)
