@@ -10,7 +10,6 @@ this module's own (`off`), not the simulator's. What is measured on the way is t
 from __future__ import annotations
 
 import contextlib
-import copy
 import dataclasses
 import itertools
 import math
@@ -339,7 +338,7 @@ def _turn(info: FieldInfo, nought: PointCloud, turned: PointCloud) -> int:
 
 def _with(subject: Subject, name: str, path: str, value: int, seed: int) -> bytes:
     """An example with every element of one field set; no bytes where no frame can carry it."""
-    parsed = copy.deepcopy(subject.sensor.parse(subject.example(name, seed=seed), frame=name))
+    parsed = subject.sensor.parse(subject.example(name, seed=seed), frame=name)
     for holder, key, own in list(material.integers(parsed)):
         if own == path:
             holder[key] = value
