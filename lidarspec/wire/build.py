@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import bisect
 import copy
 import functools
+import itertools
 import re
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
@@ -25,6 +27,8 @@ from lidarspec.wire.slots import SPELLING, Recoder, recoder
 
 #: how often a frame is built until its lengths agree: once more where it has any, and again where these themselves have no fixed length.
 RETRIES = 4
+#: The largest value that is tried for a field that counts.
+LARGEST_TRIED = 65535
 
 #: names of fields, and indices: a number, or "*" for every element.
 Steps = list[int | str]
@@ -439,17 +443,22 @@ def _place(values: Any, path: str) -> tuple[Any, str]:
 
 
 def _solved(count: Formula, read: Read, holder: Container, field: str, length: int, info: FieldInfo, axis: str) -> int:
-    """The value of the count field that gives this length."""
-    top = info.limits[1] if info.kind == "int" else 65535
+    """Return the value of the count field that gives this length, and leave it in its holder."""
+    top = int(info.limits[1]) if info.kind == "int" else LARGEST_TRIED
 
-    def gives(value: int) -> bool:
+    def length_for(value: int) -> Any:
         holder[field] = value
         try:
-            return bool(evaluated(count, read) == length)
+            return evaluated(count, read)
         except Exception:  # an expression of the struct, that may divide by what is tried
-            return False
+            return -1
 
-    for value in (length, *range(int(min(top, 65535)) + 1)):
-        if value <= top and gives(value):
-            return int(value)
+    tried = range(min(top, LARGEST_TRIED) + 1)
+    # Mostly the length itself, or a number that the length grows with.
+    if length <= top and length_for(length) == length:
+        return length
+    guess = bisect.bisect_left(tried, length, key=length_for)
+    for value in itertools.chain((guess,), tried):
+        if value <= top and length_for(value) == length:
+            return value
     raise UsageError(f"{axis}: no value of {field} gives {length}")
