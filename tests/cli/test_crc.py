@@ -57,6 +57,7 @@ def test_few_frames_are_weak() -> None:
     assert "this may be chance: give more frames" in ran("crc", *(frame.hex() for frame in FRAMES[:2])).stderr
 
 
+@pytest.mark.slow
 def test_none_is_found_and_nothing_is_no_input(tmp_path: Path) -> None:
     source = random.Random(2)
     assert "no checksum of 9 frames was found" in ran("crc", *(source.randbytes(14).hex() for _ in range(9)), code=1).stderr

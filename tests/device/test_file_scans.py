@@ -26,7 +26,6 @@ from tests.shapes import SHAPES
 NAMES = [
     "shape-headed",
     "shape-inertia",
-    "shape-joined",
     "shape-lines",
     "shape-tokens",
     "ldrobot-stl27l",
@@ -34,6 +33,7 @@ NAMES = [
 ]
 #: the same in more forms: data in parts, calibration in other frames, messages of several datagrams.
 MORE = [
+    "shape-joined",
     "cepton-vista",
     "hesai-jt16",
     "hesai-pandar40p",

@@ -33,6 +33,8 @@ FRAMING_SHAPES = (
     "shape-lines",
     "shape-escaped",
 )
+#: Shapes whose large frames take the oracle long.
+LARGE_SHAPES = ("shape-joined", "shape-channels")
 #: Rules that every shape is held to in the quick tier.
 QUICK_RULES = (rule.any_split_gives_the_same, rule.every_recoverable_frame_is_recovered, rule.idle_gives_up_pending_bytes)
 #: Bytes of a stream in the quick tier.
@@ -61,7 +63,7 @@ def subject_of(name: str) -> Subject:
 each_rule = pytest.mark.parametrize("holds", rule.RULES, ids=lambda holds: holds.__name__)
 
 
-@pytest.mark.parametrize("name", STREAM_SHAPES)
+@pytest.mark.parametrize("name", [pytest.param(name, marks=pytest.mark.slow if name in LARGE_SHAPES else ()) for name in STREAM_SHAPES])
 def test_the_rule_holds_on_every_shape(name: str) -> None:
     for holds in rule.RULES if name in FRAMING_SHAPES else QUICK_RULES:
         holds(subject_of(name), QUICK_LENGTH)

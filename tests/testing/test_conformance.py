@@ -14,27 +14,22 @@ from tests.shapes import SHAPES
 INTERPRETED = {"shape-text data"}
 INTERPRETED_OF_HOKUYO = ("version", "parameters", "state")
 
-#: shapes whose examples are long, or that construct reads: over one second of processor time each.
-COSTLY = {
-    "shape-channels",
-    "shape-columns",
-    "shape-conversation",
-    "shape-escaped",
-    "shape-fragments",
-    "shape-headed",
-    "shape-joined",
-    "shape-lines",
-    "shape-measured",
-    "shape-millimetres",
-    "shape-modes",
-    "shape-options",
-    "shape-segments",
-    "shape-sized",
-    "shape-tags",
-    "shape-text",
-    "shape-tokens",
+#: Shapes that are held to all properties in the quick tier: one for each way to find, to check and to cut frames.
+QUICK = {
+    "shape-ahead",
+    "shape-bits",
+    "shape-calibration",
+    "shape-clock",
+    "shape-commands",
+    "shape-count",
+    "shape-datagrams",
+    "shape-floats",
+    "shape-middle",
+    "shape-nested",
+    "shape-nibbles",
+    "shape-weak",
 }
-CASES = [pytest.param(name, marks=pytest.mark.slow if name in COSTLY else ()) for name in SHAPES]
+CASES = [pytest.param(name, marks=() if name in QUICK else pytest.mark.slow) for name in SHAPES]
 
 
 @pytest.mark.parametrize("name", CASES)

@@ -115,9 +115,10 @@ def test_the_picture_follows_the_window(tmp_path: Path) -> None:
         assert terminal.ended() == 0
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("end", "code"),
-    [("\x03", 130), *(pytest.param(*case, marks=pytest.mark.slow) for case in ((signal.SIGTERM, 143), (signal.SIGHUP, 129)))],
+    [("\x03", 130), (signal.SIGTERM, 143), (signal.SIGHUP, 129)],
 )
 def test_whatever_ends_it_leaves_the_terminal_clean(tmp_path: Path, end: str | signal.Signals, code: int) -> None:
     with Terminal(*LIVE, cwd=tmp_path) as terminal:
