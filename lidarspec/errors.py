@@ -268,10 +268,11 @@ class UnknownSensor(UnknownName):
         super().__init__(name, known, place=place, hint=hint, aliases=aliases)
 
 
-class UnknownFrame(UnknownName):
+class UnknownFrame(UnknownName, KeyError):
     """The sensor has no frame type of this name."""
 
     what = "frame"
+    __str__ = Exception.__str__  # KeyError shows the repr of the message
 
 
 class UnknownField(UnknownName, AttributeError):  # type: ignore[misc]  # AttributeError.name is the same thing

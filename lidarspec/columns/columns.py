@@ -38,6 +38,7 @@ BITWISE = {np.bitwise_and, np.bitwise_or, np.bitwise_xor, np.invert}
 #: what is said where Python, or a bitwise operator, asks one answer of a column.
 NO_TRUTH = "a column has an answer for each packet: & | ~ in place of `and`, `or`, `not` and a < f.x < b, np.where in place of `if`"
 NO_BITS = "& | ~ take conditions, and fields are float64: each comparison in parentheses, (f.a < 1) & (f.b < 2); for bits a BitStruct"
+NO_TEXT = "columns are numbers and cannot be combined with {!r}; a field of bytes has one number per byte, such as 65 for b'A'"
 
 Carry = dict[int, NDArray[np.float64]]
 
@@ -150,6 +151,9 @@ class Column(NDArrayOperatorsMixin):
         except TypeError:
             if function in BITWISE:
                 raise SpecError(NO_BITS, rule="LS213") from None
+            texts = [value for value in values if isinstance(value, bytes | str)]
+            if texts:
+                raise SpecError(NO_TEXT.format(texts[0])) from None
             raise
         except ValueError:
             together({str(place): array for place, array in enumerate(arrays, 1)}, axes)

@@ -68,7 +68,7 @@ def random_frame(sensor: Spec, frame: str, source: random.Random, drawn: Drawn =
     if engine is None or engine.schema.parts:
         return _interpreted(sensor, frame, known, source, drawn)
     largest = LARGEST_BATCH if recoder(engine.frame) is None else WRITTEN
-    for attempt in range(TRIES if _sweep(sensor, frame) is None else TRIES_BEFORE_SWEEP):
+    for attempt in range(TRIES if sensor.simulation_of(frame).sweep is None else TRIES_BEFORE_SWEEP):
         number = min(FIRST_BATCH << 2 * attempt, largest)
         layout, chosen = header(engine, source, drawn)
         rows = _random(engine, layout, number, source)
@@ -204,14 +204,9 @@ def _sent(sensor: Spec, frame: str, layout: Layout, rows: NDArray[np.uint8]) -> 
     return [data for data in recoding.written(rows, layout) if data is not None]
 
 
-def _sweep(sensor: Spec, frame: str) -> Callable[[int], Mapping[str, Any]] | None:
-    """Return the function of a packet number that gives its values, if the sensor declares one for this frame."""
-    return None if sensor.simulation is None else sensor.simulation_of(frame).sweep
-
-
 def _swept(sensor: Spec, frame: str, engine: CompiledCodec, source: random.Random) -> bytes:
     """A frame around the values that the sensor's `sweep` declares, where random ones are never plausible."""
-    sweep = _sweep(sensor, frame)
+    sweep = sensor.simulation_of(frame).sweep
     if sweep is None:
         raise SpecError("no random frame passes `plausible`, and there is no `sweep` to start from", path=frame, sensor=sensor.id)
     for _ in range(TRIES):

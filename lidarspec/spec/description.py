@@ -6,17 +6,18 @@ arrays, and has no engine: engines are functions of a `Spec`. `lidarspec.spec.se
 
 from __future__ import annotations
 
+import functools
 import re
 import sys
 from collections.abc import Callable, Iterable, Mapping
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field, fields, replace
 from functools import cached_property
 from types import MappingProxyType
 from typing import Any, Literal, TypeVar
 
 from construct import Construct
 
-from lidarspec.errors import SpecError, UnknownFrame
+from lidarspec.errors import SpecError, UnknownFrame, did_you_mean
 from lidarspec.spec.arguments import Address, Argument, Count, Filled, Text, argument
 from lidarspec.spec.construct_layer import check_struct, fixed_size, frame_tree, prepare
 from lidarspec.spec.links import Link, is_datagram
@@ -36,6 +37,37 @@ DIRECTIONS = ("forward", "back", "left", "right", "up", "down")
 Answer = str | tuple[str, Mapping[str, Any]] | bytes | float
 Answers = tuple[Answer, ...] | Callable[[Mapping[str, Any]], Iterable[Answer]]
 _ID = re.compile(r"[a-z0-9]+(-[a-z0-9]+)+")
+_Described = TypeVar("_Described")
+
+
+def reject_unknown_arguments(described: type[_Described]) -> type[_Described]:
+    """Make a dataclass raise SpecError for an unknown keyword argument."""
+    known = [one.name for one in fields(described) if one.init]  # type: ignore[arg-type]
+    init = described.__init__
+
+    @functools.wraps(init)
+    def checked_init(self: Any, *args: Any, **arguments: Any) -> None:
+        for name in arguments:
+            if name not in known:
+                raise SpecError(_unknown_argument(type(self).__name__, name, known))
+        init(self, *args, **arguments)
+
+    described.__init__ = checked_init  # type: ignore[method-assign]
+    return described
+
+
+def _unknown_argument(owner: str, name: str, known: Iterable[str]) -> str:
+    """Return the message about an argument that a class does not have."""
+    if name in Simulation.__dataclass_fields__:
+        suggestion = f"; write {owner}(simulation=Simulation({name}=...))"
+    else:
+        suggestion = did_you_mean(name, known)
+    return f"{owner} has no argument {name!r}{suggestion}"
+
+
+def _check_simulation(simulation: object) -> None:
+    if not isinstance(simulation, Simulation):
+        raise SpecError(f"expected a Simulation(...), got {simulation!r}; leave it out if nothing is needed", path="simulation")
 
 
 @dataclass(frozen=True, eq=False)
@@ -64,6 +96,7 @@ class Simulation:
         _freeze(self, "answers")
 
 
+@reject_unknown_arguments
 @dataclass(frozen=True, eq=False)
 class Frame:
     """One message type.
@@ -112,6 +145,7 @@ class Frame:
             raise SpecError(f"direction is 'in' or 'out', not {self.direction!r}")
         if self.max_length < 0 or self.confirm < 1:
             raise SpecError("max_length and confirm are at least 1")
+        _check_simulation(self.simulation)
         _freeze(self, "acknowledged")
         for name in ("points", "imu"):
             if isinstance(own := getattr(self, name), Mapping) and len(own) != 1:
@@ -227,6 +261,18 @@ class Relative:
     sends: Callable[[Any], Any]
 
 
+class FrameTypes(dict[str, Frame]):
+    """The frame types of a sensor by name; a missing name raises UnknownFrame."""
+
+    def __init__(self, sensor: str, frames: Mapping[str, Frame]) -> None:
+        super().__init__(frames)
+        self._sensor = sensor
+
+    def __missing__(self, name: str) -> Frame:
+        raise UnknownFrame(name, self, place=self._sensor)
+
+
+@reject_unknown_arguments
 @dataclass(frozen=True, eq=False, repr=False)
 class Spec:
     """One sensor as its manual describes it: facts, without the methods of a `Sensor`.
@@ -269,7 +315,8 @@ class Spec:
     hooked: Callable[[Any], Any] | None = field(default=None, kw_only=True)
 
     def __post_init__(self) -> None:
-        _freeze(self, "frames", "links", "commands", "state", "relatives", "info", "acknowledged", "options")
+        object.__setattr__(self, "frames", MappingProxyType(FrameTypes(self.id, self.frames)))
+        _freeze(self, "links", "commands", "state", "relatives", "info", "acknowledged", "options")
         for name in ("on_open", "on_close", "aliases"):
             object.__setattr__(self, name, tuple(getattr(self, name)))
         _check_spec(self)
@@ -367,6 +414,7 @@ def _freeze(value: object, *names: str) -> None:
 
 
 def _check_spec(sensor: Spec) -> None:
+    _check_simulation(sensor.simulation)
     if not _ID.fullmatch(sensor.id):
         raise SpecError("an id is vendor-model in lower case with hyphens", path="id", sensor=sensor.id)
     if sensor.status not in STATUSES:

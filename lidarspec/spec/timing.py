@@ -6,6 +6,10 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
+from lidarspec.errors import SpecError
+
+#: times are counted in 64-bit nanoseconds: 292 years.
+MAX_CLOCK_S = 2**63 / 1e9
 #: a field path, several that add up, or a function of the frame's `Fields` (returning a column or several).
 Source = str | tuple[str, ...] | Callable[[Any], Any]
 
@@ -83,12 +87,26 @@ class Clock:
         told: what completes a clock that starts again: another frame type that has the clock's field too, and a function of its `Fields`
             to the seconds since 1970 that it tells, nan where it tells none. The turn of the clock is the one closest to what the first
             frame that tells it says, for the packets from there on.
+
+    Raises:
+        SpecError: if `wraps_at` is not positive, or too long to ever be reached.
     """
 
     source: Source
     wraps_at: float | None = None
     pace: Callable[[Any], Any] | None = None
     told: tuple[str, Callable[[Any], Any]] | None = None
+
+    def __post_init__(self) -> None:
+        if self.wraps_at is None:
+            return
+        if not self.wraps_at > 0:
+            raise SpecError(f"expected a positive number of seconds, got {self.wraps_at}", path="clock.wraps_at")
+        if self.wraps_at >= MAX_CLOCK_S:
+            raise SpecError(
+                f"{self.wraps_at:.4g} s is longer than 292 years; leave wraps_at out, as this clock never wraps",
+                path="clock.wraps_at",
+            )
 
 
 @dataclass(frozen=True)

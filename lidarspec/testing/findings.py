@@ -74,7 +74,7 @@ LS215 `spread` folds everything onto one value | all samples of a packet get one
       | full= as the circle in the unit of the angles; steps(count) for the index of a sample
 LS216 a field that no data frame has | scans, clock or counter come from it, and never come | a path that `lidarspec show` prints
 LS301 no example can be made up | nothing can be tried on it
-      | a `sweep`, on another frame than data Frame(sweep=), or strategies = {"frame.field": ...} in the test class
+      | `simulation=Simulation(sweep=...)` of the sensor or of the Frame, or strategies = {"frame.field": ...} in the test class
 LS302 bytes do not survive parsing and building | a replayed or edited frame is another one | fields that keep every bit
 LS303 a value is cut, not rounded | int() loses a step whenever a float falls short | Scaled, or round() in place of int()
 LS304 values in units build other bytes | what was read cannot be written | Scaled with the right scale and offset

@@ -16,7 +16,7 @@ from lidarspec.packets.packets import Packets
 from lidarspec.points.cloud import LazyCloud, Mount
 from lidarspec.points.evaluate import evaluated
 from lidarspec.points.plain import evaluate
-from lidarspec.spec import Cartesian, Extra, Fields, Frame, Polar, Scaled, along, take
+from lidarspec.spec import Cartesian, Extra, Fields, Frame, Polar, Scaled, Simulation, along, take
 from lidarspec.testing.agreement import assert_same_points, assert_well_formed
 from tests.points.backends import BACKENDS, EVERY_BACKEND
 from tests.shapes import SHAPES
@@ -177,7 +177,9 @@ def words() -> Sensor:
         extra = {name: getattr(pixels, name) for name in names}
         return Polar(pixels.distance, take(table, number), along("pixels", level), origin=place, intensity=pixels.reflectivity, extra=extra)
 
-    return dataclasses.replace(SENSOR, frames={"data": Frame(struct, data=True)}, points=points, clock=None, sequence=None, simulation=None)
+    return dataclasses.replace(
+        SENSOR, frames={"data": Frame(struct, data=True)}, points=points, clock=None, sequence=None, simulation=Simulation()
+    )
 
 
 @BACKENDS
