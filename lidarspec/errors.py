@@ -247,7 +247,8 @@ class UnknownSensor(UnknownName):
     """No installed sensor has this id or alias.
 
     Attributes:
-        distribution: the distribution that has it, if that is known and not installed, else "".
+        distribution: the distribution that has it, if that is known and is not installed or failed to load, else "".
+        failure: why the installed distribution failed to load, else "".
     """
 
     what = "sensor"
@@ -261,9 +262,13 @@ class UnknownSensor(UnknownName):
         hint: str = "",
         aliases: Mapping[str, str] = MappingProxyType({}),
         distribution: str = "",
+        failure: str = "",
     ) -> None:
         self.distribution = distribution
-        if distribution:
+        self.failure = failure
+        if failure:
+            hint = f": it comes with {distribution}, which failed to load: {failure}"
+        elif distribution:
             hint = f": it comes with {distribution}, which is not installed"
         super().__init__(name, known, place=place, hint=hint, aliases=aliases)
 

@@ -147,18 +147,27 @@ def no_sensors() -> str:
     return f"no sensor is installed: {install_command(ANY_DISTRIBUTION)}\n  vendors: {', '.join(vendors)}"
 
 
-def unknown_sensor(name: str, installed: Iterable[str], aliases: Mapping[str, str]) -> UnknownSensor:
+def unknown_sensor(
+    name: str,
+    installed: Iterable[str],
+    aliases: Mapping[str, str],
+    failures: Mapping[str, str],
+) -> UnknownSensor:
     """Return the error for a sensor that is not installed, with the command that installs it if the table has it.
 
     Args:
         name: an id or alias.
         installed: the ids of the installed sensors.
         aliases: other names of the installed sensors, by alias.
+        failures: reasons why plugins of unknown content failed to load, by distribution.
     """
     row = find_known_sensor(name)
     if row is not None:
         return suggest(UnknownSensor(name, distribution=row.distribution), install_command(row.distribution))
     installed = tuple(installed)
+    if failures:
+        hint = "".join(f"; {distribution} failed to load: {reason}" for distribution, reason in failures.items())
+        return suggest(UnknownSensor(name, installed, aliases=aliases, hint=hint), "lidarspec plugins")
     if not installed:
         return suggest(UnknownSensor(name, hint="; no sensor is installed"), install_command(ANY_DISTRIBUTION))
     return UnknownSensor(name, installed, aliases=aliases)

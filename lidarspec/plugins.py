@@ -363,10 +363,22 @@ class Registry:
         if found is None:
             known = self._found()
             aliases = {alias: one.id for one in known.values() for alias in one.aliases}
-            raise unknown_sensor(name, known, aliases)
+            raise self._load_error(name) or unknown_sensor(name, known, aliases, self._failed_modules())
         if name not in self._ready:
             self._ready[name] = self.hooked(found)
         return self._ready[name]
+
+    def _load_error(self, name: str) -> UnknownSensor | None:
+        """Return the error for a sensor whose entry point failed to load, else None."""
+        for entry, plugin in self._tried.items():
+            if entry.name == name and plugin.error:
+                error = UnknownSensor(name, distribution=plugin.distribution, failure=plugin.error)
+                return suggest(error, "lidarspec plugins")
+        return None
+
+    def _failed_modules(self) -> dict[str, str]:
+        """Return the reasons why modules with hooks failed to load, by distribution: their sensors are not known."""
+        return {plugin.distribution: plugin.error for plugin in self._modules if plugin.error and not plugin.sensors}
 
     def hooked(self, sensor: Sensor) -> Sensor:
         """The sensor with the checksum and points hooks of all plugins applied to it."""

@@ -169,6 +169,23 @@ def test_an_unknown_id_is_told_with_the_ids_of_all_plugins(plugins: dict[str, Si
         registry(offered=OFFERED).sensor("bta-x1")
 
 
+def test_sensor_of_a_broken_distribution_is_named_with_its_error(plugins: dict[str, SimpleNamespace]) -> None:
+    expected = (
+        "unknown sensor 'acme-x7': it comes with dist, which failed to load: "
+        "ModuleNotFoundError: No module named 'a_module_that_nobody_has'"
+    )
+    for name in ("acme-x7", "ACME_X7"):
+        with pytest.raises(UnknownSensor) as raised:
+            registry(offered=f"{OFFERED}, acme-x7 = a_module_that_nobody_has").sensor(name)
+        assert str(raised.value) == expected
+        assert raised.value.__notes__ == ["next: lidarspec plugins"]
+
+
+def test_unknown_sensor_names_plugins_of_unknown_content_that_failed(plugins: dict[str, SimpleNamespace]) -> None:
+    with pytest.raises(UnknownSensor, match=r"^unknown sensor 'gamma-x1'.*; dist failed to load: ModuleNotFoundError: .* 'a_module_that"):
+        registry("gamma = a_module_that_nobody_has", offered=OFFERED).sensor("gamma-x1")
+
+
 @pytest.mark.parametrize("asked", [["acme-x1"], ["acme-x3"], ["other-x1"], ["acme-x2"], []])
 def test_of_two_with_one_id_the_first_wins_whichever_is_asked_for(plugins: dict[str, SimpleNamespace], asked: list[str]) -> None:
     found = registry(offered="acme-x1 = acme, acme-x2 = acme, acme-x2 = again, acme-x3 = again")
