@@ -167,6 +167,7 @@ BY_NAME: dict[str, Callable[[click.Context, str], Iterable[str]]] = {
     "ramp": _columns,
     "suffix": _formats,
     **dict.fromkeys(
-        ("file", "words", "target", "output", "scene", "vectors", "capture", "into", "diff", "link", "place", "to", "folder"), _files
+        ("file", "files", "words", "target", "output", "scene", "vectors", "capture", "into", "diff", "link", "place", "to", "folder"),
+        _files,
     ),
 }

@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import io
 import itertools
+import json
 import math
 import time
 from collections import Counter
@@ -30,7 +31,7 @@ from lidarspec.cli.inputs import (
     scans_of,
 )
 from lidarspec.cli.options import BYTES, DURATION, colour_option, count_option, points_option, selecting, sensor_option
-from lidarspec.cli.output import Progress, emit, emit_json, output_options, size
+from lidarspec.cli.output import Progress, emit, emit_json, emit_parts, output_options, size
 from lidarspec.cli.terminal import note
 from lidarspec.device.device import Device, open as open_device
 from lidarspec.device.source_recording import recorder_like
@@ -276,23 +277,31 @@ def _no_data(device: Device, target: str) -> Exception:
 
 
 @click.command()
-@click.argument("file", metavar="FILE")
+@click.argument("files", metavar="FILE...", nargs=-1, required=True)
 @output_options
-def info(file: str, as_json: bool, output: str | None) -> None:
+def info(files: Sequence[str], as_json: bool, output: str | None) -> None:
     """What is in a file: kind, times, senders, sensor, rates, loss, and how it is read.
 
     FILE is anything that is read: a recording, a capture, a robotics log, bytes. Of a long one the beginning is looked at, and when it
-    ends.
+    ends. Several files are printed in turn.
     """
-    held = contents(file)
-    if as_json:
-        emit_json(held.to_dict(), output)
-    else:
-        lines = [f"{held.path}: {held.kind}, {size(held.size)}", *(f"  {word:<8}  {text}" for word, text in shown(held))]
-        emit("\n".join(lines), output)
-    for warning in held.warnings:
-        note(warning)
-    if not any(content.sensors for content in held.contents):
+    unknown = []
+
+    def texts() -> Iterator[str]:
+        for file in files:
+            held = contents(file)
+            if as_json:
+                yield json.dumps(held.to_dict(), indent=2, allow_nan=False)
+            else:
+                yield f"{held.path}: {held.kind}, {size(held.size)}"
+                yield from (f"  {word:<8}  {text}" for word, text in shown(held))
+            for warning in held.warnings:
+                note(warning)
+            if not any(content.sensors for content in held.contents):
+                unknown.append(file)
+
+    emit_parts(texts(), output)
+    if unknown:
         raise click.exceptions.Exit(NO_DATA)
 
 

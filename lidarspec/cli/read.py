@@ -220,7 +220,8 @@ class Lines:
                 say(f"  {name:<8} {text(reading):>10} {unit}")
 
     def _figures(self, reading: Reading) -> dict[str, Any]:
-        return {"sensor": self.device.sensor.id, **reading.to_dict(), "queue": self.device.queued, "state": self.device.state}
+        facts = {"source": str(self.device.source), "sensor": self.device.sensor.id}
+        return {**facts, **reading.to_dict(), "queue": self.device.queued, "state": self.device.state}
 
     def _emit(self, value: dict[str, Any]) -> None:
         say(json.dumps(value, allow_nan=False))
@@ -228,7 +229,7 @@ class Lines:
 
 
 @click.command()
-@click.argument("source", metavar="SOURCE")
+@click.argument("sources", metavar="SOURCE...", nargs=-1, required=True)
 @sensor_option
 @count_option("lines")
 @selecting("times", "scans", "every", "ranges", "time")
@@ -237,7 +238,7 @@ class Lines:
 @click.option("--max-errors", type=SHARE, help="Exit code 1 where more of the frames are wrong or lost, such as 1%.")
 @click.option("--json", "as_json", is_flag=True, help="Print a JSON object on each line.")
 def stats(
-    source: str,
+    sources: Sequence[str],
     sensor_id: str | Sensor | None,
     count: int | None,
     selection: Selection,
@@ -250,8 +251,32 @@ def stats(
 
     A line for each interval, and a summary at the end. Errors are frames whose checksum, length or values are wrong; loss counts
     what is missing by the sensor's own numbers or clock. A file is read as fast as possible, in batches, and by the time of its packets:
-    there an interval can be longer than asked for.
+    there an interval can be longer than asked for. Several sources are read in turn.
     """
+    has_findings = False
+    for source in sources:
+        if len(sources) > 1 and not as_json:
+            say(f"{source}:")
+        try:
+            _print_stats(source, sensor_id, count, selection, duration, interval, max_errors, as_json=as_json)
+        except click.exceptions.Exit:
+            has_findings = True
+    if has_findings:
+        raise click.exceptions.Exit(FINDINGS)
+
+
+def _print_stats(
+    source: str,
+    sensor_id: str | Sensor | None,
+    count: int | None,
+    selection: Selection,
+    duration: float | None,
+    interval: float,
+    max_errors: float | None,
+    *,
+    as_json: bool,
+) -> None:
+    """Print the lines and the summary of one source."""
     with open_device(source, sensor_id, period=LOOK) as device:
         lines, feed, start = Lines(device, as_json), Feed(device, select=selection), time.monotonic()
         lasting = min(duration or math.inf, interval * count if count else math.inf)
