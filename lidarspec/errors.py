@@ -7,6 +7,7 @@ own text from typed arguments, so that the place of a fault can be read from the
 
 from __future__ import annotations
 
+import math
 import os
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
@@ -174,7 +175,14 @@ class LibraryError(UsageError):
 SUGGESTED = 6
 
 
-def did_you_mean(name: str, known: Iterable[str], *, alike: float = 0.5, aliases: Mapping[str, str] = MappingProxyType({})) -> str:
+def did_you_mean(
+    name: str,
+    known: Iterable[str],
+    *,
+    alike: float = 0.5,
+    aliases: Mapping[str, str] = MappingProxyType({}),
+    max_parts: int = SUGGESTED,
+) -> str:
     """A closing clause such as ``; did you mean 'speed'?``, or an empty text where nothing is close.
 
     Names that have this one as a part are meant before the one whose letters are the most alike.
@@ -182,13 +190,14 @@ def did_you_mean(name: str, known: Iterable[str], *, alike: float = 0.5, aliases
     Args:
         alike: the share of letters, from 0 to 1, that a name has to have in common.
         aliases: other names of some of those, which are suggested in their place.
+        max_parts: the most names that contain `name` and are suggested together.
     """
     import difflib  # for the one call in many thousands that has to suggest something
 
     by_letters = {other.lower(): aliases.get(other, other) for other in (*known, *aliases)}
     parts = dict.fromkeys(meant for other, meant in by_letters.items() if len(name) > 1 and name.lower() in other)
     close = difflib.get_close_matches(name.lower(), by_letters, n=1, cutoff=alike)
-    named = list(parts) if 0 < len(parts) <= SUGGESTED else [by_letters[other] for other in close]
+    named = list(parts) if 0 < len(parts) <= max_parts else [by_letters[other] for other in close]
     return f"; did you mean {listed(named)}?" if named else ""
 
 
@@ -228,17 +237,26 @@ def refuse_text(data: object) -> None:
 
 
 class UnknownName(UsageError):
-    """A name that is not among those known; the message suggests the closest one."""
+    """A name that is not among those known; the message suggests the closest one, or lists all.
+
+    Attributes:
+        alike: the share of letters that a suggested name has in common with the given one.
+        max_parts: the most names that contain the given one and are suggested together.
+        max_listed: the most names that are listed if none is suggested.
+    """
 
     what = "name"
     alike = 0.5
+    max_parts = SUGGESTED
+    max_listed: float = 12
 
     def __init__(
         self, name: str, known: Iterable[str] = (), *, place: str = "", hint: str = "", aliases: Mapping[str, str] = MappingProxyType({})
     ) -> None:
         self.name, self.known, self.place = name, tuple(sorted(known)), place
-        suggestion = did_you_mean(name, self.known, alike=self.alike, aliases=aliases)
-        names = f" (known: {', '.join(self.known)})" if self.known and not suggestion and len(self.known) <= 12 else ""
+        suggestion = did_you_mean(name, self.known, alike=self.alike, aliases=aliases, max_parts=self.max_parts)
+        is_listed = 0 < len(self.known) <= self.max_listed and not suggestion
+        names = f" (known: {', '.join(self.known)})" if is_listed else ""
         where = f"{place}: " if place else ""
         super().__init__(f"{where}unknown {self.what} {name!r}{suggestion}{names}{hint}")
 
@@ -252,6 +270,7 @@ class UnknownSensor(UnknownName):
     """
 
     what = "sensor"
+    max_parts = 30  # a vendor's name suggests all of its sensors
 
     def __init__(
         self,
@@ -277,6 +296,8 @@ class UnknownFrame(UnknownName, KeyError):
     """The sensor has no frame type of this name."""
 
     what = "frame"
+    alike = 0.7
+    max_listed = math.inf
     __str__ = Exception.__str__  # KeyError shows the repr of the message
 
 
@@ -290,6 +311,8 @@ class UnknownCommand(UnknownName):
     """The sensor has no command of this name."""
 
     what = "command"
+    alike = 0.8  # a wrong guess can stop a motor
+    max_listed = math.inf
 
 
 class UnknownOption(UnknownName):
