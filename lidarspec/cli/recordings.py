@@ -40,6 +40,7 @@ from lidarspec.transports.serving import LATE, Replay
 @click.option("--no-start", is_flag=True, help="Send the sensor no commands.")
 @click.option("--force", is_flag=True, help="Overwrite FILE.")
 @click.option("--salvage", is_flag=True, help="Go on behind damaged places, where SOURCE is a recording.")
+@click.option("--slice", "times", hidden=True)
 @click.option("--json", "as_json", is_flag=True, help="Print a summary as JSON.")
 def record(
     source: str,
@@ -50,6 +51,7 @@ def record(
     no_start: bool,
     force: bool,
     salvage: bool,
+    times: str | None,
     as_json: bool,
 ) -> None:
     """Everything that a source sends, with the time of its arrival, in one file that survives a crash.
@@ -58,6 +60,8 @@ def record(
     recorded as they come.
     """
     check_suffix(target)
+    if times is not None:
+        raise _slice_refused(source, target, times)
     refuse_overwriting(target, source, sensor_id)
     known = named(source)
     sensor = named_sensor(sensor_id) if sensor_id else declared(source) if is_live(source) else known.configured() if known else None
@@ -86,6 +90,14 @@ def record(
         note(str(error))
     if interrupted:
         raise click.exceptions.Exit(INTERRUPTED)
+
+
+def _slice_refused(source: str, target: str, times: str) -> UsageError:
+    """Return the error for --slice, with the command that cuts a recording."""
+    if is_live(source):
+        return suggest(UsageError("--slice cuts recordings; of a live source, -t takes the first seconds"), "lidarspec record --help")
+    command = f"lidarspec replay {shlex.quote(source)} --to {shlex.quote(target)} --slice {shlex.quote(times)}"
+    return suggest(UsageError("record copies a whole file; replay cuts a part out of it"), command)
 
 
 def _recorded(task: SourceRecording) -> None:
