@@ -44,6 +44,9 @@ def build(sensor_id: str, frame: str, assignments: Sequence[str], as_json: bool,
     Constants, counts and checksums are filled in. -o writes the bytes themselves, or text where FILE ends in .hex.
     """
     sensor = named_sensor(sensor_id)
+    if "=" in frame:
+        error = UsageError(f"frame name missing before {frame!r}; frames of {sensor.id}: {', '.join(sensor.frames)}")
+        raise suggest(error, f"lidarspec build {quote(str(sensor_id))} {next(iter(sensor.frames), 'FRAME')} {quote(frame)}")
     if frame not in sensor.frames:
         raise suggest(UnknownFrame(frame, sensor.frames, place=sensor.id), f"lidarspec show {quote(str(sensor_id))}")
     try:
