@@ -66,8 +66,8 @@ class Selection:
         times = (moment.replace(tzinfo=moment.tzinfo or UTC) if isinstance(moment, datetime) else moment for moment in self.times)
         object.__setattr__(self, "times", tuple(times))
         for low, high in (self.scans, self.times, self.ranges):
-            if low is not None and high is not None and (isinstance(low, datetime) != isinstance(high, datetime) or low >= high):  # type: ignore[operator]
-                raise UsageError(f"from {low} up to {high} there is nothing")
+            if low is not None and high is not None:
+                _check_order(low, high)
         if self.every < 1:
             raise UsageError(f"each {self.every}th scan: the number is 1 or more")
 
@@ -80,6 +80,16 @@ class Selection:
     def is_counted(self) -> bool:
         """Whether it takes all scans of a source, from the first one on, to tell which are wanted."""
         return self.is_timed or self.scans != (0, None) or self.every != 1
+
+
+def _check_order(low: Any, high: Any) -> None:
+    """Raise UsageError unless an interval begins before it ends."""
+    if isinstance(low, datetime) != isinstance(high, datetime):
+        raise UsageError(f"one end is a date and the other is not: {low} to {high}")
+    if low > high:
+        raise UsageError(f"end before start: {low} to {high}")
+    if low == high:
+        raise UsageError(f"start and end are equal: {low}")
 
 
 #: all of a source.
