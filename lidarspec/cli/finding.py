@@ -202,8 +202,9 @@ def detect(source: str | None, duration: float, start: bool, as_json: bool, outp
 
 
 def _code(source: str | None, found: Sequence[Verdict]) -> int:
-    """The exit code where no sensor fits: nothing came from a source, or nothing that is known."""
-    is_silent = source is not None and live_address(source) is not None and not any(one.heard.size for one in found)
+    """Return the exit code if no sensor fits: live sources sent nothing, or nothing that is known."""
+    is_live = source is None or live_address(source) is not None
+    is_silent = is_live and not any(one.heard.size for one in found)
     return DEVICE if is_silent else NO_DATA
 
 

@@ -16,6 +16,8 @@ from typing import Any
 import pytest
 
 import lidarspec as ls
+from lidarspec.discovery.detect import Verdict
+from lidarspec.discovery.heard import Heard
 from lidarspec.simulation.simulator import simulate
 from lidarspec.spec import Crc
 from lidarspec.testing.fixtures import virtual_port
@@ -274,3 +276,10 @@ def test_bytes_sent_by_hand_are_answered_and_the_answer_is_explained() -> None:
     assert "data frames came meanwhile\nnothing came back\n" in streaming.stderr
     for words in (("--hex", "5z"), ("--hex", "a5 50", "start"), ()):
         ran("send", "sim:slamtec-rplidar-a1", *words, *sensor, code=2)
+
+
+@pytest.mark.parametrize("source", [(), ("udp://:45999",)])
+def test_detect_exits_with_5_if_live_sources_are_silent(source: tuple[str, ...], monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("lidarspec.cli.finding._everywhere", lambda duration, start: iter([]))
+    monkeypatch.setattr("lidarspec.cli.finding._one", lambda source, duration, start: [Verdict(Heard(source))])
+    assert ran("detect", *source, code=5).stderr.startswith("nothing came\n")
