@@ -371,4 +371,12 @@ def system_errors(place: object) -> Iterator[None]:
     except LidarSpecError:  # what took too long is an OSError as well
         raise
     except OSError as error:
-        raise SourceError(f"{place}: {error.strerror or error}") from None
+        raise SourceError(f"{place}: {failure_reason(place, error)}") from None
+
+
+def failure_reason(place: object, error: OSError) -> str:
+    """Return why the system refused a path; a missing folder is named."""
+    folder = os.path.dirname(str(place))
+    if isinstance(error, FileNotFoundError) and folder and not os.path.isdir(folder):
+        return f"there is no folder {folder}"
+    return error.strerror or str(error)

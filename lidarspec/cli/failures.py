@@ -64,7 +64,7 @@ def _message(error: Exception) -> str:
     if isinstance(error, click.ClickException):
         return error.format_message()
     if isinstance(error, OSError) and error.filename is not None:
-        return f"{error.filename}: {error.strerror}"
+        return f"{error.filename}: {errors.failure_reason(error.filename, error)}"
     if isinstance(error, errors.WireError) and error.data:
         from lidarspec.explaining.wording import hexdump
 

@@ -48,6 +48,7 @@ def replacing(path: Path) -> Iterator[Path]:
         with contextlib.suppress(SourceError):
             take_away(part)
         with system_errors(path):
+            path.parent.stat()  # a missing folder is reported before anything is made
             yield part
             if path.is_dir() and part.is_dir():
                 refuse_foreign_files(path)

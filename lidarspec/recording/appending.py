@@ -19,7 +19,7 @@ from pathlib import Path
 from types import TracebackType
 from typing import Any, Literal, Protocol, Self
 
-from lidarspec.errors import SourceError, SourceTimeout, UsageError
+from lidarspec.errors import SourceError, SourceTimeout, UsageError, failure_reason
 from lidarspec.transports.protocol import Chunk
 
 #: when what was put in is written out, and when the disk is asked to keep it.
@@ -53,7 +53,7 @@ class RecordFile:
         except FileExistsError:
             raise UsageError(f"{path} exists already; it is not overwritten unless asked for") from None
         except OSError as error:
-            raise SourceError(f"{path}: {error.strerror or error}") from None
+            raise SourceError(f"{path}: {failure_reason(path, error)}") from None
         self.size, self._size_at = 0, size_at
 
     def append(self, records: bytes | bytearray) -> None:
