@@ -353,6 +353,18 @@ class SourceTimeout(SourceError, TimeoutError):
     """A source that gave nothing, or took nothing, within its time."""
 
 
+class WriteError(SourceError):
+    """A recording cannot be written any further.
+
+    Attributes:
+        reason: why, without the path.
+    """
+
+    def __init__(self, path: str, reason: str, state: str) -> None:
+        self.reason = reason
+        super().__init__(f"{path}: {reason}; {state}")
+
+
 class CommandError(LidarSpecError):
     """The device refused a command, or answered with something else."""
 

@@ -36,7 +36,7 @@ from lidarspec.cli.terminal import note
 from lidarspec.device.device import Device, open as open_device
 from lidarspec.device.source_recording import recorder_like
 from lidarspec.discovery.detect import detected
-from lidarspec.errors import UsageError, WireError, suggest, suggestion
+from lidarspec.errors import UsageError, WireError, WriteError, suggest, suggestion
 from lidarspec.explaining.contents import contents, shown
 from lidarspec.formats import check_holds, format_of, targets, write, write_imu
 from lidarspec.formats.writing import replacing
@@ -185,11 +185,14 @@ def _write_packets(source: str, target: str, sensor_id: str | Sensor | None, tim
     with contextlib.closing(transport(source)) as opened, Progress(size) as progress, replacing(Path(target)) as part:
         needs_sensor = not opened.datagrams and Path(target).suffix.lower() != ".lsr"  # whose frames are the packets
         sensor = named_sensor(sensor_id) if sensor_id is not None else _detected(source, target) if needs_sensor else None
-        with recorder_like(opened, source, str(part), sensor, overwrite=True) as file:
-            for chunk in received(opened, times, source):
-                file.keep_up()
-                file.write(chunk)
-                progress(lambda: f"{target}: {file.records} packets", opened.place)
+        try:
+            with recorder_like(opened, source, str(part), sensor, overwrite=True) as file:
+                for chunk in received(opened, times, source):
+                    file.keep_up()
+                    file.write(chunk)
+                    progress(lambda: f"{target}: {file.records} packets", opened.place)
+        except WriteError as error:  # its text names the temporary file
+            raise WriteError(target, error.reason, "nothing was written") from None
         if not file.records:
             raise suggest(WireError(no_bytes(source, opened.warnings)), f"lidarspec info {quote(source)}")
     for remark in (f"{target}: {file.records} packets, {size(file.bytes)}", *opened.warnings):

@@ -19,7 +19,7 @@ from pathlib import Path
 from types import TracebackType
 from typing import Any, Literal, Protocol, Self
 
-from lidarspec.errors import SourceError, SourceTimeout, UsageError, failure_reason
+from lidarspec.errors import SourceError, SourceTimeout, UsageError, WriteError, failure_reason
 from lidarspec.transports.protocol import Chunk
 
 #: when what was put in is written out, and when the disk is asked to keep it.
@@ -279,7 +279,7 @@ class Appender:
             with self._changed:
                 reason = (error.strerror if isinstance(error, OSError) else None) or error
                 held = f"the recording is whole up to byte {self._file.size}" if self._file.is_settled else "what was there before is kept"
-                self.error = SourceError(f"{self.path}: {reason}; {held}")
+                self.error = WriteError(self.path, str(reason), held)
                 self._changed.notify_all()
         finally:
             self._file.close()

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import csv
+import errno
 import gzip
 import itertools
 import json
@@ -19,6 +20,7 @@ import pytest
 
 import lidarspec as ls
 from lidarspec.captures.records import WRITINGS
+from lidarspec.recording.appending import RecordFile
 from lidarspec.simulation.simulator import simulate
 from lidarspec.transports.open_url import transport
 from tests.cli.running import COIN_D4, EXAMPLE, LD06, printed, process, ran
@@ -340,3 +342,16 @@ def test_what_an_imu_felt_is_written_in_place_of_the_points(tmp_path: Path) -> N
         "no frame says what an IMU felt"
         in ran("convert", capture(COIN_D4), tmp_path / "b.csv", "-s", "cspc-coin-d4", "--imu", code=2).stderr
     )
+
+
+@pytest.mark.parametrize("suffix", [".lsr", ".pcap", ".pcapng"])
+def test_full_disk_names_the_output_and_leaves_nothing(suffix: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def append(self: RecordFile, records: bytes) -> None:
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+    (path := tmp_path / "in.bin").write_bytes(EXAMPLE * 3)
+    target = tmp_path / f"out{suffix}"
+    monkeypatch.setattr(RecordFile, "append", append)
+    failed = ran("convert", path, target, "-s", "ldrobot-stl27l", code=3)
+    assert failed.stderr.startswith(f"{target}: No space left on device; nothing was written\n")
+    assert os.listdir(tmp_path) == ["in.bin"]
