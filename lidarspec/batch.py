@@ -157,7 +157,7 @@ def converted(piece: Piece) -> Record:
             counted = _counted(piece, piece.numbered(scans), counts)
             first = next(counted, None)
             if first is None and piece.is_last and not piece.first:
-                raise WireError(f"no scan in {piece.source}: {scans.stats}")
+                raise WireError(f"no scan: {scans.stats}")
             if first is not None:
                 _write(piece, itertools.chain([first], counted))
             return piece.record(**about, **counts, output=piece.output if first is not None else None, warnings=scans.warnings)

@@ -87,7 +87,7 @@ def test_pieces_have_the_points_of_one_pass_and_a_bad_file_stops_no_other(drives
     assert {"north/a.parquet", "north/b.parquet"} < outputs(tmp_path).keys()
     failed = [record for record in records(tmp_path) if "error" in record]
     assert [Path(record["source"]).name for record in failed] == ["bad.bin"]
-    assert "no scan in" in failed[0]["error"]
+    assert failed[0]["error"].startswith("no scan: ")
     told = next(record for record in records(tmp_path) if record["source"].endswith("a.bin"))
     assert told["points"] == pq.read_metadata(tmp_path / "north" / "a.parquet").num_rows
     assert {"size", "modified", "digest", "versions", "scans"} < told.keys()

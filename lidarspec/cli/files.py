@@ -240,9 +240,10 @@ def _convert_all(records: Iterable[tuple[batch.Record, bool]], folder: str, file
             before += is_old
             if "error" in record:
                 failed.append(record)
-                progress.note(f"{record['source']}: {record['error']}")
+                reason = record["error"].removeprefix(f"{record['source']}: ")
+                progress.note(f"{record['source']}: {reason}")
                 continue
-            totals.update({"files": record["last"], "pieces": 1, "scans": record["scans"], "points": record["points"]})
+            totals.update({"files": int(record["last"]), "pieces": 1, "scans": record["scans"], "points": record["points"]})
             progress(lambda: f"{folder}: {totals['points']} points", (totals["files"] + len(failed), files))
     told = ", ".join(f"{number} {what}" for what, number in totals.items() if what != "pieces" or number > totals["files"])
     note(f"{folder}: {told or 'nothing'}" + f"; {before} pieces were done before" * bool(before) + f"; {len(failed)} failed" * bool(failed))
@@ -348,9 +349,13 @@ def plot(
                 emit(svg(chosen.points, how, title), output)
             else:
                 _save(figures.of_scan(chosen, how, title), output, suffix)
+            if output != "-":
+                note(f"{output}: {title}")
         else:
             until = time.monotonic() + (duration or (PATIENCE if device.is_live else math.inf))
             _save(_over_time(device, source, selection, kind, until), output, suffix)
+            if output != "-":
+                note(f"{output}: {kind} of {device.sensor.id}")
 
 
 def _numbered(device: Device, source: str, selection: Selection, number: int) -> Scan:

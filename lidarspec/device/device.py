@@ -13,7 +13,7 @@ from collections.abc import Iterator, Mapping
 from functools import partial
 from pathlib import Path
 from shlex import quote
-from typing import Any, overload
+from typing import Any, NoReturn, overload
 
 from lidarspec.device.arrivals import Arrival, FileInput, Input
 from lidarspec.device.live_input import PERIOD, LiveInput
@@ -167,6 +167,18 @@ class Device(Closing):
         if self.learned:
             self.sensor = self._input.sensor
             self._latest = ScanStream(self.sensor, mount)
+
+    async def __aenter__(self) -> NoReturn:
+        """Raise: `async with` takes the device of `open_async`.
+
+        Raises:
+            UsageError: always.
+        """
+        self.close()
+        raise UsageError("lidarspec.open(...) is used with `with`; for `async with` call lidarspec.open_async(...)")
+
+    async def __aexit__(self, *_: object) -> None:
+        """Exist beside `__aenter__`, without which Python raises its own TypeError."""
 
     @property
     def stats(self) -> Counters:

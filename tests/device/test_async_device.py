@@ -133,3 +133,16 @@ def test_what_cannot_be_opened_raises_in_the_loop() -> None:
 
     with pytest.raises(SourceError, match="no such port"):
         asyncio.run(use())
+
+
+def test_async_with_a_synchronous_device_names_open_async(tmp_path: Path) -> None:
+    (path := tmp_path / "data.bin").write_bytes(TURNING.example("data"))
+    device = ls.open(path, TURNING)
+
+    async def use() -> None:
+        async with device:
+            pass
+
+    with pytest.raises(UsageError, match=r"call lidarspec\.open_async"):
+        asyncio.run(use())
+    assert device.state == "closed"
