@@ -289,7 +289,9 @@ def _conclusions(source: str | None, found: Sequence[Verdict], unknown: Structur
         yield f"next: {install_commands(missing)}"
         return
     if size:
-        yield f"{size} bytes, and no frame of an installed sensor" + ("" if unknown else "; nor can frames of one kind be seen in them")
+        kind = " of text" if any(one.heard.is_text for one in found) else ""
+        structure_note = "" if unknown else "; nor can frames of one kind be seen in them"
+        yield f"{size} bytes{kind}, and no frame of an installed sensor{structure_note}"
         yield f"next: {_following(source, unknown)}"
         return
     if source is not None and live_address(source) is None:

@@ -197,7 +197,8 @@ def no_frame(sensor: Sensor, given: Heard) -> WireError:
     if (fault := _never_right(given)) is not None:
         return fault
     if len(data) > longest:
-        error = WireError(f"no frame in {len(data)} bytes", sensor=sensor.id, expected="a frame", data=data[:longest])
+        kind = " of text" if given.is_text else ""
+        error = WireError(f"no frame in {len(data)} bytes{kind}", sensor=sensor.id, expected="a frame", data=data[:longest])
         return suggest(error, "lidarspec sensors")
     try:
         parse_typed(sensor, data)
@@ -218,6 +219,8 @@ def nearest_fault(given: Heard) -> WireError:
     best = nearest(given.data)
     if best is None:
         text = f"no frame of any of the {len(sensors())} installed sensors" if sensors() else "no frame of an installed sensor"
+        if given.is_text:
+            text = f"{given.source}: this is text, and {text} is in it"
         error = suggest_installation(WireError(text, data=given.data[:QUOTED]), given)
         return suggest(error, "lidarspec sensors")
     return suggest(best, f"lidarspec explain {quote(given.source)} -s {best.sensor}")
@@ -239,8 +242,12 @@ def nothing_came(device: Device, source: str, seconds: float | None = None) -> L
     if not device.is_live:
         if stats.bytes_in and (instead := fits_instead(sensor, source)):
             return suggest(WireError(f"{source} {instead[0]}", sensor=sensor.id), f"the same with {instead[1]}")
-        if not stats.frames and (given := again(source)) is not None and (fault := _never_right(given)) is not None:
+        given = None if stats.frames else again(source)
+        if given is not None and (fault := _never_right(given)) is not None:
             return fault
+        if given is not None and given.is_text:
+            error = WireError(f"{source} is text, and has no data frame: {stats}", sensor=sensor.id)
+            return suggest(error, f"lidarspec detect {quote(source)}")
         said = (
             "; ".join([f"{source} has no data frame: {stats}", *device.warnings]) if stats.bytes_in else no_bytes(source, device.warnings)
         )

@@ -463,7 +463,8 @@ def _nothing(source: str, found: Sequence[Verdict]) -> Exception:
     if fault := next((one.fault for one in found if one.fault), ""):
         return suggest(WireError(f"{source}: {fault}"), f"lidarspec crc {quote(str(source))}")
     if heard.size:
-        error = WireError(f"{source}: no installed sensor's frames are in it", data=heard.chunks[0][:SHOWN])
+        kind = "this is text, and " if heard.is_text else ""
+        error = WireError(f"{source}: {kind}no installed sensor's frames are in it", data=heard.chunks[0][:SHOWN])
         return suggest_installation(error, heard)
     if live_address(source) is None:
         return WireError(no_bytes(source, heard.warnings))

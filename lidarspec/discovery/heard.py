@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import itertools
+import re
 from collections.abc import Iterable
 from dataclasses import dataclass, field, replace
 
@@ -11,6 +12,9 @@ from lidarspec.transports.protocol import Chunk, Transport
 
 #: bytes of a file that are looked at.
 LOOKED_AT = 1 << 17
+#: bytes that are looked at to tell text, and the least that are enough for it.
+TEXT_BYTES = 1 << 12
+MIN_TEXT_BYTES = 16
 
 
 @dataclass(frozen=True)
@@ -46,6 +50,12 @@ class Heard:
     def data(self) -> bytes:
         """All bytes in order."""
         return b"".join(self.chunks)
+
+    @property
+    def is_text(self) -> bool:
+        """Whether the bytes begin as lines of printable text, which only some sensors send."""
+        head = self.data[:TEXT_BYTES].removesuffix(b"\r")
+        return len(head) >= MIN_TEXT_BYTES and head.isascii() and re.sub(rb"[\t\r\n]", b"", head).decode().isprintable()
 
 
 def beginning(opened: Transport, most: int, *, number: int | None = None) -> list[Chunk]:
