@@ -24,7 +24,7 @@ DEPTH = ("depth" / Scaled(Int32ul, 0.001, "m"),)
 DIRECTION = ("zenith" / Scaled(Int16ul, 0.01, "deg") * "from the z axis", "azimuth" / Scaled(Int16ul, 0.01, "deg"))
 INERTIAL = (
     *(f"gyro_{axis}" / Scaled(Float32l, 1, "rad/s") for axis in "xyz"),
-    *(f"acc_{axis}" / Scaled(Float32l, GRAVITY, "m/s2") * "in g" for axis in "xyz"),
+    *(f"acc_{axis}" / Scaled(Float32l, GRAVITY, "m/s2") * "sent in g" for axis in "xyz"),
 )
 
 

@@ -181,3 +181,9 @@ def test_a_simulated_one_is_opened_started_and_read(name: str) -> None:
         if name != MID40.id:
             assert device.send("get", timeout=30, key=0).confirmed
             assert device.info == told, "an answer that leaves it out takes nothing back"
+
+
+def test_note_on_acceleration_does_not_contradict_its_unit() -> None:
+    text = str(ls.explain(MID360.example("imu"), MID360, frame="imu"))
+    assert "m/s2" in text
+    assert "; in g" not in text

@@ -108,7 +108,7 @@ E1_DIFOP = Struct(
     *TIME,
     "phy_mode" / Int8ub * "0 negotiated, 1 master, 2 slave",
     "reserved_114" / Bytes(94),
-    *(f"acceleration_{axis}" / Scaled(Float32b, GRAVITY, "m/s2") * "in g" for axis in "xyz"),
+    *(f"acceleration_{axis}" / Scaled(Float32b, GRAVITY, "m/s2") * "sent in g" for axis in "xyz"),
     *(f"rotation_{axis}" / Scaled(Float32b, 1, "rad/s") for axis in "xyz"),
     "reserved_end" / Bytes(24),
 )
