@@ -177,4 +177,12 @@ def _failures(url: str) -> Iterator[None]:
     except LidarSpecError:
         raise
     except Exception as error:
-        raise SourceError(f"{url}: {str(error) or type(error).__name__}") from error
+        raise SourceError(f"{url}: {_failure_reason(url, error)}") from error
+
+
+def _failure_reason(url: str, error: Exception) -> str:
+    """Return why a store failed; many drivers repeat only the URL or path of a missing file."""
+    text = str(error)
+    if plain(text) != plain(url) and text.lstrip("/") != plain(url) and text:
+        return text
+    return "no such file" if isinstance(error, FileNotFoundError) else type(error).__name__

@@ -26,7 +26,7 @@ from lidarspec.framing.decoder import Decoder, backend as backend_named
 from lidarspec.framing.results import Counters, Frames
 from lidarspec.recording.appending import Log
 from lidarspec.spec.arguments import Address
-from lidarspec.spec.links import Link, Udp
+from lidarspec.spec.links import Http, Link, Udp
 from lidarspec.spec.sensor import Sensor
 from lidarspec.transports.base import HostClock, own_address, with_option
 from lidarspec.transports.open_url import control_link, has_control
@@ -285,9 +285,12 @@ class LiveInput(Input):
             self._help(pending)
         try:
             return pending.result()
-        except ReplyTimeout as error:
-            why = self._captures[self.sensor.commands[name].link].transport.warnings
-            raise ReplyTimeout("; ".join([str(error), *why])) from None
+        except CommandError as error:
+            link = self.sensor.commands[name].link
+            if not isinstance(error, ReplyTimeout) and not isinstance(self.sensor.links[link], Http):
+                raise
+            why = self._captures[link].transport.warnings
+            raise type(error)("; ".join([str(error), *why])) from None
 
     def _find_own_address(self, name: str) -> None:
         """Let the session know where we are, as the sensor sees it, where a command says that."""

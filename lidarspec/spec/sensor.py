@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import base64
 import inspect
+import os
 import re
 import warnings
 import zlib
@@ -344,6 +345,8 @@ class Configure:
             if not self.takes(name, value):
                 kinds = " or ".join(_TOLD[kind] for kind in sorted(self._kinds[name]) if kind in _TOLD) or "no content"
                 raise UsageError(f"{self.sensor.id}: {name} is {kinds}, not {shown(value)}")
+            if name in self.files and value is not None and not isinstance(value, Learned):
+                _refuse_pipe(value)
         try:
             configured = self.function(self.sensor, **options)
         except (LidarSpecError, OSError):
@@ -352,6 +355,12 @@ class Configure:
             raise PluginError.of(error, "configure", sensor=self.sensor.id, function=self.function) from error
         hooked: Sensor = self.sensor.hooked(configured) if self.sensor.hooked else configured
         return hooked
+
+
+def _refuse_pipe(path: str | PathLike[str]) -> None:
+    """Raise UsageError for a pipe or device, which may never end."""
+    if os.path.exists(path) and not os.path.isfile(path) and not os.path.isdir(path):
+        raise UsageError(f"{path!s}: a pipe or device is not read as a file; write its content to a file first")
 
 
 def _anything(value: object) -> bool:

@@ -45,12 +45,15 @@ class HttpTransport(LiveTransport):
         except queue.Empty:
             return []
         try:
-            status, body = self._asked(str(request.method), request.path.decode("latin-1"), request.body)
+            status, body, location = self._asked(str(request.method), request.path.decode("latin-1"), request.body)
         except (OSError, http.client.HTTPException, ValueError) as error:
             why = reason(error) or f"no answer within {self._link.timeout:g} s"
             self.warnings = [f"{self.label}{request.path.decode('latin-1')}: {why}"]
             return []
         self.warnings = []
+        if location:
+            path = request.path.decode("latin-1")
+            self.warnings = [f"{self.label}{path}: status {status}, moved to {location}, which is not followed"]
         reply = HttpReply.build({"status": status, "size": len(body), "body": body})
         return [Chunk(reply, self._clock.now(), (self._host, self._link.port))]
 
@@ -70,8 +73,8 @@ class HttpTransport(LiveTransport):
     def close(self) -> None:
         self.closed = True
 
-    def _asked(self, method: str, path: str, body: bytes) -> tuple[int, bytes]:
-        """The status and the body of a reply."""
+    def _asked(self, method: str, path: str, body: bytes) -> tuple[int, bytes, str]:
+        """Return the status and the body of a reply, and where a redirection leads."""
         connection = http.client.HTTPConnection(self._host, self._link.port, timeout=self._link.timeout)
         with contextlib.closing(connection):
             connection.connect()
@@ -88,7 +91,8 @@ class HttpTransport(LiveTransport):
                 raise ValueError(f"the reply is longer than {self._link.largest} bytes")
             if reply.length:
                 raise ValueError(f"the reply ends {reply.length} bytes too early, or took longer than {self._link.timeout:g} s")
-            return reply.status, found
+            location = reply.getheader("Location", "") if 300 <= reply.status < 400 else ""
+            return reply.status, found, location
 
 
 def _hang_up(connection: socket.socket) -> None:

@@ -335,6 +335,7 @@ def test_pages_of_a_web_server_are_read_and_written() -> None:
     ("sent", "link", "said"),
     [
         (b"HTTP/1.1 404 Not Found\r\nContent-Length: 4\r\n\r\nnone", Http(1), "page with status 404 instead of 200"),
+        (b"HTTP/1.1 302 Found\r\nLocation: /login\r\nContent-Length: 0\r\n\r\n", Http(1), "/status: status 302, moved to /login"),
         (b"HTTP/1.1 200 OK\r\nContent-Length: 99\r\n\r\n" + bytes(99), Http(1, largest=98), "the reply is longer than 98 bytes"),
         (b"HTTP/1.1 200 OK\r\nContent-Length: 99\r\n\r\nshort", Http(1), "94 bytes too early"),
         (b"something else\r\n\r\n", Http(1), "/status: something else"),

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import os
 from pathlib import Path
 from typing import Any, Literal, Optional
 
@@ -64,3 +65,10 @@ def test_what_a_sensors_own_function_does_not_foresee_is_the_plugins_fault(tmp_p
     (tmp_path / "heads.json").write_text("{nonsense", encoding="utf-8")
     with pytest.raises(PluginError, match=r"shape-headed: .*JSONDecodeError"):
         SHAPES["shape-headed"].configure(calibration=tmp_path / "heads.json")
+
+
+@pytest.mark.skipif(os.name != "posix", reason="named pipes are POSIX")
+def test_named_pipe_as_option_is_refused_before_it_is_opened(tmp_path: Path) -> None:
+    os.mkfifo(pipe := tmp_path / "heads.json")
+    with pytest.raises(ls.UsageError, match=r"heads\.json: a pipe or device is not read as a file"):
+        SHAPES["shape-headed"].configure(calibration=pipe)
