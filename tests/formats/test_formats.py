@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import gzip
+import os
 import subprocess
 import sys
 import tracemalloc
@@ -18,6 +19,7 @@ import lidarspec as ls
 from lidarspec import PointCloud, Scan, SourceError, simulate
 from lidarspec.errors import LibraryError, ReplyTimeout, UnknownFormat
 from lidarspec.formats import arrays, format_of, formats, tables, write
+from lidarspec.formats.writing import replacing
 from tests.libraries import needs
 from tests.recording.test_recordings import file_size_limit
 from tests.shapes import SHAPES
@@ -293,3 +295,19 @@ def test_text_keeps_the_digits_of_double_columns(tmp_path: Path) -> None:
     write(tmp_path / "a.csv", [with_column], every_point=True)
     header, values = rows(tmp_path / "a.csv")
     np.testing.assert_allclose(values[:, header.index("precise")], precise, rtol=1e-14)
+
+
+@pytest.mark.skipif(os.name != "posix", reason="other systems cannot tell whether a process runs")
+def test_part_of_a_killed_process_is_removed_by_the_next_write(tmp_path: Path) -> None:
+    target = tmp_path / "a.csv"
+    killed = tmp_path / f".{2**31 - 1}.a.csv"  # above the largest process id
+    running = tmp_path / f".{os.getppid()}.a.csv"
+    recent = tmp_path / f".{2**31 - 2}.a.csv"
+    other = tmp_path / ".notes.a.csv"
+    for path in (killed, running, recent, other):
+        path.touch()
+    for path in (killed, running, other):
+        os.utime(path, (0, 0))
+    with replacing(target) as part:
+        part.touch()
+    assert {path.name for path in tmp_path.iterdir()} == {path.name for path in (target, running, recent, other)}
