@@ -2,8 +2,9 @@
 
 Source: SICK Telegram Listing LiDAR sensors 8014631 and the tables of LMDscandata in the operating instructions 8023198 (LMS4000), with the
 values below 16 that are no distances; 8020494 (MRS1000) for the layers; sick_scan_xd for where angles count from. A telegram has
-one layer. Its channels of 16 bits are DIST1 to DISTn; RSSI1 to RSSIn follow if they are asked for, in 16 bits or in 8.
-Telegrams with channels of other kinds (ANGL, VANG, QLTY) are not read. A third of a degree is 0.3333 on the wire, and is left so.
+one layer. Its channels of 16 bits are DIST1 to DISTn; RSSI1 to RSSIn follow if they are asked for, in 16 bits or in 8. Where both are
+there, the intensity is that of 8 bits. Telegrams with channels of other kinds (ANGL, VANG, QLTY) are not read. A third of a degree is
+0.3333 on the wire, and is left so.
 """
 
 from __future__ import annotations
@@ -87,7 +88,7 @@ def scan(echoes: int) -> list[Construct]:
         *others,
         *(part.name / If(this.channels == 2 * echoes, part.subcon) for part in strengths),
         "channels8" / Int16ub * "of 8 bits",
-        *(part.name / If(this.channels8 == echoes, part.subcon) for part in strengths8),
+        *(part.name / If(this.channels8 >= number, part.subcon) for number, part in enumerate(strengths8, 1)),
         *optional("position", *(axis / Float32b for axis in ("x", "y", "z", "rx", "ry", "rz")), "rotation" / Int8ub, "named" / Int8ub),
         *optional("name", *named),
         *optional("comment", *named),
@@ -103,7 +104,7 @@ def plausible(f: Fields, echoes: int) -> Any:
     for number in range(1, echoes + 1):
         held = held & (getattr(f, f"dist{number}").count == count)
         held = held & ((f.channels != 2 * echoes) | (getattr(f, f"rssi{number}").count == count))
-        held = held & ((f.channels8 != echoes) | (getattr(f, f"rssi{number}_8bit").count == count))
+        held = held & ((f.channels8 < number) | (getattr(f, f"rssi{number}_8bit").count == count))
     return held
 
 

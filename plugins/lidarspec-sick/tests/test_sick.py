@@ -76,7 +76,8 @@ def test_any_number_of_echoes_is_read_with_their_strengths(name: str, echoes: in
     for number in range(1, echoes + 1):
         values[f"dist{number}"] = {**first, "content": f"DIST{number}".encode(), "samples": [1000 * number] * beams}
         values[f"rssi{number}"] = {**first, "content": f"RSSI{number}".encode(), "samples": [10 * number] * beams}
-    data = sensor.build(frame, {**values, "channels": 2 * echoes})
+        values[f"rssi{number}_8bit"] = None
+    data = sensor.build(frame, {**values, "channels": 2 * echoes, "channels8": 0})
     packets = sensor.decode(data * 2)
     cloud = packets.points()
     assert dict(packets.stats.frames) == {frame: 2}
