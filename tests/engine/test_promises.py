@@ -26,9 +26,11 @@ from tests.shapes import SHAPES
 
 SECOND = 10**9
 TURNING = SHAPES["shape-commands"]
-#: readings of the wall clock, and where they are allowed: as a stamp; `transports.base.HostClock` is the one that carries them on.
+#: Readings of the wall clock, and where they are allowed: as a stamp, or beside the time of a file.
+#: `transports.base.HostClock` is the one that carries a stamp on.
 WALL = {"time.time", "time.time_ns", "datetime.now", "datetime.utcnow"}
 STAMPED = {
+    ("formats/writing.py", "time.time"),
     ("recording/recorders.py", "datetime.now"),
     ("recording/recorders.py", "time.time_ns"),
     ("transports/serving.py", "time.time_ns"),
