@@ -136,7 +136,7 @@ def test_parameters_are_described_and_changed_where_that_makes_sense(run: Any, c
     assert all(one <= 3.0 or one == float("inf") for one in newest().ranges)
     assert "source is read on configuring" in client.set("source", "udp://")
     assert client.set("scan_z_min", 2.0) == "from scan_z_min 2.0 up to scan_z_max 0.0 there is nothing"
-    assert client.set("range_min", 5.0) == "from 5.0 up to 3.0 there is nothing"
+    assert "5.0 to 3.0" in client.set("range_min", 5.0)
     assert client.set("beams", -1)
     assert (client.value("scan_z_min"), client.value("range_min")) == (0.0, 0.0)
     assert client.set("angle_min", 2.0) == ""  # on through the back, to where the last beam looks a turn on
