@@ -54,6 +54,7 @@ def test_a_capture_of_two_sensors_of_which_one_lost_a_packet(frames: list[bytes]
     assert max(len(line) for line in text.replace(str(path), "drive.pcap").splitlines()) <= 80
 
 
+@pytest.mark.slow
 def test_of_a_long_recording_the_beginning_and_the_end_are_read(tmp_path: Path) -> None:
     path = tmp_path / "long.lsr"
     number, data = looking.LOOKED_AT // 60_000 * 3, bytes(60_000)

@@ -127,6 +127,7 @@ def test_nothing_is_sent_to_a_simulated_sensor_where_that_is_asked_for(tmp_path:
     ran("record", "sim:slamtec-rplidar-a1", "-o", tmp_path / "a.lsr", "-t", "0.2", "--no-start", code=5)
 
 
+@pytest.mark.slow
 @posix
 def test_recorded_replayed_and_recorded_again_it_is_the_same(stream: Path, tmp_path: Path, started: Callable[..., Running]) -> None:
     player = started("replay", stream, "--json")

@@ -73,9 +73,8 @@ def test_the_catalogue_agrees_with_crccheck() -> None:
 @pytest.mark.parametrize(
     ("width", "reflected"),
     [
-        (8, False),
         (16, True),
-        *(pytest.param(*pair, marks=pytest.mark.slow) for pair in ((8, True), (16, False), (32, False), (32, True))),
+        *(pytest.param(*pair, marks=pytest.mark.slow) for pair in ((8, False), (8, True), (16, False), (32, False), (32, True))),
     ],
 )
 def test_a_crc_that_no_catalogue_knows(width: int, *, reflected: bool) -> None:

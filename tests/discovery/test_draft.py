@@ -72,6 +72,7 @@ def test_three_frames_of_one_length_and_a_crc() -> None:
     assert rising(found) == {"rising_4": (2, "little", 0), "rising_42": (2, "little", 0)}
 
 
+@pytest.mark.slow
 def test_a_count_that_only_the_frame_cut_off_gives_away() -> None:
     found = drafted(COIN_D4)
     assert (found.sync, found.size, str(found.length), len(found.frames)) == (b"\xaa\x55", None, "10 + 3 x byte at 3", 4)
@@ -294,6 +295,7 @@ def written(frames: list[bytes], *, datagrams: bool = False) -> dict[str, str]:
     return text_of(draft(frames if datagrams else [b"".join(frames)], datagrams=datagrams), origin="the tests", link="")
 
 
+@pytest.mark.slow
 def test_fields_alike_at_equal_distances_are_an_array() -> None:
     struct = written(simulate(ls.sensor("hesai-xt16"), 300), datagrams=True)["struct"]
     assert "# 8 blocks of 66 bytes that begin with the same field" in struct

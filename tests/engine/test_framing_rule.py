@@ -116,6 +116,7 @@ def test_representatives_that_send_streams_are_known() -> None:
     assert not any(load_sensor(name).datagrams for name in STREAM_REPRESENTATIVES)
 
 
+@pytest.mark.slow
 def test_an_announcement_may_change_with_every_frame_of_a_representative() -> None:
     rule.announcements_may_change_with_every_frame(Subject(load_sensor("slamtec-rplidar-a1")), 1500)
 

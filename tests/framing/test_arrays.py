@@ -49,7 +49,7 @@ def facts(spans: Frames) -> list[tuple[str, int, bytes, int]]:
     return [(found.frame, found.offset, found.data, found.gap) for found in spans.found()]
 
 
-@each_sensor
+@pytest.mark.parametrize("name", [*SHAPES, *(pytest.param(name, marks=pytest.mark.slow) for name in REPRESENTATIVES)])
 @pytest.mark.parametrize("distance", ["uneven", *(pytest.param(name, marks=pytest.mark.slow) for name in ("none", "even"))])
 def test_datagrams_in_one_buffer_are_those_one_after_another(name: str, distance: str) -> None:
     sensor = load_sensor(name)

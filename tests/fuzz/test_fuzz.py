@@ -19,10 +19,10 @@ from tests.representatives import REPRESENTATIVES
 from tests.shapes import SHAPES
 
 #: mutated inputs that the quick tier reads, in all; and at least so many for each target.
-INPUTS = 6000
+INPUTS = 5000
 LEAST = 2
 #: Of the targets of a group, the quick tier reads one in so many; their examples take the time.
-SHARE = {"stream": 5, "frame": 3}
+SHARE = {"stream": 5, "frame": 5}
 
 
 @pytest.fixture(scope="module")

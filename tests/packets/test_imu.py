@@ -86,6 +86,7 @@ def assert_in_their_scans(scans: list[ls.Scan], number: int) -> None:
         assert index + 1 == len(scans) or scan.imu.time_ns[-1] < stamps[index + 1]
 
 
+@pytest.mark.slow
 def test_scans_have_what_was_felt_during_them(tmp_path: Path) -> None:
     data = sent()
     number = len(SENSOR.decode(data, "imu").imu()) + len(SENSOR.decode(data).imu())

@@ -112,9 +112,7 @@ QUICK = {
     *PLUGGY,
     "by_vectors/wrong_order",
     "lambda_raises",
-    "no_wrap",
     "shadowed_name",
-    "short_write",
     "silent_command",
 }
 #: mistakes in a module's own text: the line that is named has these words.

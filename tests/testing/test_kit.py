@@ -157,6 +157,7 @@ def test_what_is_meant_is_acknowledged_with_a_reason() -> None:
     assert left(replace(far, acknowledged={"LS210 data.tilt": "no"})) == {"LS209", "LS210"}
 
 
+@pytest.mark.slow
 def test_what_is_acknowledged_keeps_nothing_from_being_tried() -> None:
     coded = sound.sealed(samples=Array(this.count, Struct("distance" / Int16ul, "quality" / Int8ul)))
     bare = sound.sensor(sound.frame(coded), acknowledged={"LS201": "a code"})

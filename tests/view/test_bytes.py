@@ -109,6 +109,7 @@ def test_points_that_are_not_shown_are_gone(tmp_path: Path) -> None:
         assert page.asked("frame", point={"scan": header["scan"], "index": 1 << 20})["is"] == "gone"
 
 
+@pytest.mark.slow
 def test_frames_follow_one_another_by_number(tmp_path: Path) -> None:
     """Each is what stands behind the one before it in the file."""
     path = recorded(tmp_path, suffix=".bin")

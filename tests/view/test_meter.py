@@ -37,6 +37,7 @@ class Bench:
         return packets
 
 
+@pytest.mark.slow
 def test_rates_gaps_and_jitter_are_those_of_the_arrivals() -> None:
     bench = Bench()
     source = np.random.default_rng(3)

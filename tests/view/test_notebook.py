@@ -52,6 +52,7 @@ def test_a_point_shows_as_text_and_nothing_as_a_picture() -> None:
     assert "0 returns" in str(cloud()._repr_svg_())
 
 
+@pytest.mark.slow
 def test_a_large_cloud_makes_a_small_picture_that_says_so() -> None:
     rng = np.random.default_rng(1)
     svg = cloud(*map(tuple, rng.uniform(-9, 9, (200_000, 3)).tolist()))._repr_svg_()
