@@ -349,13 +349,13 @@ def plot(
                 emit(svg(chosen.points, how, title), output)
             else:
                 _save(figures.of_scan(chosen, how, title), output, suffix)
-            if output != "-":
-                note(f"{output}: {title}")
+            drawn = title
         else:
             until = time.monotonic() + (duration or (PATIENCE if device.is_live else math.inf))
             _save(_over_time(device, source, selection, kind, until), output, suffix)
-            if output != "-":
-                note(f"{output}: {kind} of {device.sensor.id}")
+            drawn = f"{kind} of {device.sensor.id}"
+        if output != "-":
+            note(f"{output}: {drawn}")
 
 
 def _numbered(device: Device, source: str, selection: Selection, number: int) -> Scan:

@@ -41,7 +41,7 @@ def output_option(function: Function) -> Function:
     """Add ``-o/--output`` to a verb; a file that the verb reads is refused."""
 
     @functools.wraps(function)
-    def checked(*args: Any, output: str | None, **others: Any) -> Any:
+    def refuse_and_call(*args: Any, output: str | None, **others: Any) -> Any:
         if output is not None:
             from lidarspec.cli.inputs import refuse_overwriting
             from lidarspec.spec.sensor import Sensor
@@ -50,7 +50,7 @@ def output_option(function: Function) -> Function:
             refuse_overwriting(output, *(word for word in words if isinstance(word, str | Sensor)))
         return function(*args, output=output, **others)
 
-    return click.option("-o", "--output", metavar="FILE", help="Write to a file instead of standard output.")(checked)  # type: ignore[return-value]
+    return click.option("-o", "--output", metavar="FILE", help="Write to a file instead of standard output.")(refuse_and_call)  # type: ignore[return-value]
 
 
 class Progress(contextlib.AbstractContextManager["Progress"]):

@@ -253,52 +253,45 @@ def stats(
     what is missing by the sensor's own numbers or clock. A file is read as fast as possible, in batches, and by the time of its packets:
     there an interval can be longer than asked for. Several sources are read in turn.
     """
+    lasting = min(duration or math.inf, interval * count if count else math.inf)
     has_findings = False
     for source in sources:
         if len(sources) > 1 and not as_json:
             say(f"{source}:")
-        try:
-            _print_stats(source, sensor_id, count, selection, duration, interval, max_errors, as_json=as_json)
-        except click.exceptions.Exit:
-            has_findings = True
+        with open_device(source, sensor_id, period=LOOK) as device:
+            found = _print_stats(source, Feed(device, select=selection), Lines(device, as_json), interval, lasting)
+            worst = max(found.error_rate, found.loss_rate or 0.0)
+            if max_errors is not None and worst > max_errors:
+                note(f"{worst:.3%} of the frames are wrong or lost, more than {max_errors:.3%}")
+                has_findings = True
+            try:
+                conclude(device)
+            except click.exceptions.Exit:  # damage; the sources behind this one are read all the same
+                has_findings = True
     if has_findings:
         raise click.exceptions.Exit(FINDINGS)
 
 
-def _print_stats(
-    source: str,
-    sensor_id: str | Sensor | None,
-    count: int | None,
-    selection: Selection,
-    duration: float | None,
-    interval: float,
-    max_errors: float | None,
-    *,
-    as_json: bool,
-) -> None:
-    """Print the lines and the summary of one source."""
-    with open_device(source, sensor_id, period=LOOK) as device:
-        lines, feed, start = Lines(device, as_json), Feed(device, select=selection), time.monotonic()
-        lasting = min(duration or math.inf, interval * count if count else math.inf)
-        try:
-            if device.is_live:
-                _by_the_clock(feed, lines, interval, start, lasting, Patience(device, source))
-            else:
-                _by_the_packets(feed, lines, interval, lasting)
-        except KeyboardInterrupt:
-            lines.summary(_summary(feed, start))
-            raise
-        found = _summary(feed, start)
-        if found.packets == 0:
-            raise nothing_came(device, source, found.seconds)
-        lines.summary(found)
-        worst = max(found.error_rate, found.loss_rate or 0.0)
-        is_too_bad = max_errors is not None and worst > max_errors
-        if is_too_bad:
-            note(f"{worst:.3%} of the frames are wrong or lost, more than {max_errors:.3%}")
-        conclude(device)
-        if is_too_bad:
-            raise click.exceptions.Exit(FINDINGS)
+def _print_stats(source: str, feed: Feed, lines: Lines, interval: float, lasting: float) -> Reading:
+    """Print the lines and the summary of one source, and return the summary.
+
+    Args:
+        interval, lasting: seconds from line to line, and of all lines together.
+    """
+    start = time.monotonic()
+    try:
+        if feed.device.is_live:
+            _by_the_clock(feed, lines, interval, start, lasting, Patience(feed.device, source))
+        else:
+            _by_the_packets(feed, lines, interval, lasting)
+    except KeyboardInterrupt:
+        lines.summary(_summary(feed, start))
+        raise
+    found = _summary(feed, start)
+    if found.packets == 0:
+        raise nothing_came(feed.device, source, found.seconds)
+    lines.summary(found)
+    return found
 
 
 def _summary(feed: Feed, start: float) -> Reading:

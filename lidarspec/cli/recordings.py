@@ -61,7 +61,7 @@ def record(
     """
     check_suffix(target)
     if times is not None:
-        raise _slice_refused(source, target, times)
+        raise _slice_error(source, target, times)
     refuse_overwriting(target, source, sensor_id)
     known = named(source)
     sensor = named_sensor(sensor_id) if sensor_id else declared(source) if is_live(source) else known.configured() if known else None
@@ -92,7 +92,7 @@ def record(
         raise click.exceptions.Exit(INTERRUPTED)
 
 
-def _slice_refused(source: str, target: str, times: str) -> UsageError:
+def _slice_error(source: str, target: str, times: str) -> UsageError:
     """Return the error for --slice, with the command that cuts a recording."""
     if is_live(source):
         return suggest(UsageError("--slice cuts recordings; of a live source, -t takes the first seconds"), "lidarspec record --help")
