@@ -287,10 +287,10 @@ class LiveInput(Input):
             return pending.result()
         except CommandError as error:
             link = self.sensor.commands[name].link
-            if not isinstance(error, ReplyTimeout) and not isinstance(self.sensor.links[link], Http):
-                raise
-            why = self._captures[link].transport.warnings
-            raise type(error)("; ".join([str(error), *why])) from None
+            # The warnings of HTTP are about this request; those of a stream explain no more than silence.
+            is_explained = isinstance(error, ReplyTimeout) or isinstance(self.sensor.links[link], Http)
+            remarks = self._captures[link].transport.warnings if is_explained else []
+            raise type(error)("; ".join([str(error), *remarks])) from None
 
     def _find_own_address(self, name: str) -> None:
         """Let the session know where we are, as the sensor sees it, where a command says that."""

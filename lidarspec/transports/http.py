@@ -44,15 +44,15 @@ class HttpTransport(LiveTransport):
             request = HttpRequest.parse(self._requests.get(timeout=timeout))
         except queue.Empty:
             return []
+        path = request.path.decode("latin-1")
         try:
-            status, body, location = self._asked(str(request.method), request.path.decode("latin-1"), request.body)
+            status, body, location = self._request(str(request.method), path, request.body)
         except (OSError, http.client.HTTPException, ValueError) as error:
             why = reason(error) or f"no answer within {self._link.timeout:g} s"
-            self.warnings = [f"{self.label}{request.path.decode('latin-1')}: {why}"]
+            self.warnings = [f"{self.label}{path}: {why}"]
             return []
         self.warnings = []
         if location:
-            path = request.path.decode("latin-1")
             self.warnings = [f"{self.label}{path}: status {status}, moved to {location}, which is not followed"]
         reply = HttpReply.build({"status": status, "size": len(body), "body": body})
         return [Chunk(reply, self._clock.now(), (self._host, self._link.port))]
@@ -73,7 +73,7 @@ class HttpTransport(LiveTransport):
     def close(self) -> None:
         self.closed = True
 
-    def _asked(self, method: str, path: str, body: bytes) -> tuple[int, bytes, str]:
+    def _request(self, method: str, path: str, body: bytes) -> tuple[int, bytes, str]:
         """Return the status and the body of a reply, and where a redirection leads."""
         connection = http.client.HTTPConnection(self._host, self._link.port, timeout=self._link.timeout)
         with contextlib.closing(connection):
