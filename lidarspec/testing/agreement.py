@@ -246,9 +246,8 @@ def single_packets_equal_a_batch(subject: Subject) -> None:
 
 def scans_do_not_depend_on_batches(subject: Subject) -> None:
     """Scans are cut alike, with the same points, however many packets come at a time."""
-    found: list[Found] = []
 
-    def scans(size: int) -> list[Scan]:
+    def scans(found: list[Found], size: int) -> list[Scan]:
         stats = Decoder(subject.sensor, stream=True).stats
         stream = PacketStream(subject.sensor, subject.sensor.data_frame, stats)
         batches = [stream.add([packed(found[start : start + size])]) for start in range(0, len(found), size)]
@@ -256,15 +255,16 @@ def scans_do_not_depend_on_batches(subject: Subject) -> None:
         require(not stats.plugin_errors, "LS414", str(stats.failure("")))
         return scans
 
+    found: list[Found] = []
     whole: list[Scan] = []
     for rounds in (None, MORE_ROUNDS):
         found = subject.sensor.split(material.delivery(subject.sensor, subject.conversation(rounds=rounds)))
-        whole = scans(len(found))
+        whole = scans(found, len(found))
         if whole:
             break
     require(whole, "LS404", "there is no scan")
     for size in (1, 3):
-        parts = scans(size)
+        parts = scans(found, size)
         alike = [(len(scan), scan.whole, scan.complete) for scan in parts] == [(len(scan), scan.whole, scan.complete) for scan in whole]
         require(alike, "LS404", f"{size} packets at a time give other scans than all at once")
         for part, other in zip(parts, whole, strict=True):

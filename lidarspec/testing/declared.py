@@ -29,6 +29,8 @@ from lidarspec.wire.schema import without_indices
 MEASURES = frozenset(["distance", "range", "radius", "angle", "azimuth", "elevation", "temperature", "voltage", "timestamp"])
 #: share of the places in a payload at which a sync pattern may stand by chance.
 COMMON = 1 / 200
+#: Examples whose length is looked at before a frame is simulated for it, and all of them.
+FIRST_LENGTHS, LENGTHS = 3, 12
 #: example frames in whose payloads the sync pattern is counted, with the usual number of examples.
 SYNC_EXAMPLES = 12
 #: bits of constants and checksums below which noise makes a frame every few megabytes, on a stream and in a datagram.
@@ -141,10 +143,11 @@ def _longest(subject: Subject, name: str, frame: Frame) -> Findings:
 
 
 def _sizes(subject: Subject, name: str) -> Iterator[int]:
-    yield from (len(subject.example(name, seed=seed)) for seed in range(3))
+    """The lengths of examples, and of a simulated frame between them, whose simulation takes long and is seldom needed."""
+    yield from (len(subject.example(name, seed=seed)) for seed in range(FIRST_LENGTHS))
     if name in subject.sensor.data_frames and subject.sensor.simulation_of(name).sweep is not None:
         yield len(simulation(subject.sensor, name).block(0, 1, Room(), 0.0).frames[0])
-    yield from (len(subject.example(name, seed=seed)) for seed in range(3, 12))
+    yield from (len(subject.example(name, seed=seed)) for seed in range(FIRST_LENGTHS, LENGTHS))
 
 
 def _names(subject: Subject, name: str, frame: Frame) -> Findings:

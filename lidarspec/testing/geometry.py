@@ -65,7 +65,7 @@ ALONG = 0.9
 EXACT, UNTOLD = 2e-6, 0.004
 
 
-def swept(subject: Subject, name: str, packets: int) -> list[bytes]:
+def make_sweep(subject: Subject, name: str, packets: int) -> list[bytes]:
     """Return the first packets along the sensor's `sweep`, none if it declares none or the frame type is not compiled."""
     sweep = subject.sensor.simulation_of(name).sweep
     if sweep is None:
@@ -168,7 +168,7 @@ def clouds_keep_the_conventions(subject: Subject, name: str) -> None:
 
 def directions_are_radians(subject: Subject, name: str) -> None:
     """No direction is so large that it can only be degrees."""
-    along = swept(subject, name, 64)
+    along = make_sweep(subject, name, 64)
     if not along and any(info.kind == "float" for info in subject.fields(name).values()):
         return  # which may hold any number
     frames = along or [subject.example(name, seed=seed) for seed in range(16)]
@@ -250,7 +250,7 @@ def _sense_of(axes: tuple[str, str, str], zero: float) -> int:
 
 def angles_are_in_order(subject: Subject, name: str) -> None:
     """Along the sweep of a sensor that rotates, the azimuths of each laser go one way, also across the full circle."""
-    frames = swept(subject, name, PACKETS if subject.sensor.frames[name].max_length <= material.SHORT else PACKETS // 4)
+    frames = make_sweep(subject, name, PACKETS if subject.sensor.frames[name].max_length <= material.SHORT else PACKETS // 4)
     if not frames:
         return
     found = evaluate(read(subject, name, frames).with_points)
@@ -282,7 +282,7 @@ def angles_are_in_order(subject: Subject, name: str) -> None:
 
 def counters_run_on(subject: Subject, name: str) -> None:
     """Along the sweep no packet counts as lost, late or doubled, and time does not run back."""
-    frames = swept(subject, name, 700 if subject.sensor.frames[name].max_length <= LONG_FRAME_BYTES else 260)
+    frames = make_sweep(subject, name, 700 if subject.sensor.frames[name].max_length <= LONG_FRAME_BYTES else 260)
     if not frames or name != subject.sensor.data_frame:
         return
     packets = read(subject, name, frames)

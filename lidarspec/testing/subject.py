@@ -111,6 +111,8 @@ def seals(sensor: Sensor, name: str, data: bytes) -> set[str]:
 
 #: examples of each frame type that a property tries, and those for which numbers of rounds are stated.
 USUAL_EXAMPLES = 40
+#: Rounds of a conversation with the usual number of examples, and at least.
+USUAL_ROUNDS, LEAST_ROUNDS = 3, 2
 EXAMPLES = int(os.environ.get("LIDARSPEC_EXAMPLES", USUAL_EXAMPLES))
 #: sensors with more frame types than this are tried with less of each.
 MANY = 8
@@ -190,7 +192,7 @@ class Subject:
     def conversation(self, *, seed: int = 0, rounds: int | None = None) -> list[tuple[str, bytes]]:
         """Frames of all incoming types as the sensor could send them: (type, bytes), each where it is looked for and believed."""
         frames: list[tuple[str, bytes]] = []
-        for turn in range(self.scale_rounds(3, least=2) if rounds is None else rounds):
+        for turn in range(self.scale_rounds(USUAL_ROUNDS, LEAST_ROUNDS) if rounds is None else rounds):
             for name in self.sensor.incoming:
                 frame = self.sensor.frames[name]
                 number = frame.confirm + 2 if frame.data or frame.confirm > 1 else 1
