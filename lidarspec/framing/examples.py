@@ -34,8 +34,8 @@ from lidarspec.wire.slots import recoder
 #: How often random frames are made, and how often where a sensor's own `sweep` helps if none is plausible.
 TRIES = 40
 TRIES_BEFORE_SWEEP = 8
-#: Random frames of the first try, and at most of a later one; each try makes four times as many.
-FIRST_BATCH = 1
+#: Each try makes so many times the random frames of the one before, beginning with one frame, and at most so many.
+GROWTH = 4
 LARGEST_BATCH = 64
 #: At most so many of a wire form, which are written one slot after another.
 WRITTEN = 8
@@ -69,7 +69,7 @@ def random_frame(sensor: Spec, frame: str, source: random.Random, drawn: Drawn =
         return _interpreted(sensor, frame, known, source, drawn)
     largest = LARGEST_BATCH if recoder(engine.frame) is None else WRITTEN
     for attempt in range(TRIES if sensor.simulation_of(frame).sweep is None else TRIES_BEFORE_SWEEP):
-        number = min(FIRST_BATCH << 2 * attempt, largest)
+        number = min(GROWTH**attempt, largest)
         layout, chosen = header(engine, source, drawn)
         rows = _random(engine, layout, number, source)
         for path, draw in drawn.items():

@@ -246,7 +246,7 @@ def fill_in(formula: Formula | None, given: Container, value: int, fields: Mappi
     holder, name = _place(given, asked[0].path)
     if isinstance(holder, dict) and holder.get(name) is None:
         read = functools.partial(given_value, given, fields)
-        holder[name] = _solved(formula, read, holder, name, value, fields[asked[0].path], axis)
+        holder[name] = _find_count(formula, read, holder, name, value, fields[asked[0].path], axis)
 
 
 def _open(node: Node, given: Any, values: Container) -> None:
@@ -442,7 +442,7 @@ def _place(values: Any, path: str) -> tuple[Any, str]:
     return values, last
 
 
-def _solved(count: Formula, read: Read, holder: Container, field: str, length: int, info: FieldInfo, axis: str) -> int:
+def _find_count(count: Formula, read: Read, holder: Container, field: str, length: int, info: FieldInfo, axis: str) -> int:
     """Return the value of the count field that gives this length, and leave it in its holder."""
     top = int(info.limits[1]) if info.kind == "int" else LARGEST_TRIED
 

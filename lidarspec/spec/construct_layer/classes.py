@@ -95,7 +95,7 @@ class MarkedStruct(Struct):  # type: ignore[misc]
             start = stream.tell()
             value = con._parsereport(stream, inner, path)
             end = stream.tell()
-            if trail is not None:
+            if trail is not None:  # as `note` does; most parses have no trail, and need no path
                 trail.append(Seen(f"{path} -> {con.name or UNNAMED}", start, end, value))
             if con.name:
                 obj[con.name] = inner[con.name] = value
