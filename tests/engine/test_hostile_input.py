@@ -25,12 +25,13 @@ each_sensor = pytest.mark.parametrize("name", [*SHAPES, *REPRESENTATIVES])
 
 
 @each_sensor
-def test_a_mutated_frame_is_parsed_or_is_a_wire_error(name: str) -> None:
+@pytest.mark.parametrize("times", [1, pytest.param(3, marks=pytest.mark.slow)])
+def test_a_mutated_frame_is_parsed_or_is_a_wire_error(name: str, times: int) -> None:
     sensor = load_sensor(name)
     subject = Subject(sensor)
-    source = subject.source("hostile frames")
+    source = subject.source(f"hostile frames {times}")
     examples = [(frame, subject.example(frame, seed=seed)) for frame in sensor.frames for seed in range(SEEDS)]
-    for _ in range(SHAPE_FRAMES if name in SHAPES else REPRESENTATIVE_FRAMES):
+    for _ in range(times * (SHAPE_FRAMES if name in SHAPES else REPRESENTATIVE_FRAMES)):
         frame, data = source.choice(examples)
         mutated = material.mutated(data, source)
         with contextlib.suppress(WireError):

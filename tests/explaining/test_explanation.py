@@ -57,7 +57,7 @@ each_sensor = pytest.mark.parametrize("name", [*SHAPES, *REPRESENTATIVES])
 
 
 @functools.cache
-def explained(name: str, frame: str, seed: int = 0) -> Explanation:
+def explain_example(name: str, frame: str, seed: int = 0) -> Explanation:
     """Return the explanation of an example of a frame type."""
     sensor = load_sensor(name)
     return explain(sensor.example(frame, seed=seed), sensor, frame)
@@ -75,7 +75,7 @@ def bytes_of_rows(explanation: Explanation) -> bytes:
 @each_sensor
 def test_every_byte_is_named_once(name: str) -> None:
     for frame in load_sensor(name).frames:
-        found = explained(name, frame)
+        found = explain_example(name, frame)
         assert bytes_of_rows(found) == found.data
         assert found.fault is None
         assert all(row.right and row.path for row in found.rows)
@@ -86,7 +86,7 @@ def test_every_byte_is_named_once(name: str) -> None:
 def test_a_truncated_frame_is_explained_as_far_as_it_goes(name: str) -> None:
     sensor = load_sensor(name)
     for frame in sensor.frames:
-        whole = explained(name, frame)
+        whole = explain_example(name, frame)
         data = whole.data
         for end in range(0, len(data), 1 + len(data) // CUTS) if name in CUT_AT_MANY_BYTES else (len(data) // 2,):
             found = explain(data[:end], sensor, frame)
@@ -101,7 +101,7 @@ def test_a_truncated_frame_is_explained_as_far_as_it_goes(name: str) -> None:
 def test_the_values_are_those_that_parse_gives(name: str) -> None:
     sensor = load_sensor(name)
     for frame in sensor.frames:
-        explanation = explained(name, frame)
+        explanation = explain_example(name, frame)
         parsed = sensor.parse(explanation.data, frame)
         values = [value for row in explanation.rows for value in row.values]
         for value in values:
@@ -118,7 +118,7 @@ def test_the_values_are_those_that_parse_gives(name: str) -> None:
 @each_sensor
 def test_pictures_show_every_bit_of_a_block_once(name: str) -> None:
     for frame in load_sensor(name).frames:
-        for row in explained(name, frame).rows:
+        for row in explain_example(name, frame).rows:
             shown = bytearray(len(row.data))
             for value in row.values:
                 assert value.masks or value.raw == b""
@@ -153,9 +153,9 @@ def leaf_count(parsed: object) -> int:
 def test_points_are_those_of_the_cloud(name: str) -> None:
     sensor = load_sensor(name)
     frame = sensor.data_frame
-    found = explained(name, frame)
+    found = explain_example(name, frame)
     if not any(row.points for row in found.rows):  # the count of a random frame may be 0
-        found = explained(name, frame, seed=1)
+        found = explain_example(name, frame, seed=1)
     # a point is listed at several rows if its range and its intensity stand in arrays of their own
     points = list({id(point): point for row in found.rows for point in row.points}.values())
     if sensor.frames[frame].after or not points:
