@@ -6,6 +6,8 @@ sensor is proved in the `tests` folder of its plugin. Ids only: a sensor is load
 
 from __future__ import annotations
 
+import pytest
+
 import lidarspec as ls
 from tests.shapes import SHAPES
 
@@ -24,6 +26,11 @@ REPRESENTATIVES = (
 
 #: The representatives that send a stream of bytes; the others send datagrams.
 STREAM_REPRESENTATIVES = ("ldrobot-stl27l", "cspc-m1c1-mini", "slamtec-rplidar-a1", "hokuyo-ust10lx")
+
+#: The `name` of every shape and every representative.
+each_sensor = pytest.mark.parametrize("name", [*SHAPES, *REPRESENTATIVES])
+#: The same, with the representatives in the slow tier: for what the shapes prove.
+each_shape = pytest.mark.parametrize("name", [*SHAPES, *(pytest.param(name, marks=pytest.mark.slow) for name in REPRESENTATIVES)])
 
 
 def load_sensor(sensor_id: str) -> ls.Sensor:

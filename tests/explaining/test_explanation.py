@@ -32,7 +32,7 @@ from lidarspec.errors import UnknownFrame
 from lidarspec.explaining.explanation import Explanation, explain
 from lidarspec.explaining.wording import hexdump
 from lidarspec.spec import Checksummed, Frame, Polar, Scaled, Simulation, Sum, Xor
-from tests.representatives import REPRESENTATIVES, load_sensor
+from tests.representatives import each_sensor, each_shape, load_sensor
 from tests.shapes import SHAPES
 
 EXAMPLE = bytes.fromhex("542c6808ab7ee000e4dc00e2d900e5d500e3d300e4d000e9cd00e4ca00e2c700e9c500e5c200e5c000e5be823a1a50")
@@ -53,7 +53,6 @@ WITHOUT_POINTS = (
     "slamtec-rplidar-a1",
     "sick-multiscan136",
 )
-each_sensor = pytest.mark.parametrize("name", [*SHAPES, *REPRESENTATIVES])
 
 
 @functools.cache
@@ -72,7 +71,7 @@ def bytes_of_rows(explanation: Explanation) -> bytes:
     return b"".join(row.data for row in explanation.rows)
 
 
-@each_sensor
+@each_shape
 def test_every_byte_is_named_once(name: str) -> None:
     for frame in load_sensor(name).frames:
         found = explain_example(name, frame)
@@ -115,7 +114,7 @@ def test_the_values_are_those_that_parse_gives(name: str) -> None:
         assert len(values) == leaf_count(parsed)
 
 
-@each_sensor
+@each_shape
 def test_pictures_show_every_bit_of_a_block_once(name: str) -> None:
     for frame in load_sensor(name).frames:
         for row in explain_example(name, frame).rows:

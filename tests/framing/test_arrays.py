@@ -26,10 +26,9 @@ from lidarspec.spec import Fields, Frame
 from lidarspec.wire.arrays import repeated
 from lidarspec.wire.frame_table import Rows
 from tests.engine.engines import is_compiled
-from tests.representatives import REPRESENTATIVES, load_sensor
+from tests.representatives import each_sensor, each_shape, load_sensor
 from tests.shapes import SHAPES
 
-each_sensor = pytest.mark.parametrize("name", [*SHAPES, *REPRESENTATIVES])
 EXAMPLES = 10
 
 
@@ -49,7 +48,7 @@ def facts(spans: Frames) -> list[tuple[str, int, bytes, int]]:
     return [(found.frame, found.offset, found.data, found.gap) for found in spans.found()]
 
 
-@pytest.mark.parametrize("name", [*SHAPES, *(pytest.param(name, marks=pytest.mark.slow) for name in REPRESENTATIVES)])
+@each_shape
 @pytest.mark.parametrize("distance", ["uneven", *(pytest.param(name, marks=pytest.mark.slow) for name in ("none", "even"))])
 def test_datagrams_in_one_buffer_are_those_one_after_another(name: str, distance: str) -> None:
     sensor = load_sensor(name)
@@ -67,7 +66,7 @@ def test_datagrams_in_one_buffer_are_those_one_after_another(name: str, distance
     assert together.stats == one_by_one.stats
 
 
-@each_sensor
+@each_shape
 def test_the_rows_of_an_array_are_those_datagrams(name: str) -> None:
     sensor = load_sensor(name)
     rows = damaged(name)
@@ -78,7 +77,7 @@ def test_the_rows_of_an_array_are_those_datagrams(name: str) -> None:
         np.testing.assert_array_equal(getattr(array, column), getattr(listed, column))
 
 
-@each_sensor
+@each_shape
 def test_arrays_of_sound_frames_alone_and_with_damaged_ones_in_turn(name: str) -> None:
     sensor = load_sensor(name)
     mixed = damaged(name)

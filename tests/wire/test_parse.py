@@ -36,7 +36,7 @@ from lidarspec.wire.layout import Layout
 from lidarspec.wire.layout_tree import HeaderTree, frame_layouts
 from lidarspec.wire.parse import unpacked
 from tests.engine.engines import is_compiled
-from tests.representatives import REPRESENTATIVES, load_sensor
+from tests.representatives import each_sensor, each_shape, load_sensor
 from tests.shapes import SHAPES
 
 #: Examples of each frame type; long frames of real sensors take construct its time.
@@ -45,8 +45,6 @@ REPRESENTATIVE_EXAMPLES = 1
 #: Bytes at the start of a frame that are damaged one by one.
 SHAPE_DAMAGED_BYTES = 15
 REPRESENTATIVE_DAMAGED_BYTES = 4
-
-each_sensor = pytest.mark.parametrize("name", [*SHAPES, *REPRESENTATIVES])
 
 
 def compiled_frames(sensor: Sensor) -> list[str]:
@@ -79,7 +77,7 @@ def unpack(frame: Frame, data: bytes) -> Any:
     return unpacked(frame.tree, layout, data) if isinstance(layout, Layout) and layout.sound(data) else None
 
 
-@each_sensor
+@each_shape
 def test_frames_unpack_to_what_construct_parses(name: str) -> None:
     sensor = load_sensor(name)
     for frame in compiled_frames(sensor):
@@ -90,7 +88,7 @@ def test_frames_unpack_to_what_construct_parses(name: str) -> None:
             same(found, clean(sensor.frames[frame].prepared.parse(data)))
 
 
-@each_sensor
+@each_shape
 def test_damaged_frames_are_left_to_construct(name: str) -> None:
     sensor = load_sensor(name)
     for frame in compiled_frames(sensor):

@@ -12,19 +12,18 @@ from lidarspec.framing.frame_engine import CompiledCodec, codec
 from lidarspec.spec import Frame
 from lidarspec.wire.layout import Layout
 from lidarspec.wire.wire_table import INDICES, Extent, WireRow, frame_size, wire_table
-from tests.representatives import REPRESENTATIVES, load_sensor
+from tests.representatives import each_sensor, each_shape, load_sensor
 from tests.shapes import SHAPES
 
 #: Types of rows that stand for no field.
 NO_FIELDS = ("array", "parts", "check", "no frame")
-each_sensor = pytest.mark.parametrize("name", [*SHAPES, *REPRESENTATIVES])
 
 
 def evaluated(formula: str, names: dict[str, object]) -> int:
     return int(eval(formula, {"__builtins__": {}}, names))
 
 
-@each_sensor
+@each_shape
 def test_offsets_are_those_of_the_layout(name: str) -> None:
     sensor = load_sensor(name)
     for frame in sensor.frames:
