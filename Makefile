@@ -149,6 +149,8 @@ $(USERS): $(PROJECTS)
 $(TESTERS): $(USERS)
 	@echo "installing pytest and the small libraries that the quick tests need into $(VENV)"
 	@$(INSTALL) '$(CORE)[test]'
+	@echo "compiling the tests, once for all processes that run them"
+	@$(BIN)/python -m pytest --collect-only -qq >/dev/null || true  # what does not compile is reported when the tests run
 	@touch $@
 
 $(DEVELOPERS): $(USERS)
