@@ -8,14 +8,19 @@ from __future__ import annotations
 import gc
 import os
 import signal
+import weakref
 from collections.abc import Iterator
 
 import pytest
 
+from lidarspec.framing import examples
+from lidarspec.spec.description import Spec
 from tests.missing import describe_missing
 
 #: plugins whose tests need an environment of their own: `make test-ros2`.
 collect_ignore = ["plugins/lidarspec-ros2"]
+
+gc.disable()
 
 if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
     signal.signal(signal.SIGINT, signal.default_int_handler)
@@ -46,6 +51,23 @@ def _isolated(tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:
         yield
 
 
+@pytest.fixture(autouse=True, scope="session")
+def _examples_are_made_once() -> Iterator[None]:
+    """Make each example frame once: the same frames of the same sensors are asked for by thousands of tests."""
+    made: weakref.WeakKeyDictionary[Spec, dict[tuple[str, int], bytes]] = weakref.WeakKeyDictionary()
+    original = examples.example
+
+    def example(sensor: Spec, frame: str, *, seed: int = 0) -> bytes:
+        frames = made.setdefault(sensor, {})
+        if (frame, seed) not in frames:
+            frames[frame, seed] = original(sensor, frame, seed=seed)
+        return frames[frame, seed]
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(examples, "example", example)
+        yield
+
+
 @pytest.fixture(autouse=True, scope="module")
 def _frozen() -> None:
     """Exempt everything that exists before a module's first test from garbage collection, which saves time."""
@@ -53,11 +75,9 @@ def _frozen() -> None:
     gc.freeze()
 
 
-@pytest.hookimpl(optionalhook=True)
-def pytest_xdist_auto_num_workers() -> int:
-    """Return one worker more than there are processors, as many tests wait for a port, a page or a process."""
-    available = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()
-    return (available or 1) + 1
+def pytest_collection_finish() -> None:
+    """Collect garbage again, of which there is next to none while tests are collected."""
+    gc.enable()
 
 
 def pytest_terminal_summary(terminalreporter: pytest.TerminalReporter) -> None:
