@@ -101,8 +101,12 @@ def view(
 
 
 def _tell_recordings(switch: Switch | None) -> None:
-    for path, size in switch.written if switch else ():
+    if switch is None:
+        return
+    for path, size in switch.written:
         note(f"recorded {size} bytes; next: lidarspec view {Path(path).name}")
+    if switch.trouble:
+        note(switch.trouble)
 
 
 def _serve(

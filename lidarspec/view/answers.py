@@ -77,7 +77,8 @@ class Answers:
         """
         broadcast, shown = self.broadcast, at or self.broadcast.shown
         switch, paused = broadcast.switch, frozen or broadcast.paused
-        recording = None if switch is None or switch.name is None else {"name": switch.name, "bytes": switch.bytes}
+        current = None if switch is None else switch.recording
+        recording = None if current is None else {"name": current[0], "bytes": current[1]}
         trouble = [switch.trouble] if switch is not None and switch.trouble else []
         return {
             "is": "state",

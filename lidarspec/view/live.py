@@ -8,6 +8,7 @@ from __future__ import annotations
 import itertools
 import math
 import textwrap
+import threading
 import time
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -54,24 +55,26 @@ Figure = tuple[str, str, int]
 
 
 class Switch:
-    """Stands where a recorder does, and hands on to a new one for each time that it is switched on.
+    """The recorder of a source, which starts a new file each time that it is switched on.
+
+    Any thread may switch: one change at a time is made.
 
     Args:
         source: as the user called it.
-        folder: where the files go.
+        folder: for the files.
 
     Attributes:
-        name: of the file that is being written, None while it is off.
-        trouble: why it could not be switched on, "" where it could.
-        written: files and the bytes of the wire in them, those that are closed.
+        trouble: why the last change did not do what was asked, "" if it did.
+        written: closed files, and the bytes of the wire in them.
     """
 
     def __init__(self, source: str, folder: Path) -> None:
-        self._source, self._folder = source, folder
+        self._source = source
+        self._folder = folder
+        self._changing = threading.Lock()
         self._opened: Transport | None = None
         self._recorder: Appender | None = None
         self.sensor_id = ""
-        self.name: str | None = None
         self.trouble = ""
         self.written: list[tuple[str, int]] = []
 
@@ -82,19 +85,20 @@ class Switch:
 
     def toggle(self) -> None:
         """Start a file named after the sensor and the time, or end the one that is being written."""
-        self.trouble = ""
-        try:
-            if self._recorder is None:
-                self._begin()
-            else:
-                self.close()
-        except LidarSpecError as error:
-            self.trouble = str(error)
+        with self._changing:
+            self._change(on=self._recorder is None)
+
+    def set(self, *, on: bool) -> None:
+        """Start a file, or end it; does nothing if that is done already."""
+        with self._changing:
+            if on == (self._recorder is None):
+                self._change(on=on)
 
     @property
-    def bytes(self) -> int:
-        """The bytes of the wire in the file that is being written; 0 while it is off."""
-        return self._recorder.bytes if self._recorder is not None else 0
+    def recording(self) -> tuple[str, int] | None:
+        """The name of the file that is being written, and the bytes of the wire in it."""
+        current = self._recorder
+        return None if current is None else (Path(current.path).name, current.bytes)
 
     @property
     def error(self) -> SourceError | None:
@@ -117,11 +121,18 @@ class Switch:
         Raises:
             SourceError: where it could not be written.
         """
-        current, self._recorder = self._recorder, None
-        if current is not None:
-            self.written.append((current.path, current.bytes))
-            self.name = None
-            current.close()
+        with self._changing:
+            self._end()
+
+    def _change(self, *, on: bool) -> None:
+        self.trouble = ""
+        try:
+            if on:
+                self._begin()
+            else:
+                self._end()
+        except LidarSpecError as error:
+            self.trouble = str(error)
 
     def _begin(self) -> None:
         opened = self._opened
@@ -130,7 +141,21 @@ class Switch:
         paths = (self._folder / f"{begin}{f'-{number}' if number else ''}.lsr" for number in itertools.count())
         path = next(path for path in paths if not path.exists())
         self._recorder = recorder(path, self.sensor_id, self._source, datagrams=opened.datagrams, baud=opened.baud)
-        self.name = path.name
+
+    def _end(self) -> None:
+        current = self._recorder
+        if current is None:
+            return
+        self._recorder = None
+        try:
+            current.close()
+        finally:
+            if current.records:
+                self.written.append((current.path, current.bytes))
+            else:
+                current.discard()
+        if not current.records:
+            self.trouble = f"nothing came while {Path(current.path).name} was recorded: it is removed"
 
 
 def _write_beside(whole: Cells, left: int, figures: Sequence[Figure], look: Look) -> None:
@@ -352,8 +377,8 @@ class Window:
     def _state(self) -> tuple[str, int]:
         """What is going on, in a word, and the ink of it."""
         device = self._feed.device
-        if self._record is not None and self._record.name is not None:
-            return f"● {self._record.name}", ALARM
+        if self._record is not None and (recording := self._record.recording) is not None:
+            return f"● {recording[0]}", ALARM
         if self.choice.paused:
             return "‖ paused", STRONG
         if not self._live:

@@ -145,6 +145,7 @@ class Page:
         self._frozen: Backlog | None = None  # the bytes as they were when a live source was paused
         self._watches, self._watched, self._known = False, -1, 0
         self._has_ended = False
+        self._sent_recording = ("", "")
         self._due = {"state": 0.0, "frame": 0.0}
 
     async def serve(self) -> str:
@@ -220,13 +221,23 @@ class Page:
                 self._watched = newest
                 with contextlib.suppress(LidarSpecError):  # what cannot be explained is not shown
                     return await asyncio.to_thread(self._answers.frame, taken, "last")
-        if now >= self._due["state"]:
+        recording = self._recording()
+        if now >= self._due["state"] or recording != self._sent_recording:
             self._due["state"] = now + STATE
+            self._sent_recording = recording
             frozen = self._frozen is not None
             state = self._answers.state(frozen=frozen, since=self._known, at=self._held[-1] if frozen else None)
             self._known = state["damaged"]["total"]
             return state
         return None
+
+    def _recording(self) -> tuple[str, str]:
+        """Return the name of the file that is being written, and why the last one failed."""
+        switch = self._broadcast.switch
+        if switch is None:
+            return "", ""
+        current = switch.recording
+        return current[0] if current is not None else "", switch.trouble
 
     def _unseen(self) -> Shown | None:
         """The newest scan, where the page has not had it yet and wants to see it go on."""
@@ -336,10 +347,21 @@ class Page:
         self._later("send", lambda: self._answers.sent(name, words), name)
 
     def _record(self, message: Mapping[str, Any]) -> None:
-        if (switch := self._broadcast.switch) is None:
+        switch = self._broadcast.switch
+        if switch is None:
             raise UsageError(f"{self._broadcast.source} is a file already: there is nothing to record")
-        self._due["state"] = 0.0
-        self._later("record", switch.toggle)
+        on = message.get("on")
+        if not isinstance(on, bool | None):
+            raise UsageError("on is true or false")
+
+        def change() -> None:
+            if on is None:
+                switch.toggle()
+            else:
+                switch.set(on=on)
+            self._broadcast.news()
+
+        self._later("record", change)
 
     _words: Mapping[str, Callable[[Page, Mapping[str, Any]], None]] = {
         "next": _next_scan,

@@ -13,6 +13,8 @@ const MOVE = 0.2;
 const MOVES: Record<string, [number, number]> = { ArrowUp: [0, MOVE], ArrowDown: [0, -MOVE], ArrowLeft: [-MOVE, 0], ArrowRight: [MOVE, 0] };
 /** Milliseconds from one place that is sought to the next while the bar is dragged. */
 const SOUGHT = 150;
+/** Milliseconds from one press of Record to the next that counts: the second click of a double click does not. */
+const RECORD_AGAIN = 500;
 const KEYS = [
   ["space", "pause and go on"],
   [".", "one scan on, while paused"],
@@ -37,6 +39,8 @@ export class Controls {
   #paused = false;
   #duration: number | null = null;
   #sought = 0;
+  #isRecording = false;
+  #recordPressed = -RECORD_AGAIN;
 
   constructor(
     readonly picture: Picture,
@@ -63,7 +67,7 @@ export class Controls {
     this.#speed.replaceChildren(...SPEEDS.map((times) => made("option", { value: String(times), textContent: `${times}×`, selected: times === 1 })));
     this.#speed.onchange = () => this.ask({ do: "speed", times: Number(this.#speed.value) });
     this.#record.hidden = !hello.records;
-    this.#record.onclick = () => this.ask({ do: "record" });
+    this.#record.onclick = () => this.#switchRecording();
     const saves = [...hello.saves, "png"].map((as) => made("button", { textContent: as === "png" ? "picture .png" : `scan .${as}`, data: { value: as }, onclick: () => this.#saved(as) }));
     named("saves").replaceChildren(...saves);
     this.#keys.replaceChildren(made("h2", {}, "Keys"), made("dl", {}, ...KEYS.flatMap(([key, text]) => [made("dt", { textContent: key! }), made("dd", { textContent: text! })])));
@@ -83,7 +87,8 @@ export class Controls {
     this.#paused = paused || state === "ended";
     this.#play.textContent = this.#paused ? "▶ Play" : "❚❚ Pause";
     this.#step.disabled = !paused;
-    this.#record.classList.toggle("on", recording !== null);
+    this.#isRecording = recording !== null;
+    this.#record.classList.toggle("on", this.#isRecording);
     named("recording").textContent = recording ? `${recording.name} · ${(recording.bytes / 1e6).toFixed(1)} MB` : "Record";
     const known = [...this.#speed.options].find(({ value }) => Number(value) === speed);
     if (known && document.activeElement !== this.#speed) known.selected = true;
@@ -104,6 +109,13 @@ export class Controls {
 
   #toggle(): void {
     this.ask({ do: this.#paused ? "play" : "pause" });
+  }
+
+  /** Ask for the state that the button offers, so that two pages that are pressed at once agree. */
+  #switchRecording(): void {
+    if (performance.now() - this.#recordPressed < RECORD_AGAIN) return;
+    this.#recordPressed = performance.now();
+    this.ask({ do: "record", on: !this.#isRecording });
   }
 
   #view(view: View): void {
@@ -129,7 +141,7 @@ export class Controls {
     else if (event.key === "+" || event.key === "=") this.picture.zoom(ZOOM);
     else if (event.key === "-") this.picture.zoom(1 / ZOOM);
     else if (event.key === "0") this.picture.reset();
-    else if (event.key === "r" && this.hello.records) this.ask({ do: "record" });
+    else if (event.key === "r" && this.hello.records) this.#switchRecording();
     else if (event.key === "?") this.#keys.showModal();
     else if (views[Number(event.key) - 1]) this.#view(views[Number(event.key) - 1]!);
     else return;

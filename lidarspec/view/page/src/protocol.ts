@@ -172,7 +172,8 @@ export type Message =
 
 export type Ask =
   | { do: "next"; most: number }
-  | { do: "pause" | "play" | "step" | "record" }
+  | { do: "pause" | "play" | "step" }
+  | { do: "record"; on: boolean }
   | { do: "seek"; to: number }
   | { do: "speed"; times: number }
   | { do: "watch"; frames: boolean }
