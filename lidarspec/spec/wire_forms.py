@@ -214,14 +214,14 @@ class Tokens:
 
     def _numbers(self, part: Bytes2D, run: tuple[Slot, ...]) -> tuple[NDArray[np.uint8], NDArray[np.bool_]]:
         """The characters of numbers, (n, count, most), and which of them are written."""
-        counts = [slot.count for slot in run]
-        edges = np.cumsum([0, *(slot.size * slot.count for slot in run)]).tolist()
-        values = np.concatenate(
-            [slot.numbers(part[:, start:end]) for slot, (start, end) in zip(run, itertools.pairwise(edges), strict=True)], axis=1
-        )
-        sizes, is_negative = np.repeat([slot.size for slot in run], counts), np.zeros(values.shape, np.bool_)
+        fixed = _places(run)
+        sizes = fixed.sizes
+        wide = np.zeros((len(part), 8 * len(sizes)), np.uint8)
+        wide[:, fixed.index] = part
+        values = wide.view(">u8").astype(np.uint64)
+        is_negative = np.zeros(values.shape, np.bool_)
         if self.base == 10:
-            is_signed = np.repeat([slot.kind == "int" for slot in run], counts)
+            is_signed = fixed.lowest > 0
             is_negative = (values >> (8 * sizes - 1).astype(np.uint64)).astype(np.bool_) & is_signed
             values = np.where(is_negative, (~values + np.uint64(1)) & KEPT[sizes], values)
         most = max(len(f"{256 ** int(sizes.max()) - 1:{'X' if self.base == 16 else 'd'}}"), self.width)

@@ -32,8 +32,9 @@ CHANGES = 8
 BASES, MOST = 8, 3
 #: places at which a frame is cut short or changed, at least.
 LEAST_SPOTS = 12
-#: frames of which every bit is flipped.
+#: frames of which every bit is flipped, with the usual number of examples, and at least.
 SAMPLES = 3
+LEAST_SAMPLES = 2
 
 
 def examples_are_valid_and_repeat(subject: Subject, name: str) -> None:
@@ -290,7 +291,7 @@ def every_single_bit_error_is_seen(subject: Subject, name: str) -> None:
         return
     tried = passed = 0
     sealed = False
-    for seed in range(SAMPLES):
+    for seed in range(subject.scale_rounds(SAMPLES, LEAST_SAMPLES)):
         data = subject.example(name, seed=seed)
         layout = engine.tree.layout(data)
         assert isinstance(layout, Layout)

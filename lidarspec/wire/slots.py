@@ -279,12 +279,15 @@ def _elements(leaves: Sequence[Leaf], first: int, end: int) -> Iterator[tuple[st
     """The slots from one byte of the row to another, one by one: path, place and kind; constants without a name and parts are text."""
     known = [slot_of(leaf) for leaf in leaves]
     for offset, index in _spots(leaves).tolist():
-        if first < min(offset, end):
-            yield "", first, Slot("text", min(offset, end) - first)
-            first = offset
-        if first <= offset < end:
-            yield leaves[index].info.path, offset, known[index]
-            first = offset + known[index].size
+        if offset >= end:
+            break
+        if offset < first:
+            continue
+        if offset > first:
+            yield "", first, Slot("text", offset - first)
+        slot = known[index]
+        yield leaves[index].info.path, offset, slot
+        first = offset + slot.size
     if first < end:
         yield "", first, Slot("text", end - first)
 
