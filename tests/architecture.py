@@ -54,7 +54,7 @@ CONFINED = {
     "serial": {"transports.serial", "transports.ports"},
     "click": {"cli"},
     "rich": {"cli", "view"},
-    "starlette": {"view.server"},
+    "starlette": {"view.access", "view.server"},
     "uvicorn": {"view.server"},
     "hypothesis": {"testing"},
     "pytest": {"testing"},

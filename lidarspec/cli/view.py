@@ -8,6 +8,7 @@ import sys
 import time
 import webbrowser
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import click
 
@@ -29,6 +30,9 @@ from lidarspec.view.live import Switch, Window
 from lidarspec.view.polar import picture
 from lidarspec.view.screen import Screen, Terminated, encodable, interactive, keyboard
 
+if TYPE_CHECKING:
+    from lidarspec.view.server import Site
+
 
 @click.command()
 @click.argument("source", metavar="SOURCE")
@@ -37,11 +41,9 @@ from lidarspec.view.screen import Screen, Terminated, encodable, interactive, ke
 @click.option("--once", is_flag=True, help="Print one picture and end, as where standard output is no terminal.")
 @selecting("times", "scans", "every", "ranges", "time")
 @colour_option
-@click.option("--web", is_flag=True, help="A page in the browser; its link is printed.")
+@click.option("--web", is_flag=True, help="A page in the browser; its link, with the token that it needs, is printed.")
 @click.option("--open", "opens", is_flag=True, help="Open the page in the browser.")
-@click.option(
-    "--address", metavar="HOST[:PORT]", help="Where the page is; by default 127.0.0.1 and a free port. Elsewhere the link has a token."
-)
+@click.option("--address", metavar="HOST[:PORT]", help="Where the page is; by default 127.0.0.1 and a free port.")
 @click.option("--control", is_flag=True, help="Let the page send commands to the sensor; to a simulated one it always may.")
 @click.option("--rerun", "in_rerun", is_flag=True, help="In Rerun's 3D viewer, which is opened, and not in the terminal.")
 @click.option(
@@ -134,12 +136,20 @@ def _serve(
     try:
         with ended_by_terminate(), broadcast, Site(broadcast, host=host, port=port, control=control, say=note) as site:
             say(site.link)
-            if opens and not webbrowser.open(site.link):
+            if opens and not _open_in_browser(site):
                 note("no browser was found: open the link yourself")
             broadcast.run(math.inf if duration is None else time.monotonic() + duration)
             conclude(broadcast.device)
     finally:
         _tell_recordings(switch)
+
+
+def _open_in_browser(site: Site) -> bool:
+    """Open the page in the browser, and return whether there is one."""
+    try:
+        return webbrowser.open(site.opening_page())
+    except OSError:
+        return False
 
 
 def listening(address: str | None) -> tuple[str, int]:

@@ -15,6 +15,8 @@ In: a device, or points. Out: pictures, and what a page makes them of. Modules i
 * `broadcast`: a source that is read once and shown to any number of pages; files played, moved through.
 * `backlog`: the newest bytes of it, frame by frame, and what was damaged.
 * `answers`: what a page is told, in JSON.
-* `server`: the page's files, its socket, and what may reach them.
+* `access`: who may reach the page: the token of its link, hosts and origins.
+* `temporary`: the temporary folder of the server.
+* `server`: the page's files, its socket, and what is done on a page's request.
 * `widget`: a source in a cell of a notebook, drawn as by the page.
 """

@@ -1,18 +1,16 @@
 """A broadcast as a page: the files of the page, a WebSocket for each one that is open, and scans to be saved.
 
 One event loop in a thread of its own serves them all. A page is sent a scan only where it has asked for one, so that a slow or hidden one
-costs nothing; and nobody but the page itself is served: of requests to another host, or from another page in the browser, none is.
+costs nothing. `access` says which requests are served.
 """
 
 from __future__ import annotations
 
 import asyncio
 import contextlib
-import ipaddress
 import json
 import math
 import os
-import secrets
 import socket
 import tempfile
 import threading
@@ -25,21 +23,22 @@ from typing import Any, Self
 
 import uvicorn
 from starlette.applications import Starlette
-from starlette.datastructures import Headers, MutableHeaders, QueryParams
 from starlette.requests import Request
-from starlette.responses import FileResponse, PlainTextResponse, Response
+from starlette.responses import FileResponse, HTMLResponse, PlainTextResponse, Response
 from starlette.routing import Mount, Route, WebSocketRoute
 from starlette.staticfiles import StaticFiles
-from starlette.types import ASGIApp, Message, Receive, Scope, Send
+from starlette.types import Receive, Scope, Send
 from starlette.websockets import WebSocket, WebSocketDisconnect
 
 from lidarspec.errors import LidarSpecError, SourceError, UsageError, suggestion
 from lidarspec.formats import write
 from lidarspec.points.look import look
+from lidarspec.view.access import ANY_ADDRESS, Guard, add_token, make_token, write_opening_page
 from lidarspec.view.answers import Answers, saves
 from lidarspec.view.backlog import Backlog
 from lidarspec.view.broadcast import Broadcast, Shown
 from lidarspec.view.svg import svg
+from lidarspec.view.temporary import TemporaryFolder, remove_stale_folders
 
 #: the page, as it was built.
 PAGE = Path(__file__).parent / "page" / "dist"
@@ -55,78 +54,6 @@ GREETING, CLOSED, PAGES = 3.0, (1000, 1001, 1012), 64
 POINTS, HELD = 1 << 24, 2
 #: the largest number in a message, and one digit more than a scan's number has.
 LONGEST, DIGITS = 1e12, 12
-#: how a page on this computer is called.
-LOCAL = ("127.0.0.1", "localhost", "[::1]")
-HEADERS = {
-    "content-security-policy": "default-src 'none'; script-src 'self'; style-src 'self'; font-src 'self'; img-src 'self' data: blob:; "
-    "connect-src 'self'; base-uri 'none'; form-action 'none'; frame-ancestors 'none'",
-    "x-content-type-options": "nosniff",
-    "referrer-policy": "no-referrer",
-    "cross-origin-opener-policy": "same-origin",
-    "cross-origin-resource-policy": "same-origin",
-    "cache-control": "no-store",
-}
-
-
-class Guard:
-    """Lets through what comes from the page itself, and adds what browsers are to keep to.
-
-    Args:
-        inside: what is guarded.
-        host, port: where it listens.
-        token: what the link has to bring along; "" where it listens on this computer alone.
-    """
-
-    def __init__(self, inside: ASGIApp, host: str, port: int, token: str) -> None:
-        self._inside, self._port, self._token = inside, port, token
-        self._names = {*LOCAL, f"[{host}]" if ":" in host else host}
-        self._anywhere = host in ("0.0.0.0", "::")
-
-    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
-        """Serve a request, or refuse it."""
-        if scope["type"] not in ("http", "websocket"):
-            return
-        reason = self.refusal(scope["type"], scope["path"], Headers(scope=scope), QueryParams(scope["query_string"]))
-        if reason and scope["type"] == "websocket":
-            await send({"type": "websocket.close"})
-            return
-
-        async def hardened(message: Message) -> None:
-            if message["type"] == "http.response.start":
-                MutableHeaders(scope=message).update(HEADERS)
-            await send(message)
-
-        await (PlainTextResponse(reason, 403) if reason else self._inside)(scope, receive, hardened)
-
-    def refusal(self, kind: str, path: str, headers: Headers, query: QueryParams) -> str:
-        """Why a request is not served; "" where it is."""
-        host = headers.get("host", "")
-        if not self._is_own(host):
-            return "this is not the host that is asked for"
-        origin = headers.get("origin")
-        if (origin is None and kind == "websocket") or origin not in (None, f"http://{host}"):
-            return "another page asks"
-        if path.startswith("/save/") and headers.get("sec-fetch-site", "same-origin") not in ("same-origin", "none"):
-            return "another page asks"
-        guarded = path in ("/", "/index.html", "/socket") or path.startswith("/save/")
-        if self._token and guarded and not secrets.compare_digest(query.get("token", "").encode(), self._token.encode()):
-            return "the link to this page has a token, which is missing or wrong"
-        return ""
-
-    def _is_own(self, host: str) -> bool:
-        """Whether a host is one that it listens at; where that is any, an address, since a name can be made to point here."""
-        name, _, port = host.rpartition(":") if host.rpartition("]")[2] else (host, "", "")
-        if (port or "80") != str(self._port):
-            return False
-        return name in self._names or (self._anywhere and _is_address(name.strip("[]")))
-
-
-def _is_address(text: str) -> bool:
-    try:
-        ipaddress.ip_address(text)
-    except ValueError:
-        return False
-    return True
 
 
 class Page:
@@ -403,13 +330,13 @@ class Site:
 
     Args:
         broadcast: what is shown.
-        host, port: where to listen; 0 is a free port. At another address than this computer's own, the link has a token.
+        host, port: where to listen; 0 is a free port.
         control: whether commands may be sent to a sensor that is no simulated one.
         page: the folder of the page's files; by default `PAGE`.
         say: is told, line by line, of pages that come and go.
 
     Attributes:
-        link: to the page.
+        link: to the page, with the token that it needs.
 
     Raises:
         SourceError: where it cannot listen there.
@@ -429,17 +356,22 @@ class Site:
         self._open, self._pages = set[Page](), 0
         self._socket = _listening(host, port)
         port = self._socket.getsockname()[1]
-        token = "" if _is_loopback(host) else secrets.token_urlsafe(24)
-        name = {"0.0.0.0": socket.gethostname(), "::": socket.gethostname()}.get(host, f"[{host}]" if ":" in host else host)
-        self.link = f"http://{name}:{port}/{f'?token={token}' if token else ''}"
+        name = _name_of(host)
+        self._token = make_token()
+        self.link = f"http://{name}:{port}/?token={self._token}"
+        self._folder = TemporaryFolder()
+        self._files = page or PAGE
         routes = [
+            Route("/", self._send_page),
+            Route("/index.html", self._send_page),
             WebSocketRoute("/socket", self._watched),
             Route("/save/{name}", self._saved),
-            Mount("/", StaticFiles(directory=page or PAGE, html=True)),
+            Mount("/", StaticFiles(directory=self._files)),
         ]
+        app = Starlette(routes=routes)
         self._server = uvicorn.Server(
             uvicorn.Config(
-                Guard(Starlette(routes=routes), host, port, token),
+                Guard(app, host=host, name=name, port=port, token=self._token),
                 log_config=None,
                 log_level="critical",  # what it has to say of requests is not for a terminal
                 access_log=False,
@@ -456,7 +388,16 @@ class Site:
         )
         self._thread = threading.Thread(target=lambda: asyncio.run(self._serve()), name="pages")
 
+    def opening_page(self) -> str:
+        """Return the URL of a file that leads to the link, to start a browser with.
+
+        Raises:
+            OSError: if it cannot be written.
+        """
+        return write_opening_page(self._folder.path, self.link).as_uri()
+
     def __enter__(self) -> Self:
+        remove_stale_folders()
         self._thread.start()
         return self
 
@@ -465,6 +406,7 @@ class Site:
         self._server.should_exit = True
         self._thread.join()
         self._socket.close()
+        self._folder.remove()
 
     async def _serve(self) -> None:
         loop = asyncio.get_running_loop()
@@ -478,6 +420,10 @@ class Site:
     def _stir(self) -> None:
         for page in self._open:
             page.stir()
+
+    def _send_page(self, request: Request) -> Response:
+        text = (self._files / "index.html").read_text(encoding="utf-8")
+        return HTMLResponse(add_token(text, self._token))
 
     async def _watched(self, socket: WebSocket) -> None:
         """One page, from its opening until it is closed."""
@@ -537,6 +483,13 @@ def _write(path: Path, shown: Shown) -> None:
         write(path, [shown.scan])
 
 
+def _name_of(host: str) -> str:
+    """Return the host of the link to a server that listens there."""
+    if host in ANY_ADDRESS:
+        return socket.gethostname()
+    return f"[{host}]" if ":" in host else host
+
+
 def _listening(host: str, port: int) -> socket.socket:
     try:
         found = socket.create_server((host, port), family=socket.AF_INET6 if ":" in host else socket.AF_INET)
@@ -545,7 +498,3 @@ def _listening(host: str, port: int) -> socket.socket:
     if hasattr(socket, "TCP_USER_TIMEOUT"):  # so that the system gives up what a page never takes; connections have it from here
         found.setsockopt(socket.IPPROTO_TCP, socket.TCP_USER_TIMEOUT, round(STALLED * 1000))
     return found
-
-
-def _is_loopback(host: str) -> bool:
-    return host == "localhost" or (_is_address(host) and ipaddress.ip_address(host).is_loopback)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import os
+import re
 import signal
 import socket
 import subprocess
@@ -11,6 +12,7 @@ import sys
 import time
 from collections.abc import Iterator
 from pathlib import Path
+from urllib.parse import urlsplit
 
 import pytest
 
@@ -26,12 +28,12 @@ sys.exit(main())"""
 
 
 @contextlib.contextmanager
-def served(folder: Path, *words: object) -> Iterator[tuple[subprocess.Popen[str], str]]:
-    """The verb at work, and its link."""
+def served(folder: Path, *words: object, **variables: str) -> Iterator[tuple[subprocess.Popen[str], str]]:
+    """The verb at work, with environment variables, and its link."""
     (folder / "page").mkdir(exist_ok=True)
     (folder / "page" / "index.html").write_text("<!doctype html><title>page</title>")
     command = [sys.executable, "-c", MAIN, str(folder / "page"), "view", *map(str, words), "--web"]
-    names = {**os.environ, "TMPDIR": str(folder), "PYTHONUNBUFFERED": "1"}
+    names = {**os.environ, "TMPDIR": str(folder), "PYTHONUNBUFFERED": "1", **variables}
     running = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, cwd=folder, env=names)
     try:
         assert running.stdout is not None
@@ -53,14 +55,14 @@ def ended(running: subprocess.Popen[str], by: signal.Signals | None = None) -> t
 @pytest.mark.parametrize("by", [signal.SIGINT, pytest.param(signal.SIGTERM, marks=pytest.mark.slow)])
 def test_it_prints_its_link_and_ends_when_it_is_told_to(tmp_path: Path, by: signal.Signals) -> None:
     with served(tmp_path, f"sim:{FLAT}") as (running, link), Page(link) as page:
-        assert link.startswith("http://127.0.0.1:")
+        assert re.fullmatch(r"http://127\.0\.0\.1:\d+/\?token=[\w-]{32}", link)
         page.scan()
         code, out, lines = ended(running, by)
     assert (code, out) == (130, "")
     assert lines == ["page 1 opened by 127.0.0.1; 1 open", "page 1 closed; 0 open", "interrupted"]
     assert [path.name for path in tmp_path.iterdir()] == ["page"]
     with pytest.raises(ConnectionRefusedError):
-        socket.create_connection(("127.0.0.1", int(link.rpartition(":")[2].strip("/"))), 1)
+        socket.create_connection(("127.0.0.1", urlsplit(link).port), 1)
 
 
 @pytest.mark.slow
@@ -98,12 +100,25 @@ def test_a_port_that_is_taken_is_one_clear_line(tmp_path: Path) -> None:
 
 
 @pytest.mark.slow
-def test_another_address_has_a_token(tmp_path: Path) -> None:
+def test_another_address_is_reached_from_here(tmp_path: Path) -> None:
     with served(tmp_path, f"sim:{FLAT}", "--address", "0.0.0.0") as (_, link):
-        assert "/?token=" in link
         local = f"http://127.0.0.1:{link.rpartition(':')[2]}"
         with Page(local) as page:
             assert page.scan()[1]["x"].size
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(os.name != "posix", reason="the browser is a script of a shell")
+def test_the_browser_is_led_to_the_link(tmp_path: Path) -> None:
+    """The command that starts it has no token, and the file that it opens has."""
+    browser = tmp_path / "browser"
+    browser.write_text(f'#!/bin/sh\necho "$@" > {tmp_path}/words\n')
+    browser.chmod(0o700)
+    with served(tmp_path, f"sim:{FLAT}", "--open", BROWSER=f"{browser} %s") as (_, link), Page(link) as page:
+        page.scan()
+        words = (tmp_path / "words").read_text().strip()
+        assert link.partition("?token=")[2] not in words
+        assert f"url={link}" in Path(words.removeprefix("file://")).read_text()
 
 
 @pytest.mark.slow

@@ -36,6 +36,8 @@ client = Library("websockets.sync.client")
 #: seconds that anything may take; many times what it does.
 DEADLINE = 30.0
 FLAT, SOLID = "ldrobot-stl27l", "robosense-m1"
+#: a page that stands for the built one.
+PAGE_TEXT = '<!doctype html><title>page</title><link rel="icon" href="data:,"><script src="page.js"></script>'
 
 
 class Station:
@@ -58,8 +60,9 @@ class Station:
         reopened = partial(open_device, self.source, device.sensor)
         self.broadcast = Broadcast(self.source, device, reopened=reopened, select=select, switch=self.switch)
         (folder / "page").mkdir(exist_ok=True)
-        (folder / "page" / "index.html").write_text("<!doctype html><title>page</title>")
-        self.site = Site(self.broadcast, page=folder / "page", say=self.said.append, **options)
+        (folder / "page" / "index.html").write_text(PAGE_TEXT)
+        (folder / "page" / "page.js").write_text("1")
+        self.site = Site(self.broadcast, say=self.said.append, **{"page": folder / "page", **options})
         self.failure: LidarSpecError | None = None
         self._thread = threading.Thread(target=self._read, name="reading")
 
@@ -76,6 +79,21 @@ class Station:
     @property
     def port(self) -> int:
         return int(self.link.rpartition(":")[2].partition("/")[0])
+
+    @property
+    def token(self) -> str:
+        return self.link.partition("?token=")[2]
+
+    def answered(self, path: str, **headers: str) -> tuple[int, dict[str, str], bytes]:
+        """What comes back on a raw request with the token."""
+        return answered(self.port, f"{path}?token={self.token}", **headers)
+
+    def handshake(self) -> bytes:
+        """What opens a WebSocket by hand."""
+        host = f"127.0.0.1:{self.port}"
+        given = {"Host": host, "Origin": f"http://{host}", "Connection": "Upgrade", **UPGRADE}
+        lines = [f"GET /socket?token={self.token} HTTP/1.1", *(f"{name.replace('_', '-')}: {value}" for name, value in given.items())]
+        return "\r\n".join([*lines, "", ""]).encode()
 
     def page(self, **options: Any) -> Page:
         return Page(self.link, **options)
@@ -188,14 +206,6 @@ def answered(port: int, path: str, **headers: str) -> tuple[int, dict[str, str],
 
 #: the headers that ask for a WebSocket, with which a browser says whose page asks.
 UPGRADE = {"upgrade": "websocket", "Sec_WebSocket_Key": "dGhlIHNhbXBsZSBub25jZQ==", "Sec_WebSocket_Version": "13"}
-
-
-def handshake(port: int) -> bytes:
-    """What opens a WebSocket by hand."""
-    host = f"127.0.0.1:{port}"
-    given = {"Host": host, "Origin": f"http://{host}", "Connection": "Upgrade", **UPGRADE}
-    lines = ["GET /socket HTTP/1.1", *(f"{name.replace('_', '-')}: {value}" for name, value in given.items()), "", ""]
-    return "\r\n".join(lines).encode()
 
 
 def masked(message: dict[str, Any]) -> bytes:

@@ -20,7 +20,10 @@ import pytest
 import lidarspec as ls
 from lidarspec.simulation.scenes import Room
 from lidarspec.transports.protocol import Chunk
+from lidarspec.view.access import write_opening_page
+from lidarspec.view.server import PAGE
 from tests.view.browser import FLAGS, installed
+from tests.view.pages import Station
 from tests.view.visits import PATIENCE, Visit, served
 
 pytestmark = pytest.mark.slow
@@ -235,7 +238,8 @@ def test_text_of_the_sensor_is_never_part_of_the_page(browser: Any, tmp_path: Pa
         assert not visit.errors
 
 
-def test_a_page_whose_server_is_gone_connects_again(browser: Any) -> None:
+def test_a_page_whose_server_is_started_again_says_so(browser: Any) -> None:
+    """The new server has a new token: the link that it prints shows it."""
     with socket.create_server(("127.0.0.1", 0)) as free:
         port = free.getsockname()[1]
     source = "sim:ldrobot-stl27l?rate=0.5"
@@ -243,12 +247,39 @@ def test_a_page_whose_server_is_gone_connects_again(browser: Any) -> None:
         visit = Visit(browser, link)
     visit.until(lambda: "connection is lost" in visit.text("#notice"), "nothing is said of it")
     assert visit.text("#status") == "no server"
-    with served(source, address=f"127.0.0.1:{port}"):
+    with served(source, address=f"127.0.0.1:{port}") as link:
+        visit.until(lambda: "open the link that it printed" in visit.text("#notice"), "it does not say what to do")
+        visit.page.reload()
+        assert "lidarspec view --web" in visit.text("body")
+        visit.page.goto(link)
+        visit.until(lambda: visit.text("#status") == "streaming", "the new link does not show it")
+        assert not visit.page.locator("#notice").is_visible()
+        visit.context.close()
+
+
+def test_a_page_whose_connection_is_lost_connects_again(browser: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A network that fails for a moment: the same server is there again, with the same token."""
+    monkeypatch.setattr("lidarspec.view.server.make_token", lambda: "token" * 6)
+    source = "sim:ldrobot-stl27l?rate=0.5"
+    with Station(source, tmp_path, page=PAGE) as station:
+        visit = Visit(browser, station.link)
+    visit.until(lambda: "connection is lost" in visit.text("#notice"), "nothing is said of it")
+    with Station(source, tmp_path, page=PAGE, port=station.port):
         visit.until(lambda: visit.text("#status") == "streaming", "it does not connect again")
         assert not visit.page.locator("#notice").is_visible()
         asked = len(visit.asked_for("next"))
         visit.until(lambda: len(visit.asked_for("next")) > asked + 3, "no scan comes any more")
         visit.context.close()
+
+
+def test_the_file_that_a_browser_is_started_with_leads_to_the_page(browser: Any, tmp_path: Path) -> None:
+    with served("sim:ldrobot-stl27l?rate=0.5") as link:
+        page = browser.new_page()
+        page.goto(write_opening_page(tmp_path, link).as_uri())
+        page.wait_for_url(link)
+        page.wait_for_selector('#status:has-text("streaming")')
+        assert page.evaluate("document.referrer") == ""
+        page.close()
 
 
 def test_a_hidden_page_asks_for_nothing(tmp_path: Path) -> None:

@@ -1,7 +1,12 @@
-"""Who may reach the page: raw requests with hosts and origins of others, tokens, and what devices say of themselves."""
+"""Who may reach the page: raw requests with hosts and origins of others, without the token, and what devices say of themselves."""
 
 from __future__ import annotations
 
+import os
+import re
+import socket
+import urllib.parse
+import urllib.request
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -10,6 +15,8 @@ import pytest
 
 import lidarspec as ls
 from lidarspec.errors import SourceError
+from lidarspec.view.access import add_token
+from lidarspec.view.server import PAGE
 from tests.view.pages import FLAT, UPGRADE, Station, answered, recorded
 
 EVIL = "http://evil.example"
@@ -41,23 +48,23 @@ def test_a_foreign_host_is_refused(shared: Station, path: str, host: str) -> Non
     """A name of others that was made to point here (DNS rebinding) brings its own host along."""
     named = host.format(port=shared.port)
     more: dict[str, Any] = {**UPGRADE, "Origin": f"http://{named}"} if path == "/socket" else {}
-    status, _, body = answered(shared.port, path, Host=named, **more)
+    status, _, body = shared.answered(path, Host=named, **more)
     assert status in (400, 403)
     assert b"<title>" not in body
 
 
 def test_all_names_of_this_computer_are_its_own(shared: Station) -> None:
     for name in ("127.0.0.1", "localhost", "[::1]"):
-        status, _, body = answered(shared.port, "/", Host=f"{name}:{shared.port}")
+        status, _, body = shared.answered("/", Host=f"{name}:{shared.port}")
         assert (status, b"<title>page</title>" in body) == (200, True), name
 
 
 @pytest.mark.parametrize("origin", FOREIGN_ORIGINS)
 def test_a_foreign_or_missing_origin_gets_no_socket(shared: Station, origin: str | None) -> None:
     headers = {**UPGRADE} | ({} if origin is None else {"Origin": origin.format(port=shared.port)})
-    assert answered(shared.port, "/socket", **headers)[0] == 403
+    assert shared.answered("/socket", **headers)[0] == 403
     own = f"http://127.0.0.1:{shared.port}"
-    assert answered(shared.port, "/socket", **UPGRADE, Origin=own)[0] == 101
+    assert shared.answered("/socket", **UPGRADE, Origin=own)[0] == 101
 
 
 def test_other_pages_get_no_scan(tmp_path: Path) -> None:
@@ -66,15 +73,15 @@ def test_other_pages_get_no_scan(tmp_path: Path) -> None:
         page.say("pause")
         page.state(lambda state: state["paused"])
         path = f"/save/{header['scan']}.csv"
-        assert answered(station.port, path, Origin=EVIL)[0] == 403
-        assert answered(station.port, path, Sec_Fetch_Site="cross-site")[0] == 403
-        assert answered(station.port, path, Sec_Fetch_Site="same-origin")[0] == 200
-        assert answered(station.port, path, Origin=f"http://127.0.0.1:{station.port}")[0] == 200
+        assert station.answered(path, Origin=EVIL)[0] == 403
+        assert station.answered(path, Sec_Fetch_Site="cross-site")[0] == 403
+        assert station.answered(path, Sec_Fetch_Site="same-origin")[0] == 200
+        assert station.answered(path, Origin=f"http://127.0.0.1:{station.port}")[0] == 200
 
 
 @pytest.mark.parametrize("path", ["/", "/nothing.js", "/save/0.pcd"])
 def test_browsers_are_told_to_keep_to_the_page_itself(shared: Station, path: str) -> None:
-    _, headers, _ = answered(shared.port, path)
+    _, headers, _ = shared.answered(path)
     policy = dict(part.strip().partition(" ")[::2] for part in headers["content-security-policy"].split(";"))
     assert (policy["default-src"], policy["script-src"], policy["style-src"]) == ("'none'", "'self'", "'self'")
     assert (policy["frame-ancestors"], policy["base-uri"], policy["form-action"]) == ("'none'", "'none'", "'none'")
@@ -86,30 +93,77 @@ def test_browsers_are_told_to_keep_to_the_page_itself(shared: Station, path: str
 
 @pytest.mark.parametrize("path", ["/../server.py", "/%2e%2e/%2e%2e/etc/passwd", "//etc/passwd", "/..%5c..%5cserver.py"])
 def test_only_the_files_of_the_page_are_served(shared: Station, path: str) -> None:
-    status, _, body = answered(shared.port, path)
+    status, _, body = shared.answered(path)
     assert status in (400, 404)
     assert b"secret" not in body
 
 
-def test_elsewhere_than_here_the_link_has_a_token(tmp_path: Path) -> None:
+@pytest.mark.parametrize("path", ["/", "/index.html", "/page.js", "/nothing.js", "/save/0.csv", "/socket", "/?"])
+def test_nothing_is_served_without_the_token(shared: Station, path: str) -> None:
+    """Other users of this computer can connect, and know no token."""
+    token = shared.token
+    assert len(token) >= 32
+    more = {**UPGRADE, "Origin": f"http://127.0.0.1:{shared.port}"} if path == "/socket" else {}
+    wrong = ("", "?token=", f"?token={token[:-1]}", f"?token={token}x", f"?tokem={token}", "?token=%C3%A9", f"#{token}")
+    for query in wrong:
+        status, headers, body = answered(shared.port, f"{path}{query}", **more)
+        assert status == 403, query
+        assert headers["connection"] == "close"
+        assert b"<title>page" not in body
+        assert token.encode() not in body
+    assert answered(shared.port, path, Cookie=f"token={token}", **more)[0] == 403
+    assert answered(shared.port, path, Referer=shared.link, **more)[0] == 403
+
+
+def test_a_refused_page_says_where_the_link_is(shared: Station) -> None:
+    _, headers, body = answered(shared.port, "/")
+    assert headers["content-type"].startswith("text/html")
+    assert b"Open the whole link that <code>lidarspec view --web</code> printed" in body
+    assert headers["referrer-policy"] == "no-referrer"
+
+
+def test_the_page_loads_its_files_with_the_token(shared: Station) -> None:
+    status, headers, body = shared.answered("/")
+    assert (status, headers["cache-control"]) == (200, "no-store")
+    assert f'<link rel="icon" href="data:,"><script src="page.js?token={shared.token}">'.encode() in body
+    assert shared.answered("/index.html")[2] == body
+    assert shared.answered("/page.js")[2] == b"1"
+    assert "set-cookie" not in headers
+
+
+def test_the_built_page_names_no_file_that_would_lack_the_token() -> None:
+    """Scripts and styles are in the head of the page, and load nothing themselves."""
+    text = add_token((PAGE / "index.html").read_text(encoding="utf-8"), "TOKEN")
+    assert re.findall(r'(?:href|src)="([^"]*)"', text) == ["data:,", "page.css?token=TOKEN", "page.js?token=TOKEN"]
+    assert "url(" not in (PAGE / "page.css").read_text(encoding="utf-8")
+
+
+def test_each_server_has_a_token_of_its_own(tmp_path: Path, shared: Station) -> None:
+    with Station(f"sim:{FLAT}", tmp_path) as station:
+        assert station.token != shared.token
+        assert answered(station.port, f"/?token={shared.token}")[0] == 403
+
+
+def test_a_browser_is_started_with_a_file_and_not_with_the_token(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Other users see the command lines of all programs."""
+    monkeypatch.setattr("tempfile.tempdir", str(tmp_path))
+    with Station(f"sim:{FLAT}", tmp_path) as station:
+        url = station.site.opening_page()
+        assert station.token not in url
+        path = Path(urllib.request.url2pathname(urllib.parse.urlsplit(url).path))
+        assert f'content="0; url={station.link}"' in path.read_text()
+        if os.name == "posix":
+            assert (path.stat().st_mode & 0o777, path.parent.stat().st_mode & 0o777) == (0o600, 0o700)
+    assert not path.parent.exists()
+
+
+def test_all_addresses_and_its_own_name_reach_a_server_at_all_interfaces(tmp_path: Path) -> None:
     with Station(f"sim:{FLAT}", tmp_path, host="0.0.0.0") as station:
-        token = station.link.partition("?token=")[2]
-        assert len(token) >= 32
-        port = int(station.link.partition("?")[0].rpartition(":")[2].strip("/"))
-        own = f"http://127.0.0.1:{port}"
-        for wrong in ("", "?token=", f"?token={token[:-1]}", f"?token={token}x", f"?tokem={token}"):
-            assert answered(port, f"/{wrong}")[0] == 403, wrong
-            assert answered(port, f"/save/0.csv{wrong}")[0] == 403, wrong
-            assert answered(port, f"/socket{wrong}", **UPGRADE, Origin=own)[0] == 403, wrong
-        assert answered(port, f"/?token={token}")[0] == 200
-        assert answered(port, f"/save/9999.csv?token={token}")[0] == 404
-        assert answered(port, f"/socket?token={token}", **UPGRADE, Origin=own)[0] == 101
-        assert answered(port, f"/?token={token}", Host=f"evil.example:{port}")[0] == 403
-        assert answered(port, f"/?token={token}", Host=f"192.168.7.9:{port}")[0] == 200  # one of its addresses, for all it knows
-
-
-def test_here_the_link_is_plain(shared: Station) -> None:
-    assert shared.link == f"http://127.0.0.1:{shared.port}/"
+        name, port = socket.gethostname(), station.port
+        assert station.link.startswith(f"http://{name}:{port}/?token=")
+        for host in (name, name.upper(), "192.168.7.9"):
+            assert station.answered("/", Host=f"{host}:{port}")[0] == 200
+        assert station.answered("/", Host=f"evil.example:{port}")[0] == 403
 
 
 def test_a_port_that_is_taken_is_told_of(tmp_path: Path) -> None:

@@ -13,7 +13,7 @@ import pytest
 import lidarspec as ls
 from lidarspec import UsageError
 from lidarspec.scans.selection import Selection
-from tests.view.pages import DEADLINE, FLAT, SOLID, Station, answered, handshake, masked, recorded
+from tests.view.pages import DEADLINE, FLAT, SOLID, Station, masked, recorded
 
 
 @pytest.mark.parametrize(("sensor", "planar"), [(FLAT, True), pytest.param(SOLID, False, marks=pytest.mark.slow)])
@@ -267,7 +267,7 @@ def test_a_scan_is_saved_as_it_is_shown(tmp_path: Path) -> None:
         page.say("pause")
         page.state(lambda state: state["paused"])
         for suffix in page.until("hello")["saves"]:
-            status, headers, body = answered(station.port, f"/save/{header['scan']}.{suffix}")
+            status, headers, body = station.answered(f"/save/{header['scan']}.{suffix}")
             assert (status, len(body) > 1000) == (200, True), suffix
             assert f'filename="{FLAT}-{header["scan"]}.{suffix}"' in headers["content-disposition"]
             assert headers["cache-control"] == "no-store"
@@ -275,7 +275,7 @@ def test_a_scan_is_saved_as_it_is_shown(tmp_path: Path) -> None:
                 x = np.array([float(line.split(b",")[0]) for line in body.splitlines()[1:]], np.float32)
                 assert np.allclose(x, columns["x"])
         for name in ("9999.pcd", f"{header['scan']}.exe", f"{header['scan']}.", "x.pcd", "..%2f..%2fetc%2fpasswd", "-1.pcd"):
-            assert answered(station.port, f"/save/{name}")[0] == 404, name
+            assert station.answered(f"/save/{name}")[0] == 404, name
 
 
 def test_a_recording_is_switched_on_and_off(tmp_path: Path) -> None:
@@ -308,7 +308,7 @@ def test_a_page_that_takes_nothing_is_dropped_and_a_recording_loses_nothing(tmp_
     ):
         healthy.say("record")
         name = healthy.state(lambda state: state["recording"])["recording"]["name"]
-        raw.sendall(handshake(station.port))
+        raw.sendall(station.handshake())
         end = time.monotonic() + DEADLINE
         while not any("dropped" in text for text in station.said) and time.monotonic() < end:
             with contextlib.suppress(OSError):

@@ -143,6 +143,6 @@ class Visit:
     def saved(self) -> list[dict[str, str]]:
         """The scan that is shown as the server saves it, row by row."""
         number = self.value("lidarspec.picture.scan.scan")
-        answer = self.page.request.get(f"{self.link}save/{number}.csv")
+        answer = self.page.request.get(self.link.replace("?", f"save/{number}.csv?"))
         assert answer.ok, answer.text()
         return list(csv.DictReader(io.StringIO(answer.text())))

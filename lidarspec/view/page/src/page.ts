@@ -39,6 +39,7 @@ class Page {
   #refused = "";
   #refusals = 0;
   #open = false;
+  #refusesLink = false;
   #latency = 0;
 
   constructor() {
@@ -77,8 +78,21 @@ class Page {
   #connected(open: boolean): void {
     this.#open = open;
     this.#ended = "";
+    if (open) this.#refusesLink = false;
+    else void this.#checkLink();
     this.#notice();
     if (open) this.#connection.next(this.#pace.most);
+  }
+
+  /** Find out whether a server is there that does not accept the token of this page: it was started again. */
+  async #checkLink(): Promise<void> {
+    try {
+      const answer = await fetch(location.href, { method: "HEAD" });
+      this.#refusesLink = answer.status === 403;
+    } catch {
+      this.#refusesLink = false; // no server
+    }
+    this.#notice();
   }
 
   #said(message: Message): void {
@@ -192,7 +206,8 @@ class Page {
 
   /** The one line that says what is wrong: the connection before the source, and that before what was refused. */
   #notice(): void {
-    const lost = this.#hello ? "The connection is lost; it is tried again." : "Connecting.";
+    let lost = this.#hello ? "The connection is lost; it is tried again." : "Connecting.";
+    if (this.#refusesLink) lost = "The server was started again, with another token: open the link that it printed.";
     const text = this.#open ? this.#ended || this.#refused : lost;
     const notice = named("notice");
     notice.textContent = text;

@@ -1,0 +1,167 @@
+"""Who may reach the page: the token of its link, and the Host and Origin of each request.
+
+Each server makes a token, and each request needs it in its query: pages, scripts, downloads, socket.
+Other users of this computer can connect to the server, but do not know the token. It is not kept in
+a cookie: browsers send the cookies of one port to all ports of this computer, so a server of another
+user would receive it. Host and Origin stop other pages in the same browser, also those whose name
+was made to point to this computer.
+"""
+
+from __future__ import annotations
+
+import ipaddress
+import os
+import re
+import secrets
+from html import escape
+from pathlib import Path
+
+from starlette.datastructures import Headers, MutableHeaders, QueryParams
+from starlette.responses import HTMLResponse, PlainTextResponse, Response
+from starlette.types import ASGIApp, Message, Receive, Scope, Send
+
+#: random bytes of a token.
+TOKEN_BYTES = 24
+#: names of this computer in its own browser.
+LOCAL_NAMES = ("127.0.0.1", "localhost", "[::1]")
+#: addresses that stand for all interfaces.
+ANY_ADDRESS = ("0.0.0.0", "::")
+HEADERS = {
+    "content-security-policy": "default-src 'none'; script-src 'self'; style-src 'self'; "
+    "font-src 'self'; img-src 'self' data: blob:; connect-src 'self'; base-uri 'none'; "
+    "form-action 'none'; frame-ancestors 'none'",
+    "x-content-type-options": "nosniff",
+    "referrer-policy": "no-referrer",
+    "cross-origin-opener-policy": "same-origin",
+    "cross-origin-resource-policy": "same-origin",
+    "cache-control": "no-store",
+}
+OTHER_HOST = "this server has another host name: open the link that lidarspec printed"
+OTHER_PAGE = "another page asked for this"
+TOKEN_NEEDED = """<!doctype html>
+<html lang="en">
+<meta charset="utf-8">
+<meta name="viewport" content="width=device-width, initial-scale=1">
+<meta name="color-scheme" content="dark light">
+<title>lidarspec: token needed</title>
+<h1>This page needs a token</h1>
+<p>The token in the address is missing or wrong.
+<p>Open the whole link that <code>lidarspec view --web</code> printed in its terminal:
+it ends with <code>?token=</code> and 32 characters.
+<p>Each start of lidarspec makes a new token, so the link of an earlier start is not valid any more.
+</html>
+"""
+_OWN_FILE = re.compile(r'((?:href|src)="[\w-]+\.\w+)(?=")')
+
+
+def make_token() -> str:
+    """Return a new token."""
+    return secrets.token_urlsafe(TOKEN_BYTES)
+
+
+class Guard:
+    """Passes on the requests that the page itself makes, and adds headers that bind the browser.
+
+    Args:
+        app: serves them.
+        host: where the server listens.
+        name: the host in the printed link.
+        port: where the server listens.
+        token: of the printed link.
+    """
+
+    def __init__(self, app: ASGIApp, *, host: str, name: str, port: int, token: str) -> None:
+        self._app = app
+        self._port = port
+        self._token = token.encode()
+        self._names = {*LOCAL_NAMES, name.lower()}
+        self._is_anywhere = host in ANY_ADDRESS
+
+    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
+        """Serve a request, or refuse it."""
+        if scope["type"] not in ("http", "websocket"):
+            return
+        refusal = self._refusal(scope)
+        if refusal is not None and scope["type"] == "websocket":
+            await send({"type": "websocket.close"})
+            return
+
+        async def send_with_headers(message: Message) -> None:
+            if message["type"] == "http.response.start":
+                MutableHeaders(scope=message).update(HEADERS)
+            await send(message)
+
+        if refusal is not None:
+            await refusal(scope, receive, send_with_headers)
+            return
+        # Nothing behind this point sees the token, so that it is in no log and no message.
+        await self._app({**scope, "query_string": b""}, receive, send_with_headers)
+
+    def _refusal(self, scope: Scope) -> Response | None:
+        """Return the answer to a request that is not served."""
+        headers = Headers(scope=scope)
+        host = headers.get("host", "")
+        origin = headers.get("origin")
+        if not self._is_own_host(host):
+            return _refused(OTHER_HOST)
+        if origin is None:
+            is_own_page = scope["type"] == "http"  # browsers name the origin of each socket
+        else:
+            is_own_page = origin == f"http://{host}"
+        if scope["path"].startswith("/save/"):
+            site = headers.get("sec-fetch-site", "same-origin")
+            is_own_page = is_own_page and site in ("same-origin", "none")
+        if not is_own_page:
+            return _refused(OTHER_PAGE)
+        token = QueryParams(scope["query_string"]).get("token", "")
+        if not secrets.compare_digest(token.encode(), self._token):
+            return HTMLResponse(TOKEN_NEEDED, 403, {"connection": "close"})
+        return None
+
+    def _is_own_host(self, host: str) -> bool:
+        """Return whether a Host header names this server.
+
+        A server at all interfaces accepts each address, but only its own name: other names can be
+        made to point here.
+        """
+        name, _, port = host.rpartition(":") if host.rpartition("]")[2] else (host, "", "")
+        if (port or "80") != str(self._port):
+            return False
+        return name.lower() in self._names or (self._is_anywhere and is_address(name.strip("[]")))
+
+
+def _refused(reason: str) -> Response:
+    return PlainTextResponse(reason, 403, {"connection": "close"})
+
+
+def is_address(text: str) -> bool:
+    """Return whether a text is an IP address."""
+    try:
+        ipaddress.ip_address(text)
+    except ValueError:
+        return False
+    return True
+
+
+def add_token(page: str, token: str) -> str:
+    """Return an HTML page that loads its own scripts and styles with the token."""
+    return _OWN_FILE.sub(rf"\1?token={token}", page)
+
+
+def write_opening_page(folder: Path, link: str) -> Path:
+    """Write a page that leads to the link, which the user alone can read, and return its path.
+
+    A browser is started with this file: other users see the command lines of all programs, and
+    would find the token of the link there.
+    """
+    path = folder / "open.html"
+    address = escape(link)
+    text = (
+        '<!doctype html><meta charset="utf-8"><meta name="referrer" content="no-referrer">'
+        f'<meta http-equiv="refresh" content="0; url={address}"><title>lidarspec</title>'
+        f'<p><a href="{address}">Open the page</a>'
+    )
+    descriptor = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o600)
+    with open(descriptor, "w", encoding="utf-8") as file:
+        file.write(text)
+    return path
