@@ -5,7 +5,10 @@ sensor's clock and counter, and with what frames of other types said last. Modul
 
 * `packets`: the columns of n frames, raw and physical.
 * `clocks`: the sensor's own time as integer nanoseconds that run on.
-* `continuity`: what was lost, came twice or late; packets put back in order.
+* `pace`: how long a packet takes by the clock.
+* `continuity`: what was lost, came twice or late, by the counter, the clock and the bytes.
+* `clock_order`: the same for datagrams that only their clock numbers.
+* `reorder`: packets put back in order, doubles left out.
 * `imu`: what an IMU felt, beside the points.
 * `stream`: what is remembered from batch to batch.
 """

@@ -4,19 +4,14 @@
 counters, the breaks and the completeness of scans all follow from the index that it gives: it runs on, and leaves out as many numbers as
 packets are missing. What the counter cannot tell, the clock does: how often the counter has wrapped in a gap, and whether a number that
 jumps is damaged. How long a packet takes by the clock is declared (`Clock.pace`), or learned (`Pace`).
-
-By this index packets are put in order, doubles left out (`Reorder`), so that a late packet gives the same scan as a punctual one: what
-stands behind a gap is kept back for a while.
+Datagrams that only their clock numbers are judged by `clock_order`.
 """
 
 from __future__ import annotations
 
-import copy
 import math
-from bisect import bisect
 from dataclasses import dataclass
 from functools import partial
-from itertools import pairwise
 from typing import Any
 
 import numpy as np
@@ -27,7 +22,8 @@ from lidarspec.columns.graph import header_function
 from lidarspec.errors import SpecError
 from lidarspec.framing.results import Counters, Numbers
 from lidarspec.packets.clocks import Times
-from lidarspec.packets.packets import Index, Packets, joined
+from lidarspec.packets.pace import Pace, Paces
+from lidarspec.packets.packets import Index
 from lidarspec.spec.description import Spec
 from lidarspec.spec.timing import Clock, Sequence
 from lidarspec.wire.arrays import alike, counted
@@ -44,77 +40,6 @@ WIDE = 1 << 63
 FARTHEST = 1 << 32
 #: a clock that goes on by more nanoseconds from one packet to the next was set.
 SET = 3600 * 10**9
-#: packets from which the pace is learned: from one to another, the first ones, and then the first ones of each so many.
-LEARNED, EVERY = ((0, 8), (8, 72)), 512
-
-#: from which packet of a batch on each takes so many ns, nan where nobody knows; the first one from its beginning.
-Paces = list[tuple[int, float]]
-
-
-class Pace:
-    """How long a packet takes by the sensor's clock, as the spec declares it or most of the packets before show it.
-
-    It is learned from some packets now and then, for those behind them, so that batches do not change it. A clock that does not advance
-    evenly tells nothing.
-
-    Attributes:
-        grain: the step of the clock, ns; 0 where a function computes it.
-    """
-
-    def __init__(self, clock: Clock, grain: float) -> None:
-        self._declared, self.grain = clock.pace, grain
-        self._pace, self._seen, self._lessons = math.nan, 0, 0
-        self._times = list[int]()
-
-    def of(self, batch: Batch, times: Times) -> Paces:
-        """Nanoseconds that each packet takes; nan where nobody knows."""
-        if self._declared is not None:
-            (seconds,) = header_function(self._declared, batch.table.schema, _seconds)(batch)
-            if (seconds == seconds[0]).all():
-                return [(0, seconds.item(0) * 1e9)]
-            return [(spot, second * 1e9) for spot, second in enumerate(seconds.tolist())]
-        paces = [(0, self._pace)]
-        first, end = self._lesson()
-        while first < len(times):
-            if first >= 0 and self._lessons >= len(LEARNED):
-                starts = np.arange(first, len(times) + first - end + 1, EVERY)
-                keep = self._keep(times[starts + end - first - 1] - times[starts], end - first - 1)
-                self._lessons += len(keep) if keep.all() else int(keep.argmin())
-                first, end = self._lesson()
-            self._times += times[max(first, 0) : end].tolist()
-            if end > len(times):
-                break
-            if self._lessons < len(LEARNED) or not self._keep(self._times[-1] - self._times[0], end - first - 1):
-                self._pace = self._usual(self._times)
-                paces.append((end, self._pace))
-            self._times, self._lessons = [], self._lessons + 1
-            first, end = self._lesson()
-        self._seen += len(times)
-        return paces
-
-    def forget(self) -> None:
-        """Time has passed that no packet shows: what is being learned is begun anew."""
-        self._seen, self._times = self._seen + self._lesson()[0], []
-
-    def _lesson(self) -> tuple[int, int]:
-        """From which to before which packet, counted from the next one on, there is to be learned next."""
-        further = (self._lessons - len(LEARNED) + 1) * EVERY
-        first, last = LEARNED[self._lessons] if further <= 0 else (further, further + LEARNED[-1][1] - LEARNED[-1][0])
-        return first - self._seen, last + 1 - self._seen
-
-    def _keep(self, passed: Any, packets: int) -> Any:
-        """Whether so many packets have taken as long as is known."""
-        return abs(passed - packets * self._pace) <= packets * self._pace / 10
-
-    def _usual(self, times: list[int]) -> float:
-        """What most of these packets take, in whichever order they came; nan where they differ."""
-        times = sorted(times)
-        steps = sorted([after - before for before, after in pairwise(times)])
-        limit = 1.5 * steps[len(steps) // 2] + self.grain
-        near = steps[: bisect(steps, limit)]
-        pace = sum(near) / len(near)
-        even = bisect(near, 1.25 * pace + self.grain) - bisect(near, 0.75 * pace - self.grain)
-        return pace if pace > 0 and even > 0.55 * len(steps) else math.nan
 
 
 @dataclass(frozen=True, eq=False)
@@ -150,15 +75,6 @@ class Clues:
         """After how many packets the counter of a packet starts again."""
         return max(self.periods if isinstance(self.periods, int) else self.periods.item(spot), 1)
 
-    def pace(self, spot: int) -> float:
-        """How long a packet takes, ns; nan where nobody knows."""
-        return self.paces[bisect(self.paces, spot, key=_first) - 1][1]
-
-    def paces_at(self, spots: NDArray[np.intp]) -> NDArray[np.float64]:
-        """How long some packets take, (k,) ns; nan where nobody knows."""
-        firsts, paces = zip(*self.paces, strict=True)
-        return np.array(paces)[np.searchsorted(firsts, spots, side="right") - 1]
-
 
 class Continuity:
     """Whether the packets of one stream follow one another; counts into `stats`.
@@ -173,13 +89,11 @@ class Continuity:
         self._rule: Sequence | None = sensor.sequence if counted else None
         self._clock: Clock | None = sensor.clock if timed else None
         self._pace = None if self._clock is None else Pace(self._clock, grain)
-        self._by_clock_alone = timed and not counted and sensor.datagrams
-        self._number: int | None = None  # of the newest packet, its time, ns, and where only the clock tells packets apart its bytes
-        self._time: int | None = None
-        self._newest, self._largest = b"", 1  # and bytes of the largest packet
+        self._number: int | None = None  # of the newest packet
+        self._time: int | None = None  # of the newest packet, ns
+        self._largest = 1  # bytes of the largest packet
         self._arrived: int | None = None  # the time of the packet that came last, ns
         self._suspect: tuple[int, int] | None = None  # number and time of a packet whose counter jumped while the clock went on
-        self._jump: tuple[int, int] | None = None  # the time before the clock jumped, ns, and how many packets that lost
         self._period, self._index, self._first = 0, -1, 0
         self._missing: set[int] = set()
 
@@ -199,7 +113,7 @@ class Continuity:
             self._index, self._largest = self._index + number, max(self._largest, batch.table.sizes.item(0))
             return range(self._index + 1 - number, self._index + 1), breaks
         clues = self._clues(batch, times, skipped)
-        if self._rule is None and not self._by_clock_alone:
+        if self._rule is None:
             return self._in_order(clues, breaks), breaks
         found: Numbers = np.empty(number, np.int64)
         odd, spot, turn = [*self._odd(clues), number], 0, 0
@@ -218,8 +132,6 @@ class Continuity:
                 found = self._placed(found, index, spot, end)
                 breaks[spot] |= is_break
             spot = end
-        if number and self._by_clock_alone:
-            self._newest = batch.table.frame(number - 1)
         return found, breaks
 
     def forget(self) -> None:
@@ -239,7 +151,7 @@ class Continuity:
 
     def _clues(self, batch: Batch, times: Times | None, skipped: NDArray[np.int64]) -> Clues:
         """What these packets say."""
-        passed, paces = None, [(0, math.nan)]
+        passed, paces = None, Paces([(0, math.nan)])
         if times is not None and self._pace is not None:
             passed, paces = np.empty(len(times), np.int64), self._pace.of(batch, times)
             passed[0] = 1 if self._arrived is None else times.item(0) - self._arrived
@@ -257,14 +169,9 @@ class Continuity:
     def _odd(self, clues: Clues) -> list[int]:
         """The packets that do not follow the one that arrived before them: all others, but the first, go on from there."""
         numbers, passed = clues.numbers, clues.passed
+        assert numbers is not None
         if clues.there is not None and not clues.there.all():
             return list(range(len(clues.batch)))
-        slowest = self._slowest(clues)
-        if numbers is None:
-            assert passed is not None
-            if passed.min() > 0 and passed.max() <= min(1.5 * slowest, SET):
-                return []
-            return np.flatnonzero((passed <= 0) | (passed > SET) | (passed > 1.5 * clues.paces_at(counted(len(passed))))).tolist()
         each: Any = clues.periods if isinstance(clues.periods, int) else np.maximum(clues.periods, 1)
         steps = numbers[1:] - numbers[:-1]
         odd = steps != 1
@@ -273,21 +180,17 @@ class Continuity:
         if not isinstance(each, int):
             odd |= each[1:] != each[:-1]
         least = each if isinstance(each, int) else int(each.min())
-        if passed is not None and least < LONG and max(int(passed.max()), -int(passed.min())) > slowest * least / 2:  # it may have wrapped
-            odd |= (np.abs(passed) > clues.paces_at(counted(len(passed))) * each / 2)[1:]
+        half = clues.paces.shortest * least / 2
+        if passed is not None and least < LONG and max(int(passed.max()), -int(passed.min())) > half:  # it may have wrapped
+            odd |= (np.abs(passed) > clues.paces.at_each(counted(len(passed))) * each / 2)[1:]
         return (np.flatnonzero(odd) + 1).tolist()
-
-    @staticmethod
-    def _slowest(clues: Clues) -> float:
-        """The least time that a packet takes, as far as that is known; inf where it is not."""
-        return min((pace for _, pace in clues.paces if pace > 0), default=math.inf)
 
     def _in_order(self, clues: Clues, breaks: NDArray[np.bool_]) -> Index:
         """The index of packets that come in order, and are not counted; `breaks` are marked."""
         passed, first, number = clues.passed, self._index + 1, len(clues.batch)
         grain = 0.0 if self._pace is None else self._pace.grain
-        slowest = self._slowest(clues)
-        limit = min(slowest + max(grain, slowest / 2), SET)
+        shortest = clues.paces.shortest
+        limit = min(shortest + max(grain, shortest / 2), SET)
         is_steady = passed is None or (int(passed.min()) >= 0 and int(passed.max()) <= limit)
         spots, packets = clues.skipped
         if is_steady and not packets.any():
@@ -300,7 +203,7 @@ class Continuity:
             spots = np.flatnonzero(is_odd)
             ahead = np.ones(len(spots), np.int64)
             ahead[np.searchsorted(spots, clues.skipped[0])] += packets
-            paces, steps = clues.paces_at(spots), passed[spots]
+            paces, steps = clues.paces.at_each(spots), passed[spots]
             by_clock = np.fmax(np.ceil((steps - np.maximum(grain, paces / 2)) / paces), 1).astype(np.int64)
             ahead = np.where(grain <= paces / 2, by_clock, np.maximum(by_clock, ahead))
             restarts = (steps < 0) | (steps > SET)
@@ -336,10 +239,8 @@ class Continuity:
 
     def _ahead(self, clues: Clues, spot: int) -> tuple[int | None, int | None]:
         """How many places a packet stands ahead of the newest one, None where the sensor has started again; and its number, if right."""
-        time, number, pace = clues.time(spot), clues.number(spot), clues.pace(spot)
+        time, number, pace = clues.time(spot), clues.number(spot), clues.paces.at(spot)
         passed = None if time is None or self._time is None or abs(time - self._time) > SET else time - self._time
-        if self._rule is None:
-            return self._by_clock(clues, spot, passed, pace), None
         if number is None:
             return 1, self._number
         period = clues.period(spot)
@@ -355,7 +256,11 @@ class Continuity:
         if ahead == 1 and not is_right:
             near = 1  # the clock was set, or is uneven, or a recording begins anew
         elif not is_right:
-            return self._damaged(number, time or 0, pace, by_clock) if by_clock > 0.5 else (None, number)
+            if by_clock <= -LATE:
+                return None, number
+            if by_clock <= 0.5:
+                return round(by_clock), number  # late, from before the numbers started again or after it
+            return self._damaged(number, time or 0, pace, by_clock)
         self._suspect = None
         return None if near <= -LATE else near, number
 
@@ -375,26 +280,6 @@ class Continuity:
         assert self._number is not None
         return ahead, self._number + ahead
 
-    def _by_clock(self, clues: Clues, spot: int, passed: int | None, pace: float) -> int | None:
-        """How many places a datagram without a number is ahead, None where the clock was set or has started again."""
-        time = clues.time(spot) or 0
-        if passed is None:
-            return 1 if self._index < 0 or self._time is None else None
-        if passed == 0 and self._is_doubled(clues, spot):
-            return 0
-        if not pace > 0:
-            return 1
-        if abs(passed) > LATE * pace and self._jump is not None and 0 < time - self._jump[0] <= LATE * pace:
-            self._stats.lost -= self._jump[1]  # one reading was damaged
-            return None
-        ahead = math.ceil(passed / pace - 0.5)
-        return max(ahead, 1) if passed >= 0 else None if ahead < -LATE else ahead or 1
-
-    def _is_doubled(self, clues: Clues, spot: int) -> bool:
-        """Whether a packet has the bytes of the one before it."""
-        table = clues.batch.table
-        return table.frame(spot) == (table.frame(spot - 1) if spot else self._newest)
-
     def _step(self, clues: Clues, spot: int, ahead: int | None, number: int | None) -> tuple[int, bool]:
         """The index of a packet that does not follow the newest one, and whether there is a break before it."""
         if ahead is not None and ahead <= 0:
@@ -407,7 +292,6 @@ class Continuity:
             self._missing = {index for index in self._missing if index > self._index + ahead - LATE}
             self._missing.update(range(self._index + 1, self._index + ahead)[-LATE:])
             self._index += ahead
-        self._jump = (self._time, lost) if self._time is not None and (ahead is None or lost > LATE) else None
         self._number, self._time = number, clues.time(spot)
         return self._index, before >= 0 and (ahead is None or lost > 0)
 
@@ -440,10 +324,6 @@ def _with_gaps(first: int, number: int, spots: NDArray[np.intp], gaps: NDArray[n
     return np.cumsum(index, out=index)
 
 
-def _first(pace: tuple[int, float]) -> int:
-    return pace[0]
-
-
 def _agree(ahead: int, by_clock: float) -> bool:
     """Whether a counter and a clock say the same."""
     return abs(ahead - by_clock) <= 1 + abs(by_clock) / 8 and (ahead > 0) == (by_clock > 0.5)
@@ -452,82 +332,3 @@ def _agree(ahead: int, by_clock: float) -> bool:
 def _whole(values: Any, number: int) -> NDArray[np.int64]:
     found = np.asarray(values, np.float64).reshape(-1).astype(np.int64)
     return found if len(found) == 1 else np.broadcast_to(found, (number,))
-
-
-def _seconds(values: Any, number: int) -> NDArray[np.float64]:
-    return np.broadcast_to(np.asarray(values, np.float64).reshape(-1), (number,))
-
-
-#: how many packets are kept back while one before them is missing, or may be, as at the beginning.
-WINDOW = 10
-
-
-class Reorder:
-    """Orders the packets of one stream; without a sequence everything passes as it comes."""
-
-    def __init__(self, *, enabled: bool) -> None:
-        self._enabled = enabled
-        self._next: int | None = None
-        self._held: Packets | None = None
-
-    def push(self, packets: Packets) -> list[Packets]:
-        """The packets that are now in order; at most one batch."""
-        if not self._enabled or not len(packets):
-            return [packets] if len(packets) else []
-        if self._held is None and (self._next is None or int(packets.index[0]) >= self._next):
-            steps = packets.index[1:] - packets.index[:-1]
-            if not len(steps) or int(steps.min()) > 0:
-                return self._ascending(packets, None if not len(steps) or int(steps.max()) == 1 else steps)
-        return self._ordered(packets)
-
-    def finish(self) -> list[Packets]:
-        """The packets that are still kept back."""
-        held, self._held = self._held, None
-        if held is None:
-            return []
-        return [self._marked(held.take(np.argsort(held.index, kind="stable")), self._next)]
-
-    def _ascending(self, packets: Packets, steps: NDArray[np.int64] | None) -> list[Packets]:
-        """Packets none of which is late, in order: those behind the first gap that is still open are kept back.
-
-        Args:
-            steps: of the index from each packet to the next; None where all are 1.
-        """
-        number, before = len(packets), self._next
-        gaps = [] if before == int(packets.index[0]) else [0]
-        if steps is not None:
-            gaps += (np.flatnonzero(steps > 1) + 1).tolist()
-        end = next((gap for gap in gaps if gap >= number - WINDOW), number)
-        if end < number:
-            self._held = packets.take(slice(end, None))
-            packets = packets.take(slice(0, end))
-        if not end:
-            return []
-        self._next = int(packets.index[-1]) + 1
-        return [self._marked(packets, before) if len(gaps) > (before is None) or packets.breaks.any() else packets]
-
-    def _ordered(self, packets: Packets) -> list[Packets]:
-        known = 0 if self._held is None else len(self._held)
-        everything = packets if self._held is None else joined([self._held, packets])
-        waiting = {int(index): spot for spot, index in enumerate(everything.index[:known].tolist())}
-        released: list[int] = []
-        before = self._next
-        for spot, index in enumerate(everything.index.tolist()[known:], start=known):
-            if index in waiting or (self._next is not None and index < self._next):
-                continue
-            waiting[index] = spot
-            if len(waiting) > WINDOW:
-                self._next = min(waiting)
-            while self._next in waiting:
-                released.append(waiting.pop(self._next))
-                self._next += 1
-        self._held = everything.take(np.array([waiting[index] for index in sorted(waiting)], np.intp)) if waiting else None
-        return [self._marked(everything.take(np.array(released, np.intp)), before)] if released else []
-
-    @staticmethod
-    def _marked(packets: Packets, before: int | None = None) -> Packets:
-        """These packets with a break wherever the index jumps, and nowhere else."""
-        start = int(packets.index[0]) if before is None else before
-        marked = copy.copy(packets)
-        marked.breaks = np.diff(packets.index, prepend=start - 1) != 1
-        return marked

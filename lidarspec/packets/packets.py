@@ -38,6 +38,7 @@ class Packets:
         time_ns: (n,) int64, by the sensor's clock, unwrapped; else the host's.
         host_ns: (n,) int64 arrival times; 0 where the caller gave none.
         breaks: (n,) True where something was lost before the packet.
+        grain_ns: the step of the sensor's clock, 0 if a function computes it, if the clock alone orders the packets; None if not.
         state: for each other frame type, its frames and which of them was last before each packet.
         stats: the counters of the decoder.
         backend: what makes points of them, "auto", "numpy" or "jit".
@@ -57,8 +58,12 @@ class Packets:
         state: Mapping[str, StateOf],
         stats: Counters,
         backend: str = "auto",
+        order: NDArray[np.int64] | None = None,
+        grain_ns: float | None = None,
     ) -> None:
         self.sensor, self.frame, self.table = sensor, frame, table
+        self._order = order
+        self.grain_ns = grain_ns
         self._offset, self.time_ns, self.host_ns, self._index, self.breaks = offset, time_ns, host_ns, index, breaks
         self.state, self.stats, self.backend = state, stats, backend
 
@@ -71,6 +76,11 @@ class Packets:
     def index(self) -> NDArray[np.int64]:
         """The number of each, (n,), which runs on over what is missing: the sensor's, unwrapped, where it counts its packets."""
         return self._index() if callable(self._index) else array_of(self._index)
+
+    @property
+    def order(self) -> NDArray[np.int64]:
+        """The place of each among the others, (n,), equal for doubled packets: by the counter, or else the clock, of datagrams."""
+        return self.index if self._order is None else self._order
 
     def __len__(self) -> int:
         return len(self.table)
@@ -141,10 +151,16 @@ class Packets:
     def take(self, which: Any) -> Packets:
         """The packets that indices, a mask or a slice pick, with their times, offsets and state."""
         indices = np.arange(len(self))[which]
-        columns: dict[str, Any] = {name: getattr(self, name)[indices] for name in _COLUMNS}
+        columns = self._columns_at(indices)
         state = {name: (table, chosen[indices]) for name, (table, chosen) in self.state.items()}
         table = self.table.take(indices)
         return Packets(self.sensor, self.frame, table, **columns, state=state, stats=self.stats, backend=self.backend)
+
+    def _columns_at(self, indices: NDArray[np.intp]) -> dict[str, Any]:
+        """Return what is known of some packets besides their fields, as `Packets` takes it."""
+        columns: dict[str, Any] = {name: getattr(self, name)[indices] for name in _COLUMNS}
+        order = None if self._order is None else self._order[indices]
+        return {**columns, "order": order, "grain_ns": self.grain_ns}
 
     def parts(self, path: str) -> Packets:
         """The parts of all packets, in stream order, as packets: with the times, numbers and state of the frames that they are in.
@@ -160,7 +176,7 @@ class Packets:
             raise UnknownField(path, self.table.schema.parts, place=f"{self.sensor.id} {self.frame}")
         axis, kind, below = place
         table, which = self.table.parts(axis, kind)
-        columns: dict[str, Any] = {name: getattr(self, name)[which] for name in _COLUMNS}
+        columns = self._columns_at(which)
         columns["breaks"] = np.diff(np.cumsum(self.breaks)[which], prepend=0) > 0  # also of a frame without parts before
         columns["time_ns"] = part_times(self.sensor, (axis, kind), table, which, columns["time_ns"])
         state = {name: (frames, chosen[which]) for name, (frames, chosen) in self.state.items() if name != AROUND}
@@ -199,7 +215,10 @@ def joined(parts: Sequence[Packets]) -> Packets:
         starts = np.cumsum([0] + [0 if table is None else len(table) for table in tables])
         which = [np.where(part.state[name][1] < 0, -1, part.state[name][1] + start) for part, start in zip(parts, starts[:-1], strict=True)]
         state[name] = (joined_tables(known) if known else None, np.concatenate(which))
-    columns = {key: np.concatenate([getattr(part, key) for part in parts]) for key in _COLUMNS}
+    columns: dict[str, Any] = {key: np.concatenate([getattr(part, key) for part in parts]) for key in _COLUMNS}
+    if all(part.grain_ns is not None for part in parts):
+        columns["order"] = np.concatenate([part.order for part in parts])
+        columns["grain_ns"] = head.grain_ns
     table = joined_tables([part.table for part in parts])
     return Packets(head.sensor, head.frame, table, **columns, state=state, stats=parts[-1].stats, backend=head.backend)
 

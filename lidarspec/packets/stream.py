@@ -19,9 +19,11 @@ from lidarspec.columns.columns import Batch
 from lidarspec.errors import PluginError, SpecError, UnknownFrame
 from lidarspec.framing.frame_engine import Codec, codec
 from lidarspec.framing.results import Counters, Frames, Numbers
+from lidarspec.packets.clock_order import ClockOrder
 from lidarspec.packets.clocks import Epoch, Unwrapper, clock_parts, clock_terms, clocked, held, paths
 from lidarspec.packets.continuity import Continuity
 from lidarspec.packets.imu import ImuSamples, Waiting, joined
+from lidarspec.packets.pace import Pace
 from lidarspec.packets.packets import Index, Packets, StateOf, joined_tables
 from lidarspec.spec.description import Spec
 from lidarspec.spec.timing import Clock
@@ -68,6 +70,10 @@ class PacketStream:
         grain = float(min((step for _, step, _, _ in terms), default=0))
         # a frame without the parts that have the clock says nothing of time, so that only a counter tells what was lost beside it
         self._continuity = Continuity(sensor, stats, counted=counted, timed=timed and (counted or not in_parts), grain=grain)
+        self._grain_ns = grain
+        self._clock_order: ClockOrder | None = None
+        if sensor.clock is not None and timed and not counted and not in_parts and sensor.datagrams:
+            self._clock_order = ClockOrder(stats, Pace(sensor.clock, grain))
         self._skipped = 0  # bytes since the last packet
         self._time: int | None = None  # of the last packet with parts that have the clock
         self._tables: dict[str, tuple[bytes, Table]] = {}
@@ -83,20 +89,28 @@ class PacketStream:
         state = self._states(parts, len(table), whole=whole)
         offset, host = _offsets(parts), _times([part.column(part.frames.at) for part in parts])
         index: Index = range(0)
+        order: NDArray[np.int64] | None = None
         breaks, time = np.zeros(len(table), np.bool_) if alike(skipped) == 0 else skipped > 0, None
         if len(table):
             batch, otherwise = Batch(table, breaks, state, self.sensor.state), (range(len(table)), breaks)
             with np.errstate(all="ignore"):
                 time = self._guarded("clock", self._times, None, batch, host) if self._clock is not None else None
-                index, breaks = self._guarded("sequence", self._continuity.push, otherwise, batch, time, skipped)
+                if self._clock_order is not None and time is not None:
+                    index, order = self._guarded("clock", self._clock_order.push, (otherwise[0], None), batch, time)
+                else:
+                    index, breaks = self._guarded("sequence", self._continuity.push, otherwise, batch, time, skipped)
         time = host if time is None else self._complete(time)
         columns: dict[str, Any] = {"offset": offset, "time_ns": time, "host_ns": host, "index": index, "breaks": breaks}
+        if order is not None:
+            columns |= {"order": order, "grain_ns": self._grain_ns}
         return Packets(self.sensor, self.frame, table, **columns, state=state, stats=self.stats, backend=self._backend)
 
     def interrupt(self) -> None:
         """Input was lost here: there is a break before the next packet."""
         self._skipped = max(self._skipped, 1)
         self._continuity.forget()
+        if self._clock_order is not None:
+            self._clock_order.forget()
 
     def _guarded(self, what: str, function: Callable[..., Any], otherwise: Any, batch: Batch, *args: Any) -> Any:
         try:

@@ -14,9 +14,9 @@ from numpy.typing import NDArray
 from lidarspec.columns.columns import Carry
 from lidarspec.display import drawn
 from lidarspec.errors import UsageError
-from lidarspec.packets.continuity import Reorder
 from lidarspec.packets.imu import ImuSamples, Waiting
 from lidarspec.packets.packets import Packets, joined as joined_packets
+from lidarspec.packets.reorder import Reorder
 from lidarspec.points.cloud import ColumnSource, LazyCloud, Mount, PointCloud, Stretch, Stretches, source_of
 from lidarspec.points.conventions import axes_of
 from lidarspec.points.evaluate import guarded

@@ -31,7 +31,9 @@ class Promise:
 RULE, LIMITS, PROMISES = "tests/engine/test_framing_rule.py", "tests/engine/test_limits.py", "tests/engine/test_promises.py"
 RECORDINGS, DEVICE = "tests/recording/test_recordings.py", "tests/device/test_device.py"
 HOSTILE = "tests/captures/test_pcap_hostile.py"
-CONTINUITY, SCANS = "tests/packets/test_continuity.py", "tests/scans/test_scans.py"
+CONTINUITY = "tests/packets/test_continuity.py"
+REORDER = "tests/packets/test_reorder.py"
+SCANS = "tests/scans/test_scans.py"
 
 EVERY = (
     Promise("P1", "any split of a stream gives the same result", (RULE,), "", figures.splits),
@@ -88,7 +90,7 @@ EVERY = (
         (f"{PROMISES}::TestClocks", "tests/packets/test_clocks.py"),
         "100 turns of 30 s, an hour, and 16 bits, late packets among them: exact",
     ),
-    Promise("P17", "late, doubled and reordered packets give the same scan", (CONTINUITY, SCANS), "", figures.in_any_order),
+    Promise("P17", "late, doubled and reordered packets give the same scan", (CONTINUITY, REORDER, SCANS), "", figures.in_any_order),
     Promise("P18", "decoders are independent", ("tests/framing/test_framing.py",), "in turn, and in 8 threads: as alone"),
     Promise("P19", "a scan always ends", (SCANS,), "", figures.blocked),
     Promise("P20", "no stream is slower than its line: 10 times its rate, under 64 bytes kept for each", (RULE,), "", figures.slowest),

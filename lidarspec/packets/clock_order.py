@@ -1,0 +1,234 @@
+"""Order of datagrams that only their clock numbers.
+
+`ClockOrder` judges datagrams as they arrive: each is the next one, or late, or doubled, or the first one after a gap or
+after the clock was set. It remembers the newest packets in the order of their times. A packet with the time and the
+bytes of one of them is a double. A late packet is placed between its neighbours, and the number of packets that are
+missing there is counted anew. So the counters end up as if the packets had arrived in order.
+
+Each packet gets an index and an order. The index runs on over what is missing. The order is the time of the packet in
+nanoseconds, from the first packet on; it differs for packets of one time that are no doubles, and leaps by
+`2 * MAX_STEP_NS` where the clock was set or the sensor started again. Packets sorted by it and judged by another
+`ClockOrder` give the index and the breaks that they would have got without any disorder.
+"""
+
+from __future__ import annotations
+
+import math
+from bisect import bisect_left, bisect_right
+from dataclasses import dataclass
+from operator import attrgetter
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lidarspec.columns.columns import Batch
+from lidarspec.framing.results import Counters, Numbers
+from lidarspec.packets.clocks import Times
+from lidarspec.packets.pace import Pace, Paces
+
+#: places that a packet may be late; a clock that goes back further was set, or the sensor started again.
+MAX_PLACES_LATE = 64
+#: the same in time, if the pace is unknown.
+MAX_LATE_NS = 10**9
+#: a clock that advances by more from one packet to the next was set.
+MAX_STEP_NS = 3600 * 10**9
+#: packets of which the bytes are remembered; an older one with the same time counts as the same packet.
+REMEMBERED_FRAMES = 16
+
+_time_of = attrgetter("time")
+
+
+@dataclass
+class Neighbour:
+    """One of the newest packets.
+
+    Attributes:
+        missing: packets that are missing between it and the one before it in time.
+        data: its bytes; None if they are no longer remembered.
+    """
+
+    time: int
+    order: int
+    index: int
+    missing: int
+    data: bytes | None
+
+
+class ClockOrder:
+    """Judges the datagrams of one stream by their clock.
+
+    Args:
+        stats: counts what is lost, late and doubled.
+        pace: how long a packet takes.
+    """
+
+    def __init__(self, stats: Counters, pace: Pace) -> None:
+        self._stats = stats
+        self._pace = pace
+        self._arrived: int | None = None  # time of the packet that arrived last, ns
+        self._newest: Neighbour | None = None
+        self._neighbours = list[Neighbour]()  # by their times
+        self._offset = 0  # from a time to an order
+        self._leap: tuple[int, int] | None = None  # the time before the clock leapt, ns, and how many packets that lost
+
+    def push(self, batch: Batch, times: Times) -> tuple[Numbers, NDArray[np.int64]]:
+        """Return the index and the order of each packet, (n,); mark the breaks before packets in `batch.breaks`.
+
+        Args:
+            times: by the sensor's clock, (n,) ns.
+        """
+        paces = self._pace.of(batch, times)
+        odd_rows = self._find_odd(times, paces)
+        count = len(times)
+        self._arrived = times.item(-1)
+        if not odd_rows and self._follows(times.item(0), paces.at(0)):
+            first = self._add_run(batch, times, 0, count)
+            self._trim()
+            return range(first, first + count), times + self._offset
+        index = np.empty(count, np.int64)
+        order = np.empty(count, np.int64)
+        odd_rows.append(count)
+        next_odd = row = 0
+        while row < count:
+            while odd_rows[next_odd] <= row:
+                next_odd += 1
+            if self._follows(times.item(row), paces.at(row)):
+                stop = odd_rows[next_odd]
+                first = self._add_run(batch, times, row, stop)
+                index[row:stop] = np.arange(first, first + stop - row)
+                order[row:stop] = times[row:stop] + self._offset
+                row = stop
+            else:
+                place = self._place(batch, row, times.item(row), paces.at(row))
+                index[row] = place.index
+                order[row] = place.order
+                row += 1
+            self._trim()
+        return index, order
+
+    def forget(self) -> None:
+        """Treat the next packet as the first one after the clock was set: nothing tells what passed until then."""
+        self._arrived = None
+        self._neighbours.clear()
+        self._pace.forget()
+
+    def _find_odd(self, times: Times, paces: Paces) -> list[int]:
+        """Return the packets that do not follow the one that arrived before them."""
+        passed = np.empty(len(times), np.int64)
+        passed[0] = 1 if self._arrived is None else times.item(0) - self._arrived
+        np.subtract(times[1:], times[:-1], out=passed[1:])
+        if passed.min() > 0 and passed.max() <= min(1.5 * paces.shortest, MAX_STEP_NS):
+            return []
+        each = paces.at_each(np.arange(len(times)))
+        return np.flatnonzero((passed <= 0) | (passed > MAX_STEP_NS) | (passed > 1.5 * each)).tolist()
+
+    def _follows(self, time: int, pace: float) -> bool:
+        """Return whether a packet is the next one after the newest."""
+        if not self._neighbours:
+            return False
+        passed = time - self._neighbours[-1].time
+        return 0 < passed <= MAX_STEP_NS and not passed > 1.5 * pace
+
+    def _add_run(self, batch: Batch, times: Times, start: int, stop: int) -> int:
+        """Add packets that follow one another after the newest; return the index of the first one."""
+        assert self._newest is not None
+        first = self._newest.index + 1
+        for row in range(max(start, stop - MAX_PLACES_LATE), stop):
+            data = batch.table.frame(row) if row >= stop - REMEMBERED_FRAMES else None
+            time = times.item(row)
+            self._newest = Neighbour(time, time + self._offset, first + row - start, 0, data)
+            self._neighbours.append(self._newest)
+        return first
+
+    def _place(self, batch: Batch, row: int, time: int, pace: float) -> Neighbour:
+        """Return the place of a packet that does not follow the newest one."""
+        data = batch.table.frame(row)
+        if self._newest is None or not self._neighbours:
+            return self._begin(batch, row, time, data)
+        newest = self._neighbours[-1]
+        passed = time - newest.time
+        if self._leap is not None and self._leaps_back(time, passed, pace):
+            self._stats.lost -= self._leap[1]  # one reading was damaged
+            return self._begin(batch, row, time, data)
+        if passed > MAX_STEP_NS or self._is_too_early(time, passed, pace):
+            return self._begin(batch, row, time, data)
+        start = bisect_left(self._neighbours, time, key=_time_of)
+        stop = bisect_right(self._neighbours, time, key=_time_of)
+        for twin in self._neighbours[start:stop]:
+            if twin.data is None or twin.data == data:
+                self._stats.duplicates += 1
+                return twin
+        if stop < len(self._neighbours):
+            return self._insert(stop, time, pace, data)
+        missing = _count_missing(passed, pace)
+        self._stats.lost += missing
+        self._leap = (newest.time, missing) if missing > MAX_PLACES_LATE else None
+        batch.breaks[row] |= missing > 0
+        order = max(time + self._offset, newest.order + 1)
+        self._newest = Neighbour(time, order, newest.index + 1 + missing, missing, data)
+        self._neighbours.append(self._newest)
+        return self._newest
+
+    def _leaps_back(self, time: int, passed: int, pace: float) -> bool:
+        """Return whether the clock leaps to where it was before it leapt last."""
+        assert self._leap is not None
+        reach = MAX_PLACES_LATE * pace
+        return abs(passed) > reach and 0 < time - self._leap[0] <= reach
+
+    def _is_too_early(self, time: int, passed: int, pace: float) -> bool:
+        """Return whether the clock has gone back further than by a late packet."""
+        if pace > 0:
+            return passed < -MAX_PLACES_LATE * pace
+        is_full = len(self._neighbours) >= MAX_PLACES_LATE
+        return passed < -MAX_LATE_NS or (is_full and time < self._neighbours[0].time)
+
+    def _begin(self, batch: Batch, row: int, time: int, data: bytes) -> Neighbour:
+        """Begin with a first packet, or anew after the clock was set: the index leaves out one number."""
+        before = self._newest
+        if before is None:
+            self._offset = -time
+            index = 0
+        else:
+            self._offset = before.order + 2 * MAX_STEP_NS - time
+            index = before.index + 2
+            batch.breaks[row] = True
+            self._leap = (before.time, 0)
+        self._newest = Neighbour(time, time + self._offset, index, 0, data)
+        self._neighbours = [self._newest]
+        return self._newest
+
+    def _insert(self, position: int, time: int, pace: float, data: bytes) -> Neighbour:
+        """Place a late packet before a neighbour, and count anew what is missing on both sides of it."""
+        self._stats.late += 1
+        after = self._neighbours[position]
+        missing_after = _count_missing(after.time - time, pace)
+        order = time + self._offset
+        if position:
+            before = self._neighbours[position - 1]
+            missing = _count_missing(time - before.time, pace)
+            index = max(min(before.index + 1 + missing, after.index - 1), before.index)
+            order = max(order, before.order + 1)
+        else:
+            missing = max(after.missing - 1 - missing_after, 0)
+            index = after.index - 1 - missing_after
+        self._stats.lost += missing + missing_after - after.missing
+        after.missing = missing_after
+        placed = Neighbour(time, order, index, missing, data)
+        self._neighbours.insert(position, placed)
+        return placed
+
+    def _trim(self) -> None:
+        """Forget packets that are too old to have late neighbours."""
+        if len(self._neighbours) > MAX_PLACES_LATE:
+            del self._neighbours[:-MAX_PLACES_LATE]
+        for neighbour in reversed(self._neighbours[:-REMEMBERED_FRAMES]):
+            if neighbour.data is None:
+                break
+            neighbour.data = None
+
+
+def _count_missing(passed: int, pace: float) -> int:
+    """Return how many packets are missing in a step of the clock."""
+    if not pace > 0:
+        return 0
+    return max(math.ceil(passed / pace - 0.5), 1) - 1

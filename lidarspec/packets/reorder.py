@@ -1,0 +1,150 @@
+"""Packets in order, each once.
+
+A packet whose predecessor has not arrived is held until it arrives, or until more than `WINDOW` packets are held.
+Doubled packets are left out, and so are packets whose successors were released before they arrived. All other packets
+pass at once, so that order costs no time while nothing is late. At the start `START_WINDOW` packets are held, since the
+first packet to arrive may be late as well.
+
+`Packets.order` gives the place of each packet. With a counter it is the index. With a clock alone it is a time, and the
+packets are judged again once they are in order: scans depend on the packets, not on the order in which they arrive.
+"""
+
+from __future__ import annotations
+
+import copy
+from bisect import bisect_left, insort
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lidarspec.columns.columns import Batch
+from lidarspec.framing.results import Counters
+from lidarspec.packets.clock_order import ClockOrder
+from lidarspec.packets.pace import FIRST_LESSONS, Pace
+from lidarspec.packets.packets import Packets, joined
+
+#: packets that are held while one before them is missing.
+WINDOW = 10
+#: packets that are held at the start if only the clock numbers them: the pace is learned from the first ones to arrive.
+START_WINDOW = WINDOW + FIRST_LESSONS[0][1]
+
+
+class Reorder:
+    """Orders the packets of one stream.
+
+    Args:
+        enabled: whether packets can be put in order; all pass as they arrive if not.
+    """
+
+    def __init__(self, *, enabled: bool) -> None:
+        self._enabled = enabled
+        self._next: int | None = None  # index that follows the packets released so far
+        self._released = 0  # the order of the last one of them
+        self._held: Packets | None = None
+        self._clock_order: ClockOrder | None = None
+
+    def push(self, packets: Packets) -> list[Packets]:
+        """Return the packets that are now in order; at most one batch."""
+        if not self._enabled or not len(packets):
+            return [packets] if len(packets) else []
+        if self._held is None:
+            order = packets.order
+            is_ascending = bool((order[1:] > order[:-1]).all())
+            if is_ascending and (self._next is None or order.item(0) > self._released):
+                return self._push_ascending(packets)
+        return self._push_disordered(packets)
+
+    def finish(self) -> list[Packets]:
+        """Return the packets that are still held."""
+        held = self._held
+        self._held = None
+        if held is None:
+            return []
+        return [self._mark(held.take(np.argsort(held.order, kind="stable")), self._next)]
+
+    def _window(self, packets: Packets) -> int:
+        """Return the number of packets that are held until the next one that is missing arrives."""
+        return START_WINDOW if self._next is None and packets.grain_ns is not None else WINDOW
+
+    def _push_ascending(self, packets: Packets) -> list[Packets]:
+        """Release packets none of which is late, up to the first gap that may still be filled."""
+        index = packets.index
+        before = self._next
+        gaps = [] if before == index.item(0) else [0]
+        steps = index[1:] - index[:-1]
+        if len(steps) and int(steps.max()) > 1:
+            gaps += (np.flatnonzero(steps > 1) + 1).tolist()
+        end = len(packets)
+        for gap in gaps:
+            if gap >= len(packets) - (self._window(packets) if gap == 0 else WINDOW):
+                end = gap
+                break
+        if end < len(packets):
+            self._held = packets.take(slice(end, None))
+            packets = packets.take(slice(0, end))
+        if not end:
+            return []
+        self._release_to(packets)
+        has_gap = len(gaps) > (before is None) or bool(packets.breaks.any())
+        if packets.grain_ns is None and not has_gap:
+            return [packets]
+        return [self._mark(packets, before)]
+
+    def _push_disordered(self, packets: Packets) -> list[Packets]:
+        """Put packets between those that are held, and release all that have no gap before them."""
+        known = 0
+        everything = packets
+        if self._held is not None:
+            known = len(self._held)
+            everything = joined([self._held, packets])
+        orders = everything.order.tolist()
+        indices = everything.index.tolist()
+        held = sorted((orders[row], row) for row in range(known))
+        window = self._window(packets)
+        rows = list[int]()
+        before = self._next
+        for row in range(known, len(orders)):
+            order = orders[row]
+            if self._next is not None and order <= self._released:
+                continue
+            position = bisect_left(held, (order, 0))
+            if position < len(held) and held[position][0] == order:
+                continue
+            insort(held, (order, row))
+            if len(held) > window:
+                self._next = indices[held[0][1]]
+                window = WINDOW
+            while held and self._next is not None and indices[held[0][1]] <= self._next:
+                self._released, released = held.pop(0)
+                self._next = max(self._next, indices[released] + 1)
+                rows.append(released)
+        self._held = everything.take(np.array([row for _, row in held], np.intp)) if held else None
+        return [self._mark(everything.take(np.array(rows, np.intp)), before)] if rows else []
+
+    def _release_to(self, packets: Packets) -> None:
+        self._next = packets.index.item(-1) + 1
+        self._released = packets.order.item(-1)
+
+    def _mark(self, packets: Packets, before: int | None) -> Packets:
+        """Return packets in order with a break wherever the index leaves out a number, and nowhere else.
+
+        Args:
+            before: the index that follows the packets released before these; None if there are none.
+        """
+        marked = copy.copy(packets)
+        if packets.grain_ns is not None:
+            marked.index, marked.breaks = self._judge(packets, packets.grain_ns)
+            return marked
+        start = packets.index.item(0) if before is None else before
+        marked.breaks = np.diff(packets.index, prepend=start - 1) != 1
+        return marked
+
+    def _judge(self, packets: Packets, grain_ns: float) -> tuple[NDArray[np.int64], NDArray[np.bool_]]:
+        """Return the index and the breaks of packets in order, by their clock."""
+        if self._clock_order is None:
+            assert packets.sensor.clock is not None
+            self._clock_order = ClockOrder(Counters(), Pace(packets.sensor.clock, grain_ns))
+        breaks = np.zeros(len(packets), np.bool_)
+        batch = Batch(packets.table, breaks, packets.state, packets.sensor.state)
+        index, _ = self._clock_order.push(batch, packets.order)
+        return np.asarray(index, np.int64), breaks

@@ -1,0 +1,134 @@
+"""Promise P17: packets that are late and doubled make the same scans as packets that are not."""
+
+from __future__ import annotations
+
+import dataclasses
+import random
+from collections.abc import Sequence
+
+import numpy as np
+import pytest
+
+import lidarspec as ls
+from lidarspec import Packets, Scan, Sensor, simulate
+from lidarspec.packets.reorder import START_WINDOW, WINDOW, Reorder
+from lidarspec.packets.stream import PacketStream
+from lidarspec.scans.scans import ScanStream
+from tests.representatives import load_sensor
+from tests.shapes.paced import FAST_S
+
+#: datagrams ordered by a counter, a counter and a clock, a clock with a declared pace, and a clock with a learned one.
+SHAPES = ["shape-headed", "shape-extras", "shape-paced", "shape-columns"]
+#: float32 columns of one packet may differ in the last bit between batches of different sizes.
+LAST_BIT = 2e-6
+
+
+def disturb(frames: Sequence[bytes], seed: str) -> list[bytes]:
+    """Return the frames with one in ten doubled, and each up to three places from where it was."""
+    draw = random.Random(seed)
+    doubled = [frame for frame in frames for _ in range(2 if draw.random() < 0.1 else 1)]
+    order = sorted(range(len(doubled)), key=lambda index: index + draw.uniform(0, 3))
+    return [doubled[index] for index in order]
+
+
+def assert_same_scans(scans: Sequence[Scan], expected: Sequence[Scan]) -> None:
+    """Compare the facts and all columns of scans."""
+    assert len(scans) == len(expected)
+    for scan, same in zip(scans, expected, strict=True):
+        assert (len(scan), scan.complete, scan.whole, scan.stamp_ns) == (len(same), same.complete, same.whole, same.stamp_ns)
+        assert scan.rate_hz == pytest.approx(same.rate_hz, nan_ok=True)
+        for column in scan.points.columns:
+            np.testing.assert_allclose(scan.points.columns[column], same.points.columns[column], rtol=LAST_BIT, atol=LAST_BIT)
+
+
+def assert_order_does_not_matter(sensor: Sensor, frames: Sequence[bytes], first: int) -> None:
+    """Compare the scans and counters of a disturbed stream with those of a stream in order.
+
+    Args:
+        first: frames at the start that come in order.
+    """
+    changed = [*frames[:first], *disturb(frames[first:], sensor.id)]
+    stats = sensor.decode(changed).stats
+    assert (stats.plugin_errors, stats.lost, stats.duplicates) == (0, 0, len(changed) - len(frames))
+    assert stats.late > len(frames) / 10
+    assert_same_scans(list(sensor.scans(changed)), list(sensor.scans(list(frames))))
+
+
+@pytest.mark.parametrize("first", [0, 10])
+@pytest.mark.parametrize("name", SHAPES)
+def test_doubled_and_displaced_packets_make_the_same_scans(name: str, first: int) -> None:
+    sensor = load_sensor(name)
+    frames = simulate(sensor, 300)
+    assert_order_does_not_matter(sensor, frames, first)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", sorted(name for name, sensor in ls.sensors().items() if sensor.datagrams))
+def test_every_sensor_that_sends_datagrams_keeps_the_promise(name: str) -> None:
+    sensor = ls.sensor(name)
+    assert_order_does_not_matter(sensor, simulate(sensor, 800), 0)
+
+
+def test_a_counter_that_starts_again_while_packets_are_late() -> None:
+    """The counter has 65,536 values, and starts again with each frame of 40 packets."""
+    plain = load_sensor("shape-extras")
+    simulation = plain.simulation
+    assert simulation is not None
+    sweep = simulation.sweep
+    restarting = dataclasses.replace(simulation, sweep=lambda i: {**sweep(i), "number": i % 40})
+    sensor = dataclasses.replace(plain, simulation=restarting)
+    assert_order_does_not_matter(sensor, simulate(sensor, 300), 100)
+
+
+def test_a_late_packet_between_unevenly_timed_ones_is_no_loss() -> None:
+    """Each packet is up to 40 % of its pace late by the clock."""
+    plain = load_sensor("shape-paced")
+    simulation = plain.simulation
+    assert simulation is not None
+    sweep = simulation.sweep
+    draw = random.Random(1)
+    delays = [draw.uniform(0, 0.4) * FAST_S for _ in range(97)]
+    uneven = dataclasses.replace(simulation, sweep=lambda i: {**sweep(i), "micros": sweep(i)["micros"] + delays[i % 97]})
+    sensor = dataclasses.replace(plain, simulation=uneven)
+    assert_order_does_not_matter(sensor, simulate(sensor, 120), 0)
+
+
+def pieces(sensor: Sensor, frames: Sequence[bytes], size: int) -> list[Packets]:
+    """Return the packets of datagrams that arrive some at a time."""
+    decoder = sensor.decoder()
+    stream = PacketStream(sensor, str(sensor.data_frame), decoder.stats)
+    parts = [frames[start : start + size] for start in range(0, len(frames), size)]
+    return [stream.add([decoder.datagrams(part, [None] * len(part))]) for part in parts]
+
+
+@pytest.mark.parametrize("name", SHAPES)
+def test_the_sizes_of_batches_do_not_matter(name: str) -> None:
+    sensor = load_sensor(name)
+    frames = disturb(simulate(sensor, 100), name)
+    stream = ScanStream(sensor)
+    scans = [scan for packets in pieces(sensor, frames, 3) for scan in stream.add(packets)]
+    assert_same_scans([*scans, *stream.finish()], list(sensor.scans(frames)))
+
+
+@pytest.mark.parametrize("name", SHAPES)
+def test_packets_in_order_are_held_at_the_start_alone(name: str) -> None:
+    sensor = load_sensor(name)
+    reorder = Reorder(enabled=True)
+    released = [sum(map(len, reorder.push(packets))) for packets in pieces(sensor, simulate(sensor, 60), 1)]
+    held = WINDOW if sensor.sequence is not None else START_WINDOW
+    assert released == [0] * held + [held + 1] + [1] * (59 - held)
+
+
+@pytest.mark.parametrize("name", SHAPES)
+def test_a_lost_packet_holds_no_more_than_a_window(name: str) -> None:
+    sensor = load_sensor(name)
+    frames = simulate(sensor, 100)
+    reorder = Reorder(enabled=True)
+    arrived = released = 0
+    most_held = 0
+    for packets in pieces(sensor, frames[:50] + frames[51:], 1):
+        arrived += 1
+        released += sum(map(len, reorder.push(packets)))
+        most_held = max(most_held, arrived - released if arrived > 40 else 0)
+    assert most_held == WINDOW
+    assert released == arrived == 99
