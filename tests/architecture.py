@@ -55,7 +55,7 @@ CONFINED = {
     "click": {"cli"},
     "rich": {"cli", "view"},
     "starlette": {"view.access", "view.server"},
-    "uvicorn": {"view.server"},
+    "uvicorn": {"view.connections", "view.server"},
     "hypothesis": {"testing"},
     "pytest": {"testing"},
 }

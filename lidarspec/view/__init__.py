@@ -16,6 +16,7 @@ In: a device, or points. Out: pictures, and what a page makes them of. Modules i
 * `backlog`: the newest bytes of it, frame by frame, and what was damaged.
 * `answers`: what a page is told, in JSON.
 * `access`: who may reach the page: the token of its link, hosts and origins.
+* `connections`: how many connections there may be, and how long one may be open without the token.
 * `temporary`: the temporary folder of the server.
 * `server`: the page's files, its socket, and what is done on a page's request.
 * `widget`: a source in a cell of a notebook, drawn as by the page.

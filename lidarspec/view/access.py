@@ -13,6 +13,7 @@ import ipaddress
 import os
 import re
 import secrets
+from collections.abc import Callable
 from html import escape
 from pathlib import Path
 
@@ -68,10 +69,21 @@ class Guard:
         name: the host in the printed link.
         port: where the server listens.
         token: of the printed link.
+        admit: called with the client of each request that has the token.
     """
 
-    def __init__(self, app: ASGIApp, *, host: str, name: str, port: int, token: str) -> None:
+    def __init__(
+        self,
+        app: ASGIApp,
+        *,
+        host: str,
+        name: str,
+        port: int,
+        token: str,
+        admit: Callable[[tuple[str, int] | None], None],
+    ) -> None:
         self._app = app
+        self._admit = admit
         self._port = port
         self._token = token.encode()
         self._names = {*LOCAL_NAMES, name.lower()}
@@ -94,6 +106,7 @@ class Guard:
         if refusal is not None:
             await refusal(scope, receive, send_with_headers)
             return
+        self._admit(scope["client"])
         # Nothing behind this point sees the token, so that it is in no log and no message.
         await self._app({**scope, "query_string": b""}, receive, send_with_headers)
 

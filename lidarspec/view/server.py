@@ -37,6 +37,7 @@ from lidarspec.view.access import ANY_ADDRESS, Guard, add_token, make_token, wri
 from lidarspec.view.answers import Answers, saves
 from lidarspec.view.backlog import Backlog
 from lidarspec.view.broadcast import Broadcast, Shown
+from lidarspec.view.connections import BACKLOG, Connections, ErrorReporter
 from lidarspec.view.svg import svg
 from lidarspec.view.temporary import TemporaryFolder, remove_stale_folders
 
@@ -369,9 +370,19 @@ class Site:
             Mount("/", StaticFiles(directory=self._files)),
         ]
         app = Starlette(routes=routes)
+        self._connections = Connections(say)
         self._server = uvicorn.Server(
             uvicorn.Config(
-                Guard(app, host=host, name=name, port=port, token=self._token),
+                Guard(
+                    app,
+                    host=host,
+                    name=name,
+                    port=port,
+                    token=self._token,
+                    admit=self._connections.admit,
+                ),
+                http=self._connections.protocol_class(),
+                backlog=BACKLOG,
                 log_config=None,
                 log_level="critical",  # what it has to say of requests is not for a terminal
                 access_log=False,
@@ -415,7 +426,10 @@ class Site:
             loop.call_soon_threadsafe(self._stir)
 
         self._broadcast.news = stir
+        loop.set_exception_handler(ErrorReporter(self._say))
+        watching = asyncio.create_task(self._connections.watch())
         await self._server.serve(sockets=[self._socket])
+        watching.cancel()
 
     def _stir(self) -> None:
         for page in self._open:

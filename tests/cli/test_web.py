@@ -122,6 +122,27 @@ def test_the_browser_is_led_to_the_link(tmp_path: Path) -> None:
 
 
 @pytest.mark.slow
+@pytest.mark.skipif(sys.platform != "linux", reason="the limit of another process is set on Linux alone")
+def test_more_idle_connections_than_files_can_be_open(tmp_path: Path) -> None:
+    """1,100 of another user, without the token: the page stays reachable, and no traceback is printed."""
+    resource = pytest.importorskip("resource")
+    soft, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
+    resource.setrlimit(resource.RLIMIT_NOFILE, (min(hard, 2048), hard))
+    try:
+        with served(tmp_path, f"sim:{FLAT}") as (running, link), contextlib.ExitStack() as stack:
+            resource.prlimit(running.pid, resource.RLIMIT_NOFILE, (256, hard))
+            for _ in range(1100):
+                stack.enter_context(socket.create_connection(("127.0.0.1", urlsplit(link).port), DEADLINE))
+            with Page(link) as page:
+                assert page.scan()[1]["x"].size
+            _, _, lines = ended(running, signal.SIGINT)
+    finally:
+        resource.setrlimit(resource.RLIMIT_NOFILE, (soft, hard))
+    assert sum("connections at once" in line for line in lines) == 1
+    assert len(lines) < 8
+
+
+@pytest.mark.slow
 def test_a_source_that_fails_ends_it_with_its_code(tmp_path: Path) -> None:
     with served(tmp_path, recorded(tmp_path), "--slice", "100:200") as (running, _):
         code, _, lines = ended(running)

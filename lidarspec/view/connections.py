@@ -1,0 +1,146 @@
+"""Limits on the connections to the server, so that whoever can connect cannot make it unreachable.
+
+A connection waits until one of its requests has brought the token. It is closed if that takes too
+long, or if it is the oldest that waits and there are too many connections. So idle connections of
+others always make way for a browser, which sends its request at once. Connections that have brought
+the token are closed by their pages, or by the timeouts of the server.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import time
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from typing import Any
+
+from uvicorn.protocols.http.h11_impl import H11Protocol
+
+#: with and without the token.
+MAX_CONNECTIONS = 128
+#: accepted by the system before the server has taken them; each needs a descriptor, too.
+BACKLOG = 64
+#: until a connection has to bring the token.
+TOKEN_TIMEOUT_S = 10.0
+CHECK_PERIOD_S = 1.0
+
+Client = tuple[str, int]
+
+
+@dataclass
+class Waiting:
+    """A connection that has not brought the token yet."""
+
+    transport: asyncio.Transport
+    since: float = field(default_factory=time.monotonic)
+
+
+class Connections:
+    """The connections of a server. All methods run in its event loop.
+
+    Args:
+        report: called once with a line if connections had to be closed for others.
+    """
+
+    def __init__(self, report: Callable[[str], None]) -> None:
+        self._report = report
+        self._has_reported = False
+        self._waiting: dict[Client, Waiting] = {}  # the oldest first
+        self._admitted: dict[Client, asyncio.Transport] = {}
+
+    def protocol_class(self) -> type[asyncio.Protocol]:
+        """Return the protocol with which uvicorn serves a connection."""
+        connections = self
+
+        class LimitedProtocol(H11Protocol):
+            def connection_made(self, transport: asyncio.BaseTransport) -> None:
+                assert isinstance(transport, asyncio.Transport)
+                super().connection_made(transport)
+                connections._add(self.client, transport)
+
+            def connection_lost(self, exc: Exception | None) -> None:
+                super().connection_lost(exc)
+                connections._remove(self.client, self.transport)
+
+        return LimitedProtocol
+
+    def admit(self, client: Client | None) -> None:
+        """Take note that a connection has brought the token; None is one that is closed again."""
+        if client in self._waiting:
+            self._admitted[client] = self._waiting.pop(client).transport
+
+    def drop(self, client: Client | None) -> None:
+        """Close the connection of a client that does not read what it asked for."""
+        if client in self._admitted:
+            self._admitted.pop(client).abort()
+
+    async def watch(self) -> None:
+        """Close connections that do not bring the token in time, until this is cancelled."""
+        while True:
+            await asyncio.sleep(CHECK_PERIOD_S)
+            self._close_late()
+
+    def _close_late(self) -> None:
+        begin = time.monotonic() - TOKEN_TIMEOUT_S
+        while self._waiting:
+            client, oldest = next(iter(self._waiting.items()))
+            if oldest.since > begin:
+                return
+            self._close_waiting(client)
+
+    def _add(self, client: Client | None, transport: asyncio.Transport) -> None:
+        if client is None:  # it is closed already
+            transport.abort()
+            return
+        if len(self._waiting) + len(self._admitted) >= MAX_CONNECTIONS:
+            self._make_room()
+        if len(self._waiting) + len(self._admitted) >= MAX_CONNECTIONS:
+            transport.abort()
+            return
+        self._waiting[client] = Waiting(transport)
+
+    def _make_room(self) -> None:
+        # Connections that became sockets do not say when they are lost.
+        for client, transport in list(self._admitted.items()):
+            if transport.is_closing():
+                del self._admitted[client]
+        if len(self._waiting) + len(self._admitted) < MAX_CONNECTIONS:
+            return
+        if self._waiting:
+            self._close_waiting(next(iter(self._waiting)))
+        if not self._has_reported:
+            self._has_reported = True
+            self._report(f"more than {MAX_CONNECTIONS} connections at once: the oldest that have not brought the token are closed")
+
+    def _close_waiting(self, client: Client) -> None:
+        self._waiting.pop(client).transport.abort()
+
+    def _remove(self, client: Client | None, transport: asyncio.Transport) -> None:
+        if client is None:
+            return
+        waiting = self._waiting.get(client)
+        if waiting is not None and waiting.transport is transport:
+            del self._waiting[client]
+        if self._admitted.get(client) is transport:
+            del self._admitted[client]
+
+
+class ErrorReporter:
+    """Reports errors of the event loop, each kind once and in one line.
+
+    Args:
+        report: called with the line.
+    """
+
+    def __init__(self, report: Callable[[str], None]) -> None:
+        self._report = report
+        self._reported: set[str] = set()
+
+    def __call__(self, loop: asyncio.AbstractEventLoop, context: dict[str, Any]) -> None:
+        """Report the error of a context, as `loop.set_exception_handler` calls it."""
+        text = str(context.get("message"))
+        if text in self._reported:
+            return
+        self._reported.add(text)
+        error = context.get("exception")
+        self._report(f"server: {text}" if error is None else f"server: {text}: {error}")
