@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import itertools
 import os
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from shlex import quote
 from textwrap import indent
 from typing import Any
@@ -13,13 +15,13 @@ import click
 from lidarspec.cli.failures import DEVICE, FINDINGS, NO_DATA
 from lidarspec.cli.inputs import read
 from lidarspec.cli.options import DURATION, sensor_option
-from lidarspec.cli.output import emit, emit_json, output_options, table
-from lidarspec.cli.terminal import note
+from lidarspec.cli.output import Progress, emit, emit_json, output_options, table
+from lidarspec.cli.terminal import note, voice
 from lidarspec.discovery.checksum_search import search
 from lidarspec.discovery.detect import Verdict, best, chosen, names, others_named, verdict, verdicts
 from lidarspec.discovery.doctor import computer, examined
 from lidarspec.discovery.heard import Heard
-from lidarspec.discovery.listen import LISTEN, everywhere, hear, probe, started_first, udp_ports
+from lidarspec.discovery.listen import LISTEN, hear, ignore, probe, started_first, udp_ports
 from lidarspec.discovery.periods import Structure, cut, structure
 from lidarspec.discovery.samples import Match
 from lidarspec.discovery.uninstalled import describe, install_commands, recognize
@@ -181,12 +183,17 @@ def detect(source: str | None, duration: float, start: bool, as_json: bool, outp
 
     SOURCE is a port, a file or a capture; without it every serial port is listened to at every baud rate that installed sensors
     declare, and every UDP port. A sensor fits by the share of the bytes in frames that pass checksum and plausibility. Sensors
-    with the same frames are told apart by their clocks, names in their frames and baud rates, as far as that goes.
+    with the same frames are told apart by their clocks, names in their frames and baud rates, as far as that goes; those that
+    were ruled out are listed with -v.
     """
     if source == "-":
         raise suggest(UsageError("standard input can be read only once: write it to a file first"), "lidarspec detect FILE")
-    source = None if source is None else resolved(source)
-    found = list(_everywhere(duration, start=start)) if source is None else _one(source, duration, start=start)
+    if source is None:
+        found = list(_everywhere(duration, start=start))
+    else:
+        source = resolved(source)
+        with Progress() as progress:
+            found = _one(source, duration, start=start, tell=lambda text: progress(lambda: f"listening to {text}"))
     fitting = [one for one in found if one.scores]
     unknown = None if fitting or any(one.fault for one in found) else _unknown(found)
     if as_json:
@@ -208,8 +215,8 @@ def _code(source: str | None, found: Sequence[Verdict]) -> int:
     return DEVICE if is_silent else NO_DATA
 
 
-def _one(source: str, duration: float, *, start: bool) -> list[Verdict]:
-    found = verdicts(source, seconds=duration)
+def _one(source: str, duration: float, *, start: bool, tell: Callable[[str], None] = ignore) -> list[Verdict]:
+    found = verdicts(source, seconds=duration, tell=tell)
     if start and not any(one.scores for one in found):
         for heard in probe(source):
             found = [best([*found, verdict(heard)])]
@@ -219,15 +226,21 @@ def _one(source: str, duration: float, *, start: bool) -> list[Verdict]:
 
 
 def _everywhere(duration: float, *, start: bool) -> Iterator[Verdict]:
-    ports = [port.path for port in serial_ports()]
-    note(f"listening to {len(ports)} serial port{'s' * (len(ports) != 1)} and UDP {', '.join(map(str, udp_ports()))}")
-    for port in ports:
+    """Return whose bytes come over each port, all of which are listened to at the same time."""
+    serial, udp = [port.path for port in serial_ports()], udp_ports()
+    note(f"listening to {len(serial)} serial port{'s' * (len(serial) != 1)} and UDP {', '.join(map(str, udp))}")
+
+    def heard_at(source: str) -> list[Verdict]:
         try:
-            yield from _one(port, duration, start=start)
+            return _one(source, duration, start=start)
         except SourceError as error:
-            yield Verdict(Heard(port, failure=error))
-    for heard in everywhere([], seconds=duration):
-        yield verdict(heard)
+            return [Verdict(Heard(source, failure=error))]
+        except UsageError as error:
+            return [Verdict(Heard(source, failure=SourceError(str(error))))]
+
+    sources = [*serial, *(f"udp://:{port}" for port in udp)]
+    with ThreadPoolExecutor(max_workers=len(sources) or 1) as pool:
+        yield from itertools.chain.from_iterable(pool.map(heard_at, sources))
 
 
 def _unknown(found: Sequence[Verdict]) -> Structure | None:
@@ -240,7 +253,8 @@ def _detected_text(found: Sequence[Verdict], output: str | None) -> str:
     rows = []
     for one in found:
         alike = {score.sensor.id for score in one.alike}
-        for score in one.scores:
+        is_told = bool(one.alike or one.others) and voice.loudness <= 0
+        for score in one.alike if is_told else one.scores:
             verdict_of = "no" if score.sensor.id not in alike else "yes" if one.sensor is not None else "perhaps"
             rows.append([_place(one.heard), score.sensor.id, verdict_of, f"{score.share:.1%}", str(score.data_frames), score.why])
         verdict_of = "perhaps" if alike else "yes"
@@ -323,8 +337,8 @@ def _following(source: str | None, unknown: Structure | None) -> str:
     """What to type where bytes come that no sensor fits."""
     if source is None or live_address(source) is not None:
         return f"lidarspec doctor {quote(source) if source else ''}".rstrip()
-    if unknown is not None and unknown.period and not unknown.checksums:
-        return f"lidarspec crc {quote(source)} --period {unknown.period}"
+    if unknown is not None and not unknown.checksums:
+        return f"lidarspec crc {quote(source)}" + (f" --period {unknown.period}" if unknown.period else "")
     return "lidarspec sensors"
 
 
@@ -382,7 +396,7 @@ def _structure_text(found: Structure) -> str:
     for match in found.checksums[:TOLD]:
         told = match.paste if "\n" not in match.paste else match.algorithm.describe()
         lines.append(f"  checksum  {told} in {match.place}: right in {match.right} of {match.total}")
-    return "\n".join(lines if found.checksums else [*lines, "  checksum  none was found"])
+    return "\n".join(lines if found.checksums else [*lines, "  checksum  none was found at the usual places"])
 
 
 @click.command()

@@ -86,19 +86,20 @@ class Changed(Checksum):
         return ((constant - values) if self.negative else (constant + values)) & np.uint64(self._mask)
 
 
-def search(frames: Iterable[bytes]) -> list[Match]:
+def search(frames: Iterable[bytes], *, quick: bool = False) -> list[Match]:
     """The checksums that fit the frames, the plainest and best proven first; empty where none does.
 
     Args:
         frames: whole frames, the more of them and the more different the better; some may be damaged, and lengths may differ.
+        quick: look only for what is found within about a second: CRCs at the usual places, those of long frames in the catalogue.
     """
     samples = Samples(frames)
     if samples.shortest < 3 or not any(map(any, samples.frames)):
         return []
     found = list(plain_matches(samples))
     if not any(match.sure for match in found):
-        found += crc_matches(samples)
-    if not found:
+        found += crc_matches(samples, quick=quick)
+    if not found and not quick:
         found += crc_matches(samples, mixed=True)
     return best_first(found)[:TOLD]
 

@@ -27,6 +27,8 @@ SPARE = 11
 WIDTHS = (32, 16, 8)
 #: frames longer than this are divided for a checksum at their end alone; elsewhere the catalogue is tried.
 DIVIDED = 256
+#: a byte that is divided takes as long as so many of which a CRC is computed, and how many of those a quick search may take.
+DIVISION, QUICK = 32, 1 << 23
 #: frames of one length that a polynomial is sought with; at the usual place other picks are tried where one fails, in case of damage.
 TAKEN, PICKS = 4, 6
 #: most polynomials that are held against all frames for one place and span.
@@ -141,25 +143,40 @@ class _Reading:
         return Crc(self.width, low, init, self.refin, self.refout, self.register(xorout))
 
 
-def crc_matches(samples: Samples, *, mixed: bool = False) -> Iterator[Match]:
-    """Every CRC that fits, up to the first place with a sure one; with `mixed`, those whose bytes and register are not mirrored alike."""
+def crc_matches(samples: Samples, *, mixed: bool = False, quick: bool = False) -> Iterator[Match]:
+    """Every CRC that fits, up to the first place with a sure one.
+
+    Args:
+        mixed: look for those whose bytes and register are not mirrored alike, in place of those where they are.
+        quick: give up after a fixed amount of work, with the usual places first.
+    """
     mirrors = [(False, True), (True, False)] if mixed else [(False, False), (True, True)]
     picks = [samples.alike(TAKEN, pick) for pick in range(PICKS if len(samples) > 2 * TAKEN else 1)]
     by_width = [[place for place in samples.places(width // 8) if _random(samples, place)] for width in WIDTHS]
-    tried, sure = 0, False
+    tried, sure, taken = 0, False, 0
     for place in (place for places in zip_longest(*by_width) for place in places if place is not None):
         width = 8 * place.size
         orders: tuple[ByteOrder, ...] = ("little", "big") if width > 8 else ("little",)
         readings = [_Reading(width, order, *mirror) for order in orders for mirror in mirrors]
         for span, reading in product(spans(place, samples), readings):
             tried += 1
-            chosen = picks if place.offset == -place.size and span == Span() else picks[:1]
-            found = (list(_fitting(samples, some, place, span, reading, tried)) for some in chosen)
+            at_end = place.offset == -place.size
+            by_catalogue = samples.shortest > DIVIDED and (quick or not at_end)
+            chosen = picks if at_end and span == Span() else picks[:1]
+            taken += sum(_work(some, reading, by_catalogue=by_catalogue) for some in chosen)
+            if quick and taken > QUICK:
+                return
+            found = (list(_fitting(samples, some, place, span, reading, tried, by_catalogue=by_catalogue)) for some in chosen)
             for match in next((matches for matches in found if matches), []):
                 sure = sure or match.sure
                 yield match
         if sure:
             return
+
+
+def _work(few: Samples, reading: _Reading, *, by_catalogue: bool) -> int:
+    """How much work one place, span and reading are, in bytes of which a CRC is computed."""
+    return few.shortest * len(reading.known()) if by_catalogue else DIVISION * sum(map(len, few.frames))
 
 
 def _random(samples: Samples, place: Place) -> bool:
@@ -177,11 +194,12 @@ def _codewords(samples: Samples, place: Place, span: Span, reading: _Reading) ->
     return [(len(row), reading.message(row) ^ reading.register(value)) for row, value in zip(rows, there, strict=True)]
 
 
-def _fitting(samples: Samples, few: Samples, place: Place, span: Span, reading: _Reading, tried: int) -> Iterator[Match]:
-    """The CRCs of one place, span and reading."""
+def _fitting(
+    samples: Samples, few: Samples, place: Place, span: Span, reading: _Reading, tried: int, *, by_catalogue: bool
+) -> Iterator[Match]:
+    """The CRCs of one place, span and reading; of the catalogue alone, or any."""
     there = samples.fields(place, reading.order)
-    long = few.shortest > DIVIDED and place.offset != -place.size
-    candidates = _catalogued(few, place, span, reading) if long else _candidates(_codewords(few, place, span, reading), reading)
+    candidates = _catalogued(few, place, span, reading) if by_catalogue else _candidates(_codewords(few, place, span, reading), reading)
     for crc, fitted, remarks in candidates:
         right = samples.right(crc, place, span, reading.order)
         known = crc.poly in KNOWN[crc.width]

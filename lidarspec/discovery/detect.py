@@ -26,7 +26,7 @@ from lidarspec.columns.columns import Fields
 from lidarspec.device.settings import named
 from lidarspec.discovery.checksum_search import search
 from lidarspec.discovery.heard import Heard
-from lidarspec.discovery.listen import hear
+from lidarspec.discovery.listen import LISTEN, hear, ignore
 from lidarspec.discovery.uninstalled import suggest_installation
 from lidarspec.errors import CommandError, LidarSpecError, UsageError, WireError, suggest
 from lidarspec.framing.decoder import Decoder
@@ -295,9 +295,9 @@ def never_right(chunks: Sequence[bytes], *, datagrams: bool) -> str:
     frames = [item.data for item in found[0].found if item.frame == most]
     ids = " or ".join(score.sensor.id for score in found)
     text = f"{len(frames)} {most} frames of {ids} by their constants, lengths and rhythm, and their checksums are never right"
-    match = next(iter(search(frames)), None)
+    match = next(iter(search(frames, quick=True)), None)
     if match is None:
-        return f"{text}; no other checksum fits either"
+        return f"{text}; no other checksum was found at the usual places"
     length = len(frames[0])
     covered = sum(last - first for first, last in match.span.ranges(match.place, length))
     where = f"{match.algorithm.describe()} in {match.place} is right in {match.right} of {match.total}"
@@ -357,18 +357,25 @@ def verdict(heard: Heard) -> Verdict:
     alike = [
         replace(score, why=score.why or ", ".join(f"{name}={value}" for name, value in score.sensor.options.items())) for score in alike
     ]
+    # Of many with the same frames, it is likelier one of the vendor that makes most of them.
+    vendors = [score.sensor.vendor for score in alike]
+    alike.sort(key=lambda score: (-vendors.count(score.sensor.vendor), score.sensor.id))
     ruled_out = [score for score in fitting if score.sensor.id not in {one.sensor.id for one in alike}]
     return Verdict(heard, (*alike, *ruled_out), tuple(alike), told.others)
 
 
-def verdicts(source: str | Path, *, seconds: float | None = None) -> list[Verdict]:
+def verdicts(source: str | Path, *, seconds: float = LISTEN, tell: Callable[[str], None] = ignore) -> list[Verdict]:
     """Whose bytes come from a source, one verdict for each sender; of a serial port, at the baud rate that fits best.
+
+    Args:
+        seconds: to listen for, at each baud rate.
+        tell: called with what is being listened to, before each time.
 
     Raises:
         SourceError: where it cannot be opened.
     """
     tried: list[Verdict] = []
-    for heard in hear(source) if seconds is None else hear(source, seconds=seconds):
+    for heard in hear(source, seconds=seconds, tell=tell):
         tried.append(verdict(heard))
         if heard.baud is not None and tried[-1].is_clear:
             break

@@ -14,7 +14,7 @@ from pathlib import Path
 
 from lidarspec.device.session import Pending, Session
 from lidarspec.discovery.heard import LOOKED_AT, Heard, beginning
-from lidarspec.errors import LidarSpecError, SourceError, UsageError
+from lidarspec.errors import LidarSpecError
 from lidarspec.framing.decoder import Decoder
 from lidarspec.plugins import sensors
 from lidarspec.spec.links import Serial, Udp
@@ -47,20 +47,38 @@ def udp_ports() -> list[int]:
     return sorted({port for link in links if link for port in link.ports})
 
 
-def hear(source: str | Path, *, seconds: float = LISTEN) -> Iterator[Heard]:
+def ignore(_: str) -> None:
+    """Tell nobody what is being listened to."""
+
+
+def hear(source: str | Path, *, seconds: float = LISTEN, tell: Callable[[str], None] = ignore) -> Iterator[Heard]:
     """What comes from a source; a serial port whose baud rate is not given, once for each that installed sensors declare.
+
+    A line that is silent at the commonest, the lowest and the highest rate is silent at all: what is sent at one rate arrives as
+    other bytes at another, and not as none.
 
     Args:
         seconds: to listen for, each time.
+        tell: called with what is being listened to, before each time.
 
     Raises:
         SourceError: where it cannot be opened.
     """
     text, address = str(source), live_address(source)
     if address is not None and address.scheme == "serial" and "baud" not in address.options:
-        plain = has_no_baud(address.place)
-        for baud in bauds()[: 1 if plain else None]:
-            yield from _heard(with_option(text, "baud", baud), seconds, None if plain else baud, text)
+        if has_no_baud(address.place):
+            tell(text)
+            yield from _heard(with_option(text, "baud", bauds()[0]), seconds, None, text)
+            return
+        rates, is_silent = bauds(), True
+        first = dict.fromkeys([rates[0], min(rates), max(rates)])
+        for number, baud in enumerate(dict.fromkeys([*first, *rates])):
+            if number == len(first) and is_silent:
+                return
+            tell(f"{text} at {baud} baud")
+            for heard in _heard(with_option(text, "baud", baud), seconds, baud, text):
+                is_silent = is_silent and not heard.size
+                yield heard
     elif address is not None and address.scheme == "udp" and not address.host_and_port()[1] and "port" not in address.options:
         yield from _heard(with_option(text, "port", ",".join(map(str, udp_ports()))), seconds, None, text)
     else:
@@ -119,15 +137,6 @@ def _listened(opened: LiveTransport, seconds: float) -> list[Chunk]:
         while (left := end - time.monotonic()) > 0 and sum(len(chunk.data) for chunk in chunks) < PLENTY:
             chunks += opened.read(min(left, LOOK))
     return chunks
-
-
-def everywhere(ports: list[str], *, seconds: float = LISTEN) -> Iterator[Heard]:
-    """What comes over every serial port given and every UDP port that installed sensors declare; failures are told, not raised."""
-    for source in (*ports, *(f"udp://:{port}" for port in udp_ports())):
-        try:
-            yield from hear(source, seconds=seconds)
-        except (SourceError, UsageError) as error:
-            yield Heard(source, failure=error if isinstance(error, SourceError) else SourceError(str(error)))
 
 
 def started_first() -> list[Sensor]:

@@ -11,6 +11,7 @@ hundredths of a degree never reaches 36 000.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from functools import cached_property
@@ -54,6 +55,8 @@ HALF, CLOSE, MANY = 0.5, 0.03, 12
 ALIKE = 0.75
 #: pairs of bytes that are tried as sync bytes, and frames that a structure needs.
 PAIRS, FRAMES = 32, 3
+#: how probable frames may be that random bytes seem to consist of as well.
+CHANCE = 1e-3
 #: bytes behind the sync that may hold a length, and the largest size of one unit of it.
 HEADER, UNIT = 8, 16
 
@@ -248,8 +251,8 @@ class Structure:
 
     @cached_property
     def checksums(self) -> tuple[Match, ...]:
-        """What may seal them, the likeliest first; the search takes seconds."""
-        return tuple(search(self.frames))
+        """What may seal them, the likeliest first, as far as a second of search finds it."""
+        return tuple(search(self.frames, quick=True))
 
 
 def structure(chunks: Sequence[bytes], *, datagrams: bool) -> Structure | None:
@@ -336,14 +339,30 @@ def _framed(data: NDArray[np.uint8], period: int) -> Iterator[tuple[float, Struc
     rows = data[: count * period].reshape(count, period)
     usual = usual_bytes(rows)
     steady = (rows == usual).mean(axis=0) >= STEADY if count >= 2 * FRAMES else (rows == usual).all(axis=0)
-    if not (steady & (usual != 0)).any() or steady.all():
+    told = int((steady & (usual != 0)).sum())
+    if told == 0 or steady.all() or _is_chance(data, told, count, period):
         return
     start, length = _longest_run(steady, usual)
     sync = bytes(np.roll(usual, -start)[:length])
     frames = [frame for frame in cut(data.tobytes(), period, start) if frame.startswith(sync)]
     if len(frames) >= FRAMES:
         share = len(frames) * period / len(data)
-        yield share * float((steady & (usual != 0)).mean()), Structure(sync[:16], period, None, share, tuple(frames))
+        yield share * told / period, Structure(sync[:16], period, None, share, tuple(frames))
+
+
+def _is_chance(data: NDArray[np.uint8], steady: int, count: int, period: int) -> bool:
+    """Whether random bytes, as usual as these, have as many of a period that are the same `count` times, at any distance that is tried.
+
+    By the bound of Chernoff on the number of such bytes.
+    """
+    shares = np.bincount(data, minlength=256)[1:] / len(data)
+    expected = period * float((shares**count).sum())
+    if steady <= expected:
+        return True
+    if expected == 0:  # of many frames
+        return False
+    tried = min(LONGEST, len(data) // FRAMES)
+    return math.log(tried) + steady - expected - steady * math.log(steady / expected) > math.log(CHANCE)
 
 
 def _longest_run(steady: NDArray[np.bool_], usual: NDArray[np.uint8]) -> tuple[int, int]:

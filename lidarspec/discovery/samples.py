@@ -129,6 +129,8 @@ class Samples:
         self.frames: list[bytes] = sorted(distinct, key=len)
         groups = (list(group) for _, group in itertools.groupby(self.frames, len))
         self.groups: list[NDArray[np.uint8]] = [np.frombuffer(b"".join(group), np.uint8).reshape(len(group), -1) for group in groups]
+        # The same fields are asked for with each algorithm that is tried.
+        self._fields: dict[tuple[Place, ByteOrder], NDArray[np.uint64]] = {}
 
     def __len__(self) -> int:
         return len(self.frames)
@@ -152,7 +154,10 @@ class Samples:
 
     def fields(self, place: Place, order: ByteOrder) -> NDArray[np.uint64]:
         """What stands at a place in each frame, shape (n,)."""
-        return np.concatenate([values(group, place.start(group.shape[1]), place.size, order) for group in self.groups]).view(np.uint64)
+        if (place, order) not in self._fields:
+            columns = [values(group, place.start(group.shape[1]), place.size, order) for group in self.groups]
+            self._fields[place, order] = np.concatenate(columns).view(np.uint64)
+        return self._fields[place, order]
 
     def covered(self, place: Place, span: Span) -> list[NDArray[np.uint8]]:
         """The bytes that a span covers, group by group: (frames, bytes) each."""

@@ -9,6 +9,7 @@ import re
 import socket
 import subprocess
 import sys
+import threading
 import time
 from pathlib import Path
 from typing import Any
@@ -21,8 +22,9 @@ from lidarspec.discovery.heard import Heard
 from lidarspec.simulation.simulator import simulate
 from lidarspec.spec import Crc
 from lidarspec.testing.fixtures import virtual_port
+from lidarspec.transports.ports import SerialPort
 from tests.cli.running import printed, process, ran
-from tests.lines import paced, port, udp, working
+from tests.lines import TIMEOUT_S, paced, port, udp, working
 
 
 class TestSend:
@@ -125,6 +127,19 @@ class TestDetect:
         assert "slamtec-rplidar-a1, slamtec-rplidar-a2, " in found.stderr
         assert "slamtec-rplidar-t1 send the same frames" in found.stderr
         assert found.stdout.count("perhaps") == 9
+
+    def test_all_ports_are_listened_to_at_the_same_time(self, monkeypatch: pytest.MonkeyPatch) -> None:
+        both = threading.Barrier(2)
+
+        def listened(source: str, duration: float, *, start: bool) -> list[Verdict]:
+            both.wait(TIMEOUT_S)
+            return [Verdict(Heard(source))]
+
+        monkeypatch.setattr("lidarspec.cli.finding._one", listened)
+        monkeypatch.setattr("lidarspec.cli.finding.serial_ports", lambda: [SerialPort("/dev/ttyUSB0", "", "", True, ())])
+        monkeypatch.setattr("lidarspec.cli.finding.udp_ports", lambda: [2368])
+        told = json.loads(ran("detect", "--json", code=5).stdout)
+        assert [one["source"] for one in told["sources"]] == ["/dev/ttyUSB0", "udp://:2368"]
 
     @pytest.mark.slow
     def test_all_udp_ports_without_a_source(self) -> None:
@@ -281,5 +296,5 @@ def test_bytes_sent_by_hand_are_answered_and_the_answer_is_explained() -> None:
 @pytest.mark.parametrize("source", [(), ("udp://:45999",)])
 def test_detect_exits_with_5_if_live_sources_are_silent(source: tuple[str, ...], monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("lidarspec.cli.finding._everywhere", lambda duration, start: iter([]))
-    monkeypatch.setattr("lidarspec.cli.finding._one", lambda source, duration, start: [Verdict(Heard(source))])
+    monkeypatch.setattr("lidarspec.cli.finding._one", lambda source, duration, start, tell: [Verdict(Heard(source))])
     assert ran("detect", *source, code=5).stderr.startswith("nothing came\n")

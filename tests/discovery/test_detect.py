@@ -7,6 +7,7 @@ import random
 import socket
 import threading
 import time
+import zlib
 from collections.abc import Callable
 from pathlib import Path
 
@@ -15,6 +16,8 @@ import pytest
 import lidarspec as ls
 from lidarspec import CommandError, SourceError, UsageError, WireError, simulate
 from lidarspec.discovery import detect, listen
+from lidarspec.discovery.checksum_search import search
+from lidarspec.discovery.crc_search import DIVISION, remainder
 from lidarspec.discovery.detect import detected, fitting, scores, verdict, verdicts
 from lidarspec.discovery.listen import Heard, bauds, hear, probe, started_first, udp_ports
 from lidarspec.discovery.periods import structure
@@ -69,7 +72,7 @@ def few_installed(monkeypatch: pytest.MonkeyPatch) -> None:
 @pytest.fixture
 def patient(monkeypatch: pytest.MonkeyPatch) -> None:
     """Listen until enough has come, however slow the machine is."""
-    monkeypatch.setitem(listen.hear.__kwdefaults__, "seconds", TIMEOUT_S)
+    monkeypatch.setitem(detect.verdicts.__kwdefaults__, "seconds", TIMEOUT_S)
 
 
 @pytest.mark.usefixtures("few_installed")
@@ -240,7 +243,7 @@ def test_frames_whose_checksums_are_never_right_are_found_and_answered(tmp_path:
     assert error.value.__notes__ == [f"next: lidarspec crc {path}"]
     noise = random.Random(2)
     sealed_by_chance = [frame[:46] + noise.randbytes(1) for frame in firmware_bug(60)]
-    assert "no other checksum fits either" in verdict(Heard("", (b"".join(sealed_by_chance[:12]),))).fault
+    assert "no other checksum was found" in verdict(Heard("", (b"".join(sealed_by_chance[:12]),))).fault
 
 
 @pytest.mark.usefixtures("few_installed")
@@ -354,8 +357,57 @@ def test_a_pseudo_terminal_is_listened_to_once() -> None:
     assert heard.size > 47
 
 
+def test_of_sensors_with_the_same_frames_those_of_the_vendor_with_most_of_them_come_first(monkeypatch: pytest.MonkeyPatch) -> None:
+    few = {name: ls.sensor(name) for name in ("cspc-coin-d4", "ydlidar-s4b", "ydlidar-tmini")}
+    monkeypatch.setattr(detect, "sensors", lambda: few)
+    found = verdict(Heard("", tuple(simulate(few["cspc-coin-d4"], 30))))
+    assert [score.sensor.id for score in found.alike] == ["ydlidar-s4b", "ydlidar-tmini", "cspc-coin-d4"]
+
+
+@pytest.mark.parametrize(("sends", "listened"), [(False, 3), (True, None)])
+def test_a_line_that_is_silent_at_three_rates_is_not_listened_to_at_others(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, sends: bool, listened: int | None
+) -> None:
+    monkeypatch.setattr("lidarspec.discovery.listen.has_no_baud", lambda port: False)  # as of a real port
+    told: list[str] = []
+    with port(tmp_path) as made, working(lambda stop: _noise(made, random.Random(4), stop) if sends else None) as stop:
+        heard = list(hear(made.name, seconds=0.1, tell=told.append))
+        stop.set()
+        made.discard()
+    assert len(heard) == len(told) == (listened or len(bauds()))
+    assert {one.baud for one in heard} >= {bauds()[0], min(bauds()), max(bauds())}
+    assert told[0] == f"{made.name} at {bauds()[0]} baud"
+
+
 class TestStructure:
     """What unknown bytes are made of."""
+
+    def test_bytes_that_are_alike_by_chance_are_no_frames(self) -> None:
+        assert structure([random.Random(1).randbytes(10_000)], datagrams=False) is None
+        few = b"".join(b"\xde\xad\xbe\xef" + random.Random(seed).randbytes(996) for seed in range(3))
+        found = structure([few], datagrams=False)
+        assert found is not None
+        assert (found.sync, found.period) == (b"\xde\xad\xbe\xef", 1000)
+
+    @pytest.mark.parametrize(("size", "number"), [(60, 256), (2000, 16)])
+    def test_a_quick_search_for_checksums_takes_a_fixed_amount_of_work(
+        self, monkeypatch: pytest.MonkeyPatch, size: int, number: int
+    ) -> None:
+        steps = 0
+
+        def counted(a: int, b: int) -> int:
+            nonlocal steps
+            steps += max(a.bit_length() - b.bit_length() + 1, 0)
+            return remainder(a, b)
+
+        monkeypatch.setattr("lidarspec.discovery.crc_search.remainder", counted)
+        monkeypatch.setattr("lidarspec.discovery.crc_search.QUICK", 1 << 19)
+        source = random.Random(size)
+        assert search((source.randbytes(size) for _ in range(number)), quick=True) == []
+        assert steps <= 2 * 8 * (1 << 19) // DIVISION
+        bodies = (source.randbytes(size) for _ in range(number))
+        sealed = (body + zlib.crc32(body).to_bytes(4, "little") for body in bodies)
+        assert search(sealed, quick=True)[0].name == "CRC-32"
 
     @pytest.mark.slow
     def test_frames_of_one_length(self) -> None:
