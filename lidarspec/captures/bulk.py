@@ -9,7 +9,7 @@ are the same, whatever is in the file.
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterable, Iterator
+from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Any
 
@@ -20,7 +20,6 @@ from lidarspec.captures.ip import Headers
 from lidarspec.captures.pcap import CaptureReader, Datagram, StreamReader
 from lidarspec.captures.records import LARGEST_BLOCK, Damaged, Form, Passed, Times, records
 from lidarspec.captures.source import Source, Truncated
-from lidarspec.framing.decoder import Decoder
 from lidarspec.framing.results import Frames, Indices
 from lidarspec.transports.protocol import Origin, Sender
 from lidarspec.wire.layout import rows_at
@@ -202,19 +201,6 @@ class Batch:
             own = senders[found.kinds == kind]
             changes = np.flatnonzero(np.diff(own, prepend=-1))
             yield from ((found.names[kind], self.names[sender]) for sender in own[changes].tolist())
-
-
-def first_frames(decoder: Decoder, batches: Iterable[Batch], wanted: Collection[str]) -> dict[str, bytes]:
-    """The first frame of each type that is wanted, as far as there are some."""
-    first: dict[str, bytes] = {}
-    for batch in batches:
-        found = decoder.placed(batch.buffer, batch.starts, batch.sizes, batch.at)
-        for kind, name in enumerate(found.names):
-            if name in wanted and name not in first and len(where := np.flatnonzero(found.kinds == kind)):
-                first[name] = found.data(int(where[0]))
-        if len(first) == len(wanted):
-            break
-    return first
 
 
 class CaptureBatches(CaptureReader):

@@ -16,7 +16,8 @@ from typing import Any, Protocol
 
 import numpy as np
 
-from lidarspec.captures.bulk import Batch, first_frames
+from lidarspec.captures.bulk import Batch
+from lidarspec.device.first_frames import FirstFrames, find_first_frames, is_searched
 from lidarspec.device.senders import Senders, frame_senders
 from lidarspec.device.session import Reply
 from lidarspec.discovery.detect import said
@@ -150,9 +151,9 @@ class Input(Protocol):
             SourceError: where the connection is lost, or there is no device.
         """
 
-    def first_state(self) -> dict[str, bytes]:
-        """Frames of other types, by name, that count as seen before the first packet: of a live sensor none, before it says it."""
-        return {}
+    def first_frames(self) -> FirstFrames:
+        """Return the frames that apply from the first packet on; of a live sensor none."""
+        return FirstFrames()
 
     def close(self) -> None:
         """Stop the sensor where it was started, and give everything back; a second call does nothing."""
@@ -263,24 +264,17 @@ class FileInput(Input):
         self._transport.close()
         self._arrivals = iter(())  # which holds this one, and both what was read
 
-    def first_state(self) -> dict[str, bytes]:
-        """The first frame of each type that `points` takes its state from: a file is read as if it stood at the start."""
-        wanted = set(self.sensor.state)
+    def first_frames(self) -> FirstFrames:
+        """Find the frames that apply from the start: the state of points, and the reference of the clock."""
         path = Path(str(self._source).partition("?")[0])
-        if not wanted or not (is_stored(self._source) or path.is_file() or path.is_dir()):
-            return {}
-        first: dict[str, bytes] = {}
+        if not is_searched(self.sensor) or not (is_stored(self._source) or path.is_file() or path.is_dir()):
+            return FirstFrames()
         with contextlib.closing(transport(self._source)) as source:
             decoder = self.sensor.decoder(stream=not source.datagrams)
             if isinstance(source, CaptureTransport) and source.datagrams:
-                return first_frames(decoder, source.batches(), wanted)
-            for chunk in source.chunks():
-                for item in decoder.feed(chunk.data, chunk.at):
-                    if item.frame in wanted:
-                        first.setdefault(item.frame, item.data)
-                if len(first) == len(wanted):
-                    break
-        return first
+                batches = ([decoder.placed(batch.buffer, batch.starts, batch.sizes, batch.at)] for batch in source.batches())
+                return find_first_frames(self.sensor, batches)
+            return find_first_frames(self.sensor, (fed(decoder, [chunk]) for chunk in source.chunks()))
 
     def _read(self) -> Iterator[Arrival]:
         """Every incoming frame, in batches."""

@@ -16,6 +16,7 @@ from shlex import quote
 from typing import Any, NoReturn, overload
 
 from lidarspec.device.arrivals import Arrival, FileInput, Input
+from lidarspec.device.first_frames import FirstFrames
 from lidarspec.device.live_input import PERIOD, LiveInput
 from lidarspec.device.session import Reply
 from lidarspec.device.settings import named
@@ -60,8 +61,8 @@ class PacketReader:
         felt: the samples of the last arrival.
     """
 
-    def __init__(self, sensor: Sensor, frame: str | None, decoder: Decoder, state: Mapping[str, bytes]) -> None:
-        self._sensor, self._decoder, self._state, self._named = sensor, decoder, state, frame
+    def __init__(self, sensor: Sensor, frame: str | None, decoder: Decoder, first: FirstFrames) -> None:
+        self._sensor, self._decoder, self._first, self._named = sensor, decoder, first, frame
         self._waiting: deque[Frames] = deque(maxlen=UNDECIDED)
         self._stream = self._made(frame) if frame is not None else None
         self.last: Packets | None = None
@@ -79,7 +80,7 @@ class PacketReader:
             self.imu.interrupt()
 
     def _feeling(self) -> ImuStream:
-        return ImuStream(self._sensor, self._decoder.stats, backend=self._decoder.backend, state=self._state)
+        return ImuStream(self._sensor, self._decoder.stats, backend=self._decoder.backend, state=self._first.state)
 
     def add(self, arrival: Arrival) -> Packets | None:
         """The packets among these frames; None while nobody knows of which type."""
@@ -124,7 +125,8 @@ class PacketReader:
 
     def _made(self, name: str) -> PacketStream:
         decoder = self._decoder
-        return PacketStream(self._sensor, name, decoder.stats, backend=decoder.backend, state=self._state)
+        first = self._first
+        return PacketStream(self._sensor, name, decoder.stats, backend=decoder.backend, state=first.state, reference=first.reference)
 
 
 class Device(Closing):
@@ -442,7 +444,7 @@ class Device(Closing):
 
     def _reader(self, frame: str | None) -> PacketReader:
         if frame not in self._streams:
-            self._streams[frame] = PacketReader(self.sensor, frame, self._input.decoder, self._input.first_state())
+            self._streams[frame] = PacketReader(self.sensor, frame, self._input.decoder, self._input.first_frames())
         return self._streams[frame]
 
     def _felt(self, reader: PacketReader, arrival: Arrival | None) -> ImuSamples:

@@ -62,7 +62,7 @@ class FileScans(Closing):
         try:
             self._input = FileInput(source, sensor, opened, backend="auto")
             if bookmark is None:
-                self._reader = PacketReader(sensor, None, self._input.decoder, self._input.first_state())
+                self._reader = PacketReader(sensor, None, self._input.decoder, self._input.first_frames())
                 self._stream = self._scan_stream()
             else:
                 self._go_on(bookmark)

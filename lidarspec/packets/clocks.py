@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from functools import lru_cache
 from typing import Any
 
@@ -11,6 +12,7 @@ from numpy.typing import NDArray
 from lidarspec.columns.columns import Batch, Fields
 from lidarspec.columns.graph import header_function
 from lidarspec.errors import SpecError
+from lidarspec.framing.frame_engine import codec
 from lidarspec.spec.description import Spec
 from lidarspec.spec.fields import factor
 from lidarspec.spec.timing import Clock
@@ -63,44 +65,101 @@ class Unwrapper:
         return times
 
 
+@dataclass(frozen=True)
+class ClockReference:
+    """A frame that tells the turn of a clock (`Clock.told`), found before the packets that it applies to.
+
+    Attributes:
+        data: its bytes.
+        host_ns: when it arrived, ns since 1970; 0 if unknown.
+    """
+
+    data: bytes
+    host_ns: int
+
+
 class Epoch:
     """The turn of a clock, by what other frames tell, see `Clock.told`.
 
+    Args:
+        sensor: with the clock of the packets.
+        reference: applies from the first packet on; None if the turn is unknown until a frame tells it.
+
     Attributes:
+        frame: the type of the frames that tell it.
         ns: nanoseconds that make the times of an `Unwrapper` complete; None before it was told.
     """
 
-    def __init__(self, sensor: Spec, clock: Clock) -> None:
+    def __init__(self, sensor: Spec, clock: Clock, reference: ClockReference | None = None) -> None:
         assert clock.told is not None
         assert clock.wraps_at is not None
-        self._sensor, (self.frame, self._function), self._turn = sensor, clock.told, _turn(clock.wraps_at)
+        self.frame = clock.told[0]
         self.ns: int | None = None
+        self._sensor = sensor
+        self._clock = clock
+        self._turn = _turn(clock.wraps_at)
+        self._reference = reference
 
-    def push(self, batch: Batch, readings: Times, times: Times) -> Times:
-        """What completes the times of packets, (n,): from the first one on before which such a frame told it; 0 before that.
+    def push(self, batch: Batch, readings: Times, times: Times, host: Times, *, whole: bool = False) -> Times:
+        """Return what completes the times of packets, (n,).
+
+        It is 0 for packets before the first frame that tells the turn, unless that one applies from the start.
 
         Args:
             readings, times: (n,), what the clock reads in the packets, and as times that run on.
+            host: (n,), when the packets arrived, ns; 0 if unknown.
+            whole: the packets are a whole input: the first frame that tells the turn applies to those before it too.
         """
-        first = 0
-        if self.ns is None:
-            table, which = batch.state[self.frame]
-            rows = np.unique(which[which >= 0])
-            if table is None or not len(rows):
-                return repeated(0, len(times))
-            frames = Batch(table.take(rows), np.zeros(len(rows), np.bool_))
-            told = np.broadcast_to(np.asarray(self._function(Fields(frames)), np.float64).reshape(-1), (len(rows),))
-            if not np.isfinite(told).any():
-                return repeated(0, len(times))
-            row = int(np.isfinite(told).argmax())
-            reading, first = clock_ns(self._sensor, frames).item(row), int(np.searchsorted(which, rows[row]))
-            complete = reading + round((round(told.item(row) * 1e9) - reading) / self._turn) * self._turn
-            self.ns = complete - times.item(first) - self._short(reading - readings.item(first))
-        return np.where(np.arange(len(times)) < first, 0, self.ns) if first else repeated(self.ns, len(times))
+        if self.ns is None and self._reference is not None:
+            self.ns = self._ns_by_reference(self._reference, readings.item(0), times.item(0), host.item(0))
+        if self.ns is not None:
+            return repeated(self.ns, len(times))
+        table, which = batch.state[self.frame]
+        rows = np.unique(which[which >= 0])
+        if table is None or not len(rows):
+            return repeated(0, len(times))
+        frames = table.take(rows)
+        told = told_seconds(self._clock, frames)
+        if not np.isfinite(told).any():
+            return repeated(0, len(times))
+        row = int(np.isfinite(told).argmax())
+        first = int(np.searchsorted(which, rows[row]))
+        reading = self._reading_of(frames, row)
+        complete = self._complete(reading, told.item(row))
+        self.ns = complete - times.item(first) - self._short(reading - readings.item(first))
+        if whole or not first:
+            return repeated(self.ns, len(times))
+        return np.where(np.arange(len(times)) < first, 0, self.ns)
+
+    def _ns_by_reference(self, reference: ClockReference, reading: int, time: int, host: int) -> int:
+        """Return what completes times, from what the clock reads in the first packet and in the reference."""
+        table = codec(self._sensor.frames[self.frame]).table([reference.data])
+        told = told_seconds(self._clock, table)
+        reading_there = self._reading_of(table, 0)
+        passed = self._short(reading_there - reading)
+        if host and reference.host_ns:
+            passed += round((reference.host_ns - host - passed) / self._turn) * self._turn
+        return self._complete(reading_there, told.item(0)) - time - passed
+
+    def _reading_of(self, table: Table, row: int) -> int:
+        """Return what the clock reads in a frame that tells the turn."""
+        return clock_ns(self._sensor, Batch(table, np.zeros(len(table), np.bool_))).item(row)
+
+    def _complete(self, reading: int, told: float) -> int:
+        """Return the reading in the turn that is nearest to the seconds told."""
+        return reading + round((round(told * 1e9) - reading) / self._turn) * self._turn
 
     def _short(self, step: int) -> int:
-        """A step of the clock, the shorter way round."""
+        """Return a step of the clock, the shorter way round."""
         return (step + self._turn // 2) % self._turn - self._turn // 2
+
+
+def told_seconds(clock: Clock, table: Table) -> NDArray[np.float64]:
+    """Return the seconds since 1970 that frames tell, (n,); nan where they tell none."""
+    assert clock.told is not None
+    frames = Batch(table, np.zeros(len(table), np.bool_))
+    seconds = np.asarray(clock.told[1](Fields(frames)), np.float64)
+    return np.broadcast_to(seconds.reshape(-1), (len(table),))
 
 
 def clock_ns(sensor: Spec, batch: Batch) -> Times:

@@ -20,7 +20,7 @@ from lidarspec.errors import PluginError, SpecError, UnknownFrame
 from lidarspec.framing.frame_engine import Codec, codec
 from lidarspec.framing.results import Counters, Frames, Numbers
 from lidarspec.packets.clock_order import ClockOrder
-from lidarspec.packets.clocks import Epoch, Unwrapper, clock_parts, clock_terms, clocked, held, paths
+from lidarspec.packets.clocks import ClockReference, Epoch, Unwrapper, clock_parts, clock_terms, clocked, held, paths
 from lidarspec.packets.continuity import Continuity
 from lidarspec.packets.imu import ImuSamples, Waiting, joined
 from lidarspec.packets.pace import Pace
@@ -40,6 +40,7 @@ class PacketStream:
         stats: the decoder's counters; lost, duplicate and late packets are added to them.
         backend: what makes points of the packets, "auto", "numpy", "jit" or "construct".
         state: frames of other types, by name, that count as seen before the first packet.
+        reference: tells the turn of the clock from the first packet on.
     """
 
     def __init__(
@@ -50,6 +51,7 @@ class PacketStream:
         *,
         backend: str = "auto",
         state: Mapping[str, bytes] | None = None,
+        reference: ClockReference | None = None,
     ) -> None:
         if frame not in sensor.frames:
             raise UnknownFrame(frame, sensor.frames, place=sensor.id)
@@ -64,7 +66,9 @@ class PacketStream:
         timed = data and clock is not None
         self._clock = Unwrapper(clock.wraps_at) if clock else None
         self._turn = repeated(0, 0)  # what completes the times of the packets at hand
-        self._epoch = Epoch(self._timer, clock) if timed and clock is not None and clock.told is not None else None
+        self._epoch: Epoch | None = None
+        if timed and clock is not None and clock.told is not None:
+            self._epoch = Epoch(self._timer, clock, reference)
         in_parts = timed and clock_parts(sensor, self._codec.schema) is not None
         terms = clock_terms(paths(sensor.clock), self._codec.schema, sensor.id) if sensor.clock and timed and not in_parts else []
         grain = float(min((step for _, step, _, _ in terms), default=0))
@@ -94,7 +98,7 @@ class PacketStream:
         if len(table):
             batch, otherwise = Batch(table, breaks, state, self.sensor.state), (range(len(table)), breaks)
             with np.errstate(all="ignore"):
-                time = self._guarded("clock", self._times, None, batch, host) if self._clock is not None else None
+                time = self._guarded("clock", self._times, None, batch, host, whole) if self._clock is not None else None
                 if self._clock_order is not None and time is not None:
                     index, order = self._guarded("clock", self._clock_order.push, (otherwise[0], None), batch, time)
                 else:
@@ -119,13 +123,13 @@ class PacketStream:
             self.stats.error(PluginError.of(error, what), len(batch))
             return otherwise
 
-    def _times(self, batch: Batch, host: NDArray[np.int64]) -> NDArray[np.int64]:
+    def _times(self, batch: Batch, host: NDArray[np.int64], whole: bool) -> NDArray[np.int64]:
         assert self._clock is not None
         which, readings = clocked(self._timer, batch)
         if which is None:
             times = self._clock.push(readings, host)
             if self._epoch is not None:
-                self._turn = self._epoch.push(batch, readings, times)
+                self._turn = self._epoch.push(batch, readings, times, host, whole=whole)
             return times
         times = self._clock.push(readings, host[which])
         before = host if self._time is None else repeated(self._time, len(host))

@@ -86,7 +86,7 @@ class Clock:
             and is needed where it depends on a mode that the packets name.
         told: what completes a clock that starts again: another frame type that has the clock's field too, and a function of its `Fields`
             to the seconds since 1970 that it tells, nan where it tells none. The turn of the clock is the one closest to what the first
-            frame that tells it says, for the packets from there on.
+            frame that tells it says: from the start of a file, and of live packets from that frame on.
 
     Raises:
         SpecError: if `wraps_at` is not positive, or too long to ever be reached.

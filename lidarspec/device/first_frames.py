@@ -1,0 +1,81 @@
+"""Frames of a file that apply from its start: the first ones with state for points, and the first reference of the clock."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lidarspec.framing.frame_engine import codec
+from lidarspec.framing.results import Frames
+from lidarspec.packets.clocks import ClockReference, told_seconds
+from lidarspec.spec.description import Spec
+
+#: bytes of a file without any frame that could tell the turn of the clock; then no such frame is expected.
+REFERENCE_SEARCH_BYTES = 64 << 20
+
+
+@dataclass
+class FirstFrames:
+    """What applies from the first packet on.
+
+    Attributes:
+        state: the first frame of each type that `points` takes its state from, by name.
+        reference: the first frame that tells the turn of the clock; None if there is none.
+    """
+
+    state: dict[str, bytes] = field(default_factory=dict)
+    reference: ClockReference | None = None
+
+
+def is_searched(sensor: Spec) -> bool:
+    """Return whether any frames of a sensor apply from the start."""
+    return bool(sensor.state) or (sensor.clock is not None and sensor.clock.told is not None)
+
+
+def find_first_frames(sensor: Spec, batches: Iterable[list[Frames]]) -> FirstFrames:
+    """Return what applies from the start of a file.
+
+    Args:
+        batches: its frames, which are read no further than needed.
+    """
+    first = FirstFrames()
+    missing = set(sensor.state)
+    clock = sensor.clock
+    teller = clock.told[0] if clock is not None and clock.told is not None else ""
+    has_teller = False
+    seen_bytes = 0
+    for batch in batches:
+        for frames in batch:
+            seen_bytes += int(frames.sizes.sum())
+            for name in missing & set(frames.names):
+                rows = np.flatnonzero(frames.kinds == frames.names.index(name))
+                if len(rows):
+                    first.state[name] = frames.data(int(rows[0]))
+            missing -= set(first.state)
+            if teller in frames.names:
+                rows = np.flatnonzero(frames.kinds == frames.names.index(teller))
+                has_teller = has_teller or len(rows) > 0
+                if first.reference is None and len(rows):
+                    first.reference = _find_reference(sensor, teller, frames, rows)
+        if teller and (first.reference is not None or (not has_teller and seen_bytes > REFERENCE_SEARCH_BYTES)):
+            teller = ""
+        if not missing and not teller:
+            break
+    return first
+
+
+def _find_reference(sensor: Spec, name: str, frames: Frames, rows: NDArray[np.intp]) -> ClockReference | None:
+    """Return the first of some frames that tells the turn of the clock."""
+    assert sensor.clock is not None
+    table = codec(sensor.frames[name]).table([frames.data(int(row)) for row in rows])
+    try:
+        told = np.isfinite(told_seconds(sensor.clock, table))
+    except Exception:
+        return None  # reported when the packets are decoded
+    if not told.any():
+        return None
+    row = int(rows[told.argmax()])
+    return ClockReference(frames.data(row), max(int(frames.at[row]), 0))
