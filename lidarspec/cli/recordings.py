@@ -17,6 +17,7 @@ from lidarspec.device.settings import named
 from lidarspec.device.source_recording import SourceRecording, recorder_like
 from lidarspec.discovery.detect import declared
 from lidarspec.errors import CommandError, LidarSpecError, SourceError, UsageError, WireError, suggest
+from lidarspec.framing.results import Counters
 from lidarspec.plugins import sensor as named_sensor
 from lidarspec.recording.appending import Appender
 from lidarspec.recording.recorders import SUFFIXES, Recorder, check_suffix, declared_port
@@ -123,7 +124,8 @@ def _sum_up_recording(task: SourceRecording, kept: Appender, source: str, sensor
             raise suggest(CommandError(f"{source} sent nothing"), f"lidarspec doctor {shlex.quote(source)}")
         raise suggest(WireError(f"{source} holds nothing that was received"), "lidarspec record --help")
     stats = device.stats if device is not None else None
-    note(f"{kept.path}: {_taken(task, kept)}{f'; {stats}' if stats else ''}")
+    damage = _damage(stats) if stats is not None else ""
+    note(f"{kept.path}: {_taken(task, kept)}{f'; {damage}' if damage else ''}")
     note(f"next: {_view_of(kept, sensor)}")
     if as_json:
         facts = {"output": kept.path, "source": source, "sensor": sensor.id if sensor else None}
@@ -131,6 +133,12 @@ def _sum_up_recording(task: SourceRecording, kept: Appender, source: str, sensor
         emit_json({**facts, **counts, "stats": stats.to_dict() if stats else None}, None)
     if stats is not None and not stats.frames and device is not None:
         raise nothing_came(device, source, task.elapsed)
+
+
+def _damage(stats: Counters) -> str:
+    """Return what was lost or damaged, in words; frames and bytes are counted by what is in the file."""
+    counted = {name: value for name, value in stats.to_dict().items() if name not in ("frames", "bytes_in", "pending")}
+    return ", ".join(f"{name} {value}" for name, value in counted.items() if value)
 
 
 def _view_of(kept: Appender, sensor: Sensor | None) -> str:

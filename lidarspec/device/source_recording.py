@@ -8,10 +8,14 @@ carries.
 from __future__ import annotations
 
 import contextlib
+import math
 import re
 import time
-from collections.abc import Generator
+from collections.abc import Generator, Iterator
 from dataclasses import replace
+from typing import Any, Literal
+
+import numpy as np
 
 from lidarspec.device.capture_thread import BoundedQueue, Capture, Mark
 from lidarspec.device.device import Device
@@ -43,6 +47,57 @@ def recorder_like(opened: Transport, source: str, target: str, sensor: Spec | st
     return recorder(target, whose, header.source, datagrams=link, baud=header.baud, overwrite=overwrite)
 
 
+class TimedLog:
+    """A recorder that takes what arrives within some seconds of the first arrival, until it is ended; and always what is sent.
+
+    Args:
+        recorder: what writes the file; closed with this one.
+        seconds: how long; None: without limit.
+
+    Attributes:
+        first, last: arrival times of what was recorded first and last, ns; None before anything was.
+        is_over: whether it takes nothing that arrives any more.
+    """
+
+    def __init__(self, recorder: Appender, seconds: float | None) -> None:
+        self._recorder, self._limit_ns = recorder, math.inf if seconds is None else seconds * 1e9
+        self.first: int | None = None
+        self.last: int | None = None
+        self.is_over = False
+
+    @property
+    def error(self) -> SourceError | None:
+        """What went wrong with the file, None where nothing did."""
+        return self._recorder.error
+
+    @property
+    def seconds(self) -> float:
+        """The time from the first to the last arrival."""
+        return 0.0 if self.first is None or self.last is None else (self.last - self.first) / 1e9
+
+    def write(self, chunk: Chunk, direction: Literal["in", "out"] = "in") -> None:
+        """Record what was sent, and what was received unless it is over."""
+        if direction == "in" and chunk.at is not None:
+            self.first = chunk.at if self.first is None else self.first
+            self.is_over = self.is_over or chunk.at - self.first >= self._limit_ns
+            if self.is_over:
+                return
+            self.last = chunk.at
+        self._recorder.write(chunk, direction)
+
+    def event(self, name: str, at: int | None = None, **details: Any) -> None:
+        """Record what happened to the line."""
+        self._recorder.event(name, at, **details)
+
+    def end(self) -> None:
+        """Take nothing that arrives any more."""
+        self.is_over = True
+
+    def close(self) -> None:
+        """Close the recorder."""
+        self._recorder.close()
+
+
 class SourceRecording:
     """Everything that a source sends, brought into one file.
 
@@ -58,8 +113,8 @@ class SourceRecording:
     Attributes:
         recorder: the file, None before the source is open.
         device: what reads a live source, None where its sensor is not known.
-        packets: data packets of the sensor so far, or datagrams.
-        elapsed: seconds since the source was open.
+        packets: data packets of the sensor so far, or datagrams; in the end as many as are in the file.
+        elapsed: seconds since the source was open; in the end those between the first and the last arrival in the file.
     """
 
     def __init__(
@@ -78,6 +133,7 @@ class SourceRecording:
         self._start, self._overwrite, self._salvage = start, overwrite, salvage
         self.recorder: Appender | None = None
         self.device: Device | None = None
+        self._log: TimedLog | None = None
         self.packets, self.elapsed, self._began = 0, 0.0, 0.0
 
     def run(self) -> Generator[str, None, None]:
@@ -93,68 +149,104 @@ class SourceRecording:
         """What a sensor sends is recorded by a thread; here it is decoded to be counted, whatever that fails at."""
         news, failures, known = list[str](), dict[str, None](), set[str]()
         with Device(self._source, sensor, start=self._start, record=MadeFor(self._opened)) as self.device:
-            while self._goes_on():
-                try:
-                    self.packets += len(next(self.device.packets(wait=TURN), ()))
-                    news = self.device.warnings
-                except SourceError:
-                    raise
-                except (Exception, SystemExit) as error:
-                    failures[f"{sensor.id}: decoding fails ({type(error).__name__}: {error}); the recording goes on"] = None
-                    time.sleep(TURN)
-                told = {_FIGURES.sub("", text): text for text in [*news, *failures]}
-                yield "\n".join(text for what, text in told.items() if what not in known)
-                known = set(told)
+            try:
+                while self._goes_on():
+                    try:
+                        self._count_next(self.device)
+                        news = self.device.warnings
+                    except SourceError:
+                        raise
+                    except (Exception, SystemExit) as error:
+                        failures[f"{sensor.id}: decoding fails ({type(error).__name__}: {error}); the recording goes on"] = None
+                        time.sleep(TURN)
+                    told = {_FIGURES.sub("", text): text for text in [*news, *failures]}
+                    yield "\n".join(text for what, text in told.items() if what not in known)
+                    known = set(told)
+            finally:
+                self._end()
+                with contextlib.suppress(Exception, SystemExit):
+                    while self._count_next(self.device):
+                        pass
+
+    def _count_next(self, device: Device) -> bool:
+        """Count the next packets that are in the file; whether there are more of them."""
+        assert self._log is not None
+        packets = next(device.packets(wait=TURN), None)
+        if packets is None or len(packets) == 0:
+            return False
+        last = self._log.last
+        recorded = len(packets) if last is None else int(np.count_nonzero(packets.host_ns <= last))
+        self.packets += recorded
+        return recorded == len(packets)
+
+    def _end(self) -> None:
+        """Record nothing more that arrives, and state how long it took by what is in the file."""
+        if self._log is not None:
+            self._log.end()
+            self.elapsed = self.elapsed if self._log.last is None else self._log.seconds
 
     def _received(self) -> Generator[str, None, None]:
         source = RecordingTransport(self._source, salvage=True) if self._salvage else transport(self._source, self._sensor)
-        with contextlib.closing(source), self._opened(source, self._sensor) as file:
-            yield from self._captured(source, file) if isinstance(source, LiveTransport) else self._copied(source, file)
+        with contextlib.closing(source), contextlib.closing(self._opened(source, self._sensor)) as log:
+            yield from self._captured(source, log) if isinstance(source, LiveTransport) else self._copied(source, log)
             yield from source.warnings
 
-    def _captured(self, source: LiveTransport, file: Appender) -> Generator[str, None, None]:
+    def _captured(self, source: LiveTransport, log: TimedLog) -> Generator[str, None, None]:
         """What arrives is recorded by a thread; here it is counted and thrown away."""
         queue = BoundedQueue()
-        with contextlib.closing(Capture(source, queue, log=file)) as capture:
-            while self._goes_on():
-                yield ""
-                for _, item in queue.take(TURN):
-                    if isinstance(item, BaseException):
-                        raise item
-                    if isinstance(item, Chunk):
-                        self.packets += source.datagrams
-                    elif item is not Mark.SILENT:
+        with contextlib.closing(Capture(source, queue, log=log)) as capture:
+            try:
+                while self._goes_on():
+                    yield ""
+                    for item in self._count_waiting(source, queue, TURN):
                         yield f"{self._source}: the device is {'gone; waiting for it to come back' if item is Mark.LOST else 'back'}"
+            finally:
+                self._end()
+                for _ in self._count_waiting(source, queue, 0.0):
+                    pass
             yield from capture.warnings
 
-    def _copied(self, source: Transport, file: Appender) -> Generator[str, None, None]:
+    def _count_waiting(self, source: LiveTransport, queue: BoundedQueue, wait: float) -> Iterator[Mark]:
+        """Count the datagrams that wait and are in the file; what happened to the line meanwhile."""
+        assert self._log is not None
+        for _, item in queue.take(wait):
+            if isinstance(item, BaseException):
+                raise item
+            if isinstance(item, Mark):
+                yield from [] if item is Mark.SILENT else [item]
+            elif self._log.last is not None and item.at is not None:
+                self.packets += source.datagrams and item.at <= self._log.last
+
+    def _copied(self, source: Transport, log: TimedLog) -> Generator[str, None, None]:
         """What is in a file; standard input gets the time of its arrival."""
-        first, clock = None, HostClock()
+        clock = HostClock()
+        assert self.recorder is not None
         for chunk in source.chunks():
-            at = clock.now() if chunk.at is None and self._source == "-" else chunk.at
-            first = at if first is None else first
-            is_late = self._seconds is not None and at is not None and first is not None and at - first >= self._seconds * 1e9
-            if is_late or not self._goes_on(timed=False):
+            if not self._goes_on(timed=False):
                 return
             yield ""
-            file.keep_up()
-            file.write(replace(chunk, at=at))
+            self.recorder.keep_up()
+            log.write(replace(chunk, at=clock.now() if chunk.at is None and self._source == "-" else chunk.at))
+            if log.is_over:
+                return
             self.packets += source.datagrams
 
-    def _opened(self, source: Transport, sensor: Spec | str | None) -> Appender:
+    def _opened(self, source: Transport, sensor: Spec | str | None) -> TimedLog:
         """The recorder, now that the source is open, and the sensor known as it is read."""
         counts = source.datagrams or (self._sensor is not None and isinstance(source, LiveTransport))
         if self._count is not None and not counts:
             raise UsageError(f"-n counts packets, and {self._source} is a byte stream: name the sensor with -s, or give a time with -t")
         self.recorder = recorder_like(source, self._source, self._target, sensor, overwrite=self._overwrite)
+        self._log = TimedLog(self.recorder, self._seconds)
         self._began = time.monotonic()
-        return self.recorder
+        return self._log
 
     def _goes_on(self, *, timed: bool = True) -> bool:
         """Whether it has neither taken its time nor got all that was asked for; raises what went wrong with the file."""
         assert self.recorder is not None
+        assert self._log is not None
         if self.recorder.error is not None:
             self.recorder.sync()
         self.elapsed = time.monotonic() - self._began
-        is_late = timed and self._seconds is not None and self.elapsed >= self._seconds
+        is_late = timed and self._seconds is not None and (self._log.is_over or self.elapsed >= self._seconds)
         return not is_late and (self._count is None or self.packets < self._count)

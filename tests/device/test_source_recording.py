@@ -23,7 +23,7 @@ from lidarspec.recording.recorders import Recorder
 from lidarspec.spec import Fields
 from lidarspec.transports.base import HostClock
 from lidarspec.transports.open_url import live
-from tests.lines import free_port, turning, udp, until
+from tests.lines import free_port, paced, turning, udp, until, working
 from tests.shapes import SHAPES
 
 
@@ -50,6 +50,20 @@ def test_a_recording_goes_on_whatever_decoding_says_and_whoever_sends(tmp_path: 
     with Recording(path) as recording:
         kept = [record.data for record in recording if record.sender is not None and record.sender[0] == "127.0.0.2"]
     assert kept == sent
+
+
+@pytest.mark.parametrize("knows", [True, False])
+def test_what_it_says_is_what_is_in_the_file_and_it_ends_at_the_time_asked(tmp_path: Path, knows: bool) -> None:
+    sensor, number, path = SHAPES["shape-datagrams"], free_port(), tmp_path / "all.lsr"
+    frames = turning(sensor, 50)
+    task = SourceRecording(f"udp://:{number}", str(path), sensor if knows else None, seconds=0.3)
+    with udp() as sender, working(lambda stop: paced(lambda data: sender.sendto(data, ("127.0.0.1", number)), frames, 500, stop)):
+        for _ in task.run():
+            pass
+    with Recording(path) as recording:
+        times = [record.at for record in recording if record.direction == "in" and record.data]
+    assert task.packets == len(times) > 0
+    assert task.elapsed == (times[-1] - times[0]) / 1e9 < 0.3
 
 
 def test_strangers_are_told_of_once_while_a_recording_goes_on(tmp_path: Path) -> None:
