@@ -54,7 +54,7 @@ CONFINED = {
     "serial": {"transports.serial", "transports.ports"},
     "click": {"cli"},
     "rich": {"cli", "view"},
-    "starlette": {"view.access", "view.server"},
+    "starlette": {"view.access", "view.saving", "view.server"},
     "uvicorn": {"view.connections", "view.server"},
     "hypothesis": {"testing"},
     "pytest": {"testing"},

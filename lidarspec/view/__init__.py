@@ -17,6 +17,8 @@ In: a device, or points. Out: pictures, and what a page makes them of. Modules i
 * `answers`: what a page is told, in JSON.
 * `access`: who may reach the page: the token of its link, hosts and origins.
 * `connections`: how many connections there may be, and how long one may be open without the token.
+* `page_requests`: how many requests of a page are taken a second, and which are done one after another.
+* `saving`: scans that are saved, a few at a time.
 * `temporary`: the temporary folder of the server.
 * `server`: the page's files, its socket, and what is done on a page's request.
 * `widget`: a source in a cell of a notebook, drawn as by the page.

@@ -74,6 +74,13 @@ class Connections:
         if client in self._admitted:
             self._admitted.pop(client).abort()
 
+    async def close(self) -> None:
+        """Close all connections, also those of clients that do not read."""
+        waiting = [one.transport for one in self._waiting.values()]
+        for transport in [*waiting, *self._admitted.values()]:
+            transport.abort()
+        await asyncio.sleep(0)  # the loop closes their sockets
+
     async def watch(self) -> None:
         """Close connections that do not bring the token in time, until this is cancelled."""
         while True:

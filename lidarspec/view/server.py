@@ -12,7 +12,6 @@ import json
 import math
 import os
 import socket
-import tempfile
 import threading
 import time
 from collections import deque
@@ -23,28 +22,35 @@ from typing import Any, Self
 
 import uvicorn
 from starlette.applications import Starlette
-from starlette.requests import Request
-from starlette.responses import FileResponse, HTMLResponse, PlainTextResponse, Response
+from starlette.requests import Request as HttpRequest
+from starlette.responses import HTMLResponse, PlainTextResponse, Response
 from starlette.routing import Mount, Route, WebSocketRoute
 from starlette.staticfiles import StaticFiles
-from starlette.types import Receive, Scope, Send
 from starlette.websockets import WebSocket, WebSocketDisconnect
 
 from lidarspec.errors import LidarSpecError, SourceError, UsageError, suggestion
-from lidarspec.formats import write
-from lidarspec.points.look import look
 from lidarspec.view.access import ANY_ADDRESS, Guard, add_token, make_token, write_opening_page
 from lidarspec.view.answers import Answers, saves
 from lidarspec.view.backlog import Backlog
 from lidarspec.view.broadcast import Broadcast, Shown
 from lidarspec.view.connections import BACKLOG, Connections, ErrorReporter
-from lidarspec.view.svg import svg
+from lidarspec.view.page_requests import (
+    MESSAGES_AT_ONCE,
+    MESSAGES_PER_S,
+    Lane,
+    RateLimit,
+    Request,
+    Workers,
+)
+from lidarspec.view.saving import Saves
 from lidarspec.view.temporary import TemporaryFolder, remove_stale_folders
 
 #: the page, as it was built.
 PAGE = Path(__file__).parent / "page" / "dist"
-#: bytes of a message from a page at most, answers that wait to be sent to one, and how much of what it asked for is done at a time.
-LARGEST, WAITING, BUSY = 1 << 16, 16, 4
+#: bytes of a message from a page at most, and answers that wait to be sent to one.
+LARGEST, WAITING = 1 << 16, 16
+#: seconds until a page that asks too much is looked at again.
+BUSY = 0.05
 #: seconds from one state to the next, and from one frame that is watched to the next.
 STATE, WATCHED = 0.5, 0.5
 #: seconds after which a page that takes nothing, or does not answer a ping, is dropped; and that pages are given at the end.
@@ -63,11 +69,16 @@ class Page:
     Args:
         answers: what it is told.
         socket: to the page.
+        workers: do what takes a while.
     """
 
-    def __init__(self, answers: Answers, socket: WebSocket) -> None:
+    def __init__(self, answers: Answers, socket: WebSocket, workers: Workers) -> None:
         self._answers, self._broadcast, self._socket = answers, answers.broadcast, socket
-        self._replies, self._tasks, self._stirred = deque[dict[str, Any]](), set[asyncio.Task[None]](), asyncio.Event()
+        self._replies, self._stirred = deque[dict[str, Any]](), asyncio.Event()
+        self._workers = workers
+        self._rate_limit = RateLimit(MESSAGES_AT_ONCE, MESSAGES_PER_S)
+        self._questions = Lane(workers.answers, self._finish)
+        self._commands = Lane(workers.commands, self._finish)
         self._most: int | None = None  # points of the scan that is wanted; None where none is
         self._held = deque[Shown](maxlen=HELD)
         self._frozen: Backlog | None = None  # the bytes as they were when a live source was paused
@@ -79,15 +90,15 @@ class Page:
     async def serve(self) -> str:
         """Answer the page until it goes away: what became of it, in words."""
         await self._socket.accept()
-        parts = {asyncio.create_task(self._listen()), asyncio.create_task(self._speak())}
+        works = (self._listen(), self._speak(), self._questions.run(), self._commands.run())
+        tasks: set[asyncio.Task[str]] = {asyncio.create_task(work) for work in works}
         try:
-            done, _ = await asyncio.wait(parts, return_when=asyncio.FIRST_COMPLETED)
+            done, _ = await asyncio.wait(tasks, return_when=asyncio.FIRST_COMPLETED)
             return next(iter(done)).result()
         finally:
-            left = {*parts, *self._tasks}
-            for task in left:
+            for task in tasks:
                 task.cancel()
-            await asyncio.gather(*left, return_exceptions=True)
+            await asyncio.gather(*tasks, return_exceptions=True)
 
     def stir(self) -> None:
         """Look whether there is something for the page."""
@@ -95,13 +106,22 @@ class Page:
 
     async def _listen(self) -> str:
         while (message := await self._socket.receive())["type"] == "websocket.receive":
+            await asyncio.sleep(self._rate_limit.delay_s(time.monotonic()))
             self._hear(message.get("text") or "")
-            while len(self._replies) > WAITING:  # of a page that asks, and does not listen
-                await asyncio.sleep(STATE)
+            while self._is_busy:
+                await asyncio.sleep(BUSY)
         return "closed" if message.get("code") in CLOSED else "dropped: it does not answer any more"
 
+    @property
+    def _is_busy(self) -> bool:
+        """Whether the page asks faster than it is answered, or does not read the answers."""
+        return len(self._replies) > WAITING or self._questions.is_full or self._commands.is_full
+
     async def _speak(self) -> str:
-        await self._greet()
+        try:
+            await self._greet()
+        except WebSocketDisconnect:
+            return "closed"
         while True:
             self._stirred.clear()
             message = await self._next()
@@ -121,7 +141,11 @@ class Page:
         patience = time.monotonic() + GREETING
         while self._broadcast.shown is None and time.monotonic() < patience:
             await asyncio.sleep(GREETING / 60)
-        await self._send(await asyncio.to_thread(self._answers.hello))
+        await self._send(await self._in_thread(self._answers.hello))
+
+    async def _in_thread(self, work: Callable[[], dict[str, Any]]) -> dict[str, Any]:
+        loop = asyncio.get_running_loop()
+        return await loop.run_in_executor(self._workers.answers, work)
 
     async def _send(self, message: bytes | dict[str, Any]) -> None:
         if isinstance(message, bytes):
@@ -148,7 +172,7 @@ class Page:
             if newest != self._watched and (taken := self._bytes.frame(newest)) is not None:
                 self._watched = newest
                 with contextlib.suppress(LidarSpecError):  # what cannot be explained is not shown
-                    return await asyncio.to_thread(self._answers.frame, taken, "last")
+                    return await self._in_thread(lambda: self._answers.frame(taken, "last"))
         recording = self._recording()
         if now >= self._due["state"] or recording != self._sent_recording:
             self._due["state"] = now + STATE
@@ -199,23 +223,18 @@ class Page:
         self.stir()
 
     def _later(self, word: str, work: Callable[[], dict[str, Any] | None], command: str = "") -> None:
-        """Do in a thread what may take a while, and answer then."""
-        if len(self._tasks) >= BUSY:
-            raise UsageError("too much at once: wait for an answer first")
+        """Answer a question that takes a while, after those before it."""
+        self._questions.add(Request(word, command, work))
 
-        async def answered() -> None:
-            try:
-                if (reply := await asyncio.to_thread(work)) is not None:
-                    self._answer(reply)
-            except LidarSpecError as error:
-                self._refuse(word, error, command)
-            except Exception as error:
-                self._refuse(word, LidarSpecError(_bug(error)), command)
-            self.stir()
-
-        task = asyncio.create_task(answered())
-        self._tasks.add(task)
-        task.add_done_callback(self._tasks.discard)
+    def _finish(self, request: Request, result: dict[str, Any] | Exception | None) -> None:
+        """Answer a request that was done in a thread."""
+        if isinstance(result, LidarSpecError):
+            self._refuse(request.word, result, request.command)
+        elif isinstance(result, Exception):
+            self._refuse(request.word, LidarSpecError(_bug(result)), request.command)
+        elif result is not None:
+            self._answer(result)
+        self.stir()
 
     def _next_scan(self, message: Mapping[str, Any]) -> None:
         self._most = round(_number(message, "most", 1, POINTS))
@@ -225,6 +244,8 @@ class Page:
         if self._broadcast.is_live:
             if not self._held:
                 raise UsageError("there is nothing to pause before the first scan")
+            if self._frozen is not None:
+                return
             self._frozen = self._broadcast.backlog.frozen()
         else:
             self._broadcast.pause()
@@ -272,7 +293,7 @@ class Page:
 
     def _command(self, message: Mapping[str, Any]) -> None:
         name, words = _command(message)
-        self._later("send", lambda: self._answers.sent(name, words), name)
+        self._commands.add(Request("send", name, lambda: self._answers.sent(name, words)))
 
     def _record(self, message: Mapping[str, Any]) -> None:
         switch = self._broadcast.switch
@@ -371,6 +392,8 @@ class Site:
         ]
         app = Starlette(routes=routes)
         self._connections = Connections(say)
+        self._workers = Workers()
+        self._saves = Saves(self._folder, self._workers.saves, self._connections.drop)
         self._server = uvicorn.Server(
             uvicorn.Config(
                 Guard(
@@ -416,6 +439,7 @@ class Site:
         self._broadcast.news = lambda: None
         self._server.should_exit = True
         self._thread.join()
+        self._workers.close()
         self._socket.close()
         self._folder.remove()
 
@@ -430,12 +454,13 @@ class Site:
         watching = asyncio.create_task(self._connections.watch())
         await self._server.serve(sockets=[self._socket])
         watching.cancel()
+        await self._connections.close()
 
     def _stir(self) -> None:
         for page in self._open:
             page.stir()
 
-    def _send_page(self, request: Request) -> Response:
+    def _send_page(self, request: HttpRequest) -> Response:
         text = (self._files / "index.html").read_text(encoding="utf-8")
         return HTMLResponse(add_token(text, self._token))
 
@@ -444,7 +469,7 @@ class Site:
         if len(self._open) >= PAGES:
             await socket.close()
             return
-        page, number = Page(self._answers, socket), self._pages + 1
+        page, number = Page(self._answers, socket, self._workers), self._pages + 1
         self._open.add(page)
         self._pages = number
         self._say(f"page {number} opened by {socket.client.host if socket.client else 'nobody'}; {len(self._open)} open")
@@ -457,7 +482,7 @@ class Site:
             self._open.discard(page)
             self._say(f"page {number} {became}; {len(self._open)} open")
 
-    async def _saved(self, request: Request) -> Response:
+    async def _saved(self, request: HttpRequest) -> Response:
         """A scan as a file, by the number that a page knows it by."""
         number, _, suffix = request.path_params["name"].partition(".")
         shown = self._broadcast.numbered(int(number)) if number.isdecimal() and len(number) < DIGITS else None
@@ -465,36 +490,7 @@ class Site:
             return PlainTextResponse(f"a scan is saved as {', '.join(saves())}", 404)
         if shown is None:
             return PlainTextResponse("this scan is not kept any more: pause before saving", 404)
-        folder = tempfile.TemporaryDirectory(prefix="lidarspec-")
-        path = Path(folder.name) / f"{shown.scan.sensor.id}-{number}.{suffix}"
-        try:
-            await asyncio.to_thread(_write, path, shown)
-        except LidarSpecError as error:
-            folder.cleanup()
-            return PlainTextResponse(str(error), 500)
-        return Fleeting(path, folder)
-
-
-class Fleeting(FileResponse):
-    """A file that is gone when it has been sent, or was not."""
-
-    def __init__(self, path: Path, folder: tempfile.TemporaryDirectory[str]) -> None:
-        super().__init__(path, filename=path.name, media_type="application/octet-stream")
-        self._folder = folder
-
-    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
-        """Send it."""
-        with self._folder:
-            await super().__call__(scope, receive, send)
-
-
-def _write(path: Path, shown: Shown) -> None:
-    """Write a scan to a file."""
-    if path.suffix == ".svg":
-        points = shown.scan.points
-        path.write_text(svg(points, look(points), f"{shown.scan.sensor.id}: {shown.scan}"), encoding="utf-8")
-    else:
-        write(path, [shown.scan])
+        return self._saves.response(shown, suffix)
 
 
 def _name_of(host: str) -> str:

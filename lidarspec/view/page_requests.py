@@ -1,0 +1,115 @@
+"""The requests of one page: how many are taken a second, and those that take a while.
+
+A page that asks without end waits for itself: the server reads its next message later. Requests that
+take a while are done in threads, for each page one after another, so that no page has more than its
+share of the threads.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import time
+from collections.abc import Callable
+from concurrent.futures import Executor, ThreadPoolExecutor
+from dataclasses import dataclass
+from typing import Any, NoReturn
+
+#: messages of a page that are taken at once, and in each second.
+MESSAGES_AT_ONCE = 100
+MESSAGES_PER_S = 100.0
+#: requests of a lane that wait before no message of the page is read any more.
+MAX_WAITING = 16
+#: at most, between two requests of a lane.
+MAX_REST_S = 0.1
+ANSWER_THREADS = 4
+
+
+class Workers:
+    """The threads of a server, by what they do. Threads are started when they are needed."""
+
+    def __init__(self) -> None:
+        self.answers = ThreadPoolExecutor(ANSWER_THREADS, "page-answers")
+        # The sensor answers one command after another, which may take seconds.
+        self.commands = ThreadPoolExecutor(1, "page-commands")
+        self.saves = ThreadPoolExecutor(1, "page-saves")
+
+    def close(self) -> None:
+        """Forget the work that waits, and wait for the work that has begun."""
+        for executor in (self.answers, self.commands, self.saves):
+            executor.shutdown(cancel_futures=True)
+
+
+class RateLimit:
+    """The delay of messages that come faster than is allowed.
+
+    Args:
+        at_once: messages that need not wait after a pause.
+        per_second: messages.
+    """
+
+    def __init__(self, at_once: int, per_second: float) -> None:
+        self._period_s = 1 / per_second
+        self._burst_s = at_once / per_second
+        self._due = 0.0
+
+    def delay_s(self, now: float) -> float:
+        """Take a message at a time of `time.monotonic`, and return how long it has to wait."""
+        self._due = max(self._due, now - self._burst_s) + self._period_s
+        return max(self._due - now, 0.0)
+
+
+@dataclass(frozen=True)
+class Request:
+    """A request that takes a while.
+
+    Attributes:
+        word: of the message.
+        command: of the sensor that it is about, "" for none.
+        work: returns the reply, None for none.
+    """
+
+    word: str
+    command: str
+    work: Callable[[], dict[str, Any] | None]
+
+
+class Lane:
+    """Requests of one page that are done one after another, in a thread.
+
+    Args:
+        executor: has the thread.
+        finish: called with each request and its reply, or the exception that it ended with.
+    """
+
+    def __init__(
+        self,
+        executor: Executor,
+        finish: Callable[[Request, dict[str, Any] | Exception | None], None],
+    ) -> None:
+        self._executor = executor
+        self._finish = finish
+        self._requests = asyncio.Queue[Request]()
+
+    @property
+    def is_full(self) -> bool:
+        """Whether no further request is to be added for now."""
+        return self._requests.qsize() >= MAX_WAITING
+
+    def add(self, request: Request) -> None:
+        """Add a request behind those that wait."""
+        self._requests.put_nowait(request)
+
+    async def run(self) -> NoReturn:
+        """Do the requests until this is cancelled."""
+        loop = asyncio.get_running_loop()
+        while True:
+            request = await self._requests.get()
+            begin = time.monotonic()
+            result: dict[str, Any] | Exception | None
+            try:
+                result = await loop.run_in_executor(self._executor, request.work)
+            except Exception as error:
+                result = error
+            self._finish(request, result)
+            # Threads share one processor: other pages have the next turn.
+            await asyncio.sleep(min(time.monotonic() - begin, MAX_REST_S))
