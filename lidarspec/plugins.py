@@ -89,8 +89,10 @@ def lidarspec_formats() -> Iterable[Any]:  # type: ignore[empty-body]
     """File formats by suffix that the plugin adds."""
 
 
-#: seconds after which a plugin that is being loaded is named, and after which one that is tried counts as hanging.
+#: seconds after which a plugin that is being loaded is named, and after which it counts as hanging.
 PATIENCE, LIMIT = 5.0, 10.0
+#: modules that hang -> what to say of them.
+_hanging: dict[str, str] = {}
 HOOKS = tuple(name for name in globals() if name.startswith("lidarspec_"))
 
 
@@ -473,29 +475,53 @@ def named_owners() -> dict[str, str]:
     return named
 
 
-@contextlib.contextmanager
-def _watched(entry: EntryPoint) -> Iterator[None]:
-    """Within, a plugin that takes long is named: one that hangs keeps everything else from going on."""
+def _imported(entry: EntryPoint) -> Any:
+    """What an entry point stands for, imported in a thread: one that hangs is named and left alone, and everything else goes on.
+
+    Raises:
+        SpecError: where it hangs.
+        BaseException: whatever the import fails with.
+    """
+    if entry.module in _hanging:
+        raise SpecError(_hanging[entry.module])
     if entry.module in sys.modules:
-        yield
-        return
-    text = f"{entry.distribution}: {entry.module} has been loading for {PATIENCE:g} s; next: lidarspec plugins"
-    timer = threading.Timer(PATIENCE, warnings.warn, [text])
-    timer.daemon = True
-    timer.start()
-    try:
-        yield
-    finally:
-        timer.cancel()
-        timer.join()
+        return entry.load()
+    outcome: list[tuple[Any, BaseException | None]] = []
+
+    def load() -> None:
+        try:
+            outcome.append((entry.load(), None))
+        except BaseException as error:
+            outcome.append((None, error))
+
+    thread = threading.Thread(target=load, name=f"import of {entry.module}", daemon=True)
+    thread.start()
+    thread.join(PATIENCE)
+    if thread.is_alive():
+        warnings.warn(f"{entry.distribution}: {entry.module} has been loading for {PATIENCE:g} s; next: lidarspec plugins", stacklevel=2)
+        thread.join(max(LIMIT - PATIENCE, 0))
+    if not outcome:
+        _hanging[entry.module] = f"it hangs: not loaded after {LIMIT:g} s{_place(thread)}"
+        warnings.warn(f"{entry.distribution}: {_hanging[entry.module]}; what it adds is left out", stacklevel=2)
+        raise SpecError(_hanging[entry.module])
+    loaded, failure = outcome[0]
+    if failure is not None:
+        raise failure
+    return loaded
+
+
+def _place(thread: threading.Thread) -> str:
+    """Where the code of a plugin is that a thread waits in, in words; "" where that cannot be seen."""
+    stack = traceback.extract_stack(sys._current_frames().get(thread.ident or 0))
+    own = [frame for frame in stack if frame.name == "<module>"]
+    return f" at {own[-1].filename}, line {own[-1].lineno}" if own else ""
 
 
 def _loaded(entry: EntryPoint, names: str, add: Callable[[Any], list[str]]) -> Plugin:
     """What became of an entry point that is loaded and added; whatever it raises disturbs no other."""
     plugin = Plugin(entry.distribution, entry.version, f"{names} = {entry.value}")
     try:
-        with _watched(entry):
-            return replace(plugin, sensors=tuple(add(entry.load())))
+        return replace(plugin, sensors=tuple(add(_imported(entry))))
     except KeyboardInterrupt:
         raise
     except BaseException as error:

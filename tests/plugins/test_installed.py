@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import contextlib
 import importlib.metadata
+import os
+import subprocess
 import sys
 import threading
 import warnings
@@ -360,6 +362,37 @@ def test_a_plugin_that_takes_long_is_named_while_it_does(tmp_path: Path, monkeyp
         monkeypatch.setattr(warnings, "showwarning", tell)
         Registry([EntryPoint("slow", "slow_lidars", "slow-lidars", "1")])
     assert told == ["slow-lidars: slow_lidars has been loading for 0.01 s; next: lidarspec plugins"]
+
+
+def test_a_plugin_that_hangs_is_left_out_and_the_others_work(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    code = "import its_end\n\nits_end.come.wait(60)\nits_end.gone.set()\n"
+    (tmp_path / "hanging_lidars.py").write_text(code, encoding="utf-8")
+    end, gone = threading.Event(), threading.Event()
+    monkeypatch.setitem(sys.modules, "its_end", SimpleNamespace(come=end, gone=gone))  # type: ignore[arg-type]
+    monkeypatch.syspath_prepend(tmp_path)
+    monkeypatch.setattr("lidarspec.plugins.PATIENCE", 0.01)
+    monkeypatch.setattr("lidarspec.plugins.LIMIT", 0.02)
+    monkeypatch.setattr("lidarspec.plugins._hanging", {})
+    hanging = [EntryPoint("a", "hanging_lidars", "hanging-lidars", "1"), EntryPoint("acme-x1", "hanging_lidars:X1", "hanging-lidars", "1")]
+    good = next(entry for entry in entry_points("lidarspec.sensors") if entry.name == "cspc-m1c1-mini")
+    with pytest.warns(UserWarning, match="what it adds is left out"):
+        found = Registry(hanging[:1], [hanging[1], good])
+    assert found.sensor("cspc-m1c1-mini").id == "cspc-m1c1-mini"
+    reasons = {plugin.error for plugin in found.plugins if plugin.distribution == "hanging-lidars"}
+    assert reasons == {f"it hangs: not loaded after 0.02 s at {tmp_path / 'hanging_lidars.py'}, line 3"}
+    end.set()
+    assert gone.wait(60)
+
+
+@pytest.mark.slow
+def test_a_verb_runs_beside_a_plugin_that_hangs(tmp_path: Path) -> None:
+    distribution(tmp_path, "hanging", "1", "[lidarspec]\nhanging = hanging_lidars\n")
+    (tmp_path / "hanging_lidars.py").write_text("import time\ntime.sleep(600)\n", encoding="utf-8")
+    environment = os.environ | {"PYTHONPATH": str(tmp_path)}
+    command = [sys.executable, "-m", "lidarspec", "parse", "545a", "-s", "ldrobot-stl27l"]
+    done = subprocess.run(command, env=environment, capture_output=True, text=True, check=False, timeout=300)
+    assert "hanging: it hangs: not loaded after 10 s" in done.stderr
+    assert done.returncode == 4
 
 
 #: plugins that do odd things when they are loaded: code, error and remark.
