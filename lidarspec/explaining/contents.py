@@ -214,7 +214,10 @@ def _sent(found: Contents) -> list[Content]:
             return [Content(found.path, (known.id,), None, "", _reading(found.path, known))]
     except LidarSpecError as error:
         found.warnings.append(str(error))
-    return [_content(found.path, one) for one in verdicts(found.path)]
+    judged = verdicts(found.path)
+    if any(one.heard.is_text for one in judged) and not any(one.alike for one in judged):
+        found.kind = "text"
+    return [_content(found.path, one) for one in judged]
 
 
 def _content(path: str, one: Verdict) -> Content:
