@@ -49,6 +49,22 @@ def test_what_comes_is_recorded_until_the_next_click(browser: Any, tmp_path: Pat
         assert device.stats.bad_checksum == 0
 
 
+def test_a_double_click_starts_one_recording_that_all_pages_show(browser: Any, tmp_path: Path) -> None:
+    with served("sim:ldrobot-stl27l?rate=0.5", folder=tmp_path) as link:
+        visit, other = Visit(browser, link), Visit(browser, link)
+        visit.page.dblclick("#record")
+        for page in (visit, other):
+            page.until(lambda page=page: " · " in page.text("#recording"), "it is not shown that it records")
+        assert visit.text("#recording").partition(" ")[0] == other.text("#recording").partition(" ")[0]
+        visit.page.wait_for_timeout(600)  # from then on it is another press
+        other.page.click("#record")
+        for page in (visit, other):
+            page.until(lambda page=page: page.text("#recording") == "Record", "it is not shown that it ended")
+            page.context.close()
+            assert not page.errors
+    assert len(list(tmp_path.glob("*.lsr"))) == 1
+
+
 def test_the_scan_that_is_shown_is_saved(browser: Any) -> None:
     with served("sim:ldrobot-stl27l") as link:
         visit = Visit(browser, link)
