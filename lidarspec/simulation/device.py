@@ -1,8 +1,8 @@
 """A simulated sensor as a device, sans-IO: bytes in, bytes out, in real time or any other.
 
 It behaves as its spec says and knows no sensor: data frames come at the pace of the sensor's clock, commands are answered with the
-documented replies (`Answering`), start and stop are honoured, other frames come at their own rate. A sensor that no command starts
-sends by itself.
+documented replies (`Answering`), start and stop are honoured, other frames come at their own rate. A sensor that no command of `on_open`
+starts sends from power-on.
 
 All times are the caller's, in ns of one monotonic clock.
 """
@@ -238,8 +238,16 @@ class SimulatedDevice:
         for name, frame in self.sensor.incoming.items():
             if frame.simulation.rate and not frame.data:
                 self._put(0.0, "data", name, self._answering.frame(name))
-        if not any(command.starts for command in self.sensor.commands.values()):
+        if not self._waits_for_a_command():
             self._begin(0.0, self.sensor.data_frame)
+
+    def _waits_for_a_command(self) -> bool:
+        """Return whether it sends no data until a command starts it: one that every program sends when it opens the sensor.
+
+        A sensor with a start command that `on_open` leaves out sends from power-on: nothing else would start it for a program.
+        """
+        opening = [self.sensor.commands[name] for name in self.sensor.on_open]
+        return any(command.starts and command.frame for command in opening)
 
     def unplug(self) -> None:
         """Pull the plug; `start` puts it in again."""

@@ -9,14 +9,16 @@ from __future__ import annotations
 
 import contextlib
 import hashlib
+import itertools
 import math
 import queue
 import threading
 import time
 from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
+from typing import Literal
 
-from lidarspec.errors import UsageError, WireError
+from lidarspec.errors import LidarSpecError, SpecError, UsageError, WireError
 from lidarspec.recording.recorders import recorder
 from lidarspec.scans.selection import Times, received
 from lidarspec.simulation.device import SECOND, SimulatedDevice
@@ -203,29 +205,66 @@ def write_file(device: SimulatedDevice, path: str | Path, seconds: float, *, ove
     """The number of bytes written: what a device sends in so many seconds, from its start on, as a recording of it would be.
 
     Nothing waits: the times in the file are the device's. The commands that open the device are sent to it, and recorded too.
+    The file is made when there is something to write.
 
     Args:
         path: an .lsr, .pcap, .pcapng or .bin file.
 
     Raises:
-        UnknownFormat, UsageError: for a file that cannot hold it, or exists.
+        UnknownFormat, UsageError: for a file that cannot hold it, or exists; for a time in which nothing is sent.
+        SpecError: if the sensor, as it is declared, never sends anything.
         SourceError: where it cannot be written.
     """
-    sensor, began = device.sensor, time.time_ns()
-    device.start(0)
-    written, now, opening = 0, 0, [name for name in sensor.on_open if sensor.commands[name].frame]
+    chunks = _opened(device, seconds)
+    first = list[tuple[Chunk, Literal["in", "out"]]]()
+    for chunk, direction in chunks:
+        first.append((chunk, direction))
+        if direction == "in":
+            break
+    else:
+        raise _nothing_sent(device, seconds)
+    sensor = device.sensor
+    written = 0
     with contextlib.closing(recorder(path, sensor, f"sim:{sensor.id}", datagrams=sensor.datagrams, overwrite=overwrite)) as out:
-        while now < seconds * SECOND:
-            if opening:
-                name = opening.pop(0)
-                out.write(Chunk(build_command(sensor, name, {}), began + now), "out")
-                device.receive(build_command(sensor, name, {}), now, sensor.commands[name].link)
-            now += PIECE
-            for chunk in _chunks(device, now, began + now).get("data", []):
-                out.write(chunk)
-                written += len(chunk.data)
+        for chunk, direction in itertools.chain(first, chunks):
+            out.write(chunk, direction)
             out.keep_up()
+            written += len(chunk.data) if direction == "in" else 0
     return written
+
+
+def _opened(device: SimulatedDevice, seconds: float) -> Iterator[tuple[Chunk, Literal["in", "out"]]]:
+    """Yield what goes over the data link of a device that is switched on and opened, with the commands that open it."""
+    sensor = device.sensor
+    began = time.time_ns()
+    opening = [name for name in sensor.on_open if sensor.commands[name].frame]
+    now = 0
+    device.start(now)
+    while now < seconds * SECOND:
+        if opening:
+            name = opening.pop(0)
+            data = build_command(sensor, name, {})
+            yield Chunk(data, began + now), "out"
+            device.receive(data, now, sensor.commands[name].link)
+        now += PIECE
+        for chunk in _chunks(device, now, began + now).get("data", []):
+            yield chunk, "in"
+
+
+def _nothing_sent(device: SimulatedDevice, seconds: float) -> LidarSpecError:
+    """Return the error that says why a device has sent nothing over its data link."""
+    sensor = device.sensor
+    sent = {name: device.sent[name] for name in sensor.data_frames if device.sent[name]}
+    if sent:
+        frames = ", ".join(f"{number} {name}" for name, number in sent.items())
+        return UsageError(f"nothing was written: {frames} frames were sent, and all of them were lost")
+    if device.deadline is not None:
+        due = f"its next frame is due after {device.deadline / SECOND:g} s"
+        return UsageError(f"nothing was written: the simulated {sensor.id} sends nothing in the first {seconds:g} s; {due}")
+    missed = [name for name in sensor.on_open if sensor.commands[name].frame and name not in device.heard]
+    heard = ", ".join(device.heard) or "no command"
+    reason = f"{missed[0]!r} was sent to it, and it recognized {heard}" if missed else f"nothing starts its data after {heard}"
+    return SpecError(f"nothing was written: the simulated sensor sends nothing; {reason}", path="on_open", sensor=sensor.id)
 
 
 def _chunks(device: SimulatedDevice, now: int, at: int | None = None) -> dict[str, list[Chunk]]:

@@ -20,15 +20,16 @@ import pytest
 
 import lidarspec as ls
 from lidarspec import SourceError, UsageError
-from lidarspec.errors import UnknownFormat
+from lidarspec.errors import SpecError, UnknownFormat
 from lidarspec.simulation.device import SimulatedDevice
 from lidarspec.simulation.faults import Faults
 from lidarspec.simulation.scenes import Room, read_scene
-from lidarspec.spec import Udp
+from lidarspec.spec import Command, Simulation, Udp
 from lidarspec.testing.fixtures import virtual_port
 from lidarspec.transports.outlets import simulated_outlet
 from lidarspec.transports.serving import Served, Turns, write_file
 from lidarspec.view.screen import Keyboard
+from tests.broken import sound
 from tests.lines import TIMEOUT_S, free_port, read_until, until
 from tests.simulation.test_simulator import off
 
@@ -259,6 +260,32 @@ def test_a_file_holds_what_the_sensor_would_have_sent(name: str, suffix: str, se
     write_file(again, tmp_path / f"again.{suffix}", seconds)
     if suffix == "bin":
         assert path.read_bytes() == (tmp_path / f"again.{suffix}").read_bytes()
+
+
+def test_a_start_command_that_no_program_sends_does_not_silence_a_sensor(tmp_path: Path) -> None:
+    sensor = sound.sensor()
+    assert sensor.commands["start"].starts
+    assert not sensor.on_open
+    device = SimulatedDevice(sensor, scene=Room())
+    assert write_file(device, tmp_path / "made.bin", 0.2)
+    assert device.sent["data"] == 41  # every 5 ms, both ends included
+
+
+def test_a_file_with_nothing_in_it_is_an_error_with_the_reason(tmp_path: Path) -> None:
+    start = Command("order", {"code": 1}, starts=True)
+    stop = Command("order", {"code": 2}, stops=True)
+    slow = sound.sensor(on_open=("start",), simulation=Simulation(sound.sweep, answers={"start": (0.5,)}))
+    stopped = sound.sensor(commands={"stop": stop}, on_open=("stop",))
+    mistaken = sound.sensor(commands={"wake": Command("order", {"code": 1}), "start": start}, on_open=("start",))
+    for device, seconds, error, said in (
+        (SimulatedDevice(slow), 0.1, UsageError, "sends nothing in the first 0.1 s; its next frame is due after 0.5 s"),
+        (SimulatedDevice(stl(), faults=Faults(loss=1.0)), 0.1, UsageError, "data frames were sent, and all of them were lost"),
+        (SimulatedDevice(stopped), 0.1, SpecError, "nothing starts its data after stop"),
+        (SimulatedDevice(mistaken), 0.1, SpecError, "'start' was sent to it, and it recognized wake"),
+    ):
+        with pytest.raises(error, match=said):
+            write_file(device, tmp_path / "empty.bin", seconds)
+        assert not (tmp_path / "empty.bin").exists()
 
 
 def test_a_destination_that_cannot_carry_the_sensor_is_refused(tmp_path: Path) -> None:
