@@ -572,15 +572,12 @@ def registry() -> Registry:
 
 
 def tried() -> list[Plugin]:
-    """Every plugin that was found: loaded in a process of its own, and here where it neither hangs there nor ends the process."""
-    from concurrent.futures import ThreadPoolExecutor
-
+    """Every plugin that was found: loaded in another process, and here where it neither hangs there nor ends the process."""
     if len(_registries) > 1:  # one stands in for what is installed
         return registry().plugins
     groups = [_modules(), entry_points(SENSORS)]
     entries = {(entry.distribution, entry.module): entry for group in groups for entry in group}
-    with ThreadPoolExecutor(os.cpu_count()) as pool:
-        trials = dict(zip(entries, pool.map(_trial, entries), strict=True))
+    trials = _trials(list(entries))
     lost = [
         Plugin(entry.distribution, entry.version, f"{entry.name} = {entry.value}", error=trials[home][0])
         for home, entry in entries.items()
@@ -598,14 +595,26 @@ def _modules() -> list[EntryPoint]:
     return list(found.values())
 
 
-def _trial(home: Home) -> tuple[str, str]:
-    """Why a plugin cannot be loaded in this process, and what it does besides being loaded."""
+def _trials(homes: list[Home]) -> dict[Home, tuple[str, str]]:
+    """Return the result of `_trial` for each plugin: from one process for all, or if anything is wrong in it, from one for each."""
+    from concurrent.futures import ThreadPoolExecutor
+
+    nothing_wrong = ("", "")
+    if _trial(*homes) == nothing_wrong:
+        return dict.fromkeys(homes, nothing_wrong)
+    with ThreadPoolExecutor(os.cpu_count()) as pool:
+        return dict(zip(homes, pool.map(_trial, homes), strict=True))
+
+
+def _trial(*homes: Home) -> tuple[str, str]:
+    """Why plugins cannot be loaded in this process, and what they do besides being loaded."""
     import subprocess
 
     mark = f"{os.urandom(8).hex()}:"
     code = "from lidarspec.plugins import load_alone; load_alone()"
     environment = os.environ | {"PYTHONPATH": os.pathsep.join(filter(None, sys.path))}
-    command = [sys.executable, "-P", "-c", code, *home, mark, str(LIMIT)]
+    names = [name for home in homes for name in home]
+    command = [sys.executable, "-P", "-c", code, *names, mark, str(LIMIT)]
     hangs, pipe = f"it hangs: not loaded after {LIMIT:g} s", subprocess.PIPE
     try:
         done = subprocess.run(command, env=environment, timeout=9 * LIMIT, stdin=pipe, stdout=pipe, stderr=pipe, check=False)
@@ -621,12 +630,14 @@ def _trial(home: Home) -> tuple[str, str]:
 
 
 def load_alone() -> None:
-    """Load the plugin that the arguments name, print a mark and the threads that it leaves, and end the process, which is for this."""
+    """Load the plugins that the arguments name, print a mark and the threads that they leave, and end the process, which is for this."""
     import faulthandler
 
-    *home, mark, limit = sys.argv[1:]
+    *names, mark, limit = sys.argv[1:]
+    homes = set(zip(names[::2], names[1::2], strict=True))
     faulthandler.dump_traceback_later(float(limit), exit=True)
-    modules, offered = ([one for one in group if [one.distribution, one.module] == home] for group in (_modules(), entry_points(SENSORS)))
+    groups = (_modules(), entry_points(SENSORS))
+    modules, offered = ([entry for entry in group if (entry.distribution, entry.module) in homes] for group in groups)
     before = set(threading.enumerate())
     Registry(modules, offered)._load_all()
     left = [thread.name for thread in threading.enumerate() if thread not in before]

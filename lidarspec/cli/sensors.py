@@ -169,7 +169,8 @@ def _plan(sensor: Sensor, frame: str) -> list[str]:
 def plugins(ctx: click.Context, as_json: bool, output: str | None) -> None:
     """The plugins that were found, and what is wrong with those that do not load.
 
-    Each is loaded in a process of its own first, so that one that hangs or ends the program is named. Exit code 1 where something is wrong.
+    They are loaded in another process first, and if anything is wrong, each in one of its own, so that one that hangs or ends the program
+    is named. Exit code 1 where something is wrong.
     """
     from lidarspec.plugins import tried
 

@@ -415,7 +415,7 @@ HANGING = {"hangs": ("import time\ntime.sleep(600)", "it hangs: not loaded after
 
 @pytest.mark.slow
 @pytest.mark.parametrize(("plugins", "limit_s"), [(ODD, 600), (HANGING, 0.5)], ids=["odd", "hanging"])
-def test_each_plugin_is_tried_in_a_process_of_its_own(
+def test_each_plugin_is_tried_in_a_process_of_its_own_if_anything_is_wrong(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, plugins: dict[str, tuple[str, str, str]], limit_s: float
 ) -> None:
     for name, (code, _, _) in plugins.items():
@@ -428,6 +428,20 @@ def test_each_plugin_is_tried_in_a_process_of_its_own(
     monkeypatch.setattr(threading.Thread, "start", lambda thread: None if thread.name == "mine" else START(thread))  # not here too
     found = {plugin.distribution.removeprefix("odd_"): (plugin.error, plugin.remark) for plugin in tried()}
     assert found == {name: (error, remark) for name, (_, error, remark) in plugins.items()}
+
+
+@pytest.mark.slow
+def test_plugins_with_which_nothing_is_wrong_are_tried_in_one_process(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    for name in ("one", "other"):
+        (tmp_path / f"sound_{name}.py").write_text("", encoding="utf-8")
+        distribution(tmp_path, f"sound_{name}", "1", f"[lidarspec]\n{name} = sound_{name}\n")
+    monkeypatch.syspath_prepend(tmp_path)
+    entries = [entry for entry in entry_points("lidarspec") if entry.distribution.startswith("sound")]
+    monkeypatch.setattr("lidarspec.plugins.entry_points", lambda group: entries if group == "lidarspec" else [])
+    run, started = subprocess.run, []
+    monkeypatch.setattr(subprocess, "run", lambda command, **more: [started.append(command), run(command, **more)][1])
+    assert {plugin.distribution: (plugin.error, plugin.remark) for plugin in tried()} == {"sound_one": ("", ""), "sound_other": ("", "")}
+    assert len(started) == 1
 
 
 START = threading.Thread.start
