@@ -146,3 +146,13 @@ class Visit:
         answer = self.page.request.get(self.link.replace("?", f"save/{number}.csv?"))
         assert answer.ok, answer.text()
         return list(csv.DictReader(io.StringIO(answer.text())))
+
+
+@contextlib.contextmanager
+def streaming(visit: Visit) -> Iterator[None]:
+    """Let an open page play during one test only, because drawing scans in software takes much processor time."""
+    if visit.text("#status") == "paused":
+        visit.play()
+    yield
+    if visit.text("#status") != "paused":
+        visit.pause()
