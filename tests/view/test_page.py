@@ -34,8 +34,8 @@ RATE = 1800
 
 @pytest.fixture(scope="module")
 def m1_page(browser: Any) -> Iterator[Visit]:
-    """A sensor of many points, slowed down to three scans a second."""
-    with served("sim:robosense-m1?rate=0.3") as link:
+    """A sensor of many points, slowed down to one scan a second, because drawing them in software is dear."""
+    with served("sim:robosense-m1?rate=0.1") as link:
         visit = Visit(browser, link)
         yield visit
         visit.context.close()
