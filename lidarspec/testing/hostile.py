@@ -26,31 +26,36 @@ from lidarspec.spec.sensor import Sensor
 from lidarspec.testing.findings import require
 from lidarspec.testing.subject import Subject
 
-#: bytes of a stream.
+#: bytes of a stream, with the usual number of examples, and at least.
 LENGTH = 12_000
+LEAST_LENGTH = 4_000
 #: function calls that a stream may take per byte. The engine needs up to 16 for the sensors that exist, and 40 where construct
 #: reads every frame.
 MAX_CALLS_PER_BYTE = 100
 #: bytes of memory that frames may be kept in per byte of the stream.
 MAX_KEPT_PER_BYTE = 64
-#: seeds of the examples that streams are made of, frames with random headers, bytes of a head, and of noise behind it.
-SEEDS, HEADERS, HEAD, NOISE = 6, 60, 12, 3
+#: seeds of the examples that streams are made of, with the usual number of examples, and at least.
+SEEDS = 6
+LEAST_SEEDS = 3
+#: frames with random headers, bytes of a head, and of noise behind it.
+HEADERS, HEAD, NOISE = 60, 12, 3
 #: one in so many frames comes behind its announcement, where the others of its type need one.
 ANNOUNCED = 40
 
 
 def no_stream_costs_much_more_than_frames(subject: Subject) -> None:
     """No stream takes more than 100 function calls for each of its bytes, or is kept in more than 64 bytes of memory."""
-    first = streams(subject)
+    length = min(subject.scale_rounds(LENGTH, LEAST_LENGTH), LENGTH)
+    first = streams(subject, length=length)
     calls = {name: calls_per_byte(subject.sensor, parts) for name, parts in first.items()}
     dear = [name for name in calls if calls[name] >= MAX_CALLS_PER_BYTE]
     if dear:  # a second stream does not pay for layouts that the engine remembers, and its own layouts are others
-        second = streams(subject, seed=1)
+        second = streams(subject, seed=1, length=length)
         calls |= {name: min(calls[name], calls_per_byte(subject.sensor, second[name])) for name in dear}
     name = max(calls, key=lambda name: calls[name])
     subject.measured["the dearest stream"] = f"{name}, {calls[name]:.1f} calls a byte"
     require(calls[name] < MAX_CALLS_PER_BYTE, "LS416", f"{name}: {calls[name]:.0f} function calls for each byte")
-    held, name = max((kept(subject.sensor, first[name]) / LENGTH, name) for name in calls if name != SMOOTH)
+    held, name = max((kept_per_byte(subject.sensor, first[name]), name) for name in calls if name != SMOOTH)
     require(held < MAX_KEPT_PER_BYTE, "LS416", f"{name}: {held:.0f} bytes are kept for each byte")
 
 
@@ -64,8 +69,8 @@ def streams(subject: Subject, seed: int = 0, *, length: int = LENGTH) -> dict[st
     found["all of these in turn"] = _of_length(length, lambda: source.choice(list(makers.values()))(source))
     sensor = subject.sensor
     data = sensor.frames[sensor.data_frame]
-    numbers = itertools.count()
-    frames = _of_length(length, lambda: subject.example(sensor.data_frame, seed=next(numbers) % SEEDS))
+    seeds = itertools.cycle(range(_seeds(subject)))
+    frames = _of_length(length, lambda: subject.example(sensor.data_frame, seed=next(seeds)))
     return {**found, SMOOTH: [*([subject.example(data.after)] if data.after else []), *frames]}
 
 
@@ -87,18 +92,19 @@ def calls_per_byte(sensor: Sensor, parts: list[bytes]) -> float:
     return sum(entry.callcount for entry in profile.getstats()) / sum(map(len, parts))
 
 
-def kept(sensor: Sensor, parts: list[bytes]) -> int:
-    """Return how many bytes the frames of a stream take, apart from its own bytes.
+def kept_per_byte(sensor: Sensor, parts: list[bytes]) -> float:
+    """Return how many bytes the frames of a stream take, apart from its own bytes, per byte.
 
     If these are too many, the stream is read again, because layouts that the engine remembers count only the first time.
     """
+    length = sum(map(len, parts))
     gc.freeze()  # collections are to look at what is made from here on, and at nothing else
     tracemalloc.start()
     try:
         held = _held(sensor, parts)
-        if held >= MAX_KEPT_PER_BYTE * LENGTH:
+        if held >= MAX_KEPT_PER_BYTE * length:
             held = min(held, _held(sensor, parts))
-        return held
+        return held / length
     finally:
         tracemalloc.stop()
         gc.unfreeze()
@@ -117,6 +123,11 @@ def _frames(sensor: Sensor, parts: list[bytes]) -> list[Frames]:
     return [decoder.datagrams(parts)] if sensor.datagrams else [*decoder.frames(b"".join(parts)), *decoder.rest()]
 
 
+def _seeds(subject: Subject) -> int:
+    """Return how many examples of each frame type streams are made of."""
+    return min(subject.scale_rounds(SEEDS, LEAST_SEEDS), SEEDS)
+
+
 def _of_length(length: int, make: Callable[[], bytes]) -> list[bytes]:
     parts, size = list[bytes](), 0
     while size < length:
@@ -131,10 +142,11 @@ def _makers(subject: Subject) -> dict[str, Callable[[random.Random], bytes]]:
     names, after = list(incoming), {name: frame.after for name, frame in incoming.items()}
     announcing = sorted({name for name in after.values() if name})
     of_header = functools.cache(functools.partial(_of_random_header, subject))
+    seeds = _seeds(subject)
     with_headers = [(name, seed) for name in names if of_header(name, 0) for seed in range(HEADERS)]
 
     def example(source: random.Random, name: str) -> bytes:
-        return subject.example(name, seed=source.randrange(SEEDS))
+        return subject.example(name, seed=source.randrange(seeds))
 
     def behind(source: random.Random, name: str, data: bytes) -> bytes:
         """Some bytes like a frame, once in a while behind the announcement that they need."""

@@ -17,7 +17,7 @@ from lidarspec.testing.subject import Subject
 from tests.engine.oracle import Cut
 
 #: about so many bytes to a stream: the oracle takes its time.
-LENGTH = 1500
+LENGTH = 800
 MEGABYTE = 1 << 20
 MANY_HEADERS = 200
 
