@@ -204,6 +204,19 @@ def pieces(
     return list(made.values())
 
 
+#: what each record of a manifest holds, and what it holds besides if its piece did not fail.
+_OF_EACH: Mapping[str, Any] = {"source": str, "target": str, "piece": int}
+_OF_FINISHED: Mapping[str, Any] = {"last": bool, "size": int, "modified": str, "digest": str, "output": str | None}
+
+
+def _is_record(record: Any) -> bool:
+    """Whether a value has what the record of a piece has, of the right types."""
+    if not isinstance(record, dict):
+        return False
+    wanted = _OF_EACH if "error" in record else {**_OF_EACH, **_OF_FINISHED}
+    return all(name in record and isinstance(record[name], kind) for name, kind in wanted.items())
+
+
 class Manifest:
     """What is known of the pieces that were written into a folder, by this run and those before.
 
@@ -241,18 +254,20 @@ class Manifest:
             return []
 
     def _known(self, line: str, number: int) -> bool:
-        """Remember the record of a line; return False for one that a killed run left incomplete.
+        """Remember the record of a line; return False for one that a killed run left incomplete, or that is damaged.
 
         Raises:
             SourceError: if the line nests more deeply than any record does: no run of ours wrote it.
         """
         try:
             record = json.loads(line)
-            self._records.setdefault((record["source"], record["target"]), {})[record["piece"]] = record
-        except (ValueError, KeyError, TypeError):
+        except ValueError:
             return False
         except RecursionError:
             raise SourceError(f"{self.path}: line {number}: brackets are nested too deeply") from None
+        if not _is_record(record):
+            return False
+        self._records.setdefault((record["source"], record["target"]), {})[record["piece"]] = record
         return True
 
     def has(self, path: str) -> bool:

@@ -14,19 +14,21 @@ import struct
 import tempfile
 import zlib
 from collections.abc import Callable, Collection, Iterable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
 
 import lidarspec as ls
 from lidarspec import Sensor
+from lidarspec.batch import MANIFEST, Manifest, Piece
 from lidarspec.captures.bulk import CaptureBatches
 from lidarspec.captures.pcap import CaptureReader, StreamReader
 from lidarspec.device.settings import FILE as SETTINGS, devices
 from lidarspec.framing.frame_engine import codec
 from lidarspec.recording.format import DATAGRAM, EVENT, HEADER, MAGIC, RECEIVED, Header, Recording, packed
 from lidarspec.simulation.scenes import read_scene
+from lidarspec.stores import digest, stamp
 from lidarspec.testing import subject as material
 from lidarspec.testing.findings import Violation
 from lidarspec.testing.subject import Subject
@@ -98,10 +100,12 @@ class Target:
 
 #: group -> its share of all inputs, from what an input costs and how much there is to get wrong.
 SHARES = {
-    "frame": 0.57,
+    "frame": 0.53,
     "stream": 0.02,
     "capture": 0.15,
     "file": 0.02,
+    "log": 0.01,
+    "manifest": 0.03,
     "recording": 0.05,
     "settings": 0.03,
     "scene": 0.03,
@@ -123,6 +127,7 @@ def targets(folder: Path, sensors: Collection[Sensor]) -> dict[str, Target]:
     found = [_frame(sensor, name) for sensor, name in distinct_frames(sensors)]
     found += [_stream(sensor) for sensor in distinct_sensors(sensors)]
     found += [_capture(), _file(folder), _recording(folder), _settings(folder), _scene(folder), _vectors(folder)]
+    found += [_manifest(folder), *(_log(folder, kind) for kind in ("mcap", "bag", "db3"))]
     found += [_calibration(sensor, option, folder) for sensor in sensors if sensor.id not in SHAPES for option in sensor.configure.files]
     text = [word.encode() for word in HOSTILE]
     printed = [b"54 2c", b"0: {0x54, 0x2C}; // one", b"0000  54 2c  T,\n0002", b"[12:00:01.5] 54 /* */"]
@@ -284,6 +289,51 @@ def _file(folder: Path) -> Target:
         ]
 
     return Target("file", run, examples, (ls.LidarSpecError,), lambda: [*EDGES, *(word.encode() for word in HOSTILE)])
+
+
+def _log(folder: Path, kind: str) -> Target:
+    """Logs of ROS and Foxglove with packets of a sensor, named as what they are."""
+    path = folder / f"some.{kind}"
+
+    def run(data: bytes) -> None:
+        path.write_bytes(data)
+        with ls.open(path, VLP) as device:
+            for packets in device.packets():
+                len(packets)
+
+    def examples() -> list[bytes]:
+        frames = [ls.sensor(VLP).example("data", seed=seed) for seed in range(3)]
+        with tempfile.TemporaryDirectory() as place:
+            log = test_bags.recorded(Path(place), kind, {"/p": ("nebula_msgs/msg/NebulaPackets", frames)})
+            return [log.read_bytes()]
+
+    return Target(f"log {kind}", run, examples, (ls.LidarSpecError,))
+
+
+def _manifest(folder: Path) -> Target:
+    """The manifest of a folder of results that another run has left, for the file that it is of and with the result beside it."""
+    results = folder / "results"
+    source = folder / "drive.bin"
+    piece = Piece(str(source), STL, {}, str(results / "drive.ply"), True, 10**9)
+
+    def run(data: bytes) -> None:
+        results.mkdir(exist_ok=True)
+        source.write_bytes(b"")
+        Path(piece.target).touch()
+        (results / MANIFEST).write_bytes(data)
+        with contextlib.closing(Manifest(str(results))) as manifest:
+            manifest.finished(piece)
+            manifest.clear(piece)
+
+    def examples() -> list[bytes]:
+        source.write_bytes(b"")
+        made_of = stamp(str(source))
+        counts = {"first_scan": 0, "scans": 3, "points": 900, "warnings": []}
+        done = piece.record(**made_of, digest=digest(str(source)), **counts, output=piece.output)
+        failed = replace(piece, number=1).failed(ls.SourceError("gone"))
+        return [b"".join(json.dumps(record).encode() + b"\n" for record in (done, failed))]
+
+    return Target("manifest", run, examples, (ls.SourceError,), lambda: [b"[" * 5000, b"null", *TOML], is_text=True)
 
 
 def recorded(sensor: str, frames: Iterable[bytes]) -> bytes:
