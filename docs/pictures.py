@@ -82,7 +82,6 @@ def page(folder: Path, target: Path) -> None:
             seen = browser.new_page(viewport={"width": SIZE[0], "height": SIZE[1]}, color_scheme=SCHEME)
             seen.goto(serving.stdout.readline().strip())
             seen.wait_for_timeout(SETTLED)
-            seen.click("text=Live")  # the newest frame
             seen.wait_for_timeout(SETTLED / 5)
             seen.screenshot(path=target)
         finally:

@@ -18,6 +18,7 @@ MISSING = (
         "Python packages",
         "make test-all, which installs them",
     ),
+    (r"axe-core", "axe-core", "npm ci in lidarspec/view/page"),
     (r"Chromium", "Chromium", "apt-get install chromium"),
     (r"open3d", "Open3D", "pip install open3d"),
     (

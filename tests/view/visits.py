@@ -72,13 +72,23 @@ class Visit:
         states: how often it was told how things are.
     """
 
-    def __init__(self, browser: Any, link: str, *, theme: str = "dark") -> None:
+    def __init__(
+        self,
+        browser: Any,
+        link: str,
+        *,
+        theme: str = "dark",
+        size: tuple[int, int] = (1440, 900),
+        touch: bool = False,
+    ) -> None:
         self.link = link
         self.asked: list[dict[str, Any]] = []
         self.told: dict[str, dict[str, Any]] = {}
         self.states = 0
         self.errors: list[str] = []
-        self.context = browser.new_context(viewport={"width": 1440, "height": 900}, color_scheme=theme)
+        width, height = size
+        viewport = {"width": width, "height": height}
+        self.context = browser.new_context(viewport=viewport, color_scheme=theme, has_touch=touch, is_mobile=touch)
         self.page = self.context.new_page()
         self.page.on("pageerror", lambda error: self.errors.append(str(error)))
         self.page.on("console", lambda message: message.type == "error" and self.errors.append(message.text))

@@ -5,19 +5,19 @@
  */
 
 import { Anatomy, bitPicture, hexed, type Part } from "./anatomy";
-import { made, Rows } from "./dom";
+import { isNarrow, made, narrowness, Rows } from "./dom";
 import type { Ask, Frame } from "./protocol";
 
-const ACROSS = 16;
-/** Pixels of a row of bytes, and of the tree. */
-const LINE = 19;
-const BRANCH = 22;
+/** Bytes in a row, and pixels of a row of bytes and of the tree: those of a phone are touched. */
+const WIDE = { across: 16, line: 19, branch: 22 };
+const NARROW = { across: 8, line: 32, branch: 44 };
 /** Colours of fields, which begin again after so many. */
 const KINDS = 8;
 const COUNTS = new Intl.NumberFormat("en-US");
 
 export class Bytes {
-  readonly #live = made("button", { className: "live", textContent: "Live", title: "Follow the newest frame, twice a second" });
+  readonly #live = made("button", { className: "live", textContent: "Live", title: "Follow the newest frame, twice a second; or hold the one that is shown" });
+  readonly #held = made("span", { className: "badge held", textContent: "held" });
   readonly #title = made("span", { className: "caption" });
   readonly #verdict = made("span", { className: "verdict" });
   readonly #said = made("p", { className: "said" });
@@ -31,7 +31,8 @@ export class Bytes {
   #unfolded = new Set<string>();
   #pointed: Part | null = null;
   #kept: Part | null = null;
-  #watching = false;
+  #watching = true;
+  #sizes = isNarrow() ? NARROW : WIDE;
 
   constructor(
     readonly element: HTMLElement,
@@ -41,38 +42,43 @@ export class Bytes {
     const bar = made(
       "div",
       { className: "bar" },
-      made("button", { textContent: "‹", title: "The frame before", onclick: step(-1) }),
-      made("button", { textContent: "›", title: "The frame after", onclick: step(1) }),
+      made("button", { textContent: "‹", title: "The frame before", ariaLabel: "The frame before", onclick: step(-1) }),
+      made("button", { textContent: "›", title: "The frame after", ariaLabel: "The frame after", onclick: step(1) }),
       this.#live,
+      this.#held,
       this.#title,
       this.#verdict,
     );
-    const dump = made("div", { className: "dump scroll", tabIndex: 0 });
-    const tree = made("div", { className: "tree scroll", tabIndex: 0 });
+    const dump = made("div", { className: "dump scroll", tabIndex: 0, role: "group", ariaLabel: "Bytes" });
+    const tree = made("div", { className: "tree scroll", tabIndex: 0, role: "tree", ariaLabel: "Fields" });
     const heading = made("div", { className: "heading branch" }, ...["Field", "Raw", "Value", "Meaning"].map((name) => made("span", {}, name)));
     element.append(bar, made("div", { className: "beside" }, made("div", { className: "column" }, dump, this.#said), made("div", { className: "column" }, heading, tree)));
-    this.#dump = new Rows(dump, LINE, (number) => this.#line(number));
-    this.#tree = new Rows(tree, BRANCH, (number) => this.#branch(this.#seen[number]!));
+    this.#dump = new Rows(dump, this.#sizes.line, (number) => this.#line(number));
+    this.#tree = new Rows(tree, this.#sizes.branch, (number) => this.#branch(this.#seen[number]!));
+    narrowness().addEventListener("change", () => this.#resize());
     this.#live.onclick = () => this.watch(!this.#watching);
     this.#listen(dump, tree);
+    tree.onkeydown = (event) => this.#walk(event);
+    this.#tell();
     this.#say(null, null);
   }
 
   /** Show the newest frame again and again, or hold the one that is shown. */
   watch(frames: boolean): void {
     this.#watching = frames;
-    this.#live.setAttribute("aria-pressed", String(frames));
+    this.#tell();
     this.ask({ do: "watch", frames });
+  }
+
+  /** Say whether the frame is held. */
+  #tell(): void {
+    this.#live.setAttribute("aria-pressed", String(this.#watching));
+    this.#held.hidden = this.#watching;
   }
 
   /** Whether the newest frame is shown again and again. */
   get watching(): boolean {
     return this.#watching;
-  }
-
-  /** Whether there is a frame to look at. */
-  get empty(): boolean {
-    return this.#frame === null;
   }
 
   /** Ask for one frame, and hold it. */
@@ -105,7 +111,7 @@ export class Bytes {
   }
 
   show(frame: Frame): void {
-    if (frame.why === "last" && !this.#watching && this.#frame) return;
+    if (frame.why === "last" && !this.#watching) return; // it was on its way when another was held
     const before = this.#anatomy?.explanation.frame;
     this.#frame = frame;
     this.#anatomy = new Anatomy(frame.hex, frame.explanation);
@@ -113,13 +119,31 @@ export class Bytes {
     this.#pointed = this.#same(this.#pointed);
     this.#kept = frame.value === null ? (frame.why === "last" ? this.#same(this.#kept) : null) : (this.#anatomy.nodes.get(frame.value) ?? null);
     this.#head(frame);
-    this.#cells.clear();
-    this.#dump.show(Math.ceil(this.#anatomy.bytes.length / ACROSS));
+    this.#fill();
     this.#fold();
     if (frame.value !== null && this.#kept) this.#reveal(this.#kept);
     const fault = frame.explanation.fault;
-    if (frame.why === "damaged" && fault) this.#dump.reveal(Math.floor(Math.min(fault.offset, this.#anatomy.bytes.length - 1) / ACROSS));
+    if (frame.why === "damaged" && fault) this.#dump.reveal(this.#lineOf(Math.min(fault.offset, this.#anatomy.bytes.length - 1)));
     this.#mark();
+  }
+
+  #fill(): void {
+    this.#cells.clear();
+    this.#dump.show(Math.ceil((this.#anatomy?.bytes.length ?? 0) / this.#sizes.across));
+  }
+
+  /** Make all rows anew in a window that has become narrow or wide. */
+  #resize(): void {
+    this.#sizes = isNarrow() ? NARROW : WIDE;
+    this.#dump.height = this.#sizes.line;
+    this.#tree.height = this.#sizes.branch;
+    this.#fill();
+    this.#fold();
+  }
+
+  /** The row of bytes that has an offset. */
+  #lineOf(offset: number): number {
+    return Math.floor(offset / this.#sizes.across);
   }
 
   #same(node: Part | null): Part | null {
@@ -147,7 +171,31 @@ export class Bytes {
     this.#anatomy!.around(node.path).forEach((path) => this.#unfolded.add(path));
     this.#fold();
     this.#tree.reveal(this.#seen.indexOf(node));
-    this.#dump.reveal(Math.floor(node.start / ACROSS));
+    this.#dump.reveal(this.#lineOf(node.start));
+  }
+
+  /** Go through the tree by arrow keys, as in other trees: left and right fold and unfold. */
+  #walk(event: KeyboardEvent): void {
+    const place = this.#kept ? this.#seen.indexOf(this.#kept) : -1;
+    const node = this.#seen[place];
+    const last = this.#seen.length - 1;
+    const isOpen = node !== undefined && this.#unfolded.has(node.path);
+    let next = place;
+    if (event.key === "ArrowDown") next = Math.min(place + 1, last);
+    else if (event.key === "ArrowUp") next = Math.max(place - 1, 0);
+    else if (event.key === "Home") next = 0;
+    else if (event.key === "End") next = last;
+    else if (event.key === "ArrowRight" && node?.inside.length && !isOpen) this.#unfolded.add(node.path);
+    else if (event.key === "ArrowLeft" && isOpen) this.#unfolded.delete(node.path);
+    else return;
+    event.preventDefault();
+    this.#kept = this.#seen[next] ?? null;
+    if (this.#kept) {
+      this.#fold();
+      this.#tree.reveal(this.#seen.indexOf(this.#kept));
+      this.#dump.reveal(this.#lineOf(this.#kept.start));
+    }
+    this.#mark();
   }
 
   #listen(dump: HTMLElement, tree: HTMLElement): void {
@@ -180,7 +228,7 @@ export class Bytes {
         if (!this.#unfolded.delete(node.path)) this.#unfolded.add(node.path);
         this.#fold();
       }
-      this.#dump.reveal(Math.floor(node.start / ACROSS));
+      this.#dump.reveal(this.#lineOf(node.start));
       this.#mark();
     });
   }
@@ -192,7 +240,7 @@ export class Bytes {
     const marked = [this.#kept, this.#pointed].map((node) => (node ? anatomy.bits(node) : new Map<number, number>()));
     this.#cells.forEach((cells, place) => marks(cells, marked[0]!.get(place) ?? 0, marked[1]!.get(place) ?? 0));
     this.#branches.forEach((branch, path) => {
-      branch.classList.toggle("kept", path === this.#kept?.path);
+      keep(branch, path === this.#kept?.path);
       branch.classList.toggle("pointed", this.#pointed !== null && (path === this.#pointed.path || this.#isFolded(path, this.#pointed)));
     });
     const owners = offset === null ? [] : anatomy.owners(offset);
@@ -208,7 +256,7 @@ export class Bytes {
   #say(node: Part | null, shared: number | null): void {
     const anatomy = this.#anatomy;
     this.#said.replaceChildren();
-    if (!node || !anatomy) return this.#said.append("Point at a byte or at a field; a click keeps it marked. Live follows the newest frame.");
+    if (!node || !anatomy) return this.#said.append("Point at a byte or at a field; a click keeps it marked.");
     const nodes = shared === null ? [node] : anatomy.owners(shared).map((owner) => anatomy.nodes.get(anatomy.values[owner]!.path)!);
     for (const [number, part] of nodes.entries()) this.#said.append(...(number ? [made("br")] : []), ...this.#words(part, anatomy));
   }
@@ -224,13 +272,13 @@ export class Bytes {
     return [made("code", {}, `${where}  ${drawn}`), " ", made("b", {}, node.path), ` ${text}`, node.meaning ? ` · ${node.meaning}` : ""];
   }
 
-  /** Sixteen bytes: where they are, in hexadecimal, and as text. */
+  /** A row of bytes: where they are, in hexadecimal, and as text. */
   #line(number: number): HTMLElement {
     const { bytes } = this.#anatomy!;
-    const first = number * ACROSS;
+    const first = number * this.#sizes.across;
     const row = made("div", { className: "line" }, made("span", { className: "offset" }, first.toString(16).padStart(4, "0")));
     const [left, right] = [made("span", { className: "hex" }), made("span", { className: "text" })];
-    for (let offset = first; offset < Math.min(first + ACROSS, bytes.length); offset++) {
+    for (let offset = first; offset < Math.min(first + this.#sizes.across, bytes.length); offset++) {
       const byte = bytes[offset]!;
       const cells = [hexed([byte]), byte > 31 && byte < 127 ? String.fromCharCode(byte) : "·"].map((text) => this.#cell(offset, text));
       left.append(cells[0]!);
@@ -261,9 +309,18 @@ export class Bytes {
     const cells = [raw, value?.text ?? "", node.meaning].map((text) => made("span", { textContent: text, title: text }));
     const row = made("div", { className: node.right ? "branch" : "branch wrong", data: { path: node.path } }, name, ...cells);
     this.#branches.set(node.path, row);
-    row.classList.toggle("kept", node.path === this.#kept?.path);
+    row.role = "treeitem";
+    row.ariaLevel = String(node.depth + 1);
+    if (isFolder) row.ariaExpanded = String(this.#unfolded.has(node.path));
+    keep(row, node.path === this.#kept?.path);
     return row;
   }
+}
+
+/** Show that a row of the tree is kept, or that it is not. */
+function keep(row: HTMLElement, isKept: boolean): void {
+  row.classList.toggle("kept", isKept);
+  row.ariaSelected = String(isKept);
 }
 
 /** What a folded node holds, in words. */

@@ -3,6 +3,7 @@
 import uPlot from "uplot";
 import "uplot/dist/uPlot.min.css";
 import { made } from "./dom";
+import { missing, split } from "./missing";
 import type { Figures } from "./protocol";
 
 /** Seconds that charts show. */
@@ -16,13 +17,23 @@ interface Chart {
   of: (figures: Figures) => number | null;
   /** from what value on it is an alarm */
   alarming?: number;
+  /** what the value is made of, in words */
+  split?: (figures: Figures) => string;
 }
 
-const percent = (value: number | null | undefined): number | null => (value == null ? null : 100 * value);
 const CHARTS: Chart[] = [
   { title: "Scan rate", unit: "Hz", digits: 2, of: ({ speed_hz }) => speed_hz ?? null },
-  { title: "Packets lost", unit: "%", digits: 2, of: ({ loss_rate }) => percent(loss_rate), alarming: 1 },
-  { title: "Frames damaged", unit: "%", digits: 2, of: ({ error_rate }) => percent(error_rate), alarming: 1 },
+  {
+    title: "Packets missing",
+    unit: "%",
+    digits: 2,
+    of: (figures) => missing(figures)?.total ?? null,
+    alarming: 1,
+    split: (figures) => {
+      const found = missing(figures);
+      return found === null ? "" : split(found);
+    },
+  },
   { title: "Jitter", unit: "ms", digits: 3, of: ({ jitter_s }) => (jitter_s == null ? null : 1e3 * jitter_s) },
 ];
 
@@ -33,7 +44,7 @@ const FIGURES: [string, (figures: Figures) => string | null][] = [
   ["Points per scan", ({ points }) => (points == null ? null : whole.format(points))],
   ["With a return", ({ points, valid }) => (!points || valid == null ? null : `${((100 * valid) / points).toFixed(1)} %`)],
   ["Bytes skipped", ({ skipped_rate }) => (skipped_rate == null ? null : `${(100 * skipped_rate).toFixed(2)} %`)],
-  ["Packets lost so far", ({ lost }) => (lost == null ? null : whole.format(lost))],
+  ["Packets missing so far", ({ lost }) => (lost == null ? null : whole.format(lost))],
   ["Longest gap", ({ longest_gap_s: gap }) => (gap == null ? null : `${(1e3 * gap).toFixed(1)} ms`)],
   ["Disconnects", ({ disconnects }) => (disconnects ? whole.format(disconnects) : null)],
 ];
@@ -43,6 +54,7 @@ export class Charts {
   readonly #series: (number | null)[][] = CHARTS.map(() => []);
   readonly #plots: uPlot[] = [];
   readonly #values = CHARTS.map(() => made("b"));
+  readonly #splits = CHARTS.map(({ split: words }) => (words ? [made("p", { className: "split" })] : []));
   readonly #boxes: HTMLElement[];
   readonly #watcher: ResizeObserver;
 
@@ -51,7 +63,7 @@ export class Charts {
     readonly list: HTMLElement,
   ) {
     this.#boxes = CHARTS.map(({ title }, number) =>
-      made("div", { className: "chart" }, made("h3", {}, title, made("span", { className: "grow" }), this.#values[number]!), made("div", { className: "plot" })),
+      made("div", { className: "chart" }, made("h2", {}, title, made("span", { className: "grow" }), this.#values[number]!), ...this.#splits[number]!, made("div", { className: "plot" })),
     );
     element.replaceChildren(...this.#boxes);
     this.#watcher = new ResizeObserver(() => this.#plots.forEach((plot) => plot.setSize({ width: this.#width, height: TALL })));
@@ -65,6 +77,7 @@ export class Charts {
     if (at === this.#times.at(-1)) return;
     this.#times.push(at);
     this.#series.forEach((series, number) => series.push(CHARTS[number]!.of(figures)));
+    this.#splits.forEach((lines, number) => lines.forEach((line) => (line.textContent = CHARTS[number]!.split!(figures))));
     const old = this.#times.findIndex((time) => time >= at - SHOWN);
     for (const series of [this.#times, ...this.#series]) series.splice(0, old);
     this.#draw();

@@ -7,7 +7,7 @@ import type { Argument, Ask, Command, Composed, Hello, Refused, Replied } from "
 const SETTLED = 200;
 
 export class Commands {
-  readonly #list = made("div", { className: "list scroll" });
+  readonly #list = made("div", { className: "list scroll", tabIndex: 0, role: "group", ariaLabel: "Commands" });
   readonly #form = made("form", { className: "form" });
   readonly #bytes = made("div", { className: "bytes" });
   readonly #reply = made("div", { className: "reply" });
@@ -21,7 +21,7 @@ export class Commands {
     readonly element: HTMLElement,
     readonly ask: (words: Ask) => void,
   ) {
-    element.append(made("div", { className: "beside" }, this.#list, made("div", { className: "detail scroll" }, this.#hindrance, this.#form, this.#bytes, this.#reply)));
+    element.append(made("div", { className: "beside" }, this.#list, made("div", { className: "detail scroll", tabIndex: 0, role: "group", ariaLabel: "Command" }, this.#hindrance, this.#form, this.#bytes, this.#reply)));
     this.#form.onsubmit = (event) => {
       event.preventDefault();
       this.#say("sent, waiting for the reply");

@@ -21,6 +21,7 @@ const KEYS = [
   ["c", "what colours show"],
   ["+ -", "zoom in and out"],
   ["arrows", "move what is in the middle"],
+  ["enter", "with the picture in focus: the frame of the point in the middle"],
   ["0", "all of it again"],
   ["1 2 3 4", "polar, top, side, 3D"],
   ["r", "record to a file, and stop"],
@@ -131,7 +132,7 @@ export class Controls {
   #pressed(event: KeyboardEvent): void {
     const target = event.target as Element;
     const isTyped = target.matches("input:not([type=range]), select, textarea") || (event.key === " " && target.matches("button, summary"));
-    if (isTyped || event.ctrlKey || event.metaKey || event.altKey || (event.key.startsWith("Arrow") && target.matches("input, .scroll"))) return;
+    if (isTyped || event.ctrlKey || event.metaKey || event.altKey || (event.key.startsWith("Arrow") && target.matches("input, .scroll, #side"))) return;
     const views = Object.keys(VIEWS) as View[];
     const by = MOVES[event.key];
     if (by) this.picture.move(...by);

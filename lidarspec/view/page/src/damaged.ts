@@ -1,9 +1,10 @@
 /** The frames that were damaged, the newest first, each with what is wrong with it. */
 
-import { made, Rows } from "./dom";
+import { isNarrow, made, narrowness, Rows } from "./dom";
 import type { Damage } from "./protocol";
 
-const LINE = 24;
+/** Pixels of a row; those of a phone are touched. */
+const LINE = { wide: 24, narrow: 44 };
 /** Damaged frames that are kept in the list. */
 const KEPT = 1000;
 
@@ -18,9 +19,13 @@ export class Damaged {
     readonly open: (number: number) => void,
   ) {
     const heading = made("div", { className: "heading damage" }, ...["Number", "Time", "Size", "Verdict"].map((name) => made("span", {}, name)));
-    const list = made("div", { className: "scroll" });
+    const list = made("div", { className: "scroll", tabIndex: 0, role: "group", ariaLabel: "Damaged frames" });
     element.append(heading, this.#empty, list);
-    this.#list = new Rows(list, LINE, (number) => this.#row(this.#frames[number]!));
+    this.#list = new Rows(list, isNarrow() ? LINE.narrow : LINE.wide, (number) => this.#row(this.#frames[number]!));
+    narrowness().addEventListener("change", () => {
+      this.#list.height = isNarrow() ? LINE.narrow : LINE.wide;
+      this.#list.show(this.#frames.length);
+    });
   }
 
   /** Add those that have come since. */

@@ -21,6 +21,15 @@ export function named<T extends HTMLElement = HTMLElement>(id: string): T {
   return element as T;
 }
 
+/** Whether the window is as narrow as a phone, as `style.css` has it. */
+export function narrowness(): MediaQueryList {
+  return matchMedia("(max-width: 699px)");
+}
+
+export function isNarrow(): boolean {
+  return narrowness().matches;
+}
+
 /** Choose one of some buttons, or none. */
 export function chosen(buttons: Iterable<HTMLElement>, value: string): void {
   for (const button of buttons) button.setAttribute("aria-pressed", String(button.dataset.value === value));
@@ -37,7 +46,7 @@ export class Rows {
 
   constructor(
     readonly element: HTMLElement,
-    readonly height: number,
+    public height: number,
     readonly row: (number: number) => HTMLElement,
   ) {
     element.append(this.#inside);

@@ -6,17 +6,14 @@ import { Charts } from "./charts";
 import { Commands } from "./commands";
 import { Controls } from "./controls";
 import { Damaged } from "./damaged";
-import { chosen, made, named } from "./dom";
+import { made, named } from "./dom";
+import { Drawer } from "./drawer";
 import { Picture, type Theme } from "./picture";
 import { type Ask, Connection, type Hello, type Message, Pace, type Refused, type Scan, type State, thinned } from "./protocol";
 
 /** Milliseconds that a refusal is shown, and of the stretch that pictures a second are counted over. */
 const TOLD = 8000;
 const COUNTED = 3000;
-/** Pixels of the window's height from which on the bytes are open at first. */
-const ROOMY = 800;
-const TABS = { bytes: "Bytes", damaged: "Damaged", commands: "Commands" };
-type Tab = keyof typeof TABS;
 
 class Page {
   readonly #pace = new Pace();
@@ -24,16 +21,16 @@ class Page {
   readonly #charts = new Charts(named("charts"), named("figures"));
   readonly #bytes = new Bytes(named("bytes"), (words) => this.#ask(words));
   readonly #damaged = new Damaged(named("damaged"), (number) => {
-    this.#show("bytes");
+    this.#drawer.show("bytes");
     this.#bytes.ofDamaged(number);
   });
   readonly #commands = new Commands(named("commands"), (words) => this.#ask(words));
+  readonly #drawer = new Drawer(() => this.#watch());
   readonly #dark = matchMedia("(prefers-color-scheme: dark)");
   readonly #pictures: number[] = [];
   #picture: Picture | null = null;
   #controls: Controls | null = null;
   #hello: Hello | null = null;
-  #tab: Tab | null = null;
   #theme: Theme = "dark";
   #ended = "";
   #refused = "";
@@ -45,11 +42,10 @@ class Page {
   constructor() {
     const url = new URL(`socket${location.search}`, location.href);
     url.protocol = url.protocol.replace("http", "ws");
-    this.#tabs();
     this.#dress(this.#dark.matches ? "dark" : "light");
     this.#dark.onchange = () => this.#dress(this.#dark.matches ? "dark" : "light");
     named("theme").onclick = () => this.#dress(this.#theme === "dark" ? "light" : "dark");
-    document.addEventListener("visibilitychange", () => this.#ask({ do: "watch", frames: !document.hidden && this.#watched }));
+    document.addEventListener("visibilitychange", () => this.#watch());
     this.#connection = new Connection(url.href, {
       scan: (scan) => this.#picture?.show(scan),
       said: (message) => this.#said(message),
@@ -68,7 +64,12 @@ class Page {
   }
 
   get #watched(): boolean {
-    return this.#bytes.watching && this.#tab === "bytes";
+    return this.#bytes.watching && this.#drawer.open === "bytes" && !document.hidden;
+  }
+
+  /** Ask for the newest frame twice a second while it is seen. */
+  #watch(): void {
+    if (this.#open) this.#ask({ do: "watch", frames: this.#watched });
   }
 
   #ask(words: Ask): void {
@@ -102,7 +103,7 @@ class Page {
       case "state":
         return this.#state(message);
       case "frame":
-        return this.#frame(message);
+        return this.#bytes.show(message);
       case "gone":
         return this.#bytes.gone(message.what);
       case "composed":
@@ -130,7 +131,7 @@ class Page {
     this.#charts.clear();
     for (const figures of hello.history) this.#charts.add(figures);
     this.#commands.show(hello);
-    if (this.#tab === "bytes" && (this.#watched || this.#bytes.empty)) this.#ask({ do: "watch", frames: true });
+    if (this.#watched) this.#watch();
   }
 
   #begin(hello: Hello): void {
@@ -152,7 +153,7 @@ class Page {
 
   #picked(row: number, scan: Scan): void {
     this.#picture?.mark(row);
-    this.#show("bytes");
+    this.#drawer.show("bytes");
     this.#bytes.ofPoint(scan.scan, scan.columns.get("index")![row]!);
   }
 
@@ -184,13 +185,8 @@ class Page {
     named("warnings").replaceChildren(...state.warnings.map((text) => made("p", { textContent: text })));
     named("info").replaceChildren(...Object.entries(state.info).flatMap(([name, text]) => [made("dt", { textContent: name }), made("dd", { textContent: text })]));
     this.#damaged.add(state.damaged.newest);
-    named("tabs").querySelector("[data-value=damaged] b")!.textContent = state.damaged.total ? String(state.damaged.total) : "";
+    this.#drawer.count("damaged", state.damaged.total);
     this.#controls?.state(state);
-  }
-
-  #frame(frame: Extract<Message, { is: "frame" }>): void {
-    this.#bytes.show(frame);
-    if (frame.why === "last" && !this.#watched) this.#ask({ do: "watch", frames: false });
   }
 
   #refuse(refused: Refused): void {
@@ -232,29 +228,6 @@ class Page {
     document.documentElement.dataset.theme = theme;
     this.#picture?.theme(theme);
     this.#charts.theme();
-  }
-
-  #tabs(): void {
-    const buttons = Object.entries(TABS).map(([tab, text]) => made("button", { data: { value: tab }, onclick: () => this.#show(this.#tab === tab ? null : (tab as Tab)) }, text, made("b")));
-    named("tabs").append(...buttons);
-    const splitter = named("splitter");
-    const drawer = named("drawer");
-    splitter.onpointerdown = (event) => splitter.setPointerCapture(event.pointerId);
-    splitter.onpointermove = (event) => {
-      if (splitter.hasPointerCapture(event.pointerId)) drawer.style.height = `${Math.min(Math.max(innerHeight - event.clientY, 90), innerHeight - 200)}px`;
-    };
-    this.#show(innerHeight >= ROOMY ? "bytes" : null);
-  }
-
-  /** Open one of the panels, or none. */
-  #show(tab: Tab | null): void {
-    const before = this.#watched;
-    this.#tab = tab;
-    chosen(named("tabs").querySelectorAll("button"), tab ?? "");
-    named("drawer").classList.toggle("open", tab !== null);
-    for (const name of Object.keys(TABS)) named(name).hidden = name !== tab;
-    const first = tab === "bytes" && this.#bytes.empty;
-    if (this.#open && (before !== this.#watched || first)) this.#ask({ do: "watch", frames: this.#watched || first });
   }
 }
 

@@ -17,6 +17,7 @@ import {
   RGBAFormat,
   Scene,
   ShaderMaterial,
+  TOUCH,
   Vector3,
   WebGLRenderer,
 } from "three";
@@ -61,8 +62,9 @@ const BEYOND = 0.005;
 const MARGIN = 1.12;
 /** A box whose shorter side of the sensor is at least this share of the longer one has the sensor in its middle. */
 const CENTRED = 0.3;
-/** Pixels that a pointer may be beside a point, and that it may move within a click. */
+/** Pixels that a mouse and a finger may be beside a point, and that they may move within a click. */
 const BESIDE = 9;
+const BESIDE_FINGER = 22;
 const STILL = 4;
 const FIELD_OF_VIEW = 45;
 /** From where a cloud is seen at first: behind the sensor and above it; and how often the distance is bettered until all is seen. */
@@ -192,12 +194,12 @@ export class Picture {
   }
 
   /** The point at a place of the element, in its pixels: its place in the columns, null where there is none. */
-  pick(across: number, down: number): number | null {
+  pick(across: number, down: number, beside = BESIDE): number | null {
     const columns = this.#columns();
     if (!columns) return null;
     const [x, y, z] = columns;
     const place = this.#placer();
-    let [nearest, best] = [-1, BESIDE ** 2];
+    let [nearest, best] = [-1, beside ** 2];
     for (let row = 0; row < x.length; row++) {
       const spot = place(x[row]!, y[row]!, z[row]!);
       const away = spot === null ? Infinity : (spot[0] - across) ** 2 + (spot[1] - down) ** 2;
@@ -280,9 +282,18 @@ export class Picture {
     });
     canvas.addEventListener("click", (event) => {
       if (Math.hypot(event.offsetX - pressed[0], event.offsetY - pressed[1]) > STILL || !this.#scan) return;
-      const row = this.pick(...(this.#pointer ?? at(event))); // the one that is marked: a click comes in whole pixels
-      if (row !== null) this.options.picked?.(row, this.#scan);
+      // the one that is marked: a click comes in whole pixels
+      this.#choose(this.#pointer ?? at(event), event.pointerType === "touch" ? BESIDE_FINGER : BESIDE);
     });
+    this.element.addEventListener("keydown", (event) => {
+      const { clientWidth, clientHeight } = this.element;
+      if (event.key === "Enter") this.#choose([clientWidth / 2, clientHeight / 2], Infinity);
+    });
+  }
+
+  #choose([across, down]: Place, beside: number): void {
+    const row = this.pick(across, down, beside);
+    if (row !== null) this.options.picked?.(row, this.#scan!);
   }
 
   #controlled(): OrbitControls {
@@ -291,7 +302,10 @@ export class Picture {
     const controls = new OrbitControls(this.#camera, this.#renderer.domElement);
     controls.enableRotate = this.#view === "orbit";
     controls.zoomToCursor = true;
-    if (!controls.enableRotate) controls.mouseButtons.LEFT = controls.mouseButtons.RIGHT;
+    if (!controls.enableRotate) {
+      controls.mouseButtons.LEFT = controls.mouseButtons.RIGHT;
+      controls.touches.ONE = TOUCH.PAN;
+    }
     controls.addEventListener("start", () => (this.#moved = true));
     controls.addEventListener("change", () => this.#ask());
     return controls;
