@@ -172,9 +172,12 @@ def recorded(path: Path) -> list[Record]:
 
 @pytest.mark.slow
 def test_captures_and_recordings_on_standard_input_are_read_as_from_files(tmp_path: Path) -> None:
-    path, recording, copy = capture(tmp_path / "it.pcap", *records(40)), tmp_path / "it.lsr", tmp_path / "copy.lsr"
+    number = 6
+    path, recording, copy = capture(tmp_path / "it.pcap", *records(number)), tmp_path / "it.lsr", tmp_path / "copy.lsr"
     blocks = tmp_path / "it.pcapng"
-    blocks.write_bytes(made.section() + made.interface() + b"".join(made.packet(made.frame(each)) for each in simulate(ls.sensor(M1), 40)))
+    blocks.write_bytes(
+        made.section() + made.interface() + b"".join(made.packet(made.frame(each)) for each in simulate(ls.sensor(M1), number))
+    )
     ran("record", path, "-o", recording, "-s", M1)
     for file in (path, blocks, recording):
         held = file.read_bytes()
@@ -185,7 +188,7 @@ def test_captures_and_recordings_on_standard_input_are_read_as_from_files(tmp_pa
         ran("record", file, "-o", recording, "--force") if file != recording else None
         assert recorded(copy) == recorded(recording)
         said = ran("replay", "-", "--to", tmp_path / "played.lsr", "--force", given=held).stderr
-        assert "40 chunks" in said
+        assert f"{number} chunks" in said
         assert [each.data for each in recorded(tmp_path / "played.lsr")] == [each.data for each in recorded(recording)]
     assert "only once" in ran("replay", "-", "--loop", given=held, code=2).stderr
     done = process("read", "-", "--packets", "--json", "-s", M1, given=path.read_bytes())

@@ -30,8 +30,8 @@ def test_values_at_the_edges_read_alike(name: str) -> None:
 @pytest.mark.slow
 @pytest.mark.parametrize("name", [*(pytest.param(name, marks=pytest.mark.soak) for name in COMPILED_SHAPES), *REPRESENTATIVES])
 def test_much_damaged_input_reads_alike(name: str) -> None:
-    assert_damaged_input_reads_alike(load_sensor(name), count=4)
-    assert_edge_values_read_alike(load_sensor(name), count=6)
+    assert_damaged_input_reads_alike(load_sensor(name), count=2)
+    assert_edge_values_read_alike(load_sensor(name), count=3)
 
 
 #: Places at which a frame is cut.

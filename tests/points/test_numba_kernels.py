@@ -128,9 +128,9 @@ def answers_in(module: str) -> list[tuple[Sensor, str]]:
     return list(answers.values())
 
 
-def simulated(sensor: Sensor, answer: str, backend: str) -> Packets:
+def simulated(sensor: Sensor, answer: str, backend: str, number: int = 2 * MANY) -> Packets:
     configured = sensor if answer == sensor.data_frame else sensor.configure(answer=answer)
-    frames = simulate(configured, 2 * MANY)
+    frames = simulate(configured, number)
     data: Any = frames
     if not is_datagram(configured.links.get("data")):
         data = opening(configured) + b"".join(frames)
@@ -141,7 +141,7 @@ def simulated(sensor: Sensor, answer: str, backend: str) -> Packets:
 @pytest.mark.parametrize("module", sensor_modules())
 def test_every_installed_sensor_has_a_kernel(module: str) -> None:
     for sensor, answer in answers_in(module):
-        made = plan(simulated(sensor, answer, "numpy"))
+        made = plan(simulated(sensor, answer, "numpy", number=max(sensor.frames[answer].confirm, 2)))
         assert "def kernel(" in written(made, tuple(made.expressions), made.varying).source, sensor.id
 
 
