@@ -208,7 +208,7 @@ class Device(Closing):
 
     @property
     def state(self) -> str:
-        """How the source is doing: "streaming", "waiting" (for a first frame), "silent" (for a second), "no frames" (bytes only),
+        """How the source is doing: "streaming", "waiting" (for a first frame), "silent" (for three seconds), "no frames" (bytes only),
         "disconnected", "ended" (a file) or "closed"."""
         return self._input.state
 

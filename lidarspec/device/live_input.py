@@ -32,8 +32,10 @@ from lidarspec.transports.base import HostClock, own_address, with_option
 from lidarspec.transports.open_url import control_link, has_control
 from lidarspec.transports.protocol import Chunk, LiveTransport, Sender, endpoint
 
-#: seconds after which silence, or bytes without a frame, are worth a word.
+#: seconds of bytes without a frame that are worth a word.
 PATIENCE = 0.9
+#: seconds after which a source is silent; a computer that stalls for a second is no reason.
+SILENT_AFTER_S = 3.0
 #: seconds between two decodings of what has come, and the longest that a wait goes on before others have their turn.
 PERIOD, TURN = 0.02, 0.05
 #: chunks decoded together.
@@ -82,7 +84,7 @@ class Watch:
         """One of "disconnected", "silent", "no frames", "waiting" (for the first frame) and "streaming"."""
         if not self._capture.connected:
             return "disconnected"
-        if self.silent_for > PATIENCE:
+        if self.silent_for > SILENT_AFTER_S:
             return "silent"
         longest = max((frame.max_length * frame.confirm for frame in self._sensor.frames.values()), default=0)
         if self._unframed_since is not None and time.monotonic() - self._unframed_since > PATIENCE and self._unframed > longest:

@@ -2,6 +2,10 @@
 
 from __future__ import annotations
 
+import os
+import pty
+import threading
+import tty
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -204,3 +208,47 @@ def test_a_damaged_packet_is_counted_once(browser: Any, tmp_path: Path) -> None:
         assert 45 < total < 55
         visit.context.close()
         assert not visit.errors
+
+
+def test_a_sensor_that_is_unplugged_is_said_and_its_picture_dimmed(browser: Any, tmp_path: Path) -> None:
+    """The line can be dismissed, and does not repeat the path of the port."""
+    sensor = ls.sensor("ldrobot-stl27l")
+    frames = list(ls.simulate(sensor, packets=1800))
+    master, slave = pty.openpty()
+    tty.setraw(slave)
+    port = tmp_path / "usb-a-port-with-a-name-that-is-as-long-as-those-by-id"
+    port.symlink_to(os.ttyname(slave))
+    unplugged = threading.Event()
+
+    def send() -> None:
+        number = 0
+        while not unplugged.wait(0.05):
+            for _ in range(90):
+                os.write(master, frames[number % len(frames)])
+                number += 1
+
+    sending = threading.Thread(target=send)
+    sending.start()
+    try:
+        with served(str(port), "-s", sensor.id) as link:
+            visit = Visit(browser, link)
+            visit.until(lambda: visit.text("#status") == "streaming", "it does not stream")
+            assert not visit.page.locator("#notice").is_visible()
+            assert not visit.page.locator("#age").is_visible()
+            unplugged.set()
+            visit.until(lambda: visit.page.locator("#age").is_visible(), "its age is not shown")
+            assert visit.value("getComputedStyle(document.getElementById('picture')).opacity") == "0.35"
+            notice = visit.page.locator("#notice")
+            visit.until(notice.is_visible, "nothing is said of it")
+            assert len(visit.text("#reason")) < 60
+            assert port.name not in visit.text("#reason")
+            visit.page.click("#dismiss")
+            visit.page.wait_for_timeout(1200)
+            assert not notice.is_visible()
+            visit.context.close()
+            assert not visit.errors
+    finally:
+        unplugged.set()
+        sending.join()
+        os.close(master)
+        os.close(slave)

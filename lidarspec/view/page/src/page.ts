@@ -9,8 +9,11 @@ import { Damaged } from "./damaged";
 import { made, named } from "./dom";
 import { Drawer } from "./drawer";
 import { Picture, type Theme } from "./picture";
+import { aged, isStale, reason, shortened } from "./staleness";
 import { type Ask, Connection, type Hello, type Message, Pace, type Refused, type Scan, type State, thinned } from "./protocol";
 
+/** Milliseconds from one look at the age of the picture to the next. */
+const AGED = 500;
 /** Milliseconds that a refusal is shown, and of the stretch that pictures a second are counted over. */
 const TOLD = 8000;
 const COUNTED = 3000;
@@ -34,6 +37,12 @@ class Page {
   #theme: Theme = "dark";
   #ended = "";
   #refused = "";
+  #reason = "";
+  #shown = "";
+  #dismissed = "";
+  /** the last state that the server has told, and when: milliseconds of this page */
+  #state: State | null = null;
+  #stateAt = 0;
   #refusals = 0;
   #open = false;
   #refusesLink = false;
@@ -44,6 +53,8 @@ class Page {
     url.protocol = url.protocol.replace("http", "ws");
     this.#dress(this.#dark.matches ? "dark" : "light");
     this.#dark.onchange = () => this.#dress(this.#dark.matches ? "dark" : "light");
+    named("dismiss").onclick = () => this.#dismiss();
+    setInterval(() => this.#age(), AGED);
     named("theme").onclick = () => this.#dress(this.#theme === "dark" ? "light" : "dark");
     document.addEventListener("visibilitychange", () => this.#watch());
     this.#connection = new Connection(url.href, {
@@ -101,7 +112,7 @@ class Page {
       case "hello":
         return this.#greet(message);
       case "state":
-        return this.#state(message);
+        return this.#tell(message);
       case "frame":
         return this.#bytes.show(message);
       case "gone":
@@ -171,18 +182,21 @@ class Page {
     return (1000 * this.#pictures.filter((time) => time > performance.now() - COUNTED).length) / COUNTED;
   }
 
-  #state(state: State): void {
+  #tell(state: State): void {
+    this.#state = state;
+    this.#stateAt = performance.now();
     const status = named("status");
     status.textContent = state.paused ? "paused" : state.state;
     status.className = `badge ${state.paused ? "" : ["streaming", "playing"].includes(state.state) ? "good" : state.state === "ended" ? "" : "bad"}`;
-    if (state.state !== "ended" && this.#ended) {
-      this.#ended = "";
-      this.#notice();
-    }
+    if (state.state !== "ended") this.#ended = "";
+    this.#reason = state.paused ? "" : reason(state.state);
+    this.#notice();
+    this.#age();
     const isLive = this.#hello?.live === true && !state.paused;
     if (state.figures) this.#charts.add(state.figures);
     this.#charts.tell(state.figures, [["Pictures", `${this.#rate().toFixed(1)} /s`], ...(isLive && this.#latency ? [["To the screen", `${this.#latency.toFixed(0)} ms`] as [string, string]] : [])]);
-    named("warnings").replaceChildren(...state.warnings.map((text) => made("p", { textContent: text })));
+    const { source } = this.#hello ?? { source: "" };
+    named("warnings").replaceChildren(...state.warnings.map((text) => made("p", { textContent: text.replace(`${source}: `, "") })));
     named("info").replaceChildren(...Object.entries(state.info).flatMap(([name, text]) => [made("dt", { textContent: name }), made("dd", { textContent: text })]));
     this.#damaged.add(state.damaged.newest);
     this.#drawer.count("damaged", state.damaged.total);
@@ -204,12 +218,34 @@ class Page {
   #notice(): void {
     let lost = this.#hello ? "The connection is lost; it is tried again." : "Connecting.";
     if (this.#refusesLink) lost = "The server was started again, with another token: open the link that it printed.";
-    const text = this.#open ? this.#ended || this.#refused : lost;
+    const text = this.#open ? this.#ended || this.#refused || this.#reason : lost;
+    if (text !== this.#shown) {
+      this.#shown = text;
+      this.#dismissed = "";
+      named("reason").textContent = shortened(text, this.#hello?.source ?? "");
+    }
     const notice = named("notice");
-    notice.textContent = text;
-    notice.hidden = !text;
+    notice.hidden = !text || text === this.#dismissed;
     notice.className = this.#open && this.#ended ? "" : "bad";
     if (!this.#open) [named("status").textContent, named("status").className] = ["no server", "badge bad"];
+  }
+
+  #dismiss(): void {
+    this.#dismissed = this.#shown;
+    this.#notice();
+  }
+
+  /** Dim a picture of a live source that is not the present any more, and say how old it is. */
+  #age(): void {
+    const state = this.#state;
+    const scan = this.#picture?.scan;
+    if (!state || !scan || !this.#hello) return;
+    const age = state.at + (performance.now() - this.#stateAt) / 1000 - scan.sent;
+    const stands = this.#hello.live && !(this.#open && state.paused);
+    const stale = stands && isStale(age, scan.rate_hz);
+    named("stage").classList.toggle("stale", stale);
+    named("age").hidden = !stale;
+    named("age").textContent = stale ? aged(age) : "";
   }
 
   async #save(as: string): Promise<void> {
