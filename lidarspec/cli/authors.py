@@ -92,8 +92,13 @@ def check(ctx: click.Context, name: str, max_examples: int, vectors: str | None,
     """
     import_library("hypothesis", "testing")
     file = Path(vectors) if vectors else None
-    with Progress() as line:
-        found = list(reports(target(name), name, examples=max_examples, vectors=file, watch=lambda text: line(lambda: text)))
+    with Progress(lambda number: f"{number:.1f} properties", period=0.0) as line:
+
+        def show(text: str, done: int, total: int) -> None:
+            line(lambda: text, (done, total))
+
+        line(lambda: f"{name}: loading", (0, 1))
+        found = list(reports(target(name), name, examples=max_examples, vectors=file, watch=show))
     if as_json:
         emit_json([report.to_dict() for report in found], output)
     else:

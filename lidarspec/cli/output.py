@@ -58,11 +58,13 @@ class Progress(contextlib.AbstractContextManager["Progress"]):
 
     Args:
         unit: an amount of work in words.
+        period: seconds in which one text is shown at most; 0 to show each, where few come and one may stand for long.
     """
 
-    def __init__(self, unit: Callable[[float], str] = str) -> None:
+    def __init__(self, unit: Callable[[float], str] = str, period: float = PERIOD) -> None:
         self._is_shown, self._due = sys.stderr.isatty() and voice.loudness >= 0, 0.0
         self._unit = unit
+        self._period = period
         self._bar: Bar | None = None
 
     def __call__(self, text: Callable[[], str], done: tuple[float, float] | None = None) -> None:
@@ -70,7 +72,7 @@ class Progress(contextlib.AbstractContextManager["Progress"]):
         is done."""
         if not self._is_shown or time.monotonic() < self._due:
             return
-        self._due = time.monotonic() + PERIOD
+        self._due = time.monotonic() + self._period
         if self._bar is None:
             self._bar = _bar(is_measured=done is not None)
         (task,) = self._bar.tasks

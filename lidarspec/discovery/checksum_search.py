@@ -6,7 +6,7 @@ sums, split nibbles. CRCs are found without trying (`crc_search`), and looked fo
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
 
 import numpy as np
@@ -86,21 +86,22 @@ class Changed(Checksum):
         return ((constant - values) if self.negative else (constant + values)) & np.uint64(self._mask)
 
 
-def search(frames: Iterable[bytes], *, quick: bool = False) -> list[Match]:
+def search(frames: Iterable[bytes], *, quick: bool = False, stands: Callable[[Place], bool] = lambda place: True) -> list[Match]:
     """The checksums that fit the frames, the plainest and best proven first; empty where none does.
 
     Args:
         frames: whole frames, the more of them and the more different the better; some may be damaged, and lengths may differ.
         quick: look only for what is found within about a second: CRCs at the usual places, those of long frames in the catalogue.
+        stands: whether a checksum may stand at a place; by default anywhere.
     """
     samples = Samples(frames)
     if samples.shortest < 3 or not any(map(any, samples.frames)):
         return []
-    found = list(plain_matches(samples))
+    found = list(plain_matches(samples, stands))
     if not any(match.sure for match in found):
-        found += crc_matches(samples, quick=quick)
+        found += crc_matches(samples, quick=quick, stands=stands)
     if not found and not quick:
-        found += crc_matches(samples, mixed=True)
+        found += crc_matches(samples, mixed=True, stands=stands)
     return best_first(found)[:TOLD]
 
 
@@ -115,13 +116,13 @@ def pasted(algorithm: Checksum) -> str:
     return f"{type(algorithm).__name__}()"
 
 
-def plain_matches(samples: Samples) -> Iterator[Match]:
+def plain_matches(samples: Samples, stands: Callable[[Place], bool] = lambda place: True) -> Iterator[Match]:
     """Every plain checksum that fits, in no special order."""
     few = samples.few(SCREENED)
     tried, sure, certain = 0, False, False
     longest = len(few.frames[-1])
     for size, algorithms in ((4, (Sum(32),)), (2, _WIDE), (1, (Xor(), Sum(8)))):
-        for place in few.places(size):
+        for place in filter(stands, few.places(size)):
             for span in spans(place, few):
                 if 2 * sum(b - a for a, b in span.ranges(place, longest)) < longest - size:
                     continue

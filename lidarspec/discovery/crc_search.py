@@ -12,7 +12,7 @@ from __future__ import annotations
 
 import functools
 import operator
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from itertools import combinations, product, zip_longest
 
@@ -143,16 +143,19 @@ class _Reading:
         return Crc(self.width, low, init, self.refin, self.refout, self.register(xorout))
 
 
-def crc_matches(samples: Samples, *, mixed: bool = False, quick: bool = False) -> Iterator[Match]:
+def crc_matches(
+    samples: Samples, *, mixed: bool = False, quick: bool = False, stands: Callable[[Place], bool] = lambda place: True
+) -> Iterator[Match]:
     """Every CRC that fits, up to the first place with a sure one.
 
     Args:
         mixed: look for those whose bytes and register are not mirrored alike, in place of those where they are.
         quick: give up after a fixed amount of work, with the usual places first.
+        stands: whether a CRC may stand at a place; by default anywhere.
     """
     mirrors = [(False, True), (True, False)] if mixed else [(False, False), (True, True)]
     picks = [samples.alike(TAKEN, pick) for pick in range(PICKS if len(samples) > 2 * TAKEN else 1)]
-    by_width = [[place for place in samples.places(width // 8) if _random(samples, place)] for width in WIDTHS]
+    by_width = [[place for place in filter(stands, samples.places(width // 8)) if _random(samples, place)] for width in WIDTHS]
     tried, sure, taken = 0, False, 0
     for place in (place for places in zip_longest(*by_width) for place in places if place is not None):
         width = 8 * place.size

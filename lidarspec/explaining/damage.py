@@ -8,7 +8,7 @@ by chance: where they are many, what happened is told, and not where.
 from __future__ import annotations
 
 import functools
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -54,14 +54,18 @@ class Change(NamedTuple):
         return before + bytes([after[0] ^ 1 << self.value]) + after[1:]
 
 
-def changes(frame: Frame, data: bytes, kinds: Iterable[str] = KINDS) -> list[Change]:
-    """Every single change of the likeliest kind that makes these bytes of one valid and plausible frame of this type."""
+def changes(frame: Frame, data: bytes, kinds: Iterable[str] = KINDS, *, offsets: Sequence[int] | None = None) -> list[Change]:
+    """Return every single change of the likeliest kind that makes these bytes of one valid and plausible frame of this type.
+
+    Args:
+        offsets: the bytes at which changes are tried; by default all.
+    """
     engine = codec(frame)
     for kind in kinds if data else ():
         longer, values = KINDS[kind]
         size = len(data) - longer
         fits = engine.size in (None, size) and max(engine.prefix, default=-1) < size
-        if fits and 0 < size <= _most(engine, values) and (found := list(_found(kind, values, data, size, engine))):
+        if fits and 0 < size <= _most(engine, values) and (found := list(_found(kind, values, data, size, engine, offsets))):
             return found
     return []
 
@@ -81,11 +85,13 @@ def _deciding(frame: Frame) -> int:
     return len({ref.path for formula in asked for ref in refs(formula)})
 
 
-def _found(kind: str, values: int, data: bytes, size: int, engine: Codec) -> Iterator[Change]:
+def _found(kind: str, values: int, data: bytes, size: int, engine: Codec, chosen: Sequence[int] | None) -> Iterator[Change]:
     places = np.arange(max(len(data), size))
     old = np.frombuffer(data, np.uint8)
     if kind == "inserted byte":
         places = places[np.diff(old, prepend=~old[:1]) != 0]  # of a run of equal bytes the first stands for all
+    if chosen is not None:
+        places = places[np.isin(places, chosen)]
     offsets = np.repeat(places, values)
     numbers = old[places] if values == 1 else np.tile(np.arange(values, dtype=np.uint8), len(places))
     if kind == "lost byte":

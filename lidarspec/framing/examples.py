@@ -37,6 +37,8 @@ TRIES_BEFORE_SWEEP = 8
 #: Each try makes so many times the random frames of the one before, beginning with one frame, and at most so many.
 GROWTH = 4
 LARGEST_BATCH = 64
+#: Bytes of such a batch, beyond its first frame.
+BATCH_BYTES = 1 << 22
 #: At most so many of a wire form, which are written one slot after another.
 WRITTEN = 8
 #: random headers of which one at least gives a frame.
@@ -69,18 +71,14 @@ def random_frame(sensor: Spec, frame: str, source: random.Random, drawn: Drawn =
         return _interpreted(sensor, frame, known, source, drawn)
     largest = LARGEST_BATCH if recoder(engine.frame) is None else WRITTEN
     for attempt in range(TRIES if sensor.simulation_of(frame).sweep is None else TRIES_BEFORE_SWEEP):
-        number = min(GROWTH**attempt, largest)
         layout, chosen = header(engine, source, drawn)
+        number = min(GROWTH**attempt, largest, max(BATCH_BYTES // max(layout.size, 1), 1))
         rows = _random(engine, layout, number, source)
-        for path, draw in drawn.items():
-            if path in layout.leaves and path not in chosen:
-                leaf = layout.leaves[path]
-                count = number * math.prod(leaf.shape)
-                leaf.store(rows, np.array([draw(source) for _ in range(count)]).reshape(number, *leaf.shape))
+        _store_drawn(layout, rows, chosen, drawn, source)
         found = _plausible(sensor, frame, layout, _headed(rows, layout, chosen))
         if found:
             return found[0]
-    return _swept(sensor, frame, engine, source)
+    return _swept(sensor, frame, engine, source, drawn)
 
 
 def header(engine: CompiledCodec, source: random.Random, drawn: Drawn = NOTHING) -> tuple[Layout, dict[str, int]]:
@@ -204,23 +202,33 @@ def _sent(sensor: Spec, frame: str, layout: Layout, rows: NDArray[np.uint8]) -> 
     return [data for data in recoding.written(rows, layout) if data is not None]
 
 
-def _swept(sensor: Spec, frame: str, engine: CompiledCodec, source: random.Random) -> bytes:
+def _swept(sensor: Spec, frame: str, engine: CompiledCodec, source: random.Random, drawn: Drawn) -> bytes:
     """A frame around the values that the sensor's `sweep` declares, where random ones are never plausible."""
     sweep = sensor.simulation_of(frame).sweep
     if sweep is None:
         raise SpecError("no random frame passes `plausible`, and there is no `sweep` to start from", path=frame, sensor=sensor.id)
     for _ in range(TRIES):
         values = sweep(source.randrange(10_000))
-        layout, chosen = header(engine, source, _stated(engine, values))
+        layout, chosen = header(engine, source, {**_stated(engine, values), **drawn})
         rows = _random(engine, layout, 1, source)
         for path, value in values.items():
             leaf = layout.leaves.get(path)
             if leaf is not None and path not in chosen:
                 leaf.store(rows, leaf.raw([value]))
+        _store_drawn(layout, rows, chosen, drawn, source)
         found = _plausible(sensor, frame, layout, _headed(rows, layout, chosen))
         if found:
             return found[0]
     raise SpecError("neither random frames nor those along `sweep` pass `plausible`", path=frame, sensor=sensor.id)
+
+
+def _store_drawn(layout: Layout, rows: NDArray[np.uint8], chosen: Mapping[str, int], drawn: Drawn, source: random.Random) -> None:
+    """Write drawn values into rows of frames, except those that have chosen the layout."""
+    for path, draw in drawn.items():
+        if path in layout.leaves and path not in chosen:
+            leaf = layout.leaves[path]
+            count = len(rows) * math.prod(leaf.shape)
+            leaf.store(rows, np.array([draw(source) for _ in range(count)]).reshape(len(rows), *leaf.shape))
 
 
 def _stated(engine: CompiledCodec, values: Mapping[str, Any]) -> Drawn:

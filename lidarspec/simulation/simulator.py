@@ -50,6 +50,9 @@ COARSE = 1_000_000
 AHEAD = 1
 #: packets on which it is found out how a sensor carries its ranges, and how fast it is.
 PROBED = 256
+#: The same in bytes: of long frames fewer are probed, at least so many.
+PROBED_BYTES = 1 << 21
+LEAST_PROBED = 4
 Floats = NDArray[np.float64]
 #: how often ranges are measured again while directions still move.
 ROUNDS = 8
@@ -613,7 +616,8 @@ class Simulation:
         self._sensor, self._frame, self._sweep = sensor, frame, sweep
         self._maker = FrameMaker(sensor, frame)
         self._stuck = self._turning(sweep(1)) if blocked else {}
-        swept = self._swept(range(PROBED))
+        length = len(self._maker.frame(self._swept(range(1))[0]))
+        swept = self._swept(range(min(PROBED, max(PROBED_BYTES // length, LEAST_PROBED))))
         table = self._maker.table(swept)
         self._parts = sensor.parts_with("points", frame)
         given = [part for values in swept for part in values[self._parts.partition(".")[0]]] if self._parts else swept

@@ -408,6 +408,10 @@ def _short_write(call: ast.Call, *, sockets: bool) -> bool:
 FATAL, ELSE = frozenset({"LS213", "LS114", "LS115", "LS301"}), "everything else"
 
 
+#: Called with what is looked at, and with how many properties are done, of how many.
+Watch = Callable[[str, int, int], None]
+
+
 @dataclass(eq=False)
 class Report:
     """What was found.
@@ -441,7 +445,7 @@ def reports(
     strategies: Mapping[str, Any] | None = None,
     vectors: Path | None = None,
     tested: Sequence[Sensor] = (),
-    watch: Callable[[str], None] | None = None,
+    watch: Watch = lambda text, done, total: None,
 ) -> Iterator[Report]:
     """A report of the text and the loading of a target, where there is something to say, and one of each of its sensors.
 
@@ -451,7 +455,7 @@ def reports(
         strategies: "frame.field" -> how its raw value is drawn, for fields of which no valid value can be derived.
         vectors: golden vectors; by default those that the target has.
         tested: related models that are tested too: what they share with a sensor is not tested again.
-        watch: is told what is looked at.
+        watch: is called with what is looked at before it is, and how many properties of how many are done.
     """
     trees = {str(file): ast.parse(file.read_text(encoding="utf-8"), str(file)) for file in target.files}
     places = Places(trees)
@@ -460,10 +464,17 @@ def reports(
     single = [sensor for sensor in target.sensors if len(target.sensors) == 1]
     if mistakes and not single:
         yield Report(name, mistakes)
-    for sensor in target.sensors:
+    total = len(PROPERTIES) * len(target.sensors)
+    for index, sensor in enumerate(target.sensors):
         family = () if vectors and single else target.family
         subject = Subject(sensor, examples, strategies or {}, vectors or target.vectors, family, tested)
-        yield _report(subject, places, mistakes if single else [], watch or (lambda text: None))
+        before = len(PROPERTIES) * index
+        yield _report(subject, places, mistakes if single else [], functools.partial(_watch_sensor, watch, before, total))
+
+
+def _watch_sensor(watch: Watch, before: int, total: int, text: str, done: int) -> None:
+    """Pass on what is looked at in one sensor of several."""
+    watch(text, before + done, total)
 
 
 def _beside(subject: Subject) -> Iterator[tuple[str, str]]:
@@ -475,22 +486,26 @@ def _beside(subject: Subject) -> Iterator[tuple[str, str]]:
     yield "source", sensor.source
 
 
-def _report(subject: Subject, places: Places, mistakes: list[Finding], watch: Callable[[str], None]) -> Report:
+def _watch_case(watch: Callable[[str, int], None], sensor_id: str, done: int, case: str) -> None:
+    """Pass on which case of a property is looked at."""
+    watch(f"{sensor_id}: {case}", done)
+
+
+def _report(subject: Subject, places: Places, mistakes: list[Finding], watch: Callable[[str, int], None]) -> Report:
     sensor: Sensor = subject.sensor
     report = Report(sensor.id, list(mistakes))
     if not sensor.frames:
         report.skipped["all properties"] = "it has no frames before it is configured with its file"
         return report
-    watch(f"{sensor.id}: declaration")
+    watch(f"{sensor.id}: declaration", 0)
     report.findings += declared(subject)
-    for one in PROPERTIES:
+    for done, one in enumerate(PROPERTIES):
         known = sorted({finding.code for finding in left_over(report.findings, sensor, whole=False)} & set(one.unless))
         reason = one.lacks(subject) or (f"{', '.join(known)} is found already" if known else "")
         if reason:
             report.skipped[one.name] = reason
             continue
-        watch(f"{sensor.id}: {one.name}")
-        found = one.findings(subject)
+        found = one.findings(subject, functools.partial(_watch_case, watch, sensor.id, done))
         report.held += not found
         report.findings += found
         if any(finding.code in FATAL for finding in report.findings):

@@ -7,7 +7,7 @@ from ipaddress import ip_address
 from typing import Any
 
 from lidarspec.device.session import Reply, Session, found_at, learned
-from lidarspec.errors import CommandError, LidarSpecError, UsageError
+from lidarspec.errors import CommandError, LidarSpecError, SpecError, UsageError
 from lidarspec.explaining.wording import asked
 from lidarspec.framing.results import Found
 from lidarspec.simulation.device import SimulatedDevice
@@ -126,11 +126,27 @@ def the_simulated_sensor_answers(subject: Subject, name: str) -> None:
         except CommandError as error:
             refused = refused or str(error)
             continue
+        except SpecError as error:
+            if name in subject.sensor.simulation.answers:
+                raise
+            what = f"its reply cannot be made up without answers= of the Simulation: {error.reason}"
+            raise Violation("LS604", what, f"commands.{name}") from error
         require(reply.confirmed, "LS604", "the reply is not confirmed", f"commands.{name}")
-        if told := learned(subject.sensor, reply):
-            subject.sensor.configure(**told)
+        _learn(subject, name, reply)
         return
     raise Violation("LS604", refused, f"commands.{name}")
+
+
+def _learn(subject: Subject, name: str, reply: Reply) -> None:
+    """Configure the sensor with what it learns from a simulated reply."""
+    sensor = subject.sensor
+    try:
+        if told := learned(sensor, reply):
+            sensor.configure(**told)
+    except Exception as error:  # whatever `learns` and `configure` of the plugin fail with
+        which = "its reply, as given by" if name in sensor.simulation.answers else "its reply, which is made up without"
+        what = f"{which} answers= of the Simulation, cannot be learned from: {error}"
+        raise Violation("LS604", what, f"commands.{name}") from error
 
 
 def _asked(subject: Subject, name: str, given: dict[str, float]) -> Reply:

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import random
 import re
 from collections.abc import Iterator
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -11,6 +13,7 @@ import numpy as np
 from lidarspec.columns.columns import Batch, Fields
 from lidarspec.columns.graph import Traced, Untraceable
 from lidarspec.errors import LidarSpecError, SpecError, did_you_mean
+from lidarspec.framing.examples import header, random_frame
 from lidarspec.framing.frame_engine import CompiledCodec, codec
 from lidarspec.points.conventions import TYPES
 from lidarspec.simulation.scenes import Room
@@ -148,6 +151,34 @@ def _sizes(subject: Subject, name: str) -> Iterator[int]:
     if name in subject.sensor.data_frames and subject.sensor.simulation_of(name).sweep is not None:
         yield len(simulation(subject.sensor, name).block(0, 1, Room(), 0.0).frames[0])
     yield from (len(subject.example(name, seed=seed)) for seed in range(FIRST_LENGTHS, LENGTHS))
+    yield from _raised_sizes(subject, name)
+
+
+def _raised_sizes(subject: Subject, name: str) -> Iterator[int]:
+    """Yield the lengths of valid frames in which one header field is raised as far as the longest length allows.
+
+    Random headers seldom have large counts, and a `sweep` may have the same count in all packets.
+    """
+    frame = subject.sensor.frames[name]
+    engine = codec(frame)
+    if not isinstance(engine, CompiledCodec) or engine.schema.parts:
+        return
+    source = subject.source(f"lengths of {name}")
+    for path in header(engine, source)[1]:
+        info = engine.schema.fields[path]
+        for shift in range(info.bits if info.const is None else 0):
+            raised = {path: partial(_always, info.limits[1] >> shift)}
+            try:
+                size = header(engine, source, raised)[0].size
+                if FAR * size < frame.max_length:
+                    break
+                yield len(random_frame(subject.sensor, name, source, {**subject.drawers(name), **raised}))
+            except SpecError:  # too long, or not plausible
+                continue
+
+
+def _always(value: int, _: random.Random) -> int:
+    return value
 
 
 def _names(subject: Subject, name: str, frame: Frame) -> Findings:

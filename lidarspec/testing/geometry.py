@@ -49,6 +49,12 @@ PACKETS = 400
 SCENE_PACKETS = 200
 LONG_SCENE_PACKETS = 50
 LONG_FRAME_BYTES = 1500
+#: bytes of packets along the sweep, the same for counters, which wrap, and of packets in the room.
+SWEEP_BYTES = 1 << 22
+COUNTER_BYTES = 1 << 24
+SCENE_BYTES = 1 << 21
+#: packets that are made at least, however long their frames are.
+LEAST_PACKETS = 8
 #: radians beyond which an azimuth along a sweep, or a drawn one, can only be degrees.
 TURNS, DRAWN = 4 * np.pi, 15 * np.pi
 #: share of the steps that go one way where a sensor rotates, and the step against it that is too much, radians and medians.
@@ -65,15 +71,21 @@ ALONG = 0.9
 EXACT, UNTOLD = 2e-6, 0.004
 
 
-def make_sweep(subject: Subject, name: str, packets: int) -> list[bytes]:
-    """Return the first packets along the sensor's `sweep`, none if it declares none or the frame type is not compiled."""
+def make_sweep(subject: Subject, name: str, packets: int, total: int = SWEEP_BYTES) -> list[bytes]:
+    """Return the first packets along the sensor's `sweep`, none if it declares none or the frame type is not compiled.
+
+    Of long frames fewer packets are made, which have `total` bytes.
+    """
     sweep = subject.sensor.simulation_of(name).sweep
     if sweep is None:
         return []
     made = subject.swept.setdefault(name, [])
     try:
+        maker = FrameMaker(subject.sensor, name)
+        if not made:
+            made.append(maker.frame(sweep(0)))
+        packets = min(packets, max(total // len(made[0]), LEAST_PACKETS))
         if len(made) < packets:
-            maker = FrameMaker(subject.sensor, name)
             made += maker.sealed(maker.table([sweep(number) for number in range(len(made), packets)]))
     except LidarSpecError:
         return []
@@ -153,7 +165,7 @@ def _declared(subject: Subject, name: str) -> list[NDArray[np.float64]] | None:
 
 def clouds_keep_the_conventions(subject: Subject, name: str) -> None:
     """float32 metres and radians, azimuth in [-pi, pi), no place without a return; and `points` does not fail."""
-    frames = [subject.example(name, seed=seed) for seed in range(max(len(subject.seeds(subject.sensor.frames[name])), 2))]
+    frames = [subject.example(name, seed=seed) for seed in range(max(len(subject.seeds(name)), 2))]
     try:
         packets = read(subject, name, frames)
         cloud = packets.points()
@@ -283,7 +295,7 @@ def angles_are_in_order(subject: Subject, name: str) -> None:
 
 def counters_run_on(subject: Subject, name: str) -> None:
     """Along the sweep no packet counts as lost, late or doubled, and time does not run back."""
-    frames = make_sweep(subject, name, 700 if subject.sensor.frames[name].max_length <= LONG_FRAME_BYTES else 260)
+    frames = make_sweep(subject, name, 700 if subject.sensor.frames[name].max_length <= LONG_FRAME_BYTES else 260, COUNTER_BYTES)
     if not frames or name != subject.sensor.data_frame:
         return
     packets = read(subject, name, frames)
@@ -378,7 +390,10 @@ def a_simulated_scene_comes_back(subject: Subject, name: str) -> None:
     room = Room(room.walls, room.boxes)
     is_long = subject.sensor.frames[name].max_length > LONG_FRAME_BYTES
     try:
-        block = simulation(subject.sensor, name).block(5, LONG_SCENE_PACKETS if is_long else SCENE_PACKETS, room)
+        made = simulation(subject.sensor, name)
+        length = len(made.block(0, 1, room).frames[0])
+        packets = min(LONG_SCENE_PACKETS if is_long else SCENE_PACKETS, max(SCENE_BYTES // length, LEAST_PACKETS))
+        block = made.block(5, packets, room)
     except UsageError:
         return
     except LidarSpecError as error:

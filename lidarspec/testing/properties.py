@@ -44,8 +44,8 @@ class Property:
     """Something that has to hold.
 
     Attributes:
-        function: of the subject, and of a name where it holds for each frame, data frame or command.
-        each: "sensor", "frame", "data" or "command".
+        function: of the subject, and of a name where it holds for each frame, data frame, command or vector.
+        each: "sensor", "frame", "data", "command" or "vector".
         rule: that a plain assertion in it falls under.
         lacks: why it does not apply to a sensor, "" where it does.
         unless: rules that say it better; where one of them is broken, this is not looked at.
@@ -69,6 +69,8 @@ class Property:
         """Return the arguments of each call, apart from the subject."""
         if self.each == "sensor":
             return [] if self._is_tested_elsewhere(subject) else [()]
+        if self.each == "vector":
+            return [(place,) for place in vectors.places(subject)]
         names = {"frame": subject.frames, "data": subject.sensor.data_frames, "command": subject.sensor.commands}
         return [(name,) for name in names[self.each]]
 
@@ -79,10 +81,11 @@ class Property:
         wanted = [getattr(subject.sensor, name) for name in self.depends_on]
         return any(wanted == [getattr(sensor, name) for name in self.depends_on] for sensor in subject.tested)
 
-    def findings(self, subject: Subject) -> list[Finding]:
-        """Return the findings of every case that fails."""
+    def findings(self, subject: Subject, watch: Callable[[str], None] = lambda text: None) -> list[Finding]:
+        """Return the findings of every case that fails; `watch` is called with the name of each case before it begins."""
         found = []
         for case in self.cases(subject):
+            watch(" ".join((self.name, *case)))
             try:
                 self.function(subject, *case)
             except Violation as error:
@@ -119,7 +122,7 @@ PROPERTIES = (
     Property(frames.every_single_bit_error_is_seen, "frame", "LS310"),
     Property(vectors.every_checksum_is_checked, "frame", "LS212"),
     Property(vectors.the_status_is_proven, "sensor", "LS710"),
-    Property(vectors.vectors_hold, "sensor", "LS706", lacks=vectors.lacking),
+    Property(vectors.vectors_hold, "vector", "LS706", lacks=vectors.lacking),
     Property(vectors.every_data_field_is_pinned_down, "data", "LS711", lacks=vectors.lacking, unless=("LS702", "LS703", "LS707")),
     Property(vectors.points_stand_in_two_quadrants, "data", "LS712", lacks=vectors.lacking, unless=("LS702", "LS703", "LS707")),
     Property(geometry.clouds_keep_the_conventions, "data", "LS501"),

@@ -116,6 +116,12 @@ USUAL_ROUNDS, LEAST_ROUNDS = 3, 2
 EXAMPLES = int(os.environ.get("LIDARSPEC_EXAMPLES", USUAL_EXAMPLES))
 #: sensors with more frame types than this are tried with less of each.
 MANY = 8
+#: bytes of the examples of one frame type that a property tries: of long frames fewer are tried.
+EXAMPLE_BYTES = 300_000
+#: bytes after which no further round of a conversation begins.
+CONVERSATION_BYTES = 500_000
+#: seeds of the examples that tell how long frames are.
+MEASURED_SEEDS = 3
 #: values that are drawn from a hypothesis strategy.
 POOL = 60
 
@@ -164,11 +170,22 @@ class Subject:
         """Random numbers of this sensor's own for one purpose, the same in every run."""
         return random.Random(f"{self.sensor.id} {purpose}")
 
-    def seeds(self, frame: Frame, share: float = 1.0) -> range:
-        """Seeds of examples: fewer for long frames, since construct takes its time for each field, and where there are many types."""
-        few = 8 if frame.max_length > SHORT else 1
+    def seeds(self, name: str, share: float = 1.0) -> range:
+        """Return the seeds of the examples of a frame type that are tried.
+
+        They are fewer for long frames, since each field takes its time, and if the sensor has many frame types.
+        """
+        few = 8 if self.sensor.frames[name].max_length > SHORT else 1
         few *= 2 if len(self.sensor.frames) > MANY else 1
-        return range(max(int(self.examples * share) // few, 3))
+        return range(self.limit_to_bytes(name, max(int(self.examples * share) // few, 3)))
+
+    def limit_to_bytes(self, name: str, number: int, total: int = EXAMPLE_BYTES, least: int = 1) -> int:
+        """Return how many of `number` frames of a type are tried, so that they have at most `total` bytes, or are the `least`."""
+        return min(number, max(total // self.length(name), least))
+
+    def length(self, name: str) -> int:
+        """Return how long frames of a type are: the longest of a few examples, in bytes."""
+        return max(1, *(len(self.example(name, seed=seed)) for seed in range(MEASURED_SEEDS)))
 
     def scale_rounds(self, rounds: int, least: int = 1) -> int:
         """Return a number of rounds that is meant for the usual number of examples, scaled to `examples`."""
@@ -192,7 +209,10 @@ class Subject:
     def conversation(self, *, seed: int = 0, rounds: int | None = None) -> list[tuple[str, bytes]]:
         """Frames of all incoming types as the sensor could send them: (type, bytes), each where it is looked for and believed."""
         frames: list[tuple[str, bytes]] = []
+        size = 0
         for turn in range(self.scale_rounds(USUAL_ROUNDS, LEAST_ROUNDS) if rounds is None else rounds):
+            if size > CONVERSATION_BYTES:
+                break
             for name in self.sensor.incoming:
                 frame = self.sensor.frames[name]
                 number = frame.confirm + 2 if frame.data or frame.confirm > 1 else 1
@@ -200,6 +220,7 @@ class Subject:
                 if frame.after is not None:
                     frames.append((frame.after, self.example(frame.after, seed=first)))
                 frames += [(name, self.example(name, seed=first + index)) for index in range(number)]
+            size = sum(len(data) for _, data in frames)
         return frames
 
     def stream(self, *, seed: int = 0, rounds: int | None = None) -> bytes:

@@ -26,7 +26,7 @@ from typing import Any, cast
 import numpy as np
 
 from lidarspec.discovery.checksum_search import search
-from lidarspec.discovery.samples import Match
+from lidarspec.discovery.samples import Match, Place
 from lidarspec.errors import LidarSpecError, WireError
 from lidarspec.framing.frame_engine import CompiledCodec, codec
 from lidarspec.spec.tree import FieldInfo, Sealed, nodes
@@ -86,9 +86,17 @@ KEYS: dict[str, tuple[str, Callable[[object], bool]]] = {
 }
 
 
-def vectors_hold(subject: Subject) -> None:
-    """Every golden vector parses to its values, builds again, and has its points where they are said to be."""
-    for place, vector in entries(subject).items():
+def vectors_hold(subject: Subject, only: str = "") -> None:
+    """Each golden vector parses to its values, builds again, and has its points where they are said to be.
+
+    Args:
+        only: the place of the one vector that is tried; by default all are, up to the first that fails.
+    """
+    read_entries = _read_entries(subject)
+    chosen = {only: read_entries[only]} if only else read_entries
+    for place, vector in chosen.items():
+        if isinstance(vector, Violation):
+            raise vector
         require(str(vector.get("source", "")).strip(), "LS701", "it names no source", place)
         data = unhexed(vector["hex"])
         name = vector["frame"]
@@ -107,9 +115,17 @@ def lacking(subject: Subject) -> str:
     if subject.vectors is None:
         return "there is no file of golden vectors"
     try:
-        return "" if entries(subject) else f"{Path(subject.vectors).name} has none of {subject.sensor.id}"
+        return "" if _read_entries(subject) else f"{Path(subject.vectors).name} has none of {subject.sensor.id}"
     except Violation:
         return ""
+
+
+def places(subject: Subject) -> list[str]:
+    """Return the places of the sensor's vectors in their file; a single "" if it cannot be read."""
+    try:
+        return list(_read_entries(subject))
+    except Violation:
+        return [""]
 
 
 def the_status_is_proven(subject: Subject) -> None:
@@ -183,10 +199,31 @@ def _sealing_fields(subject: Subject, name: str) -> set[str]:
     return set().union(*(seals(subject.sensor, name, subject.example(name, seed=seed)) for seed in range(LAYOUT_EXAMPLES)))
 
 
+def _fitting(subject: Subject, name: str, path: str, frames: list[bytes], frame: bytes) -> list[Match]:
+    """Return the checksums that fit frames and stand in the field at `path` of one of them, as wide as it is.
+
+    If some are of the library, those that need a class of their own are left out: they fit because these do.
+    """
+    engine = codec(subject.sensor.frames[name])
+    layout = engine.tree.layout(frame) if isinstance(engine, CompiledCodec) else None
+    leaf = layout.leaves.get(path) if isinstance(layout, Layout) else None
+
+    def stands(place: Place) -> bool:
+        return leaf is None or (place.start(len(frame)), 8 * place.size) == (leaf.offset, leaf.info.bits)
+
+    matches = search(frames, stands=stands)
+    return [match for match in matches if not _needs_class(match)] or matches
+
+
+def _needs_class(match: Match) -> bool:
+    return match.paste.startswith("class ")
+
+
 def _in_words(match: Match, length: int) -> str:
     """A checksum that fits, what it covers, and the byte order of its field."""
     order = f", in a field that is {match.order}-endian," if match.place.size > 1 else ""
-    return f"{match.paste} over {match.span.told(match.place, length)}{order}"
+    algorithm = match.algorithm.describe() if _needs_class(match) else match.paste
+    return f"{algorithm} over {match.span.told(match.place, length)}{order}"
 
 
 def _common(frames: list[bytes]) -> list[Match]:
@@ -207,11 +244,16 @@ def _standing(subject: Subject, name: str, match: Match, frame: bytes) -> str:
 
 
 def entries(subject: Subject) -> dict[str, Any]:
-    """The vectors of the sensor by their places in the file.
+    """Return the valid vectors of the sensor by their places in the file.
 
     Raises:
-        Violation: where it cannot be read, or has an entry that is no vector.
+        Violation: if the file cannot be read.
     """
+    return {place: vector for place, vector in _read_entries(subject).items() if not isinstance(vector, Violation)}
+
+
+def _read_entries(subject: Subject) -> dict[str, Any]:
+    """Return the vectors of the sensor by their places in the file; for an entry that is none, its `Violation`."""
     if subject.vectors is None:
         return {}
     try:
@@ -220,30 +262,43 @@ def entries(subject: Subject) -> dict[str, Any]:
         raise Violation("LS702", str(error), str(subject.vectors)) from None
     if not isinstance(found, list):
         raise Violation("LS702", "the file is no list of vectors", str(subject.vectors))
-    mine = {}
+    mine: dict[str, Any] = {}
     for index, vector in enumerate(found):
         place = f"vectors[{index}]"
-        require(isinstance(vector, dict), "LS702", "it is no object", place)
-        unknown = sorted(vector.keys() - KEYS.keys())
-        require(not unknown, "LS702", f"unknown keys {unknown}; known are {sorted(KEYS)}", place)
-        for key, value in vector.items():
-            told, fits = KEYS[key]
-            require(fits(value), "LS702", f"{key} is {told}, not {shown(value)}", place)
-        if not _is_of(subject, vector, place):
-            continue
-        if "command" in vector:
-            known = subject.sensor.commands.get(vector["command"])
-            vector.setdefault("frame", known.frame if known is not None else None)
-            sends = known is not None and known.frame == vector["frame"]
-            require(sends, "LS702", f"no command {vector['command']!r} sends such a frame", place)
-        require(vector.get("frame") in subject.sensor.frames, "LS702", f"there is no frame {vector.get('frame')!r}", place)
         try:
-            unhexed(vector.get("hex", "-"))
-            unhexed(vector.get("reply", ""))
-        except ValueError:
-            raise Violation("LS702", "its `hex`, or its `reply`, is no hex text", place) from None
-        mine[place] = vector
+            if _check_entry(subject, vector, place):
+                mine[place] = vector
+        except Violation as error:
+            mine[place] = error
     return mine
+
+
+def _check_entry(subject: Subject, vector: Any, place: str) -> bool:
+    """Return whether an entry is of the sensor; fill in the frame of one with a command.
+
+    Raises:
+        Violation: for an entry that is no vector.
+    """
+    require(isinstance(vector, dict), "LS702", "it is no object", place)
+    unknown = sorted(vector.keys() - KEYS.keys())
+    require(not unknown, "LS702", f"unknown keys {unknown}; known are {sorted(KEYS)}", place)
+    for key, value in vector.items():
+        told, fits = KEYS[key]
+        require(fits(value), "LS702", f"{key} is {told}, not {shown(value)}", place)
+    if not _is_of(subject, vector, place):
+        return False
+    if "command" in vector:
+        known = subject.sensor.commands.get(vector["command"])
+        vector.setdefault("frame", known.frame if known is not None else None)
+        sends = known is not None and known.frame == vector["frame"]
+        require(sends, "LS702", f"no command {vector['command']!r} sends such a frame", place)
+    require(vector.get("frame") in subject.sensor.frames, "LS702", f"there is no frame {vector.get('frame')!r}", place)
+    try:
+        unhexed(vector.get("hex", "-"))
+        unhexed(vector.get("reply", ""))
+    except ValueError:
+        raise Violation("LS702", "its `hex`, or its `reply`, is no hex text", place) from None
+    return True
 
 
 def _is_of(subject: Subject, vector: Mapping[str, Any], place: str) -> bool:
@@ -265,7 +320,7 @@ def _parsed(subject: Subject, name: str, data: bytes, place: str) -> Any:
         if ": checksum " not in error.reason:
             raise Violation("LS707", error.reason, f"{place} {name}.{error.path}") from error
         same = [unhexed(one["hex"]) for one in entries(subject).values() if one["frame"] == name]
-        fitting = [_in_words(match, len(data)) for match in search(same)[:2]]
+        fitting = [_in_words(match, len(data)) for match in _fitting(subject, name, error.path, same, data)[:2]]
         fits = f"; {' or '.join(fitting)} fits" if fitting else ""
         raise Violation("LS703", f"{error.reason}{fits}", f"{place} {name}.{error.path}") from error
     except LidarSpecError as error:

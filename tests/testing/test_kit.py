@@ -15,21 +15,38 @@ from typing import Any
 
 import numpy as np
 import pytest
-from construct import Array, Const, Float16b, Float32l, Float64l, Int8ul, Int16ub, Int16ul, Struct, this
+from construct import (
+    Array,
+    Bytes,
+    Const,
+    Float16b,
+    Float32l,
+    Float64l,
+    GreedyBytes,
+    Int8ul,
+    Int16ub,
+    Int16ul,
+    NullTerminated,
+    Struct,
+    this,
+)
 from hypothesis import strategies as st
 
 from lidarspec import Sensor
-from lidarspec.spec import Checksummed, Crc, Fields, Frame, Polar, Scaled, Sum, take
+from lidarspec.framing.frame_engine import CompiledCodec
+from lidarspec.spec import Checksummed, Command, Crc, Fields, Frame, Http, HttpReply, HttpRequest, Polar, Scaled, Sum, take
+from lidarspec.testing import frames
 from lidarspec.testing.check import Target, reports
+from lidarspec.testing.commands import the_simulated_sensor_answers
 from lidarspec.testing.declared import declared
 from lidarspec.testing.findings import Violation, left_over
 from lidarspec.testing.frames import values_in_units_build_the_same_bytes, values_survive_building_and_parsing
 from lidarspec.testing.geometry import the_points_turn_as_the_axes_do
 from lidarspec.testing.hostile import MAX_CALLS_PER_BYTE, calls_per_byte, streams
-from lidarspec.testing.properties import PROPERTIES
+from lidarspec.testing.properties import PROPERTIES, Property
 from lidarspec.testing.subject import Subject
 from lidarspec.testing.vectors import vectors_hold
-from tests.broken import dear_headers, sound
+from tests.broken import dear_headers, no_example, sound
 
 AUTHOR = """
 import lidarspec as ls
@@ -100,6 +117,64 @@ def test_cost_of_a_stream_is_counted_in_function_calls() -> None:
     for sensor, is_dear in ((dear, True), (sound.sensor(), False)):
         stream = streams(Subject(sensor), length=1500)[heads]
         assert (calls_per_byte(sensor, stream) > MAX_CALLS_PER_BYTE) == is_dear
+
+
+#: bytes of a frame that is too long to try everything with it, and of its copies with flipped bits that are tried.
+LONG = 100_000
+FLIPPED_BYTES = 1 << 22
+LONG_FRAME = Checksummed(
+    Struct("header" / Const(b"\xaa\x55\xc3"), "count" / Int8ul, "picture" / Bytes(LONG - 6), "sum" / Int16ul),
+    field="sum",
+    algorithm=Sum(16),
+)
+
+
+@pytest.mark.parametrize(
+    "check", [one for one in PROPERTIES if one.function.__module__.endswith("testing.frames")], ids=lambda one: one.name
+)
+def test_work_with_a_long_frame_is_limited_in_bytes(check: Property, monkeypatch: pytest.MonkeyPatch) -> None:
+    sensor = sound.sensor(frames={**sound.sensor().frames, "picture": Frame(LONG_FRAME, max_length=LONG)})
+    parsed = surveyed = 0
+    parse, survey = Sensor.parse, CompiledCodec.survey
+
+    def counting_parse(self: Sensor, data: bytes, **options: Any) -> Any:
+        nonlocal parsed
+        parsed += len(data)
+        assert parsed <= 16 * LONG
+        return parse(self, data, **options)
+
+    def counting_survey(self: CompiledCodec, data: Any, *rest: Any) -> Any:
+        nonlocal surveyed
+        surveyed += len(data)
+        assert surveyed <= 3 * FLIPPED_BYTES + 8 * LONG
+        return survey(self, data, *rest)
+
+    monkeypatch.setattr(frames, "FLIPPED_BYTES", FLIPPED_BYTES, raising=False)
+    monkeypatch.setattr(Sensor, "parse", counting_parse)
+    monkeypatch.setattr(CompiledCodec, "survey", counting_survey)
+    check.function(Subject(sensor), "picture")
+
+
+def test_progress_names_each_case_before_it_begins() -> None:
+    seen: list[tuple[str, int, int]] = []
+    (sensor,) = no_example.lidarspec_sensors()
+    list(reports(Target([sensor]), sensor.id, watch=lambda *told: seen.append(told)))
+    assert seen[0] == ("broken-one: declaration", 0, len(PROPERTIES))
+    assert seen[1] == ("broken-one: examples_are_valid_and_repeat data", 0, len(PROPERTIES))
+
+
+def test_a_long_length_that_a_count_in_the_header_can_reach_is_no_finding() -> None:
+    def plausible(f: Fields) -> Any:
+        return (f.count >= 1) & (f.first < 360) & (f.last < 360) & (f.time < sound.WRAP)
+
+    struct = sound.sealed(count=Int16ul)
+    assert left(sound.sensor(Frame(struct, data=True, max_length=16 + 3 * 65_535, plausible=plausible))) == set()
+    page = Frame(HttpReply, max_length=65_536)
+    ask = Frame(HttpRequest, direction="out", max_length=4096)
+    assert (
+        left(sound.sensor(frames={**sound.sensor().frames, "page": page, "ask": ask}, links={**sound.sensor().links, "web": Http(80)}))
+        == set()
+    )
 
 
 def rare(f: object) -> object:
@@ -242,6 +317,19 @@ def test_a_checksum_in_the_other_byte_order_is_told_with_the_right_one() -> None
     assert "Sum(16) over all other bytes, in a field that is little-endian," in told(sound.sensor(swapped), known)[0]
 
 
+def test_the_checksum_that_is_offered_is_as_wide_as_its_field() -> None:
+    def data(algorithm: Any) -> Sensor:
+        struct = sound.struct(spare=Int16ul, sum=Int16ub)
+        return sound.sensor(sound.frame(Checksummed(struct, field="sum", algorithm=algorithm), max_length=sound.SIZE + 2))
+
+    right = data(Sum(16))
+    parsed = [right.parse(right.example("data", seed=seed)) for seed in range(6)]
+    frames = [right.build("data", {**one, "spare": 0}) for one in parsed]  # the sum is right in four bytes as well
+    vectors = [{"frame": "data", "hex": frame.hex(), "source": "made up"} for frame in frames]
+    (said,) = {text.partition("; ")[2] for text in told(data(Crc(16, 0x1021)), vectors) if text.startswith("LS703 vectors[0]")}
+    assert said == "Sum(16) over all other bytes, in a field that is big-endian, fits"
+
+
 @pytest.mark.parametrize("samples", [3, 200], ids=["short", "long"])
 def test_a_checksum_of_another_name_is_found_in_the_vectors(samples: int) -> None:
     struct = Struct("header" / Const(b"\xaa\x55\xc3"), "samples" / Array(samples, Int16ul), "end" / Int16ul)
@@ -252,6 +340,39 @@ def test_a_checksum_of_another_name_is_found_in_the_vectors(samples: int) -> Non
     said = "LS212 data.end: Crc(width=16, poly=0x8005) over all other bytes, in a field that is little-endian, fits every vector"
     assert told(sound.sensor(plain), vectors)[0].startswith(said)
     assert not any(text.startswith("LS212") for text in told(sound.sensor(sealed), vectors))
+
+
+def test_a_vector_that_cannot_be_read_hides_no_other() -> None:
+    known = json.loads(BY_VECTORS.read_text(encoding="utf-8"))
+    wrong = {**known[0], "values": {"number": 19}}
+    vectors = [
+        {"frame": "none", "hex": "", "source": "x"},
+        wrong,
+        {"frame": "data", "hex": "zz", "source": "x"},
+        {**known[1], "source": ""},
+    ]
+    said = [text.partition(":")[0] for text in told(sound.sensor(), vectors)]
+    assert said[:4] == ["LS702 vectors[0]", "LS706 vectors[1] data.number", "LS702 vectors[2]", "LS701 vectors[3]"]
+
+
+def test_a_reply_that_nothing_makes_up_asks_for_answers() -> None:
+    def configure(sensor: Sensor, *, serial: int) -> Sensor:
+        return sensor
+
+    def finding(command: Command, frame: Frame) -> list[str]:
+        plain = sound.sensor()
+        frames = {**plain.frames, "page": frame}
+        sensor = sound.sensor(frames=frames, commands={"ask": command}, configure=configure)
+        (answering,) = [one for one in PROPERTIES if one.function is the_simulated_sensor_answers]
+        return [f"{found.code} {found.path}: {found.what}" for found in answering.findings(Subject(sensor))]
+
+    page = Frame(Struct("mark" / Const(b"RPLY"), "size" / Int8ul, "text" / Bytes(this.size)), max_length=64)
+    ended = Frame(Struct("mark" / Const(b"RPLY"), "text" / NullTerminated(GreedyBytes)), max_length=64)
+    learning = Command("order", {"code": 9}, reply="page", learns=lambda reply: {"serial": int(reply.text)})
+    (empty,) = finding(learning, page)
+    assert empty.startswith("LS604 commands.ask: its reply, which is made up without answers= of the Simulation, cannot be learned from")
+    (unmade,) = finding(Command("order", {"code": 9}, reply="page"), ended)
+    assert unmade.startswith("LS604 commands.ask: its reply cannot be made up without answers= of the Simulation: cannot be simulated")
 
 
 def test_vectors_that_prove_nothing_are_findings(tmp_path: Path) -> None:

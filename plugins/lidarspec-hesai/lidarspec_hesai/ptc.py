@@ -49,7 +49,6 @@ FRAMES = {
         message(Bytes(this.length)),
         max_length=8 + LARGEST,
         plausible=plausible,
-        acknowledged={"LS203": "as long as the longest file that a unit can say"},
     ),
     "request": Frame(message(Switch(this.code, SETTINGS, default=Bytes(0))), direction="out", max_length=16),
 }

@@ -270,7 +270,6 @@ FRAMES: dict[str, Frame] = {
         message(0x0101, "count" / Int16ul, RESERVED, "wanted" / Array(this.count, Int16ul), ack=False, lidar=False),
         direction="out",
         max_length=LONGEST,
-        acknowledged=ANY_NUMBER,
     ),
     "set_number": setting("number" / Int8ul),
     "set_host": setting(*HOST.subcons),

@@ -169,7 +169,7 @@ def configure(
 LAYOUT: dict[str, Any] = {"rows": 16, "turn": 1024, "profile": "RNG19_RFL8_SIG16_NIR16"}
 HTTP = {
     "ask": Frame(HttpRequest, direction="out", max_length=65_536),
-    "reply": Frame(HttpReply, max_length=1 << 18, acknowledged={"LS203": "room for ten times the usual metadata"}),
+    "reply": Frame(HttpReply, max_length=1 << 18),
 }
 
 
