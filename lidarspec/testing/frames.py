@@ -36,7 +36,7 @@ LEAST_SPOTS = 12
 #: bytes of a long frame's cuts together: each is parsed as far as it goes.
 CUT_BYTES = 1 << 20
 #: bytes of a long frame's changed copies together, where construct alone reads it.
-CHANGED_BYTES = 1 << 20
+CHANGED_BYTES = 300_000
 #: frames of which every bit is flipped, with the usual number of examples, and at least.
 SAMPLES = 3
 LEAST_SAMPLES = 2
