@@ -193,7 +193,7 @@ class Device(Closing):
         that are another sensor's, scans without an end, times without a date, a nominal calibration; and what the plugin failed at."""
         failure = self.stats.failure(self.sensor.id)
         nominal = [_nominal(self.sensor)] if self.stats.nominal else []
-        partial = [f"{self.source}: {text}" for text in (self.stats.unended, self.stats.undated) if text]
+        partial = [f"{self.source}: {text}" for text in (self.stats.unended, self.stats.undated, self.stats.masked) if text]
         return [*self._input.warnings, *self._doubts(), *partial, *nominal, *([] if failure is None else [str(failure)])]
 
     @property

@@ -57,6 +57,7 @@ class Counters:
         nominal: whether a default calibration stood in for the sensor's own in any scan.
         unended: what to say of scans that were handed out without an end; "" where there were none.
         undated: what to say of times that no frame has completed; "" where they are complete.
+        masked: what to say of a masked sector; "" if there is none.
     """
 
     bytes_in: int = 0
@@ -83,6 +84,7 @@ class Counters:
     nominal: bool = field(default=False, repr=False, compare=False)
     unended: str = field(default="", repr=False, compare=False)
     undated: str = field(default="", repr=False, compare=False)
+    masked: str = field(default="", repr=False, compare=False)
 
     def to_dict(self) -> dict[str, Any]:
         """The counters by name."""

@@ -8,6 +8,7 @@ sensor's clock and counter, and with what frames of other types said last. Modul
 * `pace`: how long a packet takes by the clock.
 * `continuity`: what was lost, came twice or late, by the counter, the clock and the bytes.
 * `clock_order`: the same for datagrams that only their clock numbers.
+* `masked_sector`: gaps where a rotating sensor is set to send nothing, which are no loss.
 * `reorder`: packets put back in order, doubles left out.
 * `imu`: what an IMU felt, beside the points.
 * `stream`: what is remembered from batch to batch.

@@ -9,6 +9,8 @@ Each packet gets an index and an order. The index runs on over what is missing. 
 nanoseconds, from the first packet on; it differs for packets of one time that are no doubles, and leaps by
 `2 * MAX_STEP_NS` where the clock was set or the sensor started again. Packets sorted by it and judged by another
 `ClockOrder` give the index and the breaks that they would have got without any disorder.
+
+A gap at a masked sector (`masked_sector`) is no loss.
 """
 
 from __future__ import annotations
@@ -24,6 +26,7 @@ from numpy.typing import NDArray
 from lidarspec.columns.columns import Batch
 from lidarspec.framing.results import Counters, Numbers
 from lidarspec.packets.clocks import Times
+from lidarspec.packets.masked_sector import MaskedGaps
 from lidarspec.packets.pace import Pace, Paces
 
 #: places that a packet may be late; a clock that goes back further was set, or the sensor started again.
@@ -45,6 +48,8 @@ class Neighbour:
     Attributes:
         missing: packets that are missing between it and the one before it in time.
         data: its bytes; None if they are no longer remembered.
+        angle: at which it begins, in turns; nan if unknown.
+        masked: packets that a masked sector leaves out before it.
     """
 
     time: int
@@ -52,6 +57,8 @@ class Neighbour:
     index: int
     missing: int
     data: bytes | None
+    angle: float = math.nan
+    masked: int = 0
 
 
 class ClockOrder:
@@ -60,16 +67,18 @@ class ClockOrder:
     Args:
         stats: counts what is lost, late and doubled.
         pace: how long a packet takes.
+        gaps: tells masked sectors from losses; None to count them as losses.
     """
 
-    def __init__(self, stats: Counters, pace: Pace) -> None:
+    def __init__(self, stats: Counters, pace: Pace, gaps: MaskedGaps | None = None) -> None:
         self._stats = stats
         self._pace = pace
         self._arrived: int | None = None  # time of the packet that arrived last, ns
         self._newest: Neighbour | None = None
         self._neighbours = list[Neighbour]()  # by their times
         self._offset = 0  # from a time to an order
-        self._leap: tuple[int, int] | None = None  # the time before the clock leapt, ns, and how many packets that lost
+        self._gaps = gaps
+        self._leap: tuple[int, Neighbour] | None = None  # the time before the clock leapt, ns, and the packet after
 
     def push(self, batch: Batch, times: Times) -> tuple[Numbers, NDArray[np.int64]]:
         """Return the index and the order of each packet, (n,); mark the breaks before packets in `batch.breaks`.
@@ -78,6 +87,8 @@ class ClockOrder:
             times: by the sensor's clock, (n,) ns.
         """
         paces = self._pace.of(batch, times)
+        if self._gaps is not None:
+            self._gaps.read(batch.table)
         odd_rows = self._find_odd(times, paces)
         count = len(times)
         self._arrived = times.item(-1)
@@ -110,6 +121,8 @@ class ClockOrder:
         """Treat the next packet as the first one after the clock was set: nothing tells what passed until then."""
         self._arrived = None
         self._neighbours.clear()
+        if self._gaps is not None:
+            self._gaps.forget()
         self._pace.forget()
 
     def _find_odd(self, times: Times, paces: Paces) -> list[int]:
@@ -136,7 +149,7 @@ class ClockOrder:
         for row in range(max(start, stop - MAX_PLACES_LATE), stop):
             data = batch.table.frame(row) if row >= stop - REMEMBERED_FRAMES else None
             time = times.item(row)
-            self._newest = Neighbour(time, time + self._offset, first + row - start, 0, data)
+            self._newest = Neighbour(time, time + self._offset, first + row - start, 0, data, self._angle_at(row))
             self._neighbours.append(self._newest)
         return first
 
@@ -148,7 +161,7 @@ class ClockOrder:
         newest = self._neighbours[-1]
         passed = time - newest.time
         if self._leap is not None and self._leaps_back(time, passed, pace):
-            self._stats.lost -= self._leap[1]  # one reading was damaged
+            self._stats.lost -= self._leap[1].missing  # one reading was damaged
             return self._begin(batch, row, time, data)
         if passed > MAX_STEP_NS or self._is_too_early(time, passed, pace):
             return self._begin(batch, row, time, data)
@@ -159,26 +172,41 @@ class ClockOrder:
                 self._stats.duplicates += 1
                 return twin
         if stop < len(self._neighbours):
-            return self._insert(stop, time, pace, data)
+            return self._insert(stop, row, time, pace, data)
         missing = _count_missing(passed, pace)
+        angle = self._angle_at(row)
+        masked = 0
+        if missing and self._gaps is not None:
+            masked = self._gaps.count_masked(newest.angle, angle, missing)
+            missing -= masked
         self._stats.lost += missing
-        self._leap = (newest.time, missing) if missing > MAX_PLACES_LATE else None
         batch.breaks[row] |= missing > 0
         order = max(time + self._offset, newest.order + 1)
-        self._newest = Neighbour(time, order, newest.index + 1 + missing, missing, data)
+        self._newest = Neighbour(time, order, newest.index + 1 + missing, missing, data, angle, masked)
         self._neighbours.append(self._newest)
+        self._leap = (newest.time, self._newest) if missing > MAX_PLACES_LATE else None
+        if missing and self._gaps is not None:
+            self._stats.lost -= self._gaps.find_unlost(row, newest.angle, angle, self._newest)
         return self._newest
+
+    def _angle_at(self, row: int) -> float:
+        return math.nan if self._gaps is None else self._gaps.angle_at(row)
+
+    @property
+    def _places_late(self) -> int:
+        """The places that a packet may be late."""
+        return MAX_PLACES_LATE + (0 if self._gaps is None else self._gaps.masked)
 
     def _leaps_back(self, time: int, passed: int, pace: float) -> bool:
         """Return whether the clock leaps to where it was before it leapt last."""
         assert self._leap is not None
-        reach = MAX_PLACES_LATE * pace
+        reach = self._places_late * pace
         return abs(passed) > reach and 0 < time - self._leap[0] <= reach
 
     def _is_too_early(self, time: int, passed: int, pace: float) -> bool:
         """Return whether the clock has gone back further than by a late packet."""
         if pace > 0:
-            return passed < -MAX_PLACES_LATE * pace
+            return passed < -self._places_late * pace
         is_full = len(self._neighbours) >= MAX_PLACES_LATE
         return passed < -MAX_LATE_NS or (is_full and time < self._neighbours[0].time)
 
@@ -192,20 +220,23 @@ class ClockOrder:
             self._offset = before.order + 2 * MAX_STEP_NS - time
             index = before.index + 2
             batch.breaks[row] = True
-            self._leap = (before.time, 0)
-        self._newest = Neighbour(time, time + self._offset, index, 0, data)
+        self._newest = Neighbour(time, time + self._offset, index, 0, data, self._angle_at(row))
+        self._leap = None if before is None else (before.time, self._newest)
         self._neighbours = [self._newest]
         return self._newest
 
-    def _insert(self, position: int, time: int, pace: float, data: bytes) -> Neighbour:
+    def _insert(self, position: int, row: int, time: int, pace: float, data: bytes) -> Neighbour:
         """Place a late packet before a neighbour, and count anew what is missing on both sides of it."""
         self._stats.late += 1
         after = self._neighbours[position]
         missing_after = _count_missing(after.time - time, pace)
+        masked_after = min(after.masked, missing_after)
+        missing_after -= masked_after
+        masked = after.masked - masked_after
         order = time + self._offset
         if position:
             before = self._neighbours[position - 1]
-            missing = _count_missing(time - before.time, pace)
+            missing = max(_count_missing(time - before.time, pace) - masked, 0)
             index = max(min(before.index + 1 + missing, after.index - 1), before.index)
             order = max(order, before.order + 1)
         else:
@@ -213,7 +244,8 @@ class ClockOrder:
             index = after.index - 1 - missing_after
         self._stats.lost += missing + missing_after - after.missing
         after.missing = missing_after
-        placed = Neighbour(time, order, index, missing, data)
+        after.masked = masked_after
+        placed = Neighbour(time, order, index, missing, data, self._angle_at(row), masked)
         self._neighbours.insert(position, placed)
         return placed
 

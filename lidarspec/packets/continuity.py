@@ -22,6 +22,7 @@ from lidarspec.columns.graph import header_function
 from lidarspec.errors import SpecError
 from lidarspec.framing.results import Counters, Numbers
 from lidarspec.packets.clocks import Times
+from lidarspec.packets.masked_sector import MaskedGaps
 from lidarspec.packets.pace import Pace, Paces
 from lidarspec.packets.packets import Index
 from lidarspec.spec.description import Spec
@@ -76,6 +77,14 @@ class Clues:
         return max(self.periods if isinstance(self.periods, int) else self.periods.item(spot), 1)
 
 
+@dataclass
+class CountedLoss:
+    """Packets that are missing by the counter, and that a masked sector leaves out (see `masked_sector.Loss`)."""
+
+    missing: int
+    masked: int = 0
+
+
 class Continuity:
     """Whether the packets of one stream follow one another; counts into `stats`.
 
@@ -95,7 +104,9 @@ class Continuity:
         self._arrived: int | None = None  # the time of the packet that came last, ns
         self._suspect: tuple[int, int] | None = None  # number and time of a packet whose counter jumped while the clock went on
         self._period, self._index, self._first = 0, -1, 0
-        self._missing: set[int] = set()
+        self._missing = dict[int, CountedLoss]()
+        self._gaps = MaskedGaps(sensor) if counted else None
+        self._angle = math.nan  # of the newest packet, in turns
 
     def push(self, batch: Batch, times: Times | None, skipped: NDArray[np.int64]) -> tuple[Index, NDArray[np.bool_]]:
         """The index of each packet, (n,), and True where there is a break before it, (n,).
@@ -115,6 +126,8 @@ class Continuity:
         clues = self._clues(batch, times, skipped)
         if self._rule is None:
             return self._in_order(clues, breaks), breaks
+        if self._gaps is not None:
+            self._gaps.read(batch.table)
         found: Numbers = np.empty(number, np.int64)
         odd, spot, turn = [*self._odd(clues), number], 0, 0
         while spot < number:
@@ -126,6 +139,7 @@ class Continuity:
             if follows:
                 first, self._index = self._index + 1, self._index + end - spot
                 self._number, self._time = clues.number(end - 1), clues.time(end - 1)
+                self._angle = self._angle_at(end - 1)
                 found = self._placed(found, first, spot, end)
             else:
                 index, is_break = self._step(clues, spot, ahead, counts)
@@ -137,6 +151,8 @@ class Continuity:
     def forget(self) -> None:
         """Time has passed, and packets may have, that nothing tells of: the clock is not asked about the next one."""
         self._time = self._arrived = None
+        if self._gaps is not None:
+            self._gaps.forget()
         if self._pace is not None:
             self._pace.forget()
 
@@ -288,12 +304,29 @@ class Continuity:
         if ahead is None:
             self._begin(number)
         else:
-            self._stats.lost += lost
-            self._missing = {index for index in self._missing if index > self._index + ahead - LATE}
-            self._missing.update(range(self._index + 1, self._index + ahead)[-LATE:])
+            missing = range(self._index + 1, self._index + ahead)[-LATE:]
+            loss = CountedLoss(lost)
+            self._count_lost(loss, spot)
+            lost = loss.missing
+            self._missing = {index: loss for index, loss in self._missing.items() if index > self._index + ahead - LATE}
+            self._missing |= dict.fromkeys(missing, loss)
             self._index += ahead
         self._number, self._time = number, clues.time(spot)
+        self._angle = self._angle_at(spot)
         return self._index, before >= 0 and (ahead is None or lost > 0)
+
+    def _count_lost(self, loss: CountedLoss, spot: int) -> None:
+        """Count the packets that are missing before another one as lost, but for those that are masked."""
+        if self._gaps is not None and loss.missing:
+            angle = self._angle_at(spot)
+            loss.masked = self._gaps.count_masked(self._angle, angle, loss.missing)
+            loss.missing -= loss.masked
+        self._stats.lost += loss.missing
+        if self._gaps is not None and loss.missing:
+            self._stats.lost -= self._gaps.find_unlost(spot, self._angle, angle, loss)
+
+    def _angle_at(self, spot: int) -> float:
+        return math.nan if self._gaps is None else self._gaps.angle_at(spot)
 
     def _begin(self, number: int | None) -> None:
         """A first packet, or the sensor started again: nothing is known to be lost, and the index leaves out one number."""
@@ -301,13 +334,15 @@ class Continuity:
             self._index = (number - self._rule.first) % self._period % FARTHEST
         else:
             self._index += 2
-        self._first, self._missing, self._suspect = self._index, set(), None
+        self._first, self._missing, self._suspect = self._index, {}, None
 
     def _back(self, behind: int) -> int:
         index = self._index - behind
         if index in self._missing:
-            self._missing.discard(index)
-            self._stats.lost -= 1
+            loss = self._missing.pop(index)
+            if loss.missing:
+                self._stats.lost -= 1
+                loss.missing -= 1
             self._stats.late += 1
         elif behind and index < self._first:
             self._stats.late += 1

@@ -40,6 +40,7 @@ class Packets:
         breaks: (n,) True where something was lost before the packet.
         grain_ns: the step of the sensor's clock, 0 if a function computes it, if the clock alone orders the packets; None if not.
         state: for each other frame type, its frames and which of them was last before each packet.
+        masked: (n,) packets that are missing before each since a masked sector leaves them out; None if there are none.
         stats: the counters of the decoder.
         backend: what makes points of them, "auto", "numpy" or "jit".
     """
@@ -60,10 +61,12 @@ class Packets:
         backend: str = "auto",
         order: NDArray[np.int64] | None = None,
         grain_ns: float | None = None,
+        masked: NDArray[np.int64] | None = None,
     ) -> None:
         self.sensor, self.frame, self.table = sensor, frame, table
         self._order = order
         self.grain_ns = grain_ns
+        self.masked = masked
         self._offset, self.time_ns, self.host_ns, self._index, self.breaks = offset, time_ns, host_ns, index, breaks
         self.state, self.stats, self.backend = state, stats, backend
 
@@ -160,7 +163,8 @@ class Packets:
         """Return what is known of some packets besides their fields, as `Packets` takes it."""
         columns: dict[str, Any] = {name: getattr(self, name)[indices] for name in _COLUMNS}
         order = None if self._order is None else self._order[indices]
-        return {**columns, "order": order, "grain_ns": self.grain_ns}
+        masked = None if self.masked is None else self.masked[indices]
+        return {**columns, "order": order, "grain_ns": self.grain_ns, "masked": masked}
 
     def parts(self, path: str) -> Packets:
         """The parts of all packets, in stream order, as packets: with the times, numbers and state of the frames that they are in.
@@ -219,6 +223,8 @@ def joined(parts: Sequence[Packets]) -> Packets:
     if all(part.grain_ns is not None for part in parts):
         columns["order"] = np.concatenate([part.order for part in parts])
         columns["grain_ns"] = head.grain_ns
+    if any(part.masked is not None for part in parts):
+        columns["masked"] = np.concatenate([np.zeros(len(part), np.int64) if part.masked is None else part.masked for part in parts])
     table = joined_tables([part.table for part in parts])
     return Packets(head.sensor, head.frame, table, **columns, state=state, stats=parts[-1].stats, backend=head.backend)
 

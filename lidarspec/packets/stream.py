@@ -23,6 +23,7 @@ from lidarspec.packets.clock_order import ClockOrder
 from lidarspec.packets.clocks import ClockReference, Epoch, Unwrapper, clock_parts, clock_terms, clocked, held, paths
 from lidarspec.packets.continuity import Continuity
 from lidarspec.packets.imu import ImuSamples, Waiting, joined
+from lidarspec.packets.masked_sector import MaskedGaps
 from lidarspec.packets.pace import Pace
 from lidarspec.packets.packets import Index, Packets, StateOf, joined_tables
 from lidarspec.spec.description import Spec
@@ -77,7 +78,7 @@ class PacketStream:
         self._grain_ns = grain
         self._clock_order: ClockOrder | None = None
         if sensor.clock is not None and timed and not counted and not in_parts and sensor.datagrams:
-            self._clock_order = ClockOrder(stats, Pace(sensor.clock, grain))
+            self._clock_order = ClockOrder(stats, Pace(sensor.clock, grain), MaskedGaps(sensor))
         self._skipped = 0  # bytes since the last packet
         self._time: int | None = None  # of the last packet with parts that have the clock
         self._tables: dict[str, tuple[bytes, Table]] = {}

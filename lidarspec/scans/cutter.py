@@ -10,15 +10,15 @@ from numpy.typing import NDArray
 
 from lidarspec.columns.columns import Column
 from lidarspec.errors import SpecError, UnknownField
+from lidarspec.packets.masked_sector import FULL_TURNS, JITTER, AngleReader, Sector
 from lidarspec.packets.packets import Packets
 from lidarspec.points.cloud import COLUMNS
 from lidarspec.points.plain import Evaluated
+from lidarspec.spec.description import Spec
 from lidarspec.spec.timing import Every, OnChange, OnFlag, OnJump, OnRewind, OnWrap, Split
 
 #: an angle has to have been this part of a turn away from the cut before it cuts again, so that jitter does not.
 AWAY = 1 / 8
-#: the whole turn in the units of angles.
-FULL = {"deg": 360.0, "rad": 2 * np.pi}
 
 
 class Turning:
@@ -94,8 +94,16 @@ class End(NamedTuple):
 class Cutter:
     """Finds where the scans of one stream of points end."""
 
-    def __init__(self, rule: Split) -> None:
-        self._rule = rule
+    def __init__(self, sensor: Spec) -> None:
+        self._rule: Split = sensor.scan
+        self._reader = AngleReader(sensor)
+        self._cut: float | None = None  # where the user wants scans to be cut, in turns
+        if "cut" in sensor.options:
+            self._cut = sensor.options["cut"] / 360 % 1
+        self.sector: Sector | None = None
+        self._angle: float | None = None  # of the row before, in turns
+        self._direction = 0
+        self._turned = 1.0  # turns since the last end in a sector
         self._before: float | None = None
         self._armed, self._turning = True, Turning()
         self._start: int | None = None
@@ -104,20 +112,70 @@ class Cutter:
     def ends(self, packets: Packets, found: Evaluated) -> list[End]:
         """The ends in this batch, ascending."""
         rule, steps = self._rule, None
+        if self.sector is not None:
+            return self._ends_at(packets, found, self.sector.middle if self._cut is None else self._cut)
+        if self._cut is not None and isinstance(rule, OnChange):
+            return self._ends_at(packets, found, self._cut)
         if isinstance(rule, Every):
             which = self._periods(rule, packets, found)
             return self._ends(first_points(found)[which], which)
         if isinstance(rule, OnWrap) and rule.name in COLUMNS:
-            points, steps = self._wraps(np.asarray(getattr(found.cloud, rule.name), np.float64), 2 * np.pi, rule.at)
+            points, steps = self._wraps(np.asarray(getattr(found.cloud, rule.name), np.float64), 2 * np.pi, self._at(rule, 2 * np.pi))
             return self._ends(points, steps=steps)
         path = _own_path(packets, rule.name)
         column = _field(found, path)
         values, starts = _rows(column, found)
         if isinstance(rule, OnWrap):
-            rows, steps = self._wraps(values, _turn(packets, path) or 2 * np.pi, rule.at)
+            full = _turn(packets, path) or 2 * np.pi
+            rows, steps = self._wraps(values, full, self._at(rule, full))
         else:
             rows = self._changes(rule, values, _turn(packets, path) if isinstance(rule, OnJump) else None)
         return self._ends(starts[rows], rows if all(name is None for name in column.axes) else None, steps)
+
+    def _at(self, rule: OnWrap, full: float) -> float:
+        """Return the angle at which scans are cut, in the unit in which a turn is `full`."""
+        return rule.at if self._cut is None else self._cut * full
+
+    def use_sector(self, sector: Sector, angle: float | None) -> None:
+        """Cut scans in a masked sector from now on.
+
+        Args:
+            angle: of the last packet before, in turns; None if there is none.
+        """
+        self.sector = sector
+        self._direction = sector.direction
+        self._angle = angle
+
+    def _ends_at(self, packets: Packets, found: Evaluated, at: float) -> list[End]:
+        """Return the ends where the angle passes `at`, in turns, of a sensor that may leap over it."""
+        rows_are_packets = True
+        if isinstance(self._rule, OnWrap):
+            path = _own_path(packets, self._rule.name)
+            column = _field(found, path)
+            values, starts = _rows(column, found)
+            angles = values / (_turn(packets, path) or 2 * np.pi)
+            rows_are_packets = all(name is None for name in column.axes)
+        else:
+            read = self._reader.angles(packets.table)
+            angles = np.empty(0) if read is None else read[: found.ready]
+            starts = first_points(found)
+        self._direction = self._direction or self._reader.direction(packets.table)
+        if not len(angles):
+            return []
+        before = _before(angles, self._angle)
+        self._angle = float(angles[-1])
+        steps = (self._direction * (angles - before)) % 1
+        steps[steps > 1 - JITTER] = 0
+        behind = (self._direction * (before - at)) % 1
+        turned = self._turned + np.cumsum(steps)
+        rows = list[int]()
+        for row in np.flatnonzero(behind + steps >= 1).tolist():
+            if turned[row] >= AWAY:
+                rows.append(row)
+                turned -= turned[row]
+        self._turned = float(turned[-1])
+        picked = np.array(rows, np.intp)
+        return self._ends(starts[picked], picked if rows_are_packets else None)
 
     def _ends(
         self, points: NDArray[np.intp], packets: NDArray[np.intp] | None = None, steps: NDArray[np.float64] | None = None
@@ -188,7 +246,7 @@ class Cutter:
 def _turn(packets: Packets, path: str) -> float | None:
     """The whole turn in the unit of a field, None where it is no angle."""
     table = packets.frames[0] if path.startswith("frame.") else packets.table
-    return FULL.get(table.schema.fields[path.removeprefix("frame.")].unit)
+    return FULL_TURNS.get(table.schema.fields[path.removeprefix("frame.")].unit)
 
 
 def _own_path(packets: Packets, path: str) -> str:

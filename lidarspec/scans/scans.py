@@ -22,6 +22,7 @@ from lidarspec.points.conventions import axes_of
 from lidarspec.points.evaluate import guarded
 from lidarspec.points.plain import Evaluated
 from lidarspec.scans.cutter import Cutter, End, first_points
+from lidarspec.scans.masking import Masking, describe
 from lidarspec.spec.description import Spec
 from lidarspec.spec.links import Serial
 from lidarspec.spec.timing import Every, OnFlag, OnRewind, OnWrap, Split
@@ -335,11 +336,15 @@ class Progress:
         """What is looked at of the first packets, by the number of points of each, (n,), or their bytes; a frame of parts counts once."""
         times, index, broken = packets.time_ns[:number], packets.index[:number], packets.breaks[:number]
         before, (frames, which) = int(index[0]) - 1 if self._last is None else self._last[1], packets.frames
-        if frames is packets.table and int(index[-1]) - before == number:
+        if frames is packets.table and int(index[-1]) - before == number and packets.masked is None:
             sizes = frames.sizes[:number] if points is None else points
             return Batch(times, repeated(1, number), sizes, repeated(0, number), broken.copy() if broken.any() else broken)
         steps = np.diff(index, prepend=before)
         counts, missing = (steps != 0).astype(np.int64) if frames is not packets.table else repeated(1, number), np.maximum(steps - 1, 0)
+        if packets.masked is not None:
+            masked = packets.masked[:number]
+            missing = np.maximum(missing - masked, 0)
+            broken = broken & (masked == 0)
         return Batch(times, counts, counts * frames.sizes[which][:number] if points is None else points, missing, broken | (missing > 0))
 
     def _shows_start(self, packets: Packets, edge: int) -> bool:
@@ -466,7 +471,8 @@ class ScanStream:
     def __init__(self, sensor: Spec, mount: Mount | None = None, imu: Waiting | None = None) -> None:
         self._sensor, self._mount, self._imu = sensor, mount, imu
         self._reorder = Reorder(enabled=sensor.sequence is not None or (sensor.clock is not None and sensor.datagrams))
-        self._cutter = Cutter(sensor.scan)
+        self._masking = Masking(sensor)
+        self._cutter = Cutter(sensor)
         self._waiting: Packets | None = None
         self._carry: Carry = {}
         self._parts: list[Stretch] = []
@@ -489,16 +495,28 @@ class ScanStream:
 
     def add(self, packets: Packets) -> list[Scan]:
         """The scans that these packets complete."""
-        return [scan for batch in self._reorder.push(packets) for scan in self._push(batch, final=False)]
+        return [scan for batch in self._reorder.push(packets) for scan in self._push_ordered(self._masking.push(batch))]
 
     def finish(self) -> list[Scan]:
         """The scans that waited for more, and the piece that is left."""
-        scans = [scan for batch in self._reorder.finish() for scan in self._push(batch, final=False)]
+        held = [batch for ordered in self._reorder.finish() for batch in self._masking.push(ordered)]
+        scans = [*self._push_ordered(held), *self._push_ordered(self._masking.finish())]
         if self._waiting is not None and len(self._waiting):
             waiting, self._waiting = self._waiting, None
             scans += self._push(waiting, final=True)
         left = self._close(None)
         return scans + ([left] if left else [])
+
+    def _push_ordered(self, batches: list[Packets]) -> list[Scan]:
+        """Return the scans that packets in order complete."""
+        scans = list[Scan]()
+        for packets in batches:
+            sector = self._masking.sector
+            if packets.masked is not None and sector is not None and self._cutter.sector is None:
+                self._cutter.use_sector(sector, self._masking.angle_before_sector)
+                packets.stats.masked = describe(sector)
+            scans += self._push(packets, final=False)
+        return scans
 
     def _push(self, packets: Packets, *, final: bool) -> list[Scan]:
         packets = self._with_points(packets)

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import base64
 import inspect
+import math
 import os
 import re
 import warnings
@@ -22,6 +23,7 @@ from typing import TYPE_CHECKING, Any
 from lidarspec.display import drawn
 from lidarspec.errors import LidarSpecError, PluginError, UnknownOption, UsageError
 from lidarspec.spec.description import Spec
+from lidarspec.spec.timing import OnChange, OnWrap
 from lidarspec.trust import beside
 
 if TYPE_CHECKING:
@@ -37,7 +39,7 @@ if TYPE_CHECKING:
 #: bytes of something learned at most, where a file says it.
 LARGEST = 1 << 20
 #: options that every sensor has.
-OPTIONS = ("frame", "answer")
+OPTIONS = ("frame", "answer", "cut")
 FRAMES_OF_REFERENCE = ("rep103", "vendor")
 #: what a file may give as an option without naming a path.
 _WORD = re.compile(r"[A-Za-z0-9_+-]{1,40}")
@@ -397,11 +399,22 @@ def _type_names(annotation: object) -> set[str]:
     return {word.rpartition(".")[2] for word in re.findall(r"[\w.]+", text)}
 
 
+def _check_cut(sensor: Spec, degrees: object) -> None:
+    """Raise UsageError unless scans of a sensor can be cut at an angle, and it is one."""
+    has_angle = isinstance(sensor.scan, OnWrap) or (isinstance(sensor.scan, OnChange) and bool(sensor.scan.angle))
+    if not has_angle:
+        raise UsageError(f"{sensor.id}: its scans are not cut at an angle, so cut cannot be set")
+    if isinstance(degrees, bool) or not isinstance(degrees, Real) or not math.isfinite(float(degrees)):
+        raise UsageError(f"{sensor.id}: cut is an angle in degrees, not {shown(degrees)}")
+
+
 def _check_shared(sensor: Spec, options: Mapping[str, Any]) -> None:
     frame = options.get("frame", FRAMES_OF_REFERENCE[0])
     if frame not in FRAMES_OF_REFERENCE:
         raise UsageError(f"{sensor.id}: frame is one of {', '.join(FRAMES_OF_REFERENCE)}, not {frame!r}")
     if frame == "vendor" and sensor.vendor_axes is None:
         raise UsageError(f"{sensor.id} declares no axes of its vendor")
+    if "cut" in options:
+        _check_cut(sensor, options["cut"])
     if "answer" in options and options["answer"] not in sensor.data_frames:
         raise UsageError(f"{sensor.id}: answer is one of {', '.join(sensor.data_frames)}, not {options['answer']!r}")

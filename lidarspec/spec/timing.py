@@ -38,9 +38,18 @@ class OnFlag:
 
 @dataclass(frozen=True)
 class OnChange:
-    """Cut before every packet (or row) in which the field `name` differs from the one before."""
+    """Cut before every packet (or row) in which the field `name` differs from the one before.
+
+    Args:
+        name: a field path.
+        angle: the path of a field that grows evenly as a rotating sensor turns, the angle at which a packet begins. By it a masked
+            sector is found, in which scans are cut then, and `configure(cut=)` cuts. "" if there is none.
+        full: how much `angle` grows in a turn, in its unit.
+    """
 
     name: str
+    angle: str = ""
+    full: float = 360.0
 
 
 @dataclass(frozen=True)

@@ -24,11 +24,11 @@ from lidarspec.columns.graph import Node, sample_of, trace, traverse
 from lidarspec.errors import LidarSpecError, SpecError, UsageError
 from lidarspec.framing.examples import header, random_frame
 from lidarspec.framing.frame_engine import CompiledCodec, codec
+from lidarspec.packets.masked_sector import FULL_TURNS
 from lidarspec.packets.packets import Packets
 from lidarspec.points.cloud import PointCloud
 from lidarspec.points.conventions import axis_matrix
 from lidarspec.points.plain import evaluate
-from lidarspec.scans.cutter import FULL
 from lidarspec.simulation.frame_maker import FrameMaker
 from lidarspec.simulation.scenes import Room, furnished
 from lidarspec.simulation.simulator import simulation
@@ -223,13 +223,15 @@ def the_full_circle_is_the_same_as_none(subject: Subject, name: str) -> None:
         try:
             clouds = _with_values(subject, name, path, (full[0], full[0] + SMALL, full[1]))
         except SpecError as error:
-            raise Violation("LS505", f"{path} of exactly {FULL[info.unit]:g} {info.unit}: {error.reason}", f"{name}.{path}") from error
+            raise Violation(
+                "LS505", f"{path} of exactly {FULL_TURNS[info.unit]:g} {info.unit}: {error.reason}", f"{name}.{path}"
+            ) from error
         if not clouds or not _turn(info, clouds[0], clouds[1]):
             continue
         nought, _, circle = clouds
         apart = np.nanmax(np.abs(nought.xyz - circle.xyz) / (1 + np.abs(nought.range))[:, None], initial=0)
         same = np.array_equal(nought.valid, circle.valid) and apart < 1e-3
-        require(same, "LS505", f"{path} of exactly {FULL[info.unit]:g} {info.unit} gives other points than 0", f"{name}.{path}")
+        require(same, "LS505", f"{path} of exactly {FULL_TURNS[info.unit]:g} {info.unit} gives other points than 0", f"{name}.{path}")
 
 
 def the_points_turn_as_the_axes_do(subject: Subject, name: str) -> None:
@@ -311,7 +313,7 @@ def counters_run_on(subject: Subject, name: str) -> None:
 
 def _zero(info: FieldInfo) -> int | None:
     """The raw value of no angle, nearly; None where the field is no angle or has none."""
-    if info.kind != "int" or info.const is not None or info.unit not in FULL or not info.scale:
+    if info.kind != "int" or info.const is not None or info.unit not in FULL_TURNS or not info.scale:
         return None
     raw = round(-info.offset / info.scale)
     return raw if info.limits[0] <= raw <= info.limits[1] - SMALL else None
@@ -320,7 +322,7 @@ def _zero(info: FieldInfo) -> int | None:
 def _full_circle(info: FieldInfo) -> tuple[int, int] | None:
     """The raw values of no angle and of the full circle; None where the field cannot hold both."""
     zero = _zero(info)
-    circle = (FULL[info.unit] - info.offset) / info.scale if zero is not None else math.nan
+    circle = (FULL_TURNS[info.unit] - info.offset) / info.scale if zero is not None else math.nan
     whole = zero is not None and abs(circle - round(circle)) < 1e-6 and round(circle) <= info.limits[1] and not info.physical(zero)
     return (zero, round(circle)) if zero is not None and whole else None
 
@@ -348,7 +350,7 @@ def _with_values(subject: Subject, name: str, path: str, values: tuple[int, ...]
 def _turn(info: FieldInfo, nought: PointCloud, turned: PointCloud) -> int:
     """Which way points turned with a field, 1 counter-clockwise; 0 where they did not: a rate, or another angle than the azimuth."""
     moved = (turned.azimuth - nought.azimuth + np.pi) % (2 * np.pi) - np.pi
-    most = float(max(moved[np.isfinite(moved)], key=abs, default=0)) / (SMALL * info.scale * 2 * np.pi / FULL[info.unit])
+    most = float(max(moved[np.isfinite(moved)], key=abs, default=0)) / (SMALL * info.scale * 2 * np.pi / FULL_TURNS[info.unit])
     return int(np.sign(most)) if 0.5 < abs(most) < 1.5 else 0
 
 

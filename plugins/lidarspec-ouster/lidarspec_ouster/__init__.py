@@ -107,7 +107,7 @@ def shaped(sensor: Sensor, unit: Unit) -> Sensor:
         sensor,
         frames=frames,
         points=partial(points, unit=unit),
-        scan=OnChange("columns[0].frame_id" if legacy else "frame_id"),
+        scan=OnChange("columns[0].frame_id" if legacy else "frame_id", angle="columns[0].measurement_id", full=unit.turn),
         clock=Clock("columns[0].timestamp"),
         info={} if legacy else {"serial": "data.serial"},
         simulation=Simulation(partial(sweep, unit), answers={"get_metadata": (("reply", {"status": 200, "body": unit.told()}),)}),

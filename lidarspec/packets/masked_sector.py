@@ -1,0 +1,290 @@
+"""Masked sectors: the part of each turn in which a rotating sensor sends nothing, since its user has set it so.
+
+Between the packets on both sides of such a sector the clock advances and the angle leaps, as if packets were lost. A
+gap belongs to a masked sector if it recurs at the same angles while no packet has ever come from the angles between.
+In a loss the missing angles are seen one turn earlier or later.
+
+All angles here are in turns, from 0 to 1. A width is measured in the direction of rotation.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lidarspec.points.cloud import COLUMNS
+from lidarspec.spec.description import Spec
+from lidarspec.spec.timing import OnChange, OnWrap
+from lidarspec.wire.frame_table import Table
+
+Angles = NDArray[np.float64]
+
+#: whole turns in the units of angles.
+FULL_TURNS = {"deg": 360.0, "rad": 2 * np.pi}
+#: angles are remembered in so many equal parts of a turn.
+BINS = 360
+#: the narrowest sector that is looked for.
+MIN_WIDTH = 1 / 36
+#: the same in steps from packet to packet.
+MIN_WIDTH_STEPS = 4
+#: steps from packet to packet by which the edges of a gap vary.
+EDGE_STEPS = 1.25
+#: a step back by less is jitter of the angle, and no leap over the rest of the turn.
+JITTER = 1 / 200
+#: share of the wider one of two gaps that both have in common if they are of one sector.
+COMMON_SHARE = 0.5
+#: gaps that are compared with later ones.
+REMEMBERED_GAPS = 16
+#: packets by which the gap of a masked sector may vary, since packets do not begin at its edges.
+VARYING_PACKETS = 2
+
+
+@dataclass(frozen=True)
+class Sector:
+    """A sector of a turn.
+
+    Attributes:
+        start: the angle at which it begins, in the direction of rotation.
+        width: how far it reaches from there.
+        direction: 1 if angles grow as the sensor turns, else -1.
+    """
+
+    start: float
+    width: float
+    direction: int
+
+    @classmethod
+    def between(cls, start: float, stop: float, direction: int) -> Sector:
+        """Return the sector from one angle to another."""
+        return cls(start, forward(stop - start, direction), direction)
+
+    @property
+    def stop(self) -> float:
+        """The angle at which it ends."""
+        return (self.start + self.direction * self.width) % 1
+
+    @property
+    def middle(self) -> float:
+        """The angle in its middle."""
+        return (self.start + self.direction * self.width / 2) % 1
+
+    def contains(self, angle: float) -> bool:
+        """Return whether an angle lies within."""
+        return forward(angle - self.start, self.direction) < self.width
+
+    def common(self, other: Sector) -> Sector | None:
+        """Return the sector that lies in both; None if there is none."""
+        offset = forward(other.start - self.start, self.direction)
+        if offset < self.width:
+            return Sector(other.start, min(self.width - offset, other.width), self.direction)
+        return other.common(self) if other.contains(self.start) else None
+
+
+def forward(step: float, direction: int) -> float:
+    """Return a step in the direction of rotation, from 0 to 1; a little back is none."""
+    ahead = (direction * step) % 1
+    return 0.0 if ahead > 1 - JITTER else ahead
+
+
+class AngleReader:
+    """Reads the angle at which each packet begins, by the rule that cuts scans.
+
+    Args:
+        sensor: of the packets.
+
+    Attributes:
+        is_available: whether the rule names an angle in the packets.
+    """
+
+    def __init__(self, sensor: Spec) -> None:
+        rule = sensor.scan
+        self._path = ""
+        self._full: float | None = None
+        self._grows = False
+        if isinstance(rule, OnChange):
+            self._path = rule.angle
+            self._full = rule.full
+            self._grows = True
+        elif isinstance(rule, OnWrap) and rule.name not in COLUMNS:
+            self._path = rule.name
+        self.is_available = bool(self._path) and sensor.datagrams
+
+    def angles(self, table: Table) -> Angles | None:
+        """Return the angle at which each packet begins, (n,); None if the packets have no such field."""
+        info = table.schema.fields.get(self._path) if self.is_available else None
+        full = self._full if info is None or self._full is not None else FULL_TURNS.get(info.unit)
+        if info is None or full is None:
+            return None
+        raw = table.raw(self._path)
+        first = raw.reshape(len(raw), -1)[:, 0].astype(np.float64)
+        return np.mod((first * info.scale + info.offset) / full, 1.0)
+
+    def direction(self, table: Table) -> int:
+        """Return the direction in which the first packet of a table turns: 1 or -1; 0 if it does not show it."""
+        if self._grows:
+            return 1
+        info = table.schema.fields[self._path]
+        rows = table.raw(self._path)[:1].reshape(-1).astype(np.float64) * info.scale / FULL_TURNS[info.unit]
+        steps = np.diff(rows)
+        balance = np.sign(steps - np.rint(steps)).sum()
+        return int(np.sign(balance))
+
+
+class SectorFinder:
+    """Finds the masked sector of one stream.
+
+    Args:
+        direction: 1 if angles grow as the sensor turns, else -1.
+
+    Attributes:
+        sector: the masked sector; None until it is found.
+    """
+
+    def __init__(self, direction: int) -> None:
+        self.direction = direction
+        self.sector: Sector | None = None
+        self._seen = np.zeros(BINS, np.bool_)
+        self._gaps = list[Sector]()
+
+    def see(self, angles: Angles) -> None:
+        """Note that packets came from some angles."""
+        if self.sector is None:
+            self._seen[(angles * BINS).astype(np.intp) % BINS] = True
+
+    def add_gap(self, start: float, stop: float, step: float) -> list[int]:
+        """Compare a gap with earlier ones; set `sector` if it recurs.
+
+        Args:
+            start, stop: the angles of the packets before and after it.
+            step: from one packet to the next; the gap may vary by so much, as packets do not begin at its edges.
+
+        Returns:
+            How many gaps ago those were that contain the sector, which is found now; none if it is not.
+        """
+        gap = Sector.between(start, stop, self.direction)
+        for other in reversed(self._gaps):
+            common = gap.common(other)
+            is_same = common is not None and common.width > COMMON_SHARE * max(gap.width, other.width)
+            if common is not None and is_same and self._is_unseen(common, step):
+                self.sector = common
+                return [ago for ago, each in enumerate(reversed(self._gaps), start=1) if each.contains(common.middle)]
+        self._gaps.append(gap)
+        del self._gaps[:-REMEMBERED_GAPS]
+        return []
+
+    def has_unseen_gaps(self, step: float) -> bool:
+        """Return whether any gap may still turn out to be a masked sector."""
+        return any(self._is_unseen(gap, step) for gap in self._gaps)
+
+    def _is_unseen(self, sector: Sector, step: float) -> bool:
+        """Return whether no packet began within a sector, its edges left out, although one of each turn would."""
+        edge = EDGE_STEPS * step + 1 / BINS
+        inner = sector.width - 2 * edge
+        if inner < step + 1 / BINS:
+            return False
+        count = round(inner * BINS)
+        angles = sector.start + self.direction * (edge + np.arange(count + 1) / BINS)
+        return not self._seen[(angles * BINS).astype(np.intp) % BINS].any()
+
+
+class Loss(Protocol):
+    """A gap that counts as a loss so far.
+
+    Attributes:
+        missing: packets that count as lost.
+        masked: packets that do not, since a masked sector leaves them out.
+    """
+
+    missing: int
+    masked: int
+
+
+class MaskedGaps:
+    """Tells gaps at a masked sector from losses, for one stream of packets in any order.
+
+    A gap counts as a loss until it recurs, one turn later.
+
+    Args:
+        sensor: of the packets.
+
+    Attributes:
+        masked: packets that the masked sector leaves out; 0 until it is known.
+    """
+
+    def __init__(self, sensor: Spec) -> None:
+        self._reader = AngleReader(sensor)
+        self._angles: Angles | None = None  # of the packets at hand
+        self._first_unnoted = 0  # row of the first one that `_finder` has not seen
+        self._finder: SectorFinder | None = None
+        self._losses = list[Loss]()  # at the gaps that `_finder` remembers
+        self.masked = 0  # packets that the masked sector leaves out
+
+    def read(self, table: Table) -> None:
+        """Read the angles of the next packets."""
+        if self._angles is not None:
+            self._note_until(len(self._angles))
+        self._angles = self._reader.angles(table) if len(table) else None
+        self._first_unnoted = 0
+        if self._angles is not None and self._finder is None:
+            direction = self._reader.direction(table)
+            self._finder = SectorFinder(direction) if direction else None
+
+    def _note_until(self, row: int) -> None:
+        """Note that the packets at hand before a row are not masked."""
+        if self._finder is not None and self._angles is not None:
+            self._finder.see(self._angles[self._first_unnoted : row])
+        self._first_unnoted = row
+
+    def forget(self) -> None:
+        """Begin anew: the next packets may be those of another setting."""
+        self._finder = None
+        self._losses.clear()
+        self.masked = 0
+
+    def angle_at(self, row: int) -> float:
+        """Return the angle of one of the packets at hand, in turns; nan if unknown."""
+        return math.nan if self._angles is None else self._angles.item(row)
+
+    def count_masked(self, start: float, stop: float, missing: int) -> int:
+        """Return how many of the packets that are missing between two angles the masked sector leaves out, if it is known."""
+        sector = None if self._finder is None else self._finder.sector
+        if sector is None or math.isnan(start) or math.isnan(stop):
+            return 0
+        if not Sector.between(start, stop, sector.direction).contains(sector.middle):
+            return 0
+        return missing if missing <= self.masked + VARYING_PACKETS else min(self.masked, missing)
+
+    def find_unlost(self, row: int, start: float, stop: float, loss: Loss) -> int:
+        """Compare a loss between two angles with earlier ones; if it recurs, both are masked.
+
+        Args:
+            row: of the packet behind it.
+
+        Returns:
+            How many packets count as lost, and are not.
+        """
+        finder = self._finder
+        if finder is None or finder.sector is not None or math.isnan(start) or math.isnan(stop):
+            return 0
+        width = forward(stop - start, finder.direction)
+        step = width / (loss.missing + 1)
+        if width < max(MIN_WIDTH, MIN_WIDTH_STEPS * step):
+            return 0
+        self._note_until(row)
+        ago = finder.add_gap(start, stop, step)
+        if not ago:
+            self._losses.append(loss)
+            del self._losses[:-REMEMBERED_GAPS]
+            return 0
+        losses = [self._losses[-each] for each in ago]
+        self.masked = max(loss.missing, losses[0].missing)
+        unlost = 0
+        for each in (*losses, loss):
+            unlost += each.missing
+            each.masked = each.missing
+            each.missing = 0
+        return unlost

@@ -1,0 +1,188 @@
+"""Finds the masked sector of a rotating sensor, by which its scans are cut, in the first turns of a stream.
+
+Packets pass at once until the angle leaps. Then they are held until the leap recurs, which takes a turn, or until all
+angles have been seen, so that the first scans are cut as all others. Behind the first whole turn without a leap, and
+behind a sector that was found, nothing is held.
+"""
+
+from __future__ import annotations
+
+import copy
+
+import numpy as np
+
+from lidarspec.packets.masked_sector import JITTER, MIN_WIDTH, MIN_WIDTH_STEPS, VARYING_PACKETS, AngleReader, Angles, Sector, SectorFinder
+from lidarspec.packets.packets import Packets, joined
+from lidarspec.spec.description import Spec
+
+#: turns within which a leap has to recur.
+MAX_TURNS = 4
+#: packets that are held at most.
+MAX_HELD = 1 << 15
+#: seconds that a turn takes at the slowest if the sensor does not declare it.
+SLOWEST_TURN_S = 1.0
+
+
+class Masking:
+    """Marks what a masked sector leaves out in the packets of one stream, which come in order.
+
+    Args:
+        sensor: of the packets.
+
+    Attributes:
+        angle_before_sector: of the last packet before the first one that is marked, in turns; None if there is none.
+    """
+
+    def __init__(self, sensor: Spec) -> None:
+        self._reader = AngleReader(sensor)
+        self._is_settled = not self._reader.is_available
+        self._longest_ns = int(MAX_TURNS / (sensor.turn[0] if sensor.turn else 1 / SLOWEST_TURN_S) * 1e9)
+        self._finder: SectorFinder | None = None
+        self._turned = 0.0  # turns since the start
+        self._smallest_step = np.inf
+        self._angle: float | None = None  # of the last packet looked at
+        self._held: list[Packets] = []
+        self._is_holding = False
+        self._marked_angle: float | None = None  # of the last packet marked
+        self._index = 0  # of that packet
+        self._masked = 0  # packets that the sector leaves out
+        self._has_marked = False
+        self.angle_before_sector: float | None = None
+
+    @property
+    def sector(self) -> Sector | None:
+        """The masked sector; None until it is found."""
+        return None if self._finder is None else self._finder.sector
+
+    def push(self, packets: Packets) -> list[Packets]:
+        """Return the packets that may be cut into scans now; at most two batches."""
+        if not len(packets):
+            return []
+        if self._is_settled:
+            return [packets] if self.sector is None else [self._mark(packets)]
+        angles = self._reader.angles(packets.table)
+        if angles is None:
+            self._is_settled = True
+            return self._release(packets)
+        leap = self._find_leap(packets, angles)
+        held = joined([*self._held, packets]) if self._held else packets
+        if self._is_holding or leap is None:
+            return self._pass_on(held)
+        before = len(held) - len(packets) + max(leap - 1, -1 if self._held else 0)
+        self._is_holding = True
+        passed = [held.take(slice(0, before))] if before else []
+        self._held = []
+        return [*map(self._note, passed), *self._pass_on(held.take(slice(before, None)))]
+
+    def finish(self) -> list[Packets]:
+        """Return the packets that are still held."""
+        self._is_settled = True
+        return self._release(None)
+
+    def _pass_on(self, held: Packets) -> list[Packets]:
+        """Release packets, or hold them: all from the one before a leap on, else the last one."""
+        self._held = [held]
+        if self._is_settled:
+            return self._release(None)
+        if self._is_holding:
+            times = held.time_ns
+            is_late = abs(int(times[-1]) - int(times[0])) > self._longest_ns
+            if is_late or len(held) > MAX_HELD:
+                self._is_settled = True
+                return self._release(None)
+            return []
+        self._held = [held.take(slice(-1, None))]
+        return [self._note(held.take(slice(0, -1)))] if len(held) > 1 else []
+
+    def _release(self, packets: Packets | None) -> list[Packets]:
+        everything = [*self._held, *([packets] if packets is not None else [])]
+        self._held = []
+        self._is_holding = False
+        if not everything:
+            return []
+        released = joined(everything)
+        return [released if self.sector is None else self._mark(released)]
+
+    def _find_leap(self, packets: Packets, angles: Angles) -> int | None:
+        """Look for the sector in the angles of the next packets; return the row of the first leap."""
+        if self._finder is None:
+            direction = self._reader.direction(packets.table)
+            if not direction:
+                return None
+            self._finder = SectorFinder(direction)
+        steps = self._steps(angles, self._angle)
+        smallest = np.minimum.accumulate(np.where(steps > 0, steps, np.inf))
+        step_before = np.minimum(np.append(np.inf, smallest[:-1]), self._smallest_step)
+        limits = np.maximum(step_before * MIN_WIDTH_STEPS, MIN_WIDTH)
+        turned = self._turned + np.cumsum(steps)
+        leaps = np.flatnonzero(steps > limits)
+        turns = np.flatnonzero(np.floor(turned) > np.floor(np.append(self._turned, turned[:-1])))
+        before = angles[0] if self._angle is None else self._angle
+        seen = 0
+        for row in sorted({*leaps.tolist(), *turns.tolist()}):
+            self._finder.see(angles[seen:row])
+            seen = row
+            step = min(float(step_before[row]), MIN_WIDTH)
+            if steps[row] > limits[row]:
+                start = before if row == 0 else angles[row - 1]
+                self._finder.add_gap(float(start), float(angles[row]), step)
+            is_turn_without_leap = row in turns and not self._finder.has_unseen_gaps(step)
+            if self._finder.sector is not None or is_turn_without_leap or turned[row] > MAX_TURNS:
+                self._is_settled = True
+                break
+        self._finder.see(angles[seen:])
+        self._smallest_step = min(self._smallest_step, float(smallest[-1]))
+        self._turned = float(turned[-1])
+        self._angle = float(angles[-1])
+        return leaps.item(0) if len(leaps) else None
+
+    def _steps(self, angles: Angles, before: float | None) -> Angles:
+        """Return by how much of a turn each packet is ahead of the one before it, (n,)."""
+        assert self._finder is not None
+        steps = np.diff(angles, prepend=angles[0] if before is None else before)
+        ahead = (self._finder.direction * steps) % 1
+        ahead[ahead > 1 - JITTER] = 0
+        return ahead
+
+    def _note(self, packets: Packets) -> Packets:
+        """Note the last one of some packets as it is passed on."""
+        angles = self._reader.angles(packets.table)
+        if angles is not None:
+            self._marked_angle = float(angles[-1])
+        self._index = packets.index.item(-1)
+        return packets
+
+    def _mark(self, packets: Packets) -> Packets:
+        """Return packets that say how many before each the masked sector leaves out."""
+        angles = self._reader.angles(packets.table)
+        sector = self.sector
+        if not self._has_marked:
+            self._has_marked = True
+            self.angle_before_sector = self._marked_angle
+        if angles is None or sector is None:
+            return packets
+        start = angles[0] if self._marked_angle is None else self._marked_angle
+        before = np.append(start, angles[:-1])
+        behind = (sector.direction * (before - sector.middle)) % 1
+        is_leap = behind + self._steps(angles, self._marked_angle) >= 1
+        index = packets.index
+        first = index.item(0) - 1 if self._marked_angle is None else self._index
+        missing = np.where(is_leap, np.maximum(np.diff(index, prepend=first) - 1, 0), 0)
+        if not self._masked and missing.any():
+            self._masked = int(np.median(missing[missing > 0]))
+        few = missing <= self._masked + VARYING_PACKETS
+        marked = copy.copy(packets)
+        marked.masked = np.where(few, missing, self._masked)
+        self._note(packets)
+        return marked
+
+
+def describe(sector: Sector) -> str:
+    """Return what to say about a masked sector."""
+    angles = sorted([sector.start * 360, sector.stop * 360], reverse=sector.direction < 0)
+    if sector.contains(0.0):
+        angles.reverse()
+    return (
+        f"nothing comes from about {angles[0]:.0f} to {angles[1]:.0f} degrees of each turn: taken for a masked sector, "
+        "which is no loss, and scans are cut there"
+    )
