@@ -61,6 +61,7 @@ class Answers:
             "control": not self.why_no_control,
             "why_no_control": self.why_no_control,
             "commands": [form(sensor, name) for name in sensor.commands],
+            "restart": restart(sensor),
             "saves": saves(),
             "records": broadcast.switch is not None,
             "history": list(broadcast.history),
@@ -192,7 +193,31 @@ def saves() -> list[str]:
 
 def form(sensor: Sensor, name: str) -> dict[str, Any]:
     """A command as a form."""
-    return {"name": name, "text": effect(sensor, name), "arguments": [_argument(sensor, name, one) for one in sensor.commands[name].args]}
+    command = sensor.commands[name]
+    return {
+        "name": name,
+        "group": _group(sensor, name),
+        "only_stopped": command.only_stopped,
+        "text": effect(sensor, name),
+        "arguments": [_argument(sensor, name, argument) for argument in command.args],
+    }
+
+
+def _group(sensor: Sensor, name: str) -> str:
+    """Return "switch" for a command that starts or stops the data, "ask" for one that changes nothing, else "set"."""
+    command = sensor.commands[name]
+    if command.starts or command.stops:
+        return "switch"
+    return "ask" if name.startswith("get_") else "set"
+
+
+def restart(sensor: Sensor) -> dict[str, str] | None:
+    """Return the commands that stop the data and start it again, as on opening; None if there are none without arguments."""
+    names = [*sensor.on_open, *sensor.commands]
+    plain = [name for name in names if not sensor.commands[name].args]
+    stop = next((name for name in plain if sensor.commands[name].stops), None)
+    start = next((name for name in plain if sensor.commands[name].starts), None)
+    return None if stop is None or start is None else {"stop": stop, "start": start}
 
 
 def _argument(sensor: Sensor, name: str, argument: str) -> dict[str, Any]:

@@ -75,7 +75,7 @@ class Saves:
             await PlainTextResponse(str(error), 500)(scope, receive, send)
             return
         try:
-            await _send_file(path, f"{shown.scan.sensor.id}-{shown.number}.{suffix}", send)
+            await _send_file(path, f"{shown.scan.sensor.id}-{shown.position:.3f}s.{suffix}", send)
         except TimeoutError:
             self._drop(scope["client"])
         finally:

@@ -69,9 +69,9 @@ def test_the_scan_that_is_shown_is_saved(browser: Any) -> None:
     with served("sim:ldrobot-stl27l") as link:
         visit = Visit(browser, link)
         visit.pause()
-        number = visit.value("lidarspec.picture.scan.scan")
+        position = visit.value("lidarspec.picture.scan.position")
         name, table = saved(visit, "csv")
-        assert name == f"ldrobot-stl27l-scan{number}.csv"
+        assert name == f"ldrobot-stl27l-{position:.3f}s.csv"
         rows = list(csv.DictReader(io.StringIO(table.decode())))
         shown = visit.scan
         own = np.array([[float(row[axis]) for axis in "xyz"] for row in rows])

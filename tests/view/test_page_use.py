@@ -252,3 +252,45 @@ def test_a_sensor_that_is_unplugged_is_said_and_its_picture_dimmed(browser: Any,
         sending.join()
         os.close(master)
         os.close(slave)
+
+
+def test_a_question_to_a_running_sensor_stops_it_and_starts_it_again(browser: Any) -> None:
+    with served("sim:slamtec-rplidar-a1") as link:
+        visit = Visit(browser, link)
+        visit.page.click("#tab-commands")
+        assert visit.page.locator("#commands h2").all_inner_texts() == ["Ask", "Set", "Start and stop"]
+        assert visit.page.locator(".list [aria-pressed=true]").count() == 0
+        assert not visit.page.locator("#commands .primary").count(), "nothing can be sent before it is chosen"
+        visit.page.click(".list [data-value=get_info]")
+        send = visit.page.locator("#commands .primary")
+        visit.until(lambda: send.inner_text() == "Stop, ask, start again" and send.is_enabled(), "it does not offer to stop")
+        send.click()
+        visit.until(lambda: "answered" in visit.text("#commands .reply"), "there is no reply")
+        visit.until(lambda: len(visit.asked_for("send")) == 3, "it is not started again")
+        assert visit.asked_for("send")[1]["command"] == "get_info"
+        before = visit.value("lidarspec.picture.scan.scan")
+        visit.until(lambda: visit.value("lidarspec.picture.scan.scan") > before + 3, "no scan comes any more")
+        visit.context.close()
+        assert not visit.errors
+
+
+def test_a_saved_scan_is_named_after_its_time_in_the_file_at_each_replay(browser: Any, tmp_path: Path) -> None:
+    sensor = ls.sensor("ldrobot-stl27l")
+    path = tmp_path / "short.bin"
+    path.write_bytes(b"".join(ls.simulate(sensor, packets=1800)))  # a second
+    with served(str(path), "-s", sensor.id) as link:
+        visit = Visit(browser, link)
+        newest = -1
+        for _ in range(2):
+            visit.until(lambda newest=newest: visit.value("lidarspec.picture.scan.scan") > newest, "it does not begin anew")
+            visit.until(lambda: visit.text("#play") == "▶ Play", "it does not end")
+            visit.page.wait_for_timeout(500)
+            newest, position = visit.value("[lidarspec.picture.scan.scan, lidarspec.picture.scan.position]")
+            assert position < 1.0
+            visit.page.click("#save summary")
+            with visit.page.expect_download() as download:
+                visit.page.click("#saves [data-value=csv]")
+            assert download.value.suggested_filename == f"{sensor.id}-{position:.3f}s.csv"
+            visit.page.click("#play")
+        visit.context.close()
+        assert not visit.errors

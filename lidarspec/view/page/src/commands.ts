@@ -5,6 +5,9 @@ import type { Argument, Ask, Command, Composed, Hello, Refused, Replied } from "
 
 /** Milliseconds from the last key to when the bytes are asked for. */
 const SETTLED = 200;
+const GROUPS = { ask: "Ask", set: "Set", switch: "Start and stop" };
+const GROUP_NAMES = Object.keys(GROUPS) as Command["group"][];
+const UNCHOSEN = "Choose a command: its bytes are shown before it is sent.";
 
 export class Commands {
   readonly #list = made("div", { className: "list scroll", tabIndex: 0, role: "group", ariaLabel: "Commands" });
@@ -15,6 +18,12 @@ export class Commands {
   readonly #hindrance = made("p", { className: "hindrance" });
   #command: Command | null = null;
   #control = false;
+  #restart: Hello["restart"] = null;
+  #streams = false;
+  /** the commands that are still to be answered, the one that was sent first */
+  #steps: string[] = [];
+  /** the arguments of the command that is sent while the sensor is stopped */
+  #given: Record<string, string> = {};
   #timer = 0;
 
   constructor(
@@ -24,8 +33,7 @@ export class Commands {
     element.append(made("div", { className: "beside" }, this.#list, made("div", { className: "detail scroll", tabIndex: 0, role: "group", ariaLabel: "Command" }, this.#hindrance, this.#form, this.#bytes, this.#reply)));
     this.#form.onsubmit = (event) => {
       event.preventDefault();
-      this.#say("sent, waiting for the reply");
-      this.#words("send");
+      this.#submit();
     };
     this.#form.oninput = () => {
       this.#send.disabled = true;
@@ -35,14 +43,64 @@ export class Commands {
   }
 
   /** The commands of a sensor. */
-  show({ commands, control, why_no_control }: Hello): void {
+  show({ commands, control, why_no_control, restart }: Hello): void {
     this.#control = control;
+    this.#restart = restart;
+    this.#steps = [];
     this.#hindrance.textContent = control || !commands.length ? "" : why_no_control;
-    const buttons = commands.map((command) => made("button", { textContent: command.name, title: command.text, data: { value: command.name }, onclick: () => this.#choose(command) }));
-    this.#list.replaceChildren(...(buttons.length ? buttons : [made("p", { className: "empty", textContent: "This sensor has no commands." })]));
-    const again = commands.find(({ name }) => name === this.#command?.name) ?? commands[0];
-    if (again) this.#choose(again);
-    else this.#form.replaceChildren();
+    const groups = GROUP_NAMES.flatMap((group) => this.#group(group, commands.filter((command) => command.group === group)));
+    this.#list.replaceChildren(...(groups.length ? groups : [made("p", { className: "empty", textContent: "This sensor has no commands." })]));
+    const again = commands.find(({ name }) => name === this.#command?.name);
+    if (again) return this.#choose(again);
+    this.#command = null;
+    this.#form.replaceChildren(...(commands.length ? [made("p", { textContent: UNCHOSEN })] : []));
+    this.#bytes.replaceChildren();
+    this.#reply.replaceChildren();
+  }
+
+  /** A heading and the commands under it; nothing if there are none. */
+  #group(group: Command["group"], commands: Command[]): HTMLElement[] {
+    const buttons = commands.map((command) =>
+      made("button", { textContent: command.name, title: command.text, data: { value: command.name }, onclick: () => this.#choose(command) }),
+    );
+    return buttons.length ? [made("h2", { textContent: GROUPS[group] }), ...buttons] : [];
+  }
+
+  /** How the source is doing: a sensor that sends data has to be stopped before some commands. */
+  state(state: string): void {
+    this.#streams = state === "streaming";
+    if (!this.#steps.length) this.#send.textContent = this.#interrupts ? "Stop, ask, start again" : "Send";
+  }
+
+  /** Whether the sensor is stopped for the chosen command and started again after it. */
+  get #interrupts(): boolean {
+    return this.#streams && this.#restart !== null && this.#command?.only_stopped === true;
+  }
+
+  #submit(): void {
+    if (this.#steps.length) return;
+    if (!this.#interrupts) {
+      this.#say("sent, waiting for the reply");
+      return this.#words("send");
+    }
+    const { stop, start } = this.#restart!;
+    this.#given = this.#arguments();
+    this.#steps = [stop, this.#command!.name, start];
+    this.#say(`${stop} is sent first`);
+    this.#step();
+  }
+
+  #step(): void {
+    const [command] = this.#steps;
+    if (command === undefined) return;
+    this.ask({ do: "send", command, arguments: this.#steps.length === 2 ? this.#given : {} });
+  }
+
+  /** Go on to the next of several commands that are sent after each other. */
+  #answered(command: string): void {
+    if (this.#steps[0] !== command) return;
+    this.#steps.shift();
+    this.#step();
   }
 
   /** The bytes that would be sent. */
@@ -56,12 +114,17 @@ export class Commands {
   }
 
   replied({ command, text, hex }: Replied): void {
+    this.#answered(command);
     if (command !== this.#command?.name) return;
     this.#say(text);
     if (hex) this.#reply.append(made("code", { className: "whole", textContent: hex.match(/../g)?.join(" ") ?? "" }));
   }
 
-  refused({ of, text, next }: Refused): void {
+  refused({ of, command, text, next }: Refused): void {
+    if (of === "send" && command !== undefined) {
+      if (this.#steps.length === 3) this.#steps = []; // it was not stopped
+      else this.#answered(command);
+    }
     if (of === "compose") {
       this.#bytes.replaceChildren(made("p", { className: "bad", textContent: text }));
       this.#send.disabled = true;
@@ -85,10 +148,16 @@ export class Commands {
   /** What the form says, once all that is needed is there. */
   #words(word: "compose" | "send"): void {
     if (!this.#command) return;
-    const given = [...new FormData(this.#form)].map(([name, text]) => [name, text as string] as const).filter(([, text]) => text !== "");
-    const missing = this.#command.arguments.find(({ name, default: fallback }) => fallback === null && !given.some(([one]) => one === name));
+    const given = this.#arguments();
+    const missing = this.#command.arguments.find(({ name, default: fallback }) => fallback === null && !(name in given));
     if (missing) this.#bytes.replaceChildren(made("p", { className: "faint", textContent: `The bytes show when ${missing.name} is given.` }));
-    else this.ask({ do: word, command: this.#command.name, arguments: Object.fromEntries(given) });
+    else this.ask({ do: word, command: this.#command.name, arguments: given });
+  }
+
+  /** The arguments that were given, by name. */
+  #arguments(): Record<string, string> {
+    const given = [...new FormData(this.#form)].map(([name, text]) => [name, text as string] as const);
+    return Object.fromEntries(given.filter(([, text]) => text !== ""));
   }
 }
 

@@ -201,6 +201,7 @@ class Page {
     this.#damaged.add(state.damaged.newest);
     this.#drawer.count("damaged", state.damaged.total);
     this.#controls?.state(state);
+    this.#commands.state(state.state);
   }
 
   #refuse(refused: Refused): void {
@@ -252,7 +253,7 @@ class Page {
     const scan = this.#picture?.scan;
     if (!this.#picture || !scan) return;
     try {
-      const name = `${this.#hello!.sensor}-scan${scan.scan}.${as}`;
+      const name = `${this.#hello!.sensor}-${scan.position.toFixed(3)}s.${as}`;
       download(as === "png" ? await this.#picture.image() : await fetched(`save/${scan.scan}.${as}${location.search}`), name);
     } catch (error) {
       this.#refuse({ is: "refused", of: "save", text: error instanceof Error ? error.message : String(error) });

@@ -81,6 +81,9 @@ export interface Argument {
 
 export interface Command {
   name: string;
+  group: "ask" | "set" | "switch";
+  /** whether it is answered only while the sensor sends no data */
+  only_stopped: boolean;
   text: string;
   arguments: Argument[];
 }
@@ -99,6 +102,8 @@ export interface Hello {
   control: boolean;
   why_no_control: string;
   commands: Command[];
+  /** the commands that stop the data and start it again */
+  restart: { stop: string; start: string } | null;
   saves: string[];
   records: boolean;
   /** the figures of the last minute */
