@@ -214,12 +214,19 @@ def _swept(sensor: Spec, frame: str, engine: CompiledCodec, source: random.Rando
         for path, value in values.items():
             leaf = layout.leaves.get(path)
             if leaf is not None and path not in chosen:
-                leaf.store(rows, leaf.raw([value]))
+                _store_swept(leaf, rows, value)
         _store_drawn(layout, rows, chosen, drawn, source)
         found = _plausible(sensor, frame, layout, _headed(rows, layout, chosen))
         if found:
             return found[0]
     raise SpecError("neither random frames nor those along `sweep` pass `plausible`", path=frame, sensor=sensor.id)
+
+
+def _store_swept(leaf: Leaf, rows: NDArray[np.uint8], value: Any) -> None:
+    """Write a value of a sweep into a row, as far as there is room; a row with room for more elements keeps its own."""
+    raw = leaf.raw([value])[(slice(None), *map(slice, leaf.shape))]
+    if all(length in (1, room) for length, room in zip(raw.shape[1:], leaf.shape, strict=False)):
+        leaf.store(rows, raw)
 
 
 def _store_drawn(layout: Layout, rows: NDArray[np.uint8], chosen: Mapping[str, int], drawn: Drawn, source: random.Random) -> None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import random
 import re
 import subprocess
 import sys
@@ -33,8 +34,9 @@ from construct import (
 from hypothesis import strategies as st
 
 from lidarspec import Sensor
+from lidarspec.framing.examples import random_frame
 from lidarspec.framing.frame_engine import CompiledCodec
-from lidarspec.spec import Checksummed, Command, Crc, Fields, Frame, Http, HttpReply, HttpRequest, Polar, Scaled, Sum, take
+from lidarspec.spec import Checksummed, Command, Crc, Fields, Frame, Http, HttpReply, HttpRequest, Polar, Scaled, Simulation, Sum, take
 from lidarspec.testing import frames
 from lidarspec.testing.check import Target, reports
 from lidarspec.testing.commands import the_simulated_sensor_answers
@@ -47,6 +49,7 @@ from lidarspec.testing.properties import PROPERTIES, Property
 from lidarspec.testing.subject import Subject
 from lidarspec.testing.vectors import vectors_hold
 from tests.broken import dear_headers, no_example, sound
+from tests.shapes import count
 
 AUTHOR = """
 import lidarspec as ls
@@ -451,3 +454,19 @@ def test_vectors_of_any_shape_are_a_fault_of_their_file(text: str | bytes, said:
     (found,) = holding.findings(Subject(sound.sensor(), vectors=file))
     assert (found.code, found.file) == ("LS702", str(file))
     assert re.search(said, found.what)
+
+
+def is_certain(f: Fields) -> Any:
+    return (f.samples.quality == 7) & (f.samples.distance == 1.0)
+
+
+def certain_sweep(i: int) -> dict[str, Any]:
+    return {**count.sweep(i), "samples.quality": np.full(count.LONGEST, 7), "samples.distance": np.full(count.LONGEST, 1.0)}
+
+
+@pytest.mark.parametrize("number", [1, count.LONGEST])
+def test_a_frame_around_a_sweep_has_as_many_elements_as_are_drawn(number: int) -> None:
+    data = replace(count.SENSOR.frames["data"], plausible=is_certain)
+    sensor = replace(count.SENSOR, frames={"data": data}, simulation=Simulation(certain_sweep))
+    frame = sensor.parse(random_frame(sensor, "data", random.Random(1), {"count": lambda _: number}))
+    assert [sample.quality for sample in frame.samples] == [7] * number
