@@ -13,6 +13,7 @@ In: a sensor. Out: passed tests, or findings with place, reason and what to writ
 * `subject`: a sensor under test, and what it is fed.
 * `declared`: what shows in the declaration alone.
 * `frames`: single frames, sound and damaged.
+* `consistency`: whether angles, clock and times of points agree.
 * `geometry`: whether points are where the manual has them.
 * `commands`: requests, replies, and the simulated sensor's answers.
 * `agreement`: two ways to the same result.

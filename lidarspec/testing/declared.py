@@ -2,10 +2,14 @@
 
 from __future__ import annotations
 
+import dis
+import inspect
 import random
 import re
 from collections.abc import Iterator
+from dataclasses import fields, replace
 from functools import partial
+from types import CodeType
 from typing import Any
 
 import numpy as np
@@ -44,6 +48,9 @@ FAR = 8
 LONG = 7 * 86_400
 #: what points are made of, and the units of the fields that go into it.
 UNITS = {"range": ("m",), "azimuth": ("deg", "rad"), **dict.fromkeys("xyz", ("m",))}
+#: names of fields that hold how bright a return is, and of those that hold no measure.
+INTENSITY = re.compile(r"(\w+_)?(intensity|intensities|reflectivity|reflectance|rssi|amplitude|brightness|quality|signal)(_\w+)?")
+CODE = re.compile(r"(\w+_)?(code|error|fault|status|errno)(_?\d+)?")
 PLACEHOLDER = re.compile(r"\s*(\?*|-*|todo.*|tbd.*|n/?a|none|unknown)\s*", re.IGNORECASE)
 
 Findings = Iterator[tuple[str, str, str]]
@@ -52,7 +59,7 @@ Findings = Iterator[tuple[str, str, str]]
 def declared(subject: Subject) -> list[Finding]:
     """The findings in a declaration, as (code, what, path) made into findings of this sensor."""
     sensor = subject.sensor
-    checks: list[Findings] = [_sensor(sensor), _asked(sensor), _clock(sensor)]
+    checks: list[Findings] = [_sensor(sensor), _asked(sensor), _clock(sensor), _options(sensor)]
     checks += [_frame(subject, name, frame) for name, frame in subject.frames.items()]
     checks += [_points(subject, name) for name in subject.sensor.data_frames]
     checks += [_reach(subject)]
@@ -98,13 +105,49 @@ def _clock(sensor: Sensor) -> Findings:
     clock = sensor.clock
     if not isinstance(clock, Clock) or callable(clock.source) or clock.wraps_at is not None or not sensor.frames:
         return
-    fields = codec(sensor.frames[sensor.data_frame]).schema.named
+    named = codec(sensor.frames[sensor.data_frame]).schema.named
     paths = (clock.source,) if isinstance(clock.source, str) else clock.source
-    infos = [fields.get(without_indices(path)[0]) for path in paths]
+    infos = [named.get(without_indices(path)[0]) for path in paths]
     spans = [info.limits[1] * info.scale * float(factor(info.unit, "s") or 0) if info and info.kind == "int" else np.inf for info in infos]
     if 0 < sum(spans) < LONG:
         what = f"it can count {sum(spans):g} s, then it starts again, and wraps_at is not given"
         yield "LS509", what, f"{sensor.data_frame}.{paths[0]}"
+
+
+def _options(sensor: Sensor) -> Findings:
+    """Options of `configure` that it never reads, or with all values of which it returns the sensor as it is."""
+    function = sensor.configure.function
+    plain = function.func if isinstance(function, partial) else function
+    if not inspect.isfunction(plain):
+        return
+    parameters = inspect.signature(plain).parameters.values()
+    read = {instruction.argval for instruction in dis.get_instructions(plain) if instruction.opname.startswith("LOAD_")}
+    for name in [one.name for one in parameters if one.kind is inspect.Parameter.KEYWORD_ONLY]:
+        if name not in read:
+            yield "LS217", f"configure never reads {name!r}", f"configure.{name}"
+        elif name not in sensor.configure.files and _changes_nothing(sensor, name, _words(plain.__code__)):
+            yield "LS217", f"configure returns the same sensor whatever {name!r} is", f"configure.{name}"
+
+
+def _words(code: CodeType) -> list[str]:
+    """Return the texts that a function compares or returns: among them are the values of its options."""
+    flat = [each for one in code.co_consts for each in (one if isinstance(one, tuple | frozenset) else (one,))]
+    return [one for one in flat if isinstance(one, str) and re.fullmatch(r"[\w-]{1,32}", one)]
+
+
+def _changes_nothing(sensor: Sensor, name: str, values: list[str]) -> bool:
+    """Return whether `configure` accepts two values of an option at least, and returns an equal sensor for all."""
+    accepted = 0
+    for value in values:
+        try:
+            configured = sensor.configure(**{name: value})
+        except LidarSpecError:
+            continue
+        accepted += 1
+        same = replace(configured, options=sensor.options, configure=sensor.configure.function)
+        if any(getattr(same, one.name) != getattr(sensor, one.name) for one in fields(sensor) if one.name != "configure"):
+            return False
+    return accepted > 1
 
 
 def _frame(subject: Subject, name: str, frame: Frame) -> Findings:
@@ -284,6 +327,23 @@ def _points(subject: Subject, name: str) -> Findings:
     for column, units in UNITS.items():
         if hasattr(result, column):
             yield from _column(subject, name, getattr(result, column), column, units)
+    yield from _intensity(subject, name, result)
+
+
+def _intensity(subject: Subject, name: str, result: Any) -> Findings:
+    """An intensity that comes from a field of another name, while no column uses the field that is named so."""
+    own = [field_of(subject, name, node) for node in used(getattr(result, "intensity", None))]
+    if not own or any(info is None or INTENSITY.search(info.path) for info in own):
+        return
+    columns = [getattr(result, one.name) for one in fields(result)]
+    taken = {info.path for value in columns for node in used(value) if (info := field_of(subject, name, node)) is not None}
+    ranges = [info for node in used(getattr(result, "range", None)) if (info := field_of(subject, name, node)) is not None]
+    axes = {info.axes for info in ranges if info.axes}
+    for path, info in subject.fields(name).items():
+        if INTENSITY.fullmatch(info.name) and info.axes in axes and path not in taken:
+            others = ", ".join(info.path for info in own if info is not None)
+            yield "LS218", f"it comes from {others}, and no column from this field", f"{name}.{path}"
+            return
 
 
 def _reach(subject: Subject) -> Findings:
@@ -311,6 +371,9 @@ def _reach(subject: Subject) -> Findings:
 def _column(subject: Subject, name: str, value: Any, column: str, units: tuple[str, ...]) -> Findings:
     """A column that no field in a unit of its kind goes into."""
     infos = [field_of(subject, name, node) for node in used(value, looked_up=False)]
+    measured = [info for info in infos if info is not None and factor(info.unit, "m") is not None]
+    if column == "range" and measured and all(CODE.fullmatch(info.name) for info in measured):
+        yield "LS219", "the range of points comes from it, and it is a code by its name", f"{name}.{measured[0].path}"
     free = [info for info in infos if info is not None and info.const is None and not info.labels]
     if free and not any(factor(info.unit, unit) is not None for info in infos if info is not None for unit in units):
         bare = [info for info in free if not is_unit(info.unit)]

@@ -73,6 +73,10 @@ LS214 columns that do not fit together | a point needs one value of each
 LS215 `spread` folds everything onto one value | all samples of a packet get one angle, or one time
       | full= as the circle in the unit of the angles; steps(count) for the index of a sample
 LS216 a field that no data frame has | scans, clock or counter come from it, and never come | a path that `lidarspec show` prints
+LS217 an option that changes nothing | who sets it gets the same points as without | a `configure` that uses it, or one without it
+LS218 an intensity from another field | brightness means something else than the sensor measured
+      | intensity= by the field that is named so, or that field in a further column
+LS219 a range from a code | an error is drawn as a point | the field that is the distance
 LS301 no example can be made up | nothing can be tried on it
       | `simulation=Simulation(sweep=...)` of the sensor or of the Frame, or strategies = {"frame.field": ...} in the test class
 LS302 bytes do not survive parsing and building | a replayed or edited frame is another one | fields that keep every bit
@@ -107,6 +111,8 @@ LS509 the clock runs back where it starts again | durations come out negative | 
 LS510 the counter's start is taken for a loss | every turn of it counts packets as lost or late | Sequence(field, first=, last=)
 LS511 points that turn the other way | left and right are exchanged, or vendor_axes are not the manual's
       | azimuth=-np.deg2rad(clockwise), or the vendor_axes of the manual's figure
+LS512 a clock that reads more than its wrap | it is taken to start again when it does not | Clock(..., wraps_at=) in seconds
+LS513 times of points that do not fit the clock | points of one packet get times of other scans | time= in seconds
 LS601 a command that does not parse back | the sensor is told something else | values and args by the paths of its frame
 LS602 an argument that is not held to its range | the sensor is asked for what it cannot do | args={name: (path, lowest, highest)}
 LS603 a reply that cannot match | the command waits for ever | matches= and echoes= by fields that the reply has

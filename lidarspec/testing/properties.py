@@ -17,7 +17,7 @@ from pathlib import Path
 
 from lidarspec.errors import SpecError
 from lidarspec.framing.frame_engine import codec
-from lidarspec.testing import agreement, commands, frames, geometry, hostile, vectors
+from lidarspec.testing import agreement, commands, consistency, frames, geometry, hostile, vectors
 from lidarspec.testing.findings import Finding, Violation
 from lidarspec.testing.subject import Subject
 
@@ -132,6 +132,9 @@ PROPERTIES = (
     Property(geometry.the_points_turn_as_the_axes_do, "data", "LS511", unless=(*FAILS, "LS502")),
     Property(geometry.angles_are_in_order, "data", "LS506", lacks=_no_sweep, unless=(*FAILS, "LS502")),
     Property(geometry.counters_run_on, "data", "LS509", lacks=_no_sweep, unless=FAILS),
+    Property(consistency.turned_angles_turn_the_points, "data", "LS504", lacks=_no_sweep, unless=(*FAILS, "LS502", "LS504", "LS506")),
+    Property(consistency.the_clock_stays_below_its_wrap, "data", "LS512", lacks=_no_sweep, unless=(*FAILS, "LS509")),
+    Property(consistency.times_of_points_fit_the_clock, "data", "LS513", lacks=_no_sweep, unless=(*FAILS, "LS509")),
     Property(agreement.the_same_bytes_give_the_same_points, "sensor", "LS415", unless=FAILS, depends_on=READING),
     Property(agreement.a_clean_input_loses_nothing, "sensor", "LS401", depends_on=READING),
     Property(

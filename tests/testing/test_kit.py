@@ -48,7 +48,18 @@ from lidarspec.testing.hostile import MAX_CALLS_PER_BYTE, calls_per_byte, stream
 from lidarspec.testing.properties import PROPERTIES, Property
 from lidarspec.testing.subject import Subject
 from lidarspec.testing.vectors import vectors_hold
-from tests.broken import dear_headers, no_example, sound
+from tests.broken import (
+    code_for_range,
+    dear_headers,
+    intensity_of_distance,
+    no_example,
+    no_wrap_aligned,
+    option_ignored,
+    option_unread,
+    sound,
+    times_in_milliseconds,
+    wrap_too_early,
+)
 from tests.shapes import count
 
 AUTHOR = """
@@ -178,6 +189,31 @@ def test_a_long_length_that_a_count_in_the_header_can_reach_is_no_finding() -> N
         left(sound.sensor(frames={**sound.sensor().frames, "page": page, "ask": ask}, links={**sound.sensor().links, "web": Http(80)}))
         == set()
     )
+
+
+@pytest.mark.parametrize(
+    ("plugin", "code"),
+    [
+        (wrap_too_early, "LS512"),
+        (times_in_milliseconds, "LS513"),
+        (no_wrap_aligned, "LS504"),
+        (option_unread, "LS217"),
+        (option_ignored, "LS217"),
+        (intensity_of_distance, "LS218"),
+        (code_for_range, "LS219"),
+    ],
+    ids=lambda value: value if isinstance(value, str) else value.__name__.rpartition(".")[2],
+)
+def test_what_contradicts_itself_is_named(plugin: Any, code: str) -> None:
+    def found(sensor: Sensor) -> set[str]:
+        subject = Subject(sensor)
+        consistent = [one for one in PROPERTIES if one.function.__module__.endswith("testing.consistency")]
+        findings = [*declared(subject), *(finding for one in consistent for finding in one.findings(subject))]
+        return {finding.code for finding in findings}
+
+    (sensor,) = plugin.lidarspec_sensors()
+    assert found(sensor) == {code}
+    assert found(sound.sensor()) == set()
 
 
 def rare(f: object) -> object:

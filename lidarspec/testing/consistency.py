@@ -1,0 +1,124 @@
+"""Whether the parts of a declaration agree with each other: angles and points, clock and wrap, times of points and clock.
+
+Packets are made from the sensor's `sweep`, as far along it as a property needs: its first packets seldom cross the full
+circle, or the time at which the clock starts again.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lidarspec.errors import LidarSpecError
+from lidarspec.framing.frame_engine import codec
+from lidarspec.packets.clocks import clock_ns
+from lidarspec.scans.cutter import FULL
+from lidarspec.simulation.frame_maker import FrameMaker
+from lidarspec.spec import Clock
+from lidarspec.spec.tree import exact
+from lidarspec.testing.findings import require
+from lidarspec.testing.geometry import BACK, SMALL, make_sweep, read
+from lidarspec.testing.subject import Subject
+
+#: packets whose clock is looked at: far along the sweep, so that a clock that starts again has done so.
+FAR_PACKETS = (0, *(start * 10**power for power in range(8) for start in (1, 2, 4, 7)))
+#: packets whose points' times are looked at.
+TIMED_PACKETS = 64
+#: steps of the clock, from packet to packet, over which the points of a single packet may be spread.
+MOST_STEPS = 30
+#: parts of the full circle by which a packet is turned.
+TURNS = 24
+
+
+def the_clock_stays_below_its_wrap(subject: Subject, name: str) -> None:
+    """Far along the sweep the clock never reads more than the time at which it starts again."""
+    clock = subject.sensor.clock
+    sweep = subject.sensor.simulation_of(name).sweep
+    if sweep is None or not isinstance(clock, Clock) or clock.wraps_at is None:
+        return
+    try:
+        maker = FrameMaker(subject.sensor, name)
+        frames = maker.sealed(maker.table([sweep(number) for number in FAR_PACKETS]))
+        packets = read(subject, name, frames, by_clock=False)
+        readings = clock_ns(subject.sensor, packets.batch())
+    except LidarSpecError:  # a property of its own says what fails
+        return
+    most = int(readings.max(initial=0))
+    said = f"along the sweep it reads {most / 1e9:g} s, and wraps_at is {float(clock.wraps_at):g} s"
+    require(most <= exact(clock.wraps_at) * 10**9, "LS512", said, "clock")
+
+
+def times_of_points_fit_the_clock(subject: Subject, name: str) -> None:
+    """Along the sweep the points of a packet are not spread over many of the clock's steps from packet to packet."""
+    frames = make_sweep(subject, name, TIMED_PACKETS)
+    if subject.sensor.clock is None or len(frames) < 3:
+        return
+    packets = read(subject, name, frames)
+    if len(packets) < 3:
+        return
+    step = float(packets.time_ns[-1] - packets.time_ns[0]) / (len(packets) - 1) / 1e9
+    times = packets.points().time
+    spread = float(np.ptp(times)) if len(times) else 0.0
+    said = f"the points of {len(packets)} packets are spread over {spread:.3g} s, and the clock runs on by {step:.3g} s a packet"
+    require(step <= 0 or spread <= (len(packets) + MOST_STEPS) * step, "LS513", said, f"{name}.points")
+
+
+def turned_angles_turn_the_points(subject: Subject, name: str) -> None:
+    """If all angles of a packet are turned, its points turn with them, also across the full circle."""
+    sweep = subject.sensor.simulation_of(name).sweep
+    if sweep is None:
+        return
+    values = sweep(1)
+    following = sweep(2)
+    fields = codec(subject.sensor.frames[name]).schema.fields
+    known = [path for path in values if path in fields and path in following and fields[path].unit in FULL]
+    angles = [path for path in known if not np.array_equal(values[path], following[path])]
+    if not angles or len({(fields[path].unit, fields[path].scale) for path in angles}) > 1:
+        return
+    info = fields[angles[0]]
+    full = FULL[info.unit]
+    radians = 2 * np.pi / full
+    still = _azimuths(subject, name, values)
+    little = SMALL * info.scale
+    moved = _apart(_azimuths(subject, name, _turned(values, angles, little, full)), still)
+    if moved is None or not len(moved) or not np.allclose(np.abs(moved), abs(little) * radians, rtol=0.25):
+        return  # they depend on something else
+    sense = float(np.sign(moved[0])) * np.sign(little)
+    for part in range(1, TURNS):
+        shift = round(full * part / TURNS / info.scale) * info.scale
+        moved = _apart(_azimuths(subject, name, _turned(values, angles, shift, full)), still)
+        if moved is None:
+            continue
+        wrong = np.abs(_folded(moved - sense * shift * radians))
+        worst = float(wrong.max(initial=0))
+        turn = f"{' and '.join(angles)} turned by {shift:g} {info.unit}"
+        require(worst <= BACK, "LS504", f"{turn} leave a point {np.rad2deg(worst):.1f} degrees from where it belongs", f"{name}.points")
+
+
+def _turned(values: Mapping[str, Any], angles: list[str], shift: float, full: float) -> dict[str, Any]:
+    return {**values, **{path: (np.asarray(values[path]) + shift) % full for path in angles}}
+
+
+def _azimuths(subject: Subject, name: str, values: Mapping[str, Any]) -> NDArray[np.float64] | None:
+    """Return the azimuths of a packet with these values; None if it is not valid."""
+    try:
+        frame = FrameMaker(subject.sensor, name).frame(values)
+        packets = read(subject, name, [frame] * max(2, subject.sensor.frames[name].confirm))
+        return np.asarray(packets.points().azimuth, np.float64) if len(packets) else None
+    except LidarSpecError:
+        return None
+
+
+def _apart(one: NDArray[np.float64] | None, other: NDArray[np.float64] | None) -> NDArray[np.float64] | None:
+    """Return the angles between two sets of azimuths; None if these are not as many."""
+    if one is None or other is None or one.shape != other.shape:
+        return None
+    known = np.isfinite(one) & np.isfinite(other)
+    return _folded(one[known] - other[known])
+
+
+def _folded(angles: NDArray[np.float64]) -> NDArray[np.float64]:
+    return (angles + np.pi) % (2 * np.pi) - np.pi

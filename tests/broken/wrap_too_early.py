@@ -1,0 +1,11 @@
+"""A clock that starts again after 50 s, declared to do so after 3 s."""
+
+from __future__ import annotations
+
+from lidarspec.spec import Clock, hookimpl
+from tests.broken.sound import sensor
+
+
+@hookimpl
+def lidarspec_sensors():
+    return [sensor(clock=Clock("time", wraps_at=3.0))]
