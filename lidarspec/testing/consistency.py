@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from lidarspec.errors import LidarSpecError
 from lidarspec.framing.frame_engine import codec
 from lidarspec.packets.clocks import clock_ns
-from lidarspec.scans.cutter import FULL
+from lidarspec.packets.masked_sector import FULL_TURNS
 from lidarspec.simulation.frame_maker import FrameMaker
 from lidarspec.spec import Clock
 from lidarspec.spec.tree import exact
@@ -74,12 +74,12 @@ def turned_angles_turn_the_points(subject: Subject, name: str) -> None:
     values = sweep(1)
     following = sweep(2)
     fields = codec(subject.sensor.frames[name]).schema.fields
-    known = [path for path in values if path in fields and path in following and fields[path].unit in FULL]
+    known = [path for path in values if path in fields and path in following and fields[path].unit in FULL_TURNS]
     angles = [path for path in known if not np.array_equal(values[path], following[path])]
     if not angles or len({(fields[path].unit, fields[path].scale) for path in angles}) > 1:
         return
     info = fields[angles[0]]
-    full = FULL[info.unit]
+    full = FULL_TURNS[info.unit]
     radians = 2 * np.pi / full
     still = _azimuths(subject, name, values)
     little = SMALL * info.scale
