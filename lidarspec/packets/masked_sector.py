@@ -114,12 +114,14 @@ class AngleReader:
         self.is_available = bool(self._path) and sensor.datagrams
 
     def angles(self, table: Table) -> Angles | None:
-        """Return the angle at which each packet begins, (n,); None if the packets have no such field."""
+        """Return the angle at which each packet begins, (n,); None if the packets have no such field, or no part that has it."""
         info = table.schema.fields.get(self._path) if self.is_available else None
         full = self._full if info is None or self._full is not None else FULL_TURNS.get(info.unit)
         if info is None or full is None:
             return None
         raw = table.raw(self._path)
+        if not raw.size:
+            return None
         first = raw.reshape(len(raw), -1)[:, 0].astype(np.float64)
         return np.mod((first * info.scale + info.offset) / full, 1.0)
 
