@@ -367,7 +367,7 @@ class Registry:
             aliases = {alias: one.id for one in known.values() for alias in one.aliases}
             raise self._load_error(name) or unknown_sensor(name, known, aliases, self._failed_modules())
         if name not in self._ready:
-            self._ready[name] = self.hooked(found)
+            self._ready.setdefault(name, self.hooked(found))  # another thread may have been first
         return self._ready[name]
 
     def _load_error(self, name: str) -> UnknownSensor | None:
