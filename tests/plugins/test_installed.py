@@ -375,11 +375,13 @@ def test_a_plugin_that_hangs_is_left_out_and_the_others_work(tmp_path: Path, mon
     monkeypatch.setattr("lidarspec.plugins._hanging", {})
     hanging = [EntryPoint("a", "hanging_lidars", "hanging-lidars", "1"), EntryPoint("acme-x1", "hanging_lidars:X1", "hanging-lidars", "1")]
     good = next(entry for entry in entry_points("lidarspec.sensors") if entry.name == "cspc-m1c1-mini")
+    good.load()  # so that it does not take long
     with pytest.warns(UserWarning, match="what it adds is left out"):
         found = Registry(hanging[:1], [hanging[1], good])
     assert found.sensor("cspc-m1c1-mini").id == "cspc-m1c1-mini"
-    reasons = {plugin.error for plugin in found.plugins if plugin.distribution == "hanging-lidars"}
-    assert reasons == {f"it hangs: not loaded after 0.02 s at {tmp_path / 'hanging_lidars.py'}, line 3"}
+    reasons = [plugin.error for plugin in found.plugins if plugin.distribution == "hanging-lidars"]
+    assert len(reasons) == 2
+    assert all(reason.startswith("it hangs: not loaded after 0.02 s") for reason in reasons)
     end.set()
     assert gone.wait(60)
 
@@ -391,7 +393,7 @@ def test_a_verb_runs_beside_a_plugin_that_hangs(tmp_path: Path) -> None:
     environment = os.environ | {"PYTHONPATH": str(tmp_path)}
     command = [sys.executable, "-m", "lidarspec", "parse", "545a", "-s", "ldrobot-stl27l"]
     done = subprocess.run(command, env=environment, capture_output=True, text=True, check=False, timeout=300)
-    assert "hanging: it hangs: not loaded after 10 s" in done.stderr
+    assert f"hanging: it hangs: not loaded after 10 s at {tmp_path / 'hanging_lidars.py'}, line 2" in done.stderr
     assert done.returncode == 4
 
 
