@@ -124,8 +124,10 @@ def _sum_up_recording(task: SourceRecording, kept: Appender, source: str, sensor
             raise suggest(CommandError(f"{source} sent nothing"), f"lidarspec doctor {shlex.quote(source)}")
         raise suggest(WireError(f"{source} holds nothing that was received"), "lidarspec record --help")
     stats = device.stats if device is not None else None
-    damage = _damage(stats) if stats is not None else ""
-    note(f"{kept.path}: {_taken(task, kept)}{f'; {damage}' if damage else ''}")
+    summary = f"{kept.path}: {_taken(task, kept)}"
+    if stats is not None and (damage := _describe_damage(stats)):
+        summary += f"; {damage}"
+    note(summary)
     note(f"next: {_view_of(kept, sensor)}")
     if as_json:
         facts = {"output": kept.path, "source": source, "sensor": sensor.id if sensor else None}
@@ -135,10 +137,12 @@ def _sum_up_recording(task: SourceRecording, kept: Appender, source: str, sensor
         raise nothing_came(device, source, task.elapsed)
 
 
-def _damage(stats: Counters) -> str:
-    """Return what was lost or damaged, in words; frames and bytes are counted by what is in the file."""
-    counted = {name: value for name, value in stats.to_dict().items() if name not in ("frames", "bytes_in", "pending")}
-    return ", ".join(f"{name} {value}" for name, value in counted.items() if value)
+def _describe_damage(stats: Counters) -> str:
+    """Return the counters of lost and damaged input in words, without those of what was decoded: some of it is not in the file."""
+    counters = stats.to_dict()
+    for name in ("frames", "bytes_in", "pending"):
+        del counters[name]
+    return ", ".join(f"{name} {value}" for name, value in counters.items() if value)
 
 
 def _view_of(kept: Appender, sensor: Sensor | None) -> str:

@@ -11,7 +11,7 @@ import contextlib
 import math
 import re
 import time
-from collections.abc import Generator, Iterator
+from collections.abc import Generator
 from dataclasses import replace
 from typing import Any, Literal
 
@@ -48,11 +48,11 @@ def recorder_like(opened: Transport, source: str, target: str, sensor: Spec | st
 
 
 class TimedLog:
-    """A recorder that takes what arrives within some seconds of the first arrival, until it is ended; and always what is sent.
+    """A recorder that takes what arrives within some seconds of the first arrival, until it is ended. What is sent it always takes.
 
     Args:
         recorder: what writes the file; closed with this one.
-        seconds: how long; None: without limit.
+        seconds: the limit; None for none.
 
     Attributes:
         first, last: arrival times of what was recorded first and last, ns; None before anything was.
@@ -60,26 +60,33 @@ class TimedLog:
     """
 
     def __init__(self, recorder: Appender, seconds: float | None) -> None:
-        self._recorder, self._limit_ns = recorder, math.inf if seconds is None else seconds * 1e9
+        self._recorder = recorder
+        self._limit_ns = math.inf if seconds is None else seconds * 1e9
         self.first: int | None = None
         self.last: int | None = None
         self.is_over = False
 
     @property
     def error(self) -> SourceError | None:
-        """What went wrong with the file, None where nothing did."""
+        """The failure of the file; None if there was none."""
         return self._recorder.error
 
     @property
-    def seconds(self) -> float:
-        """The time from the first to the last arrival."""
-        return 0.0 if self.first is None or self.last is None else (self.last - self.first) / 1e9
+    def seconds(self) -> float | None:
+        """The time from the first arrival in the file to the last; None if there is none."""
+        return None if self.first is None or self.last is None else (self.last - self.first) / 1e9
+
+    def has(self, chunk: Chunk) -> bool:
+        """Return whether a chunk that was received is in the file."""
+        return chunk.at is None or (self.last is not None and chunk.at <= self.last)
 
     def write(self, chunk: Chunk, direction: Literal["in", "out"] = "in") -> None:
         """Record what was sent, and what was received unless it is over."""
         if direction == "in" and chunk.at is not None:
-            self.first = chunk.at if self.first is None else self.first
-            self.is_over = self.is_over or chunk.at - self.first >= self._limit_ns
+            if self.first is None:
+                self.first = chunk.at
+            if chunk.at - self.first >= self._limit_ns:
+                self.is_over = True
             if self.is_over:
                 return
             self.last = chunk.at
@@ -149,10 +156,12 @@ class SourceRecording:
         """What a sensor sends is recorded by a thread; here it is decoded to be counted, whatever that fails at."""
         news, failures, known = list[str](), dict[str, None](), set[str]()
         with Device(self._source, sensor, start=self._start, record=MadeFor(self._opened)) as self.device:
+            log = self._log
+            assert log is not None
             try:
-                while self._goes_on():
+                while self._goes_on(log):
                     try:
-                        self._count_next(self.device)
+                        self._count_next(self.device, log)
                         news = self.device.warnings
                     except SourceError:
                         raise
@@ -163,27 +172,25 @@ class SourceRecording:
                     yield "\n".join(text for what, text in told.items() if what not in known)
                     known = set(told)
             finally:
-                self._end()
+                self._end(log)
                 with contextlib.suppress(Exception, SystemExit):
-                    while self._count_next(self.device):
+                    while self._count_next(self.device, log):
                         pass
 
-    def _count_next(self, device: Device) -> bool:
-        """Count the next packets that are in the file; whether there are more of them."""
-        assert self._log is not None
+    def _count_next(self, device: Device, log: TimedLog) -> bool:
+        """Count the next packets that are in the file; return whether there may be more of them."""
         packets = next(device.packets(wait=TURN), None)
         if packets is None or len(packets) == 0:
             return False
-        last = self._log.last
-        recorded = len(packets) if last is None else int(np.count_nonzero(packets.host_ns <= last))
-        self.packets += recorded
-        return recorded == len(packets)
+        count = int(np.count_nonzero(packets.host_ns <= (log.last or 0)))
+        self.packets += count
+        return count == len(packets)
 
-    def _end(self) -> None:
-        """Record nothing more that arrives, and state how long it took by what is in the file."""
-        if self._log is not None:
-            self._log.end()
-            self.elapsed = self.elapsed if self._log.last is None else self._log.seconds
+    def _end(self, log: TimedLog) -> None:
+        """Record nothing more that arrives, and measure the time by what is in the file."""
+        log.end()
+        if log.seconds is not None:
+            self.elapsed = log.seconds
 
     def _received(self) -> Generator[str, None, None]:
         source = RecordingTransport(self._source, salvage=True) if self._salvage else transport(self._source, self._sensor)
@@ -196,37 +203,41 @@ class SourceRecording:
         queue = BoundedQueue()
         with contextlib.closing(Capture(source, queue, log=log)) as capture:
             try:
-                while self._goes_on():
+                while self._goes_on(log):
                     yield ""
-                    for item in self._count_waiting(source, queue, TURN):
-                        yield f"{self._source}: the device is {'gone; waiting for it to come back' if item is Mark.LOST else 'back'}"
+                    for mark in self._count_queued(source, queue, log, TURN):
+                        if mark is Mark.LOST:
+                            yield f"{self._source}: the device is gone; waiting for it to come back"
+                        elif mark is Mark.BACK:
+                            yield f"{self._source}: the device is back"
             finally:
-                self._end()
-                for _ in self._count_waiting(source, queue, 0.0):
-                    pass
+                self._end(log)
+                self._count_queued(source, queue, log, 0.0)
             yield from capture.warnings
 
-    def _count_waiting(self, source: LiveTransport, queue: BoundedQueue, wait: float) -> Iterator[Mark]:
-        """Count the datagrams that wait and are in the file; what happened to the line meanwhile."""
-        assert self._log is not None
+    def _count_queued(self, source: LiveTransport, queue: BoundedQueue, log: TimedLog, wait: float) -> list[Mark]:
+        """Take what is in the queue, and count the datagrams that are in the file; return what happened to the line meanwhile."""
+        marks = list[Mark]()
         for _, item in queue.take(wait):
             if isinstance(item, BaseException):
                 raise item
             if isinstance(item, Mark):
-                yield from [] if item is Mark.SILENT else [item]
-            elif self._log.last is not None and item.at is not None:
-                self.packets += source.datagrams and item.at <= self._log.last
+                marks.append(item)
+            elif source.datagrams and log.has(item):
+                self.packets += 1
+        return marks
 
     def _copied(self, source: Transport, log: TimedLog) -> Generator[str, None, None]:
         """What is in a file; standard input gets the time of its arrival."""
         clock = HostClock()
         assert self.recorder is not None
         for chunk in source.chunks():
-            if not self._goes_on(timed=False):
+            if not self._goes_on(log, timed=False):
                 return
             yield ""
             self.recorder.keep_up()
-            log.write(replace(chunk, at=clock.now() if chunk.at is None and self._source == "-" else chunk.at))
+            is_undated = chunk.at is None and self._source == "-"
+            log.write(replace(chunk, at=clock.now()) if is_undated else chunk)
             if log.is_over:
                 return
             self.packets += source.datagrams
@@ -241,12 +252,11 @@ class SourceRecording:
         self._began = time.monotonic()
         return self._log
 
-    def _goes_on(self, *, timed: bool = True) -> bool:
+    def _goes_on(self, log: TimedLog, *, timed: bool = True) -> bool:
         """Whether it has neither taken its time nor got all that was asked for; raises what went wrong with the file."""
         assert self.recorder is not None
-        assert self._log is not None
         if self.recorder.error is not None:
             self.recorder.sync()
         self.elapsed = time.monotonic() - self._began
-        is_late = timed and self._seconds is not None and (self._log.is_over or self.elapsed >= self._seconds)
+        is_late = timed and self._seconds is not None and (log.is_over or self.elapsed >= self._seconds)
         return not is_late and (self._count is None or self.packets < self._count)
