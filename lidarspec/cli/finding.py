@@ -227,20 +227,20 @@ def _one(source: str, duration: float, *, start: bool, tell: Callable[[str], Non
 
 def _everywhere(duration: float, *, start: bool) -> Iterator[Verdict]:
     """Return whose bytes come over each port, all of which are listened to at the same time."""
-    serial, udp = [port.path for port in serial_ports()], udp_ports()
+    serial = [port.path for port in serial_ports()]
+    udp = udp_ports()
     note(f"listening to {len(serial)} serial port{'s' * (len(serial) != 1)} and UDP {', '.join(map(str, udp))}")
 
-    def heard_at(source: str) -> list[Verdict]:
+    def listen(source: str) -> list[Verdict]:
         try:
             return _one(source, duration, start=start)
-        except SourceError as error:
-            return [Verdict(Heard(source, failure=error))]
-        except UsageError as error:
-            return [Verdict(Heard(source, failure=SourceError(str(error))))]
+        except (SourceError, UsageError) as error:
+            failure = error if isinstance(error, SourceError) else SourceError(str(error))
+            return [Verdict(Heard(source, failure=failure))]
 
     sources = [*serial, *(f"udp://:{port}" for port in udp)]
     with ThreadPoolExecutor(max_workers=len(sources) or 1) as pool:
-        yield from itertools.chain.from_iterable(pool.map(heard_at, sources))
+        yield from itertools.chain.from_iterable(pool.map(listen, sources))
 
 
 def _unknown(found: Sequence[Verdict]) -> Structure | None:
@@ -253,8 +253,10 @@ def _detected_text(found: Sequence[Verdict], output: str | None) -> str:
     rows = []
     for one in found:
         alike = {score.sensor.id for score in one.alike}
-        is_told = bool(one.alike or one.others) and voice.loudness <= 0
-        for score in one.alike if is_told else one.scores:
+        listed = one.scores
+        if voice.loudness <= 0 and (one.alike or one.others):
+            listed = one.alike  # without those that were ruled out
+        for score in listed:
             verdict_of = "no" if score.sensor.id not in alike else "yes" if one.sensor is not None else "perhaps"
             rows.append([_place(one.heard), score.sensor.id, verdict_of, f"{score.share:.1%}", str(score.data_frames), score.why])
         verdict_of = "perhaps" if alike else "yes"
@@ -337,9 +339,10 @@ def _following(source: str | None, unknown: Structure | None) -> str:
     """What to type where bytes come that no sensor fits."""
     if source is None or live_address(source) is not None:
         return f"lidarspec doctor {quote(source) if source else ''}".rstrip()
-    if unknown is not None and not unknown.checksums:
-        return f"lidarspec crc {quote(source)}" + (f" --period {unknown.period}" if unknown.period else "")
-    return "lidarspec sensors"
+    if unknown is None or unknown.checksums:
+        return "lidarspec sensors"
+    period = f" --period {unknown.period}" if unknown.period else ""
+    return f"lidarspec crc {quote(source)}{period}"
 
 
 def _again(one: Verdict) -> str:

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lidarspec.discovery.crc_search import crc_matches
-from lidarspec.discovery.samples import Match, Place, Samples, Span, best_first, doubt, enough, spans
+from lidarspec.discovery.samples import Match, Place, Samples, Span, anywhere, best_first, doubt, enough, spans
 from lidarspec.spec.checksums import ByteOrder, Bytes, Checksum, Fold15, Sum, Values, WordXor, Xor
 from lidarspec.wire.row_checksums import batch
 
@@ -86,13 +86,13 @@ class Changed(Checksum):
         return ((constant - values) if self.negative else (constant + values)) & np.uint64(self._mask)
 
 
-def search(frames: Iterable[bytes], *, quick: bool = False, stands: Callable[[Place], bool] = lambda place: True) -> list[Match]:
+def search(frames: Iterable[bytes], *, quick: bool = False, stands: Callable[[Place], bool] = anywhere) -> list[Match]:
     """The checksums that fit the frames, the plainest and best proven first; empty where none does.
 
     Args:
         frames: whole frames, the more of them and the more different the better; some may be damaged, and lengths may differ.
-        quick: look only for what is found within about a second: CRCs at the usual places, those of long frames in the catalogue.
-        stands: whether a checksum may stand at a place; by default anywhere.
+        quick: end after about a second: look for CRCs at the usual places only, and for those of long frames in the catalogue only.
+        stands: whether a checksum may stand at a place.
     """
     samples = Samples(frames)
     if samples.shortest < 3 or not any(map(any, samples.frames)):
@@ -116,7 +116,7 @@ def pasted(algorithm: Checksum) -> str:
     return f"{type(algorithm).__name__}()"
 
 
-def plain_matches(samples: Samples, stands: Callable[[Place], bool] = lambda place: True) -> Iterator[Match]:
+def plain_matches(samples: Samples, stands: Callable[[Place], bool] = anywhere) -> Iterator[Match]:
     """Every plain checksum that fits, in no special order."""
     few = samples.few(SCREENED)
     tried, sure, certain = 0, False, False

@@ -11,6 +11,7 @@ so that every frame counts by itself.
 from __future__ import annotations
 
 import functools
+import math
 import operator
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
@@ -18,7 +19,7 @@ from itertools import combinations, product, zip_longest
 
 import numpy as np
 
-from lidarspec.discovery.samples import Match, Place, Samples, Span, doubt, enough, spans
+from lidarspec.discovery.samples import Match, Place, Samples, Span, anywhere, doubt, enough, spans
 from lidarspec.spec.checksums import CRCS, KNOWN, MIRROR, ByteOrder, Crc, name_of, reflected
 
 #: how much larger than sought a common divisor may be, where its divisors are tried one by one.
@@ -27,8 +28,10 @@ SPARE = 11
 WIDTHS = (32, 16, 8)
 #: frames longer than this are divided for a checksum at their end alone; elsewhere the catalogue is tried.
 DIVIDED = 256
-#: a byte that is divided takes as long as so many of which a CRC is computed, and how many of those a quick search may take.
-DIVISION, QUICK = 32, 1 << 23
+#: bytes of which a CRC is computed in the time in which one byte is divided.
+DIVISION_WORK = 32
+#: work of a quick search, in bytes of which a CRC is computed: about a second.
+QUICK_WORK = 1 << 23
 #: frames of one length that a polynomial is sought with; at the usual place other picks are tried where one fails, in case of damage.
 TAKEN, PICKS = 4, 6
 #: most polynomials that are held against all frames for one place and span.
@@ -144,19 +147,21 @@ class _Reading:
 
 
 def crc_matches(
-    samples: Samples, *, mixed: bool = False, quick: bool = False, stands: Callable[[Place], bool] = lambda place: True
+    samples: Samples, *, mixed: bool = False, quick: bool = False, stands: Callable[[Place], bool] = anywhere
 ) -> Iterator[Match]:
     """Every CRC that fits, up to the first place with a sure one.
 
     Args:
         mixed: look for those whose bytes and register are not mirrored alike, in place of those where they are.
-        quick: give up after a fixed amount of work, with the usual places first.
-        stands: whether a CRC may stand at a place; by default anywhere.
+        quick: end after a fixed amount of work; the usual places come first.
+        stands: whether a CRC may stand at a place.
     """
     mirrors = [(False, True), (True, False)] if mixed else [(False, False), (True, True)]
     picks = [samples.alike(TAKEN, pick) for pick in range(PICKS if len(samples) > 2 * TAKEN else 1)]
     by_width = [[place for place in filter(stands, samples.places(width // 8)) if _random(samples, place)] for width in WIDTHS]
-    tried, sure, taken = 0, False, 0
+    tried = 0
+    sure = False
+    work_left = QUICK_WORK if quick else math.inf
     for place in (place for places in zip_longest(*by_width) for place in places if place is not None):
         width = 8 * place.size
         orders: tuple[ByteOrder, ...] = ("little", "big") if width > 8 else ("little",)
@@ -166,8 +171,8 @@ def crc_matches(
             at_end = place.offset == -place.size
             by_catalogue = samples.shortest > DIVIDED and (quick or not at_end)
             chosen = picks if at_end and span == Span() else picks[:1]
-            taken += sum(_work(some, reading, by_catalogue=by_catalogue) for some in chosen)
-            if quick and taken > QUICK:
+            work_left -= sum(_work(some, reading, by_catalogue=by_catalogue) for some in chosen)
+            if work_left < 0:
                 return
             found = (list(_fitting(samples, some, place, span, reading, tried, by_catalogue=by_catalogue)) for some in chosen)
             for match in next((matches for matches in found if matches), []):
@@ -178,8 +183,10 @@ def crc_matches(
 
 
 def _work(few: Samples, reading: _Reading, *, by_catalogue: bool) -> int:
-    """How much work one place, span and reading are, in bytes of which a CRC is computed."""
-    return few.shortest * len(reading.known()) if by_catalogue else DIVISION * sum(map(len, few.frames))
+    """Return how much work one place, span and reading are, in bytes of which a CRC is computed."""
+    if by_catalogue:
+        return few.shortest * len(reading.known())
+    return DIVISION_WORK * sum(map(len, few.frames))
 
 
 def _random(samples: Samples, place: Place) -> bool:
@@ -202,7 +209,10 @@ def _fitting(
 ) -> Iterator[Match]:
     """The CRCs of one place, span and reading; of the catalogue alone, or any."""
     there = samples.fields(place, reading.order)
-    candidates = _catalogued(few, place, span, reading) if by_catalogue else _candidates(_codewords(few, place, span, reading), reading)
+    if by_catalogue:
+        candidates = _catalogued(few, place, span, reading)
+    else:
+        candidates = _candidates(_codewords(few, place, span, reading), reading)
     for crc, fitted, remarks in candidates:
         right = samples.right(crc, place, span, reading.order)
         known = crc.poly in KNOWN[crc.width]

@@ -48,14 +48,14 @@ def udp_ports() -> list[int]:
 
 
 def ignore(_: str) -> None:
-    """Tell nobody what is being listened to."""
+    """Do nothing with what is being listened to: nobody watches."""
 
 
 def hear(source: str | Path, *, seconds: float = LISTEN, tell: Callable[[str], None] = ignore) -> Iterator[Heard]:
     """What comes from a source; a serial port whose baud rate is not given, once for each that installed sensors declare.
 
-    A line that is silent at the commonest, the lowest and the highest rate is silent at all: what is sent at one rate arrives as
-    other bytes at another, and not as none.
+    If a serial port is silent at the commonest, the lowest and the highest rate, no other rate is tried: what is sent at one rate
+    arrives at another one as wrong bytes, but it arrives.
 
     Args:
         seconds: to listen for, each time.
@@ -70,10 +70,12 @@ def hear(source: str | Path, *, seconds: float = LISTEN, tell: Callable[[str], N
             tell(text)
             yield from _heard(with_option(text, "baud", bauds()[0]), seconds, None, text)
             return
-        rates, is_silent = bauds(), True
-        first = dict.fromkeys([rates[0], min(rates), max(rates)])
-        for number, baud in enumerate(dict.fromkeys([*first, *rates])):
-            if number == len(first) and is_silent:
+        rates = bauds()
+        first_rates = list(dict.fromkeys([rates[0], min(rates), max(rates)]))
+        other_rates = [baud for baud in rates if baud not in first_rates]
+        is_silent = True
+        for baud in first_rates + other_rates:
+            if is_silent and baud in other_rates:
                 return
             tell(f"{text} at {baud} baud")
             for heard in _heard(with_option(text, "baud", baud), seconds, baud, text):

@@ -55,7 +55,7 @@ HALF, CLOSE, MANY = 0.5, 0.03, 12
 ALIKE = 0.75
 #: pairs of bytes that are tried as sync bytes, and frames that a structure needs.
 PAIRS, FRAMES = 32, 3
-#: how probable frames may be that random bytes seem to consist of as well.
+#: A structure is refused if random bytes show one like it with a higher probability.
 CHANCE = 1e-3
 #: bytes behind the sync that may hold a length, and the largest size of one unit of it.
 HEADER, UNIT = 8, 16
@@ -339,30 +339,35 @@ def _framed(data: NDArray[np.uint8], period: int) -> Iterator[tuple[float, Struc
     rows = data[: count * period].reshape(count, period)
     usual = usual_bytes(rows)
     steady = (rows == usual).mean(axis=0) >= STEADY if count >= 2 * FRAMES else (rows == usual).all(axis=0)
-    told = int((steady & (usual != 0)).sum())
-    if told == 0 or steady.all() or _is_chance(data, told, count, period):
+    steady_count = int((steady & (usual != 0)).sum())
+    if steady_count == 0 or steady.all() or _is_chance(data, steady_count, count, period):
         return
     start, length = _longest_run(steady, usual)
     sync = bytes(np.roll(usual, -start)[:length])
     frames = [frame for frame in cut(data.tobytes(), period, start) if frame.startswith(sync)]
     if len(frames) >= FRAMES:
         share = len(frames) * period / len(data)
-        yield share * told / period, Structure(sync[:16], period, None, share, tuple(frames))
+        yield share * steady_count / period, Structure(sync[:16], period, None, share, tuple(frames))
 
 
 def _is_chance(data: NDArray[np.uint8], steady: int, count: int, period: int) -> bool:
-    """Whether random bytes, as usual as these, have as many of a period that are the same `count` times, at any distance that is tried.
+    """Return whether random bytes with the same shares of values would show such a structure as well.
 
-    By the bound of Chernoff on the number of such bytes.
+    Chernoff's bound gives the probability of so many steady bytes at one period; all periods that are tried count.
+
+    Args:
+        steady: bytes of a period that are the same in each repetition, and not 0.
+        count: repetitions.
     """
     shares = np.bincount(data, minlength=256)[1:] / len(data)
     expected = period * float((shares**count).sum())
     if steady <= expected:
         return True
-    if expected == 0:  # of many frames
+    if expected == 0:  # below the smallest float, after many repetitions
         return False
-    tried = min(LONGEST, len(data) // FRAMES)
-    return math.log(tried) + steady - expected - steady * math.log(steady / expected) > math.log(CHANCE)
+    log_of_one = steady - expected - steady * math.log(steady / expected)
+    periods = min(LONGEST, len(data) // FRAMES)
+    return math.log(periods) + log_of_one > math.log(CHANCE)
 
 
 def _longest_run(steady: NDArray[np.bool_], usual: NDArray[np.uint8]) -> tuple[int, int]:

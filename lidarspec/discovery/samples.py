@@ -200,6 +200,11 @@ class Samples:
         return 2 * apart + min(1.0, distinct * (USUAL if place.offset == -place.size else 1))
 
 
+def anywhere(_: Place) -> bool:
+    """Return True: a checksum may stand at every place."""
+    return True
+
+
 def spans(place: Place, samples: Samples) -> Iterator[Span]:
     """What a checksum at a place can cover, the usual first; what says the same of these frames in other words is left out."""
     start = place.start(samples.shortest)

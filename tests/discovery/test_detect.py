@@ -16,7 +16,7 @@ import pytest
 import lidarspec as ls
 from lidarspec import CommandError, SourceError, UsageError, WireError, simulate
 from lidarspec.discovery import detect, listen
-from lidarspec.discovery.crc_search import DIVISION, QUICK, crc_matches, remainder
+from lidarspec.discovery.crc_search import DIVISION_WORK, QUICK_WORK, crc_matches, remainder
 from lidarspec.discovery.detect import detected, fitting, scores, verdict, verdicts
 from lidarspec.discovery.listen import Heard, bauds, hear, probe, started_first, udp_ports
 from lidarspec.discovery.periods import structure
@@ -379,6 +379,12 @@ def test_a_line_that_is_silent_at_three_rates_is_not_listened_to_at_others(
     assert told[0] == f"{made.name} at {bauds()[0]} baud"
 
 
+def make_bodies(size: int, number: int) -> list[bytes]:
+    """Return random bytes, `number` times `size` of them."""
+    source = random.Random(size)
+    return [source.randbytes(size) for _ in range(number)]
+
+
 class TestStructure:
     """What unknown bytes are made of."""
 
@@ -389,24 +395,29 @@ class TestStructure:
         assert found is not None
         assert (found.sync, found.period) == (b"\xde\xad\xbe\xef", 1000)
 
-    @pytest.mark.parametrize(("size", "number"), [(60, 40), (600, 8)])
-    def test_a_quick_search_for_checksums_takes_a_fixed_amount_of_work(
+    @pytest.mark.parametrize(("size", "number"), [(60, 40), (200, 8)])
+    def test_a_quick_search_divides_no_more_than_a_fixed_number_of_bytes(
         self, monkeypatch: pytest.MonkeyPatch, size: int, number: int
     ) -> None:
-        steps = 0
+        divided = 0
 
-        def counted(a: int, b: int) -> int:
-            nonlocal steps
-            steps += max(a.bit_length() - b.bit_length() + 1, 0)
+        def count_and_divide(a: int, b: int) -> int:
+            nonlocal divided
+            divided += max(a.bit_length() - b.bit_length() + 1, 0) // 8
             return remainder(a, b)
 
-        monkeypatch.setattr("lidarspec.discovery.crc_search.remainder", counted)
-        monkeypatch.setattr("lidarspec.discovery.crc_search.QUICK", QUICK // 64)
-        source = random.Random(size)
-        bodies = [source.randbytes(size) for _ in range(number)]
-        assert list(crc_matches(Samples(bodies), quick=True)) == []
-        assert 0 < steps + (size > 256) <= 2 * 8 * QUICK // 64 // DIVISION
-        sealed = Samples(body + zlib.crc32(body).to_bytes(4, "little") for body in bodies)
+        monkeypatch.setattr("lidarspec.discovery.crc_search.remainder", count_and_divide)
+        monkeypatch.setattr("lidarspec.discovery.crc_search.QUICK_WORK", QUICK_WORK // 64)
+        samples = Samples(make_bodies(size, number))
+        assert list(crc_matches(samples, quick=True)) == []
+        assert 0 < divided <= 2 * QUICK_WORK // 64 // DIVISION_WORK  # the steps of Euclid's algorithm pass over the bytes twice
+        quick = divided
+        assert list(crc_matches(samples)) == []
+        assert divided - quick > 2 * quick
+
+    @pytest.mark.parametrize(("size", "number"), [(60, 40), (600, 8)])
+    def test_a_quick_search_finds_a_usual_crc(self, size: int, number: int) -> None:
+        sealed = Samples(body + zlib.crc32(body).to_bytes(4, "little") for body in make_bodies(size, number))
         assert next(crc_matches(sealed, quick=True)).name == "CRC-32"
 
     @pytest.mark.slow
