@@ -89,9 +89,11 @@ def lidarspec_formats() -> Iterable[Any]:  # type: ignore[empty-body]
     """File formats by suffix that the plugin adds."""
 
 
-#: seconds after which a plugin that is being loaded is named, and after which it counts as hanging.
-PATIENCE, LIMIT = 5.0, 10.0
-#: modules that hang -> what to say of them.
+#: seconds after which a plugin that is being loaded is reported.
+PATIENCE = 5.0
+#: seconds after which it counts as hanging.
+LIMIT = 10.0
+#: the reason by module, for modules whose import hangs.
 _hanging: dict[str, str] = {}
 HOOKS = tuple(name for name in globals() if name.startswith("lidarspec_"))
 
@@ -475,8 +477,8 @@ def named_owners() -> dict[str, str]:
     return named
 
 
-def _imported(entry: EntryPoint) -> Any:
-    """What an entry point stands for, imported in a thread: one that hangs is named and left alone, and everything else goes on.
+def _import_in_time(entry: EntryPoint) -> Any:
+    """Import an entry point, and return its module or object. An import that hangs is reported and left alone in its thread.
 
     Raises:
         SpecError: where it hangs.
@@ -501,7 +503,7 @@ def _imported(entry: EntryPoint) -> Any:
         warnings.warn(f"{entry.distribution}: {entry.module} has been loading for {PATIENCE:g} s; next: lidarspec plugins", stacklevel=2)
         thread.join(max(LIMIT - PATIENCE, 0))
     if not outcome:
-        _hanging[entry.module] = f"it hangs: not loaded after {LIMIT:g} s{_place(thread)}"
+        _hanging[entry.module] = f"it hangs: not loaded after {LIMIT:g} s{_describe_place(thread)}"
         warnings.warn(f"{entry.distribution}: {_hanging[entry.module]}; what it adds is left out", stacklevel=2)
         raise SpecError(_hanging[entry.module])
     loaded, failure = outcome[0]
@@ -510,18 +512,20 @@ def _imported(entry: EntryPoint) -> Any:
     return loaded
 
 
-def _place(thread: threading.Thread) -> str:
-    """Where the code of a plugin is that a thread waits in, in words; "" where that cannot be seen."""
+def _describe_place(thread: threading.Thread) -> str:
+    """Return " at FILE, line NUMBER" for the line of a module that a thread is importing; "" if there is none."""
     stack = traceback.extract_stack(sys._current_frames().get(thread.ident or 0))
-    own = [frame for frame in stack if frame.name == "<module>"]
-    return f" at {own[-1].filename}, line {own[-1].lineno}" if own else ""
+    module_frames = [frame for frame in stack if frame.name == "<module>"]
+    if not module_frames:
+        return ""
+    return f" at {module_frames[-1].filename}, line {module_frames[-1].lineno}"
 
 
 def _loaded(entry: EntryPoint, names: str, add: Callable[[Any], list[str]]) -> Plugin:
     """What became of an entry point that is loaded and added; whatever it raises disturbs no other."""
     plugin = Plugin(entry.distribution, entry.version, f"{names} = {entry.value}")
     try:
-        return replace(plugin, sensors=tuple(add(_imported(entry))))
+        return replace(plugin, sensors=tuple(add(_import_in_time(entry))))
     except KeyboardInterrupt:
         raise
     except BaseException as error:
