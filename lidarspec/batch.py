@@ -204,17 +204,20 @@ def pieces(
     return list(made.values())
 
 
-#: what each record of a manifest holds, and what it holds besides if its piece did not fail.
-_OF_EACH: Mapping[str, Any] = {"source": str, "target": str, "piece": int}
-_OF_FINISHED: Mapping[str, Any] = {"last": bool, "size": int, "modified": str, "digest": str, "output": str | None}
+#: keys that each record of a manifest has, with their types.
+_RECORD_KEYS: Mapping[str, Any] = {"source": str, "target": str, "piece": int}
+#: further keys of the record of a piece that was written.
+_WRITTEN_KEYS: Mapping[str, Any] = {"last": bool, "size": int, "modified": str, "digest": str, "output": str | None}
 
 
-def _is_record(record: Any) -> bool:
-    """Whether a value has what the record of a piece has, of the right types."""
-    if not isinstance(record, dict):
+def _is_record(value: Any) -> bool:
+    """Return whether a value from a line of a manifest has the keys of a record, with values of the right types."""
+    if not isinstance(value, dict):
         return False
-    wanted = _OF_EACH if "error" in record else {**_OF_EACH, **_OF_FINISHED}
-    return all(name in record and isinstance(record[name], kind) for name, kind in wanted.items())
+    keys = dict(_RECORD_KEYS)
+    if "error" not in value:
+        keys |= _WRITTEN_KEYS
+    return all(name in value and isinstance(value[name], kind) for name, kind in keys.items())
 
 
 class Manifest:
