@@ -244,9 +244,10 @@ def _stated(engine: CompiledCodec, values: Mapping[str, Any]) -> Drawn:
     found: dict[str, Callable[[random.Random], Any]] = {}
     for path, value in values.items():
         if path in fields and np.ndim(value) == 0 and not isinstance(value, bytes):
-            found[path] = functools.partial(_always, fields[path].raw(float(value)))
+            found[path] = functools.partial(draw_always, fields[path].raw(float(value)))
     return found
 
 
-def _always(raw: int, _: random.Random) -> int:
+def draw_always(raw: int, _: random.Random) -> int:
+    """Return the same raw value each time: for what is drawn from chance elsewhere."""
     return raw

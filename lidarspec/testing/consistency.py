@@ -81,28 +81,29 @@ def turned_angles_turn_the_points(subject: Subject, name: str) -> None:
     info = fields[angles[0]]
     full = FULL_TURNS[info.unit]
     radians = 2 * np.pi / full
-    still = _azimuths(subject, name, values)
+    still = _read_azimuths(subject, name, values)
     little = SMALL * info.scale
-    moved = _apart(_azimuths(subject, name, _turned(values, angles, little, full)), still)
+    moved = _angles_between(_read_azimuths(subject, name, _turn_angles(values, angles, little, full)), still)
     if moved is None or not len(moved) or not np.allclose(np.abs(moved), abs(little) * radians, rtol=0.25):
         return  # they depend on something else
     sense = float(np.sign(moved[0])) * np.sign(little)
     for part in range(1, TURNS):
         shift = round(full * part / TURNS / info.scale) * info.scale
-        moved = _apart(_azimuths(subject, name, _turned(values, angles, shift, full)), still)
+        moved = _angles_between(_read_azimuths(subject, name, _turn_angles(values, angles, shift, full)), still)
         if moved is None:
             continue
-        wrong = np.abs(_folded(moved - sense * shift * radians))
+        wrong = np.abs(_fold(moved - sense * shift * radians))
         worst = float(wrong.max(initial=0))
         turn = f"{' and '.join(angles)} turned by {shift:g} {info.unit}"
         require(worst <= BACK, "LS504", f"{turn} leave a point {np.rad2deg(worst):.1f} degrees from where it belongs", f"{name}.points")
 
 
-def _turned(values: Mapping[str, Any], angles: list[str], shift: float, full: float) -> dict[str, Any]:
+def _turn_angles(values: Mapping[str, Any], angles: list[str], shift: float, full: float) -> dict[str, Any]:
+    """Return the values of a packet with `shift` added to its angles, whose full circle is `full`."""
     return {**values, **{path: (np.asarray(values[path]) + shift) % full for path in angles}}
 
 
-def _azimuths(subject: Subject, name: str, values: Mapping[str, Any]) -> NDArray[np.float64] | None:
+def _read_azimuths(subject: Subject, name: str, values: Mapping[str, Any]) -> NDArray[np.float64] | None:
     """Return the azimuths of a packet with these values; None if it is not valid."""
     try:
         frame = FrameMaker(subject.sensor, name).frame(values)
@@ -112,13 +113,14 @@ def _azimuths(subject: Subject, name: str, values: Mapping[str, Any]) -> NDArray
         return None
 
 
-def _apart(one: NDArray[np.float64] | None, other: NDArray[np.float64] | None) -> NDArray[np.float64] | None:
-    """Return the angles between two sets of azimuths; None if these are not as many."""
+def _angles_between(one: NDArray[np.float64] | None, other: NDArray[np.float64] | None) -> NDArray[np.float64] | None:
+    """Return the angles between two sets of azimuths; None if one is missing, or has another shape."""
     if one is None or other is None or one.shape != other.shape:
         return None
     known = np.isfinite(one) & np.isfinite(other)
-    return _folded(one[known] - other[known])
+    return _fold(one[known] - other[known])
 
 
-def _folded(angles: NDArray[np.float64]) -> NDArray[np.float64]:
+def _fold(angles: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return angles in radians as those from -pi to pi that mean the same."""
     return (angles + np.pi) % (2 * np.pi) - np.pi

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import dis
 import inspect
-import random
 import re
 from collections.abc import Iterator
 from dataclasses import fields, replace
@@ -17,7 +16,7 @@ import numpy as np
 from lidarspec.columns.columns import Batch, Fields
 from lidarspec.columns.graph import Traced, Untraceable
 from lidarspec.errors import LidarSpecError, SpecError, did_you_mean
-from lidarspec.framing.examples import header, random_frame
+from lidarspec.framing.examples import draw_always, header, random_frame
 from lidarspec.framing.frame_engine import CompiledCodec, codec
 from lidarspec.points.conventions import TYPES
 from lidarspec.simulation.scenes import Room
@@ -210,7 +209,7 @@ def _raised_sizes(subject: Subject, name: str) -> Iterator[int]:
     for path in header(engine, source)[1]:
         info = engine.schema.fields[path]
         for shift in range(info.bits if info.const is None else 0):
-            raised = {path: partial(_always, info.limits[1] >> shift)}
+            raised = {path: partial(draw_always, info.limits[1] >> shift)}
             try:
                 size = header(engine, source, raised)[0].size
                 if FAR * size < frame.max_length:
@@ -218,10 +217,6 @@ def _raised_sizes(subject: Subject, name: str) -> Iterator[int]:
                 yield len(random_frame(subject.sensor, name, source, {**subject.drawers(name), **raised}))
             except SpecError:  # too long, or not plausible
                 continue
-
-
-def _always(value: int, _: random.Random) -> int:
-    return value
 
 
 def _names(subject: Subject, name: str, frame: Frame) -> Findings:
