@@ -20,6 +20,7 @@ from tests.missing import describe_missing
 #: plugins whose tests need an environment of their own: `make test-ros2`.
 collect_ignore = ["plugins/lidarspec-ros2"]
 
+# Collecting tests makes hundreds of thousands of objects that all stay, so that looking for garbage among them is a waste.
 gc.disable()
 
 if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
@@ -53,7 +54,7 @@ def _isolated(tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:
 
 @pytest.fixture(autouse=True, scope="session")
 def _examples_are_made_once() -> Iterator[None]:
-    """Make each example frame once: the same frames of the same sensors are asked for by thousands of tests."""
+    """Make each example frame once, since thousands of tests use the same frames of the same sensors."""
     made: weakref.WeakKeyDictionary[Spec, dict[tuple[str, int], bytes]] = weakref.WeakKeyDictionary()
     original = examples.example
 
@@ -76,7 +77,7 @@ def _frozen() -> None:
 
 
 def pytest_collection_finish() -> None:
-    """Collect garbage again, of which there is next to none while tests are collected."""
+    """Collect garbage while the tests run."""
     gc.enable()
 
 

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import dataclasses
 import random
-from collections.abc import Sequence
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any
 
 import numpy as np
 import pytest
@@ -69,27 +70,27 @@ def test_every_sensor_that_sends_datagrams_keeps_the_promise(name: str) -> None:
     assert_order_does_not_matter(sensor, simulate(sensor, 800), 0)
 
 
-def test_a_counter_that_starts_again_while_packets_are_late() -> None:
-    """The counter has 65,536 values, and starts again with each frame of 40 packets."""
-    plain = load_sensor("shape-extras")
-    simulation = plain.simulation
+def with_sweep(name: str, change: Callable[[int, Mapping[str, Any]], Mapping[str, Any]]) -> Sensor:
+    """Return a shape whose sweep is changed by a function of the packet's number and its values."""
+    sensor = load_sensor(name)
+    simulation = sensor.simulation
     assert simulation is not None
     sweep = simulation.sweep
-    restarting = dataclasses.replace(simulation, sweep=lambda i: {**sweep(i), "number": i % 40})
-    sensor = dataclasses.replace(plain, simulation=restarting)
+    changed = dataclasses.replace(simulation, sweep=lambda i: change(i, sweep(i)))
+    return dataclasses.replace(sensor, simulation=changed)
+
+
+def test_a_counter_that_starts_again_while_packets_are_late() -> None:
+    """The counter has 65,536 values, and starts again with each frame of 40 packets."""
+    sensor = with_sweep("shape-extras", lambda i, values: {**values, "number": i % 40})
     assert_order_does_not_matter(sensor, simulate(sensor, 300), 100)
 
 
 def test_a_late_packet_between_unevenly_timed_ones_is_no_loss() -> None:
     """Each packet is up to 40 % of its pace late by the clock."""
-    plain = load_sensor("shape-paced")
-    simulation = plain.simulation
-    assert simulation is not None
-    sweep = simulation.sweep
     draw = random.Random(1)
     delays = [draw.uniform(0, 0.4) * FAST_S for _ in range(97)]
-    uneven = dataclasses.replace(simulation, sweep=lambda i: {**sweep(i), "micros": sweep(i)["micros"] + delays[i % 97]})
-    sensor = dataclasses.replace(plain, simulation=uneven)
+    sensor = with_sweep("shape-paced", lambda i, values: {**values, "micros": values["micros"] + delays[i % 97]})
     assert_order_does_not_matter(sensor, simulate(sensor, 120), 0)
 
 
