@@ -60,18 +60,6 @@ def distinct_sensors_in(module: str) -> list[Sensor]:
     return list(distinct.values())
 
 
-def families_in(module: str) -> list[Sensor]:
-    """Load the sensors of a module, without those that share most frames with the ones before."""
-    families: list[Sensor] = []
-    known: set[int] = set()
-    for sensor in distinct_sensors_in(module):
-        frames = set(map(id, sensor.frames.values()))
-        if 2 * len(frames - known) > len(frames):
-            families.append(sensor)
-        known |= frames
-    return families
-
-
 def conformance_cases(distribution: str) -> list[object]:
     """Return the parameters of a distribution's conformance test: one id of each sensor.
 

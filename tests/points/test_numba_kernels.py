@@ -137,7 +137,7 @@ def simulated(sensor: Sensor, answer: str, backend: str, number: int = 2 * MANY)
     return configured.decode(data, backend=backend)
 
 
-@pytest.mark.slow
+@pytest.mark.soak
 @pytest.mark.parametrize("module", sensor_modules())
 def test_every_installed_sensor_has_a_kernel(module: str) -> None:
     for sensor, answer in answers_in(module):

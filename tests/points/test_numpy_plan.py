@@ -23,8 +23,9 @@ from lidarspec.wire.frame_table import Rows
 from tests.broken import sound
 from tests.engine.against_construct import clouds_agree, sensor
 from tests.engine.random_specs import made
-from tests.installed import distinct_sensors_in, families_in, sensor_modules
+from tests.installed import distinct_sensors_in, sensor_modules
 from tests.points.backends import BACKENDS
+from tests.representatives import REPRESENTATIVES, load_sensor
 from tests.shapes import SHAPES
 
 SHAPED = [name for name, sensor in SHAPES.items() if sensor.frames]
@@ -54,9 +55,9 @@ def test_a_plan_gives_what_the_plain_evaluation_gives(name: str, number: int) ->
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("module", sensor_modules())
-def test_every_family_of_sensors_has_a_plan(module: str) -> None:
-    assert_sensors_have_a_plan(families_in(module))
+@pytest.mark.parametrize("name", REPRESENTATIVES)
+def test_every_representative_has_a_plan(name: str) -> None:
+    assert_sensors_have_a_plan([load_sensor(name)])
 
 
 @pytest.mark.soak

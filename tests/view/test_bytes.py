@@ -14,7 +14,9 @@ from lidarspec.simulation.faults import Faults
 from tests.view.pages import FLAT, SOLID, Page, Station, recorded
 
 #: a byte stream, datagrams, points that wait for the next packet, parts of a frame, text on the wire, messages of several datagrams.
-SENSORS = (FLAT, SOLID, "slamtec-rplidar-a1", "sick-multiscan136", "hokuyo-ust10lx", "robosense-airy", "livox-mid360", "velodyne-vlp16")
+SENSORS = (FLAT, SOLID, "slamtec-rplidar-a1", "sick-multiscan136", "hokuyo-ust10lx", "robosense-airy")
+#: Others of these kinds.
+MORE_SENSORS = ("livox-mid360", "velodyne-vlp16")
 #: How fast sensors of many points are simulated: simulating some of them at full speed takes a whole processor.
 SLOWLY = "rate=0.3"
 #: points of a scan that are asked for.
@@ -46,7 +48,14 @@ def agree(page: Page, header: dict[str, Any], columns: dict[str, np.ndarray], sp
     ), (frame["value"], ranges[index])
 
 
-@pytest.mark.parametrize("sensor", [FLAT, *(pytest.param(name, marks=pytest.mark.slow) for name in SENSORS[1:])])
+@pytest.mark.parametrize(
+    "sensor",
+    [
+        FLAT,
+        *(pytest.param(name, marks=pytest.mark.slow) for name in SENSORS[1:]),
+        *(pytest.param(name, marks=pytest.mark.soak) for name in MORE_SENSORS),
+    ],
+)
 def test_a_point_leads_to_its_frame_and_its_field(tmp_path: Path, sensor: str) -> None:
     """While newer scans arrive."""
     source = f"sim:{sensor}" if sensor == FLAT else f"sim:{sensor}?{SLOWLY}"
