@@ -74,7 +74,8 @@ class Page:
 
     def __init__(self, answers: Answers, socket: WebSocket, workers: Workers) -> None:
         self._answers, self._broadcast, self._socket = answers, answers.broadcast, socket
-        self._replies, self._stirred = deque[dict[str, Any]](), asyncio.Event()
+        self._replies = deque[dict[str, Any]]()
+        self._stirred = asyncio.Event()
         self._workers = workers
         self._rate_limit = RateLimit(MESSAGES_AT_ONCE, MESSAGES_PER_S)
         self._questions = Lane(workers.answers, self._finish)
@@ -469,7 +470,8 @@ class Site:
         if len(self._open) >= PAGES:
             await socket.close()
             return
-        page, number = Page(self._answers, socket, self._workers), self._pages + 1
+        page = Page(self._answers, socket, self._workers)
+        number = self._pages + 1
         self._open.add(page)
         self._pages = number
         self._say(f"page {number} opened by {socket.client.host if socket.client else 'nobody'}; {len(self._open)} open")

@@ -9,7 +9,7 @@ import { Damaged } from "./damaged";
 import { made, named } from "./dom";
 import { Drawer } from "./drawer";
 import { Picture, type Theme } from "./picture";
-import { aged, isStale, reason, shortened } from "./staleness";
+import { describeAge, isStale, reason, shorten } from "./staleness";
 import { type Ask, Connection, type Hello, type Message, Pace, type Refused, type Scan, type State, thinned } from "./protocol";
 
 /** Milliseconds from one look at the age of the picture to the next. */
@@ -223,7 +223,7 @@ class Page {
     if (text !== this.#shown) {
       this.#shown = text;
       this.#dismissed = "";
-      named("reason").textContent = shortened(text, this.#hello?.source ?? "");
+      named("reason").textContent = shorten(text, this.#hello?.source ?? "");
     }
     const notice = named("notice");
     notice.hidden = !text || text === this.#dismissed;
@@ -246,7 +246,7 @@ class Page {
     const stale = stands && isStale(age, scan.rate_hz);
     named("stage").classList.toggle("stale", stale);
     named("age").hidden = !stale;
-    named("age").textContent = stale ? aged(age) : "";
+    named("age").textContent = stale ? describeAge(age) : "";
   }
 
   async #save(as: string): Promise<void> {

@@ -23,13 +23,13 @@ export function reason(state: string): string {
 }
 
 /** Return an age in words. */
-export function aged(seconds: number): string {
+export function describeAge(seconds: number): string {
   if (seconds < 120) return `${Math.round(seconds)} s old`;
   return `${Math.round(seconds / 60)} min old`;
 }
 
 /** Return a message without the path of the source, which stands above it; its last part stays where the text needs a name. */
-export function shortened(text: string, source: string): string {
+export function shorten(text: string, source: string): string {
   if (!source) return text;
   return text.replaceAll(`${source}: `, "").replaceAll(source, source.split("/").at(-1)!);
 }
