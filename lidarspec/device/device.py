@@ -62,7 +62,10 @@ class PacketReader:
     """
 
     def __init__(self, sensor: Sensor, frame: str | None, decoder: Decoder, first: FirstFrames) -> None:
-        self._sensor, self._decoder, self._first, self._named = sensor, decoder, first, frame
+        self._sensor = sensor
+        self._decoder = decoder
+        self._first = first
+        self._named = frame
         self._waiting: deque[Frames] = deque(maxlen=UNDECIDED)
         self._stream = self._made(frame) if frame is not None else None
         self.last: Packets | None = None

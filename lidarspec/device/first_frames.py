@@ -19,7 +19,7 @@ REFERENCE_SEARCH_BYTES = 64 << 20
 
 @dataclass
 class FirstFrames:
-    """What applies from the first packet on.
+    """The frames that apply from the first packet on.
 
     Attributes:
         state: the first frame of each type that `points` takes its state from, by name.

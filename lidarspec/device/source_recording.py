@@ -150,12 +150,12 @@ class SourceRecording:
             UsageError: for a file that exists, or cannot hold what the source gives.
             SourceError: where the source cannot be read, or the file not be written.
         """
-        return self._driven(self._sensor) if self._sensor is not None and is_live(self._source) else self._received()
+        return self._record_device(self._sensor) if self._sensor is not None and is_live(self._source) else self._record_bytes()
 
-    def _driven(self, sensor: Sensor) -> Generator[str, None, None]:
+    def _record_device(self, sensor: Sensor) -> Generator[str, None, None]:
         """What a sensor sends is recorded by a thread; here it is decoded to be counted, whatever that fails at."""
         news, failures, known = list[str](), dict[str, None](), set[str]()
-        with Device(self._source, sensor, start=self._start, record=MadeFor(self._opened)) as self.device:
+        with Device(self._source, sensor, start=self._start, record=MadeFor(self._open_log)) as self.device:
             log = self._log
             assert log is not None
             try:
@@ -192,13 +192,13 @@ class SourceRecording:
         if log.seconds is not None:
             self.elapsed = log.seconds
 
-    def _received(self) -> Generator[str, None, None]:
+    def _record_bytes(self) -> Generator[str, None, None]:
         source = RecordingTransport(self._source, salvage=True) if self._salvage else transport(self._source, self._sensor)
-        with contextlib.closing(source), contextlib.closing(self._opened(source, self._sensor)) as log:
-            yield from self._captured(source, log) if isinstance(source, LiveTransport) else self._copied(source, log)
+        with contextlib.closing(source), contextlib.closing(self._open_log(source, self._sensor)) as log:
+            yield from self._record_live(source, log) if isinstance(source, LiveTransport) else self._copy(source, log)
             yield from source.warnings
 
-    def _captured(self, source: LiveTransport, log: TimedLog) -> Generator[str, None, None]:
+    def _record_live(self, source: LiveTransport, log: TimedLog) -> Generator[str, None, None]:
         """What arrives is recorded by a thread; here it is counted and thrown away."""
         queue = BoundedQueue()
         with contextlib.closing(Capture(source, queue, log=log)) as capture:
@@ -227,7 +227,7 @@ class SourceRecording:
                 self.packets += 1
         return marks
 
-    def _copied(self, source: Transport, log: TimedLog) -> Generator[str, None, None]:
+    def _copy(self, source: Transport, log: TimedLog) -> Generator[str, None, None]:
         """What is in a file; standard input gets the time of its arrival."""
         clock = HostClock()
         assert self.recorder is not None
@@ -242,7 +242,7 @@ class SourceRecording:
                 return
             self.packets += source.datagrams
 
-    def _opened(self, source: Transport, sensor: Spec | str | None) -> TimedLog:
+    def _open_log(self, source: Transport, sensor: Spec | str | None) -> TimedLog:
         """The recorder, now that the source is open, and the sensor known as it is read."""
         counts = source.datagrams or (self._sensor is not None and isinstance(source, LiveTransport))
         if self._count is not None and not counts:

@@ -251,7 +251,7 @@ class Structure:
 
     @cached_property
     def checksums(self) -> tuple[Match, ...]:
-        """What may seal them, the likeliest first, as far as a second of search finds it."""
+        """The checksums that fit, the likeliest first, as far as a second of search finds them."""
         return tuple(search(self.frames, quick=True))
 
 

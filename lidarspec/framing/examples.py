@@ -78,7 +78,7 @@ def random_frame(sensor: Spec, frame: str, source: random.Random, drawn: Drawn =
         found = _plausible(sensor, frame, layout, _headed(rows, layout, chosen))
         if found:
             return found[0]
-    return _swept(sensor, frame, engine, source, drawn)
+    return _make_along_sweep(sensor, frame, engine, source, drawn)
 
 
 def header(engine: CompiledCodec, source: random.Random, drawn: Drawn = NOTHING) -> tuple[Layout, dict[str, int]]:
@@ -202,7 +202,7 @@ def _sent(sensor: Spec, frame: str, layout: Layout, rows: NDArray[np.uint8]) -> 
     return [data for data in recoding.written(rows, layout) if data is not None]
 
 
-def _swept(sensor: Spec, frame: str, engine: CompiledCodec, source: random.Random, drawn: Drawn) -> bytes:
+def _make_along_sweep(sensor: Spec, frame: str, engine: CompiledCodec, source: random.Random, drawn: Drawn) -> bytes:
     """A frame around the values that the sensor's `sweep` declares, where random ones are never plausible."""
     sweep = sensor.simulation_of(frame).sweep
     if sweep is None:

@@ -219,7 +219,8 @@ class Continuity:
             spots = np.flatnonzero(is_odd)
             ahead = np.ones(len(spots), np.int64)
             ahead[np.searchsorted(spots, clues.skipped[0])] += packets
-            paces, steps = clues.paces.at_each(spots), passed[spots]
+            paces = clues.paces.at_each(spots)
+            steps = passed[spots]
             by_clock = np.fmax(np.ceil((steps - np.maximum(grain, paces / 2)) / paces), 1).astype(np.int64)
             ahead = np.where(grain <= paces / 2, by_clock, np.maximum(by_clock, ahead))
             restarts = (steps < 0) | (steps > SET)
@@ -334,7 +335,9 @@ class Continuity:
             self._index = (number - self._rule.first) % self._period % FARTHEST
         else:
             self._index += 2
-        self._first, self._missing, self._suspect = self._index, {}, None
+        self._first = self._index
+        self._missing = {}
+        self._suspect = None
 
     def _back(self, behind: int) -> int:
         index = self._index - behind

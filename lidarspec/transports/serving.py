@@ -215,7 +215,7 @@ def write_file(device: SimulatedDevice, path: str | Path, seconds: float, *, ove
         SpecError: if the sensor, as it is declared, never sends anything.
         SourceError: where it cannot be written.
     """
-    chunks = _opened(device, seconds)
+    chunks = _simulate_opened(device, seconds)
     first = list[tuple[Chunk, Literal["in", "out"]]]()
     for chunk, direction in chunks:
         first.append((chunk, direction))
@@ -233,7 +233,7 @@ def write_file(device: SimulatedDevice, path: str | Path, seconds: float, *, ove
     return written
 
 
-def _opened(device: SimulatedDevice, seconds: float) -> Iterator[tuple[Chunk, Literal["in", "out"]]]:
+def _simulate_opened(device: SimulatedDevice, seconds: float) -> Iterator[tuple[Chunk, Literal["in", "out"]]]:
     """Yield what goes over the data link of a device that is switched on and opened, with the commands that open it."""
     sensor = device.sensor
     began = time.time_ns()
