@@ -2,8 +2,9 @@
 
 `ClockOrder` judges datagrams as they arrive: each is the next one, or late, or doubled, or the first one after a gap or
 after the clock was set. It remembers the newest packets in the order of their times. A packet with the time and the
-bytes of one of them is a double. A late packet is placed between its neighbours, and the number of packets that are
-missing there is counted anew. So the counters end up as if the packets had arrived in order.
+bytes of one of them is a double; bytes are compared by their CRC-32. A late packet is placed between its neighbours,
+and the number of packets that are missing there is counted anew. So the counters end up as if the packets had arrived
+in order.
 
 Each packet gets an index and an order. The index runs on over what is missing. The order is the time of the packet in
 nanoseconds, from the first packet on; it differs for packets of one time that are no doubles, and leaps by
@@ -19,6 +20,7 @@ import math
 from bisect import bisect_left, bisect_right
 from dataclasses import dataclass
 from operator import attrgetter
+from zlib import crc32
 
 import numpy as np
 from numpy.typing import NDArray
@@ -35,8 +37,8 @@ MAX_PLACES_LATE = 64
 MAX_LATE_NS = 10**9
 #: a clock that advances by more from one packet to the next was set.
 MAX_STEP_NS = 3600 * 10**9
-#: packets of which the bytes are remembered; an older one with the same time counts as the same packet.
-REMEMBERED_FRAMES = 16
+#: packets of which a checksum is remembered; an older one with the same time counts as the same packet.
+REMEMBERED_CHECKSUMS = 16
 
 _time_of = attrgetter("time")
 
@@ -47,7 +49,7 @@ class Neighbour:
 
     Attributes:
         missing: packets that are missing between it and the one before it in time.
-        data: its bytes; None if they are no longer remembered.
+        checksum: of its bytes; None if it is no longer remembered.
         angle: at which it begins, in turns; nan if unknown.
         masked: packets that a masked sector leaves out before it.
     """
@@ -56,7 +58,7 @@ class Neighbour:
     order: int
     index: int
     missing: int
-    data: bytes | None
+    checksum: int | None
     angle: float = math.nan
     masked: int = 0
 
@@ -147,32 +149,32 @@ class ClockOrder:
         assert self._newest is not None
         first = self._newest.index + 1
         for row in range(max(start, stop - MAX_PLACES_LATE), stop):
-            data = batch.table.frame(row) if row >= stop - REMEMBERED_FRAMES else None
+            checksum = crc32(batch.table.frame(row)) if row >= stop - REMEMBERED_CHECKSUMS else None
             time = times.item(row)
-            self._newest = Neighbour(time, time + self._offset, first + row - start, 0, data, self._angle_at(row))
+            self._newest = Neighbour(time, time + self._offset, first + row - start, 0, checksum, self._angle_at(row))
             self._neighbours.append(self._newest)
         return first
 
     def _place(self, batch: Batch, row: int, time: int, pace: float) -> Neighbour:
         """Return the place of a packet that does not follow the newest one."""
-        data = batch.table.frame(row)
+        checksum = crc32(batch.table.frame(row))
         if self._newest is None or not self._neighbours:
-            return self._begin(batch, row, time, data)
+            return self._begin(batch, row, time, checksum)
         newest = self._neighbours[-1]
         passed = time - newest.time
         if self._leap is not None and self._leaps_back(time, passed, pace):
             self._stats.lost -= self._leap[1].missing  # one reading was damaged
-            return self._begin(batch, row, time, data)
+            return self._begin(batch, row, time, checksum)
         if passed > MAX_STEP_NS or self._is_too_early(time, passed, pace):
-            return self._begin(batch, row, time, data)
+            return self._begin(batch, row, time, checksum)
         start = bisect_left(self._neighbours, time, key=_time_of)
         stop = bisect_right(self._neighbours, time, key=_time_of)
         for twin in self._neighbours[start:stop]:
-            if twin.data is None or twin.data == data:
+            if twin.checksum is None or twin.checksum == checksum:
                 self._stats.duplicates += 1
                 return twin
         if stop < len(self._neighbours):
-            return self._insert(stop, row, time, pace, data)
+            return self._insert(stop, row, time, pace, checksum)
         missing = _count_missing(passed, pace)
         angle = self._angle_at(row)
         masked = 0
@@ -182,7 +184,7 @@ class ClockOrder:
         self._stats.lost += missing
         batch.breaks[row] |= missing > 0
         order = max(time + self._offset, newest.order + 1)
-        self._newest = Neighbour(time, order, newest.index + 1 + missing, missing, data, angle, masked)
+        self._newest = Neighbour(time, order, newest.index + 1 + missing, missing, checksum, angle, masked)
         self._neighbours.append(self._newest)
         self._leap = (newest.time, self._newest) if missing > MAX_PLACES_LATE else None
         if missing and self._gaps is not None:
@@ -210,7 +212,7 @@ class ClockOrder:
         is_full = len(self._neighbours) >= MAX_PLACES_LATE
         return passed < -MAX_LATE_NS or (is_full and time < self._neighbours[0].time)
 
-    def _begin(self, batch: Batch, row: int, time: int, data: bytes) -> Neighbour:
+    def _begin(self, batch: Batch, row: int, time: int, checksum: int) -> Neighbour:
         """Begin with a first packet, or anew after the clock was set: the index leaves out one number."""
         before = self._newest
         if before is None:
@@ -220,12 +222,12 @@ class ClockOrder:
             self._offset = before.order + 2 * MAX_STEP_NS - time
             index = before.index + 2
             batch.breaks[row] = True
-        self._newest = Neighbour(time, time + self._offset, index, 0, data, self._angle_at(row))
+        self._newest = Neighbour(time, time + self._offset, index, 0, checksum, self._angle_at(row))
         self._leap = None if before is None else (before.time, self._newest)
         self._neighbours = [self._newest]
         return self._newest
 
-    def _insert(self, position: int, row: int, time: int, pace: float, data: bytes) -> Neighbour:
+    def _insert(self, position: int, row: int, time: int, pace: float, checksum: int) -> Neighbour:
         """Place a late packet before a neighbour, and count anew what is missing on both sides of it."""
         self._stats.late += 1
         after = self._neighbours[position]
@@ -245,7 +247,7 @@ class ClockOrder:
         self._stats.lost += missing + missing_after - after.missing
         after.missing = missing_after
         after.masked = masked_after
-        placed = Neighbour(time, order, index, missing, data, self._angle_at(row), masked)
+        placed = Neighbour(time, order, index, missing, checksum, self._angle_at(row), masked)
         self._neighbours.insert(position, placed)
         return placed
 
@@ -253,10 +255,10 @@ class ClockOrder:
         """Forget packets that are too old to have late neighbours."""
         if len(self._neighbours) > MAX_PLACES_LATE:
             del self._neighbours[:-MAX_PLACES_LATE]
-        for neighbour in reversed(self._neighbours[:-REMEMBERED_FRAMES]):
-            if neighbour.data is None:
+        for neighbour in reversed(self._neighbours[:-REMEMBERED_CHECKSUMS]):
+            if neighbour.checksum is None:
                 break
-            neighbour.data = None
+            neighbour.checksum = None
 
 
 def _count_missing(passed: int, pace: float) -> int:
