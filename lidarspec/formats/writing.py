@@ -7,12 +7,10 @@ known at the end alone: they write it there and come back, or let their columns 
 from __future__ import annotations
 
 import contextlib
-import functools
 import os
 import re
 import shutil
 import tempfile
-import time
 from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
 from pathlib import Path
@@ -25,6 +23,7 @@ from lidarspec.errors import SourceError, UsageError, suggest, system_errors
 from lidarspec.points.cloud import COLUMNS, PointCloud, source_of
 from lidarspec.scans.scans import Scan
 from lidarspec.stores import take_away
+from lidarspec.unfinished import path_while_written, remove_abandoned
 
 # Files that a written folder holds, by its suffix: an existing folder with any other file is not replaced.
 FOLDER_FILES = {
@@ -33,8 +32,6 @@ FOLDER_FILES = {
 }
 #: ns since 1970 of the GPS epoch, 1980-01-06, for a clock that leaves out leap seconds, with those that there are since 2017.
 GPS_EPOCH = (315_964_800 - 18) * 10**9
-#: seconds without a write after which the part of a process that has ended is removed; another computer may be writing to it.
-ABANDONED_AFTER_S = 60.0
 _Piece = TypeVar("_Piece")
 
 
@@ -47,8 +44,8 @@ def replacing(path: Path) -> Iterator[Path]:
         UsageError: if the path is a folder that holds files of other kinds.
     """
     refuse_foreign_files(path)
-    remove_abandoned_parts(path)
-    part = path.with_name(f".{os.getpid()}.{path.name}")
+    remove_abandoned(path)
+    part = path_while_written(path)
     try:
         with contextlib.suppress(SourceError):
             take_away(part)
@@ -62,39 +59,6 @@ def replacing(path: Path) -> Iterator[Path]:
     finally:
         with contextlib.suppress(SourceError):
             take_away(part)
-
-
-def remove_abandoned_parts(path: Path) -> None:
-    """Remove the parts of a file or folder that killed processes of this computer left behind."""
-    for process, name in _list_parts(path.parent.absolute()):
-        part = path.with_name(f".{process}.{name}")
-        with contextlib.suppress(OSError, SourceError):
-            if name == path.name and not is_running(process) and time.time() - part.stat().st_mtime > ABANDONED_AFTER_S:
-                take_away(part)
-
-
-@functools.cache  # listed once: a folder can get many thousands of files
-def _list_parts(folder: Path) -> list[tuple[int, str]]:
-    """Return process and name of the parts in a folder when this process writes there first."""
-    try:
-        names = os.listdir(folder)
-    except OSError:
-        return []
-    matches = (re.fullmatch(r"\.([1-9]\d*)\.(.+)", name, re.DOTALL) for name in names)
-    return [(int(match[1]), match[2]) for match in matches if match]
-
-
-def is_running(process: int) -> bool:
-    """Return whether a process exists; True if the system has no way to tell."""
-    if os.name != "posix":
-        return True
-    try:
-        os.kill(process, 0)
-    except ProcessLookupError:
-        return False
-    except (OSError, OverflowError):
-        return True
-    return True
 
 
 def refuse_foreign_files(folder: Path) -> None:

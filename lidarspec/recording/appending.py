@@ -21,6 +21,7 @@ from typing import Any, Literal, Protocol, Self
 
 from lidarspec.errors import SourceError, SourceTimeout, UsageError, WriteError, failure_reason
 from lidarspec.transports.protocol import Chunk
+from lidarspec.unfinished import path_while_written, remove_abandoned
 
 #: when what was put in is written out, and when the disk is asked to keep it.
 FLUSH_BYTES, FLUSH_SECONDS, DISK_SECONDS = 1 << 16, 0.2, 1.0
@@ -47,7 +48,10 @@ class RecordFile:
     def __init__(self, path: str, size_at: Size | None, *, overwrite: bool) -> None:
         self._place = Path(os.path.realpath(path))
         self.replaces = overwrite and self._place.is_file() and os.name != "nt"  # where open files keep their names
-        self._opened = self._place.with_name(f".{self._place.name}.{os.getpid()}.part") if self.replaces else self._place
+        self._opened = self._place
+        if self.replaces:
+            remove_abandoned(self._place)
+            self._opened = path_while_written(self._place)
         try:
             self._file = open(self._opened, "wb" if overwrite else "xb", buffering=0)  # noqa: SIM115  closed by `close`
         except FileExistsError:

@@ -492,3 +492,25 @@ def test_an_event_that_is_none_is_a_fault_of_its_recording(path: Path) -> None:
     with contextlib.closing(transport(path)) as opened:
         assert len(list(opened.chunks())) == 2
     assert opened.warnings == [f"{path}: {len(NO_EVENTS)} events were passed over, which have no name"]
+
+
+KILLED = """
+import os, sys
+from lidarspec.recording.recorders import Recorder
+
+recorder = Recorder(sys.argv[1], overwrite=True)
+os.kill(os.getpid(), 9)
+"""
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="there is no SIGKILL")
+def test_what_a_killed_recorder_left_is_removed_by_the_next(path: Path) -> None:
+    record(path, CHUNKS[:1])
+    assert subprocess.run([sys.executable, "-c", KILLED, str(path)], check=False).returncode == -signal.SIGKILL
+    (left,) = (other for other in path.parent.iterdir() if other != path)
+    assert read(path) == as_records(CHUNKS[:1], datagram=False)
+    os.utime(left, (0, 0))
+    with Recorder(path, overwrite=True) as recorder:
+        recorder.write(CHUNKS[1])
+    assert list(path.parent.iterdir()) == [path]
+    assert read(path) == as_records(CHUNKS[1:2], datagram=False)
