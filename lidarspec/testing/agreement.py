@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 
 from lidarspec.errors import SpecError
 from lidarspec.framing.decoder import Decoder, frames_of, is_stream
+from lidarspec.framing.frame_engine import InterpretedCodec, codec
 from lidarspec.framing.results import Found, Frames, packed
 from lidarspec.packets.packets import Packets, joined
 from lidarspec.packets.stream import PacketStream
@@ -33,6 +34,8 @@ ULPS = 4
 CUTS, LEAST_CUTS, DAMAGED = 8, 2, 1
 #: rounds of a conversation if a shorter one has no scan, since few random frames of a sensor have points.
 MORE_ROUNDS = 12
+#: bytes that construct alone may read again while frames of a stream come in pieces: it begins anew with each piece.
+REREAD_BYTES = 1_000_000
 #: streams up to this length are also fed byte by byte, with the usual number of examples.
 SHORT_STREAM = 4000
 
@@ -225,7 +228,9 @@ def _cut_anywhere(subject: Subject, data: bytes) -> None:
     whole = sensor.decoder()
     expected = cuts(whole.feed(data) + whole.finish())
     rounds = CUTS if len(sensor.frames) <= MANY else CUTS // 4
-    splits = [list(material.pieces(data, source)) for _ in range(subject.scale_rounds(rounds, LEAST_CUTS))]
+    number = subject.scale_rounds(rounds, LEAST_CUTS)
+    scale = _chunk_scale(subject, number * len(data))
+    splits = [list(material.pieces(data, source, scale)) for _ in range(number)]
     splits += [[data[spot : spot + 1] for spot in range(len(data))]] if len(data) <= subject.scale_rounds(SHORT_STREAM) else []
     for split in splits:
         decoder = sensor.decoder()
@@ -233,6 +238,14 @@ def _cut_anywhere(subject: Subject, data: bytes) -> None:
         lost = next((frame for frame in expected if frame not in found), (found or expected or [("", 0, b"")])[0])
         require(found == expected, "LS405", f"in {len(split)} pieces, the frame at byte {lost[1]} is not found as in one", lost[0])
         require(decoder.stats == whole.stats, "LS405", "the counters depend on the split")
+
+
+def _chunk_scale(subject: Subject, length: int) -> int:
+    """Return how many times longer than usual the chunks of streams of so many bytes are, so that reading them anew takes no hours."""
+    incoming = subject.sensor.incoming
+    slow = [subject.length(name) for name in incoming if isinstance(codec(incoming[name]), InterpretedCodec)]
+    reread = length / material.MEAN_CHUNK * max(slow, default=0) / 2
+    return max(round(reread / REREAD_BYTES), 1)
 
 
 def single_packets_equal_a_batch(subject: Subject) -> None:

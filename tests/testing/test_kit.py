@@ -17,6 +17,7 @@ from typing import Any
 import numpy as np
 import pytest
 from construct import (
+    Adapter,
     Array,
     Bytes,
     Const,
@@ -35,9 +36,10 @@ from hypothesis import strategies as st
 
 from lidarspec import Sensor
 from lidarspec.framing.examples import random_frame
-from lidarspec.framing.frame_engine import CompiledCodec
+from lidarspec.framing.frame_engine import CompiledCodec, InterpretedCodec
 from lidarspec.spec import Checksummed, Command, Crc, Fields, Frame, Http, HttpReply, HttpRequest, Polar, Scaled, Simulation, Sum, take
 from lidarspec.testing import frames
+from lidarspec.testing.agreement import parse_decode_and_any_cutting_agree
 from lidarspec.testing.check import Target, reports
 from lidarspec.testing.commands import the_simulated_sensor_answers
 from lidarspec.testing.declared import declared
@@ -167,6 +169,29 @@ def test_work_with_a_long_frame_is_limited_in_bytes(check: Property, monkeypatch
     monkeypatch.setattr(Sensor, "parse", counting_parse)
     monkeypatch.setattr(CompiledCodec, "survey", counting_survey)
     check.function(Subject(sensor), "picture")
+
+
+def test_a_long_frame_that_construct_alone_reads_is_not_begun_anew_for_each_byte(monkeypatch: pytest.MonkeyPatch) -> None:
+    class Unknown(Adapter):
+        def _decode(self, obj: int, context: Any, path: str) -> int:
+            return obj
+
+        def _encode(self, obj: int, context: Any, path: str) -> int:
+            return obj
+
+    struct = Struct("header" / Const(b"\x91\x37\xc9"), "kind" / Unknown(Int8ul), "picture" / Bytes(LONG - 4))
+    sensor = sound.sensor(frames={**sound.sensor().frames, "picture": Frame(struct, max_length=LONG)})
+    read = 0
+    judge = InterpretedCodec._judge
+
+    def counting_judge(self: InterpretedCodec, data: bytes, errors: list[Any]) -> tuple[int, int]:
+        nonlocal read
+        read += len(data)
+        return judge(self, data, errors)
+
+    monkeypatch.setattr(InterpretedCodec, "_judge", counting_judge)
+    parse_decode_and_any_cutting_agree(Subject(sensor))
+    assert read <= 120 * LONG
 
 
 def test_progress_names_each_case_before_it_begins() -> None:
