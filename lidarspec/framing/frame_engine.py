@@ -20,6 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lidarspec.errors import PluginError, SpecError
+from lidarspec.framing.many_lengths import AlikeLayouts, Likeness, Together
 from lidarspec.framing.plausibility import Conditions, Judge, plausibility
 from lidarspec.framing.results import CHECKSUM, CONSTANT, IMPLAUSIBLE, LENGTH, PLUGIN, SHORT, VALID, Frames, Recoded, Status
 from lidarspec.spec.construct_layer import Mismatch, fixed_size, has_conditions
@@ -34,6 +35,9 @@ from lidarspec.wire.slots import Recoder, recoder
 
 #: bytes of candidates looked at in one go, so that memory stays small on hostile streams.
 BLOCK = 1 << 19
+#: Layouts are judged together if they are at least so many, and have fewer candidates each.
+MANY_LAYOUTS = 4
+MANY_CANDIDATES = 16
 
 
 class Codec:
@@ -107,6 +111,7 @@ class CompiledCodec(Codec):
         self.tree, layout = layouts, layouts.layout(b"")
         self.layout = layout if isinstance(layout, Layout) else None
         self._conditions: Conditions | None = None
+        self._alike = AlikeLayouts()
 
     @property
     def compiled(self) -> CompiledCodec:
@@ -129,21 +134,72 @@ class CompiledCodec(Codec):
             return Frames(buffer, kinds, offsets, sizes, layouts=(only,), status=status, rows=rows, errors=tuple(errors))
         status, forms = np.full(len(offsets), SHORT, np.uint8), np.full(len(offsets), -1, np.intp)
         layouts, short = list[Layout](), list[tuple[NDArray[np.intp], NDArray[np.intp]]]()
+        left = list[tuple[Layout, NDArray[np.intp]]]()
         for layout, which in groups:
             if isinstance(layout, Refused):
                 status[which] = PLUGIN if layout.error else CONSTANT if layout.by_constant else LENGTH
                 errors += [layout.error] if layout.error else []
                 continue
+            forms[which] = len(layouts)
+            layouts.append(layout)
+            left.append((layout, which))
+        sizes = np.array([*(layout.size for layout in layouts), 0], np.intp)[forms]
+        if len(left) >= MANY_LAYOUTS and sums is None:
+            left = self._judge_together(buffer, offsets, stops, left, status, sizes)
+        for layout, which in left:
             status[which], own, _ = self._judged(
                 buffer, offsets[which], None if stops is None else stops[which], layout, errors, gathered=gathered, sums=sums
             )
-            forms[which] = len(layouts)
-            layouts.append(layout)
             short += [(which, own)] if alike(own) is None else []
-        sizes = np.array([*(layout.size for layout in layouts), 0], np.intp)[forms]
         for which, own in short:
             sizes[which] = own
         return Frames(buffer, kinds, offsets, sizes, layouts=tuple(layouts), forms=forms, status=status, errors=tuple(errors))
+
+    def _judge_together(
+        self,
+        buffer: NDArray[np.uint8],
+        offsets: NDArray[np.intp],
+        stops: NDArray[np.intp] | None,
+        groups: list[tuple[Layout, NDArray[np.intp]]],
+        status: NDArray[np.uint8],
+        sizes: NDArray[np.intp],
+    ) -> list[tuple[Layout, NDArray[np.intp]]]:
+        """Judge the candidates of layouts that are alike and have few candidates each.
+
+        Args:
+            groups: layouts, and the indices of their candidates.
+            status, sizes: of all candidates, changed here.
+
+        Returns:
+            The groups that are left to be judged layout by layout.
+        """
+        left = list[tuple[Layout, NDArray[np.intp]]]()
+        alike_groups = dict[int, list[tuple[Layout, NDArray[np.intp], Likeness]]]()
+        for layout, which in groups:
+            likeness = self._alike.likeness(layout, self.judge(layout)) if len(which) < MANY_CANDIDATES else None
+            if likeness is None:
+                left.append((layout, which))
+            else:
+                alike_groups.setdefault(likeness.number, []).append((layout, which, likeness))
+        for some in alike_groups.values():
+            if len(some) < MANY_LAYOUTS:
+                left += [(layout, which) for layout, which, _ in some]
+                continue
+            layouts, own, likenesses = zip(*some, strict=True)
+            every = np.concatenate(own)
+            forms = np.repeat(np.arange(len(layouts)), list(map(len, own)))
+            ends = np.full(len(every), len(buffer)) if stops is None else stops[every]
+            is_whole = offsets[every] + sizes[every] <= ends
+            partial = every[~is_whole]
+            status[partial], sizes[partial] = _partial(buffer, offsets[partial], ends[~is_whole], layouts[0], sizes[partial])
+            whole, forms = every[is_whole], forms[is_whole]
+            together = Together(layouts, self.judge, likenesses)
+            status[whole] = together.judge(buffer, offsets[whole], forms)
+            if not together.is_final:
+                passed = status[whole] == VALID
+                found = ((layout, whole[passed & (forms == form)]) for form, layout in enumerate(layouts))
+                left += [(layout, which) for layout, which in found if len(which)]
+        return left
 
     def survey_rows(self, rows: NDArray[np.uint8], *, sums: Sums | None = None) -> tuple[Layout, Status, tuple[PluginError, ...]] | None:
         layout = self.layout or self.tree.common(rows)
@@ -184,7 +240,8 @@ class CompiledCodec(Codec):
             return judged, repeated(layout.size, number), kept
         status, sizes = np.empty(number, np.uint8), np.full(number, layout.size)
         status[whole] = judged
-        status[~whole], sizes[~whole] = _partial(buffer, offsets[~whole], len(buffer) if stops is None else stops[~whole], layout)
+        ends = len(buffer) if stops is None else stops[~whole]
+        status[~whole], sizes[~whole] = _partial(buffer, offsets[~whole], ends, layout, sizes[~whole])
         return status, sizes, kept
 
     def table(self, frames: Iterable[bytes]) -> Rows:
@@ -359,11 +416,16 @@ class RecodedCodec(Codec):
 
 
 def _partial(
-    buffer: NDArray[np.uint8], offsets: NDArray[np.intp], stops: NDArray[np.intp] | int, layout: Layout
+    buffer: NDArray[np.uint8], offsets: NDArray[np.intp], stops: NDArray[np.intp] | int, layout: Layout, sizes: NDArray[np.intp]
 ) -> tuple[NDArray[np.uint8], NDArray[np.intp]]:
-    """Candidates whose end is not there yet: still possible, or already refuted by a constant or a length; and how many bytes tell more."""
+    """Candidates whose end is not there yet: still possible, or already refuted by a constant or a length; and how many bytes tell more.
+
+    Args:
+        layout: whose constants and lengths they have.
+        sizes: of each as a whole.
+    """
     status = np.full(len(offsets), SHORT, np.uint8)
-    sizes = np.full(len(offsets), layout.size, np.intp)
+    sizes = sizes.copy()
     for verdict, known in ((LENGTH, layout.held), (CONSTANT, layout.constants)):
         for spot in sorted(known, reverse=True):
             mask, value = known[spot]

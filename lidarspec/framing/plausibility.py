@@ -45,6 +45,10 @@ class Judge:
     Args:
         met: what the struct's own conditions ask of values.
         checks: the test of plausibility, taken apart; None where only the function itself can tell.
+
+    Attributes:
+        checks: all tests of values that need no call of the frame's own function.
+        is_complete: whether these are all tests of values.
     """
 
     def __init__(
@@ -57,6 +61,8 @@ class Judge:
         checks: list[Check] | None,
     ) -> None:
         self._frame, self._schema, self._layout, self._met, self._checks = frame, schema, layout, met, checks
+        self.checks = [*met, *(checks or ())]
+        self.is_complete = checks is not None or frame.plausible is None
         self._constants = words(marks({spot: known for spot, known in layout.constants.items() if prefix.get(spot) != known}))
         self._held = words(marks(layout.held))
 
@@ -69,12 +75,7 @@ class Judge:
             sums: what computes checksums; by default their algorithms.
         """
         status = np.zeros(len(rows), np.uint8)
-        held = right(self._constants, rows) if len(rows) else None
-        if held is not None:
-            status[~held] = CONSTANT
-        held = right(self._held, rows) if len(rows) else None
-        if held is not None:
-            status[~held & (status == VALID)] = LENGTH
+        self.check_constants(status, rows)
         _parts_among(self._layout, status, rows, errors, sums)
         for seal in self._layout.seals:
             _among(status, rows, functools.partial(intactness, seal, errors, sums))
@@ -84,6 +85,15 @@ class Judge:
         elif self._frame.plausible is not None:
             _among(status, rows, lambda some: self._asked(some, errors))
         return status
+
+    def check_constants(self, status: NDArray[np.uint8], rows: Bytes2D) -> None:
+        """Enter the candidates with a wrong constant or a wrong length, among those that are valid so far."""
+        held = right(self._constants, rows) if len(rows) else None
+        if held is not None:
+            status[~held] = CONSTANT
+        held = right(self._held, rows) if len(rows) else None
+        if held is not None:
+            status[~held & (status == VALID)] = LENGTH
 
     def _check(self, status: NDArray[np.uint8], rows: Bytes2D, checks: list[Check]) -> None:
         for check in checks:
@@ -197,7 +207,7 @@ class Conditions:
             single = {path: replace(leaf.at(first), shape=(), strides=()) for path, leaf in leaves.items()}
             self._tables[key] = _table(part, single, last - first)
         shape, strides = places.pop() if places else ((), ())
-        return functools.partial(_looked_up, self._tables[key], first, shape, strides)
+        return Lookup(self._tables[key], first, shape, strides)
 
 
 @dataclass(frozen=True, eq=False)
@@ -232,16 +242,43 @@ class _Table:
         return np.frombuffer(values.tobytes().translate(self.listed.tobytes()), np.bool_).reshape(values.shape)
 
 
-def _looked_up(table: _Table, spot: int, shape: tuple[int, ...], strides: tuple[int, ...], rows: Bytes2D) -> NDArray[np.bool_]:
-    """Whether a condition holds on one or two bytes of each frame, or of each element of an array in it."""
-    if not len(rows):
-        return np.empty(0, np.bool_)
-    view = elements(rows, table.dtype, spot, shape, strides)
-    values = view if view.itemsize == 1 else view.astype(table.dtype.newbyteorder("="))
-    held = table.holds(values)
-    if not shape:
-        return held
-    return np.ones(len(held), np.bool_) if held.all() else np.asarray(held.all(axis=tuple(range(1, held.ndim))))
+@dataclass(frozen=True, eq=False)
+class Lookup:
+    """A condition on one or two bytes of each frame, or of each element of an array in it, by a table.
+
+    Attributes:
+        offset: of the first of these bytes.
+        shape, strides: of the arrays that they are in.
+    """
+
+    table: _Table
+    offset: int
+    shape: tuple[int, ...]
+    strides: tuple[int, ...]
+
+    def __call__(self, rows: Bytes2D) -> NDArray[np.bool_]:
+        """Whether the condition holds in each frame, (n,)."""
+        if not len(rows):
+            return np.empty(0, np.bool_)
+        held = self._each(rows)
+        if not self.shape:
+            return held
+        return np.ones(len(held), np.bool_) if held.all() else np.asarray(held.all(axis=tuple(range(1, held.ndim))))
+
+    def holds_within(self, rows: Bytes2D, lengths: NDArray[np.intp]) -> NDArray[np.bool_]:
+        """Whether the condition holds in each frame, (n,), if its outermost array has fewer elements than the row, (n,)."""
+        held = self._each(rows)
+        if not self.shape:
+            return held
+        held = np.asarray(held.reshape(*held.shape[:2], math.prod(held.shape[2:])).all(axis=2))
+        held |= np.arange(held.shape[1]) >= lengths[:, None]
+        return np.asarray(held.all(axis=1))
+
+    def _each(self, rows: Bytes2D) -> NDArray[np.bool_]:
+        """Whether it holds for each element, (n, *shape)."""
+        view = elements(rows, self.table.dtype, self.offset, self.shape, self.strides)
+        values = view if view.itemsize == 1 else view.astype(self.table.dtype.newbyteorder("="))
+        return self.table.holds(values)
 
 
 def _table(part: Test, leaves: Mapping[str, Leaf], size: int) -> _Table:

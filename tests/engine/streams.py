@@ -6,7 +6,7 @@ import contextlib
 import gc
 import random
 import tracemalloc
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 
 from lidarspec import Counters, Sensor, SpecError
 from lidarspec.framing.examples import header, random_frame
@@ -48,6 +48,57 @@ def worst(sensor: Sensor, length: int) -> bytes:
     longest = max((sensor.example(sensor.data_frame, seed=seed) for seed in range(40)), key=len)
     unit = b"".join(longest[: source.randint(3, 8)] + source.randbytes(2) for _ in range(64))
     return (unit * (length // len(unit) + 1))[:length]
+
+
+#: Random bytes behind a header, in streams of headers and random bytes.
+NOISE_BYTES = (0, 2, 6)
+
+
+def hostile_streams(subject: Subject, length: int) -> Iterator[tuple[str, bytes]]:
+    """Generate streams of about this length that cost a decoder much for each byte, each with a description.
+
+    Those of one frame type begin with the frame after which the type is looked for.
+    """
+    sensor = subject.sensor
+    source = random.Random(sensor.id)
+    names = list(sensor.incoming)
+    for name in names:
+        after = sensor.frames[name].after
+        lead = b"" if after is None else subject.example(after)
+        frames = [subject.example(name, seed=seed) for seed in range(6)]
+        longest = max(frames, key=len)
+        for size in NOISE_BYTES:
+            headers = _repeat(lambda name=name, size=size: _header(sensor, name, source) + source.randbytes(size), length)  # type: ignore[misc]
+            yield f"headers of {name} and {size} random bytes", lead + headers
+        one_length = _repeat(lambda longest=longest: longest[: source.randint(3, 8)] + source.randbytes(2), length)  # type: ignore[misc]
+        yield f"headers of one length of {name}", lead + one_length
+        yield f"cut frames of {name}", lead + _repeat(lambda frames=frames: _cut(source.choice(frames), source), length)  # type: ignore[misc]
+    yield "headers of all types in turn", _repeat(lambda: b"".join(_header(sensor, name, source) for name in names), length)
+    examples = [subject.example(name, seed=seed) for name in names for seed in range(4)]
+    yield "cut frames of all types", _repeat(lambda: _cut(source.choice(examples), source), length)
+    yield "types in turn", (subject.stream(rounds=2) * length)[:length]
+
+
+def _repeat(make: Callable[[], bytes], length: int) -> bytes:
+    """Return pieces back to back, at least so many bytes; an empty piece counts as a zero byte."""
+    found = bytearray()
+    while len(found) < length:
+        found += make() or b"\0"
+    return bytes(found)
+
+
+def _header(sensor: Sensor, name: str, source: random.Random) -> bytes:
+    """Return the bytes up to the last constant at the start of a frame type, random where they are no constants."""
+    prefix = codec(sensor.frames[name]).prefix
+    header = bytearray(source.randbytes(max(prefix, default=-1) + 1))
+    for offset, (mask, value) in prefix.items():
+        header[offset] = header[offset] & ~mask | value
+    return bytes(header)
+
+
+def _cut(frame: bytes, source: random.Random) -> bytes:
+    """Return the first bytes of a frame, at least one."""
+    return frame[: source.randint(1, len(frame))]
 
 
 def clean(subject: Subject, *, seed: int = 0, length: int = LENGTH) -> bytes:

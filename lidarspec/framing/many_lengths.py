@@ -1,0 +1,211 @@
+"""Candidates of many lengths, judged together.
+
+A false header announces any length, so noise with headers in it has candidates of hundreds of layouts, with one or two candidates each.
+Judging the candidates of a layout takes a few dozen calls of NumPy, whether there is one or a thousand. Most of these layouts differ only
+in the length of an array at their end: they have the same constants, checksums over the same bytes up to the same distance from the end,
+and tests of the same fields. `AlikeLayouts` finds such layouts. Their candidates become rows of one array, and whatever follows a candidate
+in its row is left out: a checksum gets zeros in its place, which do not change those in `ZERO_EXTENDED`, and a test leaves out elements.
+
+The verdicts are those of `plausibility.Judge`. A test that is more than a lookup of one or two bytes is left to it.
+"""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Callable, Hashable, Iterator, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lidarspec.framing.plausibility import Check, Judge, Lookup
+from lidarspec.framing.results import CHECKSUM, IMPLAUSIBLE, VALID
+from lidarspec.spec.checksums import Checksum, Sum, WordXor, Xor
+from lidarspec.wire.layout import Bytes2D, Layout, Leaf, Seal, rows_at
+from lidarspec.wire.row_checksums import over
+
+Bytes1D = NDArray[np.uint8]
+Offsets = NDArray[np.intp]
+Status = NDArray[np.uint8]
+
+#: The checksums that zeros behind the data do not change.
+ZERO_EXTENDED: tuple[type[Checksum], ...] = (Sum, WordXor, Xor)
+#: Rows of one array are at most so many times as long as the shortest of them, unless they have only a few bytes.
+MAX_STRETCH = 4
+SHORT_ROW_BYTES = 64
+#: Keys remembered, so that garbage does not fill the memory.
+MAX_KEYS = 1024
+#: Bytes of rows that are judged at a time.
+BLOCK_BYTES = 1 << 19
+
+
+@dataclass(frozen=True)
+class Likeness:
+    """Which other layouts one is like.
+
+    Attributes:
+        number: the same for all that are alike.
+        lengths: of the outermost array of each test, in the order of `Judge.checks`; 0 for a test of no array.
+    """
+
+    number: int
+    lengths: tuple[int, ...]
+
+
+class AlikeLayouts:
+    """Tells which layouts of a frame type are alike."""
+
+    def __init__(self) -> None:
+        self._numbers: dict[Hashable, int] = {}
+        self._next = itertools.count()
+
+    def likeness(self, layout: Layout, judge: Judge) -> Likeness | None:
+        """Return which others a layout is like; None if its candidates cannot be judged together with those of others."""
+        if Likeness not in layout.notes:
+            layout.notes[Likeness] = self._find(layout, judge)
+        known: Likeness | None = layout.notes[Likeness]
+        return known
+
+    def _find(self, layout: Layout, judge: Judge) -> Likeness | None:
+        if layout.regions or not all(_is_extended(seal) for seal in layout.seals):
+            return None
+        constants = tuple(sorted(layout.constants.items()))
+        lengths = tuple(sorted(layout.held.items()))
+        seals = tuple(_seal_key(seal, layout.size) for seal in layout.seals)
+        tests = tuple(_test_key(check) for check in judge.checks)
+        key = constants, lengths, seals, tests, judge.is_complete
+        if key not in self._numbers:
+            if len(self._numbers) >= MAX_KEYS:
+                self._numbers.clear()
+            self._numbers[key] = next(self._next)
+        return Likeness(self._numbers[key], tuple(map(_length, judge.checks)))
+
+
+def _is_extended(seal: Seal) -> bool:
+    """Whether zeros behind the bytes that a checksum covers do not change it."""
+    return type(seal.algorithm) in ZERO_EXTENDED and bool(seal.spans)
+
+
+def _seal_key(seal: Seal, size: int) -> Hashable:
+    *spans, (start, stop) = seal.spans
+    leaves = tuple((_place(leaf, seal, size), leaf.size, leaf.shape, leaf.wire, leaf.elements) for leaf in seal.leaves)
+    return seal.algorithm, seal.absent, tuple(spans), start, size - stop, leaves
+
+
+def _place(leaf: Leaf, seal: Seal, size: int) -> tuple[str, int]:
+    """Return where a checksum is: from the start of the frame, or from its end if it follows the last bytes covered."""
+    return ("end", size - leaf.offset) if _is_behind(seal) else ("start", leaf.offset)
+
+
+def _is_behind(seal: Seal) -> bool:
+    """Whether a checksum follows the last bytes that it covers, and so moves with the end of the frame."""
+    return min(leaf.offset for leaf in seal.leaves) >= seal.spans[-1][1]
+
+
+def _test_key(check: Check) -> Hashable:
+    return (check.table, check.offset, check.shape[1:], check.strides) if isinstance(check, Lookup) else None
+
+
+class Together:
+    """Judges whole candidates of layouts that are alike.
+
+    Args:
+        layouts: of all candidates.
+        judge: makes the judge of a layout.
+        likenesses: of each layout.
+
+    Attributes:
+        is_final: whether valid candidates are frames; else they have passed only some of the tests.
+    """
+
+    def __init__(self, layouts: Sequence[Layout], judge: Callable[[Layout], Judge], likenesses: Sequence[Likeness]) -> None:
+        self._layouts = layouts
+        self._judge = judge
+        self._sizes = np.array([layout.size for layout in layouts], np.intp)
+        self._lengths = np.array([likeness.lengths for likeness in likenesses], np.intp).T
+        first = judge(layouts[0])
+        self.is_final = first.is_complete and all(isinstance(check, Lookup) for check in first.checks)
+
+    def judge(self, buffer: Bytes1D, offsets: Offsets, forms: Offsets) -> Status:
+        """Return the status of each candidate, (n,).
+
+        Args:
+            offsets: where they begin, (n,).
+            forms: which of the layouts each has, (n,).
+        """
+        status = np.empty(len(offsets), np.uint8)
+        sizes = self._sizes[forms]
+        for which in _by_size(sizes):
+            longest = forms[which[-1]].item()
+            rows = _rows(buffer, offsets[which], self._layouts[longest].size)
+            status[which] = self._judge_rows(rows, sizes[which], forms[which], longest)
+        return status
+
+    def _judge_rows(self, rows: Bytes2D, sizes: Offsets, forms: Offsets, longest: int) -> Status:
+        """Return the status of candidates in rows of the longest layout, (n,); behind the end of each there may be anything."""
+        judge = self._judge(self._layouts[longest])
+        status = np.zeros(len(rows), np.uint8)
+        judge.check_constants(status, rows)
+        for seal in self._layouts[longest].seals:
+            right = _are_intact(seal, rows, sizes)
+            status[~right & (status == VALID)] = CHECKSUM
+        for index, check in enumerate(judge.checks):
+            if isinstance(check, Lookup):
+                right = check.holds_within(rows, self._lengths[index, forms])
+                status[~right & (status == VALID)] = IMPLAUSIBLE
+        return status
+
+
+def _length(check: Check) -> int:
+    """Return how many elements the outermost array of a test has; 0 if it is of no array."""
+    return check.shape[0] if isinstance(check, Lookup) and check.shape else 0
+
+
+def _by_size(sizes: Offsets) -> Iterator[Offsets]:
+    """Return the indices of candidates in groups of similar size, each ascending by size, of rows of `BLOCK_BYTES` at most."""
+    order = np.argsort(sizes, kind="stable")
+    ordered = sizes[order]
+    start = 0
+    while start < len(order):
+        longest = max(MAX_STRETCH * ordered.item(start), SHORT_ROW_BYTES)
+        stop = int(ordered.searchsorted(longest, side="right"))
+        stop = min(stop, start + max(BLOCK_BYTES // min(longest, ordered.item(stop - 1)), 1))
+        yield order[start:stop]
+        start = stop
+
+
+def _rows(buffer: Bytes1D, offsets: Offsets, size: int) -> Bytes2D:
+    """Return `size` bytes from each offset on, (n, size), with zeros behind the end of the buffer."""
+    first = int(offsets.min())
+    if int(offsets.max()) + size > len(buffer):
+        buffer = np.concatenate([buffer[first:], np.zeros(size, np.uint8)])
+        offsets = offsets - first
+    return np.ascontiguousarray(rows_at(buffer, offsets, size))
+
+
+def _are_intact(seal: Seal, rows: Bytes2D, sizes: Offsets) -> NDArray[np.bool_]:
+    """Return which candidates have the right checksum, (n,).
+
+    Args:
+        seal: of the longest layout, which fills its row.
+        sizes: of the candidates, (n,).
+    """
+    size = rows.shape[1]
+    *spans, (start, stop) = seal.spans
+    covered = np.arange(size) < (sizes - (size - stop))[:, None]
+    computed = over(seal.algorithm, rows * covered, (*spans, (start, size)))
+    stored = _stored_behind(seal, rows, sizes) if _is_behind(seal) else seal.stored(rows)
+    right = stored == computed
+    for value in seal.absent:
+        right |= stored == np.uint64(value)
+    return np.asarray(right)
+
+
+def _stored_behind(seal: Seal, rows: Bytes2D, sizes: Offsets) -> NDArray[np.uint64]:
+    """Return the checksums that candidates have at their end, (n,)."""
+    size = rows.shape[1]
+    first = min(leaf.offset for leaf in seal.leaves)
+    starts = np.arange(len(rows)) * size + sizes - (size - first)
+    ends = rows_at(rows.reshape(-1), starts, size - first)
+    moved = replace(seal, leaves=tuple(leaf.at(first) for leaf in seal.leaves))
+    return moved.stored(np.ascontiguousarray(ends))
