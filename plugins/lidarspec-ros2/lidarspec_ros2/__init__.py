@@ -4,6 +4,8 @@ A lifecycle node over a `Device`, as every verb has one. ROS is imported when th
 
 * `command`: the verb and the executable; which ROS there is.
 * `parameters`: the one table of parameters, and the values of one configuration.
+* `ros_arguments`: the parameters on the command line, before there is a node.
+* `shared_memory`: the shared memory of Fast DDS, large enough for the clouds of the sensor.
 * `node`: the lifecycle, services, and the thread that reads.
 * `topics`: what is published.
 * `packets`: packets as a topic, and as a source.

@@ -23,7 +23,9 @@ from lidarspec.errors import UsageError
 if TYPE_CHECKING:
     from rclpy.executors import Executor
 
+    from lidarspec.spec.sensor import Sensor
     from lidarspec_ros2.node import LidarNode
+    from lidarspec_ros2.shared_memory import SharedMemory
 
 
 #: seconds between two looks at whether a signal has come.
@@ -92,6 +94,7 @@ def run(given: Mapping[str, Any], ros_args: Sequence[str]) -> None:
     from rclpy.executors import SingleThreadedExecutor
 
     from lidarspec_ros2.node import LidarNode
+    from lidarspec_ros2.shared_memory import profile_in_use
 
     signals, nodes = list[int](), list[LidarNode]()
 
@@ -104,7 +107,10 @@ def run(given: Mapping[str, Any], ros_args: Sequence[str]) -> None:
     previous = {number: signal.signal(number, told) for number in (signal.SIGINT, signal.SIGTERM)}
     rclpy.init(args=["lidarspec_node", *ros_args], signal_handler_options=rclpy.SignalHandlerOptions.NO)
     try:
-        nodes.append(LidarNode(given))
+        memory = _shared_memory(given, ros_args)
+        with profile_in_use(memory):
+            nodes.append(LidarNode(given, max_cloud_bytes=memory.max_cloud_bytes))
+        _log(nodes[0], memory)
         executor = SingleThreadedExecutor()
         executor.add_node(nodes[0])
         _serve(nodes[0], executor, signals)
@@ -112,6 +118,37 @@ def run(given: Mapping[str, Any], ros_args: Sequence[str]) -> None:
         rclpy.try_shutdown()
         for number, handler in previous.items():
             signal.signal(number, handler)
+
+
+def _shared_memory(given: Mapping[str, Any], ros_args: Sequence[str]) -> SharedMemory:
+    """Return the shared memory for the sensor that the parameters name, before there is a node."""
+    from rclpy.utilities import get_rmw_implementation_identifier
+
+    from lidarspec.transports.open_url import live_address
+    from lidarspec_ros2.parameters import NAMED, NODE_NAME, Settings
+    from lidarspec_ros2.ros_arguments import read_parameters
+    from lidarspec_ros2.shared_memory import choose_shared_memory
+
+    values = {name: parameter.default for name, parameter in NAMED.items()}
+    for name, value in [*read_parameters(ros_args, NODE_NAME).items(), *given.items()]:
+        if name in NAMED and isinstance(value, type(values[name])):  # ROS refuses all other types
+            values[name] = value
+    address = live_address(str(values["source"]))
+    is_serial = address is not None and address.scheme == "serial"
+
+    def find_sensor() -> Sensor | None:
+        return Settings(values).known_sensor()
+
+    rmw = get_rmw_implementation_identifier()
+    return choose_shared_memory(rmw, find_sensor, is_serial=is_serial)
+
+
+def _log(node: LidarNode, memory: SharedMemory) -> None:
+    """Say in the log how the node uses shared memory."""
+    if memory.notice:
+        node.get_logger().info(memory.notice)
+    if memory.warning:
+        node.get_logger().warning(memory.warning)
 
 
 def _serve(node: LidarNode, executor: Executor, signals: Sequence[int]) -> None:

@@ -28,7 +28,7 @@ from lidarspec.explaining.explanation import reply_text
 from lidarspec.view.feed import LOOK, Feed, Reading
 from lidarspec_ros2.diagnostics import LOST, status
 from lidarspec_ros2.packets import PacketLog
-from lidarspec_ros2.parameters import NAMED, PARAMETERS, Parameter, Settings
+from lidarspec_ros2.parameters import NAMED, NODE_NAME, PARAMETERS, Parameter, Settings
 from lidarspec_ros2.topics import Topics
 
 #: seconds between two diagnostics.
@@ -42,6 +42,7 @@ class LidarNode(LifecycleNode):
 
     Args:
         given: parameters that come before those of the command line and of files.
+        max_cloud_bytes: size of the largest cloud that arrives with best effort; None if unknown.
 
     Attributes:
         failure: why the node could not be configured, or the sensor cannot be read any more; None where it can.
@@ -52,8 +53,9 @@ class LidarNode(LifecycleNode):
         UsageError: for a parameter that cannot be.
     """
 
-    def __init__(self, given: Mapping[str, Any]) -> None:
-        super().__init__("lidar", parameter_overrides=[RosParameter(name, value=value) for name, value in given.items()])
+    def __init__(self, given: Mapping[str, Any], *, max_cloud_bytes: int | None = None) -> None:
+        super().__init__(NODE_NAME, parameter_overrides=[RosParameter(name, value=value) for name, value in given.items()])
+        self._max_cloud_bytes = max_cloud_bytes
         self.failure: Exception | None = None
         self.ended, self.opening = threading.Event(), False
         self._device: Device | None = None
@@ -151,7 +153,13 @@ class LidarNode(LifecycleNode):
             device = self._device = settings.device(lambda opened: packets)
         finally:
             self.opening = False
-        topics = self._topics = Topics(self, settings, device.sensor, played=not device.is_live)
+        topics = self._topics = Topics(
+            self,
+            settings,
+            device.sensor,
+            played=not device.is_live,
+            max_cloud_bytes=self._max_cloud_bytes,
+        )
         packets.publish = topics.raw
         self._serve_commands(device)
         self._warn_of_unknown_parameters()

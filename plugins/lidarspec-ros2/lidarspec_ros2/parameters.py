@@ -13,7 +13,7 @@ from typing import Any
 from lidarspec.cli.options import configured
 from lidarspec.device.device import Device
 from lidarspec.device.settings import named
-from lidarspec.discovery.detect import detected
+from lidarspec.discovery.detect import declared, detected
 from lidarspec.errors import UsageError
 from lidarspec.plugins import sensor as named_sensor
 from lidarspec.points.cloud import Mount
@@ -99,6 +99,8 @@ PARAMETERS = (
 NAMED = {parameter.name: parameter for parameter in PARAMETERS}
 #: seconds from decoding to decoding when a scan is expected to end.
 PERIOD = 0.002
+#: the name of the node, unless it is renamed.
+NODE_NAME = "lidar"
 QUALITIES = ("best_effort", "reliable")
 
 
@@ -148,9 +150,24 @@ class Settings:
         Raises:
             UsageError, WireError, SourceError: as the command line.
         """
+        sensor = self._configured_sensor()
+        return detected(self["source"]) if sensor is None else sensor
+
+    def known_sensor(self) -> Sensor | None:
+        """Return the sensor that the parameters or the source name; None if it must be detected.
+
+        Raises:
+            UsageError: for a sensor that is not installed, or an option that it does not take.
+            SourceError: for a file that cannot be opened.
+        """
+        sensor = self._configured_sensor()
+        return declared(self["source"]) if sensor is None else sensor
+
+    def _configured_sensor(self) -> Sensor | None:
+        """Return the sensor that the parameters name, with its options; None if they name none."""
         options = [option for option in self["options"] if option]
-        given = configured(self["sensor"] or None, options, self["calibration"] or None)
-        return detected(self["source"]) if given is None else named_sensor(given)
+        sensor = configured(self["sensor"] or None, options, self["calibration"] or None)
+        return None if sensor is None else named_sensor(sensor)
 
     def mount(self) -> Mount | None:
         """How the sensor is mounted: by the parameters, or else as `lidarspec.toml` says."""

@@ -32,6 +32,7 @@ from lidarspec.transports.base import HostClock
 from lidarspec.transports.protocol import Chunk
 from lidarspec_ros2.clock import Stamps
 from lidarspec_ros2.parameters import Settings
+from lidarspec_ros2.shared_memory import format_megabytes
 
 #: of each kind of message its topic, its class, and how many are kept for those who are slow: of scans those of five seconds, as Fast DDS
 #: asks only every three for what was lost on the way, and a busy computer loses some of clouds of megabytes.
@@ -52,6 +53,7 @@ class Topics:
         node: whose they are.
         sensor: as it was opened.
         played: whether it is a file that is played: then /clock says its time, where `use_sim_time` is set.
+        max_cloud_bytes: size of the largest cloud that arrives with best effort; None if unknown.
 
     Attributes:
         stamps: the times of messages.
@@ -64,7 +66,16 @@ class Topics:
         UsageError: for a transform that cannot be published here.
     """
 
-    def __init__(self, node: LifecycleNode, settings: Settings, sensor: Sensor, *, played: bool) -> None:
+    def __init__(
+        self,
+        node: LifecycleNode,
+        settings: Settings,
+        sensor: Sensor,
+        *,
+        played: bool,
+        max_cloud_bytes: int | None = None,
+    ) -> None:
+        self._max_cloud_bytes = max_cloud_bytes
         self._node, self._sensor, self.stamps = node, sensor, Stamps(None if played else HostClock())
         self._messages = Messages("ROS2_HUMBLE")
         self._reliability = ReliabilityPolicy.RELIABLE if settings["qos"] == "reliable" else ReliabilityPolicy.BEST_EFFORT
@@ -175,10 +186,24 @@ class Topics:
 
     def _send(self, message: Message) -> None:
         publisher, data = self._publisher(message.kind), bytes(message.data)
+        if message.kind == CLOUD:
+            self._warn_of_large_cloud(len(data))
         with self._publishing:  # packets come from a thread of their own, transitions from another one
             if self.active:
                 publisher.publish(data)
                 self.sent[KINDS[message.kind][0]] += 1
+
+    def _warn_of_large_cloud(self, size: int) -> None:
+        """Warn once if a cloud is too large for the shared memory that was chosen at the start."""
+        limit = self._max_cloud_bytes
+        is_reliable = self._reliability == ReliabilityPolicy.RELIABLE
+        if limit is None or size <= limit or is_reliable:
+            return
+        self._max_cloud_bytes = None
+        self._node.get_logger().warning(
+            f"clouds of {format_megabytes(size)} may be lost, as shared memory was chosen for up to "
+            f"{format_megabytes(limit)}; name the sensor when the node starts, or set qos:=reliable"
+        )
 
 
 def transform(settings: Settings, stamp: Any) -> TransformStamped:

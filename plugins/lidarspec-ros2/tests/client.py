@@ -32,11 +32,21 @@ class Client:
         self.diagnostics: list[Any] = []
         self._node.create_subscription(DiagnosticArray, "/diagnostics", self.diagnostics.append, 10)
 
-    def listen(self, topic: str, kind: Any, *, reliable: bool = True, take: Callable[[bytes], None] | None = None) -> list[bytes]:
-        """The messages of a topic, as bytes, as they come, or what takes them."""
+    def listen(
+        self,
+        topic: str,
+        kind: Any,
+        *,
+        reliable: bool = True,
+        take: Callable[[bytes], None] | None = None,
+        qos: QoSProfile | None = None,
+    ) -> list[bytes]:
+        """The messages of a topic, as bytes, as they come, or what takes them; with `qos` in place of `reliable`, if given."""
         received = self.received[topic] = list[bytes]()
-        reliability = ReliabilityPolicy.RELIABLE if reliable else ReliabilityPolicy.BEST_EFFORT
-        self._node.create_subscription(kind, topic, take or received.append, QoSProfile(depth=5000, reliability=reliability), raw=True)
+        if qos is None:
+            reliability = ReliabilityPolicy.RELIABLE if reliable else ReliabilityPolicy.BEST_EFFORT
+            qos = QoSProfile(depth=5000, reliability=reliability)
+        self._node.create_subscription(kind, topic, take or received.append, qos, raw=True)
         return received
 
     def until(self, condition: Callable[[], object], *, patience: float = PATIENCE) -> None:

@@ -1,0 +1,253 @@
+"""The shared memory of Fast DDS, large enough for the clouds of the sensor.
+
+Fast DDS hands messages to other processes of the same computer in a segment of shared memory that
+the publisher owns: 512 KiB, unless a profile says otherwise. A cloud of megabytes is sent in
+fragments that overwrite each other there, and with best effort most clouds are lost. The node
+brings a profile with a larger segment. Subscribers need no profile.
+
+Fast DDS reads the profile from a file that an environment variable names, once, when the first
+participant of a process is created. `profile_in_use` sets the variable for that moment only.
+
+The profile lists the transports that Fast DDS would use anyway, shared memory and UDP. If discovery
+is limited to this computer, ROS adds its own UDP transport to those of the profile, which then
+brings shared memory alone. Of two transports of one kind Fast DDS sends with the first.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import math
+import os
+import tempfile
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+
+from lidarspec.errors import LidarSpecError
+from lidarspec.formats.messages import records
+from lidarspec.simulation.simulator import opening, simulate, simulation
+from lidarspec.spec.sensor import Sensor
+from lidarspec.spec.timing import Every
+
+#: The variable that names the file of profiles, of Fast DDS 3 (Kilted and later) and Fast DDS 2.
+PROFILE_VARIABLE = "FASTDDS_DEFAULT_PROFILES_FILE"
+OLD_PROFILE_VARIABLE = "FASTRTPS_DEFAULT_PROFILES_FILE"
+#: Variables with which users configure the transports of Fast DDS.
+USER_VARIABLES = (
+    PROFILE_VARIABLE,
+    OLD_PROFILE_VARIABLE,
+    "FASTDDS_BUILTIN_TRANSPORTS",
+    "FASTDDS_ENVIRONMENT_FILE",
+    "RMW_FASTRTPS_USE_QOS_FROM_XML",
+)
+#: Files that Fast DDS reads from the working directory.
+USER_FILES = ("DEFAULT_FASTDDS_PROFILES.xml", "DEFAULT_FASTRTPS_PROFILES.xml")
+DEFAULT_SEGMENT_BYTES = 512 * 1024
+MIN_SEGMENT_BYTES = 4_000_000
+SEGMENT_STEP_BYTES = 1_000_000
+#: A segment needs room for at least so many clouds: one is read while the next is written.
+MIN_CLOUDS = 2
+#: Clouds that a new segment has room for, and the number if memory is short. With dual return it is
+#: half as many.
+CLOUDS = 8
+FEWER_CLOUDS = 4
+#: The size of clouds if no sensor is named: 78,000 points a scan.
+ASSUMED_CLOUD_BYTES = 2_500_000
+#: Free shared memory that is needed, in segments: the node may open a second participant.
+FREE_SEGMENTS = 2
+SHARED_MEMORY_DIR = "/dev/shm"
+#: Packets from which the size of a cloud is calculated if the scan rate is declared.
+PROBED_PACKETS = 16
+#: Seconds and packets that are simulated to see a scan if no scan rate is declared.
+PROBED_S = 0.25
+MAX_PROBED_PACKETS = 1000
+
+
+@dataclass(frozen=True)
+class SharedMemory:
+    """How the node uses the shared memory of Fast DDS.
+
+    Attributes:
+        segment_bytes: size of the segment that a profile asks for; 0 if the node brings no profile.
+        max_cloud_bytes: size of the largest cloud that arrives with best effort; None if unknown.
+        notice: text for the log that says what the node does; "" if it changes nothing.
+        warning: text for the log that says why clouds will be lost; "" if they will not.
+    """
+
+    segment_bytes: int = 0
+    max_cloud_bytes: int | None = None
+    notice: str = ""
+    warning: str = ""
+
+
+def choose_shared_memory(rmw: str, find_sensor: Callable[[], Sensor | None], *, is_serial: bool) -> SharedMemory:
+    """Return the shared memory for the clouds of a sensor.
+
+    Args:
+        rmw: identifier of the middleware, such as rmw_fastrtps_cpp.
+        find_sensor: returns the sensor, or None if it is not known yet. It is called only if the
+            node may bring a profile.
+        is_serial: whether the sensor is on a serial line, which is too slow for large clouds.
+    """
+    free = free_bytes()
+    if free is None or not rmw.startswith("rmw_fastrtps") or has_user_profile():
+        return SharedMemory()
+    try:
+        sensor = find_sensor()
+        cloud_bytes = None if sensor is None else largest_cloud_bytes(sensor)
+    except LidarSpecError:  # the node reports it when it opens the sensor
+        cloud_bytes = None
+    if cloud_bytes is None and is_serial:
+        cloud_bytes = 0
+    return _fit(cloud_bytes, free)
+
+
+def _fit(cloud_bytes: int | None, free: int) -> SharedMemory:
+    """Return the shared memory for clouds of a size, None if it is unknown."""
+    assumed = ASSUMED_CLOUD_BYTES if cloud_bytes is None else cloud_bytes
+    if MIN_CLOUDS * assumed <= DEFAULT_SEGMENT_BYTES:
+        return SharedMemory(max_cloud_bytes=DEFAULT_SEGMENT_BYTES // MIN_CLOUDS)
+    size = format_megabytes(assumed)
+    for clouds in (CLOUDS, FEWER_CLOUDS):
+        segment_bytes = _segment_for(clouds * assumed)
+        if free >= FREE_SEGMENTS * segment_bytes:
+            reason = "" if cloud_bytes is not None else ", as the size of this sensor's is unknown"
+            notice = (
+                f"Fast DDS: shared memory of {format_megabytes(segment_bytes)} for clouds of up to "
+                f"{size}{reason}; set {profile_variable()} to use another profile"
+            )
+            return SharedMemory(segment_bytes, segment_bytes // MIN_CLOUDS, notice)
+    warning = (
+        f"Fast DDS: default transports, which lose clouds of {size} with best effort, as {SHARED_MEMORY_DIR} has "
+        f"{format_megabytes(free)} free and {format_megabytes(FREE_SEGMENTS * segment_bytes)} are "
+        "needed; give a container more with docker run --shm-size=512m or --ipc=host, or publish "
+        "with qos:=reliable"
+    )
+    return SharedMemory(warning=warning)
+
+
+def _segment_for(size: int) -> int:
+    """Return a round size of a segment, bytes."""
+    return max(MIN_SEGMENT_BYTES, math.ceil(size / SEGMENT_STEP_BYTES) * SEGMENT_STEP_BYTES)
+
+
+def format_megabytes(size: int) -> str:
+    """Return a number of bytes in megabytes, as "2.5 MB"."""
+    return f"{size / 1e6:.1f} MB".replace(".0 ", " ")
+
+
+def free_bytes() -> int | None:
+    """Return the bytes of free shared memory; None if this system does not show it."""
+    try:
+        status = os.statvfs(SHARED_MEMORY_DIR)
+    except (AttributeError, OSError):
+        return None
+    return status.f_bavail * status.f_frsize
+
+
+def has_user_profile() -> bool:
+    """Return whether the user has configured the transports of Fast DDS."""
+    has_variable = any(name in os.environ for name in USER_VARIABLES)
+    return has_variable or any(Path(name).exists() for name in USER_FILES)
+
+
+def profile_variable() -> str:
+    """Return the variable that names the file of profiles, for the Fast DDS that is loaded.
+
+    Later versions of ROS read the variable of Fast DDS 2 too, but warn that it is deprecated.
+    """
+    libraries = Path("/proc/self/maps").read_text(encoding="utf-8")
+    return OLD_PROFILE_VARIABLE if "libfastrtps.so" in libraries else PROFILE_VARIABLE
+
+
+def largest_cloud_bytes(sensor: Sensor) -> int | None:
+    """Return the size of the largest cloud of a sensor with single return, from simulated packets.
+
+    That is the cloud of the slowest scan. None if the specification does not say enough.
+
+    Raises:
+        LidarSpecError: if the sensor cannot be simulated.
+    """
+    interval_s = simulation(sensor, sensor.data_frame).interval * 1e-9
+    if not interval_s:
+        return None
+    scan_s = _longest_scan_s(sensor)
+    if scan_s is None:
+        count = min(math.ceil(PROBED_S / interval_s), MAX_PROBED_PACKETS)
+        scans = sensor.scans(_simulated(sensor, count))
+        return max((records(scan.points, every_point=True).nbytes for scan in scans), default=0)
+    cloud = sensor.decode(_simulated(sensor, PROBED_PACKETS)).points()
+    packet_bytes = records(cloud, every_point=True).nbytes / PROBED_PACKETS
+    return math.ceil(packet_bytes * scan_s / interval_s)
+
+
+def _longest_scan_s(sensor: Sensor) -> float | None:
+    """Return the seconds of the slowest scan; None if they are not declared."""
+    if isinstance(sensor.scan, Every):
+        return sensor.scan.seconds
+    return 1 / sensor.turn[0] if sensor.turn else None
+
+
+def _simulated(sensor: Sensor, count: int) -> bytes | list[bytes]:
+    """Return the packets that a sensor sends first."""
+    frames = [frame for frame in (opening(sensor), *simulate(sensor, count)) if frame]
+    return frames if sensor.datagrams else b"".join(frames)
+
+
+def make_profile(segment_bytes: int, environment: Mapping[str, str]) -> str:
+    """Return a profile of Fast DDS for the transports of this process, as XML.
+
+    Args:
+        segment_bytes: size of the segment of shared memory.
+        environment: variables that say whether discovery is limited to this computer.
+    """
+    udp = "" if _is_local(environment) else "<transport_id>udp</transport_id>"
+    return f"""<?xml version="1.0" encoding="UTF-8"?>
+<dds>
+  <profiles xmlns="http://www.eprosima.com">
+    <transport_descriptors>
+      <transport_descriptor>
+        <transport_id>shared_memory</transport_id>
+        <type>SHM</type>
+        <segment_size>{segment_bytes}</segment_size>
+      </transport_descriptor>
+      <transport_descriptor>
+        <transport_id>udp</transport_id>
+        <type>UDPv4</type>
+      </transport_descriptor>
+    </transport_descriptors>
+    <participant profile_name="lidarspec" is_default_profile="true">
+      <rtps>
+        <userTransports><transport_id>shared_memory</transport_id>{udp}</userTransports>
+        <useBuiltinTransports>false</useBuiltinTransports>
+      </rtps>
+    </participant>
+  </profiles>
+</dds>
+"""
+
+
+def _is_local(environment: Mapping[str, str]) -> bool:
+    """Return whether discovery is limited to this computer."""
+    discovery_range = environment.get("ROS_AUTOMATIC_DISCOVERY_RANGE", "").upper()
+    return environment.get("ROS_LOCALHOST_ONLY") == "1" or discovery_range == "LOCALHOST"
+
+
+@contextlib.contextmanager
+def profile_in_use(memory: SharedMemory) -> Iterator[None]:
+    """Have Fast DDS read the profile if it creates its first participant within the context.
+
+    Neither the file nor the environment variable remains afterwards.
+    """
+    if not memory.segment_bytes:
+        yield
+        return
+    with tempfile.TemporaryDirectory(prefix="lidarspec-") as folder:
+        file = Path(folder, "profile.xml")
+        file.write_text(make_profile(memory.segment_bytes, os.environ), encoding="utf-8")
+        name = profile_variable()
+        os.environ[name] = str(file)
+        try:
+            yield
+        finally:
+            del os.environ[name]
