@@ -437,13 +437,15 @@ class _Told:
             keys = frozenset(key for node, _ in asking if isinstance(node, tree.Select) for key, _ in node.cases if low <= key <= high)
             other = next((value for value in range(low, high + 1) if value not in keys), None)
             return cls(info.limits, low, high) if other is None else cls(info.limits, low, high, keys, other)
-        if high - low < 1 << 62 and all(isinstance(node, tree.Repeat | tree.Blob) and _rises(formula) for node, formula in asking):
+        if high - low < 1 << 62 and all(_counts(node, formula) for node, formula in asking):
             values, spans = range(low, high + 1), []
             for _, formula in asking:
                 count = functools.partial(_with_value, formula)
                 spans.append((bisect.bisect_left(values, 0, key=count) - 1, bisect.bisect_right(values, limit, key=count)))
             firsts, lasts = zip(*spans, strict=True)
-            return cls(info.limits, max(min(firsts) + low, low), min(max(lasts) + low, high), rises=max(firsts) + low + 1)
+            # Why a frame with too many parts is refused depends on its parts, not on the number alone.
+            rises = None if any(isinstance(node, tree.Parts) for node, _ in asking) else max(firsts) + low + 1
+            return cls(info.limits, max(min(firsts) + low, low), min(max(lasts) + low, high), rises=rises)
         return cls(info.limits, low, high)
 
     def refused(self, value: int) -> _Told:
@@ -473,6 +475,15 @@ def _asks(formula: tree.Formula, info: tree.FieldInfo) -> bool:
         case tree.Ref():
             return formula.path == info.path
     return isinstance(formula, tree.Code)
+
+
+def _counts(node: tree.Node, formula: tree.Formula) -> bool:
+    """Whether a formula of a node counts bytes, or elements or parts, and all numbers above the longest frame mean the same.
+
+    A part takes a byte at least (`parts`), and an array of more elements than the longest frame has bytes is refused as well.
+    """
+    is_number = isinstance(node, tree.Repeat | tree.Blob) or (isinstance(node, tree.Parts) and formula is node.count)
+    return is_number and _rises(formula)
 
 
 def _rises(formula: tree.Formula) -> bool:

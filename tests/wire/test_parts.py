@@ -2,15 +2,19 @@
 
 from __future__ import annotations
 
+import dataclasses
+import random
 from typing import Any
 
 import pytest
-from construct import Array, Bytes, Const, Int8ub, Int16ub, Struct, this
+from construct import Array, Bytes, Const, Int8ub, Int16ub, Int32ub, Struct, this
 
 from lidarspec import Sensor, SpecError, UsageError, WireError
-from lidarspec.spec import Checksummed, Frame, Parts, Sum, Xor
+from lidarspec.spec import Checksummed, Frame, Parts, Simulation, Sum, Xor
 from lidarspec.testing.agreement import assert_backends_agree
+from lidarspec.wire.layout_tree import HeaderNode, HeaderTree
 from tests.engine import against_construct
+from tests.engine.streams import Books
 from tests.shapes import SHAPES
 
 SEGMENTS, TAGS, CHANNELS = (SHAPES[f"shape-{name}"] for name in ("segments", "tags", "channels"))
@@ -165,3 +169,48 @@ def test_parts_know_which_frame_they_are_in(sensor: Sensor) -> None:
     assert frames is packets.table
     assert (packets.offset[which] == parts.offset).all()
     assert (packets.index[which] == parts.index).all()
+
+
+#: Bytes of the longest frame of `numbered`, and false headers of a stream.
+LONGEST = 60
+FALSE_HEADERS = 300
+
+
+def numbered() -> Sensor:
+    """Return a sensor whose frames say with four bytes how many parts there are."""
+    kinds = {
+        "short": Struct("type" / Const(b"\x01"), "value" / Int8ub),
+        "long": Struct("type" / Const(b"\x02"), "length" / Int8ub, "content" / Bytes(this.length)),
+    }
+    struct = Struct("header" / Const(b"\xaa\x55"), "count" / Int32ub, "parts" / Parts(kinds, count=this.count))
+    frames = {"data": Frame(struct, max_length=LONGEST)}
+    return dataclasses.replace(TAGS, id="shape-numbered", frames=frames, points=None, scan=None, simulation=Simulation())
+
+
+def test_numbers_of_parts_above_the_longest_frame_are_one_layout(monkeypatch: pytest.MonkeyPatch) -> None:
+    sensor = numbered()
+    walks = 0
+    explore = HeaderTree._explore
+
+    def counting(self: HeaderTree, *arguments: Any, **named: Any) -> HeaderNode:
+        nonlocal walks
+        walks += 1
+        return explore(self, *arguments, **named)
+
+    monkeypatch.setattr(HeaderTree, "_explore", counting)
+    source = random.Random(1)
+    parts = [b"\x01\x07", b"\x02\x01\x09", b"\x02\xff", b"\x03", b""]
+    data = b"".join(b"\xaa\x55" + source.randbytes(4) + b"".join(source.choices(parts, k=5)) for _ in range(FALSE_HEADERS))
+    decoder = sensor.decoder()
+    assert not decoder.feed(data)
+    assert not decoder.finish()
+    assert walks < FALSE_HEADERS // 5
+
+
+@pytest.mark.parametrize("count", [0, 1, 2, 26, 27, 54, 55, 2**31, 2**32 - 1])
+def test_each_number_of_parts_is_told_as_construct_tells_it(count: int) -> None:
+    sensor = numbered()
+    for part in (b"\x01\x07", b"\x02\x00", b"\x03"):
+        data = b"\xaa\x55" + count.to_bytes(4, "big") + part * 40
+        found = {backend: (Books(sensor, backend=backend).feed(data).finish()) for backend in ("numpy", "construct")}
+        assert found["numpy"] == found["construct"]
