@@ -320,7 +320,8 @@ def tabs(link: str, folder: Path) -> Iterator[tuple[Callable[[str], Any], Callab
     """A page in a tab: what evaluates an expression in it, and what puts it in front of another tab or behind it."""
     from websockets.sync.client import connect
 
-    words = [installed(), "--headless=new", *FLAGS, "--no-first-run", "--remote-debugging-port=0", f"--user-data-dir={folder}", link]
+    words = [installed(), "--headless=new", *FLAGS, "--window-size=400,300", "--no-first-run", "--remote-debugging-port=0"]
+    words += [f"--user-data-dir={folder}", link]
     process = subprocess.Popen(words, stderr=subprocess.PIPE, text=True)
     try:
         assert process.stderr is not None
