@@ -45,7 +45,7 @@ MODULES := $(PAGE)/node_modules/.installed
 RECENT := import sys; sys.exit(sys.version_info < (3, 11))
 BUILD_TOOLS := pip 'hatchling>=1.26' 'editables>=0.5'
 
-.PHONY: demo page page-test test test-all test-ros2 test-ros2-here test-long soak fuzz lint types docs wheels reference known-sensors bench bench-here clean
+.PHONY: demo page page-test test test-all test-ros2 test-ros2-here test-long soak fuzz referee lint types docs wheels reference known-sensors bench bench-here clean
 
 demo: $(USERS)
 	@$(BIN)/lidarspec demo -s ldrobot-stl27l
@@ -84,6 +84,10 @@ soak: $(DEVELOPERS)
 # Hostile input for everything that reads; the same command goes on where it was stopped. 10,000,000 inputs take about two hours on two cores.
 fuzz: $(FUZZERS)
 	@$(BIN)/python -m tests.fuzz --inputs $(INPUTS) --seed $(SEED) $(ARGS)
+
+# What the engine makes of fixed bytes of every sensor, compared with the record of another version: with ARGS=--record on that one.
+referee: $(TESTERS)
+	@$(BIN)/python -m tests.referee $(ARGS)
 
 lint: $(TESTERS)
 	@$(BIN)/ruff check .
