@@ -22,7 +22,7 @@ from screens import svg as drawn
 import lidarspec as ls
 from lidarspec.exports import narrowed
 from lidarspec.exports.diagram import svg as diagram
-from lidarspec.points.look import look
+from lidarspec.points.look import fit, look
 from lidarspec.simulation.simulator import simulate
 from lidarspec.view.feed import Feed
 from lidarspec.view.live import FIGURES, Window
@@ -56,7 +56,7 @@ def cloud() -> str:
     """A scan of a spinning lidar."""
     sensor = ls.sensor("ouster-os1")
     scan = next(scan for scan in sensor.scans(simulate(sensor, 600)) if scan.complete)
-    return svg(scan.points, look(scan.points), f"{sensor.id}: {len(scan):,} points", side=520, most=9000)
+    return svg(scan.points, fit(scan.points, look(scan.points)), f"{sensor.id}: {len(scan):,} points", side=520, most=9000)
 
 
 def packet() -> str:

@@ -42,7 +42,7 @@ from lidarspec.formats import check_holds, format_of, targets, write, write_imu
 from lidarspec.formats.writing import replacing
 from lidarspec.packets.imu import joined
 from lidarspec.plugins import sensor as named_sensor
-from lidarspec.points.look import look
+from lidarspec.points.look import fit, look
 from lidarspec.recording.recorders import SUFFIXES
 from lidarspec.scans.scans import Scan
 from lidarspec.scans.selection import EVERYTHING, Selection, Times, received
@@ -344,7 +344,10 @@ def plot(
         if kind == "scan":
             chosen = _numbered(device, source, selection, number)
             conclude(device)  # before a picture is drawn, while a live source goes on
-            how, title = look(chosen.points, ramp=ramp, reach=max_range), f"{device.sensor.id}: {chosen}"
+            how = look(chosen.points, ramp=ramp, reach=max_range)
+            if max_range is None:
+                how = fit(chosen.points, how)
+            title = f"{device.sensor.id}: {chosen}"
             if suffix == ".svg":
                 emit(svg(chosen.points, how, title), output)
             else:

@@ -20,7 +20,8 @@ from numpy.typing import NDArray
 from lidarspec.formats.writing import columns_of
 from lidarspec.libraries import import_library
 from lidarspec.points.cloud import PointCloud
-from lidarspec.points.look import BRIGHT, Look, blended, look, steps
+from lidarspec.points.colours import make_ramp
+from lidarspec.points.look import STEPS, Look, look, steps
 from lidarspec.scans.scans import Scan
 from lidarspec.transports.protocol import Format
 
@@ -204,7 +205,7 @@ class _Colours:
         shown = self._look or look(cloud, ramp=ramp)
         if len(cloud):  # an empty one tells nothing of the scale
             self._look = shown
-        colours = np.array(blended(BRIGHT["range" if shown.ramp == "range" else "intensity"]), np.uint8)
+        colours = np.array(make_ramp("dark", STEPS), np.uint8)  # the viewer is dark
         return colours[steps(cloud, shown)]
 
 

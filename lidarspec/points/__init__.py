@@ -5,7 +5,8 @@ plainly, by NumPy on a plan, and by compiled kernels. Modules in reading order:
 
 * `conventions`: what the columns mean: axes, ranges, coordinates, types.
 * `cloud`: point clouds, where their columns come from, and how a sensor is mounted.
-* `look`: how a cloud is looked at: reach, ramps of colour and what they stand for.
+* `colours`: the scale of colours for values, on a dark and on a light ground.
+* `look`: how a cloud is looked at: what a picture shows of it, and what its colours stand for.
 * `plain`: the reference: `points` evaluated with ordinary NumPy, and its result flattened.
 * `windows`: fields by their one or two bytes, and tables of what they can hold.
 * `plan`: `points` traced once for a layout, as expressions of the columns.

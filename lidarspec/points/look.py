@@ -7,15 +7,13 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
 from lidarspec.errors import UnknownName
 from lidarspec.points.cloud import PointCloud
-
-Rgb = tuple[int, int, int]
 
 #: share of the points that a picture's reach takes in, where a few are far beyond all others.
 MOST, FAR_BEYOND = 99.0, 1.5
@@ -29,11 +27,14 @@ ROUND = (1.0, 1.2, 1.5, 2.0, 2.5, 3.0, 4.0, 5.0, 6.0, 8.0, 10.0)
 WITHIN = 98.0
 #: colours of a ramp; few, so that noise in a range does not change every colour with every scan.
 STEPS = 20
-#: the stops of the ramps, hues that stay bright on a dark ground: near to far, and weak to strong.
-BRIGHT: dict[str, tuple[Rgb, ...]] = {
-    "range": ((255, 92, 87), (255, 170, 60), (236, 220, 72), (96, 216, 110), (64, 208, 220), (92, 150, 255), (186, 128, 255)),
-    "intensity": ((92, 78, 190), (160, 70, 190), (226, 84, 140), (255, 138, 84), (255, 204, 92), (255, 250, 190)),
-}
+#: share of the points that a fitted picture shows.
+CENTRAL = 0.98
+#: share of the values of an axis at each end that does not count for its scale, by which distant points are found.
+TAIL = 0.05
+#: how much more than these points a fitted picture shows.
+MARGIN = 1.08
+#: least share of their size that they keep in a picture that shows the sensor too.
+WORTH = 0.93
 
 
 @dataclass(frozen=True)
@@ -104,6 +105,43 @@ def reach_of(cloud: PointCloud) -> float:
     return rounded_up(max(farthest if farthest <= FAR_BEYOND * most else most, 1e-3))
 
 
+def fit(points: PointCloud, look: Look) -> Look:
+    """Return the look whose view from above the central 98 % of the points fill.
+
+    The sensor is shown as well if the points are not much smaller for it.
+    """
+    low, high = bounds(points[points.valid])
+    with_sensor = np.minimum(low, 0.0), np.maximum(high, 0.0)
+    if _half_extent(low, high) >= WORTH * _half_extent(*with_sensor):
+        low, high = with_sensor
+    forward, left = ((low + high) / 2)[:2].tolist()
+    return replace(look, middle=(forward, left), reach=MARGIN * max(_half_extent(low, high), 1e-3))
+
+
+def bounds(cloud: PointCloud) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Return the lowest and the highest x, y and z of the central points.
+
+    Args:
+        cloud: valid points.
+
+    Returns:
+        Two arrays (3,) in metres, zeros if there are no points. 2 % of the points, the farthest from the others, may be outside.
+    """
+    if not len(cloud):
+        return np.zeros(3), np.zeros(3)
+    xyz = np.stack([cloud.x, cloud.y, cloud.z], axis=1).astype(np.float64)
+    low, high = np.quantile(xyz, (TAIL, 1 - TAIL), axis=0)
+    extent = np.maximum(high - low, max(TAIL * float((high - low).max()), 1e-3))
+    beyond = (np.maximum(low - xyz, xyz - high) / extent).max(axis=1)
+    central = xyz[beyond <= np.quantile(beyond, CENTRAL, method="inverted_cdf")]
+    return central.min(axis=0), central.max(axis=0)
+
+
+def _half_extent(low: NDArray[np.float64], high: NDArray[np.float64]) -> float:
+    """Return half of the larger side of a box seen from above, in metres."""
+    return float((high - low)[:2].max()) / 2
+
+
 def rounded_up(value: float, rounds: Sequence[float] = ROUND) -> float:
     """The next of a few round numbers, by default such as 1.2, 1.5, 2, 2.5, 3, 4 ... 10, 12."""
     power = 10.0 ** math.floor(math.log10(value))
@@ -125,13 +163,6 @@ def shade(cloud: PointCloud, look: Look) -> NDArray[np.float64]:
 def steps(cloud: PointCloud, look: Look) -> NDArray[np.intp]:
     """The colour of each point by its number in the ramp, (n,); the first where nothing came back."""
     return np.clip(np.nan_to_num(shade(cloud, look)) * STEPS, 0, STEPS - 1).astype(np.intp)
-
-
-def blended(stops: Sequence[Rgb]) -> list[Rgb]:
-    """The colours of a ramp, from its stops."""
-    places = np.linspace(0, len(stops) - 1, STEPS)
-    channels = [np.interp(places, range(len(stops)), channel).round().astype(int).tolist() for channel in zip(*stops, strict=True)]
-    return list(zip(*channels, strict=True))
 
 
 def _shown(cloud: PointCloud, ramp: str) -> NDArray[np.float64]:

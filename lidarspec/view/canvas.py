@@ -17,12 +17,13 @@ from rich.color import Color, ColorSystem
 from rich.text import Text
 
 from lidarspec.errors import printable
-from lidarspec.points.look import BRIGHT, STEPS, Rgb, blended
+from lidarspec.points.colours import Rgb, make_ramp
+from lidarspec.points.look import STEPS
 
 Depth = Literal["truecolor", "256", "standard", "none"]
 
-#: the ramps for 16 colours.
-_STANDARD = {"range": (91, 33, 92, 96, 94, 95), "intensity": (34, 35, 95, 31, 93, 97)}
+#: the scale in 16 colours, as SGR numbers: those of its hues that get lighter from one to the next.
+_STANDARD = (94, 36, 92, 93)
 PLAIN, STRONG, FAINT, LABEL, GOOD, ALARM = range(6)
 ACROSS, DOWN = 2, 4
 #: the bit of each dot of a braille character, by row and column.
@@ -44,11 +45,6 @@ class Ink:
     faint: bool = False
 
 
-def _ramp(name: str) -> list[Ink]:
-    standard = _STANDARD[name]
-    return [Ink(rgb, standard[min(step * len(standard) // STEPS, len(standard) - 1)]) for step, rgb in enumerate(blended(BRIGHT[name]))]
-
-
 _FIXED = (
     Ink(),
     Ink(bold=True),
@@ -57,14 +53,10 @@ _FIXED = (
     Ink((96, 216, 110), 92, bold=True),
     Ink((255, 92, 87), 91, bold=True),
 )
-#: the first ink of each ramp, by what it shows: from near to far, or from weak to strong.
-RAMPS = {"range": len(_FIXED), "intensity": len(_FIXED) + STEPS}
-INKS: tuple[Ink, ...] = (*_FIXED, *_ramp("range"), *_ramp("intensity"))
-
-
-def first_ink(ramp: str) -> int:
-    """The first ink of the ramp for what colours show."""
-    return RAMPS["range" if ramp == "range" else "intensity"]
+#: the first ink of the scale, for its lowest values.
+FIRST_STEP = len(_FIXED)
+_SCALE = tuple(Ink(rgb, _STANDARD[step * len(_STANDARD) // STEPS]) for step, rgb in enumerate(make_ramp("dark", STEPS)))
+INKS: tuple[Ink, ...] = (*_FIXED, *_SCALE)
 
 
 @functools.cache
@@ -214,7 +206,7 @@ class Canvas:
         """The picture."""
         points, lines = _braille(self.dots), _braille(self.lines)
         codes = np.where(points > 0, BLANK + points, np.where(lines > 0, BLANK + lines, _SPACE)).astype(np.int32)
-        inks = np.where(points > 0, first_ink(self.ramp) + self.steps, np.where(lines > 0, FAINT, PLAIN)).astype(np.int16)
+        inks = np.where(points > 0, FIRST_STEP + self.steps, np.where(lines > 0, FAINT, PLAIN)).astype(np.int16)
         for cell, (character, ink) in self.labels.items():
             codes[cell], inks[cell] = ord(character), ink
         return Cells(codes, inks)

@@ -13,7 +13,8 @@ from numpy.typing import NDArray
 
 from lidarspec.errors import UsageError
 from lidarspec.libraries import import_library
-from lidarspec.points.look import Look
+from lidarspec.points.colours import make_ramp, to_hex
+from lidarspec.points.look import Look, bounds
 from lidarspec.scans.scans import Scan
 from lidarspec.view.feed import Feed, totals
 
@@ -25,6 +26,8 @@ WIDTH, PANEL, LOWEST, HIGHEST, DPI = 7.0, 4.2, 0.7, 3.0, 160
 BINS, NEAR, MOMENTS, NARROWEST = 128, 200, 400, 0.1
 #: the share of the ranges that the axis takes in.
 MOST = 99.8
+#: steps of the scale of colours.
+COLOURS = 256
 STYLE = {
     "font.size": 9,
     "axes.titlesize": 10,
@@ -64,12 +67,15 @@ def of_scan(scan: Scan, look: Look, title: str) -> Any:
     cloud = scan.points[scan.points.valid]
     column = cloud.range if look.ramp == "range" else cloud.intensity if look.ramp == "intensity" else cloud.extra[look.ramp]
     unit = "m" if look.ramp == "range" else look.unit
-    low, high = np.percentile(np.append(cloud.z, (0, 0)), (100 - MOST, MOST)).tolist()
+    lowest, highest = bounds(cloud)
+    low = min(float(lowest[2]), 0.0)
+    high = max(float(highest[2]), 0.0)
     tall = 0.0 if look.flat else float(np.clip((high - low) / (2 * look.reach) * WIDTH * 0.85, LOWEST, HIGHEST))
     figure = _figure(title, WIDTH * 0.92 + tall)
     rows = figure.subplots(1 if look.flat else 2, 1, squeeze=False, height_ratios=[WIDTH * 0.75, *[tall] * (not look.flat)])[:, 0]
     dots = {
         "c": column,
+        "cmap": colour_map(),
         "s": np.clip(20000 / max(len(cloud), 1), 0.4, 6),
         "linewidths": 0,
         "vmin": look.low,
@@ -77,14 +83,16 @@ def of_scan(scan: Scan, look: Look, title: str) -> Any:
         "rasterized": True,
     }
     shown = rows[0].scatter(cloud.y, cloud.x, **dots)
-    rows[0].set(
-        xlabel="y [m], left", ylabel="x [m], forward", xlim=(look.reach, -look.reach), ylim=(-look.reach, look.reach), aspect="equal"
-    )
+    forward, left = look.middle
+    seen = (forward - look.reach, forward + look.reach)
+    rows[0].set(xlim=(left + look.reach, left - look.reach), ylim=seen, aspect="equal")
+    rows[0].set(xlabel="y [m], left", ylabel="x [m], forward")
     rows[0].plot(0, 0, "k^", markersize=6)
     for side in rows[1:]:
         side.scatter(cloud.x, cloud.z, **dots)
         side.plot(0, 0, "k>", markersize=6)
-        side.set(xlabel="x [m], forward", ylabel="z [m], up", xlim=(-look.reach, look.reach), ylim=(low - 0.1, high + 0.1), aspect="equal")
+        side.set(xlim=seen, ylim=(low - 0.1, high + 0.1), aspect="equal")
+        side.set(xlabel="x [m], forward", ylabel="z [m], up")
     figure.colorbar(shown, ax=rows, label=f"{look.ramp} [{unit}]" if unit else look.ramp, shrink=0.6, pad=0.02)
     return figure
 
@@ -142,7 +150,7 @@ def of_ranges(scans: Iterable[Scan], title: str) -> Any:
     axes = figure.subplots()
     colours = import_library("matplotlib.colors", "plot").LogNorm(1, max(int(counts.max()), 2))
     begins = np.append(times[order], times[order][-1] + last)
-    shown = axes.pcolormesh(begins, edges, np.ma.masked_equal(counts, 0), norm=colours, rasterized=True)
+    shown = axes.pcolormesh(begins, edges, np.ma.masked_equal(counts, 0), norm=colours, cmap=colour_map(), rasterized=True)
     medians = [float(np.median(every[which][1])) if len(every[which][1]) else np.nan for which in order]
     axes.plot(times[order] + last / 2, medians, color="C3", linewidth=1, label="median")
     axes.set(xlabel="time from the first scan [s]", ylabel="range [m]", ylim=(0, edges[-1]))
@@ -229,6 +237,12 @@ class Rates:
         counts = np.add.reduceat(counts, np.arange(0, counts.shape[1], joined), axis=1)
         self.width = round(self.width * joined, 6)
         return np.arange(counts.shape[1] + 1) * self.width, counts
+
+
+def colour_map() -> Any:
+    """Return the colours of values on white paper, for matplotlib."""
+    colours = import_library("matplotlib.colors", "plot")
+    return colours.ListedColormap([to_hex(rgb) for rgb in make_ramp("light", COLOURS)], "lidarspec")
 
 
 def _legend(axes: Any) -> None:

@@ -23,7 +23,7 @@ from lidarspec.recording.appending import Appender, Log
 from lidarspec.recording.recorders import recorder
 from lidarspec.scans.scans import Scan
 from lidarspec.transports.protocol import Chunk, Transport
-from lidarspec.view.canvas import ALARM, FAINT, GOOD, LABEL, PLAIN, STRONG, Cells, first_ink
+from lidarspec.view.canvas import ALARM, FAINT, FIRST_STEP, GOOD, LABEL, PLAIN, STRONG, Cells
 from lidarspec.view.feed import NOTHING, Feed, Reading, told
 from lidarspec.view.polar import picture
 from lidarspec.view.screen import Screen
@@ -220,7 +220,7 @@ def _write_line(whole: Cells, figures: Sequence[Figure]) -> None:
 def _write_ramp(whole: Cells, row: int, column: int, look: Look) -> None:
     """What the colours mean: a bar of the ramp, and the values at its ends."""
     for step in range(STEPS):
-        whole.write(row, column + step, "━", first_ink(look.ramp) + step)
+        whole.write(row, column + step, "━", FIRST_STEP + step)
     begin, end = look.ends
     whole.write(row + 1, column, begin, LABEL)
     whole.write(row + 1, column + (STEPS - len(look.ramp)) // 2, look.ramp, LABEL)

@@ -20,7 +20,7 @@ from lidarspec.exports import narrowed
 from lidarspec.exports.diagram import svg as diagram
 from lidarspec.packets.packets import Packets
 from lidarspec.points.cloud import PointCloud
-from lidarspec.points.look import look
+from lidarspec.points.look import fit, look
 from lidarspec.scans.scans import Scan
 from lidarspec.spec.sensor import Sensor
 from lidarspec.spec.tree import FieldInfo
@@ -98,7 +98,7 @@ def _diagram(sensor: Sensor, name: str) -> str:
 
 
 def _picture(points: PointCloud, title: str) -> str:
-    return svg(points, look(points), title, side=SIDE, most=DOTS)
+    return svg(points, fit(points, look(points)), title, side=SIDE, most=DOTS)
 
 
 def _ends(number: int) -> NDArray[np.intp]:

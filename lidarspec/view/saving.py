@@ -18,7 +18,7 @@ from starlette.types import Receive, Scope, Send
 
 from lidarspec.errors import LidarSpecError
 from lidarspec.formats import write
-from lidarspec.points.look import look
+from lidarspec.points.look import fit, look
 from lidarspec.view.broadcast import Shown
 from lidarspec.view.connections import Client
 from lidarspec.view.svg import svg
@@ -112,7 +112,7 @@ def write_file(path: Path, shown: Shown) -> None:
     """Write a scan to a file, by its suffix."""
     if path.suffix == ".svg":
         points = shown.scan.points
-        text = svg(points, look(points), f"{shown.scan.sensor.id}: {shown.scan}")
+        text = svg(points, fit(points, look(points)), f"{shown.scan.sensor.id}: {shown.scan}")
         path.write_text(text, encoding="utf-8")
     else:
         write(path, [shown.scan])

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from html import escape
 
@@ -11,16 +11,18 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lidarspec.points.cloud import PointCloud
-from lidarspec.points.look import BRIGHT, STEPS, Look, Rgb, blended, ring_step, steps
+from lidarspec.points.colours import make_ramp, to_hex
+from lidarspec.points.look import STEPS, Look, bounds, ring_step, steps
 
 #: pixels: of each side of the view from above, of the margins, of the lines above it, of one above each view, and of a dot.
 SIDE, MARGIN, HEAD, LINE, DOT = 720, 24, 58, 18, 1.6
 #: share of a side that heights take at most, and how near to dots and to the sensor the view from above ends, pixels.
 HIGHEST, NEAR = 0.45, 24
+#: pixels above the base line of a text, and of a character of it.
+FONT_HEIGHT = 11
+CHARACTER_WIDTH = 6.7
 #: pixels from dot to dot, where there would be too many of them the next.
 GRIDS = (0.5, 1.0, 1.5, 2.0, 3.0, 4.0, 6.0)
-#: near to far, or weak to strong: hues that can be told apart on white.
-_INK: tuple[Rgb, ...] = ((205, 40, 45), (214, 116, 0), (140, 138, 0), (24, 138, 62), (0, 128, 150), (44, 84, 200), (118, 48, 176))
 #: of ground, lines, text and headings, on white; and on a dark ground.
 _LIGHT, _DARK = ("#fff", "#ddd", "#555", "#222"), ("#14161b", "#34373f", "#9ea3ae", "#e4e6eb")
 _PARTS = ("ground", "line", "text", "head")
@@ -86,18 +88,33 @@ class _Views:
         scale, side, (forward, left) = self._scale, self.side, self.look.middle
         across, down = side / 2 + left * scale, side / 2 + forward * scale
         step = ring_step(self.look.reach)
-        radii = [step * number for number in range(1, int(self.look.reach * math.sqrt(2) / step) + 1)]
+        reach = self.look.reach
+        nearest = math.hypot(max(abs(forward) - reach, 0.0), max(abs(left) - reach, 0.0))
+        farthest = math.hypot(abs(forward) + reach, abs(left) + reach)
+        radii = [step * number for number in range(max(int(nearest / step), 1), int(farthest / step) + 1)]
         circles = "".join(f'<circle cx="{across:.1f}" cy="{down:.1f}" r="{radius * scale:.1f}"/>' for radius in radii)
         rows = down - self.cloud.x * scale
         dots, paths = self._dots(across - self.cloud.y * scale, rows, side)
         top, bottom = max(min(float(rows.min(initial=down)), down) - NEAR, 0), min(max(float(rows.max(initial=down)), down) + NEAR, side)
-        labels = "".join(f'<text x="{across + r * scale - 3:.1f}" y="{down - 4:.1f}" text-anchor="end">{r:g} m</text>' for r in radii)
-        directions = f'<text x="{across + 6:.1f}" y="{top + 12:.1f}">0°</text><text x="2" y="{down - 4:.1f}">90°</text>'
+        labels = _Labels(side, top, bottom)
+        labels.write("0°", [(across + 6, top + 12)])
+        labels.write("90°", [(2, down - 4)])
+        for radius in radii:
+            text = f"{radius:g} m"
+            away = radius * scale
+            width = _text_width(text)
+            right = (across + away - 3 - width, down - 4)
+            leftward = (across - away + 3, down - 4)
+            ahead = (across + 6, down - away + 14)
+            behind = (across + 6, down + away - 4)
+            share = away / max(math.hypot(forward, left) * scale, 1e-9)
+            towards_middle = (across + share * (side / 2 - across), down + share * (side / 2 - down))
+            labels.write(text, [right, leftward, ahead, behind, towards_middle])
         axes = f'<path d="M{across:.1f} 0V{side}M0 {down:.1f}H{side}"/>'
         parts = [
             f'<g fill="none" {_as("line", "stroke")}>{axes}{circles}</g>',
             *paths,
-            f"<g {_as('text')}>{labels}{directions}</g>",
+            f"<g {_as('text')}>{''.join(labels.parts)}</g>",
             f'<path d="M{across:.1f} {down - 9:.1f}l6 15h-12z" {_as("head")}/>',
         ]
         return _View("from above, forward is up", parts, top, bottom - top, dots)
@@ -105,7 +122,9 @@ class _Views:
     def beside(self) -> _View:
         """Heights with their labels, and points; forward is right."""
         scale, side = self._scale, self.side
-        low, high = (min(float(self.cloud.z.min(initial=0)), 0.0), max(float(self.cloud.z.max(initial=0)), 0.0))
+        lowest, highest = bounds(self.cloud)
+        low = min(float(lowest[2]), 0.0)
+        high = max(float(highest[2]), 0.0)
         span = max(high - low, 1e-3)
         larger = max((n for n in (1, 2, 5, 10) if span * scale * n <= HIGHEST * side), default=1)
         steep, top, height = scale * larger, high + 0.05 * span, span * 1.1 * scale * larger
@@ -113,13 +132,15 @@ class _Views:
         step = ring_step(height / steep)
         marks = [number * step for number in range(math.ceil((level - height) / steep / step), int(top / step) + 1)]
         lines = "".join(f"M0 {level - mark * steep:.1f}H{side}" for mark in marks)
-        labels = "".join(f'<text x="2" y="{level - mark * steep - 3:.1f}">z {mark:.4g} m</text>' for mark in marks)
+        labels = _Labels(side, 0, height)
+        for mark in marks:
+            labels.write(f"z {mark:.4g} m", [(2, level - mark * steep - 3)])
         told = f"from the right, forward is right{f', heights x{larger}' if larger > 1 else ''}"
         dots, paths = self._dots(across + self.cloud.x * scale, level - self.cloud.z * steep, height)
         parts = [
             f'<path d="{lines}" {_as("line", "stroke")}/>',
             *paths,
-            f"<g {_as('text')}>{labels}</g>",
+            f"<g {_as('text')}>{''.join(labels.parts)}</g>",
             f'<path d="M{across + 9:.1f} {level:.1f}l-15 6v-12z" {_as("head")}/>',
         ]
         return _View(told, parts, 0, height, dots)
@@ -140,6 +161,39 @@ class _Views:
         ]
         group = f'<g transform="scale({grid:g})" fill="none" stroke-width="{width:.2g}" stroke-linecap="round">'
         return len(first), [group, *paths, "</g>"]
+
+
+class _Labels:
+    """Texts of a view that neither leave it nor touch each other; those for which there is no room are left out.
+
+    Attributes:
+        parts: the texts that were written, as SVG.
+    """
+
+    def __init__(self, side: float, top: float, bottom: float) -> None:
+        self._side = side
+        self._top = top
+        self._bottom = bottom
+        self._taken: list[tuple[float, float, float, float]] = []
+        self.parts: list[str] = []
+
+    def write(self, text: str, places: Iterable[tuple[float, float]]) -> None:
+        """Write a text at the first place with room; each is the left end of its base line."""
+        for left, base in places:
+            right = left + _text_width(text)
+            top = base - FONT_HEIGHT
+            if left < 0 or right > self._side or top < self._top or base > self._bottom:
+                continue
+            if any(left < other[2] and other[0] < right and top < other[3] and other[1] < base for other in self._taken):
+                continue
+            self._taken.append((left, top, right, base))
+            self.parts.append(f'<text x="{left:.1f}" y="{base:.1f}">{text}</text>')
+            return
+
+
+def _text_width(text: str) -> float:
+    """Return about how wide a text is, in pixels."""
+    return CHARACTER_WIDTH * len(text)
 
 
 def _path(places: NDArray[np.int64]) -> str:
@@ -165,13 +219,10 @@ def _as(part: str, attribute: str = "fill") -> str:
 
 def _style() -> str:
     """What is different where a dark page is preferred."""
-    ramp = [f".dots{step}{{stroke:{ink}}}.ramp{step}{{fill:{ink}}}" for step, ink in enumerate(map(_hex, blended(BRIGHT["range"])))]
+    inks = [to_hex(rgb) for rgb in make_ramp("dark", STEPS)]
+    dots = [f".dots{step}{{stroke:{ink}}}.ramp{step}{{fill:{ink}}}" for step, ink in enumerate(inks)]
     parts = [f".{part}{{{'stroke' if part == 'line' else 'fill'}:{colour}}}" for part, colour in zip(_PARTS, _DARK, strict=True)]
-    return f"@media(prefers-color-scheme:dark){{{''.join([*parts, *ramp])}}}"
+    return f"@media(prefers-color-scheme:dark){{{''.join([*parts, *dots])}}}"
 
 
-def _hex(rgb: Rgb) -> str:
-    return "#" + "".join(f"{part:02x}" for part in rgb)
-
-
-_COLOURS = [_hex(rgb) for rgb in blended(_INK)]
+_COLOURS = [to_hex(rgb) for rgb in make_ramp("light", STEPS)]

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from lidarspec.points.look import STEPS
-from lidarspec.view.canvas import ALARM, BLANK, FAINT, INKS, PLAIN, RAMPS, Canvas, Cells, sgr, style
+from lidarspec.view.canvas import ALARM, BLANK, FAINT, FIRST_STEP, INKS, PLAIN, Canvas, Cells, sgr, style
 from lidarspec.view.screen import changes
 from tests.view.test_polar import DOTS
 
@@ -49,7 +49,7 @@ def test_the_nearest_and_the_strongest_point_colour_a_cell() -> None:
     for ramp, step in (("range", 2), ("intensity", 16)):
         canvas = Canvas(1, 1, ramp)
         canvas.plot(np.zeros(3), np.zeros(3), np.array([0.3, 0.1, 0.8]))
-        assert canvas.cells().inks.tolist() == [[RAMPS[ramp] + step]]
+        assert canvas.cells().inks.tolist() == [[FIRST_STEP + step]]
 
 
 def test_writing_and_pasting_stay_inside() -> None:
@@ -103,14 +103,13 @@ def test_only_what_changed_is_written() -> None:
 
 
 def test_colours_are_what_the_terminal_can_show() -> None:
-    near = RAMPS["range"]
-    assert sgr(near, "truecolor") == "\x1b[0;38;2;255;92;87m"
-    assert sgr(near, "256") == "\x1b[0;38;5;203m"
-    assert sgr(near, "standard") == "\x1b[0;91m"
-    assert sgr(near, "none") == "\x1b[0m"
+    assert sgr(FIRST_STEP, "truecolor") == "\x1b[0;38;2;99;92;173m"
+    assert sgr(FIRST_STEP, "256") == "\x1b[0;38;5;61m"
+    assert sgr(FIRST_STEP, "standard") == "\x1b[0;94m"
+    assert sgr(FIRST_STEP, "none") == "\x1b[0m"
     assert sgr(FAINT, "none") == "\x1b[0;2m"
-    assert style(near) == "#ff5c57"
-    for ramp in RAMPS.values():
-        assert len({sgr(ramp + step, "truecolor") for step in range(STEPS)}) == STEPS
-        assert len({sgr(ramp + step, "standard") for step in range(STEPS)}) == 6
+    assert style(FIRST_STEP) == "#635cad"
+    steps = range(FIRST_STEP, FIRST_STEP + STEPS)
+    assert len({sgr(step, "truecolor") for step in steps}) == STEPS
+    assert len({sgr(step, "standard") for step in steps}) == 4
     assert all("38;2" not in sgr(ink, "256") for ink in range(len(INKS)))

@@ -15,7 +15,7 @@ import pytest
 import lidarspec as ls
 from lidarspec import Scan, simulate
 from lidarspec.errors import UsageError
-from lidarspec.points.look import look
+from lidarspec.points.look import fit, look
 from lidarspec.view.feed import Feed
 from tests.cli.running import ran
 from tests.formats.test_formats import scan
@@ -53,6 +53,15 @@ def test_a_scan_with_heights_is_seen_from_its_side_too() -> None:
     np.testing.assert_array_equal(offsets(side), np.stack([cloud.x, cloud.z], axis=1))
     np.testing.assert_array_equal(above.collections[0].get_array(), cloud.intensity)
     assert (side.get_xlabel(), side.get_ylabel(), side.get_aspect(), bar.get_ylabel()) == ("x [m], forward", "z [m], up", 1, "intensity")
+
+
+def test_a_fitted_scan_fills_the_panel() -> None:
+    one = simulated("velodyne-vlp16", 160)
+    above, side, _ = figures.of_scan(one, fit(one.points, look(one.points)), "title").axes
+    cloud = one.points[one.points.valid]
+    spans = [np.ptp(np.quantile(cloud.x, (0.01, 0.99))), np.ptp(np.quantile(cloud.y, (0.01, 0.99)))]
+    for limits in (above.get_xlim(), above.get_ylim(), side.get_xlim()):
+        assert max(spans) / abs(limits[1] - limits[0]) > 0.85
 
 
 def test_every_intensity_is_counted() -> None:

@@ -33,8 +33,10 @@ def dots(svg: str, view: int = 0) -> list[tuple[float, float]]:
 def test_a_cloud_is_drawn_where_its_points_are() -> None:
     svg = cloud((4, 0, 0), (0, 2, 0))._repr_svg_()
     assert svg is not None
-    middle, metre = 260, 260 / 4  # four metres from the middle to the edge
-    assert sorted(dots(svg)) == [(middle - 2 * metre, middle), (middle, middle - 4 * metre)]
+    middle = 260
+    metre = middle / (2 * 1.08)  # two metres from the middle of the points to their ends, and a margin
+    expected = [(middle - metre, middle + 2 * metre), (middle + metre, middle - 2 * metre)]
+    np.testing.assert_allclose(sorted(dots(svg)), expected, atol=0.5)
     assert "2 returns as 2 dots" in svg
     assert len(ET.fromstring(svg).findall("{*}svg")) == 1  # flat: from above alone
 
@@ -43,8 +45,9 @@ def test_a_cloud_with_heights_is_drawn_from_the_side_as_well() -> None:
     svg = cloud((4, 0, 1), (2, 0, -1))._repr_svg_()
     assert svg is not None
     (first, high), (second, low) = sorted(dots(svg, 1), reverse=True)
-    assert first - second == pytest.approx(2 * 260 / 4, abs=0.5)
-    assert low - high == pytest.approx(2 * 260 / 4, abs=0.5)
+    metres = 2 * 260 / 1.08  # the two metres between the points, with a margin, are the width of the picture
+    assert first - second == pytest.approx(metres, abs=0.6)
+    assert low - high == pytest.approx(metres, abs=0.6)
 
 
 def test_a_point_shows_as_text_and_nothing_as_a_picture() -> None:

@@ -11,8 +11,8 @@ import pytest
 
 from lidarspec import PointCloud
 from lidarspec.errors import UnknownName
-from lidarspec.points.look import STEPS, Look, look, ramps, ring_step, rounded_up, shade
-from lidarspec.view.canvas import BLANK, RAMPS
+from lidarspec.points.look import STEPS, Look, bounds, fit, look, ramps, ring_step, rounded_up, shade
+from lidarspec.view.canvas import BLANK, FIRST_STEP
 from lidarspec.view.polar import picture
 
 DOTS = {0x01: (0, 0), 0x02: (1, 0), 0x04: (2, 0), 0x40: (3, 0), 0x08: (0, 1), 0x10: (1, 1), 0x20: (2, 1), 0x80: (3, 1)}
@@ -109,11 +109,34 @@ def test_the_reach_takes_in_most_points_and_is_round() -> None:
     assert [rounded_up(value) for value in (0.011, 1.0, 1.01, 5.3, 99, 101)] == pytest.approx([0.012, 1.0, 1.2, 6.0, 100.0, 120.0])
 
 
+@pytest.mark.parametrize("outliers", [0, 10])
+@pytest.mark.parametrize("middle", [(0.0, 0.0), (60.0, -8.0)])
+def test_a_fitted_picture_is_filled_by_98_percent_of_the_points(middle: tuple[float, float], outliers: int) -> None:
+    turn = np.linspace(0, 2 * np.pi, 600)
+    x, y = middle[0] + 4 * np.cos(turn), middle[1] + 2.5 * np.sin(turn)
+    points = cloud(*zip(x, y, 0 * x, strict=True), *[(500.0, 300.0, 20.0)] * outliers)
+    plain = look(points)
+    fitted = fit(points, plain)
+    assert fitted.middle == pytest.approx(middle, abs=0.2)
+    assert 4 <= fitted.reach * 1.01 < 4 / 0.9
+    assert (fitted.full, fitted.ramp) == (plain.full, plain.ramp)
+
+
+def test_a_fitted_picture_shows_the_sensor_if_that_costs_little() -> None:
+    across = np.linspace(-3, 3, 100)
+    for x, forward in ((3.0, 1.5), (30.0, 30.0)):
+        points = cloud(*((x, y, 0.0) for y in across))
+        assert fit(points, look(points)).middle[0] == pytest.approx(forward)
+    empty = cloud()
+    assert fit(empty, look(empty)).middle == (0.0, 0.0)
+    assert [ends.tolist() for ends in bounds(empty)] == [[0, 0, 0], [0, 0, 0]]
+
+
 def test_colours_go_from_near_to_far_and_from_weak_to_strong() -> None:
     points = cloud((0.1, 0.1, 0), (3.4, 3.4, 0), intensity=(200, 1))
     for ramp, last in (("range", [0, STEPS - 1]), ("intensity", [STEPS - 1, 0])):
         inks = picture(points, width=60, height=30, look=Look(ramp, 5, 4.8 if ramp == "range" else 200)).inks
-        steps = inks[inks >= RAMPS["range"]] - RAMPS[ramp]
+        steps = inks[inks >= FIRST_STEP] - FIRST_STEP
         assert steps.tolist()[::-1] == last  # the near one is further down
 
 

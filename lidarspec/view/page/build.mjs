@@ -18,7 +18,7 @@ if (tests) folder = "dist-tests";
 if (check) folder = "dist-check";
 
 rmSync(folder, { recursive: true, force: true });
-const entries = tests ? readdirSync("tests").map((name) => `tests/${name}`) : ["src/page.ts", "src/widget.ts"];
+const entries = tests ? readdirSync("tests").filter((name) => name.endsWith(".ts")).map((name) => `tests/${name}`) : ["src/page.ts", "src/widget.ts"];
 
 const options = {
   entryPoints: entries,

@@ -4,13 +4,19 @@
  * The scale is a helix in the space OKLab, in which equal steps look equal: lightness and hue go on evenly while chroma stays.
  */
 
+import { quantiles } from "./sampling";
+
 export type Theme = "dark" | "light";
 export type Rgb = [number, number, number];
 
-/** Where the scale begins and ends: lightness from 0 to 1, hue in degrees; light paper takes darker colours. */
+/**
+ * Where the scale begins and ends: lightness from 0 to 1, hue in degrees. Hue goes from blue to yellow, and lightness rises all the
+ * way, so that readers who confuse red and green, or blue and yellow, still see the order. Every colour has a contrast of 3:1 with
+ * the paper of its theme, for which light paper takes darker colours. `lidarspec.points.colours` has the same scale.
+ */
 const SCALES: Record<Theme, { lightness: [number, number]; hue: [number, number]; chroma: number }> = {
-  dark: { lightness: [0.5, 0.9], hue: [285, 105], chroma: 0.125 },
-  light: { lightness: [0.38, 0.74], hue: [285, 105], chroma: 0.11 },
+  dark: { lightness: [0.52, 0.92], hue: [285, 100], chroma: 0.125 },
+  light: { lightness: [0.34, 0.66], hue: [285, 100], chroma: 0.11 },
 };
 export const STEPS = 256;
 
@@ -60,18 +66,8 @@ export function roundedUp(value: number, steps = [1, 1.2, 1.5, 2, 2.5, 3, 4, 5, 
   return Number(((steps.find((step) => step * power >= value * 0.999) ?? 10) * power).toPrecision(3));
 }
 
-/** Values that are looked at to find a span, and the share of them at each end that is beyond it. */
-const LOOKED = 4000;
+/** Share of the values at each end that is beyond the span. */
 const BEYOND = 0.01;
-
-/** The values at shares of the way through a column in order; a sample of a long one. */
-export function quantiles(column: ArrayLike<number>, shares: number[]): number[] {
-  const every = Math.max(Math.floor(column.length / LOOKED), 1);
-  const sample = Array.from({ length: Math.floor(column.length / every) }, (_, number) => column[number * every]!)
-    .filter(Number.isFinite)
-    .sort((a, b) => a - b);
-  return shares.map((share) => sample[Math.round(share * (sample.length - 1))] ?? 0);
-}
 
 /** A span that needs less than this share of the one that is kept takes its place. */
 const ROOMY = 0.5;

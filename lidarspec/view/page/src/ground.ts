@@ -6,23 +6,19 @@
  */
 
 import { colour, roundedUp, type Span, type Theme } from "./colours";
+import type { Box } from "./fit";
 
 /** The views, by what people call them. */
 export const VIEWS = { polar: "Polar", top: "Top", side: "Side", orbit: "3D" };
 export type View = keyof typeof VIEWS;
 export type Place = [number, number];
 
-/** The bounds of what is seen, in metres, and the height of the floor under it. */
-export interface Box {
-  low: [number, number, number];
-  high: [number, number, number];
-}
-
 export interface Outlook {
   view: View;
   theme: Theme;
   width: number;
   height: number;
+  /** the bounds of what is fitted, in metres; the floor is at its lower end */
   box: Box;
   /** where a point of the world is on the canvas; null behind the camera */
   place: (x: number, y: number, z: number) => Place | null;
@@ -45,6 +41,10 @@ export const INKS: Record<Theme, Inks> = {
 };
 
 const FONT = "11px system-ui, sans-serif";
+const TEXT_HEIGHT = 14;
+/** Pixels from a label to the edge of the canvas at least, and to the next one in its line. */
+const RIM = 2;
+const APART_X = 6;
 /** Pixels between two lines of a grid at least, and degrees between two spokes. */
 const APART = 70;
 const SPOKES = 30;
@@ -63,14 +63,48 @@ export function ground(context: CanvasRenderingContext2D, outlook: Outlook): voi
   else grid(context, outlook);
 }
 
-/** Draw what stands over the points: numbers at the lines, and the sensor. */
-export function labels(context: CanvasRenderingContext2D, outlook: Outlook): void {
+/** The edges of a part of the canvas, in pixels: left, top, right, bottom. */
+export type Rect = [number, number, number, number];
+
+/** Draw what stands over the points: numbers at the lines, and the sensor; `taken`: parts of the canvas without labels. */
+export function labels(context: CanvasRenderingContext2D, outlook: Outlook, taken: Rect[] = []): void {
   context.font = FONT;
-  if (outlook.view === "polar") ringLabels(context, outlook);
-  else if (outlook.view === "orbit") floorLabels(context, outlook);
-  else gridLabels(context, outlook);
-  if (outlook.view === "orbit" || outlook.view === "side") axes(context, outlook);
-  else sensor(context, outlook);
+  const writer = new Writer(context, outlook, taken);
+  if (outlook.view === "orbit" || outlook.view === "side") axes(context, outlook, writer);
+  else sensor(context, outlook, writer);
+  if (outlook.view === "polar") ringLabels(writer, outlook);
+  else if (outlook.view === "orbit") floorLabels(writer, outlook);
+  else gridLabels(writer, outlook);
+}
+
+/** Writes labels that touch neither each other nor the edges of the canvas; those for which there is no room are left out. */
+class Writer {
+  constructor(
+    readonly context: CanvasRenderingContext2D,
+    readonly outlook: Outlook,
+    readonly taken: Rect[],
+  ) {
+    this.taken = [...taken];
+  }
+
+  /** Write a text at the first place where there is room. */
+  write(text: string, places: [Place, CanvasTextAlign][], ink?: string): void {
+    const width = this.context.measureText(text).width;
+    for (const [place, align] of places) {
+      const left = place[0] - width * (align === "left" ? 0 : align === "right" ? 1 : 0.5);
+      const rect: Rect = [left, place[1] - TEXT_HEIGHT / 2, left + width, place[1] + TEXT_HEIGHT / 2];
+      if (!this.#isFree(rect)) continue;
+      this.taken.push(rect);
+      written(this.context, text, place, this.outlook.theme, align, ink);
+      return;
+    }
+  }
+
+  #isFree([left, top, right, bottom]: Rect): boolean {
+    const { width, height } = this.outlook;
+    if (left < RIM || top < RIM || right > width - RIM || bottom > height - RIM) return false;
+    return this.taken.every((other) => left > other[2] + APART_X || other[0] > right + APART_X || top > other[3] || other[1] > bottom);
+  }
 }
 
 /** A flat view: pixels for a metre, where the sensor is, and which of x y z go right and up. */
@@ -133,25 +167,34 @@ function direction(degrees: number): Place {
   return [-Math.sin(turn), -Math.cos(turn)];
 }
 
-function ringLabels(context: CanvasRenderingContext2D, outlook: Outlook): void {
+/** The order in which azimuths are written: the axes first. */
+const AZIMUTHS = [0, 180, 90, -90, 30, -30, 150, -150, 60, -60, 120, -120];
+
+function ringLabels(writer: Writer, outlook: Outlook): void {
   const seen = flat(outlook);
   const { width, height } = outlook;
   const { home, scale } = seen;
-  // Metres stand along the axis of which most is seen.
-  const room = { 0: home[1], 180: height - home[1], 90: home[0], "-90": width - home[0] };
-  const along = Number(Object.entries(room).sort((a, b) => b[1] - a[1])[0]![0]);
-  const [right, down] = direction(along);
-  for (const radius of radii(outlook, seen)) {
-    const place: Place = [home[0] + right * radius * scale + (right ? 0 : 4), home[1] + down * radius * scale + (down ? -7 : -9)];
-    if (inside(place, outlook, 3.4 * EDGE)) written(context, metres(radius), place, outlook.theme, right ? "center" : "left");
-  }
-  for (let angle = -150; angle <= 180; angle += SPOKES) {
+  for (const angle of AZIMUTHS) {
     const place = exit(home, direction(angle), outlook);
-    if (place) written(context, angle === 0 ? "0° forward" : `${angle}°`, place, outlook.theme, "center");
+    if (!place) continue;
+    writer.write(angle === 0 ? "0° forward" : `${angle}°`, [[place, "center"], [place, place[0] < width / 2 ? "left" : "right"]]);
+  }
+  // Metres are written along the axis of which most is seen, else along another one.
+  const room = { 0: home[1], 180: height - home[1], 90: home[0], "-90": width - home[0] };
+  const ways = Object.entries(room).sort((a, b) => b[1] - a[1]).map(([angle]) => Number(angle));
+  const inward = (Math.atan2(home[0] - width / 2, home[1] - height / 2) * 180) / Math.PI;
+  for (const radius of radii(outlook, seen)) {
+    const places = [...ways, inward].flatMap((angle): [Place, CanvasTextAlign][] => {
+      const [right, down] = direction(angle);
+      const [across, along]: Place = [home[0] + right * radius * scale, home[1] + down * radius * scale];
+      const isAcross = Math.abs(right) > Math.abs(down);
+      return isAcross ? [[[across, along - 9], "center"]] : [[[across + 4, along - 7], "left"], [[across + 4, along + 9], "left"]];
+    });
+    writer.write(metres(radius), places);
   }
 }
 
-/** Where a ray leaves the canvas, a little inside of its edge; null where it does not cross it. */
+/** Where a ray leaves the canvas, a little inside of its edge; null if it does not cross it. */
 function exit(home: Place, [right, down]: Place, { width, height }: Outlook): Place | null {
   const ways = [
     right > 1e-9 ? (width - 1.6 * EDGE - home[0]) / right : right < -1e-9 ? (1.6 * EDGE - home[0]) / right : Infinity,
@@ -192,51 +235,53 @@ function grid(context: CanvasRenderingContext2D, outlook: Outlook): void {
   }
 }
 
-function gridLabels(context: CanvasRenderingContext2D, outlook: Outlook): void {
+function gridLabels(writer: Writer, outlook: Outlook): void {
   const seen = flat(outlook);
   const { home, scale, across, up } = seen;
   const [columns, rows] = lines(outlook, seen);
   for (const value of columns) {
-    const place: Place = [home[0] + value * scale, outlook.height - EDGE];
-    if (inside(place, outlook, EDGE)) written(context, `${across.name} ${metres(value * across.sign || 0)}`, place, outlook.theme, "center");
+    writer.write(`${across.name} ${metres(value * across.sign || 0)}`, [[[home[0] + value * scale, outlook.height - EDGE], "center"]]);
   }
-  for (const value of rows) {
-    const place: Place = [6, home[1] - value * scale - 7];
-    if (place[1] > EDGE && place[1] < outlook.height - 2 * EDGE) written(context, `${up.name} ${metres(value)}`, place, outlook.theme, "left");
-  }
+  for (const value of rows) writer.write(`${up.name} ${metres(value)}`, [[[6, home[1] - value * scale - 8], "left"]]);
 }
 
-/** The lines of the floor: its height, and the values of x and of y that have one. */
-function tiles({ box }: Outlook): { z: number; x: number[]; y: number[] } {
-  const extent = Math.max(box.high[0] - box.low[0], box.high[1] - box.low[1]);
-  const apart = roundedUp(extent / 10, [1, 2, 5, 10]);
-  const ends = (axis: 0 | 1): number[] => {
-    const [low, high] = [Math.floor(box.low[axis] / apart) * apart, Math.ceil(box.high[axis] / apart) * apart];
-    return multiples(low, high + apart / 2, apart);
-  };
-  return { z: box.low[2], x: ends(0), y: ends(1) };
+/** The lines of the floor: its height, the values of x and of y that have one, and where they begin and end. */
+function tiles({ box }: Outlook): { z: number; x: number[]; y: number[]; low: Place; high: Place } {
+  const [low, high]: [Place, Place] = [[box.low[0], box.low[1]], [box.high[0], box.high[1]]];
+  const apart = roundedUp(Math.max(high[0] - low[0], high[1] - low[1]) / 10, [1, 2, 5, 10]);
+  return { z: box.low[2], x: multiples(low[0], high[0], apart), y: multiples(low[1], high[1], apart), low, high };
 }
 
 function floor(context: CanvasRenderingContext2D, outlook: Outlook): void {
-  const { z, x, y } = tiles(outlook);
+  const { z, x, y, low, high } = tiles(outlook);
   const inks = INKS[outlook.theme];
   const ink = (value: number): string => (value === 0 ? inks.text : inks.line);
-  for (const value of x) inSpace(context, outlook, [value, y[0]!, z], [value, y.at(-1)!, z], ink(value));
-  for (const value of y) inSpace(context, outlook, [x[0]!, value, z], [x.at(-1)!, value, z], ink(value));
+  for (const value of new Set([low[0], ...x, high[0]])) inSpace(context, outlook, [value, low[1], z], [value, high[1], z], ink(value));
+  for (const value of new Set([low[1], ...y, high[1]])) inSpace(context, outlook, [low[0], value, z], [high[0], value, z], ink(value));
 }
 
-function floorLabels(context: CanvasRenderingContext2D, outlook: Outlook): void {
-  const { z, x, y } = tiles(outlook);
-  const { camera, theme, place } = outlook;
-  const nearer = (axis: 0 | 1, values: number[]): number =>
-    Math.abs(camera[axis] - values[0]!) < Math.abs(camera[axis] - values.at(-1)!) ? values[0]! : values.at(-1)!;
-  const [besideX, besideY] = [nearer(1, y), nearer(0, x)];
-  const every = (values: number[]): number[] => values.filter((_, number) => values.length < 9 || number % 2 === 0);
+/** Write x and y along the edges of the floor that are nearer to the camera: outside of the floor, else on it. */
+function floorLabels(writer: Writer, outlook: Outlook): void {
+  const { z, x, y, low, high } = tiles(outlook);
+  const { camera, place } = outlook;
+  const nearer = (axis: 0 | 1): number => (Math.abs(camera[axis] - low[axis]) < Math.abs(camera[axis] - high[axis]) ? low[axis] : high[axis]);
+  const middle = place((low[0] + high[0]) / 2, (low[1] + high[1]) / 2, z);
+  const [besideX, besideY] = [nearer(1), nearer(0)];
+  const every = (values: number[]): number[] => (values.length < 9 ? values : values.filter((value) => Math.round(value / (values[1]! - values[0]!)) % 2 === 0));
   for (const value of every(x)) at(place(value, besideX, z), `x ${metres(value)}`);
   for (const value of every(y)) at(place(besideY, value, z), `y ${metres(value)}`);
 
   function at(spot: Place | null, text: string): void {
-    if (spot && inside(spot, outlook, 0)) written(context, text, [spot[0], spot[1] + 9], theme, "center");
+    if (!spot || !middle) return;
+    const [across, down] = spot;
+    const [outward, inward]: [CanvasTextAlign, CanvasTextAlign] = across < middle[0] ? ["right", "left"] : ["left", "right"];
+    const apart = outward === "right" ? -6 : 6;
+    writer.write(text, [
+      [[across, down + 9], "center"],
+      [[across + apart, down], outward],
+      [[across - apart, down], inward],
+      [[across, down - 9], "center"],
+    ]);
   }
 }
 
@@ -255,26 +300,36 @@ function inSpace(context: CanvasRenderingContext2D, { place }: Outlook, from: nu
   context.stroke();
 }
 
-/** The sensor's axes, x forward, y left, z up, where it stands. */
-function axes(context: CanvasRenderingContext2D, outlook: Outlook): void {
+/** The sensor's axes, x forward, y left, z up: the longest of them as many pixels. */
+const AXIS = 36;
+
+function axes(context: CanvasRenderingContext2D, outlook: Outlook, writer: Writer): void {
   const home = outlook.place(0, 0, 0);
-  const extent = Math.max(outlook.box.high[0] - outlook.box.low[0], outlook.box.high[1] - outlook.box.low[1]);
-  const long = outlook.view === "side" ? 40 / flat(outlook).scale : extent / 14;
-  const ends = [outlook.place(long, 0, 0), outlook.place(0, long, 0), outlook.place(0, 0, long)];
+  const extent = Math.max(...outlook.box.low.map((low, axis) => outlook.box.high[axis]! - low));
   const inks = INKS[outlook.theme];
-  ends.forEach((end, axis) => {
-    if (!home || !end || Math.hypot(end[0] - home[0], end[1] - home[1]) < 4) return;
+  if (!home) return;
+  const ways = [[1, 0, 0], [0, 1, 0], [0, 0, 1]].map((way) => {
+    const [x, y, z] = way.map((part) => part * extent * 0.01) as [number, number, number];
+    const end = outlook.place(x, y, z) ?? home;
+    return [end[0] - home[0], end[1] - home[1]] as Place;
+  });
+  const longest = Math.max(...ways.map((way) => Math.hypot(...way)));
+  ways.forEach((way, axis) => {
+    const [right, down] = way.map((part) => (part * AXIS) / longest) as Place;
+    if (!(Math.hypot(right, down) >= 4)) return;
     context.lineWidth = 2;
-    line(context, home, end, inks.axes[axis]!);
+    line(context, home, [home[0] + right, home[1] + down], inks.axes[axis]!);
     context.lineWidth = 1;
-    written(context, "xyz"[axis]!, [end[0] + (end[0] - home[0]) * 0.15, end[1] + (end[1] - home[1]) * 0.15], outlook.theme, "center", inks.axes[axis]);
+    const beyond = 1 + 8 / Math.hypot(right, down);
+    writer.write("xyz"[axis]!, [[[home[0] + right * beyond, home[1] + down * beyond], "center"]], inks.axes[axis]);
   });
 }
 
-/** The sensor from above, as an arrow head that points forward. */
-function sensor(context: CanvasRenderingContext2D, outlook: Outlook): void {
+/** The sensor from above, as an arrow head that points forward; labels do not cover it. */
+function sensor(context: CanvasRenderingContext2D, outlook: Outlook, writer: Writer): void {
   const [across, down] = outlook.place(0, 0, 0)!;
   const inks = INKS[outlook.theme];
+  writer.taken.push([across - 6, down - 9, across + 6, down + 6]);
   context.beginPath();
   context.moveTo(across, down - 9);
   context.lineTo(across + 6, down + 6);
@@ -299,28 +354,34 @@ export function mark(context: CanvasRenderingContext2D, [across, down]: Place, t
   context.lineWidth = 1;
 }
 
-const BAR = { width: 180, height: 8, edge: 16 };
+/** Pixels of the bar of colours: its own, to the edges of the canvas, and from the lower edge up to its upper end. */
+export const BAR = { width: 180, height: 8, edge: 16, room: 66 };
+/** Share of the canvas that the bar takes at most. */
+const BAR_SHARE = 0.4;
+
+/** The part of the canvas that the bar of colours covers. */
+export function barRect({ width, height }: Outlook): Rect {
+  const left = width - Math.min(BAR.width, BAR_SHARE * width) - BAR.edge;
+  return [left - 8, height - BAR.room, width - BAR.edge + 8, height - BAR.room + 46];
+}
 
 /** The bar that says what colours mean, with the values at its ends. */
 export function colourBar(context: CanvasRenderingContext2D, outlook: Outlook, name: string, unit: string, span: Span): void {
-  const { width, height, theme } = outlook;
-  const [left, top] = [width - BAR.width - BAR.edge, height - BAR.edge - 30];
-  const ramp = context.createLinearGradient(left, 0, left + BAR.width, 0);
+  const { theme } = outlook;
+  const rect = barRect(outlook);
+  const [left, top, right] = [rect[0] + 8, rect[1] + 20, rect[2] - 8];
+  const ramp = context.createLinearGradient(left, 0, right, 0);
   for (let stop = 0; stop <= 16; stop++) {
     const parts = colour(stop / 16, theme).map((part) => Math.round(255 * part));
     ramp.addColorStop(stop / 16, `rgb(${parts.join(" ")})`);
   }
   context.font = FONT;
-  context.fillStyle = INKS[theme].paper;
-  context.globalAlpha = 0.85;
-  context.fillRect(left - 8, top - 20, BAR.width + 16, 46);
-  context.globalAlpha = 1;
   context.fillStyle = ramp;
-  context.fillRect(left, top, BAR.width, BAR.height);
+  context.fillRect(left, top, right - left, BAR.height);
   const end = `${Number(span.high.toPrecision(4))} ${unit}`.trim();
   written(context, name, [left, top - 9], theme, "left", INKS[theme].strong);
   written(context, `${Number(span.low.toPrecision(4))}`, [left, top + 17], theme, "left");
-  written(context, end, [left + BAR.width, top + 17], theme, "right");
+  written(context, end, [right, top + 17], theme, "right");
 }
 
 function line(context: CanvasRenderingContext2D, from: Place, to: Place, ink: string): void {

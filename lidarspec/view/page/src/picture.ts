@@ -22,8 +22,9 @@ import {
   WebGLRenderer,
 } from "three";
 import { OrbitControls } from "three/addons/controls/OrbitControls.js";
-import { quantiles, roundedUp, scale, Span, STEPS, type Theme } from "./colours";
-import { type Box, colourBar, ground, INKS, labels, mark, metres, type Outlook, type Place, type View } from "./ground";
+import { scale, Span, STEPS, type Theme } from "./colours";
+import { type Axes, type Box, centralPoints, fit, isFitted, type Point } from "./fit";
+import { BAR, barRect, colourBar, ground, INKS, labels, mark, metres, type Outlook, type Place, type View } from "./ground";
 import type { Column, Scan } from "./protocol";
 
 export type { Theme, View };
@@ -57,19 +58,19 @@ void main() {
 }`;
 const COLUMNS = ["x", "y", "z", "value"] as const;
 
-/** Share of the points at each end that the view need not take in, and how much larger than the rest it is. */
-const BEYOND = 0.005;
-const MARGIN = 1.12;
-/** A box whose shorter side of the sensor is at least this share of the longer one has the sensor in its middle. */
-const CENTRED = 0.3;
 /** Pixels that a mouse and a finger may be beside a point, and that they may move within a click. */
 const BESIDE = 9;
 const BESIDE_FINGER = 22;
 const STILL = 4;
 const FIELD_OF_VIEW = 45;
-/** From where a cloud is seen at first: behind the sensor and above it; and how often the distance is bettered until all is seen. */
+/** Half of the field of view, as the tangent of its angle. */
+const TANGENT = Math.tan((FIELD_OF_VIEW * Math.PI) / 360);
+/** From where a cloud is seen at first: behind the sensor and above it. */
 const LOOK = new Vector3(-0.8, 0.14, 0.55).normalize();
-const FITTED = 4;
+/** How much more than the points is seen where a growing scan is fitted again, so that the picture does not jump with each scan. */
+const HEADROOM = 1.1;
+/** The points that are fitted while there are none. */
+const NOTHING: Point[] = [[-1, -1, 0], [1, 1, 0]];
 
 export class Picture {
   readonly #renderer: WebGLRenderer;
@@ -88,6 +89,7 @@ export class Picture {
   #size = 0;
   #view: View;
   #scan: Scan | null = null;
+  #central = NOTHING;
   #box: Box = { low: [-1, -1, 0], high: [1, 1, 0] };
   #fitted = false;
   #moved = false;
@@ -171,7 +173,7 @@ export class Picture {
   /** All of it again. */
   reset(): void {
     this.#moved = false;
-    if (this.#scan) this.#box = around(this.#scan);
+    if (this.#scan) this.#take(centralPoints(this.#scan));
     this.#aim();
   }
 
@@ -331,31 +333,30 @@ export class Picture {
     } else this.#aim();
   }
 
-  /** Point the camera so that the box is seen. */
-  #aim(): void {
-    const { clientWidth, clientHeight } = this.element;
-    const aspect = clientWidth / Math.max(clientHeight, 1);
-    const { low, high } = this.#box;
-    const middle = new Vector3(...low).add(new Vector3(...high)).multiplyScalar(0.5);
-    const [deep, wide, tall] = low.map((end, axis) => high[axis]! - end) as [number, number, number];
-    this.#controls.target.copy(middle);
-    if (this.#view === "orbit") {
+  #take(central: Point[]): void {
+    this.#central = central.length > 0 ? central : NOTHING;
+  }
+
+  /** Point the camera so that the central points fill the canvas; it sees `headroom` times as much. */
+  #aim(headroom = 1): void {
+    const { clientWidth: width, clientHeight: height } = this.element;
+    if (!width || !height) return;
+    const axes = axesOf(this.#view);
+    const isDeep = this.#view === "orbit";
+    const found = fit(this.#central, { axes, tangent: isDeep ? TANGENT : 0 }, { width, height, footer: BAR.room });
+    const distance = found.distance * headroom;
+    const aspect = width / height;
+    this.#box = found.box;
+    this.#controls.target.set(...found.target);
+    const backward = new Vector3(...axes.forward).negate();
+    if (isDeep) {
       this.#deep.aspect = aspect;
-      let away = Math.hypot(deep, wide, tall);
-      for (let time = 0; time < FITTED; time++) {
-        this.#deep.position.copy(middle).addScaledVector(LOOK, away);
-        [this.#deep.near, this.#deep.far] = [away / 500, away * 50];
-        this.#deep.lookAt(middle);
-        this.#deep.updateProjectionMatrix();
-        this.#deep.updateMatrixWorld();
-        away *= Math.max(...corners(this.#box).flatMap((corner) => corner.project(this.#deep).toArray().slice(0, 2)).map(Math.abs)) * MARGIN;
-      }
+      [this.#deep.near, this.#deep.far] = [distance / 500, distance * 50];
+      this.#deep.position.copy(this.#controls.target).addScaledVector(backward, distance);
     } else {
-      const [across, up] = this.#view === "side" ? [deep, tall] : [wide, deep];
-      const half = (Math.max(up, across / aspect, 0.1) / 2) * MARGIN;
-      const far = 4 * Math.hypot(deep, wide, tall) + 10;
-      Object.assign(this.#flat, { left: -half * aspect, right: half * aspect, top: half, bottom: -half, near: 0, far: 2 * far, zoom: 1 });
-      this.#flat.position.copy(middle).add(this.#view === "side" ? new Vector3(0, -far, 0) : new Vector3(0, 0, far));
+      const far = 4 * Math.hypot(...found.box.low.map((low, axis) => found.box.high[axis]! - low)) + 10;
+      Object.assign(this.#flat, { left: -distance * aspect, right: distance * aspect, top: distance, bottom: -distance, near: 0, far: 2 * far, zoom: 1 });
+      this.#flat.position.copy(this.#controls.target).addScaledVector(backward, far);
     }
     this.#turned();
   }
@@ -431,16 +432,17 @@ export class Picture {
     }
   }
 
-  /** The first whole scan, and one that reaches farther or much less far, set what is seen, unless somebody has moved it. */
+  /** Fit the first whole scan, and one that leaves the canvas or needs much less of it, unless the camera was moved by hand. */
   #refit(scan: Scan): void {
     if (this.#moved || !scan.points) return;
-    const box = around(scan);
-    const reach = ({ low, high }: Box): number => Math.hypot(...low.map((end, axis) => high[axis]! - end));
-    const within = box.low.every((end, axis) => end >= this.#box.low[axis]! * MARGIN - 0.01) && box.high.every((end, axis) => end <= this.#box.high[axis]! * MARGIN + 0.01);
-    if (this.#fitted && within && reach(box) > reach(this.#box) / 2) return;
-    this.#fitted = scan.whole;
-    this.#box = box;
-    this.#aim();
+    const central = centralPoints(scan);
+    const { clientWidth, clientHeight } = this.element;
+    const place = this.#placer();
+    const places = central.map((point) => place(...point));
+    if (this.#fitted && isFitted(places, clientWidth, clientHeight)) return;
+    this.#take(central);
+    this.#aim(this.#fitted ? HEADROOM : 1);
+    this.#fitted ||= scan.whole;
   }
 
   #values(scan: Scan): Column {
@@ -472,7 +474,7 @@ export class Picture {
   #label(outlook: Outlook): void {
     const over = this.#over.getContext("2d")!;
     over.clearRect(0, 0, outlook.width, outlook.height);
-    labels(over, outlook);
+    labels(over, outlook, this.#scan ? [barRect(outlook)] : []);
     if (!this.#scan) return;
     const by = this.#by === "height" ? "z" : this.#by;
     colourBar(over, outlook, this.#by, this.#scan.units.get(by) ?? "", this.#span);
@@ -535,21 +537,14 @@ function texture(theme: Theme): DataTexture {
   return made;
 }
 
-/** The box that most points are in, and the sensor, rounded so that it stays the same from scan to scan. */
-export function around(scan: Scan): Box {
-  const box: Box = { low: [0, 0, 0], high: [0, 0, 0] };
-  ["x", "y", "z"].forEach((name, axis) => {
-    const [low, high] = quantiles(scan.columns.get(name)!, [BEYOND, 1 - BEYOND]) as [number, number];
-    let [below, above] = [roundedUp(Math.max(-low, 0)), roundedUp(Math.max(high, 0))];
-    if (axis < 2 && Math.min(below, above) > CENTRED * Math.max(below, above)) below = above = Math.max(below, above);
-    box.low[axis] = axis === 2 ? Math.min(low, 0) : -below;
-    box.high[axis] = above;
-  });
-  return box;
-}
-
-function corners({ low, high }: Box): Vector3[] {
-  return Array.from({ length: 8 }, (_, number) => new Vector3(...low.map((end, axis) => ((number >> axis) & 1 ? high[axis]! : end))));
+/** Return the axes of the camera of a view: from above with forward up, from the right, or from behind and above. */
+export function axesOf(view: View): Axes {
+  if (view === "side") return { right: [1, 0, 0], up: [0, 0, 1], forward: [0, 1, 0] };
+  if (view !== "orbit") return { right: [0, -1, 0], up: [1, 0, 0], forward: [0, 0, -1] };
+  const forward = LOOK.clone().negate();
+  const right = forward.clone().cross(new Vector3(0, 0, 1)).normalize();
+  const up = right.clone().cross(forward);
+  return { right: right.toArray(), up: up.toArray(), forward: forward.toArray() };
 }
 
 /** A point in words: range and angle of a planar scan, x y z of others, and what else is known of it. */

@@ -1,0 +1,79 @@
+"""The colours of values, the same in every picture: blue for low values, over green, to yellow for high ones.
+
+The scale is a helix in the colour space OKLab, in which equal steps look equal. Its lightness rises all the way, so that readers who
+confuse red and green, or blue and yellow, still see the order. Each theme takes its own part of the lightness, so that every colour
+has a contrast of 3:1 with the ground. The page of ``view --web`` has the same scale in ``view/page/src/colours.ts``.
+
+Source: Ottosson, A perceptual color space for image processing (2020), for the matrices.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import Literal
+
+Rgb = tuple[int, int, int]
+Theme = Literal["dark", "light"]
+
+#: OKLab to the cube roots of the responses of the cones, and these responses to linear sRGB.
+_CONES = (
+    (1.0, 0.3963377774, 0.2158037573),
+    (1.0, -0.1055613458, -0.0638541728),
+    (1.0, -0.0894841775, -1.291485548),
+)
+_LINEAR = (
+    (4.0767416621, -3.3077115913, 0.2309699292),
+    (-1.2684380046, 2.6097574011, -0.3413193965),
+    (-0.0041960863, -0.7034186147, 1.707614701),
+)
+
+
+@dataclass(frozen=True)
+class Scale:
+    """The first and last lightness, from 0 to 1, the first and last hue in degrees, and the chroma."""
+
+    lightness: tuple[float, float]
+    hue: tuple[float, float]
+    chroma: float
+
+
+SCALES: dict[Theme, Scale] = {
+    "dark": Scale((0.52, 0.92), (285.0, 100.0), 0.125),
+    "light": Scale((0.34, 0.66), (285.0, 100.0), 0.11),
+}
+
+
+def colour(share: float, theme: Theme) -> Rgb:
+    """Return the colour at a share of the way along the scale, from 0 to 1."""
+    scale = SCALES[theme]
+    lightness = _between(scale.lightness, share)
+    hue = math.radians(_between(scale.hue, share))
+    red, green, blue = _srgb(lightness, scale.chroma * math.cos(hue), scale.chroma * math.sin(hue))
+    return red, green, blue
+
+
+def make_ramp(theme: Theme, count: int) -> list[Rgb]:
+    """Return `count` colours, evenly from the first to the last of the scale."""
+    return [colour(step / (count - 1), theme) for step in range(count)]
+
+
+def to_hex(rgb: Rgb) -> str:
+    """Return a colour as "#rrggbb"."""
+    return "#" + "".join(f"{part:02x}" for part in rgb)
+
+
+def _between(ends: tuple[float, float], share: float) -> float:
+    return ends[0] + (ends[1] - ends[0]) * share
+
+
+def _srgb(lightness: float, a: float, b: float) -> list[int]:
+    """Return a colour of OKLab as sRGB, limited to what a screen can show."""
+    cones = [(row[0] * lightness + row[1] * a + row[2] * b) ** 3 for row in _CONES]
+    parts = []
+    for row in _LINEAR:
+        linear = sum(factor * cone for factor, cone in zip(row, cones, strict=True))
+        linear = min(max(linear, 0.0), 1.0)
+        encoded = 12.92 * linear if linear <= 0.0031308 else 1.055 * linear ** (1 / 2.4) - 0.055
+        parts.append(round(255 * encoded))
+    return parts

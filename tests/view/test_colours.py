@@ -1,0 +1,60 @@
+"""One scale of colours for terminal, SVG, plot, Rerun, page and notebook; in order and readable for everybody."""
+
+from __future__ import annotations
+
+import json
+
+import numpy as np
+import pytest
+
+from lidarspec.points.colours import SCALES, Theme, colour, make_ramp, to_hex
+from lidarspec.points.look import STEPS, look
+from lidarspec.view.canvas import FIRST_STEP, INKS
+from lidarspec.view.server import PAGE
+from lidarspec.view.svg import svg
+from tests.libraries import Library, needs
+from tests.view.test_polar import cloud
+
+#: what the tests of the page compare its own scale with.
+OF_PAGE = PAGE.parent / "tests" / "ramp.json"
+#: the grounds of an SVG.
+PAPERS: dict[Theme, str] = {"dark": "#14161b", "light": "#ffffff"}
+
+
+def luminance(colours: list[tuple[int, int, int]]) -> np.ndarray:
+    """The relative luminance of WCAG 2, (n,)."""
+    parts = np.array(colours) / 255
+    linear = np.where(parts <= 0.04045, parts / 12.92, ((parts + 0.055) / 1.055) ** 2.4)
+    return np.asarray(linear @ (0.2126, 0.7152, 0.0722))
+
+
+@pytest.mark.parametrize("theme", SCALES)
+def test_the_page_has_the_same_scale(theme: Theme) -> None:
+    of_page = json.loads(OF_PAGE.read_text(encoding="utf-8"))[theme]
+    assert [to_hex(rgb) for rgb in make_ramp(theme, len(of_page))] == of_page
+
+
+@pytest.mark.parametrize("theme", SCALES)
+def test_lightness_rises_and_every_colour_is_readable(theme: Theme) -> None:
+    found = luminance(make_ramp(theme, 65))
+    assert np.all(np.diff(found) > 0)
+    paper = luminance([tuple(bytes.fromhex(PAPERS[theme].lstrip("#")))])  # type: ignore[list-item]
+    contrast = (np.maximum(found, paper) + 0.05) / (np.minimum(found, paper) + 0.05)
+    assert contrast.min() >= 3
+
+
+def test_terminal_and_svg_have_the_scale() -> None:
+    assert [ink.rgb for ink in INKS[FIRST_STEP:]] == make_ramp("dark", STEPS)
+    points = cloud(*((x, 0, 0) for x in np.linspace(0.1, 5, 100)))
+    picture = svg(points, look(points), "title")
+    for step, (dark, light) in enumerate(zip(make_ramp("dark", STEPS), make_ramp("light", STEPS), strict=True)):
+        assert f".dots{step}{{stroke:{to_hex(dark)}}}" in picture
+        assert f'class="ramp{step}"' in picture
+        assert f'fill="{to_hex(light)}"' in picture
+
+
+@needs("matplotlib")
+def test_plot_has_the_scale() -> None:
+    colours = Library("lidarspec.view.figures").colour_map()
+    for share in (0.0, 0.5, 1.0):
+        assert colours(share, bytes=True)[:3] == pytest.approx(colour(share, "light"), abs=2)
