@@ -175,7 +175,7 @@ def test_clouds_arrive_with_best_effort_at_the_full_rate(run: Callable[..., Any]
     client.until(lambda: client.diagnostics and sent_clouds(client) > 1)
     first_sent = sent_clouds(client)
     first_received = len(received)
-    client.until(lambda: sent_clouds(client) >= first_sent + CLOUDS)
+    client.until(lambda: sent_clouds(client) >= first_sent + CLOUDS, patience=4 * PATIENCE)
     assert client.change("deactivate")
     client.diagnostics.clear()
     client.until(lambda: len(client.diagnostics) > 1)  # no cloud is on its way any more
