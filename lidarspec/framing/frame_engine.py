@@ -144,8 +144,8 @@ class CompiledCodec(Codec):
             layouts.append(layout)
             left.append((layout, which))
         sizes = np.array([*(layout.size for layout in layouts), 0], np.intp)[forms]
-        if len(left) >= MANY_LAYOUTS and sums is None:
-            left = self._judge_together(buffer, offsets, stops, left, status, sizes)
+        if len(left) >= MANY_LAYOUTS:
+            left = self._judge_together(buffer, offsets, stops, left, status, sizes, sums)
         for layout, which in left:
             status[which], own, _ = self._judged(
                 buffer, offsets[which], None if stops is None else stops[which], layout, errors, gathered=gathered, sums=sums
@@ -163,12 +163,14 @@ class CompiledCodec(Codec):
         groups: list[tuple[Layout, NDArray[np.intp]]],
         status: NDArray[np.uint8],
         sizes: NDArray[np.intp],
+        sums: Sums | None,
     ) -> list[tuple[Layout, NDArray[np.intp]]]:
         """Judge the candidates of layouts that are alike and have few candidates each.
 
         Args:
             groups: layouts, and the indices of their candidates.
             status, sizes: of all candidates, changed here.
+            sums: what computes checksums; by default their algorithms.
 
         Returns:
             The groups that are left to be judged layout by layout.
@@ -194,7 +196,7 @@ class CompiledCodec(Codec):
             status[partial], sizes[partial] = _partial(buffer, offsets[partial], ends[~is_whole], layouts[0], sizes[partial])
             whole, forms = every[is_whole], forms[is_whole]
             together = Together(layouts, self.judge, likenesses)
-            status[whole] = together.judge(buffer, offsets[whole], forms)
+            status[whole] = together.judge(buffer, offsets[whole], forms, sums)
             if not together.is_final:
                 passed = status[whole] == VALID
                 found = ((layout, whole[passed & (forms == form)]) for form, layout in enumerate(layouts))

@@ -13,7 +13,7 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Callable, Hashable, Iterator, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
@@ -21,8 +21,7 @@ from numpy.typing import NDArray
 from lidarspec.framing.plausibility import Check, Judge, Lookup
 from lidarspec.framing.results import CHECKSUM, IMPLAUSIBLE, VALID
 from lidarspec.spec.checksums import Checksum, Sum, WordXor, Xor
-from lidarspec.wire.layout import Bytes2D, Layout, Leaf, Seal, rows_at
-from lidarspec.wire.row_checksums import over
+from lidarspec.wire.layout import Bytes2D, Layout, Leaf, Seal, Sums, rows_at
 
 Bytes1D = NDArray[np.uint8]
 Offsets = NDArray[np.intp]
@@ -94,12 +93,7 @@ def _seal_key(seal: Seal, size: int) -> Hashable:
 
 def _place(leaf: Leaf, seal: Seal, size: int) -> tuple[str, int]:
     """Return where a checksum is: from the start of the frame, or from its end if it follows the last bytes covered."""
-    return ("end", size - leaf.offset) if _is_behind(seal) else ("start", leaf.offset)
-
-
-def _is_behind(seal: Seal) -> bool:
-    """Whether a checksum follows the last bytes that it covers, and so moves with the end of the frame."""
-    return min(leaf.offset for leaf in seal.leaves) >= seal.spans[-1][1]
+    return ("end", size - leaf.offset) if leaf.offset >= seal.spans[-1][1] else ("start", leaf.offset)
 
 
 def _test_key(check: Check) -> Hashable:
@@ -126,28 +120,29 @@ class Together:
         first = judge(layouts[0])
         self.is_final = first.is_complete and all(isinstance(check, Lookup) for check in first.checks)
 
-    def judge(self, buffer: Bytes1D, offsets: Offsets, forms: Offsets) -> Status:
+    def judge(self, buffer: Bytes1D, offsets: Offsets, forms: Offsets, sums: Sums | None = None) -> Status:
         """Return the status of each candidate, (n,).
 
         Args:
             offsets: where they begin, (n,).
             forms: which of the layouts each has, (n,).
+            sums: what computes checksums; by default their algorithms.
         """
         status = np.empty(len(offsets), np.uint8)
         sizes = self._sizes[forms]
         for which in _by_size(sizes):
             longest = forms[which[-1]].item()
             rows = _rows(buffer, offsets[which], self._layouts[longest].size)
-            status[which] = self._judge_rows(rows, sizes[which], forms[which], longest)
+            status[which] = self._judge_rows(rows, sizes[which], forms[which], longest, sums)
         return status
 
-    def _judge_rows(self, rows: Bytes2D, sizes: Offsets, forms: Offsets, longest: int) -> Status:
+    def _judge_rows(self, rows: Bytes2D, sizes: Offsets, forms: Offsets, longest: int, sums: Sums | None) -> Status:
         """Return the status of candidates in rows of the longest layout, (n,); behind the end of each there may be anything."""
         judge = self._judge(self._layouts[longest])
         status = np.zeros(len(rows), np.uint8)
         judge.check_constants(status, rows)
         for seal in self._layouts[longest].seals:
-            right = _are_intact(seal, rows, sizes)
+            right = _are_intact(seal, rows, sizes, sums)
             status[~right & (status == VALID)] = CHECKSUM
         for index, check in enumerate(judge.checks):
             if isinstance(check, Lookup):
@@ -183,29 +178,20 @@ def _rows(buffer: Bytes1D, offsets: Offsets, size: int) -> Bytes2D:
     return np.ascontiguousarray(rows_at(buffer, offsets, size))
 
 
-def _are_intact(seal: Seal, rows: Bytes2D, sizes: Offsets) -> NDArray[np.bool_]:
+def _are_intact(seal: Seal, rows: Bytes2D, sizes: Offsets, sums: Sums | None) -> NDArray[np.bool_]:
     """Return which candidates have the right checksum, (n,).
+
+    In each row, the bytes behind those that the checksum covers move to the end, where the longest layout has them.
 
     Args:
         seal: of the longest layout, which fills its row.
         sizes: of the candidates, (n,).
+        sums: what computes checksums.
     """
     size = rows.shape[1]
-    *spans, (start, stop) = seal.spans
-    covered = np.arange(size) < (sizes - (size - stop))[:, None]
-    computed = over(seal.algorithm, rows * covered, (*spans, (start, size)))
-    stored = _stored_behind(seal, rows, sizes) if _is_behind(seal) else seal.stored(rows)
-    right = stored == computed
-    for value in seal.absent:
-        right |= stored == np.uint64(value)
-    return np.asarray(right)
-
-
-def _stored_behind(seal: Seal, rows: Bytes2D, sizes: Offsets) -> NDArray[np.uint64]:
-    """Return the checksums that candidates have at their end, (n,)."""
-    size = rows.shape[1]
-    first = min(leaf.offset for leaf in seal.leaves)
-    starts = np.arange(len(rows)) * size + sizes - (size - first)
-    ends = rows_at(rows.reshape(-1), starts, size - first)
-    moved = replace(seal, leaves=tuple(leaf.at(first) for leaf in seal.leaves))
-    return moved.stored(np.ascontiguousarray(ends))
+    tail = size - seal.spans[-1][1]
+    stops = sizes - tail
+    moved = rows * (np.arange(size) < stops[:, None])
+    if tail:
+        moved[:, size - tail :] = rows_at(rows.reshape(-1), np.arange(len(rows)) * size + stops, tail)
+    return seal.intact(moved, sums)

@@ -13,6 +13,7 @@ from construct import Array, Const, Int8ul, Int16ul, Struct, this
 
 from lidarspec import Sensor
 from lidarspec.framing import frame_engine
+from lidarspec.framing.decoder import Decoder
 from lidarspec.framing.many_lengths import Together
 from lidarspec.spec import Checksummed, Crc, Fields, Frame, Simulation, Sum, WordXor
 from lidarspec.spec.checksums import Checksum
@@ -93,10 +94,10 @@ def test_the_frames_and_counters_are_those_of_each_layout_by_itself(name: str, m
     judged = 0
     judge = Together.judge
 
-    def counting(self: Together, buffer: Any, offsets: Any, forms: Any) -> Any:
+    def counting(self: Together, buffer: Any, offsets: Any, forms: Any, sums: Any) -> Any:
         nonlocal judged
         judged += len(offsets)
-        return judge(self, buffer, offsets, forms)
+        return judge(self, buffer, offsets, forms, sums)
 
     monkeypatch.setattr(Together, "judge", counting)
     data = false_headers(sensor, 20_000)
@@ -110,6 +111,21 @@ def test_the_frames_and_counters_are_those_of_each_layout_by_itself(name: str, m
 def test_the_frames_are_those_of_brute_force(name: str) -> None:
     data = false_headers(SENSORS[name], 1500, seed=1)
     assert decoded(SENSORS[name], data) == Oracle(SENSORS[name], data).frames()
+
+
+def test_what_computes_checksums_is_asked_for_all_lengths() -> None:
+    """As `detect` does, which takes each checksum that stands in a frame for the right one."""
+    sensor = SENSORS["behind"]
+    data = false_headers(sensor, 6000)
+    found = []
+    for layouts in (frame_engine.MANY_LAYOUTS, NEVER):
+        with pytest.MonkeyPatch.context() as patch:
+            patch.setattr(frame_engine, "MANY_LAYOUTS", layouts)
+            decoder = Decoder(sensor, stream=True, sums=lambda seal, rows: seal.stored(rows))
+            frames = decoder.feed(data) + decoder.finish()
+            found.append(([(item.offset, item.data) for item in frames], str(decoder.stats)))
+    assert found[0] == found[1]
+    assert "bad_checksum" not in found[0][1]
 
 
 def test_a_checksum_that_zeros_change_is_computed_length_by_length(monkeypatch: pytest.MonkeyPatch) -> None:
