@@ -22,7 +22,7 @@ ROOT = Path(__file__).parents[2]
 #: seconds without a word after which a job is stopped: nothing that it may do takes as long.
 SILENCE = 300.0
 #: groups whose inputs are of kilobytes: atheris keeps each that it made until the end, which for a million of these is all the memory.
-SEEDED = {"capture", "file", "recording"}
+SEEDED = {"capture", "file", "log", "recording"}
 
 
 def arguments() -> argparse.Namespace:
