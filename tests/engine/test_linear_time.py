@@ -26,7 +26,9 @@ INTERPRETED_BYTES = 12_000
 MAX_RATIO = 2.5
 #: A run that is that good is not repeated.
 GOOD_RATIO = 2.2
-MAX_TRIES = 5
+#: On a busy machine many runs are slowed down; the shortest of both lengths are compared.
+MAX_TRIES = 15
+MUTANT_TRIES = 5
 #: CPU seconds below which a ratio says nothing.
 MIN_SECONDS = 0.05
 
@@ -65,4 +67,4 @@ def test_time_grows_with_the_input_and_no_faster(name: str) -> None:
 def test_a_buffer_copied_for_each_byte_is_caught() -> None:
     sensor = mutants.read_by(mutants.BufferCopied)
     data = random.Random(1).randbytes(COMPILED_BYTES)
-    assert not all(grows_with_the_input(sensor, data, tries=1) for _ in range(MAX_TRIES))
+    assert not all(grows_with_the_input(sensor, data, tries=1) for _ in range(MUTANT_TRIES))

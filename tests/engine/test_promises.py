@@ -30,7 +30,7 @@ TURNING = SHAPES["shape-commands"]
 #: `transports.base.HostClock` is the one that carries a stamp on.
 WALL = {"time.time", "time.time_ns", "datetime.now", "datetime.utcnow"}
 STAMPED = {
-    ("formats/writing.py", "time.time"),
+    ("unfinished.py", "time.time"),
     ("recording/recorders.py", "datetime.now"),
     ("recording/recorders.py", "time.time_ns"),
     ("transports/serving.py", "time.time_ns"),
