@@ -60,9 +60,9 @@ class AlikeLayouts:
 
     def likeness(self, layout: Layout, judge: Judge) -> Likeness | None:
         """Return which others a layout is like; None if its candidates cannot be judged together with those of others."""
-        if Likeness not in layout.notes:
-            layout.notes[Likeness] = self._find(layout, judge)
-        known: Likeness | None = layout.notes[Likeness]
+        if self not in layout.notes:  # decoders of one frame type share its layouts
+            layout.notes[self] = self._find(layout, judge)
+        known: Likeness | None = layout.notes[self]
         return known
 
     def _find(self, layout: Layout, judge: Judge) -> Likeness | None:

@@ -8,6 +8,7 @@ import sys
 from types import FrameType
 from typing import Any
 
+import numpy as np
 import pytest
 from construct import Array, Const, Int8ul, Int16ul, Struct, this
 
@@ -133,6 +134,18 @@ def test_a_checksum_that_zeros_change_is_computed_length_by_length(monkeypatch: 
     sensor = summed_behind(Crc(16, 0x1021))
     data = false_headers(sensor, 3000)
     assert books(sensor, data, 3000)[0]
+
+
+def test_two_engines_of_one_frame_type_share_its_layouts() -> None:
+    frame = summed_behind(Sum(16)).frames["data"]
+    headers = [b"\xaa\x55" + bytes([count]) + bytes(3 * MAX_SAMPLES + 4) for count in range(MAX_SAMPLES)]
+    data = np.frombuffer(b"".join(headers), np.uint8)
+    offsets = np.arange(len(headers)) * len(headers[0])
+    first = frame_engine.CompiledCodec(frame)
+    second = frame_engine.CompiledCodec(frame)
+    some = first.survey(data, offsets[1:]).status  # not the layout without samples, which has fewer tests
+    every = second.survey(data, offsets).status
+    assert every[1:].tolist() == some.tolist()
 
 
 def test_a_false_header_costs_few_calls() -> None:
