@@ -437,9 +437,13 @@ def _partial(
     return status, sizes
 
 
-@functools.lru_cache(maxsize=2048)
 def codec(frame: Frame, *, interpreted: bool = False) -> CompiledCodec | InterpretedCodec | RecodedCodec:
-    """The engine of a frame type: compiled where that is possible and construct is not asked for."""
+    """Return the engine of a frame type: compiled if that is possible and construct is not asked for; always the same one."""
+    return _codec(frame, interpreted)
+
+
+@functools.lru_cache(maxsize=2048)
+def _codec(frame: Frame, interpreted: bool) -> CompiledCodec | InterpretedCodec | RecodedCodec:
     recoding = recoder(frame)
     if recoding is not None:
         return RecodedCodec(frame, recoding, InterpretedCodec(frame, "asked for") if interpreted else CompiledCodec(frame))
