@@ -20,7 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lidarspec.errors import PluginError, SpecError
-from lidarspec.framing.many_lengths import AlikeLayouts, Likeness, Together
+from lidarspec.framing.many_lengths import AlikeLayouts, LayoutGroup, Together
 from lidarspec.framing.plausibility import Conditions, Judge, plausibility
 from lidarspec.framing.results import CHECKSUM, CONSTANT, IMPLAUSIBLE, LENGTH, PLUGIN, SHORT, VALID, Frames, Recoded, Status
 from lidarspec.spec.construct_layer import Mismatch, fixed_size, has_conditions
@@ -35,9 +35,6 @@ from lidarspec.wire.slots import Recoder, recoder
 
 #: bytes of candidates looked at in one go, so that memory stays small on hostile streams.
 BLOCK = 1 << 19
-#: Layouts are judged together if they are at least so many, and have fewer candidates each.
-MANY_LAYOUTS = 4
-MANY_CANDIDATES = 16
 
 
 class Codec:
@@ -134,7 +131,7 @@ class CompiledCodec(Codec):
             return Frames(buffer, kinds, offsets, sizes, layouts=(only,), status=status, rows=rows, errors=tuple(errors))
         status, forms = np.full(len(offsets), SHORT, np.uint8), np.full(len(offsets), -1, np.intp)
         layouts, short = list[Layout](), list[tuple[NDArray[np.intp], NDArray[np.intp]]]()
-        left = list[tuple[Layout, NDArray[np.intp]]]()
+        left = list[LayoutGroup]()
         for layout, which in groups:
             if isinstance(layout, Refused):
                 status[which] = PLUGIN if layout.error else CONSTANT if layout.by_constant else LENGTH
@@ -144,8 +141,9 @@ class CompiledCodec(Codec):
             layouts.append(layout)
             left.append((layout, which))
         sizes = np.array([*(layout.size for layout in layouts), 0], np.intp)[forms]
-        if len(left) >= MANY_LAYOUTS:
-            left = self._judge_together(buffer, offsets, stops, left, status, sizes, sums)
+        together, left = self._alike.split(left, self.judge)
+        for some in together:
+            left += self._judge_together(buffer, offsets, stops, some, status, sizes, sums)
         for layout, which in left:
             status[which], own, _ = self._judged(
                 buffer, offsets[which], None if stops is None else stops[which], layout, errors, gathered=gathered, sums=sums
@@ -160,48 +158,28 @@ class CompiledCodec(Codec):
         buffer: NDArray[np.uint8],
         offsets: NDArray[np.intp],
         stops: NDArray[np.intp] | None,
-        groups: list[tuple[Layout, NDArray[np.intp]]],
+        together: Together,
         status: NDArray[np.uint8],
         sizes: NDArray[np.intp],
         sums: Sums | None,
-    ) -> list[tuple[Layout, NDArray[np.intp]]]:
-        """Judge the candidates of layouts that are alike and have few candidates each.
+    ) -> list[LayoutGroup]:
+        """Judge the candidates of layouts that are alike; return those that are still to be judged layout by layout.
 
         Args:
-            groups: layouts, and the indices of their candidates.
             status, sizes: of all candidates, changed here.
-            sums: what computes checksums; by default their algorithms.
-
-        Returns:
-            The groups that are left to be judged layout by layout.
         """
-        left = list[tuple[Layout, NDArray[np.intp]]]()
-        alike_groups = dict[int, list[tuple[Layout, NDArray[np.intp], Likeness]]]()
-        for layout, which in groups:
-            likeness = self._alike.likeness(layout, self.judge(layout)) if len(which) < MANY_CANDIDATES else None
-            if likeness is None:
-                left.append((layout, which))
-            else:
-                alike_groups.setdefault(likeness.number, []).append((layout, which, likeness))
-        for some in alike_groups.values():
-            if len(some) < MANY_LAYOUTS:
-                left += [(layout, which) for layout, which, _ in some]
-                continue
-            layouts, own, likenesses = zip(*some, strict=True)
-            every = np.concatenate(own)
-            forms = np.repeat(np.arange(len(layouts)), list(map(len, own)))
-            ends = np.full(len(every), len(buffer)) if stops is None else stops[every]
-            is_whole = offsets[every] + sizes[every] <= ends
-            partial = every[~is_whole]
-            status[partial], sizes[partial] = _partial(buffer, offsets[partial], ends[~is_whole], layouts[0], sizes[partial])
-            whole, forms = every[is_whole], forms[is_whole]
-            together = Together(layouts, self.judge, likenesses)
-            status[whole] = together.judge(buffer, offsets[whole], forms, sums)
-            if not together.is_final:
-                passed = status[whole] == VALID
-                found = ((layout, whole[passed & (forms == form)]) for form, layout in enumerate(layouts))
-                left += [(layout, which) for layout, which in found if len(which)]
-        return left
+        which = together.which
+        ends = np.full(len(which), len(buffer)) if stops is None else stops[which]
+        is_whole = offsets[which] + sizes[which] <= ends
+        partial = which[~is_whole]
+        status[partial], sizes[partial] = _partial(buffer, offsets[partial], ends[~is_whole], together.layouts[0], sizes[partial])
+        whole = which[is_whole]
+        status[whole] = together.judge(buffer, offsets[whole], together.forms[is_whole], sums)
+        if together.is_final:
+            return []
+        is_undecided = np.zeros(len(which), np.bool_)
+        is_undecided[is_whole] = status[whole] == VALID
+        return together.by_layout(is_undecided)
 
     def survey_rows(self, rows: NDArray[np.uint8], *, sums: Sums | None = None) -> tuple[Layout, Status, tuple[PluginError, ...]] | None:
         layout = self.layout or self.tree.common(rows)

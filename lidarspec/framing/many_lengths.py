@@ -26,7 +26,14 @@ from lidarspec.wire.layout import Bytes2D, Layout, Leaf, Seal, Sums, rows_at
 Bytes1D = NDArray[np.uint8]
 Offsets = NDArray[np.intp]
 Status = NDArray[np.uint8]
+#: A layout, and the indices of its candidates.
+LayoutGroup = tuple[Layout, Offsets]
+#: Makes the judge of a layout.
+MakeJudge = Callable[[Layout], Judge]
 
+#: Layouts are judged together if they are at least so many, and have fewer candidates each.
+MANY_LAYOUTS = 4
+MANY_CANDIDATES = 16
 #: The checksums that zeros behind the data do not change.
 ZERO_EXTENDED: tuple[type[Checksum], ...] = (Sum, WordXor, Xor)
 #: Rows of one array are at most so many times as long as the shortest of them, unless they have only a few bytes.
@@ -57,6 +64,27 @@ class AlikeLayouts:
     def __init__(self) -> None:
         self._numbers: dict[Hashable, int] = {}
         self._next = itertools.count()
+
+    def split(self, groups: list[LayoutGroup], make_judge: MakeJudge) -> tuple[list[Together], list[LayoutGroup]]:
+        """Return the groups that are judged together, and those that are left to be judged layout by layout."""
+        if len(groups) < MANY_LAYOUTS:
+            return [], groups
+        left = list[LayoutGroup]()
+        alike = dict[int, list[tuple[LayoutGroup, Likeness]]]()
+        for layout, which in groups:
+            likeness = self.likeness(layout, make_judge(layout)) if len(which) < MANY_CANDIDATES else None
+            if likeness is None:
+                left.append((layout, which))
+            else:
+                alike.setdefault(likeness.number, []).append(((layout, which), likeness))
+        together = []
+        for some in alike.values():
+            some_groups, likenesses = zip(*some, strict=True)
+            if len(some) < MANY_LAYOUTS:
+                left += some_groups
+            else:
+                together.append(Together(some_groups, likenesses, make_judge))
+        return together, left
 
     def likeness(self, layout: Layout, judge: Judge) -> Likeness | None:
         """Return which others a layout is like; None if its candidates cannot be judged together with those of others."""
@@ -101,47 +129,56 @@ def _test_key(check: Check) -> Hashable:
 
 
 class Together:
-    """Judges whole candidates of layouts that are alike.
+    """Judges candidates of layouts that are alike.
 
     Args:
-        layouts: of all candidates.
-        judge: makes the judge of a layout.
+        groups: the layouts with their candidates.
         likenesses: of each layout.
 
     Attributes:
+        layouts: those of the groups.
+        which: the indices of all candidates, (n,).
+        forms: which of the layouts each of them has, (n,).
         is_final: whether valid candidates are frames; else they have passed only some of the tests.
     """
 
-    def __init__(self, layouts: Sequence[Layout], judge: Callable[[Layout], Judge], likenesses: Sequence[Likeness]) -> None:
-        self._layouts = layouts
-        self._judge = judge
-        self._sizes = np.array([layout.size for layout in layouts], np.intp)
+    def __init__(self, groups: Sequence[LayoutGroup], likenesses: Sequence[Likeness], make_judge: MakeJudge) -> None:
+        self.layouts = [layout for layout, _ in groups]
+        self.which = np.concatenate([which for _, which in groups])
+        self.forms = np.repeat(np.arange(len(groups)), [len(which) for _, which in groups])
+        self._judge = make_judge
+        self._sizes = np.array([layout.size for layout in self.layouts], np.intp)
         self._lengths = np.array([likeness.lengths for likeness in likenesses], np.intp).T
-        first = judge(layouts[0])
+        first = make_judge(self.layouts[0])
         self.is_final = first.is_complete and all(isinstance(check, Lookup) for check in first.checks)
 
+    def by_layout(self, chosen: NDArray[np.bool_]) -> list[LayoutGroup]:
+        """Return some of the candidates with their layouts; `chosen`: which of `self.which`, (n,)."""
+        found = ((layout, self.which[chosen & (self.forms == form)]) for form, layout in enumerate(self.layouts))
+        return [(layout, which) for layout, which in found if len(which)]
+
     def judge(self, buffer: Bytes1D, offsets: Offsets, forms: Offsets, sums: Sums | None = None) -> Status:
-        """Return the status of each candidate, (n,).
+        """Return the status of whole candidates, (k,).
 
         Args:
-            offsets: where they begin, (n,).
-            forms: which of the layouts each has, (n,).
+            offsets: where they begin, (k,).
+            forms: which of the layouts each has, (k,).
             sums: what computes checksums; by default their algorithms.
         """
         status = np.empty(len(offsets), np.uint8)
         sizes = self._sizes[forms]
         for which in _by_size(sizes):
             longest = forms[which[-1]].item()
-            rows = _rows(buffer, offsets[which], self._layouts[longest].size)
+            rows = _rows(buffer, offsets[which], self.layouts[longest].size)
             status[which] = self._judge_rows(rows, sizes[which], forms[which], longest, sums)
         return status
 
     def _judge_rows(self, rows: Bytes2D, sizes: Offsets, forms: Offsets, longest: int, sums: Sums | None) -> Status:
         """Return the status of candidates in rows of the longest layout, (n,); behind the end of each there may be anything."""
-        judge = self._judge(self._layouts[longest])
+        judge = self._judge(self.layouts[longest])
         status = np.zeros(len(rows), np.uint8)
         judge.check_constants(status, rows)
-        for seal in self._layouts[longest].seals:
+        for seal in self.layouts[longest].seals:
             right = _are_intact(seal, rows, sizes, sums)
             status[~right & (status == VALID)] = CHECKSUM
         for index, check in enumerate(judge.checks):

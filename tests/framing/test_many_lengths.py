@@ -13,7 +13,7 @@ import pytest
 from construct import Array, Const, Int8ul, Int16ul, Struct, this
 
 from lidarspec import Sensor
-from lidarspec.framing import frame_engine
+from lidarspec.framing import frame_engine, many_lengths
 from lidarspec.framing.decoder import Decoder
 from lidarspec.framing.many_lengths import Together
 from lidarspec.spec import Checksummed, Crc, Fields, Frame, Simulation, Sum, WordXor
@@ -104,7 +104,7 @@ def test_the_frames_and_counters_are_those_of_each_layout_by_itself(name: str, m
     data = false_headers(sensor, 20_000)
     together = [books(sensor, data, piece) for piece in (700, 20_000)]
     assert judged > 300
-    monkeypatch.setattr(frame_engine, "MANY_LAYOUTS", NEVER)
+    monkeypatch.setattr(many_lengths, "MANY_LAYOUTS", NEVER)
     assert together == [books(sensor, data, piece) for piece in (700, 20_000)]
 
 
@@ -119,9 +119,9 @@ def test_what_computes_checksums_is_asked_for_all_lengths() -> None:
     sensor = SENSORS["behind"]
     data = false_headers(sensor, 6000)
     found = []
-    for layouts in (frame_engine.MANY_LAYOUTS, NEVER):
+    for layouts in (many_lengths.MANY_LAYOUTS, NEVER):
         with pytest.MonkeyPatch.context() as patch:
-            patch.setattr(frame_engine, "MANY_LAYOUTS", layouts)
+            patch.setattr(many_lengths, "MANY_LAYOUTS", layouts)
             decoder = Decoder(sensor, stream=True, sums=lambda seal, rows: seal.stored(rows))
             frames = decoder.feed(data) + decoder.finish()
             found.append(([(item.offset, item.data) for item in frames], str(decoder.stats)))
