@@ -79,12 +79,19 @@ export function labels(context: CanvasRenderingContext2D, outlook: Outlook, take
 
 /** Writes labels that touch neither each other nor the edges of the canvas; those for which there is no room are left out. */
 class Writer {
+  readonly #taken: Rect[];
+
   constructor(
     readonly context: CanvasRenderingContext2D,
     readonly outlook: Outlook,
-    readonly taken: Rect[],
+    taken: Rect[],
   ) {
-    this.taken = [...taken];
+    this.#taken = [...taken];
+  }
+
+  /** Write no label on a part of the canvas. */
+  keepFree(rect: Rect): void {
+    this.#taken.push(rect);
   }
 
   /** Write a text at the first place where there is room. */
@@ -94,7 +101,7 @@ class Writer {
       const left = place[0] - width * (align === "left" ? 0 : align === "right" ? 1 : 0.5);
       const rect: Rect = [left, place[1] - TEXT_HEIGHT / 2, left + width, place[1] + TEXT_HEIGHT / 2];
       if (!this.#isFree(rect)) continue;
-      this.taken.push(rect);
+      this.keepFree(rect);
       written(this.context, text, place, this.outlook.theme, align, ink);
       return;
     }
@@ -103,7 +110,7 @@ class Writer {
   #isFree([left, top, right, bottom]: Rect): boolean {
     const { width, height } = this.outlook;
     if (left < RIM || top < RIM || right > width - RIM || bottom > height - RIM) return false;
-    return this.taken.every((other) => left > other[2] + APART_X || other[0] > right + APART_X || top > other[3] || other[1] > bottom);
+    return this.#taken.every((other) => left > other[2] + APART_X || other[0] > right + APART_X || top > other[3] || other[1] > bottom);
   }
 }
 
@@ -329,7 +336,7 @@ function axes(context: CanvasRenderingContext2D, outlook: Outlook, writer: Write
 function sensor(context: CanvasRenderingContext2D, outlook: Outlook, writer: Writer): void {
   const [across, down] = outlook.place(0, 0, 0)!;
   const inks = INKS[outlook.theme];
-  writer.taken.push([across - 6, down - 9, across + 6, down + 6]);
+  writer.keepFree([across - 6, down - 9, across + 6, down + 6]);
   context.beginPath();
   context.moveTo(across, down - 9);
   context.lineTo(across + 6, down + 6);
