@@ -47,8 +47,8 @@ SCALES: dict[Theme, Scale] = {
 def colour(share: float, theme: Theme) -> Rgb:
     """Return the colour at a share of the way along the scale, from 0 to 1."""
     scale = SCALES[theme]
-    lightness = _between(scale.lightness, share)
-    hue = math.radians(_between(scale.hue, share))
+    lightness = _interpolate(scale.lightness, share)
+    hue = math.radians(_interpolate(scale.hue, share))
     red, green, blue = _srgb(lightness, scale.chroma * math.cos(hue), scale.chroma * math.sin(hue))
     return red, green, blue
 
@@ -63,7 +63,8 @@ def to_hex(rgb: Rgb) -> str:
     return "#" + "".join(f"{part:02x}" for part in rgb)
 
 
-def _between(ends: tuple[float, float], share: float) -> float:
+def _interpolate(ends: tuple[float, float], share: float) -> float:
+    """Return the value at a share of the way from one end to the other."""
     return ends[0] + (ends[1] - ends[0]) * share
 
 

@@ -34,7 +34,8 @@ ULPS = 4
 CUTS, LEAST_CUTS, DAMAGED = 8, 2, 1
 #: rounds of a conversation if a shorter one has no scan, since few random frames of a sensor have points.
 MORE_ROUNDS = 12
-#: bytes that construct alone may read again while frames of a stream come in pieces: it begins anew with each piece.
+#: Bytes that construct parses again, at most, while streams come in chunks: it parses an incomplete frame from its start with each
+#: further chunk.
 REREAD_BYTES = 1_000_000
 #: streams up to this length are also fed byte by byte, with the usual number of examples.
 SHORT_STREAM = 4000
@@ -241,11 +242,16 @@ def _cut_anywhere(subject: Subject, data: bytes) -> None:
 
 
 def _chunk_scale(subject: Subject, length: int) -> int:
-    """Return how many times longer than usual the chunks of streams of so many bytes are, so that reading them anew takes no hours."""
+    """Return the factor by which chunks are longer than usual: 1 unless construct alone reads long frames.
+
+    Args:
+        length: bytes of all streams together.
+    """
     incoming = subject.sensor.incoming
-    slow = [subject.length(name) for name in incoming if isinstance(codec(incoming[name]), InterpretedCodec)]
-    reread = length / material.MEAN_CHUNK * max(slow, default=0) / 2
-    return max(round(reread / REREAD_BYTES), 1)
+    interpreted = [subject.length(name) for name, frame in incoming.items() if isinstance(codec(frame), InterpretedCodec)]
+    chunks = length / material.MEAN_CHUNK
+    reread_bytes = chunks * max(interpreted, default=0) / 2  # on average half of a frame has arrived
+    return max(round(reread_bytes / REREAD_BYTES), 1)
 
 
 def single_packets_equal_a_batch(subject: Subject) -> None:

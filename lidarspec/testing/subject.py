@@ -36,13 +36,17 @@ def places(length: int, source: random.Random, spots: int = SPOTS) -> list[int]:
     return sorted({*ends, *source.sample(range(length), min(spots, length))})
 
 
-#: bytes of the chunks that a stream is cut into, and their mean.
+#: Bytes of the chunks that a stream is cut into, and their mean.
 CHUNKS = (0, 1, 1, 2, 3, 7, 20, 100, 1000)
 MEAN_CHUNK = sum(CHUNKS) / len(CHUNKS)
 
 
 def pieces(data: bytes, source: random.Random, scale: int = 1) -> Iterator[bytes]:
-    """The bytes in chunks of random sizes, empty ones among them; `scale`: how many times longer than usual they are."""
+    """Yield the bytes in chunks of random sizes, empty ones among them.
+
+    Args:
+        scale: by which the sizes are multiplied.
+    """
     start = 0
     while start < len(data):
         size = source.choice(CHUNKS) * scale

@@ -174,9 +174,9 @@ def largest_cloud_bytes(sensor: Sensor) -> int | None:
     scan_s = _longest_scan_s(sensor)
     if scan_s is None:
         count = min(math.ceil(PROBED_S / interval_s), MAX_PROBED_PACKETS)
-        scans = sensor.scans(_simulated(sensor, count))
+        scans = sensor.scans(_simulate_packets(sensor, count))
         return max((records(scan.points, every_point=True).nbytes for scan in scans), default=0)
-    cloud = sensor.decode(_simulated(sensor, PROBED_PACKETS)).points()
+    cloud = sensor.decode(_simulate_packets(sensor, PROBED_PACKETS)).points()
     packet_bytes = records(cloud, every_point=True).nbytes / PROBED_PACKETS
     return math.ceil(packet_bytes * scan_s / interval_s)
 
@@ -188,8 +188,8 @@ def _longest_scan_s(sensor: Sensor) -> float | None:
     return 1 / sensor.turn[0] if sensor.turn else None
 
 
-def _simulated(sensor: Sensor, count: int) -> bytes | list[bytes]:
-    """Return the packets that a sensor sends first."""
+def _simulate_packets(sensor: Sensor, count: int) -> bytes | list[bytes]:
+    """Return the first packets of a simulated sensor."""
     frames = [frame for frame in (opening(sensor), *simulate(sensor, count)) if frame]
     return frames if sensor.datagrams else b"".join(frames)
 

@@ -148,7 +148,7 @@ def test_the_profile_leaves_udp_to_ros_if_discovery_is_local(environment: dict[s
 def test_file_and_variable_exist_only_while_the_participant_is_created() -> None:
     files: list[Path] = []
 
-    def interrupted() -> None:
+    def create_and_interrupt() -> None:
         with profile_in_use(SharedMemory(segment_bytes=5_000_000)):
             files.append(Path(os.environ[PROFILE_VARIABLE]))
             assert files[0].stat().st_size > 0
@@ -156,7 +156,7 @@ def test_file_and_variable_exist_only_while_the_participant_is_created() -> None
             raise KeyboardInterrupt
 
     with pytest.raises(KeyboardInterrupt):
-        interrupted()
+        create_and_interrupt()
     assert PROFILE_VARIABLE not in os.environ
     assert not files[0].parent.exists()
     with profile_in_use(SharedMemory()):
