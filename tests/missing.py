@@ -28,9 +28,12 @@ MISSING = (
     ),
 )
 
+#: files that are named for one missing thing.
+MAX_FILES = 3
+
 
 def describe_missing(skipped: Iterable[tuple[str, str]]) -> list[str]:
-    """Return a line for each missing thing: how many tests were skipped, in which files, and how to get it.
+    """Return a line for each missing thing: how many tests were skipped, in which files (the first of many), and how to get it.
 
     Args:
         skipped: (node id, reason) of each test that was skipped.
@@ -42,6 +45,13 @@ def describe_missing(skipped: Iterable[tuple[str, str]]) -> list[str]:
                 files[what, remedy][node.partition("::")[0].removeprefix("tests/")] += 1
                 break
     return [
-        f"not run without {what}: {count.total()} tests ({', '.join(sorted(count))}); to have them: {remedy}"
+        f"not run without {what}: {count.total()} tests ({_list_files(sorted(count))}); to have them: {remedy}"
         for (what, remedy), count in files.items()
     ]
+
+
+def _list_files(names: list[str]) -> str:
+    """Return names of files in words, the first few of many."""
+    if len(names) <= MAX_FILES:
+        return ", ".join(names)
+    return f"{', '.join(names[:MAX_FILES])} and {len(names) - MAX_FILES} more files"

@@ -20,3 +20,9 @@ def test_each_missing_tool_is_named_once_with_its_files_and_its_remedy() -> None
     assert tools == f"not run without tshark: 3 tests ({files}); to have them: apt-get install tshark"
     start = f"not run without captures and vectors: 1 tests ({HESAI}); to have them: LIDARSPEC_CAPTURES="
     assert captures.startswith(start)
+
+
+def test_of_many_files_a_few_are_named() -> None:
+    skipped = [(f"tests/exports/test_{name}.py::test", "Skipped: tshark is not installed") for name in "abcde"]
+    (line,) = describe_missing(skipped)
+    assert "5 tests (exports/test_a.py, exports/test_b.py, exports/test_c.py and 2 more files);" in line
