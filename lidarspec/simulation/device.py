@@ -33,6 +33,8 @@ from lidarspec.wire.parse import parse
 SECOND = 1_000_000_000
 #: ns of the device's time for which data is made in one go, and the most packets.
 AHEAD, MOST = SECOND // 4, 128
+#: frames of one type that the sensor sends by itself, such as those of an IMU, that are made together.
+UNASKED_BATCH = 50
 #: fillers that are sent in a pause.
 FILLERS = 14
 #: ns that a device may be behind; where nobody asked it for longer, its time stood still.
@@ -70,6 +72,7 @@ class Answering:
         links = {command.link for command in sensor.commands.values() if command.frame}
         self._decoders = {link: _listening(sensor, link) for link in links}
         self._makers: dict[str, FrameMaker] = {}
+        self._unasked: dict[str, tuple[int, list[bytes]]] = {}  # by type: the number of the first frame of a batch, and the batch
 
     def requests(self, data: bytes, now: int, link: str) -> list[Request]:
         """The commands that these bytes complete; what is none is ignored."""
@@ -90,17 +93,33 @@ class Answering:
             chosen = declared(request.values) if callable(declared) else declared
         return [self._answer(answer, request) for answer in chosen]
 
-    def frame(self, name: str, number: int = 0, values: Mapping[str, Any] | None = None) -> bytes:
-        """A frame of a type other than data: the defaults of the spec, its `sweep`, and these physical values."""
+    def frame(self, name: str, values: Mapping[str, Any]) -> bytes:
+        """Return a frame of a type other than data: the defaults of the spec, its `sweep`, and these physical values."""
+        return self._make(name, range(1), values)[0]
+
+    def unasked_frame(self, name: str, number: int) -> bytes:
+        """Return the frame of this number of a type that the sensor sends by itself.
+
+        A batch takes hardly longer than one frame, so they are made in batches.
+        """
+        start = number - number % UNASKED_BATCH
+        if self._unasked.get(name, (-1, []))[0] != start:
+            self._unasked[name] = start, self._make(name, range(start, start + UNASKED_BATCH), {})
+        return self._unasked[name][1][number - start]
+
+    def _make(self, name: str, numbers: range, values: Mapping[str, Any]) -> list[bytes]:
+        """Return the frames of these numbers of a type other than data."""
         if name not in self._makers:
             self._makers[name] = FrameMaker(self._sensor, name)
         declared = self._sensor.frames[name]
+        state = self._sensor.state.get(name, {})
         sweep = declared.simulation.sweep
-        given = {**self._sensor.state.get(name, {}), **(sweep(number) if sweep else {}), **(values or {})}
-        table = self._makers[name].table([given])
+        given = [{**state, **(sweep(number) if sweep else {}), **values} for number in numbers]
+        table = self._makers[name].table(given)
         if declared.imu is not None:
-            self._rests.setdefault(name, Rest(self._sensor, name, given)).fill(table, self._shake, [number])
-        return self._makers[name].sealed(table)[0]
+            rest = self._rests.setdefault(name, Rest(self._sensor, name, given[0]))
+            rest.fill(table, self._shake, [numbers.start])
+        return self._makers[name].sealed(table)
 
     def _answer(self, answer: Answer, request: Request) -> Answered:
         if isinstance(answer, bytes):
@@ -108,7 +127,7 @@ class Answering:
         if isinstance(answer, int | float):
             return Answered(pause=float(answer))
         name, values = (answer, {}) if isinstance(answer, str) else answer
-        return Answered(name, self.frame(name, 0, {**self._agreed(name, request), **values}))
+        return Answered(name, self.frame(name, {**self._agreed(name, request), **values}))
 
     def _agreed(self, name: str, request: Request) -> dict[str, Any]:
         """The physical values that tie a reply to its request."""
@@ -237,7 +256,7 @@ class SimulatedDevice:
         self._plug = now + int(self.faults.unplug * SECOND) if self.faults.unplug else None
         for name, frame in self.sensor.incoming.items():
             if frame.simulation.rate and not frame.data:
-                self._put(0.0, "data", name, self._answering.frame(name))
+                self._put(0.0, "data", name, self._answering.unasked_frame(name, 0))
         if not self._waits_for_a_command():
             self._begin(0.0, self.sensor.data_frame)
 
@@ -320,7 +339,7 @@ class SimulatedDevice:
         rate = self.sensor.frames[due.frame].simulation.rate if due.frame else 0.0
         if rate:
             number = round(due.at * rate / SECOND) + 1
-            self._put(due.at + SECOND / rate, due.link, due.frame, self._answering.frame(due.frame, number))
+            self._put(due.at + SECOND / rate, due.link, due.frame, self._answering.unasked_frame(due.frame, number))
 
     def _obey(self, request: Request, now: float) -> None:
         """Answer a command, unless it has to wait until the data stop; where it starts the sensor, data follows the answer."""

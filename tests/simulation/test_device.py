@@ -15,11 +15,13 @@ from lidarspec import Sensor, UsageError
 from lidarspec.errors import OutOfRange
 from lidarspec.simulation.device import SECOND, SimulatedDevice
 from lidarspec.simulation.faults import Faults, Line, faults_of
+from lidarspec.simulation.simulator import Rest
 from lidarspec.spec import Command, Frame, Scaled
 from lidarspec.spec.fields import duration
 from lidarspec.testing.commands import the_simulated_sensor_answers
 from lidarspec.testing.subject import Subject
 from tests.broken import sound
+from tests.shapes import SHAPES
 
 MS = SECOND // 1000
 
@@ -184,6 +186,27 @@ def test_a_deadline_is_when_something_comes() -> None:
         assert device.outgoing(due - 1) == []
         assert device.outgoing(due) != []
     assert on(mini()).deadline is None
+
+
+def test_frames_that_are_sent_unasked_are_made_together(monkeypatch: pytest.MonkeyPatch) -> None:
+    filled = 0
+    fill = Rest.fill
+
+    def counting_fill(self: Rest, *arguments: Any) -> None:
+        nonlocal filled
+        filled += self._frame == "imu"
+        fill(self, *arguments)
+
+    monkeypatch.setattr(Rest, "fill", counting_fill)
+    sensor = SHAPES["shape-inertia"]
+    device = on(sensor)
+    times = []
+    for now in range(0, SECOND, 10 * MS):
+        sent = [data for _, frame, data in device.sendings(now) if frame == "imu"]
+        times += [sensor.parse(data, frame="imu").felt_at for data in sent]
+    assert len(times) > 50
+    assert times == sorted(set(times))
+    assert filled * 20 < len(times)
 
 
 def test_a_device_that_nobody_asked_for_long_does_not_flood() -> None:
