@@ -11,16 +11,17 @@ Here are the names of those who read a lidar; those who write a sensor find thei
 The packages are stations on the way of a byte, and import each other in one direction; each says what comes in and what goes out:
 
     spec        what a sensor is               packets     frames of one type, in order, in time
-    wire        a frame and its bytes          points      packets as point clouds
-    columns     what plugins compute with      scans       where one turn ends
+    frames      a frame and its bytes          points      packets as point clouds
+    expressions columns given to plugins       scans       the end of a revolution
     framing     where frames are in bytes      device      a sensor on a source
 
     transports  where bytes come from, go to   simulation  a sensor that is not there, from its spec
     captures    pcap files of other tools      recording   all that came over a link, with its time
-    explaining  a frame, byte by byte          discovery   which sensor, what is wrong, a draft
-    exports     a spec for other tools         formats     scans as files
-    view        scans drawn                    testing     the test kit for authors
-    cli         the command line, on top       plugins     what is installed, and its hooks
+    explaining  a frame, byte by byte          detect      which sensor, what is wrong
+    exports     a spec for other tools         drafting    the spec of an unknown format
+    view        scans drawn                    formats     scans as files
+    plugins     what is installed, its hooks   testing     the test kit for authors
+    cli         the command line, on top
 """
 
 from __future__ import annotations

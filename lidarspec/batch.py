@@ -37,8 +37,8 @@ from typing import Any
 import numpy as np
 
 from lidarspec._version import __version__
+from lidarspec.detect.identification import detected
 from lidarspec.device.file_scans import FileScans
-from lidarspec.discovery.detect import detected
 from lidarspec.errors import LidarSpecError, SourceError, UsageError, WireError, suggest, system_errors
 from lidarspec.formats import format_of, write
 from lidarspec.formats.tables import tables

@@ -36,11 +36,11 @@ from lidarspec.entry_points import GROUP, SENSORS, VERBS, EntryPoint, entry_poin
 from lidarspec.errors import LidarSpecError, SourceError, SpecError, UnknownSensor, UsageError, suggest
 from lidarspec.known_sensors import KnownLink, KnownSensor, describe_entry_points, unknown_sensor
 from lidarspec.spec.checksums import Checksum
-from lidarspec.spec.construct_layer import prepare, seals
 from lidarspec.spec.description import Frame
 from lidarspec.spec.links import Http, Link, Serial, Tcp, Udp
 from lidarspec.spec.results import Points
 from lidarspec.spec.sensor import Sensor
+from lidarspec.spec.syntax import prepare, seals
 from lidarspec.trust import document, own_settings
 
 if TYPE_CHECKING:

@@ -20,8 +20,8 @@ FLOORS = (
     "_version display errors libraries trust stores entry_points known_sensors",
     "transports.protocol",  # what a source is, as values that plugins give too
     "spec",
-    "wire",
-    "columns",
+    "frames",
+    "expressions",
     "framing",
     "points",  # functions of a batch of packets: `Packets.points` hands over to them
     "packets",
@@ -32,7 +32,8 @@ FLOORS = (
     "spec.__init__ captures recording",  # the names of authors
     "device.settings device.session",
     "transports",
-    "discovery",
+    "drafting",
+    "detect",
     "device",
     "explaining exports formats view",
     "batch testing",
@@ -49,7 +50,7 @@ IO = {"asyncio", "logging", "serial", "socket", "threading", "time"}
 CONFINED = {
     "numba": {"points.numba_kernels.arithmetic", "points.numba_kernels.cache"},
     "llvmlite": {"points.numba_kernels.arithmetic"},
-    "construct": {"spec.construct_layer", "spec.fields", "spec.description", "framing.frame_engine", "wire.parse", "wire.build"},
+    "construct": {"spec.syntax", "spec.fields", "spec.description", "framing.frame_engine", "frames.parse", "frames.build"},
     "pluggy": {"plugins"},
     "serial": {"transports.serial", "transports.ports"},
     "click": {"cli"},
@@ -64,7 +65,7 @@ _IMPORT = re.compile(r"^ *(?:from +[\w.]+ +import +(?:\([^)]*\)|[^\n(#]+)|import
 _IMPORT_BY_NAME = re.compile(r"\b(?:import_module|__import__)\(\s*[\"']([\w.]+)[\"']")
 _TYPING_BLOCK = re.compile(r"^( *)if (?:typing\.)?TYPE_CHECKING:\n(?:\1 +.*\n|\s*\n)*", re.MULTILINE)
 #: the one package that asks which of construct's classes something is.
-CONSTRUCT_LAYER = "lidarspec.spec.construct_layer"
+SYNTAX = "lidarspec.spec.syntax"
 
 PLUGINS_MAY_IMPORT = {"construct", "numpy"} | sys.stdlib_module_names
 FACES = ("lidarspec", "lidarspec.spec")
@@ -206,7 +207,7 @@ def construct_asked(modules: Mapping[str, Module]) -> list[str]:
     """Places outside construct's layer that ask whether something is of a class of construct's."""
     complaints = []
     for module in modules.values():
-        if f"{module.name}.".startswith(f"{CONSTRUCT_LAYER}."):
+        if f"{module.name}.".startswith(f"{SYNTAX}."):
             continue
         if "construct" not in module.text or "isinstance" not in module.text:
             continue

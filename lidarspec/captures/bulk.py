@@ -20,9 +20,9 @@ from lidarspec.captures.ip import Headers
 from lidarspec.captures.pcap import CaptureReader, Datagram, StreamReader
 from lidarspec.captures.records import LARGEST_BLOCK, Damaged, Form, Passed, Times, records
 from lidarspec.captures.source import Source, Truncated
+from lidarspec.frames.layout import rows_at
 from lidarspec.framing.results import Frames, Indices
 from lidarspec.transports.protocol import Origin, Sender
-from lidarspec.wire.layout import rows_at
 
 #: bytes of a record, from its start, that are compared at most; longer headers are read plainly.
 WIDEST = 128

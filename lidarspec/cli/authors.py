@@ -11,8 +11,8 @@ import click
 from lidarspec.cli.failures import FINDINGS
 from lidarspec.cli.output import Progress, emit, emit_json, output_option
 from lidarspec.cli.terminal import note, say
-from lidarspec.discovery.draft import Link, Names, captured, draft, invented, joining, write
-from lidarspec.discovery.heard import beginning
+from lidarspec.detect.heard import beginning
+from lidarspec.drafting.draft import Link, Names, captured, draft, invented, joining, write
 from lidarspec.errors import UsageError, WireError, suggest
 from lidarspec.exports import EXPORTS, Refused, export as exported, narrowed
 from lidarspec.libraries import import_library

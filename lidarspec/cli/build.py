@@ -21,12 +21,12 @@ from lidarspec.errors import CommandError, LidarSpecError, UnknownFrame, UsageEr
 from lidarspec.explaining.assignments import arguments, values
 from lidarspec.explaining.explanation import explain, replied
 from lidarspec.explaining.pieces import explained, pieces
+from lidarspec.frames.schema import schema
 from lidarspec.plugins import sensor as named_sensor
 from lidarspec.spec.sensor import Sensor
 from lidarspec.transports.hexadecimal import unhexed
 from lidarspec.transports.open_url import is_live
 from lidarspec.transports.protocol import Chunk
-from lidarspec.wire.schema import schema
 
 #: seconds to wait for what comes back on bytes sent by hand, and of silence behind it that end it.
 ANSWERED, QUIET = 1.0, 0.2

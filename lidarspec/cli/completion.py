@@ -15,14 +15,14 @@ from collections.abc import Callable, Iterable
 import click
 from click.shell_completion import BashComplete, CompletionItem, add_completion_class, shell_complete
 
+from lidarspec.detect.identification import declared
 from lidarspec.device.settings import devices, named
-from lidarspec.discovery.detect import declared
 from lidarspec.errors import LidarSpecError
+from lidarspec.frames.schema import schema
 from lidarspec.plugins import registry, sensor as named_sensor
 from lidarspec.spec.sensor import Sensor
 from lidarspec.spec.tree import FieldInfo
 from lidarspec.transports.ports import serial_ports
-from lidarspec.wire.schema import schema
 
 #: the variable in which a shell says what it wants.
 VARIABLE = "_LIDARSPEC_COMPLETE"

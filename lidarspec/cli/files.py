@@ -33,9 +33,9 @@ from lidarspec.cli.inputs import (
 from lidarspec.cli.options import BYTES, DURATION, colour_option, count_option, points_option, selecting, sensor_option
 from lidarspec.cli.output import Progress, emit, emit_json, emit_parts, output_options, size
 from lidarspec.cli.terminal import note
+from lidarspec.detect.identification import detected
 from lidarspec.device.device import Device, open as open_device
 from lidarspec.device.source_recording import recorder_like
-from lidarspec.discovery.detect import detected
 from lidarspec.errors import UsageError, WireError, WriteError, suggest, suggestion
 from lidarspec.explaining.contents import contents, shown
 from lidarspec.formats import check_holds, format_of, targets, write, write_imu

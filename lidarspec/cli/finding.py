@@ -17,14 +17,14 @@ from lidarspec.cli.inputs import read
 from lidarspec.cli.options import DURATION, sensor_option
 from lidarspec.cli.output import Progress, emit, emit_json, output_options, table
 from lidarspec.cli.terminal import note, voice
-from lidarspec.discovery.checksum_search import search
-from lidarspec.discovery.detect import Verdict, best, chosen, names, others_named, verdict, verdicts
-from lidarspec.discovery.doctor import computer, examined
-from lidarspec.discovery.heard import Heard
-from lidarspec.discovery.listen import LISTEN, hear, ignore, probe, started_first, udp_ports
-from lidarspec.discovery.periods import Structure, cut, structure
-from lidarspec.discovery.samples import Match
-from lidarspec.discovery.uninstalled import describe, install_commands, recognize
+from lidarspec.detect.doctor import computer, examined
+from lidarspec.detect.heard import Heard
+from lidarspec.detect.identification import Verdict, best, chosen, names, others_named, verdict, verdicts
+from lidarspec.detect.listen import LISTEN, hear, ignore, probe, started_first, udp_ports
+from lidarspec.detect.uninstalled import describe, install_commands, recognize
+from lidarspec.drafting.checksum_search import search
+from lidarspec.drafting.periods import Structure, cut, structure
+from lidarspec.drafting.samples import Match
 from lidarspec.errors import SourceError, UsageError, WireError, suggest
 from lidarspec.known_sensors import KnownSensor, find_known_sensor, install_command, no_sensors
 from lidarspec.plugins import sensor as named_sensor, sensors

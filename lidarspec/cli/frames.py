@@ -15,7 +15,7 @@ from lidarspec.cli.listing import emit_lines
 from lidarspec.cli.options import OFFSET, count_option, selecting, sensor_option
 from lidarspec.cli.output import emit_json, emit_json_list, emit_parts, output_options, table
 from lidarspec.cli.terminal import note
-from lidarspec.discovery.heard import Heard
+from lidarspec.detect.heard import Heard
 from lidarspec.errors import UsageError, WireError, suggest
 from lidarspec.explaining.explanation import Explanation, values
 from lidarspec.explaining.listing import LINED, Line, told
@@ -295,7 +295,7 @@ def _sensor(given: Heard, sensor_id: str | Sensor | None, *, damaged: bool = Fal
     """The sensor named, or the one whose bytes these are, and the ids of all whose bytes they could be."""
     if sensor_id is not None:
         return named_sensor(sensor_id), []
-    from lidarspec.discovery.detect import fitting  # with all that detecting a sensor takes, which a named one does not need
+    from lidarspec.detect.identification import fitting  # with all that detecting a sensor takes, which a named one does not need
 
     found = fitting(given.chunks, datagrams=given.datagrams)
     if found:

@@ -23,15 +23,15 @@ import click
 
 from lidarspec.cli.failures import FINDINGS
 from lidarspec.cli.terminal import note
-from lidarspec.discovery.heard import LOOKED_AT, Heard, beginning, leading
+from lidarspec.detect.heard import LOOKED_AT, Heard, beginning, leading
 from lidarspec.errors import CommandError, LidarSpecError, SourceError, UsageError, WireError, suggest, system_errors
+from lidarspec.frames.parse import parse_typed
 from lidarspec.plugins import sensors
 from lidarspec.scans.scans import Scan
 from lidarspec.scans.selection import Selection, Times, received
 from lidarspec.spec.sensor import Sensor
 from lidarspec.transports.hexadecimal import hex_chunks, is_hexadecimal, unhexed
 from lidarspec.transports.protocol import Chunk, no_bytes
-from lidarspec.wire.parse import parse_typed
 
 if TYPE_CHECKING:
     from lidarspec.device.device import Device
@@ -209,8 +209,8 @@ def no_frame(sensor: Sensor, given: Heard) -> WireError:
 
 def nearest_fault(given: Heard) -> WireError:
     """No sensor fits: what the one that came farthest says, with its id, or that none came far."""
-    from lidarspec.discovery.detect import nearest
-    from lidarspec.discovery.uninstalled import suggest_installation
+    from lidarspec.detect.identification import nearest
+    from lidarspec.detect.uninstalled import suggest_installation
 
     if not given.data:
         return suggest(WireError(no_bytes(given.source, given.warnings)), "lidarspec sensors")
@@ -228,7 +228,7 @@ def nearest_fault(given: Heard) -> WireError:
 
 def _never_right(given: Heard) -> WireError | None:
     """That the input is frames of a sensor whose checksums are never right; None where it is not."""
-    from lidarspec.discovery.detect import never_right
+    from lidarspec.detect.identification import never_right
 
     fault = never_right(given.chunks, datagrams=given.datagrams)
     return suggest(WireError(f"{given.source}: {fault}"), f"lidarspec crc {quote(given.source)}") if fault else None
@@ -296,7 +296,7 @@ def again(source: str) -> Heard | None:
 
 def fits_instead(sensor: Sensor, source: str) -> tuple[str, str] | None:
     """What a file holds that has no data frame of a sensor, and the options with which it is read; None where nothing fits."""
-    from lidarspec.discovery.detect import chosen, verdict
+    from lidarspec.detect.identification import chosen, verdict
 
     given = again(source)
     found = verdict(given).scores if given is not None else ()

@@ -13,9 +13,9 @@ from lidarspec.cli.inputs import nothing_came, refuse_overwriting
 from lidarspec.cli.options import DURATION, SPEED, count_option, selecting, sensor_option
 from lidarspec.cli.output import Progress, emit_json, size
 from lidarspec.cli.terminal import note, say
+from lidarspec.detect.identification import declared
 from lidarspec.device.settings import named
 from lidarspec.device.source_recording import SourceRecording, recorder_like
-from lidarspec.discovery.detect import declared
 from lidarspec.errors import CommandError, LidarSpecError, SourceError, UsageError, WireError, suggest
 from lidarspec.framing.results import Counters
 from lidarspec.plugins import sensor as named_sensor

@@ -101,8 +101,8 @@ def sensors(as_json: bool, output: str | None) -> None:
 @output_options
 def show(sensor_id: str, as_plan: bool, as_json: bool, output: str | None) -> None:
     """What a sensor is, and the wire table of each of its frames."""
+    from lidarspec.frames.wire_table import frame_size, wire_table
     from lidarspec.plugins import sensor as named_sensor, summarize_links
-    from lidarspec.wire.wire_table import frame_size, wire_table
 
     sensor = named_sensor(sensor_id)
     if as_plan:
@@ -133,7 +133,7 @@ def show(sensor_id: str, as_plan: bool, as_json: bool, output: str | None) -> No
 
 def _unit(sensor: Sensor, path: str) -> str:
     """The unit of a field, as "frame.path", behind a comma."""
-    from lidarspec.wire.schema import schema
+    from lidarspec.frames.schema import schema
 
     frame, _, field = path.partition(".")
     unit = schema(sensor.frames[frame].tree).named[field].unit if frame in sensor.frames else ""
@@ -142,12 +142,12 @@ def _unit(sensor: Sensor, path: str) -> str:
 
 def _plan(sensor: Sensor, frame: str) -> list[str]:
     """The plan of a data frame in lines, or why there is none."""
+    from lidarspec.frames.frame_table import Rows
     from lidarspec.framing.results import Counters, Found, packed
     from lidarspec.packets.stream import PacketStream
     from lidarspec.points.numpy_plan import describe
     from lidarspec.points.plan import Plan, plan_for
     from lidarspec.simulation.frame_maker import FrameMaker
-    from lidarspec.wire.frame_table import Rows
 
     try:
         made, sweep = FrameMaker(sensor, frame), sensor.simulation_of(frame).sweep
@@ -217,7 +217,7 @@ def _facts(sensor: Sensor) -> dict[str, Any]:
 
 def _frame(frame: Frame) -> dict[str, Any]:
     from lidarspec.exports.json import facts
-    from lidarspec.wire.wire_table import frame_size, wire_table
+    from lidarspec.frames.wire_table import frame_size, wire_table
 
     rows = [vars(row) for row in wire_table(frame)]
     return {**facts(frame, "direction", "data"), "size": frame_size(frame), "max_length": frame.max_length, "rows": rows}

@@ -16,8 +16,8 @@ from lidarspec.cli.failures import FINDINGS
 from lidarspec.cli.options import DURATION, SHARE, configuring, count_option, sensor_option
 from lidarspec.cli.output import Progress, drawn, emit_json, size
 from lidarspec.cli.terminal import ended_by_terminate, note, say
+from lidarspec.detect.identification import chosen
 from lidarspec.device.demo import Demonstration, demonstrate
-from lidarspec.discovery.detect import chosen
 from lidarspec.errors import UsageError, suggest
 from lidarspec.known_sensors import no_sensors
 from lidarspec.plugins import registry, sensor as named_sensor

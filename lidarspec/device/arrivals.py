@@ -17,11 +17,12 @@ from typing import Any, Protocol
 import numpy as np
 
 from lidarspec.captures.bulk import Batch
+from lidarspec.detect.identification import said
 from lidarspec.device.first_frames import FirstFrames, find_first_frames, is_searched
 from lidarspec.device.senders import Senders, frame_senders
 from lidarspec.device.session import Reply
-from lidarspec.discovery.detect import said
 from lidarspec.errors import CommandError, SourceError
+from lidarspec.frames.schema import schema
 from lidarspec.framing.decoder import Decoder
 from lidarspec.framing.results import Counters, Found, Frames
 from lidarspec.spec.sensor import Sensor
@@ -29,7 +30,6 @@ from lidarspec.stores import is_stored
 from lidarspec.transports.files import CaptureTransport
 from lidarspec.transports.open_url import transport
 from lidarspec.transports.protocol import Chunk, Transport
-from lidarspec.wire.schema import schema
 
 
 @dataclass(frozen=True, eq=False)

@@ -15,12 +15,12 @@ from pathlib import Path
 from shlex import quote
 from typing import Any, NoReturn, overload
 
+from lidarspec.detect.identification import contradiction, detected, said, simulated_sensor
 from lidarspec.device.arrivals import Arrival, FileInput, Input
 from lidarspec.device.first_frames import FirstFrames
 from lidarspec.device.live_input import PERIOD, LiveInput
 from lidarspec.device.session import Reply
 from lidarspec.device.settings import named
-from lidarspec.discovery.detect import contradiction, detected, said, simulated_sensor
 from lidarspec.errors import SourceError, SourceTimeout, UsageError, suggest
 from lidarspec.framing.decoder import Decoder, Witness
 from lidarspec.framing.results import Counters, Found, Frames

@@ -20,10 +20,11 @@ from typing import Any
 
 import numpy as np
 
-from lidarspec.columns.columns import AROUND
 from lidarspec.device.arrivals import FileInput
 from lidarspec.device.device import PacketReader
 from lidarspec.errors import UsageError
+from lidarspec.expressions.columns import AROUND
+from lidarspec.frames.frame_table import Records, Rows, Table
 from lidarspec.framing.decoder import Decoder
 from lidarspec.framing.frame_engine import RecodedCodec, codec
 from lidarspec.framing.results import Counters
@@ -34,7 +35,6 @@ from lidarspec.spec.sensor import Sensor
 from lidarspec.transports.files import CaptureTransport, FileTransport
 from lidarspec.transports.open_url import transport
 from lidarspec.transports.protocol import Closing, LiveTransport
-from lidarspec.wire.frame_table import Records, Rows, Table
 
 #: what is pickled as it is.
 _PLAIN = (bool, int, float, str, bytes, type(None), type)

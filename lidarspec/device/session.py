@@ -21,13 +21,13 @@ from dataclasses import dataclass, field
 from typing import Any
 
 from lidarspec.errors import CommandError, ReplyTimeout, UnknownField, UsageError
+from lidarspec.frames.build import steps
 from lidarspec.framing.frame_engine import codec
 from lidarspec.framing.results import Found
 from lidarspec.spec.arguments import Address, Filled
 from lidarspec.spec.description import Command
 from lidarspec.spec.sensor import Learned, Sensor
 from lidarspec.spec.tree import FieldInfo
-from lidarspec.wire.build import steps
 
 #: fields that a reply's repr shows.
 SHOWN = 6

@@ -12,13 +12,13 @@ from fractions import Fraction
 from typing import Any
 
 from lidarspec.errors import OutOfRange, UnknownCommand, UnknownField, UsageError
+from lidarspec.frames.build import Steps, argument_slot, given_value, is_index, put, steps
+from lidarspec.frames.schema import Schema
 from lidarspec.spec.arguments import Octets, Range
 from lidarspec.spec.fields import factor, split_unit
 from lidarspec.spec.sensor import Sensor
 from lidarspec.spec.tree import FieldInfo, evaluated
 from lidarspec.transports.hexadecimal import unhexed
-from lidarspec.wire.build import Steps, argument_slot, given_value, is_index, put, steps
-from lidarspec.wire.schema import Schema
 
 _STEP = r"\w+(?:\[(?:\d+|\*)\])*"
 _PATH = re.compile(rf"{_STEP}(?:\.{_STEP})*")

@@ -14,8 +14,8 @@ from pathlib import Path
 from shlex import quote
 from typing import Any
 
+from lidarspec.detect.identification import Verdict, chosen, declared, names, verdicts
 from lidarspec.device.device import Device
-from lidarspec.discovery.detect import Verdict, chosen, declared, names, verdicts
 from lidarspec.errors import LidarSpecError, UsageError, suggest
 from lidarspec.recording.format import Header
 from lidarspec.scans.selection import dated

@@ -15,11 +15,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lidarspec.explaining.wording import Value
+from lidarspec.frames.arrays import counted
 from lidarspec.framing.frame_engine import Codec, CompiledCodec, codec
 from lidarspec.framing.results import VALID
 from lidarspec.spec import Frame
 from lidarspec.spec.tree import formulas, nodes, refs
-from lidarspec.wire.arrays import counted
 
 #: bytes of candidates that are tried in one go, the longest frame that construct alone has to read so often, and the longest in which
 #: lost bytes are looked for, of which there are 256 for each place; and on how many fields its layout may depend for that, since where

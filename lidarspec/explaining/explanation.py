@@ -25,6 +25,10 @@ from lidarspec.errors import LidarSpecError, WireError
 from lidarspec.explaining.damage import told
 from lidarspec.explaining.listing import Line, Listing, text
 from lidarspec.explaining.wording import Difference, Point, Row, Span, Value
+from lidarspec.frames.parse import parse_typed
+from lidarspec.frames.schema import schema
+from lidarspec.frames.slots import recoder
+from lidarspec.frames.wire_table import bit_text, hexed
 from lidarspec.framing.frame_engine import codec
 from lidarspec.framing.results import IMPLAUSIBLE, Counters, Found, packed
 from lidarspec.packets.stream import PacketStream
@@ -32,12 +36,8 @@ from lidarspec.points.plain import evaluate
 from lidarspec.scans.cutter import first_points
 from lidarspec.spec import Checksummed, Frame, Sensor
 from lidarspec.spec.bits import BitField
-from lidarspec.spec.construct_layer import UNNAMED, Seen, field_path, leaves, member
+from lidarspec.spec.syntax import UNNAMED, Seen, field_path, leaves, member
 from lidarspec.spec.tree import Block, FieldInfo, Node, Opaque, Parts, Repeat, Struct, children, exact, listed
-from lidarspec.wire.parse import parse_typed
-from lidarspec.wire.schema import schema
-from lidarspec.wire.slots import recoder
-from lidarspec.wire.wire_table import bit_text, hexed
 
 #: most points of a frame without arrays that are told.
 TOLD = 4

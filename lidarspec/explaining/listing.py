@@ -11,7 +11,7 @@ from collections.abc import Iterator, Sequence
 from itertools import groupby
 
 from lidarspec.explaining.wording import Difference, Row, Span, Value, bit_picture, number
-from lidarspec.wire.wire_table import hexed
+from lidarspec.frames.wire_table import hexed
 
 #: bytes in a line, spaces of a level of nesting, and the widest columns of bits and of names.
 LINED, LEVEL, PICTURES, NAMES = 8, 2, 35, 36

@@ -17,13 +17,13 @@ from lidarspec.errors import LidarSpecError, UnknownFrame, WireError
 from lidarspec.explaining.damage import changes
 from lidarspec.explaining.explanation import Explanation, explain
 from lidarspec.explaining.wording import Row
+from lidarspec.frames.layout import Layout
+from lidarspec.frames.parse import layout_of, parse_typed
+from lidarspec.frames.slots import recoder
 from lidarspec.framing.frame_engine import codec
 from lidarspec.spec import Sensor
 from lidarspec.spec.description import with_frames
 from lidarspec.transports.protocol import Chunk
-from lidarspec.wire.layout import Layout
-from lidarspec.wire.parse import layout_of, parse_typed
-from lidarspec.wire.slots import recoder
 
 #: constant bytes that look like the beginning of a frame in the midst of others.
 SYNC = 2

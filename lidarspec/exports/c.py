@@ -18,10 +18,10 @@ from typing import Any
 from lidarspec._version import __version__
 from lidarspec.exports import Message, Refused, beginning, c_fields, messages
 from lidarspec.exports.c_fields import CLayout, Entry, accesses, arguments, comment, identifier, parameters, quoted, word
+from lidarspec.frames.wire_table import Extent
 from lidarspec.spec import Checksum, Crc, Fold15, Sensor, Sum, WordXor, Xor, ZeroPadded
 from lidarspec.spec.checksums import byte_table, mirrored_bytes, reflected
 from lidarspec.spec.tree import Blob, Block, Check, Never, Number, Op, Repeat, Sealed, formulas, parts, refs, runs_of
-from lidarspec.wire.wire_table import Extent
 
 _FUNCTION = """\
 /* {text} */

@@ -16,8 +16,8 @@ from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 from lidarspec.exports import Message, Refused, asked
+from lidarspec.frames.wire_table import Extent, meaning, unit_text
 from lidarspec.spec import tree
-from lidarspec.wire.wire_table import Extent, meaning, unit_text
 
 #: comparisons go through a function: compilers warn of what a narrow number can never be.
 _OPERATIONS = {

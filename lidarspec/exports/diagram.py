@@ -12,8 +12,8 @@ from dataclasses import dataclass, field, replace
 from xml.sax.saxutils import escape, quoteattr
 
 from lidarspec.exports import Message, messages
+from lidarspec.frames.wire_table import INDICES, Extent, bit_text, branches, extent, frame_size, meaning, phrase, ruled, unit_text
 from lidarspec.spec import Sensor, tree
-from lidarspec.wire.wire_table import INDICES, Extent, bit_text, branches, extent, frame_size, meaning, phrase, ruled, unit_text
 
 #: how the names of fields begin that are there for nothing yet, in manuals.
 SPARE = ("reserved", "unused", "spare", "zeros", "padding")

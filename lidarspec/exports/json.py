@@ -12,10 +12,10 @@ from collections.abc import Mapping
 from typing import Any
 
 from lidarspec.exports import Message, messages
+from lidarspec.frames.wire_table import frame_size
 from lidarspec.spec import Command, Frame, Sensor, tree
 from lidarspec.spec.arguments import Address, Count
 from lidarspec.spec.links import Link, Udp
-from lidarspec.wire.wire_table import frame_size
 
 #: raised whenever a key changes its meaning or goes.
 VERSION = 1

@@ -17,10 +17,10 @@ from dataclasses import dataclass, field, replace
 from typing import Any
 
 from lidarspec.exports import Message, Refused, beginning, messages
+from lidarspec.frames.wire_table import meaning, unit_text
 from lidarspec.spec import Sensor, tree
 from lidarspec.spec.bits import BitField, Segment
 from lidarspec.spec.fields import slug
-from lidarspec.wire.wire_table import meaning, unit_text
 
 #: a string that means the same without quotes.
 _PLAIN = re.compile(r"[A-Za-z_][A-Za-z0-9_./()<>=+*-]*( [A-Za-z0-9_./()<>=+*;,-]+)*")

@@ -13,6 +13,7 @@ import numpy as np
 
 from lidarspec.errors import LidarSpecError
 from lidarspec.explaining.wording import asked
+from lidarspec.frames.wire_table import frame_size, wire_table
 from lidarspec.framing.results import Counters, Found, packed
 from lidarspec.packets.stream import PacketStream
 from lidarspec.points.cloud import PointCloud
@@ -20,7 +21,6 @@ from lidarspec.points.plain import evaluate
 from lidarspec.spec import Command, Frame, Sensor
 from lidarspec.spec.links import Http, Link, Serial, Tcp, Udp
 from lidarspec.spec.timing import Clock, Every, OnFlag, Split
-from lidarspec.wire.wire_table import frame_size, wire_table
 
 STATUSES = {
     "manual": "written from the manual",

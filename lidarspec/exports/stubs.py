@@ -16,6 +16,8 @@ from collections.abc import Iterator
 from dataclasses import dataclass, field
 
 from lidarspec.exports import Message, Refused, messages
+from lidarspec.frames.schema import schema
+from lidarspec.frames.wire_table import meaning, unit_text
 from lidarspec.spec import Command, Sensor
 from lidarspec.spec.arguments import Address, Octets, Range, Text
 from lidarspec.spec.tree import (
@@ -36,8 +38,6 @@ from lidarspec.spec.tree import (
     When,
     children,
 )
-from lidarspec.wire.schema import schema
-from lidarspec.wire.wire_table import meaning, unit_text
 
 #: the types of arguments of commands.
 TYPES = {Range: "float", Text: "str", Address: "str", Octets: "bytes"}

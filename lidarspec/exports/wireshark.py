@@ -15,10 +15,10 @@ from typing import Any
 
 from lidarspec._version import __version__
 from lidarspec.exports import Message, Refused, asked, held, messages
+from lidarspec.frames.layout_tree import prefix_of
 from lidarspec.framing.frame_engine import codec
 from lidarspec.spec import Checksum, Crc, Fold15, Sensor, Sum, Tcp, Udp, WordXor, Xor, ZeroPadded, tree
 from lidarspec.spec.bits import BitField
-from lidarspec.wire.layout_tree import prefix_of
 
 WIDTH = 140
 

@@ -15,12 +15,12 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
+from lidarspec.frames.compilability import NotCompilable
+from lidarspec.frames.layout import Layout
+from lidarspec.frames.layout_tree import frame_layouts
 from lidarspec.framing.results import Counters, Indices, Numbers
 from lidarspec.spec.description import Frame
 from lidarspec.spec.links import Assembled
-from lidarspec.wire.compilability import NotCompilable
-from lidarspec.wire.layout import Layout
-from lidarspec.wire.layout_tree import frame_layouts
 
 #: messages that are waited for at a time, of which so many are remembered when they are done, and for how many nanoseconds.
 WAITING, PATIENCE = 8, 10**9

@@ -14,9 +14,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lidarspec.errors import PluginError
+from lidarspec.frames.layout import Marks, Sums, words
 from lidarspec.framing.frame_engine import Codec
 from lidarspec.framing.results import CONSTANT, COUNTED, PLUGIN, SHORT, VALID, Frames
-from lidarspec.wire.layout import Marks, Sums, words
 
 #: candidates of one type in a piece; where there are more, the piece is made shorter, so that memory stays small.
 MOST = 1 << 15

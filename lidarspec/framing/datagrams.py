@@ -15,11 +15,11 @@ import bisect
 import numpy as np
 from numpy.typing import NDArray
 
+from lidarspec.frames.arrays import alike, repeated
+from lidarspec.frames.layout import Layout, equal
 from lidarspec.framing.candidates import Bytes1D, Framing, Mode, Piece
 from lidarspec.framing.results import CONSTANT, LENGTH, PLUGIN, SHORT, VALID, Frames, Indices, Numbers, Status, array_of
 from lidarspec.framing.steady import steady_datagrams, step_between
-from lidarspec.wire.arrays import alike, repeated
-from lidarspec.wire.layout import Layout, equal
 
 
 def sorted_datagrams(framing: Framing, buffer: Bytes1D, starts: Numbers, sizes: Indices, mode: Mode) -> Piece:

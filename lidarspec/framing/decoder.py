@@ -15,6 +15,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lidarspec.errors import PluginError, UsageError, refuse_text
+from lidarspec.frames.arrays import alike, keep_freed_memory, repeated
+from lidarspec.frames.layout import Sums
 from lidarspec.framing.assembly import Assembly, Joined
 from lidarspec.framing.candidates import Bytes1D, Framing, Mode, Piece
 from lidarspec.framing.datagrams import sorted_datagrams
@@ -24,8 +26,6 @@ from lidarspec.framing.search import leftmost
 from lidarspec.framing.steady import steady_stream
 from lidarspec.spec.description import Frame, Spec
 from lidarspec.spec.links import Udp
-from lidarspec.wire.arrays import alike, keep_freed_memory, repeated
-from lidarspec.wire.layout import Sums
 
 __all__ = ["BACKENDS", "Decoder", "backend", "frames_of", "is_stream"]
 

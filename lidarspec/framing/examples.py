@@ -17,19 +17,19 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lidarspec.errors import PluginError, SpecError, UnknownFrame, UsageError
+from lidarspec.frames.build import build
+from lidarspec.frames.frame_table import Group, Rows
+from lidarspec.frames.layout import Layout, Leaf
+from lidarspec.frames.layout_tree import TooLong, Unknown, layout_of
+from lidarspec.frames.parts import Measure
+from lidarspec.frames.schema import schema
+from lidarspec.frames.slots import recoder
 from lidarspec.framing.frame_engine import Codec, CompiledCodec, codec
 from lidarspec.framing.plausibility import plausibility
 from lidarspec.framing.results import VALID
-from lidarspec.spec.construct_layer import Fault, member, random_value
 from lidarspec.spec.description import Frame, Spec
+from lidarspec.spec.syntax import Fault, member, random_value
 from lidarspec.spec.tree import Node, Ref, Select, nodes, refs
-from lidarspec.wire.build import build
-from lidarspec.wire.frame_table import Group, Rows
-from lidarspec.wire.layout import Layout, Leaf
-from lidarspec.wire.layout_tree import TooLong, Unknown, layout_of
-from lidarspec.wire.parts import Measure
-from lidarspec.wire.schema import schema
-from lidarspec.wire.slots import recoder
 
 #: How often random frames are made, and how often where a sensor's own `sweep` helps if none is plausible.
 TRIES = 40

@@ -20,18 +20,18 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lidarspec.errors import PluginError, SpecError
+from lidarspec.frames.arrays import alike, counted, repeated
+from lidarspec.frames.compilability import NotCompilable
+from lidarspec.frames.frame_table import Group, Records, Rows, Table
+from lidarspec.frames.layout import Layout, Refused, Sums, marks, right, rows_at, words
+from lidarspec.frames.layout_tree import frame_layouts, prefix_of
+from lidarspec.frames.schema import schema
+from lidarspec.frames.slots import Recoder, recoder
 from lidarspec.framing.many_lengths import AlikeLayouts, LayoutGroup, Together
 from lidarspec.framing.plausibility import Conditions, Judge, plausibility
 from lidarspec.framing.results import CHECKSUM, CONSTANT, IMPLAUSIBLE, LENGTH, PLUGIN, SHORT, VALID, Frames, Recoded, Status
-from lidarspec.spec.construct_layer import Mismatch, fixed_size, has_conditions
 from lidarspec.spec.description import Frame
-from lidarspec.wire.arrays import alike, counted, repeated
-from lidarspec.wire.compilability import NotCompilable
-from lidarspec.wire.frame_table import Group, Records, Rows, Table
-from lidarspec.wire.layout import Layout, Refused, Sums, marks, right, rows_at, words
-from lidarspec.wire.layout_tree import frame_layouts, prefix_of
-from lidarspec.wire.schema import schema
-from lidarspec.wire.slots import Recoder, recoder
+from lidarspec.spec.syntax import Mismatch, fixed_size, has_conditions
 
 #: bytes of candidates looked at in one go, so that memory stays small on hostile streams.
 BLOCK = 1 << 19

@@ -18,10 +18,10 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from lidarspec.frames.layout import Bytes2D, Layout, Leaf, Seal, Sums, rows_at
 from lidarspec.framing.plausibility import Check, Judge, Lookup
 from lidarspec.framing.results import CHECKSUM, IMPLAUSIBLE, VALID
 from lidarspec.spec.checksums import Checksum, Sum, WordXor, Xor
-from lidarspec.wire.layout import Bytes2D, Layout, Leaf, Seal, Sums, rows_at
 
 Bytes1D = NDArray[np.uint8]
 Offsets = NDArray[np.intp]

@@ -19,16 +19,16 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from lidarspec.columns.columns import Batch, Fields
-from lidarspec.columns.graph import Expression, Traced, conjuncts, sample_of, trace
 from lidarspec.errors import PluginError
+from lidarspec.expressions.columns import Batch, Fields
+from lidarspec.expressions.graph import Expression, Traced, conjuncts, sample_of, trace
+from lidarspec.frames.arrays import taken
+from lidarspec.frames.frame_table import Group, Rows, Table
+from lidarspec.frames.layout import Bytes2D, Layout, Leaf, Seal, Sums, Test, elements, holding, marks, right, rows_at, words
+from lidarspec.frames.parts import Region
+from lidarspec.frames.schema import Schema
 from lidarspec.framing.results import CHECKSUM, CONSTANT, IMPLAUSIBLE, LENGTH, PLUGIN, VALID
 from lidarspec.spec.description import Frame
-from lidarspec.wire.arrays import taken
-from lidarspec.wire.frame_table import Group, Rows, Table
-from lidarspec.wire.layout import Bytes2D, Layout, Leaf, Seal, Sums, Test, elements, holding, marks, right, rows_at, words
-from lidarspec.wire.parts import Region
-from lidarspec.wire.schema import Schema
 
 #: values of a few bits that are compared one by one.
 ALLOWED = 2

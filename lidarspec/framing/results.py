@@ -17,8 +17,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lidarspec.errors import PluginError
-from lidarspec.wire.arrays import alike, by_value, counted, repeated, some, taken
-from lidarspec.wire.layout import Bytes2D, Layout
+from lidarspec.frames.arrays import alike, by_value, counted, repeated, some, taken
+from lidarspec.frames.layout import Bytes2D, Layout
 
 Indices = NDArray[np.intp]
 Status = NDArray[np.integer[Any]]

@@ -11,10 +11,10 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
+from lidarspec.frames.arrays import alike, repeated
+from lidarspec.frames.layout import Bytes2D, Layout, Marks, exclude, right
 from lidarspec.framing.candidates import Framing, Mode, Piece
 from lidarspec.framing.results import Frames, Indices, Numbers
-from lidarspec.wire.arrays import alike, repeated
-from lidarspec.wire.layout import Bytes2D, Layout, Marks, exclude, right
 
 #: rows that are looked at before all are; bytes of a piece that is looked at so even after a piece with damaged frames.
 FEW, SMALL = 64, 1 << 16

@@ -14,10 +14,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lidarspec.errors import PluginError
+from lidarspec.frames.arrays import repeated
+from lidarspec.frames.layout import Layout, right
 from lidarspec.framing.candidates import Bytes1D, Candidates, Framing, Mode, Offsets, Piece, fitting
 from lidarspec.framing.results import CONSTANT, IMPLAUSIBLE, PLUGIN, SHORT, VALID, Frames
-from lidarspec.wire.arrays import repeated
-from lidarspec.wire.layout import Layout, right
 
 #: strides judged together at first, and at most; and how many are judged sooner as the rows of an array.
 FIRST, LONGEST, FEW = 64, 1 << 14, 8

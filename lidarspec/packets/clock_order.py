@@ -25,7 +25,7 @@ from zlib import crc32
 import numpy as np
 from numpy.typing import NDArray
 
-from lidarspec.columns.columns import Batch
+from lidarspec.expressions.columns import Batch
 from lidarspec.framing.results import Counters, Numbers
 from lidarspec.packets.clocks import Times
 from lidarspec.packets.masked_sector import MaskedGaps

@@ -9,17 +9,17 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from lidarspec.columns.columns import Batch, Fields
-from lidarspec.columns.graph import header_function
 from lidarspec.errors import SpecError
+from lidarspec.expressions.columns import Batch, Fields
+from lidarspec.expressions.graph import header_function
+from lidarspec.frames.arrays import alike, repeated
+from lidarspec.frames.frame_table import Table
+from lidarspec.frames.schema import Schema
 from lidarspec.framing.frame_engine import codec
 from lidarspec.spec.description import Spec
 from lidarspec.spec.fields import factor
 from lidarspec.spec.timing import Clock
 from lidarspec.spec.tree import exact
-from lidarspec.wire.arrays import alike, repeated
-from lidarspec.wire.frame_table import Table
-from lidarspec.wire.schema import Schema
 
 Times = NDArray[np.int64]
 

@@ -17,9 +17,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from lidarspec.columns.columns import Batch
-from lidarspec.columns.graph import header_function
 from lidarspec.errors import SpecError
+from lidarspec.expressions.columns import Batch
+from lidarspec.expressions.graph import header_function
+from lidarspec.frames.arrays import alike, counted
 from lidarspec.framing.results import Counters, Numbers
 from lidarspec.packets.clocks import Times
 from lidarspec.packets.masked_sector import MaskedGaps
@@ -27,7 +28,6 @@ from lidarspec.packets.pace import Pace, Paces
 from lidarspec.packets.packets import Index
 from lidarspec.spec.description import Spec
 from lidarspec.spec.timing import Clock, Sequence
-from lidarspec.wire.arrays import alike, counted
 
 #: how far back a packet may come and still be a late one; further back the sensor has started again.
 LATE = 64

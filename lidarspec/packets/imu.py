@@ -9,8 +9,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from lidarspec.columns.columns import Batch, Fields, of_points, unpadded
 from lidarspec.errors import plugin_errors
+from lidarspec.expressions.columns import Batch, Fields, of_points, unpadded
 from lidarspec.points.conventions import vendor_turn
 from lidarspec.points.plain import flat
 from lidarspec.spec.description import Spec

@@ -16,10 +16,10 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import NDArray
 
+from lidarspec.frames.frame_table import Table
 from lidarspec.points.cloud import COLUMNS
 from lidarspec.spec.description import Spec
 from lidarspec.spec.timing import OnChange, OnWrap
-from lidarspec.wire.frame_table import Table
 
 Angles = NDArray[np.float64]
 

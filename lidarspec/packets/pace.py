@@ -10,8 +10,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from lidarspec.columns.columns import Batch
-from lidarspec.columns.graph import header_function
+from lidarspec.expressions.columns import Batch
+from lidarspec.expressions.graph import header_function
 from lidarspec.packets.clocks import Times
 from lidarspec.spec.timing import Clock
 

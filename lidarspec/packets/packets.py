@@ -9,17 +9,17 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from lidarspec.columns.columns import AROUND, Batch, physical
 from lidarspec.display import drawn
 from lidarspec.errors import SpecError, UnknownField
+from lidarspec.expressions.columns import AROUND, Batch, physical
+from lidarspec.frames.frame_table import Table
+from lidarspec.frames.schema import Schema
 from lidarspec.framing.results import Counters, Numbers, array_of
 from lidarspec.packets.clocks import part_times
 from lidarspec.packets.imu import ImuSamples, samples
 from lidarspec.points.cloud import PointCloud
 from lidarspec.points.evaluate import cloud_of
 from lidarspec.spec.description import Spec
-from lidarspec.wire.frame_table import Table
-from lidarspec.wire.schema import Schema
 
 #: what is known of each packet besides its fields.
 _COLUMNS = ("offset", "time_ns", "host_ns", "index", "breaks")

@@ -17,7 +17,7 @@ from bisect import bisect_left, insort
 import numpy as np
 from numpy.typing import NDArray
 
-from lidarspec.columns.columns import Batch
+from lidarspec.expressions.columns import Batch
 from lidarspec.framing.results import Counters
 from lidarspec.packets.clock_order import ClockOrder
 from lidarspec.packets.pace import FIRST_LESSONS, Pace

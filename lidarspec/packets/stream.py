@@ -15,8 +15,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from lidarspec.columns.columns import Batch
 from lidarspec.errors import PluginError, SpecError, UnknownFrame
+from lidarspec.expressions.columns import Batch
+from lidarspec.frames.arrays import alike, repeated, some
+from lidarspec.frames.frame_table import Table
+from lidarspec.frames.schema import Schema
 from lidarspec.framing.frame_engine import Codec, codec
 from lidarspec.framing.results import Counters, Frames, Numbers
 from lidarspec.packets.clock_order import ClockOrder
@@ -28,9 +31,6 @@ from lidarspec.packets.pace import Pace
 from lidarspec.packets.packets import Index, Packets, StateOf, joined_tables
 from lidarspec.spec.description import Spec
 from lidarspec.spec.timing import Clock
-from lidarspec.wire.arrays import alike, repeated, some
-from lidarspec.wire.frame_table import Table
-from lidarspec.wire.schema import Schema
 
 
 class PacketStream:

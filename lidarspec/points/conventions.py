@@ -11,8 +11,8 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from lidarspec.columns.columns import Column
-from lidarspec.columns.graph import Traced
+from lidarspec.expressions.columns import Column
+from lidarspec.expressions.graph import Traced
 from lidarspec.spec.description import DIRECTIONS, Spec
 from lidarspec.spec.results import Extra
 

@@ -13,15 +13,15 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from lidarspec.columns.columns import Batch, Carry, Column, Fields
-from lidarspec.columns.graph import Node
 from lidarspec.errors import PluginError, SpecError
+from lidarspec.expressions.columns import Batch, Carry, Column, Fields
+from lidarspec.expressions.graph import Node
+from lidarspec.frames.frame_table import Group, Rows, ascends
 from lidarspec.points.cloud import LazyCloud, PointCloud
 from lidarspec.points.conventions import Grids, grid_of
 from lidarspec.points.lazy_columns import BatchColumns, Plain, Share
 from lidarspec.points.plain import Evaluated, PacketBatch, evaluate, stamp_of
 from lidarspec.points.plan import MODERATE, REMEMBERING, Plan, plan_for
-from lidarspec.wire.frame_table import Group, Rows, ascends
 
 #: numbers that are looked at together, so that they stay in the cache.
 _AT_ONCE = 1 << 15

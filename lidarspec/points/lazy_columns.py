@@ -18,15 +18,15 @@ from typing import Any, NamedTuple, cast
 import numpy as np
 from numpy.typing import NDArray
 
-from lidarspec.columns.columns import Batch, Column, Fields, field_array
-from lidarspec.columns.graph import Node, evaluate
+from lidarspec.expressions.columns import Batch, Column, Fields, field_array
+from lidarspec.expressions.graph import Node, evaluate
+from lidarspec.frames.arrays import deep
+from lidarspec.frames.frame_table import Group
 from lidarspec.points import numpy_plan
 from lidarspec.points.cloud import ColumnSource, Stretch, later
 from lidarspec.points.conventions import TYPES, Grids, grid_of, narrowed, numbers_of, seconds_since, turned_azimuth, vendor_turn
 from lidarspec.points.plain import PacketBatch
 from lidarspec.points.plan import REMEMBERING, Maker, Plan
-from lidarspec.wire.arrays import deep
-from lidarspec.wire.frame_table import Group
 
 _MAIN = ("x", "y", "z", "intensity")
 

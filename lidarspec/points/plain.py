@@ -13,15 +13,15 @@ from typing import Any, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from lidarspec.columns.columns import Batch, Carry, Fields, of_points, unpadded
 from lidarspec.errors import plugin_errors
+from lidarspec.expressions.columns import Batch, Carry, Fields, of_points, unpadded
+from lidarspec.frames.frame_table import Table
 from lidarspec.framing.results import Counters
 from lidarspec.points import conventions
 from lidarspec.points.cloud import CloudColumns, LazyCloud, PointCloud, organised
 from lidarspec.points.conventions import Kind
 from lidarspec.spec.description import Spec
 from lidarspec.spec.results import Cartesian, Points, Polar
-from lidarspec.wire.frame_table import Table
 
 _OPTIONAL = ("intensity", "ring", "return_index", "column")
 

@@ -22,16 +22,16 @@ from weakref import WeakKeyDictionary
 import numpy as np
 from numpy.typing import NDArray
 
-from lidarspec.columns import graph
-from lidarspec.columns.columns import Batch, of_points
-from lidarspec.columns.graph import Node, Traced, Untraceable, is_full, only_field
+from lidarspec.expressions import graph
+from lidarspec.expressions.columns import Batch, of_points
+from lidarspec.expressions.graph import Node, Traced, Untraceable, is_full, only_field
+from lidarspec.frames.frame_table import Group
+from lidarspec.frames.layout import Bytes2D, Layout, Leaf
 from lidarspec.points.conventions import coordinates, direction_of, is_zero, marked, placed, returned_range, shown_range
 from lidarspec.points.plain import kinds_of, parts_of
 from lidarspec.points.windows import is_number
 from lidarspec.spec.results import Cartesian, Polar
 from lidarspec.spec.vocabulary import Along, row_numbers
-from lidarspec.wire.frame_table import Group
-from lidarspec.wire.layout import Bytes2D, Layout, Leaf
 
 PointsFunction = Callable[[Any], Any]
 

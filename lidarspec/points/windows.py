@@ -16,9 +16,9 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from lidarspec.columns.graph import Expression, Node, is_nan_where, only_field
+from lidarspec.expressions.graph import Expression, Node, is_nan_where, only_field
+from lidarspec.frames.layout import Layout, Leaf
 from lidarspec.points.conventions import returned_range
-from lidarspec.wire.layout import Layout, Leaf
 
 #: what costs hardly more than looking its result up; with these, whatever is made of numbers stays a number.
 CHEAP: set[Any] = {np.add, np.subtract, np.multiply, np.negative, np.positive, np.absolute, np.deg2rad, np.radians, np.minimum, np.maximum}

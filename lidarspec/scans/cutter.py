@@ -8,8 +8,8 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from lidarspec.columns.columns import Column
 from lidarspec.errors import SpecError, UnknownField
+from lidarspec.expressions.columns import Column
 from lidarspec.packets.masked_sector import FULL_TURNS, JITTER, AngleReader, Sector
 from lidarspec.packets.packets import Packets
 from lidarspec.points.cloud import COLUMNS

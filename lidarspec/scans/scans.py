@@ -11,9 +11,10 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from lidarspec.columns.columns import Carry
 from lidarspec.display import drawn
 from lidarspec.errors import UsageError
+from lidarspec.expressions.columns import Carry
+from lidarspec.frames.arrays import alike, repeated
 from lidarspec.packets.imu import ImuSamples, Waiting
 from lidarspec.packets.packets import Packets, joined as joined_packets
 from lidarspec.packets.reorder import Reorder
@@ -26,7 +27,6 @@ from lidarspec.scans.masking import Masking, describe
 from lidarspec.spec.description import Spec
 from lidarspec.spec.links import Serial
 from lidarspec.spec.timing import Every, OnFlag, OnRewind, OnWrap, Split
-from lidarspec.wire.arrays import alike, repeated
 
 #: seconds that a turn takes at the slowest where no sensor says so; of a scan at least where packets bear the host's time, which may pause.
 SLOWEST, UNTIMED = 1.0, 1.0

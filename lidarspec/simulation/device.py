@@ -19,6 +19,7 @@ from dataclasses import dataclass, replace
 from typing import Any, NamedTuple
 
 from lidarspec.errors import SpecError
+from lidarspec.frames.parse import parse
 from lidarspec.framing.decoder import Decoder
 from lidarspec.framing.frame_engine import codec
 from lidarspec.simulation.faults import Faults, Line
@@ -28,7 +29,6 @@ from lidarspec.simulation.simulator import Rest, Simulation, simulation
 from lidarspec.spec.description import Answer, Command, Spec, with_frames
 from lidarspec.spec.links import is_datagram
 from lidarspec.spec.tree import FieldInfo
-from lidarspec.wire.parse import parse
 
 SECOND = 1_000_000_000
 #: ns of the device's time for which data is made in one go, and the most packets.

@@ -13,16 +13,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lidarspec.errors import SpecError
+from lidarspec.frames.build import fill_in, kind_of
+from lidarspec.frames.frame_table import Group, Rows
+from lidarspec.frames.layout import Layout
+from lidarspec.frames.layout_tree import TooLong, Unknown, layout_of
+from lidarspec.frames.schema import schema, without_indices
+from lidarspec.frames.slots import Recoder, recoder
 from lidarspec.framing.frame_engine import InterpretedCodec, codec
-from lidarspec.spec.construct_layer import member
 from lidarspec.spec.description import Spec
+from lidarspec.spec.syntax import member
 from lidarspec.spec.tree import Formula, Kind, Node, refs
-from lidarspec.wire.build import fill_in, kind_of
-from lidarspec.wire.frame_table import Group, Rows
-from lidarspec.wire.layout import Layout
-from lidarspec.wire.layout_tree import TooLong, Unknown, layout_of
-from lidarspec.wire.schema import schema, without_indices
-from lidarspec.wire.slots import Recoder, recoder
 
 Values = Mapping[str, Any]
 

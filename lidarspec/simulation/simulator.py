@@ -23,8 +23,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from lidarspec.columns.columns import AROUND, Batch, Column, Fields, of_points
 from lidarspec.errors import SpecError, UsageError, plugin_errors
+from lidarspec.expressions.columns import AROUND, Batch, Column, Fields, of_points
+from lidarspec.frames.frame_table import Group, Rows, Table
+from lidarspec.frames.slots import slot_of
 from lidarspec.framing.examples import example
 from lidarspec.framing.frame_engine import codec
 from lidarspec.packets.clocks import clock_ns
@@ -38,8 +40,6 @@ from lidarspec.spec.links import Serial
 from lidarspec.spec.results import Cartesian, Points, Polar
 from lidarspec.spec.timing import Every
 from lidarspec.spec.tree import FieldInfo, exact
-from lidarspec.wire.frame_table import Group, Rows, Table
-from lidarspec.wire.slots import slot_of
 
 Times = NDArray[np.int64]
 #: bits on a serial line for each byte: start, eight, stop.

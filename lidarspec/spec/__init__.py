@@ -15,7 +15,7 @@ other package is a function. Nothing in this package reads bytes of a stream. Mo
 * `timing`: clocks, counters, where scans end.
 * `results`, `vocabulary`: what a `points` function returns, and what it is written with.
 * `tree`: a frame type as nodes, which all others walk.
-* `construct_layer`, `bits`: from construct to the tree; the bits of bit blocks, found by probing.
+* `syntax`, `bits`: from construct to the tree; the bits of bit blocks, found by probing.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ import importlib
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from lidarspec.columns.columns import Column as Column, Fields as Fields
+    from lidarspec.expressions.columns import Column as Column, Fields as Fields
     from lidarspec.plugins import hookimpl as hookimpl
     from lidarspec.spec.arguments import Address as Address, Count as Count, Text as Text
     from lidarspec.spec.checksums import (
@@ -99,7 +99,7 @@ _NAMES = {
     "spec.checksums": ("Checksum", "Crc", "Xor", "Sum", "WordXor", "Fold15", "ZeroPadded"),
     "spec.links": ("Assembled", "Serial", "Udp", "Tcp", "Http", "Link"),
     "spec.timing": ("Clock", "Sequence", "OnWrap", "OnFlag", "OnChange", "OnJump", "OnRewind", "Every"),
-    "columns.columns": ("Fields", "Column"),
+    "expressions.columns": ("Fields", "Column"),
     "spec.results": ("Points", "Polar", "Cartesian", "Extra", "Imu"),
     "spec.vocabulary": ("along", "spread", "wrap", "following", "previous", "between_blocks", "last", "running", "stack", "steps", "take"),
     "spec.wire_forms": ("Tokens", "Lines", "SixBits", "Echoes", "Scip", "Escaped", "WireForm", "Reading", "Slot", "Unescaped"),

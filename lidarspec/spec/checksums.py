@@ -1,7 +1,7 @@
 """Checksum algorithms as values, each a function of one message; and the CRCs in common use by their names.
 
 An algorithm is immutable, hashable and equal to another by its parameters. `single` is its function by itself, made once and called for one
-message after another; `lidarspec.wire.row_checksums` computes those of many frames at once. `CRCS` has the names that catalogues give.
+message after another; `lidarspec.frames.row_checksums` computes those of many frames at once. `CRCS` has the names that catalogues give.
 
 A CRC's register is kept in wire order, where the low byte is the one that meets the next data byte: for `refin` the usual reflected
 register, otherwise the usual register aligned left with its bytes swapped. One formula serves both.

@@ -19,9 +19,9 @@ from construct import Construct
 
 from lidarspec.errors import SpecError, UnknownFrame, did_you_mean
 from lidarspec.spec.arguments import Address, Argument, Count, Filled, Text, argument
-from lidarspec.spec.construct_layer import check_struct, fixed_size, frame_tree, prepare
 from lidarspec.spec.links import Link, is_datagram
 from lidarspec.spec.results import Imu, Points
+from lidarspec.spec.syntax import check_struct, fixed_size, frame_tree, prepare
 from lidarspec.spec.timing import Clock, Sequence, Split
 from lidarspec.spec.tree import Node, Sealed, children
 from lidarspec.spec.wire_forms import WireForm

@@ -34,7 +34,7 @@ from construct import (
 )
 
 from lidarspec.errors import SpecError, UsageError
-from lidarspec.spec import construct_layer as layer
+from lidarspec.spec import syntax as layer
 from lidarspec.spec.checksums import Checksum
 from lidarspec.spec.tree import FieldInfo
 

@@ -6,7 +6,7 @@ from dataclasses import dataclass, field
 from typing import Any
 
 from lidarspec.errors import SpecError
-from lidarspec.spec.construct_layer import has_member
+from lidarspec.spec.syntax import has_member
 
 
 class Link:

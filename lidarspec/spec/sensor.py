@@ -147,7 +147,7 @@ class Sensor(Spec):
         Raises:
             WireError: where the bytes are not such a frame: sensor, offset, field path, expected and got.
         """
-        from lidarspec.wire.parse import parse
+        from lidarspec.frames.parse import parse
 
         return parse(self, data, frame=frame, verify=verify, units=units)
 
@@ -161,7 +161,7 @@ class Sensor(Spec):
         Raises:
             UsageError: for a missing or unknown field, or a value that its field cannot hold.
         """
-        from lidarspec.wire.build import build
+        from lidarspec.frames.build import build
 
         return build(self, frame, value, values, units=units)
 
@@ -181,7 +181,7 @@ class Sensor(Spec):
         Raises:
             UnknownCommand, OutOfRange: for what the sensor does not take.
         """
-        from lidarspec.wire.build import build_command
+        from lidarspec.frames.build import build_command
 
         return build_command(self, name, arguments)
 

@@ -1,6 +1,6 @@
 """A frame type as a tree of nodes: what stands on the wire, in order, with formulas where fields of the header decide.
 
-`lidarspec.spec.construct_layer` makes it from an author's struct, once for each frame; schema, layouts, examples, wire tables, explain
+`lidarspec.spec.syntax` makes it from an author's struct, once for each frame; schema, layouts, examples, wire tables, explain
 and exports walk it (`children`, `nodes`) and know nothing of construct. Everything here is immutable. A node says what it is
 (`FieldInfo` for what carries a value) and how it is stored; where it begins is the sum of what stands before it.
 

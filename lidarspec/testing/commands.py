@@ -9,6 +9,8 @@ from typing import Any
 from lidarspec.device.session import Reply, Session, found_at, learned
 from lidarspec.errors import CommandError, LidarSpecError, SpecError, UsageError
 from lidarspec.explaining.wording import asked
+from lidarspec.frames.build import argument_slot, raw_argument
+from lidarspec.frames.parse import parse_typed
 from lidarspec.framing.results import Found
 from lidarspec.simulation.device import SimulatedDevice
 from lidarspec.spec.arguments import Address, Range, Text
@@ -16,8 +18,6 @@ from lidarspec.spec.links import is_datagram
 from lidarspec.spec.sensor import Sensor
 from lidarspec.testing.findings import Violation, require
 from lidarspec.testing.subject import Subject
-from lidarspec.wire.build import argument_slot, raw_argument
-from lidarspec.wire.parse import parse_typed
 
 #: ns of one step of a simulated conversation.
 STEP = 20_000_000

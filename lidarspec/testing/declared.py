@@ -13,23 +13,23 @@ from typing import Any
 
 import numpy as np
 
-from lidarspec.columns.columns import Batch, Fields
-from lidarspec.columns.graph import Traced, Untraceable
 from lidarspec.errors import LidarSpecError, SpecError, did_you_mean
+from lidarspec.expressions.columns import Batch, Fields
+from lidarspec.expressions.graph import Traced, Untraceable
+from lidarspec.frames.layout import Layout
+from lidarspec.frames.schema import without_indices
 from lidarspec.framing.examples import draw_always, header, random_frame
 from lidarspec.framing.frame_engine import CompiledCodec, codec
 from lidarspec.points.conventions import TYPES
 from lidarspec.simulation.scenes import Room
 from lidarspec.simulation.simulator import simulation
 from lidarspec.spec import Clock, Frame, OnWrap, Sensor
-from lidarspec.spec.construct_layer import is_expression
 from lidarspec.spec.fields import factor, is_unit
+from lidarspec.spec.syntax import is_expression
 from lidarspec.spec.tree import Sealed, Struct, infos, nodes
 from lidarspec.testing.findings import Finding
 from lidarspec.testing.geometry import field_of, traced, used
 from lidarspec.testing.subject import Subject
-from lidarspec.wire.layout import Layout
-from lidarspec.wire.schema import without_indices
 
 #: field names that stand for a measure.
 MEASURES = frozenset(["distance", "range", "radius", "angle", "azimuth", "elevation", "temperature", "voltage", "timestamp"])

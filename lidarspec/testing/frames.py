@@ -19,13 +19,13 @@ import numpy as np
 from lidarspec.errors import SpecError, UsageError, WireError
 from lidarspec.explaining.damage import changes
 from lidarspec.explaining.explanation import fits
+from lidarspec.frames.layout import Layout
 from lidarspec.framing.frame_engine import CompiledCodec, InterpretedCodec, codec
 from lidarspec.framing.results import VALID
 from lidarspec.spec.tree import FieldInfo
 from lidarspec.testing import subject as material
 from lidarspec.testing.findings import Violation, require
 from lidarspec.testing.subject import MANY, Subject
-from lidarspec.wire.layout import Layout
 
 #: values that each byte of a frame is changed to where construct alone reads it, with the usual number of examples.
 CHANGES = 8

@@ -19,9 +19,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from lidarspec.columns.columns import Fields, aligned, unpadded
-from lidarspec.columns.graph import Node, sample_of, trace, traverse
 from lidarspec.errors import LidarSpecError, SpecError, UsageError
+from lidarspec.expressions.columns import Fields, aligned, unpadded
+from lidarspec.expressions.graph import Node, sample_of, trace, traverse
+from lidarspec.frames.frame_table import Rows
 from lidarspec.framing.examples import header, random_frame
 from lidarspec.framing.frame_engine import CompiledCodec, codec
 from lidarspec.packets.masked_sector import FULL_TURNS
@@ -41,7 +42,6 @@ from lidarspec.testing.agreement import assert_well_formed
 from lidarspec.testing.findings import Violation, require
 from lidarspec.testing.frames import acceptable
 from lidarspec.testing.subject import Subject
-from lidarspec.wire.frame_table import Rows
 
 #: packets along the sweep whose directions are looked at.
 PACKETS = 400

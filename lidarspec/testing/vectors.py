@@ -25,9 +25,10 @@ from typing import Any, cast
 
 import numpy as np
 
-from lidarspec.discovery.checksum_search import search
-from lidarspec.discovery.samples import Match, Place
+from lidarspec.drafting.checksum_search import search
+from lidarspec.drafting.samples import Match, Place
 from lidarspec.errors import LidarSpecError, WireError
+from lidarspec.frames.layout import Layout
 from lidarspec.framing.frame_engine import CompiledCodec, codec
 from lidarspec.spec.tree import FieldInfo, Sealed, nodes
 from lidarspec.testing.commands import an_exchange_holds
@@ -37,7 +38,6 @@ from lidarspec.testing.geometry import read
 from lidarspec.testing.subject import SHORT, Subject, seals
 from lidarspec.transports.hexadecimal import unhexed
 from lidarspec.trust import document
-from lidarspec.wire.layout import Layout
 
 #: what a point may differ by: metres and radians as manuals print them.
 NEAR = 2e-4

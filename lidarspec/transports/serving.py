@@ -19,6 +19,7 @@ from pathlib import Path
 from typing import Literal
 
 from lidarspec.errors import LidarSpecError, SpecError, UsageError, WireError
+from lidarspec.frames.build import build_command
 from lidarspec.recording.recorders import recorder
 from lidarspec.scans.selection import Times, received
 from lidarspec.simulation.device import SECOND, SimulatedDevice
@@ -26,7 +27,6 @@ from lidarspec.spec.links import Udp
 from lidarspec.transports.open_url import transport
 from lidarspec.transports.outlets import HERE, Outlet
 from lidarspec.transports.protocol import POLL, Chunk, Closing, Disconnected, Sender, Transport, sender_names
-from lidarspec.wire.build import build_command
 
 #: seconds at least between two sendings.
 PAUSE = 0.001

@@ -17,13 +17,13 @@ from lidarspec.explaining.contents import duration
 from lidarspec.explaining.explanation import Explanation, explain, reply_text
 from lidarspec.explaining.wording import asked
 from lidarspec.exports.reference import effect
+from lidarspec.frames.build import argument_slot
 from lidarspec.points.look import is_flat
 from lidarspec.scans.scans import Place
 from lidarspec.spec.arguments import Range
 from lidarspec.spec.sensor import Sensor
 from lidarspec.view.backlog import DAMAGED, Backlog, Taken
 from lidarspec.view.broadcast import Broadcast, Shown
-from lidarspec.wire.build import argument_slot
 
 #: frames whose explanation is kept, and damaged pieces that are told of at once.
 KEPT, TOLD = 16, 20

@@ -19,12 +19,12 @@ from numpy.typing import NDArray
 from lidarspec.errors import WireError
 from lidarspec.explaining.explanation import Explanation
 from lidarspec.explaining.pieces import Piece, explained
+from lidarspec.frames.arrays import alike
+from lidarspec.frames.parse import parse_typed
 from lidarspec.framing.decoder import Decoder
 from lidarspec.framing.results import Frames, Numbers, array_of
 from lidarspec.scans.scans import Place
 from lidarspec.spec.sensor import Sensor
-from lidarspec.wire.arrays import alike
-from lidarspec.wire.parse import parse_typed
 
 #: bytes, and decodings, that are kept; and of what was damaged how many pieces, and bytes of each.
 BYTES, DECODINGS = 1 << 23, 1024

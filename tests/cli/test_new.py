@@ -15,7 +15,7 @@ import pytest
 
 import lidarspec as ls
 from lidarspec import spec
-from lidarspec.discovery.draft import Names
+from lidarspec.drafting.draft import Names
 from lidarspec.exports import EXPORTS, export
 from lidarspec.simulation.simulator import simulate
 from tests.architecture import Module, private_imports

@@ -17,8 +17,8 @@ from typing import Any
 import pytest
 
 import lidarspec as ls
-from lidarspec.discovery.detect import Verdict
-from lidarspec.discovery.heard import Heard
+from lidarspec.detect.heard import Heard
+from lidarspec.detect.identification import Verdict
 from lidarspec.simulation.simulator import simulate
 from lidarspec.spec import Crc
 from lidarspec.testing.fixtures import virtual_port

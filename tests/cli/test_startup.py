@@ -59,7 +59,7 @@ def test_show_loads_one_plugin_and_no_device() -> None:
 def test_explain_of_a_named_sensor_loads_one_plugin_and_no_source() -> None:
     modules = modules_after("explain", "-s", SENSOR, ls.sensor(SENSOR).example("data").hex())
     assert plugins_in(modules) == {PLUGIN}
-    unused = {"rich", "serial", "lidarspec.discovery.detect", "lidarspec.transports.open_url", "lidarspec.device.device"}
+    unused = {"rich", "serial", "lidarspec.detect.identification", "lidarspec.transports.open_url", "lidarspec.device.device"}
     assert not unused & modules
 
 

@@ -17,9 +17,9 @@ import pytest
 from construct import Construct
 
 from lidarspec import Packets, Sensor, SpecError, WireError
+from lidarspec.frames.schema import schema
 from lidarspec.spec import Every, Fields, Frame, Polar, Udp
-from lidarspec.spec.construct_layer import frame_tree
-from lidarspec.wire.schema import schema
+from lidarspec.spec.syntax import frame_tree
 
 BACKENDS = ("auto", "construct")
 #: what puts every 16-bit number among the ranges that are returns.

@@ -13,7 +13,7 @@ import numpy as np
 from construct import ConstructError
 
 from lidarspec import Sensor
-from lidarspec.columns.columns import Batch
+from lidarspec.expressions.columns import Batch
 from lidarspec.framing.frame_engine import codec
 from lidarspec.spec import Fields, Frame
 from tests.engine.plain_forms import plain_row

@@ -18,9 +18,9 @@ import pytest
 import lidarspec
 from lidarspec import Sensor, WireError
 from lidarspec.exports import Refused, beginning, export
+from lidarspec.frames.schema import Schema
 from lidarspec.framing.frame_engine import codec
 from lidarspec.testing import subject as material
-from lidarspec.wire.schema import Schema
 from tests.exports.trees import SHAPED, distinct_frames, distinct_sensors, installed_sensors, recoded, values
 
 GCC = shutil.which("gcc")

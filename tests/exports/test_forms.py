@@ -19,8 +19,8 @@ import lidarspec as ls
 from lidarspec import Sensor
 from lidarspec.exports import EXPORTS, Refused, UnknownExport, export, narrowed
 from lidarspec.exports.diagram import BIT, BITS, LEFT
+from lidarspec.frames.schema import schema
 from lidarspec.spec import Command, Frame
-from lidarspec.wire.schema import schema
 from tests.broken import sound
 from tests.cli.running import ran
 from tests.exports.json_decoder import Decoder

@@ -14,8 +14,8 @@ import lidarspec
 from lidarspec import Sensor
 from lidarspec.exports import Refused, export
 from lidarspec.exports.ksy import identifier, yaml
+from lidarspec.frames.schema import schema
 from lidarspec.spec import Every, Frame, Polar, Serial
-from lidarspec.wire.schema import schema
 from tests.exports import kaitai, trees
 from tests.exports.trees import distinct_sensors, installed_sensors, recoded
 

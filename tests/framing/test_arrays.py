@@ -16,15 +16,15 @@ from numpy.typing import NDArray
 
 import lidarspec
 from lidarspec import Counters
-from lidarspec.columns.columns import Batch
+from lidarspec.expressions.columns import Batch
+from lidarspec.frames.arrays import repeated
+from lidarspec.frames.frame_table import Rows
 from lidarspec.framing.frame_engine import codec
 from lidarspec.framing.results import Frames
 from lidarspec.packets.clocks import Unwrapper, clock_ns
 from lidarspec.packets.packets import joined
 from lidarspec.packets.stream import PacketStream
 from lidarspec.spec import Fields, Frame
-from lidarspec.wire.arrays import repeated
-from lidarspec.wire.frame_table import Rows
 from tests.engine.engines import is_compiled
 from tests.representatives import each_sensor, each_shape, load_sensor
 from tests.shapes import SHAPES

@@ -9,11 +9,11 @@ import numpy as np
 import pytest
 from construct import Bytes, Const, Struct
 
+from lidarspec.frames.row_checksums import FEW, SHORT, registers
 from lidarspec.framing.results import Frames
 from lidarspec.framing.steady import SMALL
 from lidarspec.spec import Checksummed, Frame, Xor
 from lidarspec.testing.subject import Subject
-from lidarspec.wire.row_checksums import FEW, SHORT, registers
 from tests.engine.streams import Books, damaged
 from tests.shapes import SHAPES
 

@@ -25,6 +25,7 @@ from lidarspec.batch import MANIFEST, Manifest, Piece
 from lidarspec.captures.bulk import CaptureBatches
 from lidarspec.captures.pcap import CaptureReader, StreamReader
 from lidarspec.device.settings import FILE as SETTINGS, devices
+from lidarspec.frames.layout import Layout
 from lidarspec.framing.frame_engine import codec
 from lidarspec.recording.format import DATAGRAM, EVENT, HEADER, MAGIC, RECEIVED, Header, Recording, packed
 from lidarspec.simulation.scenes import read_scene
@@ -35,7 +36,6 @@ from lidarspec.testing.subject import Subject
 from lidarspec.testing.vectors import vectors_hold
 from lidarspec.transports.hexadecimal import unhexed
 from lidarspec.transports.open_url import is_port, live_address
-from lidarspec.wire.layout import Layout
 from tests import made_captures as made
 from tests.calibration_files import write_velodyne_xml
 from tests.every_sensor import distinct_frames, distinct_sensors

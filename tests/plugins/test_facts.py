@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 
 import lidarspec as ls
-from lidarspec.columns.columns import Fields
+from lidarspec.expressions.columns import Fields
+from lidarspec.frames.schema import schema
 from lidarspec.spec import Frame
-from lidarspec.wire.schema import schema
 from tests.installed import sensor_modules, sensors_in
 
 pytestmark = pytest.mark.slow

@@ -15,8 +15,8 @@ import lidarspec as ls
 ALLOWED = {
     *(
         "_version",
-        "columns",
-        "columns.columns",
+        "expressions",
+        "expressions.columns",
         "display",
         "entry_points",
         "errors",
@@ -27,18 +27,18 @@ ALLOWED = {
         "spec.bits",
         "spec.checksums",
     ),
-    *("spec.construct_layer", "spec.construct_layer.classes", "spec.construct_layer.meaning", "spec.construct_layer.refusals"),
+    *("spec.syntax", "spec.syntax.classes", "spec.syntax.meaning", "spec.syntax.refusals"),
     *("spec.description", "spec.fields", "spec.links", "spec.results", "spec.sensor", "spec.timing", "spec.tree"),
     *(
         "spec.vocabulary",
         "spec.wire_forms",
         "trust",
-        "wire",
-        "wire.arrays",
-        "wire.frame_table",
-        "wire.layout",
-        "wire.row_checksums",
-        "wire.schema",
+        "frames",
+        "frames.arrays",
+        "frames.frame_table",
+        "frames.layout",
+        "frames.row_checksums",
+        "frames.schema",
     ),
 }
 #: of the standard library, what takes long to import; NumPy and construct may bring it along, lidarspec does not.

@@ -17,6 +17,9 @@ from construct import Bytes, Int8ub, Struct, this
 
 import lidarspec
 from lidarspec import Packets, Sensor, UsageError, simulate
+from lidarspec.frames.frame_table import Rows
+from lidarspec.frames.layout import Seal
+from lidarspec.frames.row_checksums import batch
 from lidarspec.points.evaluate import evaluated
 from lidarspec.points.numba_kernels import checksums as kernelsums
 from lidarspec.points.numba_kernels.source import written
@@ -27,9 +30,6 @@ from lidarspec.spec import Checksum, Checksummed, Crc, Fields, Polar, WordXor, X
 from lidarspec.spec.links import is_datagram
 from lidarspec.testing.agreement import assert_same_points
 from lidarspec.testing.subject import Subject
-from lidarspec.wire.frame_table import Rows
-from lidarspec.wire.layout import Seal
-from lidarspec.wire.row_checksums import batch
 from tests.engine import against_construct
 from tests.installed import sensor_modules, sensors_in
 from tests.points.backends import COMPILED

@@ -12,6 +12,7 @@ from construct import Array, Int8ul, Int16ul, Struct, this
 
 import lidarspec
 from lidarspec import Packets, Sensor, simulate
+from lidarspec.frames.frame_table import Rows
 from lidarspec.points.evaluate import evaluated
 from lidarspec.points.plain import evaluate
 from lidarspec.points.plan import Plan, plan_for
@@ -19,7 +20,6 @@ from lidarspec.spec import Fields, Polar, Scaled, take
 from lidarspec.spec.links import is_datagram
 from lidarspec.testing.agreement import assert_same_points
 from lidarspec.testing.subject import Subject
-from lidarspec.wire.frame_table import Rows
 from tests.broken import sound
 from tests.engine.against_construct import clouds_agree, sensor
 from tests.engine.random_specs import made

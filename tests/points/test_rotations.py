@@ -11,7 +11,7 @@ import pytest
 
 import lidarspec
 from lidarspec import Sensor, simulate
-from lidarspec.columns.columns import remainder
+from lidarspec.expressions.columns import remainder
 from lidarspec.points.evaluate import evaluated
 from lidarspec.points.plain import evaluate
 from lidarspec.spec import Fields, Polar, spread

@@ -21,12 +21,12 @@ from lidarspec.captures.ip import ETHERNET
 from lidarspec.captures.pcap import Datagram, datagram_record
 from lidarspec.captures.records import capture_head
 from lidarspec.errors import UsageError
+from lidarspec.frames.frame_table import Rows
 from lidarspec.packets.stream import PacketStream
 from lidarspec.points import lazy_columns
 from lidarspec.points.cloud import COLUMNS
 from lidarspec.scans.scans import ScanStream, scans_of
 from lidarspec.spec import OnChange, OnWrap, Udp
-from lidarspec.wire.frame_table import Rows
 from tests.broken import points_fail, sound
 from tests.points.backends import BACKENDS, COMPILED
 from tests.representatives import REPRESENTATIVES

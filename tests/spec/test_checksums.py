@@ -19,8 +19,8 @@ from construct import BitsInteger, BitStruct, Const, Int8ub, Struct
 from numpy.typing import NDArray
 
 from lidarspec import SpecError
+from lidarspec.frames.row_checksums import batch, over
 from lidarspec.spec import Checksum, Checksummed, Crc, Fold15, Sum, WordXor, Xor, ZeroPadded
-from lidarspec.wire.row_checksums import batch, over
 from tests.engine import against_construct
 from tests.evidence import vector_bytes
 

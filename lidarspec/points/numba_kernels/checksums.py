@@ -15,11 +15,11 @@ from weakref import WeakKeyDictionary
 import numpy as np
 from numpy.typing import NDArray
 
+from lidarspec.frames.layout import Bytes2D, Seal, Sums
+from lidarspec.frames.row_checksums import batch, finished, places
 from lidarspec.points.numba_kernels.kernels import function_of, require
 from lidarspec.points.numba_kernels.source import HEAD
 from lidarspec.spec.checksums import Crc, WordXor, Xor
-from lidarspec.wire.layout import Bytes2D, Seal, Sums
-from lidarspec.wire.row_checksums import batch, finished, places
 
 #: frames of a layout that earn its tables, and that a batch has to have.
 EARNED, FEW = 4096, 64

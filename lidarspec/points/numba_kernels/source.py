@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from lidarspec.columns.graph import FACTORS, Node, is_full, is_nan_where, last_axis, only_field, traverse
+from lidarspec.expressions.graph import FACTORS, Node, is_full, is_nan_where, last_axis, only_field, traverse
 from lidarspec.points.conventions import returned_range
 from lidarspec.points.numba_kernels.writer import TEMPLATES, Value, Wanted, Writer, is_cheap, line
 from lidarspec.points.plan import Plan

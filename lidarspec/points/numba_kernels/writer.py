@@ -17,11 +17,11 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from lidarspec.columns.graph import FACTORS, Node, key, last_axis, traverse
+from lidarspec.expressions.graph import FACTORS, Node, key, last_axis, traverse
+from lidarspec.frames.layout import Layout, Leaf
 from lidarspec.points.conventions import returned_range
 from lidarspec.points.windows import CHEAP, every_value, raw_values, window, word_of
 from lidarspec.spec.bits import whole_bytes
-from lidarspec.wire.layout import Layout, Leaf
 
 _SIGNS = {np.add: "+", np.subtract: "-", np.multiply: "*", np.true_divide: "/", np.equal: "==", np.not_equal: "!="}
 _SIGNS |= {np.less: "<", np.less_equal: "<=", np.greater: ">", np.greater_equal: ">="}

@@ -15,7 +15,7 @@ from typing import Any
 
 from numpy.typing import NDArray
 
-from lidarspec.columns.graph import traverse
+from lidarspec.expressions.graph import traverse
 from lidarspec.points.numpy_plan.compiler import Compiler
 from lidarspec.points.plan import Maker, Plan
 

@@ -13,8 +13,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from lidarspec.frames.layout import Bytes2D, Leaf, elements
 from lidarspec.points.windows import Window
-from lidarspec.wire.layout import Bytes2D, Leaf, elements
 
 #: elements of an array from which on it is not compacted.
 LONG = 64

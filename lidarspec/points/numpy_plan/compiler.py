@@ -15,7 +15,9 @@ from typing import Any, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-from lidarspec.columns.graph import Node, Term, chosen, is_full, is_nan_where, key, last_axis, only_field
+from lidarspec.expressions.graph import Node, Term, chosen, is_full, is_nan_where, key, last_axis, only_field
+from lidarspec.frames.arrays import deep
+from lidarspec.frames.layout import Leaf
 from lidarspec.points.conventions import returned_range
 from lidarspec.points.numpy_plan import products
 from lidarspec.points.numpy_plan.blocks import Blocks
@@ -25,8 +27,6 @@ from lidarspec.points.plan import Plan
 from lidarspec.points.windows import CHEAP, Window, beam_of, every_value, run_of, shift_of, window, word_of
 from lidarspec.spec.tree import FieldInfo
 from lidarspec.spec.vocabulary import row_numbers
-from lidarspec.wire.arrays import deep
-from lidarspec.wire.layout import Leaf
 
 _Made = TypeVar("_Made")
 

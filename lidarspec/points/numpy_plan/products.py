@@ -21,10 +21,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from lidarspec.columns.graph import Node, Term, chosen, split_level, terms
+from lidarspec.expressions.graph import Node, Term, chosen, split_level, terms
+from lidarspec.frames.layout import Leaf
 from lidarspec.points.numpy_plan.program import Run
 from lidarspec.points.windows import possible
-from lidarspec.wire.layout import Leaf
 
 Floats = NDArray[np.float64]
 Singles = NDArray[np.float32]

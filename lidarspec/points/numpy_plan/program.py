@@ -15,10 +15,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from lidarspec.frames.layout import Bytes2D
 from lidarspec.points.numpy_plan.blocks import Blocks
 from lidarspec.points.numpy_plan.registers import TYPES, borrowed, given_back, slots_of
 from lidarspec.points.plan import Maker, Values
-from lidarspec.wire.layout import Bytes2D
 
 #: points of a chunk, so that its scratch arrays stay in the cache.
 CHUNK = 1 << 17

@@ -7,8 +7,8 @@ import pytest
 
 import lidarspec as ls
 from lidarspec import simulate
-from lidarspec.discovery.detect import verdict
-from lidarspec.discovery.heard import Heard
+from lidarspec.detect.heard import Heard
+from lidarspec.detect.identification import verdict
 from tests.evidence import clockwise, decoded, vector_bytes, vectors
 
 FILE = "vectors_serial2d.json"

@@ -15,7 +15,7 @@ import pytest
 
 import lidarspec as ls
 from lidarspec import simulate
-from lidarspec.discovery.detect import Heard, verdict
+from lidarspec.detect.identification import Heard, verdict
 from lidarspec.simulation.faults import Faults
 from lidarspec.spec import Learned, Tcp, Udp
 from lidarspec.testing.agreement import assert_same_points

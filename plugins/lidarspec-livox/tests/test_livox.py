@@ -11,8 +11,8 @@ import numpy as np
 import pytest
 
 import lidarspec as ls
-from lidarspec.discovery.detect import verdict
-from lidarspec.discovery.heard import Heard
+from lidarspec.detect.heard import Heard
+from lidarspec.detect.identification import verdict
 from tests.evidence import decoded, vector_bytes, vectors
 
 FILE = "vectors_udp3d.json"

@@ -16,7 +16,7 @@ import pytest
 import lidarspec as ls
 from lidarspec import simulate
 from lidarspec.captures.pcap import CaptureReader
-from lidarspec.discovery.detect import verdicts
+from lidarspec.detect.identification import verdicts
 from lidarspec.spec import Learned
 from lidarspec_ouster import nominal
 from lidarspec_ouster.metadata import read

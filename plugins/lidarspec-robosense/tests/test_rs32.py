@@ -11,8 +11,8 @@ import pytest
 
 import lidarspec as ls
 from lidarspec import simulate
-from lidarspec.discovery.detect import verdict
-from lidarspec.discovery.heard import Heard
+from lidarspec.detect.heard import Heard
+from lidarspec.detect.identification import verdict
 from tests.evidence import assert_points, decoded, vector_bytes, vectors
 from tests.installed import sensor_ids
 

@@ -11,9 +11,9 @@ from dataclasses import dataclass, fields, replace
 from typing import Any
 
 from lidarspec.cli.options import configured
+from lidarspec.detect.identification import declared, detected
 from lidarspec.device.device import Device
 from lidarspec.device.settings import named
-from lidarspec.discovery.detect import declared, detected
 from lidarspec.errors import UsageError
 from lidarspec.plugins import sensor as named_sensor
 from lidarspec.points.cloud import Mount

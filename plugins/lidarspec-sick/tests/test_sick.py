@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 
 import lidarspec as ls
-from lidarspec.discovery.detect import verdict
-from lidarspec.discovery.heard import Heard
+from lidarspec.detect.heard import Heard
+from lidarspec.detect.identification import verdict
 from lidarspec.errors import CommandError, UsageError
 from tests.evidence import capture, decoded, vector_bytes, vectors
 

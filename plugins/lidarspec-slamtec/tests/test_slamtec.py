@@ -13,8 +13,8 @@ import pytest
 
 import lidarspec as ls
 from lidarspec.errors import OutOfRange
+from lidarspec.frames.row_checksums import batch
 from lidarspec.framing.frame_engine import codec
-from lidarspec.wire.row_checksums import batch
 from tests.evidence import assert_points, clockwise, decoded, vector_bytes, vectors
 
 from .rplidar import believing

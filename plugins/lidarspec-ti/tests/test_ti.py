@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 
 import lidarspec as ls
-from lidarspec.discovery.detect import verdict
-from lidarspec.discovery.heard import Heard
+from lidarspec.detect.heard import Heard
+from lidarspec.detect.identification import verdict
 from tests.evidence import decoded
 
 RADAR = ls.sensor("ti-iwr6843")

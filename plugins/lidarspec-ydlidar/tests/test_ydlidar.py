@@ -9,8 +9,8 @@ import pytest
 
 import lidarspec as ls
 from lidarspec import simulate
-from lidarspec.discovery.detect import contradiction, verdict
-from lidarspec.discovery.heard import Heard
+from lidarspec.detect.heard import Heard
+from lidarspec.detect.identification import contradiction, verdict
 from tests.evidence import capture, clockwise, decoded, vector_bytes, vectors
 
 FILE = "vectors_serial2d.json"

@@ -1,0 +1,255 @@
+"""Why nothing comes, or nothing that can be used: what is wrong with a source, one thing at a time, each with the command that mends it."""
+
+from __future__ import annotations
+
+import os
+import time
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from shlex import quote
+
+from lidarspec.detect.identification import CLEAR, Verdict, said, verdict, verdicts
+from lidarspec.detect.listen import LISTEN, bauds, heard_as, started_first, udp_ports
+from lidarspec.errors import LidarSpecError, UsageError, printable, suggestion
+from lidarspec.spec.links import Serial, Udp
+from lidarspec.spec.sensor import Sensor
+from lidarspec.transports import ports
+from lidarspec.transports.base import Address, data_link, with_option
+from lidarspec.transports.open_url import live_address, resolved
+from lidarspec.transports.protocol import no_bytes
+from lidarspec.transports.udp import BUFFER, shortfall
+
+LOOPBACK = "lo"
+
+
+@dataclass(frozen=True)
+class Finding:
+    """Something that was looked at.
+
+    Attributes:
+        ok: whether it is as it should be.
+        text: what it is.
+        mend: the command that mends it; "" where there is none, or nothing to mend.
+    """
+
+    ok: bool
+    text: str
+    mend: str = ""
+
+
+def examined(source: str | Path, sensor: Sensor | None = None, *, seconds: float = LISTEN) -> Iterator[Finding]:
+    """What is right and wrong with a source, in the order of looking.
+
+    Args:
+        sensor: whose bytes are expected; found out where left out.
+        seconds: to listen for.
+    """
+    text = resolved(source)
+    address = live_address(text)
+    if address is None:
+        yield from _file(text, sensor)
+    elif address.scheme == "serial":
+        yield from _serial(text, address, sensor, seconds)
+    elif address.scheme == "udp":
+        yield from _udp(text, address, sensor, seconds)
+    else:
+        yield from _heard(text, sensor, seconds)
+
+
+def computer() -> Iterator[Finding]:
+    """What is right and wrong with the ports of this computer, whatever is connected to them."""
+    found = ports.serial_ports()
+    if not found:
+        yield Finding(True, "there is no serial port: where one should be, its cable or driver is missing", "sudo dmesg | tail")
+    for port in found:
+        yield from _permission(port.path)
+        yield from _in_use(port.path)
+    for number in udp_ports():
+        yield from _port_in_use(number)
+    yield from _buffer()
+
+
+def _file(path: str, sensor: Sensor | None) -> Iterator[Finding]:
+    name = path if os.path.exists(path) else path.rpartition("?")[0]  # what stands behind it chooses a sender
+    if not os.path.exists(name):
+        yield Finding(False, f"{path}: no such file or port", "lidarspec ports")
+    elif not os.access(name, os.R_OK):
+        yield Finding(False, f"{path}: this user may not read it", f"sudo chmod a+r {path}")
+    elif os.path.getsize(name) == 0:
+        yield Finding(False, f"{path} is empty")
+    else:
+        tried = verdicts(path)
+        found = max(tried, key=lambda one: one.heard.size)
+        if found.heard.size:
+            yield _verdict(path, found, sensor)
+        yield from _several(path, tried)
+        for text in found.heard.warnings or [no_bytes(path, ())] * (not found.heard.size):
+            yield Finding(False, text)
+
+
+def _serial(source: str, address: Address, sensor: Sensor | None, seconds: float) -> Iterator[Finding]:
+    port = address.place
+    if os.name == "posix" and not os.path.exists(port):
+        yield Finding(False, f"{port}: no such port; it is not plugged in, or its driver is missing", "lidarspec ports")
+        return
+    problems = [finding for finding in (*_permission(port), *_in_use(port)) if not finding.ok]
+    yield from problems or [Finding(True, f"{port} is there, and may be opened")]
+    if not problems:
+        yield from _heard(source, sensor, seconds)
+
+
+def _permission(port: str) -> Iterator[Finding]:
+    if not ports.allowed(port):
+        group = ports.group(port)
+        text = f"{port}: this user may not open it"
+        by_group = Finding(False, f"{text}; the group {group} may, from the next login on", f"sudo usermod -aG {group} $USER")
+        yield by_group if group else Finding(False, f"{text}; nobody but root may", _rule(port))
+
+
+def _rule(port: str) -> str:
+    """A udev rule that lets every user open ports of this kind."""
+    kind = os.path.basename(port).rstrip("0123456789")
+    rule = f'KERNEL=="{kind}[0-9]*", MODE="0666"'
+    return f"echo '{rule}' | sudo tee /etc/udev/rules.d/99-lidarspec.rules && sudo udevadm trigger"
+
+
+def _in_use(port: str) -> Iterator[Finding]:
+    for user in ports.users(port):
+        yield Finding(False, f"{port} is in use by {user}", f"kill {user.pid}")
+
+
+def _udp(source: str, address: Address, sensor: Sensor | None, seconds: float) -> Iterator[Finding]:
+    numbers, host = _udp_numbers(address, sensor), address.host_and_port()[0]
+    busy = [finding for number in numbers for finding in _port_in_use(number)]
+    yield from busy
+    yield from _buffer()
+    if busy:
+        return
+    before, began = ports.received(), time.monotonic()
+    found = list(_heard(source, sensor, seconds))
+    yield from found
+    if any("nothing came" in finding.text for finding in found):
+        rates = {name: (count - before.get(name, count)) / (time.monotonic() - began) for name, count in ports.received().items()}
+        yield from _interfaces(numbers, host, rates)
+
+
+def _udp_numbers(address: Address, sensor: Sensor | None) -> list[int]:
+    port, given = address.host_and_port()[1], address.options.get("port", "")
+    if given:
+        return [int(part) for part in given.split(",") if part.isdecimal()]
+    link = data_link(sensor, Udp)
+    return [port] if port else list(link.ports) if link else udp_ports()
+
+
+def _port_in_use(number: int) -> Iterator[Finding]:
+    users = ports.udp_users(number)
+    if users is None:
+        return
+    for user in users:
+        yield Finding(False, f"UDP port {number} is in use by {user}", f"kill {user.pid}")
+    if not users:
+        yield Finding(False, f"UDP port {number} is in use by a program of another user", f"sudo ss -ulpn 'sport = :{number}'")
+
+
+def _buffer() -> Iterator[Finding]:
+    limit = Path("/proc/sys/net/core/rmem_max")
+    try:
+        granted = int(limit.read_text(encoding="ascii"))
+    except (OSError, ValueError):
+        return
+    for text in shortfall(BUFFER, min(granted, BUFFER)):
+        said, _, command = text.partition("; next: ")
+        yield Finding(False, said.replace("the system gave", "the system gives at most"), command)
+
+
+def _interfaces(numbers: list[int], host: str, rates: dict[str, float]) -> Iterator[Finding]:
+    """Where packets do arrive while none comes to the ports."""
+    listed = "/".join(map(str, numbers))
+    active = {name: rate for name, rate in rates.items() if name != LOOPBACK and rate >= 1}
+    if host:
+        text = f"only packets to {host} are listened to; a sensor may send to another address"
+        yield Finding(True, text, f"lidarspec doctor udp://:{numbers[0]}")
+    for name, rate in active.items():
+        text = f"{name} receives {rate:.0f} packets/s, none of them on port {listed}: another port, another address, or a firewall"
+        yield Finding(False, text, f"sudo tcpdump -ni {name} udp")
+        if ports.filters_senders(name):
+            text = f"{name} drops senders whose addresses it does not reach, as a sensor with its factory address is (rp_filter)"
+            yield Finding(False, text, f"sudo sysctl -w net.ipv4.conf.all.rp_filter=2 net.ipv4.conf.{name}.rp_filter=2")
+    if rates and not active:
+        text = "no network interface receives anything: cable, power of the sensor, or an interface that is down"
+        yield Finding(False, text, "ip -br address")
+
+
+def _heard(source: str, sensor: Sensor | None, seconds: float) -> Iterator[Finding]:
+    """What comes, and whether it is what should come."""
+    try:
+        tried = [verdict(heard) for heard in heard_as(source, sensor, seconds)] if sensor is not None else []
+        if not any(one.scores for one in tried):
+            tried += verdicts(source, seconds=seconds)
+    except LidarSpecError as error:
+        command = suggestion(error)
+        yield Finding(False, str(error), "" if "doctor" in command and not isinstance(error, UsageError) else command)
+        return
+    yield _verdict(source, max(tried, key=lambda one: (bool(one.scores), one.heard.size)), sensor)
+    yield from _several(source, tried)
+
+
+def _several(source: str, found: Sequence[Verdict]) -> Iterator[Finding]:
+    """Senders whose frames are of one sensor, and would be mixed."""
+    senders: dict[str, list[str]] = {}
+    for one in found:
+        if one.scores and one.heard.sender:
+            senders.setdefault(one.scores[0].sensor.id, []).append(one.heard.sender)
+    for name, several in senders.items():
+        if len(several) > 1:
+            command = f"lidarspec view {quote(with_option(source, 'src', several[0]))} -s {name}"
+            yield Finding(False, f"{' and '.join(several)} all send frames of {name}: choose one", command)
+
+
+def _verdict(source: str, found: Verdict, sensor: Sensor | None) -> Finding:
+    """One finding on what was heard."""
+    heard, ids = found.heard, [score.sensor.id for score in found.scores]
+    may_be = {score.sensor.id: score.why for score in found.alike} or dict(found.others)
+    quoted = quote(source)
+    if not heard.size and heard.warnings:
+        return Finding(False, heard.warnings[0], f"lidarspec detect {quote(source.partition('?')[0])}")
+    if not heard.size:
+        return _nothing(source, sensor)
+    if found.fault:
+        return Finding(False, found.fault, f"lidarspec crc {quoted}")
+    if not found.scores:
+        at = " at any baud rate" if heard.baud is not None and len(bauds()) > 1 else ""
+        return Finding(False, f"{heard.size} bytes came, and no frame of an installed sensor{at}", f"lidarspec detect {quoted}")
+    at = f" at {heard.baud} baud" if heard.baud is not None else ""
+    if sensor is not None and sensor.id not in ids:
+        return Finding(False, f"it sends frames of {ids[0]}{at}, not of {sensor.id}", f"lidarspec view {quoted} -s {ids[0]}")
+    name = sensor.id if sensor is not None else ids[0]
+    if name not in may_be:
+        other, why = next(iter(may_be.items()))
+        command = f"lidarspec view {quoted} -s {other}" if found.alike else f"lidarspec detect {quoted}"
+        return Finding(False, f"it sends frames of {other} ({why}){at}, not of {name}", command)
+    score = next(score for score in found.scores if score.sensor.id == name)
+    link = data_link(score.sensor, Serial)
+    if heard.baud is not None and link and heard.baud not in link.bauds:
+        again = quote(with_option(source, "baud", heard.baud))
+        return Finding(False, f"{name} sends{at}, and {link.baud} is declared", f"lidarspec view {again} -s {name}")
+    cut_off = 2 * max(frame.max_length for frame in score.sensor.incoming.values()) / heard.size  # the first frame, and the last
+    if score.share + (0 if heard.datagrams else cut_off) < CLEAR:
+        return Finding(False, f"{name} sends{at}, and {1 - score.share:.0%} of the bytes are in no frame: cable, ground or baud rate")
+    device = "".join(f", {role} {text}" for role, text in said(score.sensor, score.found).items())
+    return Finding(True, f"{name} sends{at}: {score.data_frames} data frames, {score.share:.0%} of the bytes in frames{printable(device)}")
+
+
+def _nothing(source: str, sensor: Sensor | None) -> Finding:
+    """Nothing was heard."""
+    quoted = quote(source)
+    if sensor is not None and sensor in started_first():
+        start = next(name for name in sensor.on_open if sensor.commands[name].starts)
+        text = f"nothing came; {sensor.id} sends nothing before it is started"
+        return Finding(False, text, f"lidarspec send {quoted} {start} -s {sensor.id}")
+    address = live_address(source)
+    if sensor is None and address is not None and address.scheme == "serial":
+        text = "nothing came: a sensor that has to be started first, no power, or its transmit line is not on our receive line"
+        return Finding(False, text, f"lidarspec detect {quoted} --start")
+    return Finding(False, "nothing came within the time of listening")

@@ -1,0 +1,229 @@
+"""Which checksum is this: what a set of sample frames is sealed with, where it stands and what it covers.
+
+The plain checksums are tried one by one, the usual ones first: XOR, sums of bytes and words, their complements, words in groups, folded
+sums, split nibbles. CRCs are found without trying (`crc_search`), and looked for only where no plain one is beyond doubt.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Iterator
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lidarspec.drafting.crc_search import crc_matches
+from lidarspec.drafting.samples import Match, Place, Samples, Span, anywhere, best_first, doubt, enough, spans
+from lidarspec.frames.row_checksums import batch
+from lidarspec.spec.checksums import ByteOrder, Bytes, Checksum, Fold15, Sum, Values, WordXor, Xor
+
+#: matches that are told.
+TOLD = 8
+#: frames that a guess is tried on before it is held against all.
+SCREENED = 16
+#: share of the frames that a checksum with a constant of its own has to be right for.
+CERTAIN = 0.95
+ANYWHERE = "an XOR of a whole frame fits at other places of it as well: of those that do, this is where bytes vary most"
+#: heads and groups of words that are tried.
+HEADS, GROUPS = (0, 2, 4, 6, 8, 10, 12), ((2,), (1, 2), (2, 1), (1, 1, 2))
+_PADDED = {"little": "", "big": '.ljust(2, b"\\0")'}
+
+
+@dataclass(frozen=True)
+class WordSum(Checksum):
+    """The sum of two-byte words modulo 2**16, an odd last byte extended by zeros; with `carry`, carries are added back."""
+
+    words: ByteOrder = "little"
+    carry: bool = False
+    width = 16
+
+    def __call__(self, data: Bytes) -> int:
+        return int(self.batch(np.frombuffer(data, np.uint8).reshape(1, -1))[0])
+
+    def describe(self) -> str:
+        return f"16-bit sum of {self.words}-endian words" + (" with carries added back" if self.carry else "")
+
+    def batch(self, rows: NDArray[np.uint8]) -> Values:
+        low, high = (rows[:, 0::2], rows[:, 1::2]) if self.words == "little" else (rows[:, 1::2], rows[:, 0::2])
+        total: NDArray[np.uint64] = low.sum(axis=1, dtype=np.uint64) + (high.sum(axis=1, dtype=np.uint64) << np.uint64(8))
+        for _ in range(2 if self.carry else 0):
+            total = (total & np.uint64(0xFFFF)) + (total >> np.uint64(16))
+        return total & np.uint64(0xFFFF)
+
+
+@dataclass(frozen=True)
+class Changed(Checksum):
+    """Another checksum with a constant on it: ``constant - it`` with `negative`, else ``constant + it``; for XORs ``constant ^ it``."""
+
+    of: Checksum
+    constant: int
+    negative: bool = False
+    width = 8
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "width", self.of.width)
+
+    def __call__(self, data: Bytes) -> int:
+        return int(self._changed(np.array([self.of(data)], np.uint64))[0])
+
+    def describe(self) -> str:
+        digits = self.width // 4
+        if self.negative and self.constant in (0, self._mask):
+            return f"{self.of.describe()}, {'negated' if self.constant == 0 else 'complemented'}"
+        return f"{self.of.describe()}, {'taken from' if self.negative else 'and'} 0x{self.constant:0{digits}x}"
+
+    def batch(self, rows: NDArray[np.uint8]) -> Values:
+        return self._changed(batch(self.of, rows))
+
+    @property
+    def _mask(self) -> int:
+        return (1 << self.width) - 1
+
+    def _changed(self, values: Values) -> Values:
+        constant = np.uint64(self.constant)
+        if isinstance(self.of, Xor | WordXor):
+            return values ^ constant
+        return ((constant - values) if self.negative else (constant + values)) & np.uint64(self._mask)
+
+
+def search(frames: Iterable[bytes], *, quick: bool = False, stands: Callable[[Place], bool] = anywhere) -> list[Match]:
+    """The checksums that fit the frames, the plainest and best proven first; empty where none does.
+
+    Args:
+        frames: whole frames, the more of them and the more different the better; some may be damaged, and lengths may differ.
+        quick: end after about a second: look for CRCs at the usual places only, and for those of long frames in the catalogue only.
+        stands: whether a checksum may stand at a place.
+    """
+    samples = Samples(frames)
+    if samples.shortest < 3 or not any(map(any, samples.frames)):
+        return []
+    found = list(plain_matches(samples, stands))
+    if not any(match.sure for match in found):
+        found += crc_matches(samples, quick=quick, stands=stands)
+    if not found and not quick:
+        found += crc_matches(samples, mixed=True, stands=stands)
+    return best_first(found)[:TOLD]
+
+
+def pasted(algorithm: Checksum) -> str:
+    """The algorithm as a plugin writes it; a class where the package has none."""
+    if isinstance(algorithm, Changed | WordSum):
+        return _class(algorithm)
+    if isinstance(algorithm, Sum):
+        return f"Sum({algorithm.width})"
+    if isinstance(algorithm, WordXor):
+        return f"WordXor(head={algorithm.head}, groups={algorithm.groups})"
+    return f"{type(algorithm).__name__}()"
+
+
+def plain_matches(samples: Samples, stands: Callable[[Place], bool] = anywhere) -> Iterator[Match]:
+    """Every plain checksum that fits, in no special order."""
+    few = samples.few(SCREENED)
+    tried, sure, certain = 0, False, False
+    longest = len(few.frames[-1])
+    for size, algorithms in ((4, (Sum(32),)), (2, _WIDE), (1, (Xor(), Sum(8)))):
+        for place in filter(stands, few.places(size)):
+            for span in spans(place, few):
+                if 2 * sum(b - a for a, b in span.ranges(place, longest)) < longest - size:
+                    continue
+                for algorithm in algorithms:
+                    if isinstance(algorithm, WordXor) and (span.head or span.tail):
+                        continue
+                    tried += 1
+                    for match in _fitting(samples, few, algorithm, place, span, tried):
+                        sure = sure or match.sure
+                        certain = certain or (match.sure and not isinstance(match.algorithm, Xor | WordXor))
+                        yield match
+            if certain:
+                return
+        if sure:
+            return
+    yield from _nibbles(samples)
+
+
+def _fitting(samples: Samples, few: Samples, algorithm: Checksum, place: Place, span: Span, tried: int) -> Iterator[Match]:
+    """An algorithm and its complements where they fit; a constant is fitted where there are frames to prove it."""
+    computed = few.computed(algorithm, place, span)
+    mask = np.uint64((1 << 8 * place.size) - 1)
+    orders: tuple[ByteOrder, ...] = ("little", "big") if place.size > 1 else ("little",)
+    for order in orders:
+        there = few.fields(place, order)
+        found: list[Checksum]
+        if isinstance(algorithm, Fold15):
+            found = [algorithm] if enough(int((there == computed).sum()), len(few)) else []
+        elif isinstance(algorithm, Xor | WordXor):
+            found = [_changed(algorithm, constant) for constant in _constant(there ^ computed)]
+        elif few.alone:
+            if not there.any():
+                return
+            found = [algorithm, Changed(algorithm, int(mask), negative=True)]
+        else:
+            found = [_changed(algorithm, constant) for constant in _constant((there - computed) & mask)]
+            found += [Changed(algorithm, constant, negative=True) for constant in _constant((there + computed) & mask)]
+        for one in found:
+            constant = one.constant if isinstance(one, Changed) else 0
+            fitted = int(constant not in (0, int(mask)))
+            right = samples.right(one, place, span, order)
+            doubtful = doubt(one.width, there, fitted, tried)
+            proven = enough(right, len(samples)) if not fitted else right >= CERTAIN * len(samples)
+            if proven and doubtful > 0 and not (few.alone and fitted):
+                remarks: tuple[str, ...] = ("a constant is in it: fields left out of what it covers, or a start value",) if fitted else ()
+                varied = 0.0
+                if isinstance(algorithm, Xor | WordXor) and span == Span():
+                    remarks, varied = (*remarks, ANYWHERE), samples.varied(place)
+                yield Match(one, place, span, order, right, len(samples), doubtful, pasted(one), remarks, "", bool(fitted), varied)
+
+
+def _changed(algorithm: Checksum, constant: int) -> Checksum:
+    return Changed(algorithm, constant) if constant else algorithm
+
+
+def _constant(values: NDArray[np.uint64]) -> list[int]:
+    """The value that nearly all of them have, if there is one."""
+    distinct, counts = np.unique(values, return_counts=True)
+    most = int(counts.argmax())
+    return [int(distinct[most])] if enough(int(counts[most]), len(values)) else []
+
+
+def _nibbles(samples: Samples) -> Iterator[Match]:
+    """An XOR whose halves stand in the low nibbles of two bytes next to each other."""
+    for front in range(min(3, samples.shortest - 4)):
+        place = Place(front, 2)
+        there = samples.fields(place, "little")
+        halves = (there & np.uint64(15)) | (there >> np.uint64(4)) & np.uint64(0xF0)
+        for span in (Span("behind"), Span("all"))[: 1 + (front > 0)]:
+            right = int((samples.computed(Xor(), place, span) == halves).sum())
+            if enough(right, len(samples)) and doubt(8, halves, 0, 8) > 0:
+                remark = "its halves are the low nibbles of two bytes, low half first: name both in Checksummed(field=(...))"
+                yield Match(Xor(), place, span, "little", right, len(samples), doubt(8, halves, 0, 8), "Xor()", (remark,))
+
+
+_WIDE: tuple[Checksum, ...] = (
+    Sum(16),
+    *(WordSum(order, carry) for order in ("little", "big") for carry in (False, True)),
+    *(WordXor(head, groups) for groups in GROUPS for head in (HEADS if groups != (2,) else (0,))),
+    Fold15(),
+)
+
+
+def _class(algorithm: Checksum) -> str:
+    """The source of a class for a checksum that the package has no name for."""
+    changed = algorithm if isinstance(algorithm, Changed) else Changed(algorithm, 0)
+    base, steps = changed.of, []
+    if isinstance(base, Xor | WordXor):
+        value = f"{pasted(base)}(data) ^ 0x{changed.constant:X}"
+    elif isinstance(base, WordSum):
+        steps = [f'words = [int.from_bytes(data[i : i + 2]{_PADDED[base.words]}, "{base.words}") for i in range(0, len(data), 2)]']
+        value = "sum(words)"
+        if base.carry:
+            steps += ["total = sum(words)", *["total = (total & 0xFFFF) + (total >> 16)"] * 2]
+            value = "total"
+    else:
+        value = "sum(data)"
+    if not isinstance(base, Xor | WordXor) and (changed.constant or changed.negative):
+        value = f"0x{changed.constant:X} {'-' if changed.negative else '+'} {value}"
+    body = "".join(f"        {line}\n" for line in (*steps, f"return ({value}) & 0x{(1 << changed.width) - 1:X}"))
+    return (
+        f"class Check(Checksum):\n    width = {changed.width}\n\n    def __call__(self, data):\n{body}\n"
+        f'    def describe(self):\n        return "{algorithm.describe()}"'
+    )

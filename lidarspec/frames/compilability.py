@@ -1,0 +1,74 @@
+"""What has no computable place, whatever the header: told before any bytes arrive, and the frame is then interpreted by construct."""
+
+from __future__ import annotations
+
+from lidarspec.frames.schema import schema
+from lidarspec.spec import tree
+
+
+class NotCompilable(Exception):
+    """A part of a struct that has no computable place; attributes `path` and `reason`."""
+
+    def __init__(self, path: str, reason: str) -> None:
+        self.path, self.reason = path, reason
+        super().__init__(f"{path}: {reason}" if path else reason)
+
+
+def check_compilable(root: tree.Node) -> None:
+    """Raise `NotCompilable` if any part of a tree has no computable place, whatever the header, or values that no column holds."""
+    _check(root, "", in_array=False)
+    _check_columns(root)
+
+
+def _check(node: tree.Node, path: str, *, in_array: bool) -> None:
+    match node:
+        case tree.Opaque():
+            raise NotCompilable(node.info.path, node.reason)
+        case tree.Sealed():
+            if in_array:
+                raise NotCompilable(path, "a checksum inside an array")
+            _ = node.algorithm
+        case tree.Parts() if in_array:
+            raise NotCompilable(path, "parts inside an array")
+        case tree.Block():
+            for part in node.parts:
+                if len(part.indices) > 1:
+                    raise NotCompilable(part.info.path, "an array of arrays of bits")
+    for formula in tree.formulas(node):
+        if isinstance(formula, tree.Code) and formula.blind:
+            raise NotCompilable(path, formula.reason.partition(": ")[2])
+        for ref in tree.refs(formula):
+            check_control(ref.info)
+    if isinstance(node, tree.Parts):
+        for kind in node.kinds:
+            _check_part(kind, path)
+        return
+    for child in tree.children(node):
+        below = f"{path}.{child.name}".strip(".") if isinstance(node, tree.Struct) else path
+        _check(child, below, in_array=in_array or isinstance(node, tree.Repeat))
+
+
+def _check_part(kind: tree.Kind, path: str) -> None:
+    """Hold a part, as a frame in itself, to what holds for frames."""
+    try:
+        for ref in () if kind.following is None else tree.refs(kind.following):
+            check_control(ref.info)
+        check_compilable(kind.root)
+    except NotCompilable as reason:
+        raise NotCompilable(f"{path}.{reason.path}".rstrip("."), reason.reason) from None
+
+
+def _check_columns(root: tree.Node) -> None:
+    """Raise `NotCompilable` if a field of a tree has values that no column holds."""
+    for info in schema(root).fields.values():
+        if info.dtype is None:
+            wide = f"its {info.bits} bits are more than a column holds"
+            raise NotCompilable(info.path, wide if info.bits > 64 else "its values are not all plain numbers of one kind")
+
+
+def check_control(info: tree.FieldInfo) -> None:
+    """Raise `NotCompilable` if a layout cannot be made to depend on a field."""
+    if info.kind == "int" and info.axes and info.axes[-1].strip("[]") != info.path:
+        raise NotCompilable(info.path, "elements of one array differ in layout: Parts(struct, count) reads such in bulk")
+    if info.axes or info.kind != "int":
+        raise NotCompilable(info.path, "the layout depends on a field that is not one integer")

@@ -1,0 +1,513 @@
+"""Where each field of a frame stands, as data: offsets, strides, bits, constants, checksums; and loading by it.
+
+A `Layout` holds for frames of one kind of header; `lidarspec.frames.layout_tree` makes it from the frame tree. A `Leaf` is the place of one
+field, a `Seal` a checksum with the bytes that it covers. All work on many frames at a time, given as rows of bytes; constants are
+compared in words of up to eight bytes.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from functools import cached_property, lru_cache, reduce
+from typing import Any, Literal, Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lidarspec.errors import PluginError
+from lidarspec.frames.row_checksums import over
+from lidarspec.spec.bits import BitField, Segment
+from lidarspec.spec.checksums import Checksum, Single, single
+from lidarspec.spec.tree import Check, FieldInfo, Formula, Node, arrays, element_of, parts, refs, width
+
+Bytes2D = NDArray[np.uint8]
+
+
+def elements(rows: Bytes2D, dtype: np.dtype[Any], offset: int, shape: tuple[int, ...], strides: tuple[int, ...]) -> NDArray[Any]:
+    """What stands at an offset of each row (contiguous by itself) and at these strides from there, (n, *shape), not copied."""
+    if rows.flags.c_contiguous:
+        return np.ndarray((len(rows), *shape), dtype, rows, offset, (rows.shape[1], *strides))
+    first = rows[:, offset : offset + dtype.itemsize].view(dtype)
+    if not shape:
+        return first[:, 0]
+    return np.lib.stride_tricks.as_strided(first, (len(rows), *shape), (rows.strides[0], *strides))
+
+
+def span(rows: Bytes2D) -> NDArray[np.uint8]:
+    """All bytes from the first of the first row to the last of the last one, those between the rows included, (k,), not copied."""
+    if rows.flags.c_contiguous:
+        return rows.reshape(-1)
+    return np.lib.stride_tricks.as_strided(rows, ((len(rows) - 1) * rows.strides[0] + rows.shape[1],), (1,))
+
+
+def rows_at(buffer: NDArray[np.uint8], offsets: NDArray[np.intp], size: int, *, gathered: bool = True) -> NDArray[np.uint8]:
+    """`size` bytes from each of these offsets on, one a row, (n, size); no copy where they stand back to back.
+
+    Args:
+        gathered: C-contiguous; else no copy either where they stand at one distance, and each row is contiguous by itself.
+    """
+    count = len(offsets)
+    if not count or not size:
+        return np.zeros((count, size), np.uint8)
+    if size == 1:
+        return buffer.take(offsets).reshape(count, 1)
+    first, step = offsets.item(0), offsets.item(1) - offsets.item(0) if count > 1 else size
+    even = offsets.item(-1) - first == (count - 1) * step
+    if even and count > 2:
+        even = np.count_nonzero(offsets[1:] - offsets[:-1] == step) == count - 1
+    if even and step == size:
+        return buffer[first : first + count * size].reshape(count, size)
+    if even and step > size and not gathered:
+        return np.ndarray((count, size), np.uint8, buffer.data, first, (step, 1))
+    windows: NDArray[Any] = np.ndarray((len(buffer) - size + 1,), f"V{size}", buffer.data, 0, (1,))
+    return windows[offsets].view(np.uint8).reshape(count, size)
+
+
+@dataclass(frozen=True, eq=False)
+class Leaf:
+    """The place of one field.
+
+    Attributes:
+        info: what the field is.
+        offset: of its first element, in bytes from the start of the frame.
+        shape, strides: number of elements and bytes from one to the next along each of its arrays.
+        wire: its type with byte order where it can be read directly, else None.
+        elements: else the bits of each element of the innermost array (one, if that is not inside the bit block).
+        size: bytes of one element, or of the block that it is a part of.
+    """
+
+    info: FieldInfo
+    offset: int
+    shape: tuple[int, ...]
+    strides: tuple[int, ...]
+    size: int
+    wire: np.dtype[Any] | None = None
+    elements: tuple[BitField, ...] = ()
+
+    def load(self, rows: Bytes2D) -> NDArray[Any]:
+        """The raw values of frames given as rows of bytes, shape (n, *shape), native byte order."""
+        if self.wire is not None:
+            return self._view(rows, self.wire, 0).astype(self._native)
+        assert self.info.dtype is not None
+        if not self._packed:
+            return self._bits(rows, self.elements[0])
+        columns = [self._bits(rows, element) for element in self.elements]
+        return np.stack(columns, axis=-1)
+
+    def scalar(self, frame: bytes | memoryview) -> int:
+        """The raw value of an integer field outside arrays, in the bytes of one frame."""
+        if self.elements:
+            return self.elements[0].value(frame[self.offset : self.offset + self.size])
+        assert self.wire is not None
+        order: Literal["big", "little"] = "big" if self.wire.byteorder == ">" else "little"
+        return int.from_bytes(frame[self.offset : self.offset + self.size], order, signed=self.wire.kind == "i")
+
+    def read(
+        self, buffer: NDArray[np.uint8], offsets: NDArray[np.intp], stops: NDArray[np.intp] | None = None
+    ) -> tuple[NDArray[np.intp] | None, NDArray[Any]]:
+        """An integer outside arrays in the candidates at these offsets: the indices of those that have it, None for all; its values.
+
+        Args:
+            stops: where the candidates end; by default with the buffer.
+        """
+        there = offsets + (self.offset + self.size) <= (len(buffer) if stops is None else stops)
+        which = None if there.all() else np.flatnonzero(there)
+        spots = (offsets if which is None else offsets[which]) + self.offset
+        if self.wire is not None and len(spots):
+            windows: NDArray[Any] = np.ndarray((len(buffer) - self.size + 1,), self.wire, buffer.data, 0, (1,))
+            return which, windows[spots].astype(self._native)
+        return which, self._alone.load(rows_at(buffer, spots, self.size))
+
+    def of(self, frame: bytes | memoryview) -> int | None:
+        """Its value in the first bytes of a frame; None where they end before it does."""
+        return self.scalar(frame) if self.offset + self.size <= len(frame) else None
+
+    def store(self, rows: Bytes2D, values: Any) -> None:
+        """Write raw values, broadcast to (n, *shape), into frames given as rows of bytes."""
+        full = np.broadcast_to(np.asarray(values), (len(rows), *self.shape))
+        if self.wire is not None:
+            self._view(rows, self.wire, 0)[...] = full.astype(self.wire.newbyteorder("="))
+            return
+        for index, element in enumerate(self.elements):
+            column = (full[..., index] if self._packed else full).astype(np.int64)
+            for part in element.segments:
+                view = self._view(rows, np.dtype("u1"), part.byte)
+                bits = (column >> part.target << part.low).astype(np.uint8) & np.uint8(part.mask)
+                view[...] = (view & np.uint8(~part.mask & 0xFF)) | bits
+
+    def raw(self, given: Sequence[Any]) -> NDArray[Any]:
+        """Physical values of n frames as raw ones, (n, ...), with room for the arrays that the field is in; bytes fill up with zeros."""
+        if self.info.kind == "bytes":
+            size = self.shape[-1]
+            given = [list(value[:size].ljust(size, b"\0")) if isinstance(value, bytes) else value for value in given]
+        values = np.array([np.asarray(value, np.float64) for value in given])
+        return np.asarray(self.info.raw(values.reshape(*values.shape, *(1,) * (1 + len(self.shape) - values.ndim))))
+
+    @cached_property
+    def _alone(self) -> Leaf:
+        return self.at(self.offset)
+
+    @cached_property
+    def _native(self) -> np.dtype[Any]:
+        assert self.wire is not None
+        return self.wire.newbyteorder("=")
+
+    @property
+    def _packed(self) -> bool:
+        """Whether the innermost array is inside the bit block, and so has no stride."""
+        return len(self.shape) > len(self.strides)
+
+    def _view(self, rows: Bytes2D, dtype: np.dtype[Any], offset: int) -> NDArray[Any]:
+        shape = self.shape[: len(self.strides)]
+        if not len(rows) or 0 in shape:
+            return np.empty((len(rows), *shape), dtype)
+        return elements(rows, dtype, self.offset + offset, shape, self.strides)
+
+    def _bits(self, rows: Bytes2D, element: BitField) -> NDArray[Any]:
+        assert self.info.dtype is not None
+        wide = np.dtype(f"u{self.info.dtype.itemsize}")
+        total = self._within(rows, element.segments[0], wide) if len(element.segments) == 1 else self._whole(rows, element, wide)
+        if total is None:
+            total = np.zeros((len(rows), *self.shape[: len(self.strides)]), wide)
+            for part in element.segments:
+                bits = (self._view(rows, np.dtype("u1"), part.byte) & np.uint8(part.mask)) >> part.low
+                total |= bits.astype(wide) << wide.type(part.target)
+        if element.signed:
+            sign = wide.type(1 << (element.width - 1))
+            return np.asarray(((total ^ sign) - sign).view(self.info.dtype))
+        return total.astype(self.info.dtype, copy=False)
+
+    def _within(self, rows: Bytes2D, part: Segment, wide: np.dtype[Any]) -> NDArray[Any]:
+        """Values of bits within one byte."""
+        total = self._view(rows, np.dtype("u1"), part.byte).astype(wide)
+        if part.mask != 0xFF:
+            total &= wide.type(part.mask)
+            total >>= wide.type(part.low)
+        return total
+
+    def _whole(self, rows: Bytes2D, element: BitField, wide: np.dtype[Any]) -> NDArray[Any] | None:
+        """Values of bits in a row, cut out of the words that end with their bytes; None where there is not so much before, or in a word."""
+        if element.run is None:
+            return None
+        order, first, count, lowest = element.run
+        spare = wide.itemsize - count
+        if spare < 0 or self.offset + first < spare:
+            return None
+        total = self._view(rows, np.dtype(f"{order}u{wide.itemsize}"), first - spare).astype(wide)
+        lowest += 8 * spare if order == "<" else 0
+        if lowest:
+            total >>= wide.type(lowest)
+        if lowest + element.width < 8 * wide.itemsize:
+            total &= wide.type((1 << element.width) - 1)
+        return total
+
+    @property
+    def held(self) -> tuple[int, int]:
+        """The first byte that holds any bit of it, where it stands first in its arrays, and the one after the last."""
+        if not self.elements:
+            return self.offset, self.offset + self.size
+        spots = [self.offset + part.byte for element in self.elements for part in element.segments]
+        return min(spots), max(spots) + 1
+
+    def element(self, path: str, indices: Mapping[str, int]) -> Leaf | None:
+        """Some element of its arrays, counted from the last one where an index is negative; None where there is none.
+
+        An array that others stand in remains, with that one element, so that each array keeps its place.
+        """
+        info = element_of(self.info, path, indices)
+        if info is None:
+            return None
+        offset, shape, elements, kept = self.offset, list(self.shape), self.elements, 0
+        for place, (axis, length) in enumerate(zip(self.info.axes, self.shape, strict=True)):
+            index = indices.get(axis, 0)
+            if not -length <= index < length:
+                return None
+            if axis not in indices:
+                kept = place + 1
+            elif place < len(self.strides):
+                offset, shape[place] = offset + index % length * self.strides[place], 1
+            else:
+                elements = (elements[index],)
+        size = 1 if self.info.kind == "bytes" and info.kind == "int" else self.size
+        return replace(self, info=info, offset=offset, shape=tuple(shape[:kept]), strides=self.strides[:kept], size=size, elements=elements)
+
+    def at(self, offset: int) -> Leaf:
+        """The field with its place counted from `offset`."""
+        return replace(self, offset=self.offset - offset)
+
+
+#: the checksums of frames by one of their seals, (n,); None where its algorithm is to compute them.
+Sums = Callable[["Seal", Bytes2D], "NDArray[np.uint64] | None"]
+
+
+@dataclass(frozen=True, eq=False)
+class Seal:
+    """A checksum of the frame: the fields that hold it, low bits first, and the byte ranges that it covers."""
+
+    leaves: tuple[Leaf, ...]
+    spans: tuple[tuple[int, int], ...]
+    algorithm: Checksum
+    absent: tuple[int, ...]
+
+    def covers(self, other: Seal) -> bool:
+        """Whether a field that holds another checksum is among what this one covers."""
+        return any(start < leaf.held[1] and leaf.held[0] < end for start, end in self.spans for leaf in other.leaves)
+
+    def stored(self, rows: Bytes2D) -> NDArray[np.uint64]:
+        """The values that stand in the frames, (n,)."""
+        if len(self.leaves) == 1 and self.leaves[0].info.kind != "bytes":
+            return self.leaves[0].load(rows).astype(np.uint64)
+        total, shift = np.zeros(len(rows), np.uint64), 0
+        for leaf in self.leaves:
+            values = leaf.load(rows).astype(np.uint64)
+            if leaf.info.kind == "bytes":
+                values = np.bitwise_or.reduce(values << self._powers(leaf), axis=1)
+            total |= values << np.uint64(shift)
+            shift += leaf.info.bits
+        return total
+
+    def _powers(self, leaf: Leaf) -> NDArray[np.uint64]:
+        """By how many bits each byte of a field of bytes is shifted, (k,)."""
+        powers = np.arange(0, leaf.info.bits, 8, dtype=np.uint64)
+        return powers if self.algorithm.order == "little" else powers[::-1]
+
+    def computed(self, rows: Bytes2D, sums: Sums | None = None) -> NDArray[np.uint64]:
+        """The values that should stand there, (n,).
+
+        Args:
+            sums: asked first, before the algorithm.
+        """
+        values = None if sums is None else sums(self, rows)
+        return over(self.algorithm, rows, self.spans or ((0, 0),)) if values is None else values
+
+    def fill(self, rows: Bytes2D) -> None:
+        """Write the right value into each frame."""
+        values, shift = self.computed(rows), 0
+        for leaf in self.leaves:
+            part = (values >> np.uint64(shift)) & np.uint64((1 << leaf.info.bits) - 1)
+            if leaf.info.kind == "bytes":
+                part = part[:, None] >> self._powers(leaf) & np.uint64(0xFF)
+            leaf.store(rows, part)
+            shift += leaf.info.bits
+
+    def sound(self, frame: bytes) -> bool:
+        """Whether one frame carries the right value, or one that means "not filled"."""
+        stored = shift = 0
+        for leaf in self.leaves:
+            if leaf.info.kind == "bytes":
+                stored |= int.from_bytes(frame[leaf.offset : leaf.offset + leaf.size], self.algorithm.order) << shift
+            else:
+                stored |= (leaf.scalar(frame) & ((1 << leaf.info.bits) - 1)) << shift
+            shift += leaf.info.bits
+        parts = [frame[a:b] for a, b in self.spans]
+        return stored in self.absent or stored == self._single(parts[0] if len(parts) == 1 else b"".join(parts))
+
+    @cached_property
+    def _single(self) -> Single:
+        return single(self.algorithm)
+
+    def intact(self, rows: Bytes2D, sums: Sums | None = None) -> NDArray[np.bool_]:
+        """Which frames carry the right value, or one that means "not filled", (n,); `sums` computes it, by default the algorithm."""
+        stored = self.stored(rows)
+        filled = reduce(np.logical_and, (stored != np.uint64(value) for value in self.absent)) if self.absent else None
+        if filled is None or filled.all():
+            return np.asarray(stored == self.computed(rows, sums))
+        right = np.ones(len(rows), np.bool_)
+        right[filled] = stored[filled] == self.computed(rows[filled], sums) if filled.any() else True
+        return right
+
+
+@dataclass(frozen=True, eq=False)
+class Condition:
+    """What frames have to meet: one field is one of some values, or a formula of fields side by side is not 0."""
+
+    fields: tuple[FieldInfo, ...]
+    formula: Formula | None
+
+    @classmethod
+    @lru_cache(maxsize=4096)
+    def of(cls, what: FieldInfo | Check) -> Condition:
+        """That a field has one of the values that it may have, or a check; the same in all layouts."""
+        if isinstance(what, FieldInfo):
+            return cls((what,), None)
+        return cls(tuple(ref.info for ref in refs(what.condition)), what.condition)
+
+    def values(self, raw: Mapping[str, NDArray[Any]]) -> NDArray[np.bool_]:
+        """Whether it holds, element by element, by the raw values of its fields; not where one is left out."""
+        if len(raw) < len(self.fields):
+            return np.zeros(1, np.bool_)
+        if self.formula is None:
+            (values,) = raw.values()
+            return np.isin(values, np.array(self.fields[0].allowed, values.dtype))
+        depth = max(array.ndim for array in raw.values())
+        columns = {path: array.astype(self._dtype).reshape(*array.shape, *(1,) * (depth - array.ndim)) for path, array in raw.items()}
+        found = np.asarray(arrays(self.formula, columns, self._dtype))
+        return found if found.dtype == np.bool_ else found != 0
+
+    @cached_property
+    def _dtype(self) -> Any:
+        """The smallest type that holds whatever the formula comes to on the way."""
+        most = max(width(part) for part in parts(self.formula or 0))
+        return np.int16 if most < 15 else np.int32 if most < 31 else np.int64
+
+
+class Test(Protocol):
+    """What frames have to pass, field by field."""
+
+    @property
+    def fields(self) -> tuple[FieldInfo, ...]:
+        """What it is made of."""
+
+    def values(self, raw: Mapping[str, NDArray[Any]]) -> NDArray[Any]:
+        """Whether it holds, element by element, by the raw values of those of its fields that a layout has."""
+
+
+def holding(test: Test, leaves: Mapping[str, Leaf], rows: Bytes2D) -> NDArray[np.bool_]:
+    """In which frames, given as rows of bytes, a test holds everywhere, (n,)."""
+    raw = {info.path: leaf.load(rows) for info in test.fields if (leaf := leaves.get(info.path)) is not None}
+    held = test.values(raw).astype(np.bool_, copy=False)
+    held = np.broadcast_to(held, (len(rows), *held.shape[1:]))
+    return np.asarray(held.all(axis=tuple(range(1, held.ndim))))
+
+
+@dataclass(frozen=True, eq=False)
+class Refused:
+    """A header that leads to no frame: too long (after these `constants`), a constant is wrong, or an expression of the plugin failed."""
+
+    error: PluginError | None = None
+    by_constant: bool = False
+    constants: Mapping[int, tuple[int, int]] = field(default_factory=dict)
+
+
+@dataclass(frozen=True, eq=False)
+class Layout:
+    """A frame of one kind of header.
+
+    Attributes:
+        size: in bytes.
+        leaves: where each field stands, by path.
+        constants: offset -> (mask, value).
+        seals: its checksums, inner ones first.
+        places: byte range of each named part outside arrays.
+        branches: what each `When` and `Select` chose.
+        following: fields whose values follow from this header in a frame that is made, and those; they are not asked of one that comes.
+        lengths: of each array, by its axis; 0 in an array without elements.
+        regions: where parts are that are frames in themselves, by their axis.
+        held: as constants, what fields have to be that say how long parts are.
+        conditions: that the values of its fields have to meet.
+        notes: what is worked out from the layout and kept with it.
+    """
+
+    size: int
+    leaves: Mapping[str, Leaf]
+    constants: Mapping[int, tuple[int, int]]
+    seals: tuple[Seal, ...]
+    places: Mapping[str, tuple[int, int]]
+    branches: Mapping[Node, Node] = field(default_factory=dict)
+    following: tuple[tuple[Leaf, int], ...] = ()
+    lengths: Mapping[str, int] = field(default_factory=dict)
+    regions: Mapping[str, Any] = field(default_factory=dict)
+    held: Mapping[int, tuple[int, int]] = field(default_factory=dict)
+    conditions: tuple[Condition, ...] = ()
+    notes: dict[Any, Any] = field(default_factory=dict, repr=False)
+
+    @cached_property
+    def known(self) -> Mapping[int, tuple[int, int]]:
+        """The bits of a frame that its header leaves no choice of, constants and lengths: offset -> (mask, value)."""
+        both = dict(self.constants)
+        for spot, (mask, value) in self.held.items():
+            other = both.get(spot, (0, 0))
+            both[spot] = (mask | other[0], value | other[1])
+        return both
+
+    @cached_property
+    def _mask(self) -> int:
+        """These bits, as one number."""
+        return sum(mask << 8 * spot for spot, (mask, _) in self.known.items())
+
+    @cached_property
+    def _value(self) -> int:
+        return sum(value << 8 * spot for spot, (_, value) in self.known.items())
+
+    def sound(self, frame: bytes) -> bool:
+        """Whether one frame has this size, all constants and the right checksums, and meets all conditions."""
+        return (
+            len(frame) == self.size
+            and int.from_bytes(frame, "little") & self._mask == self._value
+            and all(part.sound(frame) for part in (*self.seals, *self.regions.values()))
+            and (not self.conditions or self.meets(np.frombuffer(frame, np.uint8).reshape(1, -1)).item())
+        )
+
+    def meets(self, rows: Bytes2D) -> NDArray[np.bool_]:
+        """Which frames, given as rows of bytes, meet all conditions, (n,)."""
+        met = np.ones(len(rows), np.bool_)
+        for condition in self.conditions:
+            met &= holding(condition, self.leaves, rows)
+        return met
+
+    def seal(self, rows: Bytes2D) -> None:
+        """Write what follows from the header, the constants and the checksums into frames given as rows of bytes."""
+        for leaf, value in self.following:
+            leaf.store(rows, value)
+        if self.known:
+            spots, facts = list(self.known), np.array(list(self.known.values()), np.uint8)
+            rows[:, spots] = rows[:, spots] & ~facts[:, 0] | facts[:, 1]
+        for seal in self.seals:
+            seal.fill(rows)
+
+
+#: constants: offset, mask, value.
+Marks = tuple[tuple[int, int, int], ...]
+
+#: some of them side by side: offset, type, mask (None: all bits), value.
+Word = tuple[int, np.dtype[Any], Any, Any]
+
+
+def marks(constants: Mapping[int, tuple[int, int]]) -> Marks:
+    """Constants by offset, as mask and value: whole bytes first, which tell the most."""
+    found = [(spot, mask, value) for spot, (mask, value) in constants.items()]
+    return tuple(sorted(found, key=lambda mark: (mark[1] != 0xFF, mark[0])))
+
+
+@lru_cache(maxsize=2048)
+def words(constants: Marks) -> tuple[Word, ...]:
+    """Constants as few words of 1, 2, 4 or 8 bytes, each from a byte with a constant to another."""
+    left, found = {spot: (mask, value) for spot, mask, value in constants}, list[Word]()
+    while left:
+        first = min(left)
+        size = next(size for size in (8, 4, 2, 1) if first + size - 1 in left)
+        parts = [left.pop(spot, (0, 0)) for spot in range(first, first + size)]
+        dtype = np.dtype(f"<u{size}")
+        mask, value = (np.frombuffer(bytes(part), dtype)[0] for part in zip(*parts, strict=True))
+        found.append((first, dtype, None if all(part[0] == 0xFF for part in parts) else mask, value))
+    return tuple(found)
+
+
+def exclude(some: Marks, others: Marks) -> bool:
+    """Whether no frame has some constants and the others as well."""
+    known = {spot: (mask, value) for spot, mask, value in others}
+    both = [(mask & known[spot][0], value ^ known[spot][1]) for spot, mask, value in some if spot in known]
+    return any(mask & differing for mask, differing in both)
+
+
+def equal(found: NDArray[Any], word: Word) -> NDArray[np.bool_]:
+    """Whether a constant is right, for what stands at its place in each frame, of that shape."""
+    _, _, mask, value = word
+    return np.asarray((found if mask is None else found & mask) == value)
+
+
+def right(constants: tuple[Word, ...], rows: Bytes2D) -> NDArray[np.bool_] | None:
+    """Which rows have all constants, (n,); None where all have."""
+    held: NDArray[np.bool_] | None = None
+    for word in constants:
+        spot, dtype, _, _ = word
+        if spot + dtype.itemsize > rows.shape[1]:
+            return np.zeros(len(rows), np.bool_)
+        each = equal(elements(rows, dtype, spot, (), ()), word)
+        number = np.count_nonzero(each)
+        if number < len(rows):
+            held = each if held is None else np.bitwise_and(held, each, out=held)
+        if not number:
+            break
+    return held

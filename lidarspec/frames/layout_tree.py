@@ -1,0 +1,716 @@
+"""The layouts of a frame type: where each field stands, for each kind of header.
+
+Counts, conditions and keys make the layout of a frame depend on some of its own header fields. `layout_of` walks the frame's tree with
+a cursor, for given values of these fields, and says with `Unknown` which further one it needs. A `HeaderTree` keeps what it found: each
+node of it is one field, each branch one of its values, each end a `Layout`, or the reason why there is none. Candidates are sorted
+through it in bulk, by value, so that the frame's tree is walked once for each distinct header.
+"""
+
+from __future__ import annotations
+
+import bisect
+import contextlib
+import functools
+import math
+import operator
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass, field, replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lidarspec.errors import PluginError, SpecError
+from lidarspec.frames.arrays import by_value
+from lidarspec.frames.compilability import NotCompilable, check_compilable, check_control
+from lidarspec.frames.layout import Condition, Layout, Leaf, Refused, Seal
+from lidarspec.frames.parts import CONSTANT, FAILED, Kind, Measure, Region, Rule
+from lidarspec.frames.schema import ByPath, without_indices
+from lidarspec.spec import tree
+from lidarspec.spec.bits import BitField, whole_bytes
+from lidarspec.spec.description import Frame
+
+
+class Unknown(Exception):
+    """The layout depends on a field whose value is not given, or on the size of parts.
+
+    Attributes:
+        leaf: where it stands.
+    """
+
+    def __init__(self, leaf: Leaf | Measure) -> None:
+        self.leaf = leaf
+        super().__init__(leaf.info.path)
+
+
+class TooLong(Exception):
+    """The header claims more than the longest length that the frame declares, or no byte at all."""
+
+
+class Unlike(Exception):
+    """A part has the constants of no kind."""
+
+
+class CutOff(Exception):
+    """A frame is longer than the bytes that there are of it, and there will be no more."""
+
+
+def layout_of(root: tree.Node, values: Mapping[str, int], limit: int, given: Mapping[str, int] | None = None) -> Layout:
+    """The layout of the frames whose header fields have these values.
+
+    Args:
+        values: raw, by path, of the fields that the layout depends on.
+        limit: the longest frame, in bytes.
+        given: of parts, raw values of fields of the frame around them, by their path there.
+
+    Raises:
+        Unknown: where the value of a further field decides.
+        TooLong: where the frame would be longer than `limit`, or without a byte.
+        Unlike: where a part has the constants of no kind.
+        NotCompilable: where construct alone can tell what comes next.
+        Exception: whatever a formula raises on these values.
+    """
+    return _walked(_Walk(values, limit, given or {}), root)
+
+
+def _walked(walk: _Walk, root: tree.Node) -> Layout:
+    walk.visit(root, "")
+    if not walk.cursor:
+        raise TooLong("")
+    return walk.layout()
+
+
+def prefix_of(root: tree.Node, limit: int) -> dict[int, tuple[int, int]]:
+    """The constants whose place depends on no header field: offset -> (mask, value)."""
+    walk = _Walk({}, limit)
+    with contextlib.suppress(Exception):  # whatever an expression of the struct raises: what comes before counts
+        walk.visit(root, "")
+    return walk.constants
+
+
+def _unknown(leaf: Leaf | Measure, _: _Walk) -> int:
+    raise Unknown(leaf)
+
+
+Asked = Callable[[Leaf | Measure, "_Walk"], int]
+
+
+@dataclass
+class _Walk:
+    """One walk through a tree: the values of header fields, how far it came, and what it found."""
+
+    values: Mapping[str, int]
+    limit: int
+    given: Mapping[str, int] = field(default_factory=dict)
+    #: gives the value of a field that is not among them, and may set `values`.
+    asked: Asked = _unknown
+    #: the bytes that there are, where there will be no more.
+    room: int | None = None
+    cursor: int = 0
+    leaves: dict[str, Leaf] = field(default_factory=dict)
+    constants: dict[int, tuple[int, int]] = field(default_factory=dict)
+    seals: list[Seal] = field(default_factory=list)
+    places: dict[str, tuple[int, int]] = field(default_factory=dict)
+    branches: dict[tree.Node, tree.Node] = field(default_factory=dict)
+    lengths: dict[str, int] = field(default_factory=dict)
+    regions: dict[str, Region] = field(default_factory=dict)
+    #: what values have to meet; each once, as a key.
+    conditions: dict[tree.FieldInfo | tree.Check, Condition] = field(default_factory=dict)
+    #: elements without a byte, of all arrays.
+    empty: int = 0
+    #: what expressions can ask for by now: a field, the path of a struct, None for what the header leaves out.
+    parts: dict[str, Leaf | Measure | str | None] = field(default_factory=dict)
+
+    def layout(self) -> Layout:
+        """What was found, as a value."""
+        held, self.asked = self._held(), _unknown  # what follows from the header asks for no more of it
+        seals, following = tuple(_in_order(self.seals)), tuple(self._following())
+        leaves = ByPath(self.leaves, Leaf.element)
+        found = (self.cursor, leaves, self.constants, seals, self.places, self.branches, following, self.lengths, self.regions)
+        return Layout(*found, held, tuple(self.conditions.values()))
+
+    def read(self, path: str) -> tuple[tree.FieldInfo, int] | str | None:
+        """What a formula reads by a path: a field and its raw value, the path of a struct, or None for what the header leaves out.
+
+        Raises:
+            NotCompilable: for what is no field before the formula, or not one integer.
+            Unknown: for a field whose value is not given.
+        """
+        if path.startswith("_."):
+            return tree.FieldInfo(path), self.given[path[2:]]
+        if path not in self.parts and "[" in path:
+            return self._element(path)
+        if path not in self.parts:
+            scope, _, name = path.rpartition(".")
+            raise NotCompilable(scope, f"an expression asks for {name!r}, which is not a field before it")
+        part = self.parts[path]
+        if not isinstance(part, Leaf | Measure):
+            return part
+        if isinstance(part, Measure) and part.region.size is not None:
+            return part.info, part.region.size
+        if path not in self.values:
+            check_control(part.info)
+            return part.info, self.asked(part, self)
+        return part.info, self.values[path]
+
+    def _element(self, path: str) -> tuple[tree.FieldInfo, int]:
+        """An element of an array: the whole of it stands before the formula."""
+        base, indices = without_indices(path)
+        leaf = self.leaves[base].element(path, indices) if base in self.leaves else None
+        if leaf is None:
+            raise IndexError(f"{base} has no such element")
+        return leaf.info, self.values[path] if path in self.values else self.asked(leaf, self)
+
+    def visit(self, node: tree.Node, path: str, shape: tuple[int, ...] = (), strides: tuple[int, ...] = ()) -> None:
+        """Go through a part; `shape` and `strides` of the arrays that it is in."""
+        start = self.cursor
+        match node:
+            case tree.Struct():
+                self._struct(node, path, shape, strides)
+            case tree.Sealed():
+                self.visit(node.body, path, shape, strides)
+                self._seal(node, start)
+            case tree.Number() | tree.Blob() | tree.Block():
+                self._field(node, path, shape, strides)
+            case tree.Repeat():
+                self._array(node, path, shape, strides)
+            case tree.Parts():
+                self._parts(node, path)
+            case tree.When():
+                self.branches[node] = node.then if self._value(node.condition) else node.otherwise
+                self.visit(self.branches[node], path, shape, strides)
+            case tree.Select():
+                self.branches[node] = dict(node.cases).get(self._value(node.key), node.default)
+                self.visit(self.branches[node], path, shape, strides)
+            case tree.Check() if 0 not in shape:
+                self.conditions[node] = Condition.of(node)
+            case tree.Never():
+                raise TooLong(path)
+            case tree.Opaque():
+                raise NotCompilable(node.info.path, node.reason)
+        if self.cursor > self.limit:
+            raise TooLong(path)
+        if self.room is not None and self.cursor > self.room:
+            raise CutOff(path)
+        if path and not shape:
+            self.places[path] = (start, self.cursor)
+
+    def _struct(self, node: tree.Struct, path: str, shape: tuple[int, ...], strides: tuple[int, ...]) -> None:
+        self.parts.setdefault(path, path)
+        for member in node.members:
+            below = f"{node.path}.{member.name}".strip(".") if member.name else ""
+            self.visit(member, below, shape, strides)
+            self.parts.setdefault(below, None)
+
+    def _array(self, node: tree.Repeat, path: str, shape: tuple[int, ...], strides: tuple[int, ...]) -> None:
+        count, start = self._count(node.count, path), self.cursor
+        self.lengths[node.axis] = 0 if 0 in shape else count
+        if count > self.limit:
+            raise TooLong(path)
+        if count:
+            self.visit(node.element, path, (*shape, count), (*strides, 0))
+        else:
+            self._no_element(node.element, path, (*shape, count), (*strides, 0))
+        size, depth = self.cursor - start, len(strides)
+        self.empty += 0 if size else math.prod(shape) * count
+        if start + size * count > self.limit or self.empty > self.limit:
+            raise TooLong(path)
+        for name, leaf in self.leaves.items():
+            if node.axis in leaf.info.axes:
+                self.leaves[name] = replace(leaf, strides=(*leaf.strides[:depth], size, *leaf.strides[depth + 1 :]))
+        for offset in [offset for offset in self.constants if offset >= start]:
+            byte = self.constants.pop(offset)
+            self.constants.update({offset + size * index: byte for index in range(count)})
+        self.cursor = start + size * count
+
+    def _parts(self, node: tree.Parts, path: str) -> None:
+        """Go over parts: how many bytes they take is told by the header, or asked for as a field of it would be."""
+        given = {ref.path: int(self._value(ref) or 0) for ref in node.outer}
+        rule = Rule(*(None if formula is None else self._count(formula, path) for formula in (node.count, node.size, node.within)))
+        region = Region(node, kinds_of(node, tuple(given.items()), self.limit), self.cursor, rule, self.limit, given, rule.within)
+        self.parts[node.total.path] = Measure(node.total, region)
+        size = rule.within if rule.within is not None else int(self._value(tree.Ref(node.total.path, node.total)))
+        if size == -FAILED:
+            raise ValueError(f"an expression in {path} fails")
+        if size < 0:
+            raise Unlike(path) if size == -CONSTANT else TooLong(path)
+        self.regions[node.axis] = region = replace(region, size=size)
+        self.parts[node.total.path] = Measure(node.total, region)
+        self.cursor += size
+
+    def _no_element(self, node: tree.Node, path: str, shape: tuple[int, ...], strides: tuple[int, ...]) -> None:
+        """Go through an element that the array has none of, for its fields alone: nothing is asked of it."""
+        start, constants = self.cursor, dict(self.constants)
+        try:
+            self.visit(node, path, shape, strides)
+        except Unknown:
+            raise
+        except Exception:
+            pass  # whatever an expression raises: what construct never looks at cannot fail
+        finally:
+            self.cursor, self.constants = start, constants
+
+    def _field(self, node: tree.Number | tree.Blob | tree.Block, path: str, shape: tuple[int, ...], strides: tuple[int, ...]) -> None:
+        match node:
+            case tree.Number(info, size, _, order):
+                is_word = size in (1, 2, 4, 8) and info.dtype is not None
+                wire = np.dtype(f"{'<' if order == 'little' else '>'}{info.dtype.str[1:]}") if is_word else None  # type: ignore[union-attr]
+                elements = () if is_word else (whole_bytes(size, order, signed=node.kind == "int"),)
+                self._add(Leaf(info, self.cursor, shape, strides, size, wire, elements))
+                if info.const is not None:
+                    self._constant(node.encoded(info.const))
+            case tree.Blob():
+                size = self._count(node.size, path)
+                if node.name:
+                    self._add(Leaf(node.info, self.cursor, (*shape, size), (*strides, 1), size, np.dtype("u1")))
+                self._constant(node.const or b"")
+            case tree.Block():
+                size = node.size
+                self._block(node, path, shape, strides)
+        self.cursor += size
+
+    def _block(self, node: tree.Block, path: str, shape: tuple[int, ...], strides: tuple[int, ...]) -> None:
+        groups: dict[str, list[BitField]] = {}
+        infos: dict[str, tree.FieldInfo] = {}
+        for part in node.parts:
+            names = ".".join(name for name in (path, *part.names) if name)
+            groups.setdefault(names, []).append(part.bits)
+            infos[names] = part.info
+            for depth in range(len(part.names)):
+                above = ".".join(name for name in (path, *part.names[:depth]) if name)
+                self.parts.setdefault(above, above)
+        for name, elements in groups.items():
+            info = infos[name]
+            inside = len(info.axes) > len(shape)
+            if name:
+                own = (*shape, len(elements)) if inside else shape
+                self._add(Leaf(info, self.cursor, own, strides, node.size, elements=tuple(elements)))
+            if info.const is not None:
+                for element in elements:
+                    self._bit_constant(element, int(info.const))
+
+    def _constant(self, data: bytes) -> None:
+        self.constants.update({self.cursor + index: (0xFF, byte) for index, byte in enumerate(data)})
+
+    def _bit_constant(self, element: BitField, value: int) -> None:
+        for part in element.segments:
+            mask, known = self.constants.get(self.cursor + part.byte, (0, 0))
+            byte = known | (value >> part.target << part.low) & part.mask
+            self.constants[self.cursor + part.byte] = (mask | part.mask, byte)
+
+    def _add(self, leaf: Leaf) -> None:
+        if leaf.info.allowed is not None:
+            self.conditions[leaf.info] = Condition.of(leaf.info)
+        self.leaves[leaf.info.path] = self.parts[leaf.info.path] = leaf
+        if leaf.shape and len(leaf.shape) > len(leaf.strides) - (leaf.info.kind == "bytes"):  # bytes, or an array within a bit block
+            self.lengths[leaf.info.axes[-1]] = 0 if 0 in leaf.shape[:-1] else leaf.shape[-1]
+
+    def _seal(self, node: tree.Sealed, start: int) -> None:
+        leaves = tuple(self.leaves[path] for path in node.fields)
+        if node.over is not None:
+            spans = [(self.places[node.over[0]][0], self.places[node.over[1]][1])]
+        else:
+            held = sorted(leaf.held for leaf in leaves)
+            edges = [start, *(edge for span in held for edge in span), self.cursor]
+            spans = [(a, b) for a, b in zip(edges[::2], edges[1::2], strict=True) if b > a]
+        self.seals.append(Seal(leaves, tuple(spans), node.algorithm, node.absent))
+
+    def _held(self) -> dict[int, tuple[int, int]]:
+        """What fields have to be that say how long parts are, as constants, which they are in one layout."""
+        rows, found = np.zeros((2, self.cursor), np.uint8), [leaf for leaf in self.leaves.values() if leaf.info.held]
+        for leaf in found:
+            (low, high), rebuilt = leaf.info.limits, leaf.info.rebuilt
+            if rebuilt is not None:
+                value = operator.index(tree.evaluated(rebuilt, self._read_known))
+                if not low <= value <= high:
+                    raise TooLong(leaf.info.path)
+                leaf.store(rows, np.array([value, -1 if low else high], leaf.info.dtype).reshape(2, *(1 for _ in leaf.shape)))
+        spots = np.flatnonzero(rows[1]).tolist() if found else []
+        return {spot: (int(rows[1, spot]), int(rows[0, spot])) for spot in spots}
+
+    def _following(self) -> Iterator[tuple[Leaf, int]]:
+        """The values of rebuilt fields that follow from constants and from those that the layout depends on, and from no other."""
+        for leaf in self.leaves.values():
+            if leaf.info.rebuilt is not None and not leaf.info.held and not leaf.shape:
+                with contextlib.suppress(Exception):  # of the others: construct evaluates them when a frame is built
+                    yield leaf, operator.index(tree.evaluated(leaf.info.rebuilt, self._read_known))
+
+    def _read_known(self, path: str) -> tuple[tree.FieldInfo, int] | str | None:
+        part = self.parts[path]
+        if isinstance(part, Leaf) and isinstance(part.info.const, int) and path not in self.values:
+            return part.info, part.info.const
+        return self.read(path)
+
+    def _value(self, formula: tree.Formula) -> Any:
+        return tree.evaluated(formula, self.read)
+
+    def _count(self, formula: tree.Formula, path: str) -> int:
+        count = operator.index(self._value(formula))
+        if count < 0:
+            raise TooLong(path)
+        return count
+
+
+def _in_order(seals: list[Seal]) -> Iterator[Seal]:
+    """Checksums, each before those that cover its field; inner ones first where neither does."""
+    left = list(seals)
+    while left:
+        free = (seal for seal in left if not any(seal.covers(other) for other in left if other is not seal))
+        left.remove(first := next(free, left[0]))
+        yield first
+
+
+#: distinct headers remembered; garbage must not fill the memory with their layouts.
+REMEMBERED = 4096
+
+#: different values of a header field that are looked for one by one.
+FEW = 4
+
+
+@dataclass(eq=False)
+class HeaderNode:
+    """A field that decides the layout, or what the values of those before it lead to.
+
+    Attributes:
+        values: those, raw, by path.
+        above: the node that they lead from; None for the first.
+        leaf, before: the field, and all fields up to it.
+        constants: those that stand before it, without those that all frames begin with; where a frame is cut off, those up to there.
+        least: the bytes that a frame with these values has at least, as far as is known.
+        told: which of its values are told apart.
+        result: what the values lead to, where no further field decides.
+    """
+
+    values: Mapping[str, int] = field(default_factory=dict)
+    above: HeaderNode | None = None
+    leaf: Leaf | Measure | None = None
+    before: Mapping[str, Leaf] = field(default_factory=dict)
+    constants: Mapping[int, tuple[int, int]] = field(default_factory=dict)
+    least: int = 0
+    told: _Told | None = None
+    children: dict[int, HeaderNode] = field(default_factory=dict)
+    result: Layout | Refused | None = None
+
+    def meant(self, value: int) -> int:
+        """The value of its field that stands for one that means the same."""
+        return value if self.told is None else self.told.one(value)
+
+    def child(self, value: int) -> HeaderNode:
+        """The branch of a value."""
+        if value not in self.children:
+            assert self.leaf is not None
+            self.children[value] = HeaderNode({**self.values, self.leaf.info.path: value}, self)
+        return self.children[value]
+
+
+#: what reads the field of a node in some of the candidates: the indices of those that have it, None for all; and its values.
+Reader = Callable[[HeaderNode, NDArray[np.intp]], tuple[NDArray[np.intp] | None, NDArray[Any]]]
+Group = tuple[Layout | Refused, NDArray[np.intp]]
+
+
+@dataclass(frozen=True)
+class _Told:
+    """Which values of a header field the layout tells apart: all from `low` to `high`, or `keys` and any other.
+
+    A header may claim any of some billion lengths, or have any key, and garbage does: those that mean the same are one branch.
+
+    Attributes:
+        limits: of the field itself.
+        rises: the value from which on a frame never gets shorter, so that what is too long stays so; None where there is none.
+    """
+
+    limits: tuple[int, int]
+    low: int
+    high: int
+    keys: frozenset[int] = frozenset()
+    other: int = 0
+    rises: int | None = None
+
+    @classmethod
+    def of(cls, info: tree.FieldInfo, root: tree.Node, limit: int) -> _Told:
+        """What the formulas of a frame tell apart of a field; all its values, where that is not seen from their form."""
+        (low, high), known = info.limits, list(tree.nodes(root))
+        asking = [(node, formula) for node in known for formula in tree.formulas(node) if _asks(formula, info)]
+        if any(own.rebuilt is not None and not own.held and _asks(own.rebuilt, info) for node in known for own in tree.infos(node)):
+            return cls(info.limits, low, high)
+        if all(isinstance(node, tree.Select) and isinstance(formula, tree.Ref) for node, formula in asking):
+            keys = frozenset(key for node, _ in asking if isinstance(node, tree.Select) for key, _ in node.cases if low <= key <= high)
+            other = next((value for value in range(low, high + 1) if value not in keys), None)
+            return cls(info.limits, low, high) if other is None else cls(info.limits, low, high, keys, other)
+        if high - low < 1 << 62 and all(_counts(node, formula) for node, formula in asking):
+            values, spans = range(low, high + 1), []
+            for _, formula in asking:
+                count = functools.partial(_with_value, formula)
+                spans.append((bisect.bisect_left(values, 0, key=count) - 1, bisect.bisect_right(values, limit, key=count)))
+            firsts, lasts = zip(*spans, strict=True)
+            # Why a frame with too many parts is refused depends on its parts, not on the number alone.
+            rises = None if any(isinstance(node, tree.Parts) for node, _ in asking) else max(firsts) + low + 1
+            return cls(info.limits, max(min(firsts) + low, low), min(max(lasts) + low, high), rises=rises)
+        return cls(info.limits, low, high)
+
+    def refused(self, value: int) -> _Told:
+        """The same, where the frame of a value is known to be too long."""
+        return replace(self, high=value) if self.rises is not None and self.rises <= value < self.high else self
+
+    def one(self, value: int) -> int:
+        """The value that stands for one that means the same."""
+        if self.keys:
+            return value if value in self.keys else self.other
+        return min(max(value, self.low), self.high)
+
+    def all(self, values: NDArray[Any]) -> NDArray[Any]:
+        """Those that stand for many, of their shape and type."""
+        if (self.low, self.high) == self.limits and not self.keys:
+            return values
+        if self.keys:
+            return np.where(np.isin(values, np.array(list(self.keys), values.dtype)), values, values.dtype.type(self.other))
+        return np.asarray(np.clip(values, self.low, self.high))
+
+
+def _asks(formula: tree.Formula, info: tree.FieldInfo) -> bool:
+    """Whether a formula may ask for a field; nobody knows all that Python asks for."""
+    match formula:
+        case tree.Op():
+            return any(_asks(arg, info) for arg in formula.args)
+        case tree.Ref():
+            return formula.path == info.path
+    return isinstance(formula, tree.Code)
+
+
+def _counts(node: tree.Node, formula: tree.Formula) -> bool:
+    """Whether a formula of a node counts bytes, or elements or parts, and all numbers above the longest frame mean the same.
+
+    A part takes a byte at least (`parts`), and an array of more elements than the longest frame has bytes is refused as well.
+    """
+    is_number = isinstance(node, tree.Repeat | tree.Blob) or (isinstance(node, tree.Parts) and formula is node.count)
+    return is_number and _rises(formula)
+
+
+def _rises(formula: tree.Formula) -> bool:
+    """Whether a formula is of one field, and never falls as that grows."""
+    match formula:
+        case tree.Ref() | tree.Op("+", (int(), tree.Ref())):
+            return True
+        case tree.Op("+" | "-" | "*" | "//" | ">>" as symbol, (first, int() as second)):
+            return _rises(first) and (second > 0 or symbol in "+-")
+    return False
+
+
+def _with_value(formula: tree.Formula, value: int) -> int:
+    """A formula of one field, where that has this value."""
+    ref, *_ = tree.refs(formula)
+    return int(tree.evaluated(formula, lambda _: (ref.info, value)))
+
+
+class _Places:
+    """Candidates in a buffer, as `HeaderTree.classify` gets them, of frames of at most `limit` bytes.
+
+    Attributes:
+        refuted: those whose header is cut off, or that are too long, and have a wrong constant before.
+    """
+
+    def __init__(self, buffer: NDArray[np.uint8], offsets: NDArray[np.intp], stops: NDArray[np.intp] | None, limit: int) -> None:
+        self._buffer, self._offsets, self.stops, self._limit = buffer, offsets, stops, limit
+        self.refuted: list[NDArray[np.intp]] = []
+
+    def longest(self, which: NDArray[np.intp]) -> bytes | memoryview:
+        """What there is of the one that has the most bytes, up to the longest frame."""
+        first = which.item(0)
+        if self.stops is not None and len(which) > 1:
+            first = which.item((self.stops[which] - self._offsets[which]).argmax())
+        start = self._offsets.item(first)
+        return self._buffer.data[start : min(start + self._limit, len(self._buffer) if self.stops is None else self.stops.item(first))]
+
+    def read(self, node: HeaderNode, which: NDArray[np.intp]) -> tuple[NDArray[np.intp] | None, NDArray[Any]]:
+        """As `Reader`; those whose field is cut off are looked at here."""
+        assert node.leaf is not None
+        there, values = node.leaf.read(self._buffer, self._offsets[which], None if self.stops is None else self.stops[which])
+        if there is not None:
+            self.cut_off(node, np.delete(which, there))
+        return there, values
+
+    def cut_off(self, node: HeaderNode, which: NDArray[np.intp]) -> None:
+        """Look whether some that are cut off at a node can still be frames."""
+        if node.constants:
+            self.refuted.append(which[self.wrong(node.constants, which)])
+
+    def wrong(self, constants: Mapping[int, tuple[int, int]], which: NDArray[np.intp]) -> NDArray[np.bool_]:
+        """Which candidates have a wrong constant, as far as their bytes go, (n,)."""
+        offsets, stops = self._offsets[which], len(self._buffer) if self.stops is None else self.stops[which]
+        wrong = np.zeros(len(which), np.bool_)
+        for spot, (mask, value) in constants.items() if len(which) else ():
+            there = offsets + spot < stops
+            wrong[there] |= self._buffer[offsets[there] + spot] & mask != value
+        return wrong
+
+
+class HeaderTree:
+    """All layouts of one frame type, or of a kind of parts, with the values of fields around them."""
+
+    def __init__(self, frame: tree.Node, limit: int, given: Mapping[str, int] | None = None) -> None:
+        self._frame, self._limit, self._given = frame, limit, given or {}
+        self._root, self._size = HeaderNode(), 0
+        self._told: dict[str, _Told] = {}
+
+    @functools.cached_property
+    def _prefix(self) -> dict[int, tuple[int, int]]:
+        return prefix_of(self._frame, self._limit)
+
+    def classify(self, buffer: NDArray[np.uint8], offsets: NDArray[np.intp], stops: NDArray[np.intp] | None = None) -> list[Group]:
+        """The candidates at `offsets`, sorted by layout: (layout or refusal, indices) for each, without those whose header is cut off.
+
+        Args:
+            stops: where their bytes end, and no more will come; by default with those of the buffer, and more may come.
+        """
+        places = _Places(buffer, offsets, stops, self._limit)
+        groups: list[Group] = []
+        for result, which in self.sorted(len(offsets), places.read, places):
+            groups.append((result, which))
+            if isinstance(result, Refused) and result.constants:
+                wrong = places.wrong(result.constants, which)
+                groups[-1] = result, which[~wrong]
+                places.refuted.append(which[wrong])
+        return groups + [(Refused(by_constant=True), which) for which in places.refuted if len(which)]
+
+    def sorted(self, number: int, read: Reader, places: _Places | None = None) -> list[Group]:
+        """So many candidates by layout, as `classify` has them, whose header fields `read` reads.
+
+        Args:
+            places: where they are, if their fields can be read one by one as well.
+        """
+        if self._size > REMEMBERED:
+            self._root, self._size = HeaderNode(), 0
+        groups: list[Group] = []
+        stack = [(self._root, np.arange(number))] if number else []
+        while stack:
+            node, which = stack.pop()
+            if len(which) == 1 and places is not None:
+                node = self._end(places.longest(which), node, is_all=places.stops is not None)
+            elif node.leaf is None and node.result is None:
+                data: bytes | memoryview = b"" if places is None else places.longest(which)
+                self._explore(node, data, is_all=places is not None and places.stops is not None)
+            if node.result is not None:
+                groups.append((node.result, which))
+                continue
+            if places is not None and (len(which) == 1 or node.leaf is None):
+                places.cut_off(node, which)
+                continue
+            there, values = read(node, which)
+            which = which if there is None else which[there]
+            values = values if node.told is None else node.told.all(values)
+            if not len(which):
+                continue
+            if np.count_nonzero(values == values[0]) == len(values):
+                stack.append((node.child(values.item(0)), which))
+            else:
+                stack += [(node.child(value), which[places]) for value, places in by_value(values, FEW)]
+        return groups
+
+    def first(self) -> tuple[tuple[Leaf, ...], dict[int, tuple[int, int]]]:
+        """The fields and the constants whose place depends on no header field."""
+        self._explore(self._root)
+        known = self._root.result.leaves if isinstance(self._root.result, Layout) else self._root.before
+        return tuple(known.values()), prefix_of(self._frame, self._limit)
+
+    def common(self, rows: NDArray[np.uint8]) -> Layout | None:
+        """The layout of candidates, one a row, if they have one and the fields that decide it mean the same in all; else None."""
+        node = self._root
+        while node.result is None:
+            if node.leaf is None:
+                self._explore(node, rows[0].tobytes())
+            leaf = node.leaf
+            if leaf is None:
+                break
+            if isinstance(leaf, Leaf) and leaf.offset + leaf.size > rows.shape[1]:
+                return None
+            values = leaf.load(rows)
+            values = values if node.told is None else node.told.all(values)
+            if np.count_nonzero(values == values[0]) < len(rows) or (isinstance(leaf, Measure) and values[0] < 0):
+                return None
+            node = node.child(values.item(0))
+        return node.result if isinstance(node.result, Layout) else None
+
+    def layout(self, frame: bytes) -> Layout | Refused | None:
+        """The layout of one frame, or None where its header is not all there."""
+        return self._end(frame, self._root).result
+
+    def _end(self, data: bytes | memoryview, node: HeaderNode, *, is_all: bool = False) -> HeaderNode:
+        """Where the header of a frame leads from a node, as `_explore` has it."""
+        while node.leaf is not None:
+            value = node.leaf.of(data)
+            if value is None:
+                return node
+            node = node.child(node.meant(value))
+        return node if node.result is not None else self._explore(node, data, is_all=is_all)
+
+    def _explore(self, node: HeaderNode, data: bytes | memoryview = b"", *, is_all: bool = False) -> HeaderNode:
+        """Find out, where nobody has yet, which fields decide next, as far as the header of a frame tells, in one walk.
+
+        Returns:
+            The last node: with a result, with a field that the bytes end before, or with neither where the frame is longer than these.
+
+        Args:
+            is_all: there are no more bytes of this frame.
+        """
+
+        def asked(leaf: Leaf | Measure, walk: _Walk) -> int:
+            nonlocal node
+            node.leaf, node.before, node.told, node.constants = leaf, dict(walk.leaves), self._telling(leaf), self._behind(walk)
+            value = leaf.of(data)
+            if value is None:
+                raise Unknown(leaf)
+            node = node.child(node.meant(value))
+            self._size += 1
+            walk.values = node.values
+            return node.values[leaf.info.path]
+
+        if is_all and len(data) < node.least:
+            return node
+        self._size += not node.least  # it is known, where it was cut off before
+        walk = _Walk(node.values, self._limit, self._given, asked, len(data) if is_all else None)
+        try:
+            node.result = _walked(walk, self._frame)
+        except Unknown:
+            pass
+        except CutOff:
+            node.constants, node.least = self._behind(walk), walk.cursor
+        except TooLong:
+            node.result = Refused(constants=self._behind(walk))
+        except Unlike:
+            node.result = Refused(by_constant=True)
+        except SpecError:
+            raise
+        except Exception as error:
+            node.result = Refused(PluginError.of(error, "struct"))
+        above = node.above
+        if above is not None and above.told is not None and isinstance(node.result, Refused) and not node.result.error:
+            above.told = above.told.refused([*node.values.values()][-1])
+        return node
+
+    def _behind(self, walk: _Walk) -> dict[int, tuple[int, int]]:
+        """The constants found by a walk, without those that all frames begin with, which candidates are known to have."""
+        return {spot: known for spot, known in walk.constants.items() if self._prefix.get(spot) != known}
+
+    def _telling(self, leaf: Leaf | Measure) -> _Told | None:
+        if not isinstance(leaf, Leaf):
+            return None  # nothing is known of parts before they are walked
+        if leaf.info.path not in self._told:
+            self._told[leaf.info.path] = _Told.of(leaf.info, self._frame, self._limit)
+        return self._told[leaf.info.path]
+
+
+@functools.lru_cache(maxsize=256)
+def kinds_of(node: tree.Parts, given: tuple[tuple[str, int], ...], limit: int) -> tuple[Kind, ...]:
+    """What the parts of frames can be in which fields around them have these values."""
+    values = dict(given)
+    return tuple(Kind(kind, HeaderTree(kind.root, limit, values), prefix_of(kind.root, limit)) for kind in node.kinds)
+
+
+@functools.lru_cache(maxsize=2048)
+def frame_layouts(frame: Frame) -> HeaderTree | NotCompilable:
+    """The layouts of a frame type, or why they cannot be computed."""
+    try:
+        check_compilable(frame.tree)
+        return HeaderTree(frame.tree, frame.room)
+    except NotCompilable as reason:
+        return reason

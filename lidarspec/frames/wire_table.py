@@ -1,0 +1,255 @@
+"""The wire table of a frame type, drawn from its tree: where each field stands, how wide it is, what it means.
+
+Nothing here knows a frame's bytes, so what depends on a header is a formula of its fields ("10 + 3*i"), and a part that only some headers
+have is marked with the condition. `extent` gives the size of any part in this way, and the texts for fields, bits and formulas are those of
+exports and explanations, too.
+"""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, replace
+
+from lidarspec.spec import tree
+from lidarspec.spec.bits import BitField
+from lidarspec.spec.description import Frame
+from lidarspec.spec.syntax import UNNAMED
+
+INDICES = "ijklmn"
+
+
+@dataclass(frozen=True)
+class WireRow:
+    """One line of a wire table.
+
+    Attributes:
+        offset: first byte, counted from the start of the frame; a formula where that depends on a header or an index.
+        size: in bytes, or "7 bits"; a formula where it depends on a header.
+        type: "uint16 le", "bytes", or the bits of a block from the most significant on.
+        field: path, array elements by index names: "points[i].distance".
+        unit: unit and scale: "0.01 deg".
+        meaning: the author's text, constant, labels, checksum, condition.
+    """
+
+    offset: str
+    size: str
+    type: str
+    field: str
+    unit: str = ""
+    meaning: str = ""
+
+
+@dataclass(frozen=True)
+class Extent:
+    """A number of bytes: a constant, and formulas of header fields and indices added to it."""
+
+    number: int = 0
+    terms: tuple[str, ...] = ()
+
+    def __add__(self, other: Extent) -> Extent:
+        return Extent(self.number + other.number, self.terms + other.terms)
+
+    def times(self, factor: int | str) -> Extent:
+        """The extent of so many elements."""
+        if isinstance(factor, int):
+            return Extent(self.number * factor, tuple(f"{factor}*({term})" for term in self.terms))
+        if str(self) == "0":
+            return self
+        size = f"({self})" if self.terms else str(self)
+        return Extent(0, (factor if size == "1" else f"{size}*({factor})" if " " in factor else f"{size}*{factor}",))
+
+    def __str__(self) -> str:
+        return " + ".join([str(self.number)] * (self.number > 0 or not self.terms) + list(self.terms))
+
+
+def wire_table(frame: Frame) -> tuple[WireRow, ...]:
+    """The rows of a frame type in the order of the wire."""
+    seals = {path: _sealed(node) for node in tree.nodes(frame.tree) if isinstance(node, tree.Sealed) for path in node.fields}
+    return tuple(_rows(frame.tree, "", Extent(), "", seals))
+
+
+def frame_size(frame: Frame) -> str:
+    """The length of a frame in bytes: a number, or a formula of its header fields."""
+    return str(extent(frame.tree))
+
+
+def extent(node: tree.Node, shown: str = "") -> Extent:
+    """The size of a part; `shown` is how it is called where its size is only known from its bytes: "size(points[i].text)"."""
+    match node:
+        case tree.Number() | tree.Block():
+            return Extent(node.size)
+        case tree.Blob() | tree.Opaque():
+            return _length(node.size, shown)
+        case tree.Struct():
+            return sum((extent(member, _member(shown, member)) for member in node.members), Extent())
+        case tree.Sealed():
+            return extent(node.body, shown)
+        case tree.Repeat():
+            return extent(node.element, _element(shown)[0]).times(_count(node))
+        case tree.Parts():
+            return _length(node.within, shown)
+        case tree.When() | tree.Select():
+            sizes = {extent(branch, shown) for branch in tree.children(node) if not isinstance(branch, tree.Never)}
+            return sizes.pop() if len(sizes) == 1 else _length(None, shown)
+    return Extent()
+
+
+def _length(size: tree.Formula | None, shown: str) -> Extent:
+    """A declared length; None for one that only the bytes tell."""
+    return Extent(size) if isinstance(size, int) else Extent(0, (f"size({shown})" if size is None else phrase(size),))
+
+
+def _count(node: tree.Repeat) -> int | str:
+    return node.count if isinstance(node.count, int) else phrase(node.count)
+
+
+def _member(shown: str, member: tree.Node) -> str:
+    """How a member of what is shown so is shown."""
+    return ".".join(filter(None, (shown, member.name or UNNAMED)))
+
+
+def _element(shown: str) -> tuple[str, str]:
+    """How an element of an array is shown, "points[i]", and its index."""
+    index = INDICES[shown.count("[") % len(INDICES)]
+    return f"{shown}[{index}]", index
+
+
+def _rows(node: tree.Node, shown: str, start: Extent, condition: str, seals: Mapping[str, str]) -> Iterator[WireRow]:
+    """The rows of a part that begins at `start`, and is there under a condition."""
+    match node:
+        case tree.Struct():
+            for member in node.members:
+                below = _member(shown, member)
+                yield from _rows(member, below, start, condition, seals)
+                start = start + extent(member, below)
+        case tree.Sealed():
+            yield from _rows(node.body, shown, start, condition, seals)
+        case tree.Repeat():
+            element, index = _element(shown)
+            size = extent(node.element, element)
+            says = "; ".join(filter(None, (condition, f"{_count(node)} elements of {size}")))
+            yield WireRow(str(start), str(size.times(_count(node))), "array", shown, "", says)
+            yield from _rows(node.element, element, start + size.times(index), condition, seals)
+        case tree.Parts():
+            element, _ = _element(shown)
+            yield WireRow(str(start), str(extent(node, shown)), "parts", shown, "", "; ".join(filter(None, (condition, ruled(node)))))
+            for kind in node.kinds:
+                said = f"{kind.name} in it" if kind.name else ""
+                yield from _rows(kind.element, element, Extent(0, (f"at({element})",)), said, seals)
+        case tree.When() | tree.Select():
+            for asked, branch in branches(node):
+                yield from _rows(branch, shown, start, asked, seals)
+        case tree.Check():
+            yield WireRow(str(start), "0", "check", shown, "", "; ".join(filter(None, (condition, f"holds: {phrase(node.condition)}"))))
+        case tree.Never():
+            yield WireRow(str(start), "0", "no frame", shown, "", condition)
+        case tree.Block():
+            for part in node.parts:
+                yield _row(part.info, str(start), *_bits(part), _part(shown, part), condition, seals)
+        case tree.Number() | tree.Blob() | tree.Opaque():
+            length = "varies" if isinstance(node, tree.Opaque) and node.size is None else str(extent(node, shown))
+            info = replace(node.info, const=node.const) if isinstance(node, tree.Blob) else node.info
+            yield _row(info, str(start), length, _type(node), shown, condition, seals)
+
+
+def _row(info: tree.FieldInfo, offset: str, size: str, kind: str, shown: str, condition: str, seals: Mapping[str, str]) -> WireRow:
+    says = "; ".join(filter(None, (condition, meaning(info), seals.get(info.path, ""))))
+    return WireRow(offset, size, kind, shown, unit_text(info), says)
+
+
+def _part(shown: str, part: tree.Part) -> str:
+    return ".".join(filter(None, (shown, *part.names))) + "".join(f"[{index}]" for index in part.indices)
+
+
+def _bits(part: tree.Part) -> tuple[str, str]:
+    """Size and type of a part of a block: bits, or bytes for an integer that is wider than any number."""
+    if part.info.dtype is None and part.bits.run is not None and part.bits.is_whole:
+        order, _, size, _ = part.bits.run
+        return str(size), f"{'int' if part.bits.signed else 'uint'}{8 * size} {'be' if order == '>' else 'le'}"
+    return f"{part.bits.width} bit{'s' * (part.bits.width > 1)}", bit_text(part.bits)
+
+
+def _type(node: tree.Number | tree.Blob | tree.Opaque) -> str:
+    match node:
+        case tree.Number():
+            return f"{node.kind}{8 * node.size}" + f" {node.order[0]}e" * (node.size > 1)
+        case tree.Opaque():
+            return node.form or node.kind
+    return "bytes"
+
+
+def branches(node: tree.When | tree.Select) -> list[tuple[str, tree.Node]]:
+    """The alternatives of a part, each with its condition in words."""
+    if isinstance(node, tree.When):
+        asked = phrase(node.condition)
+        return [(f"if {asked}", node.then), (f"unless {asked}", node.otherwise)]
+    key, labels = phrase(node.key), node.key.info.labels if isinstance(node.key, tree.Ref) else {}
+    cases = [(f"if {key} == {labels.get(value, value)!r}", case) for value, case in node.cases]
+    return [*cases, (f"for other values of {key}", node.default)]
+
+
+def ruled(node: tree.Parts) -> str:
+    """What says where the last one of some parts is, in words."""
+    if node.count is not None:
+        return f"{phrase(node.count)} parts of sizes of their own"
+    if node.within is not None:
+        return f"as many parts as fill {phrase(node.within)} bytes"
+    assert node.size is not None
+    following = ", ".join(dict.fromkeys(phrase(kind.following) for kind in node.kinds if kind.following is not None))
+    return f"a chain: {phrase(node.size)} bytes, then as many as {following} of the part before says; 0 ends it"
+
+
+def phrase(formula: tree.Formula) -> str:
+    """A formula as people write it, with its fields by their whole paths; "?" for a function that cannot be read."""
+    match formula:
+        case tree.Op("==" | "!=" as symbol, (tree.Ref() as ref, int() as value)) if value in ref.info.labels:
+            return f"{ref.path} {symbol} {ref.info.labels[value]!r}"
+    text = formula.text if isinstance(formula, tree.Code) else tree.written(formula, lambda ref: ref.path, {})
+    return text[1:-1] if _is_enclosed(text) else text
+
+
+def _is_enclosed(text: str) -> bool:
+    """Whether the first bracket of a text closes at its end."""
+    depths = list(itertools.accumulate((part == "(") - (part == ")") for part in text))
+    return text.startswith("(") and depths.index(0) == len(text) - 1
+
+
+def bit_text(bits: BitField) -> str:
+    """The bits of a value in its block, the most significant first: "byte 1 bits 1-0, byte 0 bits 7-2"."""
+    parts = []
+    for part in sorted(bits.segments, key=lambda segment: -segment.target):
+        high = part.low + part.mask.bit_count() - 1
+        parts.append(f"byte {part.byte} " + (f"bits {high}-{part.low}" if high > part.low else f"bit {part.low}"))
+    return ("signed, " if bits.signed else "") + ", ".join(parts)
+
+
+def unit_text(info: tree.FieldInfo) -> str:
+    """Unit and scale of a field: "0.01 deg", "0.01 deg - 327.68"."""
+    if not info.scaled:
+        return info.unit
+    shift = f" {'-' if info.offset < 0 else '+'} {abs(info.offset):g}" if info.offset else ""
+    return f"{info.scale:.10g} {info.unit}".strip() + shift
+
+
+def meaning(info: tree.FieldInfo) -> str:
+    """What is said of a field: its constant, what it follows from, its text, the names of its values."""
+    const = f"always {hexed(info.const, info.bits)}" if info.const is not None else ""
+    const = const or (f"only {tree.listed(info.allowed)}" if info.allowed is not None and not info.labels else "")
+    follows = phrase(info.rebuilt) if info.rebuilt is not None else "?"
+    labels = ", ".join(f"{value} {name}" for value, name in info.labels.items())
+    return "; ".join(filter(None, (const, "" if follows == "?" else f"= {follows}", info.docs, labels)))
+
+
+def hexed(value: object, bits: int) -> str:
+    """Bytes and integers in hexadecimal, integers with all digits of their width."""
+    if isinstance(value, bytes | bytearray):
+        return value.hex(" ")
+    return f"0x{value:0{-(-bits // 4)}x}" if isinstance(value, int) else repr(value)
+
+
+def _sealed(node: tree.Sealed) -> str:
+    """What is said of the fields that hold a checksum."""
+    name = node.declared.describe() if node.declared else "a checksum that a hook supplies"
+    first, last = (path.removeprefix(f"{node.struct.path}.") for path in node.over or ("", ""))
+    return f"{name} over " + (f"{first} to {last}" if first != last else first or "all other bytes")

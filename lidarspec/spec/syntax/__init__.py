@@ -1,0 +1,44 @@
+"""The layer over construct, and the only package that knows its classes: an author's struct made fit for the engine, and read off.
+
+In: an author's struct. Out: `prepare`, a copy of it for the engine; `check_struct`, what speaks against it; `frame_tree`, the nodes that
+it means. Modules in reading order:
+
+* `classes`: the few classes that stand in the places of construct's, and what one can ask of a construct.
+* `refusals`: what no frame can be described by, with the reason.
+* `meaning`: a struct read off as nodes.
+"""
+
+from __future__ import annotations
+
+from lidarspec.spec.syntax.classes import (
+    UNNAMED as UNNAMED,
+    Describing as Describing,
+    Fault as Fault,
+    MarkedStruct as MarkedStruct,
+    Mismatch as Mismatch,
+    Partition as Partition,
+    Pieces as Pieces,
+    Sealing as Sealing,
+    Seen as Seen,
+    Sizing as Sizing,
+    WireNaN as WireNaN,
+    bit_width as bit_width,
+    bounded as bounded,
+    clean as clean,
+    field_path as field_path,
+    fixed_size as fixed_size,
+    has_conditions as has_conditions,
+    has_member as has_member,
+    is_expression as is_expression,
+    is_struct as is_struct,
+    leaves as leaves,
+    member as member,
+    note as note,
+    prepare as prepare,
+    random_value as random_value,
+    seals as seals,
+    unwrap as unwrap,
+    verifying as verifying,
+)
+from lidarspec.spec.syntax.meaning import bytes_of as bytes_of, frame_tree as frame_tree, seen as seen, unnamed as unnamed
+from lidarspec.spec.syntax.refusals import check_struct as check_struct

@@ -1,0 +1,238 @@
+"""The search for a checksum: frames sealed with a known one, and whether it is found, where it stands, and at what price."""
+
+from __future__ import annotations
+
+import random
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+import pytest
+
+import lidarspec
+import lidarspec.spec
+from lidarspec.drafting.checksum_search import Changed, WordSum, search
+from lidarspec.drafting.crc_search import common_divisor, crc_matches, divisors, quotient, remainder, solve
+from lidarspec.drafting.samples import Match, Place, Samples, best_first
+from lidarspec.simulation.simulator import simulate
+from lidarspec.spec import Checksum, Crc, Fold15, Sum, WordXor, Xor
+from lidarspec.spec.checksums import CRCS, name_of
+
+HEAD = b"\xaa\x55"
+
+
+def sealed(checksum: Checksum, number: int = 12, length: int = 30, *, order: str = "little", skip: int = 0, vary: int = 1) -> list[bytes]:
+    """Frames of random content with a header, and a checksum at the end over all but the first `skip` bytes."""
+    source = random.Random(number * length)
+    bodies = [HEAD + source.randbytes(length + source.randrange(vary)) for _ in range(number)]
+    return [body + checksum(body[skip:]).to_bytes(-(-checksum.width // 8), order) for body in bodies]  # type: ignore[arg-type]
+
+
+def found(frames: list[bytes]) -> Match:
+    return search(frames)[0]
+
+
+def found_among_crcs(frames: list[bytes]) -> Match:
+    """The same, where plain checksums are not tried before."""
+    samples = Samples(frames)
+    return best_first(list(crc_matches(samples)) or list(crc_matches(samples, mixed=True)))[0]
+
+
+def assert_found_by_name(find: Callable[[list[bytes]], Match], name: str, length: int) -> None:
+    crc = CRCS[name]
+    match = find(sealed(crc, length=length, order="big" if len(name) % 2 else "little", vary=3))
+    assert (match.algorithm, match.name, match.place) == (crc, name, Place(-crc.width // 8, crc.width // 8))
+    assert (match.right, match.total) == (12, 12)
+    assert match.order == ("big" if len(name) % 2 and crc.width > 8 else "little")
+
+
+#: those of the catalogue that a search tells from others; one in six in the quick tier.
+TOLD_APART = [name for name in CRCS if name not in ("CRC-8/I-CODE", "CRC-16/AUG-CCITT", "CRC-8/ITU")]
+
+
+@pytest.mark.parametrize("name", [pytest.param(name, marks=pytest.mark.slow if index % 6 else ()) for index, name in enumerate(TOLD_APART)])
+def test_every_crc_of_the_catalogue_is_found_by_name(name: str) -> None:
+    assert_found_by_name(found_among_crcs, name, 16)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", ["CRC-16/MODBUS", "CRC-8", "CRC-32/BZIP2"])
+def test_a_crc_is_found_behind_the_plain_checksums(name: str) -> None:
+    assert_found_by_name(found, name, 30)
+
+
+def test_the_catalogue_agrees_with_crccheck() -> None:
+    others = {
+        (c._width, c._poly, c._initvalue, c._reflect_input, c._reflect_output, c._xor_output)
+        for c in pytest.importorskip("crccheck.crc").ALLCRCCLASSES
+    }
+    for crc in CRCS.values():
+        assert (crc.width, crc.poly, crc.init, crc.refin, crc.refout, crc.xorout) in others
+
+
+@pytest.mark.parametrize(
+    ("width", "reflected"),
+    [
+        (16, True),
+        *(pytest.param(*pair, marks=pytest.mark.slow) for pair in ((8, False), (8, True), (16, False), (32, False), (32, True))),
+    ],
+)
+def test_a_crc_that_no_catalogue_knows(width: int, *, reflected: bool) -> None:
+    source = random.Random(width)
+    poly, init, xorout = (source.getrandbits(width) | 1 for _ in range(3))
+    crc = Crc(width, poly, init, reflected, reflected, xorout)
+    assert name_of(crc) == ""
+    frames = sealed(crc, 24, 25, vary=5)
+    match = found_among_crcs(frames)
+    assert isinstance(match.algorithm, Crc)
+    assert (match.algorithm.poly, match.algorithm.refin, match.right) == (poly, reflected, 24)
+    assert all(match.algorithm(frame[: -width // 8]) == crc(frame[: -width // 8]) for frame in frames)
+    assert match.algorithm == crc or match.open  # several pairs of init and xorout can be the same function
+
+
+@pytest.mark.slow
+def test_frames_of_one_length_leave_init_and_xorout_open_and_say_so() -> None:
+    crc = Crc(16, 0x755B, 0x1234, xorout=0x4321)
+    frames = sealed(crc)
+    match = found(frames)
+    assert isinstance(match.algorithm, Crc)
+    assert match.algorithm.poly == crc.poly
+    assert match.open
+    assert "cannot be told apart" in match.remarks[0]
+    assert all(match.algorithm(frame[:-2]) == crc(frame[:-2]) for frame in frames)
+
+
+@pytest.mark.slow
+def test_what_the_checksum_leaves_out_in_front() -> None:
+    match = found(sealed(CRCS["CRC-16/MODBUS"], skip=2))
+    assert (match.name, match.span.head, match.span.told(match.place, 34)) == ("CRC-16/MODBUS", 2, "all other bytes but the first 2")
+
+
+@pytest.mark.parametrize(
+    "checksum",
+    [
+        pytest.param(Xor(), marks=pytest.mark.slow),
+        pytest.param(Sum(8), marks=pytest.mark.slow),
+        Sum(16),
+        Sum(32),
+        Fold15(),
+        pytest.param(WordXor(), marks=pytest.mark.slow),
+        WordSum("little"),
+        WordSum("big", carry=True),
+        pytest.param(Changed(Sum(8), 0xFF, negative=True), marks=pytest.mark.slow),
+    ],
+    ids=lambda checksum: checksum.describe(),
+)
+def test_plain_checksums(checksum: Checksum) -> None:
+    frames = sealed(checksum, length=27 if not isinstance(checksum, WordXor) else 28)
+    at_end = [match for match in search(frames) if match.place.offset == -match.place.size]
+    assert checksum in [match.algorithm for match in at_end]
+    assert at_end[0].right == 12
+
+
+@pytest.mark.parametrize(
+    "checksum",
+    [
+        WordSum("big", carry=True),
+        *(
+            pytest.param(checksum, marks=pytest.mark.slow)
+            for checksum in (Changed(Sum(8), 0x5A), Changed(Sum(16), 0, negative=True), Changed(Sum(16), 0x1234))
+        ),
+    ],
+)
+def test_what_is_pasted_computes_the_same(checksum: Checksum) -> None:
+    frames = sealed(checksum, 40, 27)
+    match = found(frames)
+    scope: dict[str, Any] = vars(lidarspec) | {name: getattr(lidarspec.spec, name) for name in ("Checksum", "Xor", "WordXor")}
+    exec(match.paste, scope)
+    pasted = scope["Check"]()
+    for frame in frames:
+        first, last = match.span.ranges(match.place, len(frame))[0]
+        assert pasted(frame[first:last]) == match.algorithm(frame[first:last]) == int.from_bytes(frame[-match.place.size :], match.order)
+
+
+@pytest.mark.parametrize("number", [5, pytest.param(40, marks=pytest.mark.slow)])
+def test_words_in_groups_around_a_field_in_the_middle(number: int) -> None:
+    match = found(simulate(lidarspec.sensor("cspc-m1c1-mini"), 40)[-number:])
+    assert (match.algorithm, match.place) == (WordXor(head=8, groups=(1, 2)), Place(8, 2))
+    assert match.paste == "WordXor(head=8, groups=(1, 2))"
+
+
+@pytest.mark.slow
+def test_an_xor_with_a_constant_is_found_and_its_place_a_guess() -> None:
+    frames = sealed(Changed(Xor(), 0x33), 40, 27)
+    matches = search(frames)
+    assert {match.algorithm for match in matches} == {Changed(Xor(), 0x33)}
+    assert Place(-1, 1) in [match.place for match in matches]
+    assert all("at other places" in match.remarks[-1] for match in matches if match.span.head == 0)
+
+
+@pytest.mark.slow
+def test_an_xor_in_two_nibbles() -> None:
+    match = found(simulate(lidarspec.sensor("slamtec-rplidar-a1").configure(answer="express"), 20))
+    assert (match.algorithm, match.place) == (Xor(), Place(0, 2))
+    assert "low nibbles" in match.remarks[0]
+
+
+@pytest.mark.slow
+def test_damaged_frames_do_not_hide_it() -> None:
+    frames = sealed(Crc(8, 0x4D), 60, 44)
+    damaged = [bytes([*frame[:9], frame[9] ^ 0x40, *frame[10:]]) if index % 5 == 0 else frame for index, frame in enumerate(frames)]
+    match = found(damaged)
+    assert (match.algorithm, match.right, match.total) == (Crc(8, 0x4D), 48, 60)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("length", [20, 300])
+def test_random_bytes_have_none(length: int) -> None:
+    source = random.Random(length)
+    assert search([source.randbytes(length) for _ in range(20)]) == []
+
+
+def test_nothing_is_made_of_nothing() -> None:
+    assert search([]) == []
+    assert search([b"\x01"]) == []
+    assert search([bytes(20)] * 30) == []
+
+
+def test_division() -> None:
+    source = random.Random(1)
+    for _ in range(50):
+        a, b = source.getrandbits(60), source.getrandbits(20) | 1
+        q, r, product = quotient(a, b), remainder(a, b), 0
+        for bit in range(q.bit_length()):
+            product ^= (b << bit) * (q >> bit & 1)
+        assert product ^ r == a
+        assert r.bit_length() < b.bit_length()
+
+
+def test_divisors_of_a_common_multiple() -> None:
+    poly, source = 0x18005, random.Random(2)
+
+    def times(other: int) -> int:
+        product = 0
+        for bit in range(other.bit_length()):
+            product ^= (poly << bit) * (other >> bit & 1)
+        return product
+
+    multiples = [times(source.getrandbits(200)) for _ in range(4)]
+    assert divisors(common_divisor(multiples), 16) == [poly]
+    assert poly in divisors(times(0b1011), 16)
+    assert poly in divisors(multiples[0], 16)  # every polynomial of degree 16 is tried at once
+    assert divisors(0, 8) == []
+
+
+def test_linear_equations_and_their_freedom() -> None:
+    unknown = 0b1011
+    equations = [(mask, bin(mask & unknown).count("1") & 1) for mask in (0b0001, 0b0011, 0b0111)]
+    solution, free = solve(equations, 4) or (0, [])
+    assert len(free) == 1
+    assert unknown in (solution, solution ^ free[0])
+    assert solve([*equations, (0b0001, 0)], 4) is None
+
+
+def test_batches_of_the_checksums_without_a_name() -> None:
+    rows = np.frombuffer(random.Random(3).randbytes(60), np.uint8).reshape(4, 15)
+    for checksum in (WordSum("big"), WordSum("little", carry=True), Changed(Sum(8), 7, negative=True), Changed(Xor(), 9)):
+        assert checksum.batch(rows).tolist() == [checksum(row.tobytes()) for row in rows]
+        assert checksum.describe()
