@@ -1,6 +1,8 @@
-"""Isolate the tests from settings, kernels and variables of the user; list at the end which tools were missing.
+"""Isolate the tests from settings, kernels and variables of the user; list at the end which tools
+were missing.
 
-Ctrl-C reaches the programs that tests start, also in the background of a shell, where it is ignored and that is inherited.
+Ctrl-C reaches the programs that tests start, also in the background of a shell, where it is ignored
+and that is inherited.
 """
 
 from __future__ import annotations
@@ -20,19 +22,23 @@ from tests.missing import describe_missing
 #: plugins whose tests need an environment of their own: `make test-ros2`.
 collect_ignore = ["plugins/lidarspec-ros2"]
 
-# Collecting tests makes hundreds of thousands of objects that all stay, so that looking for garbage among them is a waste.
+# Collecting tests makes hundreds of thousands of objects that all stay, so that looking for garbage
+# among them is a waste.
 gc.disable()
 
 if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
     signal.signal(signal.SIGINT, signal.default_int_handler)
 
-#: variables that change what a program does; those of the tests themselves (LIDARSPEC_CAPTURES, LIDARSPEC_EXAMPLES, LIDARSPEC_KSC) stay.
+#: variables that change what a program does; those of the tests themselves (LIDARSPEC_CAPTURES,
+#: LIDARSPEC_EXAMPLES, LIDARSPEC_KSC) stay.
 CHANGING = ("LIDARSPEC_BACKEND", "LIDARSPEC_THREADS", "LIDARSPEC_DEBUG", "LIDARSPEC_TRUST")
 
 
 @pytest.fixture(autouse=True, scope="session")
 def _isolated(tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:
-    """Run in a directory with no `lidarspec.toml` in it or above, with own folders for settings and kernels."""
+    """Run in a directory with no `lidarspec.toml` in it or above, with own folders for settings and
+    kernels.
+    """
     base = tmp_path_factory.getbasetemp()
     (base / "lidarspec.toml").touch()  # the nearest one counts, and none above it is looked at
     here = base / "here"
@@ -45,7 +51,9 @@ def _isolated(tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:
             patch.setenv(name, str(base / "settings"))
         patch.setenv("LIDARSPEC_CACHE", str(every / "kernels"))  # one for all workers
         patch.setenv("OPENBLAS_NUM_THREADS", "1")  # programs that tests start multiply no matrices
-        if os.environ.get("PYTHONDONTWRITEBYTECODE"):  # and compile their modules once all the same, beside the sources of nobody
+        if os.environ.get(
+            "PYTHONDONTWRITEBYTECODE"
+        ):  # and compile their modules once all the same, beside the sources of nobody
             patch.delenv("PYTHONDONTWRITEBYTECODE")
             patch.setenv("PYTHONPYCACHEPREFIX", str(every / "bytecode"))
         patch.chdir(here)
@@ -54,8 +62,12 @@ def _isolated(tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:
 
 @pytest.fixture(autouse=True, scope="session")
 def _examples_are_made_once() -> Iterator[None]:
-    """Make each example frame once, since thousands of tests use the same frames of the same sensors."""
-    made: weakref.WeakKeyDictionary[Spec, dict[tuple[str, int], bytes]] = weakref.WeakKeyDictionary()
+    """Make each example frame once, since thousands of tests use the same frames of the same
+    sensors.
+    """
+    made: weakref.WeakKeyDictionary[Spec, dict[tuple[str, int], bytes]] = (
+        weakref.WeakKeyDictionary()
+    )
     original = examples.example
 
     def example(sensor: Spec, frame: str, *, seed: int = 0) -> bytes:
@@ -71,7 +83,9 @@ def _examples_are_made_once() -> Iterator[None]:
 
 @pytest.fixture(autouse=True, scope="module")
 def _frozen() -> None:
-    """Exempt everything that exists before a module's first test from garbage collection, which saves time."""
+    """Exempt everything that exists before a module's first test from garbage collection, which
+    saves time.
+    """
     gc.collect(1)
     gc.freeze()
 
@@ -83,6 +97,10 @@ def pytest_collection_finish() -> None:
 
 def pytest_terminal_summary(terminalreporter: pytest.TerminalReporter) -> None:
     """Print which tests were skipped because a tool or a capture is missing, and how to get it."""
-    skipped = [report for report in terminalreporter.stats.get("skipped", []) if isinstance(report.longrepr, tuple)]
+    skipped = [
+        report
+        for report in terminalreporter.stats.get("skipped", [])
+        if isinstance(report.longrepr, tuple)
+    ]
     for line in describe_missing((report.nodeid, report.longrepr[2]) for report in skipped):
         terminalreporter.write_line(line)

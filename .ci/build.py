@@ -2,8 +2,9 @@
 
     python .ci/build.py [--editable] FOLDER PROJECT...
 
-A frontend such as pip starts two processes for each project. With 21 projects that takes five times as long as
-everything else of an installation. This script calls the same hooks (PEP 517, PEP 660) of hatchling directly.
+A frontend such as pip starts two processes for each project. With 21 projects that takes five times
+as long as everything else of an installation. This script calls the same hooks (PEP 517, PEP 660)
+of hatchling directly.
 """
 
 from __future__ import annotations

@@ -1,7 +1,9 @@
-"""Decoders of packets as one would write them by hand in NumPy: what the engine is to match from the spec alone.
+"""Decoders of packets as one would write them by hand in NumPy: what the engine is to match from
+the spec alone.
 
-They know offsets, strides and scales; blocks are compacted before anything is computed, what depends on one 16-bit field
-is a table by its raw value, and chunks stay in the cache. Those of serial lines are in `by_hand_serial`.
+They know offsets, strides and scales; blocks are compacted before anything is computed, what
+depends on one 16-bit field is a table by its raw value, and chunks stay in the cache. Those of
+serial lines are in `by_hand_serial`.
 """
 
 from __future__ import annotations
@@ -28,14 +30,22 @@ def _m1_tables() -> dict[str, Floats]:
     code = CODES.astype("<u2").view(">u2").astype(np.float64)
     angle = np.deg2rad(code * 0.01 - 327.68)
     distance = np.where(code > 0, code * 0.005, np.nan)
-    return {"range": distance.astype(np.float32), "cos": np.cos(angle).astype(np.float32), "sin": np.sin(angle).astype(np.float32)}
+    return {
+        "range": distance.astype(np.float32),
+        "cos": np.cos(angle).astype(np.float32),
+        "sin": np.sin(angle).astype(np.float32),
+    }
 
 
 def m1_points(packets: Bytes) -> Floats:
-    """x y z intensity of RS-LiDAR-M1 packets (n, 1210): float32, (4, n * 125); nan where there is no return."""
+    """x y z intensity of RS-LiDAR-M1 packets (n, 1210): float32, (4, n * 125); nan where there is
+    no return.
+    """
     tables = _m1_tables()
     block = np.dtype({"names": ["channels"], "formats": ["V45"], "offsets": [2], "itemsize": 47})
-    packet = np.dtype({"names": ["blocks"], "formats": [(block, 25)], "offsets": [32], "itemsize": 1210})
+    packet = np.dtype(
+        {"names": ["blocks"], "formats": [(block, 25)], "offsets": [32], "itemsize": 1210}
+    )
     channels = packets.view(packet)["blocks"]["channels"]
     found = np.empty((4, len(packets) * 125), np.float32)
     compact = np.empty((M1_CHUNK, 1, 25), "V45")
@@ -46,7 +56,11 @@ def m1_points(packets: Bytes) -> Floats:
         count = rows * 125
         np.copyto(compact[:rows], channels[start : start + rows].reshape(rows, 1, 25))
         distance, level, rise, east, north = (row[:count] for row in scratch)
-        for offset, wanted in ((0, (("range", distance),)), (2, (("cos", level), ("sin", rise))), (4, (("cos", east), ("sin", north)))):
+        for offset, wanted in (
+            (0, (("range", distance),)),
+            (2, (("cos", level), ("sin", rise))),
+            (4, (("cos", east), ("sin", north))),
+        ):
             np.copyto(index[:count], column(compact, offset, "<u2", 9, count))
             for name, target in wanted:
                 tables[name].take(index[:count], out=target, mode="wrap")
@@ -60,16 +74,28 @@ def m1_points(packets: Bytes) -> Floats:
 
 
 def vlp16_points(packets: Bytes) -> Floats:
-    """x y z intensity of VLP-16 packets (n, 1206) with single return: float32, (4, n * 384); nan where there is no return.
+    """x y z intensity of VLP-16 packets (n, 1206) with single return: float32, (4, n * 384); nan
+    where there is no return.
 
-    Each firing lies on the way to the next block; where that is further than the sensor turns, the step before counts.
+    Each firing lies on the way to the next block; where that is further than the sensor turns, the
+    step before counts.
     """
     slot = np.arange(32)
-    elevation = np.deg2rad(np.tile([-15.0, 1, -13, 3, -11, 5, -9, 7, -7, 9, -5, 11, -3, 13, -1, 15], 2))
+    elevation = np.deg2rad(
+        np.tile([-15.0, 1, -13, 3, -11, 5, -9, 7, -7, 9, -5, 11, -3, 13, -1, 15], 2)
+    )
     shares = np.stack([np.ones(32), (slot // 16 * 55.296 + slot % 16 * 2.304) / 110.592])
-    level, rise = (np.tile(row.astype(np.float32), VLP_CHUNK * 12) for row in (np.cos(elevation), np.sin(elevation)))
+    level, rise = (
+        np.tile(row.astype(np.float32), VLP_CHUNK * 12)
+        for row in (np.cos(elevation), np.sin(elevation))
+    )
     height = np.tile((-0.04191 * np.tan(elevation)).astype(np.float32), VLP_CHUNK * 12)
-    blocks = np.ndarray((len(packets), 12), np.dtype("<u2"), packets.data, 2, (1206, 100)).astype(np.float64) * 0.01
+    blocks = (
+        np.ndarray((len(packets), 12), np.dtype("<u2"), packets.data, 2, (1206, 100)).astype(
+            np.float64
+        )
+        * 0.01
+    )
     ahead = (np.append(blocks.ravel()[1:], np.nan) - blocks.ravel() + 180) % 360 - 180
     before = np.concatenate([[np.nan], ahead[:-1]])
     lows = np.stack([blocks.ravel(), np.where(np.abs(ahead) < 0.995, ahead, before)], axis=1)
@@ -82,7 +108,9 @@ def vlp16_points(packets: Bytes) -> Floats:
         np.copyto(compact[:rows], channels[start : start + rows])
         distance, flat = scratch.single[0][:count], scratch.single[1][:count]
         lookup(_metres(0.002), column(compact, 0, "<u2", 3, count), scratch, distance)
-        east, north = scratch.directions(np.matmul(lows[start * 12 : (start + rows) * 12], shares), count)
+        east, north = scratch.directions(
+            np.matmul(lows[start * 12 : (start + rows) * 12], shares), count
+        )
         x, y, z, intensity = found[:, start * 384 : start * 384 + count]
         np.multiply(distance, rise[:count], out=z)
         np.add(z, height[:count], out=z)
@@ -94,10 +122,20 @@ def vlp16_points(packets: Bytes) -> Floats:
 
 
 def xt32_points(packets: Bytes) -> Floats:
-    """x y z intensity of PandarXT-32 packets (n, 1080) in steps of 4 mm: float32, (4, n * 256); nan where there is no return."""
+    """x y z intensity of PandarXT-32 packets (n, 1080) in steps of 4 mm: float32, (4, n * 256); nan
+    where there is no return.
+    """
     elevation, offset = np.deg2rad(15.0 - np.arange(32)), np.zeros(32)
-    level, rise = (np.tile(row.astype(np.float32), XT_CHUNK * 8) for row in (np.cos(elevation), np.sin(elevation)))
-    azimuth = np.ndarray((len(packets), 8), np.dtype("<u2"), packets.data, 12, (1080, 130)).astype(np.float64) * 0.01
+    level, rise = (
+        np.tile(row.astype(np.float32), XT_CHUNK * 8)
+        for row in (np.cos(elevation), np.sin(elevation))
+    )
+    azimuth = (
+        np.ndarray((len(packets), 8), np.dtype("<u2"), packets.data, 12, (1080, 130)).astype(
+            np.float64
+        )
+        * 0.01
+    )
     channels = np.ndarray((len(packets), 8), "V128", packets.data, 14, (1080, 130))
     found = np.empty((4, len(packets) * 256), np.float32)
     compact, scratch = np.empty((XT_CHUNK, 8), "V128"), Scratch(XT_CHUNK * 256)
@@ -107,7 +145,9 @@ def xt32_points(packets: Bytes) -> Floats:
         np.copyto(compact[:rows], channels[start : start + rows])
         distance, flat = scratch.single[0][:count], scratch.single[1][:count]
         lookup(_metres(0.004), column(compact, 0, "<u2", 4, count), scratch, distance)
-        east, north = scratch.directions(azimuth[start : start + rows].reshape(-1, 1) + offset, count)
+        east, north = scratch.directions(
+            azimuth[start : start + rows].reshape(-1, 1) + offset, count
+        )
         x, y, z, intensity = found[:, start * 256 : start * 256 + count]
         np.multiply(distance, rise[:count], out=z)
         np.multiply(distance, level[:count], out=flat)
@@ -118,7 +158,8 @@ def xt32_points(packets: Bytes) -> Floats:
 
 
 def payloads(path: Path) -> Bytes:
-    """The UDP payloads of a little-endian pcap file with Ethernet and IPv4 whose records are all alike: uint8, (n, size), not copied.
+    """The UDP payloads of a little-endian pcap file with Ethernet and IPv4 whose records are all
+    alike: uint8, (n, size), not copied.
 
     Raises:
         ValueError: if they are not.
@@ -134,7 +175,9 @@ def payloads(path: Path) -> Bytes:
 
 
 def m1_scans(path: Path) -> list[Floats]:
-    """x y z intensity of each frame of an RS-LiDAR-M1 in a pcap file, which begins where the packet number falls."""
+    """x y z intensity of each frame of an RS-LiDAR-M1 in a pcap file, which begins where the packet
+    number falls.
+    """
     packets = np.ascontiguousarray(payloads(path))
     number = packets[:, 4].astype(np.intp) << 8 | packets[:, 5]
     cuts = (np.flatnonzero(number[1:] < number[:-1]) + 1) * 125

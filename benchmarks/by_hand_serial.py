@@ -1,4 +1,6 @@
-"""Decoders of serial lines as one would write them by hand in NumPy, see `by_hand`: framing and checksums included."""
+"""Decoders of serial lines as one would write them by hand in NumPy, see `by_hand`: framing and
+checksums included.
+"""
 
 from __future__ import annotations
 
@@ -17,29 +19,40 @@ NODE_CHUNK = 1 << 16  # nodes
 
 @functools.cache
 def _crc_tables() -> list[NDArray[np.uint8]]:
-    """What each pair of bytes adds to the CRC-8 (0x4d) of the 46 bytes before it, by the pair loaded little-endian."""
+    """What each pair of bytes adds to the CRC-8 (0x4d) of the 46 bytes before it, by the pair
+    loaded little-endian.
+    """
     single = np.arange(256)
     for _ in range(8):
         single = np.where(single & 0x80, single << 1 ^ 0x4D, single << 1) & 0xFF
     tables = [single.astype(np.uint8)]
     while len(tables) < STL_FRAME - 1:
         tables.insert(0, single[tables[0]].astype(np.uint8))
-    return [tables[spot][CODES & 0xFF] ^ tables[spot + 1][CODES >> 8] for spot in range(0, STL_FRAME - 1, 2)]
+    return [
+        tables[spot][CODES & 0xFF] ^ tables[spot + 1][CODES >> 8]
+        for spot in range(0, STL_FRAME - 1, 2)
+    ]
 
 
 def _good(frames: Bytes) -> NDArray[np.bool_]:
-    """Which STL-27L frames (n, 47) have their checksum, angles below 360 degrees and a time of at most 30 s."""
+    """Which STL-27L frames (n, 47) have their checksum, angles below 360 degrees and a time of at
+    most 30 s.
+    """
     pairs = np.ascontiguousarray(frames[:, : STL_FRAME - 1]).view("<u2")
     crc = np.zeros(len(frames), np.uint8)
     for spot, table in enumerate(_crc_tables()):
         crc ^= table.take(pairs[:, spot], mode="wrap")
     start, end, time = pairs[:, 2], pairs[:, 21], pairs[:, 22]
-    good: NDArray[np.bool_] = (crc == frames[:, 46]) & (start < 36000) & (end < 36000) & (time <= 30_000)
+    good: NDArray[np.bool_] = (
+        (crc == frames[:, 46]) & (start < 36000) & (end < 36000) & (time <= 30_000)
+    )
     return good
 
 
 def stl27l_points(frames: Bytes) -> Floats:
-    """x y intensity of STL-27L frames (n, 47), those with a wrong checksum left out: float32, (3, points)."""
+    """x y intensity of STL-27L frames (n, 47), those with a wrong checksum left out: float32, (3,
+    points).
+    """
     found = np.empty((3, len(frames) * STL_POINTS), np.float32)
     end = 0
     for start in range(0, len(frames), STL_CHUNK):
@@ -51,7 +64,10 @@ def stl27l_points(frames: Bytes) -> Floats:
 
 def _stl27l_chunk(frames: Bytes, found: Floats, start: int) -> int:
     """Write the points of good frames from column `start` on; the column after them."""
-    first, final = (np.ascontiguousarray(frames[:, at : at + 2]).view("<u2").astype(np.float64) for at in (4, 42))
+    first, final = (
+        np.ascontiguousarray(frames[:, at : at + 2]).view("<u2").astype(np.float64)
+        for at in (4, 42)
+    )
     steps = np.arange(STL_POINTS) / (STL_POINTS - 1)
     angle = np.deg2rad((first + (final - first) % 36000 * steps) * -0.01).astype(np.float32).ravel()
     samples = np.ascontiguousarray(frames[:, 6:42])
@@ -70,7 +86,9 @@ def _stl27l_ranges() -> Floats:
 
 
 def stl27l_stream(data: bytes) -> Floats:
-    """x y intensity of the STL-27L frames in a stream of bytes with noise, the leftmost of frames that overlap."""
+    """x y intensity of the STL-27L frames in a stream of bytes with noise, the leftmost of frames
+    that overlap.
+    """
     stream = np.frombuffer(data, np.uint8)
     here = np.flatnonzero(stream[: len(stream) - STL_FRAME + 1] == 0x54)
     here = here[stream[here + 1] == 0x2C]
@@ -89,7 +107,9 @@ def stl27l_stream(data: bytes) -> Floats:
 
 
 def _leftmost(spots: NDArray[np.intp], free: int) -> NDArray[np.bool_]:
-    """Which frames at these offsets do not overlap one that was chosen before, the first byte left being at `free`."""
+    """Which frames at these offsets do not overlap one that was chosen before, the first byte left
+    being at `free`.
+    """
     chosen = np.ones(len(spots), np.bool_)
     if bool((np.diff(spots, prepend=free - STL_FRAME) < STL_FRAME).any()):
         for index, offset in enumerate(spots.tolist()):
@@ -99,7 +119,9 @@ def _leftmost(spots: NDArray[np.intp], free: int) -> NDArray[np.bool_]:
 
 
 def m1c1_points(packets: Bytes) -> Floats:
-    """x y intensity of M1C1_Mini packets (n, 10 + 3 k), those with a wrong checksum or angle left out: float32, (3, points)."""
+    """x y intensity of M1C1_Mini packets (n, 10 + 3 k), those with a wrong checksum or angle left
+    out: float32, (3, points).
+    """
     count = (packets.shape[1] - 10) // 3
     step = max(M1C1_CHUNK // count, 1)
     scratch, end = Scratch(step * count), 0
@@ -115,9 +137,15 @@ def _m1c1_good(rows: Bytes) -> NDArray[np.bool_]:
     """Which packets of one length have their checksum and angles below 360 degrees."""
     words = np.ascontiguousarray(rows[:, :10]).view("<u2")
     samples = rows[:, 10:].reshape(len(rows), -1, 3)
-    low, middle, high = (np.bitwise_xor.reduce(samples[:, :, byte], axis=1).astype(np.uint16) for byte in range(3))
-    total = words[:, 0] ^ words[:, 1] ^ words[:, 2] ^ words[:, 3] ^ low ^ middle ^ high << np.uint16(8)
-    good: NDArray[np.bool_] = (words[:, 2] >> 1 < 23040) & (words[:, 3] >> 1 < 23040) & (rows[:, 4] & rows[:, 6] & 1 == 1)
+    low, middle, high = (
+        np.bitwise_xor.reduce(samples[:, :, byte], axis=1).astype(np.uint16) for byte in range(3)
+    )
+    total = (
+        words[:, 0] ^ words[:, 1] ^ words[:, 2] ^ words[:, 3] ^ low ^ middle ^ high << np.uint16(8)
+    )
+    good: NDArray[np.bool_] = (
+        (words[:, 2] >> 1 < 23040) & (words[:, 3] >> 1 < 23040) & (rows[:, 4] & rows[:, 6] & 1 == 1)
+    )
     good &= total == words[:, 4]
     return good
 
@@ -125,10 +153,14 @@ def _m1c1_good(rows: Bytes) -> NDArray[np.bool_]:
 def _m1c1_chunk(packets: Bytes, found: Floats, start: int, scratch: Scratch) -> int:
     """Write the points of good packets of one length from column `start` on; the column after them."""
     count = int(packets.shape[1] - 10) // 3
-    first, final = (np.ascontiguousarray(packets[:, at : at + 2]).view("<u2")[:, 0] >> 1 for at in (4, 6))
+    first, final = (
+        np.ascontiguousarray(packets[:, at : at + 2]).view("<u2")[:, 0] >> 1 for at in (4, 6)
+    )
     span = (final.astype(np.float64) - first) % 23040
     lows = np.stack([first / 64, span / 64], axis=1)
-    angle = np.matmul(lows, np.stack([np.ones(count), np.arange(count) / max(count - 1, 1)])).reshape(-1)
+    angle = np.matmul(
+        lows, np.stack([np.ones(count), np.arange(count) / max(count - 1, 1)])
+    ).reshape(-1)
     samples, size = np.ascontiguousarray(packets[:, 10:]), len(packets) * count
     x, y, intensity = found[:, start : start + size]
     distance, correction = scratch.single[0][:size], scratch.single[1][:size]
@@ -147,23 +179,37 @@ def _m1c1_chunk(packets: Bytes, found: Floats, start: int, scratch: Scratch) -> 
 def _m1c1_tables() -> tuple[Floats, Floats, Floats]:
     """Range and correction by the upper two bytes of a sample, intensity by the lower two."""
     mm = CODES >> 2
-    correction = np.rad2deg(np.arctan(19.16 * (np.maximum(mm, 1) - 90.15) / (90.15 * np.maximum(mm, 1))))
-    tables = np.where(mm > 0, mm * 0.001, np.nan), np.where(mm > 0, correction, 0), CODES >> 2 & 0xFF
+    correction = np.rad2deg(
+        np.arctan(19.16 * (np.maximum(mm, 1) - 90.15) / (90.15 * np.maximum(mm, 1)))
+    )
+    tables = (
+        np.where(mm > 0, mm * 0.001, np.nan),
+        np.where(mm > 0, correction, 0),
+        CODES >> 2 & 0xFF,
+    )
     return tuple(table.astype(np.float32) for table in tables)  # type: ignore[return-value]
 
 
 def m1c1_stream(data: bytes) -> Floats:
-    """x y intensity of the M1C1_Mini packets in a stream of bytes, the leftmost of those that overlap."""
+    """x y intensity of the M1C1_Mini packets in a stream of bytes, the leftmost of those that
+    overlap.
+    """
     stream = np.frombuffer(data, np.uint8)
     here = np.flatnonzero((stream[:-1] == 0xAA) & (stream[1:] == 0x55))
     here = here[here < len(stream) - 12]
     numbers = stream[here + 3].astype(np.intp)
     sizes = 10 + 3 * numbers
-    good = (numbers > 0) & (here + sizes <= len(stream)) & ((stream[here + 2] & 1 == 0) | (numbers == 1))
+    good = (
+        (numbers > 0)
+        & (here + sizes <= len(stream))
+        & ((stream[here + 2] & 1 == 0) | (numbers == 1))
+    )
     rows: dict[int, Any] = {}
     for number in np.unique(numbers[good]).tolist():
         which = np.flatnonzero(good & (numbers == number))
-        windows: NDArray[Any] = np.ndarray((len(stream) - 9 - 3 * number,), f"V{10 + 3 * number}", stream.data, 0, (1,))
+        windows: NDArray[Any] = np.ndarray(
+            (len(stream) - 9 - 3 * number,), f"V{10 + 3 * number}", stream.data, 0, (1,)
+        )
         rows[number] = windows[here[which]].view(np.uint8).reshape(len(which), -1)
         good[which] = _m1c1_good(rows[number])
         rows[number] = rows[number][good[which]]
@@ -175,7 +221,9 @@ def m1c1_stream(data: bytes) -> Floats:
     for number, packets in rows.items():
         points = m1c1_points(packets)
         where = starts[numbers[spots] == number]
-        target: NDArray[Any] = np.ndarray((3, found.shape[1] - number + 1), f"V{4 * number}", found.data, 0, (found.strides[0], 4))
+        target: NDArray[Any] = np.ndarray(
+            (3, found.shape[1] - number + 1), f"V{4 * number}", found.data, 0, (found.strides[0], 4)
+        )
         target[:, where] = points.reshape(3, -1, number).view(f"V{4 * number}")[:, :, 0]
     return found
 
@@ -209,7 +257,14 @@ def rplidar_stream(data: bytes, opening: int) -> Floats:
 
 @functools.cache
 def _node_tables() -> tuple[Floats, Floats, Floats, Floats]:
-    """Cosine and sine by the angle's two bytes, range by the distance's, and quality by the first byte."""
+    """Cosine and sine by the angle's two bytes, range by the distance's, and quality by the first
+    byte.
+    """
     angle = -np.deg2rad((CODES >> 1) / 64)
-    tables = np.cos(angle), np.sin(angle), np.where(CODES > 0, CODES * 0.00025, np.nan), CODES[:256] >> 2
+    tables = (
+        np.cos(angle),
+        np.sin(angle),
+        np.where(CODES > 0, CODES * 0.00025, np.nan),
+        CODES[:256] >> 2,
+    )
     return tuple(table.astype(np.float32) for table in tables)  # type: ignore[return-value]

@@ -63,7 +63,9 @@ def run_installer(python: Path, requirements: Sequence[str]) -> str:
         command = [uv, "pip", "install", "--python", str(python)]
     else:
         command = [str(python), "-m", "pip", "--disable-pip-version-check", "install"]
-    done = subprocess.run([*command, "--quiet", *requirements], stderr=subprocess.PIPE, text=True, check=False)
+    done = subprocess.run(
+        [*command, "--quiet", *requirements], stderr=subprocess.PIPE, text=True, check=False
+    )
     return find_reason(done.stderr) if done.returncode else ""
 
 

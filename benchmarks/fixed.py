@@ -1,4 +1,6 @@
-"""The same sensors' frames with every field at a fixed place: no parts, counts or conditions. They read the frames of one work alone."""
+"""The same sensors' frames with every field at a fixed place: no parts, counts or conditions. They
+read the frames of one work alone.
+"""
 
 from __future__ import annotations
 
@@ -27,12 +29,26 @@ from construct import (
 )
 
 import lidarspec as ls
-from lidarspec.spec import Checksummed, Clock, Fields, Frame, OnChange, Polar, Scaled, Sensor, Tcp, Udp, Xor
+from lidarspec.spec import (
+    Checksummed,
+    Clock,
+    Fields,
+    Frame,
+    OnChange,
+    Polar,
+    Scaled,
+    Sensor,
+    Tcp,
+    Udp,
+    Xor,
+)
 from lidarspec_livox import points as livox, sdk2
 from lidarspec_sick import compact, telegrams
 
 
-def placed(struct: Construct, points: Any, size: int, *, scan: str, clock: str, stream: bool = False) -> Sensor:
+def placed(
+    struct: Construct, points: Any, size: int, *, scan: str, clock: str, stream: bool = False
+) -> Sensor:
     """A sensor with frames of this size alone."""
     return Sensor(
         "fixed-places",
@@ -70,18 +86,28 @@ def compact_telegram(sensor: ls.Sensor, frame: bytes) -> Sensor:
         "beam_count" / Const(beams, Int32ul),
         "echo_count" / Const(echoes, Int32ul),
         *(name / Array(layers, Scaled(Int64ul, 1, "us")) for name in ("start_time", "stop_time")),
-        *(name / Array(layers, Scaled(Float32l, 1, "rad")) for name in ("elevation", "first_azimuth", "last_azimuth")),
+        *(
+            name / Array(layers, Scaled(Float32l, 1, "rad"))
+            for name in ("elevation", "first_azimuth", "last_azimuth")
+        ),
         "scale" / Float32l,
         "next_size" / Int32ul,
         "available" / Int8ul,
         "echo_content" / Int8ul,
-        "beam_content" / BitStruct("reserved" / BitsInteger(6), "has_azimuth" / BitsInteger(1), "has_property" / BitsInteger(1)),
+        "beam_content"
+        / BitStruct(
+            "reserved" / BitsInteger(6),
+            "has_azimuth" / BitsInteger(1),
+            "has_property" / BitsInteger(1),
+        ),
         "reserved" / Int8ul,
         "beams" / Array(beams, Array(layers, beam)),
         "crc" / Int32ul,
     )
     sealed = Checksummed(struct, field="crc", algorithm=compact.CRC)
-    return placed(sealed, partial(compact.points, version=4), len(frame), scan="turn", clock="start_time[0]")
+    return placed(
+        sealed, partial(compact.points, version=4), len(frame), scan="turn", clock="start_time[0]"
+    )
 
 
 def cola_telegram(sensor: ls.Sensor, frame: bytes) -> Sensor:
@@ -91,7 +117,13 @@ def cola_telegram(sensor: ls.Sensor, frame: bytes) -> Sensor:
     def channel(content: bytes, values: Construct) -> Struct:
         angles = ("start" / Scaled(Int32sb, 1e-4, "deg"), "step" / Scaled(Int16ub, 1e-4, "deg"))
         factors = ("scale" / Float32b, "offset" / Float32b)
-        return Struct("content" / Const(content), *factors, *angles, "count" / Const(beams, Int16ub), "samples" / Array(beams, values))
+        return Struct(
+            "content" / Const(content),
+            *factors,
+            *angles,
+            "count" / Const(beams, Int16ub),
+            "samples" / Array(beams, values),
+        )
 
     content = (
         "kind" / Bytes(3),
@@ -106,8 +138,15 @@ def cola_telegram(sensor: ls.Sensor, frame: bytes) -> Sensor:
         "rssi1" / channel(b"RSSI1", Int16ub),
         "nothing" / Const(bytes(12)),
     )
-    struct = Struct("magic" / Const(b"\x02\x02\x02\x02"), "length" / Const(len(frame) - 9, Int32ub), *content, "checksum" / Int8ub)
-    sealed = Checksummed(struct, field="checksum", algorithm=Xor(), over=tuple(part.name for part in content))
+    struct = Struct(
+        "magic" / Const(b"\x02\x02\x02\x02"),
+        "length" / Const(len(frame) - 9, Int32ub),
+        *content,
+        "checksum" / Int8ub,
+    )
+    sealed = Checksummed(
+        struct, field="checksum", algorithm=Xor(), over=tuple(part.name for part in content)
+    )
 
     def points(f: Fields) -> Polar:
         first, second = f.dist1, f.rssi1
@@ -140,5 +179,13 @@ def livox_packet(sensor: ls.Sensor, frame: bytes) -> Sensor:
         "timestamp" / Scaled(Int64ul, 1, "ns"),
         points,
     )
-    sealed = Checksummed(struct, field="crc32", algorithm=sdk2.CRC32, over=("timestamp", "points"), absent=(0,))
-    return placed(sealed, lambda f: livox.cartesian(f, sdk2.after(f)), len(frame), scan="frame_cnt", clock="timestamp")
+    sealed = Checksummed(
+        struct, field="crc32", algorithm=sdk2.CRC32, over=("timestamp", "points"), absent=(0,)
+    )
+    return placed(
+        sealed,
+        lambda f: livox.cartesian(f, sdk2.after(f)),
+        len(frame),
+        scan="frame_cnt",
+        clock="timestamp",
+    )

@@ -1,4 +1,6 @@
-"""Captures to files of each format: in processes of their own, so that memory is theirs, beside what a user would write instead."""
+"""Captures to files of each format: in processes of their own, so that memory is theirs, beside
+what a user would write instead.
+"""
 
 from __future__ import annotations
 
@@ -25,11 +27,13 @@ from works import Facts, Work
 import lidarspec as ls
 from lidarspec import formats
 
-#: what holds all points at once is given so many times less, and many captures are so many of this size.
+#: what holds all points at once is given so many times less, and many captures are so many of this
+#: size.
 SMALLER = 8
 
-#: Runs a command and prints the seconds that passed, those of the processors, and the bytes of memory of its largest process. It stands in
-#: between, as a child begins with the peak of its parent, which holds the inputs of all works; on Linux it waits for the workers' parents.
+#: Runs a command and prints the seconds that passed, those of the processors, and the bytes of
+#: memory of its largest process. It stands in between, as a child begins with the peak of its
+#: parent, which holds the inputs of all works; on Linux it waits for the workers' parents.
 LAUNCHER = """
 import ctypes, json, os, resource, subprocess, sys, time
 if sys.platform == "linux":
@@ -89,7 +93,8 @@ class Captured(NamedTuple):
         sensor: its id.
         rate: bytes of a capture for each second.
         suffixes: of the formats.
-        period: seconds after which its clock is where it was, so that a capture may be repeated; 0: it is simulated to the end.
+        period: seconds after which its clock is where it was, so that a capture may be repeated; 0:
+            it is simulated to the end.
         share: it is so many times smaller than others.
     """
 
@@ -103,7 +108,9 @@ class Captured(NamedTuple):
 
 CAPTURES: Mapping[str, Captured] = {
     "m1": Captured("RS-LiDAR-M1", "robosense-m1", 7.99e6, tuple(formats.BUILT_IN)),
-    "stl27l": Captured("STL-27L", "ldrobot-stl27l", 113_400, (".csv", ".parquet", ".mcap"), period=30),
+    "stl27l": Captured(
+        "STL-27L", "ldrobot-stl27l", 113_400, (".csv", ".parquet", ".mcap"), period=30
+    ),
     "vlp16": Captured("VLP-16", "velodyne-vlp16", 1.035e6, tuple(TARGETS), share=SMALLER),
 }
 
@@ -127,9 +134,13 @@ class Spent:
 
 
 def process(*command: object) -> Spent:
-    """Runs Python with these arguments; modules are compiled once, as where they are installed, whatever this process is told."""
+    """Runs Python with these arguments; modules are compiled once, as where they are installed,
+    whatever this process is told.
+    """
     line = [sys.executable, "-S", "-c", LAUNCHER, sys.executable, *map(str, command)]
-    environment = {name: value for name, value in os.environ.items() if name != "PYTHONDONTWRITEBYTECODE"}
+    environment = {
+        name: value for name, value in os.environ.items() if name != "PYTHONDONTWRITEBYTECODE"
+    }
     done = subprocess.run(line, capture_output=True, text=True, check=False, env=environment)
     if done.returncode:
         raise RuntimeError(done.stderr)
@@ -144,18 +155,35 @@ def capture(inputs: Inputs, key: str, size: int) -> Path:
     if not made.period:
         return simulated(path, made.sensor, max(0.2, size / made.rate))
     once = inputs.folder / f"{key}.pcap"
-    return repeated(once if once.exists() else simulated(once, made.sensor, made.period), path, size, made.period)
+    return repeated(
+        once if once.exists() else simulated(once, made.sensor, made.period),
+        path,
+        size,
+        made.period,
+    )
 
 
 def simulated(path: Path, sensor: str, seconds: float) -> Path:
     """A capture of a simulated sensor."""
-    line = [sys.executable, "-m", "lidarspec", "sim", sensor, "--to", str(path), "-t", f"{seconds:.1f}s"]
+    line = [
+        sys.executable,
+        "-m",
+        "lidarspec",
+        "sim",
+        sensor,
+        "--to",
+        str(path),
+        "-t",
+        f"{seconds:.1f}s",
+    ]
     subprocess.run(line, capture_output=True, check=True)
     return path
 
 
 def repeated(once: Path, path: Path, size: int, period: int) -> Path:
-    """A capture of about so many bytes that holds another one again and again, each time a period later; its records have one length."""
+    """A capture of about so many bytes that holds another one again and again, each time a period
+    later; its records have one length.
+    """
     data = np.fromfile(once, np.uint8)
     head, records = data[:24], data[24:]
     rows = records.reshape(-1, 16 + int(records[8:12].view("<u4")[0]))
@@ -187,7 +215,9 @@ def flush(out: Path) -> None:
 
 
 def clear(folder: Path) -> None:
-    """Takes away what a run left: removing a large file takes a while that is no part of the next run."""
+    """Takes away what a run left: removing a large file takes a while that is no part of the next
+    run.
+    """
     shutil.rmtree(folder, ignore_errors=True)
     folder.mkdir()
 
@@ -199,15 +229,26 @@ def copy(out: Path) -> None:
 
 
 class Beside(NamedTuple):
-    """A command that a work is compared with: its arguments, the points that it writes, the modules that it needs."""
+    """A command that a work is compared with: its arguments, the points that it writes, the modules
+    that it needs.
+    """
 
     command: tuple[object, ...]
     amount: int
     modules: tuple[str, ...] = ()
 
 
-def written(title: str, out: Path, amount: int, size: int, command: tuple[object, ...], commands: Mapping[str, Beside]) -> Work:
-    """A command of lidarspec that writes a file or a folder, beside copying that and beside other commands."""
+def written(
+    title: str,
+    out: Path,
+    amount: int,
+    size: int,
+    command: tuple[object, ...],
+    commands: Mapping[str, Beside],
+) -> Work:
+    """A command of lidarspec that writes a file or a folder, beside copying that and beside other
+    commands.
+    """
     spent: dict[str, Spent] = {}
     clear(out.parent)
 
@@ -235,8 +276,15 @@ def written(title: str, out: Path, amount: int, size: int, command: tuple[object
             "s of the processors": ours.processor,
             "MB of memory": ours.memory / 1e6,
             "MB written": ours.size / 1e6,
-            "% of the speed of copying that": 100 * rates["copy"][0] * amount / (ours.seconds + ours.flushed),
-            **{f"MB of memory in {name}{part(other)}": spent[name].memory / 1e6 for name, other in commands.items() if name in spent},
+            "% of the speed of copying that": 100
+            * rates["copy"][0]
+            * amount
+            / (ours.seconds + ours.flushed),
+            **{
+                f"MB of memory in {name}{part(other)}": spent[name].memory / 1e6
+                for name, other in commands.items()
+                if name in spent
+            },
         }
 
     return Work(
@@ -256,7 +304,10 @@ def written(title: str, out: Path, amount: int, size: int, command: tuple[object
 def converting(inputs: Inputs, key: str, suffix: str) -> Work:
     """A capture to a file, beside what a user would write."""
     made, out = CAPTURES[key], inputs.folder / "out" / f"points{suffix}"
-    path, part = capture(inputs, key, inputs.size // made.share), capture(inputs, key, inputs.size // SMALLER)
+    path, part = (
+        capture(inputs, key, inputs.size // made.share),
+        capture(inputs, key, inputs.size // SMALLER),
+    )
     try:
         with ls.open(part, made.sensor) as device:
             formats.write(inputs.folder / f"one{suffix}", itertools.islice(device.scans(), 1))
@@ -266,12 +317,23 @@ def converting(inputs: Inputs, key: str, suffix: str) -> Work:
     if target := TARGETS.get(suffix):
         needed = () if target == "np.savez" else ("pyarrow",)
         amount = points_of(part, made.sensor)
-        commands[target] = Beside(("-c", BESIDE, "lidarspec", part, made.sensor, target, out), amount, needed)
+        commands[target] = Beside(
+            ("-c", BESIDE, "lidarspec", part, made.sensor, target, out), amount, needed
+        )
         if key == "vlp16":
             line = ("-c", BESIDE, "velodyne-decoder", part, made.sensor, target, out)
-            commands[f"velodyne-decoder and {target}"] = Beside(line, amount, ("velodyne_decoder", *needed))
+            commands[f"velodyne-decoder and {target}"] = Beside(
+                line, amount, ("velodyne_decoder", *needed)
+            )
     command = (path, out, "-s", made.sensor)
-    return written(f"{made.title} capture to {suffix}", out, points_of(path, made.sensor), path.stat().st_size, command, commands)
+    return written(
+        f"{made.title} capture to {suffix}",
+        out,
+        points_of(path, made.sensor),
+        path.stat().st_size,
+        command,
+        commands,
+    )
 
 
 def many(inputs: Inputs, suffix: str) -> Work:
@@ -285,10 +347,21 @@ def many(inputs: Inputs, suffix: str) -> Work:
     command = (*sorted(folder.iterdir()), out, "-s", made.sensor, "--to", suffix[1:], "--jobs")
     alone = Beside(("-m", "lidarspec", "convert", *command, 1), amount)
     size = SMALLER * part.stat().st_size
-    return written(f"{SMALLER} captures to {suffix}, 4 processes", out, amount, size, (*command, 4), {"one process": alone})
+    return written(
+        f"{SMALLER} captures to {suffix}, 4 processes",
+        out,
+        amount,
+        size,
+        (*command, 4),
+        {"one process": alone},
+    )
 
 
 CONVERSIONS: Mapping[str, Callable[[Inputs], Work]] = {
-    **{f"to-{key}{suffix}": partial(converting, key=key, suffix=suffix) for key, made in CAPTURES.items() for suffix in made.suffixes},
+    **{
+        f"to-{key}{suffix}": partial(converting, key=key, suffix=suffix)
+        for key, made in CAPTURES.items()
+        for suffix in made.suffixes
+    },
     **{f"to-many{suffix}": partial(many, suffix=suffix) for suffix in (".parquet", ".csv")},
 }

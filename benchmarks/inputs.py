@@ -1,4 +1,6 @@
-"""What the works read: packets and streams that lidarspec's own simulator makes, the same in every run."""
+"""What the works read: packets and streams that lidarspec's own simulator makes, the same in every
+run.
+"""
 
 from __future__ import annotations
 
@@ -81,19 +83,27 @@ class Inputs:
         """The frames that have the full length, (n, size)."""
         frames = self.frames(key)
         size = max(map(len, frames))
-        return np.frombuffer(b"".join(frame for frame in frames if len(frame) == size), np.uint8).reshape(-1, size)
+        return np.frombuffer(
+            b"".join(frame for frame in frames if len(frame) == size), np.uint8
+        ).reshape(-1, size)
 
     def stream(self, key: str) -> bytes:
         """All frames in a row, after what the sensor sends before them."""
         return opening(self.sensor(key)) + b"".join(self.frames(key))
 
     def noisy(self, key: str) -> Noisy:
-        """The frames with one byte of every fiftieth damaged, and as many runs of noise of a frame's mean length between them."""
+        """The frames with one byte of every fiftieth damaged, and as many runs of noise of a
+        frame's mean length between them.
+        """
         random = np.random.default_rng(SEED)
         pieces: list[bytes | bytearray] = []
         intact, offset = [], 0
         for frame in self.frames(key):
-            noise = random.bytes(int(random.integers(1, 2 * len(frame)))) if random.random() < NOISE else b""
+            noise = (
+                random.bytes(int(random.integers(1, 2 * len(frame))))
+                if random.random() < NOISE
+                else b""
+            )
             sent = bytearray(frame)
             if random.random() < NOISE:
                 sent[int(random.integers(len(frame)))] ^= int(random.integers(1, 256))
@@ -114,5 +124,9 @@ class Inputs:
         with path.open("wb") as file:
             file.write(capture_head(ETHERNET))
             for index, frame in enumerate(self.frames(key)):
-                file.write(datagram_record(Datagram(frame, 1_700_000_000 * 10**9 + index * 158_730, sender, receiver)))
+                file.write(
+                    datagram_record(
+                        Datagram(frame, 1_700_000_000 * 10**9 + index * 158_730, sender, receiver)
+                    )
+                )
         return path

@@ -39,12 +39,16 @@ VELODYNE = {"vlp16": ("VLP16", 754), "vlp32c": ("VLP32C", 1507), "vls128": ("Alp
 
 
 def velodyne_packets(key: str, frames: Sequence[bytes], points: int) -> Contender:
-    """velodyne-decoder on packets, a tenth of a second to a scan, its vectors of packets made beforehand."""
+    """velodyne-decoder on packets, a tenth of a second to a scan, its vectors of packets made
+    beforehand.
+    """
     vd, (model, rate) = library("velodyne_decoder"), VELODYNE[key]
     config, turn = vd.Config(), -(-rate // 10)
     config.model = getattr(vd.Model, model)
     packets = [vd.VelodynePacket(index / rate, frame) for index, frame in enumerate(frames)]
-    scans = [vd.PacketVector(packets[start : start + turn]) for start in range(0, len(packets), turn)]
+    scans = [
+        vd.PacketVector(packets[start : start + turn]) for start in range(0, len(packets), turn)
+    ]
     decoder = vd.ScanDecoder(config)
     return Contender(lambda: [decoder.decode(scan) for scan in scans], points)
 
@@ -63,7 +67,10 @@ def dpkt_payloads(path: Path, packets: int) -> Contender:
 
     def run() -> int:
         with path.open("rb") as file:
-            return sum(len(dpkt.ethernet.Ethernet(data).data.data.data) for _, data in dpkt.pcap.Reader(file))
+            return sum(
+                len(dpkt.ethernet.Ethernet(data).data.data.data)
+                for _, data in dpkt.pcap.Reader(file)
+            )
 
     return Contender(run, packets)
 
@@ -75,7 +82,9 @@ def ouster_payloads(path: Path, packets: int) -> Contender:
 
     def run() -> int:
         with warnings.catch_warnings():
-            warnings.simplefilter("ignore", FutureWarning)  # its successor gives packets of Ouster sensors only
+            warnings.simplefilter(
+                "ignore", FutureWarning
+            )  # its successor gives packets of Ouster sensors only
             capture, info, total = pcap.replay_initialize(str(path)), pcap.PacketInfo(), 0
             while pcap.next_packet_info(capture, info):
                 total += pcap.read_packet(capture, buffer)
@@ -85,10 +94,19 @@ def ouster_payloads(path: Path, packets: int) -> Contender:
     return Contender(run, packets)
 
 
-def ouster_scans(frames: Sequence[bytes], metadata: dict[str, dict[str, Any]], points: int) -> Contender:
-    """ouster-sdk on lidar packets, 64 to a scan: all fields and coordinates; its packets are made beforehand."""
+def ouster_scans(
+    frames: Sequence[bytes], metadata: dict[str, dict[str, Any]], points: int
+) -> Contender:
+    """ouster-sdk on lidar packets, 64 to a scan: all fields and coordinates; its packets are made
+    beforehand.
+    """
     core = library("ouster.sdk.core")
-    flat = {key: value for name, section in metadata.items() if name != "lidar_data_format" for key, value in section.items()}
+    flat = {
+        key: value
+        for name, section in metadata.items()
+        if name != "lidar_data_format"
+        for key, value in section.items()
+    }
     info = core.SensorInfo(json.dumps({**flat, "data_format": metadata["lidar_data_format"]}))
     form, table = core.PacketFormat(info), core.XYZLut(info)
     packets = [core.LidarPacket(form) for _ in frames]

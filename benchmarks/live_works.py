@@ -1,4 +1,6 @@
-"""The works on real lines: a sender in another process, capture, decoding, points; how late they are and what it takes."""
+"""The works on real lines: a sender in another process, capture, decoding, points; how late they
+are and what it takes.
+"""
 
 from __future__ import annotations
 
@@ -32,7 +34,8 @@ class Line:
 
     Args:
         rate: frames per second.
-        opened: makes the two ends of the line: the SOURCE, and the words and descriptors that the sender needs.
+        opened: makes the two ends of the line: the SOURCE, and the words and descriptors that the
+            sender needs.
     """
 
     def __init__(
@@ -43,7 +46,13 @@ class Line:
         seconds: float,
         opened: Callable[[], contextlib.AbstractContextManager[Any]],
     ) -> None:
-        self._sensor, self._frames, self._rate, self._seconds, self._opened = sensor, frames, rate, seconds, opened
+        self._sensor, self._frames, self._rate, self._seconds, self._opened = (
+            sensor,
+            frames,
+            rate,
+            seconds,
+            opened,
+        )
         self.late: dict[str, list[float]] = {}
         self.share: dict[str, list[float]] = {}
 
@@ -54,14 +63,24 @@ class Line:
             path.write_bytes(b"".join(self._frames))
             arguments = [path, len(self._frames[0]), self._rate, self._seconds, 1, times, *words]
             with ls.open(source, self._sensor, backend=backend) as device:
-                columns(self._sensor.decode(self._frames[:2] if self._sensor.datagrams else b"".join(self._frames[:2])).points())
+                columns(
+                    self._sensor.decode(
+                        self._frames[:2] if self._sensor.datagrams else b"".join(self._frames[:2])
+                    ).points()
+                )
                 began, used = time.monotonic(), time.process_time()
-                with subprocess.Popen([sys.executable, SENDING, *map(str, arguments)], pass_fds=kept, stdout=subprocess.DEVNULL) as sender:
+                with subprocess.Popen(
+                    [sys.executable, SENDING, *map(str, arguments)],
+                    pass_fds=kept,
+                    stdout=subprocess.DEVNULL,
+                ) as sender:
                     arrived = np.array(list(arrivals(device, sender)), np.int64)
                 spent = (time.process_time() - used) / (time.monotonic() - began)
             sent = np.frombuffer(times.read_bytes(), np.int64)
         if len(arrived) != len(sent):
-            raise RuntimeError(f"{len(sent)} frames were sent, and {len(arrived)} arrived: {device.stats}")
+            raise RuntimeError(
+                f"{len(sent)} frames were sent, and {len(arrived)} arrived: {device.stats}"
+            )
         self.late.setdefault(backend, []).append(float(np.median(arrived - sent)) / 1e6)
         self.share.setdefault(backend, []).append(100 * spent)
 
@@ -103,15 +122,30 @@ def loopback() -> Iterator[tuple[str, list[str], tuple[int, ...]]]:
     yield f"udp://127.0.0.1:{port}", ["udp", str(port)], ()
 
 
-def live(inputs: Inputs, key: str, title: str, rate: float, opened: Callable[[], contextlib.AbstractContextManager[Any]]) -> Work:
+def live(
+    inputs: Inputs,
+    key: str,
+    title: str,
+    rate: float,
+    opened: Callable[[], contextlib.AbstractContextManager[Any]],
+) -> Work:
     """A line at its sensor's rate for some seconds."""
     seconds = QUICK_SECONDS if inputs.is_quick else SECONDS
     frames = [row.tobytes() for row in inputs.array(key)]
     line, number = Line(inputs.sensor(key), frames, rate, seconds, opened), int(rate * seconds)
-    return Work(title, "packets", number, number * len(frames[0]), lambda backend: lambda: line.run(backend), facts=line.facts)
+    return Work(
+        title,
+        "packets",
+        number,
+        number * len(frames[0]),
+        lambda backend: lambda: line.run(backend),
+        facts=line.facts,
+    )
 
 
 ON_LINES: Mapping[str, Callable[[Inputs], Work]] = {
-    "line-stl27l": lambda inputs: live(inputs, "stl27l", "STL-27L over a serial line", 1800, pseudo_terminal),
+    "line-stl27l": lambda inputs: live(
+        inputs, "stl27l", "STL-27L over a serial line", 1800, pseudo_terminal
+    ),
     "line-m1": lambda inputs: live(inputs, "m1", "RS-LiDAR-M1 over UDP", 6300, loopback),
 }

@@ -1,4 +1,6 @@
-"""Times of several contenders, taken in turn, so that what slows the machine down slows all of them alike."""
+"""Times of several contenders, taken in turn, so that what slows the machine down slows all of them
+alike.
+"""
 
 from __future__ import annotations
 
@@ -59,13 +61,19 @@ Rates = dict[str, list[float]]
 LEAST_STEP = 1e-6
 
 
-def raced(contenders: Mapping[str, Timed], runs: int, least: float, clock: Clock = time.perf_counter) -> Rates:
+def raced(
+    contenders: Mapping[str, Timed], runs: int, least: float, clock: Clock = time.perf_counter
+) -> Rates:
     """Seconds for each of the amount, by contender, one figure for each run.
 
     Args:
-        least: seconds; what takes less is repeated within a run until it takes that long. To see that, each runs twice before; not with 0.
+        least: seconds; what takes less is repeated within a run until it takes that long. To see
+            that, each runs twice before; not with 0.
     """
-    repeats = {name: _repeats(contender, least, clock) if least else 1 for name, contender in contenders.items()}
+    repeats = {
+        name: _repeats(contender, least, clock) if least else 1
+        for name, contender in contenders.items()
+    }
     found: Rates = {name: [] for name in contenders}
     for _ in range(runs):
         for name, contender in contenders.items():
@@ -79,8 +87,12 @@ def _repeats(contender: Timed, least: float, clock: Clock) -> int:
 
 
 def cpu_seconds() -> float:
-    """What this process, all its threads and the processes that it waited for have taken of the processors."""
-    times = [resource.getrusage(which) for which in (resource.RUSAGE_SELF, resource.RUSAGE_CHILDREN)]
+    """What this process, all its threads and the processes that it waited for have taken of the
+    processors.
+    """
+    times = [
+        resource.getrusage(which) for which in (resource.RUSAGE_SELF, resource.RUSAGE_CHILDREN)
+    ]
     return sum(part.ru_utime + part.ru_stime for part in times)
 
 

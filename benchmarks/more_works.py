@@ -57,13 +57,21 @@ def from_capture(inputs: Inputs, key: str, title: str, more: Others | None = Non
 def m1_pcap(inputs: Inputs) -> Work:
     path, points = inputs.capture("m1"), 125 * len(inputs.frames("m1"))
     return from_capture(
-        inputs, "m1", "RS-LiDAR-M1 capture to scans", {"by hand": lambda: Contender(lambda: by_hand.m1_scans(path), points)}
+        inputs,
+        "m1",
+        "RS-LiDAR-M1 capture to scans",
+        {"by hand": lambda: Contender(lambda: by_hand.m1_scans(path), points)},
     )
 
 
 def vlp16_pcap(inputs: Inputs) -> Work:
     path, points = inputs.capture("vlp16"), 384 * len(inputs.frames("vlp16"))
-    return from_capture(inputs, "vlp16", "VLP-16 capture to scans", {"velodyne-decoder": lambda: libraries.velodyne_pcap(path, points)})
+    return from_capture(
+        inputs,
+        "vlp16",
+        "VLP-16 capture to scans",
+        {"velodyne-decoder": lambda: libraries.velodyne_pcap(path, points)},
+    )
 
 
 def m1_long(inputs: Inputs) -> Work:
@@ -87,7 +95,15 @@ def payloads(inputs: Inputs) -> Work:
         with CaptureBatches(path) as reader:
             return sum(int(batch.sizes.sum()) for batch in reader.batches())
 
-    return Work("capture payloads, 1210 bytes", "packets", packets, path.stat().st_size, lambda _: run, others, has_backends=False)
+    return Work(
+        "capture payloads, 1210 bytes",
+        "packets",
+        packets,
+        path.stat().st_size,
+        lambda _: run,
+        others,
+        has_backends=False,
+    )
 
 
 def one_by_one_of(path: Path) -> int:
@@ -97,11 +113,15 @@ def one_by_one_of(path: Path) -> int:
 
 
 def live(inputs: Inputs) -> Work:
-    """Packets that come one by one and are decoded every 10 ms; what it costs to decode each by itself beside it."""
+    """Packets that come one by one and are decoded every 10 ms; what it costs to decode each by
+    itself beside it.
+    """
     sensor, frames = inputs.sensor("m1"), inputs.frames("m1")
 
     def alone(backend: str) -> dict[str, Contender]:
-        return {"one by one": Contender(as_they_come(sensor, frames[:TOGETHER], 1, backend), TOGETHER)}
+        return {
+            "one by one": Contender(as_they_come(sensor, frames[:TOGETHER], 1, backend), TOGETHER)
+        }
 
     def facts(backend: str, rates: Rates) -> Facts:
         return {
@@ -120,7 +140,9 @@ def live(inputs: Inputs) -> Work:
     )
 
 
-def as_they_come(sensor: ls.Sensor, packets: list[bytes], together: int, backend: str) -> Callable[[], None]:
+def as_they_come(
+    sensor: ls.Sensor, packets: list[bytes], together: int, backend: str
+) -> Callable[[], None]:
     """Decoding to points as often as so many packets have come; receiving is not counted."""
 
     def run() -> None:
@@ -137,18 +159,32 @@ def as_they_come(sensor: ls.Sensor, packets: list[bytes], together: int, backend
 
 
 def parse(inputs: Inputs, key: str, title: str) -> Work:
-    """One frame after another to a Container, checksum included, against construct on a plain struct."""
+    """One frame after another to a Container, checksum included, against construct on a plain
+    struct.
+    """
     sensor, frames = inputs.sensor(key), inputs.frames(key)[:FEW]
     others: Others = {
         "construct": lambda: Contender(one_by_one(STRUCTS[key].parse, frames), len(frames)),
-        "compiled": lambda: Contender(one_by_one(STRUCTS[key].compile().parse, frames), len(frames)),
+        "compiled": lambda: Contender(
+            one_by_one(STRUCTS[key].compile().parse, frames), len(frames)
+        ),
     }
     ours = one_by_one(sensor.parse, frames)
-    return Work(title, "frames", len(frames), sum(map(len, frames)), lambda _: ours, others, has_backends=False)
+    return Work(
+        title,
+        "frames",
+        len(frames),
+        sum(map(len, frames)),
+        lambda _: ours,
+        others,
+        has_backends=False,
+    )
 
 
 def one_by_one(function: Callable[[bytes], Any], frames: list[bytes]) -> Callable[[], None]:
-    """Calls a function for each frame and keeps nothing: memory for all their Containers at once would cost more than they do."""
+    """Calls a function for each frame and keeps nothing: memory for all their Containers at once
+    would cost more than they do.
+    """
 
     def run() -> None:
         for frame in frames:
@@ -158,8 +194,14 @@ def one_by_one(function: Callable[[bytes], Any], frames: list[bytes]) -> Callabl
 
 
 def hostile(inputs: Inputs) -> Work:
-    """Finding the frames of streams that cost most, of each family on its fastest serial line, against the rate of that line."""
-    families = {tuple(sensor.frames): sensor for sensor in sorted(ls.sensors().values(), key=line_rate) if line_rate(sensor)}
+    """Finding the frames of streams that cost most, of each family on its fastest serial line,
+    against the rate of that line.
+    """
+    families = {
+        tuple(sensor.frames): sensor
+        for sensor in sorted(ls.sensors().values(), key=line_rate)
+        if line_rate(sensor)
+    }
     tasks: dict[str, tuple[ls.Sensor, list[bytes]]] = {}
     length = HOSTILE // QUICKER if inputs.is_quick else HOSTILE
     for sensor in families.values():
@@ -176,12 +218,24 @@ def hostile(inputs: Inputs) -> Work:
             contender.run()
 
     def facts(backend: str, rates: Rates) -> Facts:
-        least, name = min((1 / median(rates[name]) / line_rate(sensor), name) for name, (sensor, _) in tasks.items())
+        least, name = min(
+            (1 / median(rates[name]) / line_rate(sensor), name)
+            for name, (sensor, _) in tasks.items()
+        )
         return {f"times its line's rate at least, in {name}": least}
 
     size = sum(contender.amount for contender in own.values())
     title = "Hostile streams of serial sensors"
-    return Work(title, "bytes", size, size, lambda _: run, own=lambda _: own, facts=facts, has_backends=False)
+    return Work(
+        title,
+        "bytes",
+        size,
+        size,
+        lambda _: run,
+        own=lambda _: own,
+        facts=facts,
+        has_backends=False,
+    )
 
 
 def line_rate(sensor: ls.Sensor) -> float:
@@ -191,10 +245,14 @@ def line_rate(sensor: ls.Sensor) -> float:
 
 
 def importing(inputs: Inputs) -> Work:
-    """A new process that imports lidarspec and finds a sensor, against one that imports what this needs at least."""
+    """A new process that imports lidarspec and finds a sensor, against one that imports what this
+    needs at least.
+    """
 
     # As pip leaves packages behind, and not as an editable one is the first time: compiled.
-    compiled = {name: value for name, value in os.environ.items() if name != "PYTHONDONTWRITEBYTECODE"}
+    compiled = {
+        name: value for name, value in os.environ.items() if name != "PYTHONDONTWRITEBYTECODE"
+    }
     compiled["PYTHONPYCACHEPREFIX"] = str(inputs.folder / "bytecode")
 
     def python(code: str) -> Callable[[], Any]:
@@ -205,7 +263,16 @@ def importing(inputs: Inputs) -> Work:
 
     others: Others = {"libraries": lambda: Contender(python("import numpy, construct, pluggy"), 1)}
     ours = python("import lidarspec as ls; ls.sensor('ldrobot-stl27l')")
-    return Work("import and ls.sensor(...)", "imports", 1, 0, lambda _: ours, others, facts=facts, has_backends=False)
+    return Work(
+        "import and ls.sensor(...)",
+        "imports",
+        1,
+        0,
+        lambda _: ours,
+        others,
+        facts=facts,
+        has_backends=False,
+    )
 
 
 ELSEWHERE: Mapping[str, Callable[[Inputs], Work]] = {

@@ -1,11 +1,26 @@
-"""What a user would write instead: construct on plain structs, without adapters and without a checksum."""
+"""What a user would write instead: construct on plain structs, without adapters and without a
+checksum.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from typing import Any
 
-from construct import Array, Bytes, Const, If, Int8ub, Int8ul, Int16ub, Int16ul, Int32ub, Int32ul, Struct, this
+from construct import (
+    Array,
+    Bytes,
+    Const,
+    If,
+    Int8ub,
+    Int8ul,
+    Int16ub,
+    Int16ul,
+    Int32ub,
+    Int32ul,
+    Struct,
+    this,
+)
 from measure import Contender
 
 STRUCTS = {
@@ -29,7 +44,13 @@ STRUCTS = {
                 "channels"
                 / Array(
                     5,
-                    Struct("radius" / Int16ub, "elevation" / Int16ub, "azimuth" / Int16ub, "intensity" / Int8ub, "reserved" / Bytes(2)),
+                    Struct(
+                        "radius" / Int16ub,
+                        "elevation" / Int16ub,
+                        "azimuth" / Int16ub,
+                        "intensity" / Int8ub,
+                        "reserved" / Bytes(2),
+                    ),
                 ),
             ),
         ),
@@ -81,7 +102,11 @@ STRUCTS = {
             this.block_count,
             Struct(
                 "azimuth" / Int16ul,
-                "channels" / Array(this._.lasers, Struct("distance" / Int16ul, "reflectivity" / Int8ul, "reserved" / Int8ul)),
+                "channels"
+                / Array(
+                    this._.lasers,
+                    Struct("distance" / Int16ul, "reflectivity" / Int8ul, "reserved" / Int8ul),
+                ),
             ),
         ),
         "tail" / Bytes(24),

@@ -32,7 +32,9 @@ class RemoteContender:
     """
 
     def __init__(self, python: Path, prepare: Callable[..., Contender], *arguments: Any) -> None:
-        self._worker = subprocess.Popen([python, __file__], stdin=subprocess.PIPE, stdout=subprocess.PIPE)
+        self._worker = subprocess.Popen(
+            [python, __file__], stdin=subprocess.PIPE, stdout=subprocess.PIPE
+        )
         self.amount: int = self._request((prepare, arguments))
 
     def seconds(self, repeats: int, clock: Clock) -> float:

@@ -9,7 +9,12 @@ from rich.console import Console
 from rich.table import Table
 
 #: ratios that have a column of their own; the others stand in the last one.
-COLUMNS = {"construct": "construct", "compiled": "compiled\nconstruct", "plain": "plain\npoints", "by hand": "by\nhand"}
+COLUMNS = {
+    "construct": "construct",
+    "compiled": "compiled\nconstruct",
+    "plain": "plain\npoints",
+    "by hand": "by\nhand",
+}
 #: contenders that only a fact is made of.
 INNER = ("libraries",)
 #: characters; what is piped to a file is not folded to a terminal.
@@ -18,14 +23,22 @@ WIDE = 180
 LEAST_SHARE = 1e-4
 
 
-def shown(rows: Sequence[Mapping[str, Any]], versions: Mapping[str, str], *, title: str, best: bool) -> None:
+def shown(
+    rows: Sequence[Mapping[str, Any]], versions: Mapping[str, str], *, title: str, best: bool
+) -> None:
     """Print the rows: medians, or the best run of each contender."""
     console = Console()
     if not console.is_terminal:
         console = Console(width=WIDE)
     table = Table(title=title, caption=_caption(versions))
     table.add_column("work")
-    for heading in ("back\nend", "a second", "MB/s", "of memcpy", *(f"x {name}" for name in COLUMNS.values())):
+    for heading in (
+        "back\nend",
+        "a second",
+        "MB/s",
+        "of memcpy",
+        *(f"x {name}" for name in COLUMNS.values()),
+    ):
         table.add_column(heading, justify="right")
     table.add_column("x others; more")
     for row in rows:
@@ -34,7 +47,9 @@ def shown(rows: Sequence[Mapping[str, Any]], versions: Mapping[str, str], *, tit
 
 
 def _caption(versions: Mapping[str, str]) -> str:
-    return "x: times as fast as. " + ", ".join(f"{name} {version}" for name, version in versions.items())
+    return "x: times as fast as. " + ", ".join(
+        f"{name} {version}" for name, version in versions.items()
+    )
 
 
 def _cells(row: Mapping[str, Any]) -> list[str]:
@@ -51,14 +66,24 @@ def _cells(row: Mapping[str, Any]) -> list[str]:
 
 
 def _more(row: Mapping[str, Any]) -> list[str]:
-    others = [f"{name} {_figure(ratio)}" for name, ratio in row["times"].items() if name not in COLUMNS and name not in INNER]
+    others = [
+        f"{name} {_figure(ratio)}"
+        for name, ratio in row["times"].items()
+        if name not in COLUMNS and name not in INNER
+    ]
     missing = [f"{name}: {reason}" for name, reason in row["not_installed"].items()]
-    return [*others, *missing, *(f"{_figure(value)} {name}" for name, value in row["facts"].items())]
+    return [
+        *others,
+        *missing,
+        *(f"{_figure(value)} {name}" for name, value in row["facts"].items()),
+    ]
 
 
 def _number(millions: float, unit: str) -> str:
     """Millions, or where they are few the number itself."""
-    return f"{_figure(millions)} M {unit}" if millions >= 0.01 else f"{_figure(millions * 1e6)} {unit}"
+    return (
+        f"{_figure(millions)} M {unit}" if millions >= 0.01 else f"{_figure(millions * 1e6)} {unit}"
+    )
 
 
 def _figure(value: float) -> str:

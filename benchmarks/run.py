@@ -1,4 +1,6 @@
-"""Every work beside memcpy and beside what a user would pick instead: one table, one run. See docs/how-to/benchmarks.md."""
+"""Every work beside memcpy and beside what a user would pick instead: one table, one run. See
+docs/how-to/benchmarks.md.
+"""
 
 from __future__ import annotations
 
@@ -31,7 +33,17 @@ from lidarspec.framing.decoder import BACKENDS
 
 WORKS = {**ON_BYTES, **ELSEWHERE, **ON_LINES, **CONVERSIONS}
 #: distributions whose versions are shown.
-LIBRARIES = ("construct", "numpy", "numba", "pyarrow", "dpkt", "velodyne-decoder", "ouster-sdk", "lds2d", "rplidar")
+LIBRARIES = (
+    "construct",
+    "numpy",
+    "numba",
+    "pyarrow",
+    "dpkt",
+    "velodyne-decoder",
+    "ouster-sdk",
+    "lds2d",
+    "rplidar",
+)
 LEAST_RUNS = 5
 RUNS = 7
 LEAST_SECONDS = 0.05  # of a run
@@ -39,11 +51,15 @@ SIZE, QUICK_SIZE = 1000, 20  # MB of a capture that is converted
 
 
 def working() -> list[str]:
-    """The back ends that can be used here; "auto" stands for one of them, and "construct" is the reference, not a fast one."""
+    """The back ends that can be used here; "auto" stands for one of them, and "construct" is the
+    reference, not a fast one.
+    """
     sensor = ls.sensor("ldrobot-stl27l")
     found = []
     for name in BACKENDS:
-        if name in ("auto", "construct") or (name == "jit" and importlib.util.find_spec("numba") is None):
+        if name in ("auto", "construct") or (
+            name == "jit" and importlib.util.find_spec("numba") is None
+        ):
             continue
         try:
             sensor.decode(sensor.example("data"), backend=name).points()
@@ -53,13 +69,32 @@ def working() -> list[str]:
     return found
 
 
-def rows(name: str, work: Work, backends: list[str], copy: Contender, *, runs: int, least: float, clock: Clock) -> Iterator[dict[str, Any]]:
+def rows(
+    name: str,
+    work: Work,
+    backends: list[str],
+    copy: Contender,
+    *,
+    runs: int,
+    least: float,
+    clock: Clock,
+) -> Iterator[dict[str, Any]]:
     """The lines of a work, one for each back end, all measured in turn."""
     chosen = backends if work.has_backends else [""]
     others, missing = work.prepare_others()
     runs, least = (1, 0.0) if work.after else (runs, least)
-    ours = {backend: {"ours": Contender(work.ours(backend), work.amount, work.after), **work.own(backend)} for backend in chosen}
-    by_backend = {f"{own} {backend}": contender for backend, owns in ours.items() for own, contender in owns.items()}
+    ours = {
+        backend: {
+            "ours": Contender(work.ours(backend), work.amount, work.after),
+            **work.own(backend),
+        }
+        for backend in chosen
+    }
+    by_backend = {
+        f"{own} {backend}": contender
+        for backend, owns in ours.items()
+        for own, contender in owns.items()
+    }
     rates = raced({"memcpy": copy, **by_backend, **others}, runs, least, clock)
     for other in others.values():
         if isinstance(other, RemoteContender):
@@ -75,7 +110,12 @@ def rows(name: str, work: Work, backends: list[str], copy: Contender, *, runs: i
             "bytes": work.size,
             "runs": runs,
             **figures(work, mine, list(others), backend),
-            "best": figures(work, {contender: [min(seconds)] for contender, seconds in mine.items()}, list(others), backend),
+            "best": figures(
+                work,
+                {contender: [min(seconds)] for contender, seconds in mine.items()},
+                list(others),
+                backend,
+            ),
             "not_installed": missing,
         }
 
@@ -102,8 +142,20 @@ def versions() -> dict[str, str]:
 
 def record(found: list[dict[str, Any]], *, quick: bool, cpu: bool) -> dict[str, Any]:
     """What `--json` writes."""
-    machine = {"python": platform.python_version(), "machine": platform.machine(), "system": platform.system(), "cores": os.cpu_count()}
-    return {"lidarspec": ls.__version__, "quick": quick, "cpu_time": cpu, **machine, "libraries": versions(), "rows": found}
+    machine = {
+        "python": platform.python_version(),
+        "machine": platform.machine(),
+        "system": platform.system(),
+        "cores": os.cpu_count(),
+    }
+    return {
+        "lidarspec": ls.__version__,
+        "quick": quick,
+        "cpu_time": cpu,
+        **machine,
+        "libraries": versions(),
+        "rows": found,
+    }
 
 
 def arguments() -> argparse.Namespace:
@@ -114,17 +166,44 @@ def arguments() -> argparse.Namespace:
         "--only",
         metavar="NAME",
         action="append",
-        help=f"works whose names begin with NAME; default: all but those with `to-`; there are: {names}",
+        help=(
+            "works whose names begin with NAME; default: all but those with `to-`; there are:"
+            f" {names}"
+        ),
     )
-    parser.add_argument("--json", metavar="FILE", type=Path, help="write the figures to a file as well")
     parser.add_argument(
-        "--runs", metavar="N", type=int, default=RUNS, help=f"runs of each contender, {LEAST_RUNS} or more; default: {RUNS}"
+        "--json", metavar="FILE", type=Path, help="write the figures to a file as well"
     )
-    parser.add_argument("--backend", metavar="NAME", action="append", choices=BACKENDS, help="back ends; default: all that work here")
-    parser.add_argument("--cpu", action="store_true", help="count processor time, not the time that passes: for a busy machine")
-    parser.add_argument("--best", action="store_true", help="show the best run of each contender, not the median")
-    parser.add_argument("--size", metavar="MB", type=int, help=f"of each capture that is converted; default: {SIZE}")
-    parser.add_argument("--quick", action="store_true", help="tiny inputs: shows that everything runs, the figures mean nothing")
+    parser.add_argument(
+        "--runs",
+        metavar="N",
+        type=int,
+        default=RUNS,
+        help=f"runs of each contender, {LEAST_RUNS} or more; default: {RUNS}",
+    )
+    parser.add_argument(
+        "--backend",
+        metavar="NAME",
+        action="append",
+        choices=BACKENDS,
+        help="back ends; default: all that work here",
+    )
+    parser.add_argument(
+        "--cpu",
+        action="store_true",
+        help="count processor time, not the time that passes: for a busy machine",
+    )
+    parser.add_argument(
+        "--best", action="store_true", help="show the best run of each contender, not the median"
+    )
+    parser.add_argument(
+        "--size", metavar="MB", type=int, help=f"of each capture that is converted; default: {SIZE}"
+    )
+    parser.add_argument(
+        "--quick",
+        action="store_true",
+        help="tiny inputs: shows that everything runs, the figures mean nothing",
+    )
     given = parser.parse_args()
     if given.runs < LEAST_RUNS:
         parser.error(f"--runs is {LEAST_RUNS} or more")
@@ -144,7 +223,10 @@ def main() -> int:
     backends = given.backend or working()
     found: list[dict[str, Any]] = []
     copy = memcpy(quick=given.quick)
-    least, clock = (0.0 if given.quick else LEAST_SECONDS), (cpu_seconds if given.cpu else time.perf_counter)
+    least, clock = (
+        (0.0 if given.quick else LEAST_SECONDS),
+        (cpu_seconds if given.cpu else time.perf_counter),
+    )
     with tempfile.TemporaryDirectory() as folder:
         for name in given.works:
             print(f"{name} ...", file=sys.stderr)
@@ -155,9 +237,17 @@ def main() -> int:
                 continue
             found += rows(name, work, backends, copy, runs=given.runs, least=least, clock=clock)
     what = f"{'best runs' if given.best else 'medians'}{', processor time' if given.cpu else ''}"
-    shown(found, versions(), title="quick: these figures mean nothing" if given.quick else what, best=given.best)
+    shown(
+        found,
+        versions(),
+        title="quick: these figures mean nothing" if given.quick else what,
+        best=given.best,
+    )
     if given.json:
-        given.json.write_text(json.dumps(record(found, quick=given.quick, cpu=given.cpu), indent=2) + "\n", encoding="utf-8")
+        given.json.write_text(
+            json.dumps(record(found, quick=given.quick, cpu=given.cpu), indent=2) + "\n",
+            encoding="utf-8",
+        )
     return int(any(row["facts"].get("intact frames lost") for row in found))
 
 

@@ -2,8 +2,8 @@
 
     python sending.py FRAMES SIZE RATE SECONDS BURST TIMES (fd NUMBER | udp PORT)
 
-FRAMES is a file of frames of SIZE bytes each, TIMES a file for the time at which each was sent, int64 ns of the monotonic
-clock ("-" for none). Prints how many it sent.
+FRAMES is a file of frames of SIZE bytes each, TIMES a file for the time at which each was sent,
+int64 ns of the monotonic clock ("-" for none). Prints how many it sent.
 """
 
 from __future__ import annotations
@@ -31,14 +31,18 @@ def sender(kind: str, where: str) -> Callable[[bytes], object]:
     return write
 
 
-def main(path: str, size: str, rate: str, seconds: str, burst: str, times: str, kind: str, where: str) -> None:
+def main(
+    path: str, size: str, rate: str, seconds: str, burst: str, times: str, kind: str, where: str
+) -> None:
     """Send, print the number, and wait a moment before the line is closed."""
     data, step, per_second = Path(path).read_bytes(), int(size), float(rate)
     frames = [data[start : start + step] for start in range(0, len(data), step)]
     number, together, send = int(per_second * float(seconds)), int(burst), sender(kind, where)
     sent_at, began, sent = array("q"), time.monotonic(), 0
     while sent < number:
-        due = min(int((time.monotonic() - began) * per_second) // together * together + together, number)
+        due = min(
+            int((time.monotonic() - began) * per_second) // together * together + together, number
+        )
         for index in range(sent, due):
             send(frames[index % len(frames)])
             sent_at.append(time.monotonic_ns())

@@ -51,7 +51,8 @@ class Work:
         own: what each back end is compared with of its own, for `facts`.
         facts: more numbers for the last column, by back end and rates.
         has_backends: False where the back end changes nothing.
-        after: what follows a run of ours untimed, where a run takes so long that there is one, and none before.
+        after: what follows a run of ours untimed, where a run takes so long that there is one, and
+            none before.
     """
 
     title: str
@@ -79,9 +80,15 @@ class Work:
 
 
 def columns(cloud: ls.PointCloud) -> tuple[Any, ...]:
-    """The columns that every work wants; an engine that makes them when they are read makes them here."""
+    """The columns that every work wants; an engine that makes them when they are read makes them
+    here.
+    """
     if cloud.shape is None:
-        return cloud.x, cloud.y, cloud.intensity  # of these sensors, the planar ones are not organised
+        return (
+            cloud.x,
+            cloud.y,
+            cloud.intensity,
+        )  # of these sensors, the planar ones are not organised
     return cloud.x, cloud.y, cloud.z, cloud.intensity
 
 
@@ -104,7 +111,11 @@ def beside_construct(inputs: Inputs, key: str) -> Others:
     """construct, plain and compiled, on some of the clean frames that have the full length."""
     rows = inputs.array(key)
     frames = [row.tobytes() for row in rows[:FEW]]
-    points = len(inputs.sensor(key).decode(inputs.array(key)[:FEW]).points()) if key != "rplidar" else len(frames)
+    points = (
+        len(inputs.sensor(key).decode(inputs.array(key)[:FEW]).points())
+        if key != "rplidar"
+        else len(frames)
+    )
     return {
         "construct": lambda: construct_on(key, frames, points, compiled=False),
         "compiled": lambda: construct_on(key, frames, points, compiled=True),
@@ -127,13 +138,23 @@ def in_memory(inputs: Inputs, key: str, title: str, more: Others | None = None) 
         rows.size,
         lambda backend: points_of(sensor, rows, backend),
         {**others, **(more or {})},
-        lambda backend: {"points alone": Contender(evaluating(sensor.decode(rows, backend=backend)), points)},
-        lambda backend, rates: {"% of the time for points()": 100 * times(rates, "ours", "points alone")},
+        lambda backend: {
+            "points alone": Contender(evaluating(sensor.decode(rows, backend=backend)), points)
+        },
+        lambda backend, rates: {
+            "% of the time for points()": 100 * times(rates, "ours", "points alone")
+        },
     )
 
 
 def in_stream(
-    inputs: Inputs, key: str, title: str, data: bytes, by_us: Callable[[bytes], Any], more: Others, facts: Any = no_facts
+    inputs: Inputs,
+    key: str,
+    title: str,
+    data: bytes,
+    by_us: Callable[[bytes], Any],
+    more: Others,
+    facts: Any = no_facts,
 ) -> Work:
     """A byte stream to points: framing and checksums included."""
     sensor = inputs.sensor(key)
@@ -159,7 +180,9 @@ BY_HAND: Mapping[str, Callable[[Any], Any]] = {
 
 
 def vlp16(inputs: Inputs) -> Work:
-    return in_memory(inputs, "vlp16", "VLP-16 packets, look-ahead", beside_velodyne_decoder(inputs, "vlp16"))
+    return in_memory(
+        inputs, "vlp16", "VLP-16 packets, look-ahead", beside_velodyne_decoder(inputs, "vlp16")
+    )
 
 
 def beside_velodyne_decoder(inputs: Inputs, key: str) -> Others:
@@ -172,8 +195,13 @@ def velodyne(inputs: Inputs, key: str, title: str) -> Work:
     """Packets of a model that nobody has decoded by hand here."""
     sensor, rows = inputs.sensor(key), inputs.array(key)
     points = len(rows) * 384
-    others: Others = {"plain": lambda: Contender(plainly(sensor, rows), points), **beside_velodyne_decoder(inputs, key)}
-    return Work(title, "points", points, rows.size, lambda backend: points_of(sensor, rows, backend), others)
+    others: Others = {
+        "plain": lambda: Contender(plainly(sensor, rows), points),
+        **beside_velodyne_decoder(inputs, key),
+    }
+    return Work(
+        title, "points", points, rows.size, lambda backend: points_of(sensor, rows, backend), others
+    )
 
 
 def beside_ouster_sdk(prepare: Callable[..., Contender], *arguments: Any) -> Timed:
@@ -182,7 +210,9 @@ def beside_ouster_sdk(prepare: Callable[..., Contender], *arguments: Any) -> Tim
 
 
 def ouster(inputs: Inputs) -> Work:
-    """Every field and the coordinates, beside the vendor's own library; without CRCs, which that does not check."""
+    """Every field and the coordinates, beside the vendor's own library; without CRCs, which that
+    does not check.
+    """
     sensor, rows = inputs.sensor("ouster"), inputs.array("ouster").copy()
     rows[:, -8:] = 0
     frames = [row.tobytes() for row in rows]
@@ -200,13 +230,16 @@ def ouster(inputs: Inputs) -> Work:
         rows.size,
         lambda backend: lambda: ours(backend),
         {
-            "ouster-sdk": lambda: beside_ouster_sdk(libraries.ouster_scans, frames, metadata, points),
+            "ouster-sdk": lambda: beside_ouster_sdk(
+                libraries.ouster_scans, frames, metadata, points
+            ),
             "plain": lambda: Contender(plainly(sensor, rows), points),
         },
     )
 
 
-#: frames with parts, counts or conditions: title, the same with every field at a fixed place, whether they come as a stream.
+#: frames with parts, counts or conditions: title, the same with every field at a fixed place,
+#: whether they come as a stream.
 FIXED: Mapping[str, tuple[str, Callable[[ls.Sensor, bytes], ls.Sensor], bool]] = {
     "livox": ("Livox Mid-360 packets, Cartesian", fixed.livox_packet, False),
     "multiscan": ("multiScan136 telegrams", fixed.compact_telegram, False),
@@ -229,7 +262,9 @@ def beside_fixed(inputs: Inputs, key: str) -> Work:
         memoryview(data).nbytes,
         lambda backend: points_of(sensor, data, backend),
         own=lambda backend: {"fixed": Contender(points_of(simple, data, backend), points)},
-        facts=lambda backend, rates: {"times as long as with fixed places": times(rates, "fixed", "ours")},
+        facts=lambda backend, rates: {
+            "times as long as with fixed places": times(rates, "fixed", "ours")
+        },
     )
 
 
@@ -238,19 +273,27 @@ def in_text(inputs: Inputs, key: str, title: str) -> Work:
     sensor, data = inputs.sensor(key), b"".join(inputs.frames(key))
     points = len(sensor.decode(data).points())
     others: Others = {"plain": lambda: Contender(plainly(sensor, data), points)}
-    return Work(title, "points", points, len(data), lambda backend: points_of(sensor, data, backend), others)
+    return Work(
+        title, "points", points, len(data), lambda backend: points_of(sensor, data, backend), others
+    )
 
 
 def rplidar(inputs: Inputs) -> Work:
     some = inputs.frames("rplidar")[: 10 * FEW]
-    return in_memory(inputs, "rplidar", "RPLIDAR nodes", {"rplidar": lambda: libraries.rplidar_nodes(some)})
+    return in_memory(
+        inputs, "rplidar", "RPLIDAR nodes", {"rplidar": lambda: libraries.rplidar_nodes(some)}
+    )
 
 
 def stl27l_stream(inputs: Inputs) -> Work:
-    """The stream in which frames are damaged and noise stands between them; intact frames that are not found are counted."""
+    """The stream in which frames are damaged and noise stands between them; intact frames that are
+    not found are counted.
+    """
     noisy, sensor = inputs.noisy("stl27l"), inputs.sensor("stl27l")
     frames = inputs.frames("stl27l")[:FEW]
-    more: Others = {"lds2d": lambda: libraries.lds2d_stream("LD14P", b"".join(frames), 12 * len(frames))}
+    more: Others = {
+        "lds2d": lambda: libraries.lds2d_stream("LD14P", b"".join(frames), 12 * len(frames))
+    }
 
     def facts(backend: str, rates: Rates) -> Facts:
         found = np.isin(noisy.intact, sensor.decode(noisy.data, backend=backend).offset)
@@ -264,7 +307,9 @@ def m1c1_stream(inputs: Inputs) -> Work:
     frames = inputs.frames("m1c1")[:FEW]
     points = sum(frame[3] for frame in frames)
     more: Others = {"lds2d": lambda: libraries.lds2d_stream("COIN-D4", b"".join(frames), points)}
-    return in_stream(inputs, "m1c1", "M1C1_Mini stream", inputs.stream("m1c1"), by_hand_serial.m1c1_stream, more)
+    return in_stream(
+        inputs, "m1c1", "M1C1_Mini stream", inputs.stream("m1c1"), by_hand_serial.m1c1_stream, more
+    )
 
 
 def rplidar_stream(inputs: Inputs) -> Work:
@@ -272,7 +317,9 @@ def rplidar_stream(inputs: Inputs) -> Work:
     first = len(opening(inputs.sensor("rplidar")))
     more: Others = {"rplidar": lambda: libraries.rplidar_nodes(some)}
     by_us: Callable[[bytes], Any] = lambda data: by_hand_serial.rplidar_stream(data, first)  # noqa: E731
-    return in_stream(inputs, "rplidar", "RPLIDAR nodes (stream)", inputs.stream("rplidar"), by_us, more)
+    return in_stream(
+        inputs, "rplidar", "RPLIDAR nodes (stream)", inputs.stream("rplidar"), by_us, more
+    )
 
 
 ON_BYTES: Mapping[str, Callable[[Inputs], Work]] = {

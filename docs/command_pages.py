@@ -3,10 +3,10 @@
     python docs/command_pages.py          # all of it
     python docs/command_pages.py --man    # the manual pages only
 
-`make reference` runs the first, `make wheels` the second. The manual pages go to docs/man, which git
-ignores. In docs/reference/command-line.md (usage and options of each verb) and docs/reference/ros2.md
-(parameters of the node) the text between the marks is generated and the rest is written by hand;
-tests/docs/test_reference_pages.py fails if a generated part is out of date.
+`make reference` runs the first, `make wheels` the second. The manual pages go to docs/man, which
+git ignores. In docs/reference/command-line.md (usage and options of each verb) and
+docs/reference/ros2.md (parameters of the node) the text between the marks is generated and the rest
+is written by hand; tests/docs/test_reference_pages.py fails if a generated part is out of date.
 """
 
 from __future__ import annotations
@@ -36,7 +36,10 @@ def context(verb: str) -> click.Context:
 
 def paragraphs(verb: str) -> list[str]:
     """What the verb does, each paragraph in one line."""
-    return [" ".join(text.split()) for text in inspect.cleandoc(context(verb).command.help or "").split("\n\n")]
+    return [
+        " ".join(text.split())
+        for text in inspect.cleandoc(context(verb).command.help or "").split("\n\n")
+    ]
 
 
 def usage(verb: str) -> str:
@@ -47,20 +50,33 @@ def usage(verb: str) -> str:
 
 def options(verb: str) -> list[tuple[str, str]]:
     """Each option of its own as it is typed, and what it does."""
-    own = (param for param in context(verb).command.params if isinstance(param, click.Option) and param not in SPOKEN)
+    own = (
+        param
+        for param in context(verb).command.params
+        if isinstance(param, click.Option) and param not in SPOKEN
+    )
     records = (param.get_help_record(context(verb)) for param in own)
     return [(typed, " ".join(text.split())) for typed, text in filter(None, records)]
 
 
 def section(verb: str) -> str:
     """What is made of a verb's section."""
-    rows = [f"| `{typed}` | {text} |" for typed, text in ((t.replace("|", "\\|"), x.replace("|", "\\|")) for t, x in options(verb))]
+    rows = [
+        f"| `{typed}` | {text} |"
+        for typed, text in (
+            (t.replace("|", "\\|"), x.replace("|", "\\|")) for t, x in options(verb)
+        )
+    ]
     table = ["", "| option | |", "|---|---|", *rows] if rows else []
-    return "\n".join([BEGIN, "", f"`{usage(verb)}`", "", "\n\n".join(paragraphs(verb)), *table, "", END])
+    return "\n".join(
+        [BEGIN, "", f"`{usage(verb)}`", "", "\n\n".join(paragraphs(verb)), *table, "", END]
+    )
 
 
 def page(text: str) -> str:
-    """command-line.md with every made part as it is now; a verb without one gets it below its heading."""
+    """command-line.md with every made part as it is now; a verb without one gets it below its
+    heading.
+    """
     for verb in VERBS:
         before, heading, after = text.partition(f"## {verb}\n\n")
         rest = re.sub(rf"\A{re.escape(BEGIN)}.*?{re.escape(END)}\n\n?", "", after, flags=re.DOTALL)
@@ -73,8 +89,14 @@ def node(text: str) -> str:
     sys.path.insert(0, str(DOCS.parent / "plugins" / "lidarspec-ros2"))
     from lidarspec_ros2.parameters import PARAMETERS
 
-    rows = [f"| `{one.name}` | {one.kind} | `{json.dumps(one.default)}` | {one.text} | {'yes' if one.live else ''} |" for one in PARAMETERS]
-    table = "\n".join(["| parameter | type | default | | at run time |", "|---|---|---|---|---|", *rows])
+    rows = [
+        f"| `{one.name}` | {one.kind} | `{json.dumps(one.default)}` | {one.text} |"
+        f" {'yes' if one.live else ''} |"
+        for one in PARAMETERS
+    ]
+    table = "\n".join(
+        ["| parameter | type | default | | at run time |", "|---|---|---|---|---|", *rows]
+    )
     before, after = text.partition(BEGIN)[0], text.partition(END)[2]
     return f"{before}{BEGIN}\n\n{table}\n\n{END}{after}"
 
@@ -83,11 +105,22 @@ def manual(verb: str) -> str:
     """The manual page of a verb; of "" that of the command."""
     name = f"lidarspec-{verb}" if verb else "lidarspec"
     said = paragraphs(verb)
-    lines = [f'.TH {name.upper()} 1 "" "lidarspec {__version__}" "lidarspec"', ".SH NAME", f"{name} \\- {_roff(said[0])}"]
-    lines += [".SH SYNOPSIS", _roff(usage(verb)), ".SH DESCRIPTION", "\n.PP\n".join(map(_roff, said))]
+    lines = [
+        f'.TH {name.upper()} 1 "" "lidarspec {__version__}" "lidarspec"',
+        ".SH NAME",
+        f"{name} \\- {_roff(said[0])}",
+    ]
+    lines += [
+        ".SH SYNOPSIS",
+        _roff(usage(verb)),
+        ".SH DESCRIPTION",
+        "\n.PP\n".join(map(_roff, said)),
+    ]
     terms = [(".SH OPTIONS", options(verb))] if options(verb) else []
     if not verb:
-        terms.append((".SH VERBS", [(f"lidarspec-{name}(1)", text) for name, (_, text) in VERBS.items()]))
+        terms.append(
+            (".SH VERBS", [(f"lidarspec-{name}(1)", text) for name, (_, text) in VERBS.items()])
+        )
     for heading, items in terms:
         lines += [heading, *(f".TP\n\\fB{_roff(term)}\\fR\n{_roff(text)}" for term, text in items)]
     return "\n".join([*lines, *([".SH SEE ALSO\nlidarspec(1)"] if verb else []), ""])

@@ -1,10 +1,12 @@
-"""Makes the pictures of the front page and the README from simulated sensors alone: the same bytes each time.
+"""Makes the pictures of the front page and the README from simulated sensors alone: the same bytes
+each time.
 
     python docs/pictures.py [--into FOLDER]           # a terminal, a point cloud, a packet diagram: SVG
     python docs/pictures.py --page [--into FOLDER]    # the page in the browser, as PNG; needs Chromium
 
-`make docs` runs both. A PNG has other bytes wherever fonts are others: that of the page goes into the site alone, and for the README it is
-made by hand when the page has changed. tests/docs/test_pictures.py holds that the rest is up to date.
+`make docs` runs both. A PNG has other bytes wherever fonts are others: that of the page goes into
+the site alone, and for the README it is made by hand when the page has changed.
+tests/docs/test_pictures.py holds that the rest is up to date.
 """
 
 from __future__ import annotations
@@ -38,17 +40,23 @@ FLAGS = ("--no-sandbox", "--use-angle=swiftshader", "--enable-unsafe-swiftshader
 def simulated(sensor: str, file: Path, duration: str) -> Path:
     """A file with what a simulated sensor sends in a while."""
     words = ["sim", sensor, "--to", str(file), "-t", duration, "--seed", "7", "-q"]
-    subprocess.run([sys.executable, "-m", "lidarspec", *words], check=True, stdout=subprocess.DEVNULL)
+    subprocess.run(
+        [sys.executable, "-m", "lidarspec", *words], check=True, stdout=subprocess.DEVNULL
+    )
     return file
 
 
 def terminal(folder: Path) -> str:
     """The window of `view`, some seconds into a file."""
-    with ls.open(simulated("ldrobot-stl27l", folder / "room.pcap", "5s"), "ldrobot-stl27l") as device:
+    with ls.open(
+        simulated("ldrobot-stl27l", folder / "room.pcap", "5s"), "ldrobot-stl27l"
+    ) as device:
         feed = Feed(device)
         window = Window(feed, "/dev/ttyUSB0")
         feed.pump(0.0)
-        time.sleep(FIGURES)  # after which the window reads its figures, which are by the packets' own times
+        time.sleep(
+            FIGURES
+        )  # after which the window reads its figures, which are by the packets' own times
         return drawn(window.cells(92, 28))
 
 
@@ -56,7 +64,13 @@ def cloud() -> str:
     """A scan of a spinning lidar."""
     sensor = ls.sensor("ouster-os1")
     scan = next(scan for scan in sensor.scans(simulate(sensor, 600)) if scan.complete)
-    return svg(scan.points, fit(scan.points, look(scan.points)), f"{sensor.id}: {len(scan):,} points", side=520, most=9000)
+    return svg(
+        scan.points,
+        fit(scan.points, look(scan.points)),
+        f"{sensor.id}: {len(scan):,} points",
+        side=520,
+        most=9000,
+    )
 
 
 def packet() -> str:
@@ -65,7 +79,9 @@ def packet() -> str:
 
 
 def page(folder: Path, target: Path) -> None:
-    """The page while a file is played, with the newest frame below the picture, as PNG in few colours."""
+    """The page while a file is played, with the newest frame below the picture, as PNG in few
+    colours.
+    """
     from PIL import Image
     from playwright.sync_api import sync_playwright
 
@@ -74,12 +90,27 @@ def page(folder: Path, target: Path) -> None:
         print("the picture of the page stays as it was: Chromium is not installed", file=sys.stderr)
         return
     file = simulated("robosense-m1", folder / "room.lsr", "15s")
-    command = [sys.executable, "-m", "lidarspec", "view", file.name, "-s", "robosense-m1", "--web", "-q"]
-    with subprocess.Popen(command, cwd=folder, stdout=subprocess.PIPE, text=True) as serving, sync_playwright() as running:
+    command = [
+        sys.executable,
+        "-m",
+        "lidarspec",
+        "view",
+        file.name,
+        "-s",
+        "robosense-m1",
+        "--web",
+        "-q",
+    ]
+    with (
+        subprocess.Popen(command, cwd=folder, stdout=subprocess.PIPE, text=True) as serving,
+        sync_playwright() as running,
+    ):
         assert serving.stdout is not None
         browser = running.chromium.launch(executable_path=chromium, args=FLAGS)
         try:
-            seen = browser.new_page(viewport={"width": SIZE[0], "height": SIZE[1]}, color_scheme=SCHEME)
+            seen = browser.new_page(
+                viewport={"width": SIZE[0], "height": SIZE[1]}, color_scheme=SCHEME
+            )
             seen.goto(serving.stdout.readline().strip())
             seen.wait_for_timeout(SETTLED)
             seen.wait_for_timeout(SETTLED / 5)
@@ -87,13 +118,19 @@ def page(folder: Path, target: Path) -> None:
         finally:
             browser.close()
             serving.terminate()
-    Image.open(target).convert("RGB").quantize(COLOURS, Image.Quantize.FASTOCTREE, dither=Image.Dither.NONE).save(target, optimize=True)
+    Image.open(target).convert("RGB").quantize(
+        COLOURS, Image.Quantize.FASTOCTREE, dither=Image.Dither.NONE
+    ).save(target, optimize=True)
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description="Makes the pictures of the front page and the README.")
+    parser = argparse.ArgumentParser(
+        description="Makes the pictures of the front page and the README."
+    )
     parser.add_argument("--into", type=Path, default=HERE, metavar="FOLDER")
-    parser.add_argument("--page", action="store_true", help="the page in the browser, and nothing else")
+    parser.add_argument(
+        "--page", action="store_true", help="the page in the browser, and nothing else"
+    )
     given = parser.parse_args()
     given.into.mkdir(exist_ok=True)
     with tempfile.TemporaryDirectory() as folder:

@@ -2,7 +2,8 @@
 
     python docs/reference_pages.py
 
-`make reference` and `make docs` run this. The files go to docs/reference/sensors, which git ignores.
+`make reference` and `make docs` run this. The files go to docs/reference/sensors, which git
+ignores.
 """
 
 from __future__ import annotations

@@ -1,4 +1,6 @@
-"""Makes the screens of the how-to pages, `view` as SVG and what other verbs print, from simulated sensors alone."""
+"""Makes the screens of the how-to pages, `view` as SVG and what other verbs print, from simulated
+sensors alone.
+"""
 
 from __future__ import annotations
 
@@ -32,7 +34,16 @@ GROUND, PLAIN = "#101218", "#d8dae0"
 PORT = "/dev/ttyUSB0"
 
 
-def screen(source: str, sensor: str, *, columns: int, lines: int, seconds: float, ramp: str = "range", called: str = "") -> Cells:
+def screen(
+    source: str,
+    sensor: str,
+    *,
+    columns: int,
+    lines: int,
+    seconds: float,
+    ramp: str = "range",
+    called: str = "",
+) -> Cells:
     """The window of `view` after some seconds."""
     with ls.open(source, sensor) as device:
         feed = Feed(device, played=True)
@@ -45,14 +56,22 @@ def screen(source: str, sensor: str, *, columns: int, lines: int, seconds: float
 
 
 def svg(cells: Cells) -> str:
-    """A screen as an SVG document; braille is drawn dot by dot, since few fonts have it as wide as letters."""
+    """A screen as an SVG document; braille is drawn dot by dot, since few fonts have it as wide as
+    letters.
+    """
     columns, lines = cells.size
     width, height = columns * ACROSS + 2 * MARGIN, lines * DOWN + 2 * MARGIN
     return "\n".join(
         [
-            f'<svg xmlns="http://www.w3.org/2000/svg" viewBox="0 0 {width} {height}" width="{width}" height="{height}" '
-            'font-family="ui-monospace, Menlo, Consolas, monospace" font-size="13">',
-            f'<rect width="100%" height="100%" rx="8" fill="{GROUND}"/><g transform="translate({MARGIN} {MARGIN})">',
+            (
+                f'<svg xmlns="http://www.w3.org/2000/svg" viewBox="0 0 {width} {height}"'
+                f' width="{width}" height="{height}" font-family="ui-monospace, Menlo, Consolas,'
+                ' monospace" font-size="13">'
+            ),
+            (
+                f'<rect width="100%" height="100%" rx="8" fill="{GROUND}"/><g'
+                f' transform="translate({MARGIN} {MARGIN})">'
+            ),
             *_dots(cells),
             *_texts(cells),
             "</g></svg>",
@@ -68,8 +87,14 @@ def _dots(cells: Cells) -> Iterator[str]:
         path = []
         for bit, (across, down) in enumerate(places):
             found = np.argwhere((bits >> bit & 1) & (cells.inks == ink)).tolist()
-            path += [f"M{column * ACROSS + across * 4 + 2} {row * DOWN + down * 4 + 2}h0" for row, column in found]
-        yield f'<path d="{"".join(path)}" stroke="{_colour(ink)}" stroke-width="{DOT}" stroke-linecap="round"/>'
+            path += [
+                f"M{column * ACROSS + across * 4 + 2} {row * DOWN + down * 4 + 2}h0"
+                for row, column in found
+            ]
+        yield (
+            f'<path d="{"".join(path)}" stroke="{_colour(ink)}" stroke-width="{DOT}"'
+            ' stroke-linecap="round"/>'
+        )
 
 
 def _braille(cells: Cells) -> NDArray[np.bool_]:
@@ -85,8 +110,9 @@ def _texts(cells: Cells) -> Iterator[str]:
             if ink >= 0:
                 weight = ' font-weight="bold"' if INKS[ink].bold else ""
                 yield (
-                    f'<text x="{start * ACROSS}" y="{row * DOWN + 12}" textLength="{(end - start) * ACROSS}" '
-                    f'lengthAdjust="spacingAndGlyphs" fill="{_colour(ink)}"{weight}>{escape(line[start:end])}</text>'
+                    f'<text x="{start * ACROSS}" y="{row * DOWN + 12}"'
+                    f' textLength="{(end - start) * ACROSS}" lengthAdjust="spacingAndGlyphs"'
+                    f' fill="{_colour(ink)}"{weight}>{escape(line[start:end])}</text>'
                 )
             start = end
 
@@ -98,9 +124,18 @@ def _colour(ink: int) -> str:
 
 def main() -> None:
     HERE.mkdir(exist_ok=True)
-    flat = screen("sim:ldrobot-stl27l?errors=0.0001", "ldrobot-stl27l", columns=80, lines=24, seconds=4, called="/dev/ttyUSB0")
+    flat = screen(
+        "sim:ldrobot-stl27l?errors=0.0001",
+        "ldrobot-stl27l",
+        columns=80,
+        lines=24,
+        seconds=4,
+        called="/dev/ttyUSB0",
+    )
     (HERE / "view-2d.svg").write_text(svg(flat), encoding="utf-8")
-    tall = screen("sim:velodyne-vlp16", "velodyne-vlp16", columns=110, lines=36, seconds=2.2, called=":2368")
+    tall = screen(
+        "sim:velodyne-vlp16", "velodyne-vlp16", columns=110, lines=36, seconds=2.2, called=":2368"
+    )
     (HERE / "view-3d.svg").write_text(svg(tall), encoding="utf-8")
     for name in ("view.md", "find.md"):
         page = HERE.parent / name
@@ -108,19 +143,32 @@ def main() -> None:
 
 
 def printed(page: str) -> str:
-    """A page with what its commands print now; a simulated sensor stands in for its port, made bytes for its file."""
+    """A page with what its commands print now; a simulated sensor stands in for its port, made
+    bytes for its file.
+    """
     with tempfile.TemporaryDirectory() as folder:
         link = Path(folder, "port")
         Path(folder, "unknown.bin").write_bytes(b"".join(sealed(index) for index in range(60)))
         with virtual_port("ldrobot-stl27l", link=link, faults=Faults(errors=0.0001)):
-            return re.sub(r"(?<=```text\n)\$ lidarspec (.*)\n(?:.*\n)*?(?=```)", lambda found: shown(found[1], link), page)
+            return re.sub(
+                r"(?<=```text\n)\$ lidarspec (.*)\n(?:.*\n)*?(?=```)",
+                lambda found: shown(found[1], link),
+                page,
+            )
 
 
 def shown(command: str, link: Path) -> str:
     """A command as the page has it, and what it prints."""
     words = [str(link) if word == PORT else word for word in command.split()]
     program = [sys.executable, "-m", "lidarspec", *words]
-    done = subprocess.run(program, cwd=link.parent, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True, check=False)
+    done = subprocess.run(
+        program,
+        cwd=link.parent,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.STDOUT,
+        text=True,
+        check=False,
+    )
     wider = " " * (len(str(link)) - len(PORT))
     text = done.stdout.replace("source" + wider, "source").replace(str(link), PORT)
     return f"$ lidarspec {command}\n{text}"

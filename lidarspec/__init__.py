@@ -5,10 +5,12 @@
     s = ls.sensor("vendor-model")
     s.parse(frame), s.build("data", ...), s.decode(data).points(), s.scans(data), ls.open(source, s)
 
-Here are the names of those who read a lidar; those who write a sensor find theirs in `lidarspec.spec`, and every error is in
-`lidarspec.errors`. They are imported when they are first used, so that ``lidarspec --help`` is quick.
+Here are the names of those who read a lidar; those who write a sensor find theirs in
+`lidarspec.spec`, and every error is in `lidarspec.errors`. They are imported when they are first
+used, so that ``lidarspec --help`` is quick.
 
-The packages are stations on the way of a byte, and import each other in one direction; each says what comes in and what goes out:
+The packages are stations on the way of a byte, and import each other in one direction; each says
+what comes in and what goes out:
 
     spec        what a sensor is               packets     frames of one type, in order, in time
     frames      a frame and its bytes          points      packets as point clouds
@@ -74,7 +76,14 @@ _NAMES = {
     "exports": ("export",),
     "simulation.simulator": ("simulate",),
     "recording.recorders": ("Recorder",),
-    "errors": ("LidarSpecError", "SpecError", "WireError", "UsageError", "SourceError", "CommandError"),
+    "errors": (
+        "LidarSpecError",
+        "SpecError",
+        "WireError",
+        "UsageError",
+        "SourceError",
+        "CommandError",
+    ),
 }
 _HOMES = {name: module for module, names in _NAMES.items() for name in names}
 

@@ -1,14 +1,18 @@
-"""Many files, and large ones in pieces, by several processes or machines: files of points, or a table of Dask.
+"""Many files, and large ones in pieces, by several processes or machines: files of points, or a
+table of Dask.
 
-In: captures by path, pattern or URL. Out: a file of points for each, several for one that is larger than a piece, and a manifest; or a Dask
-dataframe with a partition for each piece. Nothing here schedules: tasks go to `concurrent.futures`, or to the scheduler of a Dask cluster.
+In: captures by path, pattern or URL. Out: a file of points for each, several for one that is larger
+than a piece, and a manifest; or a Dask dataframe with a partition for each piece. Nothing here
+schedules: tasks go to `concurrent.futures`, or to the scheduler of a Dask cluster.
 
-A large file is cut as `device.file_scans` does it. Its pieces are found one after another: the task that passes over one gives the bookmark
-with which the next one begins, so that points are made of a piece while those behind it are still looked for.
+A large file is cut as `device.file_scans` does it. Its pieces are found one after another: the task
+that passes over one gives the bookmark with which the next one begins, so that points are made of a
+piece while those behind it are still looked for.
 
-The manifest, `manifest.jsonl` in the folder of the results, has a line of JSON for each piece: what was read, with which sensor and
-versions, what was written, or the error. A file whose lines and results are all there is not read again. A line that is there is true: it
-is written when the result is.
+The manifest, `manifest.jsonl` in the folder of the results, has a line of JSON for each piece: what
+was read, with which sensor and versions, what was written, or the error. A file whose lines and
+results are all there is not read again. A line that is there is true: it is written when the result
+is.
 """
 
 from __future__ import annotations
@@ -39,7 +43,14 @@ import numpy as np
 from lidarspec._version import __version__
 from lidarspec.detect.identification import detected
 from lidarspec.device.file_scans import FileScans
-from lidarspec.errors import LidarSpecError, SourceError, UsageError, WireError, suggest, system_errors
+from lidarspec.errors import (
+    LidarSpecError,
+    SourceError,
+    UsageError,
+    WireError,
+    suggest,
+    system_errors,
+)
 from lidarspec.formats import format_of, write
 from lidarspec.formats.tables import tables
 from lidarspec.libraries import import_library
@@ -47,12 +58,23 @@ from lidarspec.plugins import sensor as named_sensor
 from lidarspec.scans.scans import Scan
 from lidarspec.scans.selection import EVERYTHING, Selection, Sieve
 from lidarspec.spec.sensor import Sensor
-from lidarspec.stores import digest, file_of, files_in, found, is_stored, plain, put, stamp, take_away
+from lidarspec.stores import (
+    digest,
+    file_of,
+    files_in,
+    found,
+    is_stored,
+    plain,
+    put,
+    stamp,
+    take_away,
+)
 
 #: bytes of a piece that is written to a file, and of one that is a partition in memory.
 PIECE, PARTITION = 256_000_000, 32_000_000
 MANIFEST = "manifest.jsonl"
-#: tasks handed to an executor at a time, and seconds between two writings of a manifest that cannot be appended to.
+#: tasks handed to an executor at a time, and seconds between two writings of a manifest that cannot
+#: be appended to.
 AHEAD, PERIOD = 1000, 2.0
 VERSIONS = {"lidarspec": __version__, "numpy": np.__version__, "python": platform.python_version()}
 
@@ -65,8 +87,10 @@ class Piece:
 
     Attributes:
         source: path or URL of the file.
-        sensor, options: whose, by name, with what it is configured with; "" where it is to be found out.
-        target: the file that all scans would go to; a piece has its number in the name. "" for none.
+        sensor, options: whose, by name, with what it is configured with; "" where it is to be found
+            out.
+        target: the file that all scans would go to; a piece has its number in the name. "" for
+            none.
         every_point: whether points without a valid return count.
         size: bytes of a piece.
         select: what is wanted of its scans; by their times and numbers, of a file in one piece.
@@ -101,22 +125,48 @@ class Piece:
     def asked(self) -> Record:
         """What its result depends on, besides the file and which piece of it this is."""
         options = {name: str(value) for name, value in self.options.items()}
-        select = {name: str(value) for name, value in vars(self.select).items() if value != getattr(Selection, name)}
-        how = {"options": options, "select": select, "every_point": self.every_point, "piece_size": self.size}
+        select = {
+            name: str(value)
+            for name, value in vars(self.select).items()
+            if value != getattr(Selection, name)
+        }
+        how = {
+            "options": options,
+            "select": select,
+            "every_point": self.every_point,
+            "piece_size": self.size,
+        }
         return {"asked": self.sensor, **how, "target": self.target}
 
     def opened(self) -> FileScans:
         """The file, from where the piece begins."""
-        named = _configured(self.sensor, tuple(self.options.items())) if self.sensor else detected(self.source)
+        named = (
+            _configured(self.sensor, tuple(self.options.items()))
+            if self.sensor
+            else detected(self.source)
+        )
         return FileScans(self.source, named, self.bookmark)
 
     def record(self, **more: Any) -> Record:
         """What the manifest says of it."""
-        return {"source": self.source, "piece": self.number, "last": self.is_last, **self.asked, "versions": VERSIONS, **more}
+        return {
+            "source": self.source,
+            "piece": self.number,
+            "last": self.is_last,
+            **self.asked,
+            "versions": VERSIONS,
+            **more,
+        }
 
     def failed(self, error: Exception) -> Record:
         """What the manifest says where it was not to be made."""
-        return self.record(error=str(error) if isinstance(error, LidarSpecError) else f"{type(error).__name__}: {error}")
+        return self.record(
+            error=(
+                str(error)
+                if isinstance(error, LidarSpecError)
+                else f"{type(error).__name__}: {error}"
+            )
+        )
 
     def numbered(self, scans: FileScans) -> Iterator[Scan]:
         """What is wanted of its scans, with their numbers in the file."""
@@ -144,7 +194,9 @@ def survey(piece: Piece) -> list[Piece]:
         count, bookmark = scans.survey(piece.size)
     if bookmark is None:
         return [replace(piece, count=count, is_last=True)]
-    following = replace(piece, number=piece.number + 1, first=piece.first + count, bookmark=bookmark)
+    following = replace(
+        piece, number=piece.number + 1, first=piece.first + count, bookmark=bookmark
+    )
     return [replace(piece, count=count, is_last=False), following]
 
 
@@ -160,7 +212,12 @@ def converted(piece: Piece) -> Record:
                 raise WireError(f"no scan: {scans.stats}")
             if first is not None:
                 _write(piece, itertools.chain([first], counted))
-            return piece.record(**about, **counts, output=piece.output if first is not None else None, warnings=scans.warnings)
+            return piece.record(
+                **about,
+                **counts,
+                output=piece.output if first is not None else None,
+                warnings=scans.warnings,
+            )
     except Exception as error:  # of whatever kind: the others go on
         return piece.failed(error)
 
@@ -186,7 +243,14 @@ def _write(piece: Piece, scans: Iterable[Scan]) -> None:
 
 
 def pieces(
-    sources: Sequence[str], sensor: str | Sensor | None, *, folder: str = "", to: str = "", every_point: bool, size: int, select: Selection
+    sources: Sequence[str],
+    sensor: str | Sensor | None,
+    *,
+    folder: str = "",
+    to: str = "",
+    every_point: bool,
+    size: int,
+    select: Selection,
 ) -> list[Piece]:
     """The files of some paths, patterns and URLs, each as one piece.
 
@@ -194,12 +258,17 @@ def pieces(
         SourceError: where there is none.
         UsageError: where two results would have one name.
     """
-    name, options = (sensor.id, dict(sensor.options)) if isinstance(sensor, Sensor) else (sensor or "", {})
+    name, options = (
+        (sensor.id, dict(sensor.options)) if isinstance(sensor, Sensor) else (sensor or "", {})
+    )
     made: dict[str, Piece] = {}
     for source, below in (pair for pattern in sources for pair in found(str(pattern))):
         target = f"{folder.rstrip('/')}/{below.rpartition('.')[0] or below}.{to}" if to else source
         if target in made and made[target].source != source:
-            raise UsageError(f"{made[target].source} and {source} would both become {target}: convert them to two folders")
+            raise UsageError(
+                f"{made[target].source} and {source} would both become {target}: convert them to"
+                " two folders"
+            )
         made[target] = Piece(source, name, options, target if to else "", every_point, size, select)
     return list(made.values())
 
@@ -207,11 +276,19 @@ def pieces(
 #: keys that each record of a manifest has, with their types.
 _RECORD_KEYS: Mapping[str, Any] = {"source": str, "target": str, "piece": int}
 #: further keys of the record of a piece that was written.
-_WRITTEN_KEYS: Mapping[str, Any] = {"last": bool, "size": int, "modified": str, "digest": str, "output": str | None}
+_WRITTEN_KEYS: Mapping[str, Any] = {
+    "last": bool,
+    "size": int,
+    "modified": str,
+    "digest": str,
+    "output": str | None,
+}
 
 
 def _is_record(value: Any) -> bool:
-    """Return whether a value from a line of a manifest has the keys of a record, with values of the right types."""
+    """Return whether a value from a line of a manifest has the keys of a record, with values of the
+    right types.
+    """
     if not isinstance(value, dict):
         return False
     keys = dict(_RECORD_KEYS)
@@ -238,7 +315,9 @@ class Manifest:
         self._records: dict[tuple[str, str], dict[int, Record]] = {}
         self._due = 0.0
         self._is_stored = is_stored(folder)
-        self._lines = [line for number, line in enumerate(self._read_lines(), 1) if self._known(line, number)]
+        self._lines = [
+            line for number, line in enumerate(self._read_lines(), 1) if self._known(line, number)
+        ]
         self._outputs = files_in(folder)
         self.is_new = not self.has(self.path)
         if not self._is_stored:
@@ -257,17 +336,21 @@ class Manifest:
             return []
 
     def _known(self, line: str, number: int) -> bool:
-        """Remember the record of a line; return False for one that a killed run left incomplete, or that is damaged.
+        """Remember the record of a line; return False for one that a killed run left incomplete, or
+        that is damaged.
 
         Raises:
-            SourceError: if the line nests more deeply than any record does: no run of ours wrote it.
+            SourceError: if the line nests more deeply than any record does: no run of ours wrote
+                it.
         """
         try:
             record = json.loads(line)
         except ValueError:
             return False
         except RecursionError:
-            raise SourceError(f"{self.path}: line {number}: brackets are nested too deeply") from None
+            raise SourceError(
+                f"{self.path}: line {number}: brackets are nested too deeply"
+            ) from None
         if not _is_record(record):
             return False
         self._records.setdefault((record["source"], record["target"]), {})[record["piece"]] = record
@@ -280,7 +363,11 @@ class Manifest:
     def done(self, piece: Piece) -> Record | None:
         """What was said of a piece that need not be made again."""
         record = self._records.get((piece.source, piece.target), {}).get(piece.number)
-        if record is None or "error" in record or any(record.get(name) != value for name, value in piece.asked.items()):
+        if (
+            record is None
+            or "error" in record
+            or any(record.get(name) != value for name, value in piece.asked.items())
+        ):
             return None
         is_there = record["output"] is None or self.has(record["output"])
         return record if is_there and self._is_same(piece.source, record) else None
@@ -288,7 +375,10 @@ class Manifest:
     def _is_same(self, source: str, record: Record) -> bool:
         """Whether a file is the one that a record is of."""
         now = stamp(source)
-        return bool(now["size"] == record["size"] and (now["modified"] == record["modified"] or digest(source) == record["digest"]))
+        return bool(
+            now["size"] == record["size"]
+            and (now["modified"] == record["modified"] or digest(source) == record["digest"])
+        )
 
     def finished(self, piece: Piece) -> list[Record]:
         """What was said of all pieces of a file, none where one is missing."""
@@ -348,7 +438,9 @@ class _Here(Executor):
 
 
 def _begin() -> None:
-    """A worker ends with the process that it works for, however that ends, and without a word where the user ends both."""
+    """A worker ends with the process that it works for, however that ends, and without a word where
+    the user ends both.
+    """
     signal.signal(signal.SIGINT, signal.SIG_DFL)
     parent = multiprocessing.parent_process()
     assert parent is not None
@@ -373,13 +465,17 @@ def _executor(jobs: int, scheduler: str) -> Iterator[Executor]:
         try:
             client = distributed.Client(scheduler)
         except (OSError, ValueError) as error:
-            raise suggest(SourceError(f"{scheduler}: no Dask scheduler answers: {error}"), "dask scheduler") from error
+            raise suggest(
+                SourceError(f"{scheduler}: no Dask scheduler answers: {error}"), "dask scheduler"
+            ) from error
         with client, client.get_executor(pure=False) as executor:
             yield executor
     elif jobs == 1:
         yield _Here()
     else:
-        context = multiprocessing.get_context("forkserver" if "forkserver" in multiprocessing.get_all_start_methods() else "spawn")
+        context = multiprocessing.get_context(
+            "forkserver" if "forkserver" in multiprocessing.get_all_start_methods() else "spawn"
+        )
         context.set_forkserver_preload([__name__])
         with ProcessPoolExecutor(jobs, context, initializer=_begin) as executor:
             try:
@@ -402,32 +498,45 @@ def convert(
     size: int = PIECE,
     force: bool = False,
 ) -> Iterator[tuple[Record, bool]]:
-    """Write the points of many files into a folder: what the manifest says of each piece, as it is done, and whether it was done before.
+    """Write the points of many files into a folder: what the manifest says of each piece, as it is
+    done, and whether it was done before.
 
     What fails is said in the "error" of its record, and stops nothing else.
 
     Args:
         sources: paths, patterns such as "drives/**/*.pcap", and URLs of fsspec.
-        folder: path or URL; the files in it are named as those that they are of, below the fixed part of the pattern.
+        folder: path or URL; the files in it are named as those that they are of, below the fixed
+            part of the pattern.
         to: the suffix of a format, "parquet".
         sensor: as in `lidarspec.open`; found out for each file where left out.
         jobs: how many processes of this computer work.
-        scheduler: the address of a Dask scheduler, whose workers do it instead; sources and folder have to be theirs too.
+        scheduler: the address of a Dask scheduler, whose workers do it instead; sources and folder
+            have to be theirs too.
         every_point: also the points without a valid return.
         select: what is wanted of the scans of each file; by times and numbers, the file is not cut.
         size: bytes of a piece; a larger file gives several files of points.
         force: what was done before is done again.
 
     Raises:
-        SourceError: where there is no such source, the folder cannot be written to, the scheduler not be reached, or a worker was killed.
+        SourceError: where there is no such source, the folder cannot be written to, the scheduler
+            not be reached, or a worker was killed.
         UsageError: for a format that is none, and where a library is missing.
     """
     format_of(f"x.{to}")
-    todo = pieces(sources, sensor, folder=folder, to=to, every_point=every_point, size=size, select=select)
+    todo = pieces(
+        sources, sensor, folder=folder, to=to, every_point=every_point, size=size, select=select
+    )
     with contextlib.closing(Manifest(folder)) as manifest:
         _try(to)
-        if taken := [piece.target for piece in todo if manifest.is_new and not force and manifest.has(piece.target)]:
-            error = UsageError(f"{taken[0]} exists already, and no {MANIFEST} says of what it was made; it is not overwritten")
+        if taken := [
+            piece.target
+            for piece in todo
+            if manifest.is_new and not force and manifest.has(piece.target)
+        ]:
+            error = UsageError(
+                f"{taken[0]} exists already, and no {MANIFEST} says of what it was made; it is not"
+                " overwritten"
+            )
             raise suggest(error, "the same with --force, or into another folder")
         if not force:
             known = {piece.source: manifest.finished(piece) for piece in todo}
@@ -436,20 +545,28 @@ def convert(
         for piece in todo:
             manifest.clear(piece)
         with _swept(folder, to), _executor(jobs, scheduler) as executor:
-            for record, is_old in _run(executor, todo, (lambda _: None) if force else manifest.done):
+            for record, is_old in _run(
+                executor, todo, (lambda _: None) if force else manifest.done
+            ):
                 if not is_old:
                     manifest.add(record)
                 yield record, is_old
 
 
-def _run(executor: Executor, todo: Iterable[Piece], done: Callable[[Piece], Record | None]) -> Iterator[tuple[Record, bool]]:
-    """What became of each piece, as it is done; those of which something is known already are not made again."""
+def _run(
+    executor: Executor, todo: Iterable[Piece], done: Callable[[Piece], Record | None]
+) -> Iterator[tuple[Record, bool]]:
+    """What became of each piece, as it is done; those of which something is known already are not
+    made again.
+    """
     ended = queue.SimpleQueue[tuple[Piece, Future[Any]]]()
     tasks, running = deque((survey if _is_large(piece) else converted, piece) for piece in todo), 0
     ahead = 1 if isinstance(executor, _Here) else AHEAD
 
     def hand_over(function: Callable[[Piece], Any], piece: Piece) -> None:
-        executor.submit(function, piece).add_done_callback(lambda future: ended.put((piece, future)))
+        executor.submit(function, piece).add_done_callback(
+            lambda future: ended.put((piece, future))
+        )
 
     while tasks or running:
         while tasks and running < ahead:
@@ -460,7 +577,10 @@ def _run(executor: Executor, todo: Iterable[Piece], done: Callable[[Piece], Reco
         try:
             result = future.result()
         except BrokenProcessPool:
-            error = SourceError("a worker process was killed, maybe for want of memory; what it was at is not written")
+            error = SourceError(
+                "a worker process was killed, maybe for want of memory; what it was at is not"
+                " written"
+            )
             raise suggest(error, "the same again, which goes on where this ended") from None
         except Exception as failure:  # of a survey, or a worker of Dask that died again and again
             result = piece.failed(failure)
@@ -491,7 +611,9 @@ def _try(to: str) -> None:
 
 @contextlib.contextmanager
 def _swept(folder: str, to: str) -> Iterator[None]:
-    """A folder in which, before and after, nothing is left that a process was writing when it was killed."""
+    """A folder in which, before and after, nothing is left that a process was writing when it was
+    killed.
+    """
 
     def sweep() -> None:
         for path in () if is_stored(folder) else Path(folder).rglob(f".*.{to}"):
@@ -513,9 +635,11 @@ def read(
     select: Selection = EVERYTHING,
     size: int = PARTITION,
 ) -> Any:
-    """The points of many files as a Dask dataframe, a partition for each piece, whose columns are those of a Parquet file.
+    """The points of many files as a Dask dataframe, a partition for each piece, whose columns are
+    those of a Parquet file.
 
-    A file that is larger than a piece is passed over once at this call, without making its points; the rest waits until it is asked for.
+    A file that is larger than a piece is passed over once at this call, without making its points;
+    the rest waits until it is asked for.
 
     Args:
         urls: paths, patterns such as "s3://bucket/drives/**/*.pcap", and URLs of fsspec.
@@ -530,7 +654,13 @@ def read(
     """
     dask, frames = import_library("dask", "dask"), import_library("dask.dataframe", "dask")
     import_library("pyarrow", "arrow")
-    todo = pieces([urls] if isinstance(urls, str) else urls, sensor, every_point=every_point, size=size, select=select)
+    todo = pieces(
+        [urls] if isinstance(urls, str) else urls,
+        sensor,
+        every_point=every_point,
+        size=size,
+        select=select,
+    )
     found = dask.compute(*(dask.delayed(_cut)(piece) for piece in todo))
     cut = [piece for pieces in found for piece in pieces if piece.count != 0 or not piece.number]
     return frames.from_map(_partition, cut, meta=_partition(replace(cut[0], count=1)).iloc[:0])

@@ -1,8 +1,10 @@
-"""Entry points: what installed distributions declare, by group, found without importing any of them.
+"""Entry points: what installed distributions declare, by group, found without importing any of
+them.
 
-They are read straight from the folders that Python imports from: importlib.metadata finds the same ones, but importing it takes
-longer than all else that finding a sensor takes. It is asked where something could be installed in another way than as a folder: in a
-zip file or an egg, or by an import hook.
+They are read straight from the folders that Python imports from: importlib.metadata finds the same
+ones, but importing it takes longer than all else that finding a sensor takes. It is asked where
+something could be installed in another way than as a folder: in a zip file or an egg, or by an
+import hook.
 """
 
 from __future__ import annotations
@@ -28,7 +30,9 @@ class _NotOnlyFolders(Exception):
 
 
 class EntryPoint(NamedTuple):
-    """One entry point: its name, the module or object that it stands for, and the distribution that declares it."""
+    """One entry point: its name, the module or object that it stands for, and the distribution that
+    declares it.
+    """
 
     name: str
     value: str
@@ -55,7 +59,9 @@ class EntryPoint(NamedTuple):
 
 
 def entry_points(group: str) -> list[EntryPoint]:
-    """Every entry point of a group, sorted by name and value; of several distributions of one name those of the first."""
+    """Every entry point of a group, sorted by name and value; of several distributions of one name
+    those of the first.
+    """
     try:
         found = [entry for folder in _distributions() for entry in _declared(folder, group)]
     except _NotOnlyFolders:
@@ -65,7 +71,10 @@ def entry_points(group: str) -> list[EntryPoint]:
 
 def _distributions() -> Iterator[str]:
     """The folders that describe the installed distributions, the first one of each name."""
-    if any(hasattr(finder, "find_distributions") and finder is not PathFinder for finder in sys.meta_path):
+    if any(
+        hasattr(finder, "find_distributions") and finder is not PathFinder
+        for finder in sys.meta_path
+    ):
         raise _NotOnlyFolders
     seen = set()
     for place in sys.path:
@@ -95,7 +104,9 @@ def _listed(place: str) -> list[str]:
 
 
 def _declared(folder: str, group: str) -> Iterator[EntryPoint]:
-    """The entry points of a group that one distribution declares; where not all can be read, one that says so among the modules."""
+    """The entry points of a group that one distribution declares; where not all can be read, one
+    that says so among the modules.
+    """
     text = _text(folder, "entry_points.txt")
     is_damaged = "\ufffd" in text and group == GROUP
     if not is_damaged and f"[{group}]" not in text:
@@ -134,10 +145,15 @@ def _by_metadata(group: str) -> list[EntryPoint]:
         name, version = str(getattr(distribution, "_path", "?")), "?"
         try:
             name, version = distribution.name or name, distribution.version
-            entries = [EntryPoint(e.name, e.value, name, version) for e in distribution.entry_points.select(group=group)]
+            entries = [
+                EntryPoint(e.name, e.value, name, version)
+                for e in distribution.entry_points.select(group=group)
+            ]
         except UnicodeDecodeError:
             entries = [EntryPoint("entry_points.txt", "", name, version)] if group == GROUP else []
-        except FileNotFoundError:  # so the finder of the library importlib_metadata says that there is no metadata
+        except (
+            FileNotFoundError
+        ):  # so the finder of the library importlib_metadata says that there is no metadata
             continue
         found.setdefault(normal(name), entries)
     return [entry for entries in found.values() for entry in entries]

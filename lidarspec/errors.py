@@ -1,8 +1,9 @@
 """Errors, by whose fault they are.
 
-``SpecError`` is the plugin author's, ``WireError`` the bytes', ``UsageError`` the caller's, ``SourceError`` the
-system's, ``CommandError`` the device's. Noise on a stream is none of them: decoders count it. Each error builds its
-own text from typed arguments, so that the place of a fault can be read from the exception as well as from the text.
+``SpecError`` is the plugin author's, ``WireError`` the bytes', ``UsageError`` the caller's,
+``SourceError`` the system's, ``CommandError`` the device's. Noise on a stream is none of them:
+decoders count it. Each error builds its own text from typed arguments, so that the place of a fault
+can be read from the exception as well as from the text.
 """
 
 from __future__ import annotations
@@ -16,7 +17,9 @@ from typing import Any, TypeVar
 
 
 class LidarSpecError(Exception):
-    """The base of every exception that lidarspec raises on purpose; any other one that leaves it is a bug."""
+    """The base of every exception that lidarspec raises on purpose; any other one that leaves it is
+    a bug.
+    """
 
 
 class SpecError(LidarSpecError):
@@ -38,7 +41,8 @@ _NOT_ITS_OWN = ("construct", "numpy", "pluggy", "hypothesis", "_pytest")
 
 
 class PluginError(SpecError):
-    """A function of a plugin raised, or returned what cannot be used; where a stream is read, it is counted.
+    """A function of a plugin raised, or returned what cannot be used; where a stream is read, it is
+    counted.
 
     Attributes:
         file, line: where in the plugin, "" and 0 where that is not known.
@@ -46,18 +50,34 @@ class PluginError(SpecError):
     """
 
     def __init__(
-        self, reason: str, *, path: str = "", sensor: str = "", rule: str = "", file: str = "", line: int = 0, traceback: str = ""
+        self,
+        reason: str,
+        *,
+        path: str = "",
+        sensor: str = "",
+        rule: str = "",
+        file: str = "",
+        line: int = 0,
+        traceback: str = "",
     ) -> None:
         self.file, self.line, self.traceback = file, line, traceback
         super().__init__(reason, path=path, sensor=sensor, rule=rule)
 
     @classmethod
-    def of(cls, error: Exception, what: str, *, sensor: str = "", function: Callable[..., Any] | None = None) -> PluginError:
+    def of(
+        cls,
+        error: Exception,
+        what: str,
+        *,
+        sensor: str = "",
+        function: Callable[..., Any] | None = None,
+    ) -> PluginError:
         """The error for what a plugin's function raised.
 
         Args:
             what: the function in words, such as "points of data".
-            function: it; where nothing of the plugin's own was running, its first line is the place.
+            function: it; where nothing of the plugin's own was running, its first line is the
+                place.
         """
         from traceback import format_exception  # where nothing fails, nobody waits for it
 
@@ -71,38 +91,66 @@ class PluginError(SpecError):
         kind = "" if type(error) is SpecError else f"{type(error).__name__}: "
         reason = f"{kind}{' '.join(str(error).split())}{place}"
         text = "".join(format_exception(error))
-        return cls(reason, path=what, sensor=sensor, rule=getattr(error, "rule", ""), file=file, line=line, traceback=text)
+        return cls(
+            reason,
+            path=what,
+            sensor=sensor,
+            rule=getattr(error, "rule", ""),
+            file=file,
+            line=line,
+            traceback=text,
+        )
 
 
 def printable(text: str) -> str:
-    """The text with all spelled out (`\\x1b`) that would steer a terminal or turn the direction of writing, but for ends of lines."""
+    """The text with all spelled out (`\\x1b`) that would steer a terminal or turn the direction of
+    writing, but for ends of lines.
+    """
     if text.isascii() and text.replace("\n", "").isprintable():
         return text
-    from unicodedata import category  # control, format and half characters; separators of lines and paragraphs
+    from unicodedata import (
+        category,
+    )  # control, format and half characters; separators of lines and paragraphs
 
-    steering = {character for character in text if category(character) in ("Cc", "Cf", "Cs", "Zl", "Zp")} - {"\n", "\t"}
-    return text.translate({ord(one): one.encode("unicode_escape").decode("ascii") for one in steering})
+    steering = {
+        character for character in text if category(character) in ("Cc", "Cf", "Cs", "Zl", "Zp")
+    } - {"\n", "\t"}
+    return text.translate(
+        {ord(one): one.encode("unicode_escape").decode("ascii") for one in steering}
+    )
 
 
 def shown_path(file: str) -> str:
     """A path as it is typed in the folder that one is in; as it is where it lies elsewhere."""
-    return os.path.relpath(file) if os.path.abspath(file).startswith(os.path.join(os.getcwd(), "")) else file
+    return (
+        os.path.relpath(file)
+        if os.path.abspath(file).startswith(os.path.join(os.getcwd(), ""))
+        else file
+    )
 
 
 def raised_at(error: BaseException) -> tuple[str, int]:
-    """File and line of the plugin that an exception came out of: the innermost that is neither ours nor a library's; "" and 0 for none."""
+    """File and line of the plugin that an exception came out of: the innermost that is neither ours
+    nor a library's; "" and 0 for none.
+    """
     from traceback import extract_tb
 
     ours = os.path.join(os.path.dirname(__file__), "")
     for spot in reversed(extract_tb(error.__traceback__)):
         file = spot.filename
-        if os.path.isfile(file) and not file.startswith(ours) and not set(file.split(os.sep)) & set(_NOT_ITS_OWN):
+        if (
+            os.path.isfile(file)
+            and not file.startswith(ours)
+            and not set(file.split(os.sep)) & set(_NOT_ITS_OWN)
+        ):
             return file, spot.lineno or 0
     return "", 0
 
 
 @contextmanager
-def plugin_errors(what: str, sensor: str, function: Callable[..., Any] | None = None) -> Iterator[None]:
+def plugin_errors(
+    what: str, sensor: str, function: Callable[..., Any] | None = None
+) -> Iterator[None]:
     """Whatever a plugin's function raises within, as a `PluginError`."""
     try:
         yield
@@ -133,9 +181,21 @@ class WireError(LidarSpecError):
         got: object = None,
         data: bytes = b"",
     ) -> None:
-        self.reason, self.sensor, self.frame, self.offset, self.path = reason, sensor, frame, offset, path
+        self.reason, self.sensor, self.frame, self.offset, self.path = (
+            reason,
+            sensor,
+            frame,
+            offset,
+            path,
+        )
         self.expected, self.got, self.data = expected, got, data
-        super().__init__(": ".join(part for part in (" ".join(part for part in (sensor, frame) if part), reason) if part))
+        super().__init__(
+            ": ".join(
+                part
+                for part in (" ".join(part for part in (sensor, frame) if part), reason)
+                if part
+            )
+        )
 
 
 class UsageError(LidarSpecError):
@@ -166,7 +226,9 @@ class LibraryError(UsageError):
         self.least_version = least_version
         self.installed_version = installed_version
         needed = f"{distribution} {least_version} or later" if least_version else distribution
-        found = f"version {installed_version} is installed" if installed_version else "it is missing"
+        found = (
+            f"version {installed_version} is installed" if installed_version else "it is missing"
+        )
         super().__init__(f"this needs {needed}; {found}" + (f" ({cause})" if cause else ""))
         suggest(self, f"pip install 'lidarspec[{extra}]'")
 
@@ -183,7 +245,8 @@ def did_you_mean(
     aliases: Mapping[str, str] = MappingProxyType({}),
     max_parts: int = SUGGESTED,
 ) -> str:
-    """A closing clause such as ``; did you mean 'speed'?``, or an empty text where nothing is close.
+    """A closing clause such as ``; did you mean 'speed'?``, or an empty text where nothing is
+    close.
 
     Names that have this one as a part are meant before the one whose letters are the most alike.
 
@@ -195,7 +258,9 @@ def did_you_mean(
     import difflib  # for the one call in many thousands that has to suggest something
 
     by_letters = {other.lower(): aliases.get(other, other) for other in (*known, *aliases)}
-    parts = dict.fromkeys(meant for other, meant in by_letters.items() if len(name) > 1 and name.lower() in other)
+    parts = dict.fromkeys(
+        meant for other, meant in by_letters.items() if len(name) > 1 and name.lower() in other
+    )
     close = difflib.get_close_matches(name.lower(), by_letters, n=1, cutoff=alike)
     named = list(parts) if 0 < len(parts) <= max_parts else [by_letters[other] for other in close]
     return f"; did you mean {listed(named)}?" if named else ""
@@ -212,7 +277,9 @@ _Failure = TypeVar("_Failure", bound=BaseException)
 
 
 def suggest(error: _Failure, command: str) -> _Failure:
-    """The error that is given, with the next command to type as a note; one that it has already stays."""
+    """The error that is given, with the next command to type as a note; one that it has already
+    stays.
+    """
     if not suggestion(error):
         error.add_note(_NEXT + command)
     return error
@@ -232,7 +299,8 @@ def refuse_text(data: object) -> None:
     """
     if isinstance(data, str | os.PathLike):
         raise UsageError(
-            f"bytes are taken, not {type(data).__name__}: bytes.fromhex(...) of hexadecimal text, lidarspec.open(...) of a file"
+            f"bytes are taken, not {type(data).__name__}: bytes.fromhex(...) of hexadecimal text,"
+            " lidarspec.open(...) of a file"
         )
 
 
@@ -251,10 +319,18 @@ class UnknownName(UsageError):
     max_listed: float = 12
 
     def __init__(
-        self, name: str, known: Iterable[str] = (), *, place: str = "", hint: str = "", aliases: Mapping[str, str] = MappingProxyType({})
+        self,
+        name: str,
+        known: Iterable[str] = (),
+        *,
+        place: str = "",
+        hint: str = "",
+        aliases: Mapping[str, str] = MappingProxyType({}),
     ) -> None:
         self.name, self.known, self.place = name, tuple(sorted(known)), place
-        suggestion = did_you_mean(name, self.known, alike=self.alike, aliases=aliases, max_parts=self.max_parts)
+        suggestion = did_you_mean(
+            name, self.known, alike=self.alike, aliases=aliases, max_parts=self.max_parts
+        )
         is_listed = 0 < len(self.known) <= self.max_listed and not suggestion
         names = f" (known: {', '.join(self.known)})" if is_listed else ""
         where = f"{place}: " if place else ""
@@ -265,7 +341,8 @@ class UnknownSensor(UnknownName):
     """No installed sensor has this id or alias.
 
     Attributes:
-        distribution: the distribution that has it, if that is known and is not installed or failed to load, else "".
+        distribution: the distribution that has it, if that is known and is not installed or failed
+            to load, else "".
         failure: why the installed distribution failed to load, else "".
     """
 
@@ -339,10 +416,21 @@ class MissingField(UsageError):
 class OutOfRange(UsageError):
     """A value that its field, or its command's argument, cannot take."""
 
-    def __init__(self, path: str, value: object, low: object, high: object, *, unit: str = "", place: str = "") -> None:
+    def __init__(
+        self,
+        path: str,
+        value: object,
+        low: object,
+        high: object,
+        *,
+        unit: str = "",
+        place: str = "",
+    ) -> None:
         self.path, self.value, self.low, self.high = path, value, low, high
         end = f" {unit}" if unit else ""
-        super().__init__(f"{place + ': ' if place else ''}{path} = {value} is outside {low} .. {high}{end}")
+        super().__init__(
+            f"{place + ': ' if place else ''}{path} = {value} is outside {low} .. {high}{end}"
+        )
 
 
 class SourceError(LidarSpecError):
@@ -375,7 +463,9 @@ class ReplyTimeout(CommandError, TimeoutError):
 
 @contextmanager
 def system_errors(place: object) -> Iterator[None]:
-    """What the system refuses within, an OSError, as the `SourceError` of a place, such as a path; what can be none is refused at once."""
+    """What the system refuses within, an OSError, as the `SourceError` of a place, such as a path;
+    what can be none is refused at once.
+    """
     if "\0" in str(place):
         raise SourceError(f"{str(place)!r}: no path has a zero byte in it")
     try:

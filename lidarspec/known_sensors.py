@@ -1,9 +1,10 @@
 """The sensors of this project's distributions, installed or not, read from a table.
 
-`known_sensors.json` is generated from the plugins by `make known-sensors` and is the only place in the core that names sensors. It
-serves two purposes: a sensor that is not installed can be named with its distribution, and the installed ones can be listed without
-loading their plugins. A row describes one version of a distribution; `plugins` uses it only if that version is installed and its entry
-points name the sensor as the row does.
+`known_sensors.json` is generated from the plugins by `make known-sensors` and is the only place in
+the core that names sensors. It serves two purposes: a sensor that is not installed can be named
+with its distribution, and the installed ones can be listed without loading their plugins. A row
+describes one version of a distribution; `plugins` uses it only if that version is installed and its
+entry points name the sensor as the row does.
 """
 
 from __future__ import annotations
@@ -24,7 +25,9 @@ _PREFIX = "lidarspec-"
 
 
 class KnownLink(NamedTuple):
-    """A link of a sensor: its kind, "serial", "udp", "tcp" or another, and its bauds or ports, the most likely first."""
+    """A link of a sensor: its kind, "serial", "udp", "tcp" or another, and its bauds or ports, the
+    most likely first.
+    """
 
     kind: str
     numbers: tuple[int, ...] = ()
@@ -34,7 +37,8 @@ class Signature(NamedTuple):
     """The constant bytes that a data frame begins with, and its size.
 
     Attributes:
-        sync: hexadecimal digits of each byte, ".." for a byte that is not constant, separated by spaces.
+        sync: hexadecimal digits of each byte, ".." for a byte that is not constant, separated by
+            spaces.
         size: the size of the frame in bytes; 0 if it varies.
     """
 
@@ -76,7 +80,9 @@ class KnownSensor(NamedTuple):
     @classmethod
     def from_dict(cls, row: Mapping[str, Any]) -> KnownSensor:
         """Return the row that `to_dict` wrote."""
-        links = {name: KnownLink(kind, tuple(numbers)) for name, (kind, *numbers) in row["links"].items()}
+        links = {
+            name: KnownLink(kind, tuple(numbers)) for name, (kind, *numbers) in row["links"].items()
+        }
         signatures = tuple(Signature(sync, size) for sync, size in row["signatures"])
         given = {**row, "aliases": tuple(row["aliases"]), "links": links, "signatures": signatures}
         return cls(**given)
@@ -87,23 +93,33 @@ def known_sensors() -> tuple[KnownSensor, ...]:
     """Return the rows of the table, sorted by id."""
     import json
 
-    with open(os.path.join(os.path.dirname(__file__), "known_sensors.json"), encoding="utf-8") as file:
+    with open(
+        os.path.join(os.path.dirname(__file__), "known_sensors.json"), encoding="utf-8"
+    ) as file:
         return tuple(KnownSensor.from_dict(row) for row in json.load(file))
 
 
 def describe_entry_points(entries: Iterable[EntryPoint]) -> list[KnownSensor]:
-    """Return the rows whose distribution is installed in the version of the row, with entry points of exactly its names."""
+    """Return the rows whose distribution is installed in the version of the row, with entry points
+    of exactly its names.
+    """
     offered: dict[tuple[str, str], dict[str, set[str]]] = {}
     for entry in entries:
         names = offered.setdefault((entry.distribution, entry.version), {})
         names.setdefault(entry.value, set()).add(entry.name)
-    return [row for row in known_sensors() if row.names in offered.get((row.distribution, row.version), {}).values()]
+    return [
+        row
+        for row in known_sensors()
+        if row.names in offered.get((row.distribution, row.version), {}).values()
+    ]
 
 
 def list_described_sensors() -> list[KnownSensor] | None:
-    """Return a row for each installed sensor, sorted by id; None if the table does not describe all of them.
+    """Return a row for each installed sensor, sorted by id; None if the table does not describe all
+    of them.
 
-    Then plugins have to be loaded: one that has hooks, is not of this project, or has a name that another one has too.
+    Then plugins have to be loaded: one that has hooks, is not of this project, or has a name that
+    another one has too.
     """
     if entry_points(GROUP):
         return None
@@ -116,7 +132,10 @@ def list_described_sensors() -> list[KnownSensor] | None:
 def find_known_sensor(name: str) -> KnownSensor | None:
     """Return the row with an id or alias, whatever its case and hyphens, else None."""
     letters = _letters(name)
-    return next((row for row in known_sensors() if any(_letters(known) == letters for known in row.names)), None)
+    return next(
+        (row for row in known_sensors() if any(_letters(known) == letters for known in row.names)),
+        None,
+    )
 
 
 def _letters(name: str) -> str:
@@ -126,14 +145,18 @@ def _letters(name: str) -> str:
 def install_command(*distributions: str, extra: str = "") -> str:
     """Return the command that installs distributions of this project.
 
-    No package index has them yet. If lidarspec runs from a checkout, the command names folders of it, else the repository.
+    No package index has them yet. If lidarspec runs from a checkout, the command names folders of
+    it, else the repository.
     """
     extras = f"[{extra}]" if extra else ""
     plugins = os.path.join(os.path.dirname(os.path.dirname(os.path.abspath(__file__))), "plugins")
     if os.path.isdir(plugins):
         sources = [os.path.join(plugins, name) + extras for name in distributions]
     else:
-        sources = [f"{name}{extras} @ git+{_REPOSITORY}#subdirectory=plugins/{name}" for name in distributions]
+        sources = [
+            f"{name}{extras} @ git+{_REPOSITORY}#subdirectory=plugins/{name}"
+            for name in distributions
+        ]
     return " ".join(["pip install", *map(_quote, sources)])
 
 
@@ -142,9 +165,14 @@ def _quote(word: str) -> str:
 
 
 def no_sensors() -> str:
-    """Return the text for an environment without any sensor: how to install those of a vendor, and the vendors."""
+    """Return the text for an environment without any sensor: how to install those of a vendor, and
+    the vendors.
+    """
     vendors = sorted({row.distribution.removeprefix(_PREFIX) for row in known_sensors()})
-    return f"no sensor is installed: {install_command(ANY_DISTRIBUTION)}\n  vendors: {', '.join(vendors)}"
+    return (
+        f"no sensor is installed: {install_command(ANY_DISTRIBUTION)}\n  vendors:"
+        f" {', '.join(vendors)}"
+    )
 
 
 def unknown_sensor(
@@ -153,7 +181,8 @@ def unknown_sensor(
     aliases: Mapping[str, str],
     failures: Mapping[str, str],
 ) -> UnknownSensor:
-    """Return the error for a sensor that is not installed, with the command that installs it if the table has it.
+    """Return the error for a sensor that is not installed, with the command that installs it if the
+    table has it.
 
     Args:
         name: an id or alias.
@@ -163,11 +192,20 @@ def unknown_sensor(
     """
     row = find_known_sensor(name)
     if row is not None:
-        return suggest(UnknownSensor(name, distribution=row.distribution), install_command(row.distribution))
+        return suggest(
+            UnknownSensor(name, distribution=row.distribution), install_command(row.distribution)
+        )
     installed = tuple(installed)
     if failures:
-        hint = "".join(f"; {distribution} failed to load: {reason}" for distribution, reason in failures.items())
-        return suggest(UnknownSensor(name, installed, aliases=aliases, hint=hint), "lidarspec plugins")
+        hint = "".join(
+            f"; {distribution} failed to load: {reason}"
+            for distribution, reason in failures.items()
+        )
+        return suggest(
+            UnknownSensor(name, installed, aliases=aliases, hint=hint), "lidarspec plugins"
+        )
     if not installed:
-        return suggest(UnknownSensor(name, hint="; no sensor is installed"), install_command(ANY_DISTRIBUTION))
+        return suggest(
+            UnknownSensor(name, hint="; no sensor is installed"), install_command(ANY_DISTRIBUTION)
+        )
     return UnknownSensor(name, installed, aliases=aliases)

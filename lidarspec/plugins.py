@@ -1,11 +1,13 @@
 """Plugins: the hooks that they may have, how they are found, and the registry of what they add.
 
-A distribution names its sensors in the entry-point group ``lidarspec.sensors``, one entry for each id and alias, so that asking for
-one sensor loads one plugin; modules with other hooks stand in the group ``lidarspec``, and are loaded before any sensor is handed out.
-A hook is a function of a name below, marked with ``@hookimpl``.
+A distribution names its sensors in the entry-point group ``lidarspec.sensors``, one entry for each
+id and alias, so that asking for one sensor loads one plugin; modules with other hooks stand in the
+group ``lidarspec``, and are loaded before any sensor is handed out. A hook is a function of a name
+below, marked with ``@hookimpl``.
 
-Each plugin is loaded on its own. One that cannot be imported, names a hook that does not exist or adds a sensor that cannot be, is named
-with its distribution and its error, rolled back, and disturbs no other.
+Each plugin is loaded on its own. One that cannot be imported, names a hook that does not exist or
+adds a sensor that cannot be, is named with its distribution and its error, rolled back, and
+disturbs no other.
 """
 
 from __future__ import annotations
@@ -33,7 +35,14 @@ from zlib import crc32
 import pluggy
 
 from lidarspec.entry_points import GROUP, SENSORS, VERBS, EntryPoint, entry_points, normal
-from lidarspec.errors import LidarSpecError, SourceError, SpecError, UnknownSensor, UsageError, suggest
+from lidarspec.errors import (
+    LidarSpecError,
+    SourceError,
+    SpecError,
+    UnknownSensor,
+    UsageError,
+    suggest,
+)
 from lidarspec.known_sensors import KnownLink, KnownSensor, describe_entry_points, unknown_sensor
 from lidarspec.spec.checksums import Checksum
 from lidarspec.spec.description import Frame
@@ -66,22 +75,30 @@ def lidarspec_checksum(sensor: Sensor, frame: Frame) -> Checksum | None:
 
 @hookspec(firstresult=True)
 def lidarspec_points(sensor: Sensor, fields: Any) -> Points | None:
-    """The points of a batch of packets, or None to leave them to the sensor: a site's own calibration, for example."""
+    """The points of a batch of packets, or None to leave them to the sensor: a site's own
+    calibration, for example.
+    """
 
 
 @hookspec(firstresult=True)
 def lidarspec_source(url: str, sensor: Sensor | None) -> Any:
-    """A transport for a URL scheme that the package does not know, or None; `sensor`: whose packets they are to be, where that is known."""
+    """A transport for a URL scheme that the package does not know, or None; `sensor`: whose packets
+    they are to be, where that is known.
+    """
 
 
 @hookspec(firstresult=True)
 def lidarspec_link(source: str, link: Link, host: str | None) -> Any:
-    """The open transport of a link of a kind that the package does not know, over which commands go, or None."""
+    """The open transport of a link of a kind that the package does not know, over which commands
+    go, or None.
+    """
 
 
 @hookspec
 def lidarspec_verbs() -> Iterable[click.Command]:  # type: ignore[empty-body]
-    """The verbs of the command line that a module adds, which the entry-point group `lidarspec.verbs` names."""
+    """The verbs of the command line that a module adds, which the entry-point group
+    `lidarspec.verbs` names.
+    """
 
 
 @hookspec
@@ -117,7 +134,9 @@ class HookedPoints:
 
 @dataclass(frozen=True)
 class Plugin:
-    """A plugin that was found: where it comes from, the ids it adds, what kept it or one of its ids out, and what it does besides."""
+    """A plugin that was found: where it comes from, the ids it adds, what kept it or one of its ids
+    out, and what it does besides.
+    """
 
     distribution: str
     version: str
@@ -130,23 +149,31 @@ class Plugin:
     @property
     def home(self) -> Home:
         """Its distribution and module."""
-        return self.distribution, EntryPoint("", self.entry_point.partition(" = ")[2], self.distribution, self.version).module
+        return (
+            self.distribution,
+            EntryPoint(
+                "", self.entry_point.partition(" = ")[2], self.distribution, self.version
+            ).module,
+        )
 
 
 class Registry:
     """The plugins of this environment, and the sensors with their hooks applied.
 
-    Several plugins may claim one name, an id or an alias. An entry point of this name, or a module that is always loaded, counts before a
-    sensor that merely has it. Of several distributions the owner has it: whom the user's own settings name, else `lidarspec-VENDOR` for
-    ids that begin with this vendor, and for the aliases of such a sensor; of two modules of one distribution the first. Where there is no
-    owner, to ask for the name is an error. All else of a plugin that loses a name stays.
+    Several plugins may claim one name, an id or an alias. An entry point of this name, or a module
+    that is always loaded, counts before a sensor that merely has it. Of several distributions the
+    owner has it: whom the user's own settings name, else `lidarspec-VENDOR` for ids that begin with
+    this vendor, and for the aliases of such a sensor; of two modules of one distribution the first.
+    Where there is no owner, to ask for the name is an error. All else of a plugin that loses a name
+    stays.
 
     Two threads may load the same sensor at the same time: it is then added twice, and is the same.
 
     Args:
         modules: entry points of modules with hooks; each is loaded at once.
         offered: entry points of sensors, by id and alias; each is loaded when it is asked for.
-        owners: gives the distributions that the user names as owners, by id; asked where several claim a name.
+        owners: gives the distributions that the user names as owners, by id; asked where several
+            claim a name.
     """
 
     def __init__(
@@ -159,11 +186,16 @@ class Registry:
         self._manager.add_hookspecs(sys.modules[__name__])
         self._named_owners = functools.cache(owners)
         self._sensors: dict[Home, dict[str, Sensor]] = {}
-        self._claims: dict[str, dict[Home, bool]] = {}  # name -> who claims it, and whether before being loaded
+        self._claims: dict[
+            str, dict[Home, bool]
+        ] = {}  # name -> who claims it, and whether before being loaded
         self._ready: dict[str, Sensor] = {}
         self._offered: dict[Home, list[EntryPoint]] = {}
         self._tried: dict[EntryPoint, Plugin] = {}
-        self._modules = [_loaded(entry, entry.name, functools.partial(self._add_module, entry)) for entry in modules]
+        self._modules = [
+            _loaded(entry, entry.name, functools.partial(self._add_module, entry))
+            for entry in modules
+        ]
         for entry in offered:
             home = (entry.distribution, entry.module)
             self._offered.setdefault(home, []).append(entry)
@@ -171,28 +203,41 @@ class Registry:
 
     @property
     def plugins(self) -> list[Plugin]:
-        """Every plugin that was found; those that could not be loaded, or lost a name to another, say why."""
+        """Every plugin that was found; those that could not be loaded, or lost a name to another,
+        say why.
+        """
         self._load_all()
         offered = [self._together(entries) for entries in self._offered.values()]
         return [self._judged(plugin) for plugin in (*self._modules, *offered)]
 
     def _judged(self, plugin: Plugin) -> Plugin:
-        """The plugin with the ids that it has, and the first name that another has, or that nobody can be said to have."""
+        """The plugin with the ids that it has, and the first name that another has, or that nobody
+        can be said to have.
+        """
         home = plugin.home
         own = sorted(name for name in self._sensors.get(home, {}) if self._holder(name) == home)
-        lost = [name for name, homes in self._claims.items() if home in homes and self._holder(name) != home]
+        lost = [
+            name
+            for name, homes in self._claims.items()
+            if home in homes and self._holder(name) != home
+        ]
         if lost and not plugin.error:
             holder = self._holder(lost[0])
-            others = [holder] if holder else [other for other in self._claims[lost[0]] if other != home]
+            others = (
+                [holder] if holder else [other for other in self._claims[lost[0]] if other != home]
+            )
             whose = ", ".join(":".join(other) for other in others)
-            plugin = replace(plugin, error=f"{lost[0]}: another sensor has this id already: that of {whose}")
+            plugin = replace(
+                plugin, error=f"{lost[0]}: another sensor has this id already: that of {whose}"
+            )
         return replace(plugin, sensors=tuple(own))
 
     def add(self, plugin: Any, *, name: str) -> list[str]:
         """Register one plugin (a module or object with hooks) and return the ids that it adds.
 
         Raises:
-            SpecError: for an unknown hook, a wrong signature, or a sensor that cannot be; nothing is left registered.
+            SpecError: for an unknown hook, a wrong signature, or a sensor that cannot be; nothing
+                is left registered.
         """
         _check_hooks(plugin, name)
         try:
@@ -214,7 +259,9 @@ class Registry:
 
     def _load(self, entry: EntryPoint) -> None:
         if entry not in self._tried:
-            self._tried[entry] = _loaded(entry, entry.name, functools.partial(self._add_offered, entry))
+            self._tried[entry] = _loaded(
+                entry, entry.name, functools.partial(self._add_offered, entry)
+            )
 
     def _load_all(self) -> None:
         for entries in self._offered.values():
@@ -225,7 +272,10 @@ class Registry:
         """Keep a sensor that an entry point names by its id or one of its aliases."""
         self._check(sensor, [sensor])
         if entry.name not in (sensor.id, *sensor.aliases):
-            raise SpecError(f"its entry point is called {entry.name!r}, which is none of its names", sensor=sensor.id)
+            raise SpecError(
+                f"its entry point is called {entry.name!r}, which is none of its names",
+                sensor=sensor.id,
+            )
         self._keep((entry.distribution, entry.module), [sensor])
         return [sensor.id]
 
@@ -257,17 +307,26 @@ class Registry:
             return next(iter(first.values()), None)
         alike = {home: self._alike(home, name) for home in first.values()}
         named = self._named_owners()
-        wanted = {home: {normal(named[one]) for one in names if one in named} for home, names in alike.items()}
+        wanted = {
+            home: {normal(named[one]) for one in names if one in named}
+            for home, names in alike.items()
+        }
         chosen = [home for home in alike if normal(home[0]) in wanted[home]]
-        owners = chosen or [home for home, names in alike.items() if not wanted[home] and _is_vendor(home[0], names)]
+        owners = chosen or [
+            home for home, names in alike.items() if not wanted[home] and _is_vendor(home[0], names)
+        ]
         return owners[0] if len(owners) == 1 else None
 
     def _alike(self, home: Home, name: str) -> set[str]:
-        """All names of the sensor that somebody claims this one for, as far as they are known before it is loaded."""
+        """All names of the sensor that somebody claims this one for, as far as they are known
+        before it is loaded.
+        """
         entries = self._offered.get(home, [])
         values = {entry.value for entry in entries if entry.name == name}
         loaded = [{one.id, *one.aliases} for one in self._sensors.get(home, {}).values()]
-        return {entry.name for entry in entries if entry.value in values}.union(*(names for names in loaded if name in names))
+        return {entry.name for entry in entries if entry.value in values}.union(
+            *(names for names in loaded if name in names)
+        )
 
     def _find(self, name: str) -> Sensor | None:
         """The sensor that has a name; None where there is none, or it does not load.
@@ -281,16 +340,27 @@ class Registry:
                 return None
             whose = [home[0] for home in self._claims[name]]
             told = f"{' and '.join(dict.fromkeys(whose))} each have a sensor of this name"
-            error = UsageError(f'{name}: {told}; say whose it is in {own_settings()}: [owners] {name} = "{whose[0]}"')
+            error = UsageError(
+                f"{name}: {told}; say whose it is in {own_settings()}: [owners] {name} ="
+                f' "{whose[0]}"'
+            )
             raise suggest(error, "lidarspec plugins")
         for entry in self._offered.get(home, []):
             if entry.name == name:
                 self._load(entry)
-        return next((one for one in self._sensors.get(home, {}).values() if name in (one.id, *one.aliases)), None)
+        return next(
+            (one for one in self._sensors.get(home, {}).values() if name in (one.id, *one.aliases)),
+            None,
+        )
 
     def _found(self) -> dict[str, Sensor]:
         """Every sensor that is loaded, by id, with those left out whose id is another's."""
-        return {name: one for home, own in self._sensors.items() for name, one in own.items() if self._holder(name) == home}
+        return {
+            name: one
+            for home, own in self._sensors.items()
+            for name, one in own.items()
+            if self._holder(name) == home
+        }
 
     def names(self) -> list[str]:
         """Every id and alias, sorted; what only has an entry point is not loaded for it."""
@@ -304,13 +374,17 @@ class Registry:
         return self.find(name) is not None
 
     def find(self, name: str) -> Sensor | None:
-        """Return the sensor with an id or alias, else None; only the plugin whose entry point has this name is loaded."""
+        """Return the sensor with an id or alias, else None; only the plugin whose entry point has
+        this name is loaded.
+        """
         if self._holder(name) is None or self._find(name) is None:
             return None
         return self.sensor(name)
 
     def sensors(self) -> dict[str, Sensor]:
-        """Every sensor by id, sorted, with its hooks applied; those whose id several claim, and nobody owns, are left out."""
+        """Every sensor by id, sorted, with its hooks applied; those whose id several claim, and
+        nobody owns, are left out.
+        """
         self._load_all()
         return {name: self.sensor(name) for name in sorted(self._found())}
 
@@ -325,7 +399,9 @@ class Registry:
         return [plugin for plugin in map(self._judged, (*self._modules, *offered)) if plugin.error]
 
     def list_sensors(self) -> list[KnownSensor]:
-        """Return a row for each installed sensor, sorted by id; only plugins that the table does not describe are loaded."""
+        """Return a row for each installed sensor, sorted by id; only plugins that the table does
+        not describe are loaded.
+        """
         described = describe_entry_points(itertools.chain.from_iterable(self._offered.values()))
         names = {(row.distribution, name) for row in described for name in row.names}
         for entries in self._offered.values():
@@ -344,21 +420,30 @@ class Registry:
         return home is not None and home[0] == distribution
 
     def _version(self, distribution: str) -> str:
-        versions = (entry.version for entries in self._offered.values() for entry in entries if entry.distribution == distribution)
+        versions = (
+            entry.version
+            for entries in self._offered.values()
+            for entry in entries
+            if entry.distribution == distribution
+        )
         loaded = (plugin.version for plugin in self._modules if plugin.distribution == distribution)
         return next(versions, None) or next(loaded, "")
 
     def sensor(self, name: str) -> Sensor:
-        """One sensor by id or alias, in capitals and with other hyphens too, with its hooks applied.
+        """One sensor by id or alias, in capitals and with other hyphens too, with its hooks
+        applied.
 
         Raises:
-            UnknownSensor: with a suggestion, or with what to install where there is no sensor at all.
+            UnknownSensor: with a suggestion, or with what to install where there is no sensor at
+                all.
             UsageError: where several distributions claim the name, and none owns it.
         """
         found = self._find(name)
         if found is None:
             self._load_all()
-            name = next((known for known in self._claims if _letters(known) == _letters(name)), name)
+            name = next(
+                (known for known in self._claims if _letters(known) == _letters(name)), name
+            )
             found = self._find(name)
         if found is not None and found.id != name:
             own, name = found, found.id  # whoever has the id has its aliases too
@@ -367,7 +452,9 @@ class Registry:
         if found is None:
             known = self._found()
             aliases = {alias: one.id for one in known.values() for alias in one.aliases}
-            raise self._load_error(name) or unknown_sensor(name, known, aliases, self._failed_modules())
+            raise self._load_error(name) or unknown_sensor(
+                name, known, aliases, self._failed_modules()
+            )
         if name not in self._ready:
             self._ready.setdefault(name, self.hooked(found))  # another thread may have been first
         return self._ready[name]
@@ -381,8 +468,14 @@ class Registry:
         return None
 
     def _failed_modules(self) -> dict[str, str]:
-        """Return the reasons why modules with hooks failed to load, by distribution: their sensors are not known."""
-        return {plugin.distribution: plugin.error for plugin in self._modules if plugin.error and not plugin.sensors}
+        """Return the reasons why modules with hooks failed to load, by distribution: their sensors
+        are not known.
+        """
+        return {
+            plugin.distribution: plugin.error
+            for plugin in self._modules
+            if plugin.error and not plugin.sensors
+        }
 
     def hooked(self, sensor: Sensor) -> Sensor:
         """The sensor with the checksum and points hooks of all plugins applied to it."""
@@ -394,9 +487,15 @@ class Registry:
         def asked(function: Any) -> Any:
             if isinstance(function, Mapping):
                 return {path: asked(own) for path, own in function.items()}
-            return function if function is None or isinstance(function, HookedPoints) else HookedPoints(sensor, function, points)
+            return (
+                function
+                if function is None or isinstance(function, HookedPoints)
+                else HookedPoints(sensor, function, points)
+            )
 
-        frames = {name: replace(frame, points=asked(frame.points)) for name, frame in frames.items()}
+        frames = {
+            name: replace(frame, points=asked(frame.points)) for name, frame in frames.items()
+        }
         return replace(sensor, frames=frames, points=asked(sensor.points), hooked=self.hooked)
 
     def call(self, hook: str, **arguments: Any) -> Any:
@@ -404,7 +503,9 @@ class Registry:
         return getattr(self._manager.hook, hook)(**arguments)
 
     def _sealed(self, sensor: Sensor, frame: Frame) -> Frame:
-        """The frame with the checksum of the first hook that has one for it; a hook that fails is named and passed over."""
+        """The frame with the checksum of the first hook that has one for it; a hook that fails is
+        named and passed over.
+        """
         arguments = {"sensor": sensor, "frame": frame}
         for hook in reversed(self._manager.hook.lidarspec_checksum.get_hookimpls()):
             try:
@@ -412,20 +513,27 @@ class Registry:
                 if algorithm is not None:
                     return _resealed(frame, algorithm)
             except Exception as error:
-                self._failed(hook.plugin_name, f"lidarspec_checksum for {sensor.id}: {type(error).__name__}: {error}")
+                self._failed(
+                    hook.plugin_name,
+                    f"lidarspec_checksum for {sensor.id}: {type(error).__name__}: {error}",
+                )
         return frame
 
     def _failed(self, name: str, reason: str) -> None:
         for index, plugin in enumerate(self._modules):
             if ":".join(plugin.home) == name and not plugin.error:
-                self._modules[index] = replace(plugin, error=reason, traceback=traceback.format_exc())
+                self._modules[index] = replace(
+                    plugin, error=reason, traceback=traceback.format_exc()
+                )
 
     def _check(self, sensor: Any, own: list[Any]) -> None:
         if not isinstance(sensor, Sensor):
             raise SpecError(f"lidarspec_sensors returns sensors, not {type(sensor).__name__}")
         for name in (sensor.id, *sensor.aliases):
             if sum(name in (s.id, *s.aliases) for s in own) > 1:
-                raise SpecError("another sensor has this id already: one of the same plugin", sensor=name)
+                raise SpecError(
+                    "another sensor has this id already: one of the same plugin", sensor=name
+                )
 
 
 def summarize(sensor: Sensor, distribution: str, version: str) -> KnownSensor:
@@ -459,18 +567,30 @@ def _summarize_link(link: Link) -> KnownLink:
 
 
 def _is_vendor(distribution: str, names: Iterable[str]) -> bool:
-    """Whether a distribution is `lidarspec-VENDOR`, of the vendor that one of the names begins with."""
+    """Whether a distribution is `lidarspec-VENDOR`, of the vendor that one of the names begins
+    with.
+    """
     prefix, _, vendor = normal(distribution).partition("-")
-    return prefix == NAMESPACE and bool(vendor) and any(name.startswith(f"{vendor}-") for name in names)
+    return (
+        prefix == NAMESPACE
+        and bool(vendor)
+        and any(name.startswith(f"{vendor}-") for name in names)
+    )
 
 
 def named_owners() -> dict[str, str]:
-    """The distributions that the user's own settings name as the owners of ids; what is wrong there is warned of."""
+    """The distributions that the user's own settings name as the owners of ids; what is wrong there
+    is warned of.
+    """
     file = own_settings()
     try:
         named = document(file).get("owners", {}) if file.is_file() else {}
-        if not isinstance(named, dict) or not all(isinstance(value, str) for value in named.values()):
-            raise UsageError(f'{file}: [owners]: ids and distributions, such as acme-x1 = "acme-lidars"')
+        if not isinstance(named, dict) or not all(
+            isinstance(value, str) for value in named.values()
+        ):
+            raise UsageError(
+                f'{file}: [owners]: ids and distributions, such as acme-x1 = "acme-lidars"'
+            )
     except LidarSpecError as error:
         warnings.warn(f"{error}; its [owners] are left out", stacklevel=2)
         return {}
@@ -478,7 +598,8 @@ def named_owners() -> dict[str, str]:
 
 
 def _import_in_time(entry: EntryPoint) -> Any:
-    """Import an entry point, and return its module or object. An import that hangs is reported and left alone in its thread.
+    """Import an entry point, and return its module or object. An import that hangs is reported and
+    left alone in its thread.
 
     Raises:
         SpecError: where it hangs.
@@ -500,11 +621,18 @@ def _import_in_time(entry: EntryPoint) -> Any:
     thread.start()
     thread.join(PATIENCE)
     if thread.is_alive():
-        warnings.warn(f"{entry.distribution}: {entry.module} has been loading for {PATIENCE:g} s; next: lidarspec plugins", stacklevel=2)
+        warnings.warn(
+            f"{entry.distribution}: {entry.module} has been loading for {PATIENCE:g} s; next:"
+            " lidarspec plugins",
+            stacklevel=2,
+        )
         thread.join(max(LIMIT - PATIENCE, 0))
     if not outcome:
         _hanging[entry.module] = f"it hangs: not loaded after {LIMIT:g} s{_describe_place(thread)}"
-        warnings.warn(f"{entry.distribution}: {_hanging[entry.module]}; what it adds is left out", stacklevel=2)
+        warnings.warn(
+            f"{entry.distribution}: {_hanging[entry.module]}; what it adds is left out",
+            stacklevel=2,
+        )
         raise SpecError(_hanging[entry.module])
     loaded, failure = outcome[0]
     if failure is not None:
@@ -513,7 +641,9 @@ def _import_in_time(entry: EntryPoint) -> Any:
 
 
 def _describe_place(thread: threading.Thread) -> str:
-    """Return " at FILE, line NUMBER" for the line of a module that a thread is importing; "" if there is none."""
+    """Return " at FILE, line NUMBER" for the line of a module that a thread is importing; "" if
+    there is none.
+    """
     stack = traceback.extract_stack(sys._current_frames().get(thread.ident or 0))
     module_frames = [frame for frame in stack if frame.name == "<module>"]
     if not module_frames:
@@ -529,7 +659,9 @@ def _loaded(entry: EntryPoint, names: str, add: Callable[[Any], list[str]]) -> P
     except KeyboardInterrupt:
         raise
     except BaseException as error:
-        reason = str(error) if isinstance(error, LidarSpecError) else f"{type(error).__name__}: {error}"
+        reason = (
+            str(error) if isinstance(error, LidarSpecError) else f"{type(error).__name__}: {error}"
+        )
         return replace(plugin, error=reason, traceback=traceback.format_exc())
 
 
@@ -556,10 +688,14 @@ def _check_hooks(plugin: Any, name: str) -> None:
     """pluggy passes over a misspelt hook in silence; a name that begins like one has to be one."""
     for attribute in dir(plugin):
         function = getattr(plugin, attribute, None)
-        if not _is_hook(function) and not (attribute.startswith("lidarspec_") and inspect.isfunction(function)):
+        if not _is_hook(function) and not (
+            attribute.startswith("lidarspec_") and inspect.isfunction(function)
+        ):
             continue
         if attribute not in HOOKS:
-            raise SpecError(f"there is no hook {attribute!r}; hooks are {', '.join(HOOKS)}", path=name)
+            raise SpecError(
+                f"there is no hook {attribute!r}; hooks are {', '.join(HOOKS)}", path=name
+            )
         if not _is_hook(function):
             raise SpecError(f"{attribute} lacks @hookimpl", path=name)
 
@@ -576,19 +712,32 @@ def registry() -> Registry:
 
 
 def tried() -> list[Plugin]:
-    """Every plugin that was found: loaded in another process, and here where it neither hangs there nor ends the process."""
+    """Every plugin that was found: loaded in another process, and here where it neither hangs there
+    nor ends the process.
+    """
     if len(_registries) > 1:  # one stands in for what is installed
         return registry().plugins
     groups = [_modules(), entry_points(SENSORS)]
     entries = {(entry.distribution, entry.module): entry for group in groups for entry in group}
     trials = _trials(list(entries))
     lost = [
-        Plugin(entry.distribution, entry.version, f"{entry.name} = {entry.value}", error=trials[home][0])
+        Plugin(
+            entry.distribution,
+            entry.version,
+            f"{entry.name} = {entry.value}",
+            error=trials[home][0],
+        )
         for home, entry in entries.items()
         if trials[home][0]
     ]
-    modules, offered = ([entry for entry in group if not trials[entry.distribution, entry.module][0]] for group in groups)
-    return [replace(plugin, remark=trials[plugin.home][1]) for plugin in Registry(modules, offered, named_owners).plugins] + lost
+    modules, offered = (
+        [entry for entry in group if not trials[entry.distribution, entry.module][0]]
+        for group in groups
+    )
+    return [
+        replace(plugin, remark=trials[plugin.home][1])
+        for plugin in Registry(modules, offered, named_owners).plugins
+    ] + lost
 
 
 def _modules() -> list[EntryPoint]:
@@ -600,7 +749,9 @@ def _modules() -> list[EntryPoint]:
 
 
 def _trials(homes: list[Home]) -> dict[Home, tuple[str, str]]:
-    """Return the result of `_trial` for each plugin: from one process for all, or if anything is wrong in it, from one for each."""
+    """Return the result of `_trial` for each plugin: from one process for all, or if anything is
+    wrong in it, from one for each.
+    """
     from concurrent.futures import ThreadPoolExecutor
 
     nothing_wrong = ("", "")
@@ -621,27 +772,49 @@ def _trial(*homes: Home) -> tuple[str, str]:
     command = [sys.executable, "-P", "-c", code, *names, mark, str(LIMIT)]
     hangs, pipe = f"it hangs: not loaded after {LIMIT:g} s", subprocess.PIPE
     try:
-        done = subprocess.run(command, env=environment, timeout=9 * LIMIT, stdin=pipe, stdout=pipe, stderr=pipe, check=False)
+        done = subprocess.run(
+            command,
+            env=environment,
+            timeout=9 * LIMIT,
+            stdin=pipe,
+            stdout=pipe,
+            stderr=pipe,
+            check=False,
+        )
     except subprocess.TimeoutExpired:  # something that it began holds its output
         return hangs, ""
     output, complaints = (stream.decode(errors="replace") for stream in (done.stdout, done.stderr))
     printed, ended, threads = output.partition(mark)
     if not ended:
-        return hangs if "Timeout (" in complaints else f"it ends the process, with code {done.returncode}", ""
+        return (
+            (
+                hangs
+                if "Timeout (" in complaints
+                else f"it ends the process, with code {done.returncode}"
+            ),
+            "",
+        )
     text = " ".join((printed + complaints).split())
-    said = [f"it prints {shown(text)}"] * bool(text) + [f"it leaves a thread: {threads}"] * bool(threads)
+    said = [f"it prints {shown(text)}"] * bool(text) + [f"it leaves a thread: {threads}"] * bool(
+        threads
+    )
     return "", "; ".join(said)
 
 
 def load_alone() -> None:
-    """Load the plugins that the arguments name, print a mark and the threads that they leave, and end the process, which is for this."""
+    """Load the plugins that the arguments name, print a mark and the threads that they leave, and
+    end the process, which is for this.
+    """
     import faulthandler
 
     *names, mark, limit = sys.argv[1:]
     homes = set(zip(names[::2], names[1::2], strict=True))
     faulthandler.dump_traceback_later(float(limit), exit=True)
     groups = (_modules(), entry_points(SENSORS))
-    modules, offered = ([entry for entry in group if (entry.distribution, entry.module) in homes] for group in groups)
+    modules, offered = (
+        [entry for entry in group if (entry.distribution, entry.module) in homes]
+        for group in groups
+    )
     before = set(threading.enumerate())
     Registry(modules, offered)._load_all()
     left = [thread.name for thread in threading.enumerate() if thread not in before]
@@ -659,7 +832,9 @@ def verb(entry: EntryPoint) -> click.Command:
     loaded = _loaded(entry, entry.name, functools.partial(local.add, name=place))
     if loaded.error:
         raise SpecError(loaded.error, path=entry.distribution)
-    found: dict[str, click.Command] = {one.name: one for verbs in local.call("lidarspec_verbs") for one in verbs}
+    found: dict[str, click.Command] = {
+        one.name: one for verbs in local.call("lidarspec_verbs") for one in verbs
+    }
     if entry.name not in found:
         raise SpecError(f"its lidarspec_verbs has no verb {entry.name!r}", path=entry.distribution)
     return found[entry.name]
@@ -682,7 +857,8 @@ def sensors() -> dict[str, Sensor]:
 
 
 def sensor(name: str | Path | Sensor) -> Sensor:
-    """One sensor: an installed one by id or alias, or one out of a file, "./mysensor.py" ("./mysensor.py:id" if it has several).
+    """One sensor: an installed one by id or alias, or one out of a file, "./mysensor.py"
+    ("./mysensor.py:id" if it has several).
 
     A sensor is given back as it is.
 
@@ -716,9 +892,15 @@ def _from_file(text: str) -> Sensor:
     with _faults_of(file):
         ids = local.add(module, name=str(file))
     if not ids:
-        raise SpecError("there is no function lidarspec_sensors, marked @hookimpl, that returns a sensor", path=str(file))
+        raise SpecError(
+            "there is no function lidarspec_sensors, marked @hookimpl, that returns a sensor",
+            path=str(file),
+        )
     if len(ids) > 1 and not wanted:
-        raise UsageError(f"{file} describes several sensors, name one: {', '.join(f'{file}:{name}' for name in ids)}")
+        raise UsageError(
+            f"{file} describes several sensors, name one:"
+            f" {', '.join(f'{file}:{name}' for name in ids)}"
+        )
     if wanted and wanted not in ids:
         raise UnknownSensor(wanted, ids, place=str(file))
     chosen = local.sensor(wanted or ids[0])
@@ -726,14 +908,17 @@ def _from_file(text: str) -> Sensor:
 
 
 def file_module(file: Path) -> ModuleType:
-    """A file as a module, which `sys.modules` has under a name of its own, as dataclasses, pickle and typing expect it.
+    """A file as a module, which `sys.modules` has under a name of its own, as dataclasses, pickle
+    and typing expect it.
 
     Raises:
         SourceError, SpecError: for one that is not there, or cannot be imported.
     """
     if not file.is_file():
         raise SourceError(f"{file}: no such file")
-    module_spec = importlib.util.spec_from_file_location(f"lidarspec_file_{file.stem}_{crc32(bytes(file.resolve())):08x}", file)
+    module_spec = importlib.util.spec_from_file_location(
+        f"lidarspec_file_{file.stem}_{crc32(bytes(file.resolve())):08x}", file
+    )
     if module_spec is None or module_spec.loader is None:
         raise SourceError(f"{file} is no Python file: its name does not end in .py")
     module = importlib.util.module_from_spec(module_spec)

@@ -1,4 +1,6 @@
-"""Files in stores, such as s3://bucket/drives/a.pcap: what fsspec reaches by URL, as files of this computer are by their paths."""
+"""Files in stores, such as s3://bucket/drives/a.pcap: what fsspec reaches by URL, as files of this
+computer are by their paths.
+"""
 
 from __future__ import annotations
 
@@ -15,7 +17,8 @@ from typing import Any, BinaryIO, cast
 from lidarspec.errors import LidarSpecError, SourceError, UsageError, suggest, system_errors
 from lidarspec.libraries import import_library
 
-#: what a URL of a store begins with, and the library that fsspec takes for it, where it has none of its own.
+#: what a URL of a store begins with, and the library that fsspec takes for it, where it has none of
+#: its own.
 DRIVERS = {
     **dict.fromkeys(("file", "ftp", "memory"), ""),
     **dict.fromkeys(("s3", "s3a"), "s3fs"),
@@ -68,11 +71,14 @@ def file_of(path: str) -> BinaryIO:
     system = system_of(path)
     with _failures(path):
         file = system.open(path, "rb")
-        return io.BytesIO(file.getbuffer()) if isinstance(file, io.BytesIO) else file  # of which all readers share one place
+        return (
+            io.BytesIO(file.getbuffer()) if isinstance(file, io.BytesIO) else file
+        )  # of which all readers share one place
 
 
 def found(pattern: str) -> list[tuple[str, str]]:
-    """The files of a path or URL, in which *, ? and ** stand for what they do in a shell: each with its path below the fixed part.
+    """The files of a path or URL, in which *, ? and ** stand for what they do in a shell: each with
+    its path below the fixed part.
 
     Raises:
         SourceError: where there is none.
@@ -88,7 +94,12 @@ def found(pattern: str) -> list[tuple[str, str]]:
         paths = [path for path in glob.glob(pattern, recursive=True) if os.path.isfile(path)]
     if not paths:
         raise SourceError(f"{pattern}: there is no such file")
-    names = (plain(path).removeprefix(plain(fixed)).lstrip("/") if fixed != pattern else path.rpartition("/")[2] for path in paths)
+    names = (
+        plain(path).removeprefix(plain(fixed)).lstrip("/")
+        if fixed != pattern
+        else path.rpartition("/")[2]
+        for path in paths
+    )
     return sorted(zip(paths, names, strict=True))
 
 
@@ -99,15 +110,27 @@ def files_in(folder: str) -> set[str]:
         SourceError: where the store cannot be reached.
     """
     if not is_stored(folder):
-        return {plain(Path(at, name)) for at, folders, files in os.walk(folder) for name in (*folders, *files)}
+        return {
+            plain(Path(at, name))
+            for at, folders, files in os.walk(folder)
+            for name in (*folders, *files)
+        }
     system = system_of(folder)
     with _failures(folder):
-        return {plain(system.unstrip_protocol(path)) for path in system.find(folder)} if system.exists(folder) else set()
+        return (
+            {plain(system.unstrip_protocol(path)) for path in system.find(folder)}
+            if system.exists(folder)
+            else set()
+        )
 
 
 def plain(path: object) -> str:
     """One spelling of a path or URL, to be compared: memory:///a is memory://a, and ./a is a."""
-    return str(path).partition("://")[2].lstrip("/") if is_stored(path) else Path(str(path)).as_posix().removeprefix("./")
+    return (
+        str(path).partition("://")[2].lstrip("/")
+        if is_stored(path)
+        else Path(str(path)).as_posix().removeprefix("./")
+    )
 
 
 def stamp(path: str) -> dict[str, Any]:
@@ -123,7 +146,14 @@ def stamp(path: str) -> dict[str, Any]:
     system = system_of(path)
     with _failures(path):
         info = system.info(path)
-    tag = next((info[name] for name in ("ETag", "etag", "LastModified", "mtime", "last_modified", "created") if info.get(name)), "")
+    tag = next(
+        (
+            info[name]
+            for name in ("ETag", "etag", "LastModified", "mtime", "last_modified", "created")
+            if info.get(name)
+        ),
+        "",
+    )
     return {"size": info["size"], "modified": str(tag)}
 
 

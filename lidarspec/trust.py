@@ -1,7 +1,8 @@
 """Whose files are believed, and what the others may say.
 
-Plugins that are installed and the user's own settings are believed; so is a folder that the user has allowed once. Whatever else is
-read is data: no code runs because a file names it, and paths in it lead to what lies beside it and nowhere else.
+Plugins that are installed and the user's own settings are believed; so is a folder that the user
+has allowed once. Whatever else is read is data: no code runs because a file names it, and paths in
+it lead to what lies beside it and nowhere else.
 """
 
 from __future__ import annotations
@@ -16,13 +17,15 @@ from lidarspec.errors import UsageError, system_errors
 if TYPE_CHECKING:
     from pathlib import Path
 
-#: bytes of a file that are read at most: of JSON, which has frames in it, and of TOML, where the time to read grows faster than the file.
+#: bytes of a file that are read at most: of JSON, which has frames in it, and of TOML, where the
+#: time to read grows faster than the file.
 LARGEST = {"JSON": 1 << 22, "TOML": 1 << 18}
 #: a key of so many parts that reading it would take minutes.
 _ENDLESS_KEY = re.compile(rb"(?:\.[^.=,\]\n]{0,80}){32}")
 #: the name of a settings file.
 FILE = "lidarspec.toml"
-#: the file of the folders that are allowed, a line each, and the variable that names one for a single run.
+#: the file of the folders that are allowed, a line each, and the variable that names one for a
+#: single run.
 TRUSTED, VARIABLE = "trusted", "LIDARSPEC_TRUST"
 _WRITABLE_BY_ALL = stat.S_IWOTH
 
@@ -44,8 +47,9 @@ def own_settings() -> Path:
 def foreign(path: Path) -> str:
     """Why a file is not the user's own, such as "/tmp belongs to user 0"; "" where it is.
 
-    It and its folder have to belong to the user, and nobody else may write there; a group may, which is often the user's alone. Where a
-    system has no such owners, the user's own is what lies in the user's folder.
+    It and its folder have to belong to the user, and nobody else may write there; a group may,
+    which is often the user's alone. Where a system has no such owners, the user's own is what lies
+    in the user's folder.
     """
     if not hasattr(os, "getuid"):
         home = os.path.expanduser("~")
@@ -59,7 +63,8 @@ def foreign(path: Path) -> str:
 
 
 def shared(status: os.stat_result, others: int) -> str:
-    """Why something is not the user's own, such as "belongs to user 0"; "" where it is, and on Windows, where a user's folders are.
+    """Why something is not the user's own, such as "belongs to user 0"; "" where it is, and on
+    Windows, where a user's folders are.
 
     Args:
         others: the bits of its mode that only its user may have.
@@ -82,7 +87,8 @@ def is_trusted(folder: Path) -> bool:
 
 
 def trust(folder: str | Path) -> Path:
-    """The folder, by its whole path, whose files may from now on name Python files, and paths anywhere.
+    """The folder, by its whole path, whose files may from now on name Python files, and paths
+    anywhere.
 
     Raises:
         UsageError: where it is no folder of the user's own.

@@ -1,4 +1,6 @@
-"""Files that are written beside the ones whose place they take, and what killed processes left of them."""
+"""Files that are written beside the ones whose place they take, and what killed processes left of
+them.
+"""
 
 from __future__ import annotations
 
@@ -12,7 +14,8 @@ from pathlib import Path
 from lidarspec.errors import SourceError
 from lidarspec.stores import take_away
 
-#: seconds without a write after which the file of a process that has ended is removed; another computer may be writing to it.
+#: seconds without a write after which the file of a process that has ended is removed; another
+#: computer may be writing to it.
 ABANDONED_AFTER_S = 60.0
 
 
@@ -26,13 +29,19 @@ def remove_abandoned(path: Path) -> None:
     for process, name in _list_unfinished(path.parent.absolute()):
         left = path.with_name(f".{process}.{name}")
         with contextlib.suppress(OSError, SourceError):
-            if name == path.name and not is_running(process) and time.time() - left.stat().st_mtime > ABANDONED_AFTER_S:
+            if (
+                name == path.name
+                and not is_running(process)
+                and time.time() - left.stat().st_mtime > ABANDONED_AFTER_S
+            ):
                 take_away(left)
 
 
 @functools.cache  # listed once: a folder can get many thousands of files
 def _list_unfinished(folder: Path) -> list[tuple[int, str]]:
-    """Return process and name of what is unfinished in a folder when this process writes there first."""
+    """Return process and name of what is unfinished in a folder when this process writes there
+    first.
+    """
     try:
         names = os.listdir(folder)
     except OSError:

@@ -1,4 +1,5 @@
-"""The plan of the house: which module stands on which floor, and the rules that hold it, as functions from source to complaints.
+"""The plan of the house: which module stands on which floor, and the rules that hold it, as
+functions from source to complaints.
 
 Nothing is imported to be judged; the rules read syntax trees.
 """
@@ -14,8 +15,9 @@ from functools import cached_property
 from graphlib import CycleError, TopologicalSorter
 from pathlib import Path
 
-#: the stations on the way of a byte, bottom to top; a module that is named stands on its own floor, else on that of its package. Imports
-#: go down or stay, wherever in a module they stand and for types alike.
+#: the stations on the way of a byte, bottom to top; a module that is named stands on its own floor,
+#: else on that of its package. Imports go down or stay, wherever in a module they stand and for
+#: types alike.
 FLOORS = (
     "_version display errors libraries trust stores entry_points known_sensors",
     "transports.protocol",  # what a source is, as values that plugins give too
@@ -50,7 +52,14 @@ IO = {"asyncio", "logging", "serial", "socket", "threading", "time"}
 CONFINED = {
     "numba": {"points.numba_kernels.arithmetic", "points.numba_kernels.cache"},
     "llvmlite": {"points.numba_kernels.arithmetic"},
-    "construct": {"spec.syntax", "spec.fields", "spec.description", "framing.frame_engine", "frames.parse", "frames.build"},
+    "construct": {
+        "spec.syntax",
+        "spec.fields",
+        "spec.description",
+        "framing.frame_engine",
+        "frames.parse",
+        "frames.build",
+    },
     "pluggy": {"plugins"},
     "serial": {"transports.serial", "transports.ports"},
     "click": {"cli"},
@@ -61,9 +70,13 @@ CONFINED = {
     "pytest": {"testing"},
 }
 _QUOTED = re.compile(r"\"\"\"[\s\S]*?\"\"\"|\'\'\'[\s\S]*?\'\'\'")
-_IMPORT = re.compile(r"^ *(?:from +[\w.]+ +import +(?:\([^)]*\)|[^\n(#]+)|import +[^\n#]+)", re.MULTILINE)
+_IMPORT = re.compile(
+    r"^ *(?:from +[\w.]+ +import +(?:\([^)]*\)|[^\n(#]+)|import +[^\n#]+)", re.MULTILINE
+)
 _IMPORT_BY_NAME = re.compile(r"\b(?:import_module|__import__)\(\s*[\"']([\w.]+)[\"']")
-_TYPING_BLOCK = re.compile(r"^( *)if (?:typing\.)?TYPE_CHECKING:\n(?:\1 +.*\n|\s*\n)*", re.MULTILINE)
+_TYPING_BLOCK = re.compile(
+    r"^( *)if (?:typing\.)?TYPE_CHECKING:\n(?:\1 +.*\n|\s*\n)*", re.MULTILINE
+)
 #: the one package that asks which of construct's classes something is.
 SYNTAX = "lidarspec.spec.syntax"
 
@@ -90,7 +103,8 @@ class Module:
 
     @cached_property
     def imports(self) -> list[tuple[int, str]]:
-        """Line and full dotted name of everything that the module imports, at any depth and for types too.
+        """Line and full dotted name of everything that the module imports, at any depth and for
+        types too.
 
         Import statements are found in the text: parsing every module takes ten times as long.
         """
@@ -146,7 +160,9 @@ def absolute(module: Module, node: ast.ImportFrom) -> str:
 
 
 def resolve(name: str, modules: Mapping[str, Module]) -> str | None:
-    """The module of the tree that an imported name is in, itself or as an attribute; None for what is outside."""
+    """The module of the tree that an imported name is in, itself or as an attribute; None for what
+    is outside.
+    """
     while name not in modules:
         name, dot, _ = name.rpartition(".")
         if not dot:
@@ -155,7 +171,9 @@ def resolve(name: str, modules: Mapping[str, Module]) -> str | None:
 
 
 def floor(name: str) -> int | None:
-    """The floor of a module by dotted name: its own, else that of its package; None where neither has one."""
+    """The floor of a module by dotted name: its own, else that of its package; None where neither
+    has one.
+    """
     inside = name.partition(".")[2] or "__init__"
     if inside in PACKAGES:
         inside = f"{inside}.__init__" if f"{inside}.__init__" in FLOOR_OF else inside
@@ -165,8 +183,12 @@ def floor(name: str) -> int | None:
 
 
 def climbing(modules: Mapping[str, Module]) -> list[str]:
-    """Modules without a floor, imports that go up, and the first circle; imports for types count as all others."""
-    complaints = [f"{name} stands on no floor: add it to FLOORS" for name in modules if floor(name) is None]
+    """Modules without a floor, imports that go up, and the first circle; imports for types count as
+    all others.
+    """
+    complaints = [
+        f"{name} stands on no floor: add it to FLOORS" for name in modules if floor(name) is None
+    ]
     graph: dict[str, set[str]] = {name: set() for name in modules}
     for module in modules.values():
         here = floor(module.name)
@@ -177,7 +199,9 @@ def climbing(modules: Mapping[str, Module]) -> list[str]:
             graph[module.name].add(target)
             there = floor(target)
             if here is not None and there is not None and there > here:
-                complaints.append(f"{module.name}:{line} (floor {here}) imports {target} (floor {there})")
+                complaints.append(
+                    f"{module.name}:{line} (floor {here}) imports {target} (floor {there})"
+                )
     try:
         TopologicalSorter(graph).prepare()
     except CycleError as circle:
@@ -198,8 +222,13 @@ def misplaced_imports(modules: Mapping[str, Module]) -> list[str]:
             if library in IO and here is not None and here < IO_FLOOR:
                 complaints.append(f"{module.name}:{line} imports {library} below floor {IO_FLOOR}")
             allowed = CONFINED.get(library)
-            if allowed is not None and not any(inside == name or inside.startswith(f"{name}.") for name in allowed):
-                complaints.append(f"{module.name}:{line} imports {library}, which is for {', '.join(sorted(allowed))}")
+            if allowed is not None and not any(
+                inside == name or inside.startswith(f"{name}.") for name in allowed
+            ):
+                complaints.append(
+                    f"{module.name}:{line} imports {library}, which is for"
+                    f" {', '.join(sorted(allowed))}"
+                )
     return complaints
 
 
@@ -211,19 +240,30 @@ def construct_asked(modules: Mapping[str, Module]) -> list[str]:
             continue
         if "construct" not in module.text or "isinstance" not in module.text:
             continue
-        froms = [node for node in ast.walk(module.tree) if isinstance(node, ast.ImportFrom) and node.module == "construct"]
+        froms = [
+            node
+            for node in ast.walk(module.tree)
+            if isinstance(node, ast.ImportFrom) and node.module == "construct"
+        ]
         names = {alias.asname or alias.name for node in froms for alias in node.names}
         for node in ast.walk(module.tree):
             if not isinstance(node, ast.Call) or name_of(node.func) != "isinstance":
                 continue
-            asked = {ast.unparse(part) for part in ast.walk(node.args[1]) if isinstance(part, ast.Name | ast.Attribute)}
+            asked = {
+                ast.unparse(part)
+                for part in ast.walk(node.args[1])
+                if isinstance(part, ast.Name | ast.Attribute)
+            }
             if asked & names or any(name.startswith("construct.") for name in asked):
                 complaints.append(f"{module.name}:{node.lineno} asks for a class of construct's")
     return complaints
 
 
-def private_imports(modules: Mapping[str, Module], public: Mapping[str, Collection[str]]) -> list[str]:
-    """What a plugin takes that is no public name of `lidarspec` or `lidarspec.spec`, and not numpy, construct or the standard library.
+def private_imports(
+    modules: Mapping[str, Module], public: Mapping[str, Collection[str]]
+) -> list[str]:
+    """What a plugin takes that is no public name of `lidarspec` or `lidarspec.spec`, and not numpy,
+    construct or the standard library.
 
     Args:
         public: the names of each of these two.
@@ -238,8 +278,12 @@ def private_imports(modules: Mapping[str, Module], public: Mapping[str, Collecti
                 complaints.append(f"{module.name}:{line} imports {imported}, which is not public")
             elif library not in PLUGINS_MAY_IMPORT | {own, "lidarspec"}:
                 complaints.append(f"{module.name}:{line} imports {library}")
-        used = [(line, name) for line, name in attributes(module) if name not in public["lidarspec"]]
-        complaints += [f"{module.name}:{line} uses {name}, which is not public" for line, name in used]
+        used = [
+            (line, name) for line, name in attributes(module) if name not in public["lidarspec"]
+        ]
+        complaints += [
+            f"{module.name}:{line} uses {name}, which is not public" for line, name in used
+        ]
     return complaints
 
 
@@ -250,15 +294,21 @@ def attributes(module: Module) -> Iterator[tuple[int, str]]:
     aliases = [alias for alias in imported if alias.name == "lidarspec"]
     bound = {alias.asname or alias.name for alias in aliases}
     for node in nodes:
-        if isinstance(node, ast.Attribute) and isinstance(node.value, ast.Name) and node.value.id in bound:
+        if (
+            isinstance(node, ast.Attribute)
+            and isinstance(node.value, ast.Name)
+            and node.value.id in bound
+        ):
             yield node.lineno, node.attr
 
 
 def word(name: str) -> re.Pattern[str]:
-    """Matches a vendor, model or id as a word, however it is joined; one of one or two characters only in its own case, and not as the end
-    of another name."""
+    """Matches a vendor, model or id as a word, however it is joined; one of one or two characters
+    only in its own case, and not as the end of another name."""
     parts = [re.escape(part) for part in re.split(r"[\W_]+", name) if part]
-    before, flags = (r"(?<![^\W_])", re.IGNORECASE) if len(name) > 2 else (r"(?<![^\W_]|-)", re.NOFLAG)
+    before, flags = (
+        (r"(?<![^\W_])", re.IGNORECASE) if len(name) > 2 else (r"(?<![^\W_]|-)", re.NOFLAG)
+    )
     return re.compile(before + r"[\W_]?".join(parts) + r"(?![^\W_])", flags)
 
 
@@ -267,8 +317,12 @@ def named_sensors(modules: Mapping[str, Module], names: Collection[str]) -> list
     complaints, letters = [], re.compile(r"[\W_]+")
     sought = {name: letters.sub("", name).lower() for name in names}
     for module in modules.values():
-        run = letters.sub("", module.text).lower()  # where a name is missing whatever joins it, nothing has to be searched
+        run = letters.sub(
+            "", module.text
+        ).lower()  # where a name is missing whatever joins it, nothing has to be searched
         for name in (name for name, joined in sought.items() if joined in run):
             if found := word(name).search(module.text):
-                complaints.append(f"{module.name}:{module.text.count(chr(10), 0, found.start()) + 1} names {name}")
+                complaints.append(
+                    f"{module.name}:{module.text.count(chr(10), 0, found.start()) + 1} names {name}"
+                )
     return complaints

@@ -2,8 +2,8 @@
 
     PYTHON_OF_THE_ENVIRONMENT -I tests/bare.py
 
-`--help` of every verb must run. The main job of every verb must run, or end with exit code 2 and name the extra that it
-needs. Uses the standard library only, because the environment has no pytest.
+`--help` of every verb must run. The main job of every verb must run, or end with exit code 2 and
+name the extra that it needs. Uses the standard library only, because the environment has no pytest.
 """
 
 from __future__ import annotations
@@ -16,12 +16,18 @@ import tempfile
 from pathlib import Path
 
 SENSOR = "ldrobot-stl27l"
-FRAME = "542c6808ab7ee000e4dc00e2d900e5d500e3d300e4d000e9cd00e4ca00e2c700e9c500e5c200e5c000e5be823a1a50"
-FIELDS = "speed=2152 start_angle=32427 points[*].distance=1m points[*].intensity=7 end_angle=33470 timestamp=6714"
+FRAME = (
+    "542c6808ab7ee000e4dc00e2d900e5d500e3d300e4d000e9cd00e4ca00e2c700e9c500e5c200e5c000e5be823a1a50"
+)
+FIELDS = (
+    "speed=2152 start_angle=32427 points[*].distance=1m points[*].intensity=7 end_angle=33470"
+    " timestamp=6714"
+)
 TIMEOUT_S = 120
 #: the expectation for a job that needs no extra.
 RUNS = ""
-#: verb, arguments, and `RUNS` or the extra that the job must name. Jobs run in this order in one folder.
+#: verb, arguments, and `RUNS` or the extra that the job must name. Jobs run in this order in one
+#: folder.
 JOBS = (
     ("sensors", "", RUNS),
     ("show", SENSOR, RUNS),
@@ -88,10 +94,21 @@ def main() -> int:
 def check(folder: Path, words: list[str], extra: str) -> list[str]:
     """Run a command and return a description of its failure, or nothing."""
     command = [sys.executable, "-I", "-m", "lidarspec", *words]
-    environment = {**os.environ, "XDG_CONFIG_HOME": str(folder / "settings"), "LIDARSPEC_CACHE": str(folder / "cache")}
+    environment = {
+        **os.environ,
+        "XDG_CONFIG_HOME": str(folder / "settings"),
+        "LIDARSPEC_CACHE": str(folder / "cache"),
+    }
     try:
         done = subprocess.run(
-            command, cwd=folder, env=environment, stdin=subprocess.DEVNULL, capture_output=True, text=True, timeout=TIMEOUT_S, check=False
+            command,
+            cwd=folder,
+            env=environment,
+            stdin=subprocess.DEVNULL,
+            capture_output=True,
+            text=True,
+            timeout=TIMEOUT_S,
+            check=False,
         )
     except subprocess.TimeoutExpired:
         return [f"lidarspec {' '.join(words)}: still running after {TIMEOUT_S} s"]
@@ -105,7 +122,10 @@ def check(folder: Path, words: list[str], extra: str) -> list[str]:
     if is_expected and "a bug in lidarspec" not in output:
         return []
     wanted = f"exit code 2 and lidarspec[{extra}]" if extra else "exit code 0"
-    return [f"lidarspec {' '.join(words)}: expected {wanted}, got exit code {done.returncode}\n{output[-1500:]}"]
+    return [
+        f"lidarspec {' '.join(words)}: expected {wanted}, got exit code"
+        f" {done.returncode}\n{output[-1500:]}"
+    ]
 
 
 if __name__ == "__main__":

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 from pathlib import Path
 
-#: corrections of a laser by name, and how far they differ from one laser to the next: degrees, or centimetres.
+#: corrections of a laser by name, and how far they differ from one laser to the next: degrees, or
+#: centimetres.
 _STEPS = {
     "rotCorrection_": 0.1,
     "vertCorrection_": -0.2,
@@ -12,7 +13,10 @@ _STEPS = {
     "vertOffsetCorrection_": 0.3,
     "horizOffsetCorrection_": 0.05,
 }
-_HEAD = "<?xml version='1.0'?><!DOCTYPE boost_serialization><boost_serialization><DB><distLSB_>0.2</distLSB_>"
+_HEAD = (
+    "<?xml version='1.0'?><!DOCTYPE"
+    " boost_serialization><boost_serialization><DB><distLSB_>0.2</distLSB_>"
+)
 
 
 def write_velodyne_xml(path: Path, lasers: int = 64, **values: str) -> Path:

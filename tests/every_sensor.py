@@ -23,7 +23,11 @@ def distinct_sensors(sensors: Iterable[Sensor]) -> list[Sensor]:
 
 def distinct_frames(sensors: Iterable[Sensor]) -> list[tuple[Sensor, str]]:
     """Return each frame type once, by its name in one of the sensors that have it."""
-    return list({id(frame): (sensor, name) for sensor in sensors for name, frame in sensor.frames.items()}.values())
+    return list(
+        {
+            id(frame): (sensor, name) for sensor in sensors for name, frame in sensor.frames.items()
+        }.values()
+    )
 
 
 def stream_sensors(sensors: Iterable[Sensor]) -> list[Sensor]:

@@ -1,4 +1,6 @@
-"""What the tests of the sensors share: where vectors and captures are, and decoding on both back ends."""
+"""What the tests of the sensors share: where vectors and captures are, and decoding on both back
+ends.
+"""
 
 from __future__ import annotations
 
@@ -27,7 +29,10 @@ def capture(name: str) -> Path:
 
 @functools.cache
 def _listed(file: str) -> dict[str, dict[str, Any]]:
-    return {vector["id"]: vector for vector in json.loads((PROTOCOLS / file).read_text(encoding="utf-8"))}
+    return {
+        vector["id"]: vector
+        for vector in json.loads((PROTOCOLS / file).read_text(encoding="utf-8"))
+    }
 
 
 def vectors(file: str) -> dict[str, dict[str, Any]]:
@@ -39,18 +44,30 @@ def vectors(file: str) -> dict[str, dict[str, Any]]:
 def vector_bytes(file: str, name: str) -> bytes:
     """The bytes of one vector, out of the list or out of the file that it names."""
     vector = vectors(file)[name]
-    return bytes.fromhex(vector["hex"]) if vector["hex"] else _present(PROTOCOLS / vector["file"]).read_bytes()
+    return (
+        bytes.fromhex(vector["hex"])
+        if vector["hex"]
+        else _present(PROTOCOLS / vector["file"]).read_bytes()
+    )
 
 
 def _present(path: Path) -> Path:
     if not path.exists():
-        pytest.skip(f"{path.name} is not here: set LIDARSPEC_CAPTURES to the folder of captures, with protocols beside it")
+        pytest.skip(
+            f"{path.name} is not here: set LIDARSPEC_CAPTURES to the folder of captures, with"
+            " protocols beside it"
+        )
     return path
 
 
 def decoded(sensor: Sensor, data: Any, frame: str | None = None) -> Packets:
-    """The packets of this input, after the compiled and the interpreted path gave the same ones, points and counters."""
-    packets, interpreted = sensor.decode(data, frame), sensor.decode(data, frame, backend="construct")
+    """The packets of this input, after the compiled and the interpreted path gave the same ones,
+    points and counters.
+    """
+    packets, interpreted = (
+        sensor.decode(data, frame),
+        sensor.decode(data, frame, backend="construct"),
+    )
     assert interpreted.raw.dtype == packets.raw.dtype
     assert interpreted.raw.tobytes() == packets.raw.tobytes()
     assert interpreted.stats == packets.stats
@@ -65,7 +82,9 @@ def clockwise(cloud: PointCloud) -> Any:
     return np.rad2deg(-cloud.azimuth.astype(np.float64)) % 360
 
 
-def assert_points(cloud: PointCloud, expected: Iterable[tuple[int, Sequence[float]]], *, atol: float = 2e-5) -> None:
+def assert_points(
+    cloud: PointCloud, expected: Iterable[tuple[int, Sequence[float]]], *, atol: float = 2e-5
+) -> None:
     """Fail unless the points with these indices are at these x y z."""
     for index, xyz in expected:
         np.testing.assert_allclose(cloud.xyz[index], xyz, atol=atol, err_msg=f"point {index}")

@@ -1,4 +1,6 @@
-"""The installed sensors by the module that declares them; a module is imported when its sensors are asked for."""
+"""The installed sensors by the module that declares them; a module is imported when its sensors are
+asked for.
+"""
 
 from __future__ import annotations
 
@@ -15,7 +17,8 @@ from tests.representatives import REPRESENTATIVES
 
 #: sensors whose conformance is tested in the quick tier; the engine is tested on the shapes there.
 QUICK = ("ldrobot-stl27l",)
-#: examples of each frame type in a conformance test: few, and as many as there is time for in `make test-long`.
+#: examples of each frame type in a conformance test: few, and as many as there is time for in `make
+#: test-long`.
 CONFORMANCE_EXAMPLES = int(os.environ.get("LIDARSPEC_EXAMPLES", "4"))
 
 _GROUP = "lidarspec.sensors"
@@ -65,13 +68,17 @@ def conformance_cases(distribution: str) -> list[object]:
 
     Only `QUICK` ones are tested in the quick tier.
     """
-    return [pytest.param(name, marks=() if name in QUICK else pytest.mark.slow) for name in sensor_ids(distribution)]
+    return [
+        pytest.param(name, marks=() if name in QUICK else pytest.mark.slow)
+        for name in sensor_ids(distribution)
+    ]
 
 
 def assert_installed_conformance(distribution: str, sensor_id: str) -> None:
     """Fail with every finding of `lidarspec check` for an installed sensor.
 
-    Frames and functions that it shares with a sensor before it in its distribution are tested there.
+    Frames and functions that it shares with a sensor before it in its distribution are tested
+    there.
     """
     ids = sensor_ids(distribution)
     before = [lidarspec.sensor(name) for name in ids[: ids.index(sensor_id)]]

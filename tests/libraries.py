@@ -1,4 +1,6 @@
-"""Optional libraries that tests use: imported by the first test that needs them, never at collection."""
+"""Optional libraries that tests use: imported by the first test that needs them, never at
+collection.
+"""
 
 from __future__ import annotations
 

@@ -1,4 +1,6 @@
-"""Real lines for live tests: pseudo terminals behind a name that can be pulled out, and senders that keep a rate."""
+"""Real lines for live tests: pseudo terminals behind a name that can be pulled out, and senders
+that keep a rate.
+"""
 
 from __future__ import annotations
 
@@ -15,7 +17,8 @@ from typing import Any
 
 from lidarspec import Device, Sensor
 
-#: seconds after which a test fails if an event has not come: many, since the machine may be slow or busy.
+#: seconds after which a test fails if an event has not come: many, since the machine may be slow or
+#: busy.
 TIMEOUT_S = 60.0
 #: how much later than promised something may happen while the machine is busy.
 SLACK = 5.0
@@ -87,8 +90,16 @@ def working(function: Callable[[threading.Event], None]) -> Iterator[threading.E
         thread.join()
 
 
-def paced(send: Callable[[bytes], object], frames: Sequence[bytes], rate: float, stop: threading.Event, tick: float = 0.002) -> int:
-    """Send frames at a rate, again and again until asked to stop, in bunches every `tick` seconds; the number sent."""
+def paced(
+    send: Callable[[bytes], object],
+    frames: Sequence[bytes],
+    rate: float,
+    stop: threading.Event,
+    tick: float = 0.002,
+) -> int:
+    """Send frames at a rate, again and again until asked to stop, in bunches every `tick` seconds;
+    the number sent.
+    """
     began, sent = time.monotonic(), 0
     while not stop.is_set():
         due = int((time.monotonic() - began) * rate)
@@ -136,14 +147,23 @@ def _values(sensor: str, index: int) -> dict[str, Any]:
     """What the packet of this number holds."""
     match sensor:
         case "shape-clock":  # 40 packets a scan
-            return {"seconds": index // 400 % 60, "ticks": index % 400 * 25, "distances": [1000 + index % 500] * 4}
+            return {
+                "seconds": index // 400 % 60,
+                "ticks": index % 400 * 25,
+                "distances": [1000 + index % 500] * 4,
+            }
         case "shape-commands":  # 18 packets a turn
             return {"angle": index * 2000 % 36000, "distances": [1000 + index % 500] * 3}
         case _:
-            block = {"azimuth": index * 100 % 36000, "channels": [{"distance": 400, "intensity": 7}] * 3}
+            block = {
+                "azimuth": index * 100 % 36000,
+                "channels": [{"distance": 400, "intensity": 7}] * 3,
+            }
             return {"number": 1 + index % 200, "reserved": bytes(3), "blocks": [block] * 4}
 
 
 def turning(sensor: Sensor, number: int) -> list[bytes]:
-    """The first data frames of one of the shapes that live tests use, clock, commands or datagrams, as it turns."""
+    """The first data frames of one of the shapes that live tests use, clock, commands or datagrams,
+    as it turns.
+    """
     return [sensor.build("data", **_values(sensor.id, index)) for index in range(number)]

@@ -1,4 +1,6 @@
-"""Tools, packages and captures that skipped tests need, found by the reasons of the skips, and how to get them."""
+"""Tools, packages and captures that skipped tests need, found by the reasons of the skips, and how
+to get them.
+"""
 
 from __future__ import annotations
 
@@ -12,7 +14,11 @@ MISSING = (
     (r"g\+\+ is not", "g++", "apt-get install g++"),
     (r"gcc", "gcc", "apt-get install gcc"),
     (r"no (xxd|hexdump)", "tools that print bytes", "apt-get install xxd bsdextrautils"),
-    (r"Kaitai compiler", "Kaitai's compiler", "npm install kaitai-struct-compiler js-yaml, with NODE_PATH as its node_modules"),
+    (
+        r"Kaitai compiler",
+        "Kaitai's compiler",
+        "npm install kaitai-struct-compiler js-yaml, with NODE_PATH as its node_modules",
+    ),
     (
         r"kaitaistruct|crccheck|velodyne.decoder|[Nn]umba|rosbags|mcap|foxglove|pyarrow|duckdb|laspy|pandas|polars|pye57|zarr|zstd|rerun|matplotlib|anywidget|nbclient|playwright|starlette|uvicorn|websockets",
         "Python packages",
@@ -33,7 +39,8 @@ MAX_FILES = 3
 
 
 def describe_missing(skipped: Iterable[tuple[str, str]]) -> list[str]:
-    """Return a line for each missing thing: how many tests were skipped, in which files (the first of many), and how to get it.
+    """Return a line for each missing thing: how many tests were skipped, in which files (the first
+    of many), and how to get it.
 
     Args:
         skipped: (node id, reason) of each test that was skipped.
@@ -45,7 +52,8 @@ def describe_missing(skipped: Iterable[tuple[str, str]]) -> list[str]:
                 files[what, remedy][node.partition("::")[0].removeprefix("tests/")] += 1
                 break
     return [
-        f"not run without {what}: {count.total()} tests ({_list_files(sorted(count))}); to have them: {remedy}"
+        f"not run without {what}: {count.total()} tests ({_list_files(sorted(count))}); to have"
+        f" them: {remedy}"
         for (what, remedy), count in files.items()
     ]
 

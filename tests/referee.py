@@ -1,11 +1,12 @@
-"""Record what the engine makes of fixed bytes of every sensor, and compare it with what another version made of them.
+"""Record what the engine makes of fixed bytes of every sensor, and compare it with what another
+version made of them.
 
     make referee ARGS=--record     write the record: run this on the tree before a change
     make referee                   compare: list what this tree makes differently, and end with 1
 
-The record holds its inputs: example frames, a simulated stream, and damaged copies of both. So a change of the
-generators does not change what is compared. What the commands of the command line print is compared by
-`tests/cli/test_golden.py`.
+The record holds its inputs: example frames, a simulated stream, and damaged copies of both. So a
+change of the generators does not change what is compared. What the commands of the command line
+print is compared by `tests/cli/test_golden.py`.
 """
 
 from __future__ import annotations
@@ -47,15 +48,25 @@ Results = dict[str, str]
 
 def main() -> int:
     """Return 1 if anything differs from the record, else 0."""
-    parser = argparse.ArgumentParser(prog="make referee", description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--record", action="store_true", help="write the record instead of comparing with it")
-    parser.add_argument("--file", type=Path, default=RECORD, help=f"the record; default: {RECORD.name}")
+    parser = argparse.ArgumentParser(
+        prog="make referee",
+        description=__doc__,
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
+    parser.add_argument(
+        "--record", action="store_true", help="write the record instead of comparing with it"
+    )
+    parser.add_argument(
+        "--file", type=Path, default=RECORD, help=f"the record; default: {RECORD.name}"
+    )
     given = parser.parse_args()
     if given.record:
         record = _for_each(_inputs_and_results, [(name,) for name in every_sensor()])
         given.file.parent.mkdir(parents=True, exist_ok=True)
         given.file.write_bytes(lzma.compress(json.dumps(record).encode(), preset=1))
-        print(f"{len(record)} sensors, {sum(len(one['results']) for one in record.values())} results")
+        print(
+            f"{len(record)} sensors, {sum(len(one['results']) for one in record.values())} results"
+        )
         return 0
     record = json.loads(lzma.decompress(given.file.read_bytes()))
     found = _for_each(_results_of, [(name, one["inputs"]) for name, one in record.items()])
@@ -64,7 +75,10 @@ def main() -> int:
         different += _report(name, one["results"], found[name])
     for name in every_sensor().keys() - record.keys():
         print(f"{name}: not in the record")
-    print(f"{len(record)} sensors, {sum(len(one['results']) for one in record.values())} results, {different} differences")
+    print(
+        f"{len(record)} sensors, {sum(len(one['results']) for one in record.values())} results,"
+        f" {different} differences"
+    )
     return int(different > 0)
 
 
@@ -93,8 +107,15 @@ def _inputs_and_results(name: str) -> dict[str, Any]:
 def _make_inputs(sensor: Sensor) -> dict[str, list[Any]]:
     """Return the bytes that a sensor is tried with, in base64, with the name of their frame type."""
     chance = random.Random(sensor.id)
-    frames = [(name, sensor.example(name, seed=seed)) for name in sensor.frames for seed in range(EXAMPLES)]
-    damaged = [(name, mutated(data, chance)) for name, data in itertools.islice(itertools.cycle(frames), DAMAGED)]
+    frames = [
+        (name, sensor.example(name, seed=seed))
+        for name in sensor.frames
+        for seed in range(EXAMPLES)
+    ]
+    damaged = [
+        (name, mutated(data, chance))
+        for name, data in itertools.islice(itertools.cycle(frames), DAMAGED)
+    ]
     stream = _make_stream(sensor)
     broken = [mutated(data, chance) if chance.random() < 0.1 else data for data in stream]
     return {
@@ -106,13 +127,21 @@ def _make_inputs(sensor: Sensor) -> dict[str, list[Any]]:
 
 
 def _make_stream(sensor: Sensor) -> list[bytes]:
-    """Return the frames of a simulated sensor, or examples of its data frames if it cannot be simulated."""
+    """Return the frames of a simulated sensor, or examples of its data frames if it cannot be
+    simulated.
+    """
     try:
         frames = ls.simulate(sensor, STREAM_PACKETS)
     except LidarSpecError:
-        frames = [sensor.example(name, seed=seed) for name in sensor.data_frames for seed in range(EXAMPLES)]
+        frames = [
+            sensor.example(name, seed=seed)
+            for name in sensor.data_frames
+            for seed in range(EXAMPLES)
+        ]
     sizes = itertools.accumulate(map(len, frames))
-    return [frame for frame, size in zip(frames, sizes, strict=True) if size <= STREAM_BYTES] or frames[:1]
+    return [
+        frame for frame, size in zip(frames, sizes, strict=True) if size <= STREAM_BYTES
+    ] or frames[:1]
 
 
 def _results_of(name: str, inputs: dict[str, list[Any]]) -> Results:
@@ -122,13 +151,17 @@ def _results_of(name: str, inputs: dict[str, list[Any]]) -> Results:
         warnings.simplefilter("ignore")
         for kind in ("frames", "damaged"):
             for number, (frame, text) in enumerate(inputs[kind]):
-                found |= _results_of_frame(sensor, frame, f"{kind} {number}, {frame}", _decoded(text))
+                found |= _results_of_frame(
+                    sensor, frame, f"{kind} {number}, {frame}", _decoded(text)
+                )
         for frame, texts in itertools.groupby(inputs["frames"], key=lambda pair: pair[0]):
             parts = [_decoded(text) for _, text in texts]
             found |= _results_of_table(sensor, frame, parts)
         for kind in ("stream", "broken"):
             parts = [_decoded(text) for text in inputs[kind]]
-            found |= _results_of_stream(sensor, kind, parts if sensor.datagrams else b"".join(parts))
+            found |= _results_of_stream(
+                sensor, kind, parts if sensor.datagrams else b"".join(parts)
+            )
     return found
 
 
@@ -157,7 +190,11 @@ def _results_of_table(sensor: Sensor, frame: str, parts: list[bytes]) -> Results
         raw = packets.raw
     except LidarSpecError as error:
         return {f"{key}: error": f"{type(error).__name__}: {error}"}
-    return {f"{key}: layout": str(raw.dtype), f"{key}: values": _digest(raw.tobytes()), f"{key}: counters": str(packets.stats)}
+    return {
+        f"{key}: layout": str(raw.dtype),
+        f"{key}: values": _digest(raw.tobytes()),
+        f"{key}: counters": str(packets.stats),
+    }
 
 
 def _results_of_stream(sensor: Sensor, kind: str, data: Any) -> Results:
@@ -165,11 +202,16 @@ def _results_of_stream(sensor: Sensor, kind: str, data: Any) -> Results:
     try:
         packets = sensor.decode(data)
         cloud = packets.points()
-        found = {f"{kind}, points, {name}": _digest(np.ascontiguousarray(column).tobytes()) for name, column in cloud.columns.items()}
+        found = {
+            f"{kind}, points, {name}": _digest(np.ascontiguousarray(column).tobytes())
+            for name, column in cloud.columns.items()
+        }
         found[f"{kind}, counters"] = repr(packets.stats)
         for number, scan in enumerate(sensor.scans(data)):
             said = (len(scan.points), scan.stamp_ns, scan.complete, scan.whole)
-            columns = (np.ascontiguousarray(column).tobytes() for column in scan.points.columns.values())
+            columns = (
+                np.ascontiguousarray(column).tobytes() for column in scan.points.columns.values()
+            )
             found[f"{kind}, scan {number}"] = f"{said} {_digest(b''.join(columns))}"
     except LidarSpecError as error:
         return {f"{kind}: error": f"{type(error).__name__}: {error}"}
@@ -188,7 +230,9 @@ def _plain(value: Any) -> Any:
 
 
 def _digest(data: str | bytes) -> str:
-    return hashlib.blake2b(data.encode() if isinstance(data, str) else data, digest_size=12).hexdigest()
+    return hashlib.blake2b(
+        data.encode() if isinstance(data, str) else data, digest_size=12
+    ).hexdigest()
 
 
 def _encoded(data: bytes) -> str:

@@ -1,7 +1,8 @@
 """Ten sensors that stand for all mechanisms of the installed ones.
 
-A promise about the engine is proved on the shapes of `tests.shapes` and, where real variety matters, on these; a promise about a
-sensor is proved in the `tests` folder of its plugin. Ids only: a sensor is loaded when a test needs it.
+A promise about the engine is proved on the shapes of `tests.shapes` and, where real variety
+matters, on these; a promise about a sensor is proved in the `tests` folder of its plugin. Ids only:
+a sensor is loaded when a test needs it.
 """
 
 from __future__ import annotations
@@ -14,7 +15,8 @@ from tests.shapes import SHAPES
 REPRESENTATIVES = (
     "ldrobot-stl27l",  # serial, fixed frames, CRC-8, interpolated angles
     "cspc-m1c1-mini",  # variable count, XOR over words, an angle that depends on range
-    "slamtec-rplidar-a1",  # answers of several types, each after its descriptor, differential angles
+    # answers of several types, each after its descriptor, differential angles
+    "slamtec-rplidar-a1",
     "velodyne-vlp16",  # firings, rotation between blocks, a position packet as clock
     "robosense-m1",  # MEMS directions in the packet, two returns
     "hesai-qt128",  # large blocks, optional parts, calibration from a file
@@ -25,12 +27,19 @@ REPRESENTATIVES = (
 )
 
 #: The representatives that send a stream of bytes; the others send datagrams.
-STREAM_REPRESENTATIVES = ("ldrobot-stl27l", "cspc-m1c1-mini", "slamtec-rplidar-a1", "hokuyo-ust10lx")
+STREAM_REPRESENTATIVES = (
+    "ldrobot-stl27l",
+    "cspc-m1c1-mini",
+    "slamtec-rplidar-a1",
+    "hokuyo-ust10lx",
+)
 
 #: The `name` of every shape and every representative.
 each_sensor = pytest.mark.parametrize("name", [*SHAPES, *REPRESENTATIVES])
 #: The same, with the representatives in the slow tier: for what the shapes prove.
-each_shape = pytest.mark.parametrize("name", [*SHAPES, *(pytest.param(name, marks=pytest.mark.slow) for name in REPRESENTATIVES)])
+each_shape = pytest.mark.parametrize(
+    "name", [*SHAPES, *(pytest.param(name, marks=pytest.mark.slow) for name in REPRESENTATIVES)]
+)
 
 
 def load_sensor(sensor_id: str) -> ls.Sensor:

@@ -1,4 +1,6 @@
-"""The rules of `tests.architecture`, held against the source, and what every distribution declares about itself."""
+"""The rules of `tests.architecture`, held against the source, and what every distribution declares
+about itself.
+"""
 
 from __future__ import annotations
 
@@ -62,23 +64,34 @@ def test_the_core_names_no_sensor() -> None:
 @pytest.mark.slow
 def test_the_core_names_no_model_of_a_sensor() -> None:
     sensors = lidarspec.sensors()
-    assert not named_sensors(CORE, {name for sensor in sensors.values() for name in (sensor.vendor, sensor.model)})
+    assert not named_sensors(
+        CORE, {name for sensor in sensors.values() for name in (sensor.vendor, sensor.model)}
+    )
 
 
 @pytest.mark.parametrize("plugin", PLUGINS, ids=lambda path: path.name)
 def test_plugins_import_public_names_only(plugin: Path) -> None:
-    assert not private_imports(read(plugin), {face: importlib.import_module(face).__all__ for face in FACES})
+    assert not private_imports(
+        read(plugin), {face: importlib.import_module(face).__all__ for face in FACES}
+    )
 
 
 def test_the_extra_all_names_every_distribution() -> None:
     project = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]
-    assert sorted(project["optional-dependencies"]["all"]) == sorted(path.parent.name for path in PLUGINS)
+    assert sorted(project["optional-dependencies"]["all"]) == sorted(
+        path.parent.name for path in PLUGINS
+    )
 
 
 def projects() -> dict[str, dict[str, Any]]:
     """What each distribution says of itself, by its folder."""
     folders = [".", *(path.parent.relative_to(ROOT).as_posix() for path in PLUGINS)]
-    return {folder: tomllib.loads((ROOT / folder / "pyproject.toml").read_text(encoding="utf-8"))["project"] for folder in folders}
+    return {
+        folder: tomllib.loads((ROOT / folder / "pyproject.toml").read_text(encoding="utf-8"))[
+            "project"
+        ]
+        for folder in folders
+    }
 
 
 #: what is the same for all of them.
@@ -95,16 +108,29 @@ def test_every_distribution_says_the_same_of_licence_kind_and_home() -> None:
 def test_links_of_every_readme_work_on_the_index() -> None:
     tree = projects()["."]["urls"]["Homepage"] + "/blob/main/"
     for folder in projects():
-        links = re.findall(r"\]\(([^)#]+)", (ROOT / folder / "README.md").read_text(encoding="utf-8"))
+        links = re.findall(
+            r"\]\(([^)#]+)", (ROOT / folder / "README.md").read_text(encoding="utf-8")
+        )
         assert all(link.startswith("https://") for link in links)
-        assert all((ROOT / link.removeprefix(tree)).is_file() for link in links if link.startswith(tree))
+        assert all(
+            (ROOT / link.removeprefix(tree)).is_file() for link in links if link.startswith(tree)
+        )
 
 
 def test_the_oldest_versions_that_are_tested_are_those_that_are_declared() -> None:
     project = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]
     extras = project["optional-dependencies"]
-    declared = [re.match(r"([\w-]+)>=([\d.]+)", text) for text in (*project["dependencies"], *extras["jit"], *extras["testing"])]
-    tested = re.findall(r"^([\w-]+)==([\d.]+)$", (ROOT / ".ci" / "oldest.txt").read_text(encoding="utf-8"), re.MULTILINE)
+    declared = [
+        re.match(r"([\w-]+)>=([\d.]+)", text)
+        for text in (*project["dependencies"], *extras["jit"], *extras["testing"])
+    ]
+    tested = re.findall(
+        r"^([\w-]+)==([\d.]+)$",
+        (ROOT / ".ci" / "oldest.txt").read_text(encoding="utf-8"),
+        re.MULTILINE,
+    )
     assert None not in declared
     assert dict(tested).keys() == {match[1] for match in declared if match}
-    assert all(f"{dict(tested)[match[1]]}.0".startswith(f"{match[2]}.") for match in declared if match)
+    assert all(
+        f"{dict(tested)[match[1]]}.0".startswith(f"{match[2]}.") for match in declared if match
+    )

@@ -1,4 +1,6 @@
-"""Many files at once: the same points as one by one, whoever makes them and however often that is ended."""
+"""Many files at once: the same points as one by one, whoever makes them and however often that is
+ended.
+"""
 
 from __future__ import annotations
 
@@ -58,7 +60,10 @@ def records(folder: Path) -> list[dict[str, Any]]:
 
 def outputs(folder: Path) -> dict[str, bytes]:
     """Every file of points by its name."""
-    return {str(path.relative_to(folder)): path.read_bytes() for path in sorted(folder.rglob("*.parquet"))}
+    return {
+        str(path.relative_to(folder)): path.read_bytes()
+        for path in sorted(folder.rglob("*.parquet"))
+    }
 
 
 def joined(folder: Path, name: str = "long") -> Any:
@@ -76,10 +81,14 @@ def lives(group: int) -> bool:
 
 
 def run(sources: Path | str, folder: Path | str, **how: Any) -> list[tuple[batch.Record, bool]]:
-    return list(batch.convert([str(sources)], str(folder), "parquet", SENSOR, **{"size": SIZE, **how}))
+    return list(
+        batch.convert([str(sources)], str(folder), "parquet", SENSOR, **{"size": SIZE, **how})
+    )
 
 
-def test_pieces_have_the_points_of_one_pass_and_a_bad_file_stops_no_other(drives: Path, whole: Any, tmp_path: Path) -> None:
+def test_pieces_have_the_points_of_one_pass_and_a_bad_file_stops_no_other(
+    drives: Path, whole: Any, tmp_path: Path
+) -> None:
     done = run(drives / "**" / "*.bin", tmp_path)
     assert [old for _, old in done] == [False] * len(done)
     assert joined(tmp_path).equals(whole)
@@ -111,7 +120,11 @@ def test_a_second_run_does_what_is_missing_only(drives: Path, tmp_path: Path) ->
     assert [record["piece"] for record, old in again if not old] == [2]
     assert outputs(tmp_path / "out") == first
     made(ls.sensor(SENSOR), mine / "a.bin", longest=500)
-    assert [Path(record["source"]).name for record, old in run(mine / "*.bin", tmp_path / "out") if not old] == ["a.bin"]
+    assert [
+        Path(record["source"]).name
+        for record, old in run(mine / "*.bin", tmp_path / "out")
+        if not old
+    ] == ["a.bin"]
     assert not any(old for _, old in run(mine / "*.bin", tmp_path / "out", size=10 * SIZE))
     assert outputs(tmp_path / "out").keys() == {"long.parquet", "a.parquet"}
 
@@ -125,12 +138,26 @@ def test_processes_make_the_same_files(drives: Path, tmp_path: Path) -> None:
 
 @pytest.mark.slow
 @pytest.mark.skipif(os.name != "posix", reason="SIGKILL is POSIX")
-def test_a_run_that_is_killed_is_gone_on_with(tmp_path_factory: pytest.TempPathFactory, tmp_path: Path) -> None:
+def test_a_run_that_is_killed_is_gone_on_with(
+    tmp_path_factory: pytest.TempPathFactory, tmp_path: Path
+) -> None:
     drives = tmp_path_factory.mktemp("long-drives")
     made(ls.sensor(SENSOR), drives / "long.bin", most=4_000_000, longest=10**6)
     (drives / "bad.bin").write_bytes(b"no capture at all" * 100)
     whole = read_whole(drives / "long.bin", drives / "whole.parquet")
-    words = ["convert", drives / "*.bin", tmp_path, "-s", SENSOR, "--to", "parquet", "--jobs", "2", "--piece", "1MB"]
+    words = [
+        "convert",
+        drives / "*.bin",
+        tmp_path,
+        "-s",
+        SENSOR,
+        "--to",
+        "parquet",
+        "--jobs",
+        "2",
+        "--piece",
+        "1MB",
+    ]
     command = [sys.executable, "-m", "lidarspec", *map(str, words)]
     with subprocess.Popen(command, start_new_session=True, stderr=subprocess.DEVNULL) as first:
         until(lambda: (tmp_path / batch.MANIFEST).exists() and len(records(tmp_path)) >= 2)
@@ -150,16 +177,25 @@ def test_a_run_that_is_killed_is_gone_on_with(tmp_path_factory: pytest.TempPathF
 @pytest.fixture
 def cluster() -> Iterator[Any]:
     distributed = pytest.importorskip("distributed")
-    with distributed.LocalCluster(n_workers=2, threads_per_worker=1, dashboard_address=None, silence_logs=50) as cluster:
+    with distributed.LocalCluster(
+        n_workers=2, threads_per_worker=1, dashboard_address=None, silence_logs=50
+    ) as cluster:
         yield cluster
 
 
 @pytest.mark.slow
 @pytest.mark.filterwarnings("ignore")
-def test_a_dask_cluster_makes_the_same_files_though_a_worker_is_killed(cluster: Any, drives: Path, tmp_path: Path) -> None:
+def test_a_dask_cluster_makes_the_same_files_though_a_worker_is_killed(
+    cluster: Any, drives: Path, tmp_path: Path
+) -> None:
     run(drives / "**" / "*.bin", tmp_path / "here")
     done = batch.convert(
-        [str(drives / "**" / "*.bin")], str(tmp_path / "there"), "parquet", SENSOR, size=SIZE, scheduler=cluster.scheduler_address
+        [str(drives / "**" / "*.bin")],
+        str(tmp_path / "there"),
+        "parquet",
+        SENSOR,
+        size=SIZE,
+        scheduler=cluster.scheduler_address,
     )
     next(done)
     os.kill(next(iter(cluster.workers.values())).pid, signal.SIGKILL)
@@ -171,7 +207,9 @@ def test_a_dask_cluster_makes_the_same_files_though_a_worker_is_killed(cluster: 
 @pytest.mark.filterwarnings("ignore")
 def test_a_dask_dataframe_has_a_partition_for_each_piece(drives: Path, whole: Any) -> None:
     pytest.importorskip("dask.dataframe")
-    frame = batch.read([str(drives / "long.bin"), str(drives / "north" / "*.bin")], SENSOR, size=SIZE)
+    frame = batch.read(
+        [str(drives / "long.bin"), str(drives / "north" / "*.bin")], SENSOR, size=SIZE
+    )
     assert frame.npartitions == 5
     long = batch.read(str(drives / "long.bin"), SENSOR, size=SIZE).compute(scheduler="sync")
     assert long.reset_index(drop=True).equals(whole.to_pandas())
@@ -188,7 +226,11 @@ def test_a_store_is_read_and_written_as_a_folder_is(drives: Path, tmp_path: Path
     store.get("/points", str(tmp_path / "there"), recursive=True)
     run(drives / "**" / "*.bin", tmp_path / "here")
     assert outputs(tmp_path / "here") == outputs(tmp_path / "there")
-    assert all(old for record, old in run("memory://fleet/**/*.bin", "memory://points") if "error" not in record)
+    assert all(
+        old
+        for record, old in run("memory://fleet/**/*.bin", "memory://points")
+        if "error" not in record
+    )
     result = ran("stats", "memory://fleet/north/a.bin", "-s", SENSOR)
     assert "packets" in result.stdout
 
@@ -204,13 +246,38 @@ def test_a_hostile_manifest_is_a_source_error_with_its_line(drives: Path, tmp_pa
 
 def test_wrong_input_is_one_line_and_leaves_nothing(drives: Path, tmp_path: Path) -> None:
     out, source = tmp_path / "out", drives / "*.bin"
-    assert "there is no such file" in ran("convert", drives / "*.lsr", out, "--to", "parquet", code=3).stderr
+    assert (
+        "there is no such file"
+        in ran("convert", drives / "*.lsr", out, "--to", "parquet", code=3).stderr
+    )
     assert "format" in ran("convert", source, out, "--to", "parket", code=2).stderr
-    assert "--to parquet" in ran("convert", drives / "long.bin", drives / "bad.bin", out, code=2).stderr
-    assert "leave out --jobs" in ran("convert", source, out, "--to", "csv", "--jobs", 2, "--dask", "tcp://localhost:1", code=2).stderr
-    assert "size from 1MB on" in ran("convert", source, out, "--to", "csv", "--piece", "5", code=2).stderr
+    assert (
+        "--to parquet"
+        in ran("convert", drives / "long.bin", drives / "bad.bin", out, code=2).stderr
+    )
+    assert (
+        "leave out --jobs"
+        in ran(
+            "convert",
+            source,
+            out,
+            "--to",
+            "csv",
+            "--jobs",
+            2,
+            "--dask",
+            "tcp://localhost:1",
+            code=2,
+        ).stderr
+    )
+    assert (
+        "size from 1MB on"
+        in ran("convert", source, out, "--to", "csv", "--piece", "5", code=2).stderr
+    )
     assert "without --to" in ran("convert", source, out, "--to", "csv", "-n", "5", code=2).stderr
-    assert "pip install s3fs" in ran("convert", "s3://bucket/a.bin", out, "--to", "csv", code=2).stderr
+    assert (
+        "pip install s3fs" in ran("convert", "s3://bucket/a.bin", out, "--to", "csv", code=2).stderr
+    )
     assert not out.exists()
     out.write_text("a file")
     ran("convert", source, out, "--to", "csv", code=3)
@@ -225,13 +292,23 @@ def test_wrong_input_is_one_line_and_leaves_nothing(drives: Path, tmp_path: Path
     assert (taken / "bad.csv").read_text() == "mine"
 
 
-def test_a_missing_library_is_said_before_a_file_is_read(drives: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_missing_library_is_said_before_a_file_is_read(
+    drives: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.setitem(sys.modules, "pyarrow", None)
     with pytest.raises(UsageError, match="pyarrow"):
         run(drives / "*.bin", tmp_path / "out")
     monkeypatch.setitem(sys.modules, "distributed", None)
     with pytest.raises(UsageError, match="distributed"):
-        list(batch.convert([str(drives / "*.bin")], str(tmp_path / "out"), "csv", SENSOR, scheduler="tcp://localhost:1"))
+        list(
+            batch.convert(
+                [str(drives / "*.bin")],
+                str(tmp_path / "out"),
+                "csv",
+                SENSOR,
+                scheduler="tcp://localhost:1",
+            )
+        )
     monkeypatch.setitem(sys.modules, "fsspec", None)
     with pytest.raises(UsageError, match="fsspec"):
         run("memory://fleet/a.bin", tmp_path / "out")
@@ -242,12 +319,25 @@ def test_a_scheduler_that_is_not_there_is_said(drives: Path, tmp_path: Path) -> 
     pytest.importorskip("distributed")
     import dask
 
-    with dask.config.set({"distributed.comm.timeouts.connect": "1s"}), pytest.raises(SourceError, match="no Dask scheduler answers"):
+    with (
+        dask.config.set({"distributed.comm.timeouts.connect": "1s"}),
+        pytest.raises(SourceError, match="no Dask scheduler answers"),
+    ):
         run(drives / "*.bin", tmp_path / "out", scheduler="tcp://127.0.0.1:9")
 
 
 def test_what_became_of_all_is_said_in_the_end(drives: Path, tmp_path: Path) -> None:
-    words = ("convert", drives / "north" / "*.bin", drives / "bad.bin", tmp_path, "-s", SENSOR, "--to", "csv", "--json")
+    words = (
+        "convert",
+        drives / "north" / "*.bin",
+        drives / "bad.bin",
+        tmp_path,
+        "-s",
+        SENSOR,
+        "--to",
+        "csv",
+        "--json",
+    )
     result = ran(*words, code=1)
     told = json.loads(result.stdout)
     assert (told["files"], told["before"], len(told["failed"])) == (2, 0, 1)

@@ -67,7 +67,9 @@ def measured(folder: Path, *options: str) -> list[dict[str, Any]]:
 
 def test_single_frames_are_measured_beside_construct(tmp_path: Path) -> None:
     rows = measured(tmp_path, "--only", "parse")
-    assert {row["work"] for row in rows} == {f"parse-{key}" for key in ("stl27l", "m1c1", "vlp16", "xt32", "m1")}
+    assert {row["work"] for row in rows} == {
+        f"parse-{key}" for key in ("stl27l", "m1c1", "vlp16", "xt32", "m1")
+    }
     assert {(row["unit"], row["runs"]) for row in rows} == {("frames", 5)}
     for row in rows:
         assert set(row["times"]) == {"construct", "compiled"}
@@ -84,7 +86,11 @@ def test_the_noisy_stream_loses_no_intact_frame(tmp_path: Path) -> None:
 
 
 def test_frames_with_counts_and_parts_are_measured_beside_fixed_places(tmp_path: Path) -> None:
-    named = [word for name in ("livox", "multiscan", "picoscan", "colab", "scip") for word in ("--only", name)]
+    named = [
+        word
+        for name in ("livox", "multiscan", "picoscan", "colab", "scip")
+        for word in ("--only", name)
+    ]
     rows = measured(tmp_path, "--backend", "numpy", *named)
     compared = {"livox", "multiscan", "picoscan", "colab-tim", "colab-lms"}
     assert {row["work"]: set(row["facts"]) for row in rows} == {
@@ -97,13 +103,23 @@ def test_frames_with_counts_and_parts_are_measured_beside_fixed_places(tmp_path:
 def test_conversions_are_measured_beside_a_copy_and_what_a_user_would_write(tmp_path: Path) -> None:
     names = ("to-vlp16.npz", "to-stl27l.mcap", "to-many.parquet")
     only = [word for name in names for word in ("--only", name)]
-    rows = {row["work"]: row for row in measured(tmp_path, "--backend", "numpy", "--size", "1", *only)}
+    rows = {
+        row["work"]: row for row in measured(tmp_path, "--backend", "numpy", "--size", "1", *only)
+    }
     beside = ({"np.savez", "velodyne-decoder and np.savez"}, set(), {"one process"})
-    assert {name: {*row["times"], *row["not_installed"]} for name, row in rows.items()} == dict(zip(names, beside, strict=True))
+    assert {name: {*row["times"], *row["not_installed"]} for name, row in rows.items()} == dict(
+        zip(names, beside, strict=True)
+    )
     for row in rows.values():
         facts = row["facts"]
         assert row["runs"] == 1
-        assert min(facts[name] for name in ("s", "s of the processors", "% of the speed of copying that")) > 0
+        assert (
+            min(
+                facts[name]
+                for name in ("s", "s of the processors", "% of the speed of copying that")
+            )
+            > 0
+        )
         assert all(value > 20 for name, value in facts.items() if name.startswith("MB of memory"))
         assert facts["MB written"] > row["bytes"] / 1e6
 
@@ -149,7 +165,9 @@ def test_one_library_that_cannot_be_installed_does_not_stop_the_others(
         ("", "no message"),
     ],
 )
-def test_the_reason_is_taken_from_what_the_installer_prints(stderr: str, reason: str, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_reason_is_taken_from_what_the_installer_prints(
+    stderr: str, reason: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
     assert load_module("environments", monkeypatch).find_reason(stderr) == reason
 
 
@@ -175,14 +193,23 @@ def test_a_library_that_is_missing_in_the_other_environment_is_reported(
 
 
 def test_an_unknown_work_is_refused_with_the_names_there_are() -> None:
-    done = subprocess.run([sys.executable, str(RUN), "--only", "fastest"], capture_output=True, text=True, check=False)
+    done = subprocess.run(
+        [sys.executable, str(RUN), "--only", "fastest"], capture_output=True, text=True, check=False
+    )
     assert done.returncode == 2
     assert "stl27l-stream" in done.stderr
 
 
 def test_what_is_written_by_hand_gives_the_same_points(tmp_path: Path) -> None:
-    """The decoders that the engine is measured beside do the same work: in a process of its own, where they can be imported."""
-    done = subprocess.run([sys.executable, "-c", BY_HAND, str(RUN.parent), str(tmp_path)], capture_output=True, text=True, check=False)
+    """The decoders that the engine is measured beside do the same work: in a process of its own,
+    where they can be imported.
+    """
+    done = subprocess.run(
+        [sys.executable, "-c", BY_HAND, str(RUN.parent), str(tmp_path)],
+        capture_output=True,
+        text=True,
+        check=False,
+    )
     assert done.returncode == 0, done.stderr
     assert done.stdout.split() == [
         "m1",

@@ -47,7 +47,11 @@ def test_every_imported_library_is_in_the_table() -> None:
 
 
 def test_a_missing_library_is_named_with_its_extra(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setitem(EXTRAS["ros"], "absent_library", EXTRAS["ros"]["rosbags"]._replace(distribution="absent-library"))
+    monkeypatch.setitem(
+        EXTRAS["ros"],
+        "absent_library",
+        EXTRAS["ros"]["rosbags"]._replace(distribution="absent-library"),
+    )
     with pytest.raises(LibraryError) as caught:
         import_library("absent_library.reader", "ros")
     error = caught.value
@@ -57,7 +61,9 @@ def test_a_missing_library_is_named_with_its_extra(monkeypatch: pytest.MonkeyPat
     assert suggestion(error) == "pip install 'lidarspec[ros]'"
 
 
-def test_an_old_library_is_named_with_both_versions(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+def test_an_old_library_is_named_with_both_versions(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
     versions = {"rosbags": "0.9.23"}
     monkeypatch.setattr(importlib.metadata, "version", versions.__getitem__)
     with pytest.raises(LibraryError) as caught:
@@ -69,7 +75,13 @@ def test_an_old_library_is_named_with_both_versions(monkeypatch: pytest.MonkeyPa
 
 @pytest.mark.parametrize(
     ("version", "numbers"),
-    [("0.11", (0, 11)), ("0.11.0", (0, 11)), ("3.0.8rc1", (3, 0, 8)), ("2024.8.1.dev3", (2024, 8, 1)), ("unknown", ())],
+    [
+        ("0.11", (0, 11)),
+        ("0.11.0", (0, 11)),
+        ("3.0.8rc1", (3, 0, 8)),
+        ("2024.8.1.dev3", (2024, 8, 1)),
+        ("unknown", ()),
+    ],
 )
 def test_versions_are_compared_by_their_release(version: str, numbers: tuple[int, ...]) -> None:
     assert release_numbers(version) == numbers

@@ -1,4 +1,6 @@
-"""The line at the end of a run names what was missing, the tests and how to get it; other skips are no matter of tools."""
+"""The line at the end of a run names what was missing, the tests and how to get it; other skips are
+no matter of tools.
+"""
 
 from __future__ import annotations
 
@@ -12,17 +14,34 @@ def test_each_missing_tool_is_named_once_with_its_files_and_its_remedy() -> None
         ("tests/exports/test_opens.py::test_a", "Skipped: tshark is not installed"),
         ("tests/exports/test_wireshark.py::test_b[x]", "Skipped: tshark is not installed"),
         ("tests/exports/test_wireshark.py::test_b[y]", "Skipped: tshark is not installed"),
-        (f"{HESAI}::test_c", "Skipped: a.pcap is not here: set LIDARSPEC_CAPTURES to the folder of captures"),
-        ("tests/testing/test_conformance.py::Test_x::test_vectors_hold", "Skipped: there is no file of golden vectors"),
+        (
+            f"{HESAI}::test_c",
+            "Skipped: a.pcap is not here: set LIDARSPEC_CAPTURES to the folder of captures",
+        ),
+        (
+            "tests/testing/test_conformance.py::Test_x::test_vectors_hold",
+            "Skipped: there is no file of golden vectors",
+        ),
     ]
     tools, captures = describe_missing(skipped)
     files = "exports/test_opens.py, exports/test_wireshark.py"
-    assert tools == f"not run without tshark: 3 tests ({files}); to have them: apt-get install tshark"
-    start = f"not run without captures and vectors: 1 tests ({HESAI}); to have them: LIDARSPEC_CAPTURES="
+    assert (
+        tools == f"not run without tshark: 3 tests ({files}); to have them: apt-get install tshark"
+    )
+    start = (
+        f"not run without captures and vectors: 1 tests ({HESAI}); to have them:"
+        " LIDARSPEC_CAPTURES="
+    )
     assert captures.startswith(start)
 
 
 def test_of_many_files_a_few_are_named() -> None:
-    skipped = [(f"tests/exports/test_{name}.py::test", "Skipped: tshark is not installed") for name in "abcde"]
+    skipped = [
+        (f"tests/exports/test_{name}.py::test", "Skipped: tshark is not installed")
+        for name in "abcde"
+    ]
     (line,) = describe_missing(skipped)
-    assert "5 tests (exports/test_a.py, exports/test_b.py, exports/test_c.py and 2 more files);" in line
+    assert (
+        "5 tests (exports/test_a.py, exports/test_b.py, exports/test_c.py and 2 more files);"
+        in line
+    )

@@ -18,7 +18,9 @@ from lidarspec import SourceError, stores
         (OSError("403 Forbidden"), "403 Forbidden"),
     ],
 )
-def test_failure_of_a_store_has_a_reason(failure: Exception, reason: str, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_failure_of_a_store_has_a_reason(
+    failure: Exception, reason: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
     class System:
         def open(self, path: str, mode: str) -> None:
             raise failure

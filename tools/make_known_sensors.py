@@ -1,4 +1,6 @@
-"""Write `lidarspec/known_sensors.json` from the plugins in `plugins/`: `make known-sensors`, which installs all of them first."""
+"""Write `lidarspec/known_sensors.json` from the plugins in `plugins/`: `make known-sensors`, which
+installs all of them first.
+"""
 
 from __future__ import annotations
 
@@ -15,12 +17,21 @@ TABLE = ROOT / "lidarspec" / "known_sensors.json"
 def table() -> str:
     """Return the table as JSON, one sensor in each line; sensors of other projects are left out."""
     own = {folder.name for folder in (ROOT / "plugins").iterdir()}
-    homes = {name: plugin for plugin in registry().plugins for name in plugin.sensors if plugin.distribution in own}
+    homes = {
+        name: plugin
+        for plugin in registry().plugins
+        for name in plugin.sensors
+        if plugin.distribution in own
+    }
     rows = []
     for name, sensor in registry().sensors().items():
         if name in homes:
             row = summarize(sensor, homes[name].distribution, homes[name].version)
-            rows.append(json.dumps(row._replace(signatures=signatures(sensor)).to_dict(), ensure_ascii=False))
+            rows.append(
+                json.dumps(
+                    row._replace(signatures=signatures(sensor)).to_dict(), ensure_ascii=False
+                )
+            )
     return "[\n" + ",\n".join(rows) + "\n]\n"
 
 

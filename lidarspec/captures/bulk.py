@@ -1,10 +1,12 @@
-"""Datagrams of a capture by the hundred, as arrays: where they stand in one buffer, when they came and from whom.
+"""Datagrams of a capture by the hundred, as arrays: where they stand in one buffer, when they came
+and from whom.
 
-Consecutive datagrams of a device differ in their payloads, their times and little else. So `CaptureBatches` reads one record as
-`CaptureReader` does; what was found there holds for every record of the same length whose headers have the same bytes, except for
-those that its headers and the file's format name as free. `walked` finds where the records of a buffer begin, and all that are
-`Alike` are then found at once. Whatever is not alike is read one by one, so that the datagrams, their order and what is counted
-are the same, whatever is in the file.
+Consecutive datagrams of a device differ in their payloads, their times and little else. So
+`CaptureBatches` reads one record as `CaptureReader` does; what was found there holds for every
+record of the same length whose headers have the same bytes, except for those that its headers and
+the file's format name as free. `walked` finds where the records of a buffer begin, and all that are
+`Alike` are then found at once. Whatever is not alike is read one by one, so that the datagrams,
+their order and what is counted are the same, whatever is in the file.
 """
 
 from __future__ import annotations
@@ -30,10 +32,12 @@ WIDEST = 128
 #: bytes that a buffer grows to, where the file has so many.
 LARGEST = 2 * LARGEST_BLOCK
 _TRAILER = 4
-_HEAD = 16  # bytes of a record of either format, as far as they tell the length and whether that is sure
+# bytes of a record of either format, as far as they tell the length and whether that is sure
+_HEAD = 16
 #: records of one length in a row for which looking at all of them at once is worth while.
 _RUN = 16
-#: kinds of datagrams that are known at a time, and that become known in one batch: nobody's capture makes this slow.
+#: kinds of datagrams that are known at a time, and that become known in one batch: nobody's capture
+#: makes this slow.
 MOST_KNOWN = 16
 
 
@@ -47,7 +51,8 @@ class Alike:
         source: address and port.
         times: how its time is read.
         value, mask: its first bytes, in words, and which of their bits count.
-        trailer: type of the word at its end that repeats the length, with its byte order; None where there is none.
+        trailer: type of the word at its end that repeats the length, with its byte order; None
+            where there is none.
     """
 
     length: int
@@ -59,12 +64,20 @@ class Alike:
     mask: NDArray[np.uint64]
     trailer: str | None
 
-    def find(self, storage: NDArray[np.uint8], starts: Indices, lengths: Indices) -> tuple[NDArray[np.bool_] | None, NDArray[np.int64]]:
-        """Which of these records are like it, (n,), or None where all are, and their times, (n,) ns; 128 bytes behind each can be read."""
+    def find(
+        self, storage: NDArray[np.uint8], starts: Indices, lengths: Indices
+    ) -> tuple[NDArray[np.bool_] | None, NDArray[np.int64]]:
+        """Which of these records are like it, (n,), or None where all are, and their times, (n,)
+        ns; 128 bytes behind each can be read.
+        """
         same = lengths == self.length
         if not same.all():
             found = np.zeros(len(starts), np.bool_)
-            some, at = self.find(storage, starts[same], lengths[same]) if same.any() else (None, np.empty(0, np.int64))
+            some, at = (
+                self.find(storage, starts[same], lengths[same])
+                if same.any()
+                else (None, np.empty(0, np.int64))
+            )
             found[same] = True if some is None else some
             return found, at
         heads = _windows(storage, starts, self.value.nbytes)
@@ -72,7 +85,11 @@ class Alike:
         differs &= self.mask
         at, good = self.times.ns(heads)
         if self.trailer is not None:
-            ends = _windows(storage, starts + (self.length - _TRAILER), _TRAILER).view(self.trailer).ravel()
+            ends = (
+                _windows(storage, starts + (self.length - _TRAILER), _TRAILER)
+                .view(self.trailer)
+                .ravel()
+            )
             whole: NDArray[np.bool_] = np.asarray(ends == self.length, np.bool_)
             good = whole if good is None else np.asarray(good & whole, np.bool_)
         if differs.any():
@@ -82,7 +99,8 @@ class Alike:
 
 
 def alike(record: bytes, headers: Headers, source: Sender, form: Form) -> Alike | None:
-    """What records like this one have in common; None where that cannot be told from their first bytes.
+    """What records like this one have in common; None where that cannot be told from their first
+    bytes.
 
     Args:
         record: all its bytes.
@@ -101,11 +119,22 @@ def alike(record: bytes, headers: Headers, source: Sender, form: Form) -> Alike 
     told = pattern.uncut if headers.size else ()  # headers say how long the payload is
     mask[[*pattern.free, *told, *(head + place for place in headers.free)]] = 0
     value = np.frombuffer(record[:start].ljust(size, b"\0"), np.uint64)
-    return Alike(len(record), start, headers.payload, source, pattern.times, value, mask.view(np.uint64), pattern.trailer)
+    return Alike(
+        len(record),
+        start,
+        headers.payload,
+        source,
+        pattern.times,
+        value,
+        mask.view(np.uint64),
+        pattern.trailer,
+    )
 
 
 def walked(storage: NDArray[np.uint8], start: int, stop: int, form: Form) -> tuple[Indices, bool]:
-    """Where whole records begin from `start` to `stop`, and where the last one ends; and whether what follows has to be read plainly."""
+    """Where whole records begin from `start` to `stop`, and where the last one ends; and whether
+    what follows has to be read plainly.
+    """
     pieces: list[Indices] = []
     single: list[int] = []
     at, before, patience, length = start, 0, 0, -1
@@ -124,7 +153,9 @@ def walked(storage: NDArray[np.uint8], start: int, stop: int, form: Form) -> tup
 
 
 def _same(storage: NDArray[np.uint8], at: int, count: int, length: int, form: Form) -> int:
-    """How many of `count` records that would begin every `length` bytes do have that length, until the first that has not."""
+    """How many of `count` records that would begin every `length` bytes do have that length, until
+    the first that has not.
+    """
     place, kind, claim = form.claim(length)
     claims: NDArray[Any] = np.ndarray((count,), kind, storage, at + place, (length,))
     others = claims != claim
@@ -133,7 +164,9 @@ def _same(storage: NDArray[np.uint8], at: int, count: int, length: int, form: Fo
 
 def _windows(storage: NDArray[np.uint8], starts: Indices, width: int) -> NDArray[np.uint8]:
     """The bytes from each start on, (n, width)."""
-    everywhere: NDArray[np.void] = np.ndarray((len(storage) - width + 1,), f"V{width}", storage, 0, (1,))
+    everywhere: NDArray[np.void] = np.ndarray(
+        (len(storage) - width + 1,), f"V{width}", storage, 0, (1,)
+    )
     return everywhere[starts].view(np.uint8).reshape(len(starts), width)
 
 
@@ -142,7 +175,8 @@ class Batch:
     """n datagrams in the order of their arrival.
 
     Attributes:
-        buffer: the bytes that they stand in. Whoever holds it or a view of it keeps it; otherwise it is used again.
+        buffer: the bytes that they stand in. Whoever holds it or a view of it keeps it; otherwise
+            it is used again.
         starts, sizes: (n,) of each payload in the buffer.
         at: (n,) int64 arrival times, ns since 1970; -1 where nobody knows.
         senders: (n,) indices into `names`.
@@ -178,22 +212,44 @@ class Batch:
         if all(name in origin for name in self.names):
             return self
         wanted = np.array([name in origin for name in self.names], np.bool_)[self.senders]
-        return Batch(self.buffer, self.starts[wanted], self.sizes[wanted], self.at[wanted], self.senders[wanted], self.names)
+        return Batch(
+            self.buffer,
+            self.starts[wanted],
+            self.sizes[wanted],
+            self.at[wanted],
+            self.senders[wanted],
+            self.names,
+        )
 
     def parts(self, size: int) -> Iterator[Batch]:
         """The datagrams in stretches of about so many bytes."""
         ends = np.cumsum(self.sizes)
         start = 0
         while start < len(self):
-            stop = max(int(ends.searchsorted(ends[start] - self.sizes[start] + size, side="right")), start + 1)
+            stop = max(
+                int(ends.searchsorted(ends[start] - self.sizes[start] + size, side="right")),
+                start + 1,
+            )
             own = slice(start, stop)
-            yield Batch(self.buffer, self.starts[own], self.sizes[own], self.at[own], self.senders[own], self.names)
+            yield Batch(
+                self.buffer,
+                self.starts[own],
+                self.sizes[own],
+                self.at[own],
+                self.senders[own],
+                self.names,
+            )
             start = stop
 
     def sent(self, found: Frames) -> Iterator[tuple[str, Sender]]:
-        """The types of frames found in these datagrams, and who sent them: of each type again where the sender changes."""
+        """The types of frames found in these datagrams, and who sent them: of each type again where
+        the sender changes.
+        """
         if len(self.names) == 1:
-            yield from ((found.names[kind], self.names[0]) for kind in np.flatnonzero(np.bincount(found.kinds)).tolist())
+            yield from (
+                (found.names[kind], self.names[0])
+                for kind in np.flatnonzero(np.bincount(found.kinds)).tolist()
+            )
             return
         order = np.argsort(self.starts, kind="stable")
         senders = self.senders[order[np.searchsorted(self.starts[order], found.starts)]]
@@ -204,7 +260,9 @@ class Batch:
 
 
 class CaptureBatches(CaptureReader):
-    """The datagrams of a capture in batches of arrays, which say of each what `CaptureReader` says; read either way, not both."""
+    """The datagrams of a capture in batches of arrays, which say of each what `CaptureReader` says;
+    read either way, not both.
+    """
 
     largest = LARGEST
 
@@ -214,7 +272,9 @@ class CaptureBatches(CaptureReader):
         with self._to_the_end():
             form = self._form = self._form or records(self._source)
             while self._source.begin_record():
-                starts, stuck = walked(self._source.storage, self._source.at, self._source.stop, form)
+                starts, stuck = walked(
+                    self._source.storage, self._source.at, self._source.stop, form
+                )
                 if len(starts) < 2 and not stuck and self._source.more():
                     continue
                 starts = starts if len(starts) > 1 else np.array([self._source.at])
@@ -239,18 +299,28 @@ class StreamBatches(StreamReader, CaptureBatches):
 class _Records:
     """The records that are whole in the window; where there are none, the one that comes next."""
 
-    def __init__(self, reader: CaptureReader, source: Source, form: Form, starts: Indices, known: list[Alike]) -> None:
+    def __init__(
+        self, reader: CaptureReader, source: Source, form: Form, starts: Indices, known: list[Alike]
+    ) -> None:
         self._reader, self._source, self._form, self._known = reader, source, form, known
         number = max(len(starts) - 1, 1)
         self._are_whole = len(starts) > 1
-        self._starts, self._lengths = starts, starts[1:] - starts[:-1] if self._are_whole else np.zeros(1, np.intp)
+        self._starts, self._lengths = (
+            starts,
+            starts[1:] - starts[:-1] if self._are_whole else np.zeros(1, np.intp),
+        )
         self._kinds = np.full(number, -1, np.intp)  # indices into `_known`
         self._at = np.zeros(number, np.int64)
         self._plain: dict[int, Datagram] = {}
-        self._learnt = self._counted = 0  # kinds; packets that were read plainly and are known all the same
+        self._learnt = self._counted = (
+            0  # kinds; packets that were read plainly and are known all the same
+        )
         self._only: Alike | None = None  # what all records are like
         self._section = form.sections
-        self._storage, self._buffer = source.storage, source.lent()  # of another the source may be, once it has looked further ahead
+        self._storage, self._buffer = (
+            source.storage,
+            source.lent(),
+        )  # of another the source may be, once it has looked further ahead
 
     def read(self) -> Exception | None:
         """What ended the reading of the file, if it ended here."""
@@ -280,7 +350,9 @@ class _Records:
         if len(self._known) == 1:
             return self._known
         counts = np.bincount(self._kinds[self._kinds >= 0], minlength=len(self._known))
-        return [self._known[kind] for kind in np.argsort(-counts, kind="stable")[:MOST_KNOWN].tolist()]
+        return [
+            self._known[kind] for kind in np.argsort(-counts, kind="stable")[:MOST_KNOWN].tolist()
+        ]
 
     def batch(self) -> Batch:
         """The datagrams of these records."""
@@ -290,8 +362,18 @@ class _Records:
         self._reader.stats.packets += len(known) - self._counted
         kinds = self._kinds[known]
         names: dict[Sender, int] = {}
-        facts = np.array([(one.start, one.size, names.setdefault(one.source, len(names))) for one in self._known], np.intp).reshape(-1, 3)
-        starts, sizes, senders = facts[kinds].T if len(facts) != 1 else (np.full(len(known), fact) for fact in facts.ravel())
+        facts = np.array(
+            [
+                (one.start, one.size, names.setdefault(one.source, len(names)))
+                for one in self._known
+            ],
+            np.intp,
+        ).reshape(-1, 3)
+        starts, sizes, senders = (
+            facts[kinds].T
+            if len(facts) != 1
+            else (np.full(len(known), fact) for fact in facts.ravel())
+        )
         columns = [self._starts[known] + starts, sizes, self._at[known], senders]
         buffer = self._buffer if len(known) else np.empty(0, np.uint8)
         if self._plain:
@@ -299,24 +381,46 @@ class _Records:
         return Batch(buffer, columns[0], columns[1], columns[2], columns[3], tuple(names))
 
     def _uniform(self, kind: Alike) -> Batch:
-        """What was read at once, as a batch, where all records are of one kind; columns are of shape (n,)."""
+        """What was read at once, as a batch, where all records are of one kind; columns are of
+        shape (n,).
+        """
         number = len(self._at)
         self._reader.stats.packets += number - self._counted
         sizes, senders = (np.broadcast_to(np.intp(fact), number) for fact in (kind.size, 0))
-        return Batch(self._buffer, self._starts[:number] + kind.start, sizes, self._at, senders, (kind.source,))
+        return Batch(
+            self._buffer,
+            self._starts[:number] + kind.start,
+            sizes,
+            self._at,
+            senders,
+            (kind.source,),
+        )
 
     def _with_plain(
-        self, buffer: NDArray[np.uint8], columns: list[NDArray[Any]], known: Indices, names: dict[Sender, int]
+        self,
+        buffer: NDArray[np.uint8],
+        columns: list[NDArray[Any]],
+        known: Indices,
+        names: dict[Sender, int],
     ) -> NDArray[np.uint8]:
-        """The buffer with the bytes of datagrams that are not in it as they are, which take their places in the columns."""
+        """The buffer with the bytes of datagrams that are not in it as they are, which take their
+        places in the columns.
+        """
         data = b"".join(datagram.data for datagram in self._plain.values())
         at = len(buffer)
         rows = []
         for datagram in self._plain.values():
-            rows.append((at, len(datagram.data), datagram.at, names.setdefault(datagram.source, len(names))))
+            rows.append(
+                (at, len(datagram.data), datagram.at, names.setdefault(datagram.source, len(names)))
+            )
             at += len(datagram.data)
-        order = np.argsort(np.concatenate([known, np.array(list(self._plain), np.intp)]), kind="stable")
-        columns[:] = [np.concatenate(parts)[order] for parts in zip(columns, np.array(rows, np.int64).T, strict=True)]
+        order = np.argsort(
+            np.concatenate([known, np.array(list(self._plain), np.intp)]), kind="stable"
+        )
+        columns[:] = [
+            np.concatenate(parts)[order]
+            for parts in zip(columns, np.array(rows, np.int64).T, strict=True)
+        ]
         return np.concatenate([buffer, np.frombuffer(data, np.uint8)])
 
     def _read_plainly(self, index: int) -> None:
@@ -340,7 +444,9 @@ class _Records:
                 self._counted += 1
 
     def _match(self, kind: int, since: int = 0) -> bool:
-        """Whether all records are now known; those before `since` were read: what was malformed there may be right by now."""
+        """Whether all records are now known; those before `since` were read: what was malformed
+        there may be right by now.
+        """
         alike, number = self._known[kind], len(self._kinds)
         if kind == since == 0 and self._are_whole:
             found, at = alike.find(self._storage, self._starts[:number], self._lengths)

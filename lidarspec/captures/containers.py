@@ -1,8 +1,10 @@
-"""What a file is by its first bytes: compressed, and read as what is in it, or of a kind that holds no bytes as a sensor sent them.
+"""What a file is by its first bytes: compressed, and read as what is in it, or of a kind that holds
+no bytes as a sensor sent them.
 
-Nothing is unpacked as a whole: `Unpacking` is a file that unpacks as it is read. Where the packed bytes end too early or are damaged it
-ends, and says so in `damage`; everything before was read, but for what cannot be told from the damage: at most `STEP` bytes, or a block of
-bzip2. The table of a zip archive stands at its end, so that one is read from a file and not from a pipe.
+Nothing is unpacked as a whole: `Unpacking` is a file that unpacks as it is read. Where the packed
+bytes end too early or are damaged it ends, and says so in `damage`; everything before was read, but
+for what cannot be told from the damage: at most `STEP` bytes, or a block of bzip2. The table of a
+zip archive stands at its end, so that one is read from a file and not from a pipe.
 """
 
 from __future__ import annotations
@@ -25,7 +27,8 @@ from lidarspec.stores import file_of
 
 #: bytes that say what a file is.
 HEAD = 512
-#: bytes that are unpacked in one step, and by one reading of a file; of a pipe, it gives what has come.
+#: bytes that are unpacked in one step, and by one reading of a file; of a pipe, it gives what has
+#: come.
 STEP, FILLED = 1 << 13, 1 << 20
 #: a capture may be compressed and lie in a zip archive; what is packed more often is none.
 DEEPEST = 2
@@ -34,7 +37,9 @@ NAMED = 6
 
 
 class Packing(NamedTuple):
-    """A way of compressing: its name, the module whose `open` unpacks it, and the command that does."""
+    """A way of compressing: its name, the module whose `open` unpacks it, and the command that
+    does.
+    """
 
     name: str
     module: str
@@ -52,19 +57,29 @@ PACKINGS = {
     ),
     rb"PK\x03\x04": ZIP,
 }
-#: how files begin that hold no bytes as a sensor sent them, or these in a shape of their own; what they are, and what takes the bytes out.
+#: how files begin that hold no bytes as a sensor sent them, or these in a shape of their own; what
+#: they are, and what takes the bytes out.
 CONTAINERS = {
     rb"\x04\x22\x4d\x18": ("compressed by lz4", "unlz4 {}"),
     rb"7z\xbc\xaf\x27\x1c": ("a 7z archive", "7z x {}"),
     rb"Rar!\x1a\x07": ("a RAR archive", "7z x {}"),
     rb".{257}ustar": ("a tar archive", "tar -xf {}"),
-    rb"snoop\x00{3}|btsnoop\x00|\x34\xcd\xb2\xa1|\xa1\xb2\xcd\x34": ("a capture of another format", "editcap {} capture.pcapng"),
-    rb"version https://git-lfs": ("a pointer of Git LFS, in the place of the file itself", "git lfs pull"),
+    rb"snoop\x00{3}|btsnoop\x00|\x34\xcd\xb2\xa1|\xa1\xb2\xcd\x34": (
+        "a capture of another format",
+        "editcap {} capture.pcapng",
+    ),
+    rb"version https://git-lfs": (
+        "a pointer of Git LFS, in the place of the file itself",
+        "git lfs pull",
+    ),
     rb"\x89HDF\r\n": ("an HDF5 file", ""),
     rb"PAR1": ("a Parquet file", ""),
     rb"ARROW1\x00\x00|FEA1": ("an Arrow file", ""),
     rb"\x93NUMPY": ("a NumPy array", ""),
-    rb"\x80[\x02\x03](?:[\]})(]q\x00|c\w|\x8a\n)|\x80[\x04\x05]\x95.{5}\x00{3}": ("a pickle of Python", ""),
+    rb"\x80[\x02\x03](?:[\]})(]q\x00|c\w|\x8a\n)|\x80[\x04\x05]\x95.{5}\x00{3}": (
+        "a pickle of Python",
+        "",
+    ),
     rb"# \.PCD v|ply\r?\n|LASF|ASTM-E57": ("a file of points", ""),
     rb"\x89PNG\r\n|\xff\xd8\xff[\xdb\xe0\xe1\xee]|GIF8[79]a|.{4}ftyp": ("a picture or a film", ""),
     rb"%PDF-": ("a PDF document", ""),
@@ -75,7 +90,9 @@ CONTAINERS = {
 
 
 class Damage(NamedTuple):
-    """Where unpacking ended too early, in words, and how many packed bytes were not read: 0 where there are none."""
+    """Where unpacking ended too early, in words, and how many packed bytes were not read: 0 where
+    there are none.
+    """
 
     text: str
     unread: int
@@ -125,13 +142,17 @@ class Unpacking(io.RawIOBase):
             return data
         except EOFError:
             self.damage = Damage(f"{self.name} is cut off{self._read}", 0)
-        except Exception as error:  # each library has its own for damaged bytes, and bz2 and gzip take OSError
+        except (
+            Exception
+        ) as error:  # each library has its own for damaged bytes, and bz2 and gzip take OSError
             if isinstance(error, OSError) and error.errno is not None:
                 raise
             place = self._packed.tell() if self._packed.seekable() else 0
             size = self._packed.seek(0, os.SEEK_END) if place else 0
             where = f" before byte {place} of {size}" * bool(place)
-            self.damage = Damage(f"{self.name} is damaged{where} ({error}){self._read}", max(size - place, 1))
+            self.damage = Damage(
+                f"{self.name} is damaged{where} ({error}){self._read}", max(size - place, 1)
+            )
         return b""
 
     @property
@@ -159,7 +180,8 @@ def opened(path: str | os.PathLike[str], member: str = "") -> BinaryIO:
 
 
 def unpacked(name: str, file: BinaryIO, member: str = "") -> BinaryIO:
-    """An open file itself, or where it is compressed one that unpacks it as it is read, and closes it.
+    """An open file itself, or where it is compressed one that unpacks it as it is read, and closes
+    it.
 
     Args:
         name: of the file, for messages.
@@ -184,26 +206,42 @@ def unpacked(name: str, file: BinaryIO, member: str = "") -> BinaryIO:
 
 
 def _packing(start: bytes) -> Packing | None:
-    return next((packing for beginning, packing in PACKINGS.items() if re.match(beginning, start)), None)
+    return next(
+        (packing for beginning, packing in PACKINGS.items() if re.match(beginning, start)), None
+    )
 
 
 def _of_archive(name: str, file: BinaryIO, member: str) -> Any:
     """One file of a zip archive."""
     if not file.seekable():
-        raise SourceError(f"{name} is a zip archive, and its table stands at its end: give its file, not a pipe")
+        raise SourceError(
+            f"{name} is a zip archive, and its table stands at its end: give its file, not a pipe"
+        )
     try:
         archive = zipfile.ZipFile(file)
-        names = [item.filename for item in archive.infolist() if not item.is_dir() and not item.filename.startswith("__MACOSX/")]
+        names = [
+            item.filename
+            for item in archive.infolist()
+            if not item.is_dir() and not item.filename.startswith("__MACOSX/")
+        ]
         return archive.open(_chosen(name, archive, names, member))
     except (UsageError, SourceError):
         raise
     except Exception as error:  # of a damaged one, too, zipfile raises what it will
-        command = f"zip -FF {quote(name)} --out mended.zip" if isinstance(error, zipfile.BadZipFile) else f"unzip {quote(name)}"
-        raise suggest(SourceError(f"{name} is a zip archive, and is not read: {error}"), command) from error
+        command = (
+            f"zip -FF {quote(name)} --out mended.zip"
+            if isinstance(error, zipfile.BadZipFile)
+            else f"unzip {quote(name)}"
+        )
+        raise suggest(
+            SourceError(f"{name} is a zip archive, and is not read: {error}"), command
+        ) from error
 
 
 def _chosen(name: str, archive: zipfile.ZipFile, names: list[str], member: str) -> str:
-    """The member that is asked for, or the only one, or the only one that is a capture or recording."""
+    """The member that is asked for, or the only one, or the only one that is a capture or
+    recording.
+    """
     if member:
         if member not in names:
             raise UnknownName(member, names, place=name)
@@ -215,8 +253,14 @@ def _chosen(name: str, archive: zipfile.ZipFile, names: list[str], member: str) 
         return readable[0]
     shown = ", ".join((readable or names)[:NAMED]) + ", ..." * (len(readable or names) > NAMED)
     if not readable:
-        raise SourceError(f"{name} is a zip archive, and is not read: there is no capture in it, but {shown or 'nothing'}")
-    raise suggest(UsageError(f"{name} holds {len(readable)} captures: {shown}"), f"the same with {quote(f'{name}?file={readable[0]}')}")
+        raise SourceError(
+            f"{name} is a zip archive, and is not read: there is no capture in it, but"
+            f" {shown or 'nothing'}"
+        )
+    raise suggest(
+        UsageError(f"{name} holds {len(readable)} captures: {shown}"),
+        f"the same with {quote(f'{name}?file={readable[0]}')}",
+    )
 
 
 def _is_readable(archive: zipfile.ZipFile, member: str) -> bool:
@@ -235,11 +279,21 @@ def refuse_container(path: str, start: bytes) -> None:
     Raises:
         SourceError: where it begins as a file of another kind, which is named.
     """
-    packed = {beginning: (f"compressed by {packing.name} again and again", packing.command) for beginning, packing in PACKINGS.items()}
+    packed = {
+        beginning: (f"compressed by {packing.name} again and again", packing.command)
+        for beginning, packing in PACKINGS.items()
+    }
     for beginning, (what, command) in (CONTAINERS | packed).items():
         if re.match(beginning, start, re.DOTALL):
-            error = SourceError(f"{path} is {what}, and is not read: this takes captures, recordings and bytes as a sensor sent them")
-            raise suggest(error, command.format(quote(path))) if command and Path(path).exists() else error
+            error = SourceError(
+                f"{path} is {what}, and is not read: this takes captures, recordings and bytes as a"
+                " sensor sent them"
+            )
+            raise (
+                suggest(error, command.format(quote(path)))
+                if command and Path(path).exists()
+                else error
+            )
 
 
 def head(file: BinaryIO) -> bytes:

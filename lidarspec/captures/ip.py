@@ -1,16 +1,19 @@
 """From captured frames to UDP payloads, and back: link layers, IPv4, IPv6, fragments.
 
-Knows nothing of files. A frame goes through `ip_packet`, if it is a fragment then through `Reassembly.add`, and through
-`udp`; whichever step finds that no datagram comes of it raises `Refused` with the reason.
+Knows nothing of files. A frame goes through `ip_packet`, if it is a fragment then through
+`Reassembly.add`, and through `udp`; whichever step finds that no datagram comes of it raises
+`Refused` with the reason.
 
-Two fields are not trusted. Checksums: where the capturing machine is the sender, its network card fills them in only after
-the capture. The length of an unfragmented packet, where more is claimed than is there, or 0: a lidar in the field puts the IPv4 length of
-its data packets, 1234, also into packets of 540 bytes, and a network card that cuts packets up fills it in after the capture.
-UDP's own length decides whether the payload is whole.
+Two fields are not trusted. Checksums: where the capturing machine is the sender, its network card
+fills them in only after the capture. The length of an unfragmented packet, where more is claimed
+than is there, or 0: a lidar in the field puts the IPv4 length of its data packets, 1234, also into
+packets of 540 bytes, and a network card that cuts packets up fills it in after the capture. UDP's
+own length decides whether the payload is whole.
 
-Source: RFC 768 (UDP), RFC 791 (IPv4), RFC 8200 (IPv6), RFC 5722 (overlapping fragments), RFC 6946 (atomic fragments),
-RFC 1661 and 1662 (PPP), RFC 2516 (PPPoE), RFC 3032 (MPLS), IEEE 802.1Q (VLAN tags), IEEE 802.11 9.2 and 9.3.2 (data frames),
-radiotap.org (its header), and the link-layer header types of tcpdump.org.
+Source: RFC 768 (UDP), RFC 791 (IPv4), RFC 8200 (IPv6), RFC 5722 (overlapping fragments), RFC 6946
+(atomic fragments), RFC 1661 and 1662 (PPP), RFC 2516 (PPPoE), RFC 3032 (MPLS), IEEE 802.1Q (VLAN
+tags), IEEE 802.11 9.2 and 9.3.2 (data frames), radiotap.org (its header), and the link-layer header
+types of tcpdump.org.
 """
 
 from __future__ import annotations
@@ -28,15 +31,31 @@ _LARGEST_PACKET = 65_535
 
 _LOOPBACK = {0, 108}
 _RAW = {12, 101, 228, 229}
-_ETHERTYPE_LINKS = {ETHERNET: (12, 14), 113: (14, 16), 276: (0, 20)}  # offset of the EtherType, length of the header
+_ETHERTYPE_LINKS = {
+    ETHERNET: (12, 14),
+    113: (14, 16),
+    276: (0, 20),
+}  # offset of the EtherType, length of the header
 _VLAN_TAGS = {0x8100, 0x88A8, 0x9100}
 _IP_ETHERTYPES = {0x0800, 0x86DD}
-_IP_FAMILIES = {2, 10, 24, 28, 30}  # AF_INET everywhere; AF_INET6 of Linux, NetBSD, FreeBSD and macOS
+_IP_FAMILIES = {
+    2,
+    10,
+    24,
+    28,
+    30,
+}  # AF_INET everywhere; AF_INET6 of Linux, NetBSD, FreeBSD and macOS
 _PPP_LINKS = {9: 0, 50: 0, 51: 6}  # what stands before PPP's header: nothing, or that of PPPoE
 _PPPOE, _MPLS, _PPP_IP = 0x8864, {0x8847, 0x8848}, {0x0021, 0x0057}
 _WIFI, _RADIOTAP = 105, 127
 #: what packets are called that are no UDP, by EtherType and by IP protocol.
-_ETHERTYPES = {0x0806: "ARP", 0x8863: "PPPoE discovery", 0x888E: "802.1X", 0x88CC: "LLDP", 0x88F7: "PTP"}
+_ETHERTYPES = {
+    0x0806: "ARP",
+    0x8863: "PPPoE discovery",
+    0x888E: "802.1X",
+    0x88CC: "LLDP",
+    0x88F7: "PTP",
+}
 _PROTOCOLS = {1: "ICMP", 2: "IGMP", 6: "TCP", 47: "GRE", 50: "ESP", 58: "ICMPv6", 132: "SCTP"}
 
 _UDP = 17
@@ -48,7 +67,10 @@ _IPV4_HEADER = struct.Struct(">BxHHHBB2s4s4s")
 _IPV6_HEADER = struct.Struct(">4xHBx16s16s")
 _UDP_HEADER = struct.Struct(">HHHH")
 _SNAP_HEADER, _SNAP = struct.Struct(">6sH"), bytes.fromhex("aaaa03000000")
-_TO_MAC, _FROM_MAC = bytes.fromhex("020000000001"), bytes.fromhex("020000000002")  # locally administered, nobody's
+_TO_MAC, _FROM_MAC = (
+    bytes.fromhex("020000000001"),
+    bytes.fromhex("020000000002"),
+)  # locally administered, nobody's
 _DO_NOT_FRAGMENT, _TIME_TO_LIVE = 0x4000, 64
 
 
@@ -56,7 +78,8 @@ class Refused(Exception):
     """A packet that gives no datagram.
 
     Attributes:
-        reason: "other" (not UDP), "short" (fewer bytes than its headers say) or "malformed" (headers that cannot be).
+        reason: "other" (not UDP), "short" (fewer bytes than its headers say) or "malformed"
+            (headers that cannot be).
         what: the name of what it is instead of UDP.
     """
 
@@ -66,7 +89,9 @@ class Refused(Exception):
 
 
 class Fragment(NamedTuple):
-    """Where the body of a packet belongs in the whole: bytes from `start` on, with `more` to come after it."""
+    """Where the body of a packet belongs in the whole: bytes from `start` on, with `more` to come
+    after it.
+    """
 
     ident: int
     start: int
@@ -74,7 +99,9 @@ class Fragment(NamedTuple):
 
 
 class IpPacket(NamedTuple):
-    """An IP packet that carries UDP, or a fragment of one; addresses as on the wire, 4 or 16 bytes; `at`: where in the frame `body` is."""
+    """An IP packet that carries UDP, or a fragment of one; addresses as on the wire, 4 or 16 bytes;
+    `at`: where in the frame `body` is.
+    """
 
     source: bytes
     destination: bytes
@@ -99,8 +126,8 @@ class Headers(NamedTuple):
     Attributes:
         size: of all headers together, which is where the payload starts.
         payload: its length.
-        free: the places of bytes that may differ between packets of one stream and tell nothing about it: the
-            identification of an unfragmented IPv4 packet, and checksums.
+        free: the places of bytes that may differ between packets of one stream and tell nothing
+            about it: the identification of an unfragmented IPv4 packet, and checksums.
     """
 
     size: int
@@ -151,10 +178,12 @@ def udp(packet: IpPacket) -> UdpPacket:
 
 
 def headers(frame: bytes, link: int) -> Headers | None:
-    """Where the payload stands in a frame, and which bytes before it decide that; None for fragments.
+    """Where the payload stands in a frame, and which bytes before it decide that; None for
+    fragments.
 
-    Frames of the same link type and length, whose headers are equal but for the free bytes, have their payload in the same
-    place and come from the same sender: nothing else is looked at by `ip_packet` and `udp`.
+    Frames of the same link type and length, whose headers are equal but for the free bytes, have
+    their payload in the same place and come from the same sender: nothing else is looked at by
+    `ip_packet` and `udp`.
 
     Raises:
         Refused: as `ip_packet` and `udp`.
@@ -178,7 +207,8 @@ def address(packed: bytes) -> str:
 
 
 def udp_frame(payload: bytes, source: tuple[bytes, int], destination: tuple[bytes, int]) -> bytes:
-    """An Ethernet frame with an IP and a UDP header before `payload`; over IPv4 the UDP checksum is 0 (not computed).
+    """An Ethernet frame with an IP and a UDP header before `payload`; over IPv4 the UDP checksum is
+    0 (not computed).
 
     Args:
         payload: at most `LARGEST_PAYLOAD` bytes, over IPv6 20 more.
@@ -187,19 +217,28 @@ def udp_frame(payload: bytes, source: tuple[bytes, int], destination: tuple[byte
     ends, length = source[0] + destination[0], _UDP_HEADER.size + len(payload)
     if len(ends) == 32:
         kind, ip_header = 0x86DD, struct.pack(">IHBB", 6 << 28, length, _UDP, _TIME_TO_LIVE) + ends
-        parts = ends, struct.pack(">II", length, _UDP), _UDP_HEADER.pack(source[1], destination[1], length, 0), payload
+        parts = (
+            ends,
+            struct.pack(">II", length, _UDP),
+            _UDP_HEADER.pack(source[1], destination[1], length, 0),
+            payload,
+        )
         checksum = _checksum(b"".join(parts) + bytes(len(payload) % 2)) or 0xFFFF
     else:
         kind, checksum = 0x0800, 0
         fields = (0x45, _IPV4_HEADER.size + length, 0, _DO_NOT_FRAGMENT, _TIME_TO_LIVE, _UDP)
         blank = _IPV4_HEADER.pack(*fields, b"\0\0", source[0], destination[0])
-        ip_header = _IPV4_HEADER.pack(*fields, _checksum(blank).to_bytes(2), source[0], destination[0])
+        ip_header = _IPV4_HEADER.pack(
+            *fields, _checksum(blank).to_bytes(2), source[0], destination[0]
+        )
     udp_header = _UDP_HEADER.pack(source[1], destination[1], length, checksum)
     return _ETHERNET_HEADER.pack(_TO_MAC, _FROM_MAC, kind) + ip_header + udp_header + payload
 
 
 def _checksum(words: bytes) -> int:
-    """The ones' complement of the ones' complement sum of 16-bit words: all of it as one number modulo 0xFFFF, which stands for 0."""
+    """The ones' complement of the ones' complement sum of 16-bit words: all of it as one number
+    modulo 0xFFFF, which stands for 0.
+    """
     return 0xFFFF - (int.from_bytes(words) % 0xFFFF or 0xFFFF)
 
 
@@ -207,8 +246,12 @@ def _ip_start(frame: bytes, link: int) -> int:
     if link in _RAW:
         return 0
     if link in _LOOPBACK:
-        # The family stands in the byte order of the capturing machine; families are small, so the smaller reading is right.
-        if min(*struct.unpack_from("<I", frame), *struct.unpack_from(">I", frame)) not in _IP_FAMILIES:
+        # The family stands in the byte order of the capturing machine; families are small, so the
+        # smaller reading is right.
+        if (
+            min(*struct.unpack_from("<I", frame), *struct.unpack_from(">I", frame))
+            not in _IP_FAMILIES
+        ):
             raise Refused("other", "loopback without IP")
         return 4
     if link in _PPP_LINKS:
@@ -241,7 +284,9 @@ def _past_ethertype(frame: bytes, ethertype: int, start: int) -> int:
 
 
 def _past_ppp(frame: bytes, at: int) -> int:
-    """Where IP begins behind PPP's header, of which address and control, and the upper byte of the protocol, may be left out."""
+    """Where IP begins behind PPP's header, of which address and control, and the upper byte of the
+    protocol, may be left out.
+    """
     at += 2 * (frame[at] == 0xFF)
     short = frame[at] & 1
     protocol = frame[at] if short else frame[at] << 8 | frame[at + 1]
@@ -273,7 +318,9 @@ def _past_wifi(frame: bytes, link: int) -> tuple[int, int]:
 
 
 def _past_radiotap(frame: bytes) -> tuple[int, bool]:
-    """The length of a radiotap header, and whether the header behind it is padded to words of 4 bytes, which its flags say."""
+    """The length of a radiotap header, and whether the header behind it is padded to words of 4
+    bytes, which its flags say.
+    """
     length, present = struct.unpack_from("<HI", frame, 2)
     at, more = 8, present
     while more & 1 << 31:
@@ -288,7 +335,9 @@ def _not_udp(protocol: int) -> Refused:
 
 
 def _ipv4(frame: bytes, start: int) -> IpPacket:
-    first, total, ident, place, _, protocol, _, source, destination = _IPV4_HEADER.unpack_from(frame, start)
+    first, total, ident, place, _, protocol, _, source, destination = _IPV4_HEADER.unpack_from(
+        frame, start
+    )
     header, total = (first & 0x0F) * 4, total or len(frame) - start
     if header < _IPV4_HEADER.size or total < header:
         raise Refused("malformed")
@@ -350,11 +399,15 @@ class _Partial:
         self.protocol = _UDP
 
     def add(self, start: int, body: bytes, *, more: bool) -> bool:
-        """Whether the body was taken in: it overlaps nothing and agrees with the others about the end."""
+        """Whether the body was taken in: it overlaps nothing and agrees with the others about the
+        end.
+        """
         stop = start + len(body)
         index = bisect_left(self.starts, start)
         before, after = self.starts[index - 1 : index], self.starts[index : index + 1]
-        if any(earlier + len(self.parts[earlier]) > start for earlier in before) or any(later < stop for later in after):
+        if any(earlier + len(self.parts[earlier]) > start for earlier in before) or any(
+            later < stop for later in after
+        ):
             return False
         if more and self.total is not None and stop > self.total:
             return False
@@ -371,8 +424,9 @@ class _Partial:
 class Reassembly:
     """Puts fragments together, in whatever order they come, in bounded memory.
 
-    A packet whose fragments overlap is given up (RFC 5722), except that a fragment seen twice is ignored. The oldest
-    packets are given up where more than `MOST_PACKETS` or `MOST_BYTES` wait, and those older than `PATIENCE_NS`.
+    A packet whose fragments overlap is given up (RFC 5722), except that a fragment seen twice is
+    ignored. The oldest packets are given up where more than `MOST_PACKETS` or `MOST_BYTES` wait,
+    and those older than `PATIENCE_NS`.
 
     Attributes:
         dropped: fragments of packets that were given up.
@@ -380,8 +434,11 @@ class Reassembly:
 
     MOST_PACKETS = 256
     MOST_BYTES = 4 << 20
-    PATIENCE_NS = 5_000_000_000  # at 10,000 datagrams/s the 16-bit identification of IPv4 comes round after 6.5 s
-    _OVERHEAD = 160  # bytes of objects around each fragment, so that tiny ones count for what they take
+    # at 10,000 datagrams/s the 16-bit identification of IPv4 comes round after 6.5 s
+    PATIENCE_NS = 5_000_000_000
+    _OVERHEAD = (
+        160  # bytes of objects around each fragment, so that tiny ones count for what they take
+    )
 
     def __init__(self) -> None:
         self.dropped = 0

@@ -1,8 +1,9 @@
 """Captures: the UDP datagrams of a pcap or pcapng file, and the records of those that are written.
 
-Theory of operation: `records` walks the records of the file, `ip` takes the captured frames apart, and this module
-joins the two and counts in `CaptureStats` whatever gives no datagram. Captures are hostile input: past the first four bytes
-nothing in them raises, and memory follows the bytes that are there, never a length that they claim.
+Theory of operation: `records` walks the records of the file, `ip` takes the captured frames apart,
+and this module joins the two and counts in `CaptureStats` whatever gives no datagram. Captures are
+hostile input: past the first four bytes nothing in them raises, and memory follows the bytes that
+are there, never a length that they claim.
 """
 
 from __future__ import annotations
@@ -17,7 +18,17 @@ from functools import lru_cache
 from typing import BinaryIO
 
 from lidarspec.captures.containers import opened
-from lidarspec.captures.ip import LARGEST_PAYLOAD, Headers, Reassembly, Refused, address, headers, ip_packet, udp, udp_frame
+from lidarspec.captures.ip import (
+    LARGEST_PAYLOAD,
+    Headers,
+    Reassembly,
+    Refused,
+    address,
+    headers,
+    ip_packet,
+    udp,
+    udp_frame,
+)
 from lidarspec.captures.records import (
     CapturedPacket,
     Damaged,
@@ -49,7 +60,8 @@ class Datagram:
 
     Attributes:
         data: the payload.
-        at: capture time in ns since 1970, of its last fragment where it came in several; 0 where the file has no times.
+        at: capture time in ns since 1970, of its last fragment where it came in several; 0 where
+            the file has no times.
         source, destination: address and port.
     """
 
@@ -73,9 +85,11 @@ class CaptureStats:
         fragments: UDP packets that were IP fragments.
         incomplete_fragments: those whose datagram never became whole.
         malformed: packets and records that contradict themselves.
-        damaged: places where a record could not be read, and bytes were passed over to the next one that could.
+        damaged: places where a record could not be read, and bytes were passed over to the next one
+            that could.
         lost: bytes that were passed over there.
-        stopped_at: file offset of the truncated or malformed record that ended the reading, else None.
+        stopped_at: file offset of the truncated or malformed record that ended the reading, else
+            None.
     """
 
     packets: int = 0
@@ -98,18 +112,20 @@ class CaptureStats:
 
 
 class CaptureReader(Closing):
-    """The UDP datagrams of a capture, in file order, each once: an iterator goes on where the last one stopped.
+    """The UDP datagrams of a capture, in file order, each once: an iterator goes on where the last
+    one stopped.
 
     Args:
-        file: an open binary file, also a pipe, which stays open; or a path, whose file is closed after the last datagram, and which
-            may be compressed.
+        file: an open binary file, also a pipe, which stays open; or a path, whose file is closed
+            after the last datagram, and which may be compressed.
 
     Attributes:
         stats: what was met so far.
         largest: bytes that are read at once, at most.
 
     Raises:
-        SourceError: the file cannot be read, or is no capture at all. Damage further on is counted, never raised.
+        SourceError: the file cannot be read, or is no capture at all. Damage further on is counted,
+            never raised.
     """
 
     largest = SMALLEST
@@ -127,7 +143,9 @@ class CaptureReader(Closing):
             magic = bytes(self._source.ahead(4))
             if not is_capture(magic):
                 seen = f"it begins with {magic.hex(' ')}" if magic else "it is empty"
-                raise SourceError(f"{getattr(file, 'name', 'input')}: neither a pcap nor a pcapng capture: {seen}")
+                raise SourceError(
+                    f"{getattr(file, 'name', 'input')}: neither a pcap nor a pcapng capture: {seen}"
+                )
         except SourceError:
             self.close()
             raise
@@ -138,14 +156,19 @@ class CaptureReader(Closing):
         return self._source.place
 
     def __iter__(self) -> Iterator[Datagram]:
-        if self._datagrams is None:  # and not before: it holds the reader, which would live on until the garbage is collected
+        if (
+            self._datagrams is None
+            # and not before: it holds the reader, which would live on until the garbage is collected
+        ):
             self._datagrams = self._walk()
         return self._datagrams
 
     def skip(self, at: int) -> bool:
-        """Go on close before the first datagram that came at a time, ns since 1970, or later, where a file can be sought: whether it did.
+        """Go on close before the first datagram that came at a time, ns since 1970, or later, where
+        a file can be sought: whether it did.
 
-        What is passed over is not counted, and datagrams whose fragments stand on both sides are left out.
+        What is passed over is not counted, and datagrams whose fragments stand on both sides are
+        left out.
         """
         return self._form is not None and sought(self._source, self._form, at)
 
@@ -218,12 +241,16 @@ class CaptureReader(Closing):
         return Datagram(ip.body[part.start : part.stop], packet.at, *ends)
 
     def headers(self, packet: CapturedPacket) -> Headers | None:
-        """Where the payload of a packet that gave a datagram stands, and so that of packets like it; None where others may differ."""
+        """Where the payload of a packet that gave a datagram stands, and so that of packets like
+        it; None where others may differ.
+        """
         return headers(packet.data, packet.link)
 
 
 class StreamReader(CaptureReader):
-    """The packets of a capture of a byte stream, link type USER0 to USER15, as datagrams that nobody sent."""
+    """The packets of a capture of a byte stream, link type USER0 to USER15, as datagrams that
+    nobody sent.
+    """
 
     def datagram(self, packet: CapturedPacket | Passed) -> Datagram | None:
         """What the packet holds; counts it where it is of another link type."""
@@ -254,7 +281,8 @@ def datagram_frame(datagram: Datagram) -> bytes:
     """One datagram, unfragmented, as Ethernet, IP and UDP.
 
     Raises:
-        UsageError: more bytes than UDP carries, an address that is none, or a port that there is not.
+        UsageError: more bytes than UDP carries, an address that is none, or a port that there is
+            not.
     """
     source, destination = _endpoints(datagram.source, datagram.destination)
     most = LARGEST_PAYLOAD + 20 * (len(source[0]) == 16)
@@ -264,7 +292,9 @@ def datagram_frame(datagram: Datagram) -> bytes:
 
 
 def is_stream_capture(head: bytes) -> bool:
-    """Whether a file that begins so is a capture of a byte stream, little-endian; 24 bytes of pcap tell, 64 of pcapng as written here."""
+    """Whether a file that begins so is a capture of a byte stream, little-endian; 24 bytes of pcap
+    tell, 64 of pcapng as written here.
+    """
     link = 20
     if head.startswith(b"\x0a\x0d\x0d\x0a"):
         link = 8 + int.from_bytes(head[4:8], "little")
@@ -272,7 +302,11 @@ def is_stream_capture(head: bytes) -> bool:
             return False
     elif head[:1] not in (b"\x4d", b"\xd4"):
         return False
-    return is_capture(head) and len(head) >= link + 4 and int.from_bytes(head[link : link + 2], "little") in USER_LINKS
+    return (
+        is_capture(head)
+        and len(head) >= link + 4
+        and int.from_bytes(head[link : link + 2], "little") in USER_LINKS
+    )
 
 
 @lru_cache(maxsize=256)
@@ -287,5 +321,8 @@ def _endpoints(*ends: tuple[str, int]) -> list[tuple[bytes, int]]:
         if not 0 <= port < 1 << 16:
             raise UsageError(f"{port} is not a UDP port")
     if len({len(address) for address in packed}) > 1:
-        packed = [address if len(address) == 16 else _MAPPED + address if any(address) else bytes(16) for address in packed]
+        packed = [
+            address if len(address) == 16 else _MAPPED + address if any(address) else bytes(16)
+            for address in packed
+        ]
     return [(address, port) for address, (_, port) in zip(packed, ends, strict=True)]

@@ -1,11 +1,13 @@
-"""The records of pcap and pcapng files: all that is known of the two formats, for one record and for many alike.
+"""The records of pcap and pcapng files: all that is known of the two formats, for one record and
+for many alike.
 
-Hostile input: bytes come in bounded steps (`source`), and each turn of the walkers either advances or ends the reading. Damaged input:
-a doubtful length is believed unless other records begin within what it claims, and behind a record that cannot be read `resume` goes to
-the next place where records follow each other.
+Hostile input: bytes come in bounded steps (`source`), and each turn of the walkers either advances
+or ends the reading. Damaged input: a doubtful length is believed unless other records begin within
+what it claims, and behind a record that cannot be read `resume` goes to the next place where
+records follow each other.
 
-Source: the IETF drafts "PCAP Capture File Format" (draft-ietf-opsawg-pcap) and "PCAP Now Generic Capture File Format"
-(draft-ietf-opsawg-pcapng).
+Source: the IETF drafts "PCAP Capture File Format" (draft-ietf-opsawg-pcap) and "PCAP Now Generic
+Capture File Format" (draft-ietf-opsawg-pcapng).
 """
 
 from __future__ import annotations
@@ -44,11 +46,13 @@ _LAST_KIND = 10  # that the draft gives a number, but for the section's
 _TIME_RESOLUTION, _TIME_OFFSET = 9, 14  # options of an interface
 
 LARGEST_BLOCK = 1 << 20  # a packet with its options; longer blocks are passed over unread
-#: places that are looked at together for the next record, and bytes behind each that may be needed: a packet, its options, a head.
+#: places that are looked at together for the next record, and bytes behind each that may be needed:
+#: a packet, its options, a head.
 _STEP, _REACH = 1 << 16, LARGEST_PACKET + (1 << 12)
 #: bytes before a time that is sought which are read all the same.
 NEAR = 1 << 21
-#: seconds between two packets in a row, and between two of a file, at most, where a record may begin.
+#: seconds between two packets in a row, and between two of a file, at most, where a record may
+#: begin.
 _DAY, _YEAR = 86_400, 31_536_000
 _MOST_INTERFACES = 1024
 _SECOND = 1_000_000_000
@@ -111,7 +115,9 @@ class Times:
         return self.ticks <= 9 * _SECOND and abs(self.offset) < 1 << 62
 
     def ns(self, heads: NDArray[np.uint8]) -> tuple[NDArray[np.int64], NDArray[np.bool_] | None]:
-        """Times of n records, (n,) ns since 1970, and which of them are right, (n,); None where all are."""
+        """Times of n records, (n,) ns since 1970, and which of them are right, (n,); None where all
+        are.
+        """
         words = heads.view(self.word)
         high, low = words[:, self.high].astype(np.int64), words[:, self.low]
         if self.is_split:
@@ -131,7 +137,8 @@ class Pattern(NamedTuple):
         free: places of bytes among them that differ from record to record: the time's.
         uncut: those of the length that the packet had before it was cut.
         times: how the time is read from them.
-        trailer: type of the word at the end that repeats the length, with its byte order; None where there is none.
+        trailer: type of the word at the end that repeats the length, with its byte order; None
+            where there is none.
     """
 
     head: int
@@ -168,12 +175,16 @@ class PcapRecords:
         return other
 
     def length(self, data: memoryview | bytes, at: int) -> int:
-        """The length of the record that begins there, of which 16 bytes are there; 0 where it is doubtful, or cannot be."""
+        """The length of the record that begins there, of which 16 bytes are there; 0 where it is
+        doubtful, or cannot be.
+        """
         captured, original = self._lengths.unpack_from(data, at + 8)
         return self._head.size + captured if self._is_sure(captured, original) else 0
 
     def claim(self, length: int) -> tuple[int, str, int]:
-        """Where in a whole packet's record of a length that stands, as what type, and the number that stands there: the length, twice."""
+        """Where in a whole packet's record of a length that stands, as what type, and the number
+        that stands there: the length, twice.
+        """
         captured: int = length - self._head.size
         return 8, f"{self.order}u8", captured << 32 | captured
 
@@ -198,15 +209,28 @@ class PcapRecords:
             raise Damaged
         self._began = seconds if self._began is None else self._began
         self._source.skip(self._head.size)
-        return CapturedPacket(self.link, seconds * _SECOND + fraction * self._unit, self._source.take(captured), original)
+        return CapturedPacket(
+            self.link,
+            seconds * _SECOND + fraction * self._unit,
+            self._source.take(captured),
+            original,
+        )
 
     def first_place(self, data: memoryview, stop: int, *, is_end: bool) -> int | None:
-        """The first place below `stop` where a record begins that another one, or the end of the input, follows."""
+        """The first place below `stop` where a record begins that another one, or the end of the
+        input, follows.
+        """
         count = len(data) - self._head.size + 1
         if count <= 0:
             return None
-        seconds, fractions, captured, original = (np.ndarray((count,), f"{self.order}u4", data, at, (1,)) for at in (0, 4, 8, 12))
-        likely = (captured[:stop] <= original[:stop]) & (original[:stop] <= LARGEST_PACKET) & (captured[:stop] > 0)
+        seconds, fractions, captured, original = (
+            np.ndarray((count,), f"{self.order}u4", data, at, (1,)) for at in (0, 4, 8, 12)
+        )
+        likely = (
+            (captured[:stop] <= original[:stop])
+            & (original[:stop] <= LARGEST_PACKET)
+            & (captured[:stop] > 0)
+        )
         places = np.flatnonzero(likely & (fractions[:stop] < _SECOND // self._unit))
         if self._began is not None:
             places = places[abs(seconds[places].astype(np.int64) - self._began) <= _YEAR]
@@ -214,7 +238,11 @@ class PcapRecords:
         right = (behind == len(data)) & (captured[places] == original[places]) & is_end
         followed = behind < count
         before, after = places[followed], behind[followed]
-        right[followed] = (captured[after] <= original[after]) & (original[after] <= LARGEST_PACKET) & (captured[after] > 0)
+        right[followed] = (
+            (captured[after] <= original[after])
+            & (original[after] <= LARGEST_PACKET)
+            & (captured[after] > 0)
+        )
         right[followed] &= abs(seconds[after].astype(np.int64) - seconds[before]) <= _DAY
         return int(places[right.argmax()]) if right.any() else None
 
@@ -223,7 +251,9 @@ class PcapRecords:
         return 0 < captured <= LARGEST_PACKET and captured in (original, self._snap_length)
 
     def _is_false(self, captured: int, original: int) -> bool:
-        """Whether a record is longer or shorter than it says: none begins where it ends, and others do within it or its whole packet."""
+        """Whether a record is longer or shorter than it says: none begins where it ends, and others
+        do within it or its whole packet.
+        """
         size, within = self._head.size + captured, max(captured, min(original, LARGEST_PACKET) + 1)
         data = self._source.ahead(self._head.size + within + _REACH)
         is_end = len(data) < self._head.size + within + _REACH
@@ -263,10 +293,12 @@ class PcapngBlocks:
         return other
 
     def length(self, data: memoryview | bytes, at: int) -> int:
-        """The length of the block that begins there; 0 where it can only be read by itself, since it says something that cannot be,
-        begins a section, or is longer than is ever held."""
+        """The length of the block that begins there; 0 where it can only be read by itself, since
+        it says something that cannot be, begins a section, or is longer than is ever held."""
         kind, length = struct.unpack_from(self.order + "II", data, at)
-        return 0 if kind == _SECTION_KIND or length > LARGEST_BLOCK or not _can_be(length) else length
+        return (
+            0 if kind == _SECTION_KIND or length > LARGEST_BLOCK or not _can_be(length) else length
+        )
 
     def claim(self, length: int) -> tuple[int, str, int]:
         """Where in a block of a length that stands, as what type, and the number that stands there."""
@@ -293,7 +325,12 @@ class PcapngBlocks:
         if head[:4] == _SECTION:
             if head[8:] not in _ORDERS:
                 raise Damaged
-            self.order, self._interfaces, self._knows_all, self.sections = _ORDERS[head[8:]], [], True, self.sections + 1
+            self.order, self._interfaces, self._knows_all, self.sections = (
+                _ORDERS[head[8:]],
+                [],
+                True,
+                self.sections + 1,
+            )
         kind, length = struct.unpack_from(self.order + "II", head)
         if self._is_false(kind, length):
             self._knows_all = self._knows_all and kind != _INTERFACE
@@ -307,10 +344,15 @@ class PcapngBlocks:
                 self._knows_all = False
                 raise Damaged
             self._interfaces.append(_interface(self.order, body))
-        return _block_packet(self.order, kind, body, self._interfaces) or Passed.MALFORMED if kind in _PACKETS else Passed.NO_PACKET
+        return (
+            _block_packet(self.order, kind, body, self._interfaces) or Passed.MALFORMED
+            if kind in _PACKETS
+            else Passed.NO_PACKET
+        )
 
     def first_place(self, data: memoryview, stop: int, *, is_end: bool) -> int | None:
-        """The first place below `stop` where a whole block begins, or a section; the latter alone where an interface was lost.
+        """The first place below `stop` where a whole block begins, or a section; the latter alone
+        where an interface was lost.
 
         Packets name interfaces by number: with one lost, all that follow would be misread.
         """
@@ -321,14 +363,18 @@ class PcapngBlocks:
             return section
         words = np.ndarray((count + 8,), f"{self.order}u4", data, 0, (1,))
         kinds, lengths = words[:-8][:stop], words[4:-4][:stop]
-        places = np.flatnonzero((kinds > 0) & (kinds <= _LAST_KIND) & (lengths >= 12) & (lengths <= _REACH))
+        places = np.flatnonzero(
+            (kinds > 0) & (kinds <= _LAST_KIND) & (lengths >= 12) & (lengths <= _REACH)
+        )
         ends = places + lengths[places]
         places, ends = places[ends <= len(data)], ends[ends <= len(data)]
         right = places[words[ends - 4] == lengths[places]].tolist()
         return min([*right[:1], *([section] if section is not None else [])], default=None)
 
     def _is_false(self, kind: int, length: int) -> bool:
-        """Whether a block is of another length than it says: its end does not repeat it, or is not there while others begin within it."""
+        """Whether a block is of another length than it says: its end does not repeat it, or is not
+        there while others begin within it.
+        """
         if not _can_be(length) or (length > LARGEST_BLOCK and kind in _PACKETS | {_INTERFACE}):
             return True
         size = _REACH if length > LARGEST_BLOCK else length
@@ -352,7 +398,9 @@ def records(source: Source) -> Form:
 
 
 def resume(source: Source, form: Form) -> bool:
-    """Goes to the next place where records begin, behind one that is damaged; False where there is none, at the end."""
+    """Goes to the next place where records begin, behind one that is damaged; False where there is
+    none, at the end.
+    """
     source.skip(len(source.ahead(1)))
     while data := source.ahead(_STEP + _REACH):
         found = form.first_place(data, _STEP, is_end=len(data) < _STEP + _REACH)
@@ -363,13 +411,16 @@ def resume(source: Source, form: Form) -> bool:
 
 
 def sought(source: Source, form: Form, at: int) -> bool:
-    """Goes on close before the first packet that was captured at a time, ns since 1970, or later: `NEAR` bytes away at most.
+    """Goes on close before the first packet that was captured at a time, ns since 1970, or later:
+    `NEAR` bytes away at most.
 
-    Packets are taken to stand in the order of their times. Further sections of a pcapng file are taken to have the interfaces of this
-    one: where a section begins, or times are years away, since they are counted otherwise there, nothing is passed over.
+    Packets are taken to stand in the order of their times. Further sections of a pcapng file are
+    taken to have the interfaces of this one: where a section begins, or times are years away, since
+    they are counted otherwise there, nothing is passed over.
 
     Returns:
-        False where that is behind here, and for a pipe or a packed file: it then goes on where it was.
+        False where that is behind here, and for a pipe or a packed file: it then goes on where it
+        was.
     """
     here = low = source.place
     high = source.size
@@ -388,7 +439,9 @@ def sought(source: Source, form: Form, at: int) -> bool:
 
 
 def _captured(source: Source, form: Form, stop: int) -> tuple[int, int] | None:
-    """Time and place of the first packet behind here, of those whose time is known; None where there is none up to a place."""
+    """Time and place of the first packet behind here, of those whose time is known; None where
+    there is none up to a place.
+    """
     form, section = form.over(source), form.sections
     while resume(source, form) and source.begin_record() and source.record < stop:
         try:
@@ -425,7 +478,9 @@ def _interface(order: str, body: bytes) -> Interface:
     return Interface(link, snap_length, ticks, offset)
 
 
-def _block_packet(order: str, kind: int, body: bytes, interfaces: list[Interface]) -> CapturedPacket | None:
+def _block_packet(
+    order: str, kind: int, body: bytes, interfaces: list[Interface]
+) -> CapturedPacket | None:
     """The packet of a block, None where the block contradicts itself or names an unknown interface."""
     if kind == _SIMPLE_PACKET:
         if len(body) < 4 or not interfaces:
@@ -437,7 +492,9 @@ def _block_packet(order: str, kind: int, body: bytes, interfaces: list[Interface
         return CapturedPacket(interfaces[0].link, 0, body[4 : 4 + captured], original)
     if len(body) < 20:
         return None
-    number, high, low, captured, original = struct.unpack_from(order + ("IIIII" if kind == ENHANCED_PACKET else "HxxIIII"), body)
+    number, high, low, captured, original = struct.unpack_from(
+        order + ("IIIII" if kind == ENHANCED_PACKET else "HxxIIII"), body
+    )
     if number >= len(interfaces) or captured > len(body) - 20:
         return None
     interface = interfaces[number]
@@ -451,7 +508,8 @@ def capture_head(link: int) -> bytes:
     """What a pcap file begins with: little-endian, with nanoseconds.
 
     Args:
-        link: the link type: `ip.ETHERNET` for datagrams; USER0 for bare packets, when no protocol is around the bytes.
+        link: the link type: `ip.ETHERNET` for datagrams; USER0 for bare packets, when no protocol
+            is around the bytes.
     """
     return _HEAD.pack(NANOSECOND_MAGIC, 2, 4, 0, 0, LARGEST_PACKET, link)
 
@@ -475,7 +533,9 @@ def _refuse_size(data: bytes) -> None:
 
 
 def record_size(data: bytes | bytearray, at: int) -> int:
-    """The length of the record that begins there in a piece of a written file, or of the file's head, which the first piece begins with."""
+    """The length of the record that begins there in a piece of a written file, or of the file's
+    head, which the first piece begins with.
+    """
     if at == 0 and is_capture(bytes(data[:4])):
         return _HEAD.size
     return _RECORD.size + int.from_bytes(data[at + 8 : at + 12], "little")
@@ -498,7 +558,10 @@ class Writing(NamedTuple):
 def _pcapng_head(link: int) -> bytes:
     """A section, and an interface whose times are in nanoseconds; little-endian."""
     section = _block(_SECTION_KIND, struct.pack("<IHHq", 0x1A2B3C4D, 1, 0, -1))
-    return section + _block(_INTERFACE, struct.pack("<HHIHHB3xHH", link, 0, LARGEST_PACKET, _TIME_RESOLUTION, 1, 9, 0, 0))
+    return section + _block(
+        _INTERFACE,
+        struct.pack("<HHIHHB3xHH", link, 0, LARGEST_PACKET, _TIME_RESOLUTION, 1, 9, 0, 0),
+    )
 
 
 def _pcapng_record(data: bytes, at: int) -> bytes:
@@ -517,5 +580,9 @@ def _block(kind: int, body: bytes) -> bytes:
 #: by the suffix of the file.
 WRITINGS = {
     ".pcap": Writing(capture_head, packet_record, record_size),
-    ".pcapng": Writing(_pcapng_head, _pcapng_record, lambda data, at: int.from_bytes(data[at + 4 : at + 8], "little")),
+    ".pcapng": Writing(
+        _pcapng_head,
+        _pcapng_record,
+        lambda data, at: int.from_bytes(data[at + 4 : at + 8], "little"),
+    ),
 }

@@ -1,7 +1,9 @@
-"""The bytes of a capture, from a file or a pipe: read in bounded steps, so that a length in the file never becomes an allocation.
+"""The bytes of a capture, from a file or a pipe: read in bounded steps, so that a length in the
+file never becomes an allocation.
 
-`Source` reads into buffers that can be lent out: one is not written to again while an array that was `lent`, or anything made from it
-without a copy, is alive. So whoever needs the bytes for longer just keeps them.
+`Source` reads into buffers that can be lent out: one is not written to again while an array that
+was `lent`, or anything made from it without a copy, is alive. So whoever needs the bytes for longer
+just keeps them.
 """
 
 from __future__ import annotations
@@ -21,7 +23,8 @@ from lidarspec.errors import SourceError
 
 #: bytes of a buffer at first, and most of those that are passed over at once.
 SMALLEST = 1 << 16
-#: bytes behind what was read that may be looked at, whatever they are, so that records can be compared in words.
+#: bytes behind what was read that may be looked at, whatever they are, so that records can be
+#: compared in words.
 SLACK = 256
 #: buffers kept for use again.
 MOST_KEPT = 2
@@ -32,10 +35,12 @@ class Truncated(Exception):
 
 
 class Source:
-    """Bytes of a file or pipe, in buffers that can be lent out: what is held follows what is there, never a length that it claims.
+    """Bytes of a file or pipe, in buffers that can be lent out: what is held follows what is there,
+    never a length that it claims.
 
     Args:
-        largest: bytes that a buffer grows to where the file has so many; a record that does not fit makes it longer.
+        largest: bytes that a buffer grows to where the file has so many; a record that does not fit
+            makes it longer.
 
     Attributes:
         storage: the buffer in use, `SLACK` bytes longer than it is ever filled.
@@ -67,7 +72,9 @@ class Source:
         return self._passed + self.at
 
     def apart(self, place: int) -> Source:
-        """The same file's bytes from a place on, in a buffer apart; this one then has to `go` to where it goes on."""
+        """The same file's bytes from a place on, in a buffer apart; this one then has to `go` to
+        where it goes on.
+        """
         return _source_at(self._file, SMALLEST, place)
 
     def go(self, place: int) -> None:
@@ -126,7 +133,9 @@ class Source:
         return self._has(len(self._data) - self.at + 1)
 
     def lent(self) -> NDArray[np.uint8]:
-        """The bytes in the buffer, (n,), read-only: not written to again while this array or a view of it is alive."""
+        """The bytes in the buffer, (n,), read-only: not written to again while this array or a view
+        of it is alive.
+        """
         array = np.frombuffer(self._view[: len(self._data)], np.uint8)
         array.flags.writeable = False
         self._lent = weakref.ref(array)
@@ -188,7 +197,9 @@ def _source_at(file: BinaryIO, largest: int, place: int) -> Source:
 
 
 def _into(file: BinaryIO) -> Callable[[memoryview], int | None]:
-    """What fills a buffer with the bytes that have arrived: of a pipe, others would wait for as many as there is room for."""
+    """What fills a buffer with the bytes that have arrived: of a pipe, others would wait for as
+    many as there is room for.
+    """
     if isinstance(file, io.BufferedIOBase):
         return file.readinto1
     return file.readinto if isinstance(file, io.RawIOBase) else functools.partial(_copied, file)

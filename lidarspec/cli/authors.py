@@ -28,67 +28,135 @@ MOST = 1 << 22
 
 @click.command()
 @click.argument("sensor_id", metavar="ID")
-@click.option("--into", metavar="DIR", default=".", help="Where the distribution's folder goes; by default into this one.")
 @click.option(
-    "--distribution", metavar="NAME", help="What is installed, such as lidarspec-acme; one that is there gets this sensor as well."
+    "--into",
+    metavar="DIR",
+    default=".",
+    help="Where the distribution's folder goes; by default into this one.",
+)
+@click.option(
+    "--distribution",
+    metavar="NAME",
+    help="What is installed, such as lidarspec-acme; one that is there gets this sensor as well.",
 )
 @click.option("--vendor", metavar="NAME", help="As people write it; by default after the id.")
 @click.option("--model", metavar="NAME", help="As people write it; by default after the id.")
-@click.option("--link", type=click.Choice(["serial", "udp"]), help="What the sensor sends over; serial by default.")
-@click.option("--from-capture", "capture", metavar="FILE", help="Draft the frames from their bytes: raw, .pcap, .lsr, .hex.")
+@click.option(
+    "--link",
+    type=click.Choice(["serial", "udp"]),
+    help="What the sensor sends over; serial by default.",
+)
+@click.option(
+    "--from-capture",
+    "capture",
+    metavar="FILE",
+    help="Draft the frames from their bytes: raw, .pcap, .lsr, .hex.",
+)
 def new(
-    sensor_id: str, into: str, distribution: str | None, vendor: str | None, model: str | None, link: str | None, capture: str | None
+    sensor_id: str,
+    into: str,
+    distribution: str | None,
+    vendor: str | None,
+    model: str | None,
+    link: str | None,
+    capture: str | None,
 ) -> None:
     """A distribution for a sensor of your own, which works before anything in it is changed.
 
-    It has an invented sensor with frames, checksum, points, commands and simulation, its tests, and the entry point by which it is
-    found once it is installed. With --distribution it joins a family: a module and tests of its own, beside those that are there.
-    With --from-capture it has what the bytes of a capture can be told to consist of: sync bytes, length,
-    checksum, counters, angles, each with the evidence for it; what cannot be told is called unknown.
+    It has an invented sensor with frames, checksum, points, commands and simulation, its tests, and
+    the entry point by which it is found once it is installed. With --distribution it joins a
+    family: a module and tests of its own, beside those that are there. With --from-capture it has
+    what the bytes of a capture can be told to consist of: sync bytes, length, checksum, counters,
+    angles, each with the evidence for it; what cannot be told is called unknown.
     """
     names = Names(sensor_id, distribution or "", vendor or "", model or "")
     if sensor_id in sensors():
-        raise suggest(UsageError(f"{sensor_id} is installed already: choose another id"), f"lidarspec show {quote(sensor_id)}")
+        raise suggest(
+            UsageError(f"{sensor_id} is installed already: choose another id"),
+            f"lidarspec show {quote(sensor_id)}",
+        )
     folder = Path(into) / names.distribution
     if folder.exists() and distribution is None:
-        raise suggest(UsageError(f"{folder} exists already: nothing was written"), f"lidarspec new {quote(sensor_id)} --distribution NAME")
-    texts = invented(names, "udp" if link == "udp" else "serial") if capture is None else _drafted(names, link, capture)
+        raise suggest(
+            UsageError(f"{folder} exists already: nothing was written"),
+            f"lidarspec new {quote(sensor_id)} --distribution NAME",
+        )
+    texts = (
+        invented(names, "udp" if link == "udp" else "serial")
+        if capture is None
+        else _drafted(names, link, capture)
+    )
     texts = joining(folder, names, texts) if folder.exists() else texts
     write(folder, texts)
     for name in texts:
         say(str(folder / name))
     look = f"demo -s {sensor_id}" if capture is None else f"explain {quote(capture)} -s {sensor_id}"
-    note(f"next: pip install -e {quote(f'{folder}[test]')} && pytest {quote(str(folder))} && lidarspec {look}")
+    note(
+        f"next: pip install -e {quote(f'{folder}[test]')} && pytest {quote(str(folder))} &&"
+        f" lidarspec {look}"
+    )
 
 
 def _drafted(names: Names, link: str | None, capture: str) -> dict[str, str]:
-    """The files with a draft of the capture's frames: of several senders and ports, those that the most bytes come from and go to."""
+    """The files with a draft of the capture's frames: of several senders and ports, those that the
+    most bytes come from and go to.
+    """
     groups: dict[object, list[Chunk]] = {}
     with contextlib.closing(transport(capture)) as opened:
         for chunk in beginning(opened, MOST):
-            groups.setdefault((chunk.sender, chunk.receiver and chunk.receiver[1]), []).append(chunk)
-    chunks = max(groups.values(), key=lambda group: sum(len(chunk.data) for chunk in group), default=[])
+            groups.setdefault((chunk.sender, chunk.receiver and chunk.receiver[1]), []).append(
+                chunk
+            )
+    chunks = max(
+        groups.values(), key=lambda group: sum(len(chunk.data) for chunk in group), default=[]
+    )
     if not any(chunk.data for chunk in chunks):
         raise WireError(no_bytes(capture, opened.warnings))
     found = draft([chunk.data for chunk in chunks], datagrams=opened.datagrams)
     note(f"{capture}: {len(found.frames)} frames, {found.share:.1%} of {found.bytes_in} bytes")
     receiver = chunks[0].receiver
-    chosen: Link = "udp" if (link or ("udp" if opened.datagrams else "serial")) == "udp" else "serial"
-    return captured(names, chosen, found, origin=f"a capture, {Path(capture).name}", port=receiver[1] if receiver else None)
+    chosen: Link = (
+        "udp" if (link or ("udp" if opened.datagrams else "serial")) == "udp" else "serial"
+    )
+    return captured(
+        names,
+        chosen,
+        found,
+        origin=f"a capture, {Path(capture).name}",
+        port=receiver[1] if receiver else None,
+    )
 
 
 @click.command()
 @click.argument("name", metavar="ID|FILE|DISTRIBUTION|FOLDER")
-@click.option("--max-examples", type=click.IntRange(1), default=EXAMPLES, show_default=True, help="Examples of each frame type.")
-@click.option("--vectors", metavar="FILE", help="Golden vectors; by default vectors.json beside the modules.")
-@click.option("-v", "--verbose", is_flag=True, help="Also what was skipped and why, and what was measured.")
+@click.option(
+    "--max-examples",
+    type=click.IntRange(1),
+    default=EXAMPLES,
+    show_default=True,
+    help="Examples of each frame type.",
+)
+@click.option(
+    "--vectors", metavar="FILE", help="Golden vectors; by default vectors.json beside the modules."
+)
+@click.option(
+    "-v", "--verbose", is_flag=True, help="Also what was skipped and why, and what was measured."
+)
 @click.option("--json", "as_json", is_flag=True, help="Print JSON.")
 @output_option
 @click.pass_context
-def check(ctx: click.Context, name: str, max_examples: int, vectors: str | None, verbose: bool, as_json: bool, output: str | None) -> None:
-    """What is wrong with a sensor, a file or a distribution: every promise, and mistakes in its spec.
+def check(
+    ctx: click.Context,
+    name: str,
+    max_examples: int,
+    vectors: str | None,
+    verbose: bool,
+    as_json: bool,
+    output: str | None,
+) -> None:
+    """Check a sensor, a file or a distribution against every promise of the test kit.
 
-    Everything that the test kit asks, without a test file. Exit code 1 where there are findings.
+    No test file is needed. Exit code 1 if there are findings.
     """
     import_library("hypothesis", "testing")
     file = Path(vectors) if vectors else None
@@ -102,7 +170,9 @@ def check(ctx: click.Context, name: str, max_examples: int, vectors: str | None,
     if as_json:
         emit_json([report.to_dict() for report in found], output)
     else:
-        emit("\n\n".join(text for report in found for text in _told(report, verbose=verbose)), output)
+        emit(
+            "\n\n".join(text for report in found for text in _told(report, verbose=verbose)), output
+        )
     if any(report.findings for report in found):
         ctx.exit(FINDINGS)
 
@@ -126,7 +196,12 @@ def _told(report: Report, *, verbose: bool) -> list[str]:
 @click.argument("kind", metavar="KIND", type=click.Choice(list(EXPORTS)))
 @click.argument("sensor_id", metavar="SENSOR")
 @output_option
-@click.option("-f", "--frame", metavar="NAME", help="One frame type alone; by default all, or the one that carries the points.")
+@click.option(
+    "-f",
+    "--frame",
+    metavar="NAME",
+    help="One frame type alone; by default all, or the one that carries the points.",
+)
 def export(kind: str, sensor_id: str, output: str | None, frame: str | None) -> None:
     """A sensor's spec for another tool: wireshark, c, ksy (Kaitai), md, svg, json, pyi.
 

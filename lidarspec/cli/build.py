@@ -37,24 +37,41 @@ ANSWERED, QUIET = 1.0, 0.2
 @click.argument("frame")
 @click.argument("assignments", metavar="FIELD=VALUE", nargs=-1)
 @output_options
-def build(sensor_id: str, frame: str, assignments: Sequence[str], as_json: bool, output: str | None) -> None:
+def build(
+    sensor_id: str, frame: str, assignments: Sequence[str], as_json: bool, output: str | None
+) -> None:
     """The bytes of one frame from field=value; a unit makes a value physical.
 
-    A bare number is the wire's integer. points[*].distance=1m sets every element, points[3].intensity=7 one; later ones win.
-    Constants, counts and checksums are filled in. -o writes the bytes themselves, or text where FILE ends in .hex.
+    A bare number is the wire's integer. points[*].distance=1m sets every element,
+    points[3].intensity=7 one; later ones win. Constants, counts and checksums are filled in. -o
+    writes the bytes themselves, or text where FILE ends in .hex.
     """
     sensor = named_sensor(sensor_id)
     if "=" in frame:
-        error = UsageError(f"frame name missing before {frame!r}; frames of {sensor.id}: {', '.join(sensor.frames)}")
-        raise suggest(error, f"lidarspec build {quote(str(sensor_id))} {next(iter(sensor.frames), 'FRAME')} {quote(frame)}")
+        error = UsageError(
+            f"frame name missing before {frame!r}; frames of {sensor.id}:"
+            f" {', '.join(sensor.frames)}"
+        )
+        raise suggest(
+            error,
+            f"lidarspec build {quote(str(sensor_id))} {next(iter(sensor.frames), 'FRAME')}"
+            f" {quote(frame)}",
+        )
     if frame not in sensor.frames:
-        raise suggest(UnknownFrame(frame, sensor.frames, place=sensor.id), f"lidarspec show {quote(str(sensor_id))}")
+        raise suggest(
+            UnknownFrame(frame, sensor.frames, place=sensor.id),
+            f"lidarspec show {quote(str(sensor_id))}",
+        )
     try:
-        data = sensor.build(frame, values(schema(sensor.frames[frame].tree), assignments, f"{sensor.id} {frame}"))
+        data = sensor.build(
+            frame, values(schema(sensor.frames[frame].tree), assignments, f"{sensor.id} {frame}")
+        )
     except LidarSpecError as error:
         raise suggest(error, f"lidarspec show {quote(str(sensor_id))}") from None
     if as_json:
-        emit_json({"sensor": sensor.id, "frame": frame, "size": len(data), "hex": data.hex(" ")}, output)
+        emit_json(
+            {"sensor": sensor.id, "frame": frame, "size": len(data), "hex": data.hex(" ")}, output
+        )
     else:
         emit(data.hex(" ") if output is None or output.endswith(".hex") else data, output)
 
@@ -64,8 +81,18 @@ def build(sensor_id: str, frame: str, assignments: Sequence[str], as_json: bool,
 @click.argument("command", required=False)
 @click.argument("assignments", metavar="[ARGUMENT=VALUE]...", nargs=-1)
 @sensor_option
-@click.option("--hex", "digits", metavar="HEX", help="Send these bytes in the place of a command, and explain what comes back.")
-@click.option("--timeout", type=DURATION, metavar="TIME", help="How long to wait for the reply; by default what the sensor declares.")
+@click.option(
+    "--hex",
+    "digits",
+    metavar="HEX",
+    help="Send these bytes in the place of a command, and explain what comes back.",
+)
+@click.option(
+    "--timeout",
+    type=DURATION,
+    metavar="TIME",
+    help="How long to wait for the reply; by default what the sensor declares.",
+)
 @output_options
 def send(
     source: str,
@@ -79,8 +106,9 @@ def send(
 ) -> None:
     """Send a command to a sensor, and print its reply.
 
-    Nothing else is sent: a sensor that it starts goes on when the verb ends. Values are in the unit that `show` prints, or bring
-    their own: rate=600rpm. A sensor that keeps silent until it is started has to be named with -s.
+    Nothing else is sent: a sensor that it starts goes on when the verb ends. Values are in the unit
+    that `show` prints, or bring their own: rate=600rpm. A sensor that keeps silent until it is
+    started has to be named with -s.
     """
     if (command is None) == (digits is None):
         raise UsageError("send takes either the name of a command, or bytes: --hex 'a5 50'")
@@ -127,7 +155,9 @@ class _Answer:
         """There is nothing to close."""
 
     def after(self, number: int, seconds: float) -> list[Chunk]:
-        """The chunks behind the first so many: until the line has been quiet for a moment, or so many seconds have passed."""
+        """The chunks behind the first so many: until the line has been quiet for a moment, or so
+        many seconds have passed.
+        """
         end, heard, quiet = time.monotonic() + seconds, number, math.inf
         while (now := time.monotonic()) < min(end, quiet):
             if len(self.chunks) > heard:
@@ -136,8 +166,19 @@ class _Answer:
         return self.chunks[number:]
 
 
-def _write(device: Device, source: str, data: bytes, answer: _Answer, timeout: float | None, *, as_json: bool, output: str | None) -> None:
-    """Send bytes, and print what comes back, explained; data frames, which come all the same, are only counted."""
+def _write(
+    device: Device,
+    source: str,
+    data: bytes,
+    answer: _Answer,
+    timeout: float | None,
+    *,
+    as_json: bool,
+    output: str | None,
+) -> None:
+    """Send bytes, and print what comes back, explained; data frames, which come all the same, are
+    only counted.
+    """
     _refuse_file(device, source)
     sensor, before = device.sensor, len(answer.chunks)
     device.write(data)
@@ -145,10 +186,17 @@ def _write(device: Device, source: str, data: bytes, answer: _Answer, timeout: f
     heard = answer.after(before, ANSWERED if timeout is None else timeout)
     found = list(pieces(sensor, heard, datagrams=sensor.datagrams)) if heard else []
     rest = [piece for piece in found if piece.frame not in sensor.data_frames]
-    if len(rest) < len(found):  # they go on: what is cut off by the beginning and the end of listening is of these
+    if len(rest) < len(
+        found
+    ):  # they go on: what is cut off by the beginning and the end of listening is of these
         note(f"{len(found) - len(rest)} data frames came meanwhile")
         rest = [piece for piece in rest if piece.is_valid or piece not in (found[0], found[-1])]
-    parts = [(piece, part) for cut in rest for piece, part in explained(sensor, cut) if not part.is_filler]
+    parts = [
+        (piece, part)
+        for cut in rest
+        for piece, part in explained(sensor, cut)
+        if not part.is_filler
+    ]
     if as_json:
         frames = [{"offset": piece.offset, **part.to_dict()} for piece, part in parts]
         emit_json({"sensor": sensor.id, "sent": data.hex(" "), "frames": frames}, output)
@@ -158,7 +206,9 @@ def _write(device: Device, source: str, data: bytes, answer: _Answer, timeout: f
         note("nothing came back")
 
 
-def _sent(device: Device, source: str, command: str, assignments: Sequence[str], timeout: float | None) -> Reply:
+def _sent(
+    device: Device, source: str, command: str, assignments: Sequence[str], timeout: float | None
+) -> Reply:
     sensor = device.sensor
     _refuse_file(device, source)
     try:
@@ -171,11 +221,18 @@ def _sent(device: Device, source: str, command: str, assignments: Sequence[str],
 
 def _refuse_file(device: Device, source: str) -> None:
     if not device.is_live:
-        raise suggest(UsageError(f"{source} is a file: nothing can be sent to it"), "lidarspec ports")
+        raise suggest(
+            UsageError(f"{source} is a file: nothing can be sent to it"), "lidarspec ports"
+        )
 
 
 def _told(sensor: Sensor, reply: Reply) -> dict[str, Any]:
-    told: dict[str, Any] = {"sensor": sensor.id, "command": reply.command, "confirmed": reply.confirmed, "frame": reply.frame}
+    told: dict[str, Any] = {
+        "sensor": sensor.id,
+        "command": reply.command,
+        "confirmed": reply.confirmed,
+        "frame": reply.frame,
+    }
     if reply.frame is None:
         return {**told, "hex": None, "fields": None, "values": []}
     values = [value.to_dict() for value in explain(reply.data, sensor, reply.frame).fields.values()]

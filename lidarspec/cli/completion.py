@@ -1,7 +1,9 @@
-"""What can stand at a place of the command line, for completion in bash, zsh and fish: click's own, with what lidarspec knows.
+"""What can stand at a place of the command line, for completion in bash, zsh and fish: click's own,
+with what lidarspec knows.
 
-`_LIDARSPEC_COMPLETE=bash_source lidarspec` prints what the shell has to be told. What stands for a parameter follows from its name, which
-means the same in every verb (`BY_NAME`): ids of sensors, frames, fields, commands, ports, devices of `lidarspec.toml`, files.
+`_LIDARSPEC_COMPLETE=bash_source lidarspec` prints what the shell has to be told. What stands for a
+parameter follows from its name, which means the same in every verb (`BY_NAME`): ids of sensors,
+frames, fields, commands, ports, devices of `lidarspec.toml`, files.
 """
 
 from __future__ import annotations
@@ -13,7 +15,12 @@ import warnings
 from collections.abc import Callable, Iterable
 
 import click
-from click.shell_completion import BashComplete, CompletionItem, add_completion_class, shell_complete
+from click.shell_completion import (
+    BashComplete,
+    CompletionItem,
+    add_completion_class,
+    shell_complete,
+)
 
 from lidarspec.detect.identification import declared
 from lidarspec.device.settings import devices, named
@@ -32,10 +39,13 @@ BREAKS = ":="
 
 @add_completion_class
 class Bash(BashComplete):
-    """click's completion for bash, with words that hold ``:`` or ``=``, and without a blank behind ``field=`` and ``sim:``."""
+    """click's completion for bash, with words that hold ``:`` or ``=``, and without a blank behind
+    ``field=`` and ``sim:``.
+    """
 
     source_template = BashComplete.source_template.replace(
-        "COMPREPLY+=($value)", "COMPREPLY+=($value)\n            [[ $value == *[=:/] ]] && compopt -o nospace"
+        "COMPREPLY+=($value)",
+        "COMPREPLY+=($value)\n            [[ $value == *[=:/] ]] && compopt -o nospace",
     )
     _broken = ""
 
@@ -60,7 +70,9 @@ class Bash(BashComplete):
 def completed(group: click.Command, instruction: str) -> int:
     """Print what a shell asks for; the exit code."""
     try:
-        with warnings.catch_warnings(action="ignore"):  # the verb itself will say what there is to say
+        with warnings.catch_warnings(
+            action="ignore"
+        ):  # the verb itself will say what there is to say
             return shell_complete(group, {}, "lidarspec", VARIABLE, instruction)
     except LidarSpecError:  # settings or plugins with a mistake, which the verb itself will name
         return 1
@@ -74,8 +86,14 @@ def attach(command: click.Command) -> None:
             param.shell_complete = functools.partial(_items, names)  # type: ignore[method-assign]
 
 
-def _items(names: Callable[[click.Context, str], Iterable[str]], ctx: click.Context, incomplete: str) -> list[CompletionItem]:
-    found = [CompletionItem(name) for name in names(ctx, incomplete) if name.startswith(incomplete) and name != incomplete]
+def _items(
+    names: Callable[[click.Context, str], Iterable[str]], ctx: click.Context, incomplete: str
+) -> list[CompletionItem]:
+    found = [
+        CompletionItem(name)
+        for name in names(ctx, incomplete)
+        if name.startswith(incomplete) and name != incomplete
+    ]
     return found if found or names in LISTED else [CompletionItem(incomplete, type="file")]
 
 
@@ -84,16 +102,30 @@ def _sensors(ctx: click.Context, incomplete: str) -> Iterable[str]:
 
 
 def _sources(ctx: click.Context, incomplete: str) -> Iterable[str]:
-    """Devices, ports, simulated sensors, and files beside them; where there are files alone the shell does that better."""
-    simulated = [f"sim:{name}" for name in registry().names()] if incomplete.startswith("sim:") else ["sim:"]
+    """Devices, ports, simulated sensors, and files beside them; where there are files alone the
+    shell does that better.
+    """
+    simulated = (
+        [f"sim:{name}" for name in registry().names()]
+        if incomplete.startswith("sim:")
+        else ["sim:"]
+    )
     places = [*devices(), *(port.path for port in serial_ports()), "udp://", "tcp://", *simulated]
     if not any(place.startswith(incomplete) for place in places):
         return []
-    return [*places, *(name + "/" * os.path.isdir(name) for name in sorted(glob.glob(glob.escape(incomplete) + "*")))]
+    return [
+        *places,
+        *(
+            name + "/" * os.path.isdir(name)
+            for name in sorted(glob.glob(glob.escape(incomplete) + "*"))
+        ),
+    ]
 
 
 def _sensor(ctx: click.Context) -> Sensor | None:
-    """The sensor of the words in front of the cursor: named, of a device of lidarspec.toml, or simulated."""
+    """The sensor of the words in front of the cursor: named, of a device of lidarspec.toml, or
+    simulated.
+    """
     if ctx.params.get("sensor_id"):
         return named_sensor(ctx.params["sensor_id"])
     source = ctx.params.get("source") or ""
@@ -113,11 +145,19 @@ def _commands(ctx: click.Context, incomplete: str) -> Iterable[str]:
 
 def _assignments(ctx: click.Context, incomplete: str) -> Iterable[str]:
     """Fields of a frame, or arguments of a command."""
-    sensor, frame, command = _sensor(ctx), ctx.params.get("frame") or "", ctx.params.get("command") or ""
+    sensor, frame, command = (
+        _sensor(ctx),
+        ctx.params.get("frame") or "",
+        ctx.params.get("command") or "",
+    )
     if sensor and frame in sensor.frames:
         fields = schema(sensor.frames[frame].tree).all_fields
         return [f"{_assigned(path, info)}=" for path, info in fields.items() if info.const is None]
-    return [f"{argument}=" for argument in sensor.commands[command].args] if sensor and command in sensor.commands else ()
+    return (
+        [f"{argument}=" for argument in sensor.commands[command].args]
+        if sensor and command in sensor.commands
+        else ()
+    )
 
 
 def _assigned(path: str, info: FieldInfo) -> str:
@@ -167,7 +207,22 @@ BY_NAME: dict[str, Callable[[click.Context, str], Iterable[str]]] = {
     "ramp": _columns,
     "suffix": _formats,
     **dict.fromkeys(
-        ("file", "files", "words", "target", "output", "scene", "vectors", "capture", "into", "diff", "link", "place", "to", "folder"),
+        (
+            "file",
+            "files",
+            "words",
+            "target",
+            "output",
+            "scene",
+            "vectors",
+            "capture",
+            "into",
+            "diff",
+            "link",
+            "place",
+            "to",
+            "folder",
+        ),
         _files,
     ),
 }

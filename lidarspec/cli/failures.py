@@ -14,10 +14,15 @@ from lidarspec.known_sensors import no_sensors
 
 FINDINGS, USAGE, SOURCE, NO_DATA, DEVICE, INTERRUPTED = 1, 2, 3, 4, 5, 130
 
-#: error class -> exit code and the next command; the first that fits, "{sensor}" and "{verb}" filled in.
+#: error class -> exit code and the next command; the first that fits, "{sensor}" and "{verb}"
+#: filled in.
 CODES: tuple[tuple[type[Exception] | tuple[type[Exception], ...], int, str], ...] = (
     (errors.UnknownSensor, USAGE, "lidarspec sensors"),
-    ((errors.UnknownFrame, errors.UnknownField, errors.MissingField, errors.OutOfRange), USAGE, "lidarspec show {sensor}"),
+    (
+        (errors.UnknownFrame, errors.UnknownField, errors.MissingField, errors.OutOfRange),
+        USAGE,
+        "lidarspec show {sensor}",
+    ),
     ((errors.UsageError, click.ClickException), USAGE, "lidarspec {verb} --help"),
     (errors.CommandError, DEVICE, "lidarspec show {sensor}"),
     ((errors.SourceError, OSError), SOURCE, "lidarspec {verb} --help"),
@@ -29,8 +34,14 @@ CODES: tuple[tuple[type[Exception] | tuple[type[Exception], ...], int, str], ...
 
 def report(error: Exception, verb: str) -> int:
     """Print what went wrong and what to do next; the exit code."""
-    code, command = next(((code, command) for kind, code, command in CODES if isinstance(error, kind)), (FINDINGS, ""))
-    is_detailed, voice.loudness = voice.loudness > 0 or (not command and bool(os.environ.get("LIDARSPEC_DEBUG"))), 0
+    code, command = next(
+        ((code, command) for kind, code, command in CODES if isinstance(error, kind)),
+        (FINDINGS, ""),
+    )
+    is_detailed, voice.loudness = (
+        voice.loudness > 0 or (not command and bool(os.environ.get("LIDARSPEC_DEBUG"))),
+        0,
+    )
     if is_detailed:
         note("".join(traceback.format_exception(error)))
     if not command:
@@ -52,7 +63,11 @@ def report(error: Exception, verb: str) -> int:
 def _lacks_sensors(error: Exception) -> bool:
     """Whether bytes or a device are nobody's because no sensor is installed."""
     suggestion = errors.suggestion(error)
-    named = str(getattr(error, "sensor", "")) or " -s " in suggestion or suggestion.startswith("pip install")
+    named = (
+        str(getattr(error, "sensor", ""))
+        or " -s " in suggestion
+        or suggestion.startswith("pip install")
+    )
     if named or not isinstance(error, errors.WireError | errors.CommandError):
         return False
     from lidarspec.plugins import sensors
@@ -73,16 +88,24 @@ def _message(error: Exception) -> str:
 
 
 def _following(error: Exception, command: str, verb: str) -> str:
-    """The next command; what is said of plugins, where an unknown sensor may be one of a plugin that does not load."""
+    """The next command; what is said of plugins, where an unknown sensor may be one of a plugin
+    that does not load.
+    """
     from lidarspec.plugins import registry
 
     if isinstance(error, errors.UnknownSensor):
-        return "lidarspec plugins" if any(plugin.error for plugin in registry().plugins) else command
+        return (
+            "lidarspec plugins" if any(plugin.error for plugin in registry().plugins) else command
+        )
     sensor = str(getattr(error, "sensor", "") or getattr(error, "place", "")).partition(" ")[0]
     if isinstance(error, errors.SpecError) and error.path.endswith(".py"):
         return f"lidarspec check {shlex.quote(error.path)}"
-    if isinstance(error, errors.PluginError) and error.file and sensor not in registry():  # one of a file that was named
+    if (
+        isinstance(error, errors.PluginError) and error.file and sensor not in registry()
+    ):  # one of a file that was named
         return f"lidarspec check {shlex.quote(errors.shown_path(error.file))}"
     if "{sensor}" in command and not sensor:
         return "lidarspec plugins" if isinstance(error, errors.SpecError) else "lidarspec sensors"
-    return command.format(sensor=shlex.quote(sensor) if sensor else "", verb=verb).replace("  ", " ")
+    return command.format(sensor=shlex.quote(sensor) if sensor else "", verb=verb).replace(
+        "  ", " "
+    )

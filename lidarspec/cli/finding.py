@@ -1,4 +1,6 @@
-"""`ports`, `detect`, `doctor` and `crc`: what is there, whose bytes come, why nothing comes, and which checksum it is."""
+"""`ports`, `detect`, `doctor` and `crc`: what is there, whose bytes come, why nothing comes, and
+which checksum it is.
+"""
 
 from __future__ import annotations
 
@@ -19,7 +21,15 @@ from lidarspec.cli.output import Progress, emit, emit_json, output_options, tabl
 from lidarspec.cli.terminal import note, voice
 from lidarspec.detect.doctor import computer, examined
 from lidarspec.detect.heard import Heard
-from lidarspec.detect.identification import Verdict, best, chosen, names, others_named, verdict, verdicts
+from lidarspec.detect.identification import (
+    Verdict,
+    best,
+    chosen,
+    names,
+    others_named,
+    verdict,
+    verdicts,
+)
 from lidarspec.detect.listen import LISTEN, hear, ignore, probe, started_first, udp_ports
 from lidarspec.detect.uninstalled import describe, install_commands, recognize
 from lidarspec.drafting.checksum_search import search
@@ -51,19 +61,35 @@ def ports(as_json: bool, output: str | None) -> None:
     serial, udp = serial_ports(), {port: udp_users(port) for port in udp_ports()}
     if as_json:
         listed = [{**vars(port), "users": [vars(user) for user in port.users]} for port in serial]
-        emit_json({"serial": listed, "udp": [_udp(port, users) for port, users in udp.items()]}, output)
+        emit_json(
+            {"serial": listed, "udp": [_udp(port, users) for port, users in udp.items()]}, output
+        )
         return
-    rows = [[port.path, port.description or "serial port", _state(port), port.lasting] for port in serial]
-    rows += [[f"udp://:{port}", ", ".join(_senders(port)), _udp_state(users), ""] for port, users in udp.items()]
+    rows = [
+        [port.path, port.description or "serial port", _state(port), port.lasting]
+        for port in serial
+    ]
+    rows += [
+        [f"udp://:{port}", ", ".join(_senders(port)), _udp_state(users), ""]
+        for port, users in udp.items()
+    ]
     emit(table(["port", "what it is", "state", "lasting name"], rows, output), output)
     if not serial:
         note("there is no serial port; one that should be here: is it plugged in?")
-    note(f"next: lidarspec detect{f' {serial[0].path}' if len(serial) == 1 else ''}" if sensors() else no_sensors())
+    note(
+        f"next: lidarspec detect{f' {serial[0].path}' if len(serial) == 1 else ''}"
+        if sensors()
+        else no_sensors()
+    )
 
 
 def _senders(port: int) -> list[str]:
     """The installed sensors whose data come to a UDP port."""
-    return [sensor.id for sensor in sensors().values() if (link := data_link(sensor, Udp)) and port in link.ports]
+    return [
+        sensor.id
+        for sensor in sensors().values()
+        if (link := data_link(sensor, Udp)) and port in link.ports
+    ]
 
 
 def _state(port: SerialPort) -> str:
@@ -77,31 +103,48 @@ def _udp_state(users: tuple[User, ...] | None) -> str:
 
 
 def _udp(port: int, users: tuple[User, ...] | None) -> dict[str, Any]:
-    return {"port": port, "sensors": _senders(port), "free": users is None, "users": [vars(user) for user in users or ()]}
+    return {
+        "port": port,
+        "sensors": _senders(port),
+        "free": users is None,
+        "users": [vars(user) for user in users or ()],
+    }
 
 
 @click.command()
 @click.argument("words", metavar="HEX...|FILE|-", nargs=-1, required=True)
-@click.option("--period", type=click.IntRange(min=3), help="The length of the frames, for a file in which they follow each other.")
-@click.option("--offset", type=click.IntRange(min=0), default=0, help="Where the first of them begins.")
+@click.option(
+    "--period",
+    type=click.IntRange(min=3),
+    help="The length of the frames, for a file in which they follow each other.",
+)
+@click.option(
+    "--offset", type=click.IntRange(min=0), default=0, help="Where the first of them begins."
+)
 @output_options
-def crc(words: Sequence[str], period: int | None, offset: int, as_json: bool, output: str | None) -> None:
+def crc(
+    words: Sequence[str], period: int | None, offset: int, as_json: bool, output: str | None
+) -> None:
     """Which checksum seals some sample frames: XOR, sums, or a CRC of 8, 16 or 32 bits.
 
-    Frames are words of hexadecimal digits, one each; a text file with a frame in each line (.hex, .txt); or a capture. Of raw
-    bytes the frames are found out, or --period says how long they are. The more frames, the surer the answer: a dozen is plenty. Of a long
-    file the beginning is looked at.
+    Frames are words of hexadecimal digits, one each; a text file with a frame in each line (.hex,
+    .txt); or a capture. Of raw bytes the frames are found out, or --period says how long they are.
+    The more frames, the surer the answer: a dozen is plenty. Of a long file the beginning is looked
+    at.
     """
     frames = _frames(words, period, offset)
     found = search(frames)
     if as_json:
-        emit_json({"frames": len(frames), "matches": [checksum_told(match) for match in found]}, output)
+        emit_json(
+            {"frames": len(frames), "matches": [checksum_told(match) for match in found]}, output
+        )
     elif found:
         shown = [match for match in found if match.open == found[0].open][:PRINTED]
         emit("\n\n".join(_text(match, len(frames[0])) for match in shown), output)
     if not found:
         note(
-            f"no checksum of {len(frames)} frame{'s' * (len(frames) != 1)} was found: are they whole, and do they begin where they should?"
+            f"no checksum of {len(frames)} frame{'s' * (len(frames) != 1)} was found: are they"
+            " whole, and do they begin where they should?"
         )
         raise click.exceptions.Exit(FINDINGS)
     if found[0].doubt < WEAK:
@@ -137,7 +180,8 @@ def _of_file(path: str, period: int | None, offset: int) -> list[bytes]:
     found = structure(chunks, datagrams=datagrams)
     if found is None:
         raise suggest(
-            UsageError(f"{path}: where its frames begin cannot be seen"), f"lidarspec crc {quote(path)} --period BYTES --offset BYTES"
+            UsageError(f"{path}: where its frames begin cannot be seen"),
+            f"lidarspec crc {quote(path)} --period BYTES --offset BYTES",
         )
     length = f"{found.period} bytes" if found.period else f"{found.length} bytes"
     note(f"{len(found.frames)} frames that begin with {found.sync.hex(' ')}, {length} long")
@@ -162,9 +206,16 @@ def checksum_told(match: Match) -> dict[str, Any]:
 def _text(match: Match, length: int) -> str:
     order = f", {match.order}-endian" if match.place.size > 1 else ""
     name = f" ({match.name})" if match.name else ""
-    chance = f"one wrong guess in {match.odds} would be" if match.doubt >= WEAK else "which may be chance"
+    chance = (
+        f"one wrong guess in {match.odds} would be"
+        if match.doubt >= WEAK
+        else "which may be chance"
+    )
     lines = [
-        f"{match.algorithm.describe()}{name}: right in {match.right} of {match.total} frames; {chance}",
+        (
+            f"{match.algorithm.describe()}{name}: right in {match.right} of {match.total} frames;"
+            f" {chance}"
+        ),
         f"  field: {match.place}{order}",
         f"  over:  {match.span.told(match.place, length)}",
         *(f"  note:  {remark}" for remark in match.remarks),
@@ -175,29 +226,54 @@ def _text(match: Match, length: int) -> str:
 
 @click.command()
 @click.argument("source", required=False)
-@click.option("-t", "--duration", type=DURATION, default=LISTEN, metavar="TIME", help="How long to listen for, each time.")
-@click.option("--start", is_flag=True, help="Also send the start commands of sensors that keep silent until they are started.")
+@click.option(
+    "-t",
+    "--duration",
+    type=DURATION,
+    default=LISTEN,
+    metavar="TIME",
+    help="How long to listen for, each time.",
+)
+@click.option(
+    "--start",
+    is_flag=True,
+    help="Also send the start commands of sensors that keep silent until they are started.",
+)
 @output_options
-def detect(source: str | None, duration: float, start: bool, as_json: bool, output: str | None) -> None:
+def detect(
+    source: str | None, duration: float, start: bool, as_json: bool, output: str | None
+) -> None:
     """Which installed sensor sends, and at which port and baud rate.
 
-    SOURCE is a port, a file or a capture; without it every serial port is listened to at every baud rate that installed sensors
-    declare, and every UDP port. A sensor fits by the share of the bytes in frames that pass checksum and plausibility. Sensors
-    with the same frames are told apart by their clocks, names in their frames and baud rates, as far as that goes; those that
-    were ruled out are listed with -v.
+    SOURCE is a port, a file or a capture; without it every serial port is listened to at every baud
+    rate that installed sensors declare, and every UDP port. A sensor fits by the share of the bytes
+    in frames that pass checksum and plausibility. Sensors with the same frames are told apart by
+    their clocks, names in their frames and baud rates, as far as that goes; those that were ruled
+    out are listed with -v.
     """
     if source == "-":
-        raise suggest(UsageError("standard input can be read only once: write it to a file first"), "lidarspec detect FILE")
+        raise suggest(
+            UsageError("standard input can be read only once: write it to a file first"),
+            "lidarspec detect FILE",
+        )
     if source is None:
         found = list(_everywhere(duration, start=start))
     else:
         source = resolved(source)
         with Progress() as progress:
-            found = _one(source, duration, start=start, tell=lambda text: progress(lambda: f"listening to {text}"))
+            found = _one(
+                source,
+                duration,
+                start=start,
+                tell=lambda text: progress(lambda: f"listening to {text}"),
+            )
     fitting = [one for one in found if one.scores]
     unknown = None if fitting or any(one.fault for one in found) else _unknown(found)
     if as_json:
-        emit_json({"sources": [_told(one) for one in found], "structure": _structure_told(unknown)}, output)
+        emit_json(
+            {"sources": [_told(one) for one in found], "structure": _structure_told(unknown)},
+            output,
+        )
     elif fitting:
         emit(_detected_text(found, output), output)
     elif unknown is not None:
@@ -215,7 +291,9 @@ def _code(source: str | None, found: Sequence[Verdict]) -> int:
     return DEVICE if is_silent else NO_DATA
 
 
-def _one(source: str, duration: float, *, start: bool, tell: Callable[[str], None] = ignore) -> list[Verdict]:
+def _one(
+    source: str, duration: float, *, start: bool, tell: Callable[[str], None] = ignore
+) -> list[Verdict]:
     found = verdicts(source, seconds=duration, tell=tell)
     if start and not any(one.scores for one in found):
         for heard in probe(source):
@@ -229,7 +307,10 @@ def _everywhere(duration: float, *, start: bool) -> Iterator[Verdict]:
     """Return whose bytes come over each port, all of which are listened to at the same time."""
     serial = [port.path for port in serial_ports()]
     udp = udp_ports()
-    note(f"listening to {len(serial)} serial port{'s' * (len(serial) != 1)} and UDP {', '.join(map(str, udp))}")
+    note(
+        f"listening to {len(serial)} serial port{'s' * (len(serial) != 1)} and UDP"
+        f" {', '.join(map(str, udp))}"
+    )
 
     def listen(source: str) -> list[Verdict]:
         try:
@@ -246,7 +327,11 @@ def _everywhere(duration: float, *, start: bool) -> Iterator[Verdict]:
 def _unknown(found: Sequence[Verdict]) -> Structure | None:
     """What the bytes are made of that fit no sensor."""
     heard = max((one.heard for one in found), key=lambda heard: heard.size, default=None)
-    return structure(heard.chunks, datagrams=heard.datagrams) if heard is not None and heard.size else None
+    return (
+        structure(heard.chunks, datagrams=heard.datagrams)
+        if heard is not None and heard.size
+        else None
+    )
 
 
 def _detected_text(found: Sequence[Verdict], output: str | None) -> str:
@@ -257,10 +342,28 @@ def _detected_text(found: Sequence[Verdict], output: str | None) -> str:
         if voice.loudness <= 0 and (one.alike or one.others):
             listed = one.alike  # without those that were ruled out
         for score in listed:
-            verdict_of = "no" if score.sensor.id not in alike else "yes" if one.sensor is not None else "perhaps"
-            rows.append([_place(one.heard), score.sensor.id, verdict_of, f"{score.share:.1%}", str(score.data_frames), score.why])
+            verdict_of = (
+                "no"
+                if score.sensor.id not in alike
+                else "yes"
+                if one.sensor is not None
+                else "perhaps"
+            )
+            rows.append(
+                [
+                    _place(one.heard),
+                    score.sensor.id,
+                    verdict_of,
+                    f"{score.share:.1%}",
+                    str(score.data_frames),
+                    score.why,
+                ]
+            )
         verdict_of = "perhaps" if alike else "yes"
-        rows += [[_place(one.heard), f"{name}, not installed", verdict_of, "", "", why] for name, why in one.others.items()]
+        rows += [
+            [_place(one.heard), f"{name}, not installed", verdict_of, "", "", why]
+            for name, why in one.others.items()
+        ]
     return table(["source", "sensor", "is it", "in frames", "data frames", "told by"], rows, output)
 
 
@@ -269,7 +372,9 @@ def _place(heard: Heard) -> str:
     return f"{where} at {heard.baud} baud" if heard.baud is not None else where
 
 
-def _conclusions(source: str | None, found: Sequence[Verdict], unknown: Structure | None, *, start: bool) -> Iterator[str]:
+def _conclusions(
+    source: str | None, found: Sequence[Verdict], unknown: Structure | None, *, start: bool
+) -> Iterator[str]:
     missing = _missing(found)
     if not sensors() and not missing:
         yield no_sensors()
@@ -280,9 +385,19 @@ def _conclusions(source: str | None, found: Sequence[Verdict], unknown: Structur
         elif one.sensor is not None:
             yield f"next: lidarspec {_verb(one)} {_again(one)} {chosen(one.sensor)}"
         elif one.alike:
-            yield f"{_place(one.heard)}: {', '.join(names(one))} send the same frames, and nothing in these tells them apart: choose one"
-            if files := [name for name in one.alike[0].sensor.configure.files if one.alike[0].sensor.recognise is not None]:
-                yield f"which unit it is, and where its beams point, no packet says: -O {files[0]}=FILE does"
+            yield (
+                f"{_place(one.heard)}: {', '.join(names(one))} send the same frames, and nothing in"
+                " these tells them apart: choose one"
+            )
+            if files := [
+                name
+                for name in one.alike[0].sensor.configure.files
+                if one.alike[0].sensor.recognise is not None
+            ]:
+                yield (
+                    "which unit it is, and where its beams point, no packet says: -O"
+                    f" {files[0]}=FILE does"
+                )
             yield f"next: lidarspec {_verb(one)} {_again(one)} {chosen(one.alike[0].sensor)}"
         elif one.others:
             yield f"{_place(one.heard)}: {others_named(one)}"
@@ -315,16 +430,23 @@ def _conclusions(source: str | None, found: Sequence[Verdict], unknown: Structur
         yield "next: lidarspec sensors"
         return
     yield from [] if any(one.heard.warnings for one in found) else ["nothing came"]
-    is_serial = source is None or ((address := live_address(source)) is not None and address.scheme == "serial")
+    is_serial = source is None or (
+        (address := live_address(source)) is not None and address.scheme == "serial"
+    )
     if is_serial and not start and started_first():
-        yield f"{', '.join(sensor.id for sensor in started_first())} send nothing before they are started"
+        yield (
+            f"{', '.join(sensor.id for sensor in started_first())} send nothing before they are"
+            " started"
+        )
         yield f"next: lidarspec detect {source or ''}".rstrip() + " --start"
     else:
         yield f"next: lidarspec doctor {quote(source) if source else ''}".rstrip()
 
 
 def _missing(found: Sequence[Verdict]) -> list[KnownSensor]:
-    """Return the sensors that are not installed and may have sent the most of the bytes, if no installed one fits."""
+    """Return the sensors that are not installed and may have sent the most of the bytes, if no
+    installed one fits.
+    """
     if any(one.scores or one.fault for one in found):
         return []
     largest = max((one.heard for one in found), key=lambda heard: heard.size, default=None)
@@ -370,7 +492,12 @@ def _told(one: Verdict) -> dict[str, Any]:
         "not_installed": dict(one.others),
         "fault": one.fault or None,
         "fits": [
-            {"sensor": score.sensor.id, "share": round(score.share, 4), "data_frames": score.data_frames, "told_by": score.why}
+            {
+                "sensor": score.sensor.id,
+                "share": round(score.share, 4),
+                "data_frames": score.data_frames,
+                "told_by": score.why,
+            }
             for score in one.scores
         ],
     }
@@ -398,20 +525,38 @@ def _structure_text(found: Structure) -> str:
     ]
     for match in found.checksums[:TOLD]:
         told = match.paste if "\n" not in match.paste else match.algorithm.describe()
-        lines.append(f"  checksum  {told} in {match.place}: right in {match.right} of {match.total}")
-    return "\n".join(lines if found.checksums else [*lines, "  checksum  none was found at the usual places"])
+        lines.append(
+            f"  checksum  {told} in {match.place}: right in {match.right} of {match.total}"
+        )
+    return "\n".join(
+        lines if found.checksums else [*lines, "  checksum  none was found at the usual places"]
+    )
 
 
 @click.command()
 @click.argument("source", required=False)
 @sensor_option
-@click.option("-t", "--duration", type=DURATION, default=LISTEN, metavar="TIME", help="How long to listen for, each time.")
+@click.option(
+    "-t",
+    "--duration",
+    type=DURATION,
+    default=LISTEN,
+    metavar="TIME",
+    help="How long to listen for, each time.",
+)
 @output_options
-def doctor(source: str | None, sensor_id: str | Sensor | None, duration: float, as_json: bool, output: str | None) -> None:
+def doctor(
+    source: str | None,
+    sensor_id: str | Sensor | None,
+    duration: float,
+    as_json: bool,
+    output: str | None,
+) -> None:
     """What keeps a sensor's bytes from coming, and the command that mends it.
 
-    Looks for missing ports and rights, ports in use, small buffers, silence, a wrong baud rate, a wrong interface. Without SOURCE
-    all ports of this computer. Ends with 1 where something is wrong.
+    Looks for missing ports and rights, ports in use, small buffers, silence, a wrong baud rate, a
+    wrong interface. Without SOURCE all ports of this computer. Ends with 1 where something is
+    wrong.
     """
     sensor = None if sensor_id is None else named_sensor(sensor_id)
     if source is not None and not as_json:
@@ -420,7 +565,11 @@ def doctor(source: str | None, sensor_id: str | Sensor | None, duration: float, 
     if as_json:
         emit_json([vars(finding) for finding in found], output)
     else:
-        lines = [f"{'ok   ' if one.ok else 'wrong'}  {one.text}" + (f"\n       next: {one.mend}" if one.mend else "") for one in found]
+        lines = [
+            f"{'ok   ' if one.ok else 'wrong'}  {one.text}"
+            + (f"\n       next: {one.mend}" if one.mend else "")
+            for one in found
+        ]
         emit("\n".join(lines) or "nothing is wrong with the ports of this computer", output)
     if sensor is None and not sensors():
         note(no_sensors())

@@ -55,7 +55,12 @@ def parse(
             raise no_frame(sensor, given)
         frames = itertools.chain([first], found)
         if as_json:
-            emit_json_list({"sensor": sensor.id, "fits": fits}, "frames", (_fields(sensor, piece) for piece in frames), output)
+            emit_json_list(
+                {"sensor": sensor.id, "fits": fits},
+                "frames",
+                (_fields(sensor, piece) for piece in frames),
+                output,
+            )
         else:
             emit_parts(_tables(sensor, frames, output), output)
         if wanted.unframed:
@@ -71,22 +76,48 @@ def _fields(sensor: Sensor, piece: Piece) -> dict[str, Any]:
 def _tables(sensor: Sensor, frames: Iterable[Piece], output: str | None) -> Iterator[str]:
     for index, piece in enumerate(frames):
         found = values(piece.data, sensor, piece.frame).values()
-        rows = [[value.path, _raw_text(value.raw), str(value) if value.unit or value.label else ""] for value in found]
-        yield "\n" * bool(index) + _title(sensor, piece, piece.frame) + "\n" + table(["field", "raw", "value"], rows, output)
+        rows = [
+            [value.path, _raw_text(value.raw), str(value) if value.unit or value.label else ""]
+            for value in found
+        ]
+        yield (
+            "\n" * bool(index)
+            + _title(sensor, piece, piece.frame)
+            + "\n"
+            + table(["field", "raw", "value"], rows, output)
+        )
 
 
 @click.command()
 @words_argument
 @sensor_option
-@click.option("-f", "--frame", metavar="NAME", help="The frame type, where the bytes do not tell; of many frames, this type alone.")
+@click.option(
+    "-f",
+    "--frame",
+    metavar="NAME",
+    help="The frame type, where the bytes do not tell; of many frames, this type alone.",
+)
 @count_option("frames")
 @click.option("--bad", is_flag=True, help="What is damaged, or in no frame, alone.")
-@click.option("--at", type=OFFSET, metavar="OFFSET", help="What stands at this byte of the input alone.")
-@click.option("--bytes", "stretch", metavar="FROM:TO", help="What stands in these bytes of the input alone, whole frames.")
-@selecting("times")
-@click.option("--bits", is_flag=True, help="Draw the bits of every element of an array, not of the first alone.")
 @click.option(
-    "--diff", metavar="HEX|FILE|next", help="What differs from this frame, to the bit; 'next': from the second frame of the input."
+    "--at", type=OFFSET, metavar="OFFSET", help="What stands at this byte of the input alone."
+)
+@click.option(
+    "--bytes",
+    "stretch",
+    metavar="FROM:TO",
+    help="What stands in these bytes of the input alone, whole frames.",
+)
+@selecting("times")
+@click.option(
+    "--bits",
+    is_flag=True,
+    help="Draw the bits of every element of an array, not of the first alone.",
+)
+@click.option(
+    "--diff",
+    metavar="HEX|FILE|next",
+    help="What differs from this frame, to the bit; 'next': from the second frame of the input.",
 )
 @output_options
 def explain(
@@ -105,9 +136,10 @@ def explain(
 ) -> None:
     """Every byte of each frame: offset, hex, field, value, unit, meaning.
 
-    A damaged frame is told with what became of it: a flipped bit, a lost or inserted byte, where it is cut off. With --bad the exit
-    code is 1 where something is damaged. OFFSETs are those that are printed, 940 or 0x3ac; of a capture, in the payloads, joined; with
-    --slice, which goes by the times of arrival, they count from its beginning.
+    A damaged frame is told with what became of it: a flipped bit, a lost or inserted byte, where it
+    is cut off. With --bad the exit code is 1 where something is damaged. OFFSETs are those that are
+    printed, 940 or 0x3ac; of a capture, in the payloads, joined; with --slice, which goes by the
+    times of arrival, they count from its beginning.
     """
     if at is not None and stretch is not None:
         raise UsageError("--at is for one byte, and --bytes for several: leave out one of them")
@@ -130,13 +162,27 @@ def explain(
 
 
 def listing(
-    sensor: Sensor, parts: Iterable[tuple[Piece, Explanation]], at: int | None = None, *, every: bool = False, verdicts: bool = False
+    sensor: Sensor,
+    parts: Iterable[tuple[Piece, Explanation]],
+    at: int | None = None,
+    *,
+    every: bool = False,
+    verdicts: bool = False,
 ) -> Iterator[Line]:
-    """The lines of explained pieces, each below a title, which says what stands `at` a byte, and with `verdicts` what is wrong."""
+    """The lines of explained pieces, each below a title, which says what stands `at` a byte, and
+    with `verdicts` what is wrong.
+    """
     for index, (piece, part) in enumerate(parts):
         yield from [()] * bool(index)
         title = Span(_title(sensor, piece, part.frame), "title")
-        place = "" if at is None else next((value.path for value in part.fields.values() if value.covers(at - piece.offset)), "")
+        place = (
+            ""
+            if at is None
+            else next(
+                (value.path for value in part.fields.values() if value.covers(at - piece.offset)),
+                "",
+            )
+        )
         verdict = f": {part.verdict}" if verdicts and part.fault is not None else ""
         yield (title, Span(f"; byte {at} is in {place}" if place else ""), Span(verdict, "bad"))
         yield from part.lines(every=every)
@@ -152,7 +198,8 @@ class Selection:
         at, stretch: what stands at this byte alone, or in these, as "FROM:TO".
 
     Attributes:
-        valid, damaged, unframed, others: frames, damaged ones, bytes that are in neither, and frames of other types.
+        valid, damaged, unframed, others: frames, damaged ones, bytes that are in neither, and
+            frames of other types.
 
     Raises:
         UsageError: for a stretch that is none.
@@ -168,7 +215,12 @@ class Selection:
         at: int | None = None,
         stretch: str | None = None,
     ) -> None:
-        self._sensor, self._frame, self._count, self._bad = sensor, frame, math.inf if count is None else count, bad
+        self._sensor, self._frame, self._count, self._bad = (
+            sensor,
+            frame,
+            math.inf if count is None else count,
+            bad,
+        )
         stretched: tuple[float, float] = _stretch(stretch) if at is None else (at, at + 1)
         self._from, self._to = stretched
         self._fault: WireError | None = None
@@ -240,8 +292,14 @@ class Selection:
         if not self.valid and (self._ended or not self._bad):
             if self._fault is None and self._frame is not None:
                 others = f", and {self.others} of other types" if self.others else ""
-                raise WireError(f"{given.source} has no {self._frame} frame{others}", sensor=self._sensor.id)
-            raise no_frame(self._sensor, given) if self._fault is None else suggest(self._fault, f"lidarspec show {self._sensor.id}")
+                raise WireError(
+                    f"{given.source} has no {self._frame} frame{others}", sensor=self._sensor.id
+                )
+            raise (
+                no_frame(self._sensor, given)
+                if self._fault is None
+                else suggest(self._fault, f"lidarspec show {self._sensor.id}")
+            )
         if self._bad or self.others or ((self.damaged or self.unframed) and self._shown > 1):
             note(", ".join(self._counts()))
         if self._bad and (self.damaged or self.unframed):
@@ -268,10 +326,21 @@ def _stretch(text: str | None) -> tuple[float, float]:
 
 
 def _compare(
-    sensor: Sensor, given: Heard, found: Iterator[Piece], diff: str, frame: str | None, *, as_json: bool, output: str | None
+    sensor: Sensor,
+    given: Heard,
+    found: Iterator[Piece],
+    diff: str,
+    frame: str | None,
+    *,
+    as_json: bool,
+    output: str | None,
 ) -> None:
     """Print what differs between the first frame of the input and another one."""
-    frames = (piece for piece in found if piece.frame and (frame is None or piece.frame == frame or not piece.is_valid))
+    frames = (
+        piece
+        for piece in found
+        if piece.frame and (frame is None or piece.frame == frame or not piece.is_valid)
+    )
     first = next(frames, None)
     if first is None:
         raise no_frame(sensor, given)
@@ -282,25 +351,50 @@ def _compare(
     else:
         with opened([diff]) as (heard, chunks):
             second = pieces(sensor, chunks, datagrams=heard.datagrams, frame=frame)
-            other = next((piece for piece in second if piece.frame == first.frame), Piece(0, heard.data, first.frame))
+            other = next(
+                (piece for piece in second if piece.frame == first.frame),
+                Piece(0, heard.data, first.frame),
+            )
     (_, before), (_, after) = (next(explained(sensor, piece, frame)) for piece in (first, other))
     differing = before.differences(after)
     if as_json:
-        emit_json({"sensor": sensor.id, "frame": before.frame, "differences": [part.to_dict() for part in differing]}, output)
+        emit_json(
+            {
+                "sensor": sensor.id,
+                "frame": before.frame,
+                "differences": [part.to_dict() for part in differing],
+            },
+            output,
+        )
     else:
-        emit_lines([(Span(f"{sensor.id} {before.frame}", "title"),), *told(differing, (len(before.data), len(after.data)))], output)
+        emit_lines(
+            [
+                (Span(f"{sensor.id} {before.frame}", "title"),),
+                *told(differing, (len(before.data), len(after.data))),
+            ],
+            output,
+        )
 
 
-def _sensor(given: Heard, sensor_id: str | Sensor | None, *, damaged: bool = False) -> tuple[Sensor, list[str]]:
-    """The sensor named, or the one whose bytes these are, and the ids of all whose bytes they could be."""
+def _sensor(
+    given: Heard, sensor_id: str | Sensor | None, *, damaged: bool = False
+) -> tuple[Sensor, list[str]]:
+    """The sensor named, or the one whose bytes these are, and the ids of all whose bytes they could
+    be.
+    """
     if sensor_id is not None:
         return named_sensor(sensor_id), []
-    from lidarspec.detect.identification import fitting  # with all that detecting a sensor takes, which a named one does not need
+    from lidarspec.detect.identification import (
+        fitting,
+    )  # with all that detecting a sensor takes, which a named one does not need
 
     found = fitting(given.chunks, datagrams=given.datagrams)
     if found:
         fits = [sensor.id for sensor in found]
-        note(f"these bytes fit {fits[0]}" + (f"; so do {', '.join(fits[1:])}: choose with -s" if fits[1:] else ""))
+        note(
+            f"these bytes fit {fits[0]}"
+            + (f"; so do {', '.join(fits[1:])}: choose with -s" if fits[1:] else "")
+        )
         return found[0], fits
     fault = nearest_fault(given)
     if not damaged or not fault.sensor:
@@ -311,21 +405,36 @@ def _sensor(given: Heard, sensor_id: str | Sensor | None, *, damaged: bool = Fal
 
 def _title(sensor: Sensor, piece: Piece, frame: str) -> str:
     where = f" at byte {piece.offset}" if piece.offset else ""
-    return f"{sensor.id} {frame or 'skipped'}{where}, {len(piece.data)} byte{'s' * (len(piece.data) != 1)}"
+    return (
+        f"{sensor.id} {frame or 'skipped'}{where}, {len(piece.data)}"
+        f" byte{'s' * (len(piece.data) != 1)}"
+    )
 
 
 def _raw_text(raw: Any) -> str:
     if not isinstance(raw, bytes | bytearray):
         return str(raw)
-    return raw.hex(" ") if len(raw) <= 2 * LINED else f"{raw[: 2 * LINED].hex(' ')} ... ({len(raw)} bytes)"
+    return (
+        raw.hex(" ")
+        if len(raw) <= 2 * LINED
+        else f"{raw[: 2 * LINED].hex(' ')} ... ({len(raw)} bytes)"
+    )
 
 
 def plain(parsed: Any) -> Any:
-    """A parsed frame as JSON takes it: its fields, bytes as hexadecimal text, null for nan and infinity."""
+    """A parsed frame as JSON takes it: its fields, bytes as hexadecimal text, null for nan and
+    infinity.
+    """
     if isinstance(parsed, dict):
         return {name: plain(value) for name, value in parsed.items() if not name.startswith("_")}
     if isinstance(parsed, list):
         return [plain(value) for value in parsed]
     if isinstance(parsed, bytes | bytearray):
         return parsed.hex(" ")
-    return getattr(parsed, "intvalue", None) if isinstance(parsed, str) else int(parsed) if isinstance(parsed, int) else number(parsed)
+    return (
+        getattr(parsed, "intvalue", None)
+        if isinstance(parsed, str)
+        else int(parsed)
+        if isinstance(parsed, int)
+        else number(parsed)
+    )

@@ -1,6 +1,8 @@
-"""Read the input of verbs, bytes as text, files and live sources, and explain input without a frame.
+"""Read the input of verbs, bytes as text, files and live sources, and explain input without a
+frame.
 
-Sources, files and the search for a sensor are imported by the functions that need them: the bytes of a named sensor need none of them.
+Sources, files and the search for a sensor are imported by the functions that need them: the bytes
+of a named sensor need none of them.
 """
 
 from __future__ import annotations
@@ -24,7 +26,15 @@ import click
 from lidarspec.cli.failures import FINDINGS
 from lidarspec.cli.terminal import note
 from lidarspec.detect.heard import LOOKED_AT, Heard, beginning, leading
-from lidarspec.errors import CommandError, LidarSpecError, SourceError, UsageError, WireError, suggest, system_errors
+from lidarspec.errors import (
+    CommandError,
+    LidarSpecError,
+    SourceError,
+    UsageError,
+    WireError,
+    suggest,
+    system_errors,
+)
 from lidarspec.frames.parse import parse_typed
 from lidarspec.plugins import sensors
 from lidarspec.scans.scans import Scan
@@ -48,8 +58,11 @@ LOOK = 0.1
 
 
 @contextlib.contextmanager
-def opened(words: Sequence[str], times: Times = (None, None)) -> Iterator[tuple[Heard, Iterator[Chunk]]]:
-    """The beginning of the input that the words of a command line stand for, and all of it, which is read as it is asked for.
+def opened(
+    words: Sequence[str], times: Times = (None, None)
+) -> Iterator[tuple[Heard, Iterator[Chunk]]]:
+    """The beginning of the input that the words of a command line stand for, and all of it, which
+    is read as it is asked for.
 
     Args:
         times: of a file only what arrived then.
@@ -65,7 +78,9 @@ def opened(words: Sequence[str], times: Times = (None, None)) -> Iterator[tuple[
         try:
             if not (data := unhexed(text)):
                 raise ValueError("there are no digits")
-            reading = _beginning(text if len(text) <= REPEATED else "-", iter([Chunk(data)]), datagrams=False)
+            reading = _beginning(
+                text if len(text) <= REPEATED else "-", iter([Chunk(data)]), datagrams=False
+            )
         except ValueError as error:
             from lidarspec.device.settings import named
 
@@ -90,7 +105,11 @@ def _file(path: str, times: Times) -> Iterator[tuple[Heard, Iterator[Chunk]]]:
     from lidarspec.transports.open_url import transport
 
     with contextlib.closing(transport(path)) as file:
-        chunks = _standard_input(file) if path == "-" and type(file) is FileTransport else received(file, times, path)
+        chunks = (
+            _standard_input(file)
+            if path == "-" and type(file) is FileTransport
+            else received(file, times, path)
+        )
         with _beginning(path, chunks, datagrams=file.datagrams, warnings=file.warnings) as given:
             yield given
         for warning in file.warnings if given[0].chunks else ():
@@ -104,7 +123,10 @@ def _beginning(
     with system_errors(source):
         head = leading(chunks, LOOKED_AT)
     data = tuple(chunk.data for chunk in head)
-    yield Heard(source, data, datagrams, warnings=tuple(warnings)), itertools.chain(head, _rest(source, chunks))
+    yield (
+        Heard(source, data, datagrams, warnings=tuple(warnings)),
+        itertools.chain(head, _rest(source, chunks)),
+    )
 
 
 def _rest(source: str, chunks: Iterator[Chunk]) -> Iterator[Chunk]:
@@ -113,7 +135,9 @@ def _rest(source: str, chunks: Iterator[Chunk]) -> Iterator[Chunk]:
 
 
 def _standard_input(file: FileTransport) -> Iterator[Chunk]:
-    """What comes over standard input, as it comes; hexadecimal text as the bytes that it stands for."""
+    """What comes over standard input, as it comes; hexadecimal text as the bytes that it stands
+    for.
+    """
     head, stdin = sys.stdin.buffer.read(LOOKED_AT), sys.stdin.buffer
     if not is_hexadecimal(head, whole=len(head) < LOOKED_AT):
         yield Chunk(head)
@@ -123,7 +147,11 @@ def _standard_input(file: FileTransport) -> Iterator[Chunk]:
 
     def readline(size: int) -> bytes:
         line = looked_at.readline(size)
-        return line if line.endswith(b"\n") or len(line) == size else line + stdin.readline(size - len(line))
+        return (
+            line
+            if line.endswith(b"\n") or len(line) == size
+            else line + stdin.readline(size - len(line))
+        )
 
     yield from hex_chunks("standard input", readline)
 
@@ -145,14 +173,20 @@ def _no_bytes(words: Sequence[str], error: ValueError) -> LidarSpecError:
 
     text = " ".join(words)
     if len(words) == 1 and live_address(text) is not None:
-        return suggest(UsageError(f"{text} is live: this takes bytes or a file"), f"lidarspec read {quote(text)} --packets")
+        return suggest(
+            UsageError(f"{text} is live: this takes bytes or a file"),
+            f"lidarspec read {quote(text)} --packets",
+        )
     if len(words) == 1 and re.search(r"[/\\.]", text):
         return SourceError(f"{text}: no such file")
     return UsageError(f"{text[:QUOTED]!r} is no file, and not hexadecimal: {error}")
 
 
-def refuse_overwriting(target: str | Sequence[str] | None, *inputs: str | Path | Sensor | None, force: bool = True) -> None:
-    """Nothing, where a file is written to that is none of those that are read, by whatever name, and with `force` off is new.
+def refuse_overwriting(
+    target: str | Sequence[str] | None, *inputs: str | Path | Sensor | None, force: bool = True
+) -> None:
+    """Nothing, where a file is written to that is none of those that are read, by whatever name,
+    and with `force` off is new.
 
     Args:
         target: the file, or files.
@@ -161,10 +195,18 @@ def refuse_overwriting(target: str | Sequence[str] | None, *inputs: str | Path |
     Raises:
         UsageError: where it is not.
     """
-    existing = [file for file in ([target] if isinstance(target, str) else target or ()) if os.path.exists(file)]
+    existing = [
+        file
+        for file in ([target] if isinstance(target, str) else target or ())
+        if os.path.exists(file)
+    ]
     files = [file for file in existing if os.path.isfile(file)]
     for path in [path for given in inputs for path in _read_for(given)] if files else ():
-        same = next((file for file in files if os.path.samefile(path, file)), None) if os.path.exists(path) else None
+        same = (
+            next((file for file in files if os.path.samefile(path, file)), None)
+            if os.path.exists(path)
+            else None
+        )
         if same is not None:
             name = "standard input" if path == 0 else f"read as {path}" if path != same else "read"
             raise UsageError(f"{same} is {name}: it would be overwritten")
@@ -179,12 +221,20 @@ def _read_for(given: str | Path | Sensor | None) -> Iterator[str | int]:
         yield from (str(value) for value in given.options.values() if isinstance(value, str | Path))
         return
     word = str(given or "")
-    yield from [0] if word == "-" else [word, word.partition("?")[0], word.rpartition(":")[0], word.partition("=")[2]]
+    yield from (
+        [0]
+        if word == "-"
+        else [word, word.partition("?")[0], word.rpartition(":")[0], word.partition("=")[2]]
+    )
     from lidarspec.device.settings import named
 
-    with contextlib.suppress(LidarSpecError):  # settings that are wrong are told of where a name is looked up
+    with contextlib.suppress(
+        LidarSpecError
+    ):  # settings that are wrong are told of where a name is looked up
         known = named(word)
-        yield from (known.source.partition("?")[0], *map(str, known.options.values())) if known else ()
+        yield from (
+            (known.source.partition("?")[0], *map(str, known.options.values())) if known else ()
+        )
 
 
 def no_frame(sensor: Sensor, given: Heard) -> WireError:
@@ -193,12 +243,20 @@ def no_frame(sensor: Sensor, given: Heard) -> WireError:
     longest = max((frame.max_length for frame in sensor.frames.values()), default=0)
     command = f"lidarspec explain {quote(given.source)} -s {sensor.id}"
     if not data:
-        return suggest(WireError(no_bytes(given.source, given.warnings), sensor=sensor.id), f"lidarspec build {sensor.id} --help")
+        return suggest(
+            WireError(no_bytes(given.source, given.warnings), sensor=sensor.id),
+            f"lidarspec build {sensor.id} --help",
+        )
     if (fault := _never_right(given)) is not None:
         return fault
     if len(data) > longest:
         kind = " of text" if given.is_text else ""
-        error = WireError(f"no frame in {len(data)} bytes{kind}", sensor=sensor.id, expected="a frame", data=data[:longest])
+        error = WireError(
+            f"no frame in {len(data)} bytes{kind}",
+            sensor=sensor.id,
+            expected="a frame",
+            data=data[:longest],
+        )
         return suggest(error, "lidarspec sensors")
     try:
         parse_typed(sensor, data)
@@ -218,7 +276,11 @@ def nearest_fault(given: Heard) -> WireError:
         return fault
     best = nearest(given.data)
     if best is None:
-        text = f"no frame of any of the {len(sensors())} installed sensors" if sensors() else "no frame of an installed sensor"
+        text = (
+            f"no frame of any of the {len(sensors())} installed sensors"
+            if sensors()
+            else "no frame of an installed sensor"
+        )
         if given.is_text:
             text = f"{given.source}: this is text, and {text} is in it"
         error = suggest_installation(WireError(text, data=given.data[:QUOTED]), given)
@@ -231,17 +293,25 @@ def _never_right(given: Heard) -> WireError | None:
     from lidarspec.detect.identification import never_right
 
     fault = never_right(given.chunks, datagrams=given.datagrams)
-    return suggest(WireError(f"{given.source}: {fault}"), f"lidarspec crc {quote(given.source)}") if fault else None
+    return (
+        suggest(WireError(f"{given.source}: {fault}"), f"lidarspec crc {quote(given.source)}")
+        if fault
+        else None
+    )
 
 
 def nothing_came(device: Device, source: str, seconds: float | None = None) -> LidarSpecError:
-    """Why there is nothing to show: a plugin that raises, no data frame in a file, a silent device, or one whose bytes are no frames."""
+    """Why there is nothing to show: a plugin that raises, no data frame in a file, a silent device,
+    or one whose bytes are no frames.
+    """
     sensor, stats = device.sensor, device.stats
     if (failure := stats.failure(sensor.id)) is not None:
         return failure
     if not device.is_live:
         if stats.bytes_in and (instead := fits_instead(sensor, source)):
-            return suggest(WireError(f"{source} {instead[0]}", sensor=sensor.id), f"the same with {instead[1]}")
+            return suggest(
+                WireError(f"{source} {instead[0]}", sensor=sensor.id), f"the same with {instead[1]}"
+            )
         given = None if stats.frames else again(source)
         if given is not None and (fault := _never_right(given)) is not None:
             return fault
@@ -249,28 +319,41 @@ def nothing_came(device: Device, source: str, seconds: float | None = None) -> L
             error = WireError(f"{source} is text, and has no data frame: {stats}", sensor=sensor.id)
             return suggest(error, f"lidarspec detect {quote(source)}")
         said = (
-            "; ".join([f"{source} has no data frame: {stats}", *device.warnings]) if stats.bytes_in else no_bytes(source, device.warnings)
+            "; ".join([f"{source} has no data frame: {stats}", *device.warnings])
+            if stats.bytes_in
+            else no_bytes(source, device.warnings)
         )
-        return suggest(WireError(said, sensor=sensor.id), f"lidarspec explain {quote(source)} -s {sensor.id}")
+        return suggest(
+            WireError(said, sensor=sensor.id), f"lidarspec explain {quote(source)} -s {sensor.id}"
+        )
     waited = "" if seconds is None else f" within {seconds:.1f} s".replace(".0 s", " s")
     if stats.bytes_in == 0:
         others = f", and others {stats.foreign} datagrams" * bool(stats.foreign)
         return suggest(
-            CommandError(f"{sensor.id} on {source} sent nothing{waited}{others}"), f"lidarspec doctor {quote(source)} -s {sensor.id}"
+            CommandError(f"{sensor.id} on {source} sent nothing{waited}{others}"),
+            f"lidarspec doctor {quote(source)} -s {sensor.id}",
         )
-    error = WireError(f"{source}: {stats.bytes_in} bytes{waited}, and not a scan of data frames among them: {stats}", sensor=sensor.id)
+    error = WireError(
+        f"{source}: {stats.bytes_in} bytes{waited}, and not a scan of data frames among them:"
+        f" {stats}",
+        sensor=sensor.id,
+    )
     return suggest(error, f"lidarspec detect {quote(source)}")
 
 
 def conclude(device: Device) -> None:
-    """Say what there is to be said of a source that was read; exit code 1 where bytes of it are damaged, and could not be.
+    """Say what there is to be said of a source that was read; exit code 1 where bytes of it are
+    damaged, and could not be.
 
     Raises:
         PluginError: where a function of the plugin raised at some of the packets.
     """
     failure = device.stats.failure(device.sensor.id)
     for name, value in device.learned.items():
-        note(f"{device.sensor.id} has said its {name}: {f'{len(value)} bytes' if isinstance(value, bytes) else value}")
+        note(
+            f"{device.sensor.id} has said its {name}:"
+            f" {f'{len(value)} bytes' if isinstance(value, bytes) else value}"
+        )
     for warning in device.warnings:
         if failure is None or warning != str(failure):
             note(warning)
@@ -295,7 +378,9 @@ def again(source: str) -> Heard | None:
 
 
 def fits_instead(sensor: Sensor, source: str) -> tuple[str, str] | None:
-    """What a file holds that has no data frame of a sensor, and the options with which it is read; None where nothing fits."""
+    """What a file holds that has no data frame of a sensor, and the options with which it is read;
+    None where nothing fits.
+    """
     from lidarspec.detect.identification import chosen, verdict
 
     given = again(source)
@@ -303,15 +388,25 @@ def fits_instead(sensor: Sensor, source: str) -> tuple[str, str] | None:
     own = next((score.sensor.options for score in found if score.sensor.id == sensor.id), None)
     if own:
         told = " and ".join(f"{name}={value}" for name, value in own.items())
-        return f"does not say which data frames it holds: they are found with {told}", chosen(sensor.configure(**own))
+        return f"does not say which data frames it holds: they are found with {told}", chosen(
+            sensor.configure(**own)
+        )
     others = [score.sensor for score in found if score.sensor.id != sensor.id]
     if not others:
         return None
-    return f"has no data frame of it; its frames are those of {', '.join(other.id for other in others)}", chosen(others[0])
+    return (
+        (
+            "has no data frame of it; its frames are those of"
+            f" {', '.join(other.id for other in others)}"
+        ),
+        chosen(others[0]),
+    )
 
 
 class Patience:
-    """The time in which a live source has to send its first data frame, or first one of another type."""
+    """The time in which a live source has to send its first data frame, or first one of another
+    type.
+    """
 
     def __init__(self, device: Device, source: str, frame: str | None = None) -> None:
         self._device, self._source, self._began = device, source, time.monotonic()
@@ -321,18 +416,27 @@ class Patience:
         """Nothing, while there is hope.
 
         Raises:
-            CommandError, WireError: where the device has sent nothing, or nothing of the sensor's, for too long.
+            CommandError, WireError: where the device has sent nothing, or nothing of the sensor's,
+                for too long.
         """
         waited = time.monotonic() - self._began
-        if waited > PATIENCE and self._device.is_live and not any(name in self._device.stats.frames for name in self._awaited):
+        if (
+            waited > PATIENCE
+            and self._device.is_live
+            and not any(name in self._device.stats.frames for name in self._awaited)
+        ):
             raise nothing_came(self._device, self._source, waited)
 
 
-def scans_of(device: Device, source: str, select: Selection | None = None, *, until: float = math.inf) -> Iterator[Scan]:
-    """The scans of a device that are wanted, which has to send its first data frame in time; `until`: a time of `time.monotonic`.
+def scans_of(
+    device: Device, source: str, select: Selection | None = None, *, until: float = math.inf
+) -> Iterator[Scan]:
+    """The scans of a device that are wanted, which has to send its first data frame in time;
+    `until`: a time of `time.monotonic`.
 
     Raises:
-        CommandError, WireError: where the device has sent nothing, or nothing of the sensor's, for too long.
+        CommandError, WireError: where the device has sent nothing, or nothing of the sensor's, for
+            too long.
         UsageError: where there are scans, and none of them is wanted.
     """
     patience = Patience(device, source)

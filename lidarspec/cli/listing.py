@@ -25,7 +25,8 @@ STYLES = {
 
 
 def emit_lines(lines: Iterable[Line], output: str | None) -> None:
-    """Print lines as they are made: coloured and folded to its width on a terminal, else as plain text.
+    """Print lines as they are made: coloured and folded to its width on a terminal, else as plain
+    text.
 
     NO_COLOR and FORCE_COLOR are obeyed; coloured output into a pipe is not folded.
     """
@@ -33,7 +34,9 @@ def emit_lines(lines: Iterable[Line], output: str | None) -> None:
     if output is not None or not may_be_coloured:
         emit_parts(map(plain_text, lines), output)
         return
-    from rich.console import Console  # only for colours: importing it takes a third of the time of this verb
+    from rich.console import (
+        Console,
+    )  # only for colours: importing it takes a third of the time of this verb
 
     console = Console()
     if not console.is_terminal:

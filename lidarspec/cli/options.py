@@ -1,4 +1,6 @@
-"""The options and the kinds of values that verbs share, and those that select: the same words in every verb that reads."""
+"""The options and the kinds of values that verbs share, and those that select: the same words in
+every verb that reads.
+"""
 
 from __future__ import annotations
 
@@ -25,17 +27,27 @@ def sensor_option(function: Function) -> Function:
 
 
 def configuring(function: Function) -> Function:
-    """``-O`` and ``--calibration``, with which the sensor is configured: the verb is given an id, or the sensor so configured."""
+    """``-O`` and ``--calibration``, with which the sensor is configured: the verb is given an id,
+    or the sensor so configured.
+    """
 
     @functools.wraps(function)
-    def chosen(*args: Any, sensor_id: str | None, options: Sequence[str], calibration: str | None, **others: Any) -> Any:
+    def chosen(
+        *args: Any,
+        sensor_id: str | None,
+        options: Sequence[str],
+        calibration: str | None,
+        **others: Any,
+    ) -> Any:
         return function(*args, sensor_id=configured(sensor_id, options, calibration), **others)
 
     return _optional(chosen)  # type: ignore[return-value]
 
 
 def sensor_words(function: Callable[..., Any]) -> Callable[..., Any]:
-    """The same options, as they are typed: `sensor_id`, `options` and `calibration`, as `configured` takes them."""
+    """The same options, as they are typed: `sensor_id`, `options` and `calibration`, as
+    `configured` takes them.
+    """
     return _named(_optional(function))
 
 
@@ -45,12 +57,20 @@ def _named(function: Callable[..., Any]) -> Callable[..., Any]:
 
 
 def _optional(function: Callable[..., Any]) -> Callable[..., Any]:
-    unit = click.option("--calibration", metavar="FILE", help="The unit's own calibration, short for -O calibration=FILE.")(function)
+    unit = click.option(
+        "--calibration",
+        metavar="FILE",
+        help="The unit's own calibration, short for -O calibration=FILE.",
+    )(function)
     told = "An option of the sensor, such as calibration=FILE or answer=FRAME; may be given again."
-    return click.option("-O", "--option", "options", metavar="NAME=VALUE", multiple=True, help=told)(unit)
+    return click.option(
+        "-O", "--option", "options", metavar="NAME=VALUE", multiple=True, help=told
+    )(unit)
 
 
-def configured(sensor_id: str | None, options: Sequence[str], calibration: str | None) -> str | Sensor | None:
+def configured(
+    sensor_id: str | None, options: Sequence[str], calibration: str | None
+) -> str | Sensor | None:
     """The id, or the sensor with these options.
 
     Args:
@@ -64,12 +84,16 @@ def configured(sensor_id: str | None, options: Sequence[str], calibration: str |
     if not options:
         return sensor_id
     if sensor_id is None:
-        raise UsageError(f"{options[0].partition('=')[0]} is an option of a sensor: name the sensor with -s")
+        raise UsageError(
+            f"{options[0].partition('=')[0]} is an option of a sensor: name the sensor with -s"
+        )
     given = dict(option.partition("=")[::2] for option in options)
     if unset := [option for option in options if "=" not in option]:
         raise UsageError(f"-O {unset[0]}: an option has a value: NAME=VALUE")
     known: Sensor = sensor(sensor_id)
-    found: Sensor = known.configure(**{name: _value(known, name, text) for name, text in given.items()})
+    found: Sensor = known.configure(
+        **{name: _value(known, name, text) for name, text in given.items()}
+    )
     return found
 
 
@@ -84,13 +108,27 @@ def _value(sensor: Sensor, name: str, text: str) -> Any:
 
 def count_option(what: str, **more: Any) -> Callable[[Function], Function]:
     """``-n/--count``: so many, and then the verb ends."""
-    return click.option("-n", "--count", type=click.IntRange(min=1), help=f"So many {what}, and then it ends.", **more)
+    return click.option(
+        "-n",
+        "--count",
+        type=click.IntRange(min=1),
+        help=f"So many {what}, and then it ends.",
+        **more,
+    )
 
 
 def colour_option(function: Function) -> Function:
     """``--colour`` of pictures, in both spellings."""
     told = "What colours show: range, intensity, or a further column of the points."
-    return click.option("--colour", "--color", "ramp", metavar="COLUMN", default="range", show_default=True, help=told)(function)
+    return click.option(
+        "--colour",
+        "--color",
+        "ramp",
+        metavar="COLUMN",
+        default="range",
+        show_default=True,
+        help=told,
+    )(function)
 
 
 class Number(click.ParamType):  # type: ignore[type-arg]  # older versions of click have no types
@@ -151,10 +189,14 @@ def _speed(text: str) -> float:
 
 
 def _between(text: str, parse: Callable[[str], Any]) -> tuple[Any, Any]:
-    """What stands before and behind the colon of a text, None where nothing does; dates have colons of their own."""
+    """What stands before and behind the colon of a text, None where nothing does; dates have colons
+    of their own.
+    """
     for place in (place for place, mark in enumerate(text) if mark == ":"):
         try:
-            low, high = (parse(part) if part else None for part in (text[:place], text[place + 1 :]))
+            low, high = (
+                parse(part) if part else None for part in (text[:place], text[place + 1 :])
+            )
         except (ValueError, UsageError):
             continue
         if (low, high) != (None, None) and (None in (low, high) or type(low) is type(high)):
@@ -202,7 +244,11 @@ BYTES = Number("size", _bytes, "size from 1MB on, such as 256MB or 1GB")
 #: a factor above 0; 0 for "max".
 SPEED = Number("speed", _speed, "speed: a factor such as 1, 0.5 or 10, or max")
 #: from when to when, seconds or dates, from "10s:20s", ":1min" or "2026-11-23T05:02:00Z:".
-SLICE = Number("slice", lambda text: _between(text, _moment), "slice of time, such as 10s:20s, 10s:, :1min or 2026-11-23T05:02:00Z:")
+SLICE = Number(
+    "slice",
+    lambda text: _between(text, _moment),
+    "slice of time, such as 10s:20s, 10s:, :1min or 2026-11-23T05:02:00Z:",
+)
 #: from which number to which, from "5:10".
 INDICES = Number("indices", _indices, "slice of whole numbers, such as 5:10, 5: or :10")
 #: from how far to how far, metres, from "0.5m:30m".
@@ -210,14 +256,49 @@ DISTANCES = Number("distances", _distances, "span of distances, such as 0.5m:30m
 
 #: what selects, by the name of its argument of `Selection`.
 SELECTING: dict[str, Callable[[Any], Any]] = {
-    "times": click.option("--slice", "times", type=SLICE, metavar="FROM:TO", help="By time from the first scan, 10s:20s, or by date."),
-    "scans": click.option("--scans", "scans", type=INDICES, metavar="FROM:TO", help="By number from 0 on, without the last: 5:10."),
-    "every": click.option("--every", type=click.IntRange(min=1), metavar="N", help="Each Nth scan of those."),
-    "ranges": click.option("--range", "ranges", type=DISTANCES, metavar="NEAR:FAR", help="Returns from elsewhere are none: 0.5m:30m."),
-    "columns": click.option("--columns", metavar="NAME,...", help="Columns of the points, in this order: x,y,z,intensity."),
-    "time": click.option("--time", type=click.Choice(["device", "host"]), help="Whose clock stamps and --slice are by.  [default: device]"),
-    "beams": click.option("--beams", type=click.IntRange(min=1), metavar="N", help="Ranges of a LaserScan: always so many."),
-    "frame_id": click.option("--frame-id", metavar="NAME", help="The frame that ROS's messages name.  [default: laser]"),
+    "times": click.option(
+        "--slice",
+        "times",
+        type=SLICE,
+        metavar="FROM:TO",
+        help="By time from the first scan, 10s:20s, or by date.",
+    ),
+    "scans": click.option(
+        "--scans",
+        "scans",
+        type=INDICES,
+        metavar="FROM:TO",
+        help="By number from 0 on, without the last: 5:10.",
+    ),
+    "every": click.option(
+        "--every", type=click.IntRange(min=1), metavar="N", help="Each Nth scan of those."
+    ),
+    "ranges": click.option(
+        "--range",
+        "ranges",
+        type=DISTANCES,
+        metavar="NEAR:FAR",
+        help="Returns from elsewhere are none: 0.5m:30m.",
+    ),
+    "columns": click.option(
+        "--columns",
+        metavar="NAME,...",
+        help="Columns of the points, in this order: x,y,z,intensity.",
+    ),
+    "time": click.option(
+        "--time",
+        type=click.Choice(["device", "host"]),
+        help="Whose clock stamps and --slice are by.  [default: device]",
+    ),
+    "beams": click.option(
+        "--beams",
+        type=click.IntRange(min=1),
+        metavar="N",
+        help="Ranges of a LaserScan: always so many.",
+    ),
+    "frame_id": click.option(
+        "--frame-id", metavar="NAME", help="The frame that ROS's messages name.  [default: laser]"
+    ),
 }
 
 
@@ -231,10 +312,14 @@ def selecting(*names: str) -> Callable[[Function], Function]:
 
             given = {name: value for name in names if (value := others.pop(name)) is not None}
             if "columns" in given:
-                given["columns"] = tuple(name.strip() for name in given["columns"].split(",") if name.strip())
+                given["columns"] = tuple(
+                    name.strip() for name in given["columns"].split(",") if name.strip()
+                )
             return function(*args, selection=Selection(**given), **others)
 
-        return functools.reduce(lambda decorated, name: SELECTING[name](decorated), reversed(names), selected)  # type: ignore[return-value]
+        return functools.reduce(
+            lambda decorated, name: SELECTING[name](decorated), reversed(names), selected
+        )  # type: ignore[return-value]
 
     return options
 

@@ -1,4 +1,6 @@
-"""What verbs print: text, tables or JSON, on standard output or into a file; and one line on a terminal that says how far a verb is."""
+"""What verbs print: text, tables or JSON, on standard output or into a file; and one line on a
+terminal that says how far a verb is.
+"""
 
 from __future__ import annotations
 
@@ -28,13 +30,16 @@ Function = TypeVar("Function", bound=Callable[..., Any])
 
 #: seconds between two lines.
 PERIOD = 0.2
-#: blanks between columns of a table; those before prose below its row; the least width of prose beside it.
+#: blanks between columns of a table; those before prose below its row; the least width of prose
+#: beside it.
 GAP, HANGING, PROSE = 2, 6, 24
 
 
 def output_options(function: Function) -> Function:
     """Add ``--json`` and ``-o/--output`` to a verb that prints."""
-    return click.option("--json", "as_json", is_flag=True, help="Print JSON.")(output_option(function))
+    return click.option("--json", "as_json", is_flag=True, help="Print JSON.")(
+        output_option(function)
+    )
 
 
 def output_option(function: Function) -> Function:
@@ -46,19 +51,27 @@ def output_option(function: Function) -> Function:
             from lidarspec.cli.inputs import refuse_overwriting
             from lidarspec.spec.sensor import Sensor
 
-            words = [word for value in others.values() for word in (value if isinstance(value, tuple) else [value])]
+            words = [
+                word
+                for value in others.values()
+                for word in (value if isinstance(value, tuple) else [value])
+            ]
             refuse_overwriting(output, *(word for word in words if isinstance(word, str | Sensor)))
         return function(*args, output=output, **others)
 
-    return click.option("-o", "--output", metavar="FILE", help="Write to a file instead of standard output.")(refuse_and_call)  # type: ignore[return-value]
+    return click.option(
+        "-o", "--output", metavar="FILE", help="Write to a file instead of standard output."
+    )(refuse_and_call)  # type: ignore[return-value]
 
 
 class Progress(contextlib.AbstractContextManager["Progress"]):
-    """A line on standard error, where that is a terminal; a context manager that takes it away at the end.
+    """A line on standard error, where that is a terminal; a context manager that takes it away at
+    the end.
 
     Args:
         unit: an amount of work in words.
-        period: seconds in which one text is shown at most; 0 to show each, where few come and one may stand for long.
+        period: seconds in which one text is shown at most; 0 to show each, where few come and one
+            may stand for long.
     """
 
     def __init__(self, unit: Callable[[float], str] = str, period: float = PERIOD) -> None:
@@ -68,8 +81,8 @@ class Progress(contextlib.AbstractContextManager["Progress"]):
         self._bar: Bar | None = None
 
     def __call__(self, text: Callable[[], str], done: tuple[float, float] | None = None) -> None:
-        """Show a text, made only where it is time for one; a bar, the rate and the time that is left, where it is known what of how much
-        is done."""
+        """Show a text, made only where it is time for one; a bar, the rate and the time that is
+        left, where it is known what of how much is done."""
         if not self._is_shown or time.monotonic() < self._due:
             return
         self._due = time.monotonic() + self._period
@@ -78,12 +91,16 @@ class Progress(contextlib.AbstractContextManager["Progress"]):
         (task,) = self._bar.tasks
         rate = f"{self._unit(task.speed)}/s" if task.speed else ""
         completed, total = done or (0, 0)
-        self._bar.update(task.id, description=printable(text()), completed=completed, total=total, rate=rate)
+        self._bar.update(
+            task.id, description=printable(text()), completed=completed, total=total, rate=rate
+        )
         self._bar.start()
         self._bar.refresh()
 
     def follow(self, remarks: Iterable[str], text: Callable[[], str]) -> None:
-        """Show a text while something goes on, and what it remarks; empty remarks only pass the time."""
+        """Show a text while something goes on, and what it remarks; empty remarks only pass the
+        time.
+        """
         for remark in remarks:
             self(text)
             if remark:
@@ -107,13 +124,27 @@ class Progress(contextlib.AbstractContextManager["Progress"]):
 def _bar(*, is_measured: bool) -> Bar:
     """A line of text, with a bar behind it where it is measured how far it is."""
     from rich.console import Console
-    from rich.progress import BarColumn, Progress as Bar, TaskProgressColumn, TextColumn, TimeRemainingColumn
+    from rich.progress import (
+        BarColumn,
+        Progress as Bar,
+        TaskProgressColumn,
+        TextColumn,
+        TimeRemainingColumn,
+    )
     from rich.table import Column
 
-    text = TextColumn("{task.description}", markup=False, table_column=Column(no_wrap=True, ratio=1))
+    text = TextColumn(
+        "{task.description}", markup=False, table_column=Column(no_wrap=True, ratio=1)
+    )
     rate = TextColumn("{task.fields[rate]}", markup=False)
-    columns = (text, BarColumn(20), TaskProgressColumn(), rate, TimeRemainingColumn(compact=True)) if is_measured else (text,)
-    bar = Bar(*columns, console=Console(stderr=True), transient=True, auto_refresh=False, expand=True)
+    columns = (
+        (text, BarColumn(20), TaskProgressColumn(), rate, TimeRemainingColumn(compact=True))
+        if is_measured
+        else (text,)
+    )
+    bar = Bar(
+        *columns, console=Console(stderr=True), transient=True, auto_refresh=False, expand=True
+    )
     bar.add_task("", rate="")
     return bar
 
@@ -125,7 +156,8 @@ def size(number: float) -> str:
 
 
 def emit(content: str | bytes, output: str | None) -> None:
-    """Text, or bytes as they are, to standard output or into a file, which keeps what it held until the new content is whole.
+    """Text, or bytes as they are, to standard output or into a file, which keeps what it held until
+    the new content is whole.
 
     Raises:
         SourceError: where the file cannot be written.
@@ -133,17 +165,27 @@ def emit(content: str | bytes, output: str | None) -> None:
     emit_parts([content], output)
 
 
-def emit_parts(parts: Iterable[str | bytes], output: str | None, *, colour: bool | None = None) -> None:
-    """Texts, a line or more each, or bytes, as they are made; the same places as `emit`; `colour`: whether colours stay in a pipe."""
+def emit_parts(
+    parts: Iterable[str | bytes], output: str | None, *, colour: bool | None = None
+) -> None:
+    """Texts, a line or more each, or bytes, as they are made; the same places as `emit`; `colour`:
+    whether colours stay in a pipe.
+    """
     if output is None or output == "-":
         for part in parts:
             say(part, nl=isinstance(part, str), colour=colour)
         return
-    from lidarspec.formats.writing import replacing  # and all that scans are made of, for the verbs that write a file
+    from lidarspec.formats.writing import (
+        replacing,
+    )  # and all that scans are made of, for the verbs that write a file
 
     path = Path(output)
     is_replaced = path.is_file() or not path.exists()  # and not a device or a pipe
-    with system_errors(output), replacing(path) if is_replaced else contextlib.nullcontext(path) as written, written.open("wb") as file:
+    with (
+        system_errors(output),
+        replacing(path) if is_replaced else contextlib.nullcontext(path) as written,
+        written.open("wb") as file,
+    ):
         for part in parts:
             file.write(part if isinstance(part, bytes) else f"{part}\n".encode())
 
@@ -153,8 +195,12 @@ def emit_json(value: Any, output: str | None) -> None:
     emit(json.dumps(value, indent=2, allow_nan=False), output)
 
 
-def emit_json_list(head: dict[str, Any], name: str, items: Iterable[Any], output: str | None) -> None:
-    """An object as JSON whose last entry is a list, each item as it is made; the same places as `emit`."""
+def emit_json_list(
+    head: dict[str, Any], name: str, items: Iterable[Any], output: str | None
+) -> None:
+    """An object as JSON whose last entry is a list, each item as it is made; the same places as
+    `emit`.
+    """
     beginning = json.dumps({**head, name: []}, indent=2, allow_nan=False).removesuffix("]\n}")
     emit_parts(itertools.chain(_items(beginning, items), ["  ]\n}"]), output)
 
@@ -169,13 +215,18 @@ def _items(beginning: str, items: Iterable[Any]) -> Iterator[str]:
 
 
 def table(headers: Sequence[str], rows: Sequence[Sequence[str]], output: str | None = None) -> str:
-    """Rows as aligned columns; fitted to a terminal's width where there is one, each row in one line otherwise.
+    """Rows as aligned columns; fitted to a terminal's width where there is one, each row in one
+    line otherwise.
 
-    Cells are folded between words, so that an id or a path stays whole. Where that leaves too little for the last column, which has the
-    prose, it stands in lines of its own below each row.
+    Cells are folded between words, so that an id or a path stays whole. Where that leaves too
+    little for the last column, which has the prose, it stands in lines of its own below each row.
     """
     lines = [headers, *rows]
-    room = shutil.get_terminal_size().columns if output is None and sys.stdout.isatty() else sys.maxsize
+    room = (
+        shutil.get_terminal_size().columns
+        if output is None and sys.stdout.isatty()
+        else sys.maxsize
+    )
     widths = _widths(lines, room)
     full = max(len(line[-1]) for line in lines)
     hangs = widths[-1] < min(full, PROSE) or sum(widths) + GAP * (len(widths) - 1) > room
@@ -198,7 +249,11 @@ def _folded(line: Sequence[str], widths: Sequence[int], room: int) -> Iterator[s
     """The lines of one row; cells for which there is no width below it."""
 
     def wrapped(cell: str, width: int) -> list[str]:
-        return textwrap.wrap(cell, width, break_long_words=False, break_on_hyphens=False) if len(cell) > width else [cell]
+        return (
+            textwrap.wrap(cell, width, break_long_words=False, break_on_hyphens=False)
+            if len(cell) > width
+            else [cell]
+        )
 
     cells = [wrapped(cell, width) for cell, width in zip(line, widths, strict=False)]
     for parts in itertools.zip_longest(*cells, fillvalue=""):
@@ -208,7 +263,9 @@ def _folded(line: Sequence[str], widths: Sequence[int], room: int) -> Iterator[s
 
 
 def drawn(what: Text) -> str:
-    """What rich draws, as text to echo in colour; rich itself would end the process on a closed pipe."""
+    """What rich draws, as text to echo in colour; rich itself would end the process on a closed
+    pipe.
+    """
     from rich.console import Console
 
     console = Console()

@@ -16,7 +16,14 @@ import numpy as np
 
 from lidarspec.cli.failures import FINDINGS
 from lidarspec.cli.inputs import Patience, conclude, nothing_came, scans_of
-from lidarspec.cli.options import DURATION, SHARE, count_option, points_option, selecting, sensor_option
+from lidarspec.cli.options import (
+    DURATION,
+    SHARE,
+    count_option,
+    points_option,
+    selecting,
+    sensor_option,
+)
 from lidarspec.cli.terminal import note, say
 from lidarspec.device.device import Device, open as open_device
 from lidarspec.errors import UnknownFrame, UsageError
@@ -30,9 +37,16 @@ from lidarspec.view.feed import LOOK, Feed, Reading, told
 POINTS = {
     **dict.fromkeys(("x", "y", "z", "range"), (9, 3)),
     **dict.fromkeys(("azimuth", "elevation"), (9, 4)),
-    **{"intensity": (9, 0), "time": (10, 6), "ring": (5, 0), "return_index": (12, 0), "column": (6, 0)},
+    **{
+        "intensity": (9, 0),
+        "time": (10, 6),
+        "ring": (5, 0),
+        "return_index": (12, 0),
+        "column": (6, 0),
+    },
 }
-#: digits of a packet's field, of a further column of points in float32, and the width of a column at least.
+#: digits of a packet's field, of a further column of points in float32, and the width of a column
+#: at least.
 DIGITS, SINGLE, NARROWEST = 10, 7, 8
 #: digits of a float64 in JSON.
 KEPT = 14
@@ -48,7 +62,12 @@ ROUNDED = 1e-6
 @click.command()
 @click.argument("source", metavar="SOURCE")
 @sensor_option
-@click.option("--packets", "whole", is_flag=True, help="A row for each packet of the data frame, not for each point.")
+@click.option(
+    "--packets",
+    "whole",
+    is_flag=True,
+    help="A row for each packet of the data frame, not for each point.",
+)
 @click.option("-f", "--frame", metavar="NAME", help="The packets of this frame type.")
 @count_option("rows")
 @click.option("-t", "--duration", type=DURATION, help="How long at most, such as 10s.")
@@ -68,9 +87,10 @@ def read(
 ) -> None:
     """The points that a sensor sends, a row each; or its packets.
 
-    Points come as their scan is completed, with the columns of a PointCloud and the number of the scan: metres, radians, seconds
-    since the scan's stamp. Packets have their offset in the input, their time, and the values of their fields in units; arrays are
-    printed only by --json. Of what selects, --slice and --time are for packets too.
+    Points come as their scan is completed, with the columns of a PointCloud and the number of the
+    scan: metres, radians, seconds since the scan's stamp. Packets have their offset in the input,
+    their time, and the values of their fields in units; arrays are printed only by --json. Of what
+    selects, --slice and --time are for packets too.
     """
     with open_device(source, sensor_id) as device:
         if frame is not None and frame not in device.sensor.frames:
@@ -79,7 +99,9 @@ def read(
         if whole or frame:
             rows = _packets(device, frame, until, Patience(device, source, frame), selection)
         else:
-            rows = _points(scans_of(device, source, selection, until=until), every_point=every_point)
+            rows = _points(
+                scans_of(device, source, selection, until=until), every_point=every_point
+            )
         printed = 0
         for line in _lines(itertools.islice(rows, count), as_json=as_json):
             say(line)
@@ -99,7 +121,9 @@ def _lines(rows: Iterable[tuple[Units, Row]], *, as_json: bool) -> Iterator[str]
         shown = {name: value for name, value in row.items() if not isinstance(value, np.ndarray)}
         if not widths:
             headers = [f"{name} [{units[name]}]" if units.get(name) else name for name in shown]
-            widths = [max(len(header), _width(name)) for header, name in zip(headers, shown, strict=True)]
+            widths = [
+                max(len(header), _width(name)) for header, name in zip(headers, shown, strict=True)
+            ]
             yield _row(headers, widths)
         yield _row([_text(name, value) for name, value in shown.items()], widths)
 
@@ -114,21 +138,30 @@ def _points(scans: Iterable[Scan], *, every_point: bool) -> Iterator[tuple[Units
             yield units, {"scan": number, **dict(zip(columns, values, strict=True))}
 
 
-def _packets(device: Device, frame: str | None, until: float, patience: Patience, selection: Selection) -> Iterator[tuple[Units, Row]]:
+def _packets(
+    device: Device, frame: str | None, until: float, patience: Patience, selection: Selection
+) -> Iterator[tuple[Units, Row]]:
     """The packets one by one, with the fields of their header in units; arrays as arrays."""
     if replace(selection, times=(None, None), time="device") != Selection():
         raise UsageError("packets are selected by --slice and --time alone")
     wanted, number = Slice(selection.times), 0
     for batch in device.packets(frame, wait=LOOK):
         patience.check()
-        packets = batch.take(wanted.holds(batch.host_ns if selection.time == "host" else batch.time_ns))
+        packets = batch.take(
+            wanted.holds(batch.host_ns if selection.time == "host" else batch.time_ns)
+        )
         number += len(packets)
-        fields = {path: info for path, info in packets.table.schema.fields.items() if info.const is None}
+        fields = {
+            path: info for path, info in packets.table.schema.fields.items() if info.const is None
+        }
         units = {path: info.unit for path, info in fields.items()}
         columns = {path: packets[path] for path in fields}
         for place in range(len(packets)):
             times = {"offset": int(packets.offset[place]), "time_ns": int(packets.time_ns[place])}
-            yield units, {**times, **{path: _scalar(column[place]) for path, column in columns.items()}}
+            yield (
+                units,
+                {**times, **{path: _scalar(column[place]) for path, column in columns.items()}},
+            )
         if time.monotonic() >= until or wanted.ended:
             break
     if wanted.first is not None and not number:
@@ -160,12 +193,20 @@ def _plain(value: Any) -> Any:
     """A value as JSON takes it: null for nan and infinity, whole numbers without a point."""
     if isinstance(value, np.ndarray):
         return [_plain(item) for item in value]
-    number, single = value.item() if isinstance(value, np.generic) else value, isinstance(value, np.float32)
+    number, single = (
+        value.item() if isinstance(value, np.generic) else value,
+        isinstance(value, np.float32),
+    )
     if isinstance(number, float):
         if not math.isfinite(number):
             return None
-        # a float32 has the digits that it prints; scales of ten leave their rounding in the last digits of a float64
-        return int(number) if number.is_integer() and abs(number) < 2**53 else float(str(value) if single else f"{number:.{KEPT}g}")
+        # a float32 has the digits that it prints; scales of ten leave their rounding in the last
+        # digits of a float64
+        return (
+            int(number)
+            if number.is_integer() and abs(number) < 2**53
+            else float(str(value) if single else f"{number:.{KEPT}g}")
+        )
     return number
 
 
@@ -211,17 +252,27 @@ class Lines:
     def summary(self, reading: Reading) -> None:
         """The figures of everything."""
         if self.as_json:
-            self._emit({"kind": "summary", **self._figures(reading), "stats": self.device.stats.to_dict()})
+            self._emit(
+                {"kind": "summary", **self._figures(reading), "stats": self.device.stats.to_dict()}
+            )
             return
         lasted = f" in {reading.seconds:.1f} s" if reading.seconds else ""
-        say(f"\n{self.device.sensor.id}: {reading.packets} packets, {reading.scans} whole scans{lasted}; {self.device.stats}")
+        say(
+            f"\n{self.device.sensor.id}: {reading.packets} packets, {reading.scans} whole"
+            f" scans{lasted}; {self.device.stats}"
+        )
         for name, unit, _, text in FIGURES:
             if text(reading) != "-":
                 say(f"  {name:<8} {text(reading):>10} {unit}")
 
     def _figures(self, reading: Reading) -> dict[str, Any]:
         facts = {"source": str(self.device.source), "sensor": self.device.sensor.id}
-        return {**facts, **reading.to_dict(), "queue": self.device.queued, "state": self.device.state}
+        return {
+            **facts,
+            **reading.to_dict(),
+            "queue": self.device.queued,
+            "state": self.device.state,
+        }
 
     def _emit(self, value: dict[str, Any]) -> None:
         say(json.dumps(value, allow_nan=False))
@@ -233,9 +284,20 @@ class Lines:
 @sensor_option
 @count_option("lines")
 @selecting("times", "scans", "every", "ranges", "time")
-@click.option("-t", "--duration", type=DURATION, help="How long, such as 10s; without it until the input ends.")
-@click.option("--interval", type=DURATION, default="1s", show_default=True, help="From line to line.")
-@click.option("--max-errors", type=SHARE, help="Exit code 1 where more of the frames are wrong or lost, such as 1%.")
+@click.option(
+    "-t",
+    "--duration",
+    type=DURATION,
+    help="How long, such as 10s; without it until the input ends.",
+)
+@click.option(
+    "--interval", type=DURATION, default="1s", show_default=True, help="From line to line."
+)
+@click.option(
+    "--max-errors",
+    type=SHARE,
+    help="Exit code 1 where more of the frames are wrong or lost, such as 1%.",
+)
 @click.option("--json", "as_json", is_flag=True, help="Print a JSON object on each line.")
 def stats(
     sources: Sequence[str],
@@ -249,9 +311,11 @@ def stats(
 ) -> None:
     """How a sensor is doing: speed, rates, errors, loss, jitter, queue.
 
-    A line for each interval, and a summary at the end. Errors are frames whose checksum, length or values are wrong; loss counts
-    what is missing by the sensor's own numbers or clock. A file is read as fast as possible, in batches, and by the time of its packets:
-    there an interval can be longer than asked for. Several sources are read in turn.
+    A line for each interval, and a summary at the end. Errors are frames whose checksum, length or
+    values are wrong; loss counts
+    what is missing by the sensor's own numbers or clock. A file is read as fast as possible, in
+    batches, and by the time of its packets: there an interval can be longer than asked for. Several
+    sources are read in turn.
     """
     lasting = min(duration or math.inf, interval * count if count else math.inf)
     has_findings = False
@@ -259,14 +323,18 @@ def stats(
         if len(sources) > 1 and not as_json:
             say(f"{source}:")
         with open_device(source, sensor_id, period=LOOK) as device:
-            found = _print_stats(source, Feed(device, select=selection), Lines(device, as_json), interval, lasting)
+            found = _print_stats(
+                source, Feed(device, select=selection), Lines(device, as_json), interval, lasting
+            )
             worst = max(found.error_rate, found.loss_rate or 0.0)
             if max_errors is not None and worst > max_errors:
                 note(f"{worst:.3%} of the frames are wrong or lost, more than {max_errors:.3%}")
                 has_findings = True
             try:
                 conclude(device)
-            except click.exceptions.Exit:  # damage; the sources behind this one are read all the same
+            except (
+                click.exceptions.Exit
+            ):  # damage; the sources behind this one are read all the same
                 has_findings = True
     if has_findings:
         raise click.exceptions.Exit(FINDINGS)
@@ -296,10 +364,14 @@ def _print_stats(source: str, feed: Feed, lines: Lines, interval: float, lasting
 
 def _summary(feed: Feed, start: float) -> Reading:
     """The figures of everything, since a time of `time.monotonic` where the source is live."""
-    return feed.meter.summary(feed.device.stats, time.monotonic() - start if feed.device.is_live else None)
+    return feed.meter.summary(
+        feed.device.stats, time.monotonic() - start if feed.device.is_live else None
+    )
 
 
-def _by_the_clock(feed: Feed, lines: Lines, interval: float, start: float, lasting: float, patience: Patience) -> None:
+def _by_the_clock(
+    feed: Feed, lines: Lines, interval: float, start: float, lasting: float, patience: Patience
+) -> None:
     """Print a line for each interval of the clock."""
     edge = last = start
     end = start + lasting
@@ -313,7 +385,9 @@ def _by_the_clock(feed: Feed, lines: Lines, interval: float, start: float, lasti
 
 
 def _by_the_packets(feed: Feed, lines: Lines, interval: float, lasting: float) -> None:
-    """Print a line for each interval of the packets' own time, where they have one; as long as a batch at least."""
+    """Print a line for each interval of the packets' own time, where they have one; as long as a
+    batch at least.
+    """
     start: int | None = None
     edges, passed = 0, 0.0
     while not feed.ended and passed < lasting:

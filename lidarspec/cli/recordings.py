@@ -1,4 +1,6 @@
-"""`record` and `replay`: everything that a source sends into one file, and what was recorded out again, byte for byte and in time."""
+"""`record` and `replay`: everything that a source sends into one file, and what was recorded out
+again, byte for byte and in time.
+"""
 
 from __future__ import annotations
 
@@ -16,7 +18,14 @@ from lidarspec.cli.terminal import note, say
 from lidarspec.detect.identification import declared
 from lidarspec.device.settings import named
 from lidarspec.device.source_recording import SourceRecording, recorder_like
-from lidarspec.errors import CommandError, LidarSpecError, SourceError, UsageError, WireError, suggest
+from lidarspec.errors import (
+    CommandError,
+    LidarSpecError,
+    SourceError,
+    UsageError,
+    WireError,
+    suggest,
+)
 from lidarspec.framing.results import Counters
 from lidarspec.plugins import sensor as named_sensor
 from lidarspec.recording.appending import Appender
@@ -33,14 +42,27 @@ from lidarspec.transports.serving import LATE, Replay
 @click.command()
 @click.argument("source", metavar="SOURCE")
 @click.option(
-    "-o", "--output", "target", metavar="FILE", required=True, help="The file: .lsr, .pcap and .pcapng for Wireshark, .bin for bytes."
+    "-o",
+    "--output",
+    "target",
+    metavar="FILE",
+    required=True,
+    help="The file: .lsr, .pcap and .pcapng for Wireshark, .bin for bytes.",
 )
 @sensor_option
-@click.option("-t", "--duration", "seconds", type=DURATION, help="How long, such as 10s; until Ctrl-C by default.")
+@click.option(
+    "-t",
+    "--duration",
+    "seconds",
+    type=DURATION,
+    help="How long, such as 10s; until Ctrl-C by default.",
+)
 @count_option("packets (the sensor's data packets, or datagrams) at least")
 @click.option("--no-start", is_flag=True, help="Send the sensor no commands.")
 @click.option("--force", is_flag=True, help="Overwrite FILE.")
-@click.option("--salvage", is_flag=True, help="Go on behind damaged places, where SOURCE is a recording.")
+@click.option(
+    "--salvage", is_flag=True, help="Go on behind damaged places, where SOURCE is a recording."
+)
 @click.option("--slice", "times", hidden=True)
 @click.option("--json", "as_json", is_flag=True, help="Print a summary as JSON.")
 def record(
@@ -55,18 +77,35 @@ def record(
     times: str | None,
     as_json: bool,
 ) -> None:
-    """Everything that a source sends, with the time of its arrival, in one file that survives a crash.
+    """Record a source, with the time of every arrival, in one file that survives a crash.
 
-    A sensor that is named, with -s or by the source (sim:ID), is started, and what it is stands in the file; without, bytes are
-    recorded as they come.
+    A sensor that is named, with -s or by the source (sim:ID), is started, and what it is stands in
+    the file; without, bytes are recorded as they come.
     """
     check_suffix(target)
     if times is not None:
         raise _slice_error(source, target, times)
     refuse_overwriting(target, source, sensor_id)
     known = named(source)
-    sensor = named_sensor(sensor_id) if sensor_id else declared(source) if is_live(source) else known.configured() if known else None
-    task = SourceRecording(source, target, sensor, seconds=seconds, count=count, start=not no_start, overwrite=force, salvage=salvage)
+    sensor = (
+        named_sensor(sensor_id)
+        if sensor_id
+        else declared(source)
+        if is_live(source)
+        else known.configured()
+        if known
+        else None
+    )
+    task = SourceRecording(
+        source,
+        target,
+        sensor,
+        seconds=seconds,
+        count=count,
+        start=not no_start,
+        overwrite=force,
+        salvage=salvage,
+    )
     interrupted = False
     try:
         _recorded(task)
@@ -96,14 +135,22 @@ def record(
 def _slice_error(source: str, target: str, times: str) -> UsageError:
     """Return the error for --slice, with the command that cuts a recording."""
     if is_live(source):
-        return suggest(UsageError("--slice cuts recordings; of a live source, -t takes the first seconds"), "lidarspec record --help")
-    command = f"lidarspec replay {shlex.quote(source)} --to {shlex.quote(target)} --slice {shlex.quote(times)}"
+        return suggest(
+            UsageError("--slice cuts recordings; of a live source, -t takes the first seconds"),
+            "lidarspec record --help",
+        )
+    command = (
+        f"lidarspec replay {shlex.quote(source)} --to {shlex.quote(target)} --slice"
+        f" {shlex.quote(times)}"
+    )
     return suggest(UsageError("record copies a whole file; replay cuts a part out of it"), command)
 
 
 def _recorded(task: SourceRecording) -> None:
     with Progress() as progress, contextlib.closing(task.run()) as remarks:
-        progress.follow(remarks, lambda: _taken(task, task.recorder) if task.recorder is not None else "")
+        progress.follow(
+            remarks, lambda: _taken(task, task.recorder) if task.recorder is not None else ""
+        )
 
 
 def _taken(task: SourceRecording, kept: Appender) -> str:
@@ -112,7 +159,9 @@ def _taken(task: SourceRecording, kept: Appender) -> str:
     return f"{packets}{kept.records} records, {size(kept.bytes)} in {task.elapsed:.1f} s"
 
 
-def _sum_up_recording(task: SourceRecording, kept: Appender, source: str, sensor: Sensor | None, *, as_json: bool) -> None:
+def _sum_up_recording(
+    task: SourceRecording, kept: Appender, source: str, sensor: Sensor | None, *, as_json: bool
+) -> None:
     """What was recorded, and what can be done with it; an empty file is not left behind."""
     device = task.device
     if not kept.records:
@@ -121,8 +170,12 @@ def _sum_up_recording(task: SourceRecording, kept: Appender, source: str, sensor
         if device is not None:
             raise nothing_came(device, source, task.elapsed)
         if live_address(source) is not None:
-            raise suggest(CommandError(f"{source} sent nothing"), f"lidarspec doctor {shlex.quote(source)}")
-        raise suggest(WireError(f"{source} holds nothing that was received"), "lidarspec record --help")
+            raise suggest(
+                CommandError(f"{source} sent nothing"), f"lidarspec doctor {shlex.quote(source)}"
+            )
+        raise suggest(
+            WireError(f"{source} holds nothing that was received"), "lidarspec record --help"
+        )
     stats = device.stats if device is not None else None
     summary = f"{kept.path}: {_taken(task, kept)}"
     if stats is not None and (damage := _describe_damage(stats)):
@@ -131,14 +184,22 @@ def _sum_up_recording(task: SourceRecording, kept: Appender, source: str, sensor
     note(f"next: {_view_of(kept, sensor)}")
     if as_json:
         facts = {"output": kept.path, "source": source, "sensor": sensor.id if sensor else None}
-        counts = {"records": kept.records, "bytes": kept.bytes, "packets": task.packets, "seconds": task.elapsed, "dropped": kept.dropped}
+        counts = {
+            "records": kept.records,
+            "bytes": kept.bytes,
+            "packets": task.packets,
+            "seconds": task.elapsed,
+            "dropped": kept.dropped,
+        }
         emit_json({**facts, **counts, "stats": stats.to_dict() if stats else None}, None)
     if stats is not None and not stats.frames and device is not None:
         raise nothing_came(device, source, task.elapsed)
 
 
 def _describe_damage(stats: Counters) -> str:
-    """Return the counters of lost and damaged input in words, without those of what was decoded: some of it is not in the file."""
+    """Return the counters of lost and damaged input in words, without those of what was decoded:
+    some of it is not in the file.
+    """
     counters = stats.to_dict()
     for name in ("frames", "bytes_in", "pending"):
         del counters[name]
@@ -155,14 +216,28 @@ def _view_of(kept: Appender, sensor: Sensor | None) -> str:
 @click.command()
 @click.argument("file", metavar="FILE")
 @click.option(
-    "--to", "place", default="pty", show_default=True, metavar="PLACE", help="pty, udp://host[:port], tcp://host:port, or a new file."
+    "--to",
+    "place",
+    default="pty",
+    show_default=True,
+    metavar="PLACE",
+    help="pty, udp://host[:port], tcp://host:port, or a new file.",
 )
-@click.option("--speed", type=SPEED, help="1 as it came, 0.5 half as fast, max as fast as possible.  [default: 1; max into a file]")
+@click.option(
+    "--speed",
+    type=SPEED,
+    help="1 as it came, 0.5 half as fast, max as fast as possible.  [default: 1; max into a file]",
+)
 @click.option("--loop", is_flag=True, help="Begin again at the end, until Ctrl-C.")
 @click.option("--force", is_flag=True, help="Overwrite a file to play to.")
 @sensor_option
 @selecting("times")
-@click.option("--json", "as_json", is_flag=True, help="Print a summary as JSON, with the SHA-256 of all bytes.")
+@click.option(
+    "--json",
+    "as_json",
+    is_flag=True,
+    help="Print a summary as JSON, with the SHA-256 of all bytes.",
+)
 def replay(
     file: str,
     place: str,
@@ -175,12 +250,14 @@ def replay(
 ) -> None:
     """A recording or capture, sent again as it came: bit for bit, and by the clock.
 
-    To a pty or tcp:// it begins when somebody opens it. udp:// without a port uses those of the recording. A new .lsr or .pcap
-    file keeps the times of the recording. --slice goes by the times of arrival.
+    To a pty or tcp:// it begins when somebody opens it. udp:// without a port uses those of the
+    recording. A new .lsr or .pcap file keeps the times of the recording. --slice goes by the times
+    of arrival.
     """
     if is_live(file):
         raise suggest(
-            UsageError(f"{file} is live: only what was recorded can be replayed"), f"lidarspec record {shlex.quote(file)} -o recording.lsr"
+            UsageError(f"{file} is live: only what was recorded can be replayed"),
+            f"lidarspec record {shlex.quote(file)} -o recording.lsr",
         )
     is_file = place.endswith(SUFFIXES) and "://" not in place
     if is_file and loop:
@@ -200,7 +277,15 @@ def replay(
         undo.pop_all()  # the replay closes it
     _announce(file, outlet, sensor, as_json=as_json)
     factor = (None if is_file else 1.0) if speed is None else speed or None
-    played = Replay(file, outlet, speed=factor, needs_times=speed is not None, loop=loop, source=source, times=selection.times)
+    played = Replay(
+        file,
+        outlet,
+        speed=factor,
+        needs_times=speed is not None,
+        loop=loop,
+        source=source,
+        times=selection.times,
+    )
     is_interrupted = _run(played, outlet, file)
     _sum_up(file, outlet, sensor, played, as_json=as_json)
     if is_interrupted:
@@ -222,7 +307,9 @@ def _run(played: Replay, outlet: Outlet, file: str) -> bool:
 
 
 def _sensor(source: Transport, sensor_id: str | Sensor | None) -> Sensor | None:
-    """The sensor that is named, or the one of the recording if it is installed; None where nobody knows."""
+    """The sensor that is named, or the one of the recording if it is installed; None where nobody
+    knows.
+    """
     if sensor_id:
         return named_sensor(sensor_id)
     with contextlib.suppress(LidarSpecError):
@@ -230,12 +317,18 @@ def _sensor(source: Transport, sensor_id: str | Sensor | None) -> Sensor | None:
     return None
 
 
-def _file(source: Transport, file: str, place: str, sensor: Sensor | None, *, force: bool) -> FileOutlet:
+def _file(
+    source: Transport, file: str, place: str, sensor: Sensor | None, *, force: bool
+) -> FileOutlet:
     """A new file in the place of the old one's source."""
     try:
         return FileOutlet(recorder_like(source, file, place, sensor, overwrite=force))
     except UsageError as error:
-        raise suggest(error, "the same with --force, or with another file") if os.path.exists(place) and not force else error from None
+        raise (
+            suggest(error, "the same with --force, or with another file")
+            if os.path.exists(place) and not force
+            else error
+        ) from None
 
 
 def _announce(file: str, outlet: Outlet, sensor: Sensor | None, *, as_json: bool) -> None:
@@ -261,17 +354,36 @@ def _told(played: Replay) -> str:
     return f"{played.chunks} chunks, {size(played.bytes)} in {played.seconds:.1f} s"
 
 
-def _sum_up(file: str, outlet: Outlet, sensor: Sensor | None, played: Replay, *, as_json: bool) -> None:
+def _sum_up(
+    file: str, outlet: Outlet, sensor: Sensor | None, played: Replay, *, as_json: bool
+) -> None:
     is_file = isinstance(outlet, FileOutlet)
     note(f"{file} to {outlet.place}: {_told(played)}")
     if not played.is_timed:
-        note(f"{file} does not say when its bytes arrived: they went out as fast as they were taken")
+        note(
+            f"{file} does not say when its bytes arrived: they went out as fast as they were taken"
+        )
     if played.late:
-        note(f"{played.late} chunks went out more than {LATE // 1_000_000} ms late, up to {played.latest / 1e6:.0f} ms")
+        note(
+            f"{played.late} chunks went out more than {LATE // 1_000_000} ms late, up to"
+            f" {played.latest / 1e6:.0f} ms"
+        )
     if len(played.senders) > 1 and not is_file:
-        note(f"{len(played.senders)} senders were recorded, and all went out from one address; choose one with '{file}?src=ADDRESS'")
+        note(
+            f"{len(played.senders)} senders were recorded, and all went out from one address;"
+            f" choose one with '{file}?src=ADDRESS'"
+        )
     if is_file:
         note(f"next: lidarspec {_shown(sensor, outlet.place)}")
     if as_json:
-        facts = {"source": file, "to": outlet.place, "chunks": played.chunks, "bytes": played.bytes, "sha256": played.digest.hexdigest()}
-        emit_json({**facts, "seconds": played.seconds, "late": played.late, "latest_ns": played.latest}, None)
+        facts = {
+            "source": file,
+            "to": outlet.place,
+            "chunks": played.chunks,
+            "bytes": played.bytes,
+            "sha256": played.digest.hexdigest(),
+        }
+        emit_json(
+            {**facts, "seconds": played.seconds, "late": played.late, "latest_ns": played.latest},
+            None,
+        )

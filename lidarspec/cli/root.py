@@ -27,38 +27,89 @@ GROUPS = {
     "look": {
         "sensors": ("sensors", "The installed sensors, and how far each is proven."),
         "show": ("sensors", "What a sensor is, and the wire table of each of its frames."),
-        "ports": ("finding", "The serial ports of this computer, and the UDP ports that installed sensors send to."),
+        "ports": (
+            "finding",
+            "The serial ports of this computer, and the UDP ports that installed sensors send to.",
+        ),
         "detect": ("finding", "Which installed sensor sends, and at which port and baud rate."),
-        "doctor": ("finding", "What keeps a sensor's bytes from coming, and the command that mends it."),
-        "plugins": ("sensors", "The plugins that were found, and what is wrong with those that do not load."),
-        "trust": ("sensors", "Allow a folder: its lidarspec.toml may name Python files, and files elsewhere."),
-        "demo": ("sim", "A simulated sensor on a port: started, read through a bad line, recorded, read again, drawn."),
+        "doctor": (
+            "finding",
+            "What keeps a sensor's bytes from coming, and the command that mends it.",
+        ),
+        "plugins": (
+            "sensors",
+            "The plugins that were found, and what is wrong with those that do not load.",
+        ),
+        "trust": (
+            "sensors",
+            "Allow a folder: its lidarspec.toml may name Python files, and files elsewhere.",
+        ),
+        "demo": (
+            "sim",
+            (
+                "A simulated sensor on a port: started, read through a bad line, recorded, read"
+                " again, drawn."
+            ),
+        ),
         "help": ("root", "What a verb does, and its options; without a verb, all of them."),
     },
     "stream": {
         "read": ("read", "The points that a sensor sends, a row each; or its packets."),
         "view": ("view", "A sensor at work, drawn in the terminal, or with --web in the browser."),
-        "record": ("recordings", "Everything that a source sends, with the time of its arrival, in one file that survives a crash."),
-        "replay": ("recordings", "A recording or capture, sent again as it came: bit for bit, and by the clock."),
+        "record": (
+            "recordings",
+            "Record a source, with the time of every arrival, in one file that survives a crash.",
+        ),
+        "replay": (
+            "recordings",
+            "A recording or capture, sent again as it came: bit for bit, and by the clock.",
+        ),
         "sim": ("sim", "A simulated sensor on a serial port, UDP, TCP or in a file."),
         "send": ("build", "Send a command to a sensor, and print its reply."),
         "stats": ("read", "How a sensor is doing: speed, rates, errors, loss, jitter, queue."),
     },
     "files": {
-        "info": ("files", "What is in a file: kind, times, senders, sensor, rates, loss, and how it is read."),
-        "convert": ("files", "Write the points of a capture or raw file to a file, in the format of its suffix."),
+        "info": (
+            "files",
+            "What is in a file: kind, times, senders, sensor, rates, loss, and how it is read.",
+        ),
+        "convert": (
+            "files",
+            "Write the points of a capture or raw file to a file, in the format of its suffix.",
+        ),
         "plot": ("files", "A scan as a picture; or intensities, ranges and rates over time."),
     },
     "bytes": {
         "parse": ("frames", "The fields of each frame in some bytes."),
-        "explain": ("frames", "Every byte of each frame: offset, hex, field, value, unit, meaning."),
-        "build": ("build", "The bytes of one frame from field=value; a unit makes a value physical."),
-        "crc": ("finding", "Which checksum seals some sample frames: XOR, sums, or a CRC of 8, 16 or 32 bits."),
+        "explain": (
+            "frames",
+            "Every byte of each frame: offset, hex, field, value, unit, meaning.",
+        ),
+        "build": (
+            "build",
+            "The bytes of one frame from field=value; a unit makes a value physical.",
+        ),
+        "crc": (
+            "finding",
+            "Which checksum seals some sample frames: XOR, sums, or a CRC of 8, 16 or 32 bits.",
+        ),
     },
     "authors": {
-        "new": ("authors", "A distribution for a sensor of your own, which works before anything in it is changed."),
-        "check": ("authors", "What is wrong with a sensor, a file or a distribution: every promise, and mistakes in its spec."),
-        "export": ("authors", "A sensor's spec for another tool: wireshark, c, ksy (Kaitai), md, svg, json, pyi."),
+        "new": (
+            "authors",
+            (
+                "A distribution for a sensor of your own, which works before anything in it is"
+                " changed."
+            ),
+        ),
+        "check": (
+            "authors",
+            "Check a sensor, a file or a distribution against every promise of the test kit.",
+        ),
+        "export": (
+            "authors",
+            "A sensor's spec for another tool: wireshark, c, ksy (Kaitai), md, svg, json, pyi.",
+        ),
     },
 }
 VERBS = {verb: place for verbs in GROUPS.values() for verb, place in verbs.items()}
@@ -78,8 +129,21 @@ def _spoken(loudness: int, *names: str, help: str) -> click.Option:
 
 #: the options of all verbs, but for those that have one of the same name.
 SPOKEN = (
-    _spoken(-1, "-q", "--quiet", help="No remarks, and nothing on how far it is; failures are told all the same."),
-    _spoken(1, "-v", "--verbose", help="Also how long it took, the memory that it needed, and where in the code a failure arose."),
+    _spoken(
+        -1,
+        "-q",
+        "--quiet",
+        help="No remarks, and nothing on how far it is; failures are told all the same.",
+    ),
+    _spoken(
+        1,
+        "-v",
+        "--verbose",
+        help=(
+            "Also how long it took, the memory that it needed, and where in the code a failure"
+            " arose."
+        ),
+    ),
 )
 
 
@@ -97,7 +161,9 @@ class Verbs(click.Group):
 
     def get_command(self, ctx: click.Context, cmd_name: str) -> click.Command | None:
         if cmd_name in VERBS:
-            found: click.Command = getattr(importlib.import_module(f"lidarspec.cli.{VERBS[cmd_name][0]}"), cmd_name)
+            found: click.Command = getattr(
+                importlib.import_module(f"lidarspec.cli.{VERBS[cmd_name][0]}"), cmd_name
+            )
         elif cmd_name in added():
             from lidarspec.plugins import verb
 
@@ -112,12 +178,18 @@ class Verbs(click.Group):
             attach(found)
         return found
 
-    def resolve_command(self, ctx: click.Context, args: list[str]) -> tuple[str | None, click.Command | None, list[str]]:
+    def resolve_command(
+        self, ctx: click.Context, args: list[str]
+    ) -> tuple[str | None, click.Command | None, list[str]]:
         if args[0] not in VERBS and args[0] not in added() and not ctx.resilient_parsing:
             if args[0] in ELSEWHERE:
-                error = click.UsageError(f"the verb {args[0]!r} comes with a plugin that is not installed", ctx)
+                error = click.UsageError(
+                    f"the verb {args[0]!r} comes with a plugin that is not installed", ctx
+                )
                 raise suggest(error, install_command(ELSEWHERE[args[0]], extra=args[0]))
-            raise click.UsageError(f"unknown verb {args[0]!r}{did_you_mean(args[0], self.list_commands(ctx))}", ctx)
+            raise click.UsageError(
+                f"unknown verb {args[0]!r}{did_you_mean(args[0], self.list_commands(ctx))}", ctx
+            )
         return super().resolve_command(ctx, args)
 
     def format_commands(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
@@ -132,11 +204,19 @@ class Verbs(click.Group):
         """The verbs, none of which is loaded for it; and the options."""
         from click.shell_completion import CompletionItem
 
-        known = {verb: text for verb, (_, text) in VERBS.items()} | {verb: _from(entry) for verb, entry in added().items()}
-        found = [CompletionItem(verb, help=text) for verb, text in known.items() if verb.startswith(incomplete)]
+        known = {verb: text for verb, (_, text) in VERBS.items()} | {
+            verb: _from(entry) for verb, entry in added().items()
+        }
+        found = [
+            CompletionItem(verb, help=text)
+            for verb, text in known.items()
+            if verb.startswith(incomplete)
+        ]
         return found + click.Command.shell_complete(self, ctx, incomplete)
 
-    def main(self, args: Sequence[str] | None = None, prog_name: str | None = None, **extra: Any) -> NoReturn:  # type: ignore[override]
+    def main(  # type: ignore[override]
+        self, args: Sequence[str] | None = None, prog_name: str | None = None, **extra: Any
+    ) -> NoReturn:
         """Run one verb and exit with its code; no exception leaves this."""
         if instruction := os.environ.get("_LIDARSPEC_COMPLETE"):
             from lidarspec.cli.completion import completed
@@ -177,19 +257,27 @@ def _spent(seconds: float) -> str:
     except ImportError:
         return f"{seconds:.1f} s"
     unit = 1 if sys.platform == "darwin" else 1024
-    return f"{seconds:.1f} s, {resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * unit / 1e6:.0f} MB of memory"
+    return (
+        f"{seconds:.1f} s, {resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * unit / 1e6:.0f} MB"
+        " of memory"
+    )
 
 
-@click.group(cls=Verbs, invoke_without_command=True, context_settings={"help_option_names": ["-h", "--help"], "max_content_width": 120})
+@click.group(
+    cls=Verbs,
+    invoke_without_command=True,
+    context_settings={"help_option_names": ["-h", "--help"], "max_content_width": 120},
+)
 @click.version_option(__version__, prog_name="lidarspec", message="%(prog)s %(version)s")
 @click.pass_context
 def main(ctx: click.Context) -> None:
     """Read, record, simulate and explain lidars, each from one description of its wire protocol.
 
-    SOURCE is a serial port (/dev/ttyUSB0, COM4), a socket (udp://:2368, tcp://HOST:PORT), a simulated sensor (sim:ID),
-    a file (.lsr, .pcap, .pcapng, .bin, .hex) or - for standard input.
+    SOURCE is a serial port (/dev/ttyUSB0, COM4), a socket (udp://:2368, tcp://HOST:PORT), a
+    simulated sensor (sim:ID), a file (.lsr, .pcap, .pcapng, .bin, .hex) or - for standard input.
 
-    Exit codes: 0 ok, 1 findings, 2 usage, 3 source cannot be opened, 4 no valid data, 5 device refused, 130 interrupted.
+    Exit codes: 0 ok, 1 findings, 2 usage, 3 source cannot be opened, 4 no valid data, 5 device
+    refused, 130 interrupted.
     """
     if ctx.invoked_subcommand is None:
         from lidarspec.cli.sensors import guide

@@ -1,6 +1,7 @@
 """The verbs that look at what is installed, and the one that says what is believed beside it.
 
-`sensors` and `show` are typed often and need little of the package: each function imports what the other verbs do not need.
+`sensors` and `show` are typed often and need little of the package: each function imports what the
+other verbs do not need.
 """
 
 from __future__ import annotations
@@ -29,8 +30,12 @@ PACKETS = 32
 
 
 def list_sensors() -> tuple[list[KnownSensor], list[Plugin]]:
-    """Return a row for each installed sensor, and the plugins that failed to load; most need not be loaded."""
-    is_fresh = "lidarspec.plugins" not in sys.modules  # else the program may have registered sensors of its own
+    """Return a row for each installed sensor, and the plugins that failed to load; most need not be
+    loaded.
+    """
+    is_fresh = (
+        "lidarspec.plugins" not in sys.modules
+    )  # else the program may have registered sensors of its own
     rows = list_described_sensors() if is_fresh else None
     if rows is not None:
         return rows, []
@@ -85,19 +90,35 @@ def sensors(as_json: bool, output: str | None) -> None:
         homes = {row.id: row.distribution for row in known}
         loaded = registry().sensors()
         broken = registry().failures
-        emit_json([_facts(sensor) | {"distribution": homes.get(name, "")} for name, sensor in loaded.items()], output)
+        emit_json(
+            [
+                _facts(sensor) | {"distribution": homes.get(name, "")}
+                for name, sensor in loaded.items()
+            ],
+            output,
+        )
     elif known:
-        rows = [[row.id, f"{row.vendor} {row.model}", _links(row.links), row.status, row.distribution] for row in known]
+        rows = [
+            [row.id, f"{row.vendor} {row.model}", _links(row.links), row.status, row.distribution]
+            for row in known
+        ]
         emit(table(["id", "device", "link", "status", "distribution"], rows, output), output)
     if not known:
         note(no_sensors())
     if broken:
-        note(f"{len(broken)} plugin{'s' * (len(broken) > 1)} could not be loaded; next: lidarspec plugins")
+        note(
+            f"{len(broken)} plugin{'s' * (len(broken) > 1)} could not be loaded; next: lidarspec plugins"
+        )
 
 
 @click.command()
 @click.argument("sensor_id", metavar="SENSOR")
-@click.option("--plan", "as_plan", is_flag=True, help="How its points are computed, and what falls back to plain evaluation.")
+@click.option(
+    "--plan",
+    "as_plan",
+    is_flag=True,
+    help="How its points are computed, and what falls back to plain evaluation.",
+)
 @output_options
 def show(sensor_id: str, as_plan: bool, as_json: bool, output: str | None) -> None:
     """What a sensor is, and the wire table of each of its frames."""
@@ -107,7 +128,9 @@ def show(sensor_id: str, as_plan: bool, as_json: bool, output: str | None) -> No
     sensor = named_sensor(sensor_id)
     if as_plan:
         plans = {name: _plan(sensor, name) for name in sensor.data_frames}
-        emit_json(plans, output) if as_json else emit("\n".join(line for name in plans for line in (f"{name}:", *plans[name])), output)
+        emit_json(plans, output) if as_json else emit(
+            "\n".join(line for name in plans for line in (f"{name}:", *plans[name])), output
+        )
         return
     if as_json:
         frames = {name: _frame(frame) for name, frame in sensor.frames.items()}
@@ -117,14 +140,24 @@ def show(sensor_id: str, as_plan: bool, as_json: bool, output: str | None) -> No
     low, high = sensor.range_limits
     links = _links(summarize_links(sensor))
     parts = [
-        f"{sensor.id}: {sensor.vendor} {sensor.model}" + (f", also {', '.join(sensor.aliases)}" if sensor.aliases else ""),
+        f"{sensor.id}: {sensor.vendor} {sensor.model}"
+        + (f", also {', '.join(sensor.aliases)}" if sensor.aliases else ""),
         f"  link    {links}\n  range   {low:g} .. {high:g} m\n  status  {sensor.status}\n  source  {sensor.source}",
     ]
     units = {role: _unit(sensor, path) for role, path in sensor.info.items()}
-    parts += [f"  says    {', '.join(f'{role} ({path}{units[role]})' for role, path in sensor.info.items())}"] if sensor.info else []
+    parts += (
+        [
+            f"  says    {', '.join(f'{role} ({path}{units[role]})' for role, path in sensor.info.items())}"
+        ]
+        if sensor.info
+        else []
+    )
     parts += [f"  command {name}{_command_text(sensor, name)}" for name in sensor.commands]
     for name, frame in sensor.frames.items():
-        rows = [[row.offset, row.size, row.type, row.field, row.unit, row.meaning] for row in wire_table(frame)]
+        rows = [
+            [row.offset, row.size, row.type, row.field, row.unit, row.meaning]
+            for row in wire_table(frame)
+        ]
         kind = " (to the sensor)" if frame.direction == "out" else " (points)" if frame.data else ""
         headers = ["offset", "size", "type", "field", "unit", "meaning"]
         parts.append(f"\n{name}{kind}: {frame_size(frame)} bytes\n{table(headers, rows, output)}")
@@ -153,7 +186,11 @@ def _plan(sensor: Sensor, frame: str) -> list[str]:
         made, sweep = FrameMaker(sensor, frame), sensor.simulation_of(frame).sweep
     except SpecError as error:
         return [f"plain evaluation: {error}"]
-    frames = made.sealed(made.table([sweep(index) for index in range(PACKETS)])) if sweep else [sensor.example(frame)]
+    frames = (
+        made.sealed(made.table([sweep(index) for index in range(PACKETS)]))
+        if sweep
+        else [sensor.example(frame)]
+    )
     sent = packed([Found(frame, 0, data) for data in frames])
     packets = PacketStream(sensor, frame, Counters()).add([sent]).with_points
     if not isinstance(packets.table, Rows) or not packets.table.groups:
@@ -169,8 +206,8 @@ def _plan(sensor: Sensor, frame: str) -> list[str]:
 def plugins(ctx: click.Context, as_json: bool, output: str | None) -> None:
     """The plugins that were found, and what is wrong with those that do not load.
 
-    They are loaded in another process first, and if anything is wrong, each in one of its own, so that one that hangs or ends the program
-    is named. Exit code 1 where something is wrong.
+    They are loaded in another process first, and if anything is wrong, each in one of its own, so
+    that one that hangs or ends the program is named. Exit code 1 where something is wrong.
     """
     from lidarspec.plugins import tried
 
@@ -179,7 +216,12 @@ def plugins(ctx: click.Context, as_json: bool, output: str | None) -> None:
     if as_json:
         emit_json([{**vars(plugin), "sensors": list(plugin.sensors)} for plugin in found], output)
     else:
-        emit(table(["distribution", "version", "entry point", "sensors"], rows, output) if rows else no_sensors(), output)
+        emit(
+            table(["distribution", "version", "entry point", "sensors"], rows, output)
+            if rows
+            else no_sensors(),
+            output,
+        )
     if any(plugin.error or plugin.remark for plugin in found):
         ctx.exit(FINDINGS)
 
@@ -195,10 +237,12 @@ def _told(plugin: Plugin) -> str:
 def trust(folder: str) -> None:
     """Allow a folder: its lidarspec.toml may name Python files, and files elsewhere.
 
-    It is for folders of your own whose files you know; it is kept, and holds for this folder alone. For a single run the
-    variable LIDARSPEC_TRUST names one.
+    It is for folders of your own whose files you know; it is kept, and holds for this folder alone.
+    For a single run the variable LIDARSPEC_TRUST names one.
     """
-    say(f"{trusted(folder)}: what its {FILE} names is believed from now on; a line in {user_folder() / TRUSTED} says so")
+    say(
+        f"{trusted(folder)}: what its {FILE} names is believed from now on; a line in {user_folder() / TRUSTED} says so"
+    )
 
 
 def _facts(sensor: Sensor) -> dict[str, Any]:
@@ -220,7 +264,12 @@ def _frame(frame: Frame) -> dict[str, Any]:
     from lidarspec.frames.wire_table import frame_size, wire_table
 
     rows = [vars(row) for row in wire_table(frame)]
-    return {**facts(frame, "direction", "data"), "size": frame_size(frame), "max_length": frame.max_length, "rows": rows}
+    return {
+        **facts(frame, "direction", "data"),
+        "size": frame_size(frame),
+        "max_length": frame.max_length,
+        "rows": rows,
+    }
 
 
 def _command(sensor: Sensor, name: str) -> Mapping[str, Any]:
@@ -240,8 +289,15 @@ def _command_text(sensor: Sensor, name: str) -> str:
     from lidarspec.explaining.wording import asked
 
     command = _command(sensor, name)
-    args = "".join(f" {name}={asked(argument.kind)}" for name, argument in sensor.commands[name].arguments.items())
-    answer = f", answered by {command['reply']}{' while it is stopped' if command['only_stopped'] else ''}" if command["reply"] else ""
+    args = "".join(
+        f" {name}={asked(argument.kind)}"
+        for name, argument in sensor.commands[name].arguments.items()
+    )
+    answer = (
+        f", answered by {command['reply']}{' while it is stopped' if command['only_stopped'] else ''}"
+        if command["reply"]
+        else ""
+    )
     return f"{args}{': ' if command['hex'] else ''}{command['hex']}{answer}"
 
 

@@ -1,4 +1,6 @@
-"""`sim` and `demo`: a simulated sensor on a serial port, UDP, TCP or in a file; and one that is read, recorded and drawn."""
+"""`sim` and `demo`: a simulated sensor on a serial port, UDP, TCP or in a file; and one that is
+read, recorded and drawn.
+"""
 
 from __future__ import annotations
 
@@ -42,7 +44,10 @@ if TYPE_CHECKING:
 IN_A_FILE = 10.0
 #: cells of the picture at most, and lines that are kept for the summary.
 WIDEST, HIGHEST, SUMMARY = 100, 42, 8
-PLACES = f"pty, udp://HOST:PORT, tcp://HOST:PORT, or a file ({', '.join(SUFFIXES)}).  [default: pty or udp]"
+PLACES = (
+    f"pty, udp://HOST:PORT, tcp://HOST:PORT, or a file ({', '.join(SUFFIXES)}).  [default: pty or"
+    " udp]"
+)
 
 
 @click.command(short_help="A simulated sensor on a serial port, UDP, TCP or in a file.")
@@ -50,16 +55,61 @@ PLACES = f"pty, udp://HOST:PORT, tcp://HOST:PORT, or a file ({', '.join(SUFFIXES
 @configuring
 @click.option("--to", metavar="PLACE", help=PLACES)
 @click.option("--link", metavar="PATH", help="A symbolic link that leads to the pty.")
-@click.option("-t", "--duration", type=DURATION, help="End after so long; of a file, how much goes in.  [default: never; 10s]")
-@click.option("--rate", metavar="FACTOR", default="1", show_default=True, help="How many times faster than in reality, or max.")
-@click.option("--scene", metavar="FILE", help="What the sensor sees, a TOML file.  [default: a room]")
-@click.option("--seed", type=click.IntRange(min=0), default=0, show_default=True, help="Of the room and of what goes wrong.")
-@click.option("--errors", type=SHARE, default="0%", show_default=True, help="Share of the bytes that the line damages.")
-@click.option("--loss", type=SHARE, default="0%", show_default=True, help="Share of the packets that get lost.")
-@click.option("--reorder", type=click.IntRange(0, 1000), default=0, show_default=True, help="How many places late a datagram may come.")
+@click.option(
+    "-t",
+    "--duration",
+    type=DURATION,
+    help="End after so long; of a file, how much goes in.  [default: never; 10s]",
+)
+@click.option(
+    "--rate",
+    metavar="FACTOR",
+    default="1",
+    show_default=True,
+    help="How many times faster than in reality, or max.",
+)
+@click.option(
+    "--scene", metavar="FILE", help="What the sensor sees, a TOML file.  [default: a room]"
+)
+@click.option(
+    "--seed",
+    type=click.IntRange(min=0),
+    default=0,
+    show_default=True,
+    help="Of the room and of what goes wrong.",
+)
+@click.option(
+    "--errors",
+    type=SHARE,
+    default="0%",
+    show_default=True,
+    help="Share of the bytes that the line damages.",
+)
+@click.option(
+    "--loss",
+    type=SHARE,
+    default="0%",
+    show_default=True,
+    help="Share of the packets that get lost.",
+)
+@click.option(
+    "--reorder",
+    type=click.IntRange(0, 1000),
+    default=0,
+    show_default=True,
+    help="How many places late a datagram may come.",
+)
 @click.option("--unplug", type=DURATION, help="Pull the plug after so long, again and again.")
-@click.option("--shake", type=click.FloatRange(min=0), default=0.0, metavar="NOISE", help="Deviation of what an IMU feels: m/s2 and rad/s.")
-@click.option("--absent", type=DURATION, default="2s", show_default=True, help="How long it is out then.")
+@click.option(
+    "--shake",
+    type=click.FloatRange(min=0),
+    default=0.0,
+    metavar="NOISE",
+    help="Deviation of what an IMU feels: m/s2 and rad/s.",
+)
+@click.option(
+    "--absent", type=DURATION, default="2s", show_default=True, help="How long it is out then."
+)
 @click.option("--rotor", type=click.Choice([BLOCKED]), help="It does not turn.")
 @click.option("--force", is_flag=True, help="Write over a file that exists.")
 @click.option("--json", "as_json", is_flag=True, help="Print as JSON where the sensor is.")
@@ -83,8 +133,8 @@ def sim(
 ) -> None:
     """A simulated sensor on a serial port, UDP, TCP or in a file.
 
-    It behaves as its spec says: it keeps real time, answers commands, starts and stops. Where it is goes to standard
-    output, all else to standard error.
+    It behaves as its spec says: it keeps real time, answers commands, starts and stops. Where it is
+    goes to standard output, all else to standard error.
     """
     sensor = named_sensor(sensor_id)
     faults = Faults(errors, loss, reorder, unplug or 0.0, absent, rotor or "", shake)
@@ -95,7 +145,10 @@ def sim(
         if link is not None:
             raise UsageError("a link leads to a pseudo-terminal: it goes with --to pty")
         if Path(place).suffix.lower() not in SUFFIXES:
-            raise UsageError(f"{place!r} is no place: pty, udp://HOST:PORT, tcp://HOST:PORT, or a file ({', '.join(SUFFIXES)})")
+            raise UsageError(
+                f"{place!r} is no place: pty, udp://HOST:PORT, tcp://HOST:PORT, or a file"
+                f" ({', '.join(SUFFIXES)})"
+            )
         written = write_file(device, place, duration or IN_A_FILE, overwrite=force)
         _tell(sensor, place, place, {}, as_json=as_json)
         note(f"{_sent(device)}, {size(written)}")
@@ -103,7 +156,10 @@ def sim(
     try:
         opened = simulated_outlet(sensor, place, link)
     except UsageError as error:
-        raise suggest(error, f"lidarspec sim {sensor.id} --to {'udp://' + HERE if sensor.datagrams else 'pty'}") from None
+        raise suggest(
+            error,
+            f"lidarspec sim {sensor.id} --to {'udp://' + HERE if sensor.datagrams else 'pty'}",
+        ) from None
     try:
         controls = {name: control.place for name, control in opened.controls.items()}
         _tell(sensor, opened.place, opened.source, controls, as_json=as_json)
@@ -115,12 +171,21 @@ def sim(
         note(f"{_sent(device)}{lost}")
 
 
-def _tell(sensor: Sensor, where: str, source: str, controls: Mapping[str, str], *, as_json: bool) -> None:
+def _tell(
+    sensor: Sensor, where: str, source: str, controls: Mapping[str, str], *, as_json: bool
+) -> None:
     """Where the sensor is, with its other links, and what to type next."""
     following = f"lidarspec view {shlex.quote(source)} {chosen(sensor)}"
     if as_json:
         emit_json(
-            {"sensor": sensor.id, "place": where, "source": source, **({"controls": controls} if controls else {}), "next": following}, None
+            {
+                "sensor": sensor.id,
+                "place": where,
+                "source": source,
+                **({"controls": controls} if controls else {}),
+                "next": following,
+            },
+            None,
         )
         return
     say(where)
@@ -129,7 +194,9 @@ def _tell(sensor: Sensor, where: str, source: str, controls: Mapping[str, str], 
 
 
 def _watching(device: SimulatedDevice, opened: Outlet, progress: Progress) -> Callable[[], None]:
-    """What is called while the sensor is at work: says which commands arrive, and that the plug was pulled."""
+    """What is called while the sensor is at work: says which commands arrive, and that the plug was
+    pulled.
+    """
     began, heard, present = time.monotonic(), 0, True
 
     def turn() -> None:
@@ -153,11 +220,21 @@ def _sent(device: SimulatedDevice) -> str:
 @click.command()
 @sensor_option
 @count_option("whole scans", default=5, show_default=True)
-@click.option("--errors", type=SHARE, default="1%", show_default=True, help="Share of the bytes that the line damages.")
+@click.option(
+    "--errors",
+    type=SHARE,
+    default="1%",
+    show_default=True,
+    help="Share of the bytes that the line damages.",
+)
 @click.option("--json", "as_json", is_flag=True, help="Print the summary as JSON.")
 def demo(sensor_id: str | Sensor | None, count: int, errors: float, as_json: bool) -> None:
     """A simulated sensor on a port: started, read through a bad line, recorded, read again, drawn."""
-    simulated = (one for one in registry().sensors().values() if any(one.simulation_of(name).sweep for name in one.data_frames))
+    simulated = (
+        one
+        for one in registry().sensors().values()
+        if any(one.simulation_of(name).sweep for name in one.data_frames)
+    )
     sensor = named_sensor(sensor_id) if sensor_id else next(simulated, None)
     if sensor is None:
         raise UsageError(no_sensors())
@@ -182,18 +259,28 @@ def _summary(result: Demonstration, whole: list[Scan], errors: float) -> list[st
     frames = sum(stats.frames.values())
     harm = "of the datagrams lost" if result.sensor.datagrams else "of the bytes damaged"
     lacks_pty = data_link(result.sensor, Serial) and not has_terminals()
-    where = f"{result.place}, since this system has no pseudo-terminals" if lacks_pty else result.place
+    where = (
+        f"{result.place}, since this system has no pseudo-terminals" if lacks_pty else result.place
+    )
     passed = f"{errors:.1%} {harm}, {result.intact} came through unharmed"
     told = [
         f"{name}, simulated on {where}: {result.sent} frames sent, {passed}",
         *(str(reply) for reply in result.replies if reply.confirmed),
-        f"{frames} frames decoded, {stats.bad_checksum} checksum errors, {stats.bytes_skipped} of {stats.bytes_in} bytes skipped",
+        (
+            f"{frames} frames decoded, {stats.bad_checksum} checksum errors, {stats.bytes_skipped}"
+            f" of {stats.bytes_in} bytes skipped"
+        ),
     ]
     facts = _facts(result, whole)
     rate = f" at {facts['rate_hz']:.1f} Hz" if facts["rate_hz"] else ""
-    told.append(f"{len(whole)} whole scan{'s' * (len(whole) != 1)}{rate}, {facts['points']} points; the last one: {whole[-1]}")
+    told.append(
+        f"{len(whole)} whole scan{'s' * (len(whole) != 1)}{rate}, {facts['points']} points; the"
+        f" last one: {whole[-1]}"
+    )
     same = "the same points" if result.digest == result.again else "OTHER points"
-    told.append(f"recorded ({size(result.recorded)}) and read again: {same}, SHA-256 {result.again[:16]}...")
+    told.append(
+        f"recorded ({size(result.recorded)}) and read again: {same}, SHA-256 {result.again[:16]}..."
+    )
     return [*told, f"next: lidarspec view sim:{name}"]
 
 

@@ -1,7 +1,9 @@
-"""Standard output and standard error: all that verbs print goes through here, whatever it is made of and whether or not anybody reads it.
+"""Standard output and standard error: all that verbs print goes through here, whatever it is made
+of and whether or not anybody reads it.
 
-Addresses, file names and texts of devices and plugins are others': what would steer a terminal is spelled out. Remarks that nobody can
-read end no verb, a recording least of all; data that cannot be written are a failure.
+Addresses, file names and texts of devices and plugins are others': what would steer a terminal is
+spelled out. Remarks that nobody can read end no verb, a recording least of all; data that cannot be
+written are a failure.
 """
 
 from __future__ import annotations
@@ -46,7 +48,11 @@ def say(content: str | bytes, *, nl: bool = True, colour: bool | None = None) ->
         SourceError: where it cannot be written otherwise.
     """
     if isinstance(content, str):
-        content = printable(content) if colour is None else "".join(map(_coloured, _COLOURS.split(content)))
+        content = (
+            printable(content)
+            if colour is None
+            else "".join(map(_coloured, _COLOURS.split(content)))
+        )
     with _written():
         click.echo(content, nl=nl, color=colour)
 
@@ -63,15 +69,20 @@ def note(text: str) -> None:
 
 @contextlib.contextmanager
 def streams() -> Iterator[None]:
-    """What a verb needs around it: all three streams, also closed ones; warnings as remarks, once each; everything printed.
+    """What a verb needs around it: all three streams, also closed ones; warnings as remarks, once
+    each; everything printed.
 
     Raises:
         BrokenPipeError, SourceError: as `say`.
     """
     voice.loudness = 0
     for name, flags in (("stdin", os.O_RDONLY), ("stdout", os.O_RDONLY), ("stderr", os.O_WRONLY)):
-        if getattr(sys, name) is None:  # a file opened later would take its number, and what is printed; output that was closed is refused
-            setattr(sys, name, open(os.open(os.devnull, flags), "r" if name == "stdin" else "w", closefd=False))  # noqa: SIM115
+        if getattr(sys, name) is None:
+            # A file opened later would take its number and what is printed; output that was closed
+            # is refused.
+            descriptor = os.open(os.devnull, flags)
+            mode = "r" if name == "stdin" else "w"
+            setattr(sys, name, open(descriptor, mode, closefd=False))  # noqa: SIM115
     for stream in (sys.stdout, sys.stderr):
         with contextlib.suppress(AttributeError):
             stream.reconfigure(errors="replace")  # type: ignore[union-attr]

@@ -1,4 +1,6 @@
-"""`view`: a sensor at work, drawn in the terminal, on a page in the browser, or in the viewer of Rerun."""
+"""`view`: a sensor at work, drawn in the terminal, on a page in the browser, or in the viewer of
+Rerun.
+"""
 
 from __future__ import annotations
 
@@ -37,17 +39,46 @@ if TYPE_CHECKING:
 @click.command()
 @click.argument("source", metavar="SOURCE")
 @sensor_option
-@click.option("-t", "--duration", type=DURATION, help="How long at most, such as 30s; for a first picture 10s.")
-@click.option("--once", is_flag=True, help="Print one picture and end, as where standard output is no terminal.")
+@click.option(
+    "-t",
+    "--duration",
+    type=DURATION,
+    help="How long at most, such as 30s; for a first picture 10s.",
+)
+@click.option(
+    "--once",
+    is_flag=True,
+    help="Print one picture and end, as where standard output is no terminal.",
+)
 @selecting("times", "scans", "every", "ranges", "time")
 @colour_option
-@click.option("--web", is_flag=True, help="A page in the browser; its link, with the token that it needs, is printed.")
-@click.option("--open", "opens", is_flag=True, help="Open the page in the browser.")
-@click.option("--address", metavar="HOST[:PORT]", help="Where the page is; by default 127.0.0.1 and a free port.")
-@click.option("--control", is_flag=True, help="Let the page send commands to the sensor; to a simulated one it always may.")
-@click.option("--rerun", "in_rerun", is_flag=True, help="In Rerun's 3D viewer, which is opened, and not in the terminal.")
 @click.option(
-    "-o", "--output", metavar="FILE.rrd|URL", help="With --rerun: into a file, or a viewer that runs, rerun+http://HOST:9876/proxy."
+    "--web",
+    is_flag=True,
+    help="A page in the browser; its link, with the token that it needs, is printed.",
+)
+@click.option("--open", "opens", is_flag=True, help="Open the page in the browser.")
+@click.option(
+    "--address",
+    metavar="HOST[:PORT]",
+    help="Where the page is; by default 127.0.0.1 and a free port.",
+)
+@click.option(
+    "--control",
+    is_flag=True,
+    help="Let the page send commands to the sensor; to a simulated one it always may.",
+)
+@click.option(
+    "--rerun",
+    "in_rerun",
+    is_flag=True,
+    help="In Rerun's 3D viewer, which is opened, and not in the terminal.",
+)
+@click.option(
+    "-o",
+    "--output",
+    metavar="FILE.rrd|URL",
+    help="With --rerun: into a file, or a viewer that runs, rerun+http://HOST:9876/proxy.",
 )
 def view(
     source: str,
@@ -65,12 +96,14 @@ def view(
 ) -> None:
     """A sensor at work, drawn in the terminal, or with --web in the browser.
 
-    From above, and from the side where the points are not in one plane. A file is played at its own speed. One picture is printed
-    where standard output is no terminal.
+    From above, and from the side where the points are not in one plane. A file is played at its own
+    speed. One picture is printed where standard output is no terminal.
 
-    Keys: space pauses, r records, c switches colours, + - zoom, arrows move, 0 shows all again, ? helps, q quits.
+    Keys: space pauses, r records, c switches colours, + - zoom, arrows move, 0 shows all again, ?
+    helps, q quits.
 
-    --rerun needs lidarspec[rerun]; a file is read there as fast as possible, and its time runs in the viewer.
+    --rerun needs lidarspec[rerun]; a file is read there as fast as possible, and its time runs in
+    the viewer.
     """
     if once + web + in_rerun > 1:
         raise UsageError("--once, --web and --rerun are three ways to look at it: choose one")
@@ -79,7 +112,9 @@ def view(
     if output is not None and not in_rerun:
         raise UsageError("-o is for --rerun; a picture is drawn into a file by lidarspec plot")
     if web:
-        _serve(source, sensor_id, duration, selection, opens=opens, address=address, control=control)
+        _serve(
+            source, sensor_id, duration, selection, opens=opens, address=address, control=control
+        )
         return
     if in_rerun:
         _in_rerun(source, sensor_id, output or "", ramp, duration, selection)
@@ -90,12 +125,20 @@ def view(
             conclude(device)
         return
     switch = Switch(source, Path.cwd()) if is_live(source) else None
-    with open_device(source, sensor_id, record=switch.attached if switch else None, period=LOOK) as device:
+    with open_device(
+        source, sensor_id, record=switch.attached if switch else None, period=LOOK
+    ) as device:
         if switch is not None:
             switch.sensor_id = device.sensor.id
         _show(
             device,
-            Window(Feed(device, played=True, select=selection), source, ramp=ramp, record=switch, duration=duration),
+            Window(
+                Feed(device, played=True, select=selection),
+                source,
+                ramp=ramp,
+                record=switch,
+                duration=duration,
+            ),
             taken=source == "-",
         )
         conclude(device)
@@ -132,9 +175,19 @@ def _serve(
     device = open_device(source, sensor_id, record=switch.attached if switch else None, period=LOOK)
     if switch is not None:
         switch.sensor_id = device.sensor.id
-    broadcast = Broadcast(source, device, reopened=lambda: open_device(source, device.sensor), select=selection, switch=switch)
+    broadcast = Broadcast(
+        source,
+        device,
+        reopened=lambda: open_device(source, device.sensor),
+        select=selection,
+        switch=switch,
+    )
     try:
-        with ended_by_terminate(), broadcast, Site(broadcast, host=host, port=port, control=control, say=note) as site:
+        with (
+            ended_by_terminate(),
+            broadcast,
+            Site(broadcast, host=host, port=port, control=control, say=note) as site,
+        ):
             say(site.link)
             if opens and not _open_in_browser(site):
                 note("no browser was found: open the link yourself")
@@ -165,14 +218,25 @@ def listening(address: str | None) -> tuple[str, int]:
     return origin.host, origin.port or 0
 
 
-def _in_rerun(source: str, sensor_id: str | Sensor | None, target: str, ramp: str, duration: float | None, selection: Selection) -> None:
-    """Scans in Rerun's viewer, or in a file of its, until the input ends or somebody has had enough."""
+def _in_rerun(
+    source: str,
+    sensor_id: str | Sensor | None,
+    target: str,
+    ramp: str,
+    duration: float | None,
+    selection: Selection,
+) -> None:
+    """Scans in Rerun's viewer, or in a file of its, until the input ends or somebody has had
+    enough.
+    """
     from lidarspec.formats.rerun import RERUN  # with all other formats, which take a moment
     from lidarspec.view.rerun import SCHEMES, show
 
     if target and not target.startswith(SCHEMES):
         if not target.lower().endswith(RERUN.suffix):
-            raise UsageError(f"{target}: a recording for Rerun's viewer has the suffix {RERUN.suffix}")
+            raise UsageError(
+                f"{target}: a recording for Rerun's viewer has the suffix {RERUN.suffix}"
+            )
         refuse_overwriting([target], source, sensor_id)
     with open_device(source, sensor_id, period=LOOK) as device:
         feed = Feed(device, select=selection)
@@ -205,7 +269,11 @@ def _printed(device: Device, source: str, ramp: str, patience: float, selection:
         WireError, CommandError: where none comes.
     """
     feed, end = Feed(device, select=selection), time.monotonic() + patience
-    while not feed.ended and time.monotonic() < end and not (feed.scan is not None and feed.scan.whole):
+    while (
+        not feed.ended
+        and time.monotonic() < end
+        and not (feed.scan is not None and feed.scan.whole)
+    ):
         feed.pump(0.0)
     if feed.scan is None:
         raise nothing_came(device, source, patience)

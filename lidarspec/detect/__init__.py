@@ -1,6 +1,7 @@
 """Identify the sensor that sends, and diagnose a source that delivers nothing usable.
 
-In: a SOURCE, or bytes. Out: a verdict, and findings with the command that fixes them. Modules in reading order:
+In: a SOURCE, or bytes. Out: a verdict, and findings with the command that fixes them. Modules in
+reading order:
 
 * `heard`: the bytes of one source.
 * `listen`: read some bytes from any source.

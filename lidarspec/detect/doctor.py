@@ -1,4 +1,6 @@
-"""Why nothing comes, or nothing that can be used: what is wrong with a source, one thing at a time, each with the command that mends it."""
+"""Why nothing comes, or nothing that can be used: what is wrong with a source, one thing at a time,
+each with the command that mends it.
+"""
 
 from __future__ import annotations
 
@@ -38,7 +40,9 @@ class Finding:
     mend: str = ""
 
 
-def examined(source: str | Path, sensor: Sensor | None = None, *, seconds: float = LISTEN) -> Iterator[Finding]:
+def examined(
+    source: str | Path, sensor: Sensor | None = None, *, seconds: float = LISTEN
+) -> Iterator[Finding]:
     """What is right and wrong with a source, in the order of looking.
 
     Args:
@@ -61,7 +65,11 @@ def computer() -> Iterator[Finding]:
     """What is right and wrong with the ports of this computer, whatever is connected to them."""
     found = ports.serial_ports()
     if not found:
-        yield Finding(True, "there is no serial port: where one should be, its cable or driver is missing", "sudo dmesg | tail")
+        yield Finding(
+            True,
+            "there is no serial port: where one should be, its cable or driver is missing",
+            "sudo dmesg | tail",
+        )
     for port in found:
         yield from _permission(port.path)
         yield from _in_use(port.path)
@@ -71,7 +79,9 @@ def computer() -> Iterator[Finding]:
 
 
 def _file(path: str, sensor: Sensor | None) -> Iterator[Finding]:
-    name = path if os.path.exists(path) else path.rpartition("?")[0]  # what stands behind it chooses a sender
+    name = (
+        path if os.path.exists(path) else path.rpartition("?")[0]
+    )  # what stands behind it chooses a sender
     if not os.path.exists(name):
         yield Finding(False, f"{path}: no such file or port", "lidarspec ports")
     elif not os.access(name, os.R_OK):
@@ -88,10 +98,16 @@ def _file(path: str, sensor: Sensor | None) -> Iterator[Finding]:
             yield Finding(False, text)
 
 
-def _serial(source: str, address: Address, sensor: Sensor | None, seconds: float) -> Iterator[Finding]:
+def _serial(
+    source: str, address: Address, sensor: Sensor | None, seconds: float
+) -> Iterator[Finding]:
     port = address.place
     if os.name == "posix" and not os.path.exists(port):
-        yield Finding(False, f"{port}: no such port; it is not plugged in, or its driver is missing", "lidarspec ports")
+        yield Finding(
+            False,
+            f"{port}: no such port; it is not plugged in, or its driver is missing",
+            "lidarspec ports",
+        )
         return
     problems = [finding for finding in (*_permission(port), *_in_use(port)) if not finding.ok]
     yield from problems or [Finding(True, f"{port} is there, and may be opened")]
@@ -103,7 +119,11 @@ def _permission(port: str) -> Iterator[Finding]:
     if not ports.allowed(port):
         group = ports.group(port)
         text = f"{port}: this user may not open it"
-        by_group = Finding(False, f"{text}; the group {group} may, from the next login on", f"sudo usermod -aG {group} $USER")
+        by_group = Finding(
+            False,
+            f"{text}; the group {group} may, from the next login on",
+            f"sudo usermod -aG {group} $USER",
+        )
         yield by_group if group else Finding(False, f"{text}; nobody but root may", _rule(port))
 
 
@@ -130,7 +150,10 @@ def _udp(source: str, address: Address, sensor: Sensor | None, seconds: float) -
     found = list(_heard(source, sensor, seconds))
     yield from found
     if any("nothing came" in finding.text for finding in found):
-        rates = {name: (count - before.get(name, count)) / (time.monotonic() - began) for name, count in ports.received().items()}
+        rates = {
+            name: (count - before.get(name, count)) / (time.monotonic() - began)
+            for name, count in ports.received().items()
+        }
         yield from _interfaces(numbers, host, rates)
 
 
@@ -149,7 +172,11 @@ def _port_in_use(number: int) -> Iterator[Finding]:
     for user in users:
         yield Finding(False, f"UDP port {number} is in use by {user}", f"kill {user.pid}")
     if not users:
-        yield Finding(False, f"UDP port {number} is in use by a program of another user", f"sudo ss -ulpn 'sport = :{number}'")
+        yield Finding(
+            False,
+            f"UDP port {number} is in use by a program of another user",
+            f"sudo ss -ulpn 'sport = :{number}'",
+        )
 
 
 def _buffer() -> Iterator[Finding]:
@@ -171,25 +198,46 @@ def _interfaces(numbers: list[int], host: str, rates: dict[str, float]) -> Itera
         text = f"only packets to {host} are listened to; a sensor may send to another address"
         yield Finding(True, text, f"lidarspec doctor udp://:{numbers[0]}")
     for name, rate in active.items():
-        text = f"{name} receives {rate:.0f} packets/s, none of them on port {listed}: another port, another address, or a firewall"
+        text = (
+            f"{name} receives {rate:.0f} packets/s, none of them on port {listed}: another port,"
+            " another address, or a firewall"
+        )
         yield Finding(False, text, f"sudo tcpdump -ni {name} udp")
         if ports.filters_senders(name):
-            text = f"{name} drops senders whose addresses it does not reach, as a sensor with its factory address is (rp_filter)"
-            yield Finding(False, text, f"sudo sysctl -w net.ipv4.conf.all.rp_filter=2 net.ipv4.conf.{name}.rp_filter=2")
+            text = (
+                f"{name} drops senders whose addresses it does not reach, as a sensor with its"
+                " factory address is (rp_filter)"
+            )
+            yield Finding(
+                False,
+                text,
+                f"sudo sysctl -w net.ipv4.conf.all.rp_filter=2 net.ipv4.conf.{name}.rp_filter=2",
+            )
     if rates and not active:
-        text = "no network interface receives anything: cable, power of the sensor, or an interface that is down"
+        text = (
+            "no network interface receives anything: cable, power of the sensor, or an interface"
+            " that is down"
+        )
         yield Finding(False, text, "ip -br address")
 
 
 def _heard(source: str, sensor: Sensor | None, seconds: float) -> Iterator[Finding]:
     """What comes, and whether it is what should come."""
     try:
-        tried = [verdict(heard) for heard in heard_as(source, sensor, seconds)] if sensor is not None else []
+        tried = (
+            [verdict(heard) for heard in heard_as(source, sensor, seconds)]
+            if sensor is not None
+            else []
+        )
         if not any(one.scores for one in tried):
             tried += verdicts(source, seconds=seconds)
     except LidarSpecError as error:
         command = suggestion(error)
-        yield Finding(False, str(error), "" if "doctor" in command and not isinstance(error, UsageError) else command)
+        yield Finding(
+            False,
+            str(error),
+            "" if "doctor" in command and not isinstance(error, UsageError) else command,
+        )
         return
     yield _verdict(source, max(tried, key=lambda one: (bool(one.scores), one.heard.size)), sensor)
     yield from _several(source, tried)
@@ -204,7 +252,9 @@ def _several(source: str, found: Sequence[Verdict]) -> Iterator[Finding]:
     for name, several in senders.items():
         if len(several) > 1:
             command = f"lidarspec view {quote(with_option(source, 'src', several[0]))} -s {name}"
-            yield Finding(False, f"{' and '.join(several)} all send frames of {name}: choose one", command)
+            yield Finding(
+                False, f"{' and '.join(several)} all send frames of {name}: choose one", command
+            )
 
 
 def _verdict(source: str, found: Verdict, sensor: Sensor | None) -> Finding:
@@ -213,32 +263,58 @@ def _verdict(source: str, found: Verdict, sensor: Sensor | None) -> Finding:
     may_be = {score.sensor.id: score.why for score in found.alike} or dict(found.others)
     quoted = quote(source)
     if not heard.size and heard.warnings:
-        return Finding(False, heard.warnings[0], f"lidarspec detect {quote(source.partition('?')[0])}")
+        return Finding(
+            False, heard.warnings[0], f"lidarspec detect {quote(source.partition('?')[0])}"
+        )
     if not heard.size:
         return _nothing(source, sensor)
     if found.fault:
         return Finding(False, found.fault, f"lidarspec crc {quoted}")
     if not found.scores:
         at = " at any baud rate" if heard.baud is not None and len(bauds()) > 1 else ""
-        return Finding(False, f"{heard.size} bytes came, and no frame of an installed sensor{at}", f"lidarspec detect {quoted}")
+        return Finding(
+            False,
+            f"{heard.size} bytes came, and no frame of an installed sensor{at}",
+            f"lidarspec detect {quoted}",
+        )
     at = f" at {heard.baud} baud" if heard.baud is not None else ""
     if sensor is not None and sensor.id not in ids:
-        return Finding(False, f"it sends frames of {ids[0]}{at}, not of {sensor.id}", f"lidarspec view {quoted} -s {ids[0]}")
+        return Finding(
+            False,
+            f"it sends frames of {ids[0]}{at}, not of {sensor.id}",
+            f"lidarspec view {quoted} -s {ids[0]}",
+        )
     name = sensor.id if sensor is not None else ids[0]
     if name not in may_be:
         other, why = next(iter(may_be.items()))
-        command = f"lidarspec view {quoted} -s {other}" if found.alike else f"lidarspec detect {quoted}"
+        command = (
+            f"lidarspec view {quoted} -s {other}" if found.alike else f"lidarspec detect {quoted}"
+        )
         return Finding(False, f"it sends frames of {other} ({why}){at}, not of {name}", command)
     score = next(score for score in found.scores if score.sensor.id == name)
     link = data_link(score.sensor, Serial)
     if heard.baud is not None and link and heard.baud not in link.bauds:
         again = quote(with_option(source, "baud", heard.baud))
-        return Finding(False, f"{name} sends{at}, and {link.baud} is declared", f"lidarspec view {again} -s {name}")
-    cut_off = 2 * max(frame.max_length for frame in score.sensor.incoming.values()) / heard.size  # the first frame, and the last
+        return Finding(
+            False,
+            f"{name} sends{at}, and {link.baud} is declared",
+            f"lidarspec view {again} -s {name}",
+        )
+    cut_off = (
+        2 * max(frame.max_length for frame in score.sensor.incoming.values()) / heard.size
+    )  # the first frame, and the last
     if score.share + (0 if heard.datagrams else cut_off) < CLEAR:
-        return Finding(False, f"{name} sends{at}, and {1 - score.share:.0%} of the bytes are in no frame: cable, ground or baud rate")
+        return Finding(
+            False,
+            f"{name} sends{at}, and {1 - score.share:.0%} of the bytes are in no frame: cable,"
+            " ground or baud rate",
+        )
     device = "".join(f", {role} {text}" for role, text in said(score.sensor, score.found).items())
-    return Finding(True, f"{name} sends{at}: {score.data_frames} data frames, {score.share:.0%} of the bytes in frames{printable(device)}")
+    return Finding(
+        True,
+        f"{name} sends{at}: {score.data_frames} data frames, {score.share:.0%} of the bytes in"
+        f" frames{printable(device)}",
+    )
 
 
 def _nothing(source: str, sensor: Sensor | None) -> Finding:
@@ -250,6 +326,9 @@ def _nothing(source: str, sensor: Sensor | None) -> Finding:
         return Finding(False, text, f"lidarspec send {quoted} {start} -s {sensor.id}")
     address = live_address(source)
     if sensor is None and address is not None and address.scheme == "serial":
-        text = "nothing came: a sensor that has to be started first, no power, or its transmit line is not on our receive line"
+        text = (
+            "nothing came: a sensor that has to be started first, no power, or its transmit line is"
+            " not on our receive line"
+        )
         return Finding(False, text, f"lidarspec detect {quoted} --start")
     return Finding(False, "nothing came within the time of listening")

@@ -1,4 +1,6 @@
-"""Bytes that were read from one source to find out which sensor sent them, and how the beginning of a file is read."""
+"""Bytes that were read from one source to find out which sensor sent them, and how the beginning of
+a file is read.
+"""
 
 from __future__ import annotations
 
@@ -25,7 +27,8 @@ class Heard:
         source: how to open it again.
         chunks: datagrams, or pieces of a stream.
         datagrams: whether they are datagrams.
-        baud: at which a serial port was read; None for another source, and for a port that has no baud rate.
+        baud: at which a serial port was read; None for another source, and for a port that has no
+            baud rate.
         sender: address of the sender, where there are several.
         failure: why it could not be opened.
         warnings: what is to be said of the source, once it was read to its end.
@@ -55,12 +58,19 @@ class Heard:
     def is_text(self) -> bool:
         """Whether the bytes begin as lines of printable text, which only some sensors send."""
         head = self.data[:TEXT_BYTES].removesuffix(b"\r")
-        return len(head) >= MIN_TEXT_BYTES and head.isascii() and re.sub(rb"[\t\r\n]", b"", head).decode().isprintable()
+        return (
+            len(head) >= MIN_TEXT_BYTES
+            and head.isascii()
+            and re.sub(rb"[\t\r\n]", b"", head).decode().isprintable()
+        )
 
 
 def beginning(opened: Transport, most: int, *, number: int | None = None) -> list[Chunk]:
     """The beginning of a file: what holds `most` bytes, or `number` chunks if these are fewer."""
-    return [replace(chunk, data=chunk.data[:most]) for chunk in leading(itertools.islice(opened.chunks(), number), most)]
+    return [
+        replace(chunk, data=chunk.data[:most])
+        for chunk in leading(itertools.islice(opened.chunks(), number), most)
+    ]
 
 
 def leading(chunks: Iterable[Chunk], most: int) -> list[Chunk]:

@@ -1,6 +1,8 @@
-"""Bytes out of any source, to find out whose they are: the beginning of a file, or a second of what comes over a live one.
+"""Bytes out of any source, to find out whose they are: the beginning of a file, or a second of what
+comes over a live one.
 
-Some sensors keep silent until they are started: `probe` sends their start commands, and hears what comes back.
+Some sensors keep silent until they are started: `probe` sends their start commands, and hears what
+comes back.
 """
 
 from __future__ import annotations
@@ -27,7 +29,8 @@ from lidarspec.transports.protocol import Chunk, Disconnected, LiveTransport, en
 DATAGRAMS, PLENTY = 400, 1 << 14
 #: seconds to listen for, and between two looks.
 LISTEN, LOOK = 1.2, 0.1
-#: seconds to wait for data: of a device that has answered, and a motor may have to come up; and of one that has not.
+#: seconds to wait for data: of a device that has answered, and a motor may have to come up; and of
+#: one that has not.
 ANSWERED, UNANSWERED = 4.0, 1.0
 #: seconds that one read takes at most, and after which the line counts as silent.
 TURN = 0.05
@@ -37,7 +40,13 @@ STOPPING = 2.0
 
 def bauds() -> list[int]:
     """The baud rates that installed sensors declare, those of the most sensors first."""
-    declared = [baud for sensor in sensors().values() for link in sensor.links.values() if isinstance(link, Serial) for baud in link.bauds]
+    declared = [
+        baud
+        for sensor in sensors().values()
+        for link in sensor.links.values()
+        if isinstance(link, Serial)
+        for baud in link.bauds
+    ]
     return sorted(set(declared), key=lambda baud: (-declared.count(baud), baud))
 
 
@@ -51,11 +60,14 @@ def ignore(_: str) -> None:
     """Do nothing with what is being listened to: nobody watches."""
 
 
-def hear(source: str | Path, *, seconds: float = LISTEN, tell: Callable[[str], None] = ignore) -> Iterator[Heard]:
-    """What comes from a source; a serial port whose baud rate is not given, once for each that installed sensors declare.
+def hear(
+    source: str | Path, *, seconds: float = LISTEN, tell: Callable[[str], None] = ignore
+) -> Iterator[Heard]:
+    """What comes from a source; a serial port whose baud rate is not given, once for each that
+    installed sensors declare.
 
-    If a serial port is silent at the commonest, the lowest and the highest rate, no other rate is tried: what is sent at one rate
-    arrives at another one as wrong bytes, but it arrives.
+    If a serial port is silent at the commonest, the lowest and the highest rate, no other rate is
+    tried: what is sent at one rate arrives at another one as wrong bytes, but it arrives.
 
     Args:
         seconds: to listen for, each time.
@@ -81,10 +93,24 @@ def hear(source: str | Path, *, seconds: float = LISTEN, tell: Callable[[str], N
             for heard in _heard(with_option(text, "baud", baud), seconds, baud, text):
                 is_silent = is_silent and not heard.size
                 yield heard
-    elif address is not None and address.scheme == "udp" and not address.host_and_port()[1] and "port" not in address.options:
-        yield from _heard(with_option(text, "port", ",".join(map(str, udp_ports()))), seconds, None, text)
+    elif (
+        address is not None
+        and address.scheme == "udp"
+        and not address.host_and_port()[1]
+        and "port" not in address.options
+    ):
+        yield from _heard(
+            with_option(text, "port", ",".join(map(str, udp_ports()))), seconds, None, text
+        )
     else:
-        yield from _heard(text, seconds, int(address.options["baud"]) if address is not None and "baud" in address.options else None, text)
+        yield from _heard(
+            text,
+            seconds,
+            int(address.options["baud"])
+            if address is not None and "baud" in address.options
+            else None,
+            text,
+        )
 
 
 def has_no_baud(port: str) -> bool:
@@ -95,8 +121,18 @@ def has_no_baud(port: str) -> bool:
 def _heard(source: str, seconds: float, baud: int | None, name: str) -> Iterator[Heard]:
     with contextlib.closing(transport(source)) as opened:
         number = DATAGRAMS if opened.datagrams else None
-        chunks = _listened(opened, seconds) if isinstance(opened, LiveTransport) else beginning(opened, LOOKED_AT, number=number)
-        said = tuple(opened.warnings) if not isinstance(opened, LiveTransport) else () if chunks else _strangers(opened)
+        chunks = (
+            _listened(opened, seconds)
+            if isinstance(opened, LiveTransport)
+            else beginning(opened, LOOKED_AT, number=number)
+        )
+        said = (
+            tuple(opened.warnings)
+            if not isinstance(opened, LiveTransport)
+            else ()
+            if chunks
+            else _strangers(opened)
+        )
     yield from _by_sender(Heard(name, (), opened.datagrams, baud, warnings=said), chunks)
 
 
@@ -121,14 +157,18 @@ def _by_sender(heard: Heard, chunks: Sequence[Chunk]) -> Iterator[Heard]:
 
 
 def heard_as(source: str | Path, sensor: Sensor, seconds: float) -> list[Heard]:
-    """What comes over a live source within some seconds, of each sender, where it is opened as a sensor declares; [] where nothing does."""
+    """What comes over a live source within some seconds, of each sender, where it is opened as a
+    sensor declares; [] where nothing does.
+    """
     address, chunks = live_address(source), list[Chunk]()
     with contextlib.closing(transport(source, sensor)) as opened:
         end = time.monotonic() + seconds
         while (left := end - time.monotonic()) > 0 and isinstance(opened, LiveTransport):
             chunks += opened.read(min(left, LOOK))
     baud = None if address is not None and has_no_baud(address.place) else opened.baud
-    return list(_by_sender(Heard(str(source), (), opened.datagrams, baud), chunks)) if chunks else []
+    return (
+        list(_by_sender(Heard(str(source), (), opened.datagrams, baud), chunks)) if chunks else []
+    )
 
 
 def _listened(opened: LiveTransport, seconds: float) -> list[Chunk]:
@@ -136,19 +176,26 @@ def _listened(opened: LiveTransport, seconds: float) -> list[Chunk]:
     chunks: list[Chunk] = []
     end = time.monotonic() + seconds
     with contextlib.suppress(Disconnected):
-        while (left := end - time.monotonic()) > 0 and sum(len(chunk.data) for chunk in chunks) < PLENTY:
+        while (left := end - time.monotonic()) > 0 and sum(
+            len(chunk.data) for chunk in chunks
+        ) < PLENTY:
             chunks += opened.read(min(left, LOOK))
     return chunks
 
 
 def started_first() -> list[Sensor]:
     """The installed sensors on a serial port that send nothing before they are told to."""
-    told = [sensor for sensor in sensors().values() if any(sensor.commands[name].starts for name in sensor.on_open)]
+    told = [
+        sensor
+        for sensor in sensors().values()
+        if any(sensor.commands[name].starts for name in sensor.on_open)
+    ]
     return [sensor for sensor in told if data_link(sensor, Serial)]
 
 
 def probe(source: str | Path) -> Iterator[Heard]:
-    """What comes after the start commands of each sensor that needs them, at each of its baud rates; it is stopped again.
+    """What comes after the start commands of each sensor that needs them, at each of its baud
+    rates; it is stopped again.
 
     Raises:
         SourceError: where the port cannot be opened.
@@ -183,7 +230,10 @@ class _Probe:
         try:
             started = self._asked(self._sensor.on_open)
             self._turns(lambda: all(pending.done for pending in started), ANSWERED)
-            self._turns(lambda: sum(map(len, self._heard)) >= PLENTY, ANSWERED if any(map(_answered, started)) else UNANSWERED)
+            self._turns(
+                lambda: sum(map(len, self._heard)) >= PLENTY,
+                ANSWERED if any(map(_answered, started)) else UNANSWERED,
+            )
             found = list(self._heard)
             stopped = self._asked(self._sensor.on_close)
             self._turns(lambda: all(pending.done for pending in stopped), STOPPING)
@@ -205,7 +255,11 @@ class _Probe:
                     self._opened.lines(**out.lines)
                 self._opened.write(out.data)
             chunks = self._opened.read(TURN)
-            found = [item for chunk in chunks for item in self._decoder.feed(chunk.data)] if chunks else self._decoder.idle()
+            found = (
+                [item for chunk in chunks for item in self._decoder.feed(chunk.data)]
+                if chunks
+                else self._decoder.idle()
+            )
             self._heard += [chunk.data for chunk in chunks]
             self._session.receive(found, time.monotonic_ns())
 

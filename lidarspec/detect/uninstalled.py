@@ -1,8 +1,9 @@
 """Recognize bytes of sensors that are not installed, by the table of known sensors.
 
-A plugin that is not installed cannot parse anything, so the evidence is weaker than that of `detect`: the constant bytes that a data
-frame begins with and its size, then the UDP ports. Several sensors of a vendor, and of related vendors, often share them. The result
-is good enough to name the distributions to install.
+A plugin that is not installed cannot parse anything, so the evidence is weaker than that of
+`detect`: the constant bytes that a data frame begins with and its size, then the UDP ports. Several
+sensors of a vendor, and of related vendors, often share them. The result is good enough to name the
+distributions to install.
 """
 
 from __future__ import annotations
@@ -24,7 +25,8 @@ MIN_SYNC_BYTES = 2
 MIN_MATCHING_SHARE = 0.2
 #: frames in a stream that must follow one another.
 MIN_FRAMES_IN_A_ROW = 3
-#: how often the sync bytes of frames of variable size must occur in a stream, and how much more often than by chance.
+#: how often the sync bytes of frames of variable size must occur in a stream, and how much more
+#: often than by chance.
 MIN_SYNC_COUNT = 8
 MIN_SYNC_COUNT_BY_CHANCE = 20
 #: sensors that a message lists.
@@ -36,7 +38,11 @@ def signatures(sensor: Spec) -> tuple[Signature, ...]:
     found = []
     for name in sensor.data_frames:
         engine = codec(sensor.frames[name])
-        constant = {offset: value for offset, (mask, value) in engine.prefix.items() if mask == 0xFF and offset < MAX_SYNC_BYTES}
+        constant = {
+            offset: value
+            for offset, (mask, value) in engine.prefix.items()
+            if mask == 0xFF and offset < MAX_SYNC_BYTES
+        }
         signature = Signature(_sync_text(constant), engine.size or 0)
         if len(constant) >= MIN_SYNC_BYTES and signature not in found:
             found.append(signature)
@@ -45,11 +51,15 @@ def signatures(sensor: Spec) -> tuple[Signature, ...]:
 
 def _sync_text(constant: dict[int, int]) -> str:
     length = max(constant, default=-1) + 1
-    return " ".join(f"{constant[offset]:02x}" if offset in constant else ".." for offset in range(length))
+    return " ".join(
+        f"{constant[offset]:02x}" if offset in constant else ".." for offset in range(length)
+    )
 
 
 def recognize(heard: Heard) -> list[KnownSensor]:
-    """Return the sensors of the table that are not installed and whose bytes these may be; those of a known port if no frame matches."""
+    """Return the sensors of the table that are not installed and whose bytes these may be; those of
+    a known port if no frame matches.
+    """
     installed = set(registry().names())
     missing = [row for row in known_sensors() if row.id not in installed]
     shares = [_matching_share(row, heard) if heard.size else 0.0 for row in missing]
@@ -74,19 +84,26 @@ def _matching_share(row: KnownSensor, heard: Heard) -> float:
 
 
 def _pattern(sync: str) -> bytes:
-    return b"".join(b"." if byte == ".." else re.escape(bytes.fromhex(byte)) for byte in sync.split())
+    return b"".join(
+        b"." if byte == ".." else re.escape(bytes.fromhex(byte)) for byte in sync.split()
+    )
 
 
 def _share_of_datagrams(signature: Signature, heard: Heard) -> float:
     begins = re.compile(_pattern(signature.sync), re.DOTALL)
     sizes = {signature.size} if signature.size else {len(datagram) for datagram in heard.chunks}
-    count = sum(begins.match(datagram) is not None for datagram in heard.chunks if len(datagram) in sizes)
+    count = sum(
+        begins.match(datagram) is not None for datagram in heard.chunks if len(datagram) in sizes
+    )
     return count / len(heard.chunks)
 
 
 def _share_of_stream(signature: Signature, heard: Heard) -> float:
     data = heard.data
-    offsets = [match.start() for match in re.finditer(b"(?=" + _pattern(signature.sync) + b")", data, re.DOTALL)]
+    offsets = [
+        match.start()
+        for match in re.finditer(b"(?=" + _pattern(signature.sync) + b")", data, re.DOTALL)
+    ]
     if not signature.size:
         constant_bytes = sum(byte != ".." for byte in signature.sync.split())
         needed = max(MIN_SYNC_COUNT, MIN_SYNC_COUNT_BY_CHANCE * len(data) / 256**constant_bytes)
@@ -111,7 +128,9 @@ def describe(found: Sequence[KnownSensor]) -> str:
 
 
 def suggest_installation(error: WireError, heard: Heard) -> WireError:
-    """Return the error for bytes of no installed sensor, with the distributions to install if the table has some."""
+    """Return the error for bytes of no installed sensor, with the distributions to install if the
+    table has some.
+    """
     missing = recognize(heard)
     if missing:
         error.add_note(describe(missing))

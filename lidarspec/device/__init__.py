@@ -1,10 +1,12 @@
 """A sensor on a source: what `open` gives.
 
-In: a SOURCE and a sensor. Out: packets and scans as they come, replies to commands, counters, warnings. Modules in reading order:
+In: a SOURCE and a sensor. Out: packets and scans as they come, replies to commands, counters,
+warnings. Modules in reading order:
 
 * `device`: `Device`, which users hold: packets and scans out of what its input gives.
 * `arrivals`: what an input is, live or not, and that of a file.
-* `first_frames`: frames of a file that apply from its start: its first state, and the first reference of its clock.
+* `first_frames`: frames of a file that apply from its start: its first state, and the first
+  reference of its clock.
 * `file_scans`: the scans of a file, in pieces that other processes read.
 * `senders`: whose datagrams these are, and which of them are read.
 * `live_input`: frames as they come, decoded every few milliseconds; how the source is doing.

@@ -1,6 +1,7 @@
 """What a device reads from, live or not: an input that gives frames in batches.
 
-`FileInput` is that of a file or standard input, which are read as fast as they are asked for; `live_input` has the other.
+`FileInput` is that of a file or standard input, which are read as fast as they are asked for;
+`live_input` has the other.
 """
 
 from __future__ import annotations
@@ -39,7 +40,8 @@ class Arrival:
     Attributes:
         found: the frames of every incoming type.
         interrupted: whether input is missing behind them: no frame, packet or scan goes on there.
-        replaced: whether these are the frames of another sensor than those before, of which nothing counts any more.
+        replaced: whether these are the frames of another sensor than those before, of which nothing
+            counts any more.
     """
 
     found: list[Frames] = field(default_factory=list)
@@ -55,7 +57,8 @@ class Input(Protocol):
         decoder: what finds the frames on the data link.
         stays_on: whether the sensor is left as it is at the end.
         sensor: whose frames they are, configured with the options that it has `learned` of itself.
-        told: the last frame of each type that says what `Sensor.info` declares, on whichever link it came.
+        told: the last frame of each type that says what `Sensor.info` declares, on whichever link
+            it came.
     """
 
     is_live: bool = False
@@ -66,14 +69,23 @@ class Input(Protocol):
     told: Mapping[str, Found] = MappingProxyType({})
 
     def note(self, found: Sequence[Frames]) -> None:
-        """Keep what frames say of the device itself; of those with parts one that leaves out what another one said is none."""
+        """Keep what frames say of the device itself; of those with parts one that leaves out what
+        another one said is none.
+        """
         telling = {path.partition(".")[0] for path in self.sensor.info.values()}
         for frames in found if telling else ():
             for name in telling.intersection(frames.names):
                 where = np.flatnonzero(np.equal(frames.kinds, frames.names.index(name)))
                 for item in frames.only(where[-1:]).found():
-                    known = [self.told[name]] if name in self.told and schema(self.sensor.frames[name].tree).parts else []
-                    if said(self.sensor, known).keys() <= said(self.sensor, [item] if known else []).keys():
+                    known = (
+                        [self.told[name]]
+                        if name in self.told and schema(self.sensor.frames[name].tree).parts
+                        else []
+                    )
+                    if (
+                        said(self.sensor, known).keys()
+                        <= said(self.sensor, [item] if known else []).keys()
+                    ):
                         self.told = {**self.told, name: item}
 
     @property
@@ -99,18 +111,26 @@ class Input(Protocol):
 
     @property
     def place(self) -> tuple[int, int] | None:
-        """How many bytes of the stored file were read, and how many there are; None where nobody knows."""
+        """How many bytes of the stored file were read, and how many there are; None where nobody
+        knows.
+        """
         return None
 
     def skip(self, at: int) -> bool:
-        """Pass over what arrived before a time, ns since 1970, where that can be done without reading it: whether it is."""
+        """Pass over what arrived before a time, ns since 1970, where that can be done without
+        reading it: whether it is.
+        """
         return False
 
     def read_ahead(self, size: int) -> None:
-        """Read a file in portions of about so many bytes from now on; what is live comes as it does."""
+        """Read a file in portions of about so many bytes from now on; what is live comes as it
+        does.
+        """
 
     def gather(self, until: float) -> None:
-        """Let what comes wait up to a time of `time.monotonic`, to be decoded together, and no longer than one wait for it takes."""
+        """Let what comes wait up to a time of `time.monotonic`, to be decoded together, and no
+        longer than one wait for it takes.
+        """
 
     def begin(self) -> None:
         """Send the commands that the sensor declares for its start.
@@ -132,15 +152,19 @@ class Input(Protocol):
         return 0
 
     def caught_up(self, mark: int) -> bool:
-        """Whether everything that had been produced at a mark has been decoded; of a file each scan is looked at in its turn."""
+        """Whether everything that had been produced at a mark has been decoded; of a file each scan
+        is looked at in its turn.
+        """
         return True
 
     def send(self, name: str, /, *, timeout: float | None = None, **arguments: Any) -> Reply:
         """The reply to a command, which other threads may wait for at the same time.
 
         Raises:
-            UnknownCommand, UnknownField, MissingField, OutOfRange: for what the sensor does not take; nothing is sent.
-            CommandError: where the device refuses, the connection is lost or there is no device; ReplyTimeout where it keeps silent.
+            UnknownCommand, UnknownField, MissingField, OutOfRange: for what the sensor does not
+                take; nothing is sent.
+            CommandError: where the device refuses, the connection is lost or there is no device;
+                ReplyTimeout where it keeps silent.
         """
 
     def write(self, data: bytes, link: str = "data") -> None:
@@ -156,11 +180,15 @@ class Input(Protocol):
         return FirstFrames()
 
     def close(self) -> None:
-        """Stop the sensor where it was started, and give everything back; a second call does nothing."""
+        """Stop the sensor where it was started, and give everything back; a second call does
+        nothing.
+        """
 
 
 def fed(decoder: Decoder, chunks: Sequence[Chunk]) -> list[Frames]:
-    """The frames that consecutive chunks complete, each with the arrival time of the chunk that holds its last byte."""
+    """The frames that consecutive chunks complete, each with the arrival time of the chunk that
+    holds its last byte.
+    """
     if not decoder.stream:
         return [decoder.datagrams([chunk.data for chunk in chunks], [chunk.at for chunk in chunks])]
     if len(chunks) == 1:
@@ -169,16 +197,22 @@ def fed(decoder: Decoder, chunks: Sequence[Chunk]) -> list[Frames]:
     ends = np.array([*accumulate(map(len, data), initial=decoder.stats.bytes_in)])[1:]
     found = decoder.frames(b"".join(data), chunks[-1].at)
     times = np.array([-1 if chunk.at is None else chunk.at for chunk in chunks], np.int64)
-    return [frames.arrived(times[ends.searchsorted(frames.offsets + frames.sizes)]) for frames in found]
+    return [
+        frames.arrived(times[ends.searchsorted(frames.offsets + frames.sizes)]) for frames in found
+    ]
 
 
 def _streamed(decoder: Decoder, packets: Batch, together: int) -> Iterator[list[Frames]]:
-    """The frames that the packets of a byte stream complete, with the times of the packets that hold their last bytes."""
+    """The frames that the packets of a byte stream complete, with the times of the packets that
+    hold their last bytes.
+    """
     data, ends = packets.joined, decoder.stats.bytes_in + np.cumsum(packets.sizes)
     at = np.where(packets.at, packets.at, -1)  # nobody knows
     for start in range(0, len(data), together):
         found = decoder.frames(data[start : start + together])
-        yield [frames.arrived(at[ends.searchsorted(frames.offsets + frames.sizes)]) for frames in found]
+        yield [
+            frames.arrived(at[ends.searchsorted(frames.offsets + frames.sizes)]) for frames in found
+        ]
 
 
 def answers(found: Sequence[Frames], awaited: frozenset[str]) -> list[Found]:
@@ -195,7 +229,8 @@ BATCH_BYTES, BATCH_CHUNKS = 1 << 18, 1024
 
 
 class FileInput(Input):
-    """What a transport that ends holds; the consumer's own pace is the policy, so that nothing is ever dropped.
+    """What a transport that ends holds; the consumer's own pace is the policy, so that nothing is
+    ever dropped.
 
     Attributes:
         state: "streaming", "ended" or "closed".
@@ -204,7 +239,9 @@ class FileInput(Input):
 
     state = "streaming"
 
-    def __init__(self, source: str | Path, sensor: Sensor, opened: Transport, *, backend: str) -> None:
+    def __init__(
+        self, source: str | Path, sensor: Sensor, opened: Transport, *, backend: str
+    ) -> None:
         self._source, self.sensor, self._transport = source, sensor, opened
         self.decoder: Decoder = sensor.decoder(stream=not opened.datagrams, backend=backend)
         self.senders = Senders(source, sensor)
@@ -218,15 +255,26 @@ class FileInput(Input):
     @property
     def warnings(self) -> list[str]:
         said, stats = list(self._transport.warnings), self.decoder.stats
-        if self.state == "ended" and stats.bytes_in and not any(name in stats.frames for name in self.sensor.data_frames):
-            text = f"{self._source}: {stats.bytes_in} bytes, and no data frame of {self.sensor.id} among them"
+        if (
+            self.state == "ended"
+            and stats.bytes_in
+            and not any(name in stats.frames for name in self.sensor.data_frames)
+        ):
+            text = (
+                f"{self._source}: {stats.bytes_in} bytes, and no data frame of {self.sensor.id}"
+                " among them"
+            )
             said.append(f"{text}; next: lidarspec detect {quote(str(self._source))}")
         return said
 
     @property
     def stats(self) -> Counters:
         stats = self.decoder.stats
-        stats.foreign, stats.disconnects, stats.unread = self._transport.foreign, self._transport.disconnects, self._transport.unread
+        stats.foreign, stats.disconnects, stats.unread = (
+            self._transport.foreign,
+            self._transport.disconnects,
+            self._transport.unread,
+        )
         return stats
 
     @property
@@ -254,7 +302,9 @@ class FileInput(Input):
         """A file has no sensor to be started."""
 
     def send(self, name: str, /, *, timeout: float | None = None, **arguments: Any) -> Reply:
-        raise CommandError(f"{self.sensor.id} {name}: {self._source} is a file, there is no device to send it to")
+        raise CommandError(
+            f"{self.sensor.id} {name}: {self._source} is a file, there is no device to send it to"
+        )
 
     def write(self, data: bytes, link: str = "data") -> None:
         raise SourceError(f"{self._source} is a file, there is no device to send bytes to")
@@ -265,16 +315,25 @@ class FileInput(Input):
         self._arrivals = iter(())  # which holds this one, and both what was read
 
     def first_frames(self) -> FirstFrames:
-        """Find the frames that apply from the start: the state of points, and the reference of the clock."""
+        """Find the frames that apply from the start: the state of points, and the reference of the
+        clock.
+        """
         path = Path(str(self._source).partition("?")[0])
-        if not is_searched(self.sensor) or not (is_stored(self._source) or path.is_file() or path.is_dir()):
+        if not is_searched(self.sensor) or not (
+            is_stored(self._source) or path.is_file() or path.is_dir()
+        ):
             return FirstFrames()
         with contextlib.closing(transport(self._source)) as source:
             decoder = self.sensor.decoder(stream=not source.datagrams)
             if isinstance(source, CaptureTransport) and source.datagrams:
-                batches = ([decoder.placed(batch.buffer, batch.starts, batch.sizes, batch.at)] for batch in source.batches())
+                batches = (
+                    [decoder.placed(batch.buffer, batch.starts, batch.sizes, batch.at)]
+                    for batch in source.batches()
+                )
                 return find_first_frames(self.sensor, batches)
-            return find_first_frames(self.sensor, (fed(decoder, [chunk]) for chunk in source.chunks()))
+            return find_first_frames(
+                self.sensor, (fed(decoder, [chunk]) for chunk in source.chunks())
+            )
 
     def _read(self) -> Iterator[Arrival]:
         """Every incoming frame, in batches."""
@@ -283,7 +342,9 @@ class FileInput(Input):
                 if datagrams.gap:
                     yield Arrival(self.decoder.rest(), interrupted=True)
                 if self.decoder.stream:
-                    yield from map(Arrival, _streamed(self.decoder, datagrams, self._together or BATCH_BYTES))
+                    yield from map(
+                        Arrival, _streamed(self.decoder, datagrams, self._together or BATCH_BYTES)
+                    )
                     continue
                 for part in datagrams.parts(self._together) if self._together else [datagrams]:
                     spans = self.decoder.placed(part.buffer, part.starts, part.sizes, part.at)
@@ -301,11 +362,18 @@ class FileInput(Input):
         yield Arrival(self.decoder.rest())
 
     def _batches(self) -> Iterator[list[Chunk]]:
-        """The chunks, as many at once as are worth decoding together, up to where the line was interrupted or fell silent."""
+        """The chunks, as many at once as are worth decoding together, up to where the line was
+        interrupted or fell silent.
+        """
         found: list[Chunk] = []
         size = 0
         for chunk in self._portions():
-            if found and (chunk.gap or chunk.quiet or size >= (self._together or BATCH_BYTES) or len(found) >= BATCH_CHUNKS):
+            if found and (
+                chunk.gap
+                or chunk.quiet
+                or size >= (self._together or BATCH_BYTES)
+                or len(found) >= BATCH_CHUNKS
+            ):
                 yield found
                 found, size = [], 0
             found.append(chunk)

@@ -1,6 +1,8 @@
-"""A device for asyncio: each wait goes on in a thread of the device's own, so that the event loop is never held up.
+"""A device for asyncio: each wait goes on in a thread of the device's own, so that the event loop
+is never held up.
 
-What a thread has found is kept where the next call finds it: a call that is cancelled loses nothing.
+What a thread has found is kept where the next call finds it: a call that is cancelled loses
+nothing.
 """
 
 from __future__ import annotations
@@ -55,7 +57,9 @@ class AsyncDevice:
             UsageError: before it is opened.
         """
         if self._device is None:
-            raise UsageError("the device is not open yet: async with lidarspec.open_async(...) as device")
+            raise UsageError(
+                "the device is not open yet: async with lidarspec.open_async(...) as device"
+            )
         return self._device
 
     @property
@@ -75,21 +79,27 @@ class AsyncDevice:
 
     @property
     def state(self) -> str:
-        """How the source is doing: "streaming", "waiting", "silent", "no frames", "disconnected", "ended" or "closed"."""
+        """How the source is doing: "streaming", "waiting", "silent", "no frames", "disconnected",
+        "ended" or "closed".
+        """
         return self.device.state
 
     async def packets(self, frame: str | None = None) -> AsyncIterator[Packets]:
-        """The packets of the data frame, or of another type, in batches, until the input ends or the device is closed.
+        """The packets of the data frame, or of another type, in batches, until the input ends or
+        the device is closed.
 
         Raises:
             SourceError: where a file has been read to its end before.
         """
-        feed = self._packets.setdefault(frame, _Feed(self.device.packets(frame, wait=STEP), lambda packets: not len(packets)))
+        feed = self._packets.setdefault(
+            frame, _Feed(self.device.packets(frame, wait=STEP), lambda packets: not len(packets))
+        )
         async for packets in self._drained(feed):
             yield packets
 
     async def scans(self, *, select: Selection = EVERYTHING) -> AsyncIterator[Scan]:
-        """Every scan; the first and last piece, and those before and after an interruption, are marked ``complete=False``.
+        """Every scan; the first and last piece, and those before and after an interruption, are
+        marked ``complete=False``.
 
         Args:
             select: which of them, and what of each; those before the first that is wanted are read.
@@ -128,7 +138,8 @@ class AsyncDevice:
             timeout: seconds to wait.
 
         Raises:
-            SourceTimeout: where none comes in time; SourceError where the input has ended or the device was closed.
+            SourceTimeout: where none comes in time; SourceError where the input has ended or the
+                device was closed.
         """
         deadline = None if timeout is None else time.monotonic() + timeout
         while True:
@@ -147,16 +158,22 @@ class AsyncDevice:
             arguments: by name, in units.
 
         Raises:
-            UnknownCommand, UnknownField, MissingField, OutOfRange: for what the sensor does not take; nothing is sent.
-            CommandError: where the device refuses, or the connection is lost; ReplyTimeout where it keeps silent.
+            UnknownCommand, UnknownField, MissingField, OutOfRange: for what the sensor does not
+                take; nothing is sent.
+            CommandError: where the device refuses, or the connection is lost; ReplyTimeout where it
+                keeps silent.
         """
-        return await self._run(self._sender, partial(self.device.send, name, timeout=timeout, **arguments))
+        return await self._run(
+            self._sender, partial(self.device.send, name, timeout=timeout, **arguments)
+        )
 
     async def write(self, data: bytes, link: str = "data") -> None:
-        """Send bytes by hand, as they are; nothing is waited for, and what answers them comes with everything else.
+        """Send bytes by hand, as they are; nothing is waited for, and what answers them comes with
+        everything else.
 
         Args:
-            data: the bytes; nobody looks at what they say, so that a sensor that they start is not stopped on closing.
+            data: the bytes; nobody looks at what they say, so that a sensor that they start is not
+                stopped on closing.
             link: over which of the sensor's links.
 
         Raises:
@@ -166,7 +183,9 @@ class AsyncDevice:
         await self._run(self._sender, partial(self.device.write, data, link))
 
     async def close(self) -> None:
-        """Stop the sensor where it was started, and give the source back; a second call does nothing."""
+        """Stop the sensor where it was started, and give the source back; a second call does
+        nothing.
+        """
         if self._device is not None:
             await _whole(asyncio.get_running_loop().run_in_executor(None, self._device.close))
         self._reader.shutdown(wait=False)
@@ -183,7 +202,12 @@ class AsyncDevice:
             raise
         return self
 
-    async def __aexit__(self, kind: type[BaseException] | None, error: BaseException | None, traceback: TracebackType | None) -> None:
+    async def __aexit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        traceback: TracebackType | None,
+    ) -> None:
         await self.close()
 
     async def _run(self, executor: ThreadPoolExecutor, function: Callable[[], T]) -> T:
@@ -242,6 +266,10 @@ async def _whole(future: asyncio.Future[T]) -> T:
         raise
 
 
-def open_async(source: str | Path, sensor: str | Sensor | None = None, **options: Any) -> AsyncDevice:
-    """A sensor on any SOURCE, to be used with ``async with``; arguments and errors are those of `open`."""
+def open_async(
+    source: str | Path, sensor: str | Sensor | None = None, **options: Any
+) -> AsyncDevice:
+    """A sensor on any SOURCE, to be used with ``async with``; arguments and errors are those of
+    `open`.
+    """
     return AsyncDevice(partial(open_device, source, sensor, **options))

@@ -1,11 +1,14 @@
-"""Capture apart from decoding: a thread fetches what arrives and hands it on through a bounded queue.
+"""Capture apart from decoding: a thread fetches what arrives and hands it on through a bounded
+queue.
 
-The thread does nothing but read, keep the time, record and queue, so that a consumer which is slow, or busy in Python, costs
-no byte. A recording gets everything; the queue is bounded by its policy: with "drop_oldest" the oldest chunks give way, with
-"block" the thread waits. What was produced is always what was consumed, dropped or still waits.
+The thread does nothing but read, keep the time, record and queue, so that a consumer which is slow,
+or busy in Python, costs no byte. A recording gets everything; the queue is bounded by its policy:
+with "drop_oldest" the oldest chunks give way, with "block" the thread waits. What was produced is
+always what was consumed, dropped or still waits.
 
-When the device goes away the thread says so, tries to find it again with growing pauses, and marks the first chunk after the
-gap. Silence is what the system has confirmed, not what a thread that got no time believes: reads that came back empty.
+When the device goes away the thread says so, tries to find it again with growing pauses, and marks
+the first chunk after the gap. Silence is what the system has confirmed, not what a thread that got
+no time believes: reads that came back empty.
 """
 
 from __future__ import annotations
@@ -49,10 +52,13 @@ class BoundedQueue:
         chunks, size: what it holds at most: chunks, and bytes in them.
 
     Attributes:
-        produced, consumed, dropped: chunks; ``produced == consumed + dropped + len(queue)`` always holds.
+        produced, consumed, dropped: chunks; ``produced == consumed + dropped + len(queue)`` always
+            holds.
     """
 
-    def __init__(self, policy: str = "drop_oldest", *, chunks: int = CHUNKS, size: int = BYTES) -> None:
+    def __init__(
+        self, policy: str = "drop_oldest", *, chunks: int = CHUNKS, size: int = BYTES
+    ) -> None:
         if policy not in POLICIES:
             raise UsageError(f"a full queue can {' or '.join(POLICIES)}, not {policy!r}")
         self._blocks, self._most, self._largest = policy == "block", chunks, size
@@ -84,17 +90,21 @@ class BoundedQueue:
             self._changed.notify_all()
 
     def take(self, timeout: float, *, until: float = 0.0, chunks: int = CHUNKS) -> list[Event]:
-        """What has arrived, in order; empty where nothing does within `timeout` seconds, or the queue is closed and empty.
+        """What has arrived, in order; empty where nothing does within `timeout` seconds, or the
+        queue is closed and empty.
 
         Args:
-            until: a time of the monotonic clock up to which everything is gathered before any of it is given.
+            until: a time of the monotonic clock up to which everything is gathered before any of it
+                is given.
             chunks: how many events at most.
         """
         pause = min(until - time.monotonic(), timeout)
         if pause > 0 and not self.closed:
             time.sleep(pause)  # what arrives meanwhile wakes nobody
         with self._changed:
-            self._changed.wait_for(lambda: self._events or self._kept or self.closed, timeout - max(pause, 0.0))
+            self._changed.wait_for(
+                lambda: self._events or self._kept or self.closed, timeout - max(pause, 0.0)
+            )
             found = list(self._kept)
             self._kept.clear()
             if len(found) + len(self._events) <= chunks and not self._cut:
@@ -126,7 +136,11 @@ class BoundedQueue:
         return link, item
 
     def _make_room(self, size: int) -> None:
-        while self._waiting and not self.closed and (self._waiting >= self._most or self._size + size > self._largest):
+        while (
+            self._waiting
+            and not self.closed
+            and (self._waiting >= self._most or self._size + size > self._largest)
+        ):
             if self._blocks:
                 self._changed.notify_all()
                 self._changed.wait(POLL)
@@ -161,9 +175,20 @@ class Capture:
     """
 
     def __init__(
-        self, transport: LiveTransport, queue: BoundedQueue, *, link: str = "data", log: Log | None = None, clock: HostClock | None = None
+        self,
+        transport: LiveTransport,
+        queue: BoundedQueue,
+        *,
+        link: str = "data",
+        log: Log | None = None,
+        clock: HostClock | None = None,
     ) -> None:
-        self.transport, self.connected, self.disconnects, self.last = transport, True, 0, time.monotonic()
+        self.transport, self.connected, self.disconnects, self.last = (
+            transport,
+            True,
+            0,
+            time.monotonic(),
+        )
         self._queue, self._link, self._log = queue, link, log
         self._clock, self.warnings = clock or HostClock(), list[str]()
         self._stop, self._handing = threading.Event(), threading.Lock()
@@ -178,7 +203,9 @@ class Capture:
         self.transport.close()
 
     def record(self, log: Log | None) -> None:
-        """Record from now on, and forget what waits in the queue: what comes out of it is what is recorded."""
+        """Record from now on, and forget what waits in the queue: what comes out of it is what is
+        recorded.
+        """
         while not self._handing.acquire(timeout=POLL):
             self._queue.take(0.0)  # which it may wait for
         self._log = log
@@ -222,16 +249,23 @@ class Capture:
             self._queue.put(self._link, chunks)
 
     def _look_at_the_clock(self, chunk: Chunk) -> None:
-        """Where the wall clock was set before a chunk came, arrival times go on as before; it is said once, and recorded each time."""
+        """Where the wall clock was set before a chunk came, arrival times go on as before; it is
+        said once, and recorded each time.
+        """
         ahead = self._clock.parted()
         if ahead is None:
             return
-        self.warnings = [f"the clock of this computer was set, and is {ahead / 1e9:+.3f} s from the arrival times, which go on evenly"]
+        self.warnings = [
+            f"the clock of this computer was set, and is {ahead / 1e9:+.3f} s from the arrival"
+            " times, which go on evenly"
+        ]
         if self._log is not None:
             self._log.event("clock", chunk.at, ahead_ns=ahead)
 
     def _found_again(self) -> bool:
-        """Say that the device is gone, and wait until it is back; False where somebody wants to stop meanwhile."""
+        """Say that the device is gone, and wait until it is back; False where somebody wants to
+        stop meanwhile.
+        """
         self.connected = False
         self.disconnects += 1
         self._tell(Mark.LOST, "disconnect")

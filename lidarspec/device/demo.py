@@ -1,7 +1,9 @@
-"""The main job with nothing attached, end to end: a simulated sensor on a real line, asked to start, read, recorded, read again.
+"""The main job with nothing attached, end to end: a simulated sensor on a real line, asked to
+start, read, recorded, read again.
 
-A serial sensor stands on a pseudo-terminal, or on a TCP port where the system has none; the others send UDP datagrams on loopback.
-The line does its harm on the way. What was recorded is decoded once more, and has to give the same points.
+A serial sensor stands on a pseudo-terminal, or on a TCP port where the system has none; the others
+send UDP datagrams on loopback. The line does its harm on the way. What was recorded is decoded once
+more, and has to give the same points.
 """
 
 from __future__ import annotations
@@ -61,12 +63,15 @@ class Demonstration:
     recorded: int
 
 
-def demonstrate(sensor: Sensor, *, turns: int = 5, errors: float = 0.01, seed: int = 1) -> Demonstration:
+def demonstrate(
+    sensor: Sensor, *, turns: int = 5, errors: float = 0.01, seed: int = 1
+) -> Demonstration:
     """Let a simulated sensor work until so many whole scans have come.
 
     Args:
         turns: whole scans wanted.
-        errors: share of the bytes of a stream that are damaged, at most one in each of the longest frames; of datagrams, those lost.
+        errors: share of the bytes of a stream that are damaged, at most one in each of the longest
+            frames; of datagrams, those lost.
 
     Raises:
         SourceError: where no line can be had, or the scans do not come.
@@ -80,9 +85,13 @@ def demonstrate(sensor: Sensor, *, turns: int = 5, errors: float = 0.01, seed: i
         place, replies, scans, stats = _live(sensor, simulated, path, turns)
         line, recorded = simulated.lines["data"], path.stat().st_size
         with open_device(path, sensor) as recording:
-            again = digest(list(itertools.islice((scan for scan in recording.scans() if scan.whole), turns)))
+            again = digest(
+                list(itertools.islice((scan for scan in recording.scans() if scan.whole), turns))
+            )
     digested = digest([scan for scan in scans if scan.whole])
-    return Demonstration(sensor, place, replies, scans, stats, line.sent, line.intact, digested, again, recorded)
+    return Demonstration(
+        sensor, place, replies, scans, stats, line.sent, line.intact, digested, again, recorded
+    )
 
 
 def digest(scans: Sequence[Scan]) -> str:
@@ -95,12 +104,19 @@ def digest(scans: Sequence[Scan]) -> str:
     return found.hexdigest()
 
 
-def _live(sensor: Sensor, simulated: SimulatedDevice, path: Path, turns: int) -> tuple[str, tuple[Reply, ...], tuple[Scan, ...], Counters]:
-    """The place of the sensor, its replies, its scans and the counters; everything that came is recorded."""
+def _live(
+    sensor: Sensor, simulated: SimulatedDevice, path: Path, turns: int
+) -> tuple[str, tuple[Reply, ...], tuple[Scan, ...], Counters]:
+    """The place of the sensor, its replies, its scans and the counters; everything that came is
+    recorded.
+    """
     if sensor.datagrams:
         port = _free_port()
         at = f"udp://{HERE}:{port}"
-        with open_device(at, sensor, start=False, record=path) as device, Served(simulated, simulated_outlet(sensor, at)) as served:
+        with (
+            open_device(at, sensor, start=False, record=path) as device,
+            Served(simulated, simulated_outlet(sensor, at)) as served,
+        ):
             return at, *_read(device, served, turns)
     to = "pty" if has_terminals() and data_link(sensor, Serial) else f"tcp://{HERE}:0"
     with (
@@ -110,7 +126,9 @@ def _live(sensor: Sensor, simulated: SimulatedDevice, path: Path, turns: int) ->
         return served.path, *_read(device, served, turns)
 
 
-def _read(device: Device, served: Served, turns: int) -> tuple[tuple[Reply, ...], tuple[Scan, ...], Counters]:
+def _read(
+    device: Device, served: Served, turns: int
+) -> tuple[tuple[Reply, ...], tuple[Scan, ...], Counters]:
     replies = tuple(device.send(name) for name in device.sensor.on_open)
     limit = time.monotonic() + PATIENCE + turns
     scans: list[Scan] = []

@@ -1,7 +1,8 @@
 """A sensor on a source: packets and scans as they come, commands, counters.
 
-A `Device` asks its input for what has arrived: a `FileInput` or a `LiveInput`, which look the same from here. `PacketReader` makes
-packets of one type out of it, with what one batch has to know of the one before, and scans out of those.
+A `Device` asks its input for what has arrived: a `FileInput` or a `LiveInput`, which look the same
+from here. `PacketReader` makes packets of one type out of it, with what one batch has to know of
+the one before, and scans out of those.
 """
 
 from __future__ import annotations
@@ -51,7 +52,8 @@ class PacketReader:
     """The packets of one type out of what arrives.
 
     Args:
-        frame: the type; where the sensor has several data frames and none is named, the first that arrives decides.
+        frame: the type; where the sensor has several data frames and none is named, the first that
+            arrives decides.
         decoder: where the frames come from.
         state: frames of other types, by name, that count as seen before the first packet.
 
@@ -61,7 +63,9 @@ class PacketReader:
         felt: the samples of the last arrival.
     """
 
-    def __init__(self, sensor: Sensor, frame: str | None, decoder: Decoder, first: FirstFrames) -> None:
+    def __init__(
+        self, sensor: Sensor, frame: str | None, decoder: Decoder, first: FirstFrames
+    ) -> None:
         self._sensor = sensor
         self._decoder = decoder
         self._first = first
@@ -83,7 +87,12 @@ class PacketReader:
             self.imu.interrupt()
 
     def _feeling(self) -> ImuStream:
-        return ImuStream(self._sensor, self._decoder.stats, backend=self._decoder.backend, state=self._first.state)
+        return ImuStream(
+            self._sensor,
+            self._decoder.stats,
+            backend=self._decoder.backend,
+            state=self._first.state,
+        )
 
     def add(self, arrival: Arrival) -> Packets | None:
         """The packets among these frames; None while nobody knows of which type."""
@@ -108,7 +117,8 @@ class PacketReader:
         return (self._stream or self._made(self._sensor.data_frame)).add([])
 
     def scans(self, stream: ScanStream, arrival: Arrival, *, read: bool = False) -> Iterator[Scan]:
-        """The scans that an arrival completes; an interruption ends the one under way, and the stream with it.
+        """The scans that an arrival completes; an interruption ends the one under way, and the
+        stream with it.
 
         Args:
             read: it is the last one, of which packets were made before.
@@ -129,17 +139,26 @@ class PacketReader:
     def _made(self, name: str) -> PacketStream:
         decoder = self._decoder
         first = self._first
-        return PacketStream(self._sensor, name, decoder.stats, backend=decoder.backend, state=first.state, reference=first.reference)
+        return PacketStream(
+            self._sensor,
+            name,
+            decoder.stats,
+            backend=decoder.backend,
+            state=first.state,
+            reference=first.reference,
+        )
 
 
 class Device(Closing):
     """A sensor read from a source; a context manager.
 
     Attributes:
-        felt: what the sensor's IMU felt with the last batch of `packets`, in the carrier's axes where the sensor is mounted.
+        felt: what the sensor's IMU felt with the last batch of `packets`, in the carrier's axes
+            where the sensor is mounted.
         source: where it is read from.
         sensor: the sensor, given or detected.
-        mount: how it is mounted, where `lidarspec.toml` says so: scans come in the carrier's axes, packets in the sensor's.
+        mount: how it is mounted, where `lidarspec.toml` says so: scans come in the carrier's axes,
+            packets in the sensor's.
     """
 
     def __init__(
@@ -159,7 +178,10 @@ class Device(Closing):
         self._latest: ScanStream | None = None
         self._unseen = deque[Scan]()
         self._ahead: Arrival | None = None
-        self._first, self._another = list[Found](), None if sensor.relatives or "model" in sensor.info else ""
+        self._first, self._another = (
+            list[Found](),
+            None if sensor.relatives or "model" in sensor.info else "",
+        )
         self._own_recorders = list[Log]()
         self._input = self._opened(backend, record, overflow, period, learns=start)
         self._finalizer = weakref.finalize(self, _close, self._input, self._own_recorders)
@@ -180,7 +202,10 @@ class Device(Closing):
             UsageError: always.
         """
         self.close()
-        raise UsageError("lidarspec.open(...) is used with `with`; for `async with` call lidarspec.open_async(...)")
+        raise UsageError(
+            "lidarspec.open(...) is used with `with`; for `async with` call"
+            " lidarspec.open_async(...)"
+        )
 
     async def __aexit__(self, *_: object) -> None:
         """Exist beside `__aenter__`, without which Python raises its own TypeError."""
@@ -192,27 +217,42 @@ class Device(Closing):
 
     @property
     def warnings(self) -> list[str]:
-        """What is to be said about the source now: a file that is cut off, silence, a likely wrong baud rate, a small buffer, frames
-        that are another sensor's, scans without an end, times without a date, a nominal calibration; and what the plugin failed at."""
+        """What is to be said about the source now: a file that is cut off, silence, a likely wrong
+        baud rate, a small buffer, frames that are another sensor's, scans without an end, times
+        without a date, a nominal calibration; and what the plugin failed at."""
         failure = self.stats.failure(self.sensor.id)
         nominal = [_nominal(self.sensor)] if self.stats.nominal else []
-        partial = [f"{self.source}: {text}" for text in (self.stats.unended, self.stats.undated, self.stats.masked) if text]
-        return [*self._input.warnings, *self._doubts(), *partial, *nominal, *([] if failure is None else [str(failure)])]
+        partial = [
+            f"{self.source}: {text}"
+            for text in (self.stats.unended, self.stats.undated, self.stats.masked)
+            if text
+        ]
+        return [
+            *self._input.warnings,
+            *self._doubts(),
+            *partial,
+            *nominal,
+            *([] if failure is None else [str(failure)]),
+        ]
 
     @property
     def learned(self) -> Mapping[str, Any]:
-        """The options that the sensor has said of itself on opening; `sensor` is configured with them."""
+        """The options that the sensor has said of itself on opening; `sensor` is configured with
+        them.
+        """
         return self._input.learned
 
     @property
     def info(self) -> dict[str, str]:
-        """What the sensor has said of itself so far: of "serial", "firmware", "model" and "temperature" those that its frames have."""
+        """What the sensor has said of itself so far: of "serial", "firmware", "model" and
+        "temperature" those that its frames have.
+        """
         return said(self.sensor, self._input.told.values())
 
     @property
     def state(self) -> str:
-        """How the source is doing: "streaming", "waiting" (for a first frame), "silent" (for three seconds), "no frames" (bytes only),
-        "disconnected", "ended" (a file) or "closed"."""
+        """How the source is doing: "streaming", "waiting" (for a first frame), "silent" (for three
+        seconds), "no frames" (bytes only), "disconnected", "ended" (a file) or "closed"."""
         return self._input.state
 
     @property
@@ -222,7 +262,9 @@ class Device(Closing):
 
     @property
     def place(self) -> tuple[int, int] | None:
-        """How many bytes of a file were read, as it is stored, compressed or not, and how many there are; None where nobody knows."""
+        """How many bytes of a file were read, as it is stored, compressed or not, and how many
+        there are; None where nobody knows.
+        """
         return self._input.place
 
     @property
@@ -237,24 +279,46 @@ class Device(Closing):
                 yield arrival.found
 
     def packets(self, frame: str | None = None, *, wait: float | None = None) -> Iterator[Packets]:
-        """The packets of the data frame, or of another type, in batches, until the input ends or the device is closed.
+        """The packets of the data frame, or of another type, in batches, until the input ends or
+        the device is closed.
 
-        A file is read once, whoever reads it. After `latest` they begin with the batch in which its scan was found.
+        A file is read once, whoever reads it. After `latest` they begin with the batch in which its
+        scan was found.
 
         Args:
             frame: the name of a frame type.
-            wait: yield a batch of no packets where none have come for so many seconds, so that the caller has a turn.
+            wait: yield a batch of no packets where none have come for so many seconds, so that the
+                caller has a turn.
 
         Raises:
             SourceError: where a file has been read to its end before.
         """
         reader, ahead, turn = self._reader(frame), self._taken_back(), time.monotonic()
         for arrival in self._arrivals(wait, ahead):
-            packets = None if arrival is None else reader.last if arrival is ahead and frame is None else reader.add(arrival)
-            if frame is None and arrival is not None and arrival is not ahead and self.sensor.imu_frames:
+            packets = (
+                None
+                if arrival is None
+                else reader.last
+                if arrival is ahead and frame is None
+                else reader.add(arrival)
+            )
+            if (
+                frame is None
+                and arrival is not None
+                and arrival is not ahead
+                and self.sensor.imu_frames
+            ):
                 reader.feel(arrival, packets)
-            self.felt, is_due = self._felt(reader, arrival), wait is not None and time.monotonic() - turn >= wait
-            if (packets is not None and len(packets)) or len(self.felt) or arrival is None or is_due:
+            self.felt, is_due = (
+                self._felt(reader, arrival),
+                wait is not None and time.monotonic() - turn >= wait,
+            )
+            if (
+                (packets is not None and len(packets))
+                or len(self.felt)
+                or arrival is None
+                or is_due
+            ):
                 yield reader.none() if packets is None else packets
                 turn = time.monotonic()
 
@@ -265,28 +329,38 @@ class Device(Closing):
     def scans(self, *, wait: float, select: Selection | None = None) -> Iterator[Scan | None]: ...
 
     def scans(self, *, wait: float | None = None, select: Selection | None = None) -> Iterator[Any]:
-        """Every scan; the first and last piece, and those before and after an interruption, are marked ``complete=False``.
+        """Every scan; the first and last piece, and those before and after an interruption, are
+        marked ``complete=False``.
 
-        Where a scan does not end within twice the slowest turn, what there is of it is handed out, and `warnings` says so.
+        Where a scan does not end within twice the slowest turn, what there is of it is handed out,
+        and `warnings` says so.
 
-        A file is read once, whoever reads it. After `latest` they begin with the batch in which its scan was found.
+        A file is read once, whoever reads it. After `latest` they begin with the batch in which its
+        scan was found.
 
         Args:
-            wait: yield None where no scan has come for so many seconds, so that the caller has a turn.
-            select: which of them, and what of each; nothing is read behind the last that is wanted, and of a recording nothing that lies
-                long before the first.
+            wait: yield None where no scan has come for so many seconds, so that the caller has a
+                turn.
+            select: which of them, and what of each; nothing is read behind the last that is wanted,
+                and of a recording nothing that lies long before the first.
 
         Raises:
             SourceError: where a file has been read to its end before.
             UsageError: where none of its scans is wanted.
         """
-        return self._scans(wait) if select is None else Sieve(select, self.source, self.skip).of(self._scans(wait))
+        return (
+            self._scans(wait)
+            if select is None
+            else Sieve(select, self.source, self.skip).of(self._scans(wait))
+        )
 
     def _scans(self, wait: float | None) -> Iterator[Scan | None]:
         reader, ahead, turn = self._reader(None), self._taken_back(), time.monotonic()
         stream = self._scan_stream()
         for arrival in self._arrivals(wait, ahead):
-            for scan in () if arrival is None else reader.scans(stream, arrival, read=arrival is ahead):
+            for scan in (
+                () if arrival is None else reader.scans(stream, arrival, read=arrival is ahead)
+            ):
                 yield scan
                 del scan  # nobody is to keep it but the caller
                 turn = time.monotonic()
@@ -297,12 +371,14 @@ class Device(Closing):
         yield from stream.finish()
 
     def imu(self, *, wait: float | None = None) -> Iterator[ImuSamples]:
-        """What the sensor's IMU felt, in batches as it comes, in the carrier's axes where the sensor is mounted, until the input ends.
+        """What the sensor's IMU felt, in batches as it comes, in the carrier's axes where the
+        sensor is mounted, until the input ends.
 
         Scans have what was felt during them in `Scan.imu`. A file is read once, whoever reads it.
 
         Args:
-            wait: yield no samples where none have come for so many seconds, so that the caller has a turn.
+            wait: yield no samples where none have come for so many seconds, so that the caller has
+                a turn.
 
         Raises:
             UsageError: where no frame of the sensor says what an IMU felt.
@@ -317,35 +393,45 @@ class Device(Closing):
             if reader.imu.waiting is not None:
                 reader.imu.waiting.until(None)  # no scan asks for them
             felt = self._felt(reader, arrival)
-            if len(felt) or arrival is None or (wait is not None and time.monotonic() - turn >= wait):
+            if (
+                len(felt)
+                or arrival is None
+                or (wait is not None and time.monotonic() - turn >= wait)
+            ):
                 yield felt
                 turn = time.monotonic()
 
     def skip(self, at: int) -> bool:
-        """Pass over what arrived before a time, ns since 1970, where the source can do so without reading it: whether it does.
+        """Pass over what arrived before a time, ns since 1970, where the source can do so without
+        reading it: whether it does.
 
         What was read already is still given; then the stream goes on as behind an interruption.
         """
         return self._input.skip(at)
 
     def gather(self, until: float) -> None:
-        """Let what comes of a live source wait up to a time of `time.monotonic`, to be decoded together, which takes less of the processor.
+        """Let what comes of a live source wait up to a time of `time.monotonic`, to be decoded
+        together, which takes less of the processor.
 
         It waits no longer than the `wait` of whoever iterates.
         """
         self._input.gather(until)
 
     def read_ahead(self, size: int) -> None:
-        """Read a file in portions of about so many bytes from now on, for whoever shows it at the pace of its times: then counters, and
-        what a `Witness` is shown, are not far ahead of what is seen. 0: as many as are decoded quickest."""
+        """Read a file in portions of about so many bytes from now on, for whoever shows it at the
+        pace of its times: then counters, and what a `Witness` is shown, are not far ahead of what
+        is seen. 0: as many as are decoded quickest."""
         self._input.read_ahead(size)
 
     def witnessed(self, by: Witness) -> None:
-        """Show someone everything that is decoded from now on, and the frames that are found in it, in the thread that reads."""
+        """Show someone everything that is decoded from now on, and the frames that are found in it,
+        in the thread that reads.
+        """
         self._input.decoder.witness = by
 
     def latest(self, timeout: float | None = None) -> Scan:
-        """The newest whole scan, newer than the one that the last call gave; waits for it. Older ones are passed over.
+        """The newest whole scan, newer than the one that the last call gave; waits for it. Older
+        ones are passed over.
 
         A file has no newest scan: it gives one after another.
 
@@ -353,16 +439,22 @@ class Device(Closing):
             timeout: seconds to wait.
 
         Raises:
-            SourceTimeout: where none comes in time; SourceError where the input has ended or the device was closed.
+            SourceTimeout: where none comes in time; SourceError where the input has ended or the
+                device was closed.
         """
         deadline = None if timeout is None else time.monotonic() + timeout
-        while (found := self.newest(LONG if deadline is None else max(deadline - time.monotonic(), 0.0))) is None:
+        while (
+            found := self.newest(
+                LONG if deadline is None else max(deadline - time.monotonic(), 0.0)
+            )
+        ) is None:
             if deadline is not None and time.monotonic() >= deadline:
                 raise self.overdue()
         return found
 
     def newest(self, wait: float) -> Scan | None:
-        """The newest whole scan, newer than the one given last; None where none comes within `wait` seconds.
+        """The newest whole scan, newer than the one given last; None where none comes within `wait`
+        seconds.
 
         Raises:
             SourceError: where the input has ended or the device was closed.
@@ -370,7 +462,9 @@ class Device(Closing):
         deadline, mark, reader = time.monotonic() + wait, self._input.mark(), self._reader(None)
         while not (self._unseen and self._input.caught_up(mark)):
             if self._input.ended:
-                raise SourceError(f"{self.source}: no further scan, since the input is {self._input.state}")
+                raise SourceError(
+                    f"{self.source}: no further scan, since the input is {self._input.state}"
+                )
             arrival = self._next(max(deadline - time.monotonic(), 0.0))
             if arrival is not None:
                 self._latest = self._latest or self._scan_stream()
@@ -378,7 +472,11 @@ class Device(Closing):
                 self._ahead = arrival if found and not self.is_live else None
                 self._unseen += found
                 self._latest = None if arrival.interrupted else self._latest
-            if not self._unseen and time.monotonic() >= deadline and (arrival is None or self._input.caught_up(mark)):
+            if (
+                not self._unseen
+                and time.monotonic() >= deadline
+                and (arrival is None or self._input.caught_up(mark))
+            ):
                 return None
         if not self.is_live:
             return self._unseen.popleft()
@@ -400,16 +498,20 @@ class Device(Closing):
             arguments: by name, in units.
 
         Raises:
-            UnknownCommand, UnknownField, MissingField, OutOfRange: for what the sensor does not take; nothing is sent.
-            CommandError: where the device refuses, or the connection is lost; ReplyTimeout where it keeps silent.
+            UnknownCommand, UnknownField, MissingField, OutOfRange: for what the sensor does not
+                take; nothing is sent.
+            CommandError: where the device refuses, or the connection is lost; ReplyTimeout where it
+                keeps silent.
         """
         return self._input.send(name, timeout=timeout, **arguments)
 
     def write(self, data: bytes, link: str = "data") -> None:
-        """Send bytes by hand, as they are; nothing is waited for, and what answers them comes with everything else.
+        """Send bytes by hand, as they are; nothing is waited for, and what answers them comes with
+        everything else.
 
         Args:
-            data: the bytes; nobody looks at what they say, so that a sensor that they start is not stopped on closing.
+            data: the bytes; nobody looks at what they say, so that a sensor that they start is not
+                stopped on closing.
             link: over which of the sensor's links.
 
         Raises:
@@ -423,13 +525,23 @@ class Device(Closing):
         self._input.stays_on = True
 
     def close(self) -> None:
-        """Stop the sensor where it was started, and give the source back; a second call does nothing."""
+        """Stop the sensor where it was started, and give the source back; a second call does
+        nothing.
+        """
         self._finalizer()
 
     def __repr__(self) -> str:
         return f"Device({self.sensor.id} on {self.source}, {self.state}: {self.stats})"
 
-    def _opened(self, backend: str, record: RecordTo | None, overflow: str | None, period: float, *, learns: bool) -> Input:
+    def _opened(
+        self,
+        backend: str,
+        record: RecordTo | None,
+        overflow: str | None,
+        period: float,
+        *,
+        learns: bool,
+    ) -> Input:
         opened = transport(self.source, self.sensor)
         try:
             if not isinstance(opened, LiveTransport):
@@ -437,9 +549,18 @@ class Device(Closing):
                     raise UsageError(f"{self.source} is a file already: there is nothing to record")
                 return FileInput(self.source, self.sensor, opened, backend=backend)
             policy = opened.overflow if overflow is None else overflow
-            recorder = partial(_recorder, record, self.source, opened, self._own_recorders)  # which holds no device: it may be forgotten
+            recorder = partial(
+                _recorder, record, self.source, opened, self._own_recorders
+            )  # which holds no device: it may be forgotten
             return LiveInput(
-                self.source, self.sensor, opened, backend=backend, policy=policy, record=recorder, learns=learns, period=period
+                self.source,
+                self.sensor,
+                opened,
+                backend=backend,
+                policy=policy,
+                record=recorder,
+                learns=learns,
+                period=period,
             )
         except BaseException:
             _close(opened, self._own_recorders)
@@ -447,7 +568,9 @@ class Device(Closing):
 
     def _reader(self, frame: str | None) -> PacketReader:
         if frame not in self._streams:
-            self._streams[frame] = PacketReader(self.sensor, frame, self._input.decoder, self._input.first_frames())
+            self._streams[frame] = PacketReader(
+                self.sensor, frame, self._input.decoder, self._input.first_frames()
+            )
         return self._streams[frame]
 
     def _felt(self, reader: PacketReader, arrival: Arrival | None) -> ImuSamples:
@@ -459,16 +582,22 @@ class Device(Closing):
         return ScanStream(self.sensor, self.mount, self._reader(None).imu.waiting)
 
     def _taken_back(self) -> Arrival | None:
-        """What of a file `latest` found its last scan in, for another to begin with; its further scans are then no longer waited for."""
+        """What of a file `latest` found its last scan in, for another to begin with; its further
+        scans are then no longer waited for.
+        """
         ahead, self._ahead = self._ahead, None
         if ahead is not None:
             self._latest = None
             self._unseen.clear()
         elif self._input.state == "ended":
-            raise SourceError(f"{self.source} has been read to its end: open it again to read it once more")
+            raise SourceError(
+                f"{self.source} has been read to its end: open it again to read it once more"
+            )
         return ahead
 
-    def _arrivals(self, wait: float | None, ahead: Arrival | None = None) -> Iterator[Arrival | None]:
+    def _arrivals(
+        self, wait: float | None, ahead: Arrival | None = None
+    ) -> Iterator[Arrival | None]:
         """What arrives, until the end; None where nothing has for `wait` seconds."""
         if ahead is not None:
             yield ahead
@@ -478,7 +607,9 @@ class Device(Closing):
                 yield arrival
 
     def _next(self, wait: float) -> Arrival | None:
-        """What arrives next; the first frames are kept until somebody asks whether they are another sensor's."""
+        """What arrives next; the first frames are kept until somebody asks whether they are another
+        sensor's.
+        """
         arrival = self._input.next(wait)
         if self._another is None and arrival is not None and len(self._first) < EXAMINED:
             for frames in arrival.found:
@@ -486,7 +617,9 @@ class Device(Closing):
         return arrival
 
     def _doubts(self) -> list[str]:
-        """That the first frames are another sensor's, or name another model: found out once, when there are enough of them."""
+        """That the first frames are another sensor's, or name another model: found out once, when
+        there are enough of them.
+        """
         if self._another is None and (len(self._first) >= EXAMINED or self._input.ended):
             simulated = simulated_sensor(self.source)
             is_certain = simulated is not None and simulated.id == self.sensor.id
@@ -505,8 +638,16 @@ def _nominal(sensor: Sensor) -> str:
     return text + (f", where no {' or '.join(sensor.state)} frame had come" if sensor.state else "")
 
 
-def _recorder(record: RecordTo | None, source: str | Path, opened: LiveTransport, own: list[Log], sensor: Sensor) -> Log | None:
-    """What is to record a sensor as it is read, None for nothing; added to `own` where it is to be closed with the device."""
+def _recorder(
+    record: RecordTo | None,
+    source: str | Path,
+    opened: LiveTransport,
+    own: list[Log],
+    sensor: Sensor,
+) -> Log | None:
+    """What is to record a sensor as it is read, None for nothing; added to `own` where it is to be
+    closed with the device.
+    """
     if record is None:
         return None
     kept, is_own = recorder_for(record, sensor, source, opened)
@@ -533,17 +674,20 @@ def open(
     overflow: str | None = None,
     period: float = PERIOD,
 ) -> Device:
-    """A sensor on any SOURCE: a port, a socket, a simulated device, a file, or "-" for standard input.
+    """A sensor on any SOURCE: a port, a socket, a simulated device, a file, or "-" for standard
+    input.
 
     Args:
-        source: "/dev/ttyUSB0", "serial:///dev/ttyUSB0?baud=230400", "udp://", "tcp://host:port", "capture.pcap", or a name
-            of `lidarspec.toml` ...
+        source: "/dev/ttyUSB0", "serial:///dev/ttyUSB0?baud=230400", "udp://", "tcp://host:port",
+            "capture.pcap", or a name of `lidarspec.toml` ...
         sensor: an id, a path to a sensor's module, or a Sensor; found out where left out.
         backend: what evaluates `points`: "auto", "numpy", "jit" or "construct".
-        start: False leaves out the commands that the sensor declares for its start, and for its end.
-        record: a new file, or a `Recorder`, for everything that arrives and is sent; or what makes one of the open transport.
-        overflow: what a live source does when the consumer is too slow: "drop_oldest", or "block"; by default the first, but
-            a simulated sensor without a pace of its own waits.
+        start: False leaves out the commands that the sensor declares for its start, and for its
+            end.
+        record: a new file, or a `Recorder`, for everything that arrives and is sent; or what makes
+            one of the open transport.
+        overflow: what a live source does when the consumer is too slow: "drop_oldest", or "block";
+            by default the first, but a simulated sensor without a pace of its own waits.
         period: seconds between two decodings of what has come.
 
     Raises:
@@ -555,4 +699,13 @@ def open(
     if sensor is None:
         sensor = detected(source)
     mount = None if device is None else device.mount
-    return Device(source, named_sensor(sensor), backend=backend, start=start, record=record, overflow=overflow, period=period, mount=mount)
+    return Device(
+        source,
+        named_sensor(sensor),
+        backend=backend,
+        start=start,
+        record=record,
+        overflow=overflow,
+        period=period,
+        mount=mount,
+    )

@@ -1,11 +1,14 @@
-"""The scans of a file in one pass that can be left at a bookmark, behind which another process goes on.
+"""The scans of a file in one pass that can be left at a bookmark, behind which another process goes
+on.
 
-What comes behind a place of a file depends on what was before it: bytes of a frame that has begun, frames that hold state, the turns that
-the clock has made, the counter, packets that wait for others, which way the angle turns. A bookmark is all of this, pickled, so that the
-scans behind it are, bit for bit, those of one pass. What no byte changes stands in it by its name: the sensor's functions, structs and
-rules, which could not be pickled, are those of the sensor that goes on.
+What comes behind a place of a file depends on what was before it: bytes of a frame that has begun,
+frames that hold state, the turns that the clock has made, the counter, packets that wait for
+others, which way the angle turns. A bookmark is all of this, pickled, so that the scans behind it
+are, bit for bit, those of one pass. What no byte changes stands in it by its name: the sensor's
+functions, structs and rules, which could not be pickled, are those of the sensor that goes on.
 
-A scan belongs to whoever saw its beginning: behind a bookmark the one under way is left out, and before it is read to its end.
+A scan belongs to whoever saw its beginning: behind a bookmark the one under way is left out, and
+before it is read to its end.
 """
 
 from __future__ import annotations
@@ -62,7 +65,9 @@ class FileScans(Closing):
         try:
             self._input = FileInput(source, sensor, opened, backend="auto")
             if bookmark is None:
-                self._reader = PacketReader(sensor, None, self._input.decoder, self._input.first_frames())
+                self._reader = PacketReader(
+                    sensor, None, self._input.decoder, self._input.first_frames()
+                )
                 self._stream = self._scan_stream()
             else:
                 self._go_on(bookmark)
@@ -86,7 +91,8 @@ class FileScans(Closing):
         yield from self._stream.finish()
 
     def survey(self, size: int) -> tuple[int, bytes | None]:
-        """How many scans begin in the next piece of the file, and a bookmark behind it; None where the file ends, or none can be set.
+        """How many scans begin in the next piece of the file, and a bookmark behind it; None where
+        the file ends, or none can be set.
 
         Args:
             size: bytes of the piece, at least.
@@ -122,7 +128,9 @@ class FileScans(Closing):
         return self._input.decoder.stats.bytes_in if reader is None else reader.place
 
     def _bookmark(self) -> bytes | None:
-        """What has to be known to go on from here; None where that cannot be said, or the file not be sought."""
+        """What has to be known to go on from here; None where that cannot be said, or the file not
+        be sought.
+        """
         opened = self._transport
         if not isinstance(opened, FileTransport) or not opened.can_go_on:
             return None
@@ -138,7 +146,9 @@ class FileScans(Closing):
     def _go_on(self, bookmark: bytes) -> None:
         opened = self._transport
         assert isinstance(opened, FileTransport)
-        loaded = _Loader(io.BytesIO(bookmark), self._sensor, self._input.decoder, opened.file).load()
+        loaded = _Loader(
+            io.BytesIO(bookmark), self._sensor, self._input.decoder, opened.file
+        ).load()
         self._input.decoder, self._input.senders, reader, self._reader, self._stream = loaded
         if isinstance(opened, CaptureTransport):
             opened.reader = reader
@@ -150,11 +160,16 @@ def _constants(sensor: Spec, decoder: Decoder) -> dict[tuple[Any, ...], Any]:
     """What no byte changes, by name: all that a sensor holds, and what is made of it alone."""
     found, interpreted = dict[tuple[Any, ...], Any](), decoder.backend == "construct"
     _walk(sensor, (), found, set())
-    codecs = {("codec", name): codec(frame, interpreted=interpreted) for name, frame in sensor.frames.items()}
+    codecs = {
+        ("codec", name): codec(frame, interpreted=interpreted)
+        for name, frame in sensor.frames.items()
+    }
     return {**found, **codecs, ("framing",): decoder.framing}
 
 
-def _walk(value: Any, name: tuple[Any, ...], found: dict[tuple[Any, ...], Any], seen: set[int]) -> None:
+def _walk(
+    value: Any, name: tuple[Any, ...], found: dict[tuple[Any, ...], Any], seen: set[int]
+) -> None:
     """Add a value and all that it holds to what was found, each under the names that lead there."""
     if isinstance(value, _PLAIN) or id(value) in seen:
         return
@@ -177,22 +192,34 @@ class _Writer(pickle.Pickler):
     def __init__(self, file: io.BytesIO, sensor: Sensor, decoder: Decoder, source: Any) -> None:
         super().__init__(file, protocol=pickle.HIGHEST_PROTOCOL)
         self._constants = _constants(sensor, decoder)
-        self._names = {id(value): name for name, value in self._constants.items()} | {id(source): ("file",)}
+        self._names = {id(value): name for name, value in self._constants.items()} | {
+            id(source): ("file",)
+        }
         self._frames = {id(codec(frame).schema): name for name, frame in sensor.frames.items()}
 
     def persistent_id(self, obj: Any) -> Any:
-        """The name of what is not pickled; of a sensor that reads its time from another clock, that of the clock."""
+        """The name of what is not pickled; of a sensor that reads its time from another clock, that
+        of the clock.
+        """
         name = self._names.get(id(obj))
         if name is None and isinstance(obj, Spec):
             return ("clock", self._names[id(obj.clock)])
         return name
 
     def reducer_override(self, obj: Any) -> Any:
-        """Tables as the bytes of their frames, and with packets no more of other frames than belongs to them."""
+        """Tables as the bytes of their frames, and with packets no more of other frames than
+        belongs to them.
+        """
         if isinstance(obj, Rows | Records):
             if id(obj.schema) not in self._frames:
-                raise pickle.PicklingError("parts of frames, whose layout is in what is around them")
-            return _table, (self._constants[()], self._frames[id(obj.schema)], [obj.frame(index) for index in range(len(obj))])
+                raise pickle.PicklingError(
+                    "parts of frames, whose layout is in what is around them"
+                )
+            return _table, (
+                self._constants[()],
+                self._frames[id(obj.schema)],
+                [obj.frame(index) for index in range(len(obj))],
+            )
         if isinstance(obj, Packets):
             if AROUND in obj.state:
                 raise pickle.PicklingError("parts of frames")
@@ -216,11 +243,15 @@ class _Loader(pickle.Unpickler):
 
 def _table(sensor: Sensor, frame: str, frames: list[bytes]) -> Table:
     known = codec(sensor.frames[frame])
-    return (known.engine if isinstance(known, RecodedCodec) else known).table(frames)  # of which they are the rows
+    return (known.engine if isinstance(known, RecodedCodec) else known).table(
+        frames
+    )  # of which they are the rows
 
 
 def _of_these(table: Table | None, which: Any) -> StateOf:
-    """The frames of another type that some packets have before them, and which: none that is nobody's."""
+    """The frames of another type that some packets have before them, and which: none that is
+    nobody's.
+    """
     rows = np.unique(which[which >= 0])
     if table is None or not len(rows):
         return None, which

@@ -1,4 +1,6 @@
-"""Frames of a file that apply from its start: the first ones with state for points, and the first reference of the clock."""
+"""Frames of a file that apply from its start: the first ones with state for points, and the first
+reference of the clock.
+"""
 
 from __future__ import annotations
 
@@ -13,7 +15,8 @@ from lidarspec.framing.results import Frames
 from lidarspec.packets.clocks import ClockReference, told_seconds
 from lidarspec.spec.description import Spec
 
-#: bytes of a file without any frame that could tell the turn of the clock; then no such frame is expected.
+#: bytes of a file without any frame that could tell the turn of the clock; then no such frame is
+#: expected.
 REFERENCE_SEARCH_BYTES = 64 << 20
 
 
@@ -60,14 +63,18 @@ def find_first_frames(sensor: Spec, batches: Iterable[list[Frames]]) -> FirstFra
                 has_teller = has_teller or len(rows) > 0
                 if first.reference is None and len(rows):
                     first.reference = _find_reference(sensor, teller, frames, rows)
-        if teller and (first.reference is not None or (not has_teller and seen_bytes > REFERENCE_SEARCH_BYTES)):
+        if teller and (
+            first.reference is not None or (not has_teller and seen_bytes > REFERENCE_SEARCH_BYTES)
+        ):
             teller = ""
         if not missing and not teller:
             break
     return first
 
 
-def _find_reference(sensor: Spec, name: str, frames: Frames, rows: NDArray[np.intp]) -> ClockReference | None:
+def _find_reference(
+    sensor: Spec, name: str, frames: Frames, rows: NDArray[np.intp]
+) -> ClockReference | None:
     """Return the first of some frames that tells the turn of the clock."""
     assert sensor.clock is not None
     table = codec(sensor.frames[name]).table([frames.data(int(row)) for row in rows])

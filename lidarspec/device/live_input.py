@@ -1,9 +1,11 @@
-"""Frames as they come: what the capture threads queue, decoded every few milliseconds in the consumer's thread.
+"""Frames as they come: what the capture threads queue, decoded every few milliseconds in the
+consumer's thread.
 
-`next` takes what has arrived, decodes it in one go and hands it on; while it waits it also drives the `Session`: sends what is
-to be sent, gives it the frames that may be answers, and lets it know the time. Whoever calls it has the decoders for himself;
-`send` from another thread waits for its answer while they do the work. `Watch` says how the source is doing: data, silence, bytes that
-are no frames, a device that went away; and what to type next.
+`next` takes what has arrived, decodes it in one go and hands it on; while it waits it also drives
+the `Session`: sends what is to be sent, gives it the frames that may be answers, and lets it know
+the time. Whoever calls it has the decoders for himself; `send` from another thread waits for its
+answer while they do the work. `Watch` says how the source is doing: data, silence, bytes that are
+no frames, a device that went away; and what to type next.
 """
 
 from __future__ import annotations
@@ -21,7 +23,15 @@ from lidarspec.device.arrivals import Arrival, Input, answers, fed
 from lidarspec.device.capture_thread import BoundedQueue, Capture, Event, Mark
 from lidarspec.device.senders import Kept, frame_senders
 from lidarspec.device.session import Outgoing, Pending, Reply, Session, learned
-from lidarspec.errors import CommandError, LidarSpecError, ReplyTimeout, SourceError, UsageError, refuse_text, suggest
+from lidarspec.errors import (
+    CommandError,
+    LidarSpecError,
+    ReplyTimeout,
+    SourceError,
+    UsageError,
+    refuse_text,
+    suggest,
+)
 from lidarspec.framing.decoder import Decoder, backend as backend_named
 from lidarspec.framing.results import Counters, Frames
 from lidarspec.recording.appending import Log
@@ -36,7 +46,8 @@ from lidarspec.transports.protocol import Chunk, LiveTransport, Sender, endpoint
 PATIENCE = 0.9
 #: seconds after which a source is silent; a computer that stalls for a second is no reason.
 SILENT_AFTER_S = 3.0
-#: seconds between two decodings of what has come, and the longest that a wait goes on before others have their turn.
+#: seconds between two decodings of what has come, and the longest that a wait goes on before others
+#: have their turn.
 PERIOD, TURN = 0.02, 0.05
 #: chunks decoded together.
 TOGETHER = 4096
@@ -53,8 +64,22 @@ class Watch:
         streams: whether a data frame has come, ever.
     """
 
-    def __init__(self, source: str | Path, sensor: Sensor, opened: LiveTransport, capture: Capture, decoder: Decoder, kept: Kept) -> None:
-        self._source, self._sensor, self._transport, self._capture, self._decoder = source, sensor, opened, capture, decoder
+    def __init__(
+        self,
+        source: str | Path,
+        sensor: Sensor,
+        opened: LiveTransport,
+        capture: Capture,
+        decoder: Decoder,
+        kept: Kept,
+    ) -> None:
+        self._source, self._sensor, self._transport, self._capture, self._decoder = (
+            source,
+            sensor,
+            opened,
+            capture,
+            decoder,
+        )
         self._kept = kept
         self._framed, self._bytes = time.monotonic(), 0
         self._unframed_since: float | None = None
@@ -68,26 +93,43 @@ class Watch:
     def saw(self, found: Sequence[Frames]) -> None:
         """Take note of what was decoded."""
         if any(map(len, found)):
-            self._framed, self._bytes, self._unframed_since = time.monotonic(), self._decoder.stats.bytes_in, None
+            self._framed, self._bytes, self._unframed_since = (
+                time.monotonic(),
+                self._decoder.stats.bytes_in,
+                None,
+            )
             if not self.streams:
-                self.streams = any(frame.data and name in self._decoder.stats.frames for name, frame in self._sensor.frames.items())
+                self.streams = any(
+                    frame.data and name in self._decoder.stats.frames
+                    for name, frame in self._sensor.frames.items()
+                )
         elif self._unframed_since is None and self._decoder.stats.bytes_in > self._bytes:
             self._unframed_since = time.monotonic()
 
     @property
     def silent_for(self) -> float:
         """Seconds since something last arrived from the sensor."""
-        return time.monotonic() - min(self._capture.last, self._strangers_since or self._capture.last)
+        return time.monotonic() - min(
+            self._capture.last, self._strangers_since or self._capture.last
+        )
 
     @property
     def state(self) -> str:
-        """One of "disconnected", "silent", "no frames", "waiting" (for the first frame) and "streaming"."""
+        """One of "disconnected", "silent", "no frames", "waiting" (for the first frame) and
+        "streaming".
+        """
         if not self._capture.connected:
             return "disconnected"
         if self.silent_for > SILENT_AFTER_S:
             return "silent"
-        longest = max((frame.max_length * frame.confirm for frame in self._sensor.frames.values()), default=0)
-        if self._unframed_since is not None and time.monotonic() - self._unframed_since > PATIENCE and self._unframed > longest:
+        longest = max(
+            (frame.max_length * frame.confirm for frame in self._sensor.frames.values()), default=0
+        )
+        if (
+            self._unframed_since is not None
+            and time.monotonic() - self._unframed_since > PATIENCE
+            and self._unframed > longest
+        ):
             return "no frames"
         return "streaming" if self._decoder.stats.frames else "waiting"
 
@@ -97,15 +139,24 @@ class Watch:
         baud = f": {self._transport.baud} baud is likely wrong" if self._transport.baud else ""
         text = {
             "disconnected": f"{self._source}: the device is gone; waiting for it to come back",
-            "silent": f"{self._source}: nothing has arrived{self._from_others} for {self.silent_for:.1f} s",
-            "no frames": f"{self._source}: {self._unframed} bytes, and no frame of {self._sensor.id} among them{baud}",
+            "silent": (
+                f"{self._source}: nothing has arrived{self._from_others} for"
+                f" {self.silent_for:.1f} s"
+            ),
+            "no frames": (
+                f"{self._source}: {self._unframed} bytes, and no frame of {self._sensor.id} among"
+                f" them{baud}"
+            ),
         }.get(self.state)
         return [f"{text}; next: {self.following()}"] if text else []
 
     def following(self) -> str:
         """The command that finds out more."""
         if self._stranger is not None and self.state == "silent":
-            return f"the same with {quote(with_option(self._source, 'src', endpoint(self._stranger)))} to read that one"
+            return (
+                f"the same with {quote(with_option(self._source, 'src', endpoint(self._stranger)))}"
+                " to read that one"
+            )
         if self._decoder.stats.bytes_in and not self._decoder.stats.frames:
             return f"lidarspec detect {quote(str(self._source).partition('?')[0])}"
         return f"lidarspec doctor {quote(str(self._source))} -s {self._sensor.id}"
@@ -124,7 +175,10 @@ class Watch:
         """What else has come, in words."""
         if self._stranger is None:
             return ""
-        return f" from the sensor, and {self.foreign} datagrams from others, such as {endpoint(self._stranger)},"
+        return (
+            f" from the sensor, and {self.foreign} datagrams from others, such as"
+            f" {endpoint(self._stranger)},"
+        )
 
     @property
     def _unframed(self) -> int:
@@ -137,8 +191,10 @@ class LiveInput(Input):
     Args:
         source, sensor, opened: the open transport of the data link, and whose.
         policy: of the queue, "drop_oldest" or "block".
-        record: makes what gets everything that arrives and is sent, before the queue, of the sensor as it is read.
-        learns: whether `begin` is to be called, in which the sensor may say how it is read: nothing counts before that.
+        record: makes what gets everything that arrives and is sent, before the queue, of the sensor
+            as it is read.
+        learns: whether `begin` is to be called, in which the sensor may say how it is read: nothing
+            counts before that.
         period: seconds between two decodings.
     """
 
@@ -157,11 +213,17 @@ class LiveInput(Input):
         period: float = PERIOD,
     ) -> None:
         self._source, self.sensor, self._record, self._period = source, sensor, record, period
-        self._teachers = [name for name in sensor.on_open if sensor.commands[name].learns is not None] if learns else []
+        self._teachers = (
+            [name for name in sensor.on_open if sensor.commands[name].learns is not None]
+            if learns
+            else []
+        )
         self._recorder = None if self._teachers else record(sensor)
         self.learned: dict[str, Any] = {}
         chosen = backend_named(backend)
-        self._backend = "numpy" if chosen == "auto" else chosen  # none by itself that stops to compile: nothing would be decoded meanwhile
+        self._backend = (
+            "numpy" if chosen == "auto" else chosen
+        )  # none by itself that stops to compile: nothing would be decoded meanwhile
         self.queue, self._session = BoundedQueue(policy), Session(sensor)
         self.decoder: Decoder = sensor.decoder(stream=not opened.datagrams, backend=self._backend)
         self._decoders, self._captures = {"data": self.decoder}, {}
@@ -175,7 +237,9 @@ class LiveInput(Input):
         self._said: list[str] = []
         self._captures["data"] = Capture(opened, self.queue, log=self._recorder)
         self._checked, self._silent = list[Pending](), list[CommandError]()
-        self._watch = Watch(source, sensor, opened, self._captures["data"], self.decoder, self._kept)
+        self._watch = Watch(
+            source, sensor, opened, self._captures["data"], self.decoder, self._kept
+        )
 
     @property
     def ended(self) -> bool:
@@ -189,11 +253,20 @@ class LiveInput(Input):
 
     @property
     def warnings(self) -> list[str]:
-        said = [warning for capture in self._captures.values() for warning in (*capture.transport.warnings, *capture.warnings)]
-        said += [warning for kept in (self._kept, *self._answering.values()) for warning in kept.warnings] + self._said
+        said = [
+            warning
+            for capture in self._captures.values()
+            for warning in (*capture.transport.warnings, *capture.warnings)
+        ]
+        said += [
+            warning for kept in (self._kept, *self._answering.values()) for warning in kept.warnings
+        ] + self._said
         if self._recorder is not None and self._recorder.error is not None:
             said.append(f"the recording has stopped: {self._recorder.error}")
-        silent = [f"{self._source}: {error}; it is started again" for error in list(self._session.unanswered.values())]
+        silent = [
+            f"{self._source}: {error}; it is started again"
+            for error in list(self._session.unanswered.values())
+        ]
         return said if self._closed else said + silent + self._watch.warnings
 
     @property
@@ -201,7 +274,9 @@ class LiveInput(Input):
         stats, captures = self.decoder.stats, list(self._captures.values())
         stats.kernel_drops = sum(capture.transport.kernel_drops for capture in captures)
         others = sum(kept.foreign for kept in self._answering.values())
-        stats.foreign = self._kept.foreign + others + sum(capture.transport.foreign for capture in captures)
+        stats.foreign = (
+            self._kept.foreign + others + sum(capture.transport.foreign for capture in captures)
+        )
         stats.disconnects = sum(capture.disconnects for capture in captures)
         stats.queue_dropped = self.queue.dropped
         return stats
@@ -216,8 +291,14 @@ class LiveInput(Input):
             try:
                 reply = self.send(name)
             except CommandError as error:
-                if name in self._teachers and self.sensor.data_frames and not self.sensor.commands[name].starts:
-                    self._said.append(f"{error}; it is read as it stands, without what it would say of itself")
+                if (
+                    name in self._teachers
+                    and self.sensor.data_frames
+                    and not self.sensor.commands[name].starts
+                ):
+                    self._said.append(
+                        f"{error}; it is read as it stands, without what it would say of itself"
+                    )
                 elif isinstance(error, ReplyTimeout) and self._watch.streams:
                     self._said.append(f"{error}; data come all the same")
                 else:
@@ -232,19 +313,24 @@ class LiveInput(Input):
         try:
             self.sensor = self.sensor.configure(**self.learned)
         except UsageError as error:
-            raise CommandError(f"{self.sensor.id}: what it says of itself cannot be: {error}") from error
+            raise CommandError(
+                f"{self.sensor.id}: what it says of itself cannot be: {error}"
+            ) from error
         with self._turn, self._talk:
             data = self._captures["data"]
             self._session.sensor = self.sensor
             self._kept.configured(self.sensor)
             self._decoders = {
-                link: self.sensor.decoder(stream=decoder.stream, backend=self._backend) for link, decoder in self._decoders.items()
+                link: self.sensor.decoder(stream=decoder.stream, backend=self._backend)
+                for link, decoder in self._decoders.items()
             }
             self.decoder = self._decoders["data"]
             self._recorder = self._record(self.sensor)
             data.record(self._recorder)
             self._ready.clear()
-            self._watch = Watch(self._source, self.sensor, data.transport, data, self.decoder, self._kept)
+            self._watch = Watch(
+                self._source, self.sensor, data.transport, data, self.decoder, self._kept
+            )
 
     def next(self, wait: float) -> Arrival | None:
         deadline = time.monotonic() + wait
@@ -276,7 +362,10 @@ class LiveInput(Input):
     def send(self, name: str, /, *, timeout: float | None = None, **arguments: Any) -> Reply:
         if name in self.sensor.commands:
             command = self.sensor.commands[name]
-            self._await_sender(command.link, command.timeout * (1 + command.retries) if timeout is None else timeout)
+            self._await_sender(
+                command.link,
+                command.timeout * (1 + command.retries) if timeout is None else timeout,
+            )
         with self._talk:
             self._find_own_address(name)
             pending = self._session.request(name, self._clock.now(), timeout=timeout, **arguments)
@@ -289,22 +378,30 @@ class LiveInput(Input):
             return pending.result()
         except CommandError as error:
             link = self.sensor.commands[name].link
-            # The warnings of HTTP are about this request; those of a stream explain no more than silence.
-            is_explained = isinstance(error, ReplyTimeout) or isinstance(self.sensor.links[link], Http)
+            # The warnings of HTTP are about this request; those of a stream explain no more than
+            # silence.
+            is_explained = isinstance(error, ReplyTimeout) or isinstance(
+                self.sensor.links[link], Http
+            )
             remarks = self._captures[link].transport.warnings if is_explained else []
             raise type(error)("; ".join([str(error), *remarks])) from None
 
     def _find_own_address(self, name: str) -> None:
         """Let the session know where we are, as the sensor sees it, where a command says that."""
         command = self.sensor.commands.get(name)
-        if command is not None and any(isinstance(value, Address) for value in command.filled.values()):
+        if command is not None and any(
+            isinstance(value, Address) for value in command.filled.values()
+        ):
             peer = self._opened(command.link).peer()
             self._session.host = own_address(peer) if peer else None
 
     def write(self, data: bytes, link: str = "data") -> None:
         refuse_text(data)
         if link not in self.sensor.links:
-            raise UsageError(f"{self.sensor.id} has no link {link!r}; its links are {', '.join(self.sensor.links)}")
+            raise UsageError(
+                f"{self.sensor.id} has no link {link!r}; its links are"
+                f" {', '.join(self.sensor.links)}"
+            )
         if self._closed:
             raise SourceError(f"{self._source}: the device is closed")
         self._await_sender(link, PATIENCE)
@@ -314,7 +411,12 @@ class LiveInput(Input):
     def _await_sender(self, link: str, seconds: float) -> None:
         """Wait for a first datagram where it alone says where the sensor is."""
         data = self._captures["data"].transport
-        is_known = link in self._captures or self._host() or has_control(self._source) or _is_broadcast(self.sensor.links.get(link))
+        is_known = (
+            link in self._captures
+            or self._host()
+            or has_control(self._source)
+            or _is_broadcast(self.sensor.links.get(link))
+        )
         if link != "data" and is_known:
             return
         limit = time.monotonic() + seconds
@@ -336,9 +438,17 @@ class LiveInput(Input):
         """Send the commands for the end, as far as the device still listens."""
         if self.stays_on:
             return
-        if self._failure is not None or not self._captures["data"].connected or not (self._stops or self._session.started):
+        if (
+            self._failure is not None
+            or not self._captures["data"].connected
+            or not (self._stops or self._session.started)
+        ):
             return
-        stopping = [name for name, command in self.sensor.commands.items() if command.stops and not command.args][:1]
+        stopping = [
+            name
+            for name, command in self.sensor.commands.items()
+            if command.stops and not command.args
+        ][:1]
         with self._talk:
             self._session.abandon("the device is being closed")
             names = self.sensor.on_close or stopping
@@ -367,7 +477,8 @@ class LiveInput(Input):
     def _pump(self, wait: float) -> None:
         """Take what has arrived within `wait` seconds, decode it, and let the session know.
 
-        Nothing is given up before that is looked at; where this comes late, on a busy computer, those who read were held up as well.
+        Nothing is given up before that is looked at; where this comes late, on a busy computer,
+        those who read were held up as well.
         """
         with self._talk:
             deadline = self._session.deadline
@@ -384,9 +495,9 @@ class LiveInput(Input):
         if self._checked:
             self._compare()
         elif (silent := list(self._session.unanswered.values())) and silent != self._silent:
-            self._silent = (
-                silent  # for each beat that is not answered once: the sensor may have started anew, and have forgotten everything
-            )
+            # for each beat that is not answered once: the sensor may have started anew, and have
+            # forgotten everything
+            self._silent = silent
             self._start_again()
 
     def _take(self, link: str, run: list[Chunk] | Mark | BaseException) -> None:
@@ -397,11 +508,17 @@ class LiveInput(Input):
             self._hand_on(link, self._decoders[link].rest(), interrupted=run is Mark.LOST)
             if run is Mark.LOST:
                 with self._talk:
-                    self._session.abandon("the connection was lost", None if link == "data" else link)
+                    self._session.abandon(
+                        "the connection was lost", None if link == "data" else link
+                    )
             elif run is Mark.BACK:
                 self._start_again()
         elif self._failure is None and not self._closed:
-            self._failure = run if isinstance(run, SourceError) else SourceError(f"{self._source}: nothing is read any more: {run}")
+            self._failure = (
+                run
+                if isinstance(run, SourceError)
+                else SourceError(f"{self._source}: nothing is read any more: {run}")
+            )
             self._failure.__cause__ = None if run is self._failure else run
 
     def _decode(self, link: str, chunks: list[Chunk]) -> None:
@@ -416,13 +533,19 @@ class LiveInput(Input):
             return
         found = fed(decoder, chunks)
         if link == "data" and not decoder.stream:
-            found = [self._kept.of_ports(frame_senders(chunks, found[0], decoder.stats.bytes_in), found[0])]
+            found = [
+                self._kept.of_ports(
+                    frame_senders(chunks, found[0], decoder.stats.bytes_in), found[0]
+                )
+            ]
         if link == "data" and self._kept.address is not None:
             self._captures[link].transport.accept(self._kept.address)
         self._hand_on(link, found)
 
     def _of_the_sensor(self, chunks: list[Chunk]) -> list[Chunk]:
-        """What of it the sensor sent; where it turns out to be another one than was thought, that one's frames are no longer waited for."""
+        """What of it the sensor sent; where it turns out to be another one than was thought, that
+        one's frames are no longer waited for.
+        """
         mine = self._kept.ours(chunks)
         self._watch.heard(ours=bool(mine))
         if self._kept.has_changed:
@@ -440,7 +563,9 @@ class LiveInput(Input):
 
     def _host(self) -> str | None:
         """The address of the sensor, as far as it is known."""
-        answered = [kept.address[0] for kept in self._answering.values() if kept.address is not None]
+        answered = [
+            kept.address[0] for kept in self._answering.values() if kept.address is not None
+        ]
         return self._captures["data"].transport.peer() or next(iter(answered), None)
 
     def _hand_on(self, link: str, found: list[Frames], *, interrupted: bool = False) -> None:
@@ -465,13 +590,23 @@ class LiveInput(Input):
             self._speak()
 
     def _compare(self) -> None:
-        """Say it where the sensor that came back says something else of itself: it may be another one."""
-        done, self._checked = [one for one in self._checked if one.done], [one for one in self._checked if not one.done]
+        """Say it where the sensor that came back says something else of itself: it may be another
+        one.
+        """
+        done, self._checked = (
+            [one for one in self._checked if one.done],
+            [one for one in self._checked if not one.done],
+        )
         for pending in done:
             with contextlib.suppress(CommandError):
                 again = learned(self.sensor, pending.result())
-                others = [name for name, value in again.items() if self.learned.get(name, value) != value]
-                self._said += [f"{self._source}: the sensor that came back has another {name}: open it again" for name in others]
+                others = [
+                    name for name, value in again.items() if self.learned.get(name, value) != value
+                ]
+                self._said += [
+                    f"{self._source}: the sensor that came back has another {name}: open it again"
+                    for name in others
+                ]
 
     def _speak(self) -> None:
         """Send what the session wants to be sent."""
@@ -499,10 +634,14 @@ class LiveInput(Input):
         """The transport of a link; one apart from the data's is opened when it is first needed."""
         if link not in self._captures:
             data = self._captures["data"].transport
-            opened = data.link(link) or control_link(self._source, link, self.sensor.links[link], self._host())
+            opened = data.link(link) or control_link(
+                self._source, link, self.sensor.links[link], self._host()
+            )
             if _is_broadcast(self.sensor.links[link]):
                 self._answering[link] = Kept(self._source, self.sensor, datagrams=True)
-            self._decoders[link] = self.sensor.decoder(stream=not opened.datagrams, backend=self._backend)
+            self._decoders[link] = self.sensor.decoder(
+                stream=not opened.datagrams, backend=self._backend
+            )
             self._captures[link] = Capture(opened, self.queue, link=link)
         return self._captures[link].transport
 

@@ -1,8 +1,11 @@
-"""Whose datagrams a device is made of: those of one sensor, since the frames of two must not be mixed into one cloud.
+"""Whose datagrams a device is made of: those of one sensor, since the frames of two must not be
+mixed into one cloud.
 
-A sensor is an address: its data, calibration and answers come from there. The frames of one type come from one port of it, from another
-one only after a restart; two ports that take turns are two sensors. A file with frames of two is refused (`Senders`), since one can be
-chosen at leisure. Of a live source the first that sends data is kept (`Kept`): what others send is left out before it is decoded.
+A sensor is an address: its data, calibration and answers come from there. The frames of one type
+come from one port of it, from another one only after a restart; two ports that take turns are two
+sensors. A file with frames of two is refused (`Senders`), since one can be chosen at leisure. Of a
+live source the first that sends data is kept (`Kept`): what others send is left out before it is
+decoded.
 """
 
 from __future__ import annotations
@@ -50,7 +53,9 @@ class Senders:
                 raise self._several(other, sender)
 
     def _younger(self, name: str, sender: Sender) -> Sender | None:
-        """The port that frames of a type came from until now, where it took turns with this one; else None, and they come from this one."""
+        """The port that frames of a type came from until now, where it took turns with this one;
+        else None, and they come from this one.
+        """
         known, before = self._now.setdefault(name, sender), self._before.setdefault(name, {})
         if sender == known or sender in before:
             return None if sender == known else known
@@ -60,21 +65,28 @@ class Senders:
         return None
 
     def _several(self, first: Sender, other: Sender) -> UsageError:
-        one, two = (endpoint(sender) if first[0] == other[0] else sender[0] for sender in (first, other))
+        one, two = (
+            endpoint(sender) if first[0] == other[0] else sender[0] for sender in (first, other)
+        )
         chosen = with_option(self._source, "src", one)
-        error = UsageError(f"{self._source}: {one} and {two} both send frames of {self._sensor.id}; choose one with {chosen}")
+        error = UsageError(
+            f"{self._source}: {one} and {two} both send frames of {self._sensor.id}; choose one"
+            f" with {chosen}"
+        )
         return suggest(error, f"the same with {quote(chosen)}")
 
 
 class Kept(Senders):
-    """The sensor that is read of a live source: the first that sends data frames, and before that the first that sends any.
+    """The sensor that is read of a live source: the first that sends data frames, and before that
+    the first that sends any.
 
     Args:
         datagrams: whether each datagram is a whole frame, not a piece of a stream.
 
     Attributes:
         foreign: datagrams of others, so far; `stranger` sent the first of them.
-        has_changed: whether the last call of `ours` has found that it is another one than what was read before.
+        has_changed: whether the last call of `ours` has found that it is another one than what was
+            read before.
     """
 
     def __init__(self, source: str | Path, sensor: Sensor, *, datagrams: bool) -> None:
@@ -84,7 +96,9 @@ class Kept(Senders):
         self._is_sure, self._datagrams = False, datagrams
         self._first: Sender | None = None  # whose stream is read while nobody has sent a frame
         self._probes: dict[Sender, Decoder] = {}
-        self._strangers: dict[Sender, None] = {}  # other sensors' ports at the address of the sensor
+        self._strangers: dict[
+            Sender, None
+        ] = {}  # other sensors' ports at the address of the sensor
 
     @property
     def address(self) -> Sender | None:
@@ -105,11 +119,19 @@ class Kept(Senders):
         """Whom the device is made of, where others send as well."""
         if self.stranger is None or self._owner is None:
             return []
-        text = f"{self._source}: {endpoint(self._owner)} is read; {endpoint(self.stranger)} sends as well, and is left out"
-        return [f"{text}; next: the same with {quote(with_option(self._source, 'src', endpoint(self.stranger)))} to read that one"]
+        text = (
+            f"{self._source}: {endpoint(self._owner)} is read; {endpoint(self.stranger)} sends as"
+            " well, and is left out"
+        )
+        return [
+            f"{text}; next: the same with"
+            f" {quote(with_option(self._source, 'src', endpoint(self.stranger)))} to read that one"
+        ]
 
     def ours(self, chunks: Sequence[Chunk]) -> list[Chunk]:
-        """Those of these datagrams that the sensor sent; while nobody has sent a frame, all (of a stream the first sender's)."""
+        """Those of these datagrams that the sensor sent; while nobody has sent a frame, all (of a
+        stream the first sender's).
+        """
         mine: list[Chunk] = []
         self.has_changed = False
         for chunk in chunks:
@@ -128,7 +150,8 @@ class Kept(Senders):
         """Those of these frames, of the sensor's address, that come from its ports.
 
         Args:
-            sent: the type and the sender of each frame, or, where one sender sent them all, of each type.
+            sent: the type and the sender of each frame, or, where one sender sent them all, of each
+                type.
         """
         known = len(self._strangers)
         for name, sender in sent:
@@ -144,9 +167,15 @@ class Kept(Senders):
         return found.only(np.array(mine, np.bool_))
 
     def _replaces(self, sender: Sender, chunk: Chunk) -> bool:
-        """Look at what a sender sends while it is open who is the sensor; whether it takes the place of another."""
+        """Look at what a sender sends while it is open who is the sensor; whether it takes the
+        place of another.
+        """
         owner = self._owner
-        if self._is_sure and owner is not None and (self._datagrams or sender == owner or not self._is_near(sender, owner)):
+        if (
+            self._is_sure
+            and owner is not None
+            and (self._datagrams or sender == owner or not self._is_near(sender, owner))
+        ):
             return False
         names = self._names(sender, chunk)
         if self._is_sure:
@@ -177,7 +206,9 @@ class Kept(Senders):
         return {item.frame for item in decoder.feed(chunk.data)}
 
     def _take_turns(self, name: str, sender: Sender) -> Sender:
-        """The port that frames of a type come from: of those that take turns the one that was there first."""
+        """The port that frames of a type come from: of those that take turns the one that was there
+        first.
+        """
         younger = self._younger(name, sender)
         if younger is not None:
             self._strangers |= dict.fromkeys([*self._before[name], younger])
@@ -192,7 +223,8 @@ class Kept(Senders):
 
 
 def frame_senders(chunks: Sequence[Chunk], found: Frames, end: int) -> list[tuple[str, Sender]]:
-    """The type and the sender of each frame found in datagrams; where one sent them all, of each type; [] where senders are not known.
+    """The type and the sender of each frame found in datagrams; where one sent them all, of each
+    type; [] where senders are not known.
 
     Args:
         end: where these datagrams end in everything that was decoded.
@@ -201,8 +233,16 @@ def frame_senders(chunks: Sequence[Chunk], found: Frames, end: int) -> list[tupl
     if None in senders:
         return []
     if len(senders) == 1:
-        return [(found.names[kind], sender) for sender in senders if sender for kind in np.unique(found.kinds).tolist()]
+        return [
+            (found.names[kind], sender)
+            for sender in senders
+            if sender
+            for kind in np.unique(found.kinds).tolist()
+        ]
     ends = end - np.cumsum([len(chunk.data) for chunk in reversed(chunks)])[::-1]
     places = np.searchsorted(ends, found.offsets, side="right") - 1
     known = [chunk.sender for chunk in chunks if chunk.sender is not None]
-    return [(found.names[kind], known[place]) for kind, place in zip(found.kinds.tolist(), places.tolist(), strict=True)]
+    return [
+        (found.names[kind], known[place])
+        for kind, place in zip(found.kinds.tolist(), places.tolist(), strict=True)
+    ]

@@ -1,16 +1,19 @@
 """Commands and their replies, sans-IO: requests in, what to send out; frames in, replies out.
 
-All times are the caller's, in ns of one monotonic clock. On each link one request is under way at a time; the others wait in
-a queue, also while the device settles. The reply is looked for among all frames that arrive on the link, data or not.
+All times are the caller's, in ns of one monotonic clock. On each link one request is under way at a
+time; the others wait in a queue, also while the device settles. The reply is looked for among all
+frames that arrive on the link, data or not.
 
-A late answer is never taken for the next one's. A sending that was not answered in time is *owed* an answer, until twice the
-time that it may take has passed since. While one is owed that could be the reply to the next request as well (a type of frame
-in common, and no field in which the two have to differ), that request is held back; an owed answer that does come is counted
-in `late` and frees it. A frame that arrived before a request was sent is no answer to it. An answer that is later still can be
-told from the next one's only by what the command `matches` or `echoes`.
+A late answer is never taken for the next one's. A sending that was not answered in time is *owed*
+an answer, until twice the time that it may take has passed since. While one is owed that could be
+the reply to the next request as well (a type of frame in common, and no field in which the two have
+to differ), that request is held back; an owed answer that does come is counted in `late` and frees
+it. A frame that arrived before a request was sent is no answer to it. An answer that is later still
+can be told from the next one's only by what the command `matches` or `echoes`.
 
-A running number (`Count`) is filled in where a request is made, so that what is sent once more has the number that it had; `echoes` then
-tells its answer from every other. What a reply teaches is for the owner of the session, who configures the sensor.
+A running number (`Count`) is filled in where a request is made, so that what is sent once more has
+the number that it had; `echoes` then tells its answer from every other. What a reply teaches is for
+the owner of the session, who configures the sensor.
 """
 
 from __future__ import annotations
@@ -51,7 +54,8 @@ class Reply:
     Attributes:
         command: the name of the command.
         frame: the type of the frame that answered; None where no answer is documented.
-        values: its fields, raw wire integers as `Sensor.parse` gives them; ``reply["path"]`` is the physical value.
+        values: its fields, raw wire integers as `Sensor.parse` gives them; ``reply["path"]`` is the
+            physical value.
         confirmed: whether the device answered.
         at: when, in the session's clock; for one that is not confirmed, when the command was sent.
         data: the bytes of the frame.
@@ -73,15 +77,26 @@ class Reply:
         """
         value = found_at(self.values, path)
         if path not in self.fields or value is _MISSING:
-            raise UnknownField(path, self.fields, place=f"{self.command} {self.frame or 'without a reply'}")
+            raise UnknownField(
+                path, self.fields, place=f"{self.command} {self.frame or 'without a reply'}"
+            )
         return _physical(self.fields[path], value)
 
     def __repr__(self) -> str:
         if not self.confirmed:
             return f"Reply({self.command}, not confirmed)"
-        free = [info for info in self.fields.values() if info.const is None and found_at(self.values, info.path) is not _MISSING]
-        told = [f"{info.path} {self[info.path]}{' ' * bool(info.unit)}{info.unit}" for info in free[:SHOWN]]
-        return f"Reply({self.command}, {self.frame}: {', '.join(told)}{', ...' * (len(free) > SHOWN)})"
+        free = [
+            info
+            for info in self.fields.values()
+            if info.const is None and found_at(self.values, info.path) is not _MISSING
+        ]
+        told = [
+            f"{info.path} {self[info.path]}{' ' * bool(info.unit)}{info.unit}"
+            for info in free[:SHOWN]
+        ]
+        return (
+            f"Reply({self.command}, {self.frame}: {', '.join(told)}{', ...' * (len(free) > SHOWN)})"
+        )
 
 
 class Pending:
@@ -140,19 +155,29 @@ class Expected:
             return [f"a frame {frame}"]
         asked = {path: value for path, value in self.values.items() if path in self.tables[frame]}
         got = {path: found_at(values, path) for path in asked}
-        wrong = [(path, "missing" if got[path] is _MISSING else got[path]) for path in asked if got[path] != asked[path]]
+        wrong = [
+            (path, "missing" if got[path] is _MISSING else got[path])
+            for path in asked
+            if got[path] != asked[path]
+        ]
         return [f"{path} {there} instead of {asked[path]}" for path, there in wrong]
 
     def alike(self, other: Expected) -> bool:
         """Whether one frame could be the reply to both."""
         return any(
-            all(other.values.get(path, value) == value for path, value in self.values.items() if path in self.tables[frame])
+            all(
+                other.values.get(path, value) == value
+                for path, value in self.values.items()
+                if path in self.tables[frame]
+            )
             for frame in self.tables.keys() & other.tables.keys()
         )
 
 
 def found_at(values: Any, path: str) -> Any:
-    """The value at a path of a parsed frame, a list of them below an array without an index, or a mark that there is none."""
+    """The value at a path of a parsed frame, a list of them below an array without an index, or a
+    mark that there is none.
+    """
     for name in steps(path):
         if isinstance(name, int):
             values = values[name] if isinstance(values, list) and name < len(values) else _MISSING
@@ -222,7 +247,16 @@ class _Line:
         if self.current is not None or not self.queue:
             return None
         expected = self.queue[0].expected
-        return max([self.quiet, *(owed.until for owed in self.owed if expected is not None and owed.expected.alike(expected))])
+        return max(
+            [
+                self.quiet,
+                *(
+                    owed.until
+                    for owed in self.owed
+                    if expected is not None and owed.expected.alike(expected)
+                ),
+            ]
+        )
 
 
 @dataclass(eq=False)
@@ -237,8 +271,9 @@ class _Beat:
 class Session:
     """The commands of one sensor on its links.
 
-    Feed it every frame that arrives, those included that `Decoder.idle` finds when the line has fallen silent: a device that
-    stops in the middle of a frame answers in what looks like the rest of it.
+    Feed it every frame that arrives, those included that `Decoder.idle` finds when the line has
+    fallen silent: a device that stops in the middle of a frame answers in what looks like the rest
+    of it.
 
     Attributes:
         sensor: the sensor.
@@ -257,19 +292,27 @@ class Session:
         self._beats: dict[str, _Beat] = {}
         self._out: list[Outgoing] = []
 
-    def request(self, name: str, now: int, /, *, timeout: float | None = None, **arguments: Any) -> Pending:
+    def request(
+        self, name: str, now: int, /, *, timeout: float | None = None, **arguments: Any
+    ) -> Pending:
         """The promise of a command's reply; the command is sent as soon as its link is free.
 
         Args:
             name: of the command.
             now: the time in ns.
-            timeout: seconds to wait in all; by default the command's own for each time that it is sent.
+            timeout: seconds to wait in all; by default the command's own for each time that it is
+                sent.
             arguments: of the command, in units.
 
         Raises:
-            UnknownCommand, UnknownField, MissingField, OutOfRange: for what the sensor does not take; nothing is sent.
+            UnknownCommand, UnknownField, MissingField, OutOfRange: for what the sensor does not
+                take; nothing is sent.
         """
-        filled = {path: self._next(value) for path, value in self._filled(name).items() if path not in arguments}
+        filled = {
+            path: self._next(value)
+            for path, value in self._filled(name).items()
+            if path not in arguments
+        }
         data = self.sensor.command(name, **arguments, **filled)
         command = self.sensor.commands[name]
         tables = {reply: self._table(reply) for reply in command.replies}
@@ -278,7 +321,9 @@ class Session:
         wait = _ns(command.timeout) * (1 + command.retries) if timeout is None else _ns(timeout)
         pending = Pending(f"{self.sensor.id} {name}")
         expected = Expected(tables, values, command.refusal) if tables else None
-        self._lines.setdefault(command.link, _Line()).queue.append(_Request(name, command, data, expected, wait, pending))
+        self._lines.setdefault(command.link, _Line()).queue.append(
+            _Request(name, command, data, expected, wait, pending)
+        )
         if command.every:
             self._beats[name] = _Beat(arguments, now + _ns(command.every), pending)
         self._advance(command.link, now)
@@ -294,7 +339,9 @@ class Session:
         line = self._lines.get(link)
         if line is None:
             return frozenset()
-        expected = [owed.expected for owed in line.owed] + ([line.current.expected] if line.current and line.current.expected else [])
+        expected = [owed.expected for owed in line.owed] + (
+            [line.current.expected] if line.current and line.current.expected else []
+        )
         return frozenset(name for one in expected for name in (*one.tables, one.refusal) if name)
 
     def receive(self, found: Iterable[Found], now: int, *, link: str = "data") -> None:
@@ -320,7 +367,11 @@ class Session:
             current = line.current
             if current is not None and now >= current.gives_up:
                 self._give_up(line, current, _silence(self.sensor, current))
-            elif current is not None and current.next_sending is not None and now >= current.next_sending:
+            elif (
+                current is not None
+                and current.next_sending is not None
+                and now >= current.next_sending
+            ):
                 self._send(current, now)
             self._advance(link, now)
 
@@ -342,15 +393,23 @@ class Session:
         return any(line.current is not None or line.queue for line in self._lines.values())
 
     def abandon(self, reason: str, link: str | None = None) -> None:
-        """Give up every request and heartbeat, or those on one link, since it was lost or nobody waits; what was sent stays owed."""
-        for name in [name for name in self._beats if link in (None, self.sensor.commands[name].link)]:
+        """Give up every request and heartbeat, or those on one link, since it was lost or nobody
+        waits; what was sent stays owed.
+        """
+        for name in [
+            name for name in self._beats if link in (None, self.sensor.commands[name].link)
+        ]:
             del self._beats[name]
             self.unanswered.pop(name, None)
         for line in [line for name, line in self._lines.items() if link in (None, name)]:
             waiting = list(line.queue)
             line.queue.clear()
             if line.current is not None:
-                self._give_up(line, line.current, CommandError(f"{self.sensor.id} {line.current.name}: {reason}"))
+                self._give_up(
+                    line,
+                    line.current,
+                    CommandError(f"{self.sensor.id} {line.current.name}: {reason}"),
+                )
             for request in waiting:
                 request.pending.settle(CommandError(f"{self.sensor.id} {request.name}: {reason}"))
 
@@ -358,7 +417,9 @@ class Session:
         return self.sensor.commands[name].filled if name in self.sensor.commands else {}
 
     def _next(self, value: Filled) -> Any:
-        """A value that is found out now: our own address, or the next number, which all commands of the session share."""
+        """A value that is found out now: our own address, or the next number, which all commands of
+        the session share.
+        """
         if isinstance(value, Address):
             return self.host
         self._count += 1
@@ -392,9 +453,15 @@ class Session:
         current = line.current
         if self._is_refusal(line, item, values, now):
             return
-        differs = ["not asked for"] if current is None or current.expected is None else current.expected.differs(item.frame, values)
+        differs = (
+            ["not asked for"]
+            if current is None or current.expected is None
+            else current.expected.differs(item.frame, values)
+        )
         if current is not None and not differs and now >= current.sent[0]:
-            reply = Reply(current.name, item.frame, values, True, now, item.data, self._table(item.frame))
+            reply = Reply(
+                current.name, item.frame, values, True, now, item.data, self._table(item.frame)
+            )
             self._close(line, current, answers=1, since=now)
             current.pending.settle(reply)
             self.unanswered.pop(current.name, None)
@@ -404,22 +471,36 @@ class Session:
                 line.owed.remove(owed)
                 self.late += 1
                 return
-        if current is not None and current.expected is not None and item.frame in current.expected.tables and now >= current.sent[0]:
+        if (
+            current is not None
+            and current.expected is not None
+            and item.frame in current.expected.tables
+            and now >= current.sent[0]
+        ):
             current.wrong = f"{item.frame} with {', '.join(differs)}"
 
     def _is_refusal(self, line: _Line, item: Found, values: Any, now: int) -> bool:
-        """Whether a frame refuses the oldest request that waits or is owed an answer: it says of none which it means."""
+        """Whether a frame refuses the oldest request that waits or is owed an answer: it says of
+        none which it means.
+        """
         owed = next((owed for owed in line.owed if owed.expected.refusal == item.frame), None)
         current = line.current
         if owed is not None:
             line.owed.remove(owed)
             self.late += 1
-        elif current is not None and current.expected is not None and current.expected.refusal == item.frame and now >= current.sent[0]:
+        elif (
+            current is not None
+            and current.expected is not None
+            and current.expected.refusal == item.frame
+            and now >= current.sent[0]
+        ):
             self._close(line, current, answers=1, since=now)
             why = _reasons(self._table(item.frame), values) or repr(
                 Reply(current.name, item.frame, values, True, now, fields=self._table(item.frame))
             )
-            current.pending.settle(CommandError(f"{self.sensor.id} {current.name}: the sensor refuses it: {why}"))
+            current.pending.settle(
+                CommandError(f"{self.sensor.id} {current.name}: the sensor refuses it: {why}")
+            )
         else:
             return False
         return True
@@ -433,7 +514,9 @@ class Session:
         line.current = None
         line.quiet = since + _ns(request.command.settle)
         if request.expected is not None:
-            line.owed += [_Owed(request.expected, sent + request.patience) for sent in request.sent[answers:]]
+            line.owed += [
+                _Owed(request.expected, sent + request.patience) for sent in request.sent[answers:]
+            ]
 
 
 def learned(sensor: Sensor, reply: Reply) -> dict[str, Any]:
@@ -447,13 +530,23 @@ def learned(sensor: Sensor, reply: Reply) -> dict[str, Any]:
         return {}
     place = f"{sensor.id} {reply.command}"
     try:
-        told = {name: value.encode() if isinstance(value, str) else value for name, value in learns(reply.values).items()}
+        told = {
+            name: value.encode() if isinstance(value, str) else value
+            for name, value in learns(reply.values).items()
+        }
     except Exception as error:
-        raise CommandError(f"{place}: nothing can be learned from the reply: {type(error).__name__}: {error}") from error
+        raise CommandError(
+            f"{place}: nothing can be learned from the reply: {type(error).__name__}: {error}"
+        ) from error
     for name, value in told.items():
         if not isinstance(value, bytes | int | float):
-            raise CommandError(f"{place}: {name} is learned as a number, bytes or a text, not as {type(value).__name__}")
-    return {name: Learned(value) if isinstance(value, bytes) else value for name, value in told.items()}
+            raise CommandError(
+                f"{place}: {name} is learned as a number, bytes or a text, not as"
+                f" {type(value).__name__}"
+            )
+    return {
+        name: Learned(value) if isinstance(value, bytes) else value for name, value in told.items()
+    }
 
 
 def _reasons(fields: Mapping[str, FieldInfo], values: Any) -> str:
@@ -473,10 +566,16 @@ def _silence(sensor: Sensor, request: _Request) -> CommandError:
     if request.wrong:
         return CommandError(f"{place}: the device answered with {request.wrong}")
     often = f", sent {len(request.sent)} times" if len(request.sent) > 1 else ""
-    stop = next((name for name, command in sensor.commands.items() if command.stops), "stop") if request.command.only_stopped else ""
+    stop = (
+        next((name for name, command in sensor.commands.items() if command.stops), "stop")
+        if request.command.only_stopped
+        else ""
+    )
     hint = f"; it is answered only while the sensor is stopped: send {stop!r} first" if stop else ""
     waited = f"{request.timeout / SECOND:g} s{often}"
-    return ReplyTimeout(f"{place}: no {' or '.join(request.command.replies)} frame came within {waited}{hint}")
+    return ReplyTimeout(
+        f"{place}: no {' or '.join(request.command.replies)} frame came within {waited}{hint}"
+    )
 
 
 def _ns(seconds: float) -> int:

@@ -6,10 +6,11 @@
     mount = {x = 0.2, yaw_deg = 90, inverted = true}
     options = {calibration = "./angles.csv"}
 
-A name stands for its device wherever a SOURCE is asked for; ``./front`` is the file of that name. The file in the user's configuration
-directory comes first, and then the nearest one, in the working directory or above it, that belongs to the user: it adds names, and hides
-none. A project may come from anybody, so its file runs no Python and leads to no path outside its folder, unless the user has allowed
-that folder. A file with a mistake takes away its own devices, and no others.
+A name stands for its device wherever a SOURCE is asked for; ``./front`` is the file of that name.
+The file in the user's configuration directory comes first, and then the nearest one, in the working
+directory or above it, that belongs to the user: it adds names, and hides none. A project may come
+from anybody, so its file runs no Python and leads to no path outside its folder, unless the user
+has allowed that folder. A file with a mistake takes away its own devices, and no others.
 """
 
 from __future__ import annotations
@@ -31,7 +32,8 @@ from lidarspec.spec.sensor import Sensor
 from lidarspec.stores import is_stored
 from lidarspec.trust import FILE, beside, document, foreign, is_trusted, own_settings
 
-#: what can be a name: nothing that has a suffix, a scheme or a folder, and no port of a system that calls them by letters.
+#: what can be a name: nothing that has a suffix, a scheme or a folder, and no port of a system that
+#: calls them by letters.
 _NAME = re.compile(r"(?!(?i:com|lpt)\d+$)[A-Za-z][A-Za-z0-9_-]*")
 _KEYS = ("source", "sensor", "mount", "options")
 
@@ -73,7 +75,11 @@ class Named:
             return found
         place = f"{self.file}: [device.{self.name}]"
         try:
-            options = self.options if self.believed else found.configure.options_of_file(self.options, Path(self.file).parent)
+            options = (
+                self.options
+                if self.believed
+                else found.configure.options_of_file(self.options, Path(self.file).parent)
+            )
         except UsageError as error:
             raise self._asking(UsageError(f"{place}: {error}")) from None
         try:
@@ -90,13 +96,19 @@ class Named:
         if self.sensor is not None and names_file(self.sensor):
             reason = f"sensor {self.sensor!r} is Python, which would run"
         elif is_stored(self.source):
-            reason = f"source {self.source!r} is a URL, which would be contacted or lead outside {folder}"
+            reason = (
+                f"source {self.source!r} is a URL, which would be contacted or lead outside"
+                f" {folder}"
+            )
         elif os.path.isfile(file):
             try:
                 beside(folder, os.path.abspath(file))
             except UsageError:
                 reason = f"source {self.source!r} is a file outside {folder}"
-        error = UsageError(f"{self.file}: [device.{self.name}]: {reason}: that takes a folder that you have allowed")
+        error = UsageError(
+            f"{self.file}: [device.{self.name}]: {reason}: that takes a folder that you have"
+            " allowed"
+        )
         return self._asking(error) if reason else None
 
     def _asking(self, error: UsageError) -> UsageError:
@@ -108,8 +120,9 @@ def named(source: str | Path) -> Named | None:
     """The device of this name; None for every other SOURCE.
 
     Raises:
-        UsageError: for a device of a file with a mistake, which is named with table and key, or with something that only a folder may name
-            that the user has allowed; and for a word that is neither a name nor a file.
+        UsageError: for a device of a file with a mistake, which is named with table and key, or
+            with something that only a folder may name that the user has allowed; and for a word
+            that is neither a name nor a file.
         SourceError: for a settings file that cannot be read.
     """
     word = str(source)
@@ -121,7 +134,9 @@ def named(source: str | Path) -> Named | None:
             raise faults[0]
         if known:
             places = sorted({device.file for device in known.values()})
-            raise UsageError(f"{word!r} is no file, and no device of {', '.join(places)}{_closest(word, known)}")
+            raise UsageError(
+                f"{word!r} is no file, and no device of {', '.join(places)}{_closest(word, known)}"
+            )
     for fault in faults:
         warnings.warn(f"{fault}; its devices are left out", stacklevel=2)
     device = known.get(word)
@@ -130,7 +145,9 @@ def named(source: str | Path) -> Named | None:
     if refused := device.refused():
         raise refused
     if device.hidden:
-        warnings.warn(f"{word}: the device of {device.file}, not that of {device.hidden}", stacklevel=2)
+        warnings.warn(
+            f"{word}: the device of {device.file}, not that of {device.hidden}", stacklevel=2
+        )
     return device
 
 
@@ -155,7 +172,9 @@ def _known() -> tuple[dict[str, Named], list[LidarSpecError]]:
 
 
 def files() -> list[Path]:
-    """The settings files that count here: the user's own, then the nearest one of a project; others' are passed over, with a warning."""
+    """The settings files that count here: the user's own, then the nearest one of a project;
+    others' are passed over, with a warning.
+    """
     own, here = own_settings(), Path.cwd()
     found = [own] if os.path.isfile(own) else []
     for path in (folder / FILE for folder in (here, *here.parents)):
@@ -180,20 +199,35 @@ def read(path: Path) -> dict[str, Named]:
         raise UsageError(f"{path}: [owners] stands in your own settings alone, {own_settings()}")
     _check_keys(path, "", content, ["device", "owners"])
     tables = content.get("device", {})
-    if not isinstance(tables, dict) or not all(isinstance(table, dict) for table in tables.values()):
+    if not isinstance(tables, dict) or not all(
+        isinstance(table, dict) for table in tables.values()
+    ):
         raise UsageError(f"{path}: devices are tables of their own: [device.front]")
     believed = is_own or is_trusted(path.parent)
-    return {name: replace(_device(path, name, table), believed=believed) for name, table in tables.items()}
+    return {
+        name: replace(_device(path, name, table), believed=believed)
+        for name, table in tables.items()
+    }
 
 
 def _device(path: Path, name: str, table: Mapping[str, Any]) -> Named:
     place = f"[device.{name}]"
     if not _NAME.fullmatch(name):
-        raise UsageError(f"{path}: {place}: a name is a letter, then letters, digits, '-' and '_', and no port such as COM4")
+        raise UsageError(
+            f"{path}: {place}: a name is a letter, then letters, digits, '-' and '_', and no port"
+            " such as COM4"
+        )
     _check_keys(path, place, table, _KEYS)
     if "source" not in table:
-        raise UsageError(f'{path}: {place}: source is missing, such as source = "serial:///dev/ttyUSB0"')
-    for key, kind, told in (("source", str, "text"), ("sensor", str, "text"), ("mount", dict, "a table"), ("options", dict, "a table")):
+        raise UsageError(
+            f'{path}: {place}: source is missing, such as source = "serial:///dev/ttyUSB0"'
+        )
+    for key, kind, told in (
+        ("source", str, "text"),
+        ("sensor", str, "text"),
+        ("mount", dict, "a table"),
+        ("options", dict, "a table"),
+    ):
         if key in table and not isinstance(table[key], kind):
             raise UsageError(f"{path}: {place}: {key} is {told}, not {shown(table[key])}")
     options = {key: _beside(path, value) for key, value in table.get("options", {}).items()}
@@ -203,15 +237,24 @@ def _device(path: Path, name: str, table: Mapping[str, Any]) -> Named:
         raise UsageError(f"{path}: {place}: options are a sensor's: name the sensor as well")
     source = _beside(path, table["source"])
     if _NAME.fullmatch(source) and not os.path.exists(source):
-        raise UsageError(f"{path}: {place}: source {source!r} is a name again; a device names its port, address or file")
-    return Named(name, source, None if sensor is None else _beside(path, sensor), mount, options, str(path))
+        raise UsageError(
+            f"{path}: {place}: source {source!r} is a name again; a device names its port, address"
+            " or file"
+        )
+    return Named(
+        name, source, None if sensor is None else _beside(path, sensor), mount, options, str(path)
+    )
 
 
 def _mount(path: Path, place: str, given: Mapping[str, Any]) -> Mount:
     kinds = {f.name: type(f.default) for f in fields(Mount)}
     _check_keys(path, f"{place} mount", given, kinds)
     for key, value in given.items():
-        right = isinstance(value, bool) if kinds[key] is bool else isinstance(value, int | float) and not isinstance(value, bool)
+        right = (
+            isinstance(value, bool)
+            if kinds[key] is bool
+            else isinstance(value, int | float) and not isinstance(value, bool)
+        )
         if not right or value in (float("inf"), float("-inf")) or value != value:
             wanted = "true or false" if kinds[key] is bool else "a number"
             raise UsageError(f"{path}: {place}: mount.{key} is {wanted}, not {shown(value)}")
@@ -221,7 +264,10 @@ def _mount(path: Path, place: str, given: Mapping[str, Any]) -> Mount:
 def _check_keys(path: Path, place: str, given: Iterable[str], known: Iterable[str]) -> None:
     for key in given:
         if key not in known:
-            raise UsageError(f"{path}: {place + ': ' if place else ''}unknown {'key' if place else 'table'} {key!r}{_closest(key, known)}")
+            raise UsageError(
+                f"{path}: {place + ': ' if place else ''}unknown {'key' if place else 'table'}"
+                f" {key!r}{_closest(key, known)}"
+            )
 
 
 def _closest(word: str, known: Iterable[str]) -> str:
@@ -230,4 +276,8 @@ def _closest(word: str, known: Iterable[str]) -> str:
 
 def _beside(path: Path, value: Any) -> Any:
     """A path that begins with a dot as one from the file's folder; everything else as it is."""
-    return str(path.parent / value) if isinstance(value, str) and value.startswith(("./", "../")) else value
+    return (
+        str(path.parent / value)
+        if isinstance(value, str) and value.startswith(("./", "../"))
+        else value
+    )

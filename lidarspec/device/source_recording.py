@@ -1,8 +1,9 @@
-"""A source recorded as it comes: a live one until it is told to end, a file as fast as the disk takes it.
+"""A source recorded as it comes: a live one until it is told to end, a file as fast as the disk
+takes it.
 
-A live source whose sensor is known is a `Device`: it is started and stopped, and what arrives is decoded to be counted. Without a
-sensor a `Capture` reads it and nothing is sent. The recorder is made when the source is open, since only then it is known what it
-carries.
+A live source whose sensor is known is a `Device`: it is started and stopped, and what arrives is
+decoded to be counted. Without a sensor a `Capture` reads it and nothing is sent. The recorder is
+made when the source is open, since only then it is known what it carries.
 """
 
 from __future__ import annotations
@@ -36,26 +37,37 @@ TURN = 0.1
 _FIGURES = re.compile(r"[\d.]+")
 
 
-def recorder_like(opened: Transport, source: str, target: str, sensor: Spec | str | None, *, overwrite: bool) -> Appender:
-    """The recorder of a new file in the place of an open source: of a recording its sensor, source and baud rate are taken over.
+def recorder_like(
+    opened: Transport, source: str, target: str, sensor: Spec | str | None, *, overwrite: bool
+) -> Appender:
+    """The recorder of a new file in the place of an open source: of a recording its sensor, source
+    and baud rate are taken over.
 
     Raises:
         UnknownFormat, UsageError, SourceError: as `recorder`.
     """
-    header = opened.header if isinstance(opened, RecordingTransport) else Header(source=source, baud=opened.baud)
+    header = (
+        opened.header
+        if isinstance(opened, RecordingTransport)
+        else Header(source=source, baud=opened.baud)
+    )
     whose, link = sensor or header.sensor, opened.datagrams
-    return recorder(target, whose, header.source, datagrams=link, baud=header.baud, overwrite=overwrite)
+    return recorder(
+        target, whose, header.source, datagrams=link, baud=header.baud, overwrite=overwrite
+    )
 
 
 class TimedLog:
-    """A recorder that takes what arrives within some seconds of the first arrival, until it is ended. What is sent it always takes.
+    """A recorder that takes what arrives within some seconds of the first arrival, until it is
+    ended. What is sent it always takes.
 
     Args:
         recorder: what writes the file; closed with this one.
         seconds: the limit; None for none.
 
     Attributes:
-        first, last: arrival times of what was recorded first and last, ns; None before anything was.
+        first, last: arrival times of what was recorded first and last, ns; None before anything
+            was.
         is_over: whether it takes nothing that arrives any more.
     """
 
@@ -112,7 +124,8 @@ class SourceRecording:
         source: any SOURCE.
         target: an .lsr, .pcap, .pcapng or .bin file.
         sensor: whose bytes they are; without it they are recorded as they come.
-        seconds, count: when it ends: after a time, or so many data packets of the sensor, or datagrams; None: never.
+        seconds, count: when it ends: after a time, or so many data packets of the sensor, or
+            datagrams; None: never.
         start: whether the sensor is sent the commands for its start and end.
         overwrite: whether the file may exist.
         salvage: go on behind damaged places, where the source is a recording.
@@ -120,8 +133,10 @@ class SourceRecording:
     Attributes:
         recorder: the file, None before the source is open.
         device: what reads a live source, None where its sensor is not known.
-        packets: data packets of the sensor so far, or datagrams; in the end as many as are in the file.
-        elapsed: seconds since the source was open; in the end those between the first and the last arrival in the file.
+        packets: data packets of the sensor so far, or datagrams; in the end as many as are in the
+            file.
+        elapsed: seconds since the source was open; in the end those between the first and the last
+            arrival in the file.
     """
 
     def __init__(
@@ -136,7 +151,13 @@ class SourceRecording:
         overwrite: bool = False,
         salvage: bool = False,
     ) -> None:
-        self._source, self._target, self._sensor, self._seconds, self._count = source, target, sensor, seconds, count
+        self._source, self._target, self._sensor, self._seconds, self._count = (
+            source,
+            target,
+            sensor,
+            seconds,
+            count,
+        )
         self._start, self._overwrite, self._salvage = start, overwrite, salvage
         self.recorder: Appender | None = None
         self.device: Device | None = None
@@ -150,12 +171,20 @@ class SourceRecording:
             UsageError: for a file that exists, or cannot hold what the source gives.
             SourceError: where the source cannot be read, or the file not be written.
         """
-        return self._record_device(self._sensor) if self._sensor is not None and is_live(self._source) else self._record_bytes()
+        return (
+            self._record_device(self._sensor)
+            if self._sensor is not None and is_live(self._source)
+            else self._record_bytes()
+        )
 
     def _record_device(self, sensor: Sensor) -> Generator[str, None, None]:
-        """What a sensor sends is recorded by a thread; here it is decoded to be counted, whatever that fails at."""
+        """What a sensor sends is recorded by a thread; here it is decoded to be counted, whatever
+        that fails at.
+        """
         news, failures, known = list[str](), dict[str, None](), set[str]()
-        with Device(self._source, sensor, start=self._start, record=MadeFor(self._open_log)) as self.device:
+        with Device(
+            self._source, sensor, start=self._start, record=MadeFor(self._open_log)
+        ) as self.device:
             log = self._log
             assert log is not None
             try:
@@ -166,7 +195,10 @@ class SourceRecording:
                     except SourceError:
                         raise
                     except (Exception, SystemExit) as error:
-                        failures[f"{sensor.id}: decoding fails ({type(error).__name__}: {error}); the recording goes on"] = None
+                        failures[
+                            f"{sensor.id}: decoding fails ({type(error).__name__}: {error}); the"
+                            " recording goes on"
+                        ] = None
                         time.sleep(TURN)
                     told = {_FIGURES.sub("", text): text for text in [*news, *failures]}
                     yield "\n".join(text for what, text in told.items() if what not in known)
@@ -193,9 +225,20 @@ class SourceRecording:
             self.elapsed = log.seconds
 
     def _record_bytes(self) -> Generator[str, None, None]:
-        source = RecordingTransport(self._source, salvage=True) if self._salvage else transport(self._source, self._sensor)
-        with contextlib.closing(source), contextlib.closing(self._open_log(source, self._sensor)) as log:
-            yield from self._record_live(source, log) if isinstance(source, LiveTransport) else self._copy(source, log)
+        source = (
+            RecordingTransport(self._source, salvage=True)
+            if self._salvage
+            else transport(self._source, self._sensor)
+        )
+        with (
+            contextlib.closing(source),
+            contextlib.closing(self._open_log(source, self._sensor)) as log,
+        ):
+            yield from (
+                self._record_live(source, log)
+                if isinstance(source, LiveTransport)
+                else self._copy(source, log)
+            )
             yield from source.warnings
 
     def _record_live(self, source: LiveTransport, log: TimedLog) -> Generator[str, None, None]:
@@ -215,8 +258,12 @@ class SourceRecording:
                 self._count_queued(source, queue, log, 0.0)
             yield from capture.warnings
 
-    def _count_queued(self, source: LiveTransport, queue: BoundedQueue, log: TimedLog, wait: float) -> list[Mark]:
-        """Take what is in the queue, and count the datagrams that are in the file; return what happened to the line meanwhile."""
+    def _count_queued(
+        self, source: LiveTransport, queue: BoundedQueue, log: TimedLog, wait: float
+    ) -> list[Mark]:
+        """Take what is in the queue, and count the datagrams that are in the file; return what
+        happened to the line meanwhile.
+        """
         marks = list[Mark]()
         for _, item in queue.take(wait):
             if isinstance(item, BaseException):
@@ -244,19 +291,30 @@ class SourceRecording:
 
     def _open_log(self, source: Transport, sensor: Spec | str | None) -> TimedLog:
         """The recorder, now that the source is open, and the sensor known as it is read."""
-        counts = source.datagrams or (self._sensor is not None and isinstance(source, LiveTransport))
+        counts = source.datagrams or (
+            self._sensor is not None and isinstance(source, LiveTransport)
+        )
         if self._count is not None and not counts:
-            raise UsageError(f"-n counts packets, and {self._source} is a byte stream: name the sensor with -s, or give a time with -t")
-        self.recorder = recorder_like(source, self._source, self._target, sensor, overwrite=self._overwrite)
+            raise UsageError(
+                f"-n counts packets, and {self._source} is a byte stream: name the sensor with -s,"
+                " or give a time with -t"
+            )
+        self.recorder = recorder_like(
+            source, self._source, self._target, sensor, overwrite=self._overwrite
+        )
         self._log = TimedLog(self.recorder, self._seconds)
         self._began = time.monotonic()
         return self._log
 
     def _goes_on(self, log: TimedLog, *, timed: bool = True) -> bool:
-        """Whether it has neither taken its time nor got all that was asked for; raises what went wrong with the file."""
+        """Whether it has neither taken its time nor got all that was asked for; raises what went
+        wrong with the file.
+        """
         assert self.recorder is not None
         if self.recorder.error is not None:
             self.recorder.sync()
         self.elapsed = time.monotonic() - self._began
-        is_late = timed and self._seconds is not None and (log.is_over or self.elapsed >= self._seconds)
+        is_late = (
+            timed and self._seconds is not None and (log.is_over or self.elapsed >= self._seconds)
+        )
         return not is_late and (self._count is None or self.packets < self._count)

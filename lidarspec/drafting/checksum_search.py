@@ -1,7 +1,9 @@
-"""Which checksum is this: what a set of sample frames is sealed with, where it stands and what it covers.
+"""Which checksum is this: what a set of sample frames is sealed with, where it stands and what it
+covers.
 
-The plain checksums are tried one by one, the usual ones first: XOR, sums of bytes and words, their complements, words in groups, folded
-sums, split nibbles. CRCs are found without trying (`crc_search`), and looked for only where no plain one is beyond doubt.
+The plain checksums are tried one by one, the usual ones first: XOR, sums of bytes and words, their
+complements, words in groups, folded sums, split nibbles. CRCs are found without trying
+(`crc_search`), and looked for only where no plain one is beyond doubt.
 """
 
 from __future__ import annotations
@@ -13,7 +15,17 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lidarspec.drafting.crc_search import crc_matches
-from lidarspec.drafting.samples import Match, Place, Samples, Span, anywhere, best_first, doubt, enough, spans
+from lidarspec.drafting.samples import (
+    Match,
+    Place,
+    Samples,
+    Span,
+    anywhere,
+    best_first,
+    doubt,
+    enough,
+    spans,
+)
 from lidarspec.frames.row_checksums import batch
 from lidarspec.spec.checksums import ByteOrder, Bytes, Checksum, Fold15, Sum, Values, WordXor, Xor
 
@@ -31,7 +43,9 @@ _PADDED = {"little": "", "big": '.ljust(2, b"\\0")'}
 
 @dataclass(frozen=True)
 class WordSum(Checksum):
-    """The sum of two-byte words modulo 2**16, an odd last byte extended by zeros; with `carry`, carries are added back."""
+    """The sum of two-byte words modulo 2**16, an odd last byte extended by zeros; with `carry`,
+    carries are added back.
+    """
 
     words: ByteOrder = "little"
     carry: bool = False
@@ -41,11 +55,19 @@ class WordSum(Checksum):
         return int(self.batch(np.frombuffer(data, np.uint8).reshape(1, -1))[0])
 
     def describe(self) -> str:
-        return f"16-bit sum of {self.words}-endian words" + (" with carries added back" if self.carry else "")
+        return f"16-bit sum of {self.words}-endian words" + (
+            " with carries added back" if self.carry else ""
+        )
 
     def batch(self, rows: NDArray[np.uint8]) -> Values:
-        low, high = (rows[:, 0::2], rows[:, 1::2]) if self.words == "little" else (rows[:, 1::2], rows[:, 0::2])
-        total: NDArray[np.uint64] = low.sum(axis=1, dtype=np.uint64) + (high.sum(axis=1, dtype=np.uint64) << np.uint64(8))
+        low, high = (
+            (rows[:, 0::2], rows[:, 1::2])
+            if self.words == "little"
+            else (rows[:, 1::2], rows[:, 0::2])
+        )
+        total: NDArray[np.uint64] = low.sum(axis=1, dtype=np.uint64) + (
+            high.sum(axis=1, dtype=np.uint64) << np.uint64(8)
+        )
         for _ in range(2 if self.carry else 0):
             total = (total & np.uint64(0xFFFF)) + (total >> np.uint64(16))
         return total & np.uint64(0xFFFF)
@@ -53,7 +75,9 @@ class WordSum(Checksum):
 
 @dataclass(frozen=True)
 class Changed(Checksum):
-    """Another checksum with a constant on it: ``constant - it`` with `negative`, else ``constant + it``; for XORs ``constant ^ it``."""
+    """Another checksum with a constant on it: ``constant - it`` with `negative`, else ``constant +
+    it``; for XORs ``constant ^ it``.
+    """
 
     of: Checksum
     constant: int
@@ -83,15 +107,21 @@ class Changed(Checksum):
         constant = np.uint64(self.constant)
         if isinstance(self.of, Xor | WordXor):
             return values ^ constant
-        return ((constant - values) if self.negative else (constant + values)) & np.uint64(self._mask)
+        return ((constant - values) if self.negative else (constant + values)) & np.uint64(
+            self._mask
+        )
 
 
-def search(frames: Iterable[bytes], *, quick: bool = False, stands: Callable[[Place], bool] = anywhere) -> list[Match]:
+def search(
+    frames: Iterable[bytes], *, quick: bool = False, stands: Callable[[Place], bool] = anywhere
+) -> list[Match]:
     """The checksums that fit the frames, the plainest and best proven first; empty where none does.
 
     Args:
-        frames: whole frames, the more of them and the more different the better; some may be damaged, and lengths may differ.
-        quick: end after about a second: look for CRCs at the usual places only, and for those of long frames in the catalogue only.
+        frames: whole frames, the more of them and the more different the better; some may be
+            damaged, and lengths may differ.
+        quick: end after about a second: look for CRCs at the usual places only, and for those of
+            long frames in the catalogue only.
         stands: whether a checksum may stand at a place.
     """
     samples = Samples(frames)
@@ -132,7 +162,9 @@ def plain_matches(samples: Samples, stands: Callable[[Place], bool] = anywhere) 
                     tried += 1
                     for match in _fitting(samples, few, algorithm, place, span, tried):
                         sure = sure or match.sure
-                        certain = certain or (match.sure and not isinstance(match.algorithm, Xor | WordXor))
+                        certain = certain or (
+                            match.sure and not isinstance(match.algorithm, Xor | WordXor)
+                        )
                         yield match
             if certain:
                 return
@@ -141,8 +173,12 @@ def plain_matches(samples: Samples, stands: Callable[[Place], bool] = anywhere) 
     yield from _nibbles(samples)
 
 
-def _fitting(samples: Samples, few: Samples, algorithm: Checksum, place: Place, span: Span, tried: int) -> Iterator[Match]:
-    """An algorithm and its complements where they fit; a constant is fitted where there are frames to prove it."""
+def _fitting(
+    samples: Samples, few: Samples, algorithm: Checksum, place: Place, span: Span, tried: int
+) -> Iterator[Match]:
+    """An algorithm and its complements where they fit; a constant is fitted where there are frames
+    to prove it.
+    """
     computed = few.computed(algorithm, place, span)
     mask = np.uint64((1 << 8 * place.size) - 1)
     orders: tuple[ByteOrder, ...] = ("little", "big") if place.size > 1 else ("little",)
@@ -158,8 +194,13 @@ def _fitting(samples: Samples, few: Samples, algorithm: Checksum, place: Place, 
                 return
             found = [algorithm, Changed(algorithm, int(mask), negative=True)]
         else:
-            found = [_changed(algorithm, constant) for constant in _constant((there - computed) & mask)]
-            found += [Changed(algorithm, constant, negative=True) for constant in _constant((there + computed) & mask)]
+            found = [
+                _changed(algorithm, constant) for constant in _constant((there - computed) & mask)
+            ]
+            found += [
+                Changed(algorithm, constant, negative=True)
+                for constant in _constant((there + computed) & mask)
+            ]
         for one in found:
             constant = one.constant if isinstance(one, Changed) else 0
             fitted = int(constant not in (0, int(mask)))
@@ -167,11 +208,28 @@ def _fitting(samples: Samples, few: Samples, algorithm: Checksum, place: Place, 
             doubtful = doubt(one.width, there, fitted, tried)
             proven = enough(right, len(samples)) if not fitted else right >= CERTAIN * len(samples)
             if proven and doubtful > 0 and not (few.alone and fitted):
-                remarks: tuple[str, ...] = ("a constant is in it: fields left out of what it covers, or a start value",) if fitted else ()
+                remarks: tuple[str, ...] = (
+                    ("a constant is in it: fields left out of what it covers, or a start value",)
+                    if fitted
+                    else ()
+                )
                 varied = 0.0
                 if isinstance(algorithm, Xor | WordXor) and span == Span():
                     remarks, varied = (*remarks, ANYWHERE), samples.varied(place)
-                yield Match(one, place, span, order, right, len(samples), doubtful, pasted(one), remarks, "", bool(fitted), varied)
+                yield Match(
+                    one,
+                    place,
+                    span,
+                    order,
+                    right,
+                    len(samples),
+                    doubtful,
+                    pasted(one),
+                    remarks,
+                    "",
+                    bool(fitted),
+                    varied,
+                )
 
 
 def _changed(algorithm: Checksum, constant: int) -> Checksum:
@@ -195,7 +253,17 @@ def _nibbles(samples: Samples) -> Iterator[Match]:
             right = int((samples.computed(Xor(), place, span) == halves).sum())
             if enough(right, len(samples)) and doubt(8, halves, 0, 8) > 0:
                 remark = "its halves are the low nibbles of two bytes, low half first: name both in Checksummed(field=(...))"
-                yield Match(Xor(), place, span, "little", right, len(samples), doubt(8, halves, 0, 8), "Xor()", (remark,))
+                yield Match(
+                    Xor(),
+                    place,
+                    span,
+                    "little",
+                    right,
+                    len(samples),
+                    doubt(8, halves, 0, 8),
+                    "Xor()",
+                    (remark,),
+                )
 
 
 _WIDE: tuple[Checksum, ...] = (
@@ -213,7 +281,9 @@ def _class(algorithm: Checksum) -> str:
     if isinstance(base, Xor | WordXor):
         value = f"{pasted(base)}(data) ^ 0x{changed.constant:X}"
     elif isinstance(base, WordSum):
-        steps = [f'words = [int.from_bytes(data[i : i + 2]{_PADDED[base.words]}, "{base.words}") for i in range(0, len(data), 2)]']
+        steps = [
+            f'words = [int.from_bytes(data[i : i + 2]{_PADDED[base.words]}, "{base.words}") for i in range(0, len(data), 2)]'
+        ]
         value = "sum(words)"
         if base.carry:
             steps += ["total = sum(words)", *["total = (total & 0xFFFF) + (total >> 16)"] * 2]
@@ -222,7 +292,10 @@ def _class(algorithm: Checksum) -> str:
         value = "sum(data)"
     if not isinstance(base, Xor | WordXor) and (changed.constant or changed.negative):
         value = f"0x{changed.constant:X} {'-' if changed.negative else '+'} {value}"
-    body = "".join(f"        {line}\n" for line in (*steps, f"return ({value}) & 0x{(1 << changed.width) - 1:X}"))
+    body = "".join(
+        f"        {line}\n"
+        for line in (*steps, f"return ({value}) & 0x{(1 << changed.width) - 1:X}")
+    )
     return (
         f"class Check(Checksum):\n    width = {changed.width}\n\n    def __call__(self, data):\n{body}\n"
         f'    def describe(self):\n        return "{algorithm.describe()}"'

@@ -1,10 +1,13 @@
-"""The distribution of a new sensor: drafted from a capture of unknown frames, or with an invented sensor that has everything.
+"""The distribution of a new sensor: drafted from a capture of unknown frames, or with an invented
+sensor that has everything.
 
-What the frames can be told to consist of, as far as their bytes say it, is a `Draft`. The structure of a stream is looked for in its
-beginning and then held against all of it. Constant bytes in front are the sync; what rises steadily is no checksum, which rules out
-most of the places where an XOR fits as well. `drafted` is the text of a first spec out of that: each field with the evidence for it,
-and honest names for what nobody knows yet. The files come from the templates inside the package, where a line that ends in
-``#if serial`` or ``#if udp`` is for sensors with that link alone.
+What the frames can be told to consist of, as far as their bytes say it, is a `Draft`. The structure
+of a stream is looked for in its beginning and then held against all of it. Constant bytes in front
+are the sync; what rises steadily is no checksum, which rules out most of the places where an XOR
+fits as well. `drafted` is the text of a first spec out of that: each field with the evidence for
+it, and honest names for what nobody knows yet. The files come from the templates inside the
+package, where a line that ends in ``#if serial`` or ``#if udp`` is for sensors with that link
+alone.
 """
 
 from __future__ import annotations
@@ -24,12 +27,25 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lidarspec.drafting.checksum_search import search
-from lidarspec.drafting.periods import CIRCLES, FEW, FRONT, STEADY, Candidate, Length, candidates, follows, runs, structure, usual_bytes
+from lidarspec.drafting.periods import (
+    CIRCLES,
+    FEW,
+    FRONT,
+    STEADY,
+    Candidate,
+    Length,
+    candidates,
+    follows,
+    runs,
+    structure,
+    usual_bytes,
+)
 from lidarspec.drafting.samples import Match, Place, values
 from lidarspec.errors import UsageError, WireError, system_errors
 from lidarspec.spec.checksums import ByteOrder
 
-#: frames that a checksum is looked for with, longest sync, and the same where there are few frames: more may be chance.
+#: frames that a checksum is looked for with, longest sync, and the same where there are few frames:
+#: more may be chance.
 SOUGHT, SYNC, SHORT_SYNC, MANY = 256, 4, 2, 12
 #: fewest blocks, and the share of a frame that they fill.
 BLOCKS, FILLED = 3, 0.5
@@ -48,7 +64,8 @@ LINE = 140
 _CONDITION = re.compile(r"^(.*?) *#if (\w+)\n", re.MULTILINE)
 #: bytes of a constant that are told, and how many have to be constant together to be a field.
 TOLD, RUN = 8, 2
-#: unknown bytes in a row in which no constant ones are looked for: there the scene decides what changes.
+#: unknown bytes in a row in which no constant ones are looked for: there the scene decides what
+#: changes.
 LONG = 64
 #: doubt below which a checksum may be chance, as one in so many powers of two.
 WEAK = 12
@@ -62,7 +79,9 @@ FEW_BITS = 24
 
 @dataclass(frozen=True)
 class Blocks:
-    """Parts of a frame that begin alike: `count` of `size` bytes from `start` on, each beginning with `flag`."""
+    """Parts of a frame that begin alike: `count` of `size` bytes from `start` on, each beginning
+    with `flag`.
+    """
 
     start: int
     size: int
@@ -91,7 +110,8 @@ class Draft:
         blocks: parts of the frame that begin alike.
         seal: the checksum, None where none was found.
         others: what else fits as the checksum.
-        front: bytes that nearly all frames have at least, where a length counts bytes: as many are looked into.
+        front: bytes that nearly all frames have at least, where a length counts bytes: as many are
+            looked into.
     """
 
     datagrams: bool
@@ -114,7 +134,11 @@ class Draft:
     @property
     def tail(self) -> int:
         """Bytes of a checksum that stands at the end of frames of several lengths."""
-        return -self.seal.place.offset if self.size is None and self.seal is not None and self.seal.place.offset < 0 else 0
+        return (
+            -self.seal.place.offset
+            if self.size is None and self.seal is not None and self.seal.place.offset < 0
+            else 0
+        )
 
     @property
     def head(self) -> int:
@@ -126,7 +150,9 @@ class Draft:
     @property
     def rows(self) -> NDArray[np.uint8]:
         """The heads of all frames, shape (n, head)."""
-        return np.frombuffer(b"".join(frame[: self.head] for _, frame in self.frames), np.uint8).reshape(-1, self.head)
+        return np.frombuffer(
+            b"".join(frame[: self.head] for _, frame in self.frames), np.uint8
+        ).reshape(-1, self.head)
 
 
 def draft(chunks: Sequence[bytes], *, datagrams: bool) -> Draft:
@@ -140,12 +166,22 @@ def draft(chunks: Sequence[bytes], *, datagrams: bool) -> Draft:
     """
     found = structure(chunks, datagrams=datagrams)
     if found is None:
-        raise WireError("no frames of one kind can be seen in these bytes", data=b"".join(chunks[:1])[:16])
+        raise WireError(
+            "no frames of one kind can be seen in these bytes", data=b"".join(chunks[:1])[:16]
+        )
     parts = chunks if datagrams else [b"".join(chunks)]
     size = sum(map(len, chunks))
-    start = 0 if datagrams or found.period is None or size % found.period == 0 else max(parts[0].find(found.sync), 0)
+    start = (
+        0
+        if datagrams or found.period is None or size % found.period == 0
+        else max(parts[0].find(found.sync), 0)
+    )
     first = Draft(datagrams, b"", found.period, found.length, (), size)
-    first = _begun(first, parts, start) or _begun(first, parts, max(parts[0].find(found.sync), 0)) or replace(first, sync=found.sync)
+    first = (
+        _begun(first, parts, start)
+        or _begun(first, parts, max(parts[0].find(found.sync), 0))
+        or replace(first, sync=found.sync)
+    )
     known = _counted(replace(first, frames=tuple(_walk(first, parts))), parts[-1])
     known = _fronted(known, parts)
     known = replace(known, candidates=tuple(candidates(known.rows)))
@@ -155,11 +191,16 @@ def draft(chunks: Sequence[bytes], *, datagrams: bool) -> Draft:
 
 
 def _begun(first: Draft, parts: Sequence[bytes], start: int) -> Draft | None:
-    """The sync bytes of frames that are cut at equal distances, or have their length in them; None where they begin differently."""
+    """The sync bytes of frames that are cut at equal distances, or have their length in them; None
+    where they begin differently.
+    """
     if first.datagrams:
         frames = [part for part in parts if len(part) == first.size]
     elif first.size is not None:
-        frames = [parts[0][at : at + first.size] for at in range(start, len(parts[0]) - first.size + 1, first.size)]
+        frames = [
+            parts[0][at : at + first.size]
+            for at in range(start, len(parts[0]) - first.size + 1, first.size)
+        ]
     else:
         return None
     rows = np.frombuffer(b"".join(frames), np.uint8).reshape(len(frames), -1)
@@ -171,7 +212,9 @@ def _begun(first: Draft, parts: Sequence[bytes], start: int) -> Draft | None:
 
 
 def _walk(known: Draft, parts: Sequence[bytes]) -> Iterator[tuple[int, bytes]]:
-    """The frames that fit, leftmost first, with their places in the whole input; behind one that does not fit, one byte further."""
+    """The frames that fit, leftmost first, with their places in the whole input; behind one that
+    does not fit, one byte further.
+    """
     base = 0
     for part in parts:
         at = part.find(known.sync)
@@ -189,8 +232,17 @@ def _fits(known: Draft, part: bytes, at: int) -> int:
     """The length of the frame that begins here, 0 where none does."""
     size = known.size
     if size is None and known.length is not None:
-        size = known.length.of(part[at : at + known.length.end]) if at + known.length.end <= len(part) else 0
-    if not size or at + size > len(part) or (known.datagrams and (at or size != len(part))) or size < known.head + known.tail:
+        size = (
+            known.length.of(part[at : at + known.length.end])
+            if at + known.length.end <= len(part)
+            else 0
+        )
+    if (
+        not size
+        or at + size > len(part)
+        or (known.datagrams and (at or size != len(part)))
+        or size < known.head + known.tail
+    ):
         return 0
     return size if known.seal is None or _sealed(known.seal, part[at : at + size]) else 0
 
@@ -203,16 +255,26 @@ def _sealed(seal: Match, frame: bytes) -> bool:
 
 
 def _counted(known: Draft, data: bytes) -> Draft:
-    """Frames of one length, unless what is left of one behind them says another number, where theirs tells their length."""
+    """Frames of one length, unless what is left of one behind them says another number, where
+    theirs tells their length.
+    """
     if known.size is None or known.datagrams or not known.frames:
         return known
     at, last = known.frames[-1]
     rest = data[at + len(last) :]
     for place in range(len(known.sync), HEADER):
         same = len({frame[: place + 1] for _, frame in known.frames}) == 1
-        if not same or len(rest) <= place or rest[:place] != last[:place] or rest[place] == last[place]:
+        if (
+            not same
+            or len(rest) <= place
+            or rest[:place] != last[:place]
+            or rest[place] == last[place]
+        ):
             continue
-        told = [Length(place, 1, "little", unit, known.size - unit * last[place]) for unit in range(SMALLEST, LARGEST + 1)]
+        told = [
+            Length(place, 1, "little", unit, known.size - unit * last[place])
+            for unit in range(SMALLEST, LARGEST + 1)
+        ]
         fitting = [length for length in told if length.rest > place and length.of(rest) > len(rest)]
         if fitting:
             return replace(known, size=None, length=min(fitting, key=lambda length: length.rest))
@@ -220,28 +282,41 @@ def _counted(known: Draft, data: bytes) -> Draft:
 
 
 def _fronted(known: Draft, parts: Sequence[bytes]) -> Draft:
-    """Where the length counts bytes, with a head of the fields in front of what varies: short frames are of another kind then."""
+    """Where the length counts bytes, with a head of the fields in front of what varies: short
+    frames are of another kind then.
+    """
     if known.length is None or known.length.unit > 1 or not known.frames:
         return known
     lengths = sorted(len(frame) for _, frame in known.frames)
-    known = replace(known, front=min(FRONT, lengths[int(len(lengths) * (1 - STEADY))] - LONGEST_SEAL))
+    known = replace(
+        known, front=min(FRONT, lengths[int(len(lengths) * (1 - STEADY))] - LONGEST_SEAL)
+    )
     return replace(known, frames=tuple(_walk(known, parts)))
 
 
 def _seals(known: Draft) -> list[Match]:
-    """The checksums that fit and do not stand where something rises, or where next to nothing changes."""
+    """The checksums that fit and do not stand where something rises, or where next to nothing
+    changes.
+    """
     frames = [frame for _, frame in known.frames]
     step = max(1, len(frames) // SOUGHT)
     shortest = min(map(len, frames), default=0)
     some = frames[::step][:SOUGHT]
-    free = (match for match in search(some) if not any(_overlaps(match.place, one, shortest) for one in known.candidates))
+    free = (
+        match
+        for match in search(some)
+        if not any(_overlaps(match.place, one, shortest) for one in known.candidates)
+    )
     return [match for match in free if _can_stand(known, match) and _changes(match, some)]
 
 
 def _changes(match: Match, frames: Sequence[bytes]) -> bool:
     """Whether most bits of a checksum change; of few frames nobody knows."""
     starts = [match.place.start(len(frame)) for frame in frames]
-    stored = [int.from_bytes(frame[start : start + match.place.size]) for frame, start in zip(frames, starts, strict=True)]
+    stored = [
+        int.from_bytes(frame[start : start + match.place.size])
+        for frame, start in zip(frames, starts, strict=True)
+    ]
     changing = np.bitwise_or.reduce([value ^ stored[0] for value in stored])
     return len(frames) < DIFFERENT or 2 * int(changing).bit_count() > 8 * match.place.size
 
@@ -252,11 +327,16 @@ def _overlaps(place: Place, one: Candidate, length: int) -> bool:
 
 
 def _can_stand(known: Draft, match: Match) -> bool:
-    """Whether a struct can have it: not inside of what varies in number, in one range, and not split over nibbles."""
+    """Whether a struct can have it: not inside of what varies in number, in one range, and not
+    split over nibbles.
+    """
     if any("nibbles" in remark for remark in match.remarks):
         return False
     place, span = match.place, match.span
-    whole = (span.part, span.head, span.tail) == ("all", 0, 0) or (span.part, span.tail) == ("before", 0)
+    whole = (span.part, span.head, span.tail) == ("all", 0, 0) or (span.part, span.tail) == (
+        "before",
+        0,
+    )
     at_end = place.offset == -place.size
     if known.size is None and not at_end:
         return 0 <= place.offset <= known.head - place.size and whole
@@ -264,7 +344,9 @@ def _can_stand(known: Draft, match: Match) -> bool:
 
 
 def _detailed(known: Draft) -> Draft:
-    """With the fields that rise and the blocks that begin alike; what belongs to the checksum is neither."""
+    """With the fields that rise and the blocks that begin alike; what belongs to the checksum is
+    neither.
+    """
     if not known.frames:
         return known
     rows = known.rows
@@ -273,16 +355,26 @@ def _detailed(known: Draft) -> Draft:
     if blocks is not None:
         inside = rows[:, blocks.start : blocks.end].reshape(-1, blocks.size)
         within = tuple(one for one in candidates(inside) if one.offset >= len(blocks.flag))
-        blocks = replace(blocks, candidates=within) if blocks.flag or any(one.offset == 0 for one in within) else None
+        blocks = (
+            replace(blocks, candidates=within)
+            if blocks.flag or any(one.offset == 0 for one in within)
+            else None
+        )
     if blocks is not None:
         found = tuple(one for one in found if one.end <= blocks.start or one.offset >= blocks.end)
     shortest = min(len(frame) for _, frame in known.frames)
-    free = tuple(one for one in found if known.seal is None or not _overlaps(known.seal.place, one, shortest))
-    return replace(known, candidates=tuple(one for one in free if one.offset >= len(known.sync)), blocks=blocks)
+    free = tuple(
+        one for one in found if known.seal is None or not _overlaps(known.seal.place, one, shortest)
+    )
+    return replace(
+        known, candidates=tuple(one for one in free if one.offset >= len(known.sync)), blocks=blocks
+    )
 
 
 def _blocks(rows: NDArray[np.uint8]) -> Blocks | None:
-    """The parts of a frame that begin with the same two constant bytes at equal distances, if they fill much of it."""
+    """The parts of a frame that begin with the same two constant bytes at equal distances, if they
+    fill much of it.
+    """
     first, steady = rows[0], (rows == rows[0]).mean(axis=0) >= STEADY
     pairs: dict[tuple[int, int], list[int]] = {}
     for spot in np.flatnonzero(steady[:-1] & steady[1:]).tolist():
@@ -290,7 +382,12 @@ def _blocks(rows: NDArray[np.uint8]) -> Blocks | None:
     found = []
     for pair, spots in pairs.items():
         steps = np.diff(spots)
-        if pair in ((0, 0), (255, 255)) or len(spots) < BLOCKS or (steps != steps[0]).any() or steps[0] <= 2:
+        if (
+            pair in ((0, 0), (255, 255))
+            or len(spots) < BLOCKS
+            or (steps != steps[0]).any()
+            or steps[0] <= 2
+        ):
             continue
         size = int(steps[0])
         count = min(len(spots), (rows.shape[1] - spots[0]) // size)
@@ -300,15 +397,22 @@ def _blocks(rows: NDArray[np.uint8]) -> Blocks | None:
 
 
 def _rows_of(found: Sequence[Candidate], length: int) -> Blocks | None:
-    """The parts of a frame that begin with a field of the same kind at equal distances, the longest row of them."""
+    """The parts of a frame that begin with a field of the same kind at equal distances, the longest
+    row of them.
+    """
     rows = []
     for one in found:
         like = [(one.size, one.order, one.kind, one.circle)]
         same = [
-            other.offset for other in found if (other.size, other.order, other.kind, other.circle) in like and other.offset >= one.offset
+            other.offset
+            for other in found
+            if (other.size, other.order, other.kind, other.circle) in like
+            and other.offset >= one.offset
         ]
         for step in {offset - one.offset for offset in same[1:]}:
-            count = next(number for number in itertools.count(1) if one.offset + number * step not in same)
+            count = next(
+                number for number in itertools.count(1) if one.offset + number * step not in same
+            )
             count -= one.offset + count * step > length
             if count >= BLOCKS:
                 rows.append(Blocks(one.offset, step, count, b""))
@@ -317,7 +421,9 @@ def _rows_of(found: Sequence[Candidate], length: int) -> Blocks | None:
 
 @dataclass(frozen=True)
 class Field:
-    """A line of a struct: where it begins, how long it is, its name, what follows the name, and the evidence."""
+    """A line of a struct: where it begins, how long it is, its name, what follows the name, and the
+    evidence.
+    """
 
     start: int
     size: int
@@ -344,24 +450,38 @@ def drafted(draft: Draft, *, origin: str, link: str) -> dict[str, str]:
     angles = _angles(draft)
     lines = [line for field in fields for line in field.lines(" " * (8 if seal else 4))]
     body = "\n".join(lines)
-    struct = f"Checksummed(\n    Struct(\n{body}\n    ),\n{seal[0]})" if seal else f"Struct(\n{body}\n)"
+    struct = (
+        f"Checksummed(\n    Struct(\n{body}\n    ),\n{seal[0]})" if seal else f"Struct(\n{body}\n)"
+    )
     below = [f"f.{path} < 360" for path in angles if "." not in path]
     plausible = below[0] if len(below) == 1 else " & ".join(f"({one})" for one in below)
     check = f'def plausible(f: Fields) -> Any:\n    """Angles below 360 degrees."""\n    return {plausible}\n\n\n'
     is_weak = not draft.datagrams and not below and _strength(draft) <= FEW_BITS
-    counting = (one for one in draft.candidates if one.kind == "counter" and one.offset < draft.head)
-    counters = sorted(counting, key=lambda one: (-one.right / one.total, -one.size))  # the one that never jumps
+    counting = (
+        one for one in draft.candidates if one.kind == "counter" and one.offset < draft.head
+    )
+    counters = sorted(
+        counting, key=lambda one: (-one.right / one.total, -one.size)
+    )  # the one that never jumps
     text = {
         "frames_told": f"{len(draft.frames)} frame{'s' * (len(draft.frames) != 1)}, {draft.share:.1%} of its {draft.bytes_in} bytes",
         "origin": origin,
         "checksum_class": f"\n{seal[1]}\n\n\n" if seal and seal[1] else "",
-        "sealed": "" if seal else "# No checksum was found: XORs, sums and CRCs of 8, 16 and 32 bits were tried.\n",
+        "sealed": ""
+        if seal
+        else "# No checksum was found: XORs, sums and CRCs of 8, 16 and 32 bits were tried.\n",
         "struct": struct,
         "plausible": check if below else "",
         "azimuth": f"np.deg2rad(f.{angles[0]})" if angles else "np.zeros(1)",
         "distance": f"0 * f.{angles[0]}" if angles else "np.zeros(1)",
         "arguments": "".join(f"    {line}\n" for line in _arguments(angles, counters)),
-        "frame_arguments": ", ".join([f"max_length={_longest(draft)}", *["plausible=plausible"] * bool(below), *["confirm=2"] * is_weak]),
+        "frame_arguments": ", ".join(
+            [
+                f"max_length={_longest(draft)}",
+                *["plausible=plausible"] * bool(below),
+                *["confirm=2"] * is_weak,
+            ]
+        ),
         "link_code": link,
     }
     return {**text, **_imports(text)}
@@ -370,7 +490,14 @@ def drafted(draft: Draft, *, origin: str, link: str) -> dict[str, str]:
 def _fields(draft: Draft) -> Iterator[Field]:
     """The fields of a frame in their order."""
     rows, known = draft.rows, _known(draft)
-    cuts = sorted({0, draft.head, *_span_cuts(draft), *(edge for one in known for edge in (one.start, one.start + one.size))})
+    cuts = sorted(
+        {
+            0,
+            draft.head,
+            *_span_cuts(draft),
+            *(edge for one in known for edge in (one.start, one.start + one.size)),
+        }
+    )
     at = 0
     for field in [*known, Field(draft.head, 0, "", "")]:
         yield from _gap(rows, at, field.start, cuts)
@@ -388,7 +515,15 @@ def _known(draft: Draft) -> list[Field]:
         sizes = sorted({len(frame) for _, frame in draft.frames})
         of_one = f"whole frames of {sizes[0]} bytes, and the beginning of another"
         why = f"frames are as long as {length} says: {of_one if len(sizes) == 1 else f'frames of {sizes[0]} to {sizes[-1]} bytes'}"
-        found.append(Field(length.place, length.size, _counter_name(draft), _integer(length.size, length.order), (why,)))
+        found.append(
+            Field(
+                length.place,
+                length.size,
+                _counter_name(draft),
+                _integer(length.size, length.order),
+                (why,),
+            )
+        )
     if draft.seal is not None and not draft.tail:
         found.append(_check(draft, draft.seal, draft.seal.place.start(draft.head)))
     if draft.blocks is not None:
@@ -396,19 +531,26 @@ def _known(draft: Draft) -> list[Field]:
     found += [_rising(draft, one) for one in draft.candidates]
     chosen: list[Field] = []
     for field in found:
-        if all(field.start + field.size <= other.start or other.start + other.size <= field.start for other in chosen):
+        if all(
+            field.start + field.size <= other.start or other.start + other.size <= field.start
+            for other in chosen
+        ):
             chosen.append(field)
     return sorted(chosen, key=lambda field: field.start)
 
 
 def _header(draft: Draft) -> Iterator[Field]:
-    """The sync bytes, in pieces where the checksum's span begins among them; those of blocks that begin with them are theirs."""
+    """The sync bytes, in pieces where the checksum's span begins among them; those of blocks that
+    begin with them are theirs.
+    """
     end = len(draft.sync) if draft.blocks is None else min(len(draft.sync), draft.blocks.start)
     edges = [0, *(cut for cut in _span_cuts(draft) if 0 < cut < end), end]
     for a, b in itertools.pairwise(edges):
         if b > a:
             why = (f"{len(draft.frames)} frames begin so",) if a == 0 else ()
-            yield Field(a, b - a, f"header_{a}" if a else "header", f"Const({_bytes(draft.sync[a:b])})", why)
+            yield Field(
+                a, b - a, f"header_{a}" if a else "header", f"Const({_bytes(draft.sync[a:b])})", why
+            )
 
 
 def _gap(rows: NDArray[np.uint8], start: int, end: int, cuts: Sequence[int]) -> Iterator[Field]:
@@ -442,18 +584,35 @@ def _rising(draft: Draft, one: Candidate, what: str = "frame") -> Field:
         code = f'Scaled({code}, {CIRCLES[one.circle][0]:g}, "deg")'
     if what == "frame":
         for other in draft.candidates:
-            same = other.circle == one.circle and other.kind == one.kind != "counter" and other.offset < one.offset
-            first, last = (values(draft.rows, each.offset, each.size, each.order) for each in (other, one))
+            same = (
+                other.circle == one.circle
+                and other.kind == one.kind != "counter"
+                and other.offset < one.offset
+            )
+            first, last = (
+                values(draft.rows, each.offset, each.size, each.order) for each in (other, one)
+            )
             if same and follows(first, last, one.circle) > 1 - 1 / FEW:
-                why = (*why, f"lies between this frame's {other.name} and the next one's: the angle of the last sample?")
+                why = (
+                    *why,
+                    f"lies between this frame's {other.name} and the next one's: the angle of the last sample?",
+                )
                 break
     return Field(one.offset, one.size, one.name, code, why)
 
 
 def _block_field(draft: Draft, blocks: Blocks) -> Field:
     rows = draft.rows[:, blocks.start : blocks.end].reshape(-1, blocks.size)
-    fields, at = [Field(0, len(blocks.flag), "flag", f"Const({_bytes(blocks.flag)})")] if blocks.flag else [], len(blocks.flag)
-    for one in [*(_rising(draft, each, "block") for each in blocks.candidates), Field(blocks.size, 0, "", "")]:
+    fields, at = (
+        [Field(0, len(blocks.flag), "flag", f"Const({_bytes(blocks.flag)})")]
+        if blocks.flag
+        else [],
+        len(blocks.flag),
+    )
+    for one in [
+        *(_rising(draft, each, "block") for each in blocks.candidates),
+        Field(blocks.size, 0, "", ""),
+    ]:
         fields += _gap(rows, at, one.start, ())
         fields += [one] if one.name else []
         at = one.start + one.size
@@ -469,13 +628,28 @@ def _varying(draft: Draft) -> Iterator[Field]:
     assert draft.length is not None
     rest, name = draft.head + draft.tail - draft.length.rest, _counter_name(draft)
     if draft.length.unit > 1 and rest == 0:
-        yield Field(draft.head, 0, "samples", f'Array(this.{name}, Struct("unknown_0" / Bytes({draft.length.unit})))')
+        yield Field(
+            draft.head,
+            0,
+            "samples",
+            f'Array(this.{name}, Struct("unknown_0" / Bytes({draft.length.unit})))',
+        )
     else:
         number = f"this.{name}" if draft.length.unit == 1 else f"{draft.length.unit} * this.{name}"
         lengths = {len(frame) for _, frame in draft.frames}
         step = int(np.gcd.reduce([length - min(lengths) for length in lengths]))
-        why = (f"their lengths differ by multiples of {step}: samples of {step} bytes?",) if step > 1 else ()
-        yield Field(draft.head, 0, f"unknown_{draft.head}", f"Bytes({number} - {rest})" if rest else f"Bytes({number})", why)
+        why = (
+            (f"their lengths differ by multiples of {step}: samples of {step} bytes?",)
+            if step > 1
+            else ()
+        )
+        yield Field(
+            draft.head,
+            0,
+            f"unknown_{draft.head}",
+            f"Bytes({number} - {rest})" if rest else f"Bytes({number})",
+            why,
+        )
     if draft.tail and draft.seal is not None:
         yield _check(draft, draft.seal, -draft.tail)
 
@@ -485,16 +659,28 @@ def _counter_name(draft: Draft) -> str:
 
 
 def _check(draft: Draft, seal: Match, start: int) -> Field:
-    chance = "which may be chance: hold more frames against it" if seal.doubt < WEAK else f"a wrong one would be so once in {seal.odds}"
-    why = (f"right in {seal.right} of {seal.total} frames, {chance}", *(one for one in seal.remarks if "constant" not in one))
+    chance = (
+        "which may be chance: hold more frames against it"
+        if seal.doubt < WEAK
+        else f"a wrong one would be so once in {seal.odds}"
+    )
+    why = (
+        f"right in {seal.right} of {seal.total} frames, {chance}",
+        *(one for one in seal.remarks if "constant" not in one),
+    )
     size = min(len(frame) for _, frame in draft.frames)
     for other in draft.others[:OFFERED]:
-        why = (*why, f"or {other.paste.splitlines()[0]} at byte {other.place.start(size)} over {other.span.told(other.place, size)}")
+        why = (
+            *why,
+            f"or {other.paste.splitlines()[0]} at byte {other.place.start(size)} over {other.span.told(other.place, size)}",
+        )
     return Field(start, seal.place.size, "check", _integer(seal.place.size, seal.order), why)
 
 
 def _seal_text(draft: Draft, fields: Sequence[Field]) -> tuple[str, str] | None:
-    """The arguments of `Checksummed` behind its struct, and a class where the checksum needs one of its own."""
+    """The arguments of `Checksummed` behind its struct, and a class where the checksum needs one of
+    its own.
+    """
     if draft.seal is None:
         return None
     own = draft.seal.paste.startswith("class ")
@@ -504,9 +690,16 @@ def _seal_text(draft: Draft, fields: Sequence[Field]) -> tuple[str, str] | None:
     ranges = draft.seal.span.ranges(draft.seal.place, shortest)
     if sum(b - a for a, b in ranges) < shortest - draft.seal.place.size:
         (first, last), place = (ranges[0][0], ranges[-1][1]), draft.seal.place.start(shortest)
-        inside = [field.name for field in fields if first <= (field.start if field.start >= 0 else place) < last and field.name != "check"]
+        inside = [
+            field.name
+            for field in fields
+            if first <= (field.start if field.start >= 0 else place) < last
+            and field.name != "check"
+        ]
         over = f"    over={tuple(inside)!r},\n".replace("'", '"')
-    typed = draft.seal.paste.replace("(self, data):", "(self, data: Any) -> int:").replace("(self):", "(self) -> str:")
+    typed = draft.seal.paste.replace("(self, data):", "(self, data: Any) -> int:").replace(
+        "(self):", "(self) -> str:"
+    )
     return f'    field="check",\n    algorithm={algorithm},\n{over}', typed if own else ""
 
 
@@ -521,7 +714,11 @@ def _span_cuts(draft: Draft) -> list[int]:
 
 def _angles(draft: Draft) -> list[str]:
     """The paths of the angles that wrap, those of blocks first."""
-    inside = [f"blocks.{one.name}" for one in draft.blocks.candidates if one.kind == "angle"] if draft.blocks else []
+    inside = (
+        [f"blocks.{one.name}" for one in draft.blocks.candidates if one.kind == "angle"]
+        if draft.blocks
+        else []
+    )
     return inside + [one.name for one in draft.candidates if one.kind == "angle"]
 
 
@@ -552,14 +749,21 @@ def _longest(draft: Draft) -> str:
     if draft.size is not None or draft.length is None:
         return str(draft.size)
     longest = max(len(frame) for _, frame in draft.frames)
-    return str(draft.length.rest + 255 * draft.length.unit if draft.length.size == 1 else 2 * longest)
+    return str(
+        draft.length.rest + 255 * draft.length.unit if draft.length.size == 1 else 2 * longest
+    )
 
 
 def _imports(text: dict[str, str]) -> dict[str, str]:
     """The names that the text uses, by the library that they are from."""
     code = "\n".join(text.values())
-    construct = sorted(set(re.findall(r"\b(Array|Bytes|Const|Int\d+u[lb]|this(?=\.))\b", code)) | {"Struct"})
-    asked = re.findall(r"\b(Check(?:sum|summed)|Crc|Every|Fold15|OnWrap|Scaled|Sequence|Serial|Sum|Udp|WordXor|Xor)\b", code)
+    construct = sorted(
+        set(re.findall(r"\b(Array|Bytes|Const|Int\d+u[lb]|this(?=\.))\b", code)) | {"Struct"}
+    )
+    asked = re.findall(
+        r"\b(Check(?:sum|summed)|Crc|Every|Fold15|OnWrap|Scaled|Sequence|Serial|Sum|Udp|WordXor|Xor)\b",
+        code,
+    )
     own = {"Fields", "Frame", "Polar", "Sensor", "hookimpl", *asked}
     return {
         "construct_names": ", ".join(sorted(construct, key=_case)),
@@ -571,13 +775,21 @@ def _imports(text: dict[str, str]) -> dict[str, str]:
 def _import(module: str, names: list[str]) -> str:
     """An import of these names, on one line where that holds them."""
     line = f"from {module} import {', '.join(names)}"
-    return line if len(line) <= LINE else f"from {module} import (\n" + "".join(f"    {name},\n" for name in names) + ")"
+    return (
+        line
+        if len(line) <= LINE
+        else f"from {module} import (\n" + "".join(f"    {name},\n" for name in names) + ")"
+    )
 
 
 def _case(name: str) -> tuple[bool, str, int]:
     """Classes before functions, and numbers by their size."""
     number = re.search(r"\d+", name)
-    return name[0].islower(), name[: number.start()] if number else name, int(number[0]) if number else 0
+    return (
+        name[0].islower(),
+        name[: number.start()] if number else name,
+        int(number[0]) if number else 0,
+    )
 
 
 def _integer(size: int, order: ByteOrder) -> str:
@@ -594,11 +806,13 @@ class Names:
 
     Args:
         id: of the sensor.
-        distribution: what is installed; by default one for this sensor alone, "lidarspec-" and its id.
+        distribution: what is installed; by default one for this sensor alone, "lidarspec-" and its
+            id.
         vendor, model: as people write them; by default after the id.
 
     Raises:
-        UsageError: for what is no id, no name of a distribution, or cannot stand in a text of Python.
+        UsageError: for what is no id, no name of a distribution, or cannot stand in a text of
+            Python.
     """
 
     id: str
@@ -608,13 +822,21 @@ class Names:
 
     def __post_init__(self) -> None:
         if not _ID.fullmatch(self.id):
-            raise UsageError(f"{self.id!r} is no id: it is vendor-model in lower case with hyphens, such as acme-x1")
+            raise UsageError(
+                f"{self.id!r} is no id: it is vendor-model in lower case with hyphens, such as acme-x1"
+            )
         vendor, _, model = self.id.partition("-")
-        defaults = {"distribution": f"lidarspec-{self.id}", "vendor": vendor.capitalize(), "model": model.upper()}
+        defaults = {
+            "distribution": f"lidarspec-{self.id}",
+            "vendor": vendor.capitalize(),
+            "model": model.upper(),
+        }
         for name, default in defaults.items():
             object.__setattr__(self, name, getattr(self, name) or default)
         if not re.fullmatch(r"[a-z][a-z0-9]*(-[a-z0-9]+)*", self.distribution):
-            raise UsageError(f"{self.distribution!r} is no name of a distribution: lower case with hyphens, such as lidarspec-acme")
+            raise UsageError(
+                f"{self.distribution!r} is no name of a distribution: lower case with hyphens, such as lidarspec-acme"
+            )
         if unfit := re.search(r'["\\\n]', self.vendor + self.model):
             raise UsageError(f"vendor and model cannot have {unfit[0]!r} in them")
 
@@ -631,16 +853,27 @@ class Names:
 
     def values(self) -> dict[str, str]:
         """Everything for the templates."""
-        return {name: getattr(self, name) for name in ("id", "constant", "distribution", "module", "vendor", "model")}
+        return {
+            name: getattr(self, name)
+            for name in ("id", "constant", "distribution", "module", "vendor", "model")
+        }
 
 
 def invented(names: Names, link: Link) -> dict[str, str]:
     """The files of a distribution with an invented sensor that has everything, by path."""
     values = {**names.values(), "speed_remark": ", with code 3; else 0" if link == "serial" else ""}
-    return _files(names, link, values, filled("vectors.json", values, link), ("README.md", "module.py", "test_module.py"))
+    return _files(
+        names,
+        link,
+        values,
+        filled("vectors.json", values, link),
+        ("README.md", "module.py", "test_module.py"),
+    )
 
 
-def captured(names: Names, link: Link, draft: Draft, *, origin: str, port: int | None) -> dict[str, str]:
+def captured(
+    names: Names, link: Link, draft: Draft, *, origin: str, port: int | None
+) -> dict[str, str]:
     """The files of a distribution with the sensor that a capture was drafted to, by path.
 
     Args:
@@ -648,17 +881,44 @@ def captured(names: Names, link: Link, draft: Draft, *, origin: str, port: int |
         port: the UDP port that the datagrams were sent to, where that is known.
     """
     serial = "Serial(115_200)},  # the baud rate: a capture does not tell it"
-    udp = f"Udp({port})}},  # where the capture's datagrams went" if port else "Udp(2368)},  # the port: this capture does not tell it"
-    values = {**names.values(), **drafted(draft, origin=origin, link=serial if link == "serial" else udp)}
+    udp = (
+        f"Udp({port})}},  # where the capture's datagrams went"
+        if port
+        else "Udp(2368)},  # the port: this capture does not tell it"
+    )
+    values = {
+        **names.values(),
+        **drafted(draft, origin=origin, link=serial if link == "serial" else udp),
+    }
     frames = [
-        {"sensor": names.id, "frame": "data", "hex": data.hex(" "), "values": {}, "source": f"{origin}, at byte {at}"}
+        {
+            "sensor": names.id,
+            "frame": "data",
+            "hex": data.hex(" "),
+            "values": {},
+            "source": f"{origin}, at byte {at}",
+        }
         for at, data in draft.frames[:VECTORS]
     ]
-    return _files(names, link, values, json.dumps(frames, indent=2) + "\n", ("README_draft.md", "draft.py", "test_draft.py"))
+    return _files(
+        names,
+        link,
+        values,
+        json.dumps(frames, indent=2) + "\n",
+        ("README_draft.md", "draft.py", "test_draft.py"),
+    )
 
 
-def _files(names: Names, link: Link, values: Mapping[str, str], vectors: str, templates: tuple[str, str, str]) -> dict[str, str]:
-    """The files of a distribution by path; the templates are those of its README, its module and its tests."""
+def _files(
+    names: Names,
+    link: Link,
+    values: Mapping[str, str],
+    vectors: str,
+    templates: tuple[str, str, str],
+) -> dict[str, str]:
+    """The files of a distribution by path; the templates are those of its README, its module and
+    its tests.
+    """
     readme, module, tests = (filled(template, values, link) for template in templates)
     return {
         "pyproject.toml": filled("pyproject.toml", values, link),
@@ -683,7 +943,8 @@ _LISTED = '[project.entry-points."lidarspec.sensors"]\n'
 
 
 def joining(folder: Path, names: Names, texts: Mapping[str, str]) -> dict[str, str]:
-    """The files, by path, that make a sensor one more of a distribution that is there: a module and tests of its own, and what is changed.
+    """The files, by path, that make a sensor one more of a distribution that is there: a module and
+    tests of its own, and what is changed.
 
     Args:
         folder: of the distribution.
@@ -695,10 +956,16 @@ def joining(folder: Path, names: Names, texts: Mapping[str, str]) -> dict[str, s
     """
     listed = f"{names.module}/vectors.json"
     with system_errors(folder):
-        project, readme = ((folder / name).read_text(encoding="utf-8") for name in ("pyproject.toml", "README.md"))
-        vectors = (folder / listed).read_text(encoding="utf-8") if (folder / listed).exists() else "[]"
+        project, readme = (
+            (folder / name).read_text(encoding="utf-8") for name in ("pyproject.toml", "README.md")
+        )
+        vectors = (
+            (folder / listed).read_text(encoding="utf-8") if (folder / listed).exists() else "[]"
+        )
     if f'name = "{names.distribution}"\n' not in project or _LISTED not in project:
-        raise UsageError(f"{folder / 'pyproject.toml'} is not that of {names.distribution}, or lists no lidarspec.sensors")
+        raise UsageError(
+            f"{folder / 'pyproject.toml'} is not that of {names.distribution}, or lists no lidarspec.sensors"
+        )
     part = names.id.partition("-")[2].replace("-", "_")
     part = part if part.isidentifier() else f"model_{part}"
     test = f"tests/test_{names.id.replace('-', '_')}.py"
@@ -707,7 +974,10 @@ def joining(folder: Path, names: Names, texts: Mapping[str, str]) -> dict[str, s
         if (folder / name).exists():
             raise UsageError(f"{folder / name} exists already: nothing was written")
     entry = f'{names.id} = "{names.module}.{part}:{names.constant}"\n'
-    own, before = texts[listed].strip().removeprefix("["), vectors.rstrip().removesuffix("]").rstrip()
+    own, before = (
+        texts[listed].strip().removeprefix("["),
+        vectors.rstrip().removesuffix("]").rstrip(),
+    )
     return {
         **new,
         "pyproject.toml": project.replace(_LISTED, _LISTED + entry),

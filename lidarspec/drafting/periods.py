@@ -1,12 +1,14 @@
-"""What unknown bytes are made of: where frames may begin, how long they are, which checksum seals them, and which fields change steadily.
+"""What unknown bytes are made of: where frames may begin, how long they are, which checksum seals
+them, and which fields change steadily.
 
-Frames of one length show as a distance at which many bytes are equal; their sync bytes are then the longest run of bytes that
-never change. Frames of several lengths show as a pair of bytes that comes again and again, at distances that a length field in
-front of each frame explains.
+Frames of one length show as a distance at which many bytes are equal; their sync bytes are then the
+longest run of bytes that never change. Frames of several lengths show as a pair of bytes that comes
+again and again, at distances that a length field in front of each frame explains.
 
-Counters, angles that wrap at a full circle and clocks show by how they change: such a field rises from frame to frame by about the same
-step each time; the wrong byte order, or a field read one byte off, jumps. What it falls back from tells its scale: an angle in
-hundredths of a degree never reaches 36 000.
+Counters, angles that wrap at a full circle and clocks show by how they change: such a field rises
+from frame to frame by about the same step each time; the wrong byte order, or a field read one byte
+off, jumps. What it falls back from tells its scale: an angle in hundredths of a degree never
+reaches 36 000.
 """
 
 from __future__ import annotations
@@ -39,15 +41,18 @@ CIRCLES = {
 }
 #: frames below which only the ends of a frame are looked at, and how far these go.
 FEW, FRONT, BACK = 8, 16, 8
-#: share of the steps that has to be regular, by which share of a step they may differ, and units that they always may.
+#: share of the steps that has to be regular, by which share of a step they may differ, and units
+#: that they always may.
 MOST, EVEN, GRAIN = 0.9, 0.05, 4
 #: how much less even steps have to be without the lowest byte.
 ROUGH = 1.5
-#: part of all values that a step may be, and share of frames in which something may stay as it is (two returns of one firing).
+#: part of all values that a step may be, and share of frames in which something may stay as it is
+#: (two returns of one firing).
 WIDE, STILL = 4, 0.75
 #: bytes that are looked at, and the shortest and longest period.
 LOOKED_AT, SHORTEST, LONGEST = 1 << 15, 4, 4096
-#: distances that are tried as a length, and the share of frames in which a byte that never changes is the same.
+#: distances that are tried as a length, and the share of frames in which a byte that never changes
+#: is the same.
 LAGS, STEADY = 48, 0.9
 #: share of the bytes that has to be in frames, shares that are about the same, and many frames.
 HALF, CLOSE, MANY = 0.5, 0.03, 12
@@ -67,7 +72,8 @@ class Candidate:
 
     Attributes:
         offset, size, order: where it stands in a frame or block, and how it is read.
-        kind: "counter" rises by one each time; "angle" wraps at a full circle; "rising" is anything else that rises.
+        kind: "counter" rises by one each time; "angle" wraps at a full circle; "rising" is anything
+            else that rises.
         circle: what it wraps at, 0 where it was not seen to wrap.
         steps: the smallest, usual and largest step.
         right, total: steps that are regular, and all.
@@ -114,11 +120,15 @@ def candidates(rows: NDArray[np.uint8]) -> list[Candidate]:
     """The fields that rise, without overlaps, in the order of the frame.
 
     Args:
-        rows: frames that follow each other, or as much of their beginnings as they have in common, shape (n, size).
+        rows: frames that follow each other, or as much of their beginnings as they have in common,
+            shape (n, size).
     """
     if len(rows) < 3:
         return []
-    found = sorted(_all(rows), key=lambda one: (one.kind == "rising", -one.size, -one.right / one.total, one.offset))
+    found = sorted(
+        _all(rows),
+        key=lambda one: (one.kind == "rising", -one.size, -one.right / one.total, one.offset),
+    )
     chosen: list[Candidate] = []
     for one in found:
         if all(one.end <= other.offset or one.offset >= other.end for other in chosen):
@@ -154,7 +164,9 @@ def _offsets(rows: NDArray[np.uint8], size: int) -> Iterable[int]:
     return sorted({*range(min(FRONT, last + 1)), *range(max(last - BACK, 0), last + 1)})
 
 
-def _counter(rows: NDArray[np.uint8], offset: int, size: int, order: ByteOrder) -> Iterator[Candidate]:
+def _counter(
+    rows: NDArray[np.uint8], offset: int, size: int, order: ByteOrder
+) -> Iterator[Candidate]:
     """What rises by one each time, and falls back to where it began."""
     there = values(rows, offset, size, order)
     steps, first, last = np.diff(there), int(there.min()), int(there.max())
@@ -162,10 +174,23 @@ def _counter(rows: NDArray[np.uint8], offset: int, size: int, order: ByteOrder) 
     right = int((steps == 1).sum() + back.sum())
     if right >= MOST * len(steps) and (steps == 1).sum() >= 2:
         wraps = int(back.sum())
-        yield Candidate(offset, size, order, "counter", last + 1 if wraps else 0, (1, 1, 1), right, len(steps), wraps, first)
+        yield Candidate(
+            offset,
+            size,
+            order,
+            "counter",
+            last + 1 if wraps else 0,
+            (1, 1, 1),
+            right,
+            len(steps),
+            wraps,
+            first,
+        )
 
 
-def _rising(rows: NDArray[np.uint8], offset: int, size: int, order: ByteOrder) -> Iterator[Candidate]:
+def _rising(
+    rows: NDArray[np.uint8], offset: int, size: int, order: ByteOrder
+) -> Iterator[Candidate]:
     """What rises by about the same step each time."""
     there = values(rows, offset, size, order)
     steps = np.diff(there)
@@ -181,7 +206,11 @@ def _rising(rows: NDArray[np.uint8], offset: int, size: int, order: ByteOrder) -
     forward = np.where(falls, moved + circle, moved) if circle else moved
     uneven = np.abs(np.diff(forward))
     within = (forward > 0) & (forward <= WIDE * usual)
-    if within.mean() < MOST or np.median(uneven) > max(GRAIN, EVEN * usual) or usual * WIDE > (circle or 1 << 8 * size):
+    if (
+        within.mean() < MOST
+        or np.median(uneven) > max(GRAIN, EVEN * usual)
+        or usual * WIDE > (circle or 1 << 8 * size)
+    ):
         return
     if len(rows) >= FEW and not _low_byte_counts(there):
         return
@@ -193,7 +222,9 @@ def _rising(rows: NDArray[np.uint8], offset: int, size: int, order: ByteOrder) -
 
 
 def _low_byte_counts(there: NDArray[np.int64]) -> bool:
-    """Whether the steps become less even without the lowest byte: else it belongs to something else."""
+    """Whether the steps become less even without the lowest byte: else it belongs to something
+    else.
+    """
     steps, coarse = np.diff(there), 256 * np.diff(there >> 8)
     fine, rough = (np.abs(np.diff(each[steps != 0])) for each in (steps, coarse))
     forward = steps[steps != 0] > 0
@@ -202,14 +233,22 @@ def _low_byte_counts(there: NDArray[np.int64]) -> bool:
 
 
 def _circle(highest: int, fallen: int, usual: int) -> int:
-    """What a field wraps at: a full circle that it comes near to and never reaches, else about as much as it was seen to fall."""
-    near = [circle for circle in CIRCLES if highest < circle <= highest + 3 * usual and abs(fallen - circle) <= 3 * usual]
+    """What a field wraps at: a full circle that it comes near to and never reaches, else about as
+    much as it was seen to fall.
+    """
+    near = [
+        circle
+        for circle in CIRCLES
+        if highest < circle <= highest + 3 * usual and abs(fallen - circle) <= 3 * usual
+    ]
     return min(near, key=lambda circle: abs(fallen - circle), default=fallen)
 
 
 @dataclass(frozen=True)
 class Length:
-    """What a header says of the length of its frame: `rest` + `unit` times the number of `size` bytes at `place`."""
+    """What a header says of the length of its frame: `rest` + `unit` times the number of `size`
+    bytes at `place`.
+    """
 
     place: int
     size: int
@@ -261,7 +300,11 @@ def structure(chunks: Sequence[bytes], *, datagrams: bool) -> Structure | None:
     Args:
         chunks: datagrams, or pieces of a stream.
     """
-    return _of_datagrams(chunks) if datagrams else _of_stream(np.frombuffer(b"".join(chunks)[:LOOKED_AT], np.uint8))
+    return (
+        _of_datagrams(chunks)
+        if datagrams
+        else _of_stream(np.frombuffer(b"".join(chunks)[:LOOKED_AT], np.uint8))
+    )
 
 
 def usual_bytes(rows: NDArray[np.uint8]) -> NDArray[np.uint8]:
@@ -292,7 +335,9 @@ def _of_datagrams(chunks: Sequence[bytes]) -> Structure | None:
     rows = np.frombuffer(b"".join(frames), np.uint8).reshape(len(frames), length)
     steady = (rows == rows[0]).all(axis=0)
     sync = frames[0][: int(np.argmin(steady)) if not steady.all() else length][:16]
-    return Structure(sync, length, None, len(frames) * length / sum(map(len, chunks)), tuple(frames))
+    return Structure(
+        sync, length, None, len(frames) * length / sum(map(len, chunks)), tuple(frames)
+    )
 
 
 def _of_stream(data: NDArray[np.uint8]) -> Structure | None:
@@ -305,25 +350,39 @@ def _of_stream(data: NDArray[np.uint8]) -> Structure | None:
 
 
 def _periodic(data: NDArray[np.uint8]) -> Structure | None:
-    """Frames of one length: of the distances at which most bytes are equal, the one at which the most stay the same all along."""
+    """Frames of one length: of the distances at which most bytes are equal, the one at which the
+    most stay the same all along.
+    """
     lags = np.arange(SHORTEST, min(LONGEST, len(data) // FRAMES) + 1)
     equal = np.array([float((data[lag:] == data[:-lag]).mean()) for lag in lags])
     likely = lags[np.argsort(equal)[::-1][:LAGS]].tolist()
-    framed = [(weight, found) for lag in likely for weight, found in _framed(data, lag) if found.share > HALF]
+    framed = [
+        (weight, found)
+        for lag in likely
+        for weight, found in _framed(data, lag)
+        if found.share > HALF
+    ]
     best = max((weight for weight, _ in framed), default=0.0)
-    shortest = min((found for weight, found in framed if weight > ALIKE * best), key=lambda found: found.period or 0, default=None)
+    shortest = min(
+        (found for weight, found in framed if weight > ALIKE * best),
+        key=lambda found: found.period or 0,
+        default=None,
+    )
     return None if shortest is None else _divided(data, shortest)
 
 
 def _divided(data: NDArray[np.uint8], whole: Structure) -> Structure:
-    """The frames of which a whole number repeats together, as turns of an index or in a simulation do; else the same.
+    """The frames of which a whole number repeats together, as turns of an index or in a simulation
+    do; else the same.
 
     They are frames of their own where more than one byte begins them, or one and a counter.
     """
     period = whole.period or 0
     for part in (part for part in range(SHORTEST, period // 2 + 1) if period % part == 0):
         for _, found in _framed(data, part):
-            if found.share > whole.share - CLOSE and (len(set(found.sync)) > 1 or _is_counted(found)):
+            if found.share > whole.share - CLOSE and (
+                len(set(found.sync)) > 1 or _is_counted(found)
+            ):
                 return found
     return whole
 
@@ -334,11 +393,17 @@ def _is_counted(found: Structure) -> bool:
 
 
 def _framed(data: NDArray[np.uint8], period: int) -> Iterator[tuple[float, Structure]]:
-    """Frames of this length, which begin with the longest run of bytes that are always the same, and the share of such bytes."""
+    """Frames of this length, which begin with the longest run of bytes that are always the same,
+    and the share of such bytes.
+    """
     count = len(data) // period
     rows = data[: count * period].reshape(count, period)
     usual = usual_bytes(rows)
-    steady = (rows == usual).mean(axis=0) >= STEADY if count >= 2 * FRAMES else (rows == usual).all(axis=0)
+    steady = (
+        (rows == usual).mean(axis=0) >= STEADY
+        if count >= 2 * FRAMES
+        else (rows == usual).all(axis=0)
+    )
     steady_count = int((steady & (usual != 0)).sum())
     if steady_count == 0 or steady.all() or _is_chance(data, steady_count, count, period):
         return
@@ -347,13 +412,18 @@ def _framed(data: NDArray[np.uint8], period: int) -> Iterator[tuple[float, Struc
     frames = [frame for frame in cut(data.tobytes(), period, start) if frame.startswith(sync)]
     if len(frames) >= FRAMES:
         share = len(frames) * period / len(data)
-        yield share * steady_count / period, Structure(sync[:16], period, None, share, tuple(frames))
+        yield (
+            share * steady_count / period,
+            Structure(sync[:16], period, None, share, tuple(frames)),
+        )
 
 
 def _is_chance(data: NDArray[np.uint8], steady: int, count: int, period: int) -> bool:
-    """Return whether random bytes with the same shares of values would show such a structure as well.
+    """Return whether random bytes with the same shares of values would show such a structure as
+    well.
 
-    Chernoff's bound gives the probability of so many steady bytes at one period; all periods that are tried count.
+    Chernoff's bound gives the probability of so many steady bytes at one period; all periods that
+    are tried count.
 
     Args:
         steady: bytes of a period that are the same in each repetition, and not 0.
@@ -371,12 +441,17 @@ def _is_chance(data: NDArray[np.uint8], steady: int, count: int, period: int) ->
 
 
 def _longest_run(steady: NDArray[np.bool_], usual: NDArray[np.uint8]) -> tuple[int, int]:
-    """Start and length of the longest run of steady bytes, around the end too, without zeros in front: they tell little."""
+    """Start and length of the longest run of steady bytes, around the end too, without zeros in
+    front: they tell little.
+    """
     turn, best = int(np.argmin(steady)), (-1, 0, 0)  # the circle is cut where no run is
     for start, end in runs(np.roll(steady, -turn)):
         run = np.roll(usual, -turn)[start:end]
         zeros = int(np.argmax(run != 0)) if run.any() else 0
-        best = max(best, (int(np.count_nonzero(run)), -((turn + start + zeros) % len(usual)), len(run) - zeros))
+        best = max(
+            best,
+            (int(np.count_nonzero(run)), -((turn + start + zeros) % len(usual)), len(run) - zeros),
+        )
     return -best[1], best[2]
 
 
@@ -392,14 +467,23 @@ def _by_length(data: NDArray[np.uint8]) -> Structure | None:
         found = _explained(data, starts, bytes([pair >> 8, pair & 0xFF]))
         if found is None:
             continue
-        begins = int(starts[0])  # of pairs in a header that do as well, the one in front: captures often begin with a frame
-        if best is None or found.share > best[0] + CLOSE or (found.share > best[0] - CLOSE and begins < best[1]):
+        begins = int(
+            starts[0]
+            # of pairs in a header that do as well, the one in front: captures often begin with a frame
+        )
+        if (
+            best is None
+            or found.share > best[0] + CLOSE
+            or (found.share > best[0] - CLOSE and begins < best[1])
+        ):
             best = (found.share, begins, found)
     return best[2] if best is not None and best[0] > HALF else None
 
 
 def _explained(data: NDArray[np.uint8], starts: NDArray[np.intp], sync: bytes) -> Structure | None:
-    """Frames from one sync to the next, where a byte or a word behind it tells most of their lengths."""
+    """Frames from one sync to the next, where a byte or a word behind it tells most of their
+    lengths.
+    """
     starts = starts[starts + HEADER + 2 < len(data)]
     steps = np.diff(starts)
     if len(steps) < FRAMES:
@@ -407,8 +491,13 @@ def _explained(data: NDArray[np.uint8], starts: NDArray[np.intp], sync: bytes) -
     best: tuple[float, Length | None, NDArray[np.bool_]] = (0.0, None, np.zeros(0, np.bool_))
     kinds: tuple[tuple[int, ByteOrder], ...] = ((1, "little"), (2, "little"), (2, "big"))
     for place in range(2, HEADER):
-        low, high = data[starts[:-1] + place].astype(np.int64), data[starts[:-1] + place + 1].astype(np.int64)
-        for (size, order), numbers in zip(kinds, (low, low | high << 8, high | low << 8), strict=True):
+        low, high = (
+            data[starts[:-1] + place].astype(np.int64),
+            data[starts[:-1] + place + 1].astype(np.int64),
+        )
+        for (size, order), numbers in zip(
+            kinds, (low, low | high << 8, high | low << 8), strict=True
+        ):
             for unit in range(1, UNIT + 1):
                 rest = steps - unit * numbers
                 usual, number = _commonest(rest)
@@ -421,7 +510,10 @@ def _explained(data: NDArray[np.uint8], starts: NDArray[np.intp], sync: bytes) -
     if length is None:
         return None
     whole = data.tobytes()
-    frames = [whole[start : start + step] for start, step in zip(starts[:-1][told].tolist(), steps[told].tolist(), strict=True)]
+    frames = [
+        whole[start : start + step]
+        for start, step in zip(starts[:-1][told].tolist(), steps[told].tolist(), strict=True)
+    ]
     return Structure(sync, None, length, share, tuple(frames))
 
 

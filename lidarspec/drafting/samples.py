@@ -1,4 +1,6 @@
-"""Sample frames of an unknown format, where a checksum could stand in them, and which bytes it could cover."""
+"""Sample frames of an unknown format, where a checksum could stand in them, and which bytes it
+could cover.
+"""
 
 from __future__ import annotations
 
@@ -19,17 +21,21 @@ Part = Literal["all", "before", "behind"]
 SHORT, NEAR = 64, 12
 #: bytes in front that a checksum at the end may leave out, and how far from the end that is.
 HEAD, TAIL = 6, 4
-#: how far apart the values of each byte of a checksum lie, and how much more likely the usual place is.
+#: how far apart the values of each byte of a checksum lie, and how much more likely the usual place
+#: is.
 APART, USUAL = 96, 1.1
 #: share of the frames that a checksum has to be right for: some may be damaged.
 ENOUGH = 0.6
-#: doubt at which a match is sure enough for the search to end: one wrong guess in a million looks like that.
+#: doubt at which a match is sure enough for the search to end: one wrong guess in a million looks
+#: like that.
 SURE = 20
 
 
 @dataclass(frozen=True)
 class Place:
-    """Where a checksum stands: `size` bytes from `offset` on, which counts from the end where it is negative."""
+    """Where a checksum stands: `size` bytes from `offset` on, which counts from the end where it is
+    negative.
+    """
 
     offset: int
     size: int
@@ -47,7 +53,9 @@ class Place:
 
 @dataclass(frozen=True)
 class Span:
-    """Which bytes a checksum covers: those before its place, behind it, or both, without the first `head` and the last `tail`."""
+    """Which bytes a checksum covers: those before its place, behind it, or both, without the first
+    `head` and the last `tail`.
+    """
 
     part: Part = "all"
     head: int = 0
@@ -57,19 +65,28 @@ class Span:
         """The byte ranges in a frame of this length."""
         start = place.start(length)
         end = start + place.size
-        before, behind = (self.head, start), (end + (self.head if self.part == "behind" else 0), length - self.tail)
+        before, behind = (
+            (self.head, start),
+            (end + (self.head if self.part == "behind" else 0), length - self.tail),
+        )
         chosen = {"all": [before, behind], "before": [before], "behind": [behind]}[self.part]
         return [(first, last) for first, last in chosen if last > first]
 
     def told(self, place: Place, length: int) -> str:
         """The bytes in words."""
-        if (self.part, self.head, self.tail) == ("all", 0, 0) or sum(b - a for a, b in self.ranges(place, length)) == length - place.size:
+        if (self.part, self.head, self.tail) == ("all", 0, 0) or sum(
+            b - a for a, b in self.ranges(place, length)
+        ) == length - place.size:
             return "all other bytes"
         if self.part == "before":
             return f"bytes {self.head} up to the checksum"
         if self.part == "behind":
-            return f"all bytes from {self.head} behind the checksum" + (f" but the last {self.tail}" if self.tail else "")
-        return f"all other bytes but the first {self.head}" + (f" and the last {self.tail}" if self.tail else "")
+            return f"all bytes from {self.head} behind the checksum" + (
+                f" but the last {self.tail}" if self.tail else ""
+            )
+        return f"all other bytes but the first {self.head}" + (
+            f" and the last {self.tail}" if self.tail else ""
+        )
 
 
 @dataclass(frozen=True)
@@ -80,12 +97,14 @@ class Match:
         algorithm: what computes it.
         place, span, order: where it stands, what it covers, and its byte order.
         right, total: frames that it is right for, and all.
-        doubt: 2**doubt is the number of wrong checksums of which one would fit as well by chance; low is weak.
+        doubt: 2**doubt is the number of wrong checksums of which one would fit as well by chance;
+            low is weak.
         paste: the algorithm as a plugin writes it.
         remarks: what else is to be said.
         name: what a catalogue calls it.
         open: whether other parameters fit these frames as well.
-        varied: how much that byte of its place varies that varies least, as `Samples.varied` has it.
+        varied: how much that byte of its place varies that varies least, as `Samples.varied` has
+            it.
     """
 
     algorithm: Checksum
@@ -103,21 +122,31 @@ class Match:
 
     @property
     def odds(self) -> str:
-        """The number of wrong checksums of which one would fit as well by chance, as a power of ten."""
+        """The number of wrong checksums of which one would fit as well by chance, as a power of
+        ten.
+        """
         return f"1e+{int(self.doubt * np.log10(2)):02}"
 
     @property
     def sure(self) -> bool:
-        """Whether nothing else has to be looked for: it stands at an end, and covers all or all but a header."""
+        """Whether nothing else has to be looked for: it stands at an end, and covers all or all but
+        a header.
+        """
         at_end = self.place.offset < 0 and self.place.offset + self.place.size == 0
-        return self.doubt >= SURE and not self.open and ((self.span.part, self.span.tail) == ("all", 0) or at_end)
+        return (
+            self.doubt >= SURE
+            and not self.open
+            and ((self.span.part, self.span.tail) == ("all", 0) or at_end)
+        )
 
 
 def values(rows: NDArray[np.uint8], offset: int, size: int, order: ByteOrder) -> NDArray[np.int64]:
     """What stands at a place in each row, (n,); at most 7 bytes."""
     columns = rows[:, offset : offset + size].astype(np.int64)
     shifts = 8 * np.arange(size, dtype=np.int64)
-    total: NDArray[np.int64] = (columns << (shifts if order == "little" else shifts[::-1])).sum(axis=1)
+    total: NDArray[np.int64] = (columns << (shifts if order == "little" else shifts[::-1])).sum(
+        axis=1
+    )
     return total
 
 
@@ -128,7 +157,9 @@ class Samples:
         distinct = list(dict.fromkeys(frame for frame in frames if frame))[:most]
         self.frames: list[bytes] = sorted(distinct, key=len)
         groups = (list(group) for _, group in itertools.groupby(self.frames, len))
-        self.groups: list[NDArray[np.uint8]] = [np.frombuffer(b"".join(group), np.uint8).reshape(len(group), -1) for group in groups]
+        self.groups: list[NDArray[np.uint8]] = [
+            np.frombuffer(b"".join(group), np.uint8).reshape(len(group), -1) for group in groups
+        ]
         # The same fields are asked for with each algorithm that is tried.
         self._fields: dict[tuple[Place, ByteOrder], NDArray[np.uint64]] = {}
 
@@ -146,43 +177,72 @@ class Samples:
         return Samples(self.frames[::step][:number])
 
     def alike(self, number: int, pick: int) -> Samples:
-        """So many frames of the commonest length, by `pick` other ones, and two of as many other lengths."""
+        """So many frames of the commonest length, by `pick` other ones, and two of as many other
+        lengths.
+        """
         largest = max(self.groups, key=len)
         step = max(1, len(largest) // number)
-        others = [group[2 * pick % len(group) :][:2] for group in self.groups if group is not largest][:number]
-        return Samples(row.tobytes() for rows in (largest[pick % step :: step][:number], *others) for row in rows)
+        others = [
+            group[2 * pick % len(group) :][:2] for group in self.groups if group is not largest
+        ][:number]
+        return Samples(
+            row.tobytes()
+            for rows in (largest[pick % step :: step][:number], *others)
+            for row in rows
+        )
 
     def fields(self, place: Place, order: ByteOrder) -> NDArray[np.uint64]:
         """What stands at a place in each frame, shape (n,)."""
         if (place, order) not in self._fields:
-            columns = [values(group, place.start(group.shape[1]), place.size, order) for group in self.groups]
+            columns = [
+                values(group, place.start(group.shape[1]), place.size, order)
+                for group in self.groups
+            ]
             self._fields[place, order] = np.concatenate(columns).view(np.uint64)
         return self._fields[place, order]
 
     def covered(self, place: Place, span: Span) -> list[NDArray[np.uint8]]:
         """The bytes that a span covers, group by group: (frames, bytes) each."""
-        return [np.concatenate([group[:, a:b] for a, b in span.ranges(place, group.shape[1])], axis=1) for group in self.groups]
+        return [
+            np.concatenate([group[:, a:b] for a, b in span.ranges(place, group.shape[1])], axis=1)
+            for group in self.groups
+        ]
 
     def computed(self, algorithm: Checksum, place: Place, span: Span) -> NDArray[np.uint64]:
         """The checksum of each frame, shape (n,)."""
-        return np.concatenate([batch(algorithm, np.ascontiguousarray(rows)) for rows in self.covered(place, span)])
+        return np.concatenate(
+            [batch(algorithm, np.ascontiguousarray(rows)) for rows in self.covered(place, span)]
+        )
 
     def right(self, algorithm: Checksum, place: Place, span: Span, order: ByteOrder) -> int:
         """How many frames a checksum is right for."""
         return int((self.computed(algorithm, place, span) == self.fields(place, order)).sum())
 
     def places(self, size: int) -> Iterator[Place]:
-        """Where a checksum of so many bytes can stand: at the end, in front, and elsewhere; only where what stands there varies."""
+        """Where a checksum of so many bytes can stand: at the end, in front, and elsewhere; only
+        where what stands there varies.
+        """
         last = self.shortest - size
         first = last if self.alone else 0
-        near = range(first, last + 1) if self.alone or self.shortest <= SHORT else [*range(NEAR), *range(last - NEAR, last + 1)]
-        by_front = sorted((place for place in near if place >= 0), key=lambda place: min(last - place, place + 0.5))
+        near = (
+            range(first, last + 1)
+            if self.alone or self.shortest <= SHORT
+            else [*range(NEAR), *range(last - NEAR, last + 1)]
+        )
+        by_front = sorted(
+            (place for place in near if place >= 0),
+            key=lambda place: min(last - place, place + 0.5),
+        )
         for front in dict.fromkeys(by_front):
             from_end = len(self.groups) > 1 or front > last // 2
             places = [Place(front - self.shortest, size)] if from_end else []
             if not from_end or (len(self.groups) > 1 and front < NEAR):
                 places.append(Place(front, size))
-            yield from (place for place in places if self.alone or len(np.unique(self.fields(place, "little"))) > len(self) // 8 + 1)
+            yield from (
+                place
+                for place in places
+                if self.alone or len(np.unique(self.fields(place, "little"))) > len(self) // 8 + 1
+            )
 
     @property
     def alone(self) -> bool:
@@ -190,11 +250,14 @@ class Samples:
         return len(self) == 1
 
     def varied(self, place: Place) -> float:
-        """How much that byte of a place varies that varies least: whether its values lie far apart, and how many are distinct.
+        """How much that byte of a place varies that varies least: whether its values lie far apart,
+        and how many are distinct.
 
         The usual place, at the end, needs a little less.
         """
-        columns = [self.fields(Place(place.offset + spot, 1), "little") for spot in range(place.size)]
+        columns = [
+            self.fields(Place(place.offset + spot, 1), "little") for spot in range(place.size)
+        ]
         distinct = min(len(np.unique(column)) for column in columns) / min(len(self), 256)
         apart = min(int(np.ptp(column)) for column in columns) >= APART
         return 2 * apart + min(1.0, distinct * (USUAL if place.offset == -place.size else 1))
@@ -206,26 +269,35 @@ def anywhere(_: Place) -> bool:
 
 
 def spans(place: Place, samples: Samples) -> Iterator[Span]:
-    """What a checksum at a place can cover, the usual first; what says the same of these frames in other words is left out."""
+    """What a checksum at a place can cover, the usual first; what says the same of these frames in
+    other words is left out.
+    """
     start = place.start(samples.shortest)
     before, behind = start, samples.shortest - start - place.size
     at_end = behind <= TAIL
     told: set[tuple[tuple[int, int], ...]] = set()
-    parts: tuple[tuple[Part, int, int], ...] = (("all", HEAD if at_end else 2, 1), ("before", HEAD if at_end else 2, 0), ("behind", 0, 1))
+    parts: tuple[tuple[Part, int, int], ...] = (
+        ("all", HEAD if at_end else 2, 1),
+        ("before", HEAD if at_end else 2, 0),
+        ("behind", 0, 1),
+    )
     parts = (("all", 2, 0),) if samples.alone else parts
     for head in range(HEAD + 1):
         for part, heads, tails in parts:
             for tail in range(tails + 1) if head <= heads else ():
                 span = Span(part, head, tail)
                 ranges = tuple(span.ranges(place, samples.shortest))
-                fits = (part == "behind" or head < before or head == 0) and (tail == 0 or tail < behind)
+                fits = (part == "behind" or head < before or head == 0) and (
+                    tail == 0 or tail < behind
+                )
                 if fits and ranges not in told and sum(b - a for a, b in ranges) >= 2:
                     told.add(ranges)
                     yield span
 
 
 def doubt(width: int, values: NDArray[np.uint64], fitted: int, tried: int) -> float:
-    """How many bits of doubt a match leaves: of 2**doubt wrong checksums one would fit as well by chance.
+    """How many bits of doubt a match leaves: of 2**doubt wrong checksums one would fit as well by
+    chance.
 
     Args:
         width: of the checksum, bits.

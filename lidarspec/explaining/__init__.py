@@ -1,7 +1,7 @@
 """Frames for people: what every byte says, what is wrong with it, what differs from another frame.
 
-In: the bytes of a frame, whole or damaged, or of a stream, and a sensor. Out: an `Explanation` of each frame, and its lines; of a file
-what is in it.
+In: the bytes of a frame, whole or damaged, or of a stream, and a sensor. Out: an `Explanation` of
+each frame, and its lines; of a file what is in it.
 Modules in reading order:
 
 * `explanation`: `explain`: from bytes to rows, verdict and points.

@@ -1,6 +1,8 @@
-"""What people write, as the values of the wire: field=value of a frame, and the arguments of a command.
+"""What people write, as the values of the wire: field=value of a frame, and the arguments of a
+command.
 
-A bare number is the wire's integer of a field, and in the unit of its field as an argument; a number with a unit is turned into that one.
+A bare number is the wire's integer of a field, and in the unit of its field as an argument; a
+number with a unit is turned into that one.
 """
 
 from __future__ import annotations
@@ -28,7 +30,8 @@ def values(table: Schema, assignments: Sequence[str], place: str) -> dict[str, A
     """Raw values, nested as in the struct.
 
     Raises:
-        UsageError: for an assignment that is none, an unknown field, or a value that its field cannot take.
+        UsageError: for an assignment that is none, an unknown field, or a value that its field
+            cannot take.
     """
     parsed = [_assignment(table, text, place) for text in assignments]
     found: dict[str, Any] = {}
@@ -49,12 +52,17 @@ def _assignment(table: Schema, text: str, place: str) -> tuple[Steps, Any]:
     arrays = len(info.axes) - (info.kind == "bytes")
     given = sum(map(is_index, names))
     if given != arrays:
-        raise UsageError(f"{place}: {plain} is in {arrays} array{'s' * (arrays != 1)}, and {path!r} has {given} indices")
+        raise UsageError(
+            f"{place}: {plain} is in {arrays} array{'s' * (arrays != 1)}, and {path!r} has {given}"
+            " indices"
+        )
     return names, _raw(info, value.strip(), path, place)
 
 
 def _raw(info: FieldInfo, text: str, path: str, place: str) -> Any:
-    """The raw value that a text stands for: hexadecimal for bytes, a label, a number, or a number with a unit."""
+    """The raw value that a text stands for: hexadecimal for bytes, a label, a number, or a number
+    with a unit.
+    """
     if info.kind == "bytes":
         return _octets(text, f"{place}: {path}")
     for raw, label in info.labels.items():
@@ -66,7 +74,10 @@ def _raw(info: FieldInfo, text: str, path: str, place: str) -> Any:
     if number.denominator == 1 and info.kind != "float":
         return int(number)
     if info.kind == "int":
-        raise UsageError(f"{place}: {path} = {text} is not a raw integer{f'; give it a unit: {text}{info.unit}' if info.unit else ''}")
+        raise UsageError(
+            f"{place}: {path} = {text} is not a raw"
+            f" integer{f'; give it a unit: {text}{info.unit}' if info.unit else ''}"
+        )
     return float(number)
 
 
@@ -82,9 +93,15 @@ def _number(text: str, unit: str, place: str, wanted: str) -> tuple[Fraction, st
     digits, given = split_unit(text)
     per_unit = factor(given, unit) if given else Fraction(1)
     if per_unit is None:
-        raise UsageError(f"{place} is in {unit or 'no unit'}, and {given!r} cannot be turned into that")
+        raise UsageError(
+            f"{place} is in {unit or 'no unit'}, and {given!r} cannot be turned into that"
+        )
     try:
-        number = Fraction(int(digits, 0)) if digits[:2].lower() in ("0x", "0b", "0o") else Fraction(digits)
+        number = (
+            Fraction(int(digits, 0))
+            if digits[:2].lower() in ("0x", "0b", "0o")
+            else Fraction(digits)
+        )
     except ValueError:
         raise UsageError(f"{place} takes {wanted}, not {text!r}") from None
     return number * per_unit, given
@@ -103,7 +120,9 @@ def _nearest(info: FieldInfo, number: Fraction, path: str, place: str) -> int | 
 
 
 def _length(table: Schema, given: Mapping[str, Any], path: str, place: str) -> int:
-    """The length of an array: declared, or from the count fields given; 0 where it follows from single elements given."""
+    """The length of an array: declared, or from the count fields given; 0 where it follows from
+    single elements given.
+    """
     declared = table.arrays.get(path)
     if isinstance(declared, int):
         return declared
@@ -115,11 +134,15 @@ def _length(table: Schema, given: Mapping[str, Any], path: str, place: str) -> i
             target = target.get(name, {}) if isinstance(target, Mapping) else {}
         if isinstance(target, list) and target:
             return 0
-        raise UsageError(f"{place}: how many elements {path}[*] has is not known: give the count field, or {path}[0]=...") from None
+        raise UsageError(
+            f"{place}: how many elements {path}[*] has is not known: give the count field, or"
+            f" {path}[0]=..."
+        ) from None
 
 
 def arguments(sensor: Sensor, name: str, assignments: Sequence[str]) -> dict[str, Any]:
-    """The arguments of a command: numbers in the units of their fields, texts and addresses as they are, bytes from hexadecimal digits.
+    """The arguments of a command: numbers in the units of their fields, texts and addresses as they
+    are, bytes from hexadecimal digits.
 
     Raises:
         UsageError: for an unknown command or argument, or a text that stands for no value of it.
@@ -135,10 +158,16 @@ def arguments(sensor: Sensor, name: str, assignments: Sequence[str]) -> dict[str
             raise UsageError(f"{sensor.id} {name}: {text!r} is not argument=value")
         if argument not in command.args or command.frame is None:
             raise UnknownField(argument, command.args, place=f"{sensor.id} {name}")
-        slot, kind, place = argument_slot(sensor, name, argument), command.arguments[argument].kind, f"{sensor.id} {name}: {argument}"
+        slot, kind, place = (
+            argument_slot(sensor, name, argument),
+            command.arguments[argument].kind,
+            f"{sensor.id} {name}: {argument}",
+        )
         if isinstance(kind, Range):
             unit = slot.info.unit
-            number, _ = _number(value.strip(), unit, place, f"a number in {unit}" if unit else "a number")
+            number, _ = _number(
+                value.strip(), unit, place, f"a number in {unit}" if unit else "a number"
+            )
             found[argument] = int(number) if number.denominator == 1 else float(number)
         else:
             found[argument] = _octets(value, place) if isinstance(kind, Octets) else value

@@ -1,7 +1,8 @@
-"""What is in a file: its kind, who sent what to where, whose frames these are, from when to when, and how much of them is lost.
+"""What is in a file: its kind, who sent what to where, whose frames these are, from when to when,
+and how much of them is lost.
 
-A long file is looked at from its beginning for as long as anybody waits; what is counted then is of that part, and says so. Where times
-can be found in it without reading it, the last one is.
+A long file is looked at from its beginning for as long as anybody waits; what is counted then is of
+that part, and says so. Where times can be found in it without reading it, the last one is.
 """
 
 from __future__ import annotations
@@ -21,12 +22,18 @@ from lidarspec.recording.format import Header
 from lidarspec.scans.selection import dated
 from lidarspec.spec.sensor import Sensor
 from lidarspec.transports.bags import BagTransport
-from lidarspec.transports.files import CaptureTransport, HexTransport, RecordingTransport, StreamCaptureTransport
+from lidarspec.transports.files import (
+    CaptureTransport,
+    HexTransport,
+    RecordingTransport,
+    StreamCaptureTransport,
+)
 from lidarspec.transports.open_url import is_live, transport
 from lidarspec.transports.protocol import Chunk, Sender, Transport, endpoint
 from lidarspec.view.feed import Feed, Reading
 
-#: bytes, and packets, that are looked at from the beginning of a file, and bytes of a sensor that are decoded.
+#: bytes, and packets, that are looked at from the beginning of a file, and bytes of a sensor that
+#: are decoded.
 LOOKED_AT, PACKETS, DECODED = 1 << 26, 1 << 18, 1 << 24
 #: senders that are listed.
 FLOWS = 6
@@ -62,7 +69,8 @@ class Content:
     Attributes:
         source: how it is read.
         sensors: those that it may be, by id; where it is one alone, that one.
-        share: of the bytes that are in its frames, from 0 to 1; None where the file itself names the sensor.
+        share: of the bytes that are in its frames, from 0 to 1; None where the file itself names
+            the sensor.
         options: what to type for it, "" where the file says it.
         reading: how it was doing in the part that was decoded.
     """
@@ -87,7 +95,8 @@ class Contents:
         path, kind, size: of the file: its name, what it is in words, its bytes.
         header: of a recording.
         flows: who sent to where, most first; of a byte stream one.
-        first_ns, last_ns: when the first and the last packet arrived, ns since 1970; None where nobody knows it.
+        first_ns, last_ns: when the first and the last packet arrived, ns since 1970; None where
+            nobody knows it.
         seen_ns: when the last packet that was looked at arrived.
         whole: whether all of the file was looked at; else what is counted is of its beginning.
         contents: what was sent, of each sensor.
@@ -119,27 +128,60 @@ class Contents:
     @property
     def seconds(self) -> float | None:
         """From the first packet to the last; None where times are not known."""
-        return None if self.first_ns is None or self.last_ns is None else (self.last_ns - self.first_ns) * 1e-9
+        return (
+            None
+            if self.first_ns is None or self.last_ns is None
+            else (self.last_ns - self.first_ns) * 1e-9
+        )
 
     @property
     def seen_seconds(self) -> float | None:
         """How long what was looked at took."""
-        return None if self.first_ns is None or self.seen_ns is None else (self.seen_ns - self.first_ns) * 1e-9
+        return (
+            None
+            if self.first_ns is None or self.seen_ns is None
+            else (self.seen_ns - self.first_ns) * 1e-9
+        )
 
     def to_dict(self) -> dict[str, Any]:
         """The same for JSON."""
         return {
             **{
                 name: getattr(self, name)
-                for name in ("path", "kind", "size", "whole", "packets", "bytes", "first_ns", "last_ns", "seconds")
+                for name in (
+                    "path",
+                    "kind",
+                    "size",
+                    "whole",
+                    "packets",
+                    "bytes",
+                    "first_ns",
+                    "last_ns",
+                    "seconds",
+                )
             },
-            "recorded": None if self.header is None else {"source": self.header.source, "at": self.header.created},
+            "recorded": (
+                None
+                if self.header is None
+                else {"source": self.header.source, "at": self.header.created}
+            ),
             "flows": [
-                {**vars(flow), **{end: address and endpoint(address) for end in ("sender", "receiver") if [address := getattr(flow, end)]}}
+                {
+                    **vars(flow),
+                    **{
+                        end: address and endpoint(address)
+                        for end in ("sender", "receiver")
+                        if [address := getattr(flow, end)]
+                    },
+                }
                 for flow in self.flows
             ],
             "contents": [
-                {**vars(content), "command": content.command, "reading": content.reading and content.reading.to_dict()}
+                {
+                    **vars(content),
+                    "command": content.command,
+                    "reading": content.reading and content.reading.to_dict(),
+                }
                 for content in self.contents
             ],
             "warnings": self.warnings,
@@ -155,7 +197,8 @@ def contents(path: str | Path) -> Contents:
     """
     if str(path) == "-" or is_live(path):
         raise suggest(
-            UsageError(f"{path} is no file"), f"lidarspec detect {quote(str(path))}" if str(path) != "-" else "lidarspec info FILE"
+            UsageError(f"{path} is no file"),
+            f"lidarspec detect {quote(str(path))}" if str(path) != "-" else "lidarspec info FILE",
         )
     with contextlib.closing(transport(path)) as opened:
         kind = KINDS.get(type(opened), "bytes as a sensor sent them")
@@ -169,7 +212,8 @@ def contents(path: str | Path) -> Contents:
 
 
 def duration(path: str | Path) -> float | None:
-    """Seconds from the first packet of a file to the last, where that is found without reading all of a long one; None where not.
+    """Seconds from the first packet of a file to the last, where that is found without reading all
+    of a long one; None where not.
 
     Raises:
         SourceError: where the file cannot be opened.
@@ -181,7 +225,11 @@ def duration(path: str | Path) -> float | None:
 
 
 def _size(path: Path) -> int:
-    return sum(part.stat().st_size for part in path.rglob("*")) if path.is_dir() else path.stat().st_size
+    return (
+        sum(part.stat().st_size for part in path.rglob("*"))
+        if path.is_dir()
+        else path.stat().st_size
+    )
 
 
 def _count(found: Contents, opened: Transport) -> None:
@@ -190,7 +238,11 @@ def _count(found: Contents, opened: Transport) -> None:
     chunks = opened.chunks()
     for number, chunk in enumerate(chunks):
         flow = flows.setdefault((chunk.sender, chunk.receiver), Flow(chunk.sender, chunk.receiver))
-        flow.packets, flow.bytes, left = flow.packets + 1, flow.bytes + len(chunk.data), left - len(chunk.data)
+        flow.packets, flow.bytes, left = (
+            flow.packets + 1,
+            flow.bytes + len(chunk.data),
+            left - len(chunk.data),
+        )
         found.first_ns = chunk.at if found.first_ns is None else found.first_ns
         found.seen_ns = found.last_ns = chunk.at or found.last_ns
         if left <= 0 or number >= PACKETS:
@@ -225,7 +277,9 @@ def _content(path: str, one: Verdict) -> Content:
     if not one.alike:
         return Content(source, tuple(names(one)))
     best = one.alike[0]
-    return Content(source, tuple(names(one)), best.share, chosen(best.sensor), _reading(source, best.sensor))
+    return Content(
+        source, tuple(names(one)), best.share, chosen(best.sensor), _reading(source, best.sensor)
+    )
 
 
 def _reading(source: str, sensor: Sensor) -> Reading | None:
@@ -246,22 +300,40 @@ def shown(found: Contents) -> Sequence[tuple[str, str]]:
     if (header := found.header) is not None:
         lines.append(("recorded", f"{header.created} from {header.source or 'an unknown source'}"))
     if found.first_ns is not None:
-        until = f" to {dated(found.last_ns)}, {found.seconds:.3f} s" if found.last_ns is not None else ""
+        until = (
+            f" to {dated(found.last_ns)}, {found.seconds:.3f} s"
+            if found.last_ns is not None
+            else ""
+        )
         lines.append(("time", f"{dated(found.first_ns)}{until}"))
     else:
         lines.append(("time", "it does not say when its bytes arrived"))
     seconds = found.seen_seconds or 0.0
-    rate = f", {found.packets / seconds:.1f}/s, {found.bytes / seconds / 1e3:.1f} kB/s" if seconds else ""
+    rate = (
+        f", {found.packets / seconds:.1f}/s, {found.bytes / seconds / 1e3:.1f} kB/s"
+        if seconds
+        else ""
+    )
     what = "packets" if any(flow.sender for flow in found.flows) else "pieces"
     lines.append(("holds", f"{found.packets} {what}, {found.bytes} bytes{rate}"))
     for flow in found.flows[:FLOWS]:
         if flow.sender is not None:
             to = f" to {endpoint(flow.receiver)}" if flow.receiver is not None else ""
-            lines.append(("from", f"{endpoint(flow.sender)}{to}: {flow.packets} packets, {flow.bytes} bytes"))
+            lines.append(
+                ("from", f"{endpoint(flow.sender)}{to}: {flow.packets} packets, {flow.bytes} bytes")
+            )
     if further := found.flows[FLOWS:]:
-        lines.append(("from", f"{len(further)} others: {sum(flow.packets for flow in further)} packets"))
+        lines.append(
+            ("from", f"{len(further)} others: {sum(flow.packets for flow in further)} packets")
+        )
     if not found.whole:
-        lines.append(("part", "the file is long: what is counted is of its beginning" + ", its end is not known" * (found.last_ns is None)))
+        lines.append(
+            (
+                "part",
+                "the file is long: what is counted is of its beginning"
+                + ", its end is not known" * (found.last_ns is None),
+            )
+        )
     for content in found.contents:
         lines.extend(_told(content))
     return lines
@@ -271,11 +343,21 @@ def _told(content: Content) -> Iterator[tuple[str, str]]:
     if not content.sensors:
         yield "sensor", f"none that is installed sends such bytes ({content.source})"
         return
-    sure = "as the file says" if content.share is None else f"{content.share:.1%} of the bytes are in its frames"
+    sure = (
+        "as the file says"
+        if content.share is None
+        else f"{content.share:.1%} of the bytes are in its frames"
+    )
     yield "sensor", f"{' or '.join(content.sensors)}: {sure}"
     if (reading := content.reading) is not None:
         if reading.speed_hz is not None:
-            yield "scans", f"{reading.speed_hz:.2f} Hz, {reading.points or 0:.0f} points each, {reading.valid or 0:.0f} of them valid"
+            yield (
+                "scans",
+                (
+                    f"{reading.speed_hz:.2f} Hz, {reading.points or 0:.0f} points each,"
+                    f" {reading.valid or 0:.0f} of them valid"
+                ),
+            )
         lost = "" if reading.loss_rate is None else f", lost {reading.loss_rate:.3%}"
         rest = f", bytes in none of them {reading.skipped_rate:.3%}" * (content.share is None)
         yield "frames", f"wrong {reading.error_rate:.3%}{lost}{rest}"

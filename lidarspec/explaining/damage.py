@@ -1,8 +1,9 @@
 """What became of the bytes of a frame on their way: the one change that explains the damage.
 
-Each single bit is turned back, each single byte taken out, and every byte put in at every place, and the engine itself says which of
-these make one valid frame of the type. So nothing is known here of checksums and lengths. With a short checksum several changes may do
-by chance: where they are many, what happened is told, and not where.
+Each single bit is turned back, each single byte taken out, and every byte put in at every place,
+and the engine itself says which of these make one valid frame of the type. So nothing is known here
+of checksums and lengths. With a short checksum several changes may do by chance: where they are
+many, what happened is told, and not where.
 """
 
 from __future__ import annotations
@@ -21,13 +22,15 @@ from lidarspec.framing.results import VALID
 from lidarspec.spec import Frame
 from lidarspec.spec.tree import formulas, nodes, refs
 
-#: bytes of candidates that are tried in one go, the longest frame that construct alone has to read so often, and the longest in which
-#: lost bytes are looked for, of which there are 256 for each place; and on how many fields its layout may depend for that, since where
-#: they are many nearly each candidate has a layout of its own.
+#: bytes of candidates that are tried in one go, the longest frame that construct alone has to read
+#: so often, and the longest in which lost bytes are looked for, of which there are 256 for each
+#: place; and on how many fields its layout may depend for that, since where they are many nearly
+#: each candidate has a layout of its own.
 BLOCK, INTERPRETED, SEARCHED, HEADED = 1 << 20, 128, 512, 4
 #: most changes that are told one by one.
 TOLD = 3
-#: what may have happened, the likeliest first: by how many bytes it made the frame longer, and how many candidates there are for a place.
+#: what may have happened, the likeliest first: by how many bytes it made the frame longer, and how
+#: many candidates there are for a place.
 KINDS = {"flipped bit": (0, 8), "inserted byte": (1, 1), "lost byte": (-1, 256)}
 
 
@@ -36,7 +39,8 @@ class Change(NamedTuple):
 
     Attributes:
         kind: "flipped bit", "inserted byte" or "lost byte".
-        offset: the byte of the damaged frame that was changed or inserted, or before which one was lost.
+        offset: the byte of the damaged frame that was changed or inserted, or before which one was
+            lost.
         value: which bit, 0 the lowest; or the byte.
     """
 
@@ -54,8 +58,11 @@ class Change(NamedTuple):
         return before + bytes([after[0] ^ 1 << self.value]) + after[1:]
 
 
-def changes(frame: Frame, data: bytes, kinds: Iterable[str] = KINDS, *, offsets: Sequence[int] | None = None) -> list[Change]:
-    """Return every single change of the likeliest kind that makes these bytes of one valid and plausible frame of this type.
+def changes(
+    frame: Frame, data: bytes, kinds: Iterable[str] = KINDS, *, offsets: Sequence[int] | None = None
+) -> list[Change]:
+    """Return every single change of the likeliest kind that makes these bytes of one valid and
+    plausible frame of this type.
 
     Args:
         offsets: the bytes at which changes are tried; by default all.
@@ -65,7 +72,11 @@ def changes(frame: Frame, data: bytes, kinds: Iterable[str] = KINDS, *, offsets:
         longer, values = KINDS[kind]
         size = len(data) - longer
         fits = engine.size in (None, size) and max(engine.prefix, default=-1) < size
-        if fits and 0 < size <= _most(engine, values) and (found := list(_found(kind, values, data, size, engine, offsets))):
+        if (
+            fits
+            and 0 < size <= _most(engine, values)
+            and (found := list(_found(kind, values, data, size, engine, offsets)))
+        ):
             return found
     return []
 
@@ -85,15 +96,21 @@ def _deciding(frame: Frame) -> int:
     return len({ref.path for formula in asked for ref in refs(formula)})
 
 
-def _found(kind: str, values: int, data: bytes, size: int, engine: Codec, chosen: Sequence[int] | None) -> Iterator[Change]:
+def _found(
+    kind: str, values: int, data: bytes, size: int, engine: Codec, chosen: Sequence[int] | None
+) -> Iterator[Change]:
     places = np.arange(max(len(data), size))
     old = np.frombuffer(data, np.uint8)
     if kind == "inserted byte":
-        places = places[np.diff(old, prepend=~old[:1]) != 0]  # of a run of equal bytes the first stands for all
+        places = places[
+            np.diff(old, prepend=~old[:1]) != 0
+        ]  # of a run of equal bytes the first stands for all
     if chosen is not None:
         places = places[np.isin(places, chosen)]
     offsets = np.repeat(places, values)
-    numbers = old[places] if values == 1 else np.tile(np.arange(values, dtype=np.uint8), len(places))
+    numbers = (
+        old[places] if values == 1 else np.tile(np.arange(values, dtype=np.uint8), len(places))
+    )
     if kind == "lost byte":
         is_new = numbers != old[offsets - 1]  # the same byte once more before an equal one
         is_new[offsets == 0] = True
@@ -107,11 +124,24 @@ def _found(kind: str, values: int, data: bytes, size: int, engine: Codec, chosen
             fits &= rows[:, spot] & mask == value
         which = np.flatnonzero(fits)
         survey = engine.survey(rows.reshape(-1), which * size) if len(which) else None
-        right = which[(survey.status == VALID) & (survey.sizes == size)] if survey is not None else which
-        yield from (Change(kind, int(offsets[first + one]), int(numbers[first + one])) for one in right.tolist())
+        right = (
+            which[(survey.status == VALID) & (survey.sizes == size)]
+            if survey is not None
+            else which
+        )
+        yield from (
+            Change(kind, int(offsets[first + one]), int(numbers[first + one]))
+            for one in right.tolist()
+        )
 
 
-def _rows(kind: str, old: NDArray[np.uint8], offsets: NDArray[np.intp], numbers: NDArray[np.uint8], size: int) -> NDArray[np.uint8]:
+def _rows(
+    kind: str,
+    old: NDArray[np.uint8],
+    offsets: NDArray[np.intp],
+    numbers: NDArray[np.uint8],
+    size: int,
+) -> NDArray[np.uint8]:
     """The bytes with each change undone, one a row."""
     columns, places = counted(size), offsets[:, None]
     if kind == "inserted byte":
@@ -125,7 +155,9 @@ def _rows(kind: str, old: NDArray[np.uint8], offsets: NDArray[np.intp], numbers:
     return rows
 
 
-def told(frame: Frame, data: bytes, values: Callable[[bytes], Mapping[str, Value]]) -> Iterator[str]:
+def told(
+    frame: Frame, data: bytes, values: Callable[[bytes], Mapping[str, Value]]
+) -> Iterator[str]:
     """Which single change would explain the damage, with what its field would have said.
 
     Args:
@@ -133,11 +165,17 @@ def told(frame: Frame, data: bytes, values: Callable[[bytes], Mapping[str, Value
     """
     found = changes(frame, data)
     if len(found) > TOLD:
-        yield f"one {found[0].kind} would explain it, but in any of {len(found)} places, so that nothing can be said of where"
+        yield (
+            f"one {found[0].kind} would explain it, but in any of {len(found)} places, so that"
+            " nothing can be said of where"
+        )
         return
     before = values(data) if found else {}
     for change in found:
-        explains = f"{'one' if len(found) == 1 else 'an' if change.kind[0] in 'aeiou' else 'a'} {change.kind} would explain it"
+        explains = (
+            f"{'one' if len(found) == 1 else 'an' if change.kind[0] in 'aeiou' else 'a'}"
+            f" {change.kind} would explain it"
+        )
         yield f"{explains}: {_place(change, before, values(change.mended(data)))}"
 
 
@@ -145,8 +183,21 @@ def _place(change: Change, before: Mapping[str, Value], after: Mapping[str, Valu
     kind, offset, value = change
     if kind == "inserted byte":
         return f"byte {offset}, 0x{value:02x}"
-    path = next((path for path, there in after.items() if there.holds(offset, value) or (kind == "lost byte" and there.covers(offset))), "")
+    path = next(
+        (
+            path
+            for path, there in after.items()
+            if there.holds(offset, value) or (kind == "lost byte" and there.covers(offset))
+        ),
+        "",
+    )
     if kind == "lost byte":
         return f"0x{value:02x} before byte {offset}" + (f", in {path}" if path else "")
     values = [str(part[path]) for part in (before, after) if path in part]
-    return f"byte {offset} bit {value}" + (f", {path} {', sent as '.join(values)}" if path and all(values) else f", {path}" if path else "")
+    return f"byte {offset} bit {value}" + (
+        f", {path} {', sent as '.join(values)}"
+        if path and all(values)
+        else f", {path}"
+        if path
+        else ""
+    )

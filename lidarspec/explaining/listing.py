@@ -1,7 +1,8 @@
-"""How an explained frame is listed: a line for each part, indented as the struct is nested, bit fields drawn below.
+"""How an explained frame is listed: a line for each part, indented as the struct is nested, bit
+fields drawn below.
 
-Lines are pieces with roles, so that who has a terminal can colour them; their texts alone say the same. What differs between two
-frames is listed in the same way, field by field and down to the bit.
+Lines are pieces with roles, so that who has a terminal can colour them; their texts alone say the
+same. What differs between two frames is listed in the same way, field by field and down to the bit.
 """
 
 from __future__ import annotations
@@ -30,7 +31,9 @@ def text(line: Line) -> str:
 
 
 def folded(line: Line, width: int) -> Line:
-    """A line with line breaks where it is wider than `width`; what goes on stands below the first piece of its text."""
+    """A line with line breaks where it is wider than `width`; what goes on stands below the first
+    piece of its text.
+    """
     indent = sum(len(span.text) for span in line[:FIXED])
     if len(text(line)) <= width or indent + FOLDED > width:
         return line
@@ -45,21 +48,42 @@ def folded(line: Line, width: int) -> Line:
 
 
 def parents(path: str) -> list[str]:
-    """The structs and elements that a path goes through, outermost first: "a[0].b.c" is in "a[0]" and "a[0].b"."""
+    """The structs and elements that a path goes through, outermost first: "a[0].b.c" is in "a[0]"
+    and "a[0].b".
+    """
     parts = path.split(".")
     return [".".join(parts[:depth]) for depth in range(1, len(parts))]
 
 
 class Listing:
-    """The lines of the rows of a frame, in columns; `every` draws the bits of all elements of an array, and not of the first alone."""
+    """The lines of the rows of a frame, in columns; `every` draws the bits of all elements of an
+    array, and not of the first alone.
+    """
 
     def __init__(self, rows: Sequence[Row], *, every: bool) -> None:
         self._rows = rows
-        self._drawn = [any(value.bits for value in row.values) and (every or row.first) for row in rows]
+        self._drawn = [
+            any(value.bits for value in row.values) and (every or row.first) for row in rows
+        ]
         self._bytes = min(max([1, *(len(row.data) for row in rows)]), LINED)
-        pictures = [bit_picture(*part) for row, drawn in zip(rows, self._drawn, strict=True) if drawn for part in _bits(row)]
-        self._left = max([3 * self._bytes - 1, *(len(picture) for picture in pictures if len(picture) <= PICTURES)])
-        self._paths = min(max((len(name) for index in range(len(rows)) for name in self._names(index)), default=0), NAMES)
+        pictures = [
+            bit_picture(*part)
+            for row, drawn in zip(rows, self._drawn, strict=True)
+            if drawn
+            for part in _bits(row)
+        ]
+        self._left = max(
+            [
+                3 * self._bytes - 1,
+                *(len(picture) for picture in pictures if len(picture) <= PICTURES),
+            ]
+        )
+        self._paths = min(
+            max(
+                (len(name) for index in range(len(rows)) for name in self._names(index)), default=0
+            ),
+            NAMES,
+        )
 
     def lines(self) -> Iterator[Line]:
         """The lines, those of structs and elements before what is in them."""
@@ -73,33 +97,65 @@ class Listing:
             yield from self._row(row, len(around), drawn=self._drawn[index])
 
     def _row(self, row: Row, depth: int, *, drawn: bool) -> Iterator[Line]:
-        parts = [row.data[start : start + self._bytes] for start in range(0, len(row.data), self._bytes)] or [b""]
+        parts = [
+            row.data[start : start + self._bytes] for start in range(0, len(row.data), self._bytes)
+        ] or [b""]
         role = "hex" if row.right else "bad"
-        yield self._line(row.offset, Span(parts[0].hex(" "), role), _indented(row.path, depth), row.spans(drawn=drawn))
+        yield self._line(
+            row.offset,
+            Span(parts[0].hex(" "), role),
+            _indented(row.path, depth),
+            row.spans(drawn=drawn),
+        )
         for row_number, part in enumerate(parts[1:], 1):
-            yield (Span(f"{row.offset + row_number * self._bytes:04x}  ", "offset"), Span(part.hex(" "), role))
+            yield (
+                Span(f"{row.offset + row_number * self._bytes:04x}  ", "offset"),
+                Span(part.hex(" "), role),
+            )
         for value, picture in zip(row.values, _bits(row), strict=True) if drawn else ():
             words = [Span(str(value) or value.raw.hex(" "))]
-            words += [Span(f" ({value.bits})", "docs")] * (len(value.masks) - value.masks.count(0) > 1 and bool(value.bits))
+            words += [Span(f" ({value.bits})", "docs")] * (
+                len(value.masks) - value.masks.count(0) > 1 and bool(value.bits)
+            )
             words += [Span(f"; {value.docs}", "docs")] if value.docs else []
-            drawing = Span(bit_picture(*picture), "bits") if value.bits else Span(picture[0].hex(" "), role)
-            yield self._line(value.start, drawing, " " * LEVEL * (depth + 1) + value.path.removeprefix(f"{row.path}."), words)
+            drawing = (
+                Span(bit_picture(*picture), "bits")
+                if value.bits
+                else Span(picture[0].hex(" "), role)
+            )
+            yield self._line(
+                value.start,
+                drawing,
+                " " * LEVEL * (depth + 1) + value.path.removeprefix(f"{row.path}."),
+                words,
+            )
 
     def _line(self, offset: int, left: Span, name: str, words: Sequence[Span]) -> Line:
         padded = Span(f"{left.text:<{self._left}}  ", left.role)
-        return (Span(f"{offset:04x}  ", "offset"), padded, Span(f"{name:<{self._paths}}  ", "name"), *words)
+        return (
+            Span(f"{offset:04x}  ", "offset"),
+            padded,
+            Span(f"{name:<{self._paths}}  ", "name"),
+            *words,
+        )
 
     def _names(self, index: int) -> Iterator[str]:
         row = self._rows[index]
         around = parents(row.path)
         yield from (_indented(path, depth) for depth, path in enumerate([*around, row.path]))
         if self._drawn[index]:
-            yield from (" " * LEVEL * (len(around) + 1) + value.path.removeprefix(f"{row.path}.") for value in row.values)
+            yield from (
+                " " * LEVEL * (len(around) + 1) + value.path.removeprefix(f"{row.path}.")
+                for value in row.values
+            )
 
 
 def _bits(row: Row) -> list[tuple[bytes, bytes]]:
     """The bytes and the bits in them of each value."""
-    return [(row.data[value.start - row.offset :][: len(value.masks)], value.masks) for value in row.values]
+    return [
+        (row.data[value.start - row.offset :][: len(value.masks)], value.masks)
+        for value in row.values
+    ]
 
 
 def _indented(path: str, depth: int) -> str:
@@ -107,7 +163,9 @@ def _indented(path: str, depth: int) -> str:
 
 
 def told(differences: list[Difference], sizes: tuple[int, int]) -> Iterator[Line]:
-    """The differences of two frames of so many bytes: each field with both values, and the bits that differ below it."""
+    """The differences of two frames of so many bytes: each field with both values, and the bits
+    that differ below it.
+    """
     for missing, group in groupby(differences, lambda difference: difference.missing):
         if missing:
             yield _missing(list(group), missing)
@@ -117,7 +175,9 @@ def told(differences: list[Difference], sizes: tuple[int, int]) -> Iterator[Line
     length = f"{' and '.join(map(str, dict.fromkeys(sizes)))} bytes"
     bits = sum(mask.bit_count() for difference in differences for mask in difference.masks)
     fields = len(differences)
-    differing = f"{bits} bit{'s' * (bits != 1)} in {fields} field{'s' * (fields != 1)} of {length} differ"
+    differing = (
+        f"{bits} bit{'s' * (bits != 1)} in {fields} field{'s' * (fields != 1)} of {length} differ"
+    )
     yield (Span(differing if fields else f"{length}, all alike", "note"),)
 
 
@@ -133,9 +193,16 @@ def _lines(difference: Difference) -> Iterator[Line]:
     for start in range(0, len(masks), COMPARED):
         part = slice(start, start + COMPARED)
         if any(masks[part]):
-            for sign, data, role in (("-", difference.first, "bad"), ("+", difference.second, "good")):
+            for sign, data, role in (
+                ("-", difference.first, "bad"),
+                ("+", difference.second, "good"),
+            ):
                 bits = bit_picture(data[part], masks[part])
-                yield (Span(f"{'':6}{sign} "), Span(f"{data[part].hex(' '):<{3 * COMPARED - 1}}  ", "hex"), Span(bits, role))
+                yield (
+                    Span(f"{'':6}{sign} "),
+                    Span(f"{data[part].hex(' '):<{3 * COMPARED - 1}}  ", "hex"),
+                    Span(bits, role),
+                )
 
 
 def _missing(group: list[Difference], which: str) -> Line:

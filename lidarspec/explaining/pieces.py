@@ -1,7 +1,9 @@
-"""An input in pieces: its frames, what lies between them, and of this what was a frame before it was damaged.
+"""An input in pieces: its frames, what lies between them, and of this what was a frame before it
+was damaged.
 
-The decoder alone says what is a frame, and pieces come as soon as it does. Bytes that it passed over are cut where a frame seems to begin:
-after as many bytes as the frame has, one more or fewer, or where the next one begins before that.
+The decoder alone says what is a frame, and pieces come as soon as it does. Bytes that it passed
+over are cut where a frame seems to begin: after as many bytes as the frame has, one more or fewer,
+or where the next one begins before that.
 """
 
 from __future__ import annotations
@@ -35,7 +37,9 @@ NEAREST = "?"
 
 @dataclass(frozen=True)
 class Piece:
-    """A frame in the input, or with `frame` "" bytes that are in none: of a stream, or one whole datagram."""
+    """A frame in the input, or with `frame` "" bytes that are in none: of a stream, or one whole
+    datagram.
+    """
 
     offset: int
     data: bytes
@@ -57,13 +61,17 @@ class Piece:
         return Piece(self.offset + start, self.data[start:end], frame)
 
 
-def pieces(sensor: Sensor, chunks: Iterable[Chunk], *, datagrams: bool, frame: str | None = None) -> Iterator[Piece]:
-    """The frames of the input and the bytes between them, in order, as they are found; a datagram that is no frame is a piece of its own.
+def pieces(
+    sensor: Sensor, chunks: Iterable[Chunk], *, datagrams: bool, frame: str | None = None
+) -> Iterator[Piece]:
+    """The frames of the input and the bytes between them, in order, as they are found; a datagram
+    that is no frame is a piece of its own.
 
     An input that is no longer than a frame and holds none is one piece, of the type `NEAREST`.
 
     Args:
-        frame: look for frames of this type, also where another one has the same bytes or has to come before; other types are pieces too.
+        frame: look for frames of this type, also where another one has the same bytes or has to
+            come before; other types are pieces too.
 
     Raises:
         UnknownFrame: for a type that the sensor does not have.
@@ -71,23 +79,35 @@ def pieces(sensor: Sensor, chunks: Iterable[Chunk], *, datagrams: bool, frame: s
     if frame is not None and frame not in sensor.frames:
         raise UnknownFrame(frame, sensor.frames, place=sensor.id)
     chunks, head, longest = iter(chunks), list[Chunk](), _longest(sensor)
-    while sum(len(chunk.data) for chunk in head) <= longest and (chunk := next(chunks, None)) is not None:
+    while (
+        sum(len(chunk.data) for chunk in head) <= longest
+        and (chunk := next(chunks, None)) is not None
+    ):
         head.append(chunk)
     whole = b"".join(chunk.data for chunk in head)
     if len(whole) > longest:
-        yield from _cut(sensor if frame is None else _preferring(sensor, frame), itertools.chain(head, chunks), datagrams=datagrams)
+        yield from _cut(
+            sensor if frame is None else _preferring(sensor, frame),
+            itertools.chain(head, chunks),
+            datagrams=datagrams,
+        )
         return
     try:
         yield Piece(0, whole, parse_typed(sensor, whole, frame=frame)[0])
     except LidarSpecError:
-        found = list(_cut(sensor if frame is None else _preferring(sensor, frame), head, datagrams=datagrams))
+        found = list(
+            _cut(sensor if frame is None else _preferring(sensor, frame), head, datagrams=datagrams)
+        )
         yield from found if any(piece.frame for piece in found) else [Piece(0, whole, NEAREST)]
 
 
 def _preferring(sensor: Sensor, frame: str) -> Sensor:
     """The sensor with one type as an incoming one that comes before all others, and after none."""
     first = replace(sensor.frames[frame], direction="in", after=None)
-    return with_frames(sensor, {frame: first, **{name: other for name, other in sensor.frames.items() if name != frame}})
+    return with_frames(
+        sensor,
+        {frame: first, **{name: other for name, other in sensor.frames.items() if name != frame}},
+    )
 
 
 def _cut(sensor: Sensor, chunks: Iterable[Chunk], *, datagrams: bool) -> Iterator[Piece]:
@@ -114,8 +134,11 @@ def _cut(sensor: Sensor, chunks: Iterable[Chunk], *, datagrams: bool) -> Iterato
         start = end
 
 
-def explained(sensor: Sensor, piece: Piece, frame: str | None = None) -> Iterator[tuple[Piece, Explanation]]:
-    """A piece, and what is in it; one without a frame is cut into what were frames before they were damaged, and the rest.
+def explained(
+    sensor: Sensor, piece: Piece, frame: str | None = None
+) -> Iterator[tuple[Piece, Explanation]]:
+    """A piece, and what is in it; one without a frame is cut into what were frames before they were
+    damaged, and the rest.
 
     Args:
         frame: what `NEAREST` stands for; the type that comes nearest where left out.
@@ -139,7 +162,9 @@ def explained(sensor: Sensor, piece: Piece, frame: str | None = None) -> Iterato
 def _skipped(sensor: Sensor, piece: Piece) -> tuple[Piece, Explanation]:
     is_filler = not piece.data.translate(None, bytes(sensor.fillers))
     remark = "filler" if is_filler else "in no frame"
-    return piece, Explanation(sensor.id, "", piece.data, (Row(0, piece.data, "", (), (remark,), right=is_filler),))
+    return piece, Explanation(
+        sensor.id, "", piece.data, (Row(0, piece.data, "", (), (remark,), right=is_filler),)
+    )
 
 
 def _damaged(sensor: Sensor, piece: Piece) -> Iterator[Piece]:
@@ -151,19 +176,29 @@ def _damaged(sensor: Sensor, piece: Piece) -> Iterator[Piece]:
             yield piece.part(end, start, name)
             end = start
         if end <= start < len(data) and (name := _nearest(sensor, data[start:])):
-            end = len(data) if piece.datagram else _end(sensor, data, start, name, [*starts, len(data)])
+            end = (
+                len(data)
+                if piece.datagram
+                else _end(sensor, data, start, name, [*starts, len(data)])
+            )
             yield piece.part(start, end, name)
 
 
 def likely_starts(sensor: Sensor, data: bytes) -> list[int]:
-    """Where bytes begin like an incoming frame: with two constant bytes or more, and any other; in ascending order."""
+    """Where bytes begin like an incoming frame: with two constant bytes or more, and any other; in
+    ascending order.
+    """
     starts: set[int] = set()
     for frame in sensor.incoming.values():
         prefix = codec(frame).prefix
-        size = next((spot for spot in range(len(prefix) + 1) if prefix.get(spot, (0, 0))[0] != 0xFF), 0)
+        size = next(
+            (spot for spot in range(len(prefix) + 1) if prefix.get(spot, (0, 0))[0] != 0xFF), 0
+        )
         if size >= SYNC:
             magic = bytes(prefix[spot][1] for spot in range(size))
-            starts |= {found.start() for found in re.finditer(re.escape(magic) + b"(?=.)", data, re.DOTALL)}
+            starts |= {
+                found.start() for found in re.finditer(re.escape(magic) + b"(?=.)", data, re.DOTALL)
+            }
     return sorted(starts)
 
 
@@ -176,15 +211,21 @@ def _nearest(sensor: Sensor, data: bytes) -> str:
 
 
 def _headless(sensor: Sensor, data: bytes) -> str:
-    """The type that bytes were a frame of which do not begin like one; "" where no single change makes them one."""
+    """The type that bytes were a frame of which do not begin like one; "" where no single change
+    makes them one.
+    """
     return next((name for name, frame in sensor.incoming.items() if changes(frame, data)), "")
 
 
 def _end(sensor: Sensor, data: bytes, start: int, name: str, ends: list[int]) -> int:
-    """Where a damaged frame ends: by its length or next to that, where something else begins, or else where the first thing does."""
+    """Where a damaged frame ends: by its length or next to that, where something else begins, or
+    else where the first thing does.
+    """
     following = [end for end in ends if end > start]
     if (recoding := recoder(sensor.frames[name])) is not None:
-        size = recoding.reading(np.frombuffer(data[start:], np.uint8), np.zeros(1, np.intp)).sizes.item(0)
+        size = recoding.reading(
+            np.frombuffer(data[start:], np.uint8), np.zeros(1, np.intp)
+        ).sizes.item(0)
         return start + size if size > 0 else following[0]
     layout = layout_of(sensor, name, data[start : start + sensor.frames[name].max_length])
     if not isinstance(layout, Layout):

@@ -19,14 +19,18 @@ DEGREES_PER_TURN = 360
 
 
 class Span(NamedTuple):
-    """A piece of a line and its role: "" or "offset", "hex", "name", "bits", "docs", "good", "bad", "point", "note", "title"."""
+    """A piece of a line and its role: "" or "offset", "hex", "name", "bits", "docs", "good", "bad",
+    "point", "note", "title".
+    """
 
     text: str
     role: str = ""
 
 
 class Point(NamedTuple):
-    """One point of a cloud in metres and degrees; x y z nan and range inf or nan where there is no return."""
+    """One point of a cloud in metres and degrees; x y z nan and range inf or nan where there is no
+    return.
+    """
 
     x: float
     y: float
@@ -38,14 +42,25 @@ class Point(NamedTuple):
     @classmethod
     def of(cls, cloud: PointCloud, index: int) -> Point:
         """Point number `index` of a cloud."""
-        x, y, z, distance = (float(column[index]) for column in (cloud.x, cloud.y, cloud.z, cloud.range))
-        return cls(x, y, z, distance, math.degrees(cloud.azimuth[index]), math.degrees(cloud.elevation[index]))
+        x, y, z, distance = (
+            float(column[index]) for column in (cloud.x, cloud.y, cloud.z, cloud.range)
+        )
+        return cls(
+            x,
+            y,
+            z,
+            distance,
+            math.degrees(cloud.azimuth[index]),
+            math.degrees(cloud.elevation[index]),
+        )
 
     def __str__(self) -> str:
         if math.isnan(self.azimuth_deg + self.elevation_deg):
             return "direction not known from this frame alone"
         level = round(self.elevation_deg, 2) == 0
-        direction = f"at {fixed(self.azimuth_deg, 2)} deg" + ("" if level else f", {fixed(self.elevation_deg, 2)} deg up")
+        direction = f"at {fixed(self.azimuth_deg, 2)} deg" + (
+            "" if level else f", {fixed(self.elevation_deg, 2)} deg up"
+        )
         if math.isnan(self.x):
             return f"{direction} -> {'no return' if math.isinf(self.range) else 'not valid'}"
         height = "" if level and fixed(self.z, 3) == "0.000" else f" z {fixed(self.z, 3)}"
@@ -94,7 +109,9 @@ class Value:
 
     def __str__(self) -> str:
         if self.physical is None:
-            return ascii_text(self.raw) if isinstance(self.raw, bytes | bytearray) else repr(self.raw)
+            return (
+                ascii_text(self.raw) if isinstance(self.raw, bytes | bytearray) else repr(self.raw)
+            )
         if self.label:
             return f"{self.raw} {self.label}"
         plain = isinstance(self.raw, int) and self.digits == 0 and self.physical == float(self.raw)
@@ -103,11 +120,17 @@ class Value:
         return f"{text} {self.unit}".strip() + turns
 
     def to_dict(self) -> dict[str, Any]:
-        """The value for JSON: bytes and masks as hexadecimal text, no entry for what is not there, null for nan and infinity."""
+        """The value for JSON: bytes and masks as hexadecimal text, no entry for what is not there,
+        null for nan and infinity.
+        """
         raw = self.raw.hex(" ") if isinstance(self.raw, bytes | bytearray) else number(self.raw)
         physical = {} if self.physical is None else {"value": number(self.physical)}
         place = {"start": self.start, "masks": self.masks.hex(" ")}
-        more = {name: text for name in ("unit", "label", "bits", "docs") if (text := getattr(self, name))}
+        more = {
+            name: text
+            for name in ("unit", "label", "bits", "docs")
+            if (text := getattr(self, name))
+        }
         more |= {"text": text} if (text := str(self)) else {}
         return {"path": self.path, "raw": raw, **physical, **more, **place}
 
@@ -141,40 +164,70 @@ class Row:
         return "".join(text for text, _ in self.spans())
 
     def spans(self, *, drawn: bool = False) -> list[Span]:
-        """The meaning in pieces with their roles; with `drawn`, without the values, which stand bit by bit below the row."""
+        """The meaning in pieces with their roles; with `drawn`, without the values, which stand bit
+        by bit below the row.
+        """
         alone = len(self.values) == 1 and not self.values[0].bits
         values = [] if drawn else self._values(alone=alone)
         verdict = "good" if self.right else "bad"
         docs = self.values[0].docs if alone and self.first else ""
         points = list(dict.fromkeys(str(point) for point in self.points))
-        parts = [(", ", text, "") for text in values] + [(", ", text, "point") for text in points[:1]]
-        parts += [("; ", text, verdict) for text in self.remarks] + [("; ", docs, "docs")] + [("; ", text, "point") for text in points[1:]]
+        parts = [(", ", text, "") for text in values] + [
+            (", ", text, "point") for text in points[:1]
+        ]
+        parts += (
+            [("; ", text, verdict) for text in self.remarks]
+            + [("; ", docs, "docs")]
+            + [("; ", text, "point") for text in points[1:]]
+        )
         parts = [part for part in parts if part[1]]
-        return [Span(separator * (index > 0) + text, role) for index, (separator, text, role) in enumerate(parts)]
+        return [
+            Span(separator * (index > 0) + text, role)
+            for index, (separator, text, role) in enumerate(parts)
+        ]
 
     @property
     def first(self) -> bool:
-        """Whether it stands in the first element of every array around it; the others are the same again."""
+        """Whether it stands in the first element of every array around it; the others are the same
+        again.
+        """
         return set(re.findall(r"\[(\d+)\]", self.path)) <= {"0"}
 
     def _values(self, *, alone: bool) -> list[str]:
-        """Each value in words: with its name, unless the unit says enough, and with its bits; those of further elements are left out."""
+        """Each value in words: with its name, unless the unit says enough, and with its bits; those
+        of further elements are left out.
+        """
         if alone and self.remarks:
             return []
         units = [value.unit for value in self.values if value.unit and "[" in self.path]
         names = [value.name for value in self.values]
         words = []
         for value in self.values:
-            name = value.name if names.count(value.name) == 1 else value.path.removeprefix(f"{self.path}.")
+            name = (
+                value.name
+                if names.count(value.name) == 1
+                else value.path.removeprefix(f"{self.path}.")
+            )
             text, where = str(value), f" ({value.bits})" if value.bits and self.first else ""
             says_enough = alone or units.count(value.unit) == 1
-            words.append(f"{text}{where}" if says_enough else f"{name} {text or value.raw.hex(' ')}{where}")
+            words.append(
+                f"{text}{where}" if says_enough else f"{name} {text or value.raw.hex(' ')}{where}"
+            )
         return words
 
     def to_dict(self) -> dict[str, Any]:
         """The row for JSON."""
-        facts = {"offset": self.offset, "hex": self.data.hex(" "), "path": self.path, "meaning": self.meaning, "right": self.right}
-        points = [{name: number(value) for name, value in point._asdict().items()} for point in self.points]
+        facts = {
+            "offset": self.offset,
+            "hex": self.data.hex(" "),
+            "path": self.path,
+            "meaning": self.meaning,
+            "right": self.right,
+        }
+        points = [
+            {name: number(value) for name, value in point._asdict().items()}
+            for point in self.points
+        ]
         more = {"remarks": list(self.remarks), "values": [value.to_dict() for value in self.values]}
         return {**facts, **more} | ({"points": points} if points else {})
 
@@ -202,27 +255,50 @@ class Difference:
 
     @property
     def masks(self) -> bytes:
-        """The bits that differ, of bytes that both frames have; bits of other fields in the same bytes are not among them."""
+        """The bits that differ, of bytes that both frames have; bits of other fields in the same
+        bytes are not among them.
+        """
         own = self.before.masks if self.before else b""
-        return bytes((a ^ b) & mask for a, b, mask in zip(self.first, self.second, own, strict=False))
+        return bytes(
+            (a ^ b) & mask for a, b, mask in zip(self.first, self.second, own, strict=False)
+        )
 
     @property
     def change(self) -> str:
         """By how much a physical value went up or down; "" for what is no number."""
-        if not self.before or not self.after or self.before.physical is None or self.after.physical is None or self.before.label:
+        if (
+            not self.before
+            or not self.after
+            or self.before.physical is None
+            or self.after.physical is None
+            or self.before.label
+        ):
             return ""
         step = fixed(self.after.physical - self.before.physical, self.before.digits)
         return f"{'' if step.startswith('-') else '+'}{step} {self.before.unit}".strip()
 
     def to_dict(self) -> dict[str, Any]:
         """The difference for JSON."""
-        values = {name: None if value is None else value.to_dict() for name, value in (("before", self.before), ("after", self.after))}
-        offsets = {name: None if value is None else value.start for name, value in (("offset", self.before), ("offset_after", self.after))}
-        return {"path": self.path, **offsets, **values, "bits": sum(mask.bit_count() for mask in self.masks)}
+        values = {
+            name: None if value is None else value.to_dict()
+            for name, value in (("before", self.before), ("after", self.after))
+        }
+        offsets = {
+            name: None if value is None else value.start
+            for name, value in (("offset", self.before), ("offset_after", self.after))
+        }
+        return {
+            "path": self.path,
+            **offsets,
+            **values,
+            "bits": sum(mask.bit_count() for mask in self.masks),
+        }
 
 
 def bit_picture(data: bytes, masks: bytes) -> str:
-    """The bits of one value in some bytes, the highest of each byte first: ".. 000001.. 00011000"; dots are bits of other values."""
+    """The bits of one value in some bytes, the highest of each byte first: ".. 000001.. 00011000";
+    dots are bits of other values.
+    """
     parts = []
     for byte, mask in zip(data, masks, strict=True):
         bits = "".join(str(byte >> bit & 1) if mask >> bit & 1 else "." for bit in range(7, -1, -1))
@@ -243,7 +319,9 @@ def fixed(value: float, digits: int | None) -> str:
 
 def limits(low: float, high: float, between: str = "..") -> str:
     """A range of numbers, with every digit of whole ones: "0..4294967295"."""
-    return between.join(f"{end:.0f}" if float(end).is_integer() else f"{end:g}" for end in (low, high))
+    return between.join(
+        f"{end:.0f}" if float(end).is_integer() else f"{end:g}" for end in (low, high)
+    )
 
 
 def asked(kind: Taken, between: str = "..") -> str:
@@ -258,7 +336,9 @@ def ascii_text(data: bytes | bytearray) -> str:
 
 
 def hexdump(error: WireError) -> str:
-    """The bytes around the place of an error, sixteen to a line, with the place and its field marked; "" without bytes."""
+    """The bytes around the place of an error, sixteen to a line, with the place and its field
+    marked; "" without bytes.
+    """
     size = _marked(error)
     first = min(error.offset, len(error.data)) // DUMPED * DUMPED
     if error.offset == len(error.data) and first == len(error.data) and first:
@@ -270,7 +350,11 @@ def hexdump(error: WireError) -> str:
     place = error.offset - first
     columns = [8 + 3 * index + (index >= 8) for index in (place, min(place + size, DUMPED) - 1)]
     marks = "^" * (max(columns[1], columns[0]) + 2 - columns[0])
-    return "\n".join([*lines, f"{' ' * columns[0]}{marks} {error.path}".rstrip()]) if error.data else ""
+    return (
+        "\n".join([*lines, f"{' ' * columns[0]}{marks} {error.path}".rstrip()])
+        if error.data
+        else ""
+    )
 
 
 def _marked(error: WireError) -> int:

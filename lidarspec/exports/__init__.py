@@ -1,7 +1,9 @@
 """What a spec says, in the languages of other tools: kinds of exports by name.
 
-In: a sensor. Out: a text, by `export`. An export walks the frame trees (`lidarspec.spec.tree`) that `messages` hands out, and is refused,
-with the reason, where they hold Python code or its target cannot say what the spec says. Modules in reading order:
+In: a sensor. Out: a text, by `export`. An export walks the frame trees (`lidarspec.spec.tree`) that
+`messages` hands out, and is refused,
+with the reason, where they hold Python code or its target cannot say what the spec says. Modules in
+reading order:
 
 * `json`, `stubs`: the spec as data, and as types for an editor.
 * `reference`, `diagram`: a page in Markdown, and packet diagrams in SVG.
@@ -45,7 +47,8 @@ class UnknownExport(UnknownName):
 
 
 def narrowed(sensor: Sensor, frame: str) -> Sensor:
-    """The sensor with one frame type alone, and no commands: what exports of a single message are made from.
+    """The sensor with one frame type alone, and no commands: what exports of a single message are
+    made from.
 
     Raises:
         UnknownFrame: if it has no frame type of this name.
@@ -73,13 +76,17 @@ def export(sensor: Sensor, kind: str) -> str:
     if kind not in EXPORTS:
         raise UnknownExport(kind, EXPORTS)
     module, _, function = EXPORTS[kind].partition(":")
-    plain = replace(sensor, vendor=_line(sensor.vendor), model=_line(sensor.model), source=_line(sensor.source))
+    plain = replace(
+        sensor, vendor=_line(sensor.vendor), model=_line(sensor.model), source=_line(sensor.source)
+    )
     text: str = getattr(importlib.import_module(module), function)(plain)
     return text
 
 
 def _line(text: str) -> str:
-    """What stands in a heading, a comment or a string of any language as one line; its own marks each export escapes itself."""
+    """What stands in a heading, a comment or a string of any language as one line; its own marks
+    each export escapes itself.
+    """
     return printable(" ".join(text.split()))
 
 
@@ -94,7 +101,12 @@ class Message:
     @property
     def seals(self) -> dict[str, tree.Sealed]:
         """The checksums, by the path of each field that holds one or a part of it."""
-        return {path: node for node in tree.nodes(self.root) if isinstance(node, tree.Sealed) for path in node.fields}
+        return {
+            path: node
+            for node in tree.nodes(self.root)
+            if isinstance(node, tree.Sealed)
+            for path in node.fields
+        }
 
 
 def messages(sensor: Sensor, *, on_wire: bool = True) -> tuple[Message, ...]:
@@ -104,26 +116,43 @@ def messages(sensor: Sensor, *, on_wire: bool = True) -> tuple[Message, ...]:
         on_wire: their bytes as they are sent are asked for, and not the fields alone.
 
     Raises:
-        Refused: if it has none yet, or one holds a part that only Python code can decide, or stands on the wire in a form of its own.
+        Refused: if it has none yet, or one holds a part that only Python code can decide, or stands
+            on the wire in a form of its own.
     """
     if not sensor.frames:
         raise Refused(f"{sensor.id}: has no frames yet: configure it first")
-    formed = [f"{name} in {frame.wire}" for name, frame in sensor.frames.items() if frame.wire is not None and on_wire]
+    formed = [
+        f"{name} in {frame.wire}"
+        for name, frame in sensor.frames.items()
+        if frame.wire is not None and on_wire
+    ]
     if formed:
-        raise Refused(f"{sensor.id}: no other language recodes what stands on the wire: {', '.join(formed)}")
+        raise Refused(
+            f"{sensor.id}: no other language recodes what stands on the wire: {', '.join(formed)}"
+        )
     return tuple(_message(sensor, name, frame) for name, frame in sensor.frames.items())
 
 
 def asked(node: tree.Node) -> list[tree.Ref]:
-    """The fields that the formulas of a node and of what is in it ask for, and those that lengths and conditions are held to."""
-    found = [value for below in tree.nodes(node) for value in (*tree.formulas(below), *held(below).values())]
+    """The fields that the formulas of a node and of what is in it ask for, and those that lengths
+    and conditions are held to.
+    """
+    found = [
+        value
+        for below in tree.nodes(node)
+        for value in (*tree.formulas(below), *held(below).values())
+    ]
     found += [below.condition for below in tree.nodes(node) if isinstance(below, tree.Check)]
     return [ref for value in found for ref in tree.refs(value)]
 
 
 def held(node: tree.Node) -> dict[str, tree.Formula]:
     """What the fields that a node is have to say of other parts, by their paths."""
-    return {info.path: info.rebuilt for info in tree.infos(node) if info.held and info.rebuilt is not None}
+    return {
+        info.path: info.rebuilt
+        for info in tree.infos(node)
+        if info.held and info.rebuilt is not None
+    }
 
 
 def _message(sensor: Sensor, name: str, frame: Frame) -> Message:
@@ -140,12 +169,21 @@ def _message(sensor: Sensor, name: str, frame: Frame) -> Message:
 
 def _check(node: tree.Node) -> None:
     """Refuse what no other language can say."""
-    for formula in (*tree.formulas(node), *([node.condition] if isinstance(node, tree.Check) else [])):
+    for formula in (
+        *tree.formulas(node),
+        *([node.condition] if isinstance(node, tree.Check) else []),
+    ):
         if isinstance(formula, tree.Code):
             raise Refused(formula.reason)
         if element := next((ref.path for ref in tree.refs(formula) if "[" in ref.path), None):
-            raise Refused(f"{element}: an element of an array decides on what follows, and this language keeps none")
+            raise Refused(
+                f"{element}: an element of an array decides on what follows, and this language"
+                " keeps none"
+            )
     if isinstance(node, tree.Opaque):
-        raise Refused(f"{node.info.path}: {node.reason if node.inside else f'{node.kind} is Python code, which no other language runs'}")
+        raise Refused(
+            f"{node.info.path}:"
+            f" {node.reason if node.inside else f'{node.kind} is Python code, which no other language runs'}"
+        )
     if isinstance(node, tree.Sealed):
         _ = node.algorithm

@@ -1,9 +1,12 @@
-"""A C99 header for a sensor: accessors, lengths, checksums and scaling, as functions of bytes; nothing in it depends on struct packing.
+"""A C99 header for a sensor: accessors, lengths, checksums and scaling, as functions of bytes;
+nothing in it depends on struct packing.
 
-`header` puts together what all headers have (``c_bytes.h``, beside this module), a function for each checksum algorithm that the sensor
-uses, and for each frame type the accessors of `lidarspec.exports.c_fields` and the functions of the whole frame: how long it is by its
-header, whether a whole, sound frame stands there, and each checksum as it is and as it has to be. A checksum's function takes the byte
-ranges that it covers, so that one serves every frame; `frame_length` looks at no byte before it has asked whether the byte is there.
+`header` puts together what all headers have (``c_bytes.h``, beside this module), a function for
+each checksum algorithm that the sensor uses, and for each frame type the accessors of
+`lidarspec.exports.c_fields` and the functions of the whole frame: how long it is by its header,
+whether a whole, sound frame stands there, and each checksum as it is and as it has to be. A
+checksum's function takes the byte ranges that it covers, so that one serves every frame;
+`frame_length` looks at no byte before it has asked whether the byte is there.
 """
 
 from __future__ import annotations
@@ -17,11 +20,34 @@ from typing import Any
 
 from lidarspec._version import __version__
 from lidarspec.exports import Message, Refused, beginning, c_fields, messages
-from lidarspec.exports.c_fields import CLayout, Entry, accesses, arguments, comment, identifier, parameters, quoted, word
+from lidarspec.exports.c_fields import (
+    CLayout,
+    Entry,
+    accesses,
+    arguments,
+    comment,
+    identifier,
+    parameters,
+    quoted,
+    word,
+)
 from lidarspec.frames.wire_table import Extent
 from lidarspec.spec import Checksum, Crc, Fold15, Sensor, Sum, WordXor, Xor, ZeroPadded
 from lidarspec.spec.checksums import byte_table, mirrored_bytes, reflected
-from lidarspec.spec.tree import Blob, Block, Check, Never, Number, Op, Repeat, Sealed, formulas, parts, refs, runs_of
+from lidarspec.spec.tree import (
+    Blob,
+    Block,
+    Check,
+    Never,
+    Number,
+    Op,
+    Repeat,
+    Sealed,
+    formulas,
+    parts,
+    refs,
+    runs_of,
+)
 
 _FUNCTION = """\
 /* {text} */
@@ -40,7 +66,9 @@ static inline uint64_t {name}(const uint8_t *p, const int64_t (*spans)[2], size_
 
 @dataclass(frozen=True)
 class _Body:
-    """What makes one algorithm: before the bytes, for each byte, and what comes of it; `i` counts the bytes covered so far."""
+    """What makes one algorithm: before the bytes, for each byte, and what comes of it; `i` counts
+    the bytes covered so far.
+    """
 
     begin: str
     step: str
@@ -58,7 +86,9 @@ def checksum(algorithm: Checksum, name: str) -> str:
     pad, is_counting = "", isinstance(algorithm, ZeroPadded) or isinstance(inner, WordXor | Fold15)
     if isinstance(algorithm, ZeroPadded):
         if isinstance(inner, Fold15):
-            raise Refused("a folded sum that is padded with zeros: which bytes count depends on how many there are in all")
+            raise Refused(
+                "a folded sum that is padded with zeros: which bytes count depends on how many there are in all"
+            )
         pad = f"    for (; i % {algorithm.to}; ++i) {{\n        const uint8_t byte = 0;\n{indent(body.step, 8 * ' ')}\n    }}\n"
     return _FUNCTION.format(
         text=algorithm.describe(),
@@ -78,7 +108,11 @@ def _body(algorithm: Checksum) -> _Body:
         case Xor():
             return _Body("uint64_t total = 0;", "total ^= byte;", "total")
         case Sum():
-            return _Body("uint64_t total = 0;", "total += byte;", f"total & UINT64_C(0x{(1 << algorithm.width) - 1:x})")
+            return _Body(
+                "uint64_t total = 0;",
+                "total += byte;",
+                f"total & UINT64_C(0x{(1 << algorithm.width) - 1:x})",
+            )
         case WordXor():
             return _word_xor(algorithm)
         case Fold15():
@@ -100,23 +134,37 @@ def _word_xor(algorithm: WordXor) -> _Body:
     begin = f"static const uint8_t halves[{len(halves)}] = {{{', '.join(map(str, halves))}}};\nuint64_t total = 0;"
     head = f"i < {algorithm.head} ? i % 2 : " if algorithm.head else ""
     back = f"(i - {algorithm.head})" if algorithm.head else "i"
-    return _Body(begin, f"total ^= (uint64_t)byte << 8 * ({head}halves[{back} % {len(halves)}]);", "total")
+    return _Body(
+        begin, f"total ^= (uint64_t)byte << 8 * ({head}halves[{back} % {len(halves)}]);", "total"
+    )
 
 
 def _crc(crc: Crc) -> _Body:
-    """By the engine's own table, with the register as it has it: its low byte is the one that meets the next byte of data."""
+    """By the engine's own table, with the register as it has it: its low byte is the one that meets
+    the next byte of data.
+    """
     size = next(size for size in (8, 16, 32, 64) if crc.width <= size)
     entries = [_literal(register, size) for register in byte_table(crc.width, crc.poly, crc.refin)]
     per_line = max(96 // (len(entries[0]) + 2), 1)
-    table = ",\n    ".join(", ".join(entries[first : first + per_line]) for first in range(0, 256, per_line))
+    table = ",\n    ".join(
+        ", ".join(entries[first : first + per_line]) for first in range(0, 256, per_line)
+    )
     start = reflected(crc.init, crc.width)
     begin = f"static const uint{size}_t table[256] = {{\n    {table}}};\n"
-    begin += f"uint{size}_t total = {_literal(start if crc.refin else mirrored_bytes(start), size)};"
+    begin += (
+        f"uint{size}_t total = {_literal(start if crc.refin else mirrored_bytes(start), size)};"
+    )
     step = f"total = (uint{size}_t)(table[(total ^ byte) & 0xff] ^ total >> 8);"
-    result = "(uint64_t)total" if crc.refin else f"lidarspec_swapped(total, {size // 8}) >> {size - crc.width}"
+    result = (
+        "(uint64_t)total"
+        if crc.refin
+        else f"lidarspec_swapped(total, {size // 8}) >> {size - crc.width}"
+    )
     if crc.refin != crc.refout:
         result = f"lidarspec_mirrored({result}, {crc.width})"
-    return _Body(begin, step, f"({result}) ^ {_literal(crc.xorout, size)}" if crc.xorout else result)
+    return _Body(
+        begin, step, f"({result}) ^ {_literal(crc.xorout, size)}" if crc.xorout else result
+    )
 
 
 def _literal(value: int, size: int) -> str:
@@ -161,20 +209,36 @@ static inline int {name}(const uint8_t *p, size_t n)
 
 
 def _frame(layout: CLayout, algorithms: Mapping[Checksum, str]) -> Iterator[str]:
-    """The functions of a frame type that are about the whole of it; `algorithms` are the names of the checksums' functions."""
+    """The functions of a frame type that are about the whole of it; `algorithms` are the names of
+    the checksums' functions.
+    """
     length, longest = layout.name("", "frame_length"), layout.message.frame.max_length
     checks = _lines(_needs(layout))
     unused = "" if checks else "    (void)p;\n    (void)n;\n"
-    yield _LENGTH.format(name=length, unused=unused, checks=checks, size=layout.size, longest=longest)
+    yield _LENGTH.format(
+        name=length, unused=unused, checks=checks, size=layout.size, longest=longest
+    )
     seals = dict[str, tuple[Entry, Sealed]]()
     for entry in layout.entries:
-        if isinstance(entry.node, Sealed):  # of several around one struct, the inner ones are called after their fields
-            path = entry.path if layout.name(entry.path, "checksum_ok") not in seals else entry.node.fields[0]
+        if isinstance(
+            entry.node, Sealed
+        ):  # of several around one struct, the inner ones are called after their fields
+            path = (
+                entry.path
+                if layout.name(entry.path, "checksum_ok") not in seals
+                else entry.node.fields[0]
+            )
             seals[layout.name(path, "checksum_ok")] = entry, entry.node
     for name, (entry, seal) in seals.items():
         yield _checksum(layout, entry, seal, name, algorithms[seal.algorithm])
-    sealed = [_unless(entry, f"!{name}({arguments(entry.depth)})") for name, (entry, _) in seals.items()]
-    yield _IS_FRAME.format(name=layout.name("", "is_frame"), length=length, checks=_lines([*_constants(layout), *sealed]))
+    sealed = [
+        _unless(entry, f"!{name}({arguments(entry.depth)})") for name, (entry, _) in seals.items()
+    ]
+    yield _IS_FRAME.format(
+        name=layout.name("", "is_frame"),
+        length=length,
+        checks=_lines([*_constants(layout), *sealed]),
+    )
 
 
 def _lines(statements: Iterable[str]) -> str:
@@ -182,10 +246,14 @@ def _lines(statements: Iterable[str]) -> str:
 
 
 def _needs(layout: CLayout) -> Iterator[str]:
-    """Checks that what the length depends on is there, and makes sense, in the order in which it is met."""
+    """Checks that what the length depends on is there, and makes sense, in the order in which it is
+    met.
+    """
     longest = layout.message.frame.max_length
     for entry in layout.entries:
-        before = "".join(f"{condition.text} && " for condition in entry.conditions if condition.is_fixed)
+        before = "".join(
+            f"{condition.text} && " for condition in entry.conditions if condition.is_fixed
+        )
         for value in formulas(entry.node):
             if any(ref.info.axes for ref in refs(value)):
                 continue
@@ -193,7 +261,11 @@ def _needs(layout: CLayout) -> Iterator[str]:
                 ends = [other.start + other.size for other in layout.named(ref.path)]
                 yield from (f"if ({before}(int64_t)n < {end}) return 0;" for end in ends)
             for part in parts(value):
-                if isinstance(part, Op) and part.symbol in ("//", "%") and not isinstance(part.args[1], int):
+                if (
+                    isinstance(part, Op)
+                    and part.symbol in ("//", "%")
+                    and not isinstance(part.args[1], int)
+                ):
                     yield f"if ({before}!lidarspec_int({layout.formula(part.args[1])})) return 0;"
             if isinstance(entry.node, Repeat | Blob) and not isinstance(value, int):
                 yield f"if ({before}!lidarspec_within({layout.formula(value)}, {longest})) return 0;"
@@ -215,8 +287,12 @@ def _checksum(layout: CLayout, entry: Entry, seal: Sealed, name: str, algorithm:
     )
 
 
-def _spans(layout: CLayout, entry: Entry, seal: Sealed, held: list[Entry]) -> Iterator[tuple[Extent, Extent]]:
-    """The byte ranges that a checksum covers: from its first to its last part, or all that holds no bit of it."""
+def _spans(
+    layout: CLayout, entry: Entry, seal: Sealed, held: list[Entry]
+) -> Iterator[tuple[Extent, Extent]]:
+    """The byte ranges that a checksum covers: from its first to its last part, or all that holds no
+    bit of it.
+    """
     if seal.over is not None:
         first, last = (layout.whole(path) for path in seal.over)
         yield first.start, last.start + last.size
@@ -253,7 +329,9 @@ def _constants(layout: CLayout) -> Iterator[str]:
     for entry in layout.entries:
         node = entry.node
         if isinstance(node, Blob) and node.const is not None:
-            yield _unless(entry, f"memcmp(p + {entry.start}, {quoted(node.const)}, {len(node.const)}) != 0")
+            yield _unless(
+                entry, f"memcmp(p + {entry.start}, {quoted(node.const)}, {len(node.const)}) != 0"
+            )
         elif isinstance(node, Check):
             yield _unless(entry, f"!{layout.formula(node.condition)}")
         elif isinstance(node, Never):
@@ -265,12 +343,18 @@ def _constants(layout: CLayout) -> Iterator[str]:
                 elif access.info.allowed is not None:
                     yield _unless(entry, f"!({_among(access.expression, access.info.allowed)})")
                 elif access.info.held and access.info.rebuilt is not None:
-                    yield _unless(entry, f"(int64_t)({access.expression}) != {layout.formula(access.info.rebuilt)}")
+                    yield _unless(
+                        entry,
+                        f"(int64_t)({access.expression}) != {layout.formula(access.info.rebuilt)}",
+                    )
 
 
 def _among(expression: str, allowed: tuple[int, ...]) -> str:
     """Whether a number is one of some."""
-    ranges = (f"(lidarspec_int({expression}) >= {first} && lidarspec_int({expression}) <= {last})" for first, last in runs_of(allowed))
+    ranges = (
+        f"(lidarspec_int({expression}) >= {first} && lidarspec_int({expression}) <= {last})"
+        for first, last in runs_of(allowed)
+    )
     return " || ".join(ranges) or "0"
 
 
@@ -282,10 +366,14 @@ def _number(value: Any) -> str:
 
 
 def _unless(entry: Entry, wrong: str) -> str:
-    """A statement that ends with 0 where something is wrong, for every element of the arrays that it is in."""
+    """A statement that ends with 0 where something is wrong, for every element of the arrays that
+    it is in.
+    """
     where = " && ".join(filter(None, (entry.where, wrong)))
     names = [(c_fields.index(level), count) for level, count in enumerate(entry.loops)]
-    loops = "".join(f"for (size_t {name} = 0; {name} < (size_t)({count}); ++{name}) " for name, count in names)
+    loops = "".join(
+        f"for (size_t {name} = 0; {name} < (size_t)({count}); ++{name}) " for name, count in names
+    )
     return f"{loops}if ({where}) return 0;"
 
 
@@ -323,34 +411,61 @@ def header(sensor: Sensor) -> str:
     """A C99 header that reads the frames of a sensor.
 
     Raises:
-        Refused: where only Python code can decide what a frame is made of, or its layout cannot be computed in C.
+        Refused: where only Python code can decide what a frame is made of, or its layout cannot be
+            computed in C.
     """
     prefix = identifier(beginning(sensor))
-    title, source = (text.replace("*/", "* /").replace("/*", "/ *") for text in (f"{sensor.vendor} {sensor.model}", sensor.source))
+    title, source = (
+        text.replace("*/", "* /").replace("/*", "/ *")
+        for text in (f"{sensor.vendor} {sensor.model}", sensor.source)
+    )
     found = messages(sensor)
-    algorithms = dict.fromkeys(seal.algorithm for message in found for seal in message.seals.values())
-    names = {algorithm: f"{prefix}_checksum_{number}" for number, algorithm in enumerate(algorithms, 1)}
+    algorithms = dict.fromkeys(
+        seal.algorithm for message in found for seal in message.seals.values()
+    )
+    names = {
+        algorithm: f"{prefix}_checksum_{number}" for number, algorithm in enumerate(algorithms, 1)
+    }
     given: dict[str, tuple[str, str, str]] = {}
     frames = [text for message in found for text in _message(message, prefix, given, names)]
-    head = _HEAD.format(title=title, version=__version__, source=source, prefix=prefix, guard=f"{prefix.upper()}_H")
+    head = _HEAD.format(
+        title=title, version=__version__, source=source, prefix=prefix, guard=f"{prefix.upper()}_H"
+    )
     helpers = resources.files("lidarspec.exports").joinpath("c_bytes.h").read_text(encoding="utf-8")
-    return "\n".join([head, helpers, *(checksum(algorithm, name) for algorithm, name in names.items()), *frames, _TAIL])
+    return "\n".join(
+        [
+            head,
+            helpers,
+            *(checksum(algorithm, name) for algorithm, name in names.items()),
+            *frames,
+            _TAIL,
+        ]
+    )
 
 
-def _message(message: Message, prefix: str, given: dict[str, tuple[str, str, str]], algorithms: Mapping[Checksum, str]) -> Iterator[str]:
+def _message(
+    message: Message,
+    prefix: str,
+    given: dict[str, tuple[str, str, str]],
+    algorithms: Mapping[Checksum, str],
+) -> Iterator[str]:
     """All of a frame type; `given` are the names that are taken, and what has them."""
     name = functools.partial(_name, given, prefix, message.name)
     for own in _OWN:
         name("", own)
     layout = CLayout(message, name)
-    yield comment(f"---- {message.name}: {'from' if message.frame.direction == 'in' else 'to'} the sensor ----")
+    yield comment(
+        f"---- {message.name}: {'from' if message.frame.direction == 'in' else 'to'} the sensor ----"
+    )
     yield f"#define {prefix.upper()}_{identifier(message.name).upper()}_MAX_LENGTH {message.frame.max_length}"
     yield from (text for text in c_fields.fields(layout) if text)
     yield ""
     yield from _frame(layout, algorithms)
 
 
-def _name(given: dict[str, tuple[str, str, str]], prefix: str, frame: str, path: str, ending: str) -> str:
+def _name(
+    given: dict[str, tuple[str, str, str]], prefix: str, frame: str, path: str, ending: str
+) -> str:
     """The C name of what stands at a path of a frame, with an ending; each is given once."""
     name = "_".join(identifier(part) for part in (prefix, frame, path, ending) if part)
     while given.setdefault(name, (frame, path, ending)) != (frame, path, ending):

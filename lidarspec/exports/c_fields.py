@@ -1,10 +1,11 @@
 """Where everything in a frame type stands, as C expressions, and the C functions that read it.
 
-`CLayout` walks a frame tree once and notes an `Entry` for each node: its first byte as a C expression of the frame's bytes and of array
-indices, its size, the conditions under which it is there and the counts of the arrays around it. A length or count that a header decides is
-a call of the function that reads it, so that no expression grows with the header. From the entries come an accessor for each field,
-which tries what alternatives have of it one after another, the counts of arrays, whether an optional field is there, and the scaling
-to its unit and to the SI unit.
+`CLayout` walks a frame tree once and notes an `Entry` for each node: its first byte as a C
+expression of the frame's bytes and of array indices, its size, the conditions under which it is
+there and the counts of the arrays around it. A length or count that a header decides is a call of
+the function that reads it, so that no expression grows with the header. From the entries come an
+accessor for each field, which tries what alternatives have of it one after another, the counts of
+arrays, whether an optional field is there, and the scaling to its unit and to the SI unit.
 """
 
 from __future__ import annotations
@@ -21,7 +22,11 @@ from lidarspec.spec import tree
 
 #: comparisons go through a function: compilers warn of what a narrow number can never be.
 _OPERATIONS = {
-    **{"//": "lidarspec_floor_div({}, {})", "%": "lidarspec_floor_mod({}, {})", "not": "(int64_t)!{}"},
+    **{
+        "//": "lidarspec_floor_div({}, {})",
+        "%": "lidarspec_floor_mod({}, {})",
+        "not": "(int64_t)!{}",
+    },
     **{symbol: f"(lidarspec_int({{}}) {symbol} {{}})" for symbol in tree.COMPARISONS},
 }
 _INDICES = "ijklmnoq"
@@ -50,16 +55,29 @@ def identifier(text: str) -> str:
 def number_type(fields: Sequence[tree.FieldInfo]) -> str:
     """The C type that holds what any of these fields holds."""
     if any(info.kind == "float" for info in fields):
-        return "double" if max(info.bits for info in fields) > 32 or any(info.kind != "float" for info in fields) else "float"
+        return (
+            "double"
+            if max(info.bits for info in fields) > 32
+            or any(info.kind != "float" for info in fields)
+            else "float"
+        )
     signed = any(info.dtype is not None and info.dtype.kind == "i" for info in fields)
     mixed = signed and any(info.dtype is not None and info.dtype.kind == "u" for info in fields)
-    width = next(size for size in (8, 16, 32, 64) if max(info.bits for info in fields) + mixed <= size or size == 64)
+    width = next(
+        size
+        for size in (8, 16, 32, 64)
+        if max(info.bits for info in fields) + mixed <= size or size == 64
+    )
     return f"{'int' if signed else 'uint'}{width}_t"
 
 
 def comment(*texts: str) -> str:
     """A comment of one line, whatever the texts hold; "" where they hold nothing."""
-    text = "; ".join(" ".join(part.split()) for part in texts if part).replace("*/", "* /").replace("/*", "/ *")
+    text = (
+        "; ".join(" ".join(part.split()) for part in texts if part)
+        .replace("*/", "* /")
+        .replace("/*", "/ *")
+    )
     return f"/* {text} */" if text else ""
 
 
@@ -106,7 +124,11 @@ class Entry:
     @property
     def fields(self) -> list[Entry]:
         """What can be read there: an entry for each part of a bit block, else itself."""
-        return [replace(self, part=part) for part in self.node.parts] if isinstance(self.node, tree.Block) else [self]
+        return (
+            [replace(self, part=part) for part in self.node.parts]
+            if isinstance(self.node, tree.Block)
+            else [self]
+        )
 
     @property
     def info(self) -> tree.FieldInfo:
@@ -141,12 +163,16 @@ class Entry:
     @property
     def condition(self) -> str:
         """When it is there, of a part in its bit block too; "" for always."""
-        inside = [f"{index(self.depth + level)} == {number}" for level, number in enumerate(self.indices)]
+        inside = [
+            f"{index(self.depth + level)} == {number}" for level, number in enumerate(self.indices)
+        ]
         return " && ".join(filter(None, (self.where, *inside)))
 
 
 def given(node: tree.Node, depth: int) -> str:
-    """The arguments by which a size is asked for in so many arrays; where it is the same for all elements, it is that of the first."""
+    """The arguments by which a size is asked for in so many arrays; where it is the same for all
+    elements, it is that of the first.
+    """
     is_own = any(ref.info.axes for ref in asked(node))
     return arguments(depth) if is_own else ", ".join(["p", *["0"] * depth])
 
@@ -171,8 +197,14 @@ class CLayout:
         self._visit(top)
 
     def named(self, path: str) -> list[Entry]:
-        """Every entry of the numbers, bytes or bits at a path: one, unless alternatives have it each."""
-        return [entry for entry in self.entries if any(info.path == path for info in tree.infos(entry.node))]
+        """Every entry of the numbers, bytes or bits at a path: one, unless alternatives have it
+        each.
+        """
+        return [
+            entry
+            for entry in self.entries
+            if any(info.path == path for info in tree.infos(entry.node))
+        ]
 
     def whole(self, path: str) -> Entry:
         """The entry of the part at a path, of whatever kind: all of an array, all alternatives."""
@@ -186,7 +218,11 @@ class CLayout:
         """
         if tree.width(value) > tree.MOST_BITS:
             raise Refused("a formula that may pass what a 64-bit integer holds")
-        return tree.written(value, lambda ref: f"(int64_t){self.name(ref.path, '')}({arguments(len(ref.info.axes))})", _OPERATIONS)
+        return tree.written(
+            value,
+            lambda ref: f"(int64_t){self.name(ref.path, '')}({arguments(len(ref.info.axes))})",
+            _OPERATIONS,
+        )
 
     def length(self, value: tree.Formula) -> str:
         """A number of elements or bytes as C."""
@@ -206,23 +242,41 @@ class CLayout:
             case tree.Blob(size=int() as size):
                 return Extent(size)
             case tree.Blob():
-                return Extent(0, (f"(int64_t){self.name(entry.path, 'size')}({given(entry.node, entry.depth)})",))
+                return Extent(
+                    0,
+                    (
+                        (
+                            f"(int64_t){self.name(entry.path, 'size')}({given(entry.node, entry.depth)})"
+                        ),
+                    ),
+                )
             case tree.Repeat():
                 return self._element(entry, entry.node).times(self.count(entry.node, entry.depth))
             case tree.When() | tree.Select():
                 sizes = self.sizes(entry)
                 if len({str(size) for _, size in sizes}) == 1:
                     return sizes[0][1]
-                return Extent(0, (f"(int64_t){self.extent_name(entry)}({given(entry.node, entry.depth)})",))
+                return Extent(
+                    0, (f"(int64_t){self.extent_name(entry)}({given(entry.node, entry.depth)})",)
+                )
             case tree.Parts():
-                raise Refused(f"{entry.path}: parts of sizes of their own, of which none has a place without reading those before it")
+                raise Refused(
+                    f"{entry.path}: parts of sizes of their own, of which none has a place without"
+                    " reading those before it"
+                )
             case tree.Empty():
                 return Extent()
         return sum((self.extent(below) for below in self._below(entry)), Extent())
 
     def extent_name(self, entry: Entry) -> str:
-        """The function that gives the size of a part with alternatives; one of these may be the alternative of another."""
-        choices = [node for node in tree.nodes(self.message.root) if isinstance(node, tree.When | tree.Select)]
+        """The function that gives the size of a part with alternatives; one of these may be the
+        alternative of another.
+        """
+        choices = [
+            node
+            for node in tree.nodes(self.message.root)
+            if isinstance(node, tree.When | tree.Select)
+        ]
         alike = [id(node) for node in choices if node.name == entry.node.name]
         return self.name(entry.path, f"extent{alike.index(id(entry.node)) or ''}")
 
@@ -239,7 +293,15 @@ class CLayout:
         if isinstance(node, tree.Repeat):
             step = self._element(entry, node).times(f"(int64_t){index(entry.depth)}")
             loops = (*entry.loops, str(self.count(node, entry.depth)))
-            self._visit(replace(entry, node=node.element, start=entry.start + step, depth=entry.depth + 1, loops=loops))
+            self._visit(
+                replace(
+                    entry,
+                    node=node.element,
+                    start=entry.start + step,
+                    depth=entry.depth + 1,
+                    loops=loops,
+                )
+            )
         elif isinstance(node, tree.When | tree.Select):
             for condition, below in self._cases(entry):
                 self._visit(replace(below, conditions=(*entry.conditions, condition)))
@@ -256,27 +318,41 @@ class CLayout:
             yield replace(entry, node=node.body)
         elif isinstance(node, tree.Struct):
             for member in node.members:
-                yield replace(entry, node=member, path=".".join(filter(None, (node.path, member.name))))
+                yield replace(
+                    entry, node=member, path=".".join(filter(None, (node.path, member.name)))
+                )
 
     def _element(self, entry: Entry, node: tree.Repeat) -> Extent:
         size = self.extent(replace(entry, node=node.element, depth=entry.depth + 1))
         if size.terms and any(node.axis in ref.info.axes for ref in asked(node.element)):
-            raise Refused(f"{node.axis}: its elements differ in size, so that none has a place of its own without reading those before it")
+            raise Refused(
+                f"{node.axis}: its elements differ in size, so that none has a place of its own"
+                " without reading those before it"
+            )
         return size
 
     def _cases(self, entry: Entry) -> list[tuple[Condition, Entry]]:
         """The alternatives of a part, each with its condition."""
         node = entry.node
-        is_fixed = not any(ref.info.axes for value in tree.formulas(node) for ref in tree.refs(value))
+        is_fixed = not any(
+            ref.info.axes for value in tree.formulas(node) for ref in tree.refs(value)
+        )
         if isinstance(node, tree.When):
             holds = self.formula(node.condition)
-            holds = holds[1:-1] if isinstance(node.condition, tree.Op) and node.condition.symbol in tree.COMPARISONS else f"{holds} != 0"
+            holds = (
+                holds[1:-1]
+                if isinstance(node.condition, tree.Op) and node.condition.symbol in tree.COMPARISONS
+                else f"{holds} != 0"
+            )
             cases = [(holds, node.then), (f"!({holds})", node.otherwise)]
         else:
             assert isinstance(node, tree.Select)
             key = self.formula(node.key)
             others = " && ".join(f"{key} != {value}" for value, _ in node.cases) or "1"
-            cases = [*((f"{key} == {value}", case) for value, case in node.cases), (others, node.default)]
+            cases = [
+                *((f"{key} == {value}", case) for value, case in node.cases),
+                (others, node.default),
+            ]
         return [(Condition(text, is_fixed), replace(entry, node=case)) for text, case in cases]
 
 
@@ -318,12 +394,21 @@ def _bits(part: tree.Part, start: Extent) -> str:
 
 def accesses(layout: CLayout, path: str) -> list[Entry]:
     """All ways to read a field: an entry for each."""
-    return [access for entry in layout.named(path) for access in entry.fields if access.info.path == path]
+    return [
+        access
+        for entry in layout.named(path)
+        for access in entry.fields
+        if access.info.path == path
+    ]
 
 
 def fields(layout: CLayout) -> Iterator[str]:
-    """The functions of all fields in the order of the wire; one that stands in several alternatives comes with the last."""
-    functions = [function for entry in layout.entries for function in dict.fromkeys(_functions(entry))]
+    """The functions of all fields in the order of the wire; one that stands in several alternatives
+    comes with the last.
+    """
+    functions = [
+        function for entry in layout.entries for function in dict.fromkeys(_functions(entry))
+    ]
     extents = list(_extents(layout))
     yield from (text.partition("\n")[0].partition(" {")[0] + ";" for text in extents)
     for write, path in reversed(dict.fromkeys(reversed(functions))):
@@ -341,7 +426,9 @@ def _functions(entry: Entry) -> Iterator[tuple[Writer, str]]:
         for part in entry.node.parts:
             yield from ((_inner_count, axis) for axis in _inner(part))
             yield _field, part.info.path
-    elif isinstance(entry.node, tree.Number) or (isinstance(entry.node, tree.Blob) and entry.node.name):
+    elif isinstance(entry.node, tree.Number) or (
+        isinstance(entry.node, tree.Blob) and entry.node.name
+    ):
         yield _field, entry.path
     elif isinstance(entry.node, tree.Repeat):
         yield _count, entry.path
@@ -353,7 +440,10 @@ def _extents(layout: CLayout) -> Iterator[str]:
         if isinstance(entry.node, tree.When | tree.Select):
             sizes = layout.sizes(entry)
             if len({str(size) for _, size in sizes}) > 1:
-                ways = [*((condition, f"(size_t)({size})") for condition, size in sizes[:-1]), ("", f"(size_t)({sizes[-1][1]})")]
+                ways = [
+                    *((condition, f"(size_t)({size})") for condition, size in sizes[:-1]),
+                    ("", f"(size_t)({sizes[-1][1]})"),
+                ]
                 yield _function("size_t", layout.extent_name(entry), entry.depth, ways)
 
 
@@ -364,7 +454,12 @@ def _inner(part: tree.Part) -> tuple[str, ...]:
 
 def _inner_count(layout: CLayout, axis: str) -> Iterator[str]:
     """The number of elements of an array inside a bit block."""
-    inside = [(access, access.part) for entry in layout.entries for access in entry.fields if access.part and axis in _inner(access.part)]
+    inside = [
+        (access, access.part)
+        for entry in layout.entries
+        for access in entry.fields
+        if access.part and axis in _inner(access.part)
+    ]
     entry, part = inside[0]
     level = _inner(part).index(axis)
     count = max(part.indices[level] for _, part in inside) + 1
@@ -372,29 +467,57 @@ def _inner_count(layout: CLayout, axis: str) -> Iterator[str]:
 
 
 def _count(layout: CLayout, axis: str) -> Iterator[str]:
-    arrays = [(entry, entry.node.count) for entry in layout.entries if entry.path == axis and isinstance(entry.node, tree.Repeat)]
+    arrays = [
+        (entry, entry.node.count)
+        for entry in layout.entries
+        if entry.path == axis and isinstance(entry.node, tree.Repeat)
+    ]
     ways = [(entry.where, layout.length(count)) for entry, count in arrays]
     yield _function("size_t", layout.name(axis, "count"), arrays[0][0].depth, ways)
 
 
 def _field(layout: CLayout, path: str) -> Iterator[str]:
-    """The functions of a field: what it holds, whether it is there, its scaling; and the names of its values."""
+    """The functions of a field: what it holds, whether it is there, its scaling; and the names of
+    its values.
+    """
     ways = accesses(layout, path)
     name, first = layout.name(path, ""), ways[0]
     depth = first.depth + len(first.indices)
-    yield from (f"#define {name.upper()}_{identifier(label).upper()} {value}" for value, label in first.info.labels.items())
+    yield from (
+        f"#define {name.upper()}_{identifier(label).upper()} {value}"
+        for value, label in first.info.labels.items()
+    )
     yield comment(unit_text(first.info), meaning(first.info))
     if isinstance(first.node, tree.Blob):
         kind = ""
-        sizes = [(access.where, layout.length(access.node.size)) for access in ways if isinstance(access.node, tree.Blob)]
+        sizes = [
+            (access.where, layout.length(access.node.size))
+            for access in ways
+            if isinstance(access.node, tree.Blob)
+        ]
         yield _function("size_t", layout.name(path, "size"), depth, sizes)
-        yield _function("const uint8_t *", name, depth, [(access.where, f"p + ({access.start})") for access in ways])
+        yield _function(
+            "const uint8_t *",
+            name,
+            depth,
+            [(access.where, f"p + ({access.start})") for access in ways],
+        )
     else:
         kind = number_type([access.info for access in ways])
-        yield _function(kind, name, depth, [(access.condition, f"({kind}){_grouped(access.expression)}") for access in ways])
+        yield _function(
+            kind,
+            name,
+            depth,
+            [(access.condition, f"({kind}){_grouped(access.expression)}") for access in ways],
+        )
     if any(access.conditions for access in ways):
         places = dict.fromkeys(access.where or "1" for access in ways)
-        yield _function("int", layout.name(path, "present"), depth, [("", " || ".join(f"({where})" for where in places))])
+        yield _function(
+            "int",
+            layout.name(path, "present"),
+            depth,
+            [("", " || ".join(f"({where})" for where in places))],
+        )
     if kind and (first.info.scaled or first.info.unit):
         yield from _scaling(first.info, name, kind)
 
@@ -402,15 +525,30 @@ def _field(layout: CLayout, path: str) -> Iterator[str]:
 def _function(kind: str, name: str, depth: int, ways: list[tuple[str, str]]) -> str:
     """A function that gives the first value whose condition holds, else 0."""
     used = " ".join(condition + " " + value for condition, value in ways)
-    lines = [f"    (void){argument};" for argument in arguments(depth).split(", ") if not re.search(rf"\b{argument}\b", used)]
-    lines += [f"    if ({condition}) return {value};" if condition else f"    return {value};" for condition, value in ways]
+    lines = [
+        f"    (void){argument};"
+        for argument in arguments(depth).split(", ")
+        if not re.search(rf"\b{argument}\b", used)
+    ]
+    lines += [
+        f"    if ({condition}) return {value};" if condition else f"    return {value};"
+        for condition, value in ways
+    ]
     lines += ["    return 0;"] * bool(ways[-1][0])
     head = f"static inline {kind}{'' if kind.endswith('*') else ' '}{name}({parameters(depth)})"
-    return f"{head} {{ {lines[0].strip()} }}" if len(lines) == 1 else "\n".join([head, "{", *lines, "}"])
+    return (
+        f"{head} {{ {lines[0].strip()} }}"
+        if len(lines) == 1
+        else "\n".join([head, "{", *lines, "}"])
+    )
 
 
 def _grouped(expression: str) -> str:
-    return f"({expression})" if " " in expression and not expression.startswith(("lidarspec_", "p[")) else expression
+    return (
+        f"({expression})"
+        if " " in expression and not expression.startswith(("lidarspec_", "p["))
+        else expression
+    )
 
 
 def _scaling(info: tree.FieldInfo, name: str, kind: str) -> Iterator[str]:
@@ -418,13 +556,22 @@ def _scaling(info: tree.FieldInfo, name: str, kind: str) -> Iterator[str]:
     yield _conversion(f"{name}_to_{_unit_name(info.unit)}", kind, info.scale, info.offset)
     if info.unit in SI:
         unit, factor, offset = SI[info.unit]
-        yield _conversion(f"{name}_to_{unit}", kind, info.scale * factor, info.offset * factor + offset)
+        yield _conversion(
+            f"{name}_to_{unit}", kind, info.scale * factor, info.offset * factor + offset
+        )
 
 
 def _conversion(name: str, kind: str, scale: float, offset: float) -> str:
-    text = f"(double)raw * {float(scale)!r}" + (f" {'-' if offset < 0 else '+'} {abs(float(offset))!r}" if offset else "")
+    text = f"(double)raw * {float(scale)!r}" + (
+        f" {'-' if offset < 0 else '+'} {abs(float(offset))!r}" if offset else ""
+    )
     return f"static inline double {name}({kind} raw) {{ return {text}; }}"
 
 
 def _unit_name(unit: str) -> str:
-    return identifier(unit.replace("/", "_per_").replace("%", "percent").replace("^", "").replace("**", "")) or "value"
+    return (
+        identifier(
+            unit.replace("/", "_per_").replace("%", "percent").replace("^", "").replace("**", "")
+        )
+        or "value"
+    )

@@ -1,8 +1,11 @@
-"""Packet diagrams as manuals have them: rows of four bytes, every field a box, repeated parts drawn once with their number.
+"""Packet diagrams as manuals have them: rows of four bytes, every field a box, repeated parts drawn
+once with their number.
 
-A diagram is made in two steps. `_Cells` says what is shown of a frame tree: boxes in the order of the wire (`Cell`), and groups
-that repeat or that some headers leave out (`Group`). `_Sheet` draws these from top to bottom as SVG: a box across the end of a row goes on
-in the next, a group has rows of its own with a bracket beside them, and a field too long to draw, or of no fixed length, is a torn row.
+A diagram is made in two steps. `_Cells` says what is shown of a frame tree: boxes in the order of
+the wire (`Cell`), and groups that repeat or that some headers leave out (`Group`). `_Sheet` draws
+these from top to bottom as SVG: a box across the end of a row goes on in the next, a group has rows
+of its own with a bracket beside them, and a field too long to draw, or of no fixed length, is a
+torn row.
 """
 
 from __future__ import annotations
@@ -12,7 +15,18 @@ from dataclasses import dataclass, field, replace
 from xml.sax.saxutils import escape, quoteattr
 
 from lidarspec.exports import Message, messages
-from lidarspec.frames.wire_table import INDICES, Extent, bit_text, branches, extent, frame_size, meaning, phrase, ruled, unit_text
+from lidarspec.frames.wire_table import (
+    INDICES,
+    Extent,
+    bit_text,
+    branches,
+    extent,
+    frame_size,
+    meaning,
+    phrase,
+    ruled,
+    unit_text,
+)
 from lidarspec.spec import Sensor, tree
 
 #: how the names of fields begin that are there for nothing yet, in manuals.
@@ -39,7 +53,9 @@ class Cell:
 
 @dataclass(frozen=True)
 class Group:
-    """Boxes that stand together: repeated, or with `optional` there under a condition, as the label says."""
+    """Boxes that stand together: repeated, or with `optional` there under a condition, as the label
+    says.
+    """
 
     label: str
     items: tuple[Item, ...]
@@ -50,8 +66,14 @@ Item = Cell | Group
 
 
 def byte_order(message: Message) -> str:
-    """The byte order of all numbers of a frame type, "" where they differ or there are none of several bytes."""
-    orders = {node.order for node in tree.nodes(message.root) if isinstance(node, tree.Number) and node.size > 1}
+    """The byte order of all numbers of a frame type, "" where they differ or there are none of
+    several bytes.
+    """
+    orders = {
+        node.order
+        for node in tree.nodes(message.root)
+        if isinstance(node, tree.Number) and node.size > 1
+    }
     return orders.pop() if len(orders) == 1 else ""
 
 
@@ -83,37 +105,75 @@ class _Cells:
             case tree.Repeat():
                 return (self._repeat(node, start, depth),)
             case tree.Parts():
-                kinds = [(kind.name, self.visit(kind.element, Extent(0, ("i",)), depth + 1)) for kind in node.kinds]
-                items = kinds[0][1] if len(kinds) == 1 else tuple(Group(name, items, optional=True) for name, items in kinds)
+                kinds = [
+                    (kind.name, self.visit(kind.element, Extent(0, ("i",)), depth + 1))
+                    for kind in node.kinds
+                ]
+                items = (
+                    kinds[0][1]
+                    if len(kinds) == 1
+                    else tuple(Group(name, items, optional=True) for name, items in kinds)
+                )
                 return (Group(f"{node.name}: {ruled(node)}", items),)
             case tree.When() | tree.Select():
-                parts = ((label, self.visit(branch, start, depth)) for label, branch in branches(node))
+                parts = (
+                    (label, self.visit(branch, start, depth)) for label, branch in branches(node)
+                )
                 return tuple(Group(label, items, optional=True) for label, items in parts if items)
         return ()
 
     def _struct(self, node: tree.Struct, start: Extent, depth: int) -> Iterator[Item]:
         for member in node.members:
-            named = isinstance(member, tree.Struct | tree.Sealed) or (isinstance(member, tree.Block) and member.parts[0].names)
+            named = isinstance(member, tree.Struct | tree.Sealed) or (
+                isinstance(member, tree.Block) and member.parts[0].names
+            )
             for item in self.visit(member, start, depth):
-                yield replace(item, name=f"{member.name}.{item.name}") if named and isinstance(item, Cell) else item
+                yield (
+                    replace(item, name=f"{member.name}.{item.name}")
+                    if named and isinstance(item, Cell)
+                    else item
+                )
             start = start + extent(member, member.name)
 
     def _number(self, node: tree.Number, start: Extent) -> Cell:
         width, is_long = 8 * node.size, node.size > 1
-        short = {"uint": "u", "int": "s", "float": "float "}[node.kind] + f"{width}{f' {node.order[0]}e' * (self.mixed and is_long)}"
+        short = {"uint": "u", "int": "s", "float": "float "}[
+            node.kind
+        ] + f"{width}{f' {node.order[0]}e' * (self.mixed and is_long)}"
         detail = " ".join(filter(None, (short, unit_text(node.info))))
         if node.info.const is not None:
-            detail = f"{node.info.const:#0{2 * node.size + 2}x}" if isinstance(node.info.const, int) else str(node.info.const)
-        return self._cell(node.info, node.name, width, detail, f"{node.kind}{width}{f' {node.order}' * is_long}", start)
+            detail = (
+                f"{node.info.const:#0{2 * node.size + 2}x}"
+                if isinstance(node.info.const, int)
+                else str(node.info.const)
+            )
+        return self._cell(
+            node.info,
+            node.name,
+            width,
+            detail,
+            f"{node.kind}{width}{f' {node.order}' * is_long}",
+            start,
+        )
 
     def _blob(self, node: tree.Blob, start: Extent) -> Cell:
         size = extent(node)
-        detail = node.const.hex(" ") if node.const is not None and len(node.const) <= 8 else f"{size} byte{'s' * (str(size) != '1')}"
+        detail = (
+            node.const.hex(" ")
+            if node.const is not None and len(node.const) <= 8
+            else f"{size} byte{'s' * (str(size) != '1')}"
+        )
         return self._cell(node.info, node.name, 8 * size.number, detail, "bytes", start)
 
     def _block(self, node: tree.Block, start: Extent) -> list[Cell]:
-        """A box for each run of bits of one value, in the order of the wire, the highest bit of each byte first."""
-        segments = [(run.byte, run.low + run.mask.bit_count() - 1, run, part) for part in node.parts for run in part.bits.segments]
+        """A box for each run of bits of one value, in the order of the wire, the highest bit of
+        each byte first.
+        """
+        segments = [
+            (run.byte, run.low + run.mask.bit_count() - 1, run, part)
+            for part in node.parts
+            for run in part.bits.segments
+        ]
         runs: list[tuple[tree.Part, int, int, int]] = []
         for byte, _, run, part in sorted(segments, key=lambda entry: (entry[0], -entry[1])):
             low, high = run.target, run.target + run.mask.bit_count() - 1
@@ -121,7 +181,9 @@ class _Cells:
                 runs[-1] = (part, low, *runs[-1][2:])
             else:
                 runs.append((part, low, high, byte))
-        return [self._run(node, part, low, high, start + Extent(byte)) for part, low, high, byte in runs]
+        return [
+            self._run(node, part, low, high, start + Extent(byte)) for part, low, high, byte in runs
+        ]
 
     def _run(self, node: tree.Block, part: tree.Part, low: int, high: int, start: Extent) -> Cell:
         """The box of some bits of a value, with their numbers where it has others, too."""
@@ -131,19 +193,38 @@ class _Cells:
         detail = unit_text(part.info) if width == part.bits.width else numbers
         return self._cell(part.info, name, width, detail, bit_text(part.bits), start)
 
-    def _cell(self, info: tree.FieldInfo, name: str, bits: int, detail: str, kind: str, start: Extent) -> Cell:
+    def _cell(
+        self, info: tree.FieldInfo, name: str, bits: int, detail: str, kind: str, start: Extent
+    ) -> Cell:
         seal = self.seals.get(info.path)
-        role = "sum" if seal else "const" if info.const is not None else "spare" if name.startswith(SPARE) else ""
-        said = (info.path, kind, unit_text(info), meaning(info), seal.algorithm.describe() if seal else "")
+        role = (
+            "sum"
+            if seal
+            else "const"
+            if info.const is not None
+            else "spare"
+            if name.startswith(SPARE)
+            else ""
+        )
+        said = (
+            info.path,
+            kind,
+            unit_text(info),
+            meaning(info),
+            seal.algorithm.describe() if seal else "",
+        )
         return Cell(name or "(constant)", bits, detail, "; ".join(filter(None, said)), role, start)
 
     def _repeat(self, node: tree.Repeat, start: Extent, depth: int) -> Group:
         step = extent(node.element, node.name).times(INDICES[depth % len(INDICES)])
         count = node.count if isinstance(node.count, int) else phrase(node.count)
-        return Group(f"{node.name} \u00d7\u00a0{count}", self.visit(node.element, start + step, depth + 1))
+        return Group(
+            f"{node.name} \u00d7\u00a0{count}", self.visit(node.element, start + step, depth + 1)
+        )
 
 
-#: bits in a row, pixels of a bit and of a row, of the offsets at the left, of a level of brackets, and around everything.
+#: bits in a row, pixels of a bit and of a row, of the offsets at the left, of a level of brackets,
+#: and around everything.
 BITS, BIT, ROW, LEFT, LEVEL, EDGE = 32, 22, 46, 104, 136, 16
 #: bits that are drawn in full; a longer field is a torn row.
 LONGEST = 128
@@ -165,7 +246,9 @@ def svg(sensor: Sensor) -> str:
     for message in messages(sensor, on_wire=False):
         size = frame_size(message.frame)
         order = byte_order(message)
-        detail = f"{size} byte{'s' * (size != '1')}" + (f", integers {order}-endian" if order else "")
+        detail = f"{size} byte{'s' * (size != '1')}" + (
+            f", integers {order}-endian" if order else ""
+        )
         sheet.title(f"{sensor.vendor} {sensor.model}: {message.name}", detail)
         sheet.items(_Cells(message.seals, mixed=not order).visit(message.root, Extent(), 0), 0)
         sheet.close()
@@ -178,7 +261,9 @@ Piece = tuple[float, float, int]
 
 @dataclass
 class _Sheet:
-    """A drawing while it grows downwards: `top` is the upper edge of the current row, `used` how many of its bits are taken."""
+    """A drawing while it grows downwards: `top` is the upper edge of the current row, `used` how
+    many of its bits are taken.
+    """
 
     parts: list[str] = field(default_factory=list)
     top: float = EDGE
@@ -191,9 +276,27 @@ class _Sheet:
         self.parts.append(_text(EDGE, self.top + 31, detail, 11.5, fill=FAINT))
         self.top += 48
         for byte in range(BITS // 8):
-            self.parts.append(_text(LEFT + (8 * byte + 4) * BIT, self.top, f"byte {byte}", 10.5, fill=FAINT, anchor="middle"))
+            self.parts.append(
+                _text(
+                    LEFT + (8 * byte + 4) * BIT,
+                    self.top,
+                    f"byte {byte}",
+                    10.5,
+                    fill=FAINT,
+                    anchor="middle",
+                )
+            )
         for bit in range(BITS):
-            self.parts.append(_text(LEFT + (bit + 0.5) * BIT, self.top + 13, str(7 - bit % 8), 8.5, fill=FAINT, anchor="middle"))
+            self.parts.append(
+                _text(
+                    LEFT + (bit + 0.5) * BIT,
+                    self.top + 13,
+                    str(7 - bit % 8),
+                    8.5,
+                    fill=FAINT,
+                    anchor="middle",
+                )
+            )
         self.top += 18
 
     def items(self, items: Sequence[Item], depth: int) -> None:
@@ -215,11 +318,18 @@ class _Sheet:
         """All of it."""
         width, height = LEFT + BITS * BIT + EDGE + LEVEL * self.deepest, self.top - 26 + EDGE
         head = (
-            f'<svg xmlns="http://www.w3.org/2000/svg" viewBox="0 0 {width:g} {height:g}" width="{width:g}" height="{height:g}" '
-            'font-family="Helvetica, Arial, sans-serif">'
+            f'<svg xmlns="http://www.w3.org/2000/svg" viewBox="0 0 {width:g} {height:g}"'
+            f' width="{width:g}" height="{height:g}" font-family="Helvetica, Arial, sans-serif">'
         )
         return "\n".join(
-            [head, f"<title>{escape(title)}</title>", '<rect width="100%" height="100%" fill="#ffffff"/>', *self.parts, "</svg>", ""]
+            [
+                head,
+                f"<title>{escape(title)}</title>",
+                '<rect width="100%" height="100%" fill="#ffffff"/>',
+                *self.parts,
+                "</svg>",
+                "",
+            ]
         )
 
     def _row_ends(self) -> None:
@@ -236,7 +346,9 @@ class _Sheet:
         x = LEFT + BITS * BIT + 8 + LEVEL * _depth(group)
         path = f"M{x} {top + 2:g}h6v{self.top - top - 4:g}h-6"
         dashes = ' stroke-dasharray="4 3"' if group.optional else ""
-        self.parts.append(f'<path d="{path}" fill="none" stroke="{LINE}" stroke-width="1.4"{dashes}/>')
+        self.parts.append(
+            f'<path d="{path}" fill="none" stroke="{LINE}" stroke-width="1.4"{dashes}/>'
+        )
         self.parts += _lines(x + 12, (top + self.top) / 2, group.label)
 
     def _box(self, cell: Cell) -> None:
@@ -257,7 +369,9 @@ class _Sheet:
             if index == widest:
                 self.parts += _label(x, y, bits * BIT, cell)
             elif len(pieces) == 2 and not _below(*pieces):
-                self.parts += _label(x, y, bits * BIT, replace(cell, name=f"({cell.name})", detail=""), fill=FAINT)
+                self.parts += _label(
+                    x, y, bits * BIT, replace(cell, name=f"({cell.name})", detail=""), fill=FAINT
+                )
 
     def _torn(self, cell: Cell) -> None:
         """A field too long to draw, or of no known length: a row with a wavy cut."""
@@ -273,10 +387,16 @@ class _Sheet:
         self.top, self.used = self.top + ROW, 0
 
     def _offset(self, cell: Cell, more: int) -> None:
-        """The offset of a row, so many bytes after the field's, left of it; a long formula in two lines."""
+        """The offset of a row, so many bytes after the field's, left of it; a long formula in two
+        lines.
+        """
         text = str(cell.offset + Extent(more))
         middle = text.find(" + ", len(text) // 2 - 4)
-        lines = [text] if len(text) <= FORMULA or middle < 0 else [text[: middle + 2], text[middle + 3 :]]
+        lines = (
+            [text]
+            if len(text) <= FORMULA or middle < 0
+            else [text[: middle + 2], text[middle + 3 :]]
+        )
         for index, line in enumerate(lines):
             y = self.top + ROW / 2 + 4 + 13 * (index - (len(lines) - 1) / 2)
             size = min(11, (LEFT - 12) / (LETTER * len(line)))
@@ -290,18 +410,31 @@ def _depth(group: Group) -> int:
 
 def _outlined(pieces: Sequence[Piece], cell: Cell) -> Iterator[str]:
     """The box of a field: its pieces filled, and lines around them but not between two of them."""
-    rects = "".join(f'<rect x="{x:g}" y="{y:g}" width="{bits * BIT}" height="{ROW}"/>' for x, y, bits in pieces)
+    rects = "".join(
+        f'<rect x="{x:g}" y="{y:g}" width="{bits * BIT}" height="{ROW}"/>' for x, y, bits in pieces
+    )
     yield f'<g fill="{FILLS[cell.role]}"><title>{escape(cell.said)}</title>{rects}</g>'
     path = ""
     for index, piece in enumerate(pieces):
         x, y, bits = piece
         end = x + bits * BIT
         path += f"M{x:g} {y:g}v{ROW}M{end:g} {y:g}v{ROW}"
-        before, after = pieces[index - 1] if index else None, pieces[index + 1] if index + 1 < len(pieces) else None
-        path += f"M{max(x, _end(before)):g} {y:g}H{end:g}" if before is None or _end(before) < end else ""
+        before, after = (
+            pieces[index - 1] if index else None,
+            pieces[index + 1] if index + 1 < len(pieces) else None,
+        )
+        path += (
+            f"M{max(x, _end(before)):g} {y:g}H{end:g}"
+            if before is None or _end(before) < end
+            else ""
+        )
         path += f"M{x:g} {y + ROW:g}H{end:g}" if after is None or not _below(piece, after) else ""
         path += f"M{x:g} {y:g}H{before[0]:g}" if before and before[0] > x else ""
-        path += f"M{_end(after):g} {y + ROW:g}H{end:g}" if after and _below(piece, after) and _end(after) < end else ""
+        path += (
+            f"M{_end(after):g} {y + ROW:g}H{end:g}"
+            if after and _below(piece, after) and _end(after) < end
+            else ""
+        )
     yield f'<path d="{path}" fill="none" stroke="{LINE}"/>'
 
 
@@ -315,7 +448,9 @@ def _below(one: Piece, other: Piece) -> bool:
 
 
 def _label(x: float, y: float, width: float, cell: Cell, fill: str = INK) -> Iterator[str]:
-    """The name of a field and what it is, as large as there is room; a name that fits nowhere is written upright."""
+    """The name of a field and what it is, as large as there is room; a name that fits nowhere is
+    written upright.
+    """
     room = width - 5
     if LETTER * SMALLEST * len(cell.name) > room:
         cell = replace(cell, name=cell.name.rpartition(".")[2])
@@ -323,13 +458,26 @@ def _label(x: float, y: float, width: float, cell: Cell, fill: str = INK) -> Ite
     middle = x + width / 2
     if size < SMALLEST and len(cell.name) > 1:
         tall = min(NAMED - 2, (ROW - 4) / (LETTER * len(cell.name)))
-        text = cell.name if tall >= SMALLEST - 1 else cell.name[: int((ROW - 4) / (LETTER * (SMALLEST - 1)))]
+        text = (
+            cell.name
+            if tall >= SMALLEST - 1
+            else cell.name[: int((ROW - 4) / (LETTER * (SMALLEST - 1)))]
+        )
         tall = max(tall, SMALLEST - 1)
         turned = f' transform="rotate(-90 {middle:g} {y + ROW / 2:g})"'
-        yield _text(middle, y + ROW / 2 + tall * 0.35, text, tall, fill=fill, anchor="middle", more=turned)
+        yield _text(
+            middle, y + ROW / 2 + tall * 0.35, text, tall, fill=fill, anchor="middle", more=turned
+        )
         return
     has_room = cell.detail and LETTER * DETAILED * len(cell.detail) <= room
-    yield _text(middle, y + ROW / 2 + (-1 if has_room else size * 0.35), cell.name, size, fill=fill, anchor="middle")
+    yield _text(
+        middle,
+        y + ROW / 2 + (-1 if has_room else size * 0.35),
+        cell.name,
+        size,
+        fill=fill,
+        anchor="middle",
+    )
     if has_room:
         yield _text(middle, y + ROW / 2 + 13, cell.detail, DETAILED, fill=FAINT, anchor="middle")
 
@@ -346,6 +494,23 @@ def _lines(x: float, y: float, label: str) -> Iterator[str]:
         yield _text(x, y + 4 + 15 * (index - (len(lines) - 1) / 2), line, size, weight="bold")
 
 
-def _text(x: float, y: float, text: str, size: float, *, fill: str = INK, anchor: str = "", weight: str = "", more: str = "") -> str:
-    extra = "".join(f" {name}={quoteattr(value)}" for name, value in (("text-anchor", anchor), ("font-weight", weight)) if value)
-    return f'<text x="{x:g}" y="{y:g}" font-size="{size:.3g}" fill="{fill}"{extra}{more}>{escape(text)}</text>'
+def _text(
+    x: float,
+    y: float,
+    text: str,
+    size: float,
+    *,
+    fill: str = INK,
+    anchor: str = "",
+    weight: str = "",
+    more: str = "",
+) -> str:
+    extra = "".join(
+        f" {name}={quoteattr(value)}"
+        for name, value in (("text-anchor", anchor), ("font-weight", weight))
+        if value
+    )
+    return (
+        f'<text x="{x:g}" y="{y:g}" font-size="{size:.3g}"'
+        f' fill="{fill}"{extra}{more}>{escape(text)}</text>'
+    )

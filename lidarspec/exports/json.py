@@ -1,7 +1,9 @@
-"""A whole spec as data, for programs in any language: JSON whose every key stands in docs/reference/spec-json.md.
+"""A whole spec as data, for programs in any language: JSON whose every key stands in
+docs/reference/spec-json.md.
 
-Wire types, places of bits, formulas and checksums are said in full, so that a decoder can be written from it. What is Python code
-(`points`, `plausible`, `sweep`) is not in it; that a frame has such a function is.
+Wire types, places of bits, formulas and checksums are said in full, so that a decoder can be
+written from it. What is Python code (`points`, `plausible`, `sweep`) is not in it; that a frame has
+such a function is.
 """
 
 from __future__ import annotations
@@ -39,11 +41,25 @@ def spec(sensor: Sensor) -> dict[str, Any]:
     sequence = sensor.sequence
     return {
         "lidarspec": VERSION,
-        **facts(sensor, "id", "vendor", "model", "aliases", "status", "source", "range_limits", "vendor_axes"),
+        **facts(
+            sensor,
+            "id",
+            "vendor",
+            "model",
+            "aliases",
+            "status",
+            "source",
+            "range_limits",
+            "vendor_axes",
+        ),
         "links": {name: link_data(link) for name, link in sensor.links.items()},
         "scan": {"rule": type(sensor.scan).__name__, **dataclasses.asdict(sensor.scan)},
         "clock": _clock(sensor),
-        "sequence": sequence and facts(sequence, "field", "first") | {"last": None if callable(sequence.last) else sequence.last},
+        "sequence": (
+            sequence
+            and facts(sequence, "field", "first")
+            | {"last": None if callable(sequence.last) else sequence.last}
+        ),
         "fillers": sensor.fillers.hex(),
         "frames": {message.name: _frame(message) for message in messages(sensor)},
         "commands": {name: _command(command) for name, command in sensor.commands.items()},
@@ -73,7 +89,10 @@ def link_data(link: Link) -> dict[str, Any]:
     said = {"kind": type(link).__name__.lower(), **facts(link, *vars(link))}
     if isinstance(link, Udp) and (rule := link.assembled) is not None:
         fragment = node_data(Frame(rule.struct, max_length=65_535).tree)
-        said["assembled"] = {**facts(rule, "keys", "index", "count", "payload", "first", "in_bytes"), "fragment": fragment}
+        said["assembled"] = {
+            **facts(rule, "keys", "index", "count", "payload", "first", "in_bytes"),
+            "fragment": fragment,
+        }
     return said
 
 
@@ -124,26 +143,57 @@ def node_data(node: tree.Node) -> dict[str, Any]:
     """A part of a frame as data: "kind" says which keys follow."""
     match node:
         case tree.Struct():
-            return {"kind": "struct", "name": node.name, "members": [node_data(member) for member in node.members]}
+            return {
+                "kind": "struct",
+                "name": node.name,
+                "members": [node_data(member) for member in node.members],
+            }
         case tree.Sealed():
             body = node_data(node.body)
             return body | {"checksum": _seal(node) | {"inner": body.get("checksum")}}
         case tree.Number():
-            return {"kind": node.kind, "name": node.name, "bytes": node.size, "order": node.order} | _info(node.info)
+            return {
+                "kind": node.kind,
+                "name": node.name,
+                "bytes": node.size,
+                "order": node.order,
+            } | _info(node.info)
         case tree.Blob():
-            return {"kind": "bytes", "name": node.name, "bytes": formula_data(node.size)} | _info(node.info)
+            return {"kind": "bytes", "name": node.name, "bytes": formula_data(node.size)} | _info(
+                node.info
+            )
         case tree.Block():
-            return {"kind": "block", "name": node.name, "bytes": node.size, "parts": [_part(part) for part in node.parts]}
+            return {
+                "kind": "block",
+                "name": node.name,
+                "bytes": node.size,
+                "parts": [_part(part) for part in node.parts],
+            }
         case tree.Repeat():
-            return {"kind": "array", "name": node.name, "count": formula_data(node.count), "element": node_data(node.element)}
+            return {
+                "kind": "array",
+                "name": node.name,
+                "count": formula_data(node.count),
+                "element": node_data(node.element),
+            }
         case tree.Parts():
             return _parts(node)
         case tree.When():
             branches = {"then": node_data(node.then), "else": node_data(node.otherwise)}
-            return {"kind": "if", "name": node.name, "condition": formula_data(node.condition)} | branches
+            return {
+                "kind": "if",
+                "name": node.name,
+                "condition": formula_data(node.condition),
+            } | branches
         case tree.Select():
             cases = [{"value": value, "part": node_data(case)} for value, case in node.cases]
-            return {"kind": "switch", "name": node.name, "key": formula_data(node.key), "cases": cases, "default": node_data(node.default)}
+            return {
+                "kind": "switch",
+                "name": node.name,
+                "key": formula_data(node.key),
+                "cases": cases,
+                "default": node_data(node.default),
+            }
         case tree.Check():
             return {"kind": "check", "name": node.name, "condition": formula_data(node.condition)}
         case tree.Never():
@@ -153,10 +203,19 @@ def node_data(node: tree.Node) -> dict[str, Any]:
 
 
 def _parts(node: tree.Parts) -> dict[str, Any]:
-    """Parts: what says where the last one is, and what each kind is; `following` is the bytes of the next part."""
+    """Parts: what says where the last one is, and what each kind is; `following` is the bytes of
+    the next part.
+    """
     rules = {"count": node.count, "size": node.size, "within": node.within}
     data = {name: formula_data(rule) for name, rule in rules.items()}
-    kinds = [{"name": kind.name, "part": node_data(kind.element), "following": formula_data(node.following(kind))} for kind in node.kinds]
+    kinds = [
+        {
+            "name": kind.name,
+            "part": node_data(kind.element),
+            "following": formula_data(node.following(kind)),
+        }
+        for kind in node.kinds
+    ]
     return {"kind": "parts", "name": node.name, **data, "kinds": kinds}
 
 
@@ -173,7 +232,14 @@ def formula_data(formula: tree.Formula | None) -> Any:
 
 def _info(info: tree.FieldInfo) -> dict[str, Any]:
     const = info.const.hex() if isinstance(info.const, bytes | bytearray) else info.const
-    facts = {"path": info.path, "unit": info.unit, "scale": info.scale, "offset": info.offset, "const": const, "docs": info.docs}
+    facts = {
+        "path": info.path,
+        "unit": info.unit,
+        "scale": info.scale,
+        "offset": info.offset,
+        "const": const,
+        "docs": info.docs,
+    }
     if info.allowed is not None:
         facts["allowed"] = list(info.allowed)
     if info.held and info.rebuilt is not None:
@@ -182,14 +248,30 @@ def _info(info: tree.FieldInfo) -> dict[str, Any]:
 
 
 def _part(part: tree.Part) -> dict[str, Any]:
-    runs = [{"byte": run.byte, "low": run.low, "width": run.mask.bit_count(), "target": run.target} for run in part.bits.segments]
-    head = {"name": ".".join(part.names), "indices": list(part.indices), "width": part.bits.width, "signed": part.bits.signed}
+    runs = [
+        {"byte": run.byte, "low": run.low, "width": run.mask.bit_count(), "target": run.target}
+        for run in part.bits.segments
+    ]
+    head = {
+        "name": ".".join(part.names),
+        "indices": list(part.indices),
+        "width": part.bits.width,
+        "signed": part.bits.signed,
+    }
     return {**head, "runs": runs} | _info(part.info)
 
 
 def _seal(node: tree.Sealed) -> dict[str, Any]:
     algorithm = node.algorithm
-    own: dict[str, Any] = dataclasses.asdict(algorithm) if dataclasses.is_dataclass(algorithm) else {}
-    known = {name: value for name, value in own.items() if isinstance(value, int | str | bool | tuple)}
-    kind = {"kind": type(algorithm).__name__, "width": algorithm.width, "describe": algorithm.describe()}
+    own: dict[str, Any] = (
+        dataclasses.asdict(algorithm) if dataclasses.is_dataclass(algorithm) else {}
+    )
+    known = {
+        name: value for name, value in own.items() if isinstance(value, int | str | bool | tuple)
+    }
+    kind = {
+        "kind": type(algorithm).__name__,
+        "width": algorithm.width,
+        "describe": algorithm.describe(),
+    }
     return {**facts(node, "fields", "over", "absent"), "algorithm": {**kind, **known}}

@@ -1,10 +1,12 @@
 """A spec as a Kaitai Struct format, for Kaitai's compiler, its web IDE and its visualizer.
 
-A frame type becomes a Kaitai type, and so does each struct in it: a type has attributes in the order of the wire (`seq`), calculated
-`instances` and inner `types`, and is plain data until `yaml` writes the document. Formulas name a field by its way from the type that asks
-(`reached`), since Kaitai knows no paths from the top. Bit blocks become bit-sized integers where one of Kaitai's two bit orders meets their
-parts in a row, else bytes and calculated instances; a field with a scale gets an instance with the physical value. Checksums,
-plausibility and what points are made of cannot be said in Kaitai: checksums are named in the documentation of their fields.
+A frame type becomes a Kaitai type, and so does each struct in it: a type has attributes in the
+order of the wire (`seq`), calculated `instances` and inner `types`, and is plain data until `yaml`
+writes the document. Formulas name a field by its way from the type that asks (`reached`), since
+Kaitai knows no paths from the top. Bit blocks become bit-sized integers where one of Kaitai's two
+bit orders meets their parts in a row, else bytes and calculated instances; a field with a scale
+gets an instance with the physical value. Checksums, plausibility and what points are made of cannot
+be said in Kaitai: checksums are named in the documentation of their fields.
 """
 
 from __future__ import annotations
@@ -56,7 +58,9 @@ def _lines(value: Any, indent: str) -> Iterator[str]:
 
 
 def _entry(head: str, part: Any, indent: str) -> Iterator[str]:
-    if (isinstance(part, Mapping) and part) or (isinstance(part, list) and any(isinstance(item, Mapping | list) for item in part)):
+    if (isinstance(part, Mapping) and part) or (
+        isinstance(part, list) and any(isinstance(item, Mapping | list) for item in part)
+    ):
         yield head
         yield from _lines(part, indent)
     elif isinstance(part, Mapping):
@@ -69,7 +73,13 @@ def _entry(head: str, part: Any, indent: str) -> Iterator[str]:
 
 def _scalar(value: Any) -> str:
     plain = isinstance(value, str) and _PLAIN.fullmatch(value) and value.lower() not in _WORDS
-    return value if plain else json.dumps(value, ensure_ascii=False) if isinstance(value, str | bool) else repr(value)
+    return (
+        value
+        if plain
+        else json.dumps(value, ensure_ascii=False)
+        if isinstance(value, str | bool)
+        else repr(value)
+    )
 
 
 def identifier(name: str) -> str:
@@ -77,7 +87,8 @@ def identifier(name: str) -> str:
     return re.sub(r"[^a-z0-9_]", "_", name.lower())
 
 
-#: the types that an expression stands in, outermost first, by the path of their struct; None for one that holds a single part.
+#: the types that an expression stands in, outermost first, by the path of their struct; None for
+#: one that holds a single part.
 Scope = tuple[str | None, ...]
 
 
@@ -90,11 +101,17 @@ def reached(scope: Scope, ref: tree.Ref) -> str:
     for up, path in enumerate(reversed(scope)):
         if path is not None and (path == "" or ref.path.startswith(f"{path}.")):
             names = ref.path.removeprefix(f"{path}.").split(".")
-            return "_parent." * up + ".".join(map(identifier, names)) + ".to_i" * (ref.info.bits == 1)
+            return (
+                "_parent." * up + ".".join(map(identifier, names)) + ".to_i" * (ref.info.bits == 1)
+            )
     raise Refused(f"{ref.path} cannot be reached in Kaitai")
 
 
-_OPERATIONS = {"//": "({} / {})", "not": "({} == 0 ? 1 : 0)", **{symbol: f"({{}} {symbol} {{}} ? 1 : 0)" for symbol in tree.COMPARISONS}}
+_OPERATIONS = {
+    "//": "({} / {})",
+    "not": "({} == 0 ? 1 : 0)",
+    **{symbol: f"({{}} {symbol} {{}} ? 1 : 0)" for symbol in tree.COMPARISONS},
+}
 
 
 def number(formula: tree.Formula, scope: Scope) -> str:
@@ -120,7 +137,9 @@ Attribute = dict[str, Any]
 WIDEST, INTEGERS, FLOATS = 64, (1, 2, 4, 8), (4, 8)
 
 
-def block_type(block: tree.Block, doc: Callable[[tree.FieldInfo], Attribute]) -> tuple[list[Attribute], dict[str, Attribute]]:
+def block_type(
+    block: tree.Block, doc: Callable[[tree.FieldInfo], Attribute]
+) -> tuple[list[Attribute], dict[str, Attribute]]:
     """The attributes and the instances of the type of a block, with what is said of each part.
 
     Raises:
@@ -130,7 +149,9 @@ def block_type(block: tree.Block, doc: Callable[[tree.FieldInfo], Attribute]) ->
         raise Refused(f"{block.info.path}: an integer of more than {WIDEST} bits")
     ordered = _in_order(block)
     if ordered is None:
-        calculated = {_name(part): {"value": _assembled(part, "raw")} | doc(part.info) for part in block.parts}
+        calculated = {
+            _name(part): {"value": _assembled(part, "raw")} | doc(part.info) for part in block.parts
+        }
         return [{"id": "raw", "size": block.size}], calculated
     seq: list[Attribute] = []
     instances: dict[str, Attribute] = {}
@@ -138,15 +159,21 @@ def block_type(block: tree.Block, doc: Callable[[tree.FieldInfo], Attribute]) ->
         name, width = _name(part), part.bits.width
         kind: Attribute = {"type": f"b{width}{ordered[1]}"}
         if part.bits.signed:
-            instances[name] = {"value": f"{name}_bits - (({name}_bits >> {width - 1}) << {width})"} | doc(part.info)
+            instances[name] = {
+                "value": f"{name}_bits - (({name}_bits >> {width - 1}) << {width})"
+            } | doc(part.info)
             seq.append({"id": f"{name}_bits"} | kind)
         else:
             seq.append({"id": name} | kind | _valid(part) | doc(part.info))
     return seq, instances
 
 
-def inline(block: tree.Block, more: Mapping[str, Any]) -> tuple[Attribute, dict[str, Attribute]] | None:
-    """The attribute and the instances of a block that is one plain integer; None for any other block."""
+def inline(
+    block: tree.Block, more: Mapping[str, Any]
+) -> tuple[Attribute, dict[str, Attribute]] | None:
+    """The attribute and the instances of a block that is one plain integer; None for any other
+    block.
+    """
     if len(block.parts) != 1 or block.parts[0].names or block.parts[0].indices or not block.name:
         return None
     part, name, ordered = block.parts[0], identifier(block.name), _in_order(block)
@@ -154,14 +181,20 @@ def inline(block: tree.Block, more: Mapping[str, Any]) -> tuple[Attribute, dict[
         return {"id": name, "type": f"b{part.bits.width}{ordered[1]}", **more} | _valid(part), {}
     if "repeat" in more:
         return None
-    return {"id": f"{name}_raw", "size": block.size, **more}, {name: {"value": _assembled(part, f"{name}_raw")} | _condition(more)}
+    return {"id": f"{name}_raw", "size": block.size, **more}, {
+        name: {"value": _assembled(part, f"{name}_raw")} | _condition(more)
+    }
 
 
 def odd(node: tree.Node) -> tree.Node:
-    """A node, or where it is an integer of a size that Kaitai has no type for, the block of one part that says the same."""
+    """A node, or where it is an integer of a size that Kaitai has no type for, the block of one
+    part that says the same.
+    """
     if not isinstance(node, tree.Number) or node.kind == "float" or node.size in INTEGERS:
         return node
-    targets = [8 * (byte if node.order == "little" else node.size - 1 - byte) for byte in range(node.size)]
+    targets = [
+        8 * (byte if node.order == "little" else node.size - 1 - byte) for byte in range(node.size)
+    ]
     segments = tuple(Segment(byte, 0xFF, 0, target) for byte, target in enumerate(targets))
     part = tree.Part(node.info, BitField((), segments, 8 * node.size, node.kind == "int"), (), ())
     return tree.Block(node.name, node.info, node.size, (part,))
@@ -174,7 +207,11 @@ def _name(part: tree.Part) -> str:
 
 def _any_of(info: tree.FieldInfo) -> Attribute:
     """The values that a field may have, unless they are too many to be listed."""
-    return {"valid": {"any-of": list(info.allowed)}} if info.allowed and len(info.allowed) <= LISTED else {}
+    return (
+        {"valid": {"any-of": list(info.allowed)}}
+        if info.allowed and len(info.allowed) <= LISTED
+        else {}
+    )
 
 
 def _valid(part: tree.Part) -> Attribute:
@@ -189,9 +226,11 @@ def _condition(more: Mapping[str, Any]) -> Attribute:
 
 
 def _in_order(block: tree.Block) -> tuple[list[tree.Part], str] | None:
-    """The parts as one of Kaitai's bit orders meets them, and its suffix; None where they do not fill the block in either.
+    """The parts as one of Kaitai's bit orders meets them, and its suffix; None where they do not
+    fill the block in either.
 
-    "be" reads each byte from its highest bit on and fills integers from the top, "le" does both from the lowest bit on.
+    "be" reads each byte from its highest bit on and fills integers from the top, "le" does both
+    from the lowest bit on.
     """
     if sum(part.bits.width for part in block.parts) != 8 * block.size:
         return None
@@ -203,39 +242,58 @@ def _in_order(block: tree.Block) -> tuple[list[tree.Part], str] | None:
 
 
 def _starts(bits: BitField, suffix: str) -> set[int]:
-    """Where reading would have begun for each bit to stand where it does; one number if the bits follow each other."""
+    """Where reading would have begun for each bit to stand where it does; one number if the bits
+    follow each other.
+    """
     ahead = ((segment, segment.low - segment.target) for segment in bits.segments)
-    return {8 * segment.byte + (bits_ahead if suffix == "le" else 8 - bits.width - bits_ahead) for segment, bits_ahead in ahead}
+    return {
+        8 * segment.byte + (bits_ahead if suffix == "le" else 8 - bits.width - bits_ahead)
+        for segment, bits_ahead in ahead
+    }
 
 
 def _assembled(part: tree.Part, raw: str) -> str:
     """A part as an expression of the block's bytes."""
     terms = []
     for segment in part.bits.segments:
-        byte = f"{raw}[{segment.byte}]" if segment.mask == 0xFF else f"({raw}[{segment.byte}] & {segment.mask:#04x})"
+        byte = (
+            f"{raw}[{segment.byte}]"
+            if segment.mask == 0xFF
+            else f"({raw}[{segment.byte}] & {segment.mask:#04x})"
+        )
         shift = segment.target - segment.low
         terms.append(f"({byte} {'<<' if shift > 0 else '>>'} {abs(shift)})" if shift else byte)
     value = " | ".join(terms)
     if part.bits.width == 1:
         return f"({value}) != 0"
-    return f"({value}) - ((({value}) >> {part.bits.width - 1}) << {part.bits.width})" if part.bits.signed else value
+    return (
+        f"({value}) - ((({value}) >> {part.bits.width - 1}) << {part.bits.width})"
+        if part.bits.signed
+        else value
+    )
 
 
 def ksy(sensor: Sensor) -> str:
-    """The sensor's frame types as a .ksy document; parsed with it is a row of data frames, or of the only frame type.
+    """The sensor's frame types as a .ksy document; parsed with it is a row of data frames, or of
+    the only frame type.
 
     Raises:
-        Refused: for what Kaitai cannot say: half-precision floats, Python code, names that are one name there.
+        Refused: for what Kaitai cannot say: half-precision floats, Python code, names that are one
+            name there.
     """
     frames = messages(sensor)
     main = next((message for message in frames if message.frame.data), frames[0])
     types = {identifier(message.name): _frame(sensor, message) for message in frames}
     if len(types) < len(frames):
-        raise Refused(f"{sensor.id}: two frame types have one name in Kaitai, where names are in lower case")
+        raise Refused(
+            f"{sensor.id}: two frame types have one name in Kaitai, where names are in lower case"
+        )
     name = identifier(beginning(sensor))
     document = {
         "meta": {"id": name, "title": f"{sensor.vendor} {sensor.model}", "ks-version": "0.10"},
-        "doc": f"{sensor.source}. Made by lidarspec export ksy {sensor.id}. Checksums are not checked.",
+        "doc": (
+            f"{sensor.source}. Made by lidarspec export ksy {sensor.id}. Checksums are not checked."
+        ),
         "seq": [{"id": "frames", "type": identifier(main.name), "repeat": "eos"}],
         "types": types,
     }
@@ -266,7 +324,9 @@ class _Type:
         ids = [part["id"] for part in self.seq if "id" in part] + list(self.instances)
         twice = next((name for name in ids if ids.count(name) > 1), None)
         if twice:
-            raise Refused(f"{path or 'the frame'} has two members that are called {twice!r} in Kaitai")
+            raise Refused(
+                f"{path or 'the frame'} has two members that are called {twice!r} in Kaitai"
+            )
         return {name: part for name, part in vars(self).items() if part or name == "seq"}
 
 
@@ -290,14 +350,32 @@ class _Types:
             case tree.Empty():
                 return
             case tree.Check():
-                kaitai.seq.append({"id": identifier(node.name), "size": 0, "valid": {"expr": truth(node.condition, scope)}, **more})
+                kaitai.seq.append(
+                    {
+                        "id": identifier(node.name),
+                        "size": 0,
+                        "valid": {"expr": truth(node.condition, scope)},
+                        **more,
+                    }
+                )
             case tree.Never():
-                kaitai.seq.append({"id": identifier(node.name), "size": 0, "valid": {"expr": "false"}, **more})
+                kaitai.seq.append(
+                    {"id": identifier(node.name), "size": 0, "valid": {"expr": "false"}, **more}
+                )
             case tree.When(otherwise=tree.Empty()):
-                self._member(kaitai, node.then, scope, **more, **{"if": truth(node.condition, scope)})
+                self._member(
+                    kaitai, node.then, scope, **more, **{"if": truth(node.condition, scope)}
+                )
             case tree.When():
                 cases = {"1": node.then, "0": node.otherwise}
-                self._switch(kaitai, node.name, f"{truth(node.condition, scope)} ? 1 : 0", cases, scope, **more)
+                self._switch(
+                    kaitai,
+                    node.name,
+                    f"{truth(node.condition, scope)} ? 1 : 0",
+                    cases,
+                    scope,
+                    **more,
+                )
             case tree.Select():
                 cases = {str(value): case for value, case in node.cases} | {"_": node.default}
                 self._switch(kaitai, node.name, number(node.key, scope), cases, scope, **more)
@@ -318,10 +396,15 @@ class _Types:
     def _parts(self, kaitai: _Type, node: tree.Parts, scope: Scope, **more: Any) -> None:
         """Add parts; those of one kind, since Kaitai chooses a type before it reads it."""
         if len(node.kinds) > 1:
-            raise Refused(f"{node.axis}: parts that are told apart by their constants, which Kaitai cannot do")
+            raise Refused(
+                f"{node.axis}: parts that are told apart by their constants, which Kaitai cannot do"
+            )
         (kind,), name = node.kinds, identifier(node.name)
         if node.within is not None:
-            inner = _Type([{"id": "value", "type": "part", "repeat": "eos"}], types={"part": self._type(kind.element, (*scope, None))})
+            inner = _Type(
+                [{"id": "value", "type": "part", "repeat": "eos"}],
+                types={"part": self._type(kind.element, (*scope, None))},
+            )
             kaitai.types[name] = inner.done(node.axis)
             kaitai.seq.append({"id": name, "type": name, "size": _size(node.within, scope), **more})
             return
@@ -329,7 +412,11 @@ class _Types:
             more |= {"repeat": "expr", "repeat-expr": _size(node.count, scope)}
         elif node.size is not None and kind.following is not None:
             ends = tree.written(kind.following, lambda ref: f"_.{ref.path}", _OPERATIONS)
-            condition = f"({more['if']}) and {number(node.size, scope)} != 0" if "if" in more else f"{number(node.size, scope)} != 0"
+            condition = (
+                f"({more['if']}) and {number(node.size, scope)} != 0"
+                if "if" in more
+                else f"{number(node.size, scope)} != 0"
+            )
             more |= {"repeat": "until", "repeat-until": f"{ends} == 0", "if": condition}
         self._typed(kaitai, node.name, kind.element, scope, **more)
 
@@ -363,42 +450,71 @@ class _Types:
         else:
             self._typed(kaitai, node.name, element, scope, **more)
 
-    def _switch(self, kaitai: _Type, name: str, key: str, cases: Mapping[str, tree.Node], scope: Scope, **more: Any) -> None:
+    def _switch(
+        self,
+        kaitai: _Type,
+        name: str,
+        key: str,
+        cases: Mapping[str, tree.Node],
+        scope: Scope,
+        **more: Any,
+    ) -> None:
         types = {}
         for value, case in cases.items():
             if value == "_" and isinstance(case, tree.Empty):
                 continue
-            types[value] = identifier(f"{name}_{'other' if value == '_' else value.replace('-', 'minus_')}")
-            kaitai.types[types[value]] = {"seq": []} if isinstance(case, tree.Empty) else self._type(case, scope)
-        kaitai.seq.append({"id": identifier(name), "type": {"switch-on": key, "cases": types}, **more})
+            types[value] = identifier(
+                f"{name}_{'other' if value == '_' else value.replace('-', 'minus_')}"
+            )
+            kaitai.types[types[value]] = (
+                {"seq": []} if isinstance(case, tree.Empty) else self._type(case, scope)
+            )
+        kaitai.seq.append(
+            {"id": identifier(name), "type": {"switch-on": key, "cases": types}, **more}
+        )
 
     def _plain(self, node: tree.Number | tree.Blob, scope: Scope) -> Attribute:
         """The attribute of a number or of bytes."""
         head = {"id": identifier(node.name)} if node.name else {}
         if isinstance(node, tree.Blob):
             size = _size(node.size, scope)
-            kind: Attribute = {"size": size} if node.const is None else {"contents": [Byte(byte) for byte in node.const]}
+            kind: Attribute = (
+                {"size": size}
+                if node.const is None
+                else {"contents": [Byte(byte) for byte in node.const]}
+            )
             return head | kind | self._doc(node.info)
         letter = {"uint": "u", "int": "s", "float": "f"}[node.kind]
         if node.kind == "float" and node.size not in FLOATS:
-            raise Refused(f"{node.info.path}: a float of {node.size} bytes, and Kaitai knows those of 4 and 8")
+            raise Refused(
+                f"{node.info.path}: a float of {node.size} bytes, and Kaitai knows those of 4 and 8"
+            )
         order = {"little": "le", "big": "be"}[node.order] if node.size > 1 else ""
         const = _any_of(node.info) if node.info.const is None else {"valid": node.info.const}
         return head | {"type": f"{letter}{node.size}{order}"} | const | self._doc(node.info)
 
     def _doc(self, info: tree.FieldInfo) -> Attribute:
         seal = self.seals.get(info.path)
-        sealed = "" if seal is None else f"{seal.algorithm.describe()} over {_span(seal)}; not checked here"
+        sealed = (
+            ""
+            if seal is None
+            else f"{seal.algorithm.describe()} over {_span(seal)}; not checked here"
+        )
         unchecked = "a length, which is not checked here" if info.held else ""
         text = "; ".join(filter(None, (unit_text(info), meaning(info), unchecked, sealed)))
         return {"doc": text} if text else {}
 
-    def _physical(self, kaitai: _Type, info: tree.FieldInfo, more: Mapping[str, Any], *, name: str = "") -> None:
+    def _physical(
+        self, kaitai: _Type, info: tree.FieldInfo, more: Mapping[str, Any], *, name: str = ""
+    ) -> None:
         """An instance with the physical value of a field that has a scale."""
         own = identifier(name or info.name)
         if info.scaled and own:
             value = f"{own} * {info.scale!r}" + (f" + {info.offset!r}" if info.offset else "")
-            kaitai.instances[f"{own}_{slug(info.unit) or 'physical'}"] = {"value": value.replace("+ -", "- "), **_condition(more)}
+            kaitai.instances[f"{own}_{slug(info.unit) or 'physical'}"] = {
+                "value": value.replace("+ -", "- "),
+                **_condition(more),
+            }
 
 
 def _size(formula: tree.Formula, scope: Scope) -> int | str:

@@ -1,7 +1,9 @@
-"""A sensor's reference page in Markdown: links, commands, the wire table of every frame, checksums, clock and geometry.
+"""A sensor's reference page in Markdown: links, commands, the wire table of every frame, checksums,
+clock and geometry.
 
-Each section is a table or a few sentences made from the spec alone. Only geometry looks at bytes: the points of an example frame say which
-columns there are, and in which directions the channels look.
+Each section is a table or a few sentences made from the spec alone. Only geometry looks at bytes:
+the points of an example frame say which columns there are, and in which directions the channels
+look.
 """
 
 from __future__ import annotations
@@ -58,21 +60,31 @@ def page(sensor: Sensor, pictures: Mapping[str, str] | None = None) -> str:
 def _facts(sensor: Sensor) -> Iterator[str]:
     rows = [("id", ", ".join(f"`{name}`" for name in (sensor.id, *sensor.aliases)))]
     rows += [(f"link `{name}`", _link(link)) for name, link in sensor.links.items()]
-    rows += [("range", "{:g} m to {:g} m".format(*sensor.range_limits)), ("scan", f"ends {_rule(sensor.scan)}")]
+    rows += [
+        ("range", "{:g} m to {:g} m".format(*sensor.range_limits)),
+        ("scan", f"ends {_rule(sensor.scan)}"),
+    ]
     rows += [("clock", _clock(sensor.clock))] if sensor.clock else []
     rows += [("counter", f"`{sensor.sequence.field}`; a jump is a loss")] if sensor.sequence else []
     rows += [("fillers", f"`{sensor.fillers.hex(' ')}` between frames")] if sensor.fillers else []
-    rows += [("proven", f"{sensor.status}: {STATUSES[sensor.status]}"), ("source", escape(sensor.source))]
+    rows += [
+        ("proven", f"{sensor.status}: {STATUSES[sensor.status]}"),
+        ("source", escape(sensor.source)),
+    ]
     return _table(["", ""], rows)
 
 
 def _link(link: Link) -> str:
     if isinstance(link, Serial):
         bauds = " or ".join(f"{baud:,}".replace(",", " ") for baud in link.bauds)
-        return ", ".join([f"serial, {bauds} baud, 8N1", *_levels({"dtr": link.dtr, "rts": link.rts})])
+        return ", ".join(
+            [f"serial, {bauds} baud, 8N1", *_levels({"dtr": link.dtr, "rts": link.rts})]
+        )
     if isinstance(link, Udp):
         ports = [f"port {' and '.join(str(port) for port in link.ports)}"] * bool(link.ports)
-        asked = [f"broadcast to port {link.broadcast}"] * bool(link.broadcast) + [f"from port {link.local}"] * bool(link.local)
+        asked = [f"broadcast to port {link.broadcast}"] * bool(link.broadcast) + [
+            f"from port {link.local}"
+        ] * bool(link.local)
         return ", ".join(["UDP", *ports, *asked, *["a byte stream in datagrams"] * link.stream])
     kind = type(link).__name__
     return f"{kind.upper()}, port {link.port}" if isinstance(link, Tcp | Http) else kind
@@ -80,7 +92,11 @@ def _link(link: Link) -> str:
 
 def _levels(lines: Mapping[str, bool | None]) -> list[str]:
     """Control lines with the level that they are set to."""
-    return [f"{name.upper()} {'high' if level else 'low'}" for name, level in lines.items() if level is not None]
+    return [
+        f"{name.upper()} {'high' if level else 'low'}"
+        for name, level in lines.items()
+        if level is not None
+    ]
 
 
 def _rule(scan: Split) -> str:
@@ -93,13 +109,20 @@ def _rule(scan: Split) -> str:
 
 def _clock(clock: Clock) -> str:
     names = [clock.source] if isinstance(clock.source, str) else clock.source
-    fields = "calculated from the packet" if callable(names) else " + ".join(f"`{name}`" for name in names)
+    fields = (
+        "calculated from the packet"
+        if callable(names)
+        else " + ".join(f"`{name}`" for name in names)
+    )
     again = f", starts again at {clock.wraps_at:g} s" if clock.wraps_at else ""
     return fields + again + (f", completed by {clock.told[0]} frames" if clock.told else "")
 
 
 def _commands(sensor: Sensor) -> Iterator[str]:
-    rows = [(f"`{name}`", _asked(sensor, name), _answer(command), effect(sensor, name)) for name, command in sensor.commands.items()]
+    rows = [
+        (f"`{name}`", _asked(sensor, name), _answer(command), effect(sensor, name))
+        for name, command in sensor.commands.items()
+    ]
     return _table(["command", "bytes or arguments", "reply", ""], rows)
 
 
@@ -107,7 +130,10 @@ def _asked(sensor: Sensor, name: str) -> str:
     command = sensor.commands[name]
     said = _levels(command.lines)
     if command.frame and command.args:
-        args = " and ".join(f"`{name}` {asked(argument.kind, ' to ')}" for name, argument in command.arguments.items())
+        args = " and ".join(
+            f"`{name}` {asked(argument.kind, ' to ')}"
+            for name, argument in command.arguments.items()
+        )
         said.insert(0, f"`{command.frame}` with {args}")
     elif command.frame:
         said.insert(0, f"`{sensor.command(name).hex(' ')}`")
@@ -115,7 +141,11 @@ def _asked(sensor: Sensor, name: str) -> str:
 
 
 def _answer(command: Command) -> str:
-    return " or ".join(f"`{name}`" for name in command.replies) if command.replies else "none documented"
+    return (
+        " or ".join(f"`{name}`" for name in command.replies)
+        if command.replies
+        else "none documented"
+    )
 
 
 def effect(sensor: Sensor, name: str) -> str:
@@ -135,24 +165,40 @@ def effect(sensor: Sensor, name: str) -> str:
 
 
 def _frame(name: str, frame: Frame, picture: str) -> Iterator[str]:
-    kind = "to the sensor" if frame.direction == "out" else "points" if frame.data else "from the sensor"
+    kind = (
+        "to the sensor"
+        if frame.direction == "out"
+        else "points"
+        if frame.data
+        else "from the sensor"
+    )
     yield f"## `{name}`: {kind}"
     size = frame_size(frame)
     said = [f"{size} bytes" if size.isdigit() else f"`{size}` bytes, at most {frame.max_length}"]
     said += [f"looked for after a `{frame.after}`"] * (frame.after is not None)
     said += [f"believed in runs of {frame.confirm} or more"] * (frame.confirm > 1)
-    said += ["a plausibility test turns down what no sensor would send"] * (frame.plausible is not None)
+    said += ["a plausibility test turns down what no sensor would send"] * (
+        frame.plausible is not None
+    )
     yield "; ".join(said) + "."
     if picture:
         yield f"![{name}: packet diagram]({picture})"
-    rows = [(row.offset, row.size, row.type, f"`{row.field}`", row.unit, row.meaning) for row in wire_table(frame)]
-    told = [[cell if "`" in cell else cell.replace("[", r"\[") for cell in row] for row in rows]  # an index is no link
+    rows = [
+        (row.offset, row.size, row.type, f"`{row.field}`", row.unit, row.meaning)
+        for row in wire_table(frame)
+    ]
+    told = [
+        [cell if "`" in cell else cell.replace("[", r"\[") for cell in row] for row in rows
+    ]  # an index is no link
     yield "\n".join(_table(["offset", "size", "type", "field", "unit", "meaning"], told))
 
 
 def _geometry(sensor: Sensor) -> Iterator[str]:
     """What points there are, in which axes, and the direction of each channel where that is fixed."""
-    yield "Points are in metres, x forward, y left, z up; the manual's zero direction is +x, and azimuth counts counter-clockwise."
+    yield (
+        "Points are in metres, x forward, y left, z up; the manual's zero direction is +x, and"
+        " azimuth counts counter-clockwise."
+    )
     if sensor.vendor_axes:
         x, y, z = sensor.vendor_axes
         yield f"With `configure(frame='vendor')` they are in the vendor's own: x {x}, y {y}, z {z}."
@@ -160,16 +206,36 @@ def _geometry(sensor: Sensor) -> Iterator[str]:
         cloud = _cloud(sensor, name) if frame.data else None
         if cloud is None:
             continue
-        more = [column for column in ("intensity", "ring", "return_index", "column") if getattr(cloud, column) is not None]
-        more += [
-            f"`{column}` ({', '.join(filter(None, (cloud.units[column], values.dtype.name)))})" for column, values in cloud.extra.items()
+        more = [
+            column
+            for column in ("intensity", "ring", "return_index", "column")
+            if getattr(cloud, column) is not None
         ]
-        many = "a point" if len(cloud) == 1 else f"{len(cloud)} points" if frame_size(frame).isdigit() else "points by its header"
+        more += [
+            f"`{column}` ({', '.join(filter(None, (cloud.units[column], values.dtype.name)))})"
+            for column, values in cloud.extra.items()
+        ]
+        many = (
+            "a point"
+            if len(cloud) == 1
+            else f"{len(cloud)} points"
+            if frame_size(frame).isdigit()
+            else "points by its header"
+        )
         yield ""
-        yield f"A `{name}` frame has {many}" + (f", with {', '.join(more[:-1])}{' and ' * (len(more) > 1)}{more[-1]}." if more else ".")
+        yield f"A `{name}` frame has {many}" + (
+            f", with {', '.join(more[:-1])}{' and ' * (len(more) > 1)}{more[-1]}." if more else "."
+        )
         rows = _rings(cloud)
         if rows:
-            yield "" if not cloud.nominal else "\nThe directions below are the default ones; a calibration file gives the device's own."
+            yield (
+                ""
+                if not cloud.nominal
+                else (
+                    "\nThe directions below are the default ones; a calibration file gives the"
+                    " device's own."
+                )
+            )
             yield from _table(["channel", "elevation"], rows)
 
 

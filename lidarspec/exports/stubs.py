@@ -1,4 +1,5 @@
-"""A spec as a type stub for editors and type checkers: a class for each struct of each frame, and the sensor's own methods.
+"""A spec as a type stub for editors and type checkers: a class for each struct of each frame, and
+the sensor's own methods.
 
 What `parse` returns has the fields as attributes, so a frame can be typed by the class of its type:
 
@@ -57,8 +58,14 @@ def pyi(sensor: Sensor) -> str:
         raise Refused(f"{sensor.id}: two frame types have one class name")
     classes = _Classes({camel(sensor.id)})
     for message in frames:
-        names[message.name] = classes.add(message.root, names[message.name], f"A frame of the type {message.name}.")
-    parts = [_HEAD.format(id=sensor.id, title=_quoted(f"{sensor.vendor} {sensor.model}")), *classes.done, _sensor(sensor, frames, names)]
+        names[message.name] = classes.add(
+            message.root, names[message.name], f"A frame of the type {message.name}."
+        )
+    parts = [
+        _HEAD.format(id=sensor.id, title=_quoted(f"{sensor.vendor} {sensor.model}")),
+        *classes.done,
+        _sensor(sensor, frames, names),
+    ]
     return "\n\n".join(part.rstrip() + "\n" for part in parts)
 
 
@@ -77,7 +84,9 @@ from lidarspec import Sensor'''
 
 @dataclass
 class _Classes:
-    """The classes written so far, the inner ones before those that hold them, and the names that are taken."""
+    """The classes written so far, the inner ones before those that hold them, and the names that
+    are taken.
+    """
 
     taken: set[str]
     done: list[str] = field(default_factory=list)
@@ -88,10 +97,14 @@ class _Classes:
             name += "_"
         self.taken.add(name)
         lines = [line for member in self._members(node) for line in self._attribute(name, *member)]
-        self.done.append("\n".join([f"class {name}:", f'    """{_quoted(says)}"""', "", *(lines or ["    ..."])]))
+        self.done.append(
+            "\n".join([f"class {name}:", f'    """{_quoted(says)}"""', "", *(lines or ["    ..."])])
+        )
         return name
 
-    def _members(self, node: Struct | Sealed | Block) -> Iterator[tuple[str, Node | list[FieldInfo]]]:
+    def _members(
+        self, node: Struct | Sealed | Block
+    ) -> Iterator[tuple[str, Node | list[FieldInfo]]]:
         if isinstance(node, Struct | Sealed):
             yield from ((member.name, member) for member in node.struct.members if member.name)
         else:
@@ -99,14 +112,26 @@ class _Classes:
                 yield name, [part.info for part in node.parts if part.names[0] == name]
 
     def _attribute(self, owner: str, name: str, node: Node | list[FieldInfo]) -> list[str]:
-        """The lines of a member: a node, or the infos of the parts of a bit block that begin with its name."""
+        """The lines of a member: a node, or the infos of the parts of a bit block that begin with
+        its name.
+        """
         if isinstance(node, list):
             kind, infos = "int" if len(node) == 1 else "Any", node
         else:
-            kind, infos = self._type(owner, name, node), [node.info] if isinstance(node, Number | Blob | Block) else []
-        said = "; ".join(filter(None, (text(info) for info in infos[:1] for text in (unit_text, meaning))))
-        line = f"    {name}: {kind}" + ("  # a keyword: getattr()" if keyword.iskeyword(name) else "")
-        return [line if not keyword.iskeyword(name) else f"    # {line.strip()}", *([f'    """{_quoted(said)}"""'] if said else [])]
+            kind, infos = (
+                self._type(owner, name, node),
+                [node.info] if isinstance(node, Number | Blob | Block) else [],
+            )
+        said = "; ".join(
+            filter(None, (text(info) for info in infos[:1] for text in (unit_text, meaning)))
+        )
+        line = f"    {name}: {kind}" + (
+            "  # a keyword: getattr()" if keyword.iskeyword(name) else ""
+        )
+        return [
+            line if not keyword.iskeyword(name) else f"    # {line.strip()}",
+            *([f'    """{_quoted(said)}"""'] if said else []),
+        ]
 
     def _type(self, owner: str, name: str, node: Node) -> str:
         match node:
@@ -123,7 +148,9 @@ class _Classes:
             case Parts():
                 return f"list[{' | '.join(self._type(owner, name + camel(kind.name), kind.element) for kind in node.kinds)}]"
             case When() | Select():
-                return " | ".join(dict.fromkeys(self._type(owner, name, branch) for branch in children(node)))
+                return " | ".join(
+                    dict.fromkeys(self._type(owner, name, branch) for branch in children(node))
+                )
             case Empty() | Check() | Never() | Opaque():
                 return "None"
 
@@ -131,12 +158,17 @@ class _Classes:
 def _sensor(sensor: Sensor, frames: tuple[Message, ...], names: dict[str, str]) -> str:
     """The class of the sensor: what `parse`, `build`, `example` and `command` take and give."""
     parses = "\n".join(
-        f'    @overload\n    def parse(self, data: bytes, frame: Literal["{frame}"], *, {PARSING}) -> {name}: ...'
+        f'    @overload\n    def parse(self, data: bytes, frame: Literal["{frame}"], *, {PARSING})'
+        f" -> {name}: ..."
         for frame, name in names.items()
     )
     builds = "\n".join(_build(message) for message in frames)
     commands = "\n".join(_command(name, command) for name, command in sensor.commands.items())
-    rest = "    @overload\n    def command(self, _name: str, /, **arguments: Any) -> bytes: ..." if len(sensor.commands) > 0 else ""
+    rest = (
+        "    @overload\n    def command(self, _name: str, /, **arguments: Any) -> bytes: ..."
+        if len(sensor.commands) > 0
+        else ""
+    )
     literals = ", ".join(f'"{name}"' for name in names)
     data = next((message.frame for message in frames if message.frame.data), frames[0].frame)
     fields = ", ".join(f'"{path}"' for path in schema(data.tree).all_fields)
@@ -157,21 +189,34 @@ class {camel(sensor.id)}(Sensor):
 
 
 def _build(message: Message) -> str:
-    """The signature that builds a frame: its fields by name, numbers raw or with `units` physical; constants and sums are filled in."""
+    """The signature that builds a frame: its fields by name, numbers raw or with `units` physical;
+    constants and sums are filled in.
+    """
     fields = "".join(
         f", {member.name}: {'float' if isinstance(member, Number) else 'Any'} = ..."
         for member in message.root.struct.members
         if member.name not in ("", "self", "units")
         and not keyword.iskeyword(member.name)
-        and not (isinstance(member, Number | Blob) and (member.info.const is not None or member.info.held))
+        and not (
+            isinstance(member, Number | Blob)
+            and (member.info.const is not None or member.info.held)
+        )
     )
     more = f", units: bool = False{fields}, **values: Any"
-    return f'    @overload\n    def build(self, _frame: Literal["{message.name}"], _value: Any = None, /, *{more}) -> bytes: ...'
+    return (
+        f'    @overload\n    def build(self, _frame: Literal["{message.name}"], _value: Any = None,'
+        f" /, *{more}) -> bytes: ..."
+    )
 
 
 def _command(name: str, command: Command) -> str:
-    args = "".join(f", {arg}: {TYPES[type(argument.kind)]}" for arg, argument in command.arguments.items())
-    return f'    @overload\n    def command(self, _name: Literal["{name}"], /{", *" * bool(args)}{args}) -> bytes: ...'
+    args = "".join(
+        f", {arg}: {TYPES[type(argument.kind)]}" for arg, argument in command.arguments.items()
+    )
+    return (
+        f'    @overload\n    def command(self, _name: Literal["{name}"],'
+        f" /{', *' * bool(args)}{args}) -> bytes: ..."
+    )
 
 
 def _quoted(said: str) -> str:

@@ -1,9 +1,11 @@
 """A Wireshark dissector: what a spec says as Lua tables, and the Lua code that walks them.
 
-``wireshark.lua``, beside this module, is the same for all sensors: it finds frames, measures them, checks them and fills Wireshark's tree.
-What depends on the sensor is written here: each node of a frame tree becomes a table that says what kind it is, which field of Wireshark
-shows it (`_Writer`), which values later formulas ask for (`keep`), and how many bytes may be skipped where a frame is only measured.
-Formulas are Lua functions of the values kept so far. Lua counts in floats there, so that what Python does with integers is called by name.
+``wireshark.lua``, beside this module, is the same for all sensors: it finds frames, measures them,
+checks them and fills Wireshark's tree. What depends on the sensor is written here: each node of a
+frame tree becomes a table that says what kind it is, which field of Wireshark shows it (`_Writer`),
+which values later formulas ask for (`keep`), and how many bytes may be skipped where a frame is
+only measured. Formulas are Lua functions of the values kept so far. Lua counts in floats there, so
+that what Python does with integers is called by name.
 """
 
 from __future__ import annotations
@@ -17,7 +19,19 @@ from lidarspec._version import __version__
 from lidarspec.exports import Message, Refused, asked, held, messages
 from lidarspec.frames.layout_tree import prefix_of
 from lidarspec.framing.frame_engine import codec
-from lidarspec.spec import Checksum, Crc, Fold15, Sensor, Sum, Tcp, Udp, WordXor, Xor, ZeroPadded, tree
+from lidarspec.spec import (
+    Checksum,
+    Crc,
+    Fold15,
+    Sensor,
+    Sum,
+    Tcp,
+    Udp,
+    WordXor,
+    Xor,
+    ZeroPadded,
+    tree,
+)
 from lidarspec.spec.bits import BitField
 
 WIDTH = 140
@@ -30,8 +44,17 @@ class Code(str):
 _OPERATIONS = {
     "<<": "({} * 2 ^ {})",
     ">>": "int.div({}, 2 ^ {})",
-    **{"//": "int.div({}, {})", "%": "int.mod({}, {})", "&": "int.band({}, {})", "|": "int.bor({}, {})", "^": "int.bxor({}, {})"},
-    **{symbol: f"int.truth({{}} {'~=' if symbol == '!=' else symbol} {{}})" for symbol in tree.COMPARISONS},
+    **{
+        "//": "int.div({}, {})",
+        "%": "int.mod({}, {})",
+        "&": "int.band({}, {})",
+        "|": "int.bor({}, {})",
+        "^": "int.bxor({}, {})",
+    },
+    **{
+        symbol: f"int.truth({{}} {'~=' if symbol == '!=' else symbol} {{}})"
+        for symbol in tree.COMPARISONS
+    },
     "not": "int.truth({} == 0)",
 }
 
@@ -42,8 +65,13 @@ def formula(value: tree.Formula) -> Code:
 
 
 def _function(value: tree.Formula, missing: str = "") -> Code:
-    """A formula as a function of the values of fields; `missing`: what is added to each, for one that may not be there."""
-    return Code(f"function(v) return {tree.written(value, lambda ref: f'(v[{quoted(ref.path)}]{missing})', _OPERATIONS)} end")
+    """A formula as a function of the values of fields; `missing`: what is added to each, for one
+    that may not be there.
+    """
+    return Code(
+        "function(v) return"
+        f" {tree.written(value, lambda ref: f'(v[{quoted(ref.path)}]{missing})', _OPERATIONS)} end"
+    )
 
 
 def lua(value: Any, indent: str = "") -> str:
@@ -56,7 +84,9 @@ def lua(value: Any, indent: str = "") -> str:
         return json.dumps(value, allow_nan=False)
     deeper = indent + "  "
     if isinstance(value, Mapping):
-        entries = [f"{_key(key)} = {lua(item, deeper)}" for key, item in value.items() if item is not None]
+        entries = [
+            f"{_key(key)} = {lua(item, deeper)}" for key, item in value.items() if item is not None
+        ]
     else:
         entries = [lua(item, deeper) for item in value]
     line = "{" + ", ".join(entries) + "}"
@@ -72,7 +102,14 @@ def _key(key: object) -> str:
 def quoted(text: str | bytes) -> str:
     """A Lua string; what is not printable ASCII as decimal escapes."""
     data = text.encode() if isinstance(text, str) else text
-    return '"' + "".join(chr(byte) if 32 <= byte < 127 and byte not in b'"\\' else f"\\{byte:03d}" for byte in data) + '"'
+    return (
+        '"'
+        + "".join(
+            chr(byte) if 32 <= byte < 127 and byte not in b'"\\' else f"\\{byte:03d}"
+            for byte in data
+        )
+        + '"'
+    )
 
 
 #: elements of arrays say what is in them, where it is no more than this.
@@ -98,7 +135,9 @@ class _Writer:
         self.types: dict[str, str] = {}
 
     def node(self, node: tree.Node, path: str = "") -> Table:
-        """A node as a table; `skip` says how many bytes it takes where it need not be looked at to measure the frame."""
+        """A node as a table; `skip` says how many bytes it takes where it need not be looked at to
+        measure the frame.
+        """
         match node:
             case tree.Number():
                 return self._number(node)
@@ -109,18 +148,35 @@ class _Writer:
             case tree.Struct():
                 return self._struct(node)
             case tree.Sealed():
-                return {"kind": "sealed", "name": node.name or None, "body": self.node(node.body), "seal": self._seal(node)}
+                return {
+                    "kind": "sealed",
+                    "name": node.name or None,
+                    "body": self.node(node.body),
+                    "seal": self._seal(node),
+                }
             case tree.Repeat():
                 return self._repeat(node, path)
             case tree.Parts():
                 return self._parts(node)
             case tree.When():
                 then, otherwise = self.node(node.then, path), self.node(node.otherwise, path)
-                return {"kind": "when", "name": node.name, "condition": _function(node.condition), "yes": then, "no": otherwise}
+                return {
+                    "kind": "when",
+                    "name": node.name,
+                    "condition": _function(node.condition),
+                    "yes": then,
+                    "no": otherwise,
+                }
             case tree.Select():
                 cases = {value: self.node(case, path) for value, case in node.cases}
                 default = self.node(node.default, path)
-                return {"kind": "select", "name": node.name, "key": _function(node.key), "cases": cases, "default": default}
+                return {
+                    "kind": "select",
+                    "name": node.name,
+                    "key": _function(node.key),
+                    "cases": cases,
+                    "default": default,
+                }
             case tree.Check():
                 return {"kind": "check", "name": node.name, "condition": _function(node.condition)}
             case tree.Never():
@@ -130,23 +186,44 @@ class _Writer:
 
     def _number(self, node: tree.Number) -> Table:
         width = _width(8 * node.size)
-        kind = {"uint": f"UINT{width}", "int": f"INT{width}", "float": "DOUBLE" if node.size == 8 else "FLOAT"}[node.kind]
+        kind = {
+            "uint": f"UINT{width}",
+            "int": f"INT{width}",
+            "float": "DOUBLE" if node.size == 8 else "FLOAT",
+        }[node.kind]
         table: Table = {"kind": "number", "name": node.name, "type": node.kind, "size": node.size}
-        table |= {"le": (node.order == "little" and node.size > 1) or None, **self._described(node.info, kind)}
+        table |= {
+            "le": (node.order == "little" and node.size > 1) or None,
+            **self._described(node.info, kind),
+        }
         return table | {"skip": self._skip(node.info, node.size)}
 
     def _blob(self, node: tree.Blob) -> Table:
         name = node.name or "constant"
         path = node.info.path if node.name else ".".join(filter(None, (node.info.path, name)))
         new = self._new("BYTES", path, name, node.info.docs, "NONE")
-        table: Table = {"kind": "bytes", "name": name, "field": new, "size": formula(node.size), "keep": self._keep(path)}
+        table: Table = {
+            "kind": "bytes",
+            "name": name,
+            "field": new,
+            "size": formula(node.size),
+            "keep": self._keep(path),
+        }
         table["const"] = Code(quoted(node.const)) if node.const is not None else None
-        return table | {"skip": self._skip(node.info, node.size) if isinstance(node.size, int) and node.const is None else None}
+        return table | {
+            "skip": (
+                self._skip(node.info, node.size)
+                if isinstance(node.size, int) and node.const is None
+                else None
+            )
+        }
 
     def _block(self, node: tree.Block) -> Table:
         order = _word_order(node)
         parts = [self._part(node, part, order) for part in node.parts]
-        looked_at = any(part[fact] is not None for fact in ("keep", "const", "allowed") for part in parts)
+        looked_at = any(
+            part[fact] is not None for fact in ("keep", "const", "allowed") for part in parts
+        )
         return {
             "kind": "block",
             "name": node.name,
@@ -162,7 +239,11 @@ class _Writer:
         letters = "INT" if part.bits.signed else "UINT"
         is_masked = order is not None and part.bits.width < 8 * block.size
         kind = f"{letters}{8 * block.size if is_masked else _width(part.bits.width)}"
-        mask = ((1 << part.bits.width) - 1) << (_run(part.bits, block.size, order) or 0) if is_masked and order else None
+        mask = (
+            ((1 << part.bits.width) - 1) << (_run(part.bits, block.size, order) or 0)
+            if is_masked and order
+            else None
+        )
         label = ".".join(part.names) + "".join(f"[{index}]" for index in part.indices)
         return {
             "name": part.info.name,
@@ -172,7 +253,9 @@ class _Writer:
             "width": part.bits.width,
             "signed": part.bits.signed or None,
             "masked": is_masked or None,
-            "segments": [[one.byte, one.low, one.mask.bit_count(), one.target] for one in part.bits.segments],
+            "segments": [
+                [one.byte, one.low, one.mask.bit_count(), one.target] for one in part.bits.segments
+            ],
             **self._described(part.info, kind, mask),
         }
 
@@ -190,53 +273,121 @@ class _Writer:
             for path, value in inside.items()
             if node.path == _around(path, *(ref.path for ref in tree.refs(value)))
         ]
-        return {"kind": "struct", "name": node.name or None, "skip": total, "members": members, "lengths": lengths or None}
+        return {
+            "kind": "struct",
+            "name": node.name or None,
+            "skip": total,
+            "members": members,
+            "lengths": lengths or None,
+        }
 
     def _repeat(self, node: tree.Repeat, path: str) -> Table:
         element = self.node(node.element, path)
         size = element.get("skip")
         whole = size * node.count if isinstance(node.count, int) and size is not None else None
-        few = isinstance(node.element, tree.Block) or (isinstance(node.element, tree.Struct) and len(_leaves(node.element)) <= SUMMED)
+        few = isinstance(node.element, tree.Block) or (
+            isinstance(node.element, tree.Struct) and len(_leaves(node.element)) <= SUMMED
+        )
         summed = (few and bool(_leaves(node.element))) or None
-        return {"kind": "repeat", "name": node.name, "count": formula(node.count), "summed": summed, "skip": whole, "element": element}
+        return {
+            "kind": "repeat",
+            "name": node.name,
+            "count": formula(node.count),
+            "summed": summed,
+            "skip": whole,
+            "element": element,
+        }
 
     def _parts(self, node: tree.Parts) -> Table:
         kinds = []
         for kind in node.kinds:
-            magic = [[offset, mask, value] for offset, (mask, value) in sorted(prefix_of(kind.root, self.message.frame.max_length).items())]
+            magic = [
+                [offset, mask, value]
+                for offset, (mask, value) in sorted(
+                    prefix_of(kind.root, self.message.frame.max_length).items()
+                )
+            ]
             after = node.following(kind)
-            kinds.append({"magic": magic, "element": self.node(kind.element), "following": None if after is None else formula(after)})
+            kinds.append(
+                {
+                    "magic": magic,
+                    "element": self.node(kind.element),
+                    "following": None if after is None else formula(after),
+                }
+            )
         rules = {"count": node.count, "size": node.size, "within": node.within}
         said = {name: None if rule is None else formula(rule) for name, rule in rules.items()}
-        return {"kind": "parts", "name": node.name, "total": self._keep(node.total.path), **said, "kinds": kinds}
+        return {
+            "kind": "parts",
+            "name": node.name,
+            "total": self._keep(node.total.path),
+            **said,
+            "kinds": kinds,
+        }
 
     def _described(self, info: tree.FieldInfo, kind: str, mask: int | None = None) -> Table:
         """What a number says of itself, and its fields in Wireshark."""
-        is_hex = (info.path in self.message.seals or info.const is not None) and kind.startswith("UINT")
+        is_hex = (info.path in self.message.seals or info.const is not None) and kind.startswith(
+            "UINT"
+        )
         shown = "HEX" if is_hex else "NONE" if kind in ("FLOAT", "DOUBLE") else "DEC"
-        table: Table = {"field": self._new(kind, info.path, info.name, info.docs, shown, info.labels, mask)}
+        table: Table = {
+            "field": self._new(kind, info.path, info.name, info.docs, shown, info.labels, mask)
+        }
         if info.scaled:
-            table["physical"] = self._new("DOUBLE", f"{info.path}.physical", info.name, f"{info.docs} in {info.unit}".strip(), "NONE")
-        table |= {"scale": info.scale if info.scaled else None, "offset": info.offset or None, "unit": info.unit or None}
+            table["physical"] = self._new(
+                "DOUBLE",
+                f"{info.path}.physical",
+                info.name,
+                f"{info.docs} in {info.unit}".strip(),
+                "NONE",
+            )
+        table |= {
+            "scale": info.scale if info.scaled else None,
+            "offset": info.offset or None,
+            "unit": info.unit or None,
+        }
         table |= {"labels": dict(info.labels) or None, "const": info.const}
-        table["allowed"] = None if info.allowed is None else [list(run) for run in tree.runs_of(info.allowed)]
+        table["allowed"] = (
+            None if info.allowed is None else [list(run) for run in tree.runs_of(info.allowed)]
+        )
         return table | {"keep": self._keep(info.path)}
 
-    def _new(self, kind: str, path: str, name: str, docs: str, base: str, labels: Any = None, mask: int | None = None) -> Code:
+    def _new(
+        self,
+        kind: str,
+        path: str,
+        name: str,
+        docs: str,
+        base: str,
+        labels: Any = None,
+        mask: int | None = None,
+    ) -> Code:
         """A field of Wireshark; one name stands for numbers of one family only."""
         family = "".join(letter for letter in kind if letter.isalpha()) + "64" * kind.endswith("64")
         abbreviation = f"{self.prefix}.{path}"
         while self.types.setdefault(abbreviation, family) != family:
             abbreviation += "_"
-        valued = "{" + ", ".join(f"[{value}] = {quoted(text)}" for value, text in labels.items()) + "}" if labels else "nil"
+        valued = (
+            "{" + ", ".join(f"[{value}] = {quoted(text)}" for value, text in labels.items()) + "}"
+            if labels
+            else "nil"
+        )
         masked = f"0x{mask:x}" if mask is not None else "nil"
-        return Code(f"new({quoted(abbreviation)}, {quoted(name)}, ftypes.{kind}, base.{base}, {valued}, {masked}, {quoted(docs)})")
+        return Code(
+            f"new({quoted(abbreviation)}, {quoted(name)}, ftypes.{kind}, base.{base}, {valued},"
+            f" {masked}, {quoted(docs)})"
+        )
 
     def _keep(self, path: str) -> str | None:
         return path if path in self.kept else None
 
     def _skip(self, info: tree.FieldInfo, size: int) -> int | None:
-        return None if info.path in self.kept or info.const is not None or info.allowed is not None else size
+        return (
+            None
+            if info.path in self.kept or info.const is not None or info.allowed is not None
+            else size
+        )
 
     def _seal(self, node: tree.Sealed) -> Table:
         widths = {info.path: info.bits for below in tree.nodes(node) for info in tree.infos(below)}
@@ -255,7 +406,13 @@ def _algorithm(algorithm: Checksum) -> Table:
     match algorithm:
         case Crc():
             digits = {name: f"{getattr(algorithm, name):x}" for name in ("poly", "init", "xorout")}
-            return {"algorithm": "crc", "width": algorithm.width, **digits, "refin": algorithm.refin, "refout": algorithm.refout}
+            return {
+                "algorithm": "crc",
+                "width": algorithm.width,
+                **digits,
+                "refin": algorithm.refin,
+                "refout": algorithm.refout,
+            }
         case Xor():
             return {"algorithm": "xor"}
         case Sum():
@@ -269,7 +426,9 @@ def _algorithm(algorithm: Checksum) -> Table:
             if isinstance(algorithm.algorithm, ZeroPadded):
                 raise Refused("a checksum padded twice")
             return {**_algorithm(algorithm.algorithm), "pad": algorithm.to}
-    raise Refused(f"the checksum {type(algorithm).__name__} is Python code, which Wireshark does not run")
+    raise Refused(
+        f"the checksum {type(algorithm).__name__} is Python code, which Wireshark does not run"
+    )
 
 
 def _leaves(node: tree.Node) -> list[tree.Node | tree.Part]:
@@ -278,13 +437,24 @@ def _leaves(node: tree.Node) -> list[tree.Node | tree.Part]:
     if any(isinstance(part, tree.Repeat | tree.When | tree.Select) for part in below):
         return []
     numbers = (part for part in below if isinstance(part, tree.Block | tree.Number))
-    return [leaf for part in numbers for leaf in (part.parts if isinstance(part, tree.Block) else (part,))]
+    return [
+        leaf
+        for part in numbers
+        for leaf in (part.parts if isinstance(part, tree.Block) else (part,))
+    ]
 
 
 def _around(*paths: str) -> str:
     """The path of the innermost struct that has all of these fields."""
     parents = [path.split(".")[:-1] for path in paths]
-    depth = next((depth for depth in range(min(map(len, parents))) if len({names[depth] for names in parents}) > 1), min(map(len, parents)))
+    depth = next(
+        (
+            depth
+            for depth in range(min(map(len, parents)))
+            if len({names[depth] for names in parents}) > 1
+        ),
+        min(map(len, parents)),
+    )
     return ".".join(parents[0][:depth])
 
 
@@ -293,19 +463,30 @@ def _width(bits: int) -> int:
 
 
 def _word_order(block: tree.Block) -> str | None:
-    """The byte order by which all parts are runs of bits of one word, which Wireshark can draw; None where there is none."""
-    orders = (order for order in ("big", "little") if all(_run(part.bits, block.size, order) is not None for part in block.parts))
+    """The byte order by which all parts are runs of bits of one word, which Wireshark can draw;
+    None where there is none.
+    """
+    orders = (
+        order
+        for order in ("big", "little")
+        if all(_run(part.bits, block.size, order) is not None for part in block.parts)
+    )
     return next(orders, None) if block.size <= 4 else None
 
 
 def _run(bits: BitField, size: int, order: str) -> int | None:
-    """The lowest bit of a field in the word that a block is, None where it is no run of bits in order."""
-    places = ((run, run.byte if order == "little" else size - 1 - run.byte) for run in bits.segments)
+    """The lowest bit of a field in the word that a block is, None where it is no run of bits in
+    order.
+    """
+    places = (
+        (run, run.byte if order == "little" else size - 1 - run.byte) for run in bits.segments
+    )
     starts = {8 * byte + run.low - run.target for run, byte in places}
     return starts.pop() if len(starts) == 1 else None
 
 
-#: the link types that captures keep for private use, USER0 to USER15, by the numbers that Wireshark's wtap gives them.
+#: the link types that captures keep for private use, USER0 to USER15, by the numbers that
+#: Wireshark's wtap gives them.
 USER_LINKS = tuple(range(45, 61))
 
 _HEAD = """\
@@ -344,16 +525,27 @@ local marks = {{
 
 
 def dissector(sensor: Sensor) -> str:
-    """A Lua dissector for Wireshark: of the sensor's UDP and TCP ports, and of captures of a serial line.
+    """A Lua dissector for Wireshark: of the sensor's UDP and TCP ports, and of captures of a serial
+    line.
 
     Raises:
         Refused: where only Python code can decide what a frame is made of.
     """
-    name, title, link = sensor.id.replace("-", "_"), f"{sensor.vendor} {sensor.model}", sensor.links.get("data")
+    name, title, link = (
+        sensor.id.replace("-", "_"),
+        f"{sensor.vendor} {sensor.model}",
+        sensor.links.get("data"),
+    )
     if isinstance(link, Udp) and link.assembled is not None:
-        raise Refused(f"{sensor.id}: messages in several datagrams, which the dissector does not join")
-    # the first that fits is shown: what goes either way came in, and the one with more constants says more
-    by_direction = sorted(messages(sensor), key=lambda message: (message.frame.direction, -len(codec(message.frame).prefix)))
+        raise Refused(
+            f"{sensor.id}: messages in several datagrams, which the dissector does not join"
+        )
+    # the first that fits is shown: what goes either way came in, and the one with more constants
+    # says more
+    by_direction = sorted(
+        messages(sensor),
+        key=lambda message: (message.frame.direction, -len(codec(message.frame).prefix)),
+    )
     about = {
         "title": title,
         "is_stream": any(isinstance(link, Udp) and link.stream for link in sensor.links.values()),
@@ -361,8 +553,16 @@ def dissector(sensor: Sensor) -> str:
         "places": _patterns(sensor),
         "frames": [_frame(message, name) for message in by_direction],
     }
-    head = _HEAD.format(title=title, version=__version__, source=sensor.source, name=quoted(name), title_quoted=quoted(title))
-    walker = resources.files("lidarspec.exports").joinpath("wireshark.lua").read_text(encoding="utf-8")
+    head = _HEAD.format(
+        title=title,
+        version=__version__,
+        source=sensor.source,
+        name=quoted(name),
+        title_quoted=quoted(title),
+    )
+    walker = (
+        resources.files("lidarspec.exports").joinpath("wireshark.lua").read_text(encoding="utf-8")
+    )
     return "\n".join([head, f"local sensor = {lua(about)}\n", walker])
 
 

@@ -1,17 +1,20 @@
 """Columns: what `points`, `plausible` and clock functions compute with.
 
-A `Batch` is a table of packets with what surrounds them: where something was lost, the frames of other types that were last before each
-packet, and what the batch before left over. `Fields` is what a function is given as ``f``: the fields of a batch by attribute, each of
-which is a `Column`.
+A `Batch` is a table of packets with what surrounds them: where something was lost, the frames of
+other types that were last before each packet, and what the batch before left over. `Fields` is what
+a function is given as ``f``: the fields of a batch by attribute, each of which is a `Column`.
 
-A `Column` is an array with one axis for the packets and one for each array level of the struct, of length 1 where its field is further
-out. Each axis is named by its array, so that arithmetic lines up by itself, and sibling arrays cannot be mixed by accident. A column also
-knows its batch, and so where packets were lost and how long variable arrays are; and how many packets are already certain (``ready``)
-where a value depends on what follows. `RowOfValues` is a column as one run of values in stream order, without padding, which is what
-`previous`, `following` and `last` mean by "before" and "after".
+A `Column` is an array with one axis for the packets and one for each array level of the struct, of
+length 1 where its field is further out. Each axis is named by its array, so that arithmetic lines
+up by itself, and sibling arrays cannot be mixed by accident. A column also knows its batch, and so
+where packets were lost and how long variable arrays are; and how many packets are already certain
+(``ready``) where a value depends on what follows. `RowOfValues` is a column as one run of values in
+stream order, without padding, which is what `previous`, `following` and `last` mean by "before" and
+"after".
 
-Arrays that are no columns line up with them, too (`aligned`): what `along` made by the name of its array, a plain array where its length
-is that of one array alone; only one that has as many axes as the arrays that are nested lines up by place, as in NumPy.
+Arrays that are no columns line up with them, too (`aligned`): what `along` made by the name of its
+array, a plain array where its length is that of one array alone; only one that has as many axes as
+the arrays that are nested lines up by place, as in NumPy.
 """
 
 from __future__ import annotations
@@ -36,9 +39,18 @@ from lidarspec.spec.vocabulary import ELEMENTWISE, Along, row_numbers
 BITWISE = {np.bitwise_and, np.bitwise_or, np.bitwise_xor, np.invert}
 
 #: what is said where Python, or a bitwise operator, asks one answer of a column.
-NO_TRUTH = "a column has an answer for each packet: & | ~ in place of `and`, `or`, `not` and a < f.x < b, np.where in place of `if`"
-NO_BITS = "& | ~ take conditions, and fields are float64: each comparison in parentheses, (f.a < 1) & (f.b < 2); for bits a BitStruct"
-NO_TEXT = "columns are numbers and cannot be combined with {!r}; a field of bytes has one number per byte, such as 65 for b'A'"
+NO_TRUTH = (
+    "a column has an answer for each packet: & | ~ in place of `and`, `or`, `not` and a < f.x < b,"
+    " np.where in place of `if`"
+)
+NO_BITS = (
+    "& | ~ take conditions, and fields are float64: each comparison in parentheses, (f.a < 1) &"
+    " (f.b < 2); for bits a BitStruct"
+)
+NO_TEXT = (
+    "columns are numbers and cannot be combined with {!r}; a field of bytes has one number per"
+    " byte, such as 65 for b'A'"
+)
 
 Carry = dict[int, NDArray[np.float64]]
 
@@ -53,7 +65,8 @@ class Batch:
     Attributes:
         table: their raw columns.
         breaks: (n,) True where something was lost before the packet.
-        state: per frame type, its table and for each packet the index of the frame that was last (-1: none yet).
+        state: per frame type, its table and for each packet the index of the frame that was last
+            (-1: none yet).
         defaults: declared defaults of state columns, per frame type and path.
         carry: what the previous batch left for `previous` and `last`, by order of call.
     """
@@ -75,7 +88,9 @@ class Batch:
 
     def of(self, group: Group) -> Batch:
         """The packets of a group, in its order, as a batch of their own, which no other follows."""
-        table = Rows(self.table.schema, [Group(group.layout, np.arange(len(group.where)), group.rows)])
+        table = Rows(
+            self.table.schema, [Group(group.layout, np.arange(len(group.where)), group.rows)]
+        )
         state = {name: (frames, which[group.where]) for name, (frames, which) in self.state.items()}
         return Batch(table, self.breaks[group.where], state, self.defaults, nominal=self.nominal)
 
@@ -84,9 +99,11 @@ class Column(NDArrayOperatorsMixin):
     """Numbers of a batch of packets: NumPy's ufuncs and functions apply, see the module's text.
 
     Attributes:
-        array: shape (n or 1, ...), one axis per array level of the struct, length 1 where the value is further out.
-        axes: names of the axes after the first; None where the length is 1; with a "?" where no field is along it by now: behind the
-            name that `along` gave it, before the one that a plain array is guessed to be along.
+        array: shape (n or 1, ...), one axis per array level of the struct, length 1 where the value
+            is further out.
+        axes: names of the axes after the first; None where the length is 1; with a "?" where no
+            field is along it by now: behind the name that `along` gave it, before the one that a
+            plain array is guessed to be along.
         ready: packets from the start whose values depend on nothing that is still to come.
         source: the field's path, while the column is an unchanged field.
         frame: the other frame type that this is a field of; "" for the packets themselves.
@@ -105,7 +122,13 @@ class Column(NDArrayOperatorsMixin):
         source: str = "",
         frame: str = "",
     ) -> None:
-        self.array, self.axes, self.batch, self.source, self.frame = array, axes, batch, source, frame
+        self.array, self.axes, self.batch, self.source, self.frame = (
+            array,
+            axes,
+            batch,
+            source,
+            frame,
+        )
         self.ready = len(batch) if ready is None else ready
 
     @property
@@ -127,7 +150,10 @@ class Column(NDArrayOperatorsMixin):
     def __getitem__(self, index: int) -> Column:
         """An element of a field that is an array, of each packet; nan where a packet has fewer."""
         if not self.source or not isinstance(index, int):
-            raise SpecError("only fields have elements, each by one index: f.columns[0].timestamp, f.distances[-1]")
+            raise SpecError(
+                "only fields have elements, each by one index: f.columns[0].timestamp,"
+                " f.distances[-1]"
+            )
         return _column(self.batch, self.frame, f"{self.source}[{index}]")
 
     def __array_ufunc__(self, ufunc: np.ufunc, method: str, *inputs: Any, **kwargs: Any) -> Any:
@@ -135,16 +161,22 @@ class Column(NDArrayOperatorsMixin):
             raise SpecError("columns cannot be changed in place; write a new expression instead")
         if method != "__call__":
             return getattr(ufunc, method)(*(np.asarray(value) for value in inputs), **kwargs)
-        return self.applied((lambda *arrays: ufunc(*arrays, **kwargs)) if kwargs else ufunc, *inputs)
+        return self.applied(
+            (lambda *arrays: ufunc(*arrays, **kwargs)) if kwargs else ufunc, *inputs
+        )
 
-    def __array_function__(self, function: Callable[..., Any], types: Any, args: Any, kwargs: Any) -> Any:
+    def __array_function__(
+        self, function: Callable[..., Any], types: Any, args: Any, kwargs: Any
+    ) -> Any:
         if function in ELEMENTWISE:
             return self.applied(lambda *arrays: function(*arrays, **kwargs), *args)
         plain = [np.asarray(value) if isinstance(value, Column) else value for value in args]
         return function(*plain, **kwargs)
 
     def applied(self, function: Callable[..., Any], *values: Any) -> Column:
-        """`function` of arrays, lined up by axes; columns on the left, arrays by their last axes as in NumPy."""
+        """`function` of arrays, lined up by axes; columns on the left, arrays by their last axes as
+        in NumPy.
+        """
         arrays, axes, ready = aligned(values, self.batch)
         try:
             array = called(function, arrays)
@@ -162,9 +194,11 @@ class Column(NDArrayOperatorsMixin):
         return Column(array, names, self.batch, ready=ready)
 
     def on(self, *axes: str) -> Column:
-        """The column's values on other axes, by the names of any arrays of the frame; its own axes go to the last of those named.
+        """The column's values on other axes, by the names of any arrays of the frame; its own axes
+        go to the last of those named.
 
-        Where they are fewer than that array has elements, as in frames that lack theirs, the others are nan.
+        Where they are fewer than that array has elements, as in frames that lack theirs, the others
+        are nan.
 
         Raises:
             SpecError: for fewer axes than the column has, or an array that the frame does not have.
@@ -180,7 +214,12 @@ class Column(NDArrayOperatorsMixin):
         lengths = dict(zip(places, (array.shape[1 + index] for index in own), strict=True))
         depth = max(schema.depth(), len(self.axes), *(place + 1 for place in names))
         array = array.reshape(len(array), *(lengths.get(place, 1) for place in range(depth)))
-        return Column(array, tuple(names[place] if place in lengths else None for place in range(depth)), self.batch, ready=self.ready)
+        return Column(
+            array,
+            tuple(names[place] if place in lengths else None for place in range(depth)),
+            self.batch,
+            ready=self.ready,
+        )
 
     @property
     def index(self) -> Along:
@@ -189,26 +228,45 @@ class Column(NDArrayOperatorsMixin):
         Raises:
             SpecError: where they are in none.
         """
-        schema, names = self.batch.table.schema, [str(name).strip("?") for name in self.axes if name is not None]
-        if not names and not self.frame and self.source in schema.fields:  # of one element in all packets
+        schema, names = (
+            self.batch.table.schema,
+            [str(name).strip("?") for name in self.axes if name is not None],
+        )
+        if (
+            not names and not self.frame and self.source in schema.fields
+        ):  # of one element in all packets
             names = list(schema.fields[self.source].axes)
         if not names:
             raise SpecError("there is an index of arrays only, and these values are in none")
         return Along((names[-1],), np.arange(self.array.shape[1 + schema.places[names[-1]]]))
 
     def steps(self) -> Along | NDArray[np.intp]:
-        """0, 1, 2 ... up to the largest value, (m,): the indices of the array of which this column is the count."""
+        """0, 1, 2 ... up to the largest value, (m,): the indices of the array of which this column
+        is the count.
+        """
         schema, most = self.batch.table.schema, int(np.nanmax(self.array, initial=0))
-        counted = [axis for axis, count in schema.arrays.items() if isinstance(count, Ref) and count.path == self.source and not self.frame]
+        counted = [
+            axis
+            for axis, count in schema.arrays.items()
+            if isinstance(count, Ref) and count.path == self.source and not self.frame
+        ]
         axis = counted[0] if len(counted) == 1 else schema.chain[-1] if schema.chain else None
-        return np.arange(most) if axis is None else Along((axis,), np.arange(_reach(self.batch.table, axis, most)))
+        return (
+            np.arange(most)
+            if axis is None
+            else Along((axis,), np.arange(_reach(self.batch.table, axis, most)))
+        )
 
     def gathered(self, table: NDArray[np.float64]) -> Column:
-        """The rows of a table, (m + 1, k), the last one nan, at these indices, along the array of k elements that stands in theirs."""
+        """The rows of a table, (m + 1, k), the last one nan, at these indices, along the array of k
+        elements that stands in theirs.
+        """
         own = [place for place, name in enumerate(self.axes) if name is not None]
         depth = max(len(self.axes), self.batch.table.schema.depth())
         place = _spot(table.shape[1:], [None] * depth, [1] * depth, self.batch.table, without=own)
-        found = table.take(row_numbers(deep(self.array, depth).squeeze(1 + place), len(table)), axis=0)
+        found = table.take(
+            row_numbers(deep(self.array, depth).squeeze(1 + place), len(table)), axis=0
+        )
         axes = [*self.axes, *(None,) * (depth - len(self.axes))]
         axes[place] = f"?{self.batch.table.schema.chain[place]}"
         return Column(np.moveaxis(found, -1, 1 + place), tuple(axes), self.batch, ready=self.ready)
@@ -216,10 +274,17 @@ class Column(NDArrayOperatorsMixin):
     def running(self) -> Column:
         """The sum of the values so far along the innermost array that they are in."""
         place = max([place for place, name in enumerate(self.axes) if name is not None], default=0)
-        return Column(np.cumsum(self.array, axis=1 + place, dtype=np.float64), self.axes, self.batch, ready=self.ready)
+        return Column(
+            np.cumsum(self.array, axis=1 + place, dtype=np.float64),
+            self.axes,
+            self.batch,
+            ready=self.ready,
+        )
 
     def shifted(self, step: int) -> Column:
-        """The values `step` places later (earlier if negative) in stream order, on the same axes; nan across a loss and at the end."""
+        """The values `step` places later (earlier if negative) in stream order, on the same axes;
+        nan across a loss and at the end.
+        """
         row = RowOfValues(self)
         size = abs(step)
         slot = len(self.batch.left)
@@ -235,9 +300,18 @@ class Column(NDArrayOperatorsMixin):
         ready = self.ready
         if step > 0:
             certain = row.starts[ready] - step
-            ready = min(ready, int(np.searchsorted(row.starts, certain, side="right")) - 1 if certain >= 0 else 0)
-        self.batch.left.append(lambda upto: _tail(values, edges, len(carried) + row.starts[upto], 0 if step > 0 else size))
-        return Column(row.spread(shifted[len(carried) :]), self.axes, self.batch, ready=max(ready, 0))
+            ready = min(
+                ready,
+                int(np.searchsorted(row.starts, certain, side="right")) - 1 if certain >= 0 else 0,
+            )
+        self.batch.left.append(
+            lambda upto: _tail(
+                values, edges, len(carried) + row.starts[upto], 0 if step > 0 else size
+            )
+        )
+        return Column(
+            row.spread(shifted[len(carried) :]), self.axes, self.batch, ready=max(ready, 0)
+        )
 
     def latest(self, where: Any = None) -> Column:
         """The most recent value at which `where` was true, this one included; nan before the first.
@@ -245,14 +319,21 @@ class Column(NDArrayOperatorsMixin):
         Args:
             where: a condition that lines up with the column; by default where its value is finite.
         """
-        (values, flags), axes, ready = aligned((self, np.isfinite(self) if where is None else where), self.batch)
+        (values, flags), axes, ready = aligned(
+            (self, np.isfinite(self) if where is None else where), self.batch
+        )
         shape = np.broadcast_shapes(values.shape, flags.shape)
-        both = [Column(np.broadcast_to(array, shape), axes, self.batch, ready=ready) for array in (values, flags)]
+        both = [
+            Column(np.broadcast_to(array, shape), axes, self.batch, ready=ready)
+            for array in (values, flags)
+        ]
         row, known = (RowOfValues(column) for column in both)
         slot = len(self.batch.left)
         carried = self.batch.carry.get(slot, np.empty(0))
         numbers = np.concatenate([carried, row.values])
-        indices = np.where(np.concatenate([np.ones(len(carried)), known.values]) > 0, np.arange(len(numbers)), -1)
+        indices = np.where(
+            np.concatenate([np.ones(len(carried)), known.values]) > 0, np.arange(len(numbers)), -1
+        )
         indices = np.maximum.accumulate(indices) if len(indices) else indices
         latest = np.where(indices >= 0, numbers[indices], np.nan)
         self.batch.left.append(lambda upto: latest[: len(carried) + row.starts[upto]][-1:])
@@ -270,10 +351,16 @@ class RowOfValues:
 
     def __init__(self, column: Column) -> None:
         self._shape = (len(column.batch), *column.shape[1:])
-        full = column.array if column.array.shape == self._shape else np.broadcast_to(column.array, self._shape)
+        full = (
+            column.array
+            if column.array.shape == self._shape
+            else np.broadcast_to(column.array, self._shape)
+        )
         flat = full.reshape(self._shape[0], math.prod(self._shape[1:]))
         self._mask = unpadded(column.axes, self._shape, column.batch)
-        self.values = np.asarray((flat if self._mask is None else flat[self._mask]).reshape(-1), np.float64)
+        self.values = np.asarray(
+            (flat if self._mask is None else flat[self._mask]).reshape(-1), np.float64
+        )
         if self._mask is None:
             self.starts = np.arange(len(flat) + 1, dtype=np.intp) * flat.shape[1]
         else:
@@ -289,7 +376,9 @@ class RowOfValues:
         return full.reshape(self._shape)
 
 
-def unpadded(axes: tuple[str | None, ...], shape: tuple[int, ...], batch: Batch) -> NDArray[np.bool_] | None:
+def unpadded(
+    axes: tuple[str | None, ...], shape: tuple[int, ...], batch: Batch
+) -> NDArray[np.bool_] | None:
     """Which elements, (n, product of the other lengths), are not padding; None where none is."""
     mask: NDArray[np.bool_] | None = None
     for index, axis in enumerate(axes):
@@ -300,38 +389,70 @@ def unpadded(axes: tuple[str | None, ...], shape: tuple[int, ...], batch: Batch)
         if len(counts) and int(counts.min()) == shape[1 + index]:
             continue
         inside = np.arange(shape[1 + index]) < counts[:, None]
-        inside = inside.reshape(len(counts), *(shape[1 + i] if i == index else 1 for i in range(len(axes))))
+        inside = inside.reshape(
+            len(counts), *(shape[1 + i] if i == index else 1 for i in range(len(axes)))
+        )
         mask = inside if mask is None else mask & inside
-    return None if mask is None else np.broadcast_to(mask, shape).reshape(shape[0], math.prod(shape[1:]))
+    return (
+        None
+        if mask is None
+        else np.broadcast_to(mask, shape).reshape(shape[0], math.prod(shape[1:]))
+    )
 
 
-def aligned(values: tuple[Any, ...], batch: Batch) -> tuple[list[NDArray[Any]], tuple[str | None, ...], int]:
-    """Columns and arrays as arrays that broadcast, the names of the axes they have together, and the smallest `ready`.
+def aligned(
+    values: tuple[Any, ...], batch: Batch
+) -> tuple[list[NDArray[Any]], tuple[str | None, ...], int]:
+    """Columns and arrays as arrays that broadcast, the names of the axes they have together, and
+    the smallest `ready`.
 
     Raises:
         SpecError: where axes of different arrays meet.
     """
     columns = [value for value in values if isinstance(value, Column)]
-    if columns and all(column.axes == columns[0].axes for column in columns) and _only_numbers_beside(values):
-        arrays = [value.array if isinstance(value, Column) else np.asarray(value) for value in values]
+    if (
+        columns
+        and all(column.axes == columns[0].axes for column in columns)
+        and _only_numbers_beside(values)
+    ):
+        arrays = [
+            value.array if isinstance(value, Column) else np.asarray(value) for value in values
+        ]
         return arrays, columns[0].axes, min([column.ready for column in columns])
     schema = batch.table.schema
-    named = {at: {schema.places[axis]: axis for axis in map(schema.axis, v.axes)} for at, v in enumerate(values) if isinstance(v, Along)}
-    depth = max([len(column.axes) for column in columns] + [place + 1 for places in named.values() for place in places], default=0)
+    named = {
+        at: {schema.places[axis]: axis for axis in map(schema.axis, v.axes)}
+        for at, v in enumerate(values)
+        if isinstance(v, Along)
+    }
+    depth = max(
+        [len(column.axes) for column in columns]
+        + [place + 1 for places in named.values() for place in places],
+        default=0,
+    )
     axes, lengths = list[str | None]([None] * depth), [1] * depth
     for column in columns:
         for place, name in enumerate(column.axes):
-            axes[place], lengths[place] = _met(axes[place], name), max(lengths[place], column.array.shape[1 + place])
+            axes[place], lengths[place] = (
+                _met(axes[place], name),
+                max(lengths[place], column.array.shape[1 + place]),
+            )
     for at, places in named.items():
         for place, axis in places.items():
             length = _length(values[at], axis)
-            axes[place], lengths[place] = _met(axes[place], f"{axis}?" if length != 1 else None), max(lengths[place], length)
+            axes[place], lengths[place] = (
+                _met(axes[place], f"{axis}?" if length != 1 else None),
+                max(lengths[place], length),
+            )
     arrays = []
     for at, value in enumerate(values):
         if isinstance(value, Column):
             arrays.append(deep(value.array, depth))
         elif at in named:
-            names = tuple(named[at].get(place, "").rpartition(".")[2] for place in range(min(named[at]), depth))
+            names = tuple(
+                named[at].get(place, "").rpartition(".")[2]
+                for place in range(min(named[at]), depth)
+            )
             arrays.append(value.lined_up(names))
         else:
             arrays.append(_placed(np.asarray(value), axes, lengths, batch.table))
@@ -347,9 +468,13 @@ def _cut_to_shortest(arrays: list[NDArray[Any]]) -> list[NDArray[Any]]:
     """
     reversed_shapes = [array.shape[::-1] for array in arrays]
     shortest = [
-        min((length for length in lengths if length != 1), default=1) for lengths in itertools.zip_longest(*reversed_shapes, fillvalue=1)
+        min((length for length in lengths if length != 1), default=1)
+        for lengths in itertools.zip_longest(*reversed_shapes, fillvalue=1)
     ]
-    return [array[tuple(slice(shortest[place]) for place in reversed(range(array.ndim)))] for array in arrays]
+    return [
+        array[tuple(slice(shortest[place]) for place in reversed(range(array.ndim)))]
+        for array in arrays
+    ]
 
 
 def _met(known: str | None, name: str | None) -> str | None:
@@ -360,18 +485,32 @@ def _met(known: str | None, name: str | None) -> str | None:
     """
     if known is None or name is None:
         return known or name
-    if known.strip("?") != name.strip("?") and not known.startswith("?") and not name.startswith("?"):
-        raise SpecError(f"axis {known.strip('?')!r} meets axis {name.strip('?')!r}: put one on the other's place with .on(...)")
+    if (
+        known.strip("?") != name.strip("?")
+        and not known.startswith("?")
+        and not name.startswith("?")
+    ):
+        raise SpecError(
+            f"axis {known.strip('?')!r} meets axis {name.strip('?')!r}: put one on the other's"
+            " place with .on(...)"
+        )
     return min(known, name, key=lambda one: (one.startswith("?"), one.endswith("?")))
 
 
 def _length(value: Along, axis: str) -> int:
     """How many numbers there are along an array."""
-    return int(value.array.shape[[name.rpartition(".")[2] for name in value.axes].index(axis.rpartition(".")[2])])
+    return int(
+        value.array.shape[
+            [name.rpartition(".")[2] for name in value.axes].index(axis.rpartition(".")[2])
+        ]
+    )
 
 
-def _placed(array: NDArray[Any], axes: list[str | None], lengths: Sequence[int], table: Table) -> NDArray[Any]:
-    """A plain array, lined up with axes of these lengths, which are given a name where they have none.
+def _placed(
+    array: NDArray[Any], axes: list[str | None], lengths: Sequence[int], table: Table
+) -> NDArray[Any]:
+    """A plain array, lined up with axes of these lengths, which are given a name where they have
+    none.
 
     Raises:
         SpecError: where its length is that of several of them, or of no array of the frame.
@@ -380,48 +519,93 @@ def _placed(array: NDArray[Any], axes: list[str | None], lengths: Sequence[int],
     if array.size == 1:
         return array
     if array.ndim < depth:
-        array = array.reshape(*array.shape, *(1,) * (depth - array.ndim - _spot(array.shape, axes, lengths, table)))
+        array = array.reshape(
+            *array.shape, *(1,) * (depth - array.ndim - _spot(array.shape, axes, lengths, table))
+        )
     for place in range(max(depth - array.ndim, 0), depth):
         if array.shape[place - depth] != 1 and axes[place] is None:
             chain = table.schema.chain
-            guess = "" if array.ndim > depth else "?"  # with an axis for the packets it was made of columns
+            guess = (
+                "" if array.ndim > depth else "?"
+            )  # with an axis for the packets it was made of columns
             axes[place] = f"{guess}{chain[place] if place < len(chain) else f'<{place}>'}"
     return array
 
 
-def _spot(shape: tuple[int, ...], axes: Sequence[str | None], lengths: Sequence[int], table: Table, without: Sequence[int] = ()) -> int:
-    """The axis that the first one of a plain array goes with, as its lengths say: among those that are there, else among the frame's.
+def _spot(
+    shape: tuple[int, ...],
+    axes: Sequence[str | None],
+    lengths: Sequence[int],
+    table: Table,
+    without: Sequence[int] = (),
+) -> int:
+    """The axis that the first one of a plain array goes with, as its lengths say: among those that
+    are there, else among the frame's.
 
     Args:
         without: axes that it does not go with.
     """
     wanted = [(place, length) for place, length in enumerate(shape) if length != 1]
-    there = {(place, length): (axes[place] or "").strip("?") for place, length in enumerate(lengths)}
+    there = {
+        (place, length): (axes[place] or "").strip("?") for place, length in enumerate(lengths)
+    }
     texts = {info.path for info in table.schema.fields.values() if info.kind == "bytes"}
-    whole = {(place, table.length(axis)): axis for axis, place in table.schema.places.items() if axis not in texts and place not in without}
+    whole = {
+        (place, table.length(axis)): axis
+        for axis, place in table.schema.places.items()
+        if axis not in texts and place not in without
+    }
     for known in (there, whole):
-        spots = [[(first + place, length) for place, length in wanted] for first in range(len(lengths) - len(shape) + 1)]
-        found = {first: [known[spot] for spot in some] for first, some in enumerate(spots) if all(spot in known for spot in some)}
-        fixed = {first: names for first, names in found.items() if all(isinstance(table.schema.arrays.get(name, 0), int) for name in names)}
-        found = fixed or found  # which other arrays are as long by chance is not to change what a spec means
-        if len(found) == 1 or (len(shape) > 1 and len(lengths) - len(shape) in found):  # which says itself how far out it is
+        spots = [
+            [(first + place, length) for place, length in wanted]
+            for first in range(len(lengths) - len(shape) + 1)
+        ]
+        found = {
+            first: [known[spot] for spot in some]
+            for first, some in enumerate(spots)
+            if all(spot in known for spot in some)
+        }
+        fixed = {
+            first: names
+            for first, names in found.items()
+            if all(isinstance(table.schema.arrays.get(name, 0), int) for name in names)
+        }
+        found = (
+            fixed or found
+        )  # which other arrays are as long by chance is not to change what a spec means
+        if len(found) == 1 or (
+            len(shape) > 1 and len(lengths) - len(shape) in found
+        ):  # which says itself how far out it is
             return max(found)
         if found:
             names = [" x ".join(names) for names in found.values()]
-            reason = f"goes with {' as well as with '.join(names)}: say which with along({found[max(found)][-1]!r}, ...)"
+            reason = (
+                f"goes with {' as well as with '.join(names)}: say which with"
+                f" along({found[max(found)][-1]!r}, ...)"
+            )
             break
     else:
-        reason = f"goes with no array of the frame: {', '.join(f'{axis} {length}' for (_, length), axis in whole.items()) or 'it has none'}"
+        reason = (
+            "goes with no array of the frame:"
+            f" {', '.join(f'{axis} {length}' for (_, length), axis in whole.items()) or 'it has none'}"
+        )
     raise SpecError(f"an array of {' x '.join(map(str, shape))} values {reason}", rule="LS214")
 
 
-def of_points(parts: Mapping[str, Any], batch: Batch) -> tuple[list[NDArray[Any]], tuple[str | None, ...], int, tuple[int, ...]]:
+def of_points(
+    parts: Mapping[str, Any], batch: Batch
+) -> tuple[list[NDArray[Any]], tuple[str | None, ...], int, tuple[int, ...]]:
     """The parts of points as `aligned` gives them, and the shape that they have together, (n, ...).
 
     Raises:
-        SpecError: where axes of different arrays meet, lengths do not fit, or a plain array is along an axis that no field has.
+        SpecError: where axes of different arrays meet, lengths do not fit, or a plain array is
+            along an axis that no field has.
     """
-    anchor = Column(np.zeros((1,) * (1 + batch.table.schema.depth())), (None,) * batch.table.schema.depth(), batch)
+    anchor = Column(
+        np.zeros((1,) * (1 + batch.table.schema.depth())),
+        (None,) * batch.table.schema.depth(),
+        batch,
+    )
     (_, *arrays), axes, ready = aligned((anchor, *parts.values()), batch)
     named = dict(zip(parts, arrays, strict=True))
     shape = together({"": np.empty((len(batch), *(1,) * len(axes)), np.bool_), **named}, axes)
@@ -429,19 +613,28 @@ def of_points(parts: Mapping[str, Any], batch: Batch) -> tuple[list[NDArray[Any]
     if stray is not None or len(shape) > 1 + len(axes):
         where = f"along {stray!r}" if stray is not None else "along a further axis"
         raise SpecError(
-            f"points {where}, where no field of theirs is ({_lengths(named, axes)}); numbers go along an array with along(...)",
+            f"points {where}, where no field of theirs is ({_lengths(named, axes)}); numbers go"
+            " along an array with along(...)",
             rule="LS214",
         )
     return arrays, axes, ready, shape
 
 
 def _reach(table: Table, axis: str, length: int) -> int:
-    """How far along an axis values are; no further than the array where frames say its length and have no array around it."""
-    return min(length, table.length(axis)) if any((table.counts(other) == 0).any() for other in table.schema.outer(axis)) else length
+    """How far along an axis values are; no further than the array where frames say its length and
+    have no array around it.
+    """
+    return (
+        min(length, table.length(axis))
+        if any((table.counts(other) == 0).any() for other in table.schema.outer(axis))
+        else length
+    )
 
 
 def _reaching(array: NDArray[Any], place: int, table: Table, axis: str) -> NDArray[Any]:
-    """An array at a place of its shape as far along an axis as frames go; nan where they have nothing to put there."""
+    """An array at a place of its shape as far along an axis as frames go; nan where they have
+    nothing to put there.
+    """
     length = array.shape[place]
     missing = table.length(axis) - length
     if missing > 0:
@@ -463,14 +656,22 @@ def together(arrays: Mapping[str, NDArray[Any]], axes: tuple[str | None, ...]) -
     try:
         return np.broadcast_shapes(*(array.shape for array in arrays.values()))
     except ValueError:
-        raise SpecError(f"lengths that do not go together: {_lengths(arrays, axes)}", rule="LS214") from None
+        raise SpecError(
+            f"lengths that do not go together: {_lengths(arrays, axes)}", rule="LS214"
+        ) from None
 
 
 def _lengths(arrays: Mapping[str, NDArray[Any]], axes: tuple[str | None, ...]) -> str:
-    """How long arrays are along which axes: "range: samples 3, azimuth: samples 4"; those of one number are left out."""
+    """How long arrays are along which axes: "range: samples 3, azimuth: samples 4"; those of one
+    number are left out.
+    """
     names, told = ("packets", *((name or "").strip("?") for name in axes)), []
     for what, array in arrays.items():
-        own = [f"{name} {size}".strip() for name, size in zip(reversed(names), reversed(array.shape), strict=False) if size != 1]
+        own = [
+            f"{name} {size}".strip()
+            for name, size in zip(reversed(names), reversed(array.shape), strict=False)
+            if size != 1
+        ]
         extra = [str(size) for size in array.shape[: max(array.ndim - len(names), 0)]]
         told += [f"{what}: {' x '.join(extra + own[::-1])}"] if what and (own or extra) else []
     return ", ".join(told)
@@ -487,7 +688,9 @@ def called(function: Callable[..., Any], arrays: Sequence[Any]) -> NDArray[Any]:
 
 
 def remainder(values: Any, full: Any) -> NDArray[Any]:
-    """``np.remainder``, bit by bit; a quarter of the time for what is a turn away at most, as nearly all angles are."""
+    """``np.remainder``, bit by bit; a quarter of the time for what is a turn away at most, as
+    nearly all angles are.
+    """
     if np.ndim(full) or not full > 0 or np.ndim(values) == 0 or values.dtype != np.float64:
         return np.asarray(np.remainder(values, full))
     turns = np.subtract(values < 0, values >= full, dtype=np.int8)
@@ -498,7 +701,9 @@ def remainder(values: Any, full: Any) -> NDArray[Any]:
     return rest
 
 
-def _tail(values: NDArray[np.float64], edges: NDArray[np.intp], end: int, size: int) -> NDArray[np.float64]:
+def _tail(
+    values: NDArray[np.float64], edges: NDArray[np.intp], end: int, size: int
+) -> NDArray[np.float64]:
     """The last values before `end` that nothing lost separates from it."""
     if end == 0 or size == 0:
         return np.empty(0)
@@ -506,8 +711,17 @@ def _tail(values: NDArray[np.float64], edges: NDArray[np.intp], end: int, size: 
     return values[max(end - size, int(lost[-1]) if len(lost) else 0, 0) : end].copy()
 
 
-def field_column(info: FieldInfo, table: Table, depth: int, batch: Batch, which: NDArray[np.intp] | None = None, frame: str = "") -> Column:
-    """A field in its unit as a column of `depth` array axes; `which`: the frame of the table, of type `frame`, for each packet."""
+def field_column(
+    info: FieldInfo,
+    table: Table,
+    depth: int,
+    batch: Batch,
+    which: NDArray[np.intp] | None = None,
+    frame: str = "",
+) -> Column:
+    """A field in its unit as a column of `depth` array axes; `which`: the frame of the table, of
+    type `frame`, for each packet.
+    """
     array = field_array(info, table, depth)
     if which is not None:
         array = array[which]
@@ -519,21 +733,33 @@ def field_column(info: FieldInfo, table: Table, depth: int, batch: Batch, which:
 
 
 def field_array(info: FieldInfo, table: Table, depth: int, *, raw: bool = False) -> NDArray[Any]:
-    """A field in its unit, (n, ...), each array's axis in its place, with `depth` axes at least behind the first, some of length 1.
+    """A field in its unit, (n, ...), each array's axis in its place, with `depth` axes at least
+    behind the first, some of length 1.
 
     Args:
         raw: as it was sent, of its own type.
     """
-    array, places = table.raw(info.path) if raw else physical(info, table), [table.schema.places[axis] for axis in info.axes]
+    array, places = (
+        table.raw(info.path) if raw else physical(info, table),
+        [table.schema.places[axis] for axis in info.axes],
+    )
     if places and places[-1] >= len(places):  # an element of an array in which others stand
         lengths = dict(zip(places, array.shape[1:], strict=True))
-        array = array.reshape(len(array), *(lengths.get(place, 1) for place in range(places[-1] + 1)))
+        array = array.reshape(
+            len(array), *(lengths.get(place, 1) for place in range(places[-1] + 1))
+        )
     return deep(array, depth)
 
 
 def _axis(name: str, length: int, table: Table, *, known: bool) -> str | None:
-    """The name of an axis; of length 1 it needs none, unless packets of the batch have no element at all."""
-    if length != 1 or (known and not isinstance(table.schema.arrays.get(name), int) and not table.counts(name).all()):
+    """The name of an axis; of length 1 it needs none, unless packets of the batch have no element
+    at all.
+    """
+    if length != 1 or (
+        known
+        and not isinstance(table.schema.arrays.get(name), int)
+        and not table.counts(name).all()
+    ):
         return name
     return None
 
@@ -552,8 +778,9 @@ def physical(info: FieldInfo, table: Table) -> NDArray[np.float64]:
 
 
 class Fields:
-    """The fields of a batch of packets by attribute, as columns: ``f.points.distance``, ``f.state.difop.vertical``; of parts also those
-    of the frame that each is in, ``f.frame.counter``.
+    """The fields of a batch of packets by attribute, as columns: ``f.points.distance``,
+    ``f.state.difop.vertical``; of parts also those of the frame that each is in,
+    ``f.frame.counter``.
 
     Args:
         prefix: the names so far, each with a dot behind it.
@@ -579,12 +806,23 @@ class Fields:
         axis = base.rpartition(".")[0]
         if name == "index" and not self._frame and axis in self._batch.table.schema.arrays:
             return Along((axis,), np.arange(self._batch.table.length(axis)))
-        raise UnknownField(path, known, place="frame" if self._frame == AROUND else f"state.{self._frame}" if self._frame else "")
+        raise UnknownField(
+            path,
+            known,
+            place=(
+                "frame" if self._frame == AROUND else f"state.{self._frame}" if self._frame else ""
+            ),
+        )
 
     def __getitem__(self, index: int) -> Fields:
-        """An element of an array of structs, counted from the last one of each packet where the index is negative."""
+        """An element of an array of structs, counted from the last one of each packet where the
+        index is negative.
+        """
         if not self._prefix or not isinstance(index, int):
-            raise SpecError("only arrays have elements, each by one index: f.columns[0].timestamp, f.distances[-1]")
+            raise SpecError(
+                "only arrays have elements, each by one index: f.columns[0].timestamp,"
+                " f.distances[-1]"
+            )
         return Fields(self._batch, f"{self._prefix.removesuffix('.')}[{index}].", self._frame)
 
     @property
@@ -594,7 +832,9 @@ class Fields:
 
 
 def _paths(batch: Batch, frame: str) -> Iterable[str]:
-    """The fields of a batch, or those of the frames of another type that were last before its packets."""
+    """The fields of a batch, or those of the frames of another type that were last before its
+    packets.
+    """
     if not frame:
         return batch.table.schema.fields
     table, _ = batch.state[frame]
@@ -616,10 +856,16 @@ class _States:
 
 
 def _column(batch: Batch, frame: str, path: str) -> Column:
-    """A field of a batch; of another frame type that of the frame that was last before each packet, or its declared default."""
+    """A field of a batch; of another frame type that of the frame that was last before each packet,
+    or its declared default.
+    """
     depth = batch.table.schema.depth()
     table, which = batch.state[frame] if frame else (batch.table, np.zeros(0, np.intp))
-    if table is not None and path not in table.schema.fields and without_indices(path)[0] in table.schema.fields:
+    if (
+        table is not None
+        and path not in table.schema.fields
+        and without_indices(path)[0] in table.schema.fields
+    ):
         raise SpecError("there is no such element", path=path)
     if not frame:
         return field_column(batch.table.schema.fields[path], batch.table, depth, batch)
@@ -627,16 +873,23 @@ def _column(batch: Batch, frame: str, path: str) -> Column:
     missing = which < 0
     if not missing.any() and table is not None:
         same = len(which) == 0 or int(which.min()) == int(which.max())
-        return field_column(table.schema.fields[path], table, depth, batch, which[:1] if same else which, frame)
+        return field_column(
+            table.schema.fields[path], table, depth, batch, which[:1] if same else which, frame
+        )
     base, indices = without_indices(path)
     if base not in defaults:
-        raise SpecError(f"no {frame} frame has arrived yet, and no default is declared", path=f"state.{frame}.{path}")
+        raise SpecError(
+            f"no {frame} frame has arrived yet, and no default is declared",
+            path=f"state.{frame}.{path}",
+        )
     batch.nominal = True
     default = np.asarray(defaults[base], np.float64)[tuple(indices.values())]
     names = tuple(path if length != 1 else None for length in default.shape)
     spare = (1,) * max(depth - default.ndim, 0)
     array = default.reshape(1, *default.shape, *spare)
     if table is not None and not missing.all():
-        known = field_column(table.schema.fields[path], table, depth, batch, np.maximum(which, 0)).array
+        known = field_column(
+            table.schema.fields[path], table, depth, batch, np.maximum(which, 0)
+        ).array
         array = np.where(missing.reshape(-1, *(1,) * (known.ndim - 1)), array, known)
     return Column(array, (*names, *(None,) * len(spare)), batch, source=path, frame=frame)

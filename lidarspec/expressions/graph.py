@@ -1,18 +1,22 @@
-"""What a function of fields computes, as a graph: it is called once with columns that note down what is done to them.
+"""What a function of fields computes, as a graph: it is called once with columns that note down
+what is done to them.
 
-`trace` calls a `points`, `plausible` or clock function with `TracedFields`, and gives back what it returned, with the `Tape` of its
-steps. A step is a `Node`: a field, a state column, an elementwise call, or one of the steps that know packets by name (`on`, `shifted`,
-`latest`). Every node carries the plain result for two sample packets, so shapes and axes need no rules of their own. What cannot be
-noted down (a branch on data, reductions, attributes of arrays) is `Untraceable`, with the reason.
+`trace` calls a `points`, `plausible` or clock function with `TracedFields`, and gives back what it
+returned, with the `Tape` of its steps. A step is a `Node`: a field, a state column, an elementwise
+call, or one of the steps that know packets by name (`on`, `shifted`, `latest`). Every node carries
+the plain result for two sample packets, so shapes and axes need no rules of their own. What cannot
+be noted down (a branch on data, reductions, attributes of arrays) is `Untraceable`, with the
+reason.
 
-Whoever works with a graph goes through it with `traverse`, and computes it with `evaluate`: the plain evaluation of a batch, tables of all
-values that a field can have, tests of plausibility and clocks differ only in what they say the fields are. The compilers of points
-(`points.numpy_plan`, `points.numba_kernels`) write a graph down in another form; what they ask of it stands here, too: the fields that a
-value is made of, conditions and sums taken apart. For them a value is *full* where each point has its own, else *low*: then it is
-computed once for its packet or block, plainly.
+Whoever works with a graph goes through it with `traverse`, and computes it with `evaluate`: the
+plain evaluation of a batch, tables of all values that a field can have, tests of plausibility and
+clocks differ only in what they say the fields are. The compilers of points (`points.numpy_plan`,
+`points.numba_kernels`) write a graph down in another form; what they ask of it stands here, too:
+the fields that a value is made of, conditions and sums taken apart. For them a value is *full*
+where each point has its own, else *low*: then it is computed once for its packet or block, plainly.
 
-A node's axes are those of its sample. What is no column (`vocabulary.Along`, plain arrays) is lined up with these as it is noted down, so
-that whoever computes with the graph broadcasts arrays.
+A node's axes are those of its sample. What is no column (`vocabulary.Along`, plain arrays) is lined
+up with these as it is noted down, so that whoever computes with the graph broadcasts arrays.
 
 Room is left for what is to come. More columns of a point (M5): further values that are traced.
 """
@@ -45,9 +49,10 @@ class Node:
     """One step of the computation.
 
     Attributes:
-        kind: "field", "state", "shift", "latest", "on", "running", "rows" (of a table, at indices) or "call".
-        function: for "call" what is applied to arrays that broadcast; for "field" and "state" what makes its column of `Fields`; for the
-            others what makes a column of columns.
+        kind: "field", "state", "shift", "latest", "on", "running", "rows" (of a table, at indices)
+            or "call".
+        function: for "call" what is applied to arrays that broadcast; for "field" and "state" what
+            makes its column of `Fields`; for the others what makes a column of columns.
         args: nodes, numbers and arrays.
         sample: the result for the sample.
         number: position in the order of evaluation.
@@ -74,7 +79,9 @@ class Node:
 
     @cached_property
     def fields(self) -> tuple[Node, ...] | None:
-        """The fields of the frame that it is made of, each once, with numbers and element by element; None where it is made of more."""
+        """The fields of the frame that it is made of, each once, with numbers and element by
+        element; None where it is made of more.
+        """
         if self.kind == "field":
             return (self,)
         depth = max((len(arg.sample.axes) for arg in self.args if isinstance(arg, Node)), default=0)
@@ -95,12 +102,23 @@ class Node:
 
     @cached_property
     def _operands(self) -> list[tuple[bool, Any]]:
-        """Of what is called with: whether it is a node, and the axes that it lacks of the deepest one; or else what it is, as an array."""
+        """Of what is called with: whether it is a node, and the axes that it lacks of the deepest
+        one; or else what it is, as an array.
+        """
         depth = max(len(arg.sample.axes) for arg in self.args if isinstance(arg, Node))
-        return [(True, (1,) * (depth - len(arg.sample.axes))) if isinstance(arg, Node) else (False, np.asarray(arg)) for arg in self.args]
+        return [
+            (
+                (True, (1,) * (depth - len(arg.sample.axes)))
+                if isinstance(arg, Node)
+                else (False, np.asarray(arg))
+            )
+            for arg in self.args
+        ]
 
     def value(self, args: list[Any]) -> Any:
-        """What it comes to, from what its arguments do: a column where these are columns, else an array where they are arrays."""
+        """What it comes to, from what its arguments do: a column where these are columns, else an
+        array where they are arrays.
+        """
         if self.kind != "call":
             return self.function(*args)
         first = args[self._first]
@@ -119,14 +137,22 @@ class Tape:
 
     Attributes:
         nodes: in order.
-        steps: (node, largest value) of counts whose indices were asked for: the trace holds for these only.
+        steps: (node, largest value) of counts whose indices were asked for: the trace holds for
+            these only.
     """
 
     nodes: list[Node] = field(default_factory=list)
     steps: list[tuple[Node, int]] = field(default_factory=list)
     _read: dict[str, Node] = field(default_factory=dict)
 
-    def add(self, kind: str, function: Callable[..., Any], args: tuple[Any, ...], sample: Column, path: str = "") -> Traced:
+    def add(
+        self,
+        kind: str,
+        function: Callable[..., Any],
+        args: tuple[Any, ...],
+        sample: Column,
+        path: str = "",
+    ) -> Traced:
         """A new node, as a traced column; a field that was read before has one already."""
         if path in self._read:
             return Traced(self._read[path], self)
@@ -153,21 +179,32 @@ class Traced(NDArrayOperatorsMixin):
             raise SpecError("columns cannot be changed in place; write a new expression instead")
         if method != "__call__":
             raise Untraceable(f"np.{ufunc.__name__}.{method} takes several values together")
-        return self.applied((lambda *arrays: ufunc(*arrays, **kwargs)) if kwargs else ufunc, *inputs)
+        return self.applied(
+            (lambda *arrays: ufunc(*arrays, **kwargs)) if kwargs else ufunc, *inputs
+        )
 
-    def __array_function__(self, function: Callable[..., Any], types: Any, args: Any, kwargs: Any) -> Traced:
+    def __array_function__(
+        self, function: Callable[..., Any], types: Any, args: Any, kwargs: Any
+    ) -> Traced:
         if function not in ELEMENTWISE:
             raise Untraceable(f"np.{function.__name__} is not elementwise")
-        return self.applied((lambda *arrays: function(*arrays, **kwargs)) if kwargs else function, *args)
+        return self.applied(
+            (lambda *arrays: function(*arrays, **kwargs)) if kwargs else function, *args
+        )
 
     def applied(self, function: Callable[..., Any], *values: Any) -> Traced:
         """What a function of arrays makes of the values, noted down."""
         samples = [value.node.sample if isinstance(value, Traced) else value for value in values]
-        arrays, _, _ = aligned(tuple(samples), self.node.sample.batch)  # what is no column is noted down in its place
+        arrays, _, _ = aligned(
+            tuple(samples), self.node.sample.batch
+        )  # what is no column is noted down in its place
         table = _folded(function, values, arrays)
         if table is not None:
             return Traced(table[0], self._tape).gathered(table[1])
-        args = tuple(value if isinstance(value, Traced | int | float) else array for value, array in zip(values, arrays, strict=True))
+        args = tuple(
+            value if isinstance(value, Traced | int | float) else array
+            for value, array in zip(values, arrays, strict=True)
+        )
         return self._tape.add("call", function, args, self.node.sample.applied(function, *samples))
 
     @property
@@ -176,38 +213,59 @@ class Traced(NDArrayOperatorsMixin):
         return self.node.sample.index
 
     def on(self, *axes: str) -> Any:
-        """The value on other axes, by the names of arrays, noted down; nan where frames of this layout lack the array that it is in."""
+        """The value on other axes, by the names of arrays, noted down; nan where frames of this
+        layout lack the array that it is in.
+        """
         sample = self.node.sample.on(*axes)
         if sample.array.size > self.node.sample.array.size:
             if not self.node.sample.array.size:
                 return np.nan
             raise Untraceable("an array shorter than the one that it is put on")
-        if sample.axes == self.node.sample.axes and sample.array.shape == self.node.sample.array.shape:
+        if (
+            sample.axes == self.node.sample.axes
+            and sample.array.shape == self.node.sample.array.shape
+        ):
             return self  # which stands on them already
         return self._tape.add("on", lambda column: column.on(*axes), (self,), sample)
 
     def gathered(self, table: NDArray[np.float64]) -> Traced:
         """The rows of a table at these indices, noted down."""
-        return self._tape.add("rows", lambda column, rows: column.gathered(rows), (self, table), self.node.sample.gathered(table))
+        return self._tape.add(
+            "rows",
+            lambda column, rows: column.gathered(rows),
+            (self, table),
+            self.node.sample.gathered(table),
+        )
 
     def running(self) -> Traced:
         """The sum so far along the innermost array, noted down."""
-        return self._tape.add("running", lambda column: column.running(), (self,), self.node.sample.running())
+        return self._tape.add(
+            "running", lambda column: column.running(), (self,), self.node.sample.running()
+        )
 
     def steps(self) -> Along | NDArray[np.intp]:
-        """0, 1, 2 ... up to the largest value in the sample; the tape remembers how many these were."""
+        """0, 1, 2 ... up to the largest value in the sample; the tape remembers how many these
+        were.
+        """
         found = self.node.sample.steps()
         self._tape.steps.append((self.node, len(found)))
         return found
 
     def shifted(self, step: int) -> Traced:
         """The value `step` places later (earlier if negative) in stream order, noted down."""
-        return self._tape.add("shift", lambda column: column.shifted(step), (self,), self.node.sample.shifted(step))
+        return self._tape.add(
+            "shift", lambda column: column.shifted(step), (self,), self.node.sample.shifted(step)
+        )
 
     def latest(self, where: Any = None) -> Traced:
         """The most recent value at which `where` was true, noted down."""
         condition = where.node.sample if isinstance(where, Traced) else where
-        return self._tape.add("latest", lambda column, flags=None: column.latest(flags), (self, where), self.node.sample.latest(condition))
+        return self._tape.add(
+            "latest",
+            lambda column, flags=None: column.latest(flags),
+            (self, where),
+            self.node.sample.latest(condition),
+        )
 
     def __getattr__(self, name: str) -> Any:
         if name.startswith("__"):
@@ -226,13 +284,25 @@ class Traced(NDArrayOperatorsMixin):
     def __getitem__(self, index: Any) -> Traced:
         """An element of a field that is an array: a field by itself."""
         node = self.node
-        return self._tape.add(node.kind, lambda fields: node.function(fields)[index], (), node.sample[index], f"{node.path}[{index}]")
+        return self._tape.add(
+            node.kind,
+            lambda fields: node.function(fields)[index],
+            (),
+            node.sample[index],
+            f"{node.path}[{index}]",
+        )
 
 
 class TracedFields:
     """What `points` is given while it is traced: the fields of the sample, noted down."""
 
-    def __init__(self, real: Any, tape: Tape, path: str = "", read: Callable[[Any], Any] = lambda fields: fields) -> None:
+    def __init__(
+        self,
+        real: Any,
+        tape: Tape,
+        path: str = "",
+        read: Callable[[Any], Any] = lambda fields: fields,
+    ) -> None:
         self._real, self._tape, self._path, self._read = real, tape, path, read
 
     def __getattr__(self, name: str) -> Any:
@@ -248,13 +318,22 @@ class TracedFields:
 
     def __getitem__(self, index: Any) -> TracedFields:
         before = self._read
-        return TracedFields(self._real[index], self._tape, f"{self._path}[{index}]", lambda fields: before(fields)[index])
+        return TracedFields(
+            self._real[index],
+            self._tape,
+            f"{self._path}[{index}]",
+            lambda fields: before(fields)[index],
+        )
 
 
-def _folded(function: Callable[..., Any], values: Sequence[Any], arrays: Sequence[Any]) -> tuple[Node, NDArray[np.float64]] | None:
-    """A function of rows of tables at the same indices, of numbers and of a row that all packets share, as rows of one table.
+def _folded(
+    function: Callable[..., Any], values: Sequence[Any], arrays: Sequence[Any]
+) -> tuple[Node, NDArray[np.float64]] | None:
+    """A function of rows of tables at the same indices, of numbers and of a row that all packets
+    share, as rows of one table.
 
-    So the sines and cosines of directions that are looked up, and their products, are computed once, for the table.
+    So the sines and cosines of directions that are looked up, and their products, are computed
+    once, for the table.
 
     Args:
         arrays: the values, those that are no columns lined up with the others.
@@ -266,12 +345,17 @@ def _folded(function: Callable[..., Any], values: Sequence[Any], arrays: Sequenc
     if any(node.kind != "rows" or node.args[0] is not nodes[0].args[0] for node in nodes):
         return None
     (index, first), shape = nodes[0].args, nodes[0].sample.array.shape
-    has_rows = shape[-1] == first.shape[1] and index.sample.array.shape[len(shape) - 1 :] in ((), (1,))
+    has_rows = shape[-1] == first.shape[1] and index.sample.array.shape[len(shape) - 1 :] in (
+        (),
+        (1,),
+    )
     known: list[Any] = []
     for value, array in zip(values, arrays, strict=True):
         if isinstance(value, Traced):
             known.append(value.node.args[1])
-        elif np.size(value) == 1 or (has_rows and array.shape[-1] == np.size(array) == first.shape[1]):
+        elif np.size(value) == 1 or (
+            has_rows and array.shape[-1] == np.size(array) == first.shape[1]
+        ):
             known.append(np.asarray(array).reshape(-1))
         else:
             return None
@@ -296,8 +380,12 @@ def trace(function: Callable[[Any], Any], sample: Batch) -> tuple[Any, Tape]:
 
 
 def sample_of(batch: Batch, group: Group) -> Batch:
-    """The first frame of a group of a batch, twice, as a batch to trace functions on: enough to tell what all packets share."""
-    return batch.of(Group(group.layout, group.where[[0, 0]], np.ascontiguousarray(group.rows[[0, 0]])))
+    """The first frame of a group of a batch, twice, as a batch to trace functions on: enough to
+    tell what all packets share.
+    """
+    return batch.of(
+        Group(group.layout, group.where[[0, 0]], np.ascontiguousarray(group.rows[[0, 0]]))
+    )
 
 
 def traverse(*values: Any, into: Callable[[Node], bool] = lambda node: True) -> Iterator[Node]:
@@ -315,12 +403,16 @@ def traverse(*values: Any, into: Callable[[Node], bool] = lambda node: True) -> 
             waiting += node.args if into(node) else ()
 
 
-def evaluate(node: Node, known: dict[Node, Any], source: Callable[[Node], Any] = lambda node: None) -> Any:
+def evaluate(
+    node: Node, known: dict[Node, Any], source: Callable[[Node], Any] = lambda node: None
+) -> Any:
     """What a node comes to, by what the fields are.
 
     Args:
-        known: the values of nodes: columns, or arrays whose first axis is for the packets; added to, so that each is computed once.
-        source: the value of a node that is not computed from others, such as a field; None for those that are.
+        known: the values of nodes: columns, or arrays whose first axis is for the packets; added
+            to, so that each is computed once.
+        source: the value of a node that is not computed from others, such as a field; None for
+            those that are.
 
     Returns:
         A column or an array, as those that it is made of are.
@@ -329,7 +421,12 @@ def evaluate(node: Node, known: dict[Node, Any], source: Callable[[Node], Any] =
     if value is None:
         value = source(node)
         if value is None:
-            value = node.value([evaluate(arg, known, source) if isinstance(arg, Node) else arg for arg in node.args])
+            value = node.value(
+                [
+                    evaluate(arg, known, source) if isinstance(arg, Node) else arg
+                    for arg in node.args
+                ]
+            )
         known[node] = value
     return value
 
@@ -366,9 +463,14 @@ class Expression:
         return cls(node, infos)
 
     def values(self, raw: Mapping[str, NDArray[Any]]) -> NDArray[Any]:
-        """What it comes to, element by element, by the raw values of its fields; one that is left out is nan."""
+        """What it comes to, element by element, by the raw values of its fields; one that is left
+        out is nan.
+        """
         with np.errstate(all="ignore"):
-            columns = {info.path: info.physical(np.asarray(raw.get(info.path, np.nan), np.float64)) for info in self.fields}
+            columns = {
+                info.path: info.physical(np.asarray(raw.get(info.path, np.nan), np.float64))
+                for info in self.fields
+            }
             return np.asarray(evaluate(self.node, {}, lambda node: columns.get(node.path)))
 
 
@@ -380,9 +482,11 @@ Made = Callable[[Any, int], NDArray[np.int64]]
 
 
 class HeaderFunction:
-    """A function of header fields, taken apart: each term of it is computed again only where its fields change.
+    """A function of header fields, taken apart: each term of it is computed again only where its
+    fields change.
 
-    Most of a clock is a date, and most counters depend on a setting: the same in thousands of packets, and dozens of operations to read.
+    Most of a clock is a date, and most counters depend on a setting: the same in thousands of
+    packets, and dozens of operations to read.
 
     Args:
         function: of `Fields`; gives a column, or several, the terms.
@@ -400,13 +504,18 @@ class HeaderFunction:
         if not self._is_tried and isinstance(table, Rows):
             self._is_tried, self._terms = True, self._apart(batch, table)
         if self._terms is None:  # only the function itself can tell
-            return [self._made(term, len(batch)) for term in _several(self._function(Fields(batch)))]
+            return [
+                self._made(term, len(batch)) for term in _several(self._function(Fields(batch)))
+            ]
         return [term(table) for term in self._terms]
 
     def _apart(self, batch: Batch, table: Rows) -> list[_Term] | None:
         try:
             traced, _ = trace(self._function, sample_of(batch, table.groups[0]))
-            return [_Term(Expression.of(term.node, table.schema), self._made) for term in _several(traced)]
+            return [
+                _Term(Expression.of(term.node, table.schema), self._made)
+                for term in _several(traced)
+            ]
         except Exception:  # the function itself says so, if anything is wrong
             return None
 
@@ -456,7 +565,9 @@ class _Term:
         return found
 
     def _computed(self, columns: list[NDArray[Any]]) -> NDArray[np.int64]:
-        raw = {info.path: column for info, column in zip(self._expression.fields, columns, strict=True)}
+        raw = {
+            info.path: column for info, column in zip(self._expression.fields, columns, strict=True)
+        }
         return self._made(self._expression.values(raw), len(columns[0]))
 
 
@@ -469,7 +580,9 @@ def header_function(function: Callable[[Any], Any], schema: Schema, made: Made) 
 def conjuncts(node: Node) -> Iterator[Node]:
     """The conditions that have to hold together for a condition to hold."""
     both = node.kind == "call" and node.function in (np.bitwise_and, np.logical_and)
-    if both and all(isinstance(arg, Node) and arg.sample.array.dtype == np.bool_ for arg in node.args):
+    if both and all(
+        isinstance(arg, Node) and arg.sample.array.dtype == np.bool_ for arg in node.args
+    ):
         for arg in node.args:
             yield from conjuncts(arg)
     else:
@@ -483,7 +596,9 @@ FACTORS |= {np.rad2deg: 180 / np.pi, np.degrees: 180 / np.pi}
 
 @dataclass(frozen=True, eq=False)
 class Term:
-    """A part of a sum: `full` times a number, or `low` (None: 1) times a row of numbers that every packet shares."""
+    """A part of a sum: `full` times a number, or `low` (None: 1) times a row of numbers that every
+    packet shares.
+    """
 
     row: NDArray[np.float64]
     low: Node | None = None
@@ -500,19 +615,31 @@ def is_full(value: Any, width: int) -> bool:
 
 
 def chosen(node: Node, width: int) -> tuple[Node, Any, Any] | None:
-    """The condition of a ``np.where`` that packets or blocks decide, and what it chooses from, each a number or full of one field."""
+    """The condition of a ``np.where`` that packets or blocks decide, and what it chooses from, each
+    a number or full of one field.
+    """
     if node.kind != "call" or node.function is not np.where or len(node.args) != 3:
         return None
     condition, *options = node.args
-    fits = [only_field(o) is not None and is_full(o, width) if isinstance(o, Node) else np.size(o) == 1 for o in options]
+    fits = [
+        only_field(o) is not None and is_full(o, width) if isinstance(o, Node) else np.size(o) == 1
+        for o in options
+    ]
     if not isinstance(condition, Node) or is_full(condition, width) or not all(fits):
         return None
-    return condition, *(o if isinstance(o, Node) else float(np.asarray(o).reshape(())) for o in options)  # type: ignore[return-value]
+    return condition, *(
+        o if isinstance(o, Node) else float(np.asarray(o).reshape(())) for o in options
+    )  # type: ignore[return-value]
 
 
 def is_nan_where(node: Node) -> bool:
     """Whether a node is nan where a condition holds, and else another value."""
-    if node.function is not np.where or len(node.args) != 3 or isinstance(node.args[1], Node) or np.size(node.args[1]) > 1:
+    if (
+        node.function is not np.where
+        or len(node.args) != 3
+        or isinstance(node.args[1], Node)
+        or np.size(node.args[1]) > 1
+    ):
         return False
     return isinstance(node.args[2], Node) and bool(np.isnan(node.args[1]).all())
 
@@ -521,7 +648,10 @@ def key(node: Node) -> tuple[Any, ...]:
     """What makes two expressions of one field the same."""
     if node.kind == "field":
         return ("field", node.path)
-    return (node.function, *(key(arg) if isinstance(arg, Node) else np.asarray(arg).item() for arg in node.args))
+    return (
+        node.function,
+        *(key(arg) if isinstance(arg, Node) else np.asarray(arg).item() for arg in node.args),
+    )
 
 
 def terms(value: Any, width: int) -> list[Term]:
@@ -538,7 +668,11 @@ def terms(value: Any, width: int) -> list[Term]:
             sign = 1.0 if function is np.add else -1.0
             return terms(args[0], width) + [term.times(sign) for term in terms(args[1], width)]
         if function in (np.multiply, np.true_divide) and not isinstance(args[1], Node):
-            factor = np.asarray(args[1], np.float64) if function is np.multiply else 1 / np.asarray(args[1], np.float64)
+            factor = (
+                np.asarray(args[1], np.float64)
+                if function is np.multiply
+                else 1 / np.asarray(args[1], np.float64)
+            )
             return _scaled(value, terms(args[0], width), factor)
         if function is np.multiply and not isinstance(args[0], Node):
             return _scaled(value, terms(args[1], width), np.asarray(args[0], np.float64))

@@ -1,11 +1,13 @@
 """File formats of scans, by the suffix of the file.
 
-In: scans. Out: a file, which appears under its name only when it is whole. `write` is all that is asked for; `formats` knows the plugins'
+In: scans. Out: a file, which appears under its name only when it is whole. `write` is all that is
+asked for; `formats` knows the plugins'
 formats, too. Modules in reading order:
 
 * `writing`: what formats have in common.
 * `text`: .csv, .csv.gz and .xyz, a row a point.
-* `arrays`: .npz, an array a column; .npy, a structured array; .zarr, a folder with an array a column.
+* `arrays`: .npz, an array a column; .npy, a structured array; .zarr, a folder with an array a
+  column.
 * `tables`: .parquet, .arrow and .feather, for data tools.
 * `rows`: points as rows of bytes behind a header.
 * `clouds`: .pcd, .lzf.pcd, .ply and KITTI's .bin.
@@ -29,7 +31,14 @@ from typing import NoReturn
 
 import numpy as np
 
-from lidarspec.errors import LidarSpecError, SpecError, UnknownFormat, UsageError, suggest, system_errors
+from lidarspec.errors import (
+    LidarSpecError,
+    SpecError,
+    UnknownFormat,
+    UsageError,
+    suggest,
+    system_errors,
+)
 from lidarspec.formats.arrays import NPY, NPZ, ZARR
 from lidarspec.formats.bags import BAG, DB3, MCAP, ROSBAG2
 from lidarspec.formats.clouds import KITTI, LZF_PCD, PCD, PLY
@@ -45,7 +54,8 @@ from lidarspec.plugins import registry
 from lidarspec.scans.scans import Scan
 from lidarspec.transports.protocol import Chunk, Format
 
-#: the places in a path of a scan's number, and of its stamp's date, hour, minute and second, of which these are the letters of an ISO text.
+#: the places in a path of a scan's number, and of its stamp's date, hour, minute and second, of
+#: which these are the letters of an ISO text.
 MOMENT = {"%F": slice(10), "%H": slice(11, 13), "%M": slice(14, 16), "%S": slice(17, 19)}
 PLACE = re.compile(rf"%0?\d?d|{'|'.join(MOMENT)}")
 ARRAYS, TABLES = (CSV, CSV_GZ, XYZ, NPZ, NPY, ZARR), (PARQUET, ARROW, FEATHER)
@@ -69,7 +79,8 @@ def formats() -> dict[str, Format]:
 
 
 def format_of(path: str | Path) -> Format:
-    """The format that a file name asks for by its suffix; plugins are asked only where it is not one of our own.
+    """The format that a file name asks for by its suffix; plugins are asked only where it is not
+    one of our own.
 
     Raises:
         UnknownFormat: with a suggestion.
@@ -80,7 +91,11 @@ def format_of(path: str | Path) -> Format:
 def _longest(path: str | Path, known: Mapping[str, Format]) -> Format | None:
     """The format with the longest of the suffixes that a name ends with, such as .csv.gz."""
     name = Path(path).name.lower()
-    return max((found for suffix, found in known.items() if name.endswith(suffix)), key=lambda found: len(found.suffix), default=None)
+    return max(
+        (found for suffix, found in known.items() if name.endswith(suffix)),
+        key=lambda found: len(found.suffix),
+        default=None,
+    )
 
 
 def _unknown(path: str | Path, known: Mapping[str, Format]) -> NoReturn:
@@ -104,7 +119,9 @@ def write_imu(path: str | Path, samples: ImuSamples) -> None:
 
 
 def targets(path: str | Path) -> list[str]:
-    """The files that `write` may replace: that of the path, or those that there are already under such names with numbers and times."""
+    """The files that `write` may replace: that of the path, or those that there are already under
+    such names with numbers and times.
+    """
     path = Path(path)
     if not PLACE.search(str(path)):
         return [str(path)]
@@ -115,24 +132,31 @@ def targets(path: str | Path) -> list[str]:
 
 
 def write(
-    path: str | Path, scans: Iterable[Scan], *, every_point: bool = False, organized: bool = False, packets: Iterable[Chunk] | None = None
+    path: str | Path,
+    scans: Iterable[Scan],
+    *,
+    every_point: bool = False,
+    organized: bool = False,
+    packets: Iterable[Chunk] | None = None,
 ) -> None:
     """Write scans to a file in the format of its suffix, or to several.
 
     Args:
-        path: the file; what it held is replaced once the new content is whole, and stays if that fails. With places in it, consecutive
-            scans for which it is the same share a file, and folders are made where there are none: "scans/%05d.pcd", the number of the
-            scan from 0 on, has a file for each; "drive/date=%F/hour=%H/%M.parquet" one for each minute, by the stamp, in UTC; %S is the
-            second.
+        path: the file; what it held is replaced once the new content is whole, and stays if that
+            fails. With places in it, consecutive scans for which it is the same share a file, and
+            folders are made where there are none: "scans/%05d.pcd", the number of the scan from 0
+            on, has a file for each; "drive/date=%F/hour=%H/%M.parquet" one for each minute, by the
+            stamp, in UTC; %S is the second.
         every_point: also the points without a valid return.
-        organized: every point of a scan in rows and columns, (rows, columns), missing ones as nan: of one scan a file, unless the format
-            keeps scans apart.
+        organized: every point of a scan in rows and columns, (rows, columns), missing ones as nan:
+            of one scan a file, unless the format keeps scans apart.
         packets: what the sensor sent, to stand beside the points in a log of ROS.
 
     Raises:
         UnknownFormat: for a suffix that is none.
-        UsageError: where a file that is written would be begun again, since the time in its name came again; where points are to be
-            organised or packets to stand beside them, and the format, the sensor or the number of scans is not for that.
+        UsageError: where a file that is written would be begun again, since the time in its name
+            came again; where points are to be organised or packets to stand beside them, and the
+            format, the sensor or the number of scans is not for that.
         SourceError: where the file cannot be written.
     """
     path = Path(path)
@@ -141,12 +165,21 @@ def write(
     if beside:
         check_holds(path, "packets")
         if PLACE.search(str(path)):
-            raise UsageError(f"{path}: packets stand beside the points in one file, and not in several")
+            raise UsageError(
+                f"{path}: packets stand beside the points in one file, and not in several"
+            )
     if organized:
         check_holds(path, "organized")
         is_alone = "scans" not in chosen.holds
-        scans, every_point = _organized(path, scans, alone=is_alone and not PLACE.search(str(path))), True
-        chosen = dataclasses.replace(chosen, write=partial(chosen.write, organized=True)) if is_alone else chosen
+        scans, every_point = (
+            _organized(path, scans, alone=is_alone and not PLACE.search(str(path))),
+            True,
+        )
+        chosen = (
+            dataclasses.replace(chosen, write=partial(chosen.write, organized=True))
+            if is_alone
+            else chosen
+        )
     for target, held in _each(path, scans) if PLACE.search(str(path)) else [(path, scans)]:
         with replacing(target) as part:
             chosen.write(part, held, every_point=every_point, **beside)
@@ -160,35 +193,57 @@ def check_holds(path: str | Path, what: str) -> None:
     """
     if what not in format_of(path).holds:
         having = ", ".join(suffix for suffix, known in formats().items() if what in known.holds)
-        raise UsageError(f"{path}: {format_of(path).suffix} has no place for --{what}; those that have are {having}")
+        raise UsageError(
+            f"{path}: {format_of(path).suffix} has no place for --{what}; those that have are"
+            f" {having}"
+        )
 
 
 def _organized(path: Path, scans: Iterable[Scan], *, alone: bool) -> Iterator[Scan]:
     """Scans, while they are organised; `alone`: where there is one."""
     for number, scan in enumerate(scans):
         if scan.points.shape is None:
-            raise UsageError(f"{scan.sensor.id}: its points have no rows and columns: leave out --organized")
+            raise UsageError(
+                f"{scan.sensor.id}: its points have no rows and columns: leave out --organized"
+            )
         if number and alone:
-            error = UsageError(f"{path} holds the rows and columns of one scan, and there are several")
-            raise suggest(error, f"the same with --scans 1:2, or with a file for each scan: {path.with_suffix('')}-%05d{path.suffix}")
+            error = UsageError(
+                f"{path} holds the rows and columns of one scan, and there are several"
+            )
+            raise suggest(
+                error,
+                "the same with --scans 1:2, or with a file for each scan:"
+                f" {path.with_suffix('')}-%05d{path.suffix}",
+            )
         yield scan
 
 
 def _each(path: Path, scans: Iterable[Scan]) -> Iterator[tuple[Path, Iterator[Scan]]]:
     """Each file, and the scans that go into it."""
     begun = set[str]()
-    for name, group in itertools.groupby(enumerate(scans), lambda numbered: _placed(str(path), *numbered)):
+    for name, group in itertools.groupby(
+        enumerate(scans), lambda numbered: _placed(str(path), *numbered)
+    ):
         if name in begun:
             raise UsageError(
-                f"{name}: its time comes again after that of other files; %F, %H, %M and %S in the name together tell them apart"
+                f"{name}: its time comes again after that of other files; %F, %H, %M and %S in the"
+                " name together tell them apart"
             )
         begun.add(name)
         with system_errors(path):
             Path(name).parent.mkdir(parents=True, exist_ok=True)
-        yield Path(name), (scan if scan.number is not None else dataclasses.replace(scan, number=number) for number, scan in group)
+        yield (
+            Path(name),
+            (
+                scan if scan.number is not None else dataclasses.replace(scan, number=number)
+                for number, scan in group
+            ),
+        )
 
 
 def _placed(path: str, number: int, scan: Scan) -> str:
     """A path with number and time in their places; another percent sign stays."""
     moment = str(np.datetime64(scan.stamp_ns, "ns"))
-    return PLACE.sub(lambda place: moment[MOMENT[place[0]]] if place[0] in MOMENT else place[0] % number, path)
+    return PLACE.sub(
+        lambda place: moment[MOMENT[place[0]]] if place[0] in MOMENT else place[0] % number, path
+    )

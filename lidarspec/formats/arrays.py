@@ -1,7 +1,9 @@
-"""Arrays: NumPy's .npz, one a column, with a stamp a scan; .npy, one structured array; and Zarr, a folder of compressed ones.
+"""Arrays: NumPy's .npz, one a column, with a stamp a scan; .npy, one structured array; and Zarr, a
+folder of compressed ones.
 
-How long an array is stands before it, and is known at the end alone: until then each column of an .npz grows in a file of its own,
-without a name, in the same folder. Those of Zarr, as xarray and Dask open them, grow by whole chunks.
+How long an array is stands before it, and is known at the end alone: until then each column of an
+.npz grows in a file of its own, without a name, in the same folder. Those of Zarr, as xarray and
+Dask open them, grow by whole chunks.
 """
 
 from __future__ import annotations
@@ -43,10 +45,11 @@ def put(archive: zipfile.ZipFile, name: str, column: Spool, height: int | None =
 
 
 def write(path: Path, scans: Iterable[Scan], *, every_point: bool, organized: bool = False) -> None:
-    """Write the columns that all scans have, `scan` for each point, and for each scan `stamp_ns`, `rate_hz` and `complete`.
+    """Write the columns that all scans have, `scan` for each point, and for each scan `stamp_ns`,
+    `rate_hz` and `complete`.
 
-    The unit of a sensor's further column stands in NAME.unit. With `organized` the columns of the one scan that there is are
-    (rows, columns), several returns of a place side by side.
+    The unit of a sensor's further column stands in NAME.unit. With `organized` the columns of the
+    one scan that there is are (rows, columns), several returns of a place side by side.
     """
     height: int | None = None
     with contextlib.ExitStack() as files:
@@ -54,7 +57,11 @@ def write(path: Path, scans: Iterable[Scan], *, every_point: bool, organized: bo
         def column(dtype: DTypeLike) -> Spool:
             return files.enter_context(contextlib.closing(Spool(path.parent, dtype)))
 
-        of_scans = {"stamp_ns": column(np.int64), "rate_hz": column(np.float64), "complete": column(np.bool_)}
+        of_scans = {
+            "stamp_ns": column(np.int64),
+            "rate_hz": column(np.float64),
+            "complete": column(np.bool_),
+        }
         numbers, columns, units = column(np.int32), dict[str, Spool](), dict[str, str]()
         for number, scan in enumerate(scans):
             cloud = written(scan, every_point=every_point)
@@ -62,7 +69,9 @@ def write(path: Path, scans: Iterable[Scan], *, every_point: bool, organized: bo
             if organized:
                 height = len(picture(cloud.valid, cloud))
                 own = {name: picture(column, cloud).ravel() for name, column in own.items()}
-            columns = columns if number else {name: column(values.dtype) for name, values in own.items()}
+            columns = (
+                columns if number else {name: column(values.dtype) for name, values in own.items()}
+            )
             units = units if number else {name: unit for name, unit in cloud.units.items() if unit}
             columns = {name: kept for name, kept in columns.items() if name in own}
             for name, kept in columns.items():
@@ -80,17 +89,25 @@ def write(path: Path, scans: Iterable[Scan], *, every_point: bool, organized: bo
                 put(archive, name, kept)
 
 
-def write_npy(path: Path, scans: Iterable[Scan], *, every_point: bool, organized: bool = False) -> None:
-    """Write one structured array with PCL's layout, as `PointCloud.to_structured` makes it: what the sensor lacks is 0.
+def write_npy(
+    path: Path, scans: Iterable[Scan], *, every_point: bool, organized: bool = False
+) -> None:
+    """Write one structured array with PCL's layout, as `PointCloud.to_structured` makes it: what
+    the sensor lacks is 0.
 
-    Where there are several scans, their number is a further column, `scan`; with `organized` the one that there is is (rows, columns).
-    Such a file can be mapped: ``np.load(path, mmap_mode="r")``.
+    Where there are several scans, their number is a further column, `scan`; with `organized` the
+    one that there is is (rows, columns). Such a file can be mapped: ``np.load(path,
+    mmap_mode="r")``.
     """
-    write_rows(path, Rows(scans, _structured, every_point=every_point, is_picture=organized), _npy_header)
+    write_rows(
+        path, Rows(scans, _structured, every_point=every_point, is_picture=organized), _npy_header
+    )
 
 
 def _structured(types: Mapping[str, Any]) -> np.dtype[Any]:
-    return structured_type({name: np.dtype(dtype) for name, dtype in types.items() if name not in NAMES})
+    return structured_type(
+        {name: np.dtype(dtype) for name, dtype in types.items() if name not in NAMES}
+    )
 
 
 def _npy_header(rows: Rows) -> bytes:
@@ -108,7 +125,9 @@ def _npy_header(rows: Rows) -> bytes:
 class _ZarrColumn:
     """An array that grows by whole chunks, so that none is compressed twice."""
 
-    def __init__(self, group: Any, name: str, dtype: DTypeLike, *, unit: str = "", along: str = "points") -> None:
+    def __init__(
+        self, group: Any, name: str, dtype: DTypeLike, *, unit: str = "", along: str = "points"
+    ) -> None:
         self._chunk = {"points": ROWS, "scans": SCANS}[along]
         self._array = group.create_array(
             name,
@@ -123,7 +142,9 @@ class _ZarrColumn:
     def add(self, values: NDArray[Any] | None, length: int) -> None:
         """Append values; without any, nan or 0 as often as `length` says."""
         dtype = self._array.dtype
-        self._waiting.append(np.full(length, np.nan if dtype.kind == "f" else 0, dtype) if values is None else values)
+        self._waiting.append(
+            np.full(length, np.nan if dtype.kind == "f" else 0, dtype) if values is None else values
+        )
         self._length += length
         if self._length >= self._chunk:
             self.write(self._length - self._length % self._chunk)
@@ -140,13 +161,18 @@ class _ZarrColumn:
 
 
 def write_zarr(path: Path, scans: Iterable[Scan], *, every_point: bool) -> None:
-    """Write the columns that the first scan has, and `scan`, along "points", `stamp_ns`, `rate_hz` and `complete` along "scans".
+    """Write the columns that the first scan has, and `scan`, along "points", `stamp_ns`, `rate_hz`
+    and `complete` along "scans".
 
-    Arrays have their `units`; the group has `sensor`, `source`, `frame` (where x, y and z point) and `calibration`. A column that a later
-    scan lacks is nan there, or 0 where it holds whole numbers.
+    Arrays have their `units`; the group has `sensor`, `source`, `frame` (where x, y and z point)
+    and `calibration`. A column that a later scan lacks is nan there, or 0 where it holds whole
+    numbers.
     """
     group = import_library("zarr", "zarr").open_group(str(path), mode="w")
-    of_scans = {name: _ZarrColumn(group, name, dtype, unit=unit, along="scans") for name, (dtype, unit) in OF_SCANS.items()}
+    of_scans = {
+        name: _ZarrColumn(group, name, dtype, unit=unit, along="scans")
+        for name, (dtype, unit) in OF_SCANS.items()
+    }
     columns = {"scan": _ZarrColumn(group, "scan", np.int32)}
     for number, scan in enumerate(scans):
         cloud = written(scan, every_point=every_point)
@@ -154,7 +180,10 @@ def write_zarr(path: Path, scans: Iterable[Scan], *, every_point: bool) -> None:
         if not number:
             units = units_of(cloud)
             group.attrs.update(scan.facts)
-            columns |= {name: _ZarrColumn(group, name, own[name].dtype, unit=units.get(name, "")) for name in cloud.columns}
+            columns |= {
+                name: _ZarrColumn(group, name, own[name].dtype, unit=units.get(name, ""))
+                for name in cloud.columns
+            }
         for name, column in columns.items():
             column.add(own.get(name), len(cloud))
         for name, column in of_scans.items():

@@ -1,9 +1,11 @@
 """Robotics logs: each scan as ROS's messages, in an MCAP file, a ROS 1 bag or a ROS 2 bag.
 
-On /points stands each scan as sensor_msgs/PointCloud2, and on /scan, where the sensor has one plane, as sensor_msgs/LaserScan (see
-`messages`), in the frame "laser". Both are in the log at the stamp of the scan, which is that of the cloud. What no message can say, the
-units of further columns, stands in the log's metadata; ROS 1 bags have none. Where they are asked for, /packets has what the sensor sent,
-so that the log can be read again as a source: each packet with the time of its arrival.
+On /points stands each scan as sensor_msgs/PointCloud2, and on /scan, where the sensor has one
+plane, as sensor_msgs/LaserScan (see `messages`), in the frame "laser". Both are in the log at the
+stamp of the scan, which is that of the cloud. What no message can say, the units of further
+columns, stands in the log's metadata; ROS 1 bags have none. Where they are asked for, /packets has
+what the sensor sent, so that the log can be read again as a source: each packet with the time of
+its arrival.
 """
 
 from __future__ import annotations
@@ -44,23 +46,33 @@ class Log:
         self._messages, self._planes = Messages(release), Planes()
         self.types, self.units = self._messages.types, dict[str, str]()
 
-    def messages(self, scans: Iterable[Scan], packets: Iterable[Chunk], *, every_point: bool) -> Iterator[Message]:
+    def messages(
+        self, scans: Iterable[Scan], packets: Iterable[Chunk], *, every_point: bool
+    ) -> Iterator[Message]:
         """The messages of each scan and packet, by their times as far as both are in order.
 
         Raises:
             UsageError: for a stamp that no message can hold.
         """
-        return heapq.merge(self._of_scans(scans, every_point=every_point), map(self._messages.raw, packets), key=attrgetter("at"))
+        return heapq.merge(
+            self._of_scans(scans, every_point=every_point),
+            map(self._messages.raw, packets),
+            key=attrgetter("at"),
+        )
 
     def _of_scans(self, scans: Iterable[Scan], *, every_point: bool) -> Iterator[Message]:
         for number, scan in enumerate(scans):
             self.units |= {name: unit for name, unit in scan.points.units.items() if unit}
             yield self._messages.cloud(scan, scan.stamp_ns, every_point=every_point, number=number)
             if (planar := self._planes.scan(scan)) is not None:
-                yield self._messages.laserscan(scan, planar, planar.stamp_ns, number=number)._replace(at=scan.stamp_ns)
+                yield self._messages.laserscan(
+                    scan, planar, planar.stamp_ns, number=number
+                )._replace(at=scan.stamp_ns)
 
 
-def write_mcap(path: Path, scans: Iterable[Scan], packets: Iterable[Chunk] = (), *, every_point: bool) -> None:
+def write_mcap(
+    path: Path, scans: Iterable[Scan], packets: Iterable[Chunk] = (), *, every_point: bool
+) -> None:
     """Write an MCAP file as ROS 2 records it, which Foxglove, `ros2 bag` and PlotJuggler read."""
     mcap = import_library("mcap.writer", "ros")
     held, channels = Log("ROS2_HUMBLE"), dict[str, int]()
@@ -70,24 +82,40 @@ def write_mcap(path: Path, scans: Iterable[Scan], packets: Iterable[Chunk] = (),
         for kind, at, data in held.messages(scans, packets, every_point=every_point):
             if kind not in channels:
                 text, _ = held.types.generate_msgdef(kind, ros_version=2)
-                channels[kind] = log.register_channel(TOPICS[kind], "cdr", log.register_schema(kind, "ros2msg", text.encode()))
+                channels[kind] = log.register_channel(
+                    TOPICS[kind], "cdr", log.register_schema(kind, "ros2msg", text.encode())
+                )
             log.add_message(channels[kind], log_time=at, publish_time=at, data=data)
         if held.units:
             log.add_metadata("units", held.units)
         log.finish()
 
 
-def write_ros1(path: Path, scans: Iterable[Scan], packets: Iterable[Chunk] = (), *, every_point: bool) -> None:
+def write_ros1(
+    path: Path, scans: Iterable[Scan], packets: Iterable[Chunk] = (), *, every_point: bool
+) -> None:
     """Write a bag as `rosbag record` does."""
     held = Log("ROS1_NOETIC")
-    _record(import_library("rosbags.rosbag1", "ros").Writer(path), held, held.messages(scans, packets, every_point=every_point))
+    _record(
+        import_library("rosbags.rosbag1", "ros").Writer(path),
+        held,
+        held.messages(scans, packets, every_point=every_point),
+    )
 
 
-def write_ros2(path: Path, scans: Iterable[Scan], packets: Iterable[Chunk] = (), *, storage: str, every_point: bool) -> None:
+def write_ros2(
+    path: Path,
+    scans: Iterable[Scan],
+    packets: Iterable[Chunk] = (),
+    *,
+    storage: str,
+    every_point: bool,
+) -> None:
     """Write a ROS 2 bag of metadata version 8, which releases from Foxy on read.
 
     Args:
-        storage: "mcap" for a folder with metadata.yaml and an MCAP file; "sqlite3" for a database file alone, as `ros2 bag` reads it, too.
+        storage: "mcap" for a folder with metadata.yaml and an MCAP file; "sqlite3" for a database
+            file alone, as `ros2 bag` reads it, too.
     """
     import sqlite3  # which the whole module would otherwise wait for
 
@@ -119,5 +147,10 @@ def _record(log: Any, held: Log, every: Iterable[Message]) -> None:
 _HOLDS = ("scans", "organized", "beams", "frame-id", "packets")
 MCAP = Format(".mcap", "an MCAP file with ROS 2 messages", write_mcap, _HOLDS)
 BAG = Format(".bag", "a ROS 1 bag", write_ros1, _HOLDS)
-ROSBAG2 = Format(".rosbag2", "a ROS 2 bag: a folder with an MCAP file", partial(write_ros2, storage="mcap"), _HOLDS)
+ROSBAG2 = Format(
+    ".rosbag2",
+    "a ROS 2 bag: a folder with an MCAP file",
+    partial(write_ros2, storage="mcap"),
+    _HOLDS,
+)
 DB3 = Format(".db3", "a ROS 2 bag: an SQLite file", partial(write_ros2, storage="sqlite3"), _HOLDS)

@@ -1,7 +1,8 @@
 """Files of point clouds: PCD of the Point Cloud Library, PLY, and the .bin of KITTI.
 
-They have no place for more than one scan: the rows of several follow one another, with the number of the scan in a field of its own.
-`time` counts from the stamp of the scan; that of the first one, the sensor and the units stand in comments of the header.
+They have no place for more than one scan: the rows of several follow one another, with the number
+of the scan in a field of its own. `time` counts from the stamp of the scan; that of the first one,
+the sensor and the units stand in comments of the header.
 """
 
 from __future__ import annotations
@@ -21,24 +22,34 @@ from lidarspec.libraries import import_library
 from lidarspec.scans.scans import Scan
 from lidarspec.transports.protocol import Format
 
-#: types that a format, or a common reader of it, does not know, and those that hold their numbers: whole ones of 64 bits up to 2**53.
+#: types that a format, or a common reader of it, does not know, and those that hold their numbers:
+#: whole ones of 64 bits up to 2**53.
 _PCD_TYPES = {"f2": "f4", "b1": "u1"}
-_PLY_TYPES = {**_PCD_TYPES, **dict.fromkeys(("i1", "i2", "u2"), "i4"), **dict.fromkeys(("u4", "i8", "u8"), "f8")}
+_PLY_TYPES = {
+    **_PCD_TYPES,
+    **dict.fromkeys(("i1", "i2", "u2"), "i4"),
+    **dict.fromkeys(("u4", "i8", "u8"), "f8"),
+}
 _PLY_NAMES = {"f4": "float", "f8": "double", "u1": "uchar", "i4": "int"}
 #: how many bytes the sizes before compressed points can tell.
 _MOST_COMPRESSED = (1 << 32) - 1
 
 
-def write_pcd(path: Path, scans: Iterable[Scan], *, every_point: bool, organized: bool = False) -> None:
-    """Write a binary PCD 0.7 file: x y z intensity ring time, as far as the sensor has them, and its further columns in their types.
+def write_pcd(
+    path: Path, scans: Iterable[Scan], *, every_point: bool, organized: bool = False
+) -> None:
+    """Write a binary PCD 0.7 file: x y z intensity ring time, as far as the sensor has them, and
+    its further columns in their types.
 
-    WIDTH and HEIGHT are those of a single organised scan whose every point is written, missing ones as nan, `organized` or not; else
-    HEIGHT is 1.
+    WIDTH and HEIGHT are those of a single organised scan whose every point is written, missing ones
+    as nan, `organized` or not; else HEIGHT is 1.
     """
     write_rows(path, _pcd_rows(scans, every_point=every_point), _pcd_header)
 
 
-def write_lzf_pcd(path: Path, scans: Iterable[Scan], *, every_point: bool, organized: bool = False) -> None:
+def write_lzf_pcd(
+    path: Path, scans: Iterable[Scan], *, every_point: bool, organized: bool = False
+) -> None:
     """Write the same as `write_pcd` as DATA binary_compressed: field by field, with LZF.
 
     Raises:
@@ -48,11 +59,16 @@ def write_lzf_pcd(path: Path, scans: Iterable[Scan], *, every_point: bool, organ
     rows = _pcd_rows(scans, every_point=every_point)
     with contextlib.ExitStack() as files, path.open("wb") as target:
         names = rows.dtype.names or ()
-        fields = {name: files.enter_context(contextlib.closing(Spool(path.parent, np.uint8))) for name in names}
+        fields = {
+            name: files.enter_context(contextlib.closing(Spool(path.parent, np.uint8)))
+            for name in names
+        }
         for block in rows:
             _refuse_size(rows.length * rows.dtype.itemsize)
             for name, field in fields.items():
-                field.add(_compressed(block[name], compress))  # what is compressed piece by piece is one, one piece after another
+                field.add(
+                    _compressed(block[name], compress)
+                )  # what is compressed piece by piece is one, one piece after another
         start = target.write(_pcd_header(rows, "binary_compressed")) + 8
         target.seek(start)
         for field in fields.values():
@@ -65,17 +81,23 @@ def write_lzf_pcd(path: Path, scans: Iterable[Scan], *, every_point: bool, organ
 
 def _compressed(values: NDArray[Any], compress: Any) -> NDArray[np.uint8]:
     data = values.tobytes()
-    return np.frombuffer(compress(data, len(data) + len(data) // 16 + 64) if data else b"", np.uint8)  # the most that noise grows to
+    return np.frombuffer(
+        compress(data, len(data) + len(data) // 16 + 64) if data else b"", np.uint8
+    )  # the most that noise grows to
 
 
 def _refuse_size(size: int) -> None:
     if size > _MOST_COMPRESSED:
         reason = "a compressed PCD file holds 4 GiB of points at the most"
-        raise suggest(UsageError(reason), "the same to a .pcd file, or to one for each scan: %05d.lzf.pcd")
+        raise suggest(
+            UsageError(reason), "the same to a .pcd file, or to one for each scan: %05d.lzf.pcd"
+        )
 
 
 def _pcd_rows(scans: Iterable[Scan], *, every_point: bool) -> Rows:
-    return Rows(scans, lambda types: _packed(types, _PCD_TYPES), every_point=every_point, is_picture=True)
+    return Rows(
+        scans, lambda types: _packed(types, _PCD_TYPES), every_point=every_point, is_picture=True
+    )
 
 
 def _pcd_header(rows: Rows, data: str = "binary") -> bytes:
@@ -99,11 +121,17 @@ def _pcd_header(rows: Rows, data: str = "binary") -> bytes:
 
 
 def write_ply(path: Path, scans: Iterable[Scan], *, every_point: bool) -> None:
-    """Write a binary little-endian PLY file: x y z intensity ring time, as far as the sensor has them, and its further columns.
+    """Write a binary little-endian PLY file: x y z intensity ring time, as far as the sensor has
+    them, and its further columns.
 
-    Properties are float, double, uchar or int, since Open3D skips the other types: int for `ring`, double for longer whole numbers.
+    Properties are float, double, uchar or int, since Open3D skips the other types: int for `ring`,
+    double for longer whole numbers.
     """
-    write_rows(path, Rows(scans, lambda types: _packed(types, _PLY_TYPES), every_point=every_point), _ply_header)
+    write_rows(
+        path,
+        Rows(scans, lambda types: _packed(types, _PLY_TYPES), every_point=every_point),
+        _ply_header,
+    )
 
 
 def _ply_header(rows: Rows) -> bytes:
@@ -112,7 +140,10 @@ def _ply_header(rows: Rows) -> bytes:
         "format binary_little_endian 1.0",
         *(f"comment {fact}" for fact in ["made by lidarspec" + room(rows.length), *rows.facts]),
         f"element vertex {rows.length}",
-        *(f"property {_PLY_NAMES[rows.dtype[name].str[1:]]} {name}" for name in rows.dtype.names or ()),
+        *(
+            f"property {_PLY_NAMES[rows.dtype[name].str[1:]]} {name}"
+            for name in rows.dtype.names or ()
+        ),
         "end_header",
     ]
     return "".join(f"{line}\n" for line in lines).encode("ascii", "replace")
@@ -125,9 +156,11 @@ def _packed(types: Mapping[str, Any], known: Mapping[str, str]) -> np.dtype[Any]
 
 
 def write_kitti(path: Path, scans: Iterable[Scan], *, every_point: bool) -> None:
-    """Write x y z intensity as float32, little endian, nothing else; 0 is the intensity of a sensor that has none.
+    """Write x y z intensity as float32, little endian, nothing else; 0 is the intensity of a sensor
+    that has none.
 
-    A file of KITTI is one scan: ``out/%06d.bin``. Intensities are the wire's numbers, not scaled to 1.
+    A file of KITTI is one scan: ``out/%06d.bin``. Intensities are the wire's numbers, not scaled to
+    1.
     """
     row = np.dtype([(name, "<f4") for name in ("x", "y", "z", "intensity")])
     write_rows(path, Rows(scans, lambda types: row, every_point=every_point), lambda rows: b"")

@@ -18,10 +18,22 @@ from lidarspec.transports.protocol import Format
 
 #: our columns, and the standard's names of them.
 NAMES = {
-    **{"x": "cartesianX", "y": "cartesianY", "z": "cartesianZ", "valid": "cartesianInvalidState", "intensity": "intensity"},
-    **{"time": "timeStamp", "ring": "rowIndex", "column": "columnIndex", "return_index": "returnIndex"},
+    **{
+        "x": "cartesianX",
+        "y": "cartesianY",
+        "z": "cartesianZ",
+        "valid": "cartesianInvalidState",
+        "intensity": "intensity",
+    },
+    **{
+        "time": "timeStamp",
+        "ring": "rowIndex",
+        "column": "columnIndex",
+        "return_index": "returnIndex",
+    },
 }
-#: fields whose smallest and largest number the header has, by the group that these stand in and what they are called there.
+#: fields whose smallest and largest number the header has, by the group that these stand in and
+#: what they are called there.
 LIMITS = {
     "cartesianBounds": {"x": "cartesianX", "y": "cartesianY", "z": "cartesianZ"},
     "intensityLimits": {"intensity": "intensity"},
@@ -32,16 +44,22 @@ INVALID = 2
 #: prefix of the further columns, which are an extension, and what declares it.
 PREFIX, EXTENSION = "lidarspec", "urn:lidarspec:columns"
 #: types that libE57Format does not take, and those that hold their numbers.
-TAKEN_AS = {"f2": np.float32, "b1": np.uint8, **dict.fromkeys(("i4", "u4", "i8", "u8"), np.longlong)}
+TAKEN_AS = {
+    "f2": np.float32,
+    "b1": np.uint8,
+    **dict.fromkeys(("i4", "u4", "i8", "u8"), np.longlong),
+}
 
 
 def _write(path: Path, scans: Iterable[Scan], *, every_point: bool) -> None:
-    """Write a scan with a header for each: places, intensity, time, ring as the row, column and return, and the further columns.
+    """Write a scan with a header for each: places, intensity, time, ring as the row, column and
+    return, and the further columns.
 
-    `timeStamp` counts from the scan's acquisitionStart, its stamp as GPS time with 18 leap seconds; `returnCount` is the most of the scan.
-    Further columns are an extension, lidarspec:NAME, which readers pass over that do not know it; their units stand in the scan's
-    description. With `every_point`, a point without a return is at 0 with cartesianInvalidState 2. Headers are in memory until the file
-    is closed, as the library has it.
+    `timeStamp` counts from the scan's acquisitionStart, its stamp as GPS time with 18 leap seconds;
+    `returnCount` is the most of the scan. Further columns are an extension, lidarspec:NAME, which
+    readers pass over that do not know it; their units stand in the scan's description. With
+    `every_point`, a point without a return is at 0 with cartesianInvalidState 2. Headers are in
+    memory until the file is closed, as the library has it.
     """
     pye57, libe57 = import_library("pye57", "e57"), import_library("pye57.libe57", "e57")
     with contextlib.ExitStack() as files:
@@ -57,7 +75,9 @@ def _write(path: Path, scans: Iterable[Scan], *, every_point: bool) -> None:
             raise OSError(f"{str(error).splitlines()[0]}; is the disk full?") from None
 
 
-def _add(libe57: Any, file: Any, header: Mapping[str, Any], columns: Mapping[str, NDArray[Any]]) -> None:
+def _add(
+    libe57: Any, file: Any, header: Mapping[str, Any], columns: Mapping[str, NDArray[Any]]
+) -> None:
     """Add a scan to a file."""
     image, length = file.image_file, len(columns["cartesianX"])
     prototype, buffers = libe57.StructureNode(image), libe57.VectorSourceDestBuffer()
@@ -82,10 +102,17 @@ def _columns(own: Mapping[str, NDArray[Any]]) -> dict[str, NDArray[Any]]:
     columns = {NAMES.get(name, f"{PREFIX}:{name}"): column for name, column in own.items()}
     columns["cartesianInvalidState"] = invalid * np.uint8(INVALID)
     if invalid.any():
-        columns |= {name: np.where(invalid, 0, columns[name]) for name in (NAMES[axis] for axis in "xyz")}
+        columns |= {
+            name: np.where(invalid, 0, columns[name]) for name in (NAMES[axis] for axis in "xyz")
+        }
     if "returnIndex" in columns:
-        columns["returnCount"] = np.full(len(invalid), columns["returnIndex"].max(initial=0) + 1, np.uint8)
-    return {name: np.ascontiguousarray(column, TAKEN_AS.get(column.dtype.str[1:])) for name, column in columns.items()}
+        columns["returnCount"] = np.full(
+            len(invalid), columns["returnIndex"].max(initial=0) + 1, np.uint8
+        )
+    return {
+        name: np.ascontiguousarray(column, TAKEN_AS.get(column.dtype.str[1:]))
+        for name, column in columns.items()
+    }
 
 
 def _header(number: int, scan: Scan) -> dict[str, Any]:
@@ -99,7 +126,10 @@ def _header(number: int, scan: Scan) -> dict[str, Any]:
         "sensorVendor": scan.sensor.vendor,
         "sensorModel": scan.sensor.model,
         "acquisitionStart": {"dateTimeValue": start, "isAtomicClockReferenced": 0},
-        "acquisitionEnd": {"dateTimeValue": start + float(scan.points.time.max(initial=0)), "isAtomicClockReferenced": 0},
+        "acquisitionEnd": {
+            "dateTimeValue": start + float(scan.points.time.max(initial=0)),
+            "isAtomicClockReferenced": 0,
+        },
     }
 
 
@@ -138,7 +168,9 @@ def _kind(libe57: Any, image: Any, column: NDArray[Any]) -> Any:
         return libe57.IntegerNode(image, low, low, high)
     if column.dtype == np.float64:
         return libe57.FloatNode(image, 0.0, libe57.E57_DOUBLE)
-    return libe57.FloatNode(image, 0.0, libe57.E57_SINGLE, libe57.E57_FLOAT_MIN, libe57.E57_FLOAT_MAX)
+    return libe57.FloatNode(
+        image, 0.0, libe57.E57_SINGLE, libe57.E57_FLOAT_MIN, libe57.E57_FLOAT_MAX
+    )
 
 
 E57 = Format(".e57", "ASTM E57, a header a scan (pye57)", _write)

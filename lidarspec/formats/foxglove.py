@@ -1,7 +1,9 @@
-"""Logs for Foxglove: each scan as Foxglove's own messages in Protobuf, in an MCAP file, which say nothing of ROS.
+"""Logs for Foxglove: each scan as Foxglove's own messages in Protobuf, in an MCAP file, which say
+nothing of ROS.
 
-On /points stands each scan as foxglove.PointCloud, and on /scan, where the sensor has one plane, as foxglove.LaserScan; stamps, frame,
-layout of the points and the units in the metadata are those of the logs of ROS (see `bags`).
+On /points stands each scan as foxglove.PointCloud, and on /scan, where the sensor has one plane, as
+foxglove.LaserScan; stamps, frame, layout of the points and the units in the metadata are those of
+the logs of ROS (see `bags`).
 """
 
 from __future__ import annotations
@@ -29,7 +31,10 @@ def write_foxglove(path: Path, scans: Iterable[Scan], *, every_point: bool) -> N
     Raises:
         UsageError: for a stamp before 1970.
     """
-    mcap, support = import_library("mcap.writer", "foxglove"), import_library("mcap_protobuf.writer", "foxglove")
+    mcap, support = (
+        import_library("mcap.writer", "foxglove"),
+        import_library("mcap_protobuf.writer", "foxglove"),
+    )
     planes, units = Planes(), dict[str, str]()
     with path.open("wb") as file:
         log = support.Writer(file, chunk_size=CHUNK, compression=mcap.CompressionType.NONE)
@@ -39,7 +44,9 @@ def write_foxglove(path: Path, scans: Iterable[Scan], *, every_point: bool) -> N
             units |= {name: unit for name, unit in scan.points.units.items() if unit}
             messages = {TOPICS[CLOUD]: _cloud(scan.points, every_point=every_point)}
             if (planar := planes.scan(scan)) is not None:
-                messages[TOPICS[SCAN]] = _planar(planar, is_graded=scan.points.intensity is not None)
+                messages[TOPICS[SCAN]] = _planar(
+                    planar, is_graded=scan.points.intensity is not None
+                )
             for topic, message in messages.items():
                 message.timestamp.FromNanoseconds(scan.stamp_ns)
                 message.frame_id, message.pose.orientation.w = scan.frame_id, 1
@@ -51,7 +58,10 @@ def write_foxglove(path: Path, scans: Iterable[Scan], *, every_point: bool) -> N
 
 def _cloud(cloud: PointCloud, *, every_point: bool) -> Any:
     points = records(cloud, every_point=every_point)
-    fields = [{"name": name, "offset": offset, "type": FIELD_TYPES[kind]} for name, offset, kind in fields_of(cloud, points)]
+    fields = [
+        {"name": name, "offset": offset, "type": FIELD_TYPES[kind]}
+        for name, offset, kind in fields_of(cloud, points)
+    ]
     message = import_library("foxglove_schemas_protobuf.PointCloud_pb2", "foxglove").PointCloud
     return message(point_stride=points.itemsize, fields=fields, data=points.tobytes())
 
@@ -59,7 +69,14 @@ def _cloud(cloud: PointCloud, *, every_point: bool) -> Any:
 def _planar(scan: LaserScan, *, is_graded: bool) -> Any:
     message = import_library("foxglove_schemas_protobuf.LaserScan_pb2", "foxglove").LaserScan
     intensities = scan.intensities if is_graded else ()
-    return message(start_angle=scan.angle_min, end_angle=scan.angle_max, ranges=scan.ranges, intensities=intensities)
+    return message(
+        start_angle=scan.angle_min,
+        end_angle=scan.angle_max,
+        ranges=scan.ranges,
+        intensities=intensities,
+    )
 
 
-FOXGLOVE = Format(".foxglove.mcap", "an MCAP file with Foxglove's messages", write_foxglove, ("beams", "frame-id"))
+FOXGLOVE = Format(
+    ".foxglove.mcap", "an MCAP file with Foxglove's messages", write_foxglove, ("beams", "frame-id")
+)

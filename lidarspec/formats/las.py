@@ -1,4 +1,6 @@
-"""LAS and its compressed form LAZ, by laspy: version 1.4, point format 6, with GPS time, in steps of 0.1 mm."""
+"""LAS and its compressed form LAZ, by laspy: version 1.4, point format 6, with GPS time, in steps
+of 0.1 mm.
+"""
 
 from __future__ import annotations
 
@@ -18,26 +20,32 @@ from lidarspec.libraries import import_library
 from lidarspec.scans.scans import Scan
 from lidarspec.transports.protocol import Format
 
-#: the columns that LAS has a place for, and those that are extra dimensions as the sensor's further ones are.
+#: the columns that LAS has a place for, and those that are extra dimensions as the sensor's further
+#: ones are.
 PLACED, EXTRA = ("x", "y", "z", "intensity", "time", "return_index", "valid"), ("ring", "column")
 #: types that extra dimensions do not have, and those that hold their numbers.
 WIDER = {"f2": np.dtype(np.float32), "b1": np.dtype(np.uint8)}
-#: metres a step, and metres from 0 up to which places count from there; farther away they count from whole metres nearby.
+#: metres a step, and metres from 0 up to which places count from there; farther away they count
+#: from whole metres nearby.
 STEP, NEAR = 1e-4, 1e5
 #: ns since 1970 at what adjusted standard GPS time counts from.
 EPOCH = GPS_EPOCH + 10**18
-#: points put together at once; the farthest step, the largest intensity, the last number of a return, and the flag of what is withheld.
+#: points put together at once; the farthest step, the largest intensity, the last number of a
+#: return, and the flag of what is withheld.
 ROWS, FARTHEST, BRIGHTEST, LAST, WITHHELD = 1 << 17, (1 << 31) - 1, 0xFFFF, 15, 1 << 2
 
 
 def _write(path: Path, scans: Iterable[Scan], *, every_point: bool, is_compressed: bool) -> None:
-    """Write places, intensity, return and GPS time; ring, column, number of the scan and the sensor's further columns as extra dimensions.
+    """Write places, intensity, return and GPS time; ring, column, number of the scan and the
+    sensor's further columns as extra dimensions.
 
-    `intensity` is the sensor's number, rounded, 65535 at most. A stamp is taken as a time since 1970, and written as adjusted standard
-    GPS time with 18 leap seconds, exact to 0.1 microseconds. `number_of_returns` is the most that a point of the scan has. The unit of a
-    further column is its description; where its name means something else in LAS, "_" is added. With `every_point`, a point without a
-    return is withheld and stands at the file's offset, 0, as there is no nan. What a later scan lacks is nan there, or 0. Range and
-    angles are left out: they follow from the places.
+    `intensity` is the sensor's number, rounded, 65535 at most. A stamp is taken as a time since
+    1970, and written as adjusted standard GPS time with 18 leap seconds, exact to 0.1 microseconds.
+    `number_of_returns` is the most that a point of the scan has. The unit of a further column is
+    its description; where its name means something else in LAS, "_" is added. With `every_point`, a
+    point without a return is withheld and stands at the file's offset, 0, as there is no nan. What
+    a later scan lacks is nan there, or 0. Range and angles are left out: they follow from the
+    places.
 
     Raises:
         UsageError: where places are farther apart than numbers of 32 bits reach, 214 km.
@@ -45,13 +53,22 @@ def _write(path: Path, scans: Iterable[Scan], *, every_point: bool, is_compresse
     laspy = import_library("laspy", "las")
     with contextlib.ExitStack() as files:
         header, writer = laspy.LasHeader(point_format=6, version="1.4"), None
-        opened = partial(laspy.open, files.enter_context(path.open("wb")), "w", header=header, do_compress=is_compressed, closefd=False)
+        opened = partial(
+            laspy.open,
+            files.enter_context(path.open("wb")),
+            "w",
+            header=header,
+            do_compress=is_compressed,
+            closefd=False,
+        )
         for number, scan in enumerate(scans):
             own = columns_of(scan, (*PLACED, *EXTRA, *scan.points.extra), every_point=every_point)
             own["scan"] = np.full(len(own["x"]), number, np.uint32)
             if writer is None:
                 further = _describe(laspy, header, own, scan)
-                buffers = itertools.cycle(np.zeros((2, ROWS), header.point_format.dtype()))  # of which one is written, one is filled
+                buffers = itertools.cycle(
+                    np.zeros((2, ROWS), header.point_format.dtype())
+                )  # of which one is written, one is filled
                 writer = files.enter_context(opened())
                 write = files.enter_context(behind(writer.write_points))
             own["returns"] = _returns(own)
@@ -64,13 +81,22 @@ def _write(path: Path, scans: Iterable[Scan], *, every_point: bool, is_compresse
             opened().close()
 
 
-def _describe(laspy: Any, header: Any, own: Mapping[str, NDArray[Any]], scan: Scan) -> dict[str, str]:
-    """Say in a header what points have, by those of the first scan: the names of extra dimensions, by column."""
+def _describe(
+    laspy: Any, header: Any, own: Mapping[str, NDArray[Any]], scan: Scan
+) -> dict[str, str]:
+    """Say in a header what points have, by those of the first scan: the names of extra dimensions,
+    by column.
+    """
     taken = {*header.point_format.dimension_names, *header.point_format.dtype().names}
     further = {name: f"{name}_" if name in taken else name for name in own if name not in PLACED}
     kinds = {name: WIDER.get(own[name].dtype.str[1:], own[name].dtype) for name in further}
     units = scan.points.units
-    header.add_extra_dims([laspy.ExtraBytesParams(label, kinds[name], units.get(name, "")) for name, label in further.items()])
+    header.add_extra_dims(
+        [
+            laspy.ExtraBytesParams(label, kinds[name], units.get(name, ""))
+            for name, label in further.items()
+        ]
+    )
     header.scales, header.offsets = [STEP] * 3, [_offset(own[axis]) for axis in "xyz"]
     header.global_encoding.wkt = True  # as this point format has it
     header.global_encoding.gps_time_type = laspy.header.GpsTimeType.STANDARD
@@ -86,19 +112,31 @@ def _offset(places: NDArray[Any]) -> float:
 
 def _returns(own: Mapping[str, NDArray[Any]]) -> NDArray[np.uint8]:
     """The number of each return, from 1 on, and above it how many there are, (n,)."""
-    numbers = np.minimum(own["return_index"], LAST - 1) + 1 if "return_index" in own else np.ones(len(own["x"]), np.uint8)
+    numbers = (
+        np.minimum(own["return_index"], LAST - 1) + 1
+        if "return_index" in own
+        else np.ones(len(own["x"]), np.uint8)
+    )
     returns: NDArray[np.uint8] = (numbers | numbers.max(initial=1) << 4).astype(np.uint8)
     return returns
 
 
-def _fill(rows: NDArray[Any], part: Mapping[str, NDArray[Any]], further: Mapping[str, str], offsets: Iterable[float]) -> None:
+def _fill(
+    rows: NDArray[Any],
+    part: Mapping[str, NDArray[Any]],
+    further: Mapping[str, str],
+    offsets: Iterable[float],
+) -> None:
     """Fill records with points."""
     valid = part["valid"]
     for axis, offset in zip("xyz", offsets, strict=True):
         steps = np.rint(np.subtract(part[axis], offset, dtype=np.float64) * (1 / STEP))
         steps = steps if valid.all() else np.where(valid, steps, 0)
         if np.abs(steps).max() > FARTHEST:
-            far = f"{axis} is {np.abs(steps).max() * STEP / 1000:.0f} km from {offset:.0f} m, more than LAS holds in steps of 0.1 mm"
+            far = (
+                f"{axis} is {np.abs(steps).max() * STEP / 1000:.0f} km from {offset:.0f} m, more"
+                " than LAS holds in steps of 0.1 mm"
+            )
             raise suggest(UsageError(far), "lidarspec convert IN OUT.parquet")
         rows[axis.upper()] = steps
     rows["classification_flags"] = np.where(valid, 0, WITHHELD)

@@ -1,7 +1,9 @@
-"""ROS's messages of scans, packets and IMU samples, as the bytes that stand in logs and go over topics.
+"""ROS's messages of scans, packets and IMU samples, as the bytes that stand in logs and go over
+topics.
 
-A scan is a sensor_msgs/PointCloud2, and where the sensor has one plane a sensor_msgs/LaserScan on an even grid of angles. Points have PCL's
-layout: x y z intensity time as float32, ring as uint16, then the further columns; a column that the sensor lacks is no field.
+A scan is a sensor_msgs/PointCloud2, and where the sensor has one plane a sensor_msgs/LaserScan on
+an even grid of angles. Points have PCL's layout: x y z intensity time as float32, ring as uint16,
+then the further columns; a column that the sensor lacks is no field.
 """
 
 from __future__ import annotations
@@ -49,19 +51,27 @@ class Messages:
     def __init__(self, release: str) -> None:
         typesys = import_library("rosbags.typesys", "ros")
         self.types = typesys.get_typestore(typesys.Stores[release])
-        self._serialized = self.types.serialize_ros1 if release.startswith("ROS1") else self.types.serialize_cdr
+        self._serialized = (
+            self.types.serialize_ros1 if release.startswith("ROS1") else self.types.serialize_cdr
+        )
         self._counts = release.startswith("ROS1")
 
     def raw(self, packet: Chunk, *, datagram: bool = True) -> Message:
-        """A packet as it was received, which `transports.bags` reads again; not a `datagram`: of a stream."""
+        """A packet as it was received, which `transports.bags` reads again; not a `datagram`: of a
+        stream.
+        """
         at, size, types = packet.at or 0, len(packet.data), self.types.types
-        dimension = types["std_msgs/msg/MultiArrayDimension"](label=DATAGRAM if datagram else STREAM, size=size, stride=size)
+        dimension = types["std_msgs/msg/MultiArrayDimension"](
+            label=DATAGRAM if datagram else STREAM, size=size, stride=size
+        )
         layout = types["std_msgs/msg/MultiArrayLayout"](dim=[dimension], data_offset=STAMP.size)
-        return self._message(RAW, at, layout=layout, data=np.frombuffer(STAMP.pack(at) + packet.data, np.uint8))
+        return self._message(
+            RAW, at, layout=layout, data=np.frombuffer(STAMP.pack(at) + packet.data, np.uint8)
+        )
 
     def cloud(self, scan: Scan, at: int, *, every_point: bool, number: int = 0) -> Message:
-        """The points of a scan; organised ones have a row for each row of the sensor, several returns side by side; of others, and valid
-        ones, there is one.
+        """The points of a scan; organised ones have a row for each row of the sensor, several
+        returns side by side; of others, and valid ones, there is one.
 
         Args:
             at: its stamp, ns.
@@ -70,8 +80,12 @@ class Messages:
         """
         cloud = scan.points
         points = records(cloud, every_point=every_point)
-        fields = [(name, offset, FIELD_TYPES[kind]) for name, offset, kind in fields_of(cloud, points)]
-        points = points.view(np.dtype((np.void, points.itemsize)))  # copied whole: of records what is between the fields is left out
+        fields = [
+            (name, offset, FIELD_TYPES[kind]) for name, offset, kind in fields_of(cloud, points)
+        ]
+        points = points.view(
+            np.dtype((np.void, points.itemsize))
+        )  # copied whole: of records what is between the fields is left out
         if every_point and cloud.shape and len(cloud):
             points = picture(points, cloud)
         height, width = np.atleast_2d(points).shape
@@ -99,13 +113,18 @@ class Messages:
         return self._message(SCAN, at, **values, header=self._header(number, at, scan.frame_id))
 
     def imu(self, felt: ImuSamples, index: int, at: int, frame_id: str) -> Message:
-        """One sample of an IMU, by REP-145: a first covariance of -1 says that something is not measured, 0 that its error is not known."""
+        """One sample of an IMU, by REP-145: a first covariance of -1 says that something is not
+        measured, 0 that its error is not known.
+        """
         vector = self.types.types["geometry_msgs/msg/Vector3"]
         values: dict[str, Any] = {}
         for name in ("angular_velocity", "linear_acceleration"):
             measured = getattr(felt, name)[index]
             known = bool(np.isfinite(measured).all())
-            values |= {name: vector(*np.where(known, measured, 0.0).tolist()), f"{name}_covariance": _covariance(known=known)}
+            values |= {
+                name: vector(*np.where(known, measured, 0.0).tolist()),
+                f"{name}_covariance": _covariance(known=known),
+            }
         upright = self.types.types["geometry_msgs/msg/Quaternion"](0.0, 0.0, 0.0, 1.0)
         turned = {"orientation": upright, "orientation_covariance": _covariance(known=False)}
         return self._message(IMU, at, header=self._header(0, at, frame_id), **turned, **values)
@@ -115,11 +134,15 @@ class Messages:
 
     def _header(self, number: int, stamp_ns: int, frame_id: str) -> Any:
         counted = {"seq": number} if self._counts else {}
-        return self.types.types["std_msgs/msg/Header"](**counted, stamp=self._time(stamp_ns), frame_id=frame_id)
+        return self.types.types["std_msgs/msg/Header"](
+            **counted, stamp=self._time(stamp_ns), frame_id=frame_id
+        )
 
     def _time(self, at: int) -> Any:
         if not 0 <= at < _SECOND << 31:
-            raise UsageError(f"a scan or packet at {at} ns: stamps of ROS hold the years 1970 to 2038")
+            raise UsageError(
+                f"a scan or packet at {at} ns: stamps of ROS hold the years 1970 to 2038"
+            )
         return self.types.types["builtin_interfaces/msg/Time"](*divmod(at, _SECOND))
 
 
@@ -130,9 +153,19 @@ def _covariance(*, known: bool) -> NDArray[np.float64]:
 
 
 def fields_of(cloud: PointCloud, points: NDArray[Any]) -> list[tuple[str, int, str]]:
-    """Name, offset and type ("f4") of each field of the records of a cloud; a column that it lacks is none."""
-    lacking = {name for name in ("intensity", "ring", "time") if not cloud.shows(name) or getattr(cloud, name) is None}
-    return [(name, place[1], place[0].str[1:]) for name, place in (points.dtype.fields or {}).items() if name not in lacking]
+    """Name, offset and type ("f4") of each field of the records of a cloud; a column that it lacks
+    is none.
+    """
+    lacking = {
+        name
+        for name in ("intensity", "ring", "time")
+        if not cloud.shows(name) or getattr(cloud, name) is None
+    }
+    return [
+        (name, place[1], place[0].str[1:])
+        for name, place in (points.dtype.fields or {}).items()
+        if name not in lacking
+    ]
 
 
 def records(cloud: PointCloud, *, every_point: bool) -> NDArray[Any]:
@@ -143,5 +176,8 @@ def records(cloud: PointCloud, *, every_point: bool) -> NDArray[Any]:
     kinds = {name: points.dtype[name] for name in points.dtype.names or ()}
     if all(kind.str[1:] in FIELD_TYPES for kind in kinds.values()):
         return points
-    known = [(name, kind if kind.str[1:] in FIELD_TYPES else np.dtype(np.float64)) for name, kind in kinds.items()]
+    known = [
+        (name, kind if kind.str[1:] in FIELD_TYPES else np.dtype(np.float64))
+        for name, kind in kinds.items()
+    ]
     return points.astype(np.dtype(known, align=True))

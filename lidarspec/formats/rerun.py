@@ -1,7 +1,9 @@
-"""Recordings of Rerun, .rrd: scans as coloured points on the sensor's and on the host's time, figures beside them.
+"""Recordings of Rerun, .rrd: scans as coloured points on the sensor's and on the host's time,
+figures beside them.
 
-A `Log` is also what `view --rerun` shows in Rerun's viewer. Everything of a sensor stands under its id, so that the recordings of
-several can be opened together: its points, where it is mounted, what is known of it, and under `statistics` how it is doing.
+A `Log` is also what `view --rerun` shows in Rerun's viewer. Everything of a sensor stands under its
+id, so that the recordings of several can be opened together: its points, where it is mounted, what
+is known of it, and under `statistics` how it is doing.
 """
 
 from __future__ import annotations
@@ -36,10 +38,12 @@ SENSOR, HOST, NUMBER = "sensor_time", "host_time", "scan"
 
 
 class Log:
-    """One recording, a context manager; it goes to a file (`save`), or where its `stream` is told to (`spawn`, `connect_grpc`).
+    """One recording, a context manager; it goes to a file (`save`), or where its `stream` is told
+    to (`spawn`, `connect_grpc`).
 
     Args:
-        ramp: what colours show, "range", "intensity" or a further column; their scale is that of the first scan.
+        ramp: what colours show, "range", "intensity" or a further column; their scale is that of
+            the first scan.
 
     Raises:
         UsageError: where Rerun's SDK is not installed.
@@ -57,7 +61,12 @@ class Log:
     def __enter__(self) -> Log:
         return self
 
-    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None) -> None:
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
+    ) -> None:
         try:
             if not isinstance(error, OSError):  # one that was stopped is whole as well
                 self.flush()
@@ -93,16 +102,32 @@ class Log:
         if is_first:
             self._begin(scan)
         self._set_times(scan)
-        names = ("x", "y", "z", "intensity", "ring", "return_index", "range", "time", *scan.points.extra)
+        names = (
+            "x",
+            "y",
+            "z",
+            "intensity",
+            "ring",
+            "return_index",
+            "range",
+            "time",
+            *scan.points.extra,
+        )
         columns = columns_of(scan, names, every_point=every_point)
         places = np.stack([columns.pop(name) for name in "xyz"], axis=-1)
         shown = scan.points if every_point else scan.points[scan.points.valid]
-        points = self._rerun.Points3D(places, colors=self._colours(shown, self._ramp), radii=self._rerun.Radius.ui_points(RADIUS))
+        points = self._rerun.Points3D(
+            places,
+            colors=self._colours(shown, self._ramp),
+            radii=self._rerun.Radius.ui_points(RADIUS),
+        )
         self.stream.log(f"{self._home}/points", points, self._rerun.AnyValues(**columns))
         self._waiting += len(places)
         if self._waiting >= HELD:
             self.flush()
-        self.figures({"points": len(scan), "valid": int(scan.points.valid.sum()), "speed_hz": scan.rate_hz})
+        self.figures(
+            {"points": len(scan), "valid": int(scan.points.valid.sum()), "speed_hz": scan.rate_hz}
+        )
         if is_first:  # it names what there has to be by then: a time that runs
             self.stream.send_blueprint(self._layout())
 
@@ -110,7 +135,9 @@ class Log:
         """Log figures by name at the time of the last scan; those that are not known are left out."""
         for name, value in figures.items():
             if value is not None and np.isfinite(value):
-                self.stream.log(f"{self._home}/statistics/{name}", self._rerun.Scalars(float(value)))
+                self.stream.log(
+                    f"{self._home}/statistics/{name}", self._rerun.Scalars(float(value))
+                )
 
     def flush(self) -> None:
         """Hand over what was logged.
@@ -129,9 +156,22 @@ class Log:
         self.stream.send_recording_name(scan.sensor.id)
         self.stream.log("/", rerun.ViewCoordinates.FLU, static=True)
         mount = scan.mount
-        turn = {"translation": (mount.x, mount.y, mount.z), "mat3x3": mount.rotation} if mount else {"translation": (0, 0, 0)}
-        self.stream.log(f"{self._home}/sensor", rerun.Transform3D(**turn), rerun.TransformAxes3D(AXES), static=True)
-        facts = {"model": f"{scan.sensor.vendor} {scan.sensor.model}", **scan.facts, "mount": str(mount or "as the sensor stands")}
+        turn = (
+            {"translation": (mount.x, mount.y, mount.z), "mat3x3": mount.rotation}
+            if mount
+            else {"translation": (0, 0, 0)}
+        )
+        self.stream.log(
+            f"{self._home}/sensor",
+            rerun.Transform3D(**turn),
+            rerun.TransformAxes3D(AXES),
+            static=True,
+        )
+        facts = {
+            "model": f"{scan.sensor.vendor} {scan.sensor.model}",
+            **scan.facts,
+            "mount": str(mount or "as the sensor stands"),
+        }
         units = {f"unit of {name}": unit for name, unit in scan.points.units.items() if unit}
         text = "\n".join(f"{name}: {value}" for name, value in {**facts, **units}.items())
         self.stream.log(f"{self._home}/about", rerun.TextDocument(text), static=True)
@@ -147,16 +187,24 @@ class Log:
         """The points, and beside them figures and facts; the sensor's time runs."""
         views = import_library("rerun.blueprint", "rerun")
         figures = [
-            views.TimeSeriesView(origin=f"{self._home}/statistics", contents=f"$origin/{name}", name=name) for name in ("speed_hz", "valid")
+            views.TimeSeriesView(
+                origin=f"{self._home}/statistics", contents=f"$origin/{name}", name=name
+            )
+            for name in ("speed_hz", "valid")
         ]
         facts = views.TextDocumentView(origin=f"{self._home}/about", name="about")
         beside = views.Vertical(*figures, facts)
-        whole = views.Horizontal(views.Spatial3DView(origin="/", name=self._home[1:]), beside, column_shares=[3, 1])
-        return views.Blueprint(whole, views.TimePanel(timeline=SENSOR, state="collapsed"), collapse_panels=True)
+        whole = views.Horizontal(
+            views.Spatial3DView(origin="/", name=self._home[1:]), beside, column_shares=[3, 1]
+        )
+        return views.Blueprint(
+            whole, views.TimePanel(timeline=SENSOR, state="collapsed"), collapse_panels=True
+        )
 
 
 class _Copy(threading.Thread):
-    """Writes to a file what Rerun's SDK writes into a pipe: where a disk is full, the SDK may wait for ever for its own file.
+    """Writes to a file what Rerun's SDK writes into a pipe: where a disk is full, the SDK may wait
+    for ever for its own file.
 
     Attributes:
         end: of the pipe, to write to.

@@ -1,4 +1,6 @@
-"""Points as rows of bytes, as PCD, PLY, KITTI's .bin and .npy hold them: scan by scan, behind a header that says how many they are."""
+"""Points as rows of bytes, as PCD, PLY, KITTI's .bin and .npy hold them: scan by scan, behind a
+header that says how many they are.
+"""
 
 from __future__ import annotations
 
@@ -26,21 +28,29 @@ class Rows:
     """The points of scans as structured rows of one type, (n,) a scan.
 
     Args:
-        layout: makes the type of a row from those of the columns that the first scan has: x y z intensity ring time, its further ones, and
-            `scan`, the number of the scan, where there are several. Columns of other names are left out; of a scan that has not all of
-            them, what is missing is 0.
+        layout: makes the type of a row from those of the columns that the first scan has: x y z
+            intensity ring time, its further ones, and `scan`, the number of the scan, where there
+            are several. Columns of other names are left out; of a scan that has not all of them,
+            what is missing is 0.
         every_point: also the points without a valid return.
         is_picture: where every point of a single organised scan is written, put them row by row.
 
     Attributes:
         dtype: of a row.
         length: how many rows there were so far.
-        shape: (width, height) of such a picture, else None; several returns of a place stand side by side.
-        facts: what a header may say of the sensor, the stamp of the first scan and the units, a line each.
+        shape: (width, height) of such a picture, else None; several returns of a place stand side
+            by side.
+        facts: what a header may say of the sensor, the stamp of the first scan and the units, a
+            line each.
     """
 
     def __init__(
-        self, scans: Iterable[Scan], layout: Callable[[Mapping[str, Any]], np.dtype[Any]], *, every_point: bool, is_picture: bool = False
+        self,
+        scans: Iterable[Scan],
+        layout: Callable[[Mapping[str, Any]], np.dtype[Any]],
+        *,
+        every_point: bool,
+        is_picture: bool = False,
     ) -> None:
         scans = iter(scans)
         first = list(itertools.islice(scans, 2))
@@ -49,8 +59,13 @@ class Rows:
         types: dict[str, Any] = dict.fromkeys("xyz", np.float32)
         if first:
             cloud = first[0].points
-            columns = self._columns(first[0], 0, (*NAMES, *cloud.extra, *(["scan"] if len(first) > 1 else [])))
-            types |= {name: STRUCTURED[name] if name in NAMES else column.dtype for name, column in columns.items()}
+            columns = self._columns(
+                first[0], 0, (*NAMES, *cloud.extra, *(["scan"] if len(first) > 1 else []))
+            )
+            types |= {
+                name: STRUCTURED[name] if name in NAMES else column.dtype
+                for name, column in columns.items()
+            }
             if is_picture and every_point and len(first) == 1 and cloud.shape:
                 height, width = picture(np.empty(len(cloud), np.bool_), cloud).shape
                 self.shape = width, height
@@ -78,11 +93,15 @@ class Rows:
     def _columns(self, scan: Scan, number: int, names: Sequence[str]) -> dict[str, NDArray[Any]]:
         """Those of some columns that the scan has, and its number, of the points that are written."""
         columns = columns_of(scan, names, every_point=self._every_point)
-        return columns | ({"scan": np.full(len(columns["x"]), number, np.int32)} if "scan" in names else {})
+        return columns | (
+            {"scan": np.full(len(columns["x"]), number, np.int32)} if "scan" in names else {}
+        )
 
 
 def write_rows(path: Path, rows: Rows, header: Callable[[Rows], bytes]) -> None:
-    """Write rows behind a header, which is made again when they are counted: its length must not depend on their number."""
+    """Write rows behind a header, which is made again when they are counted: its length must not
+    depend on their number.
+    """
     with path.open("wb") as file:
         file.write(header(rows))
 

@@ -1,6 +1,8 @@
-"""Tables for data tools, by pyarrow: Parquet for queries, Arrow and Feather to be mapped into memory; a row a point.
+"""Tables for data tools, by pyarrow: Parquet for queries, Arrow and Feather to be mapped into
+memory; a row a point.
 
-Scans are gathered until there are `ROWS`, which are a row group or a record batch. Columns are handed over as they are, without a copy.
+Scans are gathered until there are `ROWS`, which are a row group or a record batch. Columns are
+handed over as they are, without a copy.
 """
 
 from __future__ import annotations
@@ -25,13 +27,17 @@ ROWS = 1 << 17
 MANY = 8
 
 
-def _write(path: Path, scans: Iterable[Scan], *, every_point: bool, open_writer: Callable[[Path, Any], Any]) -> None:
+def _write(
+    path: Path, scans: Iterable[Scan], *, every_point: bool, open_writer: Callable[[Path, Any], Any]
+) -> None:
     """Write the columns that the first scan has, and for each point of which scan it is.
 
-    `scan` is its number, `stamp` its stamp, to which `time` is added, as a timestamp in ns without a zone, which pandas and DuckDB keep
-    exactly; `complete` as in `Scan`. A column that a later scan lacks is nan there, or null where it holds whole numbers; with
-    `every_point` x, y and z of a point without a return are nan. Each field has its unit in its metadata, and the schema's has `sensor`,
-    `source` (what is known of its format), `frame` (where x, y and z point), `units` as JSON, and `calibration`: "nominal" or "own".
+    `scan` is its number, `stamp` its stamp, to which `time` is added, as a timestamp in ns without
+    a zone, which pandas and DuckDB keep exactly; `complete` as in `Scan`. A column that a later
+    scan lacks is nan there, or null where it holds whole numbers; with `every_point` x, y and z of
+    a point without a return are nan. Each field has its unit in its metadata, and the schema's has
+    `sensor`, `source` (what is known of its format), `frame` (where x, y and z point), `units` as
+    JSON, and `calibration`: "nominal" or "own".
     """
     made = tables(scans, path, every_point=every_point)
     first = next(made)
@@ -44,14 +50,17 @@ def tables(scans: Iterable[Scan], path: Path | None = None, *, every_point: bool
     """The points of scans as tables of `ROWS` rows and more, at least one.
 
     Args:
-        path: where they go; a column that a folder of it says already, such as scan=7, is left out, as Hive has it.
+        path: where they go; a column that a folder of it says already, such as scan=7, is left out,
+            as Hive has it.
     """
     arrow, of_scans = import_library("pyarrow", "arrow"), _of_scans(path)
     schema, gathered, rows = None, list[Any](), 0
     for place, scan in enumerate(scans):
         cloud = written(scan, every_point=every_point)
         schema = schema or _schema(arrow, scan, cloud, of_scans)
-        gathered.append(_batch(arrow, schema, cloud, place if scan.number is None else scan.number, scan))
+        gathered.append(
+            _batch(arrow, schema, cloud, place if scan.number is None else scan.number, scan)
+        )
         rows += len(cloud)
         if rows >= ROWS:
             yield _table(arrow, gathered, schema)
@@ -71,7 +80,9 @@ def _of_scans(path: Path | None) -> list[Any]:
     arrow, folders = import_library("pyarrow", "arrow"), path.parent.parts if path else ()
     said = {part.partition("=")[0] for part in folders if "=" in part}
     types = {"scan": arrow.int32(), "stamp": arrow.timestamp("ns"), "complete": arrow.bool_()}
-    return [arrow.field(name, kind, nullable=False) for name, kind in types.items() if name not in said]
+    return [
+        arrow.field(name, kind, nullable=False) for name, kind in types.items() if name not in said
+    ]
 
 
 def _schema(arrow: Any, scan: Scan, cloud: PointCloud, of_scans: Sequence[Any]) -> Any:
@@ -83,28 +94,48 @@ def _schema(arrow: Any, scan: Scan, cloud: PointCloud, of_scans: Sequence[Any]) 
 def _batch(arrow: Any, schema: Any, cloud: PointCloud, number: int, scan: Scan) -> Any:
     """The points of a scan as a record batch."""
     own: dict[str, Any] = {**cloud.columns}
-    for name, value in (("scan", np.int32(number)), ("stamp", np.datetime64(scan.stamp_ns, "ns")), ("complete", scan.complete)):
+    for name, value in (
+        ("scan", np.int32(number)),
+        ("stamp", np.datetime64(scan.stamp_ns, "ns")),
+        ("complete", scan.complete),
+    ):
         own[name] = np.full(len(cloud), value)
     for field in schema:
         if field.name not in own:
-            own[field.name] = np.full(len(cloud), np.nan) if not field.nullable else arrow.nulls(len(cloud), field.type)
-    return arrow.RecordBatch.from_arrays([_array(arrow, own[field.name], field.type) for field in schema], schema=schema)
+            own[field.name] = (
+                np.full(len(cloud), np.nan)
+                if not field.nullable
+                else arrow.nulls(len(cloud), field.type)
+            )
+    return arrow.RecordBatch.from_arrays(
+        [_array(arrow, own[field.name], field.type) for field in schema], schema=schema
+    )
 
 
 def _array(arrow: Any, values: Any, kind: Any) -> Any:
-    """Values as an array of Arrow. Of its type they are not converted: for that pyarrow loads pandas, which takes a fifth of a second."""
+    """Values as an array of Arrow. Of its type they are not converted: for that pyarrow loads
+    pandas, which takes a fifth of a second.
+    """
     if not isinstance(values, np.ndarray) or arrow.from_numpy_dtype(values.dtype) != kind:
         return arrow.array(values, kind)
-    data = np.packbits(values, bitorder="little") if values.dtype == np.bool_ else np.ascontiguousarray(values).view(np.uint8)
+    data = (
+        np.packbits(values, bitorder="little")
+        if values.dtype == np.bool_
+        else np.ascontiguousarray(values).view(np.uint8)
+    )
     return arrow.Array.from_buffers(kind, len(values), [None, arrow.py_buffer(data)])
 
 
 def _parquet(path: Path, schema: Any) -> Any:
-    """A writer of Parquet, not compressed, which takes longer than all else; numbers of few values take few bits, as in a dictionary."""
+    """A writer of Parquet, not compressed, which takes longer than all else; numbers of few values
+    take few bits, as in a dictionary.
+    """
     few = [field.name for field in schema if str(field.type) not in ("float", "double", "bool")]
     timed = [name for name in ("scan", "stamp") if name in schema.names]
     parquet = import_library("pyarrow.parquet", "arrow")
-    return parquet.ParquetWriter(path, schema, compression="none", use_dictionary=few, write_statistics=timed)
+    return parquet.ParquetWriter(
+        path, schema, compression="none", use_dictionary=few, write_statistics=timed
+    )
 
 
 def _batches(path: Path, schema: Any, compression: str | None) -> Any:
@@ -113,6 +144,16 @@ def _batches(path: Path, schema: Any, compression: str | None) -> Any:
     return ipc.new_file(str(path), schema, options=ipc.IpcWriteOptions(compression=compression))
 
 
-PARQUET = Format(".parquet", "Parquet, one row a point (pyarrow)", partial(_write, open_writer=_parquet))
-ARROW = Format(".arrow", "Arrow, one row a point, to be mapped (pyarrow)", partial(_write, open_writer=partial(_batches, compression=None)))
-FEATHER = Format(".feather", "Arrow, compressed with LZ4 (pyarrow)", partial(_write, open_writer=partial(_batches, compression="lz4")))
+PARQUET = Format(
+    ".parquet", "Parquet, one row a point (pyarrow)", partial(_write, open_writer=_parquet)
+)
+ARROW = Format(
+    ".arrow",
+    "Arrow, one row a point, to be mapped (pyarrow)",
+    partial(_write, open_writer=partial(_batches, compression=None)),
+)
+FEATHER = Format(
+    ".feather",
+    "Arrow, compressed with LZ4 (pyarrow)",
+    partial(_write, open_writer=partial(_batches, compression="lz4")),
+)

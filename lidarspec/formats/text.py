@@ -1,4 +1,6 @@
-"""Text, a row a point: comma-separated values behind a row of names, also compressed, and .xyz; memory stays small."""
+"""Text, a row a point: comma-separated values behind a row of names, also compressed, and .xyz;
+memory stays small.
+"""
 
 from __future__ import annotations
 
@@ -18,7 +20,8 @@ from lidarspec.formats.writing import behind, kept, written
 from lidarspec.scans.scans import Scan
 from lidarspec.transports.protocol import Format
 
-#: how a number of each type is written: seven figures are half a micrometre at a metre; times keep their nanoseconds.
+#: how a number of each type is written: seven figures are half a micrometre at a metre; times keep
+#: their nanoseconds.
 _WRITTEN = {"f2": "%.7g", "f4": "%.7g", "f8": "%.15g"}
 _TIME = "%.9f"
 #: rows turned into text at once, by one template: a third quicker than row by row.
@@ -29,7 +32,9 @@ _LEVEL = 1
 
 @contextlib.contextmanager
 def text_file(path: Path, *, is_zipped: bool = False) -> Iterator[Callable[[str], None]]:
-    """What writes a file of text, which may be compressed, while the next text is made; neither a name nor a time stands in it."""
+    """What writes a file of text, which may be compressed, while the next text is made; neither a
+    name nor a time stands in it.
+    """
     with contextlib.ExitStack() as files:
         file: Any = files.enter_context(path.open("wb"))
         if is_zipped:
@@ -50,7 +55,8 @@ def write(path: Path, scans: Iterable[Scan], *, every_point: bool, is_zipped: bo
             own = cloud.columns
             columns = [_column(own.get(name), len(cloud)) for name in names]
             cells = [
-                _TIME if name == "time" else _WRITTEN.get(column.dtype.str[1:], "%d") for name, column in zip(names, columns, strict=True)
+                _TIME if name == "time" else _WRITTEN.get(column.dtype.str[1:], "%d")
+                for name, column in zip(names, columns, strict=True)
             ]
             _put_rows(put, ",".join([*cells, f"{number}\n"]), columns)
 
@@ -61,12 +67,19 @@ def write_xyz(path: Path, scans: Iterable[Scan], *, every_point: bool) -> None:
         for scan in scans:
             which = kept(scan.points, every_point=every_point)
             columns = scan.points.read("x", "y", "z").values()
-            _put_rows(put, "%.7g %.7g %.7g\n", [column if which is None else column[which] for column in columns])
+            _put_rows(
+                put,
+                "%.7g %.7g %.7g\n",
+                [column if which is None else column[which] for column in columns],
+            )
 
 
 def write_columns(path: Path, columns: Mapping[str, NDArray[Any]]) -> None:
     """Write columns of one length, whole numbers and float64, with their names above."""
-    template = ",".join("%d" if column.dtype.kind == "i" else "%.15g" for column in columns.values()) + "\n"
+    template = (
+        ",".join("%d" if column.dtype.kind == "i" else "%.15g" for column in columns.values())
+        + "\n"
+    )
     with text_file(path) as put:
         put(",".join(columns) + "\n")
         _put_rows(put, template, [*columns.values()])
@@ -85,5 +98,7 @@ def _column(values: NDArray[Any] | None, length: int) -> NDArray[Any]:
 
 
 CSV = Format(".csv", "comma-separated values, one row a point", write)
-CSV_GZ = Format(".csv.gz", "comma-separated values, compressed", functools.partial(write, is_zipped=True))
+CSV_GZ = Format(
+    ".csv.gz", "comma-separated values, compressed", functools.partial(write, is_zipped=True)
+)
 XYZ = Format(".xyz", "x y z as text, one row a point", write_xyz)

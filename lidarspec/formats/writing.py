@@ -1,7 +1,9 @@
-"""What formats have in common: the points of scans, columns that grow beside the file, and a file that appears when it is whole.
+"""What formats have in common: the points of scans, columns that grow beside the file, and a file
+that appears when it is whole.
 
-A format is a function that writes scans to a path, one by one, so that memory stays small. Many begin with how much they hold, which is
-known at the end alone: they write it there and come back, or let their columns grow in files without a name.
+A format is a function that writes scans to a path, one by one, so that memory stays small. Many
+begin with how much they hold, which is known at the end alone: they write it there and come back,
+or let their columns grow in files without a name.
 """
 
 from __future__ import annotations
@@ -25,19 +27,22 @@ from lidarspec.scans.scans import Scan
 from lidarspec.stores import take_away
 from lidarspec.unfinished import path_while_written, remove_abandoned
 
-# Files that a written folder holds, by its suffix: an existing folder with any other file is not replaced.
+# Files that a written folder holds, by its suffix: an existing folder with any other file is not
+# replaced.
 FOLDER_FILES = {
     ".zarr": re.compile(r"(.+/)?(zarr\.json|\.z(group|attrs|array|metadata)|(c/)?\d+([./]\d+)*)"),
     ".rosbag2": re.compile(r"metadata\.yaml|[^/]+\.(mcap|db3(-wal|-shm)?)"),
 }
-#: ns since 1970 of the GPS epoch, 1980-01-06, for a clock that leaves out leap seconds, with those that there are since 2017.
+#: ns since 1970 of the GPS epoch, 1980-01-06, for a clock that leaves out leap seconds, with those
+#: that there are since 2017.
 GPS_EPOCH = (315_964_800 - 18) * 10**9
 _Piece = TypeVar("_Piece")
 
 
 @contextlib.contextmanager
 def replacing(path: Path) -> Iterator[Path]:
-    """A file or folder beside another one to write to, which takes its place when the block ends, and is gone if that fails.
+    """A file or folder beside another one to write to, which takes its place when the block ends,
+    and is gone if that fails.
 
     Raises:
         SourceError: where it cannot be written.
@@ -73,13 +78,16 @@ def refuse_foreign_files(folder: Path) -> None:
     for path in sorted(folder.rglob("*")):
         name = path.relative_to(folder).as_posix()
         if path.is_symlink() or (path.is_file() and not (pattern and pattern.fullmatch(name))):
-            error = UsageError(f"{folder} holds other files, such as {name}, which would be deleted")
+            error = UsageError(
+                f"{folder} holds other files, such as {name}, which would be deleted"
+            )
             raise suggest(error, "choose another output, or move these files away")
 
 
 @contextlib.contextmanager
 def behind(write: Callable[[_Piece], object]) -> Iterator[Callable[[_Piece], None]]:
-    """A function that hands what it is given over to another one, which writes it while the next piece is made; at the end all is written.
+    """A function that hands what it is given over to another one, which writes it while the next
+    piece is made; at the end all is written.
 
     What fails there is raised with the next piece, or at the end.
     """
@@ -102,22 +110,35 @@ def written(scan: Scan, *, every_point: bool) -> PointCloud:
 
 
 def kept(cloud: PointCloud, *, every_point: bool) -> NDArray[np.intp] | None:
-    """The indices of the points that are written, which pick columns several times as fast as a mask; None for all."""
+    """The indices of the points that are written, which pick columns several times as fast as a
+    mask; None for all.
+    """
     return None if every_point or cloud.valid.all() else np.flatnonzero(cloud.valid)
 
 
 def columns_of(scan: Scan, names: Iterable[str], *, every_point: bool) -> dict[str, NDArray[Any]]:
-    """Those of some columns that a scan has, "valid" and its further ones too, of the points that are written."""
+    """Those of some columns that a scan has, "valid" and its further ones too, of the points that
+    are written.
+    """
     cloud = scan.points
     named = tuple(name for name in names if name == "valid" or cloud.shows(name))
     source_of(cloud).prepare((*named, "valid"))
-    columns = {name: getattr(cloud, name) if name in (*COLUMNS, "valid") else cloud.extra.get(name) for name in named}
+    columns = {
+        name: getattr(cloud, name) if name in (*COLUMNS, "valid") else cloud.extra.get(name)
+        for name in named
+    }
     which = kept(cloud, every_point=every_point)
-    return {name: column if which is None else column[which] for name, column in columns.items() if column is not None}
+    return {
+        name: column if which is None else column[which]
+        for name, column in columns.items()
+        if column is not None
+    }
 
 
 def picture(values: NDArray[Any], cloud: PointCloud) -> NDArray[Any]:
-    """Values of organised points, (n,), as (rows, columns), a row for each ring; several returns of a place stand side by side."""
+    """Values of organised points, (n,), as (rows, columns), a row for each ring; several returns of
+    a place stand side by side.
+    """
     columns, rows = cloud.shape or (len(cloud), 1)
     returns, height = len(cloud) // max(columns * rows, 1) or 1, rows
     if cloud.ring is not None and columns:
@@ -129,7 +150,9 @@ def picture(values: NDArray[Any], cloud: PointCloud) -> NDArray[Any]:
 
 
 class Spool:
-    """The values of one column, as long as scans come, in a file without a name in the folder of the target."""
+    """The values of one column, as long as scans come, in a file without a name in the folder of
+    the target.
+    """
 
     def __init__(self, folder: Path, dtype: DTypeLike) -> None:
         self._file = tempfile.TemporaryFile(dir=folder)  # noqa: SIM115  closed by `close`

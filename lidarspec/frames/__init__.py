@@ -1,6 +1,7 @@
 """A frame and its bytes: where each field stands, frames from values and values from frames.
 
-In: the tree of a frame type (`spec.tree`), and bytes or values. Out: layouts, single frames parsed and built, tables of many frames.
+In: the tree of a frame type (`spec.tree`), and bytes or values. Out: layouts, single frames parsed
+and built, tables of many frames.
 Modules in reading order:
 
 * `schema`: the fields of a frame type as a table, without bytes.

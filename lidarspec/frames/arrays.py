@@ -1,4 +1,6 @@
-"""Arrays that cost next to nothing: of one value repeated, of consecutive numbers, some of the rows of another; and their memory."""
+"""Arrays that cost next to nothing: of one value repeated, of consecutive numbers, some of the rows
+of another; and their memory.
+"""
 
 from __future__ import annotations
 
@@ -17,11 +19,15 @@ KEPT = 1 << 24
 
 
 def repeated(value: int, count: int) -> NDArray[np.int64]:
-    """One value so many times, (count,), read-only; what `np.broadcast_to` gives, at a tenth of its cost."""
+    """One value so many times, (count,), read-only; what `np.broadcast_to` gives, at a tenth of its
+    cost.
+    """
     return np.ndarray((count,), np.int64, value.to_bytes(8, sys.byteorder, signed=True), 0, (0,))
 
 
-def some(values: NDArray[np.int64], which: NDArray[np.bool_] | NDArray[np.intp] | slice) -> NDArray[np.int64]:
+def some(
+    values: NDArray[np.int64], which: NDArray[np.bool_] | NDArray[np.intp] | slice
+) -> NDArray[np.int64]:
     """The values, (k,), that a mask, indices or a slice pick; equal ones stay `repeated`."""
     value = alike(values)
     if value is None or isinstance(which, slice):
@@ -30,7 +36,9 @@ def some(values: NDArray[np.int64], which: NDArray[np.bool_] | NDArray[np.intp] 
 
 
 def counted(count: int) -> NDArray[np.int64]:
-    """0, 1, 2 ... as many numbers as asked for, (count,), read-only; in the same memory each time, unless they are very many."""
+    """0, 1, 2 ... as many numbers as asked for, (count,), read-only; in the same memory each time,
+    unless they are very many.
+    """
     return _numbers()[:count] if count <= COUNTED else np.arange(count)
 
 
@@ -47,12 +55,15 @@ def _numbers() -> NDArray[np.int64]:
 
 
 def alike(values: NDArray[np.int64]) -> int | None:
-    """The value that all are, where the array itself says so, as one from `repeated` does; else None."""
+    """The value that all are, where the array itself says so, as one from `repeated` does; else
+    None.
+    """
     return values.item(0) if values.strides == (0,) and len(values) else None
 
 
 def by_value(values: NDArray[Any], few: int) -> list[tuple[int, NDArray[np.intp]]]:
-    """Each of the different values, ascending, with the indices of those that are equal to it, (k,), ascending.
+    """Each of the different values, ascending, with the indices of those that are equal to it,
+    (k,), ascending.
 
     Args:
         few: so many different ones are found one by one sooner than sorted.
@@ -69,27 +80,35 @@ def by_value(values: NDArray[Any], few: int) -> list[tuple[int, NDArray[np.intp]
     return [(ordered.item(start), order[start:stop]) for start, stop in pairwise(edges)]
 
 
-def taken(rows: NDArray[np.uint8], which: NDArray[np.intp] | NDArray[np.bool_]) -> NDArray[np.uint8]:
+def taken(
+    rows: NDArray[np.uint8], which: NDArray[np.intp] | NDArray[np.bool_]
+) -> NDArray[np.uint8]:
     """The rows of bytes that indices or a mask pick, (k, size), each copied as one piece."""
     whole = rows.view(f"V{rows.shape[1]}")[:, 0]
-    some = whole.take(which) if which.dtype != np.bool_ and rows.flags.c_contiguous else whole[which]
+    some = (
+        whole.take(which) if which.dtype != np.bool_ and rows.flags.c_contiguous else whole[which]
+    )
     return some.view(np.uint8).reshape(-1, rows.shape[1])
 
 
 @lru_cache(maxsize=1)
 def keep_freed_memory() -> None:
-    """Lets the allocator keep freed blocks, 32 MiB of them at most, from the first work on large batches on.
+    """Lets the allocator keep freed blocks, 32 MiB of them at most, from the first work on large
+    batches on.
 
-    The columns of a batch are blocks of some hundred kilobytes that live for milliseconds. glibc takes such blocks from the
-    system and gives them back, page by page, and fetching the pages anew costs several times what computing the columns
-    costs. It stops doing so for blocks smaller than the largest one that was ever freed, so one is: it is never touched,
-    and takes no memory.
+    The columns of a batch are blocks of some hundred kilobytes that live for milliseconds. glibc
+    takes such blocks from the system and gives them back, page by page, and fetching the pages anew
+    costs several times what computing the columns costs. It stops doing so for blocks smaller than
+    the largest one that was ever freed, so one is: it is never touched, and takes no memory.
 
-    Source: mallopt(3), M_MMAP_THRESHOLD: the threshold is adjusted dynamically, and M_TRIM_THRESHOLD to twice its value.
+    Source: mallopt(3), M_MMAP_THRESHOLD: the threshold is adjusted dynamically, and
+    M_TRIM_THRESHOLD to twice its value.
     """
     np.empty(KEPT, np.uint8)
 
 
 def deep(array: NDArray[Any], depth: int) -> NDArray[Any]:
-    """Values of packets, (n, ...), with axes of length 1 behind them, up to `depth` behind the first."""
+    """Values of packets, (n, ...), with axes of length 1 behind them, up to `depth` behind the
+    first.
+    """
     return array.reshape(*array.shape, *(1,) * (depth + 1 - array.ndim))

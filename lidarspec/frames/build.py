@@ -1,4 +1,6 @@
-"""One frame from values: counts filled in, units turned into raw steps, faults of the caller named by field."""
+"""One frame from values: counts filled in, units turned into raw steps, faults of the caller named
+by field.
+"""
 
 from __future__ import annotations
 
@@ -15,7 +17,16 @@ import construct
 import numpy as np
 from construct import Container
 
-from lidarspec.errors import LidarSpecError, MissingField, OutOfRange, SpecError, UnknownCommand, UnknownField, UnknownFrame, UsageError
+from lidarspec.errors import (
+    LidarSpecError,
+    MissingField,
+    OutOfRange,
+    SpecError,
+    UnknownCommand,
+    UnknownField,
+    UnknownFrame,
+    UsageError,
+)
 from lidarspec.frames.layout import Layout
 from lidarspec.frames.layout_tree import TooLong, Unknown, layout_of
 from lidarspec.frames.schema import Schema, schema
@@ -23,9 +34,24 @@ from lidarspec.frames.slots import SPELLING, Recoder, recoder
 from lidarspec.spec.arguments import Address, Count, Filled, Range, Taken
 from lidarspec.spec.description import Spec
 from lidarspec.spec.syntax import Mismatch, WireNaN, field_path, member, seen
-from lidarspec.spec.tree import Blob, FieldInfo, Formula, Kind, Node, Number, Parts, Read, Sealed, Struct, evaluated, nodes, refs
+from lidarspec.spec.tree import (
+    Blob,
+    FieldInfo,
+    Formula,
+    Kind,
+    Node,
+    Number,
+    Parts,
+    Read,
+    Sealed,
+    Struct,
+    evaluated,
+    nodes,
+    refs,
+)
 
-#: how often a frame is built until its lengths agree: once more where it has any, and again where these themselves have no fixed length.
+#: how often a frame is built until its lengths agree: once more where it has any, and again where
+#: these themselves have no fixed length.
 RETRIES = 4
 #: The largest value that is tried for a field that counts.
 LARGEST_TRIED = 65535
@@ -34,11 +60,14 @@ LARGEST_TRIED = 65535
 Steps = list[int | str]
 
 
-def build(sensor: Spec, frame: str, value: Any, values: Mapping[str, Any], *, units: bool = False) -> bytes:
+def build(
+    sensor: Spec, frame: str, value: Any, values: Mapping[str, Any], *, units: bool = False
+) -> bytes:
     """The bytes of one frame; constants, counts and the checksum are filled in.
 
     Args:
-        value: a mapping of all fields, such as what `parse` returned, or None; `values` override it.
+        value: a mapping of all fields, such as what `parse` returned, or None; `values` override
+            it.
         units: take physical values, and round them to the wire's steps.
 
     Raises:
@@ -55,7 +84,11 @@ def build(sensor: Spec, frame: str, value: Any, values: Mapping[str, Any], *, un
         _fill(tree, given, sensor.frames[frame].room)
         data = _built(sensor.frames[frame].prepared, given)
         recoding = recoder(sensor.frames[frame])
-        return data if recoding is None else _written(recoding, data, (value or {}).get(SPELLING), place)
+        return (
+            data
+            if recoding is None
+            else _written(recoding, data, (value or {}).get(SPELLING), place)
+        )
     except Mismatch as fault:
         raise _usage(fault, place) from None
     except construct.ConstructError as fault:
@@ -64,11 +97,17 @@ def build(sensor: Spec, frame: str, value: Any, values: Mapping[str, Any], *, un
     except LidarSpecError:
         raise
     except Exception as fault:
-        raise SpecError(f"an expression of the struct failed: {type(fault).__name__}: {fault}", path=frame, sensor=sensor.id) from fault
+        raise SpecError(
+            f"an expression of the struct failed: {type(fault).__name__}: {fault}",
+            path=frame,
+            sensor=sensor.id,
+        ) from fault
 
 
 def _built(con: Any, given: Container) -> bytes:
-    """The bytes of a frame, built once more where fields say how long parts are, which is seen when these are built."""
+    """The bytes of a frame, built once more where fields say how long parts are, which is seen when
+    these are built.
+    """
     sizes, data = dict[str, int](), b""
     for _ in range(RETRIES):
         known = dict(sizes)
@@ -84,13 +123,22 @@ def _written(recoding: Recoder, row: bytes, spelling: object, place: str) -> byt
     Raises:
         UsageError: for values that its form cannot write.
     """
-    if isinstance(spelling, bytes) and (known := recoding.row(spelling)) is not None and known[1] == row:
+    if (
+        isinstance(spelling, bytes)
+        and (known := recoding.row(spelling)) is not None
+        and known[1] == row
+    ):
         return spelling
     layout = recoding.tree.layout(row)
-    data = recoding.written(np.frombuffer(row, np.uint8).reshape(1, -1), layout)[0] if isinstance(layout, Layout) else None
+    data = (
+        recoding.written(np.frombuffer(row, np.uint8).reshape(1, -1), layout)[0]
+        if isinstance(layout, Layout)
+        else None
+    )
     if data is None:
         raise UsageError(
-            f"{place}: {recoding.form} cannot write these values: a number is too large for its digits, or a text has a mark in it"
+            f"{place}: {recoding.form} cannot write these values: a number is too large for its"
+            " digits, or a text has a mark in it"
         )
     return data
 
@@ -108,13 +156,22 @@ def _usage(fault: Mismatch, place: str) -> UsageError:
 def _fields(tree: Node) -> tuple[Schema, frozenset[str]]:
     """The fields of a frame type, and the paths of these and of all that holds them."""
     table = schema(tree)
-    named = {f"{node.path}.{member.name}".strip(".") for node in nodes(tree) if isinstance(node, Struct) for member in node.members}
+    named = {
+        f"{node.path}.{member.name}".strip(".")
+        for node in nodes(tree)
+        if isinstance(node, Struct)
+        for member in node.members
+    }
     parts = [path.split(".") for path in {*table.all_fields, *table.arrays, *named}]
-    return table, frozenset(".".join(names[:depth]) for names in parts for depth in range(len(names) + 1))
+    return table, frozenset(
+        ".".join(names[:depth]) for names in parts for depth in range(len(names) + 1)
+    )
 
 
 class _Values:
-    """The caller's values checked against the fields: names, ranges, and units where they are physical."""
+    """The caller's values checked against the fields: names, ranges, and units where they are
+    physical.
+    """
 
     def __init__(self, table: Schema, known: frozenset[str], place: str, *, units: bool) -> None:
         self._table, self._known, self._place, self._units = table, known, place, units
@@ -130,7 +187,10 @@ class _Values:
         if isinstance(value, np.ndarray):
             value = value.tolist()
         if isinstance(value, list | tuple):
-            found = [self.checked(element, path, f"{shown}[{index}]") for index, element in enumerate(value)]
+            found = [
+                self.checked(element, path, f"{shown}[{index}]")
+                for index, element in enumerate(value)
+            ]
             return self._bytes(found, shown) if info is not None and info.kind == "bytes" else found
         return value if info is None or value is None else self._number(info, value, shown)
 
@@ -141,18 +201,24 @@ class _Values:
                 continue
             below = f"{path}.{name}" if path else name
             if below not in self._known:
-                raise UnknownField(below, [known for known in self._known if known], place=self._place)
+                raise UnknownField(
+                    below, [known for known in self._known if known], place=self._place
+                )
             found[name] = self.checked(element, below, f"{shown}.{name}" if shown else name)
         return found
 
     def _bytes(self, found: list[Any], shown: str) -> bytes | list[Any]:
-        """Numbers as a byte string; an array of byte strings, or of what another branch has there, stays one."""
+        """Numbers as a byte string; an array of byte strings, or of what another branch has there,
+        stays one.
+        """
         if not any(isinstance(part, int | str) for part in found):
             return found
         try:
             return bytes(found)
         except (TypeError, ValueError):
-            raise UsageError(f"{self._place}: {shown} takes bytes, or numbers from 0 to 255, not {found!r:.60}") from None
+            raise UsageError(
+                f"{self._place}: {shown} takes bytes, or numbers from 0 to 255, not {found!r:.60}"
+            ) from None
 
     def _number(self, info: FieldInfo, value: Any, shown: str) -> Any:
         if isinstance(value, np.generic):
@@ -160,12 +226,21 @@ class _Values:
         if isinstance(value, str | WireNaN | bytes):
             return value
         if info.kind not in ("int", "float"):
-            return info.raw(value) if self._units and info.scaled and isinstance(value, int | float) else value
+            return (
+                info.raw(value)
+                if self._units and info.scaled and isinstance(value, int | float)
+                else value
+            )
         if info.kind == "float":
             raw = info.raw(value) if self._units else value
             return raw if isinstance(raw, int) else float(raw)
-        if isinstance(value, float) and (not np.isfinite(value) or (not self._units and value != int(value))):
-            raise UsageError(f"{self._place}: {shown} = {value} is not a raw integer; pass units=True for physical values")
+        if isinstance(value, float) and (
+            not np.isfinite(value) or (not self._units and value != int(value))
+        ):
+            raise UsageError(
+                f"{self._place}: {shown} = {value} is not a raw integer; pass units=True for"
+                " physical values"
+            )
         raw = info.raw(value) if self._units else int(value)
         low, high = info.limits
         if not low <= raw <= high:
@@ -175,7 +250,9 @@ class _Values:
 
 
 def _fill(root: Node, given: Container, limit: int) -> dict[str, int]:
-    """Add what follows from the values of a frame, or of a part: counts, constants, the sizes of parts; the bytes of these, by path."""
+    """Add what follows from the values of a frame, or of a part: counts, constants, the sizes of
+    parts; the bytes of these, by path.
+    """
     table = schema(root)
     _fill_counts(given, table)
     _open(root, given, given)
@@ -188,28 +265,42 @@ def _fill(root: Node, given: Container, limit: int) -> dict[str, int]:
 
 
 def _fill_parts(node: Parts, given: Container, table: Schema, limit: int) -> list[int] | None:
-    """Fill in parts, and what says how many there are and how long; their sizes, None where they are not given as they have to be."""
+    """Fill in parts, and what says how many there are and how long; their sizes, None where they
+    are not given as they have to be.
+    """
     parts, sizes = member(given, node.axis, None), list[int]()
     if not isinstance(parts, list) or not all(isinstance(part, dict) for part in parts):
         return None  # construct says what is wrong
     kinds = [kind_of(node, part) for part in parts]
-    around = {ref.path: value[1] for ref in node.outer if isinstance(value := given_value(given, table.fields, ref.path), tuple)}
+    around = {
+        ref.path: value[1]
+        for ref in node.outer
+        if isinstance(value := given_value(given, table.fields, ref.path), tuple)
+    }
     for kind, part in zip(kinds, parts, strict=True):
         totals = _fill(kind.root, part, limit)
         sizes.append(_size_of(kind.root, part, limit, totals, around))
     for kind, part, after in zip(kinds, parts, [*sizes[1:], 0], strict=False):
         fill_in(kind.following, part, after, schema(kind.root).fields, node.axis)
-    for formula, number in ((node.count, len(parts)), (node.size, (sizes or [0])[0]), (node.within, sum(sizes))):
+    for formula, number in (
+        (node.count, len(parts)),
+        (node.size, (sizes or [0])[0]),
+        (node.within, sum(sizes)),
+    ):
         fill_in(formula, given, number, table.fields, node.axis)
     return sizes
 
 
 def kind_of(node: Parts, part: Mapping[str, Any]) -> Kind:
-    """The kind of a part that is given by its values: the first that has all fields of these, and no other constant; else the first."""
+    """The kind of a part that is given by its values: the first that has all fields of these, and
+    no other constant; else the first.
+    """
 
     def fits(kind: Kind) -> bool:
         fields, names = _fields(kind.root)
-        given = ((info, part.get(path)) for path, info in fields.fields.items() if info.const is not None)
+        given = (
+            (info, part.get(path)) for path, info in fields.fields.items() if info.const is not None
+        )
         return part.keys() <= {*names, *fields.parts} and all(
             value in (None, info.const, info.labels.get(info.const)) for info, value in given
         )
@@ -217,7 +308,9 @@ def kind_of(node: Parts, part: Mapping[str, Any]) -> Kind:
     return next(filter(fits, node.kinds), node.kinds[0])
 
 
-def _size_of(root: Node, part: Container, limit: int, totals: Mapping[str, int], around: Mapping[str, int]) -> int:
+def _size_of(
+    root: Node, part: Container, limit: int, totals: Mapping[str, int], around: Mapping[str, int]
+) -> int:
     """The bytes of a part with these values, by its layout.
 
     Raises:
@@ -230,17 +323,33 @@ def _size_of(root: Node, part: Container, limit: int, totals: Mapping[str, int],
             return layout_of(root, values, limit, around).size
         except Unknown as unknown:
             path = unknown.leaf.info.path
-            found = given_value(part, fields, path) if member(part, path, None) is not None else None
+            found = (
+                given_value(part, fields, path) if member(part, path, None) is not None else None
+            )
             if not isinstance(found, tuple):
                 raise MissingField(path) from None
             values[path] = int(found[1])
         except TooLong:
-            raise UsageError(f"a part is longer than the {limit} bytes that a frame has at most") from None
+            raise UsageError(
+                f"a part is longer than the {limit} bytes that a frame has at most"
+            ) from None
 
 
-def fill_in(formula: Formula | None, given: Container, value: int, fields: Mapping[str, FieldInfo], axis: str) -> None:
-    """Set the field that a formula depends on, where it is left out, so that the formula gives a value."""
-    asked = () if formula is None else tuple(ref for ref in refs(formula) if ref.path in fields and "[" not in ref.path)
+def fill_in(
+    formula: Formula | None,
+    given: Container,
+    value: int,
+    fields: Mapping[str, FieldInfo],
+    axis: str,
+) -> None:
+    """Set the field that a formula depends on, where it is left out, so that the formula gives a
+    value.
+    """
+    asked = (
+        ()
+        if formula is None
+        else tuple(ref for ref in refs(formula) if ref.path in fields and "[" not in ref.path)
+    )
     if formula is None or not asked:
         return
     holder, name = _place(given, asked[0].path)
@@ -250,7 +359,9 @@ def fill_in(formula: Formula | None, given: Container, value: int, fields: Mappi
 
 
 def _open(node: Node, given: Any, values: Container) -> None:
-    """Add to the values of a part (`given`, of all `values`) the constants, and a place for each checksum, which is filled in later."""
+    """Add to the values of a part (`given`, of all `values`) the constants, and a place for each
+    checksum, which is filled in later.
+    """
     match node:
         case Sealed():
             _open(node.body, given, values)
@@ -261,7 +372,11 @@ def _open(node: Node, given: Any, values: Container) -> None:
             for member in node.members:
                 if isinstance(member, Struct | Sealed) and isinstance(given.get(member.name), dict):
                     _open(member, given[member.name], values)
-                elif isinstance(member, Number | Blob) and member.name and member.info.const is not None:
+                elif (
+                    isinstance(member, Number | Blob)
+                    and member.name
+                    and member.info.const is not None
+                ):
                     given.setdefault(member.name, seen(member.info, member.info.const))
 
 
@@ -273,7 +388,9 @@ def _fill_counts(given: Container, table: Schema) -> None:
             fill_in(count, given, len(array), table.fields, axis)
 
 
-def given_value(given: Mapping[str, Any], fields: Mapping[str, FieldInfo], path: str) -> tuple[FieldInfo, Any] | str | None:
+def given_value(
+    given: Mapping[str, Any], fields: Mapping[str, FieldInfo], path: str
+) -> tuple[FieldInfo, Any] | str | None:
     """A value that is given for a frame, as formulas read it (`lidarspec.spec.tree.Read`).
 
     Raises:
@@ -285,7 +402,11 @@ def given_value(given: Mapping[str, Any], fields: Mapping[str, FieldInfo], path:
     if isinstance(value, Mapping) or path not in fields:
         return path
     info = fields[path]
-    raw = next((raw for raw, name in info.labels.items() if name == value), value) if isinstance(value, str) else value
+    raw = (
+        next((raw for raw, name in info.labels.items() if name == value), value)
+        if isinstance(value, str)
+        else value
+    )
     return None if value is None else (info, raw)
 
 
@@ -293,7 +414,8 @@ def build_command(sensor: Spec, name: str, arguments: Mapping[str, Any]) -> byte
     """The bytes of a command, none for one that only moves lines.
 
     Args:
-        arguments: by name, in the units of their fields; a value that is found out when it is sent by its path.
+        arguments: by name, in the units of their fields; a value that is found out when it is sent
+            by its path.
 
     Raises:
         UnknownCommand: for a command that the sensor does not have.
@@ -310,19 +432,29 @@ def build_command(sensor: Spec, name: str, arguments: Mapping[str, Any]) -> byte
         return b""
     values: Any = {}
     for path, value in command.values.items():
-        filled = _found_out(sensor, name, path, value, arguments.get(path)) if path in command.filled else copy.deepcopy(value)
+        filled = (
+            _found_out(sensor, name, path, value, arguments.get(path))
+            if path in command.filled
+            else copy.deepcopy(value)
+        )
         values = put(values, steps(path), filled)
     for argument, declared in command.arguments.items():
         slot = argument_slot(sensor, name, argument)
         if argument not in arguments:
             raise MissingField(argument, place=place)
-        values = put(values, steps(declared.path), raw_argument(slot, declared.kind, arguments[argument], argument, place))
+        values = put(
+            values,
+            steps(declared.path),
+            raw_argument(slot, declared.kind, arguments[argument], argument, place),
+        )
     return build(sensor, command.frame, None, values)
 
 
 @dataclass(frozen=True)
 class Slot:
-    """Where an argument goes: its field; and how many bytes, or numbers of an array, there are for it, None where that varies."""
+    """Where an argument goes: its field; and how many bytes, or numbers of an array, there are for
+    it, None where that varies.
+    """
 
     info: FieldInfo
     room: int | None
@@ -337,31 +469,65 @@ def argument_slot(sensor: Spec, name: str, argument: str) -> Slot:
     """
     declared, place = sensor.commands[name].arguments[argument], f"commands.{name}.args.{argument}"
     slot = _slot(sensor, name, declared.path, place)
-    takes = {"int", "float"} if isinstance(declared.kind, Range) else {"bytes", "other"} | ({"int"} if slot.is_array else set())
+    takes = (
+        {"int", "float"}
+        if isinstance(declared.kind, Range)
+        else {"bytes", "other"} | ({"int"} if slot.is_array else set())
+    )
     takes |= {"int"} if isinstance(declared.kind, Address) else set()
     if slot.info.kind not in takes or (slot.is_array and isinstance(declared.kind, Range)):
-        what = f"an array, of which an element is {declared.path}[0]" if slot.is_array else f"a field of kind {slot.info.kind!r}"
-        raise SpecError(f"{type(declared.kind).__name__} cannot stand in {declared.path!r}, which is {what}", path=place, sensor=sensor.id)
+        what = (
+            f"an array, of which an element is {declared.path}[0]"
+            if slot.is_array
+            else f"a field of kind {slot.info.kind!r}"
+        )
+        raise SpecError(
+            f"{type(declared.kind).__name__} cannot stand in {declared.path!r}, which is {what}",
+            path=place,
+            sensor=sensor.id,
+        )
     return slot
 
 
 def _slot(sensor: Spec, name: str, path: str, place: str) -> Slot:
     frame, names = sensor.commands[name].frame or "", steps(path)
     table = schema(sensor.frames[frame].tree) if frame else None
-    info = table.all_fields.get(".".join(step for step in names if isinstance(step, str))) if table is not None else None
+    info = (
+        table.all_fields.get(".".join(step for step in names if isinstance(step, str)))
+        if table is not None
+        else None
+    )
     if table is None or info is None:
-        raise SpecError(f"{frame or 'a command without a frame'} has no field {path!r}", path=place, sensor=sensor.id)
+        raise SpecError(
+            f"{frame or 'a command without a frame'} has no field {path!r}",
+            path=place,
+            sensor=sensor.id,
+        )
     arrays = dict(table.arrays)
     for axis, node in table.parts.items():
-        arrays |= {f"{axis}.{below}": count for kind in node.kinds for below, count in schema(kind.root).arrays.items()}
-    indices, counts = [step for step in names if isinstance(step, int)], [arrays.get(axis) for axis in info.axes]
+        arrays |= {
+            f"{axis}.{below}": count
+            for kind in node.kinds
+            for below, count in schema(kind.root).arrays.items()
+        }
+    indices, counts = (
+        [step for step in names if isinstance(step, int)],
+        [arrays.get(axis) for axis in info.axes],
+    )
     left = counts[len(indices) :]
     if len(left) > 1 or len(indices) > len(counts) - (info.kind == "bytes"):
-        reason = f"{path!r} names {len(indices)} elements of the {len(counts) - (info.kind == 'bytes')} arrays that its field is in"
+        reason = (
+            f"{path!r} names {len(indices)} elements of the {len(counts) - (info.kind == 'bytes')}"
+            " arrays that its field is in"
+        )
         raise SpecError(reason, path=place, sensor=sensor.id)
     for index, count in zip(indices, counts, strict=False):
         if isinstance(count, int) and index >= count:
-            raise SpecError(f"{path!r}: there are {count} elements, of which {index} is none", path=place, sensor=sensor.id)
+            raise SpecError(
+                f"{path!r}: there are {count} elements, of which {index} is none",
+                path=place,
+                sensor=sensor.id,
+            )
     room = left[0] if left else info.bits // 8 if info.kind == "int" else None
     return Slot(info, room if isinstance(room, int) else None, bool(left) and info.kind != "bytes")
 
@@ -384,23 +550,39 @@ def raw_argument(slot: Slot, kind: Taken, value: Any, argument: str, place: str)
     try:
         data = kind.packed(value, slot.room)
     except ValueError:
-        raise UsageError(f"{place}: {argument} is {kind.words(slot.room)}, not {value!r:.60}") from None
+        raise UsageError(
+            f"{place}: {argument} is {kind.words(slot.room)}, not {value!r:.60}"
+        ) from None
     if info.kind == "other":
         return data if isinstance(value, bytes) else str(value)
     return _placed(slot, data)
 
 
 def _placed(slot: Slot, data: bytes) -> Any:
-    """Bytes as the raw value of a field that is plain bytes, an array of numbers, or one number in network order."""
-    return data if slot.info.kind == "bytes" else list(data) if slot.is_array else int.from_bytes(data, "big")
+    """Bytes as the raw value of a field that is plain bytes, an array of numbers, or one number in
+    network order.
+    """
+    return (
+        data
+        if slot.info.kind == "bytes"
+        else list(data)
+        if slot.is_array
+        else int.from_bytes(data, "big")
+    )
 
 
 def _found_out(sensor: Spec, name: str, path: str, value: Filled, given: Any) -> Any:
-    """A value that is found out when a command is sent; where nobody says it, the first number, and no address."""
+    """A value that is found out when a command is sent; where nobody says it, the first number, and
+    no address.
+    """
     if isinstance(value, Count):
         return value.first if given is None else given
     slot = _slot(sensor, name, path, f"commands.{name}.values.{path}")
-    return _placed(slot, bytes(slot.room or 4)) if given is None else raw_argument(slot, value, given, path, f"{sensor.id} {name}")
+    return (
+        _placed(slot, bytes(slot.room or 4))
+        if given is None
+        else raw_argument(slot, value, given, path, f"{sensor.id} {name}")
+    )
 
 
 def is_index(step: int | str) -> bool:
@@ -413,36 +595,65 @@ def steps(path: str) -> Steps:
     return [int(step) if step.isdigit() else step for step in re.findall(r"\w+|\*", path)]
 
 
-def put(target: Any, path: Steps, value: Any, length: Callable[[str], int] = lambda array: 0, place: str = "") -> Any:
+def put(
+    target: Any,
+    path: Steps,
+    value: Any,
+    length: Callable[[str], int] = lambda array: 0,
+    place: str = "",
+) -> Any:
     """A struct or array, or a new one for None, with a value set in it.
 
     Args:
-        length: how many elements the array of a path has, where that is known; "*" stands for each of them.
+        length: how many elements the array of a path has, where that is known; "*" stands for each
+            of them.
     """
     if not path:
         return value
     step, *rest = path
     if not is_index(step):
         target = {} if target is None else target
-        target[step] = put(target.get(step), rest, value, length, f"{place.removesuffix('[]')}.{step}".removeprefix("."))
+        target[step] = put(
+            target.get(step),
+            rest,
+            value,
+            length,
+            f"{place.removesuffix('[]')}.{step}".removeprefix("."),
+        )
         return target
     target = [] if target is None else list(target)
     for index in range(length(place) or len(target)) if step == "*" else [int(step)]:
         target.extend([None] * (index + 1 - len(target)))
         element = target[index]
-        target[index] = put(dict(element) if isinstance(element, dict) else element, rest, value, length, f"{place}[]")
+        target[index] = put(
+            dict(element) if isinstance(element, dict) else element,
+            rest,
+            value,
+            length,
+            f"{place}[]",
+        )
     return target
 
 
 def _place(values: Any, path: str) -> tuple[Any, str]:
-    """Which of nested mappings holds a field, and under which name; those on the way are made where they are not there."""
+    """Which of nested mappings holds a field, and under which name; those on the way are made where
+    they are not there.
+    """
     *parents, last = path.split(".")
     for parent in parents:
         values = values.setdefault(parent, Container())
     return values, last
 
 
-def _find_count(count: Formula, read: Read, holder: Container, field: str, length: int, info: FieldInfo, axis: str) -> int:
+def _find_count(
+    count: Formula,
+    read: Read,
+    holder: Container,
+    field: str,
+    length: int,
+    info: FieldInfo,
+    axis: str,
+) -> int:
     """Return the value of the count field that gives this length, and leave it in its holder."""
     top = int(info.limits[1]) if info.kind == "int" else LARGEST_TRIED
 

@@ -1,4 +1,6 @@
-"""What has no computable place, whatever the header: told before any bytes arrive, and the frame is then interpreted by construct."""
+"""What has no computable place, whatever the header: told before any bytes arrive, and the frame is
+then interpreted by construct.
+"""
 
 from __future__ import annotations
 
@@ -15,7 +17,9 @@ class NotCompilable(Exception):
 
 
 def check_compilable(root: tree.Node) -> None:
-    """Raise `NotCompilable` if any part of a tree has no computable place, whatever the header, or values that no column holds."""
+    """Raise `NotCompilable` if any part of a tree has no computable place, whatever the header, or
+    values that no column holds.
+    """
     _check(root, "", in_array=False)
     _check_columns(root)
 
@@ -63,12 +67,18 @@ def _check_columns(root: tree.Node) -> None:
     for info in schema(root).fields.values():
         if info.dtype is None:
             wide = f"its {info.bits} bits are more than a column holds"
-            raise NotCompilable(info.path, wide if info.bits > 64 else "its values are not all plain numbers of one kind")
+            raise NotCompilable(
+                info.path,
+                wide if info.bits > 64 else "its values are not all plain numbers of one kind",
+            )
 
 
 def check_control(info: tree.FieldInfo) -> None:
     """Raise `NotCompilable` if a layout cannot be made to depend on a field."""
     if info.kind == "int" and info.axes and info.axes[-1].strip("[]") != info.path:
-        raise NotCompilable(info.path, "elements of one array differ in layout: Parts(struct, count) reads such in bulk")
+        raise NotCompilable(
+            info.path,
+            "elements of one array differ in layout: Parts(struct, count) reads such in bulk",
+        )
     if info.axes or info.kind != "int":
         raise NotCompilable(info.path, "the layout depends on a field that is not one integer")

@@ -1,9 +1,11 @@
 """Frames of one type as columns of raw values, in stream order.
 
-Two kinds with one behaviour: `Rows` loads fields from bytes by their layout, `Records` collects them from what
-construct parsed. Arrays of variable length are padded to the longest with zeros; `counts` has the lengths.
+Two kinds with one behaviour: `Rows` loads fields from bytes by their layout, `Records` collects
+them from what construct parsed. Arrays of variable length are padded to the longest with zeros;
+`counts` has the lengths.
 
-Parts, which are frames within a frame, are a table of their own, without padding, with the row of their frame for each.
+Parts, which are frames within a frame, are a table of their own, without padding, with the row of
+their frame for each.
 """
 
 from __future__ import annotations
@@ -32,10 +34,14 @@ class Table(Protocol):
 
     def __len__(self) -> int: ...
     def raw(self, path: str) -> NDArray[Any]:
-        """Raw values, shape (n, *lengths of its axes), native byte order; 0 where a frame lacks the field or element."""
+        """Raw values, shape (n, *lengths of its axes), native byte order; 0 where a frame lacks the
+        field or element.
+        """
 
     def present(self, path: str) -> NDArray[np.bool_] | None:
-        """Which frames have the field, (n,), or which elements, where not all elements of a frame have it; None where all have."""
+        """Which frames have the field, (n,), or which elements, where not all elements of a frame
+        have it; None where all have.
+        """
 
     def counts(self, axis: str) -> NDArray[np.intp]:
         """The length of an array in each frame, (n,)."""
@@ -83,7 +89,9 @@ class Rows:
         assert info.dtype is not None
         around = self.schema.fields[without_indices(path)[0]].axes if "[" in path else info.axes
         only = self.groups[0].layout.leaves.get(path) if len(self.groups) == 1 else None
-        if only is not None and 0 not in only.shape:  # arrays in an empty one have no length, whatever their count says
+        if (
+            only is not None and 0 not in only.shape
+        ):  # arrays in an empty one have no length, whatever their count says
             values = _loaded(only, around, self.groups[0].rows)
             if self._order is None:
                 self._order = _order(self.groups[0].where)
@@ -104,7 +112,9 @@ class Rows:
             return None
         there = np.zeros(len(self), np.bool_)
         for group in self.groups:
-            is_empty = any(group.layout.lengths.get(axis) == 0 for axis in self.schema.fields[path].axes)
+            is_empty = any(
+                group.layout.lengths.get(axis) == 0 for axis in self.schema.fields[path].axes
+            )
             there[group.where] = is_empty or path in group.layout.leaves
         return there
 
@@ -138,10 +148,18 @@ class Rows:
         raise IndexError(index)
 
     def take(self, which: NDArray[np.intp]) -> Rows:
-        if len(self.groups) == 1 and len(which) and which[-1] - which[0] == len(which) - 1 and ascends(which):
+        if (
+            len(self.groups) == 1
+            and len(which)
+            and which[-1] - which[0] == len(which) - 1
+            and ascends(which)
+        ):
             only = self.groups[0]
             if ascends(only.where):
-                return Rows(self.schema, [Group(only.layout, counted(len(which)), only.rows[which[0] : which[-1] + 1])])
+                return Rows(
+                    self.schema,
+                    [Group(only.layout, counted(len(which)), only.rows[which[0] : which[-1] + 1])],
+                )
         place = np.full(len(self), -1, np.intp)
         place[which] = np.arange(len(which))
         groups = []
@@ -152,10 +170,16 @@ class Rows:
         return Rows(self.schema, groups)
 
     def walks(self, axis: str) -> list[tuple[Group, NDArray[np.uint8], Walked]]:
-        """The groups that have these parts, each with the buffer that its rows are of, and the parts in that; walked through once."""
+        """The groups that have these parts, each with the buffer that its rows are of, and the
+        parts in that; walked through once.
+        """
         if axis not in self._walks:  # the clock, the points and each kind of parts ask for them
             regions = ((group, group.layout.regions.get(axis)) for group in self.groups)
-            self._walks[axis] = [(group, *region.in_rows(group.rows)) for group, region in regions if region is not None]
+            self._walks[axis] = [
+                (group, *region.in_rows(group.rows))
+                for group, region in regions
+                if region is not None
+            ]
         return self._walks[axis]
 
     def parts(self, axis: str, kind: str = "") -> tuple[Rows, NDArray[np.intp]]:
@@ -164,7 +188,10 @@ class Rows:
         found = list[_Piece]()
         for group, buffer, walked in self.walks(axis):
             rounds = (piece for pieces in walked.rounds for piece in pieces if piece.kind == wanted)
-            found += [_Piece(buffer, piece.layout, piece.spots, group.where[piece.owners]) for piece in rounds]
+            found += [
+                _Piece(buffer, piece.layout, piece.spots, group.where[piece.owners])
+                for piece in rounds
+            ]
         counts = np.zeros(len(self), np.intp)
         for piece in found:
             counts[piece.frames] += 1
@@ -172,35 +199,54 @@ class Rows:
         for piece in found:  # round after round: in each a frame has one part at most
             ranks.append(following[piece.frames])
             following[piece.frames] += 1
-        return Rows(schema(node.kinds[wanted].root), _by_layout(found, ranks)), np.repeat(np.arange(len(self)), counts)
+        return Rows(schema(node.kinds[wanted].root), _by_layout(found, ranks)), np.repeat(
+            np.arange(len(self)), counts
+        )
 
     @staticmethod
     def joined(tables: Sequence[Rows]) -> Rows:
         """Several tables of one frame type, one after another."""
         alone = [table.groups[0] for table in tables if len(table.groups) == 1]
-        if len(alone) == len(tables) and len({id(group.layout) for group in alone}) == 1 and all(ascends(group.where) for group in alone):
+        if (
+            len(alone) == len(tables)
+            and len({id(group.layout) for group in alone}) == 1
+            and all(ascends(group.where) for group in alone)
+        ):
             rows = _stacked([group.rows for group in alone])
             return Rows(tables[0].schema, [Group(alone[0].layout, counted(len(rows)), rows)])
         found: dict[int, list[Group]] = {}
         start = 0
         for table in tables:
             for group in table.groups:
-                found.setdefault(id(group.layout), []).append(Group(group.layout, group.where + start, group.rows))
+                found.setdefault(id(group.layout), []).append(
+                    Group(group.layout, group.where + start, group.rows)
+                )
             start += len(table)
         return Rows(tables[0].schema, [_merged(groups) for groups in found.values()])
 
 
 def _loaded(leaf: Leaf, around: Sequence[str], rows: Bytes2D) -> NDArray[Any]:
-    """Raw values without the axes of which only one element is asked for; `around`: the arrays that the field is in."""
+    """Raw values without the axes of which only one element is asked for; `around`: the arrays that
+    the field is in.
+    """
     values = leaf.load(rows)
     if len(around) == len(leaf.info.axes):
         return values
-    return values.reshape(len(rows), *(length for axis, length in zip(around, leaf.shape, strict=False) if axis in leaf.info.axes))
+    return values.reshape(
+        len(rows),
+        *(
+            length
+            for axis, length in zip(around, leaf.shape, strict=False)
+            if axis in leaf.info.axes
+        ),
+    )
 
 
 @dataclass(frozen=True, eq=False)
 class _Piece:
-    """Parts of one layout that were found in one round: the bytes around them, where in these they begin, and their frames, (k,)."""
+    """Parts of one layout that were found in one round: the bytes around them, where in these they
+    begin, and their frames, (k,).
+    """
 
     buffer: NDArray[np.uint8]
     layout: Layout
@@ -209,39 +255,69 @@ class _Piece:
 
 
 def _by_layout(pieces: Sequence[_Piece], ranks: Sequence[NDArray[np.intp]]) -> list[Group]:
-    """Parts as groups, their rows in stream order; `ranks`: the places of those of each piece in that."""
+    """Parts as groups, their rows in stream order; `ranks`: the places of those of each piece in
+    that.
+    """
     members: dict[int, dict[int, list[tuple[_Piece, NDArray[np.intp]]]]] = {}
     for piece, own in zip(pieces, ranks, strict=True):
-        members.setdefault(id(piece.layout), {}).setdefault(id(piece.buffer), []).append((piece, own))
-    return [_merged([_gathered(parts) for parts in buffers.values()]) for buffers in members.values()]
+        members.setdefault(id(piece.layout), {}).setdefault(id(piece.buffer), []).append(
+            (piece, own)
+        )
+    return [
+        _merged([_gathered(parts) for parts in buffers.values()]) for buffers in members.values()
+    ]
 
 
 def _gathered(parts: Sequence[tuple[_Piece, NDArray[np.intp]]]) -> Group:
     """Parts of one layout in one buffer as a group."""
-    where, spots = (np.concatenate(arrays) for arrays in zip(*((own, piece.spots) for piece, own in parts), strict=True))
+    where, spots = (
+        np.concatenate(arrays)
+        for arrays in zip(*((own, piece.spots) for piece, own in parts), strict=True)
+    )
     order, (first, _) = np.empty(len(where), np.intp), parts[0]
     if len(where) and where.max() == len(where) - 1:  # these are all: no need to sort
         order[where] = np.arange(len(where))
     else:
         order = np.argsort(where)
-    return Group(first.layout, where[order], rows_at(first.buffer, spots[order], first.layout.size, gathered=False))
+    return Group(
+        first.layout,
+        where[order],
+        rows_at(first.buffer, spots[order], first.layout.size, gathered=False),
+    )
 
 
 def _merged(groups: list[Group]) -> Group:
     if len(groups) == 1:
         return groups[0]
-    return Group(groups[0].layout, np.concatenate([g.where for g in groups]), _stacked([g.rows for g in groups]))
+    return Group(
+        groups[0].layout,
+        np.concatenate([g.where for g in groups]),
+        _stacked([g.rows for g in groups]),
+    )
 
 
 def _stacked(parts: list[Bytes2D]) -> Bytes2D:
     """Rows under one another; no copy where they stand so in memory already."""
     base, width = parts[0].base, parts[0].shape[1]
     spots = [_address(part) for part in parts]
-    follow = (spot + part.size == after for spot, part, after in zip(spots, parts, spots[1:], strict=False))
-    if not isinstance(base, np.ndarray) or not base.flags.c_contiguous or any(part.base is not base for part in parts) or not all(follow):
+    follow = (
+        spot + part.size == after
+        for spot, part, after in zip(spots, parts, spots[1:], strict=False)
+    )
+    if (
+        not isinstance(base, np.ndarray)
+        or not base.flags.c_contiguous
+        or any(part.base is not base for part in parts)
+        or not all(follow)
+    ):
         return np.concatenate(parts)
     count = sum(map(len, parts))
-    return np.ndarray((count, width), np.uint8, base.data.cast("B") if base.ndim else base, spots[0] - _address(base))
+    return np.ndarray(
+        (count, width),
+        np.uint8,
+        base.data.cast("B") if base.ndim else base,
+        spots[0] - _address(base),
+    )
 
 
 def _address(array: NDArray[Any]) -> int:
@@ -255,11 +331,15 @@ def _order(where: NDArray[np.intp]) -> NDArray[np.intp] | slice:
 
 def ascends(where: NDArray[np.intp]) -> bool:
     """Whether frames stand in the table in the order of their rows."""
-    return is_counted(where) or bool(np.count_nonzero(where[1:] > where[:-1]) == max(len(where) - 1, 0))
+    return is_counted(where) or bool(
+        np.count_nonzero(where[1:] > where[:-1]) == max(len(where) - 1, 0)
+    )
 
 
 class Records:
-    """A `Table` of frames that construct parsed, for structs that do not compile and as the second engine in tests."""
+    """A `Table` of frames that construct parsed, for structs that do not compile and as the second
+    engine in tests.
+    """
 
     def __init__(self, schema: Schema, parsed: Sequence[Any], frames: Sequence[bytes]) -> None:
         self.schema, self._parsed, self._frames = schema, list(parsed), list(frames)
@@ -279,7 +359,9 @@ class Records:
             for index, value in enumerate(found):
                 _put(column, index, value)
         except (IndexError, TypeError, ValueError):
-            raise SpecError("its branches give values of different shapes, and a column has one", path=path) from None
+            raise SpecError(
+                "its branches give values of different shapes, and a column has one", path=path
+            ) from None
         return column
 
     def present(self, path: str) -> NDArray[np.bool_] | None:
@@ -288,8 +370,18 @@ class Records:
         axes, (base, indices) = self.schema.fields[path].axes, without_indices(path)
         if indices:
             known = self.present(base)
-            elements, inside = self._element(self.raw(base) if known is None or known.ndim == 1 else known, base, indices)
-            return inside if known is None else inside & known if known.ndim == 1 else deep(inside, elements.ndim - 1) & elements
+            elements, inside = self._element(
+                self.raw(base) if known is None or known.ndim == 1 else known, base, indices
+            )
+            return (
+                inside
+                if known is None
+                else (
+                    inside & known
+                    if known.ndim == 1
+                    else deep(inside, elements.ndim - 1) & elements
+                )
+            )
         there = [_there(_values(parsed, path.split("."), len(axes))) for parsed in self._parsed]
         if not any(isinstance(one, list) for one in there):
             return np.array(there, np.bool_)
@@ -298,7 +390,9 @@ class Records:
             _put(column, index, one)
         return column
 
-    def _element(self, column: NDArray[Any], path: str, indices: Mapping[str, int]) -> tuple[NDArray[Any], NDArray[np.bool_]]:
+    def _element(
+        self, column: NDArray[Any], path: str, indices: Mapping[str, int]
+    ) -> tuple[NDArray[Any], NDArray[np.bool_]]:
         """Some element of a field's arrays, and which frames have it, (n,)."""
         inside, axes = np.ones(len(self), np.bool_), self.schema.fields[path].axes
         for axis in sorted(indices, key=axes.index, reverse=True):
@@ -306,7 +400,10 @@ class Records:
             spots = indices[axis] + (counts if indices[axis] < 0 else 0)
             inside &= (spots >= 0) & (spots < counts)
             if not column.shape[place]:
-                return np.zeros((*column.shape[:place], *column.shape[place + 1 :]), column.dtype), inside
+                return (
+                    np.zeros((*column.shape[:place], *column.shape[place + 1 :]), column.dtype),
+                    inside,
+                )
             spots = np.broadcast_to(np.clip(spots, 0, column.shape[place] - 1), len(self))
             column = np.take_along_axis(column, deep(spots, column.ndim - 1), place).squeeze(place)
         return np.where(deep(inside, column.ndim - 1), column, 0).astype(column.dtype), inside
@@ -314,13 +411,20 @@ class Records:
     def counts(self, axis: str) -> NDArray[np.intp]:
         lengths = self._lengths(axis)
         if any(len(found) > 1 for found in lengths):
-            raise SpecError("its length differs within one frame, and a column has one for each frame", path=axis)
+            raise SpecError(
+                "its length differs within one frame, and a column has one for each frame",
+                path=axis,
+            )
         return np.array([max(found, default=0) for found in lengths], np.intp)
 
     def length(self, axis: str) -> int:
         """The longest length of an array."""
         declared = self.schema.arrays.get(axis)
-        return declared if isinstance(declared, int) else max((max(found, default=0) for found in self._lengths(axis)), default=0)
+        return (
+            declared
+            if isinstance(declared, int)
+            else max((max(found, default=0) for found in self._lengths(axis)), default=0)
+        )
 
     def _lengths(self, axis: str) -> list[set[int]]:
         brackets = axis.count("[]")
@@ -335,7 +439,9 @@ class Records:
         return self._frames[index]
 
     def take(self, which: NDArray[np.intp]) -> Records:
-        return Records(self.schema, [self._parsed[i] for i in which], [self._frames[i] for i in which])
+        return Records(
+            self.schema, [self._parsed[i] for i in which], [self._frames[i] for i in which]
+        )
 
     def parts(self, axis: str, kind: str = "") -> tuple[Records, NDArray[np.intp]]:
         node, found = self.schema.parts[axis], list[tuple[int, Any, bytes]]()
@@ -343,16 +449,27 @@ class Records:
             pieces = member(parsed, axis, None)
             if pieces is not None:
                 spans = zip(pieces, pieces.spans, strict=True)
-                found += [(index, part, frame[start:end]) for part, (name, start, end) in spans if name == kind]
+                found += [
+                    (index, part, frame[start:end])
+                    for part, (name, start, end) in spans
+                    if name == kind
+                ]
         own = next(one for one in node.kinds if one.name == kind)
         frames = np.array([index for index, _, _ in found], np.intp)
-        return Records(schema(own.root), [part for _, part, _ in found], [data for _, _, data in found]), frames
+        return (
+            Records(
+                schema(own.root), [part for _, part, _ in found], [data for _, _, data in found]
+            ),
+            frames,
+        )
 
     @staticmethod
     def joined(tables: Sequence[Records]) -> Records:
         """Several tables of one frame type, one after another."""
         parsed = [item for table in tables for item in table._parsed]
-        return Records(tables[0].schema, parsed, [frame for table in tables for frame in table._frames])
+        return Records(
+            tables[0].schema, parsed, [frame for table in tables for frame in table._frames]
+        )
 
 
 def _values(parsed: Any, names: list[str], axes: int) -> Any:
@@ -397,7 +514,9 @@ def _put(column: NDArray[Any], index: int, value: Any) -> None:
 
 
 def _counts(value: Any, names: list[str], brackets: int) -> set[int]:
-    """The lengths of an array under a path in one parsed frame, of all of them where it stands in another array."""
+    """The lengths of an array under a path in one parsed frame, of all of them where it stands in
+    another array.
+    """
     if isinstance(value, list) and (names or brackets):
         below = brackets if names else brackets - 1
         return {length for part in value for length in _counts(part, names, below)}
@@ -420,10 +539,16 @@ def _common_type(found: list[Any], path: str) -> np.dtype[Any]:
     """The type of a column of which the spec does not say one."""
     values = list(_numbers(found))
     if not all(isinstance(value, int | float) for value in values):
-        raise SpecError("its values are no numbers, and a column holds numbers: declare a text as bytes", path=path)
+        raise SpecError(
+            "its values are no numbers, and a column holds numbers: declare a text as bytes",
+            path=path,
+        )
     if any(isinstance(value, float) for value in values):
         return np.dtype(np.float64)
     for kind in (np.int64, np.uint64):
-        if np.iinfo(kind).min <= min(values, default=0) and max(values, default=0) <= np.iinfo(kind).max:
+        if (
+            np.iinfo(kind).min <= min(values, default=0)
+            and max(values, default=0) <= np.iinfo(kind).max
+        ):
             return np.dtype(kind)
     raise SpecError("its numbers are wider than the 64 bits that a column holds", path=path)

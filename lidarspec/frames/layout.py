@@ -1,8 +1,10 @@
-"""Where each field of a frame stands, as data: offsets, strides, bits, constants, checksums; and loading by it.
+"""Where each field of a frame stands, as data: offsets, strides, bits, constants, checksums; and
+loading by it.
 
-A `Layout` holds for frames of one kind of header; `lidarspec.frames.layout_tree` makes it from the frame tree. A `Leaf` is the place of one
-field, a `Seal` a checksum with the bytes that it covers. All work on many frames at a time, given as rows of bytes; constants are
-compared in words of up to eight bytes.
+A `Layout` holds for frames of one kind of header; `lidarspec.frames.layout_tree` makes it from the
+frame tree. A `Leaf` is the place of one field, a `Seal` a checksum with the bytes that it covers.
+All work on many frames at a time, given as rows of bytes; constants are compared in words of up to
+eight bytes.
 """
 
 from __future__ import annotations
@@ -19,13 +21,31 @@ from lidarspec.errors import PluginError
 from lidarspec.frames.row_checksums import over
 from lidarspec.spec.bits import BitField, Segment
 from lidarspec.spec.checksums import Checksum, Single, single
-from lidarspec.spec.tree import Check, FieldInfo, Formula, Node, arrays, element_of, parts, refs, width
+from lidarspec.spec.tree import (
+    Check,
+    FieldInfo,
+    Formula,
+    Node,
+    arrays,
+    element_of,
+    parts,
+    refs,
+    width,
+)
 
 Bytes2D = NDArray[np.uint8]
 
 
-def elements(rows: Bytes2D, dtype: np.dtype[Any], offset: int, shape: tuple[int, ...], strides: tuple[int, ...]) -> NDArray[Any]:
-    """What stands at an offset of each row (contiguous by itself) and at these strides from there, (n, *shape), not copied."""
+def elements(
+    rows: Bytes2D,
+    dtype: np.dtype[Any],
+    offset: int,
+    shape: tuple[int, ...],
+    strides: tuple[int, ...],
+) -> NDArray[Any]:
+    """What stands at an offset of each row (contiguous by itself) and at these strides from there,
+    (n, *shape), not copied.
+    """
     if rows.flags.c_contiguous:
         return np.ndarray((len(rows), *shape), dtype, rows, offset, (rows.shape[1], *strides))
     first = rows[:, offset : offset + dtype.itemsize].view(dtype)
@@ -35,17 +55,25 @@ def elements(rows: Bytes2D, dtype: np.dtype[Any], offset: int, shape: tuple[int,
 
 
 def span(rows: Bytes2D) -> NDArray[np.uint8]:
-    """All bytes from the first of the first row to the last of the last one, those between the rows included, (k,), not copied."""
+    """All bytes from the first of the first row to the last of the last one, those between the rows
+    included, (k,), not copied.
+    """
     if rows.flags.c_contiguous:
         return rows.reshape(-1)
-    return np.lib.stride_tricks.as_strided(rows, ((len(rows) - 1) * rows.strides[0] + rows.shape[1],), (1,))
+    return np.lib.stride_tricks.as_strided(
+        rows, ((len(rows) - 1) * rows.strides[0] + rows.shape[1],), (1,)
+    )
 
 
-def rows_at(buffer: NDArray[np.uint8], offsets: NDArray[np.intp], size: int, *, gathered: bool = True) -> NDArray[np.uint8]:
-    """`size` bytes from each of these offsets on, one a row, (n, size); no copy where they stand back to back.
+def rows_at(
+    buffer: NDArray[np.uint8], offsets: NDArray[np.intp], size: int, *, gathered: bool = True
+) -> NDArray[np.uint8]:
+    """`size` bytes from each of these offsets on, one a row, (n, size); no copy where they stand
+    back to back.
 
     Args:
-        gathered: C-contiguous; else no copy either where they stand at one distance, and each row is contiguous by itself.
+        gathered: C-contiguous; else no copy either where they stand at one distance, and each row
+            is contiguous by itself.
     """
     count = len(offsets)
     if not count or not size:
@@ -73,7 +101,8 @@ class Leaf:
         offset: of its first element, in bytes from the start of the frame.
         shape, strides: number of elements and bytes from one to the next along each of its arrays.
         wire: its type with byte order where it can be read directly, else None.
-        elements: else the bits of each element of the innermost array (one, if that is not inside the bit block).
+        elements: else the bits of each element of the innermost array (one, if that is not inside
+            the bit block).
         size: bytes of one element, or of the block that it is a part of.
     """
 
@@ -101,12 +130,18 @@ class Leaf:
             return self.elements[0].value(frame[self.offset : self.offset + self.size])
         assert self.wire is not None
         order: Literal["big", "little"] = "big" if self.wire.byteorder == ">" else "little"
-        return int.from_bytes(frame[self.offset : self.offset + self.size], order, signed=self.wire.kind == "i")
+        return int.from_bytes(
+            frame[self.offset : self.offset + self.size], order, signed=self.wire.kind == "i"
+        )
 
     def read(
-        self, buffer: NDArray[np.uint8], offsets: NDArray[np.intp], stops: NDArray[np.intp] | None = None
+        self,
+        buffer: NDArray[np.uint8],
+        offsets: NDArray[np.intp],
+        stops: NDArray[np.intp] | None = None,
     ) -> tuple[NDArray[np.intp] | None, NDArray[Any]]:
-        """An integer outside arrays in the candidates at these offsets: the indices of those that have it, None for all; its values.
+        """An integer outside arrays in the candidates at these offsets: the indices of those that
+        have it, None for all; its values.
 
         Args:
             stops: where the candidates end; by default with the buffer.
@@ -115,7 +150,9 @@ class Leaf:
         which = None if there.all() else np.flatnonzero(there)
         spots = (offsets if which is None else offsets[which]) + self.offset
         if self.wire is not None and len(spots):
-            windows: NDArray[Any] = np.ndarray((len(buffer) - self.size + 1,), self.wire, buffer.data, 0, (1,))
+            windows: NDArray[Any] = np.ndarray(
+                (len(buffer) - self.size + 1,), self.wire, buffer.data, 0, (1,)
+            )
             return which, windows[spots].astype(self._native)
         return which, self._alone.load(rows_at(buffer, spots, self.size))
 
@@ -137,12 +174,21 @@ class Leaf:
                 view[...] = (view & np.uint8(~part.mask & 0xFF)) | bits
 
     def raw(self, given: Sequence[Any]) -> NDArray[Any]:
-        """Physical values of n frames as raw ones, (n, ...), with room for the arrays that the field is in; bytes fill up with zeros."""
+        """Physical values of n frames as raw ones, (n, ...), with room for the arrays that the
+        field is in; bytes fill up with zeros.
+        """
         if self.info.kind == "bytes":
             size = self.shape[-1]
-            given = [list(value[:size].ljust(size, b"\0")) if isinstance(value, bytes) else value for value in given]
+            given = [
+                list(value[:size].ljust(size, b"\0")) if isinstance(value, bytes) else value
+                for value in given
+            ]
         values = np.array([np.asarray(value, np.float64) for value in given])
-        return np.asarray(self.info.raw(values.reshape(*values.shape, *(1,) * (1 + len(self.shape) - values.ndim))))
+        return np.asarray(
+            self.info.raw(
+                values.reshape(*values.shape, *(1,) * (1 + len(self.shape) - values.ndim))
+            )
+        )
 
     @cached_property
     def _alone(self) -> Leaf:
@@ -167,11 +213,17 @@ class Leaf:
     def _bits(self, rows: Bytes2D, element: BitField) -> NDArray[Any]:
         assert self.info.dtype is not None
         wide = np.dtype(f"u{self.info.dtype.itemsize}")
-        total = self._within(rows, element.segments[0], wide) if len(element.segments) == 1 else self._whole(rows, element, wide)
+        total = (
+            self._within(rows, element.segments[0], wide)
+            if len(element.segments) == 1
+            else self._whole(rows, element, wide)
+        )
         if total is None:
             total = np.zeros((len(rows), *self.shape[: len(self.strides)]), wide)
             for part in element.segments:
-                bits = (self._view(rows, np.dtype("u1"), part.byte) & np.uint8(part.mask)) >> part.low
+                bits = (
+                    self._view(rows, np.dtype("u1"), part.byte) & np.uint8(part.mask)
+                ) >> part.low
                 total |= bits.astype(wide) << wide.type(part.target)
         if element.signed:
             sign = wide.type(1 << (element.width - 1))
@@ -187,7 +239,9 @@ class Leaf:
         return total
 
     def _whole(self, rows: Bytes2D, element: BitField, wide: np.dtype[Any]) -> NDArray[Any] | None:
-        """Values of bits in a row, cut out of the words that end with their bytes; None where there is not so much before, or in a word."""
+        """Values of bits in a row, cut out of the words that end with their bytes; None where there
+        is not so much before, or in a word.
+        """
         if element.run is None:
             return None
         order, first, count, lowest = element.run
@@ -204,16 +258,20 @@ class Leaf:
 
     @property
     def held(self) -> tuple[int, int]:
-        """The first byte that holds any bit of it, where it stands first in its arrays, and the one after the last."""
+        """The first byte that holds any bit of it, where it stands first in its arrays, and the one
+        after the last.
+        """
         if not self.elements:
             return self.offset, self.offset + self.size
         spots = [self.offset + part.byte for element in self.elements for part in element.segments]
         return min(spots), max(spots) + 1
 
     def element(self, path: str, indices: Mapping[str, int]) -> Leaf | None:
-        """Some element of its arrays, counted from the last one where an index is negative; None where there is none.
+        """Some element of its arrays, counted from the last one where an index is negative; None
+        where there is none.
 
-        An array that others stand in remains, with that one element, so that each array keeps its place.
+        An array that others stand in remains, with that one element, so that each array keeps its
+        place.
         """
         info = element_of(self.info, path, indices)
         if info is None:
@@ -230,7 +288,15 @@ class Leaf:
             else:
                 elements = (elements[index],)
         size = 1 if self.info.kind == "bytes" and info.kind == "int" else self.size
-        return replace(self, info=info, offset=offset, shape=tuple(shape[:kept]), strides=self.strides[:kept], size=size, elements=elements)
+        return replace(
+            self,
+            info=info,
+            offset=offset,
+            shape=tuple(shape[:kept]),
+            strides=self.strides[:kept],
+            size=size,
+            elements=elements,
+        )
 
     def at(self, offset: int) -> Leaf:
         """The field with its place counted from `offset`."""
@@ -243,7 +309,9 @@ Sums = Callable[["Seal", Bytes2D], "NDArray[np.uint64] | None"]
 
 @dataclass(frozen=True, eq=False)
 class Seal:
-    """A checksum of the frame: the fields that hold it, low bits first, and the byte ranges that it covers."""
+    """A checksum of the frame: the fields that hold it, low bits first, and the byte ranges that it
+    covers.
+    """
 
     leaves: tuple[Leaf, ...]
     spans: tuple[tuple[int, int], ...]
@@ -252,7 +320,11 @@ class Seal:
 
     def covers(self, other: Seal) -> bool:
         """Whether a field that holds another checksum is among what this one covers."""
-        return any(start < leaf.held[1] and leaf.held[0] < end for start, end in self.spans for leaf in other.leaves)
+        return any(
+            start < leaf.held[1] and leaf.held[0] < end
+            for start, end in self.spans
+            for leaf in other.leaves
+        )
 
     def stored(self, rows: Bytes2D) -> NDArray[np.uint64]:
         """The values that stand in the frames, (n,)."""
@@ -296,31 +368,48 @@ class Seal:
         stored = shift = 0
         for leaf in self.leaves:
             if leaf.info.kind == "bytes":
-                stored |= int.from_bytes(frame[leaf.offset : leaf.offset + leaf.size], self.algorithm.order) << shift
+                stored |= (
+                    int.from_bytes(
+                        frame[leaf.offset : leaf.offset + leaf.size], self.algorithm.order
+                    )
+                    << shift
+                )
             else:
                 stored |= (leaf.scalar(frame) & ((1 << leaf.info.bits) - 1)) << shift
             shift += leaf.info.bits
         parts = [frame[a:b] for a, b in self.spans]
-        return stored in self.absent or stored == self._single(parts[0] if len(parts) == 1 else b"".join(parts))
+        return stored in self.absent or stored == self._single(
+            parts[0] if len(parts) == 1 else b"".join(parts)
+        )
 
     @cached_property
     def _single(self) -> Single:
         return single(self.algorithm)
 
     def intact(self, rows: Bytes2D, sums: Sums | None = None) -> NDArray[np.bool_]:
-        """Which frames carry the right value, or one that means "not filled", (n,); `sums` computes it, by default the algorithm."""
+        """Which frames carry the right value, or one that means "not filled", (n,); `sums` computes
+        it, by default the algorithm.
+        """
         stored = self.stored(rows)
-        filled = reduce(np.logical_and, (stored != np.uint64(value) for value in self.absent)) if self.absent else None
+        filled = (
+            reduce(np.logical_and, (stored != np.uint64(value) for value in self.absent))
+            if self.absent
+            else None
+        )
         if filled is None or filled.all():
             return np.asarray(stored == self.computed(rows, sums))
         right = np.ones(len(rows), np.bool_)
-        right[filled] = stored[filled] == self.computed(rows[filled], sums) if filled.any() else True
+        right[filled] = (
+            stored[filled] == self.computed(rows[filled], sums) if filled.any() else True
+        )
         return right
 
 
 @dataclass(frozen=True, eq=False)
 class Condition:
-    """What frames have to meet: one field is one of some values, or a formula of fields side by side is not 0."""
+    """What frames have to meet: one field is one of some values, or a formula of fields side by
+    side is not 0.
+    """
 
     fields: tuple[FieldInfo, ...]
     formula: Formula | None
@@ -334,14 +423,19 @@ class Condition:
         return cls(tuple(ref.info for ref in refs(what.condition)), what.condition)
 
     def values(self, raw: Mapping[str, NDArray[Any]]) -> NDArray[np.bool_]:
-        """Whether it holds, element by element, by the raw values of its fields; not where one is left out."""
+        """Whether it holds, element by element, by the raw values of its fields; not where one is
+        left out.
+        """
         if len(raw) < len(self.fields):
             return np.zeros(1, np.bool_)
         if self.formula is None:
             (values,) = raw.values()
             return np.isin(values, np.array(self.fields[0].allowed, values.dtype))
         depth = max(array.ndim for array in raw.values())
-        columns = {path: array.astype(self._dtype).reshape(*array.shape, *(1,) * (depth - array.ndim)) for path, array in raw.items()}
+        columns = {
+            path: array.astype(self._dtype).reshape(*array.shape, *(1,) * (depth - array.ndim))
+            for path, array in raw.items()
+        }
         found = np.asarray(arrays(self.formula, columns, self._dtype))
         return found if found.dtype == np.bool_ else found != 0
 
@@ -360,12 +454,18 @@ class Test(Protocol):
         """What it is made of."""
 
     def values(self, raw: Mapping[str, NDArray[Any]]) -> NDArray[Any]:
-        """Whether it holds, element by element, by the raw values of those of its fields that a layout has."""
+        """Whether it holds, element by element, by the raw values of those of its fields that a
+        layout has.
+        """
 
 
 def holding(test: Test, leaves: Mapping[str, Leaf], rows: Bytes2D) -> NDArray[np.bool_]:
     """In which frames, given as rows of bytes, a test holds everywhere, (n,)."""
-    raw = {info.path: leaf.load(rows) for info in test.fields if (leaf := leaves.get(info.path)) is not None}
+    raw = {
+        info.path: leaf.load(rows)
+        for info in test.fields
+        if (leaf := leaves.get(info.path)) is not None
+    }
     held = test.values(raw).astype(np.bool_, copy=False)
     held = np.broadcast_to(held, (len(rows), *held.shape[1:]))
     return np.asarray(held.all(axis=tuple(range(1, held.ndim))))
@@ -373,7 +473,9 @@ def holding(test: Test, leaves: Mapping[str, Leaf], rows: Bytes2D) -> NDArray[np
 
 @dataclass(frozen=True, eq=False)
 class Refused:
-    """A header that leads to no frame: too long (after these `constants`), a constant is wrong, or an expression of the plugin failed."""
+    """A header that leads to no frame: too long (after these `constants`), a constant is wrong, or
+    an expression of the plugin failed.
+    """
 
     error: PluginError | None = None
     by_constant: bool = False
@@ -391,7 +493,8 @@ class Layout:
         seals: its checksums, inner ones first.
         places: byte range of each named part outside arrays.
         branches: what each `When` and `Select` chose.
-        following: fields whose values follow from this header in a frame that is made, and those; they are not asked of one that comes.
+        following: fields whose values follow from this header in a frame that is made, and those;
+            they are not asked of one that comes.
         lengths: of each array, by its axis; 0 in an array without elements.
         regions: where parts are that are frames in themselves, by their axis.
         held: as constants, what fields have to be that say how long parts are.
@@ -414,7 +517,9 @@ class Layout:
 
     @cached_property
     def known(self) -> Mapping[int, tuple[int, int]]:
-        """The bits of a frame that its header leaves no choice of, constants and lengths: offset -> (mask, value)."""
+        """The bits of a frame that its header leaves no choice of, constants and lengths: offset ->
+        (mask, value).
+        """
         both = dict(self.constants)
         for spot, (mask, value) in self.held.items():
             other = both.get(spot, (0, 0))
@@ -431,12 +536,17 @@ class Layout:
         return sum(value << 8 * spot for spot, (_, value) in self.known.items())
 
     def sound(self, frame: bytes) -> bool:
-        """Whether one frame has this size, all constants and the right checksums, and meets all conditions."""
+        """Whether one frame has this size, all constants and the right checksums, and meets all
+        conditions.
+        """
         return (
             len(frame) == self.size
             and int.from_bytes(frame, "little") & self._mask == self._value
             and all(part.sound(frame) for part in (*self.seals, *self.regions.values()))
-            and (not self.conditions or self.meets(np.frombuffer(frame, np.uint8).reshape(1, -1)).item())
+            and (
+                not self.conditions
+                or self.meets(np.frombuffer(frame, np.uint8).reshape(1, -1)).item()
+            )
         )
 
     def meets(self, rows: Bytes2D) -> NDArray[np.bool_]:
@@ -447,7 +557,9 @@ class Layout:
         return met
 
     def seal(self, rows: Bytes2D) -> None:
-        """Write what follows from the header, the constants and the checksums into frames given as rows of bytes."""
+        """Write what follows from the header, the constants and the checksums into frames given as
+        rows of bytes.
+        """
         for leaf, value in self.following:
             leaf.store(rows, value)
         if self.known:
@@ -480,14 +592,20 @@ def words(constants: Marks) -> tuple[Word, ...]:
         parts = [left.pop(spot, (0, 0)) for spot in range(first, first + size)]
         dtype = np.dtype(f"<u{size}")
         mask, value = (np.frombuffer(bytes(part), dtype)[0] for part in zip(*parts, strict=True))
-        found.append((first, dtype, None if all(part[0] == 0xFF for part in parts) else mask, value))
+        found.append(
+            (first, dtype, None if all(part[0] == 0xFF for part in parts) else mask, value)
+        )
     return tuple(found)
 
 
 def exclude(some: Marks, others: Marks) -> bool:
     """Whether no frame has some constants and the others as well."""
     known = {spot: (mask, value) for spot, mask, value in others}
-    both = [(mask & known[spot][0], value ^ known[spot][1]) for spot, mask, value in some if spot in known]
+    both = [
+        (mask & known[spot][0], value ^ known[spot][1])
+        for spot, mask, value in some
+        if spot in known
+    ]
     return any(mask & differing for mask, differing in both)
 
 

@@ -1,9 +1,11 @@
 """The layouts of a frame type: where each field stands, for each kind of header.
 
-Counts, conditions and keys make the layout of a frame depend on some of its own header fields. `layout_of` walks the frame's tree with
-a cursor, for given values of these fields, and says with `Unknown` which further one it needs. A `HeaderTree` keeps what it found: each
-node of it is one field, each branch one of its values, each end a `Layout`, or the reason why there is none. Candidates are sorted
-through it in bulk, by value, so that the frame's tree is walked once for each distinct header.
+Counts, conditions and keys make the layout of a frame depend on some of its own header fields.
+`layout_of` walks the frame's tree with a cursor, for given values of these fields, and says with
+`Unknown` which further one it needs. A `HeaderTree` keeps what it found: each node of it is one
+field, each branch one of its values, each end a `Layout`, or the reason why there is none.
+Candidates are sorted through it in bulk, by value, so that the frame's tree is walked once for each
+distinct header.
 """
 
 from __future__ import annotations
@@ -55,7 +57,9 @@ class CutOff(Exception):
     """A frame is longer than the bytes that there are of it, and there will be no more."""
 
 
-def layout_of(root: tree.Node, values: Mapping[str, int], limit: int, given: Mapping[str, int] | None = None) -> Layout:
+def layout_of(
+    root: tree.Node, values: Mapping[str, int], limit: int, given: Mapping[str, int] | None = None
+) -> Layout:
     """The layout of the frames whose header fields have these values.
 
     Args:
@@ -83,7 +87,9 @@ def _walked(walk: _Walk, root: tree.Node) -> Layout:
 def prefix_of(root: tree.Node, limit: int) -> dict[int, tuple[int, int]]:
     """The constants whose place depends on no header field: offset -> (mask, value)."""
     walk = _Walk({}, limit)
-    with contextlib.suppress(Exception):  # whatever an expression of the struct raises: what comes before counts
+    with contextlib.suppress(
+        Exception
+    ):  # whatever an expression of the struct raises: what comes before counts
         walk.visit(root, "")
     return walk.constants
 
@@ -118,19 +124,34 @@ class _Walk:
     conditions: dict[tree.FieldInfo | tree.Check, Condition] = field(default_factory=dict)
     #: elements without a byte, of all arrays.
     empty: int = 0
-    #: what expressions can ask for by now: a field, the path of a struct, None for what the header leaves out.
+    #: what expressions can ask for by now: a field, the path of a struct, None for what the header
+    #: leaves out.
     parts: dict[str, Leaf | Measure | str | None] = field(default_factory=dict)
 
     def layout(self) -> Layout:
         """What was found, as a value."""
-        held, self.asked = self._held(), _unknown  # what follows from the header asks for no more of it
+        held, self.asked = (
+            self._held(),
+            _unknown,
+        )  # what follows from the header asks for no more of it
         seals, following = tuple(_in_order(self.seals)), tuple(self._following())
         leaves = ByPath(self.leaves, Leaf.element)
-        found = (self.cursor, leaves, self.constants, seals, self.places, self.branches, following, self.lengths, self.regions)
+        found = (
+            self.cursor,
+            leaves,
+            self.constants,
+            seals,
+            self.places,
+            self.branches,
+            following,
+            self.lengths,
+            self.regions,
+        )
         return Layout(*found, held, tuple(self.conditions.values()))
 
     def read(self, path: str) -> tuple[tree.FieldInfo, int] | str | None:
-        """What a formula reads by a path: a field and its raw value, the path of a struct, or None for what the header leaves out.
+        """What a formula reads by a path: a field and its raw value, the path of a struct, or None
+        for what the header leaves out.
 
         Raises:
             NotCompilable: for what is no field before the formula, or not one integer.
@@ -142,7 +163,9 @@ class _Walk:
             return self._element(path)
         if path not in self.parts:
             scope, _, name = path.rpartition(".")
-            raise NotCompilable(scope, f"an expression asks for {name!r}, which is not a field before it")
+            raise NotCompilable(
+                scope, f"an expression asks for {name!r}, which is not a field before it"
+            )
         part = self.parts[path]
         if not isinstance(part, Leaf | Measure):
             return part
@@ -161,7 +184,9 @@ class _Walk:
             raise IndexError(f"{base} has no such element")
         return leaf.info, self.values[path] if path in self.values else self.asked(leaf, self)
 
-    def visit(self, node: tree.Node, path: str, shape: tuple[int, ...] = (), strides: tuple[int, ...] = ()) -> None:
+    def visit(
+        self, node: tree.Node, path: str, shape: tuple[int, ...] = (), strides: tuple[int, ...] = ()
+    ) -> None:
         """Go through a part; `shape` and `strides` of the arrays that it is in."""
         start = self.cursor
         match node:
@@ -195,14 +220,18 @@ class _Walk:
         if path and not shape:
             self.places[path] = (start, self.cursor)
 
-    def _struct(self, node: tree.Struct, path: str, shape: tuple[int, ...], strides: tuple[int, ...]) -> None:
+    def _struct(
+        self, node: tree.Struct, path: str, shape: tuple[int, ...], strides: tuple[int, ...]
+    ) -> None:
         self.parts.setdefault(path, path)
         for member in node.members:
             below = f"{node.path}.{member.name}".strip(".") if member.name else ""
             self.visit(member, below, shape, strides)
             self.parts.setdefault(below, None)
 
-    def _array(self, node: tree.Repeat, path: str, shape: tuple[int, ...], strides: tuple[int, ...]) -> None:
+    def _array(
+        self, node: tree.Repeat, path: str, shape: tuple[int, ...], strides: tuple[int, ...]
+    ) -> None:
         count, start = self._count(node.count, path), self.cursor
         self.lengths[node.axis] = 0 if 0 in shape else count
         if count > self.limit:
@@ -217,19 +246,40 @@ class _Walk:
             raise TooLong(path)
         for name, leaf in self.leaves.items():
             if node.axis in leaf.info.axes:
-                self.leaves[name] = replace(leaf, strides=(*leaf.strides[:depth], size, *leaf.strides[depth + 1 :]))
+                self.leaves[name] = replace(
+                    leaf, strides=(*leaf.strides[:depth], size, *leaf.strides[depth + 1 :])
+                )
         for offset in [offset for offset in self.constants if offset >= start]:
             byte = self.constants.pop(offset)
             self.constants.update({offset + size * index: byte for index in range(count)})
         self.cursor = start + size * count
 
     def _parts(self, node: tree.Parts, path: str) -> None:
-        """Go over parts: how many bytes they take is told by the header, or asked for as a field of it would be."""
+        """Go over parts: how many bytes they take is told by the header, or asked for as a field of
+        it would be.
+        """
         given = {ref.path: int(self._value(ref) or 0) for ref in node.outer}
-        rule = Rule(*(None if formula is None else self._count(formula, path) for formula in (node.count, node.size, node.within)))
-        region = Region(node, kinds_of(node, tuple(given.items()), self.limit), self.cursor, rule, self.limit, given, rule.within)
+        rule = Rule(
+            *(
+                None if formula is None else self._count(formula, path)
+                for formula in (node.count, node.size, node.within)
+            )
+        )
+        region = Region(
+            node,
+            kinds_of(node, tuple(given.items()), self.limit),
+            self.cursor,
+            rule,
+            self.limit,
+            given,
+            rule.within,
+        )
         self.parts[node.total.path] = Measure(node.total, region)
-        size = rule.within if rule.within is not None else int(self._value(tree.Ref(node.total.path, node.total)))
+        size = (
+            rule.within
+            if rule.within is not None
+            else int(self._value(tree.Ref(node.total.path, node.total)))
+        )
         if size == -FAILED:
             raise ValueError(f"an expression in {path} fails")
         if size < 0:
@@ -238,8 +288,12 @@ class _Walk:
         self.parts[node.total.path] = Measure(node.total, region)
         self.cursor += size
 
-    def _no_element(self, node: tree.Node, path: str, shape: tuple[int, ...], strides: tuple[int, ...]) -> None:
-        """Go through an element that the array has none of, for its fields alone: nothing is asked of it."""
+    def _no_element(
+        self, node: tree.Node, path: str, shape: tuple[int, ...], strides: tuple[int, ...]
+    ) -> None:
+        """Go through an element that the array has none of, for its fields alone: nothing is asked
+        of it.
+        """
         start, constants = self.cursor, dict(self.constants)
         try:
             self.visit(node, path, shape, strides)
@@ -250,26 +304,46 @@ class _Walk:
         finally:
             self.cursor, self.constants = start, constants
 
-    def _field(self, node: tree.Number | tree.Blob | tree.Block, path: str, shape: tuple[int, ...], strides: tuple[int, ...]) -> None:
+    def _field(
+        self,
+        node: tree.Number | tree.Blob | tree.Block,
+        path: str,
+        shape: tuple[int, ...],
+        strides: tuple[int, ...],
+    ) -> None:
         match node:
             case tree.Number(info, size, _, order):
-                is_word = size in (1, 2, 4, 8) and info.dtype is not None
-                wire = np.dtype(f"{'<' if order == 'little' else '>'}{info.dtype.str[1:]}") if is_word else None  # type: ignore[union-attr]
-                elements = () if is_word else (whole_bytes(size, order, signed=node.kind == "int"),)
+                if size in (1, 2, 4, 8) and info.dtype is not None:
+                    wire = info.dtype.newbyteorder("<" if order == "little" else ">")
+                    elements: tuple[BitField, ...] = ()
+                else:
+                    wire = None
+                    elements = (whole_bytes(size, order, signed=node.kind == "int"),)
                 self._add(Leaf(info, self.cursor, shape, strides, size, wire, elements))
                 if info.const is not None:
                     self._constant(node.encoded(info.const))
             case tree.Blob():
                 size = self._count(node.size, path)
                 if node.name:
-                    self._add(Leaf(node.info, self.cursor, (*shape, size), (*strides, 1), size, np.dtype("u1")))
+                    self._add(
+                        Leaf(
+                            node.info,
+                            self.cursor,
+                            (*shape, size),
+                            (*strides, 1),
+                            size,
+                            np.dtype("u1"),
+                        )
+                    )
                 self._constant(node.const or b"")
             case tree.Block():
                 size = node.size
                 self._block(node, path, shape, strides)
         self.cursor += size
 
-    def _block(self, node: tree.Block, path: str, shape: tuple[int, ...], strides: tuple[int, ...]) -> None:
+    def _block(
+        self, node: tree.Block, path: str, shape: tuple[int, ...], strides: tuple[int, ...]
+    ) -> None:
         groups: dict[str, list[BitField]] = {}
         infos: dict[str, tree.FieldInfo] = {}
         for part in node.parts:
@@ -284,13 +358,17 @@ class _Walk:
             inside = len(info.axes) > len(shape)
             if name:
                 own = (*shape, len(elements)) if inside else shape
-                self._add(Leaf(info, self.cursor, own, strides, node.size, elements=tuple(elements)))
+                self._add(
+                    Leaf(info, self.cursor, own, strides, node.size, elements=tuple(elements))
+                )
             if info.const is not None:
                 for element in elements:
                     self._bit_constant(element, int(info.const))
 
     def _constant(self, data: bytes) -> None:
-        self.constants.update({self.cursor + index: (0xFF, byte) for index, byte in enumerate(data)})
+        self.constants.update(
+            {self.cursor + index: (0xFF, byte) for index, byte in enumerate(data)}
+        )
 
     def _bit_constant(self, element: BitField, value: int) -> None:
         for part in element.segments:
@@ -302,7 +380,9 @@ class _Walk:
         if leaf.info.allowed is not None:
             self.conditions[leaf.info] = Condition.of(leaf.info)
         self.leaves[leaf.info.path] = self.parts[leaf.info.path] = leaf
-        if leaf.shape and len(leaf.shape) > len(leaf.strides) - (leaf.info.kind == "bytes"):  # bytes, or an array within a bit block
+        if leaf.shape and len(leaf.shape) > len(leaf.strides) - (
+            leaf.info.kind == "bytes"
+        ):  # bytes, or an array within a bit block
             self.lengths[leaf.info.axes[-1]] = 0 if 0 in leaf.shape[:-1] else leaf.shape[-1]
 
     def _seal(self, node: tree.Sealed, start: int) -> None:
@@ -316,23 +396,37 @@ class _Walk:
         self.seals.append(Seal(leaves, tuple(spans), node.algorithm, node.absent))
 
     def _held(self) -> dict[int, tuple[int, int]]:
-        """What fields have to be that say how long parts are, as constants, which they are in one layout."""
-        rows, found = np.zeros((2, self.cursor), np.uint8), [leaf for leaf in self.leaves.values() if leaf.info.held]
+        """What fields have to be that say how long parts are, as constants, which they are in one
+        layout.
+        """
+        rows, found = (
+            np.zeros((2, self.cursor), np.uint8),
+            [leaf for leaf in self.leaves.values() if leaf.info.held],
+        )
         for leaf in found:
             (low, high), rebuilt = leaf.info.limits, leaf.info.rebuilt
             if rebuilt is not None:
                 value = operator.index(tree.evaluated(rebuilt, self._read_known))
                 if not low <= value <= high:
                     raise TooLong(leaf.info.path)
-                leaf.store(rows, np.array([value, -1 if low else high], leaf.info.dtype).reshape(2, *(1 for _ in leaf.shape)))
+                leaf.store(
+                    rows,
+                    np.array([value, -1 if low else high], leaf.info.dtype).reshape(
+                        2, *(1 for _ in leaf.shape)
+                    ),
+                )
         spots = np.flatnonzero(rows[1]).tolist() if found else []
         return {spot: (int(rows[1, spot]), int(rows[0, spot])) for spot in spots}
 
     def _following(self) -> Iterator[tuple[Leaf, int]]:
-        """The values of rebuilt fields that follow from constants and from those that the layout depends on, and from no other."""
+        """The values of rebuilt fields that follow from constants and from those that the layout
+        depends on, and from no other.
+        """
         for leaf in self.leaves.values():
             if leaf.info.rebuilt is not None and not leaf.info.held and not leaf.shape:
-                with contextlib.suppress(Exception):  # of the others: construct evaluates them when a frame is built
+                with contextlib.suppress(
+                    Exception
+                ):  # of the others: construct evaluates them when a frame is built
                     yield leaf, operator.index(tree.evaluated(leaf.info.rebuilt, self._read_known))
 
     def _read_known(self, path: str) -> tuple[tree.FieldInfo, int] | str | None:
@@ -355,7 +449,11 @@ def _in_order(seals: list[Seal]) -> Iterator[Seal]:
     """Checksums, each before those that cover its field; inner ones first where neither does."""
     left = list(seals)
     while left:
-        free = (seal for seal in left if not any(seal.covers(other) for other in left if other is not seal))
+        free = (
+            seal
+            for seal in left
+            if not any(seal.covers(other) for other in left if other is not seal)
+        )
         left.remove(first := next(free, left[0]))
         yield first
 
@@ -375,7 +473,8 @@ class HeaderNode:
         values: those, raw, by path.
         above: the node that they lead from; None for the first.
         leaf, before: the field, and all fields up to it.
-        constants: those that stand before it, without those that all frames begin with; where a frame is cut off, those up to there.
+        constants: those that stand before it, without those that all frames begin with; where a
+            frame is cut off, those up to there.
         least: the bytes that a frame with these values has at least, as far as is known.
         told: which of its values are told apart.
         result: what the values lead to, where no further field decides.
@@ -403,20 +502,24 @@ class HeaderNode:
         return self.children[value]
 
 
-#: what reads the field of a node in some of the candidates: the indices of those that have it, None for all; and its values.
+#: what reads the field of a node in some of the candidates: the indices of those that have it, None
+#: for all; and its values.
 Reader = Callable[[HeaderNode, NDArray[np.intp]], tuple[NDArray[np.intp] | None, NDArray[Any]]]
 Group = tuple[Layout | Refused, NDArray[np.intp]]
 
 
 @dataclass(frozen=True)
 class _Told:
-    """Which values of a header field the layout tells apart: all from `low` to `high`, or `keys` and any other.
+    """Which values of a header field the layout tells apart: all from `low` to `high`, or `keys`
+    and any other.
 
-    A header may claim any of some billion lengths, or have any key, and garbage does: those that mean the same are one branch.
+    A header may claim any of some billion lengths, or have any key, and garbage does: those that
+    mean the same are one branch.
 
     Attributes:
         limits: of the field itself.
-        rises: the value from which on a frame never gets shorter, so that what is too long stays so; None where there is none.
+        rises: the value from which on a frame never gets shorter, so that what is too long stays
+            so; None where there is none.
     """
 
     limits: tuple[int, int]
@@ -428,29 +531,69 @@ class _Told:
 
     @classmethod
     def of(cls, info: tree.FieldInfo, root: tree.Node, limit: int) -> _Told:
-        """What the formulas of a frame tell apart of a field; all its values, where that is not seen from their form."""
+        """What the formulas of a frame tell apart of a field; all its values, where that is not
+        seen from their form.
+        """
         (low, high), known = info.limits, list(tree.nodes(root))
-        asking = [(node, formula) for node in known for formula in tree.formulas(node) if _asks(formula, info)]
-        if any(own.rebuilt is not None and not own.held and _asks(own.rebuilt, info) for node in known for own in tree.infos(node)):
+        asking = [
+            (node, formula)
+            for node in known
+            for formula in tree.formulas(node)
+            if _asks(formula, info)
+        ]
+        if any(
+            own.rebuilt is not None and not own.held and _asks(own.rebuilt, info)
+            for node in known
+            for own in tree.infos(node)
+        ):
             return cls(info.limits, low, high)
-        if all(isinstance(node, tree.Select) and isinstance(formula, tree.Ref) for node, formula in asking):
-            keys = frozenset(key for node, _ in asking if isinstance(node, tree.Select) for key, _ in node.cases if low <= key <= high)
+        if all(
+            isinstance(node, tree.Select) and isinstance(formula, tree.Ref)
+            for node, formula in asking
+        ):
+            keys = frozenset(
+                key
+                for node, _ in asking
+                if isinstance(node, tree.Select)
+                for key, _ in node.cases
+                if low <= key <= high
+            )
             other = next((value for value in range(low, high + 1) if value not in keys), None)
-            return cls(info.limits, low, high) if other is None else cls(info.limits, low, high, keys, other)
+            return (
+                cls(info.limits, low, high)
+                if other is None
+                else cls(info.limits, low, high, keys, other)
+            )
         if high - low < 1 << 62 and all(_counts(node, formula) for node, formula in asking):
             values, spans = range(low, high + 1), []
             for _, formula in asking:
                 count = functools.partial(_with_value, formula)
-                spans.append((bisect.bisect_left(values, 0, key=count) - 1, bisect.bisect_right(values, limit, key=count)))
+                spans.append(
+                    (
+                        bisect.bisect_left(values, 0, key=count) - 1,
+                        bisect.bisect_right(values, limit, key=count),
+                    )
+                )
             firsts, lasts = zip(*spans, strict=True)
-            # Why a frame with too many parts is refused depends on its parts, not on the number alone.
-            rises = None if any(isinstance(node, tree.Parts) for node, _ in asking) else max(firsts) + low + 1
-            return cls(info.limits, max(min(firsts) + low, low), min(max(lasts) + low, high), rises=rises)
+            # Why a frame with too many parts is refused depends on its parts, not on the number
+            # alone.
+            rises = (
+                None
+                if any(isinstance(node, tree.Parts) for node, _ in asking)
+                else max(firsts) + low + 1
+            )
+            return cls(
+                info.limits, max(min(firsts) + low, low), min(max(lasts) + low, high), rises=rises
+            )
         return cls(info.limits, low, high)
 
     def refused(self, value: int) -> _Told:
         """The same, where the frame of a value is known to be too long."""
-        return replace(self, high=value) if self.rises is not None and self.rises <= value < self.high else self
+        return (
+            replace(self, high=value)
+            if self.rises is not None and self.rises <= value < self.high
+            else self
+        )
 
     def one(self, value: int) -> int:
         """The value that stands for one that means the same."""
@@ -463,7 +606,11 @@ class _Told:
         if (self.low, self.high) == self.limits and not self.keys:
             return values
         if self.keys:
-            return np.where(np.isin(values, np.array(list(self.keys), values.dtype)), values, values.dtype.type(self.other))
+            return np.where(
+                np.isin(values, np.array(list(self.keys), values.dtype)),
+                values,
+                values.dtype.type(self.other),
+            )
         return np.asarray(np.clip(values, self.low, self.high))
 
 
@@ -478,11 +625,15 @@ def _asks(formula: tree.Formula, info: tree.FieldInfo) -> bool:
 
 
 def _counts(node: tree.Node, formula: tree.Formula) -> bool:
-    """Whether a formula of a node counts bytes, or elements or parts, and all numbers above the longest frame mean the same.
+    """Whether a formula of a node counts bytes, or elements or parts, and all numbers above the
+    longest frame mean the same.
 
-    A part takes a byte at least (`parts`), and an array of more elements than the longest frame has bytes is refused as well.
+    A part takes a byte at least (`parts`), and an array of more elements than the longest frame has
+    bytes is refused as well.
     """
-    is_number = isinstance(node, tree.Repeat | tree.Blob) or (isinstance(node, tree.Parts) and formula is node.count)
+    is_number = isinstance(node, tree.Repeat | tree.Blob) or (
+        isinstance(node, tree.Parts) and formula is node.count
+    )
     return is_number and _rises(formula)
 
 
@@ -503,13 +654,21 @@ def _with_value(formula: tree.Formula, value: int) -> int:
 
 
 class _Places:
-    """Candidates in a buffer, as `HeaderTree.classify` gets them, of frames of at most `limit` bytes.
+    """Candidates in a buffer, as `HeaderTree.classify` gets them, of frames of at most `limit`
+    bytes.
 
     Attributes:
-        refuted: those whose header is cut off, or that are too long, and have a wrong constant before.
+        refuted: those whose header is cut off, or that are too long, and have a wrong constant
+            before.
     """
 
-    def __init__(self, buffer: NDArray[np.uint8], offsets: NDArray[np.intp], stops: NDArray[np.intp] | None, limit: int) -> None:
+    def __init__(
+        self,
+        buffer: NDArray[np.uint8],
+        offsets: NDArray[np.intp],
+        stops: NDArray[np.intp] | None,
+        limit: int,
+    ) -> None:
         self._buffer, self._offsets, self.stops, self._limit = buffer, offsets, stops, limit
         self.refuted: list[NDArray[np.intp]] = []
 
@@ -519,12 +678,21 @@ class _Places:
         if self.stops is not None and len(which) > 1:
             first = which.item((self.stops[which] - self._offsets[which]).argmax())
         start = self._offsets.item(first)
-        return self._buffer.data[start : min(start + self._limit, len(self._buffer) if self.stops is None else self.stops.item(first))]
+        return self._buffer.data[
+            start : min(
+                start + self._limit,
+                len(self._buffer) if self.stops is None else self.stops.item(first),
+            )
+        ]
 
-    def read(self, node: HeaderNode, which: NDArray[np.intp]) -> tuple[NDArray[np.intp] | None, NDArray[Any]]:
+    def read(
+        self, node: HeaderNode, which: NDArray[np.intp]
+    ) -> tuple[NDArray[np.intp] | None, NDArray[Any]]:
         """As `Reader`; those whose field is cut off are looked at here."""
         assert node.leaf is not None
-        there, values = node.leaf.read(self._buffer, self._offsets[which], None if self.stops is None else self.stops[which])
+        there, values = node.leaf.read(
+            self._buffer, self._offsets[which], None if self.stops is None else self.stops[which]
+        )
         if there is not None:
             self.cut_off(node, np.delete(which, there))
         return there, values
@@ -534,9 +702,14 @@ class _Places:
         if node.constants:
             self.refuted.append(which[self.wrong(node.constants, which)])
 
-    def wrong(self, constants: Mapping[int, tuple[int, int]], which: NDArray[np.intp]) -> NDArray[np.bool_]:
+    def wrong(
+        self, constants: Mapping[int, tuple[int, int]], which: NDArray[np.intp]
+    ) -> NDArray[np.bool_]:
         """Which candidates have a wrong constant, as far as their bytes go, (n,)."""
-        offsets, stops = self._offsets[which], len(self._buffer) if self.stops is None else self.stops[which]
+        offsets, stops = (
+            self._offsets[which],
+            len(self._buffer) if self.stops is None else self.stops[which],
+        )
         wrong = np.zeros(len(which), np.bool_)
         for spot, (mask, value) in constants.items() if len(which) else ():
             there = offsets + spot < stops
@@ -547,7 +720,9 @@ class _Places:
 class HeaderTree:
     """All layouts of one frame type, or of a kind of parts, with the values of fields around them."""
 
-    def __init__(self, frame: tree.Node, limit: int, given: Mapping[str, int] | None = None) -> None:
+    def __init__(
+        self, frame: tree.Node, limit: int, given: Mapping[str, int] | None = None
+    ) -> None:
         self._frame, self._limit, self._given = frame, limit, given or {}
         self._root, self._size = HeaderNode(), 0
         self._told: dict[str, _Told] = {}
@@ -556,11 +731,18 @@ class HeaderTree:
     def _prefix(self) -> dict[int, tuple[int, int]]:
         return prefix_of(self._frame, self._limit)
 
-    def classify(self, buffer: NDArray[np.uint8], offsets: NDArray[np.intp], stops: NDArray[np.intp] | None = None) -> list[Group]:
-        """The candidates at `offsets`, sorted by layout: (layout or refusal, indices) for each, without those whose header is cut off.
+    def classify(
+        self,
+        buffer: NDArray[np.uint8],
+        offsets: NDArray[np.intp],
+        stops: NDArray[np.intp] | None = None,
+    ) -> list[Group]:
+        """The candidates at `offsets`, sorted by layout: (layout or refusal, indices) for each,
+        without those whose header is cut off.
 
         Args:
-            stops: where their bytes end, and no more will come; by default with those of the buffer, and more may come.
+            stops: where their bytes end, and no more will come; by default with those of the
+                buffer, and more may come.
         """
         places = _Places(buffer, offsets, stops, self._limit)
         groups: list[Group] = []
@@ -570,7 +752,9 @@ class HeaderTree:
                 wrong = places.wrong(result.constants, which)
                 groups[-1] = result, which[~wrong]
                 places.refuted.append(which[wrong])
-        return groups + [(Refused(by_constant=True), which) for which in places.refuted if len(which)]
+        return groups + [
+            (Refused(by_constant=True), which) for which in places.refuted if len(which)
+        ]
 
     def sorted(self, number: int, read: Reader, places: _Places | None = None) -> list[Group]:
         """So many candidates by layout, as `classify` has them, whose header fields `read` reads.
@@ -603,17 +787,23 @@ class HeaderTree:
             if np.count_nonzero(values == values[0]) == len(values):
                 stack.append((node.child(values.item(0)), which))
             else:
-                stack += [(node.child(value), which[places]) for value, places in by_value(values, FEW)]
+                stack += [
+                    (node.child(value), which[places]) for value, places in by_value(values, FEW)
+                ]
         return groups
 
     def first(self) -> tuple[tuple[Leaf, ...], dict[int, tuple[int, int]]]:
         """The fields and the constants whose place depends on no header field."""
         self._explore(self._root)
-        known = self._root.result.leaves if isinstance(self._root.result, Layout) else self._root.before
+        known = (
+            self._root.result.leaves if isinstance(self._root.result, Layout) else self._root.before
+        )
         return tuple(known.values()), prefix_of(self._frame, self._limit)
 
     def common(self, rows: NDArray[np.uint8]) -> Layout | None:
-        """The layout of candidates, one a row, if they have one and the fields that decide it mean the same in all; else None."""
+        """The layout of candidates, one a row, if they have one and the fields that decide it mean
+        the same in all; else None.
+        """
         node = self._root
         while node.result is None:
             if node.leaf is None:
@@ -625,7 +815,9 @@ class HeaderTree:
                 return None
             values = leaf.load(rows)
             values = values if node.told is None else node.told.all(values)
-            if np.count_nonzero(values == values[0]) < len(rows) or (isinstance(leaf, Measure) and values[0] < 0):
+            if np.count_nonzero(values == values[0]) < len(rows) or (
+                isinstance(leaf, Measure) and values[0] < 0
+            ):
                 return None
             node = node.child(values.item(0))
         return node.result if isinstance(node.result, Layout) else None
@@ -634,7 +826,9 @@ class HeaderTree:
         """The layout of one frame, or None where its header is not all there."""
         return self._end(frame, self._root).result
 
-    def _end(self, data: bytes | memoryview, node: HeaderNode, *, is_all: bool = False) -> HeaderNode:
+    def _end(
+        self, data: bytes | memoryview, node: HeaderNode, *, is_all: bool = False
+    ) -> HeaderNode:
         """Where the header of a frame leads from a node, as `_explore` has it."""
         while node.leaf is not None:
             value = node.leaf.of(data)
@@ -643,11 +837,15 @@ class HeaderTree:
             node = node.child(node.meant(value))
         return node if node.result is not None else self._explore(node, data, is_all=is_all)
 
-    def _explore(self, node: HeaderNode, data: bytes | memoryview = b"", *, is_all: bool = False) -> HeaderNode:
-        """Find out, where nobody has yet, which fields decide next, as far as the header of a frame tells, in one walk.
+    def _explore(
+        self, node: HeaderNode, data: bytes | memoryview = b"", *, is_all: bool = False
+    ) -> HeaderNode:
+        """Find out, where nobody has yet, which fields decide next, as far as the header of a frame
+        tells, in one walk.
 
         Returns:
-            The last node: with a result, with a field that the bytes end before, or with neither where the frame is longer than these.
+            The last node: with a result, with a field that the bytes end before, or with neither
+            where the frame is longer than these.
 
         Args:
             is_all: there are no more bytes of this frame.
@@ -655,7 +853,12 @@ class HeaderTree:
 
         def asked(leaf: Leaf | Measure, walk: _Walk) -> int:
             nonlocal node
-            node.leaf, node.before, node.told, node.constants = leaf, dict(walk.leaves), self._telling(leaf), self._behind(walk)
+            node.leaf, node.before, node.told, node.constants = (
+                leaf,
+                dict(walk.leaves),
+                self._telling(leaf),
+                self._behind(walk),
+            )
             value = leaf.of(data)
             if value is None:
                 raise Unknown(leaf)
@@ -683,13 +886,22 @@ class HeaderTree:
         except Exception as error:
             node.result = Refused(PluginError.of(error, "struct"))
         above = node.above
-        if above is not None and above.told is not None and isinstance(node.result, Refused) and not node.result.error:
+        if (
+            above is not None
+            and above.told is not None
+            and isinstance(node.result, Refused)
+            and not node.result.error
+        ):
             above.told = above.told.refused([*node.values.values()][-1])
         return node
 
     def _behind(self, walk: _Walk) -> dict[int, tuple[int, int]]:
-        """The constants found by a walk, without those that all frames begin with, which candidates are known to have."""
-        return {spot: known for spot, known in walk.constants.items() if self._prefix.get(spot) != known}
+        """The constants found by a walk, without those that all frames begin with, which candidates
+        are known to have.
+        """
+        return {
+            spot: known for spot, known in walk.constants.items() if self._prefix.get(spot) != known
+        }
 
     def _telling(self, leaf: Leaf | Measure) -> _Told | None:
         if not isinstance(leaf, Leaf):
@@ -703,7 +915,10 @@ class HeaderTree:
 def kinds_of(node: tree.Parts, given: tuple[tuple[str, int], ...], limit: int) -> tuple[Kind, ...]:
     """What the parts of frames can be in which fields around them have these values."""
     values = dict(given)
-    return tuple(Kind(kind, HeaderTree(kind.root, limit, values), prefix_of(kind.root, limit)) for kind in node.kinds)
+    return tuple(
+        Kind(kind, HeaderTree(kind.root, limit, values), prefix_of(kind.root, limit))
+        for kind in node.kinds
+    )
 
 
 @functools.lru_cache(maxsize=2048)

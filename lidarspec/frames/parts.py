@@ -1,8 +1,10 @@
 """Parts, which are frames within a frame: where each stands, in many frames at once.
 
-What comes next is known when the part before it is: its size says where it begins. So frames are walked through side by side, a part of
-each in every round: which kind it is, by its constants; which layout its header has; and whether there is a further one. What is found is
-places in a buffer, as frames are, so that parts have layouts, rows and tables like any frame (`frame_table.Rows.parts`).
+What comes next is known when the part before it is: its size says where it begins. So frames are
+walked through side by side, a part of each in every round: which kind it is, by its constants;
+which layout its header has; and whether there is a further one. What is found is places in a
+buffer, as frames are, so that parts have layouts, rows and tables like any frame
+(`frame_table.Rows.parts`).
 """
 
 from __future__ import annotations
@@ -21,7 +23,8 @@ from lidarspec.spec import tree
 
 Offsets = NDArray[np.intp]
 
-#: what became of the parts of a frame: all are there, the bytes end before, a length that cannot be, constants of no kind, a plugin failed.
+#: what became of the parts of a frame: all are there, the bytes end before, a length that cannot
+#: be, constants of no kind, a plugin failed.
 FOUND, CUT_OFF, LENGTH, CONSTANT, FAILED = range(5)
 #: of a part whose own struct alone says how long it is.
 ANY = -1
@@ -30,13 +33,19 @@ ANY = -1
 class Layouts(Protocol):
     """The layouts of a kind of parts, as a `HeaderTree` has them."""
 
-    def classify(self, buffer: NDArray[np.uint8], offsets: Offsets, stops: Offsets | None = None) -> list[tuple[Layout | Refused, Offsets]]:
-        """The candidates at these offsets by layout, without those whose header is cut off; `stops` where their bytes end."""
+    def classify(
+        self, buffer: NDArray[np.uint8], offsets: Offsets, stops: Offsets | None = None
+    ) -> list[tuple[Layout | Refused, Offsets]]:
+        """The candidates at these offsets by layout, without those whose header is cut off; `stops`
+        where their bytes end.
+        """
 
 
 @dataclass(frozen=True, eq=False)
 class Kind:
-    """What a part can be: its layouts and fields, the constants that it begins with, and what says how long the next part is."""
+    """What a part can be: its layouts and fields, the constants that it begins with, and what says
+    how long the next part is.
+    """
 
     node: tree.Kind
     layouts: Layouts
@@ -51,13 +60,21 @@ class Kind:
     def is_checked(self) -> bool:
         """Whether it has a checksum of its own, or conditions, or parts with such."""
         found = tree.nodes(self.node.root)
-        return any(isinstance(node, tree.Sealed | tree.Check) or any(info.allowed for info in tree.infos(node)) for node in found)
+        return any(
+            isinstance(node, tree.Sealed | tree.Check)
+            or any(info.allowed for info in tree.infos(node))
+            for node in found
+        )
 
     def further(self, layout: Layout) -> tuple[Word, ...]:
         """The constants of a layout behind those that all begin with."""
         known = layout.notes.get(Kind)
         if known is None:
-            left = {spot: byte for spot, byte in layout.constants.items() if self.prefix.get(spot) != byte}
+            left = {
+                spot: byte
+                for spot, byte in layout.constants.items()
+                if self.prefix.get(spot) != byte
+            }
             known = layout.notes[Kind] = words(marks(left))
         further: tuple[Word, ...] = known
         return further
@@ -74,7 +91,9 @@ class Rule:
 
 @dataclass(frozen=True, eq=False)
 class Piece:
-    """Parts of one layout that were found in one round: of which kind they are, of which frames, and where they begin in the buffer."""
+    """Parts of one layout that were found in one round: of which kind they are, of which frames,
+    and where they begin in the buffer.
+    """
 
     kind: int
     layout: Layout
@@ -84,7 +103,9 @@ class Piece:
 
 @dataclass(frozen=True, eq=False)
 class Walked:
-    """The parts of n frames: `FOUND` or why not, (n,); the bytes of those that were found, (n,); and they, by round."""
+    """The parts of n frames: `FOUND` or why not, (n,); the bytes of those that were found, (n,);
+    and they, by round.
+    """
 
     status: NDArray[np.uint8]
     sizes: Offsets
@@ -115,7 +136,9 @@ class Region:
 
     @property
     def is_measured(self) -> bool:
-        """Whether frames of this layout are known to have these parts, but for their checksums and conditions."""
+        """Whether frames of this layout are known to have these parts, but for their checksums and
+        conditions.
+        """
         return self.rule.within is None
 
     @property
@@ -123,8 +146,12 @@ class Region:
         """Whether any part has a checksum or conditions of its own."""
         return any(kind.is_checked for kind in self.kinds)
 
-    def walked(self, buffer: NDArray[np.uint8], offsets: Offsets, stops: Offsets | None = None) -> Walked:
-        """The parts of the frames at these offsets; `stops` where their bytes end, by default with the buffer."""
+    def walked(
+        self, buffer: NDArray[np.uint8], offsets: Offsets, stops: Offsets | None = None
+    ) -> Walked:
+        """The parts of the frames at these offsets; `stops` where their bytes end, by default with
+        the buffer.
+        """
         return _Walk(self, buffer, offsets + self.start, stops).walked()
 
     def in_rows(self, rows: Bytes2D) -> tuple[NDArray[np.uint8], Walked]:
@@ -134,20 +161,35 @@ class Region:
     def sound(self, frame: bytes) -> bool:
         """Whether the parts of one frame are sound, and as long as they have to be."""
         _, walked = self.in_rows(np.frombuffer(frame, np.uint8).reshape(1, -1))
-        return not walked.status[0] and walked.sizes[0] == self.size and all(layout.sound(data) for _, layout, data in self.listed(frame))
+        return (
+            not walked.status[0]
+            and walked.sizes[0] == self.size
+            and all(layout.sound(data) for _, layout, data in self.listed(frame))
+        )
 
     def listed(self, frame: bytes) -> list[tuple[Kind, Layout, bytes]]:
         """The parts of one frame: kind, layout and bytes of each."""
         _, walked = self.in_rows(np.frombuffer(frame, np.uint8).reshape(1, -1))
         pieces = ((piece, int(piece.spots[0])) for pieces in walked.rounds for piece in pieces)
-        return [(self.kinds[piece.kind], piece.layout, frame[spot : spot + piece.layout.size]) for piece, spot in pieces]
+        return [
+            (self.kinds[piece.kind], piece.layout, frame[spot : spot + piece.layout.size])
+            for piece, spot in pieces
+        ]
 
 
 class _Walk:
     """One walk through the parts of frames that begin at `starts` of a buffer."""
 
-    def __init__(self, region: Region, buffer: NDArray[np.uint8], starts: Offsets, stops: Offsets | None) -> None:
-        self._region, self._buffer, self._starts, self._ends, self._stops = region, buffer, starts, starts.copy(), stops
+    def __init__(
+        self, region: Region, buffer: NDArray[np.uint8], starts: Offsets, stops: Offsets | None
+    ) -> None:
+        self._region, self._buffer, self._starts, self._ends, self._stops = (
+            region,
+            buffer,
+            starts,
+            starts.copy(),
+            stops,
+        )
         rule, room = region.rule, region.limit - region.start
         self._rule, self._room = rule, room if rule.within is None else min(room, rule.within)
         self._announced = np.full(len(starts), ANY if rule.size is None else rule.size)
@@ -173,7 +215,9 @@ class _Walk:
         return active
 
     def _round(self, active: Offsets) -> list[Piece]:
-        """A part of each frame; the first kind takes it whose constants are right, as far as the bytes go."""
+        """A part of each frame; the first kind takes it whose constants are right, as far as the
+        bytes go.
+        """
         pieces = list[Piece]()
         for number, kind in enumerate(self._region.kinds):
             if not len(active):
@@ -181,9 +225,13 @@ class _Walk:
             held = self._right(active, kind.start)
             if held is not None and not np.count_nonzero(held):
                 continue  # one of many kinds, that none of these parts is of
-            own, others = (active, [active[:0]]) if held is None else (active[held], [active[~held]])
+            own, others = (
+                (active, [active[:0]]) if held is None else (active[held], [active[~held]])
+            )
             seen = np.zeros(len(own), np.bool_)
-            for layout, which in kind.layouts.classify(self._buffer, self._ends[own], self._stops_of(own)):
+            for layout, which in kind.layouts.classify(
+                self._buffer, self._ends[own], self._stops_of(own)
+            ):
                 seen[which] = True
                 if isinstance(layout, Refused):
                     self._refused(layout, own[which])
@@ -207,10 +255,16 @@ class _Walk:
 
     def _right(self, which: Offsets, constants: tuple[Word, ...]) -> NDArray[np.bool_] | None:
         """In which frames constants of the next part are right, as `right_at` has it."""
-        return right_at(self._buffer, self._ends[which], constants, self._stops_of(which)) if constants else None
+        return (
+            right_at(self._buffer, self._ends[which], constants, self._stops_of(which))
+            if constants
+            else None
+        )
 
     def _refused(self, refused: Refused, which: Offsets) -> None:
-        self._status[which] = FAILED if refused.error else CONSTANT if refused.by_constant else LENGTH
+        self._status[which] = (
+            FAILED if refused.error else CONSTANT if refused.by_constant else LENGTH
+        )
         self._errors += [refused.error] if refused.error else []
 
     def _measured(self, layout: Layout, which: Offsets) -> Offsets:
@@ -229,7 +283,9 @@ class _Walk:
         other = (announced != ANY) & (announced != layout.size)
         if not (np.count_nonzero(wrong) or np.count_nonzero(cut_off) or np.count_nonzero(other)):
             return which
-        self._status[which] = np.where(wrong, LENGTH, np.where(cut_off, CUT_OFF, np.where(other, LENGTH, FOUND)))
+        self._status[which] = np.where(
+            wrong, LENGTH, np.where(cut_off, CUT_OFF, np.where(other, LENGTH, FOUND))
+        )
         which = which[self._status[which] == FOUND]
         return which
 
@@ -242,7 +298,9 @@ class _Walk:
         if isinstance(formula, tree.Ref) and formula.path in layout.leaves:
             announced = layout.leaves[formula.path].read(self._buffer, spots)[1].astype(np.int64)
         else:
-            announced = np.array([self._computed(kind, layout, formula, spot) for spot in spots.tolist()], np.int64)
+            announced = np.array(
+                [self._computed(kind, layout, formula, spot) for spot in spots.tolist()], np.int64
+            )
         self._announced[which] = announced
         self._status[which[announced < 0]] = LENGTH
 
@@ -264,9 +322,14 @@ class _Walk:
 
 
 def right_at(
-    buffer: NDArray[np.uint8], spots: Offsets, constants: tuple[Word, ...], stops: Offsets | None = None
+    buffer: NDArray[np.uint8],
+    spots: Offsets,
+    constants: tuple[Word, ...],
+    stops: Offsets | None = None,
 ) -> NDArray[np.bool_] | None:
-    """Where constants are right, as far as the bytes go, up to these `stops` or to the end of the buffer, (n,); None where all are."""
+    """Where constants are right, as far as the bytes go, up to these `stops` or to the end of the
+    buffer, (n,); None where all are.
+    """
     held: NDArray[np.bool_] | None = None
     for word in constants:
         spot, dtype, _, _ = word
@@ -276,7 +339,10 @@ def right_at(
             each = equal(windows[spots], word)
         else:
             ends = [len(buffer)] * len(spots) if stops is None else stops.tolist()
-            parts = (buffer[at + spot : min(at + spot + dtype.itemsize, end)] for at, end in zip(spots.tolist(), ends, strict=True))
+            parts = (
+                buffer[at + spot : min(at + spot + dtype.itemsize, end)]
+                for at, end in zip(spots.tolist(), ends, strict=True)
+            )
             each = np.array([_begins(part.tobytes(), word) for part in parts], np.bool_)
         if np.count_nonzero(each) < len(each):
             held = each if held is None else held & each
@@ -287,20 +353,30 @@ def _begins(data: bytes, word: Word) -> bool:
     """Whether bytes are those of a constant, as far as they go."""
     mask, value = word[2:]
     every = (1 << 8 * len(data)) - 1
-    return int.from_bytes(data, "little") & every & (-1 if mask is None else int(mask)) == int(value) & every
+    return (
+        int.from_bytes(data, "little") & every & (-1 if mask is None else int(mask))
+        == int(value) & every
+    )
 
 
 @dataclass(frozen=True, eq=False)
 class Measure:
-    """The bytes of all parts, asked for like a field of the header: where it "stands" is said by the region."""
+    """The bytes of all parts, asked for like a field of the header: where it "stands" is said by
+    the region.
+    """
 
     info: tree.FieldInfo
     region: Region
 
-    def read(self, buffer: NDArray[np.uint8], offsets: Offsets, stops: Offsets | None = None) -> tuple[Offsets | None, NDArray[Any]]:
+    def read(
+        self, buffer: NDArray[np.uint8], offsets: Offsets, stops: Offsets | None = None
+    ) -> tuple[Offsets | None, NDArray[Any]]:
         """As `Leaf.read`; a negative number, of the status, for what cannot be a frame."""
         walked = self.region.walked(buffer, offsets, stops)
-        values, cut_off = np.where(walked.status == FOUND, walked.sizes, -walked.status.astype(np.int64)), walked.status == CUT_OFF
+        values, cut_off = (
+            np.where(walked.status == FOUND, walked.sizes, -walked.status.astype(np.int64)),
+            walked.status == CUT_OFF,
+        )
         if not np.count_nonzero(cut_off):
             return None, values
         is_all = cut_off & (

@@ -1,17 +1,22 @@
-"""The checksums of many frames at once, given as rows of bytes: what calls one by one would give, by steps that take all rows.
+"""The checksums of many frames at once, given as rows of bytes: what calls one by one would give,
+by steps that take all rows.
 
-`over` and `batch` know the algorithms of `lidarspec.spec.checksums`; one of an author's own is asked for its `batch`.
+`over` and `batch` know the algorithms of `lidarspec.spec.checksums`; one of an author's own is
+asked for its `batch`.
 
-`words` turns rows into columns of eight bytes, so that one step of NumPy takes the same eight bytes of every row.
+`words` turns rows into columns of eight bytes, so that one step of NumPy takes the same eight bytes
+of every row.
 
-A CRC is linear. A register of one byte is computed by halves: the bytes of a row in front are each advanced as far as the
-bytes behind them are away, by a table of 256, and XORed onto them, until one byte is left. Where rows are many, their words
-become one word before, without tables: eight bytes on, a byte counts as the sum of itself at fewer bytes on, which ones is
-what the polynomial says (its eighth power has the same terms, eight times as far apart). So each word is XORed onto sums for
-0 to 7 bytes on, and these are moved and added up. Where rows are few and short, each byte is looked up by its place. A wider
-register runs along all rows at once, two bytes a step, by a table of 65,536; long rows are cut into segments that run side by
-side and are joined in pairs. Rows of the usual CRC-32 that are not short are left to `zlib`. Tables depend on the polynomial
-and the distance alone. Registers are in wire order, see `Crc`.
+A CRC is linear. A register of one byte is computed by halves: the bytes of a row in front are each
+advanced as far as the bytes behind them are away, by a table of 256, and XORed onto them, until one
+byte is left. Where rows are many, their words become one word before, without tables: eight bytes
+on, a byte counts as the sum of itself at fewer bytes on, which ones is what the polynomial says
+(its eighth power has the same terms, eight times as far apart). So each word is XORed onto sums for
+0 to 7 bytes on, and these are moved and added up. Where rows are few and short, each byte is looked
+up by its place. A wider register runs along all rows at once, two bytes a step, by a table of
+65,536; long rows are cut into segments that run side by side and are joined in pairs. Rows of the
+usual CRC-32 that are not short are left to `zlib`. Tables depend on the polynomial and the distance
+alone. Registers are in wire order, see `Crc`.
 """
 
 from __future__ import annotations
@@ -42,11 +47,14 @@ from lidarspec.spec.checksums import (
 LOOP_BYTES = 2048  # below this, a Python loop over bytes is done before NumPy's calls have started
 NARROW_LOOP_BYTES = 256  # the same where the register is a byte
 ONE_BY_ONE = 4  # rows that are done one by one sooner than together
-BLOCK_BYTES = 1 << 20  # rows taken at a time: few enough for the caches, and many enough to hide NumPy's cost per call
+BLOCK_BYTES = (
+    1 << 20
+)  # rows taken at a time: few enough for the caches, and many enough to hide NumPy's cost per call
 FEW, SHORT = 1 << 13, 1 << 7  # bytes of all rows, and of one, for which a table for each place pays
 MANY = 1024  # rows whose words are summed in less time than tables take
 
-#: width, polynomial and reflection of the one CRC that `zlib` has: on rows that are not short, one by one, it is several times as fast.
+#: width, polynomial and reflection of the one CRC that `zlib` has: on rows that are not short, one
+#: by one, it is several times as fast.
 ZLIB = (32, 0x04C11DB7, True)
 
 #: which bytes of a row: from one to another, one span after another.
@@ -56,19 +64,28 @@ _BYTE, _BYTE_BITS = np.uint64(0xFF), np.uint64(8)
 
 
 def batch(algorithm: Checksum, rows: NDArray[np.uint8]) -> Values:
-    """The checksum of each row, shape (n,), for frames of one length, shape (n, m), contiguous or not."""
+    """The checksum of each row, shape (n,), for frames of one length, shape (n, m), contiguous or
+    not.
+    """
     return over(algorithm, rows, ((0, rows.shape[1]),))
 
 
 def over(algorithm: Checksum, rows: NDArray[np.uint8], spans: Spans) -> Values:
-    """The checksum of some bytes of each row, shape (n,), wherever in the rows they stand: one span after another."""
+    """The checksum of some bytes of each row, shape (n,), wherever in the rows they stand: one span
+    after another.
+    """
     values = _TOGETHER.get(type(algorithm))
     if values is None or _are_few(algorithm, rows, spans):
         return algorithm.batch(cut(rows, spans))
     step = max(1, BLOCK_BYTES // max(rows.shape[1], 1))
     if len(rows) <= step:
         return values(algorithm, rows, spans)
-    return np.concatenate([values(algorithm, rows[first : first + step], spans) for first in range(0, len(rows), step)])
+    return np.concatenate(
+        [
+            values(algorithm, rows[first : first + step], spans)
+            for first in range(0, len(rows), step)
+        ]
+    )
 
 
 def _are_few(algorithm: Checksum, rows: NDArray[np.uint8], spans: Spans) -> bool:
@@ -80,7 +97,10 @@ def _are_few(algorithm: Checksum, rows: NDArray[np.uint8], spans: Spans) -> bool
 
 
 def _crc(algorithm: Crc, rows: NDArray[np.uint8], spans: Spans) -> Values:
-    return finished(algorithm, registers(rows, spans, algorithm.start, algorithm.width, algorithm.poly, algorithm.refin))
+    return finished(
+        algorithm,
+        registers(rows, spans, algorithm.start, algorithm.width, algorithm.poly, algorithm.refin),
+    )
 
 
 def finished(algorithm: Crc, left: NDArray[Any]) -> Values:
@@ -114,8 +134,12 @@ def _word_xor(algorithm: WordXor, rows: NDArray[np.uint8], spans: Spans) -> Valu
 
 
 @lru_cache(maxsize=512)
-def _word_masks(algorithm: WordXor, number: int) -> list[tuple[list[int], tuple[np.uint64, np.uint64]]]:
-    """Where the low and the high bytes stand in so many words of `words`, as masks; with the words that have the same."""
+def _word_masks(
+    algorithm: WordXor, number: int
+) -> list[tuple[list[int], tuple[np.uint64, np.uint64]]]:
+    """Where the low and the high bytes stand in so many words of `words`, as masks; with the words
+    that have the same.
+    """
     masks = np.zeros((2, 8 * number), np.uint8)
     for mask, half in zip(masks, algorithm.halves, strict=True):
         for part in half:
@@ -146,8 +170,11 @@ _TOGETHER: dict[type[Checksum], Callable[[Any, NDArray[np.uint8], Spans], Values
 }
 
 
-def words(rows: NDArray[np.uint8], *, spans: Spans | None = None, zeros_first: bool = False) -> NDArray[np.uint64]:
-    """The rows, filled up with zeros, as columns of little-endian words of eight bytes; shape (words, n), contiguous.
+def words(
+    rows: NDArray[np.uint8], *, spans: Spans | None = None, zeros_first: bool = False
+) -> NDArray[np.uint64]:
+    """The rows, filled up with zeros, as columns of little-endian words of eight bytes; shape
+    (words, n), contiguous.
 
     Args:
         spans: which bytes of each row, one span after another; by default all.
@@ -160,7 +187,9 @@ def words(rows: NDArray[np.uint8], *, spans: Spans | None = None, zeros_first: b
     found, begun = np.empty((number, count), "<u8"), -1
     for first, length, start in runs:
         words = rows[:, start : start + 8].view("<u8")[:, 0]
-        found[first : first + length] = np.lib.stride_tricks.as_strided(words, (length, count), (8, rows.strides[0]))
+        found[first : first + length] = np.lib.stride_tricks.as_strided(
+            words, (length, count), (8, rows.strides[0])
+        )
     for word, start, right, mask, left in parts:
         part = rows[:, start : start + 8].view("<u8")[:, 0] >> right
         if mask is not None:
@@ -174,16 +203,23 @@ def words(rows: NDArray[np.uint8], *, spans: Spans | None = None, zeros_first: b
 
 
 @lru_cache(maxsize=1024)
-def _pieces(spans: Spans, size: int, zeros_first: bool) -> tuple[int, list[tuple[int, int, int]], list[tuple[Any, ...]]]:
+def _pieces(
+    spans: Spans, size: int, zeros_first: bool
+) -> tuple[int, list[tuple[int, int, int]], list[tuple[Any, ...]]]:
     """What `words` of rows of a size are made of.
 
     Returns:
-        How many there are; runs of whole ones: first word, number, place in the row; and parts of words: word, place of eight
-        bytes in the row that hold the part, and how it comes to its place: shifted right, masked (None: needless), shifted left.
+        How many there are; runs of whole ones: first word, number, place in the row; and parts of
+        words: word, place of eight bytes in the row that hold the part, and how it comes to its
+        place: shifted right, masked (None: needless), shifted left.
     """
     total = sum(stop - start for start, stop in spans)
     number = -(-total // 8)
-    runs, parts, spot = list[tuple[int, int, int]](), list[tuple[Any, ...]](), 8 * number - total if zeros_first else 0
+    runs, parts, spot = (
+        list[tuple[int, int, int]](),
+        list[tuple[Any, ...]](),
+        8 * number - total if zeros_first else 0,
+    )
     for first, stop in spans:
         start = first
         while start < stop:
@@ -195,8 +231,14 @@ def _pieces(spans: Spans, size: int, zeros_first: bool) -> tuple[int, list[tuple
                 length = 8 * whole
             else:
                 place = min(start, size - 8)
-                mask = None if start - place + length == 8 or byte + length == 8 else np.uint64((1 << 8 * length) - 1)
-                parts.append((word, place, np.uint64(8 * (start - place)), mask, np.uint64(8 * byte)))
+                mask = (
+                    None
+                    if start - place + length == 8 or byte + length == 8
+                    else np.uint64((1 << 8 * length) - 1)
+                )
+                parts.append(
+                    (word, place, np.uint64(8 * (start - place)), mask, np.uint64(8 * byte))
+                )
             spot += length
             start += length
     return number, runs, parts
@@ -230,8 +272,12 @@ def byte_sums(columns: NDArray[np.uint64]) -> NDArray[np.uint64]:
     return total
 
 
-def registers(rows: NDArray[np.uint8], spans: Spans, start: int, width: int, poly: int, refin: bool) -> NDArray[Any]:
-    """The register after some bytes of each row, shape (n,), in an integer of the bytes that it takes."""
+def registers(
+    rows: NDArray[np.uint8], spans: Spans, start: int, width: int, poly: int, refin: bool
+) -> NDArray[Any]:
+    """The register after some bytes of each row, shape (n,), in an integer of the bytes that it
+    takes.
+    """
     length = sum(stop - first for first, stop in spans)
     if 0 < length <= SHORT and len(rows) * length <= FEW:
         return _by_place(rows, spans, length, start, width, poly, refin)
@@ -247,26 +293,46 @@ def cut(rows: NDArray[np.uint8], spans: Spans) -> NDArray[np.uint8]:
 
 
 def _by_zlib(rows: NDArray[np.uint8], start: int) -> NDArray[Any]:
-    """`registers` of CRC-32 by `zlib`, row by row, which starts from the register and ends with it inverted."""
+    """`registers` of CRC-32 by `zlib`, row by row, which starts from the register and ends with it
+    inverted.
+    """
     rows = rows if rows.strides[1] == 1 else np.ascontiguousarray(rows)
-    return np.fromiter(map(zlib.crc32, rows, itertools.repeat(start ^ 0xFFFFFFFF)), np.uint32, len(rows)) ^ np.uint32(0xFFFFFFFF)
+    return np.fromiter(
+        map(zlib.crc32, rows, itertools.repeat(start ^ 0xFFFFFFFF)), np.uint32, len(rows)
+    ) ^ np.uint32(0xFFFFFFFF)
 
 
-def _by_place(rows: NDArray[np.uint8], spans: Spans, length: int, start: int, width: int, poly: int, refin: bool) -> NDArray[Any]:
-    """`registers` of a few short rows: what each byte comes to at the end is looked up, and the sum is taken."""
+def _by_place(
+    rows: NDArray[np.uint8],
+    spans: Spans,
+    length: int,
+    start: int,
+    width: int,
+    poly: int,
+    refin: bool,
+) -> NDArray[Any]:
+    """`registers` of a few short rows: what each byte comes to at the end is looked up, and the sum
+    is taken.
+    """
     table, firsts, begun = places(length, start, width, poly, refin)
     found: NDArray[Any] = np.bitwise_xor.reduce(table.take(cut(rows, spans) + firsts), axis=1)
     return np.bitwise_xor(found, begun, out=found) if begun else found
 
 
 @lru_cache(maxsize=64)
-def places(length: int, start: int, width: int, poly: int, refin: bool) -> tuple[NDArray[Any], NDArray[np.intp], Any]:
-    """The register after the bytes from each place of a row to its end, by the first of them, the others being 0.
+def places(
+    length: int, start: int, width: int, poly: int, refin: bool
+) -> tuple[NDArray[Any], NDArray[np.intp], Any]:
+    """The register after the bytes from each place of a row to its end, by the first of them, the
+    others being 0.
 
     Returns:
-        All of them, (256 * length,); where those of each place begin; and the register after `start` and as many zeros.
+        All of them, (256 * length,); where those of each place begin; and the register after
+        `start` and as many zeros.
     """
-    table = np.array(byte_table(width, poly, refin), f"<u{REGISTER_BYTES[width] if width > 8 else 1}")
+    table = np.array(
+        byte_table(width, poly, refin), f"<u{REGISTER_BYTES[width] if width > 8 else 1}"
+    )
     found = [table]
     while len(found) < length:
         found.append(table[found[-1] & 0xFF] ^ (found[-1] >> 8 if width > 8 else 0))
@@ -276,7 +342,9 @@ def places(length: int, start: int, width: int, poly: int, refin: bool) -> tuple
     return np.concatenate(found[::-1]), np.arange(length) * 256, begun
 
 
-def _narrow(rows: NDArray[np.uint8], spans: Spans, start: int, width: int, poly: int, refin: bool) -> NDArray[np.uint8]:
+def _narrow(
+    rows: NDArray[np.uint8], spans: Spans, start: int, width: int, poly: int, refin: bool
+) -> NDArray[np.uint8]:
     """`registers` of at most one byte, in one byte."""
     length = sum(stop - first for first, stop in spans)
     if not length:
@@ -300,7 +368,9 @@ def _narrow(rows: NDArray[np.uint8], spans: Spans, start: int, width: int, poly:
 
 
 def _summed(columns: NDArray[np.uint64], poly: int) -> NDArray[np.uint64]:
-    """One word of each row, (n,), that its bytes would give the same register with; `poly` has eight bits."""
+    """One word of each row, (n,), that its bytes would give the same register with; `poly` has
+    eight bits.
+    """
     shares = _shares(len(columns), poly)
     onto = np.uint64(sum(1 << 8 * (7 - power) for power in range(8) if poly >> power & 1))
     total, first = np.zeros(columns.shape[1], np.uint64), np.empty(columns.shape[1], np.uint64)
@@ -318,7 +388,9 @@ def _summed(columns: NDArray[np.uint64], poly: int) -> NDArray[np.uint64]:
 
 @lru_cache(maxsize=256)
 def _shares(number: int, poly: int) -> tuple[int, ...]:
-    """How many bytes further on each of so many words counts, relative to the last one: a bit for each number from 0 to 7."""
+    """How many bytes further on each of so many words counts, relative to the last one: a bit for
+    each number from 0 to 7.
+    """
     found = [1]
     while len(found) < number:
         share = found[-1]
@@ -328,12 +400,17 @@ def _shares(number: int, poly: int) -> tuple[int, ...]:
     return tuple(reversed(found))
 
 
-def _wide(rows: NDArray[np.uint8], spans: Spans, start: int, width: int, poly: int, refin: bool) -> NDArray[Any]:
+def _wide(
+    rows: NDArray[np.uint8], spans: Spans, start: int, width: int, poly: int, refin: bool
+) -> NDArray[Any]:
     """`registers` of any width."""
     rows = cut(rows, spans)
     (count, length), table = rows.shape, _word_table(width, poly, refin)
-    segment = min(max(64, 1 << (rows.size // 2048).bit_length()), length + length % 2)  # enough of them to hide NumPy's cost per call
-    # Zero bytes in front change nothing while the register is 0; so `start` is met in the row's first bytes.
+    segment = min(
+        max(64, 1 << (rows.size // 2048).bit_length()), length + length % 2
+    )  # enough of them to hide NumPy's cost per call
+    # Zero bytes in front change nothing while the register is 0; so `start` is met in the row's
+    # first bytes.
     padded = np.zeros((count, -(-length // segment) * segment), np.uint8)
     padded[:, -length:] = rows
     padded[:, -length:][:, :8] ^= np.frombuffer(start.to_bytes(8, "little"), np.uint8)[:length]
@@ -345,7 +422,9 @@ def _wide(rows: NDArray[np.uint8], spans: Spans, start: int, width: int, poly: i
     found = side.reshape(count, -1)
     while found.shape[1] > 1:
         odd = found.shape[1] % 2
-        jumped = _jumped(found[:, odd::2].ravel(), _jump_table(segment.bit_length() - 1, width, poly, refin))
+        jumped = _jumped(
+            found[:, odd::2].ravel(), _jump_table(segment.bit_length() - 1, width, poly, refin)
+        )
         found = np.hstack([found[:, :odd], jumped.reshape(count, -1) ^ found[:, odd + 1 :: 2]])
         segment *= 2
     return np.asarray(found[:, 0] ^ (start >> 8 * length))
@@ -357,12 +436,16 @@ def _advance(distance: int, width: int, poly: int, refin: bool) -> bytes:
     if distance == 1:
         return bytes(byte_table(width, poly, refin))
     half = _advance(distance // 2, width, poly, refin)
-    return half.translate(half if distance % 2 == 0 else _advance(distance - distance // 2, width, poly, refin))
+    return half.translate(
+        half if distance % 2 == 0 else _advance(distance - distance // 2, width, poly, refin)
+    )
 
 
 @lru_cache(maxsize=16)
 def _word_table(width: int, poly: int, refin: bool) -> NDArray[Any]:
-    """The register after two bytes, by the XOR of that little-endian word and the register's low 16 bits; shape (65536,)."""
+    """The register after two bytes, by the XOR of that little-endian word and the register's low 16
+    bits; shape (65536,).
+    """
     table = np.array(byte_table(width, poly, refin), f"<u{REGISTER_BYTES[width]}")
     first, second = np.tile(table, 256), np.repeat(np.arange(256, dtype=np.uint8), 256)
     return np.asarray(table[first.astype(np.uint8) ^ second] ^ first >> 8)
@@ -370,15 +453,23 @@ def _word_table(width: int, poly: int, refin: bool) -> NDArray[Any]:
 
 @lru_cache(maxsize=256)
 def _jump_table(power: int, width: int, poly: int, refin: bool) -> NDArray[Any]:
-    """The register after 2**power zero bytes, by place and value of each byte of the register; shape (bytes, 256)."""
+    """The register after 2**power zero bytes, by place and value of each byte of the register;
+    shape (bytes, 256).
+    """
     if power:
         half = _jump_table(power - 1, width, poly, refin)
         return _jumped(half.ravel(), half).reshape(half.shape)
-    later_places = [[value << 8 * place for value in range(256)] for place in range(REGISTER_BYTES[width] - 1)]
+    later_places = [
+        [value << 8 * place for value in range(256)] for place in range(REGISTER_BYTES[width] - 1)
+    ]
     return np.array([byte_table(width, poly, refin), *later_places], f"<u{REGISTER_BYTES[width]}")
 
 
 def _jumped(found: NDArray[Any], table: NDArray[Any]) -> NDArray[Any]:
     """Registers, shape (k,) and contiguous, each advanced by a jump table."""
     places = found.view(np.uint8).reshape(len(found), -1).T
-    return np.asarray(np.bitwise_xor.reduce([of_place.take(place) for of_place, place in zip(table, places, strict=True)]))
+    return np.asarray(
+        np.bitwise_xor.reduce(
+            [of_place.take(place) for of_place, place in zip(table, places, strict=True)]
+        )
+    )

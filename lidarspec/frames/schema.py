@@ -1,7 +1,8 @@
 """The fields of a frame type as a table, read off its tree without any bytes.
 
-Path, axes, type, unit and text of each field; where it stands is `layout`'s business, since that can depend on the
-header. Both engines (compiled and interpreted) make their columns by this table, so that they agree on types.
+Path, axes, type, unit and text of each field; where it stands is `layout`'s business, since that
+can depend on the header. Both engines (compiled and interpreted) make their columns by this table,
+so that they agree on types.
 """
 
 from __future__ import annotations
@@ -43,23 +44,33 @@ _Field = TypeVar("_Field")
 
 @lru_cache(maxsize=1024)
 def without_indices(path: str) -> tuple[str, dict[str, int]]:
-    """A path without the indices in it, and these, by the paths of their arrays: "a.b", {"a": 0} for "a[0].b"."""
+    """A path without the indices in it, and these, by the paths of their arrays: "a.b", {"a": 0}
+    for "a[0].b".
+    """
     names, indices = "", dict[str, int]()
-    for name, *numbers in (_INDEX.split(part)[:1] + _INDEX.findall(part) for part in path.split(".")):
+    for name, *numbers in (
+        _INDEX.split(part)[:1] + _INDEX.findall(part) for part in path.split(".")
+    ):
         names = f"{names}.{name}".lstrip(".")
         indices |= {names + "[]" * depth: int(number) for depth, number in enumerate(numbers)}
     return names, indices
 
 
 class ByPath(dict[str, _Field]):
-    """What fields have, by their paths; elements of arrays too, which are fields by themselves: "columns[0].timestamp".
+    """What fields have, by their paths; elements of arrays too, which are fields by themselves:
+    "columns[0].timestamp".
 
     Args:
         known: by the paths of the fields.
-        element: of what a field has, its new path and the indices of some of its arrays, what that element has; None where there is none.
+        element: of what a field has, its new path and the indices of some of its arrays, what that
+            element has; None where there is none.
     """
 
-    def __init__(self, known: Mapping[str, _Field], element: Callable[[_Field, str, Mapping[str, int]], _Field | None]) -> None:
+    def __init__(
+        self,
+        known: Mapping[str, _Field],
+        element: Callable[[_Field, str, Mapping[str, int]], _Field | None],
+    ) -> None:
         super().__init__(known)
         self._element, self._elements = element, dict[str, _Field | None]()
 
@@ -87,8 +98,9 @@ class ByPath(dict[str, _Field]):
 class Schema:
     """All fields of a frame type, in the order of the wire, and the arrays they are in.
 
-    `arrays`: path -> declared count; a number where every frame has so many elements, else a formula of header fields, or None.
-    `parts`: frames within the frame, by path, which are tables of their own; `inside`: their fields, by path from the top.
+    `arrays`: path -> declared count; a number where every frame has so many elements, else a
+    formula of header fields, or None. `parts`: frames within the frame, by path, which are tables
+    of their own; `inside`: their fields, by path from the top.
     """
 
     fields: Mapping[str, FieldInfo]
@@ -104,20 +116,29 @@ class Schema:
     @cached_property
     def chain(self) -> tuple[str, ...]:
         """The axes of the deepest nesting of arrays; the first one of equally deep ones."""
-        return max((info.axes for info in self.fields.values() if info.kind != "bytes"), key=len, default=())
+        return max(
+            (info.axes for info in self.fields.values() if info.kind != "bytes"),
+            key=len,
+            default=(),
+        )
 
     @cached_property
     def named(self) -> Mapping[str, FieldInfo]:
-        """The fields of the frame and of its parts, as scans and clocks name them: those of a kind behind its name, "tags.points.angle"."""
+        """The fields of the frame and of its parts, as scans and clocks name them: those of a kind
+        behind its name, "tags.points.angle".
+        """
         found = dict(self.fields)
         for axis, node in self.parts.items():
             for kind in node.kinds:
                 before = f"{axis}.{kind.name}".rstrip(".")
-                found |= {f"{before}.{path}": info for path, info in schema(kind.root).named.items()}
+                found |= {
+                    f"{before}.{path}": info for path, info in schema(kind.root).named.items()
+                }
         return found
 
     def within(self, path: str) -> tuple[str, str, str] | None:
-        """The parts that a path leads into: their axis, their kind, and the path in these; None where it leads into none.
+        """The parts that a path leads into: their axis, their kind, and the path in these; None
+        where it leads into none.
 
         Raises:
             UnknownField: for parts of several kinds without one of them.
@@ -136,7 +157,9 @@ class Schema:
     @cached_property
     def places(self) -> Mapping[str, int]:
         """How many arrays each array stands in, by its path."""
-        return {axis: index for info in self.fields.values() for index, axis in enumerate(info.axes)}
+        return {
+            axis: index for info in self.fields.values() for index, axis in enumerate(info.axes)
+        }
 
     def axis(self, name: str) -> str:
         """The path of an array, by it or by its last part.
@@ -144,10 +167,18 @@ class Schema:
         Raises:
             SpecError: where there is none of that name, or several.
         """
-        found = [axis for axis in self.places if axis == name] or [axis for axis in self.places if axis.rpartition(".")[2] == name]
+        found = [axis for axis in self.places if axis == name] or [
+            axis for axis in self.places if axis.rpartition(".")[2] == name
+        ]
         if len(found) != 1:
-            reason = f"several arrays are called {name!r}" if found else f"there is no array {name!r} in the frame"
-            raise SpecError(f"{reason}; there are {', '.join(found or self.places) or 'none'}", rule="LS214")
+            reason = (
+                f"several arrays are called {name!r}"
+                if found
+                else f"there is no array {name!r} in the frame"
+            )
+            raise SpecError(
+                f"{reason}; there are {', '.join(found or self.places) or 'none'}", rule="LS214"
+            )
         return found[0]
 
     def outer(self, axis: str) -> list[str]:
@@ -165,14 +196,20 @@ def schema(root: Node) -> Schema:
     fields: dict[str, FieldInfo] = {}
     arrays: dict[str, Formula | None] = {}
     _walk(root, fields, arrays, optional=False)
-    structs = {node.path: node.docs for node in nodes(root) if isinstance(node, Struct) and node.docs}
+    structs = {
+        node.path: node.docs for node in nodes(root) if isinstance(node, Struct) and node.docs
+    }
     parts = {node.axis: node for node in nodes(root) if isinstance(node, Parts)}
     inside: dict[str, FieldInfo] = {}
     for node in parts.values():
         for kind in node.kinds:
             _walk(kind.element, inside, {}, optional=False)
     own, theirs = (
-        {path: replace(info, docs=info.docs or _docs_around(path, structs)) for path, info in found.items()} for found in (fields, inside)
+        {
+            path: replace(info, docs=info.docs or _docs_around(path, structs))
+            for path, info in found.items()
+        }
+        for found in (fields, inside)
     )
     return Schema(
         ByPath(own, functools.partial(_element, arrays)),
@@ -182,12 +219,25 @@ def schema(root: Node) -> Schema:
     )
 
 
-def _element(arrays: Mapping[str, Formula | None], info: FieldInfo, path: str, indices: Mapping[str, int]) -> FieldInfo | None:
-    """An element of a field, which is left out by some headers where these decide how many there are; None where there never is one."""
-    found, counts = element_of(info, path, indices), [(arrays.get(axis), index) for axis, index in indices.items()]
-    if found is None or any(isinstance(count, int) and not -count <= index < count for count, index in counts):
+def _element(
+    arrays: Mapping[str, Formula | None], info: FieldInfo, path: str, indices: Mapping[str, int]
+) -> FieldInfo | None:
+    """An element of a field, which is left out by some headers where these decide how many there
+    are; None where there never is one.
+    """
+    found, counts = (
+        element_of(info, path, indices),
+        [(arrays.get(axis), index) for axis, index in indices.items()],
+    )
+    if found is None or any(
+        isinstance(count, int) and not -count <= index < count for count, index in counts
+    ):
         return None
-    return found if all(isinstance(count, int) for count, _ in counts) else replace(found, optional=True)
+    return (
+        found
+        if all(isinstance(count, int) for count, _ in counts)
+        else replace(found, optional=True)
+    )
 
 
 def _docs_around(path: str, structs: Mapping[str, str]) -> str:
@@ -199,7 +249,9 @@ def _docs_around(path: str, structs: Mapping[str, str]) -> str:
     return ""
 
 
-def _walk(node: Node, fields: dict[str, FieldInfo], arrays: dict[str, Formula | None], *, optional: bool) -> None:
+def _walk(
+    node: Node, fields: dict[str, FieldInfo], arrays: dict[str, Formula | None], *, optional: bool
+) -> None:
     match node:
         case Repeat():
             _count(arrays, node.axis, node.count, optional=optional)
@@ -220,8 +272,14 @@ def _walk(node: Node, fields: dict[str, FieldInfo], arrays: dict[str, Formula | 
         _walk(child, fields, arrays, optional=optional or isinstance(node, When | Select))
 
 
-def _block(node: Block, fields: dict[str, FieldInfo], arrays: dict[str, Formula | None], *, optional: bool) -> None:
-    infos = {part.info.path: part.info for part in node.parts if part.info.name and (node.name or part.names)}
+def _block(
+    node: Block, fields: dict[str, FieldInfo], arrays: dict[str, Formula | None], *, optional: bool
+) -> None:
+    infos = {
+        part.info.path: part.info
+        for part in node.parts
+        if part.info.name and (node.name or part.names)
+    }
     for path, info in infos.items():
         indices = [part.indices for part in node.parts if part.info.path == path]
         inner = info.axes[len(info.axes) - len(indices[0]) :]
@@ -235,10 +293,16 @@ def _add(fields: dict[str, FieldInfo], info: FieldInfo) -> None:
     fields[info.path] = info if known is None else _merged(known, info)
 
 
-def _count(arrays: dict[str, Formula | None], axis: str, count: Formula | None, *, optional: bool) -> None:
-    """Note the declared count of an array; one that several branches declare is a number only where all say it."""
+def _count(
+    arrays: dict[str, Formula | None], axis: str, count: Formula | None, *, optional: bool
+) -> None:
+    """Note the declared count of an array; one that several branches declare is a number only where
+    all say it.
+    """
     if optional and isinstance(count, int):
-        count = Op("+", (count, 0))  # it has so many where it is there at all, which is not in every frame
+        count = Op(
+            "+", (count, 0)
+        )  # it has so many where it is there at all, which is not in every frame
     known = arrays.setdefault(axis, count)
     if isinstance(known, int) and known != count:
         arrays[axis] = None if isinstance(count, int) else count
@@ -247,10 +311,29 @@ def _count(arrays: dict[str, Formula | None], axis: str, count: Formula | None, 
 def _merged(known: FieldInfo, other: FieldInfo) -> FieldInfo:
     """One column for a field that several branches declare."""
     kinds = {known.kind, other.kind}
-    if known.axes != other.axes or "other" in kinds or kinds > {"bytes"} or known.dtype is None or other.dtype is None:
+    if (
+        known.axes != other.axes
+        or "other" in kinds
+        or kinds > {"bytes"}
+        or known.dtype is None
+        or other.dtype is None
+    ):
         return replace(known, dtype=None, kind="other")
     dtype = np.promote_types(known.dtype, other.dtype)
-    bits = known.bits if (known.bits, known.dtype) == (other.bits, other.dtype) else 0 if known.kind == "bytes" else 8 * dtype.itemsize
+    bits = (
+        known.bits
+        if (known.bits, known.dtype) == (other.bits, other.dtype)
+        else 0
+        if known.kind == "bytes"
+        else 8 * dtype.itemsize
+    )
     const = known.const if known.const == other.const else None
     labels = known.labels if known.labels == other.labels else {}
-    return replace(known, dtype=dtype, kind="float" if dtype.kind == "f" else known.kind, bits=bits, const=const, labels=labels)
+    return replace(
+        known,
+        dtype=dtype,
+        kind="float" if dtype.kind == "f" else known.kind,
+        bits=bits,
+        const=const,
+        labels=labels,
+    )

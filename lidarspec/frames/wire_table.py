@@ -1,8 +1,10 @@
-"""The wire table of a frame type, drawn from its tree: where each field stands, how wide it is, what it means.
+"""The wire table of a frame type, drawn from its tree: where each field stands, how wide it is,
+what it means.
 
-Nothing here knows a frame's bytes, so what depends on a header is a formula of its fields ("10 + 3*i"), and a part that only some headers
-have is marked with the condition. `extent` gives the size of any part in this way, and the texts for fields, bits and formulas are those of
-exports and explanations, too.
+Nothing here knows a frame's bytes, so what depends on a header is a formula of its fields ("10 +
+3*i"), and a part that only some headers have is marked with the condition. `extent` gives the size
+of any part in this way, and the texts for fields, bits and formulas are those of exports and
+explanations, too.
 """
 
 from __future__ import annotations
@@ -24,7 +26,8 @@ class WireRow:
     """One line of a wire table.
 
     Attributes:
-        offset: first byte, counted from the start of the frame; a formula where that depends on a header or an index.
+        offset: first byte, counted from the start of the frame; a formula where that depends on a
+            header or an index.
         size: in bytes, or "7 bits"; a formula where it depends on a header.
         type: "uint16 le", "bytes", or the bits of a block from the most significant on.
         field: path, array elements by index names: "points[i].distance".
@@ -57,15 +60,33 @@ class Extent:
         if str(self) == "0":
             return self
         size = f"({self})" if self.terms else str(self)
-        return Extent(0, (factor if size == "1" else f"{size}*({factor})" if " " in factor else f"{size}*{factor}",))
+        return Extent(
+            0,
+            (
+                (
+                    factor
+                    if size == "1"
+                    else f"{size}*({factor})"
+                    if " " in factor
+                    else f"{size}*{factor}"
+                ),
+            ),
+        )
 
     def __str__(self) -> str:
-        return " + ".join([str(self.number)] * (self.number > 0 or not self.terms) + list(self.terms))
+        return " + ".join(
+            [str(self.number)] * (self.number > 0 or not self.terms) + list(self.terms)
+        )
 
 
 def wire_table(frame: Frame) -> tuple[WireRow, ...]:
     """The rows of a frame type in the order of the wire."""
-    seals = {path: _sealed(node) for node in tree.nodes(frame.tree) if isinstance(node, tree.Sealed) for path in node.fields}
+    seals = {
+        path: _sealed(node)
+        for node in tree.nodes(frame.tree)
+        if isinstance(node, tree.Sealed)
+        for path in node.fields
+    }
     return tuple(_rows(frame.tree, "", Extent(), "", seals))
 
 
@@ -75,14 +96,18 @@ def frame_size(frame: Frame) -> str:
 
 
 def extent(node: tree.Node, shown: str = "") -> Extent:
-    """The size of a part; `shown` is how it is called where its size is only known from its bytes: "size(points[i].text)"."""
+    """The size of a part; `shown` is how it is called where its size is only known from its bytes:
+    "size(points[i].text)".
+    """
     match node:
         case tree.Number() | tree.Block():
             return Extent(node.size)
         case tree.Blob() | tree.Opaque():
             return _length(node.size, shown)
         case tree.Struct():
-            return sum((extent(member, _member(shown, member)) for member in node.members), Extent())
+            return sum(
+                (extent(member, _member(shown, member)) for member in node.members), Extent()
+            )
         case tree.Sealed():
             return extent(node.body, shown)
         case tree.Repeat():
@@ -90,14 +115,22 @@ def extent(node: tree.Node, shown: str = "") -> Extent:
         case tree.Parts():
             return _length(node.within, shown)
         case tree.When() | tree.Select():
-            sizes = {extent(branch, shown) for branch in tree.children(node) if not isinstance(branch, tree.Never)}
+            sizes = {
+                extent(branch, shown)
+                for branch in tree.children(node)
+                if not isinstance(branch, tree.Never)
+            }
             return sizes.pop() if len(sizes) == 1 else _length(None, shown)
     return Extent()
 
 
 def _length(size: tree.Formula | None, shown: str) -> Extent:
     """A declared length; None for one that only the bytes tell."""
-    return Extent(size) if isinstance(size, int) else Extent(0, (f"size({shown})" if size is None else phrase(size),))
+    return (
+        Extent(size)
+        if isinstance(size, int)
+        else Extent(0, (f"size({shown})" if size is None else phrase(size),))
+    )
 
 
 def _count(node: tree.Repeat) -> int | str:
@@ -115,7 +148,9 @@ def _element(shown: str) -> tuple[str, str]:
     return f"{shown}[{index}]", index
 
 
-def _rows(node: tree.Node, shown: str, start: Extent, condition: str, seals: Mapping[str, str]) -> Iterator[WireRow]:
+def _rows(
+    node: tree.Node, shown: str, start: Extent, condition: str, seals: Mapping[str, str]
+) -> Iterator[WireRow]:
     """The rows of a part that begins at `start`, and is there under a condition."""
     match node:
         case tree.Struct():
@@ -133,7 +168,14 @@ def _rows(node: tree.Node, shown: str, start: Extent, condition: str, seals: Map
             yield from _rows(node.element, element, start + size.times(index), condition, seals)
         case tree.Parts():
             element, _ = _element(shown)
-            yield WireRow(str(start), str(extent(node, shown)), "parts", shown, "", "; ".join(filter(None, (condition, ruled(node)))))
+            yield WireRow(
+                str(start),
+                str(extent(node, shown)),
+                "parts",
+                shown,
+                "",
+                "; ".join(filter(None, (condition, ruled(node)))),
+            )
             for kind in node.kinds:
                 said = f"{kind.name} in it" if kind.name else ""
                 yield from _rows(kind.element, element, Extent(0, (f"at({element})",)), said, seals)
@@ -141,32 +183,62 @@ def _rows(node: tree.Node, shown: str, start: Extent, condition: str, seals: Map
             for asked, branch in branches(node):
                 yield from _rows(branch, shown, start, asked, seals)
         case tree.Check():
-            yield WireRow(str(start), "0", "check", shown, "", "; ".join(filter(None, (condition, f"holds: {phrase(node.condition)}"))))
+            yield WireRow(
+                str(start),
+                "0",
+                "check",
+                shown,
+                "",
+                "; ".join(filter(None, (condition, f"holds: {phrase(node.condition)}"))),
+            )
         case tree.Never():
             yield WireRow(str(start), "0", "no frame", shown, "", condition)
         case tree.Block():
             for part in node.parts:
-                yield _row(part.info, str(start), *_bits(part), _part(shown, part), condition, seals)
+                yield _row(
+                    part.info, str(start), *_bits(part), _part(shown, part), condition, seals
+                )
         case tree.Number() | tree.Blob() | tree.Opaque():
-            length = "varies" if isinstance(node, tree.Opaque) and node.size is None else str(extent(node, shown))
-            info = replace(node.info, const=node.const) if isinstance(node, tree.Blob) else node.info
+            length = (
+                "varies"
+                if isinstance(node, tree.Opaque) and node.size is None
+                else str(extent(node, shown))
+            )
+            info = (
+                replace(node.info, const=node.const) if isinstance(node, tree.Blob) else node.info
+            )
             yield _row(info, str(start), length, _type(node), shown, condition, seals)
 
 
-def _row(info: tree.FieldInfo, offset: str, size: str, kind: str, shown: str, condition: str, seals: Mapping[str, str]) -> WireRow:
+def _row(
+    info: tree.FieldInfo,
+    offset: str,
+    size: str,
+    kind: str,
+    shown: str,
+    condition: str,
+    seals: Mapping[str, str],
+) -> WireRow:
     says = "; ".join(filter(None, (condition, meaning(info), seals.get(info.path, ""))))
     return WireRow(offset, size, kind, shown, unit_text(info), says)
 
 
 def _part(shown: str, part: tree.Part) -> str:
-    return ".".join(filter(None, (shown, *part.names))) + "".join(f"[{index}]" for index in part.indices)
+    return ".".join(filter(None, (shown, *part.names))) + "".join(
+        f"[{index}]" for index in part.indices
+    )
 
 
 def _bits(part: tree.Part) -> tuple[str, str]:
-    """Size and type of a part of a block: bits, or bytes for an integer that is wider than any number."""
+    """Size and type of a part of a block: bits, or bytes for an integer that is wider than any
+    number.
+    """
     if part.info.dtype is None and part.bits.run is not None and part.bits.is_whole:
         order, _, size, _ = part.bits.run
-        return str(size), f"{'int' if part.bits.signed else 'uint'}{8 * size} {'be' if order == '>' else 'le'}"
+        return (
+            str(size),
+            f"{'int' if part.bits.signed else 'uint'}{8 * size} {'be' if order == '>' else 'le'}",
+        )
     return f"{part.bits.width} bit{'s' * (part.bits.width > 1)}", bit_text(part.bits)
 
 
@@ -196,16 +268,29 @@ def ruled(node: tree.Parts) -> str:
     if node.within is not None:
         return f"as many parts as fill {phrase(node.within)} bytes"
     assert node.size is not None
-    following = ", ".join(dict.fromkeys(phrase(kind.following) for kind in node.kinds if kind.following is not None))
-    return f"a chain: {phrase(node.size)} bytes, then as many as {following} of the part before says; 0 ends it"
+    following = ", ".join(
+        dict.fromkeys(phrase(kind.following) for kind in node.kinds if kind.following is not None)
+    )
+    return (
+        f"a chain: {phrase(node.size)} bytes, then as many as {following} of the part before says;"
+        " 0 ends it"
+    )
 
 
 def phrase(formula: tree.Formula) -> str:
-    """A formula as people write it, with its fields by their whole paths; "?" for a function that cannot be read."""
+    """A formula as people write it, with its fields by their whole paths; "?" for a function that
+    cannot be read.
+    """
     match formula:
-        case tree.Op("==" | "!=" as symbol, (tree.Ref() as ref, int() as value)) if value in ref.info.labels:
+        case tree.Op("==" | "!=" as symbol, (tree.Ref() as ref, int() as value)) if (
+            value in ref.info.labels
+        ):
             return f"{ref.path} {symbol} {ref.info.labels[value]!r}"
-    text = formula.text if isinstance(formula, tree.Code) else tree.written(formula, lambda ref: ref.path, {})
+    text = (
+        formula.text
+        if isinstance(formula, tree.Code)
+        else tree.written(formula, lambda ref: ref.path, {})
+    )
     return text[1:-1] if _is_enclosed(text) else text
 
 
@@ -216,11 +301,16 @@ def _is_enclosed(text: str) -> bool:
 
 
 def bit_text(bits: BitField) -> str:
-    """The bits of a value in its block, the most significant first: "byte 1 bits 1-0, byte 0 bits 7-2"."""
+    """The bits of a value in its block, the most significant first: "byte 1 bits 1-0, byte 0 bits
+    7-2".
+    """
     parts = []
     for part in sorted(bits.segments, key=lambda segment: -segment.target):
         high = part.low + part.mask.bit_count() - 1
-        parts.append(f"byte {part.byte} " + (f"bits {high}-{part.low}" if high > part.low else f"bit {part.low}"))
+        parts.append(
+            f"byte {part.byte} "
+            + (f"bits {high}-{part.low}" if high > part.low else f"bit {part.low}")
+        )
     return ("signed, " if bits.signed else "") + ", ".join(parts)
 
 
@@ -233,12 +323,18 @@ def unit_text(info: tree.FieldInfo) -> str:
 
 
 def meaning(info: tree.FieldInfo) -> str:
-    """What is said of a field: its constant, what it follows from, its text, the names of its values."""
+    """What is said of a field: its constant, what it follows from, its text, the names of its
+    values.
+    """
     const = f"always {hexed(info.const, info.bits)}" if info.const is not None else ""
-    const = const or (f"only {tree.listed(info.allowed)}" if info.allowed is not None and not info.labels else "")
+    const = const or (
+        f"only {tree.listed(info.allowed)}" if info.allowed is not None and not info.labels else ""
+    )
     follows = phrase(info.rebuilt) if info.rebuilt is not None else "?"
     labels = ", ".join(f"{value} {name}" for value, name in info.labels.items())
-    return "; ".join(filter(None, (const, "" if follows == "?" else f"= {follows}", info.docs, labels)))
+    return "; ".join(
+        filter(None, (const, "" if follows == "?" else f"= {follows}", info.docs, labels))
+    )
 
 
 def hexed(value: object, bits: int) -> str:

@@ -1,12 +1,15 @@
 """Where frames are: from bytes as they come to frames of known type and layout.
 
-In: a byte stream in any pieces, or datagrams. Out: `Frames`, a struct of arrays of those that were found, and counters of what became of
-every other byte. No clock, port or thread in here, and no exception for any bytes whatever. Modules in reading order:
+In: a byte stream in any pieces, or datagrams. Out: `Frames`, a struct of arrays of those that were
+found, and counters of what became of
+every other byte. No clock, port or thread in here, and no exception for any bytes whatever. Modules
+in reading order:
 
 * `results`: `Frames`, which each module passes on to the next; frames one by one; the counters.
 * `plausibility`: whether candidates of one layout are frames, many at a time.
 * `many_lengths`: candidates of layouts that differ only in the length of an array, judged together.
-* `frame_engine`: one frame type: its candidates judged, and its frames as columns; compiled, and interpreted by construct.
+* `frame_engine`: one frame type: its candidates judged, and its frames as columns; compiled, and
+  interpreted by construct.
 * `candidates`: the candidates in a piece of a stream, of the types that are looked for.
 * `weak_frames`: types that are believed in runs alone.
 * `search`: the rule of a stream: the leftmost valid candidate, then on after its last byte.

@@ -1,9 +1,10 @@
 """Messages that come in several datagrams, joined before they are framed.
 
-A fragment says of which message it is, which part of it, and how many there are (`lidarspec.spec.links.Assembled`). Fragments may come in
-any order and twice. A message is handed on with its last fragment, and never with one of another: what lacks a fragment is given up as
-soon as a few newer messages have begun, a second has passed or the line falls silent, and what comes of it later is dropped; both are
-counted. Datagrams that are no fragments pass as they are.
+A fragment says of which message it is, which part of it, and how many there are
+(`lidarspec.spec.links.Assembled`). Fragments may come in any order and twice. A message is handed
+on with its last fragment, and never with one of another: what lacks a fragment is given up as soon
+as a few newer messages have begun, a second has passed or the line falls silent, and what comes of
+it later is dropped; both are counted. Datagrams that are no fragments pass as they are.
 """
 
 from __future__ import annotations
@@ -22,7 +23,8 @@ from lidarspec.framing.results import Counters, Indices, Numbers
 from lidarspec.spec.description import Frame
 from lidarspec.spec.links import Assembled
 
-#: messages that are waited for at a time, of which so many are remembered when they are done, and for how many nanoseconds.
+#: messages that are waited for at a time, of which so many are remembered when they are done, and
+#: for how many nanoseconds.
 WAITING, PATIENCE = 8, 10**9
 
 #: the longest payload of a datagram.
@@ -39,7 +41,9 @@ class _Fragment:
 
 @dataclass
 class _Message:
-    """A message of which not all is there: fragments by their index, where the first one began in the input, and when it came."""
+    """A message of which not all is there: fragments by their index, where the first one began in
+    the input, and when it came.
+    """
 
     count: int
     place: int
@@ -98,10 +102,27 @@ class Assembly:
         """The bytes of fragments that wait for others."""
         return sum(message.size for message in self._waiting.values())
 
-    def join(self, buffer: NDArray[np.uint8], starts: Numbers, sizes: Indices, at: NDArray[np.int64], base: int) -> Joined:
-        """The messages that datagrams complete, among those that are no fragments; `base`: where these begin in the input."""
-        data, places, times, dropped, heads = list[bytes](), list[int](), list[int](), list[int](), 0
-        for start, size, time in zip(np.asarray(starts).tolist(), sizes.tolist(), at.tolist(), strict=True):
+    def join(
+        self,
+        buffer: NDArray[np.uint8],
+        starts: Numbers,
+        sizes: Indices,
+        at: NDArray[np.int64],
+        base: int,
+    ) -> Joined:
+        """The messages that datagrams complete, among those that are no fragments; `base`: where
+        these begin in the input.
+        """
+        data, places, times, dropped, heads = (
+            list[bytes](),
+            list[int](),
+            list[int](),
+            list[int](),
+            0,
+        )
+        for start, size, time in zip(
+            np.asarray(starts).tolist(), sizes.tolist(), at.tolist(), strict=True
+        ):
             datagram = buffer[start : start + size].tobytes()
             fragment = self._fragment(datagram)
             whole: tuple[bytes, int] | None = (datagram, base)
@@ -146,16 +167,24 @@ class Assembly:
         else:
             payload = datagram[layout.size :]
         key = tuple(layout.leaves[path].scalar(datagram) for path in rule.keys)
-        index, count = layout.leaves[rule.index].scalar(datagram) - rule.first, layout.leaves[rule.count].scalar(datagram)
+        index, count = (
+            layout.leaves[rule.index].scalar(datagram) - rule.first,
+            layout.leaves[rule.count].scalar(datagram),
+        )
         is_whole = len(datagram) == layout.size or not rule.payload
         return _Fragment(key, index, count, payload) if is_whole and 0 <= index < count else None
 
     def _taken(self, fragment: _Fragment, place: int, time: int) -> tuple[bytes, int] | None:
         """The message that a fragment completes, and where it began; None where others are missing."""
-        for key in [key for key, message in self._waiting.items() if 0 <= message.at < time - PATIENCE]:
+        for key in [
+            key for key, message in self._waiting.items() if 0 <= message.at < time - PATIENCE
+        ]:
             self._lose(key)
         known = self._waiting.get(fragment.key)
-        if known is not None and (known.count != fragment.count or known.parts.get(fragment.index, fragment.payload) != fragment.payload):
+        if known is not None and (
+            known.count != fragment.count
+            or known.parts.get(fragment.index, fragment.payload) != fragment.payload
+        ):
             self._lose(fragment.key)  # a message of the same key has begun
             known = None
         elif fragment.index in known.parts if known is not None else fragment.key in self._done:
@@ -178,6 +207,8 @@ class Assembly:
 
     def _lose(self, key: Hashable) -> None:
         message = self._waiting.pop(key)
-        self._stats.fragments_lost += 1 if self._rule.in_bytes else message.count - len(message.parts)
+        self._stats.fragments_lost += (
+            1 if self._rule.in_bytes else message.count - len(message.parts)
+        )
         self._dropped += message.size
         self._done.append(key)

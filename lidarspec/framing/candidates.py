@@ -1,7 +1,9 @@
-"""The candidates in a piece of a stream: which types are looked for, where their constants stand, and what is judged of them.
+"""The candidates in a piece of a stream: which types are looked for, where their constants stand,
+and what is judged of them.
 
-A type with `after` is looked for only while the frame that it names is the last seen of those named by any `after`. All candidates of a
-piece are judged in bulk, those of each type once, when it is looked for first: what is looked for may change with every frame.
+A type with `after` is looked for only while the frame that it names is the last seen of those named
+by any `after`. All candidates of a piece are judged in bulk, those of each type once, when it is
+looked for first: what is looked for may change with every frame.
 """
 
 from __future__ import annotations
@@ -18,7 +20,8 @@ from lidarspec.frames.layout import Marks, Sums, words
 from lidarspec.framing.frame_engine import Codec
 from lidarspec.framing.results import CONSTANT, COUNTED, PLUGIN, SHORT, VALID, Frames
 
-#: candidates of one type in a piece; where there are more, the piece is made shorter, so that memory stays small.
+#: candidates of one type in a piece; where there are more, the piece is made shorter, so that
+#: memory stays small.
 MOST = 1 << 15
 
 Bytes1D = NDArray[np.uint8]
@@ -27,7 +30,8 @@ Offsets = NDArray[np.intp]
 
 @dataclass
 class Mode:
-    """What is remembered between pieces: the last frame named by any `after`, a run of weak frames under way, the last frame's size.
+    """What is remembered between pieces: the last frame named by any `after`, a run of weak frames
+    under way, the last frame's size.
 
     Attributes:
         changed: where in the stream what is looked for changed last.
@@ -86,10 +90,15 @@ class Framing:
         self.marks = [codec.marks for codec in self.codecs]
         self.words = [words(marks) for marks in self.marks]
         #: bytes up to the end of the last of those.
-        self.ends = [max((spot + dtype.itemsize for spot, dtype, _, _ in found), default=0) for found in self.words]
+        self.ends = [
+            max((spot + dtype.itemsize for spot, dtype, _, _ in found), default=0)
+            for found in self.words
+        ]
         lengths = [codec.frame.max_length for codec in self.codecs]
         #: no candidate waits for more bytes than these.
-        self.reach = max(lengths) + max(codec.frame.max_length * codec.frame.confirm for codec in self.codecs)
+        self.reach = max(lengths) + max(
+            codec.frame.max_length * codec.frame.confirm for codec in self.codecs
+        )
         self._weak = {kind for kind, codec in enumerate(self.codecs) if codec.frame.confirm > 1}
         self._active: dict[str | None, list[int]] = {}
 
@@ -97,7 +106,9 @@ class Framing:
         """The types that are looked for now, in order."""
         known = self._active.get(mode.after)
         if known is None:
-            known = self._active[mode.after] = [i for i, codec in enumerate(self.codecs) if codec.frame.after in (None, mode.after)]
+            known = self._active[mode.after] = [
+                i for i, codec in enumerate(self.codecs) if codec.frame.after in (None, mode.after)
+            ]
         return known
 
     def weak(self, kind: int) -> bool:
@@ -113,12 +124,26 @@ class Framing:
         return self.names[kind] in self.named and self.names[kind] != mode.after
 
     def switching(self, mode: Mode) -> NDArray[np.bool_]:
-        """Whether a frame of each type changes what is looked for, (types + 1,), by its index; the last, for -1, is False."""
+        """Whether a frame of each type changes what is looked for, (types + 1,), by its index; the
+        last, for -1, is False.
+        """
         return np.array([*(self.switches(kind, mode) for kind in range(len(self.names))), False])
 
-    def survey(self, kind: int, buffer: Bytes1D, offsets: Offsets, stops: Offsets | None = None, *, gathered: bool = True) -> Frames:
-        """The candidates of a type at these offsets, which have its constants, each with its layout and whether it is a frame."""
-        return self.codecs[kind].survey(buffer, offsets, stops, kind=kind, gathered=gathered, sums=self.sums)
+    def survey(
+        self,
+        kind: int,
+        buffer: Bytes1D,
+        offsets: Offsets,
+        stops: Offsets | None = None,
+        *,
+        gathered: bool = True,
+    ) -> Frames:
+        """The candidates of a type at these offsets, which have its constants, each with its layout
+        and whether it is a frame.
+        """
+        return self.codecs[kind].survey(
+            buffer, offsets, stops, kind=kind, gathered=gathered, sums=self.sums
+        )
 
 
 def matches(buffer: Bytes1D, constants: Marks) -> Offsets:
@@ -133,7 +158,9 @@ def matches(buffer: Bytes1D, constants: Marks) -> Offsets:
         match[:inside] &= _right(buffer, spot, mask, value)[:inside]
     offsets = fitting(buffer, np.flatnonzero(match), tuple(rest[1:]))
     if first:
-        offsets = np.concatenate([offsets, fitting(buffer, np.arange(max(length - first, 0), length), tuple(rest))])
+        offsets = np.concatenate(
+            [offsets, fitting(buffer, np.arange(max(length - first, 0), length), tuple(rest))]
+        )
     return offsets
 
 
@@ -176,17 +203,25 @@ class Candidates:
         self.judged: dict[int, Frames] = {}
         self._known: set[int] = set()
         spots = self._spots(mode)
-        limit = min((int(offsets[MOST]) for offsets in spots.values() if len(offsets) > MOST), default=len(buffer))
+        limit = min(
+            (int(offsets[MOST]) for offsets in spots.values() if len(offsets) > MOST),
+            default=len(buffer),
+        )
         if limit < len(buffer):
             self.buffer = buffer[: max(limit, framing.reach)]
             self._begun.clear()
-            spots = {kind: offsets[: int(np.searchsorted(offsets, len(self.buffer)))] for kind, offsets in spots.items()}
+            spots = {
+                kind: offsets[: int(np.searchsorted(offsets, len(self.buffer)))]
+                for kind, offsets in spots.items()
+            }
         self.is_whole = len(self.buffer) == len(buffer)
         self.final = final and self.is_whole
         self._judge(spots)
 
     def live(self, mode: Mode) -> Frames | None:
-        """Those that are valid or wait for bytes, by offset, at each the one whose type comes first; None where there are too many."""
+        """Those that are valid or wait for bytes, by offset, at each the one whose type comes
+        first; None where there are too many.
+        """
         spots = self._spots(mode)
         if any(len(offsets) > MOST for offsets in spots.values()):
             return None
@@ -199,7 +234,10 @@ class Candidates:
         spots: dict[int, Offsets] = {}
         for kind in self._framing.active(mode):
             if kind not in self._known and not self._framing.weak(kind):
-                begin, rest = self._framing.marks[kind][:2], self._framing.marks[kind][2:]  # many types begin alike
+                begin, rest = (
+                    self._framing.marks[kind][:2],
+                    self._framing.marks[kind][2:],
+                )  # many types begin alike
                 if begin not in self._begun:
                     self._begun[begin] = matches(self.buffer, begin)
                 spots[kind] = fitting(self.buffer, self._begun[begin], rest)
@@ -211,13 +249,20 @@ class Candidates:
             if not len(offsets):
                 continue
             own = self._framing.survey(kind, self.buffer, offsets)
-            self.judged[kind] = own if own.is_sound or (right := own.status != CONSTANT).all() else own.only(right)
+            self.judged[kind] = (
+                own if own.is_sound or (right := own.status != CONSTANT).all() else own.only(right)
+            )
 
 
 def merged(candidates: Sequence[Frames], *, final: bool) -> Frames:
-    """The candidates of several types that are valid or wait for bytes, by offset, at each the one whose type comes first."""
+    """The candidates of several types that are valid or wait for bytes, by offset, at each the one
+    whose type comes first.
+    """
     worst = VALID if final else SHORT
-    parts = [own if own.is_sound or bool((own.status <= worst).all()) else own.only(own.status <= worst) for own in candidates]
+    parts = [
+        own if own.is_sound or bool((own.status <= worst).all()) else own.only(own.status <= worst)
+        for own in candidates
+    ]
     live = Frames.joined([part for part in parts if len(part)] or parts[:1])
     if len(parts) == 1:
         return live

@@ -1,9 +1,10 @@
 """Datagrams, each one frame, whole, or none: of which type each is, judged together.
 
-The rule of streams, without the search: at the first byte of a datagram the order of the types decides, a type
-with `after` only counts while it is announced, and a frame has to be as long as its datagram. Datagrams that are all alike
-are judged as rows (`lidarspec.framing.steady`); of others each type judges those that no type before it has taken. Only what
-makes a plugin fail is judged alone, so that one datagram does not cost the others.
+The rule of streams, without the search: at the first byte of a datagram the order of the types
+decides, a type with `after` only counts while it is announced, and a frame has to be as long as its
+datagram. Datagrams that are all alike are judged as rows (`lidarspec.framing.steady`); of others
+each type judges those that no type before it has taken. Only what makes a plugin fail is judged
+alone, so that one datagram does not cost the others.
 
 A message in several datagrams is joined before this (`lidarspec.framing.assembly`).
 """
@@ -18,11 +19,24 @@ from numpy.typing import NDArray
 from lidarspec.frames.arrays import alike, repeated
 from lidarspec.frames.layout import Layout, equal
 from lidarspec.framing.candidates import Bytes1D, Framing, Mode, Piece
-from lidarspec.framing.results import CONSTANT, LENGTH, PLUGIN, SHORT, VALID, Frames, Indices, Numbers, Status, array_of
+from lidarspec.framing.results import (
+    CONSTANT,
+    LENGTH,
+    PLUGIN,
+    SHORT,
+    VALID,
+    Frames,
+    Indices,
+    Numbers,
+    Status,
+    array_of,
+)
 from lidarspec.framing.steady import steady_datagrams, step_between
 
 
-def sorted_datagrams(framing: Framing, buffer: Bytes1D, starts: Numbers, sizes: Indices, mode: Mode) -> Piece:
+def sorted_datagrams(
+    framing: Framing, buffer: Bytes1D, starts: Numbers, sizes: Indices, mode: Mode
+) -> Piece:
     """The type of each datagram.
 
     Args:
@@ -46,8 +60,21 @@ class _Batch:
         steady: what they are as frames of one type and layout, where that was tried.
     """
 
-    def __init__(self, framing: Framing, buffer: Bytes1D, starts: Indices, sizes: Indices, steady: Frames | None) -> None:
-        self._framing, self._buffer, self._starts, self._sizes, self._steady = framing, buffer, starts, sizes, steady
+    def __init__(
+        self,
+        framing: Framing,
+        buffer: Bytes1D,
+        starts: Indices,
+        sizes: Indices,
+        steady: Frames | None,
+    ) -> None:
+        self._framing, self._buffer, self._starts, self._sizes, self._steady = (
+            framing,
+            buffer,
+            starts,
+            sizes,
+            steady,
+        )
         self._known: dict[str | None, tuple[int, Frames, Status, list[int]]] = {}
         self._piece = Piece(Frames.none(buffer), len(buffer))
 
@@ -66,15 +93,27 @@ class _Batch:
         """The types from here up to the datagram that changes what is looked for."""
         if mode.after not in self._known:
             frames, reasons = self._judged(self._starts[position:], self._sizes[position:], mode)
-            spots = (np.flatnonzero(self._framing.switching(mode)[frames.kinds]) + position).tolist() if self._framing.named else []
+            spots = (
+                (np.flatnonzero(self._framing.switching(mode)[frames.kinds]) + position).tolist()
+                if self._framing.named
+                else []
+            )
             self._known[mode.after] = position, frames, reasons, spots
         first, frames, reasons, spots = self._known[mode.after]
         index = bisect.bisect_left(spots, position)
         stop = spots[index] + 1 if index < len(spots) else len(self._starts)
         frames = frames.only(slice(position - first, stop - first))
         lost = np.flatnonzero(frames.kinds < 0)
-        frames = self._rejected(frames, lost, reasons[position - first :][lost], mode) if len(lost) else frames
-        if len(frames) and frames.kinds[-1] >= 0 and self._framing.switches(int(frames.kinds[-1]), mode):
+        frames = (
+            self._rejected(frames, lost, reasons[position - first :][lost], mode)
+            if len(lost)
+            else frames
+        )
+        if (
+            len(frames)
+            and frames.kinds[-1] >= 0
+            and self._framing.switches(int(frames.kinds[-1]), mode)
+        ):
             mode.after = self._framing.names[int(frames.kinds[-1])]
         return frames
 
@@ -82,14 +121,28 @@ class _Batch:
         """The type and layout of each datagram while nothing changes what is looked for.
 
         Returns:
-            They, and why those that are no frames are none, 0 where they resemble none; `PLUGIN` where each is to be judged alone.
+            They, and why those that are no frames are none, 0 where they resemble none; `PLUGIN`
+            where each is to be judged alone.
         """
         number, known = len(starts), alike(sizes)
-        least, most = (known, known) if known is not None else (int(sizes.min()), int(sizes.max())) if number else (0, 0)
-        kinds, forms, reasons, left = repeated(-1, number), repeated(-1, number), np.zeros(number, np.uint8), np.arange(number)
+        least, most = (
+            (known, known)
+            if known is not None
+            else (int(sizes.min()), int(sizes.max()))
+            if number
+            else (0, 0)
+        )
+        kinds, forms, reasons, left = (
+            repeated(-1, number),
+            repeated(-1, number),
+            np.zeros(number, np.uint8),
+            np.arange(number),
+        )
         layouts: tuple[Layout, ...] = ()
         fixed = [(kind, self._framing.codecs[kind].size) for kind in self._framing.active(mode)]
-        others = [kind for kind, size in fixed if size is not None and not least <= size <= most]  # they can only say why not
+        others = [
+            kind for kind, size in fixed if size is not None and not least <= size <= most
+        ]  # they can only say why not
         for kind in (*(kind for kind, _ in fixed if kind not in others), *others):
             if not len(left):
                 break
@@ -113,7 +166,11 @@ class _Batch:
             forms[which[fits]] = np.where(frames.forms < 0, -1, frames.forms + len(layouts))[fits]
             layouts += frames.layouts
             if np.count_nonzero(fits) < len(fits):
-                status = np.where(frames.sizes > lengths, np.uint8(SHORT), np.where(frames.status == VALID, LENGTH, frames.status))
+                status = np.where(
+                    frames.sizes > lengths,
+                    np.uint8(SHORT),
+                    np.where(frames.status == VALID, LENGTH, frames.status),
+                )
                 reasons[which] = np.maximum(reasons[which], status)
             left = np.flatnonzero(kinds < 0)
         return Frames(self._buffer, kinds, starts, sizes, layouts=layouts, forms=forms), reasons
@@ -126,7 +183,9 @@ class _Batch:
         return self._framing.survey(kind, self._buffer, starts, starts + sizes, gathered=False)
 
     def _rejected(self, frames: Frames, lost: Indices, reasons: Status, mode: Mode) -> Frames:
-        """Count those that are no frames; the types again, up to one that turns out to be a frame that changes what is looked for."""
+        """Count those that are no frames; the types again, up to one that turns out to be a frame
+        that changes what is looked for.
+        """
         parts, begun = list[Frames](), 0
         for index in lost[reasons == PLUGIN].tolist():
             alone = self._judged_alone(frames.only(slice(index, index + 1)), mode)
@@ -150,19 +209,25 @@ class _Batch:
                 continue
             frame = self._framing.survey(kind, data, np.zeros(1, np.intp))
             if frame.status[0] == VALID and frame.sizes[0] == len(data):
-                return Frames(self._buffer, frame.kinds, start, size, layouts=frame.layouts, forms=frame.forms)
+                return Frames(
+                    self._buffer, frame.kinds, start, size, layouts=frame.layouts, forms=frame.forms
+                )
             rejected = max(rejected, int(frame.status[0]) or LENGTH)
             self._piece.errors += frame.errors
         self._count(np.array([rejected], np.uint8), size, mode)
         return None
 
     def _count(self, reasons: NDArray[np.uint8], sizes: Indices, mode: Mode) -> None:
-        """Count datagrams as rejected: those that resemble no frame by their constants, or their length where it is too short for these."""
+        """Count datagrams as rejected: those that resemble no frame by their constants, or their
+        length where it is too short for these.
+        """
         least = min(self._framing.ends[kind] for kind in self._framing.active(mode))
         unknown = np.isin(reasons, (VALID, CONSTANT))
         others = unknown & (sizes >= max(least, 1))
         if number := int(np.count_nonzero(others)):
-            self._piece.rejected["bad_constant"] = self._piece.rejected.get("bad_constant", 0) + number
+            self._piece.rejected["bad_constant"] = (
+                self._piece.rejected.get("bad_constant", 0) + number
+            )
         self._piece.reject(np.bincount(np.where(unknown, LENGTH, reasons)[~others]).tolist(), ())
 
     def _marked(self, kind: int, starts: Indices, sizes: Indices) -> NDArray[np.bool_]:
@@ -182,7 +247,13 @@ class _Batch:
             values = (
                 np.ndarray((len(starts),), dtype, self._buffer, starts.item(0) + spot, (step,))
                 if step
-                else np.ndarray((len(self._buffer) - spot - dtype.itemsize + 1,), dtype, self._buffer, spot, (1,))[starts]
+                else np.ndarray(
+                    (len(self._buffer) - spot - dtype.itemsize + 1,),
+                    dtype,
+                    self._buffer,
+                    spot,
+                    (1,),
+                )[starts]
             )
             marked &= equal(values, word)
         return marked

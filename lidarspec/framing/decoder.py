@@ -1,7 +1,9 @@
-"""The incremental decoder: bytes in, frames out, everything counted. No clock, port or thread in here.
+"""The incremental decoder: bytes in, frames out, everything counted. No clock, port or thread in
+here.
 
-A byte stream is cut into pieces that stay in the cache; what a piece leaves undecided is looked at again together
-with the next. Datagram links frame by datagram. However the input is cut, the frames and counters are the same.
+A byte stream is cut into pieces that stay in the cache; what a piece leaves undecided is looked at
+again together with the next. Datagram links frame by datagram. However the input is cut, the frames
+and counters are the same.
 """
 
 from __future__ import annotations
@@ -29,10 +31,12 @@ from lidarspec.spec.links import Udp
 
 __all__ = ["BACKENDS", "Decoder", "backend", "frames_of", "is_stream"]
 
-#: bytes of a stream looked at in one go: at most, where frames follow one another and where not; and at least.
+#: bytes of a stream looked at in one go: at most, where frames follow one another and where not;
+#: and at least.
 LONGEST, PIECE, LEAST = 24 << 16, 6 << 16, 1 << 12
 
-#: datagrams of a list judged together; rows of an array, which need not be gathered first; and bytes of either, about.
+#: datagrams of a list judged together; rows of an array, which need not be gathered first; and
+#: bytes of either, about.
 TOGETHER, ROWS, ROW_BYTES = 1 << 14, 1 << 17, 1 << 23
 
 Data = bytes | bytearray | memoryview | NDArray[np.uint8]
@@ -45,8 +49,12 @@ BACKEND = "LIDARSPEC_BACKEND"
 class Witness(Protocol):
     """Who is shown what a decoder is fed, and what it finds in it."""
 
-    def fed(self, decoder: Decoder, buffer: NDArray[np.uint8], starts: Numbers, sizes: NDArray[np.intp]) -> None:
-        """What a decoder, whose `stats` do not count it yet, is fed: a piece of a stream, or datagrams, whose buffer stays as it is."""
+    def fed(
+        self, decoder: Decoder, buffer: NDArray[np.uint8], starts: Numbers, sizes: NDArray[np.intp]
+    ) -> None:
+        """What a decoder, whose `stats` do not count it yet, is fed: a piece of a stream, or
+        datagrams, whose buffer stays as it is.
+        """
 
     def found(self, frames: Frames) -> None:
         """Frames, in stream order."""
@@ -58,7 +66,8 @@ class Decoder:
     Args:
         sensor: the sensor; only its incoming frames are looked for.
         stream: a byte stream, or datagrams one for each `feed`.
-        backend: what makes points of its packets, "auto", "numpy" or "jit"; "construct" also judges every candidate.
+        backend: what makes points of its packets, "auto", "numpy" or "jit"; "construct" also judges
+            every candidate.
         sums: what computes checksums; by default their algorithms.
 
     Attributes:
@@ -66,27 +75,39 @@ class Decoder:
         witness: who is shown its bytes and frames; None for nobody.
     """
 
-    def __init__(self, sensor: Spec, *, stream: bool, backend: str = "auto", sums: Sums | None = None) -> None:
+    def __init__(
+        self, sensor: Spec, *, stream: bool, backend: str = "auto", sums: Sums | None = None
+    ) -> None:
         if not sensor.incoming:
             raise UsageError(f"{sensor.id} has no frames yet: configure it with its file first")
         self.sensor, self.stream, self.backend = sensor, stream, backend
         self.stats = Counters()
         self.witness: Witness | None = None
         keep_freed_memory()
-        self.framing = _framing(tuple(sensor.incoming), tuple(sensor.incoming.values()), backend == "construct", sums)
-        answer = sensor.options.get("answer", "")  # as if the frame that the answer comes after had been seen
+        self.framing = _framing(
+            tuple(sensor.incoming), tuple(sensor.incoming.values()), backend == "construct", sums
+        )
+        answer = sensor.options.get(
+            "answer", ""
+        )  # as if the frame that the answer comes after had been seen
         self._mode = Mode(after=sensor.frames[answer].after if answer in sensor.frames else None)
         self._pending, self._base, self._need = b"", 0, 0
         self._gap = 0
         self._fillers = bytes(sensor.fillers)
-        link, longest = sensor.links.get("data"), max(frame.max_length for frame in sensor.incoming.values())
+        link, longest = (
+            sensor.links.get("data"),
+            max(frame.max_length for frame in sensor.incoming.values()),
+        )
         rule = link.assembled if isinstance(link, Udp) and not stream else None
         self._assembly = None if rule is None else Assembly(rule, longest, self.stats)
         self._least = max(LEAST, 2 * self.framing.reach)
         self._size = max(PIECE, self._least)
 
     def __repr__(self) -> str:
-        return f"Decoder({self.sensor.id}, {'stream' if self.stream else 'datagrams'}, {self.backend}: {self.stats})"
+        return (
+            f"Decoder({self.sensor.id}, {'stream' if self.stream else 'datagrams'}, {self.backend}:"
+            f" {self.stats})"
+        )
 
     @property
     def joins(self) -> bool:
@@ -103,21 +124,30 @@ class Decoder:
         return [found for frames in self.frames(data, at) for found in frames.found()]
 
     def idle(self) -> list[Found]:
-        """The line fell silent: candidates that wait for bytes are given up, and their bytes looked at again."""
+        """The line fell silent: candidates that wait for bytes are given up, and their bytes looked
+        at again.
+        """
         return [found for frames in self.rest() for found in frames.found()]
 
     def finish(self) -> list[Found]:
-        """The input ended: candidates that wait for bytes are given up, and their bytes looked at again."""
+        """The input ended: candidates that wait for bytes are given up, and their bytes looked at
+        again.
+        """
         return self.idle()
 
     def frames(self, data: Data, at: int | None = None) -> list[Frames]:
-        """The frames that these bytes complete, in stream order, as structs of arrays. Raises on no bytes whatever.
+        """The frames that these bytes complete, in stream order, as structs of arrays. Raises on no
+        bytes whatever.
 
         Args:
             data: the next bytes of the stream, or one datagram.
             at: their arrival time in ns, if known.
         """
-        view = np.ascontiguousarray(data).data.cast("B") if isinstance(data, np.ndarray) else memoryview(data).cast("B")
+        view = (
+            np.ascontiguousarray(data).data.cast("B")
+            if isinstance(data, np.ndarray)
+            else memoryview(data).cast("B")
+        )
         if not self.stream:
             return [self.datagrams([view], [at])]
         if self.witness is not None:
@@ -149,7 +179,9 @@ class Decoder:
         self._pending, self.stats.pending = b"", 0
         return found
 
-    def datagrams(self, data: Sequence[Any] | NDArray[np.uint8], at: Sequence[int | None] | None = None) -> Frames:
+    def datagrams(
+        self, data: Sequence[Any] | NDArray[np.uint8], at: Sequence[int | None] | None = None
+    ) -> Frames:
         """Datagrams, each one frame, whole, or none.
 
         Args:
@@ -161,25 +193,49 @@ class Decoder:
         else:
             buffer, lengths = np.frombuffer(b"".join(data), np.uint8), list(map(len, data))
             is_one_size = bool(lengths) and lengths.count(lengths[0]) == len(lengths)
-            sizes = repeated(lengths[0], len(lengths)) if is_one_size else np.array(lengths, np.intp)
-        times = repeated(-1, len(data)) if at is None else np.array([-1 if one is None else one for one in at], np.int64)
+            sizes = (
+                repeated(lengths[0], len(lengths)) if is_one_size else np.array(lengths, np.intp)
+            )
+        times = (
+            repeated(-1, len(data))
+            if at is None
+            else np.array([-1 if one is None else one for one in at], np.int64)
+        )
         return self.placed(buffer, _places(sizes), sizes, times)
 
-    def placed(self, buffer: NDArray[np.uint8], starts: Numbers, sizes: NDArray[np.intp], at: NDArray[np.int64]) -> Frames:
-        """Datagrams that stand in one buffer already, each one frame, whole, or none; nothing is copied.
+    def placed(
+        self,
+        buffer: NDArray[np.uint8],
+        starts: Numbers,
+        sizes: NDArray[np.intp],
+        at: NDArray[np.int64],
+    ) -> Frames:
+        """Datagrams that stand in one buffer already, each one frame, whole, or none; nothing is
+        copied.
 
         Args:
-            buffer: one-dimensional and contiguous; what stands between the datagrams does not matter.
+            buffer: one-dimensional and contiguous; what stands between the datagrams does not
+                matter.
             starts, sizes: of each datagram, in the order of their arrival.
             at: their arrival times in ns, -1 where nobody knows.
         """
         size = alike(sizes)
-        total, places, joined = int(sizes.sum()) if size is None else size * len(sizes), _places(sizes, self._base), None
+        total, places, joined = (
+            int(sizes.sum()) if size is None else size * len(sizes),
+            _places(sizes, self._base),
+            None,
+        )
         if self.witness is not None:
             self.witness.fed(self, buffer, starts, sizes)
         if self._assembly is not None:
             joined = self._assembly.join(buffer, starts, sizes, at, self._base)
-            buffer, starts, sizes, at, places = joined.buffer, joined.starts, joined.sizes, joined.at, joined.places
+            buffer, starts, sizes, at, places = (
+                joined.buffer,
+                joined.starts,
+                joined.sizes,
+                joined.at,
+                joined.places,
+            )
             self.stats.bytes_skipped += joined.heads
             self.stats.bytes_filler += joined.heads
             self.stats.pending = self._assembly.pending
@@ -210,7 +266,9 @@ class Decoder:
         good: NDArray[np.bool_],
         joined: Joined | None,
     ) -> NDArray[np.int64]:
-        """The bytes in datagrams that are no frames before each one that is, fillers left out; counts them."""
+        """The bytes in datagrams that are no frames before each one that is, fillers left out;
+        counts them.
+        """
         lost = self._skipped(buffer, np.where(good, 0, sizes), starts + sizes)
         if joined is not None:
             lost = lost + joined.dropped[:-1]
@@ -225,7 +283,15 @@ class Decoder:
         """Count bytes that are no frame, before the next one."""
         self._gap, self.stats.bytes_skipped = self._gap + size, self.stats.bytes_skipped + size
 
-    def _cut(self, buffer: NDArray[np.uint8], at: int | None, found: list[Frames], *, lasting: bool = True, final: bool = False) -> int:
+    def _cut(
+        self,
+        buffer: NDArray[np.uint8],
+        at: int | None,
+        found: list[Frames],
+        *,
+        lasting: bool = True,
+        final: bool = False,
+    ) -> int:
         """Cut bytes into frames, piece by piece, and add those with frames to what is found.
 
         Args:
@@ -252,23 +318,37 @@ class Decoder:
         return start
 
     def _piece(self, buffer: Bytes1D, *, final: bool) -> Piece:
-        """A piece of a stream cut into frames: as rows while nothing disturbs and no weak type is looked for; else by search."""
+        """A piece of a stream cut into frames: as rows while nothing disturbs and no weak type is
+        looked for; else by search.
+        """
         framing, mode = self.framing, self._mode
         piece = None if final or framing.any_weak(mode) else steady_stream(framing, buffer, mode)
         return leftmost(framing, buffer, mode, self._base, final=final) if piece is None else piece
 
     def _entered(self, buffer: NDArray[np.uint8], piece: Piece, at: int | None) -> Frames:
-        """The frames of a piece with their place in the input, and all that was found in it counted."""
+        """The frames of a piece with their place in the input, and all that was found in it
+        counted.
+        """
         frames, base = piece.frames, self._base
         gaps = self._gaps(buffer, frames, piece.end)
         self._rejected(piece.rejected, piece.errors)
         self._count(frames.kinds)
         places = frames.places
-        places = range(places.start + base, places.stop + base, places.step) if isinstance(places, range) else places + base
-        return self._shown(frames.located(self.framing.names, places, gaps, repeated(-1 if at is None else at, len(frames))))
+        places = (
+            range(places.start + base, places.stop + base, places.step)
+            if isinstance(places, range)
+            else places + base
+        )
+        return self._shown(
+            frames.located(
+                self.framing.names, places, gaps, repeated(-1 if at is None else at, len(frames))
+            )
+        )
 
     def _gaps(self, buffer: NDArray[np.uint8], frames: Frames, end: int) -> NDArray[np.int64]:
-        """The bytes skipped before each frame of a piece that ends there, fillers left out; counts them."""
+        """The bytes skipped before each frame of a piece that ends there, fillers left out; counts
+        them.
+        """
         places = frames.places
         if not self._gap and isinstance(places, range) and places.start == 0 and places.stop == end:
             return repeated(0, len(frames))
@@ -281,7 +361,9 @@ class Decoder:
         self._gap = int(gaps[-1])
         return gaps[:-1]
 
-    def _skipped(self, buffer: NDArray[np.uint8], sizes: NDArray[np.int64], stops: NDArray[np.int64]) -> NDArray[np.int64]:
+    def _skipped(
+        self, buffer: NDArray[np.uint8], sizes: NDArray[np.int64], stops: NDArray[np.int64]
+    ) -> NDArray[np.int64]:
         """The numbers of skipped bytes that end at these stops, fillers left out; counts them."""
         self.stats.bytes_skipped += int(sizes.sum())
         for index in np.flatnonzero(sizes).tolist() if self._fillers else ():
@@ -300,7 +382,11 @@ class Decoder:
         frames = self.stats.frames
         known = len(frames)
         only = alike(kinds)
-        for kind, number in [(only, len(kinds))] if only is not None else enumerate(np.bincount(kinds).tolist() if len(kinds) else ()):
+        for kind, number in (
+            [(only, len(kinds))]
+            if only is not None
+            else enumerate(np.bincount(kinds).tolist() if len(kinds) else ())
+        ):
             if number:
                 frames[self.framing.names[kind]] = frames.get(self.framing.names[kind], 0) + number
         if len(frames) > known > 0:
@@ -310,8 +396,16 @@ class Decoder:
 
 
 @lru_cache(maxsize=256)
-def _framing(names: tuple[str, ...], frames: tuple[Frame, ...], interpreted: bool, sums: Sums | None) -> Framing:
-    return Framing({name: codec(frame, interpreted=interpreted) for name, frame in zip(names, frames, strict=True)}, sums)
+def _framing(
+    names: tuple[str, ...], frames: tuple[Frame, ...], interpreted: bool, sums: Sums | None
+) -> Framing:
+    return Framing(
+        {
+            name: codec(frame, interpreted=interpreted)
+            for name, frame in zip(names, frames, strict=True)
+        },
+        sums,
+    )
 
 
 def _places(sizes: NDArray[np.intp], first: int = 0) -> Numbers:
@@ -325,7 +419,8 @@ def _places(sizes: NDArray[np.intp], first: int = 0) -> Numbers:
 
 
 def backend(name: str) -> str:
-    """The back end that a name stands for; "auto" is what LIDARSPEC_BACKEND says, if it says anything.
+    """The back end that a name stands for; "auto" is what LIDARSPEC_BACKEND says, if it says
+    anything.
 
     Raises:
         UsageError: for a name that is none.
@@ -342,10 +437,14 @@ def frames_of(decoder: Decoder, data: Any) -> list[Frames]:
     """Every frame of a whole input: bytes as a stream, an iterable or (n, size) array as datagrams."""
     if is_stream(data):
         return decoder.frames(data) + decoder.rest()
-    packets: Any = np.ascontiguousarray(data, np.uint8) if isinstance(data, np.ndarray) else list(data)
+    packets: Any = (
+        np.ascontiguousarray(data, np.uint8) if isinstance(data, np.ndarray) else list(data)
+    )
     most = ROWS if isinstance(data, np.ndarray) else TOGETHER
     step = max(1, min(most, ROW_BYTES // max(len(packets[0]), 1))) if len(packets) else 1
-    return [decoder.datagrams(packets[start : start + step]) for start in range(0, len(packets), step)] + decoder.rest()
+    return [
+        decoder.datagrams(packets[start : start + step]) for start in range(0, len(packets), step)
+    ] + decoder.rest()
 
 
 def is_stream(data: Any) -> bool:

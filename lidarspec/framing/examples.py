@@ -1,7 +1,8 @@
 """Valid frames with seeded random content, for tests, docs and the REPL.
 
-A header is drawn by chance, and the rest of a frame of its layout is random bytes with constants and checksums in place; what is not
-plausible is drawn again, in the end around the values that the sensor's `sweep` declares. What does not compile is drawn field by field.
+A header is drawn by chance, and the rest of a frame of its layout is random bytes with constants
+and checksums in place; what is not plausible is drawn again, in the end around the values that the
+sensor's `sweep` declares. What does not compile is drawn field by field.
 """
 
 from __future__ import annotations
@@ -31,10 +32,12 @@ from lidarspec.spec.description import Frame, Spec
 from lidarspec.spec.syntax import Fault, member, random_value
 from lidarspec.spec.tree import Node, Ref, Select, nodes, refs
 
-#: How often random frames are made, and how often where a sensor's own `sweep` helps if none is plausible.
+#: How often random frames are made, and how often where a sensor's own `sweep` helps if none is
+#: plausible.
 TRIES = 40
 TRIES_BEFORE_SWEEP = 8
-#: Each try makes so many times the random frames of the one before, beginning with one frame, and at most so many.
+#: Each try makes so many times the random frames of the one before, beginning with one frame, and
+#: at most so many.
 GROWTH = 4
 LARGEST_BATCH = 64
 #: Bytes of such a batch, beyond its first frame.
@@ -70,7 +73,9 @@ def random_frame(sensor: Spec, frame: str, source: random.Random, drawn: Drawn =
     if engine is None or engine.schema.parts:
         return _interpreted(sensor, frame, known, source, drawn)
     largest = LARGEST_BATCH if recoder(engine.frame) is None else WRITTEN
-    for attempt in range(TRIES if sensor.simulation_of(frame).sweep is None else TRIES_BEFORE_SWEEP):
+    for attempt in range(
+        TRIES if sensor.simulation_of(frame).sweep is None else TRIES_BEFORE_SWEEP
+    ):
         layout, chosen = header(engine, source, drawn)
         number = min(GROWTH**attempt, largest, max(BATCH_BYTES // max(layout.size, 1), 1))
         rows = _random(engine, layout, number, source)
@@ -81,7 +86,9 @@ def random_frame(sensor: Spec, frame: str, source: random.Random, drawn: Drawn =
     return _make_along_sweep(sensor, frame, engine, source, drawn)
 
 
-def header(engine: CompiledCodec, source: random.Random, drawn: Drawn = NOTHING) -> tuple[Layout, dict[str, int]]:
+def header(
+    engine: CompiledCodec, source: random.Random, drawn: Drawn = NOTHING
+) -> tuple[Layout, dict[str, int]]:
     """A layout of a header chosen at random, with the values of the fields it depends on, by path.
 
     Args:
@@ -97,16 +104,22 @@ def header(engine: CompiledCodec, source: random.Random, drawn: Drawn = NOTHING)
     raise SpecError("no header was found that gives a frame within its longest length")
 
 
-def _header(frame: Frame, source: random.Random, drawn: Drawn, keys: list[int]) -> tuple[Layout, dict[str, int]]:
+def _header(
+    frame: Frame, source: random.Random, drawn: Drawn, keys: list[int]
+) -> tuple[Layout, dict[str, int]]:
     values: dict[str, int] = {}
     while True:
         try:
             return layout_of(frame.tree, values, frame.room), values
         except Unknown as unknown:
             if isinstance(unknown.leaf, Measure):
-                raise SpecError("a header alone does not make a frame of parts", path=unknown.leaf.info.path) from None
+                raise SpecError(
+                    "a header alone does not make a frame of parts", path=unknown.leaf.info.path
+                ) from None
             own = drawn.get(unknown.leaf.info.path)
-            values[unknown.leaf.info.path] = own(source) if own else _some_value(source, unknown.leaf, keys)
+            values[unknown.leaf.info.path] = (
+                own(source) if own else _some_value(source, unknown.leaf, keys)
+            )
 
 
 def _switch_keys(root: Node) -> Iterator[int]:
@@ -119,32 +132,64 @@ def _switch_keys(root: Node) -> Iterator[int]:
 
 def _some_value(source: random.Random, leaf: Leaf, keys: list[int]) -> int:
     if leaf.info.const is not None or leaf.info.allowed:
-        return int(leaf.info.const) if leaf.info.const is not None else source.choice(leaf.info.allowed or ())
+        return (
+            int(leaf.info.const)
+            if leaf.info.const is not None
+            else source.choice(leaf.info.allowed or ())
+        )
     top = (1 << leaf.info.bits) - 1
-    kinds = [source.randint(0, top), source.randint(0, min(top, 8)), source.randint(0, min(top, 40))]
+    kinds = [
+        source.randint(0, top),
+        source.randint(0, min(top, 8)),
+        source.randint(0, min(top, 40)),
+    ]
     named = [key for key in (*leaf.info.labels, *keys) if key <= top]
     value = source.choice(kinds + named[:16] * (1 if source.random() < 0.7 else 0))
-    is_negative = leaf.info.dtype is not None and leaf.info.dtype.kind == "i" and value >> (leaf.info.bits - 1)
+    is_negative = (
+        leaf.info.dtype is not None
+        and leaf.info.dtype.kind == "i"
+        and value >> (leaf.info.bits - 1)
+    )
     return value - (1 << leaf.info.bits) if is_negative else value
 
 
-def _random(engine: CompiledCodec, layout: Layout, number: int, source: random.Random) -> NDArray[np.uint8]:
-    """So many rows of random bytes, of which the wire form can write every value, with values that fields may have."""
-    rows = np.frombuffer(source.randbytes(number * layout.size), np.uint8).reshape(number, layout.size).copy()
+def _random(
+    engine: CompiledCodec, layout: Layout, number: int, source: random.Random
+) -> NDArray[np.uint8]:
+    """So many rows of random bytes, of which the wire form can write every value, with values that
+    fields may have.
+    """
+    rows = (
+        np.frombuffer(source.randbytes(number * layout.size), np.uint8)
+        .reshape(number, layout.size)
+        .copy()
+    )
     recoding = recoder(engine.frame)
     if recoding is not None:
         recoding.legal(rows, layout)
     for leaf in layout.leaves.values():
         if leaf.info.allowed:
-            leaf.store(rows, np.array(source.choices(leaf.info.allowed, k=number * math.prod(leaf.shape))).reshape(number, *leaf.shape))
+            leaf.store(
+                rows,
+                np.array(
+                    source.choices(leaf.info.allowed, k=number * math.prod(leaf.shape))
+                ).reshape(number, *leaf.shape),
+            )
     return rows
 
 
-def _interpreted(sensor: Spec, frame: str, engine: Codec, source: random.Random, drawn: Drawn) -> bytes:
+def _interpreted(
+    sensor: Spec, frame: str, engine: Codec, source: random.Random, drawn: Drawn
+) -> bytes:
     """A frame that construct alone can read, or one of parts."""
     for _ in range(LARGEST_BATCH * TRIES):
         try:
-            data = build(sensor, frame, _left_open(random_value(engine.frame.prepared, source, drawn), engine.frame.tree), {})
+            data = build(
+                sensor,
+                frame,
+                _left_open(random_value(engine.frame.prepared, source, drawn), engine.frame.tree),
+                {},
+            )
         except (UsageError, Fault):  # what was drawn goes not together; something else may
             continue
         if engine.survey(np.frombuffer(data, np.uint8), np.zeros(1, np.intp)).status[0] == VALID:
@@ -153,11 +198,15 @@ def _interpreted(sensor: Spec, frame: str, engine: Codec, source: random.Random,
 
 
 def _left_open(values: Any, root: Node) -> Any:
-    """The values of a frame without those that say how many parts there are and how long, which `build` fills in."""
+    """The values of a frame without those that say how many parts there are and how long, which
+    `build` fills in.
+    """
     for node in schema(root).parts.values():
         rules = (node.count, node.size, node.within)
         asked = [ref.path for rule in rules if rule is not None for ref in refs(rule)[:1]]
-        for kind, part in ((kind, part) for part in member(values, node.axis, []) for kind in node.kinds):
+        for kind, part in (
+            (kind, part) for part in member(values, node.axis, []) for kind in node.kinds
+        ):
             own = () if kind.following is None else refs(kind.following)[:1]
             for path in (ref.path for ref in own):
                 _blank(part, path)
@@ -190,7 +239,9 @@ def _plausible(sensor: Spec, frame: str, layout: Layout, rows: NDArray[np.uint8]
     errors: list[PluginError] = []
     good = np.flatnonzero(plausibility(sensor.frames[frame], table, errors) == 0)
     if errors:
-        raise SpecError(errors[0].reason, path=f"{frame}.plausible", sensor=sensor.id, rule=errors[0].rule)
+        raise SpecError(
+            errors[0].reason, path=f"{frame}.plausible", sensor=sensor.id, rule=errors[0].rule
+        )
     return _sent(sensor, frame, layout, rows[good])
 
 
@@ -202,11 +253,19 @@ def _sent(sensor: Spec, frame: str, layout: Layout, rows: NDArray[np.uint8]) -> 
     return [data for data in recoding.written(rows, layout) if data is not None]
 
 
-def _make_along_sweep(sensor: Spec, frame: str, engine: CompiledCodec, source: random.Random, drawn: Drawn) -> bytes:
-    """A frame around the values that the sensor's `sweep` declares, where random ones are never plausible."""
+def _make_along_sweep(
+    sensor: Spec, frame: str, engine: CompiledCodec, source: random.Random, drawn: Drawn
+) -> bytes:
+    """A frame around the values that the sensor's `sweep` declares, where random ones are never
+    plausible.
+    """
     sweep = sensor.simulation_of(frame).sweep
     if sweep is None:
-        raise SpecError("no random frame passes `plausible`, and there is no `sweep` to start from", path=frame, sensor=sensor.id)
+        raise SpecError(
+            "no random frame passes `plausible`, and there is no `sweep` to start from",
+            path=frame,
+            sensor=sensor.id,
+        )
     for _ in range(TRIES):
         values = sweep(source.randrange(10_000))
         layout, chosen = header(engine, source, {**_stated(engine, values), **drawn})
@@ -219,23 +278,37 @@ def _make_along_sweep(sensor: Spec, frame: str, engine: CompiledCodec, source: r
         found = _plausible(sensor, frame, layout, _headed(rows, layout, chosen))
         if found:
             return found[0]
-    raise SpecError("neither random frames nor those along `sweep` pass `plausible`", path=frame, sensor=sensor.id)
+    raise SpecError(
+        "neither random frames nor those along `sweep` pass `plausible`",
+        path=frame,
+        sensor=sensor.id,
+    )
 
 
 def _store_swept(leaf: Leaf, rows: NDArray[np.uint8], value: Any) -> None:
-    """Write a value of a sweep into a row, as far as there is room; a row with room for more elements keeps its own."""
+    """Write a value of a sweep into a row, as far as there is room; a row with room for more
+    elements keeps its own.
+    """
     raw = leaf.raw([value])[(slice(None), *map(slice, leaf.shape))]
     if all(length in (1, room) for length, room in zip(raw.shape[1:], leaf.shape, strict=False)):
         leaf.store(rows, raw)
 
 
-def _store_drawn(layout: Layout, rows: NDArray[np.uint8], chosen: Mapping[str, int], drawn: Drawn, source: random.Random) -> None:
+def _store_drawn(
+    layout: Layout,
+    rows: NDArray[np.uint8],
+    chosen: Mapping[str, int],
+    drawn: Drawn,
+    source: random.Random,
+) -> None:
     """Write drawn values into rows of frames, except those that have chosen the layout."""
     for path, draw in drawn.items():
         if path in layout.leaves and path not in chosen:
             leaf = layout.leaves[path]
             count = len(rows) * math.prod(leaf.shape)
-            leaf.store(rows, np.array([draw(source) for _ in range(count)]).reshape(len(rows), *leaf.shape))
+            leaf.store(
+                rows, np.array([draw(source) for _ in range(count)]).reshape(len(rows), *leaf.shape)
+            )
 
 
 def _stated(engine: CompiledCodec, values: Mapping[str, Any]) -> Drawn:

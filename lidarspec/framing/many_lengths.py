@@ -1,12 +1,16 @@
 """Candidates of many lengths, judged together.
 
-A false header announces any length, so noise with headers in it has candidates of hundreds of layouts, with one or two candidates each.
-Judging the candidates of a layout takes a few dozen calls of NumPy, whether there is one or a thousand. Most of these layouts differ only
-in the length of an array at their end: they have the same constants, checksums over the same bytes up to the same distance from the end,
-and tests of the same fields. `AlikeLayouts` finds such layouts. Their candidates become rows of one array, and whatever follows a candidate
-in its row is left out: a checksum gets zeros in its place, which do not change those in `ZERO_EXTENDED`, and a test leaves out elements.
+A false header announces any length, so noise with headers in it has candidates of hundreds of
+layouts, with one or two candidates each. Judging the candidates of a layout takes a few dozen calls
+of NumPy, whether there is one or a thousand. Most of these layouts differ only in the length of an
+array at their end: they have the same constants, checksums over the same bytes up to the same
+distance from the end, and tests of the same fields. `AlikeLayouts` finds such layouts. Their
+candidates become rows of one array, and whatever follows a candidate in its row is left out: a
+checksum gets zeros in its place, which do not change those in `ZERO_EXTENDED`, and a test leaves
+out elements.
 
-The verdicts are those of `plausibility.Judge`. A test that is more than a lookup of one or two bytes is left to it.
+The verdicts are those of `plausibility.Judge`. A test that is more than a lookup of one or two
+bytes is left to it.
 """
 
 from __future__ import annotations
@@ -36,7 +40,8 @@ MANY_LAYOUTS = 4
 MANY_CANDIDATES = 16
 #: The checksums that zeros behind the data do not change.
 ZERO_EXTENDED: tuple[type[Checksum], ...] = (Sum, WordXor, Xor)
-#: Rows of one array are at most so many times as long as the shortest of them, unless they have only a few bytes.
+#: Rows of one array are at most so many times as long as the shortest of them, unless they have
+#: only a few bytes.
 MAX_STRETCH = 4
 SHORT_ROW_BYTES = 64
 #: Keys remembered, so that garbage does not fill the memory.
@@ -51,7 +56,8 @@ class Likeness:
 
     Attributes:
         number: the same for all that are alike.
-        lengths: of the outermost array of each test, in the order of `Judge.checks`; 0 for a test of no array.
+        lengths: of the outermost array of each test, in the order of `Judge.checks`; 0 for a test
+            of no array.
     """
 
     number: int
@@ -65,14 +71,20 @@ class AlikeLayouts:
         self._numbers: dict[Hashable, int] = {}
         self._next = itertools.count()
 
-    def split(self, groups: list[LayoutGroup], make_judge: MakeJudge) -> tuple[list[Together], list[LayoutGroup]]:
-        """Return the groups that are judged together, and those that are left to be judged layout by layout."""
+    def split(
+        self, groups: list[LayoutGroup], make_judge: MakeJudge
+    ) -> tuple[list[Together], list[LayoutGroup]]:
+        """Return the groups that are judged together, and those that are left to be judged layout
+        by layout.
+        """
         if len(groups) < MANY_LAYOUTS:
             return [], groups
         left = list[LayoutGroup]()
         alike = dict[int, list[tuple[LayoutGroup, Likeness]]]()
         for layout, which in groups:
-            likeness = self.likeness(layout, make_judge(layout)) if len(which) < MANY_CANDIDATES else None
+            likeness = (
+                self.likeness(layout, make_judge(layout)) if len(which) < MANY_CANDIDATES else None
+            )
             if likeness is None:
                 left.append((layout, which))
             else:
@@ -87,7 +99,9 @@ class AlikeLayouts:
         return together, left
 
     def likeness(self, layout: Layout, judge: Judge) -> Likeness | None:
-        """Return which others a layout is like; None if its candidates cannot be judged together with those of others."""
+        """Return which others a layout is like; None if its candidates cannot be judged together
+        with those of others.
+        """
         if self not in layout.notes:  # decoders of one frame type share its layouts
             layout.notes[self] = self._find(layout, judge)
         known: Likeness | None = layout.notes[self]
@@ -115,17 +129,28 @@ def _is_extended(seal: Seal) -> bool:
 
 def _seal_key(seal: Seal, size: int) -> Hashable:
     *spans, (start, stop) = seal.spans
-    leaves = tuple((_place(leaf, seal, size), leaf.size, leaf.shape, leaf.wire, leaf.elements) for leaf in seal.leaves)
+    leaves = tuple(
+        (_place(leaf, seal, size), leaf.size, leaf.shape, leaf.wire, leaf.elements)
+        for leaf in seal.leaves
+    )
     return seal.algorithm, seal.absent, tuple(spans), start, size - stop, leaves
 
 
 def _place(leaf: Leaf, seal: Seal, size: int) -> tuple[str, int]:
-    """Return where a checksum is: from the start of the frame, or from its end if it follows the last bytes covered."""
-    return ("end", size - leaf.offset) if leaf.offset >= seal.spans[-1][1] else ("start", leaf.offset)
+    """Return where a checksum is: from the start of the frame, or from its end if it follows the
+    last bytes covered.
+    """
+    return (
+        ("end", size - leaf.offset) if leaf.offset >= seal.spans[-1][1] else ("start", leaf.offset)
+    )
 
 
 def _test_key(check: Check) -> Hashable:
-    return (check.table, check.offset, check.shape[1:], check.strides) if isinstance(check, Lookup) else None
+    return (
+        (check.table, check.offset, check.shape[1:], check.strides)
+        if isinstance(check, Lookup)
+        else None
+    )
 
 
 class Together:
@@ -142,7 +167,9 @@ class Together:
         is_final: whether valid candidates are frames; else they have passed only some of the tests.
     """
 
-    def __init__(self, groups: Sequence[LayoutGroup], likenesses: Sequence[Likeness], make_judge: MakeJudge) -> None:
+    def __init__(
+        self, groups: Sequence[LayoutGroup], likenesses: Sequence[Likeness], make_judge: MakeJudge
+    ) -> None:
         self.layouts = [layout for layout, _ in groups]
         self.which = np.concatenate([which for _, which in groups])
         self.forms = np.repeat(np.arange(len(groups)), [len(which) for _, which in groups])
@@ -150,14 +177,21 @@ class Together:
         self._sizes = np.array([layout.size for layout in self.layouts], np.intp)
         self._lengths = np.array([likeness.lengths for likeness in likenesses], np.intp).T
         first = make_judge(self.layouts[0])
-        self.is_final = first.is_complete and all(isinstance(check, Lookup) for check in first.checks)
+        self.is_final = first.is_complete and all(
+            isinstance(check, Lookup) for check in first.checks
+        )
 
     def by_layout(self, chosen: NDArray[np.bool_]) -> list[LayoutGroup]:
         """Return some of the candidates with their layouts; `chosen`: which of `self.which`, (n,)."""
-        found = ((layout, self.which[chosen & (self.forms == form)]) for form, layout in enumerate(self.layouts))
+        found = (
+            (layout, self.which[chosen & (self.forms == form)])
+            for form, layout in enumerate(self.layouts)
+        )
         return [(layout, which) for layout, which in found if len(which)]
 
-    def judge(self, buffer: Bytes1D, offsets: Offsets, forms: Offsets, sums: Sums | None = None) -> Status:
+    def judge(
+        self, buffer: Bytes1D, offsets: Offsets, forms: Offsets, sums: Sums | None = None
+    ) -> Status:
         """Return the status of whole candidates, (k,).
 
         Args:
@@ -173,8 +207,12 @@ class Together:
             status[which] = self._judge_rows(rows, sizes[which], forms[which], longest, sums)
         return status
 
-    def _judge_rows(self, rows: Bytes2D, sizes: Offsets, forms: Offsets, longest: int, sums: Sums | None) -> Status:
-        """Return the status of candidates in rows of the longest layout, (n,); behind the end of each there may be anything."""
+    def _judge_rows(
+        self, rows: Bytes2D, sizes: Offsets, forms: Offsets, longest: int, sums: Sums | None
+    ) -> Status:
+        """Return the status of candidates in rows of the longest layout, (n,); behind the end of
+        each there may be anything.
+        """
         judge = self._judge(self.layouts[longest])
         status = np.zeros(len(rows), np.uint8)
         judge.check_constants(status, rows)
@@ -194,7 +232,9 @@ def _length(check: Check) -> int:
 
 
 def _by_size(sizes: Offsets) -> Iterator[Offsets]:
-    """Return the indices of candidates in groups of similar size, each ascending by size, of rows of `BLOCK_BYTES` at most."""
+    """Return the indices of candidates in groups of similar size, each ascending by size, of rows
+    of `BLOCK_BYTES` at most.
+    """
     order = np.argsort(sizes, kind="stable")
     ordered = sizes[order]
     start = 0
@@ -218,7 +258,8 @@ def _rows(buffer: Bytes1D, offsets: Offsets, size: int) -> Bytes2D:
 def _are_intact(seal: Seal, rows: Bytes2D, sizes: Offsets, sums: Sums | None) -> NDArray[np.bool_]:
     """Return which candidates have the right checksum, (n,).
 
-    In each row, the bytes behind those that the checksum covers move to the end, where the longest layout has them.
+    In each row, the bytes behind those that the checksum covers move to the end, where the longest
+    layout has them.
 
     Args:
         seal: of the longest layout, which fills its row.
@@ -230,5 +271,7 @@ def _are_intact(seal: Seal, rows: Bytes2D, sizes: Offsets, sums: Sums | None) ->
     stops = sizes - tail
     moved = rows * (np.arange(size) < stops[:, None])
     if tail:
-        moved[:, size - tail :] = rows_at(rows.reshape(-1), np.arange(len(rows)) * size + stops, tail)
+        moved[:, size - tail :] = rows_at(
+            rows.reshape(-1), np.arange(len(rows)) * size + stops, tail
+        )
     return seal.intact(moved, sums)

@@ -1,11 +1,13 @@
-"""Whether candidates are frames: their constants, their checksums, and what is plausible, for many at a time.
+"""Whether candidates are frames: their constants, their checksums, and what is plausible, for many
+at a time.
 
-The order is that of the counters: a candidate with a wrong constant is none at all, one with a wrong checksum is counted
-as such, and only what is intact is asked whether it is plausible.
+The order is that of the counters: a candidate with a wrong constant is none at all, one with a
+wrong checksum is counted as such, and only what is intact is asked whether it is plausible.
 
-A frame's `plausible` is traced once. What it combines with ``&`` are conditions of their own, and one that depends on no more
-than two bytes beside each other is evaluated for all that these can hold. Frames are then judged by looking these bytes up, with
-the same answers, without making a column of every field. What cannot be traced is evaluated as it stands.
+A frame's `plausible` is traced once. What it combines with ``&`` are conditions of their own, and
+one that depends on no more than two bytes beside each other is evaluated for all that these can
+hold. Frames are then judged by looking these bytes up, with the same answers, without making a
+column of every field. What cannot be traced is evaluated as it stands.
 """
 
 from __future__ import annotations
@@ -24,7 +26,20 @@ from lidarspec.expressions.columns import Batch, Fields
 from lidarspec.expressions.graph import Expression, Traced, conjuncts, sample_of, trace
 from lidarspec.frames.arrays import taken
 from lidarspec.frames.frame_table import Group, Rows, Table
-from lidarspec.frames.layout import Bytes2D, Layout, Leaf, Seal, Sums, Test, elements, holding, marks, right, rows_at, words
+from lidarspec.frames.layout import (
+    Bytes2D,
+    Layout,
+    Leaf,
+    Seal,
+    Sums,
+    Test,
+    elements,
+    holding,
+    marks,
+    right,
+    rows_at,
+    words,
+)
 from lidarspec.frames.parts import Region
 from lidarspec.frames.schema import Schema
 from lidarspec.framing.results import CHECKSUM, CONSTANT, IMPLAUSIBLE, LENGTH, PLUGIN, VALID
@@ -60,13 +75,29 @@ class Judge:
         met: list[Check],
         checks: list[Check] | None,
     ) -> None:
-        self._frame, self._schema, self._layout, self._met, self._checks = frame, schema, layout, met, checks
+        self._frame, self._schema, self._layout, self._met, self._checks = (
+            frame,
+            schema,
+            layout,
+            met,
+            checks,
+        )
         self.checks = [*met, *(checks or ())]
         self.is_complete = checks is not None or frame.plausible is None
-        self._constants = words(marks({spot: known for spot, known in layout.constants.items() if prefix.get(spot) != known}))
+        self._constants = words(
+            marks(
+                {
+                    spot: known
+                    for spot, known in layout.constants.items()
+                    if prefix.get(spot) != known
+                }
+            )
+        )
         self._held = words(marks(layout.held))
 
-    def __call__(self, rows: Bytes2D, errors: list[PluginError], sums: Sums | None = None) -> NDArray[np.uint8]:
+    def __call__(
+        self, rows: Bytes2D, errors: list[PluginError], sums: Sums | None = None
+    ) -> NDArray[np.uint8]:
         """The status of each candidate, (n,).
 
         Args:
@@ -87,7 +118,9 @@ class Judge:
         return status
 
     def check_constants(self, status: NDArray[np.uint8], rows: Bytes2D) -> None:
-        """Enter the candidates with a wrong constant or a wrong length, among those that are valid so far."""
+        """Enter the candidates with a wrong constant or a wrong length, among those that are valid
+        so far.
+        """
         held = right(self._constants, rows) if len(rows) else None
         if held is not None:
             status[~held] = CONSTANT
@@ -102,10 +135,16 @@ class Judge:
                 status[~held & (status == VALID)] = IMPLAUSIBLE
 
     def _asked(self, rows: Bytes2D, errors: list[PluginError]) -> NDArray[np.uint8]:
-        return plausibility(self._frame, Rows(self._schema, [Group(self._layout, np.arange(len(rows)), rows)]), errors)
+        return plausibility(
+            self._frame,
+            Rows(self._schema, [Group(self._layout, np.arange(len(rows)), rows)]),
+            errors,
+        )
 
 
-def _among(status: NDArray[np.uint8], rows: Bytes2D, judge: Callable[[Bytes2D], NDArray[np.uint8]]) -> None:
+def _among(
+    status: NDArray[np.uint8], rows: Bytes2D, judge: Callable[[Bytes2D], NDArray[np.uint8]]
+) -> None:
     """Judge those that are valid so far."""
     if not np.count_nonzero(status):
         status[:] = judge(rows)
@@ -115,14 +154,24 @@ def _among(status: NDArray[np.uint8], rows: Bytes2D, judge: Callable[[Bytes2D], 
         status[left] = judge(taken(rows, left))
 
 
-def _parts_among(layout: Layout, status: NDArray[np.uint8], rows: Bytes2D, errors: list[PluginError], sums: Sums | None) -> None:
-    """Judge by their parts those that are valid so far: whether these fill their room, and by the checksums in them."""
+def _parts_among(
+    layout: Layout,
+    status: NDArray[np.uint8],
+    rows: Bytes2D,
+    errors: list[PluginError],
+    sums: Sums | None,
+) -> None:
+    """Judge by their parts those that are valid so far: whether these fill their room, and by the
+    checksums in them.
+    """
     for region in layout.regions.values():
         if not region.is_measured or region.has_checks:
             _among(status, rows, functools.partial(_by_parts, region, errors, sums))
 
 
-def _by_parts(region: Region, errors: list[PluginError], sums: Sums | None, rows: Bytes2D) -> NDArray[np.uint8]:
+def _by_parts(
+    region: Region, errors: list[PluginError], sums: Sums | None, rows: Bytes2D
+) -> NDArray[np.uint8]:
     """The status of each frame, (n,), by its parts."""
     buffer, walked = region.in_rows(rows)
     status = OF_PARTS[walked.status]
@@ -140,7 +189,9 @@ def _by_parts(region: Region, errors: list[PluginError], sums: Sums | None, rows
     return status
 
 
-def intactness(seal: Seal, errors: list[PluginError], sums: Sums | None, rows: Bytes2D) -> NDArray[np.uint8]:
+def intactness(
+    seal: Seal, errors: list[PluginError], sums: Sums | None, rows: Bytes2D
+) -> NDArray[np.uint8]:
     """`VALID`, `CHECKSUM` or `PLUGIN` for each frame, (n,), by one of its checksums."""
     try:
         wrong = ~seal.intact(rows, sums)
@@ -160,7 +211,11 @@ def plausibility(frame: Frame, table: Table, errors: list[PluginError]) -> NDArr
     try:
         with np.errstate(all="ignore"):
             answer = frame.plausible(Fields(batch))
-        array = np.broadcast_to(np.asarray(answer), (len(table), *np.shape(answer)[1:])) if np.ndim(answer) else np.full(len(table), answer)
+        array = (
+            np.broadcast_to(np.asarray(answer), (len(table), *np.shape(answer)[1:]))
+            if np.ndim(answer)
+            else np.full(len(table), answer)
+        )
         holds = array.reshape(len(array), math.prod(array.shape[1:])).astype(np.bool_).all(axis=1)
         return np.where(holds, VALID, IMPLAUSIBLE).astype(np.uint8)
     except Exception as error:
@@ -177,34 +232,61 @@ class Conditions:
         layout: any of its layouts, to trace it on.
     """
 
-    def __init__(self, plausible: Callable[[Any], Any] | None, schema: Schema, layout: Layout) -> None:
+    def __init__(
+        self, plausible: Callable[[Any], Any] | None, schema: Schema, layout: Layout
+    ) -> None:
         self._parts = [] if plausible is None else _parts(plausible, schema, layout)
         self._tables: dict[tuple[Any, ...], _Table] = {}
 
     def met(self, layout: Layout) -> list[Check]:
         """What the struct asks of the values of frames of a layout, as rows of bytes."""
-        every = ((one, {info.path: leaf for info in one.fields if (leaf := layout.leaves.get(info.path))}) for one in layout.conditions)
+        every = (
+            (
+                one,
+                {info.path: leaf for info in one.fields if (leaf := layout.leaves.get(info.path))},
+            )
+            for one in layout.conditions
+        )
         return [self._check(one, leaves) for one, leaves in every]
 
     def checks(self, layout: Layout) -> list[Check] | None:
-        """What frames of a layout, as rows of bytes, have to pass; None where only the function itself can tell."""
+        """What frames of a layout, as rows of bytes, have to pass; None where only the function
+        itself can tell.
+        """
         if self._parts is None:
             return None
-        leaves = [{info.path: leaf for info in part.fields if (leaf := layout.leaves.get(info.path))} for part in self._parts]
+        leaves = [
+            {info.path: leaf for info in part.fields if (leaf := layout.leaves.get(info.path))}
+            for part in self._parts
+        ]
         if any(
-            part.fields[0].axes and all(0 in leaf.shape for leaf in own.values()) for part, own in zip(self._parts, leaves, strict=True)
+            part.fields[0].axes and all(0 in leaf.shape for leaf in own.values())
+            for part, own in zip(self._parts, leaves, strict=True)
         ):
-            return []  # a test on no elements holds, and what is combined with it is a test on none either
+            # a test on no elements holds, and what is combined with it is a test on none either
+            return []
         return [self._check(part, own) for part, own in zip(self._parts, leaves, strict=True)]
 
     def _check(self, part: Test, leaves: Mapping[str, Leaf]) -> Check:
         places = {(leaf.shape, leaf.strides) for leaf in leaves.values()}
         first, last = _window(leaves.values())
-        if last - first > 2 or len(places) > 1 or any(len(shape) != len(strides) for shape, strides in places):
+        if (
+            last - first > 2
+            or len(places) > 1
+            or any(len(shape) != len(strides) for shape, strides in places)
+        ):
             return functools.partial(holding, part, leaves)  # more bytes than a table is made for
-        key = (part, *((path, leaf.offset - first, leaf.wire, leaf.elements) for path, leaf in leaves.items()))
+        key = (
+            part,
+            *(
+                (path, leaf.offset - first, leaf.wire, leaf.elements)
+                for path, leaf in leaves.items()
+            ),
+        )
         if key not in self._tables:
-            single = {path: replace(leaf.at(first), shape=(), strides=()) for path, leaf in leaves.items()}
+            single = {
+                path: replace(leaf.at(first), shape=(), strides=()) for path, leaf in leaves.items()
+            }
             self._tables[key] = _table(part, single, last - first)
         shape, strides = places.pop() if places else ((), ())
         return Lookup(self._tables[key], first, shape, strides)
@@ -216,7 +298,8 @@ class _Table:
 
     Attributes:
         limits: from one to another; None where they are no such range.
-        bits: else the bits that it depends on, and what they may be, if that is little; None where it is not.
+        bits: else the bits that it depends on, and what they may be, if that is little; None where
+            it is not.
         listed: for each value.
     """
 
@@ -229,7 +312,9 @@ class _Table:
         """Whether the condition holds for each of the values, of their shape."""
         if self.limits is not None:
             low, high = map(values.dtype.type, self.limits)
-            return np.asarray(values - low <= high - low if low else values <= high)  # what is below wraps round
+            return np.asarray(
+                values - low <= high - low if low else values <= high
+            )  # what is below wraps round
         if self.bits is not None:
             mask, allowed = self.bits
             left = values & values.dtype.type(mask)
@@ -239,12 +324,15 @@ class _Table:
             return np.asarray(held)
         if values.itemsize > 1:
             return self.listed.take(values)
-        return np.frombuffer(values.tobytes().translate(self.listed.tobytes()), np.bool_).reshape(values.shape)
+        return np.frombuffer(values.tobytes().translate(self.listed.tobytes()), np.bool_).reshape(
+            values.shape
+        )
 
 
 @dataclass(frozen=True, eq=False)
 class Lookup:
-    """A condition on one or two bytes of each frame, or of each element of an array in it, by a table.
+    """A condition on one or two bytes of each frame, or of each element of an array in it, by a
+    table.
 
     Attributes:
         offset: of the first of these bytes.
@@ -263,10 +351,16 @@ class Lookup:
         held = self._each(rows)
         if not self.shape:
             return held
-        return np.ones(len(held), np.bool_) if held.all() else np.asarray(held.all(axis=tuple(range(1, held.ndim))))
+        return (
+            np.ones(len(held), np.bool_)
+            if held.all()
+            else np.asarray(held.all(axis=tuple(range(1, held.ndim))))
+        )
 
     def holds_within(self, rows: Bytes2D, lengths: NDArray[np.intp]) -> NDArray[np.bool_]:
-        """Whether the condition holds in each frame, (n,), if its outermost array has fewer elements than the row, (n,)."""
+        """Whether the condition holds in each frame, (n,), if its outermost array has fewer
+        elements than the row, (n,).
+        """
         held = self._each(rows)
         if not self.shape:
             return held
@@ -284,8 +378,15 @@ class Lookup:
 def _table(part: Test, leaves: Mapping[str, Leaf], size: int) -> _Table:
     """A condition on so many bytes, at most two."""
     for dtype in map(np.dtype, ("<u2", ">u2") if size == 2 else ("u1",)):
-        blocks = np.split(np.arange(1 << 8 * dtype.itemsize, dtype=dtype), 16)  # so that it takes little memory at a time
-        listed = np.concatenate([holding(part, leaves, codes.view(np.uint8).reshape(len(codes), -1)) for codes in blocks])
+        blocks = np.split(
+            np.arange(1 << 8 * dtype.itemsize, dtype=dtype), 16
+        )  # so that it takes little memory at a time
+        listed = np.concatenate(
+            [
+                holding(part, leaves, codes.view(np.uint8).reshape(len(codes), -1))
+                for codes in blocks
+            ]
+        )
         true = np.flatnonzero(listed)
         if len(true) and true[-1] - true[0] == len(true) - 1:
             return _Table(dtype, (int(true[0]), int(true[-1])), listed)
@@ -293,9 +394,15 @@ def _table(part: Test, leaves: Mapping[str, Leaf], size: int) -> _Table:
 
 
 def _bits(listed: NDArray[np.bool_]) -> tuple[int, tuple[int, ...]] | None:
-    """The bits on which a list depends, and with which values of these it holds, if they are one or two; else None."""
+    """The bits on which a list depends, and with which values of these it holds, if they are one or
+    two; else None.
+    """
     values = np.arange(len(listed))
-    mask = sum(bit for bit in map(int, 1 << np.arange(16)) if bit < len(listed) and (listed != listed[values ^ bit]).any())
+    mask = sum(
+        bit
+        for bit in map(int, 1 << np.arange(16))
+        if bit < len(listed) and (listed != listed[values ^ bit]).any()
+    )
     allowed = np.unique(values[listed] & mask).tolist()
     return (mask, tuple(allowed)) if 0 < len(allowed) <= ALLOWED else None
 
@@ -306,10 +413,14 @@ def _window(leaves: Iterable[Leaf]) -> tuple[int, int]:
     return (min(start for start, _ in spans), max(stop for _, stop in spans)) if spans else (0, 0)
 
 
-def _parts(plausible: Callable[[Any], Any], schema: Schema, layout: Layout) -> list[Expression] | None:
+def _parts(
+    plausible: Callable[[Any], Any], schema: Schema, layout: Layout
+) -> list[Expression] | None:
     blank = Group(layout, np.zeros(1, np.intp), np.zeros((1, layout.size), np.uint8))
     try:
-        answer, _ = trace(plausible, sample_of(Batch(Rows(schema, [blank]), np.zeros(1, np.bool_)), blank))
+        answer, _ = trace(
+            plausible, sample_of(Batch(Rows(schema, [blank]), np.zeros(1, np.bool_)), blank)
+        )
         if not isinstance(answer, Traced):
             return None
         return [Expression.of(node, schema) for node in conjuncts(answer.node)]

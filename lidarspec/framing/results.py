@@ -1,9 +1,11 @@
 """What is found in an input: frames as one struct of arrays, one by one, and the counters.
 
-`Frames` is what every part of the framing passes on to the next: a frame type's engine says which candidates are frames and
-of which layout, the search takes some of them, the decoder adds where in the input they stand and when they came, and packets
-become columns by the layouts that are known by then. Frames of one size at one distance are described by a few numbers:
-arrays that follow from these cost more than finding such frames does, and are made only when they are read.
+`Frames` is what every part of the framing passes on to the next: a frame type's engine says which
+candidates are frames and of which layout, the search takes some of them, the decoder adds where in
+the input they stand and when they came, and packets
+become columns by the layouts that are known by then. Frames of one size at one distance are
+described by a few numbers: arrays that follow from these cost more than finding such frames does,
+and are made only when they are read.
 """
 
 from __future__ import annotations
@@ -28,32 +30,42 @@ Numbers = NDArray[np.int64] | range
 #: what a candidate is: a frame, one that is short of bytes, or why it is none.
 VALID, SHORT, LENGTH, CONSTANT, CHECKSUM, IMPLAUSIBLE, PLUGIN = range(7)
 
-#: layouts whose frames are found one layout after another sooner than by sorting, and sooner than by counting first.
+#: layouts whose frames are found one layout after another sooner than by sorting, and sooner than
+#: by counting first.
 FEW, FEWER = 16, 4
 
 #: bytes that the repr of a frame shows.
 SHOWN = 8
 
 #: which counter a rejected candidate raises.
-COUNTED = {SHORT: "bad_length", LENGTH: "bad_length", CHECKSUM: "bad_checksum", IMPLAUSIBLE: "implausible", PLUGIN: "plugin_errors"}
+COUNTED = {
+    SHORT: "bad_length",
+    LENGTH: "bad_length",
+    CHECKSUM: "bad_checksum",
+    IMPLAUSIBLE: "implausible",
+    PLUGIN: "plugin_errors",
+}
 
 
 @dataclass(repr=False)
 class Counters:
-    """What became of the input. ``bytes_in == bytes in frames + bytes_skipped + pending`` always holds.
+    """What became of the input. ``bytes_in == bytes in frames + bytes_skipped + pending`` always
+    holds.
 
     Attributes:
         frames: number of frames by type.
         bytes_filler: declared fillers among the skipped bytes.
         pending: bytes held because a candidate needs more.
         bad_checksum, bad_length, implausible: rejected candidates.
-        bad_constant: datagrams without the constants of any frame; in a stream such bytes are skipped, and are no candidate.
+        bad_constant: datagrams without the constants of any frame; in a stream such bytes are
+            skipped, and are no candidate.
         lost, duplicates, late: packets, by the sensor's counter and clock.
-        fragments_lost, fragments_late: datagrams of messages that were given up without them; those that came when their message was
-            joined or given up already, or for the second time.
+        fragments_lost, fragments_late: datagrams of messages that were given up without them; those
+            that came when their message was joined or given up already, or for the second time.
         kernel_drops, queue_dropped, foreign, disconnects: counted by the transports.
         unread: bytes of a damaged file that could not be read.
-        plugin_errors: packets, or candidates, at which a function of the plugin raised; `failures` keeps the first ones.
+        plugin_errors: packets, or candidates, at which a function of the plugin raised; `failures`
+            keeps the first ones.
         nominal: whether a default calibration stood in for the sensor's own in any scan.
         unended: what to say of scans that were handed out without an end; "" where there were none.
         undated: what to say of times that no frame has completed; "" where they are complete.
@@ -91,7 +103,9 @@ class Counters:
         return {f.name: getattr(self, f.name) for f in fields(self) if f.compare}
 
     def error(self, failure: PluginError, number: int) -> None:
-        """Count so many packets at which a function of the plugin raised, and keep the first few failures."""
+        """Count so many packets at which a function of the plugin raised, and keep the first few
+        failures.
+        """
         self.plugin_errors += number
         if len(self.failures) < 5:
             self.failures.append(failure)
@@ -102,21 +116,38 @@ class Counters:
         return [failure.traceback for failure in self.failures]
 
     def failure(self, sensor: str) -> PluginError | None:
-        """What the plugin of a sensor failed at first, with the number of packets, None where it did not fail."""
+        """What the plugin of a sensor failed at first, with the number of packets, None where it
+        did not fail.
+        """
         if not self.failures:
             return None
         first = self.failures[0]
         reason = f"{first.reason}, at {self.plugin_errors} packet{'s' * (self.plugin_errors != 1)}"
         return PluginError(
-            reason, path=first.path, sensor=sensor, rule=first.rule, file=first.file, line=first.line, traceback=first.traceback
+            reason,
+            path=first.path,
+            sensor=sensor,
+            rule=first.rule,
+            file=first.file,
+            line=first.line,
+            traceback=first.traceback,
         )
 
     def __repr__(self) -> str:
         return f"Counters({self})"
 
     def __str__(self) -> str:
-        parts = [f"{name} {value}" for name, value in self.to_dict().items() if value and name != "frames"]
-        return ", ".join([*(f"{number} {name} frames" for name, number in self.frames.items()), *parts]) or "nothing yet"
+        parts = [
+            f"{name} {value}"
+            for name, value in self.to_dict().items()
+            if value and name != "frames"
+        ]
+        return (
+            ", ".join(
+                [*(f"{number} {name} frames" for name, number in self.frames.items()), *parts]
+            )
+            or "nothing yet"
+        )
 
 
 @dataclass(frozen=True, slots=True, repr=False)
@@ -125,9 +156,11 @@ class Found:
 
     Attributes:
         frame: the name of its type.
-        offset: of its first byte in everything fed so far (of its datagram's payload, joined, for datagram links).
+        offset: of its first byte in everything fed so far (of its datagram's payload, joined, for
+            datagram links).
         data: its bytes.
-        at: arrival time in ns of the piece of input that completed it; None if the caller gave none.
+        at: arrival time in ns of the piece of input that completed it; None if the caller gave
+            none.
         gap: bytes (other than fillers) skipped since the frame before it.
     """
 
@@ -144,7 +177,9 @@ class Found:
 
 @dataclass(frozen=True, eq=False)
 class Recoded:
-    """Rows of frames of one type with a wire form: where they begin on the wire, ascending, and by layout the index and row of each."""
+    """Rows of frames of one type with a wire form: where they begin on the wire, ascending, and by
+    layout the index and row of each.
+    """
 
     kind: int
     starts: Indices
@@ -154,7 +189,10 @@ class Recoded:
         """The groups of the frames that begin at these places; None where not all are known."""
         place = np.full(len(self.starts) + 1, -1, np.intp)
         spots = self.starts.searchsorted(starts)
-        if not len(self.starts) or (self.starts[np.minimum(spots, len(self.starts) - 1)] != starts).any():
+        if (
+            not len(self.starts)
+            or (self.starts[np.minimum(spots, len(self.starts) - 1)] != starts).any()
+        ):
             return None
         place[spots] = np.arange(len(starts))
         found = list[tuple[Layout, Indices, Bytes2D]]()
@@ -168,15 +206,18 @@ class Frames:
     """Frames, or candidates for frames, in a piece of input, in its order: n of each array.
 
     Attributes:
-        buffer: the bytes that they stand in, at `starts`, `sizes` long; of a candidate that is short of bytes the size is how
-            many tell more (0: any).
-        names, kinds: the incoming frame types of a sensor, and which of them each is, as an index; -1 where none.
-        layouts, forms: the layouts of compiled frames, and which of them each has, as an index; -1 where nobody knows.
+        buffer: the bytes that they stand in, at `starts`, `sizes` long; of a candidate that is
+            short of bytes the size is how many tell more (0: any).
+        names, kinds: the incoming frame types of a sensor, and which of them each is, as an index;
+            -1 where none.
+        layouts, forms: the layouts of compiled frames, and which of them each has, as an index; -1
+            where nobody knows.
         status: `VALID`, or why a candidate is no frame.
-        offsets: where each begins in everything fed so far (for datagram links in the payloads, joined).
+        offsets: where each begins in everything fed so far (for datagram links in the payloads,
+            joined).
         places: these offsets, as a range where the frames have one size and follow one another.
-        rows: the bytes of each, one a row, where all have one layout and somebody gathered them; of candidates, of as many
-            from the first one on as are whole.
+        rows: the bytes of each, one a row, where all have one layout and somebody gathered them; of
+            candidates, of as many from the first one on as are whole.
         errors: failures of the plugin.
         recoded: the rows of frames with a wire form that have been read already.
     """
@@ -196,7 +237,14 @@ class Frames:
         recoded: tuple[Recoded, ...] = (),
     ) -> None:
         number = len(kinds)
-        self.buffer, self.kinds, self.sizes, self.layouts, self.rows, self.errors = buffer, kinds, sizes, layouts, rows, errors
+        self.buffer, self.kinds, self.sizes, self.layouts, self.rows, self.errors = (
+            buffer,
+            kinds,
+            sizes,
+            layouts,
+            rows,
+            errors,
+        )
         self._starts = self.places = starts
         self.forms = repeated(0 if layouts else -1, number) if forms is None else forms
         self.status = repeated(VALID, number) if status is None else status
@@ -224,7 +272,9 @@ class Frames:
             np.concatenate([part.starts for part in parts]),
             np.concatenate([part.sizes for part in parts]),
             layouts=tuple(layouts),
-            forms=np.concatenate([_shifted(part.forms, firsts[id(part.layouts)]) for part in parts]),
+            forms=np.concatenate(
+                [_shifted(part.forms, firsts[id(part.layouts)]) for part in parts]
+            ),
             status=np.concatenate([part.status for part in parts]),
             recoded=tuple({id(one): one for part in parts for one in part.recoded}.values()),
         )
@@ -244,7 +294,9 @@ class Frames:
 
     @cached_property
     def gaps(self) -> NDArray[np.int64]:
-        """The bytes (other than fillers) skipped before each frame, (n,); 0 until the decoder says otherwise."""
+        """The bytes (other than fillers) skipped before each frame, (n,); 0 until the decoder says
+        otherwise.
+        """
         return repeated(0, len(self))
 
     @cached_property
@@ -271,12 +323,20 @@ class Frames:
 
     def only(self, which: NDArray[np.bool_] | Indices | slice) -> Frames:
         """The frames that a mask, ascending indices or a slice choose."""
-        which = which if isinstance(which, slice) or which.dtype != np.bool_ else np.flatnonzero(which)
+        which = (
+            which if isinstance(which, slice) or which.dtype != np.bool_ else np.flatnonzero(which)
+        )
         rows = self.rows
         if rows is not None:
-            rows = rows[which] if isinstance(which, slice) else taken(rows, which[: which.searchsorted(len(rows))])
+            rows = (
+                rows[which]
+                if isinstance(which, slice)
+                else taken(rows, which[: which.searchsorted(len(rows))])
+            )
         chosen = {
-            name: some(getattr(self, name), which) for name in ("kinds", "sizes", "forms", "status", "gaps", "at") if name in vars(self)
+            name: some(getattr(self, name), which)
+            for name in ("kinds", "sizes", "forms", "status", "gaps", "at")
+            if name in vars(self)
         }
         starts = _chosen(self._starts, which)
         places = starts if self.places is self._starts else _chosen(self.places, which)
@@ -288,17 +348,37 @@ class Frames:
         if form is not None:
             return [(self.layouts[form], counted(len(self)))] if form >= 0 else []
         if len(self.layouts) <= FEWER:
-            groups = [(layout, np.flatnonzero(self.forms == form)) for form, layout in enumerate(self.layouts)]
+            groups = [
+                (layout, np.flatnonzero(self.forms == form))
+                for form, layout in enumerate(self.layouts)
+            ]
             return [(layout, which) for layout, which in groups if len(which)]
-        return [(self.layouts[form], which) for form, which in by_value(self.forms, FEW) if form >= 0]
+        return [
+            (self.layouts[form], which) for form, which in by_value(self.forms, FEW) if form >= 0
+        ]
 
-    def located(self, names: tuple[str, ...], places: Numbers, gaps: NDArray[np.int64], at: NDArray[np.int64]) -> Frames:
-        """These frames with their place in the input; gathered rows stand for the buffer, so that the rest of it can go."""
+    def located(
+        self,
+        names: tuple[str, ...],
+        places: Numbers,
+        gaps: NDArray[np.int64],
+        at: NDArray[np.int64],
+    ) -> Frames:
+        """These frames with their place in the input; gathered rows stand for the buffer, so that
+        the rest of it can go.
+        """
         if self.rows is None or isinstance(self._starts, range):
             return self._with(names=names, places=places, gaps=gaps, at=at)
         number, size = self.rows.shape
         starts = range(0, number * size, size)
-        return self._with(names=names, places=places, gaps=gaps, at=at, buffer=self.rows.reshape(-1), _starts=starts)
+        return self._with(
+            names=names,
+            places=places,
+            gaps=gaps,
+            at=at,
+            buffer=self.rows.reshape(-1),
+            _starts=starts,
+        )
 
     def arrived(self, at: NDArray[np.int64]) -> Frames:
         """These frames with other times of arrival, (n,) ns."""
@@ -317,7 +397,13 @@ class Frames:
 
     def found(self) -> list[Found]:
         """The frames one by one."""
-        rows = zip(self.kinds.tolist(), self.offsets.tolist(), self.gaps.tolist(), self.at.tolist(), strict=True)
+        rows = zip(
+            self.kinds.tolist(),
+            self.offsets.tolist(),
+            self.gaps.tolist(),
+            self.at.tolist(),
+            strict=True,
+        )
         return [
             Found(self.names[kind], offset, self.data(index), None if at < 0 else at, gap)
             for index, (kind, offset, gap, at) in enumerate(rows)
@@ -328,7 +414,12 @@ def packed(found: Sequence[Found]) -> Frames:
     """Frames given one by one as arrays."""
     names = tuple(dict.fromkeys(item.frame for item in found))
     sizes = np.array([len(item.data) for item in found], np.intp)
-    columns = [np.array(column, np.int64) for column in zip(*((f.offset, f.gap, -1 if f.at is None else f.at) for f in found), strict=True)]
+    columns = [
+        np.array(column, np.int64)
+        for column in zip(
+            *((f.offset, f.gap, -1 if f.at is None else f.at) for f in found), strict=True
+        )
+    ]
     offsets, gaps, at = columns or [np.empty(0, np.int64)] * 3
     kinds = np.array([names.index(item.frame) for item in found], np.intp)
     buffer = np.frombuffer(b"".join(item.data for item in found), np.uint8)
@@ -337,13 +428,21 @@ def packed(found: Sequence[Found]) -> Frames:
 
 def array_of(numbers: Numbers) -> NDArray[np.int64]:
     """The numbers as an array, (n,)."""
-    return np.arange(numbers.start, numbers.stop, numbers.step) if isinstance(numbers, range) else numbers
+    return (
+        np.arange(numbers.start, numbers.stop, numbers.step)
+        if isinstance(numbers, range)
+        else numbers
+    )
 
 
 def _shifted(forms: Indices, first: int) -> Indices:
     """Indices of layouts that stand behind others."""
     form = alike(forms)
-    return np.where(forms < 0, -1, forms + first) if form is None else repeated(form + first if form >= 0 else -1, len(forms))
+    return (
+        np.where(forms < 0, -1, forms + first)
+        if form is None
+        else repeated(form + first if form >= 0 else -1, len(forms))
+    )
 
 
 def _chosen(numbers: Numbers, which: NDArray[np.bool_] | Indices | slice) -> Numbers:

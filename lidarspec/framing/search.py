@@ -1,13 +1,15 @@
 """Finding frames in a byte stream: the one rule, the same for every sensor.
 
-A stream decodes to the leftmost valid candidate, then on after its last byte; an invalid candidate advances by one
-byte. At one offset the order of the frame types decides. A type with `after` is looked for only while the frame that
-it names is the last seen of those named by any `after`; a type with `confirm` counts only in unbroken runs.
+A stream decodes to the leftmost valid candidate, then on after its last byte; an invalid candidate
+advances by one byte. At one offset the order of the frame types decides. A type with `after` is
+looked for only while the frame that it names is the last seen of those named by any `after`; a type
+with `confirm` counts only in unbroken runs.
 
-All candidates of a piece are judged in bulk, and those that are taken are found in bulk too, with a step for each conflict
-only, and one for each frame that changes what is looked for; while types with `confirm` are, `lidarspec.framing.weak_frames` goes
-from run to run. So the work is linear in the input however often headers or changes appear in it, and the result is that of the
-byte-by-byte rule.
+All candidates of a piece are judged in bulk, and those that are taken are found in bulk too, with a
+step for each conflict only, and one for each frame that changes what is looked for; while types
+with `confirm` are, `lidarspec.framing.weak_frames` goes from run to run. So the work is linear in
+the input however often headers or changes appear in it, and the result is that of the byte-by-byte
+rule.
 """
 
 from __future__ import annotations
@@ -21,7 +23,8 @@ from lidarspec.framing.candidates import Bytes1D, Candidates, Framing, Mode, Off
 from lidarspec.framing.results import SHORT, VALID, Frames
 from lidarspec.framing.weak_frames import Runs
 
-#: bytes from one change of what is looked for to the next, at which a piece ends there, and the next one is judged for what follows alone.
+#: bytes from one change of what is looked for to the next, at which a piece ends there, and the
+#: next one is judged for what follows alone.
 SELDOM = 1 << 12
 
 
@@ -69,10 +72,12 @@ class Walk(Protocol):
     """What goes through a piece while the same types are looked for, as often as they are again."""
 
     def advance(self, position: int, piece: Piece) -> int:
-        """Take what is valid from an offset on, until the end or a frame that changes what is looked for; where that frame ends.
+        """Take what is valid from an offset on, until the end or a frame that changes what is
+        looked for; where that frame ends.
 
         Args:
-            piece: where it ends and what it waits for is entered into it, unless what is looked for changes.
+            piece: where it ends and what it waits for is entered into it, unless what is looked for
+                changes.
         """
 
     def frames(self) -> Frames:
@@ -89,11 +94,17 @@ class _Chain:
     """A `Walk` while no weak type is looked for.
 
     Args:
-        live: the candidates that are valid or wait for bytes; one that waits takes all that there are.
+        live: the candidates that are valid or wait for bytes; one that waits takes all that there
+            are.
     """
 
     def __init__(self, framing: Framing, candidates: Candidates, live: Frames, mode: Mode) -> None:
-        self._framing, self._mode, self._live, self._is_whole = framing, mode, live, candidates.is_whole
+        self._framing, self._mode, self._live, self._is_whole = (
+            framing,
+            mode,
+            live,
+            candidates.is_whole,
+        )
         ends, self._after = live.starts + live.sizes, None
         stops = np.zeros(len(live), np.bool_)
         stops[-1:] = True
@@ -106,7 +117,11 @@ class _Chain:
         self._changes, self._kinds, self._ends = bytes(len(live)), list[int](), list[int]()
         if framing.named:
             changes = framing.switching(mode)[live.kinds] & (live.status == VALID)
-            self._changes, self._kinds, self._ends = changes.tobytes(), live.kinds.tolist(), ends.tolist()
+            self._changes, self._kinds, self._ends = (
+                changes.tobytes(),
+                live.kinds.tolist(),
+                ends.tolist(),
+            )
             stops |= changes
         self._stops: list[int] = np.flatnonzero(stops).tolist()
         self._starts: list[int] = live.starts.tolist() if any(self._changes) else []
@@ -115,7 +130,11 @@ class _Chain:
     def advance(self, position: int, piece: Piece) -> int:
         live, first = self._live, 0
         if position:
-            first = bisect.bisect_left(self._starts, position) if self._starts else int(live.starts.searchsorted(position))
+            first = (
+                bisect.bisect_left(self._starts, position)
+                if self._starts
+                else int(live.starts.searchsorted(position))
+            )
         while first < len(live):
             last = self._stops[bisect.bisect_left(self._stops, first)]
             if self._changes[last]:
@@ -124,7 +143,11 @@ class _Chain:
                 return self._ends[last]
             if live.status.item(last) == SHORT:
                 self._runs.append((first, last - 1))
-                piece.end, piece.waiting, piece.need = live.starts.item(last), self._is_whole, live.sizes.item(last)
+                piece.end, piece.waiting, piece.need = (
+                    live.starts.item(last),
+                    self._is_whole,
+                    live.sizes.item(last),
+                )
                 break
             self._runs.append((first, last))
             first = last + 1 if self._after is None else self._after.item(last)
@@ -146,15 +169,20 @@ def _counted(runs: Offsets) -> Offsets:
 
 
 def _remember_size(mode: Mode, frames: Frames, since: int) -> None:
-    """Note for the next piece how the frames follow one another, of those since what is looked for changed last."""
+    """Note for the next piece how the frames follow one another, of those since what is looked for
+    changed last.
+    """
     own = frames.starts[frames.starts.searchsorted(since) :]
     if len(own):
         mode.size = frames.sizes.item(-1)
         mode.steady = own.item(-1) - own.item(0) == mode.size * (len(own) - 1)
 
 
-def count_rejected(framing: Framing, piece: Piece, candidates: Candidates, stays: list[tuple[int, str | None]]) -> None:
-    """Count the candidates outside the frames, and at a frame's first byte those of the types that come before its own.
+def count_rejected(
+    framing: Framing, piece: Piece, candidates: Candidates, stays: list[tuple[int, str | None]]
+) -> None:
+    """Count the candidates outside the frames, and at a frame's first byte those of the types that
+    come before its own.
 
     Args:
         stays: from which offset on which types were looked for.
@@ -163,7 +191,11 @@ def count_rejected(framing: Framing, piece: Piece, candidates: Candidates, stays
     numbers = {name: number for number, name in enumerate({name for _, name in stays})}
     modes = np.array([numbers[name] for _, name in stays])
     for kind, own in candidates.judged.items():
-        refused = np.flatnonzero(own.status > (VALID if candidates.final else SHORT)) if not own.is_sound else ()
+        refused = (
+            np.flatnonzero(own.status > (VALID if candidates.final else SHORT))
+            if not own.is_sound
+            else ()
+        )
         if not len(refused):
             continue
         spots = own.starts[refused]
@@ -174,6 +206,8 @@ def count_rejected(framing: Framing, piece: Piece, candidates: Candidates, stays
             before = np.searchsorted(frames.starts, spots, side="right") - 1
             held = np.maximum(before, 0)
             inside = (before >= 0) & (spots < frames.starts[held] + frames.sizes[held])
-            counted &= ~inside | ((spots == frames.starts[held]) & (own.kinds[refused] < frames.kinds[held]))
+            counted &= ~inside | (
+                (spots == frames.starts[held]) & (own.kinds[refused] < frames.kinds[held])
+            )
         if counted.any():
             piece.reject(np.bincount(own.status[refused[counted]]).tolist(), own.errors)

@@ -1,9 +1,11 @@
-"""Frames at one distance, as the rows of an array: found without a search, in a stream as in datagrams.
+"""Frames at one distance, as the rows of an array: found without a search, in a stream as in
+datagrams.
 
-In a stream that nothing disturbs, frames follow one another without a byte between; datagrams of one size stand in a capture
-at one distance, and in an array without one. Where all of them are frames of one layout, and nothing that comes first in the
-order stands at their first bytes, the search would take the same. So they are judged as rows, which takes a few calls: of a
-stream up to the first that is none, where the search goes on; of datagrams all or none.
+In a stream that nothing disturbs, frames follow one another without a byte between; datagrams of
+one size stand in a capture at one distance, and in an array without one. Where all of them are
+frames of one layout, and nothing that comes first in the order stands at their first bytes, the
+search would take the same. So they are judged as rows, which takes a few calls: of a stream up to
+the first that is none, where the search goes on; of datagrams all or none.
 """
 
 from __future__ import annotations
@@ -16,7 +18,8 @@ from lidarspec.frames.layout import Bytes2D, Layout, Marks, exclude, right
 from lidarspec.framing.candidates import Framing, Mode, Piece
 from lidarspec.framing.results import Frames, Indices, Numbers
 
-#: rows that are looked at before all are; bytes of a piece that is looked at so even after a piece with damaged frames.
+#: rows that are looked at before all are; bytes of a piece that is looked at so even after a piece
+#: with damaged frames.
 FEW, SMALL = 64, 1 << 16
 
 #: constants that tell the types of most datagrams.
@@ -38,7 +41,11 @@ def steady_stream(framing: Framing, buffer: NDArray[np.uint8], mode: Mode) -> Pi
         lead = leading(framing, kind, rows)
         if lead is None:
             continue
-        frames = judged(framing, kind, buffer, rows[:lead], 0) if 2 * lead > number and not framing.switches(kind, mode) else None
+        frames = (
+            judged(framing, kind, buffer, rows[:lead], 0)
+            if 2 * lead > number and not framing.switches(kind, mode)
+            else None
+        )
         if frames is None:
             return None
         valid = lead if frames.is_sound else int((frames.status != 0).argmax())
@@ -47,21 +54,32 @@ def steady_stream(framing: Framing, buffer: NDArray[np.uint8], mode: Mode) -> Pi
     return None
 
 
-def steady_datagrams(framing: Framing, buffer: NDArray[np.uint8], starts: Numbers, sizes: Indices, mode: Mode) -> Frames | None:
-    """Datagrams of one size at one distance, judged as frames of one type and layout; None where they may be anything else.
+def steady_datagrams(
+    framing: Framing, buffer: NDArray[np.uint8], starts: Numbers, sizes: Indices, mode: Mode
+) -> Frames | None:
+    """Datagrams of one size at one distance, judged as frames of one type and layout; None where
+    they may be anything else.
 
-    So they may where they have not all the constants of one type and none of those before it, and where they change what is
-    looked for.
+    So they may where they have not all the constants of one type and none of those before it, and
+    where they change what is looked for.
     """
     rows = _rows(buffer, starts, sizes)
     kind = None if rows is None else _likely(framing, rows, mode)
-    if rows is None or kind is None or right(framing.words[kind], rows) is not None or framing.switches(kind, mode):
+    if (
+        rows is None
+        or kind is None
+        or right(framing.words[kind], rows) is not None
+        or framing.switches(kind, mode)
+    ):
         return None
     return judged(framing, kind, buffer, rows, int(starts[0]))
 
 
-def judged(framing: Framing, kind: int, buffer: NDArray[np.uint8], rows: Bytes2D, first: int) -> Frames | None:
-    """Rows with the constants of a type as candidates of one layout; None where they have not one of their size.
+def judged(
+    framing: Framing, kind: int, buffer: NDArray[np.uint8], rows: Bytes2D, first: int
+) -> Frames | None:
+    """Rows with the constants of a type as candidates of one layout; None where they have not one
+    of their size.
 
     Args:
         rows: of the buffer, at one distance.
@@ -75,12 +93,18 @@ def judged(framing: Framing, kind: int, buffer: NDArray[np.uint8], rows: Bytes2D
     step = rows.strides[0] if number > 1 else size
     starts = range(first, first + number * step, step)
     kinds, sizes = repeated(kind, number), repeated(size, number)
-    return Frames(buffer, kinds, starts, sizes, layouts=(layout,), status=status, rows=rows, errors=errors)
+    return Frames(
+        buffer, kinds, starts, sizes, layouts=(layout,), status=status, rows=rows, errors=errors
+    )
 
 
 def leading(framing: Framing, kind: int, rows: Bytes2D) -> int | None:
-    """How many rows from the first on have the constants of a type, as far as the rows go; None where no row has them."""
-    told = tuple(word for word in framing.words[kind] if word[0] + word[1].itemsize <= rows.shape[1])
+    """How many rows from the first on have the constants of a type, as far as the rows go; None
+    where no row has them.
+    """
+    told = tuple(
+        word for word in framing.words[kind] if word[0] + word[1].itemsize <= rows.shape[1]
+    )
     for some in (rows[:FEW], rows):
         marked = right(told, some)
         if marked is not None and np.count_nonzero(marked):
@@ -100,13 +124,21 @@ def _piece(framing: Framing, mode: Mode, frames: Frames) -> Piece:
     number, size = len(frames), mode.size
     rest = frames.buffer[number * size :]
     kind, layout = frames.kinds.item(0), frames.layout
-    need = _awaited(framing, mode, kind, layout, rest.tobytes()) if layout is not None and 0 < len(rest) < size else 0
+    need = (
+        _awaited(framing, mode, kind, layout, rest.tobytes())
+        if layout is not None and 0 < len(rest) < size
+        else 0
+    )
     return Piece(frames, number * size, need > 0, need)
 
 
 def _awaited(framing: Framing, mode: Mode, kind: int, layout: Layout, rest: bytes) -> int:
-    """How many bytes tell more of a next frame of the same layout, of which so much is there; 0 where it may be something else."""
-    first = next((other for other in framing.active(mode) if _begins(framing.marks[other], rest)), None)
+    """How many bytes tell more of a next frame of the same layout, of which so much is there; 0
+    where it may be something else.
+    """
+    first = next(
+        (other for other in framing.active(mode) if _begins(framing.marks[other], rest)), None
+    )
     if first != kind or framing.codecs[kind].size != layout.size:
         return 0
     need = layout.size
@@ -123,17 +155,27 @@ def _begins(marks: Marks, data: bytes) -> bool:
 
 
 def _rows(buffer: NDArray[np.uint8], starts: Numbers, sizes: Indices) -> Bytes2D | None:
-    """Datagrams as the rows of an array, where they have one size and stand at one distance, one after another; else None."""
+    """Datagrams as the rows of an array, where they have one size and stand at one distance, one
+    after another; else None.
+    """
     count = len(sizes)
     size = sizes.item(0) if count else 0
     if not size or (alike(sizes) is None and np.count_nonzero(sizes == size) < count):
         return None
-    step = starts.step if isinstance(starts, range) else size if count == 1 else step_between(starts)
-    return np.ndarray((count, size), np.uint8, buffer, int(starts[0]), (step, 1)) if step >= size else None
+    step = (
+        starts.step if isinstance(starts, range) else size if count == 1 else step_between(starts)
+    )
+    return (
+        np.ndarray((count, size), np.uint8, buffer, int(starts[0]), (step, 1))
+        if step >= size
+        else None
+    )
 
 
 def _likely(framing: Framing, rows: Bytes2D, mode: Mode) -> int | None:
-    """The type that the first datagram resembles, if none of those with its constants resembles one that comes first; else None."""
+    """The type that the first datagram resembles, if none of those with its constants resembles one
+    that comes first; else None.
+    """
     first, before = rows[0].tobytes(), list[int]()
     for kind in framing.active(mode):
         if framing.codecs[kind].size not in (None, len(first)) or framing.ends[kind] > len(first):

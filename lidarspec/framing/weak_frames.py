@@ -1,9 +1,11 @@
-"""Frames that are believed in runs alone: cutting a piece of a stream while such a type is looked for.
+"""Frames that are believed in runs alone: cutting a piece of a stream while such a type is looked
+for.
 
-A frame of five bytes without a checksum stands at every sixth place of noise. So types with `confirm` are believed where so
-many valid ones follow each other. Here one goes from run to run: along a run, the candidates at its stride are judged
-together, as far as it lasts; where it breaks, all offsets of a stretch are, and the next run is the first place where each of
-`confirm` strides further on is valid too. Types with a checksum are few between them, and are met one by one.
+A frame of five bytes without a checksum stands at every sixth place of noise. So types with
+`confirm` are believed where so many valid ones follow each other. Here one goes from run to run:
+along a run, the candidates at its stride are judged together, as far as it lasts; where it breaks,
+all offsets of a stretch are, and the next run is the first place where each of `confirm` strides
+further on is valid too. Types with a checksum are few between them, and are met one by one.
 """
 
 from __future__ import annotations
@@ -19,7 +21,8 @@ from lidarspec.frames.layout import Layout, right
 from lidarspec.framing.candidates import Bytes1D, Candidates, Framing, Mode, Offsets, Piece, fitting
 from lidarspec.framing.results import CONSTANT, IMPLAUSIBLE, PLUGIN, SHORT, VALID, Frames
 
-#: strides judged together at first, and at most; and how many are judged sooner as the rows of an array.
+#: strides judged together at first, and at most; and how many are judged sooner as the rows of an
+#: array.
 FIRST, LONGEST, FEW = 64, 1 << 14, 8
 
 #: offsets of a stretch at first, and at most.
@@ -35,11 +38,21 @@ class Lane:
     """A weak type in a piece: what stands at each offset, judged when it is asked for.
 
     Args:
-        others: the offsets at which types that come first in the order are live, with whether they wait for bytes; sorted.
+        others: the offsets at which types that come first in the order are live, with whether they
+            wait for bytes; sorted.
         before: the weak types that come first in the order.
     """
 
-    def __init__(self, framing: Framing, kind: int, buffer: Bytes1D, others: dict[int, bool], before: list[Lane], *, final: bool) -> None:
+    def __init__(
+        self,
+        framing: Framing,
+        kind: int,
+        buffer: Bytes1D,
+        others: dict[int, bool],
+        before: list[Lane],
+        *,
+        final: bool,
+    ) -> None:
         self.kind, self._final, self._before = kind, final, before
         codec = framing.codecs[kind]
         self._framing, self._buffer = framing, buffer
@@ -56,8 +69,12 @@ class Lane:
         self._hits: list[int] = []
 
     def first(self, start: int, stop: int, *, believed: bool) -> int | None:
-        """The first offset from `start` to `stop` where a run may begin, or, if it is believed already, go on; None if there is none."""
-        if (believed and self._live(start)) or (not self._start <= start < self._stop and self._straight(start)):
+        """The first offset from `start` to `stop` where a run may begin, or, if it is believed
+        already, go on; None if there is none.
+        """
+        if (believed and self._live(start)) or (
+            not self._start <= start < self._stop and self._straight(start)
+        ):
             return start
         while start <= stop:
             if not self._start <= start < self._stop:
@@ -72,8 +89,10 @@ class Lane:
         """How many frames are taken here; `WAIT` if that takes more bytes than there are.
 
         Args:
-            believed: they go on with a run; else so many have to follow each other as it takes to believe them.
-            steady: the whole run may be taken at once, if its frames have one size; else one frame is.
+            believed: they go on with a run; else so many have to follow each other as it takes to
+                believe them.
+            steady: the whole run may be taken at once, if its frames have one size; else one frame
+                is.
         """
         wanted = 1 if believed else self._confirm
         place = spot
@@ -88,21 +107,25 @@ class Lane:
         return (self._onward(place) - spot) // self._size if steady and self._size else 1
 
     def _certain(self, spot: int, number: int) -> bool:
-        """Whether so many valid ones are known from here on, and nothing comes first; False where that is not easily told."""
+        """Whether so many valid ones are known from here on, and nothing comes first; False where
+        that is not easily told.
+        """
         if not self._size or self._before:
             return False
         stop = spot + number * self._size
         index = bisect.bisect_left(self._spots, spot)
-        return (index == len(self._spots) or self._spots[index] >= stop) and self.status[spot : stop : self._size].tobytes() == bytes(
-            number
-        )
+        return (index == len(self._spots) or self._spots[index] >= stop) and self.status[
+            spot : stop : self._size
+        ].tobytes() == bytes(number)
 
     def length(self, spot: int) -> int:
         """The size of the valid candidate at an offset."""
         return self._size or int(self._sizes[spot])
 
     def forms(self, offsets: Offsets) -> Offsets:
-        """Which of its layouts the valid candidates at these offsets have, (k,); -1 where nobody knows."""
+        """Which of its layouts the valid candidates at these offsets have, (k,); -1 where nobody
+        knows.
+        """
         return self._forms[offsets] if self.has_forms else repeated(0, len(offsets))
 
     @property
@@ -128,7 +151,9 @@ class Lane:
         return int(self.status[spot] == VALID)
 
     def _onward(self, spot: int) -> int:
-        """Where a run ends that is believed up to here: before the first invalid candidate, or at another type's."""
+        """Where a run ends that is believed up to here: before the first invalid candidate, or at
+        another type's.
+        """
         assert self._size
         number = FIRST
         while True:
@@ -145,7 +170,9 @@ class Lane:
             number = min(4 * number, LONGEST)
 
     def _along(self, spot: int, number: int) -> NDArray[np.uint8]:
-        """The status at every stride from an offset on: at so many, or at fewer if those are known already."""
+        """The status at every stride from an offset on: at so many, or at fewer if those are known
+        already.
+        """
         assert self._size
         if self._start <= spot < self._end:
             return self.status[spot : min(spot + number * self._size, self._end) : self._size]
@@ -156,7 +183,9 @@ class Lane:
         return self.status[spot : spot + number * self._size : self._size]
 
     def _judged_rows(self, spot: int, number: int) -> int:
-        """How many in a row are judged as the rows of an array: up to the first without the right constants, 0 where that cannot be."""
+        """How many in a row are judged as the rows of an array: up to the first without the right
+        constants, 0 where that cannot be.
+        """
         if number < FEW:
             return 0
         assert self._size
@@ -197,7 +226,9 @@ class Lane:
         self._judge(np.arange(start, self._end))
         count = self._stop - start
         if self._size is None:
-            self._hits = (np.flatnonzero(self._open(self.status[start : self._stop])) + start).tolist()
+            self._hits = (
+                np.flatnonzero(self._open(self.status[start : self._stop])) + start
+            ).tolist()
             return
         live = np.full(count + self._reach, not self._final)
         live[: self._end - start] = self._open(self.status[start : self._end])
@@ -222,7 +253,13 @@ class Lane:
             self._sizes[fit] = survey.sizes
         self._know(fit, survey.layouts, survey.forms, survey.errors)
 
-    def _know(self, offsets: Offsets | slice, layouts: tuple[Layout, ...], forms: Offsets, errors: tuple[PluginError, ...]) -> None:
+    def _know(
+        self,
+        offsets: Offsets | slice,
+        layouts: tuple[Layout, ...],
+        forms: Offsets,
+        errors: tuple[PluginError, ...],
+    ) -> None:
         """Remember the layouts of candidates, and failures of the plugin."""
         self.errors = errors or self.errors
         if len(self._forms):
@@ -231,7 +268,8 @@ class Lane:
 
 
 class Runs:
-    """What goes through a piece of a stream while weak types are looked for: a `Walk` of the search.
+    """What goes through a piece of a stream while weak types are looked for: a `Walk` of the
+    search.
 
     Args:
         candidates: of the strong types.
@@ -240,21 +278,37 @@ class Runs:
         base: offset of the piece in the stream.
     """
 
-    def __init__(self, framing: Framing, candidates: Candidates, live: Frames, mode: Mode, base: int) -> None:
+    def __init__(
+        self, framing: Framing, candidates: Candidates, live: Frames, mode: Mode, base: int
+    ) -> None:
         self._framing, self._mode, self._base, self._live = framing, mode, base, live
-        self._buffer, self._length, self._is_whole = candidates.buffer, len(candidates.buffer), candidates.is_whole
-        facts = zip(live.kinds.tolist(), live.sizes.tolist(), (live.status == SHORT).tolist(), strict=True)
-        self._strong: dict[int, tuple[int, int, bool]] = dict(zip(live.starts.tolist(), facts, strict=True))
+        self._buffer, self._length, self._is_whole = (
+            candidates.buffer,
+            len(candidates.buffer),
+            candidates.is_whole,
+        )
+        facts = zip(
+            live.kinds.tolist(), live.sizes.tolist(), (live.status == SHORT).tolist(), strict=True
+        )
+        self._strong: dict[int, tuple[int, int, bool]] = dict(
+            zip(live.starts.tolist(), facts, strict=True)
+        )
         self._spots = list(self._strong)
         self._lanes: list[Lane] = []
         self._taken: list[tuple[int, int, int, int]] = []
         for kind in filter(framing.weak, framing.active(mode)):
-            others = {spot: short for spot, (other, _, short) in self._strong.items() if other < kind}
+            others = {
+                spot: short for spot, (other, _, short) in self._strong.items() if other < kind
+            }
             before = list(self._lanes)
-            self._lanes.append(Lane(framing, kind, self._buffer, others, before, final=candidates.final))
+            self._lanes.append(
+                Lane(framing, kind, self._buffer, others, before, final=candidates.final)
+            )
 
     def advance(self, position: int, piece: Piece) -> int:
-        """Take what is valid from an offset on, until the end or a frame that changes what is looked for; where that frame ends."""
+        """Take what is valid from an offset on, until the end or a frame that changes what is
+        looked for; where that frame ends.
+        """
         counted = position
         while position < self._length:
             spot = self._next(position)
@@ -286,12 +340,18 @@ class Runs:
         index = bisect.bisect_left(self._spots, position)
         found = self._spots[index] if index < len(self._spots) else None
         for lane in self._lanes:
-            spot = lane.first(position, self._length - 1 if found is None else found, believed=self._believed(lane, position))
+            spot = lane.first(
+                position,
+                self._length - 1 if found is None else found,
+                believed=self._believed(lane, position),
+            )
             found = found if spot is None else spot
         return found
 
     def _at(self, spot: int) -> tuple[int, int, int] | None:
-        """The type, number and size of the frames that are taken at an offset (0: none); None if that takes more bytes than there are."""
+        """The type, number and size of the frames that are taken at an offset (0: none); None if
+        that takes more bytes than there are.
+        """
         kind, size, short = self._strong.get(spot, (len(self._framing.names), 0, False))
         for lane in self._lanes:
             if lane.kind > kind:
@@ -307,18 +367,25 @@ class Runs:
         return kind, int(size > 0), size
 
     def _believed(self, lane: Lane, spot: int) -> bool:
-        return self._mode.run == self._framing.names[lane.kind] and self._mode.run_end == self._base + spot
+        return (
+            self._mode.run == self._framing.names[lane.kind]
+            and self._mode.run_end == self._base + spot
+        )
 
     def _accepted(self, kind: int, end: int) -> bool:
         """Remember that frames of a type were taken; whether they change what is looked for."""
         name, switched = self._framing.names[kind], self._framing.switches(kind, self._mode)
-        self._mode.run, self._mode.run_end = (name, self._base + end) if self._framing.weak(kind) else (None, -1)
+        self._mode.run, self._mode.run_end = (
+            (name, self._base + end) if self._framing.weak(kind) else (None, -1)
+        )
         if switched:
             self._mode.after = name
         return switched
 
     def _count(self, piece: Piece, start: int, stop: int, *, before: int = 0) -> None:
-        """Count the weak candidates that were passed over from `start` to `stop`, and at `stop` those of types before a type."""
+        """Count the weak candidates that were passed over from `start` to `stop`, and at `stop`
+        those of types before a type.
+        """
         for lane in self._lanes:
             status = lane.status[start : stop + (lane.kind < before)].tobytes()
             if status:
@@ -327,7 +394,9 @@ class Runs:
                 piece.reject(numbers, lane.errors)
 
     def _frames(self, taken: list[tuple[int, int, int, int]]) -> Frames:
-        """The frames of the runs that were taken: type, first offset, number and size of their frames."""
+        """The frames of the runs that were taken: type, first offset, number and size of their
+        frames.
+        """
         if len(taken) == 1:
             kind, spot, number, size = taken[0]
             kinds, sizes = repeated(kind, number), repeated(size, number)

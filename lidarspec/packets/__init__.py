@@ -1,6 +1,7 @@
 """Packets: frames of one type in order and in time.
 
-In: `Frames` out of a decoder. Out: `Packets`, the frames of one type as columns, with the times, indices and breaks that follow from the
+In: `Frames` out of a decoder. Out: `Packets`, the frames of one type as columns, with the times,
+indices and breaks that follow from the
 sensor's clock and counter, and with what frames of other types said last. Modules in reading order:
 
 * `packets`: the columns of n frames, raw and physical.

@@ -1,15 +1,16 @@
 """Order of datagrams that only their clock numbers.
 
-`ClockOrder` judges datagrams as they arrive: each is the next one, or late, or doubled, or the first one after a gap or
-after the clock was set. It remembers the newest packets in the order of their times. A packet with the time and the
-bytes of one of them is a double; bytes are compared by their CRC-32. A late packet is placed between its neighbours,
-and the number of packets that are missing there is counted anew. So the counters end up as if the packets had arrived
-in order.
+`ClockOrder` judges datagrams as they arrive: each is the next one, or late, or doubled, or the
+first one after a gap or after the clock was set. It remembers the newest packets in the order of
+their times. A packet with the time and the bytes of one of them is a double; bytes are compared by
+their CRC-32. A late packet is placed between its neighbours, and the number of packets that are
+missing there is counted anew. So the counters end up as if the packets had arrived in order.
 
-Each packet gets an index and an order. The index runs on over what is missing. The order is the time of the packet in
-nanoseconds, from the first packet on; it differs for packets of one time that are no doubles, and leaps by
-`2 * MAX_STEP_NS` where the clock was set or the sensor started again. Packets sorted by it and judged by another
-`ClockOrder` give the index and the breaks that they would have got without any disorder.
+Each packet gets an index and an order. The index runs on over what is missing. The order is the
+time of the packet in nanoseconds, from the first packet on; it differs for packets of one time that
+are no doubles, and leaps by `2 * MAX_STEP_NS` where the clock was set or the sensor started again.
+Packets sorted by it and judged by another `ClockOrder` give the index and the breaks that they
+would have got without any disorder.
 
 A gap at a masked sector (`masked_sector`) is no loss.
 """
@@ -31,13 +32,15 @@ from lidarspec.packets.clocks import Times
 from lidarspec.packets.masked_sector import MaskedGaps
 from lidarspec.packets.pace import Pace, Paces
 
-#: places that a packet may be late; a clock that goes back further was set, or the sensor started again.
+#: places that a packet may be late; a clock that goes back further was set, or the sensor started
+#: again.
 MAX_PLACES_LATE = 64
 #: the same in time, if the pace is unknown.
 MAX_LATE_NS = 10**9
 #: a clock that advances by more from one packet to the next was set.
 MAX_STEP_NS = 3600 * 10**9
-#: packets of which a checksum is remembered; an older one with the same time counts as the same packet.
+#: packets of which a checksum is remembered; an older one with the same time counts as the same
+#: packet.
 REMEMBERED_CHECKSUMS = 16
 
 _time_of = attrgetter("time")
@@ -80,10 +83,13 @@ class ClockOrder:
         self._neighbours = list[Neighbour]()  # by their times
         self._offset = 0  # from a time to an order
         self._gaps = gaps
-        self._leap: tuple[int, Neighbour] | None = None  # the time before the clock leapt, ns, and the packet after
+        self._leap: tuple[int, Neighbour] | None = (
+            None  # the time before the clock leapt, ns, and the packet after
+        )
 
     def push(self, batch: Batch, times: Times) -> tuple[Numbers, NDArray[np.int64]]:
-        """Return the index and the order of each packet, (n,); mark the breaks before packets in `batch.breaks`.
+        """Return the index and the order of each packet, (n,); mark the breaks before packets in
+        `batch.breaks`.
 
         Args:
             times: by the sensor's clock, (n,) ns.
@@ -120,7 +126,9 @@ class ClockOrder:
         return index, order
 
     def forget(self) -> None:
-        """Treat the next packet as the first one after the clock was set: nothing tells what passed until then."""
+        """Treat the next packet as the first one after the clock was set: nothing tells what passed
+        until then.
+        """
         self._arrived = None
         self._neighbours.clear()
         if self._gaps is not None:
@@ -135,7 +143,9 @@ class ClockOrder:
         if passed.min() > 0 and passed.max() <= min(1.5 * paces.shortest, MAX_STEP_NS):
             return []
         each = paces.at_each(np.arange(len(times)))
-        return np.flatnonzero((passed <= 0) | (passed > MAX_STEP_NS) | (passed > 1.5 * each)).tolist()
+        return np.flatnonzero(
+            (passed <= 0) | (passed > MAX_STEP_NS) | (passed > 1.5 * each)
+        ).tolist()
 
     def _follows(self, time: int, pace: float) -> bool:
         """Return whether a packet is the next one after the newest."""
@@ -151,7 +161,9 @@ class ClockOrder:
         for row in range(max(start, stop - MAX_PLACES_LATE), stop):
             checksum = crc32(batch.table.frame(row)) if row >= stop - REMEMBERED_CHECKSUMS else None
             time = times.item(row)
-            self._newest = Neighbour(time, time + self._offset, first + row - start, 0, checksum, self._angle_at(row))
+            self._newest = Neighbour(
+                time, time + self._offset, first + row - start, 0, checksum, self._angle_at(row)
+            )
             self._neighbours.append(self._newest)
         return first
 
@@ -184,7 +196,9 @@ class ClockOrder:
         self._stats.lost += missing
         batch.breaks[row] |= missing > 0
         order = max(time + self._offset, newest.order + 1)
-        self._newest = Neighbour(time, order, newest.index + 1 + missing, missing, checksum, angle, masked)
+        self._newest = Neighbour(
+            time, order, newest.index + 1 + missing, missing, checksum, angle, masked
+        )
         self._neighbours.append(self._newest)
         self._leap = (newest.time, self._newest) if missing > MAX_PLACES_LATE else None
         if missing and self._gaps is not None:
@@ -213,7 +227,9 @@ class ClockOrder:
         return passed < -MAX_LATE_NS or (is_full and time < self._neighbours[0].time)
 
     def _begin(self, batch: Batch, row: int, time: int, checksum: int) -> Neighbour:
-        """Begin with a first packet, or anew after the clock was set: the index leaves out one number."""
+        """Begin with a first packet, or anew after the clock was set: the index leaves out one
+        number.
+        """
         before = self._newest
         if before is None:
             self._offset = -time
@@ -228,7 +244,9 @@ class ClockOrder:
         return self._newest
 
     def _insert(self, position: int, row: int, time: int, pace: float, checksum: int) -> Neighbour:
-        """Place a late packet before a neighbour, and count anew what is missing on both sides of it."""
+        """Place a late packet before a neighbour, and count anew what is missing on both sides of
+        it.
+        """
         self._stats.late += 1
         after = self._neighbours[position]
         missing_after = _count_missing(after.time - time, pace)

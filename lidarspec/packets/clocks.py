@@ -1,4 +1,6 @@
-"""The sensor's own clock: read from packets as integer nanoseconds, and made to run on where it starts again."""
+"""The sensor's own clock: read from packets as integer nanoseconds, and made to run on where it
+starts again.
+"""
 
 from __future__ import annotations
 
@@ -28,10 +30,12 @@ _FURTHEST = 9 * 10**18
 
 
 class Unwrapper:
-    """A clock that starts again at `wraps_at` seconds, made to run on; exact over any number of wraps.
+    """A clock that starts again at `wraps_at` seconds, made to run on; exact over any number of
+    wraps.
 
-    The shorter way round decides between forward and backward, so late packets go back in time. Where the host's
-    times say that more than most of a turn has passed, they decide how many turns it was; from half a turn on, whether it was forward.
+    The shorter way round decides between forward and backward, so late packets go back in time.
+    Where the host's times say that more than most of a turn has passed, they decide how many turns
+    it was; from half a turn on, whether it was forward.
     """
 
     def __init__(self, wraps_at: float | None) -> None:
@@ -52,7 +56,10 @@ class Unwrapper:
             return times
         if len(over):
             steps[over] = (steps[over] + half) % self._turn - half
-        if self._turn >= 10**9 and int(host.max()) - min(int(host.min()), at or int(host.max())) > half:
+        if (
+            self._turn >= 10**9
+            and int(host.max()) - min(int(host.min()), at or int(host.max())) > half
+        ):
             before = np.concatenate([[at], host[:-1]])
             passed = np.where((host > 0) & (before > 0), host - before, 0)
             forward = (passed > half) & (np.abs(steps + self._turn - passed) < self._turn // 4)
@@ -67,7 +74,8 @@ class Unwrapper:
 
 @dataclass(frozen=True)
 class ClockReference:
-    """A frame that tells the turn of a clock (`Clock.told`), found before the packets that it applies to.
+    """A frame that tells the turn of a clock (`Clock.told`), found before the packets that it
+    applies to.
 
     Attributes:
         data: its bytes.
@@ -83,7 +91,8 @@ class Epoch:
 
     Args:
         sensor: with the clock of the packets.
-        reference: applies from the first packet on; None if the turn is unknown until a frame tells it.
+        reference: applies from the first packet on; None if the turn is unknown until a frame tells
+            it.
 
     Attributes:
         frame: the type of the frames that tell it.
@@ -100,18 +109,24 @@ class Epoch:
         self._turn = _turn(clock.wraps_at)
         self._reference = reference
 
-    def push(self, batch: Batch, readings: Times, times: Times, host: Times, *, whole: bool = False) -> Times:
+    def push(
+        self, batch: Batch, readings: Times, times: Times, host: Times, *, whole: bool = False
+    ) -> Times:
         """Return what completes the times of packets, (n,).
 
-        It is 0 for packets before the first frame that tells the turn, unless that one applies from the start.
+        It is 0 for packets before the first frame that tells the turn, unless that one applies from
+        the start.
 
         Args:
             readings, times: (n,), what the clock reads in the packets, and as times that run on.
             host: (n,), when the packets arrived, ns; 0 if unknown.
-            whole: the packets are a whole input: the first frame that tells the turn applies to those before it too.
+            whole: the packets are a whole input: the first frame that tells the turn applies to
+                those before it too.
         """
         if self.ns is None and self._reference is not None:
-            self.ns = self._ns_by_reference(self._reference, readings.item(0), times.item(0), host.item(0))
+            self.ns = self._ns_by_reference(
+                self._reference, readings.item(0), times.item(0), host.item(0)
+            )
         if self.ns is not None:
             return repeated(self.ns, len(times))
         table, which = batch.state[self.frame]
@@ -131,8 +146,12 @@ class Epoch:
             return repeated(self.ns, len(times))
         return np.where(np.arange(len(times)) < first, 0, self.ns)
 
-    def _ns_by_reference(self, reference: ClockReference, reading: int, time: int, host: int) -> int:
-        """Return what completes times, from what the clock reads in the first packet and in the reference."""
+    def _ns_by_reference(
+        self, reference: ClockReference, reading: int, time: int, host: int
+    ) -> int:
+        """Return what completes times, from what the clock reads in the first packet and in the
+        reference.
+        """
         table = codec(self._sensor.frames[self.frame]).table([reference.data])
         told = told_seconds(self._clock, table)
         reading_there = self._reading_of(table, 0)
@@ -165,14 +184,17 @@ def told_seconds(clock: Clock, table: Table) -> NDArray[np.float64]:
 def clock_ns(sensor: Spec, batch: Batch) -> Times:
     """The sensor's own clock in each packet, (n,) int64 nanoseconds, as it stands on the wire.
 
-    Where it stands in the parts of a frame, it is that of the first one; in a frame without any that of the frame before.
+    Where it stands in the parts of a frame, it is that of the first one; in a frame without any
+    that of the frame before.
     """
     which, readings = clocked(sensor, batch)
     return readings if which is None else held(which, readings, np.zeros(len(batch), np.int64))
 
 
 def clocked(sensor: Spec, batch: Batch) -> tuple[NDArray[np.intp] | None, Times]:
-    """The packets that have the clock, None for all, and what it reads there: in the first of the parts in which it stands."""
+    """The packets that have the clock, None for all, and what it reads there: in the first of the
+    parts in which it stands.
+    """
     assert sensor.clock is not None
     place, source = clock_parts(sensor, batch.table.schema), sensor.clock.source
     if place is not None:
@@ -186,7 +208,9 @@ def clocked(sensor: Spec, batch: Batch) -> tuple[NDArray[np.intp] | None, Times]
 
 
 def held(which: NDArray[np.intp], times: Times, before: Times) -> Times:
-    """The times of some packets, each held until the next of them, (n,); before the first of them those given, (n,)."""
+    """The times of some packets, each held until the next of them, (n,); before the first of them
+    those given, (n,).
+    """
     spots = np.searchsorted(which, np.arange(len(before)), side="right") - 1
     return np.where(spots < 0, before, times[np.maximum(spots, 0)]) if len(times) else before
 
@@ -202,30 +226,42 @@ def _summed(fields: tuple[str, ...], table: Table, sensor: str) -> Times:
             if zero:
                 part += zero
         else:
-            part = _nanoseconds(raw.astype(np.float64) * float(step / 10**9) + float(zero / 10**9), len(table))
+            part = _nanoseconds(
+                raw.astype(np.float64) * float(step / 10**9) + float(zero / 10**9), len(table)
+            )
         total = part if total is None else np.add(total, part, out=total)
     return np.zeros(len(table), np.int64) if total is None else total
 
 
 def clock_parts(sensor: Spec, schema: Schema) -> tuple[str, str] | None:
     """The parts, and their kind, in which the clock stands; None where it stands in the frame."""
-    places = {schema.within(path) for path in (paths(sensor.clock) if sensor.clock is not None else ()) if path not in schema.fields}
+    places = {
+        schema.within(path)
+        for path in (paths(sensor.clock) if sensor.clock is not None else ())
+        if path not in schema.fields
+    }
     found = {place[:2] for place in places if place is not None}
     return found.pop() if len(found) == 1 else None
 
 
-def part_times(sensor: Spec, place: tuple[str, str], table: Table, which: NDArray[np.intp], times: Times) -> Times:
+def part_times(
+    sensor: Spec, place: tuple[str, str], table: Table, which: NDArray[np.intp], times: Times
+) -> Times:
     """The times of parts, (k,), where they have a clock of their own.
 
     Args:
         place: where they stand.
         which: the frame of each.
-        times: of these frames, for each part: that of their first part, where the clock stands in it.
+        times: of these frames, for each part: that of their first part, where the clock stands in
+            it.
     """
     if not len(which) or sensor.clock is None or not _stands_in(sensor.clock, place):
         return times
     readings, first = _in_parts(sensor, place, table), np.searchsorted(which, which)
-    steps, turn = readings - readings[first], _turn(sensor.clock.wraps_at) if sensor.clock.wraps_at else 0
+    steps, turn = (
+        readings - readings[first],
+        _turn(sensor.clock.wraps_at) if sensor.clock.wraps_at else 0,
+    )
     return times + ((steps + turn // 2) % turn - turn // 2 if turn else steps)
 
 
@@ -252,12 +288,21 @@ def _turn(seconds: float) -> int:
 
 def paths(clock: Clock) -> tuple[str, ...]:
     """The fields that add up to a clock; none where a function computes it."""
-    return (clock.source,) if isinstance(clock.source, str) else () if callable(clock.source) else tuple(clock.source)
+    return (
+        (clock.source,)
+        if isinstance(clock.source, str)
+        else ()
+        if callable(clock.source)
+        else tuple(clock.source)
+    )
 
 
 @lru_cache(maxsize=256)
-def clock_terms(fields: tuple[str, ...], schema: Schema, sensor: str) -> list[tuple[str, Any, Any, int]]:
-    """The fields that add up to a clock: path, nanoseconds in one step and at zero, furthest reading (0 where these are fractions).
+def clock_terms(
+    fields: tuple[str, ...], schema: Schema, sensor: str
+) -> list[tuple[str, Any, Any, int]]:
+    """The fields that add up to a clock: path, nanoseconds in one step and at zero, furthest
+    reading (0 where these are fractions).
 
     Raises:
         SpecError: for one that is no time, or not one of each packet.
@@ -268,7 +313,11 @@ def clock_terms(fields: tuple[str, ...], schema: Schema, sensor: str) -> list[tu
         scaling = _scaling(info.unit, info.scale, info.offset) if info else None
         if info is None or scaling is None or info.axes:
             reason = "a clock is one field of the frame, with a unit of time and outside arrays"
-            raise SpecError(reason if info else "no data frame has this field for the clock", path=path, sensor=sensor)
+            raise SpecError(
+                reason if info else "no data frame has this field for the clock",
+                path=path,
+                sensor=sensor,
+            )
         step, zero = scaling
         whole = isinstance(step, int) and isinstance(zero, int)
         found.append((path, step, zero, _FURTHEST // len(fields) // max(step, 1) if whole else 0))
@@ -276,7 +325,9 @@ def clock_terms(fields: tuple[str, ...], schema: Schema, sensor: str) -> list[tu
 
 
 def _scaling(unit: str, scale: float, offset: float) -> tuple[Any, Any] | None:
-    """Nanoseconds in one step of a field and at its zero: integers where both are whole, else fractions; None if it is no time."""
+    """Nanoseconds in one step of a field and at its zero: integers where both are whole, else
+    fractions; None if it is no time.
+    """
     per_unit = factor(unit, "s")
     if per_unit is None:
         return None
@@ -298,11 +349,17 @@ def _within(raw: NDArray[Any], furthest: int) -> Times:
     if raw.dtype.itemsize * 8 - (raw.dtype.kind == "i") < furthest.bit_length():
         return raw.astype(np.int64)
     edges = np.iinfo(raw.dtype)
-    return np.asarray(np.clip(raw, max(int(edges.min), -furthest), min(int(edges.max), furthest)), np.int64)
+    return np.asarray(
+        np.clip(raw, max(int(edges.min), -furthest), min(int(edges.max), furthest)), np.int64
+    )
 
 
 def _nanoseconds(seconds: Any, number: int) -> Times:
-    flat = np.broadcast_to(np.asarray(seconds, np.float64).reshape(-1), (number,)) if np.size(seconds) in (1, number) else None
+    flat = (
+        np.broadcast_to(np.asarray(seconds, np.float64).reshape(-1), (number,))
+        if np.size(seconds) in (1, number)
+        else None
+    )
     if flat is None:
         raise SpecError("a clock gives one time for each packet")
     return np.rint(np.clip(np.nan_to_num(flat), -9e9, 9e9) * 1e9).astype(np.int64)

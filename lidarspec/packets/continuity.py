@@ -1,10 +1,13 @@
-"""Whether packets follow one another: what was lost, came twice or late, where there is a break, and where each packet stands.
+"""Whether packets follow one another: what was lost, came twice or late, where there is a break,
+and where each packet stands.
 
-`Continuity` is the one judge of that. It asks the sensor's counter and its clock, and where it has neither the bytes that were skipped; the
-counters, the breaks and the completeness of scans all follow from the index that it gives: it runs on, and leaves out as many numbers as
-packets are missing. What the counter cannot tell, the clock does: how often the counter has wrapped in a gap, and whether a number that
-jumps is damaged. How long a packet takes by the clock is declared (`Clock.pace`), or learned (`Pace`).
-Datagrams that only their clock numbers are judged by `clock_order`.
+`Continuity` is the one judge of that. It asks the sensor's counter and its clock, and where it has
+neither the bytes that were skipped; the counters, the breaks and the completeness of scans all
+follow from the index that it gives: it runs on, and leaves out as many numbers as packets are
+missing. What the counter cannot tell, the clock does: how often the counter has wrapped in a gap,
+and whether a number that jumps is damaged. How long a packet takes by the clock is declared
+(`Clock.pace`), or learned (`Pace`). Datagrams that only their clock numbers are judged by
+`clock_order`.
 """
 
 from __future__ import annotations
@@ -29,15 +32,18 @@ from lidarspec.packets.packets import Index
 from lidarspec.spec.description import Spec
 from lidarspec.spec.timing import Clock, Sequence
 
-#: how far back a packet may come and still be a late one; further back the sensor has started again.
+#: how far back a packet may come and still be a late one; further back the sensor has started
+#: again.
 LATE = 64
-#: the same where the packet would stand before the first one of all, which is more likely a turn that was missed.
+#: the same where the packet would stand before the first one of all, which is more likely a turn
+#: that was missed.
 EARLY = 10
 #: counters with at least so many values start again at 0 only when the sensor does.
 LONG = 1 << 16
 #: counters with more values fill 64 bits: differences wrap by themselves.
 WIDE = 1 << 63
-#: a first index, and a step of a counter, are no larger: an index fits 64 bits whatever the counter says.
+#: a first index, and a step of a counter, are no larger: an index fits 64 bits whatever the counter
+#: says.
 FARTHEST = 1 << 32
 #: a clock that goes on by more nanoseconds from one packet to the next was set.
 SET = 3600 * 10**9
@@ -48,11 +54,14 @@ class Clues:
     """What there is to judge the packets of a batch by.
 
     Attributes:
-        numbers, periods: the counter, (n,), None where there is none; and after how many packets it starts again, one for all or (n,).
+        numbers, periods: the counter, (n,), None where there is none; and after how many packets it
+            starts again, one for all or (n,).
         there: which packets have the counter, (n,); None where all have.
-        times, paces: of the sensor's clock, (n,) ns, None where there is none; and how long packets take by it.
+        times, paces: of the sensor's clock, (n,) ns, None where there is none; and how long packets
+            take by it.
         passed: from the time of the packet that arrived before to each, (n,) ns.
-        skipped: before which packets there are bytes in no frame, (k,), and how many packets these would be, (k,).
+        skipped: before which packets there are bytes in no frame, (k,), and how many packets these
+            would be, (k,).
     """
 
     batch: Batch
@@ -66,7 +75,11 @@ class Clues:
 
     def number(self, spot: int) -> int | None:
         """The counter of a packet."""
-        return None if self.numbers is None or (self.there is not None and not self.there[spot]) else self.numbers.item(spot)
+        return (
+            None
+            if self.numbers is None or (self.there is not None and not self.there[spot])
+            else self.numbers.item(spot)
+        )
 
     def time(self, spot: int) -> int | None:
         """The time of a packet, ns."""
@@ -79,7 +92,9 @@ class Clues:
 
 @dataclass
 class CountedLoss:
-    """Packets that are missing by the counter, and that a masked sector leaves out (see `masked_sector.Loss`)."""
+    """Packets that are missing by the counter, and that a masked sector leaves out (see
+    `masked_sector.Loss`).
+    """
 
     missing: int
     masked: int = 0
@@ -93,7 +108,9 @@ class Continuity:
         grain: the step of that clock, ns; 0 where it is fine.
     """
 
-    def __init__(self, sensor: Spec, stats: Counters, *, counted: bool, timed: bool, grain: float = 0) -> None:
+    def __init__(
+        self, sensor: Spec, stats: Counters, *, counted: bool, timed: bool, grain: float = 0
+    ) -> None:
         self._sensor, self._stats = sensor, stats
         self._rule: Sequence | None = sensor.sequence if counted else None
         self._clock: Clock | None = sensor.clock if timed else None
@@ -102,13 +119,17 @@ class Continuity:
         self._time: int | None = None  # of the newest packet, ns
         self._largest = 1  # bytes of the largest packet
         self._arrived: int | None = None  # the time of the packet that came last, ns
-        self._suspect: tuple[int, int] | None = None  # number and time of a packet whose counter jumped while the clock went on
+        self._suspect: tuple[int, int] | None = (
+            None  # number and time of a packet whose counter jumped while the clock went on
+        )
         self._period, self._index, self._first = 0, -1, 0
         self._missing = dict[int, CountedLoss]()
         self._gaps = MaskedGaps(sensor) if counted else None
         self._angle = math.nan  # of the newest packet, in turns
 
-    def push(self, batch: Batch, times: Times | None, skipped: NDArray[np.int64]) -> tuple[Index, NDArray[np.bool_]]:
+    def push(
+        self, batch: Batch, times: Times | None, skipped: NDArray[np.int64]
+    ) -> tuple[Index, NDArray[np.bool_]]:
         """The index of each packet, (n,), and True where there is a break before it, (n,).
 
         Args:
@@ -120,8 +141,16 @@ class Continuity:
             SpecError: where the counter is no field of the header.
         """
         number, breaks = len(batch), batch.breaks
-        if self._rule is None and self._clock is None and alike(skipped) == 0 and alike(batch.table.sizes) is not None:
-            self._index, self._largest = self._index + number, max(self._largest, batch.table.sizes.item(0))
+        if (
+            self._rule is None
+            and self._clock is None
+            and alike(skipped) == 0
+            and alike(batch.table.sizes) is not None
+        ):
+            self._index, self._largest = (
+                self._index + number,
+                max(self._largest, batch.table.sizes.item(0)),
+            )
             return range(self._index + 1 - number, self._index + 1), breaks
         clues = self._clues(batch, times, skipped)
         if self._rule is None:
@@ -149,7 +178,9 @@ class Continuity:
         return found, breaks
 
     def forget(self) -> None:
-        """Time has passed, and packets may have, that nothing tells of: the clock is not asked about the next one."""
+        """Time has passed, and packets may have, that nothing tells of: the clock is not asked
+        about the next one.
+        """
         self._time = self._arrived = None
         if self._gaps is not None:
             self._gaps.forget()
@@ -158,7 +189,9 @@ class Continuity:
 
     @staticmethod
     def _placed(found: Numbers, first: int, start: int, stop: int) -> Numbers:
-        """Indices with those of some packets put in, which run on from `first`; a range where these are all."""
+        """Indices with those of some packets put in, which run on from `first`; a range where these
+        are all.
+        """
         if stop - start == len(found):
             return range(first, first + stop - start)
         assert not isinstance(found, range)
@@ -177,18 +210,26 @@ class Continuity:
         spots, packets = np.empty(0, np.intp), np.empty(0, np.int64)
         if alike(skipped) != 0:
             spots = np.flatnonzero(skipped > 0)
-            largest = sizes[spots] if alike(sizes) is not None else np.maximum.accumulate(sizes)[spots]
+            largest = (
+                sizes[spots] if alike(sizes) is not None else np.maximum.accumulate(sizes)[spots]
+            )
             packets = np.rint(skipped[spots] / np.maximum(largest, self._largest)).astype(np.int64)
-        self._largest = max(self._largest, int(sizes.max()) if (size := alike(sizes)) is None else size)
+        self._largest = max(
+            self._largest, int(sizes.max()) if (size := alike(sizes)) is None else size
+        )
         return Clues(batch, *self._numbers(batch), times, passed, paces, (spots, packets))
 
     def _odd(self, clues: Clues) -> list[int]:
-        """The packets that do not follow the one that arrived before them: all others, but the first, go on from there."""
+        """The packets that do not follow the one that arrived before them: all others, but the
+        first, go on from there.
+        """
         numbers, passed = clues.numbers, clues.passed
         assert numbers is not None
         if clues.there is not None and not clues.there.all():
             return list(range(len(clues.batch)))
-        each: Any = clues.periods if isinstance(clues.periods, int) else np.maximum(clues.periods, 1)
+        each: Any = (
+            clues.periods if isinstance(clues.periods, int) else np.maximum(clues.periods, 1)
+        )
         steps = numbers[1:] - numbers[:-1]
         odd = steps != 1
         if not (isinstance(each, int) and each > WIDE) and odd.any():
@@ -197,7 +238,11 @@ class Continuity:
             odd |= each[1:] != each[:-1]
         least = each if isinstance(each, int) else int(each.min())
         half = clues.paces.shortest * least / 2
-        if passed is not None and least < LONG and max(int(passed.max()), -int(passed.min())) > half:  # it may have wrapped
+        if (
+            passed is not None
+            and least < LONG
+            and max(int(passed.max()), -int(passed.min())) > half
+        ):  # it may have wrapped
             odd |= (np.abs(passed) > clues.paces.at_each(counted(len(passed))) * each / 2)[1:]
         return (np.flatnonzero(odd) + 1).tolist()
 
@@ -221,7 +266,9 @@ class Continuity:
             ahead[np.searchsorted(spots, clues.skipped[0])] += packets
             paces = clues.paces.at_each(spots)
             steps = passed[spots]
-            by_clock = np.fmax(np.ceil((steps - np.maximum(grain, paces / 2)) / paces), 1).astype(np.int64)
+            by_clock = np.fmax(np.ceil((steps - np.maximum(grain, paces / 2)) / paces), 1).astype(
+                np.int64
+            )
             ahead = np.where(grain <= paces / 2, by_clock, np.maximum(by_clock, ahead))
             restarts = (steps < 0) | (steps > SET)
             ahead[restarts] = 2
@@ -232,7 +279,9 @@ class Continuity:
         self._index += number + int(ahead.sum()) - len(ahead)
         return partial(_with_gaps, first, number, spots, ahead - 1)
 
-    def _numbers(self, batch: Batch) -> tuple[NDArray[Any] | None, int | NDArray[np.int64], NDArray[np.bool_] | None]:
+    def _numbers(
+        self, batch: Batch
+    ) -> tuple[NDArray[Any] | None, int | NDArray[np.int64], NDArray[np.bool_] | None]:
         """The counter of each packet, after how many it starts again, and which packets have it."""
         if self._rule is None:
             return None, 1, None
@@ -255,9 +304,15 @@ class Continuity:
         return widest if last is None else int(last)
 
     def _ahead(self, clues: Clues, spot: int) -> tuple[int | None, int | None]:
-        """How many places a packet stands ahead of the newest one, None where the sensor has started again; and its number, if right."""
+        """How many places a packet stands ahead of the newest one, None where the sensor has
+        started again; and its number, if right.
+        """
         time, number, pace = clues.time(spot), clues.number(spot), clues.paces.at(spot)
-        passed = None if time is None or self._time is None or abs(time - self._time) > SET else time - self._time
+        passed = (
+            None
+            if time is None or self._time is None or abs(time - self._time) > SET
+            else time - self._time
+        )
         if number is None:
             return 1, self._number
         period = clues.period(spot)
@@ -276,7 +331,9 @@ class Continuity:
             if by_clock <= -LATE:
                 return None, number
             if by_clock <= 0.5:
-                return round(by_clock), number  # late, from before the numbers started again or after it
+                return round(
+                    by_clock
+                ), number  # late, from before the numbers started again or after it
             return self._damaged(number, time or 0, pace, by_clock)
         self._suspect = None
         return None if near <= -LATE else near, number
@@ -289,16 +346,24 @@ class Continuity:
         return None if period >= LONG and ahead > min(period // 2, FARTHEST) else ahead
 
     def _damaged(self, number: int, time: int, pace: float, by_clock: float) -> tuple[int, int]:
-        """What the clock says of a packet whose number does not fit, unless the numbers go on from there: then they have started again."""
+        """What the clock says of a packet whose number does not fit, unless the numbers go on from
+        there: then they have started again.
+        """
         ahead, suspect = max(round(by_clock), 1), self._suspect
         self._suspect = number, time
-        if suspect is not None and _agree((number - suspect[0]) % self._period, (time - suspect[1]) / pace):
+        if suspect is not None and _agree(
+            (number - suspect[0]) % self._period, (time - suspect[1]) / pace
+        ):
             return ahead, number
         assert self._number is not None
         return ahead, self._number + ahead
 
-    def _step(self, clues: Clues, spot: int, ahead: int | None, number: int | None) -> tuple[int, bool]:
-        """The index of a packet that does not follow the newest one, and whether there is a break before it."""
+    def _step(
+        self, clues: Clues, spot: int, ahead: int | None, number: int | None
+    ) -> tuple[int, bool]:
+        """The index of a packet that does not follow the newest one, and whether there is a break
+        before it.
+        """
         if ahead is not None and ahead <= 0:
             return self._back(-ahead), False
         before, lost = self._index, 0 if ahead is None else ahead - 1
@@ -309,7 +374,11 @@ class Continuity:
             loss = CountedLoss(lost)
             self._count_lost(loss, spot)
             lost = loss.missing
-            self._missing = {index: loss for index, loss in self._missing.items() if index > self._index + ahead - LATE}
+            self._missing = {
+                index: loss
+                for index, loss in self._missing.items()
+                if index > self._index + ahead - LATE
+            }
             self._missing |= dict.fromkeys(missing, loss)
             self._index += ahead
         self._number, self._time = number, clues.time(spot)
@@ -317,7 +386,9 @@ class Continuity:
         return self._index, before >= 0 and (ahead is None or lost > 0)
 
     def _count_lost(self, loss: CountedLoss, spot: int) -> None:
-        """Count the packets that are missing before another one as lost, but for those that are masked."""
+        """Count the packets that are missing before another one as lost, but for those that are
+        masked.
+        """
         if self._gaps is not None and loss.missing:
             angle = self._angle_at(spot)
             loss.masked = self._gaps.count_masked(self._angle, angle, loss.missing)
@@ -330,7 +401,9 @@ class Continuity:
         return math.nan if self._gaps is None else self._gaps.angle_at(spot)
 
     def _begin(self, number: int | None) -> None:
-        """A first packet, or the sensor started again: nothing is known to be lost, and the index leaves out one number."""
+        """A first packet, or the sensor started again: nothing is known to be lost, and the index
+        leaves out one number.
+        """
         if self._index < 0 and self._rule is not None and number is not None:
             self._index = (number - self._rule.first) % self._period % FARTHEST
         else:
@@ -354,7 +427,9 @@ class Continuity:
         return index
 
 
-def _with_gaps(first: int, number: int, spots: NDArray[np.intp], gaps: NDArray[np.int64]) -> NDArray[np.int64]:
+def _with_gaps(
+    first: int, number: int, spots: NDArray[np.intp], gaps: NDArray[np.int64]
+) -> NDArray[np.int64]:
     """Consecutive numbers, (number,), that leave out so many before some places."""
     index = np.ones(number, np.int64)
     index[:1] = first

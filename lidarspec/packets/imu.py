@@ -1,4 +1,6 @@
-"""What an IMU felt, out of packets: samples in stream order, in SI and the axes of the points, and which of them belong to a scan."""
+"""What an IMU felt, out of packets: samples in stream order, in SI and the axes of the points, and
+which of them belong to a scan.
+"""
 
 from __future__ import annotations
 
@@ -17,7 +19,10 @@ from lidarspec.spec.description import Spec
 from lidarspec.spec.results import Imu
 
 #: the columns of a sample after its time, in the order in which files list them, and their units.
-UNITS = {**{f"angular_velocity_{axis}": "rad/s" for axis in "xyz"}, **{f"linear_acceleration_{axis}": "m/s2" for axis in "xyz"}}
+UNITS = {
+    **{f"angular_velocity_{axis}": "rad/s" for axis in "xyz"},
+    **{f"linear_acceleration_{axis}": "m/s2" for axis in "xyz"},
+}
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -42,7 +47,9 @@ class ImuSamples:
 
     def __getitem__(self, which: Any) -> ImuSamples:
         """The samples that a mask, indices or a slice pick."""
-        return ImuSamples(self.time_ns[which], self.angular_velocity[which], self.linear_acceleration[which])
+        return ImuSamples(
+            self.time_ns[which], self.angular_velocity[which], self.linear_acceleration[which]
+        )
 
     @property
     def columns(self) -> dict[str, NDArray[Any]]:
@@ -52,14 +59,26 @@ class ImuSamples:
 
     def turned(self, rotation: NDArray[np.float64]) -> ImuSamples:
         """The same in other axes; `rotation`: (3, 3), from these axes to those."""
-        return ImuSamples(self.time_ns, self.angular_velocity @ rotation.T, self.linear_acceleration @ rotation.T)
+        return ImuSamples(
+            self.time_ns, self.angular_velocity @ rotation.T, self.linear_acceleration @ rotation.T
+        )
 
 
 def joined(parts: Sequence[ImuSamples]) -> ImuSamples:
     """Samples one after another; none of none."""
-    parts = [*parts, ImuSamples(np.empty(0, np.int64), np.empty((0, 3)), np.empty((0, 3)))] if len(parts) != 1 else parts
+    parts = (
+        [*parts, ImuSamples(np.empty(0, np.int64), np.empty((0, 3)), np.empty((0, 3)))]
+        if len(parts) != 1
+        else parts
+    )
     names = ("time_ns", "angular_velocity", "linear_acceleration")
-    return parts[0] if len(parts) == 1 else ImuSamples(*(np.concatenate([getattr(part, name) for part in parts]) for name in names))
+    return (
+        parts[0]
+        if len(parts) == 1
+        else ImuSamples(
+            *(np.concatenate([getattr(part, name) for part in parts]) for name in names)
+        )
+    )
 
 
 def samples(sensor: Spec, frame: str, batch: Batch, time_ns: NDArray[np.int64]) -> ImuSamples:
@@ -72,25 +91,37 @@ def samples(sensor: Spec, frame: str, batch: Batch, time_ns: NDArray[np.int64]) 
 
     Raises:
         SpecError: where the frame type has nothing of an IMU.
-        PluginError: where the plugin's function fails or returns columns that do not fit; the cause is chained.
+        PluginError: where the plugin's function fails or returns columns that do not fit; the cause
+            is chained.
     """
     function = sensor.imu_of(frame)
     with plugin_errors(f"imu of {frame}", sensor.id, function), np.errstate(all="ignore"):
         result = function(Fields(batch))
         if not isinstance(result, Imu):
             raise TypeError(f"has to return Imu, not {type(result).__name__}")
-        values = dict(zip([*UNITS, "time"], (*result.angular_velocity, *result.linear_acceleration, result.time), strict=True))
+        values = dict(
+            zip(
+                [*UNITS, "time"],
+                (*result.angular_velocity, *result.linear_acceleration, result.time),
+                strict=True,
+            )
+        )
         arrays, axes, _, shape = of_points(values, batch)
         mask = unpadded(axes, shape, batch)
         after = np.rint(np.nan_to_num(np.asarray(arrays.pop(), np.float64)) * 1e9).astype(np.int64)
         time = flat(time_ns.reshape(-1, *(1,) * len(axes)) + after, shape, mask, len(batch))
-        values_of = np.stack([np.asarray(flat(array, shape, mask, len(batch)), np.float64) for array in arrays], axis=1)
+        values_of = np.stack(
+            [np.asarray(flat(array, shape, mask, len(batch)), np.float64) for array in arrays],
+            axis=1,
+        )
     found, turn = ImuSamples(time, values_of[:, :3], values_of[:, 3:]), vendor_turn(sensor)
     return found if turn is None else found.turned(turn)
 
 
 class Waiting:
-    """Samples that wait for the scan that they belong to: those from its first point to that of the next, and what was before."""
+    """Samples that wait for the scan that they belong to: those from its first point to that of the
+    next, and what was before.
+    """
 
     def __init__(self) -> None:
         self._parts: list[ImuSamples] = []

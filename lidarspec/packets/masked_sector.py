@@ -1,8 +1,10 @@
-"""Masked sectors: the part of each turn in which a rotating sensor sends nothing, since its user has set it so.
+"""Masked sectors: the part of each turn in which a rotating sensor sends nothing, since its user
+has set it so.
 
-Between the packets on both sides of such a sector the clock advances and the angle leaps, as if packets were lost. A
-gap belongs to a masked sector if it recurs at the same angles while no packet has ever come from the angles between.
-In a loss the missing angles are seen one turn earlier or later.
+Between the packets on both sides of such a sector the clock advances and the angle leaps, as if
+packets were lost. A gap belongs to a masked sector if it recurs at the same angles while no packet
+has ever come from the angles between. In a loss the missing angles are seen one turn earlier or
+later.
 
 All angles here are in turns, from 0 to 1. A width is measured in the direction of rotation.
 """
@@ -114,7 +116,9 @@ class AngleReader:
         self.is_available = bool(self._path) and sensor.datagrams
 
     def angles(self, table: Table) -> Angles | None:
-        """Return the angle at which each packet begins, (n,); None if the packets have no such field, or no part that has it."""
+        """Return the angle at which each packet begins, (n,); None if the packets have no such
+        field, or no part that has it.
+        """
         info = table.schema.fields.get(self._path) if self.is_available else None
         full = self._full if info is None or self._full is not None else FULL_TURNS.get(info.unit)
         if info is None or full is None:
@@ -126,11 +130,17 @@ class AngleReader:
         return np.mod((first * info.scale + info.offset) / full, 1.0)
 
     def direction(self, table: Table) -> int:
-        """Return the direction in which the first packet of a table turns: 1 or -1; 0 if it does not show it."""
+        """Return the direction in which the first packet of a table turns: 1 or -1; 0 if it does
+        not show it.
+        """
         if self._grows:
             return 1
         info = table.schema.fields[self._path]
-        rows = table.raw(self._path)[:1].reshape(-1).astype(np.float64) * info.scale / FULL_TURNS[info.unit]
+        rows = (
+            table.raw(self._path)[:1].reshape(-1).astype(np.float64)
+            * info.scale
+            / FULL_TURNS[info.unit]
+        )
         steps = np.diff(rows)
         balance = np.sign(steps - np.rint(steps)).sum()
         return int(np.sign(balance))
@@ -162,18 +172,26 @@ class SectorFinder:
 
         Args:
             start, stop: the angles of the packets before and after it.
-            step: from one packet to the next; the gap may vary by so much, as packets do not begin at its edges.
+            step: from one packet to the next; the gap may vary by so much, as packets do not begin
+                at its edges.
 
         Returns:
-            How many gaps ago those were that contain the sector, which is found now; none if it is not.
+            How many gaps ago those were that contain the sector, which is found now; none if it is
+            not.
         """
         gap = Sector.between(start, stop, self.direction)
         for other in reversed(self._gaps):
             common = gap.common(other)
-            is_same = common is not None and common.width > COMMON_SHARE * max(gap.width, other.width)
+            is_same = common is not None and common.width > COMMON_SHARE * max(
+                gap.width, other.width
+            )
             if common is not None and is_same and self._is_unseen(common, step):
                 self.sector = common
-                return [ago for ago, each in enumerate(reversed(self._gaps), start=1) if each.contains(common.middle)]
+                return [
+                    ago
+                    for ago, each in enumerate(reversed(self._gaps), start=1)
+                    if each.contains(common.middle)
+                ]
         self._gaps.append(gap)
         del self._gaps[:-REMEMBERED_GAPS]
         return []
@@ -183,7 +201,9 @@ class SectorFinder:
         return any(self._is_unseen(gap, step) for gap in self._gaps)
 
     def _is_unseen(self, sector: Sector, step: float) -> bool:
-        """Return whether no packet began within a sector, its edges left out, although one of each turn would."""
+        """Return whether no packet began within a sector, its edges left out, although one of each
+        turn would.
+        """
         edge = EDGE_STEPS * step + 1 / BINS
         inner = sector.width - 2 * edge
         if inner < step + 1 / BINS:
@@ -252,7 +272,9 @@ class MaskedGaps:
         return math.nan if self._angles is None else self._angles.item(row)
 
     def count_masked(self, start: float, stop: float, missing: int) -> int:
-        """Return how many of the packets that are missing between two angles the masked sector leaves out, if it is known."""
+        """Return how many of the packets that are missing between two angles the masked sector
+        leaves out, if it is known.
+        """
         sector = None if self._finder is None else self._finder.sector
         if sector is None or math.isnan(start) or math.isnan(stop):
             return 0

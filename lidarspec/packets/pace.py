@@ -15,7 +15,8 @@ from lidarspec.expressions.graph import header_function
 from lidarspec.packets.clocks import Times
 from lidarspec.spec.timing import Clock
 
-#: packets from which the pace is learned first, and next; both are numbers of packets since the start.
+#: packets from which the pace is learned first, and next; both are numbers of packets since the
+#: start.
 FIRST_LESSONS = ((0, 8), (8, 72))
 #: the pace is learned again from the first packets of each so many.
 LESSON_EVERY = 512
@@ -51,10 +52,11 @@ class Paces:
 
 
 class Pace:
-    """How long a packet takes by the sensor's clock, as the spec declares it or as most of the packets before show it.
+    """How long a packet takes by the sensor's clock, as the spec declares it or as most of the
+    packets before show it.
 
-    The pace is learned from some packets now and then and applies to the packets after them, so that it does not
-    depend on batches. A clock that does not advance evenly has no pace.
+    The pace is learned from some packets now and then and applies to the packets after them, so
+    that it does not depend on batches. A clock that does not advance evenly has no pace.
 
     Args:
         clock: the sensor's clock.
@@ -85,7 +87,9 @@ class Pace:
         while first < len(times):
             if first >= 0 and self._lessons >= len(FIRST_LESSONS):
                 starts = np.arange(first, len(times) + first - end + 1, LESSON_EVERY)
-                is_same = self._is_same(times[starts + end - first - 1] - times[starts], end - first - 1)
+                is_same = self._is_same(
+                    times[starts + end - first - 1] - times[starts], end - first - 1
+                )
                 self._lessons += len(is_same) if is_same.all() else int(is_same.argmin())
                 first, end = self._next_lesson()
             self._times += times[max(first, 0) : end].tolist()
@@ -107,7 +111,9 @@ class Pace:
         self._times = []
 
     def _next_lesson(self) -> tuple[int, int]:
-        """Return the first packet of the next lesson, and the one after its last, counted from the next packet on."""
+        """Return the first packet of the next lesson, and the one after its last, counted from the
+        next packet on.
+        """
         further = (self._lessons - len(FIRST_LESSONS) + 1) * LESSON_EVERY
         if further <= 0:
             first, last = FIRST_LESSONS[self._lessons]
@@ -120,7 +126,9 @@ class Pace:
         return abs(passed - packets * self._pace) <= packets * self._pace / 10
 
     def _usual_step(self, times: list[int]) -> float:
-        """Return the time that most of these packets take, in any order and some of them doubled; nan if they differ."""
+        """Return the time that most of these packets take, in any order and some of them doubled;
+        nan if they differ.
+        """
         steps = sorted(after - before for before, after in pairwise(sorted(times)))
         forward = steps[bisect(steps, 0) :]
         if forward and self.grain <= FINE_SHARE * forward[len(forward) // 2]:

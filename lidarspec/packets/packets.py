@@ -38,9 +38,11 @@ class Packets:
         time_ns: (n,) int64, by the sensor's clock, unwrapped; else the host's.
         host_ns: (n,) int64 arrival times; 0 where the caller gave none.
         breaks: (n,) True where something was lost before the packet.
-        grain_ns: the step of the sensor's clock, 0 if a function computes it, if the clock alone orders the packets; None if not.
+        grain_ns: the step of the sensor's clock, 0 if a function computes it, if the clock alone
+            orders the packets; None if not.
         state: for each other frame type, its frames and which of them was last before each packet.
-        masked: (n,) packets that are missing before each since a masked sector leaves them out; None if there are none.
+        masked: (n,) packets that are missing before each since a masked sector leaves them out;
+            None if there are none.
         stats: the counters of the decoder.
         backend: what makes points of them, "auto", "numpy" or "jit".
     """
@@ -67,7 +69,13 @@ class Packets:
         self._order = order
         self.grain_ns = grain_ns
         self.masked = masked
-        self._offset, self.time_ns, self.host_ns, self._index, self.breaks = offset, time_ns, host_ns, index, breaks
+        self._offset, self.time_ns, self.host_ns, self._index, self.breaks = (
+            offset,
+            time_ns,
+            host_ns,
+            index,
+            breaks,
+        )
         self.state, self.stats, self.backend = state, stats, backend
 
     @cached_property
@@ -77,32 +85,43 @@ class Packets:
 
     @cached_property
     def index(self) -> NDArray[np.int64]:
-        """The number of each, (n,), which runs on over what is missing: the sensor's, unwrapped, where it counts its packets."""
+        """The number of each, (n,), which runs on over what is missing: the sensor's, unwrapped,
+        where it counts its packets.
+        """
         return self._index() if callable(self._index) else array_of(self._index)
 
     @property
     def order(self) -> NDArray[np.int64]:
-        """The place of each among the others, (n,), equal for doubled packets: by the counter, or else the clock, of datagrams."""
+        """The place of each among the others, (n,), equal for doubled packets: by the counter, or
+        else the clock, of datagrams.
+        """
         return self.index if self._order is None else self._order
 
     def __len__(self) -> int:
         return len(self.table)
 
     def __repr__(self) -> str:
-        span = f", {(int(self.time_ns[-1]) - int(self.time_ns[0])) / 1e9:.3f} s" if len(self) > 1 else ""
+        span = (
+            f", {(int(self.time_ns[-1]) - int(self.time_ns[0])) / 1e9:.3f} s"
+            if len(self) > 1
+            else ""
+        )
         return f"Packets({len(self)} {self.frame} frames of {self.sensor.id}{span})"
 
     _repr_html_ = drawn("packets")
 
     def __getitem__(self, path: str) -> NDArray[np.float64]:
-        """A field in its unit: float64, shape (n, *lengths of its arrays); nan where a frame lacks the field.
+        """A field in its unit: float64, shape (n, *lengths of its arrays); nan where a frame lacks
+        the field.
 
         Raises:
             UnknownField: with the closest known path.
         """
         info = self.table.schema.fields.get(path)
         if info is None:
-            raise UnknownField(path, self.table.schema.fields, place=f"{self.sensor.id} {self.frame}")
+            raise UnknownField(
+                path, self.table.schema.fields, place=f"{self.sensor.id} {self.frame}"
+            )
         return physical(info, self.table)
 
     def _ipython_key_completions_(self) -> list[str]:
@@ -110,7 +129,9 @@ class Packets:
 
     @property
     def raw(self) -> NDArray[Any]:
-        """The integers of the wire: a structured array (n,), nested as in the struct, variable arrays padded with 0."""
+        """The integers of the wire: a structured array (n,), nested as in the struct, variable
+        arrays padded with 0.
+        """
         columns = {path: self.table.raw(path) for path in self.table.schema.fields}
         found = np.zeros(len(self), _nested(self.table.schema, columns, ""))
         for path, column in columns.items():
@@ -127,25 +148,38 @@ class Packets:
             UnknownField: for an array that the frame does not have.
         """
         if array in self.table.schema.parts:
-            found = (self.table.parts(array, kind.name)[1] for kind in self.table.schema.parts[array].kinds)
-            return sum((np.bincount(which, minlength=len(self)) for which in found), np.zeros(len(self), np.intp))
+            found = (
+                self.table.parts(array, kind.name)[1]
+                for kind in self.table.schema.parts[array].kinds
+            )
+            return sum(
+                (np.bincount(which, minlength=len(self)) for which in found),
+                np.zeros(len(self), np.intp),
+            )
         if array not in self.table.schema.arrays:
-            raise UnknownField(array, {*self.table.schema.arrays, *self.table.schema.parts}, place=f"{self.sensor.id} {self.frame}")
+            raise UnknownField(
+                array,
+                {*self.table.schema.arrays, *self.table.schema.parts},
+                place=f"{self.sensor.id} {self.frame}",
+            )
         return self.table.counts(array)
 
     def points(self) -> PointCloud:
         """The points of all packets in stream order, flat; columns are made when they are read.
 
         Raises:
-            SpecError: where the sensor's `points` function fails, or returns columns that do not fit.
+            SpecError: where the sensor's `points` function fails, or returns columns that do not
+                fit.
         """
         return cloud_of(self.with_points)
 
     def imu(self) -> ImuSamples:
-        """What the sensor's IMU felt, in all packets in stream order: columns in SI, and the time of each sample.
+        """What the sensor's IMU felt, in all packets in stream order: columns in SI, and the time
+        of each sample.
 
         Raises:
-            SpecError: where this frame type has nothing of an IMU, or its `imu` function fails or returns columns that do not fit.
+            SpecError: where this frame type has nothing of an IMU, or its `imu` function fails or
+                returns columns that do not fit.
         """
         path = self.sensor.parts_with("imu", self.frame)
         own = self.parts(path) if path else self
@@ -157,7 +191,15 @@ class Packets:
         columns = self._columns_at(indices)
         state = {name: (table, chosen[indices]) for name, (table, chosen) in self.state.items()}
         table = self.table.take(indices)
-        return Packets(self.sensor, self.frame, table, **columns, state=state, stats=self.stats, backend=self.backend)
+        return Packets(
+            self.sensor,
+            self.frame,
+            table,
+            **columns,
+            state=state,
+            stats=self.stats,
+            backend=self.backend,
+        )
 
     def _columns_at(self, indices: NDArray[np.intp]) -> dict[str, Any]:
         """Return what is known of some packets besides their fields, as `Packets` takes it."""
@@ -167,26 +209,42 @@ class Packets:
         return {**columns, "order": order, "grain_ns": self.grain_ns, "masked": masked}
 
     def parts(self, path: str) -> Packets:
-        """The parts of all packets, in stream order, as packets: with the times, numbers and state of the frames that they are in.
+        """The parts of all packets, in stream order, as packets: with the times, numbers and state
+        of the frames that they are in.
 
         Args:
             path: of the parts; "tlvs.points" for one of several kinds.
 
         Raises:
-            UnknownField: for parts that the frame does not have, and for several kinds of which none is named.
+            UnknownField: for parts that the frame does not have, and for several kinds of which
+                none is named.
         """
         place = self.table.schema.within(path)
         if place is None:
-            raise UnknownField(path, self.table.schema.parts, place=f"{self.sensor.id} {self.frame}")
+            raise UnknownField(
+                path, self.table.schema.parts, place=f"{self.sensor.id} {self.frame}"
+            )
         axis, kind, below = place
         table, which = self.table.parts(axis, kind)
         columns = self._columns_at(which)
-        columns["breaks"] = np.diff(np.cumsum(self.breaks)[which], prepend=0) > 0  # also of a frame without parts before
+        columns["breaks"] = (
+            np.diff(np.cumsum(self.breaks)[which], prepend=0) > 0
+        )  # also of a frame without parts before
         columns["time_ns"] = part_times(self.sensor, (axis, kind), table, which, columns["time_ns"])
-        state = {name: (frames, chosen[which]) for name, (frames, chosen) in self.state.items() if name != AROUND}
+        state = {
+            name: (frames, chosen[which])
+            for name, (frames, chosen) in self.state.items()
+            if name != AROUND
+        }
         name = ".".join(filter(None, (self.frame, axis, kind)))
         parts = Packets(
-            self.sensor, name, table, **columns, state={**state, AROUND: (self.table, which)}, stats=self.stats, backend=self.backend
+            self.sensor,
+            name,
+            table,
+            **columns,
+            state={**state, AROUND: (self.table, which)},
+            stats=self.stats,
+            backend=self.backend,
         )
         return parts.parts(below) if below else parts
 
@@ -203,7 +261,9 @@ class Packets:
         return (self.table, slice(None)) if table is None else (table, which)
 
     def batch(self, carry: dict[int, NDArray[np.float64]] | None = None) -> Batch:
-        """The packets as a plugin's functions are given them, through `Fields`; `carry`: what the batch before left."""
+        """The packets as a plugin's functions are given them, through `Fields`; `carry`: what the
+        batch before left.
+        """
         return Batch(self.table, self.breaks, self.state, self.sensor.state, dict(carry or {}))
 
 
@@ -217,16 +277,34 @@ def joined(parts: Sequence[Packets]) -> Packets:
         tables = [part.state[name][0] for part in parts]
         known = [table for table in tables if table is not None]
         starts = np.cumsum([0] + [0 if table is None else len(table) for table in tables])
-        which = [np.where(part.state[name][1] < 0, -1, part.state[name][1] + start) for part, start in zip(parts, starts[:-1], strict=True)]
+        which = [
+            np.where(part.state[name][1] < 0, -1, part.state[name][1] + start)
+            for part, start in zip(parts, starts[:-1], strict=True)
+        ]
         state[name] = (joined_tables(known) if known else None, np.concatenate(which))
-    columns: dict[str, Any] = {key: np.concatenate([getattr(part, key) for part in parts]) for key in _COLUMNS}
+    columns: dict[str, Any] = {
+        key: np.concatenate([getattr(part, key) for part in parts]) for key in _COLUMNS
+    }
     if all(part.grain_ns is not None for part in parts):
         columns["order"] = np.concatenate([part.order for part in parts])
         columns["grain_ns"] = head.grain_ns
     if any(part.masked is not None for part in parts):
-        columns["masked"] = np.concatenate([np.zeros(len(part), np.int64) if part.masked is None else part.masked for part in parts])
+        columns["masked"] = np.concatenate(
+            [
+                np.zeros(len(part), np.int64) if part.masked is None else part.masked
+                for part in parts
+            ]
+        )
     table = joined_tables([part.table for part in parts])
-    return Packets(head.sensor, head.frame, table, **columns, state=state, stats=parts[-1].stats, backend=head.backend)
+    return Packets(
+        head.sensor,
+        head.frame,
+        table,
+        **columns,
+        state=state,
+        stats=parts[-1].stats,
+        backend=head.backend,
+    )
 
 
 def joined_tables(tables: Sequence[Any]) -> Table:
@@ -235,7 +313,9 @@ def joined_tables(tables: Sequence[Any]) -> Table:
 
 
 def _nested(schema: Schema, columns: Mapping[str, NDArray[Any]], prefix: str) -> np.dtype[Any]:
-    """The structured dtype of one level of the struct; SpecError where one name is a value, a struct or an array by turns."""
+    """The structured dtype of one level of the struct; SpecError where one name is a value, a
+    struct or an array by turns.
+    """
     members: list[Any] = []
     seen: set[str] = set()
     for path, info in schema.fields.items():
@@ -247,7 +327,11 @@ def _nested(schema: Schema, columns: Mapping[str, NDArray[Any]], prefix: str) ->
         seen.add(name)
         here = prefix + name
         if len(_forms(schema, here)) > 1:
-            raise SpecError("a value, a struct or an array by turns in its branches: ask for its columns one by one", path=here)
+            raise SpecError(
+                "a value, a struct or an array by turns in its branches: ask for its columns one"
+                " by one",
+                path=here,
+            )
         own = [index for index, axis in enumerate(info.axes) if axis.rstrip("[]") == here]
         shape = tuple(columns[path].shape[1 + index] for index in own)
         kind = _nested(schema, columns, f"{here}.") if below else columns[path].dtype
@@ -256,6 +340,14 @@ def _nested(schema: Schema, columns: Mapping[str, NDArray[Any]], prefix: str) ->
 
 
 def _forms(schema: Schema, here: str) -> set[tuple[bool, int]]:
-    """What a name is in the branches that have it: whether a value, and in how many arrays of its own."""
-    parts = [(path, info) for path, info in schema.fields.items() if path == here or path.startswith(f"{here}.")]
-    return {(path == here, sum(axis.rstrip("[]") == here for axis in info.axes)) for path, info in parts}
+    """What a name is in the branches that have it: whether a value, and in how many arrays of its
+    own.
+    """
+    parts = [
+        (path, info)
+        for path, info in schema.fields.items()
+        if path == here or path.startswith(f"{here}.")
+    ]
+    return {
+        (path == here, sum(axis.rstrip("[]") == here for axis in info.axes)) for path, info in parts
+    }

@@ -1,12 +1,14 @@
 """Packets in order, each once.
 
-A packet whose predecessor has not arrived is held until it arrives, or until more than `WINDOW` packets are held.
-Doubled packets are left out, and so are packets whose successors were released before they arrived. All other packets
-pass at once, so that order costs no time while nothing is late. At the start `START_WINDOW` packets are held, since the
-first packet to arrive may be late as well.
+A packet whose predecessor has not arrived is held until it arrives, or until more than `WINDOW`
+packets are held. Doubled packets are left out, and so are packets whose successors were released
+before they arrived. All other packets pass at once, so that order costs no time while nothing is
+late. At the start `START_WINDOW` packets are held, since the first packet to arrive may be late as
+well.
 
-`Packets.order` gives the place of each packet. With a counter it is the index. With a clock alone it is a time, and the
-packets are judged again once they are in order: scans depend on the packets, not on the order in which they arrive.
+`Packets.order` gives the place of each packet. With a counter it is the index. With a clock alone
+it is a time, and the packets are judged again once they are in order: scans depend on the packets,
+not on the order in which they arrive.
 """
 
 from __future__ import annotations
@@ -25,7 +27,8 @@ from lidarspec.packets.packets import Packets, joined
 
 #: packets that are held while one before them is missing.
 WINDOW = 10
-#: packets that are held at the start if only the clock numbers them: the pace is learned from the first ones to arrive.
+#: packets that are held at the start if only the clock numbers them: the pace is learned from the
+#: first ones to arrive.
 START_WINDOW = WINDOW + FIRST_LESSONS[0][1]
 
 
@@ -126,10 +129,12 @@ class Reorder:
         self._released = packets.order.item(-1)
 
     def _mark(self, packets: Packets, before: int | None) -> Packets:
-        """Return packets in order with a break wherever the index leaves out a number, and nowhere else.
+        """Return packets in order with a break wherever the index leaves out a number, and nowhere
+        else.
 
         Args:
-            before: the index that follows the packets released before these; None if there are none.
+            before: the index that follows the packets released before these; None if there are
+                none.
         """
         marked = copy.copy(packets)
         if packets.grain_ns is not None:
@@ -139,7 +144,9 @@ class Reorder:
         marked.breaks = np.diff(packets.index, prepend=start - 1) != 1
         return marked
 
-    def _judge(self, packets: Packets, grain_ns: float) -> tuple[NDArray[np.int64], NDArray[np.bool_]]:
+    def _judge(
+        self, packets: Packets, grain_ns: float
+    ) -> tuple[NDArray[np.int64], NDArray[np.bool_]]:
         """Return the index and the breaks of packets in order, by their clock."""
         if self._clock_order is None:
             assert packets.sensor.clock is not None

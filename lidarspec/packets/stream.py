@@ -1,7 +1,8 @@
 """From frames to packets: clocks unwrapped, their continuity judged, other frames kept as state.
 
-A `PacketStream` remembers between batches what the next one needs: the last clock reading, the last sequence number,
-the last frame of each other type, and whether bytes were skipped since the last packet.
+A `PacketStream` remembers between batches what the next one needs: the last clock reading, the last
+sequence number, the last frame of each other type, and whether bytes were skipped since the last
+packet.
 """
 
 from __future__ import annotations
@@ -23,7 +24,16 @@ from lidarspec.frames.schema import Schema
 from lidarspec.framing.frame_engine import Codec, codec
 from lidarspec.framing.results import Counters, Frames, Numbers
 from lidarspec.packets.clock_order import ClockOrder
-from lidarspec.packets.clocks import ClockReference, Epoch, Unwrapper, clock_parts, clock_terms, clocked, held, paths
+from lidarspec.packets.clocks import (
+    ClockReference,
+    Epoch,
+    Unwrapper,
+    clock_parts,
+    clock_terms,
+    clocked,
+    held,
+    paths,
+)
 from lidarspec.packets.continuity import Continuity
 from lidarspec.packets.imu import ImuSamples, Waiting, joined
 from lidarspec.packets.masked_sector import MaskedGaps
@@ -58,12 +68,20 @@ class PacketStream:
             raise UnknownFrame(frame, sensor.frames, place=sensor.id)
         self.sensor, self.frame, self.stats, self._backend = sensor, frame, stats, backend
         self._codec = self._codec_of(frame)
-        self._others = [name for name, other in sensor.incoming.items() if not other.data and name != frame]
+        self._others = [
+            name for name, other in sensor.incoming.items() if not other.data and name != frame
+        ]
         self._state: dict[str, bytes] = dict(state or {})
         data = sensor.frames[frame].data
-        counted = sensor.sequence is not None and data and _has(sensor, frame, sensor.sequence.field)
+        counted = (
+            sensor.sequence is not None and data and _has(sensor, frame, sensor.sequence.field)
+        )
         clock = _clock_of(sensor, frame, self._codec.schema)
-        self._timer = replace(sensor, clock=clock) if clock is not None and clock is not sensor.clock else sensor
+        self._timer = (
+            replace(sensor, clock=clock)
+            if clock is not None and clock is not sensor.clock
+            else sensor
+        )
         timed = data and clock is not None
         self._clock = Unwrapper(clock.wraps_at) if clock else None
         self._turn = repeated(0, 0)  # what completes the times of the packets at hand
@@ -71,10 +89,17 @@ class PacketStream:
         if timed and clock is not None and clock.told is not None:
             self._epoch = Epoch(self._timer, clock, reference)
         in_parts = timed and clock_parts(sensor, self._codec.schema) is not None
-        terms = clock_terms(paths(sensor.clock), self._codec.schema, sensor.id) if sensor.clock and timed and not in_parts else []
+        terms = (
+            clock_terms(paths(sensor.clock), self._codec.schema, sensor.id)
+            if sensor.clock and timed and not in_parts
+            else []
+        )
         grain = float(min((step for _, step, _, _ in terms), default=0))
-        # a frame without the parts that have the clock says nothing of time, so that only a counter tells what was lost beside it
-        self._continuity = Continuity(sensor, stats, counted=counted, timed=timed and (counted or not in_parts), grain=grain)
+        # a frame without the parts that have the clock says nothing of time, so that only a counter
+        # tells what was lost beside it
+        self._continuity = Continuity(
+            sensor, stats, counted=counted, timed=timed and (counted or not in_parts), grain=grain
+        )
         self._grain_ns = grain
         self._clock_order: ClockOrder | None = None
         if sensor.clock is not None and timed and not counted and not in_parts and sensor.datagrams:
@@ -87,28 +112,57 @@ class PacketStream:
         """The packets among these frames.
 
         Args:
-            whole: the frames are a whole input: packets before the first frame of another type see that one as state.
+            whole: the frames are a whole input: packets before the first frame of another type see
+                that one as state.
         """
         parts = [_Part.of(frames, self.frame) for frames in found if len(frames)]
-        table, skipped = self._table(parts), _all_or_joined([self._bytes_skipped(part) for part in parts])
+        table, skipped = (
+            self._table(parts),
+            _all_or_joined([self._bytes_skipped(part) for part in parts]),
+        )
         state = self._states(parts, len(table), whole=whole)
         offset, host = _offsets(parts), _times([part.column(part.frames.at) for part in parts])
         index: Index = range(0)
         order: NDArray[np.int64] | None = None
         breaks, time = np.zeros(len(table), np.bool_) if alike(skipped) == 0 else skipped > 0, None
         if len(table):
-            batch, otherwise = Batch(table, breaks, state, self.sensor.state), (range(len(table)), breaks)
+            batch, otherwise = (
+                Batch(table, breaks, state, self.sensor.state),
+                (range(len(table)), breaks),
+            )
             with np.errstate(all="ignore"):
-                time = self._guarded("clock", self._times, None, batch, host, whole) if self._clock is not None else None
+                time = (
+                    self._guarded("clock", self._times, None, batch, host, whole)
+                    if self._clock is not None
+                    else None
+                )
                 if self._clock_order is not None and time is not None:
-                    index, order = self._guarded("clock", self._clock_order.push, (otherwise[0], None), batch, time)
+                    index, order = self._guarded(
+                        "clock", self._clock_order.push, (otherwise[0], None), batch, time
+                    )
                 else:
-                    index, breaks = self._guarded("sequence", self._continuity.push, otherwise, batch, time, skipped)
+                    index, breaks = self._guarded(
+                        "sequence", self._continuity.push, otherwise, batch, time, skipped
+                    )
         time = host if time is None else self._complete(time)
-        columns: dict[str, Any] = {"offset": offset, "time_ns": time, "host_ns": host, "index": index, "breaks": breaks}
+        columns: dict[str, Any] = {
+            "offset": offset,
+            "time_ns": time,
+            "host_ns": host,
+            "index": index,
+            "breaks": breaks,
+        }
         if order is not None:
             columns |= {"order": order, "grain_ns": self._grain_ns}
-        return Packets(self.sensor, self.frame, table, **columns, state=state, stats=self.stats, backend=self._backend)
+        return Packets(
+            self.sensor,
+            self.frame,
+            table,
+            **columns,
+            state=state,
+            stats=self.stats,
+            backend=self._backend,
+        )
 
     def interrupt(self) -> None:
         """Input was lost here: there is a break before the next packet."""
@@ -117,7 +171,9 @@ class PacketStream:
         if self._clock_order is not None:
             self._clock_order.forget()
 
-    def _guarded(self, what: str, function: Callable[..., Any], otherwise: Any, batch: Batch, *args: Any) -> Any:
+    def _guarded(
+        self, what: str, function: Callable[..., Any], otherwise: Any, batch: Batch, *args: Any
+    ) -> Any:
         try:
             return function(batch, *args)
         except Exception as error:
@@ -142,7 +198,10 @@ class PacketStream:
         if self._epoch is None or not len(times):
             return times
         if self._epoch.ns is None:
-            self.stats.undated = f"times count from where the sensor's clock began: no {self._epoch.frame} frame has told the date"
+            self.stats.undated = (
+                f"times count from where the sensor's clock began: no {self._epoch.frame} frame has"
+                " told the date"
+            )
             return times
         self.stats.undated = ""
         return times + self._turn
@@ -163,7 +222,11 @@ class PacketStream:
         return np.diff(marks, prepend=0)
 
     def _table(self, parts: Sequence[_Part]) -> Table:
-        tables = [self._codec.gather(part.frames if part.where is None else part.frames.only(part.own)) for part in parts if part.number]
+        tables = [
+            self._codec.gather(part.frames if part.where is None else part.frames.only(part.own))
+            for part in parts
+            if part.number
+        ]
         return joined_tables(tables) if tables else self._codec.table([])
 
     def _states(self, parts: Sequence[_Part], number: int, *, whole: bool) -> dict[str, StateOf]:
@@ -171,9 +234,14 @@ class PacketStream:
         if not self._state and all(part.where is None for part in parts):
             return dict.fromkeys(self._others, (None, repeated(-1, number)))
         seen = self._others_in(parts)
-        return {name: self._state_of(name, seen.get(name, []), number=number, whole=whole) for name in self._others}
+        return {
+            name: self._state_of(name, seen.get(name, []), number=number, whole=whole)
+            for name in self._others
+        }
 
-    def _others_in(self, parts: Sequence[_Part]) -> dict[str, list[tuple[Frames, NDArray[np.intp]]]]:
+    def _others_in(
+        self, parts: Sequence[_Part]
+    ) -> dict[str, list[tuple[Frames, NDArray[np.intp]]]]:
         """The frames of other types, and how many of ours came before each, (k,)."""
         seen: dict[str, list[tuple[Frames, NDArray[np.intp]]]] = {}
         number = 0
@@ -186,7 +254,9 @@ class PacketStream:
                 for kind in np.unique(kinds).tolist():
                     which, name = kinds == kind, part.frames.names[kind]
                     if name in self._others:
-                        seen.setdefault(name, []).append((part.frames.only(others[which]), before[which]))
+                        seen.setdefault(name, []).append(
+                            (part.frames.only(others[which]), before[which])
+                        )
             number += part.number
         return seen
 
@@ -201,9 +271,20 @@ class PacketStream:
             known = self._tables[name] = (data, self._codec_of(name).table([data]))
         return known[1]
 
-    def _state_of(self, name: str, seen: Sequence[tuple[Frames, NDArray[np.intp]]], *, number: int, whole: bool) -> StateOf:
+    def _state_of(
+        self,
+        name: str,
+        seen: Sequence[tuple[Frames, NDArray[np.intp]]],
+        *,
+        number: int,
+        whole: bool,
+    ) -> StateOf:
         if not seen:
-            return (self._last(name), repeated(0, number)) if name in self._state else (None, repeated(-1, number))
+            return (
+                (self._last(name), repeated(0, number))
+                if name in self._state
+                else (None, repeated(-1, number))
+            )
         tables: list[Table] = [self._codec_of(name).gather(frames) for frames, _ in seen]
         before = np.concatenate([places for _, places in seen])
         if name in self._state:
@@ -223,17 +304,34 @@ class ImuStream:
         stats, backend, state: as of `PacketStream`.
 
     Attributes:
-        waiting: for samples until the scan that they belong to ends; None where there is no IMU, or not by the clock of the points.
+        waiting: for samples until the scan that they belong to ends; None where there is no IMU, or
+            not by the clock of the points.
     """
 
-    def __init__(self, sensor: Spec, stats: Counters, *, backend: str = "auto", state: Mapping[str, bytes] | None = None) -> None:
+    def __init__(
+        self,
+        sensor: Spec,
+        stats: Counters,
+        *,
+        backend: str = "auto",
+        state: Mapping[str, bytes] | None = None,
+    ) -> None:
         self._names = [name for name in sensor.imu_frames if not sensor.frames[name].data]
-        self._made, self._new = dict[str, PacketStream](), partial(PacketStream, sensor, stats=stats, backend=backend, state=state)
-        kinds = {_clock_of(sensor, name, codec(sensor.frames[name]).schema) is None for name in (*self._names, *sensor.data_frames)}
+        self._made, self._new = (
+            dict[str, PacketStream](),
+            partial(PacketStream, sensor, stats=stats, backend=backend, state=state),
+        )
+        kinds = {
+            _clock_of(sensor, name, codec(sensor.frames[name]).schema) is None
+            for name in (*self._names, *sensor.data_frames)
+        }
         self.waiting = Waiting() if sensor.imu_frames and len(kinds) == 1 else None
 
-    def add(self, found: Sequence[Frames], data: Packets | None, *, whole: bool = False) -> ImuSamples:
-        """The samples among these frames; those that wait have them too. A failing plugin is counted.
+    def add(
+        self, found: Sequence[Frames], data: Packets | None, *, whole: bool = False
+    ) -> ImuSamples:
+        """The samples among these frames; those that wait have them too. A failing plugin is
+        counted.
 
         Args:
             data: the packets of the data among them.
@@ -241,7 +339,11 @@ class ImuStream:
         """
         own = [data] if data is not None and data.sensor.frames[data.frame].imu is not None else []
         parts = list[ImuSamples]()
-        names = [name for name in self._names if not whole or any(_Part.of(frames, name).number for frames in found)]
+        names = [
+            name
+            for name in self._names
+            if not whole or any(_Part.of(frames, name).number for frames in found)
+        ]
         for packets in (*own, *(self._stream(name).add(found, whole=whole) for name in names)):
             try:
                 parts += [packets.imu()] if len(packets) else []
@@ -297,7 +399,8 @@ class _Part:
 
 
 def data_frame(sensor: Spec, found: Sequence[Frames]) -> str | None:
-    """The data frame type that an input is read by where none is asked for: the configured one, or the first that arrived.
+    """The data frame type that an input is read by where none is asked for: the configured one, or
+    the first that arrived.
 
     Returns:
         None where the sensor has several, none is configured, and none has arrived yet.
@@ -314,7 +417,9 @@ def data_frame(sensor: Spec, found: Sequence[Frames]) -> str | None:
 
 
 def _clock_of(sensor: Spec, frame: str, schema: Schema) -> Clock | None:
-    """The clock that is read in frames of a type: the sensor's in data, and where an IMU's frames have it; else their own, if any."""
+    """The clock that is read in frames of a type: the sensor's in data, and where an IMU's frames
+    have it; else their own, if any.
+    """
     declared, shared = sensor.frames[frame], sensor.clock
     if declared.clock is not None or shared is None:
         return declared.clock
@@ -325,17 +430,28 @@ def _clock_of(sensor: Spec, frame: str, schema: Schema) -> Clock | None:
 
 
 def _has(sensor: Spec, frame: str, path: str) -> bool:
-    """Whether packets of this type are to have a field, such as the counter: not, if only other data frames have it."""
+    """Whether packets of this type are to have a field, such as the counter: not, if only other
+    data frames have it.
+    """
     schemas = {name: codec(sensor.frames[name]).schema for name in sensor.data_frames}
-    having = [name for name, schema in schemas.items() if path in schema.fields or schema.within(path) is not None]
+    having = [
+        name
+        for name, schema in schemas.items()
+        if path in schema.fields or schema.within(path) is not None
+    ]
     return frame in having or not having
 
 
 def _offsets(parts: Sequence[_Part]) -> Numbers:
-    """Where our frames begin in the input; as a range, where all have one size and follow one another."""
+    """Where our frames begin in the input; as a range, where all have one size and follow one
+    another.
+    """
     runs = [part.frames.places for part in parts if part.where is None]
     ranges = [places for places in runs if isinstance(places, range)]
-    follow = all(before.stop == after.start and before.step == after.step for before, after in pairwise(ranges))
+    follow = all(
+        before.stop == after.start and before.step == after.step
+        for before, after in pairwise(ranges)
+    )
     if ranges and len(ranges) == len(parts) and follow:
         return range(ranges[0].start, ranges[-1].stop, ranges[0].step)
     return _joined([part.column(part.frames.offsets) for part in parts], np.int64)

@@ -1,6 +1,7 @@
 """From packets to points: what a sensor's `points` function says, for a batch at a time.
 
-In: `Packets`. Out: a `PointCloud`, whose columns are made when they are read. There are three ways to compute them, with one meaning:
+In: `Packets`. Out: a `PointCloud`, whose columns are made when they are read. There are three ways
+to compute them, with one meaning:
 plainly, by NumPy on a plan, and by compiled kernels. Modules in reading order:
 
 * `conventions`: what the columns mean: axes, ranges, coordinates, types.

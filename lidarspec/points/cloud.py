@@ -1,11 +1,15 @@
-"""Point clouds: flat arrays in SI units, REP-103 axes and REP-117 ranges; and how a sensor is mounted, which turns and moves them.
+"""Point clouds: flat arrays in SI units, REP-103 axes and REP-117 ranges; and how a sensor is
+mounted, which turns and moves them.
 
-A `PointCloud` holds its columns. A `LazyCloud` takes each from a `ColumnSource` when it is first read. There is one interface of such
-sources, whatever the points are: those of a batch of packets (`lazy_columns.BatchColumns`), those of a cloud that has its columns
-(`CloudColumns`), and some of other sources one after another (`Stretches`), as slices and scans are. Scans are so cut out of batches
-without a column being made, and a source that can makes the columns of a scan for that scan alone.
+A `PointCloud` holds its columns. A `LazyCloud` takes each from a `ColumnSource` when it is first
+read. There is one interface of such sources, whatever the points are: those of a batch of packets
+(`lazy_columns.BatchColumns`), those of a cloud that has its columns (`CloudColumns`), and some of
+other sources one after another (`Stretches`), as slices and scans are. Scans are so cut out of
+batches without a column being made, and a source that can makes the columns of a scan for that scan
+alone.
 
-Columns under names of a sensor's own are in `extra`, each made when it is first read too; a source has them like all others, by name.
+Columns under names of a sensor's own are in `extra`, each made when it is first read too; a source
+has them like all others, by name.
 """
 
 from __future__ import annotations
@@ -22,7 +26,16 @@ from numpy.typing import DTypeLike, NDArray
 from lidarspec.display import drawn
 from lidarspec.errors import UnknownName, UsageError
 from lidarspec.libraries import import_library
-from lidarspec.points.conventions import TYPES, UNITS, Floats, Grid, Grids, Kind, narrowed, whole_columns
+from lidarspec.points.conventions import (
+    TYPES,
+    UNITS,
+    Floats,
+    Grid,
+    Grids,
+    Kind,
+    narrowed,
+    whole_columns,
+)
 
 #: names of the columns that a cloud can have, in the order in which files list them.
 COLUMNS = tuple(TYPES)
@@ -53,13 +66,16 @@ class PointCloud:
         intensity: (N,) float32, the wire's number; None where the sensor has none.
         ring: (N,) uint16, None where the sensor has none.
         return_index: (N,) uint8, None where the sensor has none.
-        column: (N,) uint16, which column of its turn a point is in, None where the sensor does not say.
+        column: (N,) uint16, which column of its turn a point is in, None where the sensor does not
+            say.
         valid: (N,) bool, True for real returns.
         stamp_ns: int64 nanoseconds.
-        shape: (columns, rows) where the points are organised so, else None; several returns of a place stand side by side:
-            ``cloud.range.reshape(*cloud.shape, -1)`` is (columns, rows, returns).
+        shape: (columns, rows) where the points are organised so, else None; several returns of a
+            place stand side by side: ``cloud.range.reshape(*cloud.shape, -1)`` is (columns, rows,
+            returns).
         nominal: True where a default calibration stood in for the sensor's own.
-        extra: (N,) columns that the sensor gives besides, by name, such as "velocity"; each in its type.
+        extra: (N,) columns that the sensor gives besides, by name, such as "velocity"; each in its
+            type.
         units: of those in `extra`, by name; "" for a plain number.
         chosen: the columns that `columns` and files have, see `only`; () for all.
     """
@@ -89,11 +105,19 @@ class PointCloud:
     def __repr__(self) -> str:
         if not np.ndim(self.x):
             units = units_of(self)
-            values = [f"{name}={value:.6g} {units.get(name, '')}".rstrip() for name, value in self.columns.items()]
+            values = [
+                f"{name}={value:.6g} {units.get(name, '')}".rstrip()
+                for name, value in self.columns.items()
+            ]
             return f"Point({', '.join(values)}{'' if self.valid else ', not valid'})"
-        near, far = (f(self.range[self.valid], initial=start) for f, start in ((np.min, np.inf), (np.max, 0)))
+        near, far = (
+            f(self.range[self.valid], initial=start) for f, start in ((np.min, np.inf), (np.max, 0))
+        )
         span = f", {near:.2f}..{far:.2f} m" if self.valid.any() else ""
-        return f"PointCloud({len(self)} points, {int(self.valid.sum())} valid{span}{', nominal calibration' if self.nominal else ''})"
+        return (
+            f"PointCloud({len(self)} points, {int(self.valid.sum())}"
+            f" valid{span}{', nominal calibration' if self.nominal else ''})"
+        )
 
     _repr_svg_ = drawn("cloud")
 
@@ -102,7 +126,9 @@ class PointCloud:
         """The columns that this cloud has, by name, those in `extra` last; those that were chosen."""
         names = self.chosen or (*COLUMNS, *self.extra)
         source_of(self).prepare(names)
-        columns = {name: self.extra[name] if name in self.extra else getattr(self, name) for name in names}
+        columns = {
+            name: self.extra[name] if name in self.extra else getattr(self, name) for name in names
+        }
         return {name: column for name, column in columns.items() if column is not None}
 
     def shows(self, name: str) -> bool:
@@ -110,12 +136,17 @@ class PointCloud:
         return not self.chosen or name in (*self.chosen, "x", "y", "z")
 
     def only(self, *names: str) -> PointCloud:
-        """The same points, of which `columns`, `to_structured` and files have these columns alone; x y z stay where a format takes them.
+        """The same points, of which `columns`, `to_structured` and files have these columns alone;
+        x y z stay where a format takes them.
 
         Raises:
             UnknownName: for a column that the cloud has not; it names those that it has.
         """
-        lacking = [name for name in names if name not in self.extra and (name not in COLUMNS or getattr(self, name) is None)]
+        lacking = [
+            name
+            for name in names
+            if name not in self.extra and (name not in COLUMNS or getattr(self, name) is None)
+        ]
         if lacking:
             raise UnknownName(lacking[0], self.columns, place="columns of points")
         source = CloudColumns(self)
@@ -125,7 +156,8 @@ class PointCloud:
         return cloud
 
     def read(self, *names: str) -> dict[str, NDArray[Any]]:
-        """Some columns by name, "valid" and those in `extra` too, made together, which is quicker than one after another.
+        """Some columns by name, "valid" and those in `extra` too, made together, which is quicker
+        than one after another.
 
         Raises:
             UnknownName: for a column that the cloud has not.
@@ -140,7 +172,9 @@ class PointCloud:
 
     @property
     def calibration(self) -> str:
-        """Whose calibration it is: "own", or "nominal" where a default stood in for the sensor's own."""
+        """Whose calibration it is: "own", or "nominal" where a default stood in for the sensor's
+        own.
+        """
         return "nominal" if self.nominal else "own"
 
     @property
@@ -149,41 +183,61 @@ class PointCloud:
         return np.stack([self.x, self.y, self.z], axis=-1)
 
     def __array__(self, dtype: DTypeLike | None = None, copy: bool | None = None) -> NDArray[Any]:
-        """`xyz`, which is what NumPy, SciPy and Open3D take for points; `to_structured` has the other columns too.
+        """`xyz`, which is what NumPy, SciPy and Open3D take for points; `to_structured` has the
+        other columns too.
 
         Raises:
             ValueError: with ``copy=False``, since x, y and z are columns of their own.
         """
         if copy is False:
-            raise ValueError("x, y and z of a PointCloud are columns of their own, of which (N, 3) is a copy")
+            raise ValueError(
+                "x, y and z of a PointCloud are columns of their own, of which (N, 3) is a copy"
+            )
         return self.xyz if dtype is None else self.xyz.astype(dtype, copy=False)
 
     def __getitem__(self, which: Any) -> PointCloud:
-        """The points that a mask, indices or a slice pick; organised only if a slice holds whole columns; of one index the scalars."""
+        """The points that a mask, indices or a slice pick; organised only if a slice holds whole
+        columns; of one index the scalars.
+        """
         picked = {f.name: _pick(getattr(self, f.name), which) for f in fields(self)}
         picked["extra"] = {name: column[which] for name, column in self.extra.items()}
         shape = None
         if self.shape and isinstance(which, slice) and which.step in (None, 1):
-            shape = organised(len(picked["x"]), whole_columns(grid_of(self), which.indices(len(self))[0], len(picked["x"])))
+            shape = organised(
+                len(picked["x"]),
+                whole_columns(grid_of(self), which.indices(len(self))[0], len(picked["x"])),
+            )
         return PointCloud(**{**picked, "shape": shape})
 
     def organised(self, columns: int) -> PointCloud:
-        """The points as a picture of so many columns, each in the place of its number; one that was lost is a gap of invalid points.
+        """The points as a picture of so many columns, each in the place of its number; one that was
+        lost is a gap of invalid points.
 
         Args:
             columns: of a whole turn. The points are those of one turn at most.
 
         Raises:
-            UsageError: where they have no `column` or are not organised, or a number comes twice or is too large.
+            UsageError: where they have no `column` or are not organised, or a number comes twice or
+                is too large.
         """
         if self.shape is None or self.column is None:
-            raise UsageError("a picture is made of organised points whose columns have numbers: Polar(..., column=...)")
+            raise UsageError(
+                "a picture is made of organised points whose columns have numbers: Polar(...,"
+                " column=...)"
+            )
         each = grid_of(self).column
         numbers, counts = np.unique(self.column[::each], return_counts=True)
         wrong = numbers[(numbers >= columns) | (counts > 1)]
         if len(wrong):
-            reason = f"comes {int(counts[numbers == wrong[0]][0])} times" if wrong[0] < columns else f"is not one of {columns}"
-            raise UsageError(f"column {wrong[0]} {reason}: give the points of one turn, and how many columns that has")
+            reason = (
+                f"comes {int(counts[numbers == wrong[0]][0])} times"
+                if wrong[0] < columns
+                else f"is not one of {columns}"
+            )
+            raise UsageError(
+                f"column {wrong[0]} {reason}: give the points of one turn, and how many columns"
+                " that has"
+            )
         place = np.full(columns, -1)
         place[self.column[::each]] = np.arange(self.shape[0])
         indices = np.where(place[:, None] < 0, -1, place[:, None] * each + np.arange(each))
@@ -191,13 +245,15 @@ class PointCloud:
         return replace(self._rearranged(indices), column=numbered, shape=(columns, self.shape[1]))
 
     def destaggered(self, shifts: Sequence[int]) -> PointCloud:
-        """The points of a picture, each row moved on by so many columns, round the turn: what looks in one direction stands in one column.
+        """The points of a picture, each row moved on by so many columns, round the turn: what looks
+        in one direction stands in one column.
 
         Args:
             shifts: columns for each row, (rows,), as the sensor's metadata has them.
 
         Raises:
-            UsageError: where the points are not organised (see `organised`), or there is not one shift for each row.
+            UsageError: where the points are not organised (see `organised`), or there is not one
+                shift for each row.
         """
         if self.shape is None or np.shape(shifts) != (self.shape[1],):
             what = f"{self.shape[1]} rows" if self.shape else "points that are not organised"
@@ -205,10 +261,15 @@ class PointCloud:
         grid, (columns, rows) = grid_of(self), self.shape
         source = (np.arange(columns)[:, None] - np.asarray(shifts)) % columns
         places = source * rows + np.arange(rows)
-        return replace(self._rearranged(places[:, :, None] * grid.returns + np.arange(grid.returns)), shape=self.shape)
+        return replace(
+            self._rearranged(places[:, :, None] * grid.returns + np.arange(grid.returns)),
+            shape=self.shape,
+        )
 
     def _rearranged(self, indices: NDArray[np.intp]) -> PointCloud:
-        """The points at some indices, whole columns of them; -1 is an invalid one, in the row that it stands in."""
+        """The points at some indices, whole columns of them; -1 is an invalid one, in the row that
+        it stands in.
+        """
         indices, each = indices.reshape(-1), grid_of(self).column
         gaps = indices < 0
         picked = self[np.where(gaps, np.arange(len(indices)) % each, indices)]
@@ -219,30 +280,37 @@ class PointCloud:
         return picked
 
     def to_structured(self) -> NDArray[Any]:
-        """A structured array (N,) with PCL's layout: x y z intensity ring time, itemsize 32; what is missing is 0.
+        """A structured array (N,) with PCL's layout: x y z intensity ring time, itemsize 32; what
+        is missing is 0.
 
-        The columns in `extra` follow from byte 32 on, each where its type allows, and the itemsize is a multiple of 16.
+        The columns in `extra` follow from byte 32 on, each where its type allows, and the itemsize
+        is a multiple of 16.
         """
         names = [name for name in STRUCTURED.names or () if self.shows(name)]
         source_of(self).prepare((*names, *self.extra))
         columns = {name: getattr(self, name) for name in names} | dict(self.extra)
-        structured = np.zeros(len(self), structured_type({name: column.dtype for name, column in self.extra.items()}))
+        structured = np.zeros(
+            len(self), structured_type({name: column.dtype for name, column in self.extra.items()})
+        )
         for name, column in columns.items():
             if column is not None:
                 structured[name] = column
         return structured
 
     def to_arrow(self, facts: Mapping[str, str] | None = None) -> Any:
-        """A `pyarrow.Table` with the columns of `columns`, which are not copied, but for bools; each has its unit in its field's metadata.
+        """A `pyarrow.Table` with the columns of `columns`, which are not copied, but for bools;
+        each has its unit in its field's metadata.
 
         Args:
-            facts: further metadata of the schema, beside `units` as JSON, `calibration` ("nominal" or "own") and `stamp_ns`.
+            facts: further metadata of the schema, beside `units` as JSON, `calibration` ("nominal"
+                or "own") and `stamp_ns`.
 
         Raises:
             UsageError: where pyarrow is not installed.
         """
         return import_library("pyarrow", "arrow").table(
-            dict(self.columns), arrow_schema(self, {"stamp_ns": str(self.stamp_ns), **(facts or {})})
+            dict(self.columns),
+            arrow_schema(self, {"stamp_ns": str(self.stamp_ns), **(facts or {})}),
         )
 
     def __arrow_c_stream__(self, requested_schema: object = None) -> object:
@@ -250,7 +318,8 @@ class PointCloud:
         return self.to_arrow().__arrow_c_stream__(requested_schema)
 
     def to_pandas(self) -> Any:
-        """A `pandas.DataFrame` with the columns of `columns`, which are not copied; `attrs` has "units" and "stamp_ns".
+        """A `pandas.DataFrame` with the columns of `columns`, which are not copied; `attrs` has
+        "units" and "stamp_ns".
 
         Raises:
             UsageError: where pandas is not installed.
@@ -270,31 +339,51 @@ class PointCloud:
 
 def units_of(cloud: PointCloud) -> dict[str, str]:
     """The units of the columns that a cloud has, by name, those that are plain numbers left out."""
-    return {name: unit for name in cloud.columns if (unit := UNITS.get(name) or cloud.units.get(name))}
+    return {
+        name: unit for name in cloud.columns if (unit := UNITS.get(name) or cloud.units.get(name))
+    }
 
 
 def arrow_schema(cloud: PointCloud, facts: Mapping[str, str]) -> Any:
-    """The `pyarrow.Schema` of a cloud. Fields that cannot be null are written faster; of a float nan says that there is none.
+    """The `pyarrow.Schema` of a cloud. Fields that cannot be null are written faster; of a float
+    nan says that there is none.
 
     Args:
         facts: metadata of the schema, beside `units` as JSON and `calibration`: "nominal" or "own".
     """
     arrow, units = import_library("pyarrow", "arrow"), units_of(cloud)
     fields = [
-        arrow.field(name, arrow.from_numpy_dtype(column.dtype), column.dtype.kind != "f", {"unit": units.get(name, "")})
+        arrow.field(
+            name,
+            arrow.from_numpy_dtype(column.dtype),
+            column.dtype.kind != "f",
+            {"unit": units.get(name, "")},
+        )
         for name, column in cloud.columns.items()
     ]
-    return arrow.schema(fields, {**facts, "calibration": cloud.calibration, "units": json.dumps(units)})
+    return arrow.schema(
+        fields, {**facts, "calibration": cloud.calibration, "units": json.dumps(units)}
+    )
 
 
 def structured_type(extra: Mapping[str, np.dtype[Any]]) -> np.dtype[Any]:
     """PCL's layout with further columns behind it, each where its type allows."""
-    places, end = {name: place[:2] for name, place in (STRUCTURED.fields or {}).items()}, STRUCTURED.itemsize
+    places, end = (
+        {name: place[:2] for name, place in (STRUCTURED.fields or {}).items()},
+        STRUCTURED.itemsize,
+    )
     for name, dtype in extra.items():
         start = end + -end % dtype.itemsize
         places[name], end = (dtype.newbyteorder("<"), start), start + dtype.itemsize
     formats, offsets = zip(*places.values(), strict=True)
-    return np.dtype({"names": list(places), "formats": formats, "offsets": offsets, "itemsize": end + -end % _ALIGNED})
+    return np.dtype(
+        {
+            "names": list(places),
+            "formats": formats,
+            "offsets": offsets,
+            "itemsize": end + -end % _ALIGNED,
+        }
+    )
 
 
 def _pick(value: Any, which: Any) -> Any:
@@ -303,7 +392,11 @@ def _pick(value: Any, which: Any) -> Any:
 
 def grid_of(cloud: PointCloud) -> Grid:
     """How the points of a cloud are organised."""
-    return Grid(cloud.shape[1], len(cloud) // max(cloud.shape[0] * cloud.shape[1], 1) or 1) if cloud.shape else Grid()
+    return (
+        Grid(cloud.shape[1], len(cloud) // max(cloud.shape[0] * cloud.shape[1], 1) or 1)
+        if cloud.shape
+        else Grid()
+    )
 
 
 def organised(number: int, grid: Grid) -> tuple[int, int] | None:
@@ -331,7 +424,9 @@ class ColumnSource:
     extra: Mapping[str, Kind] = {}
 
     def column(self, name: str) -> NDArray[Any] | None:
-        """A column of `PointCloud`, (size,), "valid" or one of those in `extra`; None where the sensor has none."""
+        """A column of `PointCloud`, (size,), "valid" or one of those in `extra`; None where the
+        sensor has none.
+        """
         raise NotImplementedError
 
     def holds(self, name: str) -> bool:
@@ -342,23 +437,33 @@ class ColumnSource:
         """Make columns that will be asked for together, where that is quicker."""
 
     def part(self, name: str, start: int, stop: int) -> NDArray[Any] | None:
-        """A column of the points from `start` to `stop`, (stop - start,); None where the sensor has none."""
+        """A column of the points from `start` to `stop`, (stop - start,); None where the sensor has
+        none.
+        """
         column = self.column(name)
         return None if column is None else column[start:stop]
 
     def grid_between(self, start: int, stop: int) -> Grid:
         """How the points from `start` to `stop` are organised, whatever is around them."""
-        return self.grids.between(start, stop) if self.grids else whole_columns(self.grid, start, stop - start)
+        return (
+            self.grids.between(start, stop)
+            if self.grids
+            else whole_columns(self.grid, start, stop - start)
+        )
 
     def times_at(self, indices: NDArray[np.intp]) -> NDArray[np.float64]:
-        """The column "time" at some indices, of their shape, seconds since `base`; the others need not be made for them."""
+        """The column "time" at some indices, of their shape, seconds since `base`; the others need
+        not be made for them.
+        """
         times = self.column("time")
         assert times is not None  # since every cloud has it
         picked: NDArray[np.float64] = times[indices]
         return picked
 
     def together(self, parts: Sequence[Stretch]) -> ColumnSource | None:
-        """What makes the columns of stretches of this and further sources for these points alone; None where nothing does."""
+        """What makes the columns of stretches of this and further sources for these points alone;
+        None where nothing does.
+        """
         return None
 
 
@@ -370,10 +475,19 @@ class CloudColumns(ColumnSource):
         self.grids, self.nominal = grids, bool(cloud.nominal)
         self.grid = grids.between(0, self.size) if grids else grid_of(cloud)
         own = cloud.source.extra if isinstance(cloud, LazyCloud) else None
-        self.extra = {name: Kind(column.dtype, cloud.units.get(name, "")) for name, column in cloud.extra.items()} if own is None else own
+        self.extra = (
+            {
+                name: Kind(column.dtype, cloud.units.get(name, ""))
+                for name, column in cloud.extra.items()
+            }
+            if own is None
+            else own
+        )
 
     def column(self, name: str) -> NDArray[Any] | None:
-        column: NDArray[Any] | None = self._cloud.extra[name] if name in self.extra else getattr(self._cloud, name)
+        column: NDArray[Any] | None = (
+            self._cloud.extra[name] if name in self.extra else getattr(self._cloud, name)
+        )
         return column
 
     def holds(self, name: str) -> bool:
@@ -416,22 +530,38 @@ class Stretches(ColumnSource):
         self.grid = grids.pop() if len(grids) == 1 else Grid()
         self.nominal = any(part.source.nominal for part in parts)
         first = parts[0].source.extra
-        self.extra = {name: first[name] for name in first if all(name in part.source.extra for part in parts)} if first else first
+        self.extra = (
+            {
+                name: first[name]
+                for name in first
+                if all(name in part.source.extra for part in parts)
+            }
+            if first
+            else first
+        )
         self._together = parts[0].source.together(parts)
 
     def column(self, name: str) -> NDArray[Any] | None:
         together = self._together
-        if together is not None and (together.holds(name) or not all(part.source.holds(name) for part in self._parts)):
+        if together is not None and (
+            together.holds(name) or not all(part.source.holds(name) for part in self._parts)
+        ):
             column = together.column(name)
         else:
             column = self._joined(name)
-        return column - column[0] if name == "time" and self._from_first and column is not None else column
+        return (
+            column - column[0]
+            if name == "time" and self._from_first and column is not None
+            else column
+        )
 
     def holds(self, name: str) -> bool:
         return False
 
     def prepare(self, names: Sequence[str]) -> None:
-        if self._together is not None and not any(part.source.holds(name) for name in names for part in self._parts):
+        if self._together is not None and not any(
+            part.source.holds(name) for name in names for part in self._parts
+        ):
             self._together.prepare(names)
 
     def times_at(self, indices: NDArray[np.intp]) -> NDArray[np.float64]:
@@ -446,7 +576,9 @@ class Stretches(ColumnSource):
         for part in self._parts:
             inside = (indices >= start) & (indices < start + part.size)
             if inside.any():
-                times[inside] = part.source.times_at(indices[inside] - start + part.start) + later(part.source, self.base)
+                times[inside] = part.source.times_at(indices[inside] - start + part.start) + later(
+                    part.source, self.base
+                )
             start += part.size
         return times
 
@@ -516,8 +648,12 @@ class LazyCloud(PointCloud):
         """The cloud of these columns; `stamp_ns`: the time that theirs count from."""
         cloud = object.__new__(cls)
         shape = organised(source.size, source.grid)
-        cloud.__dict__.update(source=source, stamp_ns=stamp_ns, shape=shape, nominal=np.bool_(source.nominal))
-        cloud.__dict__.update(extra=Extras(source), units={name: kind.unit for name, kind in source.extra.items()})
+        cloud.__dict__.update(
+            source=source, stamp_ns=stamp_ns, shape=shape, nominal=np.bool_(source.nominal)
+        )
+        cloud.__dict__.update(
+            extra=Extras(source), units={name: kind.unit for name, kind in source.extra.items()}
+        )
         return cloud
 
     def __len__(self) -> int:
@@ -526,13 +662,22 @@ class LazyCloud(PointCloud):
     def __getitem__(self, which: Any) -> PointCloud:
         if isinstance(which, slice) and which.step in (None, 1):
             first, end, _ = which.indices(len(self))
-            cloud = LazyCloud.of(Stretches([Stretch(CloudColumns(self), first, max(first, end))]), self.stamp_ns)
+            cloud = LazyCloud.of(
+                Stretches([Stretch(CloudColumns(self), first, max(first, end))]), self.stamp_ns
+            )
             cloud.__dict__["chosen"] = self.chosen
             return cloud
         return super().__getitem__(which)
 
     def __reduce__(self) -> Any:
-        return functools.partial(PointCloud, **{f.name: getattr(self, f.name) for f in fields(self)} | {"extra": dict(self.extra)}), ()
+        return (
+            functools.partial(
+                PointCloud,
+                **{f.name: getattr(self, f.name) for f in fields(self)}
+                | {"extra": dict(self.extra)},
+            ),
+            (),
+        )
 
 
 for _name in (*COLUMNS, "valid"):
@@ -548,11 +693,13 @@ def source_of(cloud: PointCloud) -> ColumnSource:
 class Mount:
     """Where a sensor sits on its carrier, and how it is turned there; both have REP-103 axes.
 
-    The sensor is turned over first where it is `inverted`, then by roll, pitch and yaw about the carrier's fixed axes.
+    The sensor is turned over first where it is `inverted`, then by roll, pitch and yaw about the
+    carrier's fixed axes.
 
     Attributes:
         x, y, z: the sensor's origin, metres forward, left and up.
-        roll_deg, pitch_deg, yaw_deg: about x, y and z, right-handed: a yaw of 90 makes the sensor look to the left.
+        roll_deg, pitch_deg, yaw_deg: about x, y and z, right-handed: a yaw of 90 makes the sensor
+            look to the left.
         inverted: whether it hangs upside down, turned by half a turn about its forward axis.
     """
 
@@ -567,31 +714,56 @@ class Mount:
     @property
     def rotation(self) -> NDArray[np.float64]:
         """The (3, 3) matrix from the sensor's axes to the carrier's."""
-        roll, pitch, yaw = np.deg2rad([self.roll_deg + 180.0 * self.inverted, self.pitch_deg, self.yaw_deg])
-        about_x = np.array([[1, 0, 0], [0, np.cos(roll), -np.sin(roll)], [0, np.sin(roll), np.cos(roll)]])
-        about_y = np.array([[np.cos(pitch), 0, np.sin(pitch)], [0, 1, 0], [-np.sin(pitch), 0, np.cos(pitch)]])
-        about_z = np.array([[np.cos(yaw), -np.sin(yaw), 0], [np.sin(yaw), np.cos(yaw), 0], [0, 0, 1]])
+        roll, pitch, yaw = np.deg2rad(
+            [self.roll_deg + 180.0 * self.inverted, self.pitch_deg, self.yaw_deg]
+        )
+        about_x = np.array(
+            [[1, 0, 0], [0, np.cos(roll), -np.sin(roll)], [0, np.sin(roll), np.cos(roll)]]
+        )
+        about_y = np.array(
+            [[np.cos(pitch), 0, np.sin(pitch)], [0, 1, 0], [-np.sin(pitch), 0, np.cos(pitch)]]
+        )
+        about_z = np.array(
+            [[np.cos(yaw), -np.sin(yaw), 0], [np.sin(yaw), np.cos(yaw), 0], [0, 0, 1]]
+        )
         return np.asarray(about_z @ about_y @ about_x)
 
     def applied(self, cloud: PointCloud) -> PointCloud:
         """A cloud, given in the sensor's axes, in those of the carrier.
 
         Returns:
-            x y z from the carrier's origin; azimuth and elevation of the beams in its axes. `range` stays what the sensor
-            measured, from the sensor.
+            x y z from the carrier's origin; azimuth and elevation of the beams in its axes. `range`
+            stays what the sensor measured, from the sensor.
         """
         turn = self.rotation
         azimuth, elevation = cloud.azimuth.astype(np.float64), cloud.elevation.astype(np.float64)
         level = np.cos(elevation)
-        beam = turn @ np.stack([level * np.cos(azimuth), level * np.sin(azimuth), np.sin(elevation)])
-        xyz = turn @ np.stack([cloud.x, cloud.y, cloud.z]).astype(np.float64) + np.array([[self.x], [self.y], [self.z]])
+        beam = turn @ np.stack(
+            [level * np.cos(azimuth), level * np.sin(azimuth), np.sin(elevation)]
+        )
+        xyz = turn @ np.stack([cloud.x, cloud.y, cloud.z]).astype(np.float64) + np.array(
+            [[self.x], [self.y], [self.z]]
+        )
         x, y, z = xyz.astype(np.float32)
-        # arcsin is coarse where beams point straight up; the other two sides of the triangle are not
+        # arcsin is coarse where beams point straight up; the other two sides of the triangle are
+        # not
         raised = np.arctan2(beam[2], np.hypot(beam[0], beam[1])).astype(np.float32)
         same = {f.name: getattr(cloud, f.name) for f in fields(cloud)}
-        turned = {"x": x, "y": y, "z": z, "azimuth": narrowed(np.arctan2(beam[1], beam[0])), "elevation": raised}
+        turned = {
+            "x": x,
+            "y": y,
+            "z": z,
+            "azimuth": narrowed(np.arctan2(beam[1], beam[0])),
+            "elevation": raised,
+        }
         return PointCloud(**{**same, **turned})
 
     def __str__(self) -> str:
-        given = [f"{f.name}={getattr(self, f.name):g}" for f in fields(self)[:-1] if getattr(self, f.name)]
-        return ", ".join([*given, *(["inverted"] if self.inverted else [])]) or "as the sensor stands"
+        given = [
+            f"{f.name}={getattr(self, f.name):g}"
+            for f in fields(self)[:-1]
+            if getattr(self, f.name)
+        ]
+        return (
+            ", ".join([*given, *(["inverted"] if self.inverted else [])]) or "as the sensor stands"
+        )

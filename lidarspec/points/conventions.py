@@ -1,6 +1,8 @@
-"""What the columns of points mean, whichever way they are computed: REP-103 axes, REP-117 ranges, coordinates, types, organised shapes.
+"""What the columns of points mean, whichever way they are computed: REP-103 axes, REP-117 ranges,
+coordinates, types, organised shapes.
 
-The formulas take arrays (the plain evaluation) and traced columns (plans) alike, so that each is written once.
+The formulas take arrays (the plain evaluation) and traced columns (plans) alike, so that each is
+written once.
 """
 
 from __future__ import annotations
@@ -18,14 +20,19 @@ from lidarspec.spec.results import Extra
 
 Floats = NDArray[np.float32]
 
-#: names of the columns that a cloud can have, in the order in which files list them, and their types.
+#: names of the columns that a cloud can have, in the order in which files list them, and their
+#: types.
 TYPES: Mapping[str, Any] = {
     **dict.fromkeys(("x", "y", "z", "range", "azimuth", "elevation", "intensity"), np.float32),
     **{"time": np.float64, "ring": np.uint16, "return_index": np.uint8, "column": np.uint16},
 }
 
 #: their units, by name; those that are not here are plain numbers.
-UNITS: Mapping[str, str] = {**dict.fromkeys(("x", "y", "z", "range"), "m"), **dict.fromkeys(("azimuth", "elevation"), "rad"), "time": "s"}
+UNITS: Mapping[str, str] = {
+    **dict.fromkeys(("x", "y", "z", "range"), "m"),
+    **dict.fromkeys(("azimuth", "elevation"), "rad"),
+    "time": "s",
+}
 
 #: where x, y and z point by REP-103.
 REP_103 = ("forward", "left", "up")
@@ -41,12 +48,18 @@ _FAR = 1e6
 
 
 def shown_range(measured: Any, invalid: Any) -> Any:
-    """The range that a cloud shows, metres: inf where nothing came back, nan where the sensor marks a point as wrong (REP-117)."""
-    return marked(np.where(measured == 0, np.inf, np.where(measured < 0, np.nan, measured)), invalid)
+    """The range that a cloud shows, metres: inf where nothing came back, nan where the sensor marks
+    a point as wrong (REP-117).
+    """
+    return marked(
+        np.where(measured == 0, np.inf, np.where(measured < 0, np.nan, measured)), invalid
+    )
 
 
 def returned_range(measured: Any) -> Any:
-    """The range of a return, metres; nan where nothing came back. Of what is traced it is one step, which compilers know."""
+    """The range of a return, metres; nan where nothing came back. Of what is traced it is one step,
+    which compilers know.
+    """
     if isinstance(measured, Traced):
         return measured.applied(returned_range, measured)
     return np.where((measured > 0) & (measured < np.inf), measured, np.nan)
@@ -54,10 +67,16 @@ def returned_range(measured: Any) -> Any:
 
 def marked(measured: Any, invalid: Any) -> Any:
     """Ranges, nan where the sensor marks a point as wrong."""
-    return np.where(invalid, np.nan, measured) if isinstance(invalid, Traced) or np.any(invalid) else measured
+    return (
+        np.where(invalid, np.nan, measured)
+        if isinstance(invalid, Traced) or np.any(invalid)
+        else measured
+    )
 
 
-def coordinates(distance: Any, azimuth: Any, elevation: Any, origin: Sequence[Any]) -> tuple[Any, Any, Any]:
+def coordinates(
+    distance: Any, azimuth: Any, elevation: Any, origin: Sequence[Any]
+) -> tuple[Any, Any, Any]:
     """x, y and z of points, metres, from where their beams start.
 
     Args:
@@ -72,12 +91,16 @@ def coordinates(distance: Any, azimuth: Any, elevation: Any, origin: Sequence[An
         level, sides = (1, known) if all(map(_is_row, known)) else (level, sides)
     level = _product(distance, level)
     places = *(_product(level, side) for side in sides), distance * np.sin(elevation)
-    x, y, z = (place if is_zero(start) else place + start for place, start in zip(places, origin, strict=True))
+    x, y, z = (
+        place if is_zero(start) else place + start
+        for place, start in zip(places, origin, strict=True)
+    )
     return x, y, z
 
 
 def placed(coordinates: Sequence[Any], invalid: Any) -> list[Any]:
-    """The coordinates of points that are given by them, metres: nan where nothing came back, one is no number, or the sensor says so.
+    """The coordinates of points that are given by them, metres: nan where nothing came back, one is
+    no number, or the sensor says so.
 
     Args:
         coordinates: x, y and z as `Cartesian` has them.
@@ -96,11 +119,17 @@ def direction_of(x: Any, y: Any, z: Any) -> tuple[Any, Any, Any]:
 
 
 def _product(first: Any, second: Any) -> Any:
-    return first if not isinstance(second, Traced) and np.size(second) == 1 and np.all(second == 1) else first * second
+    return (
+        first
+        if not isinstance(second, Traced) and np.size(second) == 1 and np.all(second == 1)
+        else first * second
+    )
 
 
 def _is_row(value: Any) -> bool:
-    """Whether a value is a row of a table: what is computed with such rows is computed once, for the table."""
+    """Whether a value is a row of a table: what is computed with such rows is computed once, for
+    the table.
+    """
     return isinstance(value, Traced) and value.node.kind == "rows"
 
 
@@ -115,7 +144,9 @@ def seconds_since(time_ns: NDArray[np.int64], base: int) -> NDArray[np.float64]:
 
 
 class Grid(NamedTuple):
-    """How the points of a packet are organised: places of a column, none where they are not, and returns of each place, side by side."""
+    """How the points of a packet are organised: places of a column, none where they are not, and
+    returns of each place, side by side.
+    """
 
     rows: int = 0
     returns: int = 1
@@ -127,7 +158,9 @@ class Grid(NamedTuple):
 
 
 def grid_of(shape: Sequence[int], axes: Sequence[str | None]) -> Grid:
-    """How points are organised that have this shape in every packet, along axes of these names; `stack` makes returns."""
+    """How points are organised that have this shape in every packet, along axes of these names;
+    `stack` makes returns.
+    """
     is_stacked = bool(axes) and (axes[-1] or "").startswith("<")
     *lengths, returns = shape if is_stacked else (*shape, 1)
     while len(lengths) > 2 and lengths[-1] == 1:
@@ -149,16 +182,22 @@ class Grids(NamedTuple):
     grids: Sequence[Grid]
 
     def between(self, start: int, stop: int) -> Grid:
-        """How some points are organised: not, where their packets differ, or they are not whole columns."""
+        """How some points are organised: not, where their packets differ, or they are not whole
+        columns.
+        """
         first, last = self.ends.searchsorted(start, side="right"), self.ends.searchsorted(stop)
         begin, packets = int(self.ends[first - 1]) if first else 0, slice(first, last + 1)
         has_points = np.diff(self.ends[packets], prepend=begin) > 0
         found = {self.grids[which] for which in np.unique(self.which[packets][has_points]).tolist()}
-        return whole_columns(found.pop(), start - begin, stop - start) if len(found) == 1 else Grid()
+        return (
+            whole_columns(found.pop(), start - begin, stop - start) if len(found) == 1 else Grid()
+        )
 
 
 def whole_columns(grid: Grid, first: int, number: int) -> Grid:
-    """How some points of organised ones are, which begin so many points behind a column: not, where they are not whole columns."""
+    """How some points of organised ones are, which begin so many points behind a column: not, where
+    they are not whole columns.
+    """
     return grid if grid.rows and first % grid.column == 0 and number % grid.column == 0 else Grid()
 
 
@@ -173,14 +212,26 @@ class Kind(NamedTuple):
         """What is declared, and else follows from the field that the values are."""
         is_own = isinstance(values, Column) and not values.frame
         info = values.batch.table.schema.fields.get(values.source) if is_own else None
-        as_sent = info.dtype if info is not None and info.kind == "int" and not info.scaled else None
+        as_sent = (
+            info.dtype if info is not None and info.kind == "int" and not info.scaled else None
+        )
         array = values.array if isinstance(values, Column) else np.asarray(values)
-        dtype = np.dtype(bool if array.dtype.kind == "b" else as_sent or np.float32) if extra.dtype is None else extra.dtype
-        return cls(dtype, (info.unit if info is not None else "") if extra.unit is None else extra.unit)
+        dtype = (
+            np.dtype(bool if array.dtype.kind == "b" else as_sent or np.float32)
+            if extra.dtype is None
+            else extra.dtype
+        )
+        return cls(
+            dtype, (info.unit if info is not None else "") if extra.unit is None else extra.unit
+        )
 
     def column(self, values: NDArray[Any]) -> NDArray[Any]:
         """Values in the type, of the same shape."""
-        return values.astype(self.dtype, copy=False) if self.dtype.kind == "f" else numbers_of(values, self.dtype)
+        return (
+            values.astype(self.dtype, copy=False)
+            if self.dtype.kind == "f"
+            else numbers_of(values, self.dtype)
+        )
 
 
 def numbers_of(values: NDArray[Any], dtype: Any) -> NDArray[Any]:
@@ -189,7 +240,9 @@ def numbers_of(values: NDArray[Any], dtype: Any) -> NDArray[Any]:
 
 
 def axis_matrix(axes: Sequence[str]) -> NDArray[np.float64]:
-    """The (3, 3) matrix that turns REP-103 coordinates into those of axes named by where x, y and z point."""
+    """The (3, 3) matrix that turns REP-103 coordinates into those of axes named by where x, y and z
+    point.
+    """
     matrix = np.zeros((3, 3))
     for row, name in enumerate(axes):
         axis, is_opposite = divmod(DIRECTIONS.index(name), 2)
@@ -198,19 +251,25 @@ def axis_matrix(axes: Sequence[str]) -> NDArray[np.float64]:
 
 
 def axes_of(sensor: Spec) -> tuple[str, str, str]:
-    """Where x, y and z of a sensor's points point: as REP-103 has it, or as its vendor does, where that was asked for."""
+    """Where x, y and z of a sensor's points point: as REP-103 has it, or as its vendor does, where
+    that was asked for.
+    """
     wanted = sensor.vendor_axes if sensor.options.get("frame") == "vendor" else None
     return wanted or REP_103
 
 
 def vendor_turn(sensor: Spec) -> NDArray[np.float64] | None:
-    """The (3, 3) matrix that turns REP-103 coordinates into the axes that were asked for; None where these are REP-103's own."""
+    """The (3, 3) matrix that turns REP-103 coordinates into the axes that were asked for; None
+    where these are REP-103's own.
+    """
     axes = axes_of(sensor)
     return None if axes == REP_103 else axis_matrix(axes)
 
 
 def turned_azimuth(angles: NDArray[Any], turn: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Azimuths of the same directions in turned axes, radians in [-pi, pi], the shape of `angles`; `turn` is (3, 3)."""
+    """Azimuths of the same directions in turned axes, radians in [-pi, pi], the shape of `angles`;
+    `turn` is (3, 3).
+    """
     direction = turn[:2, :2] @ np.stack([np.cos(angles), np.sin(angles)])
     return np.asarray(np.arctan2(direction[1], direction[0]))
 
@@ -220,5 +279,7 @@ def narrowed(angle: NDArray[np.float64]) -> Floats:
     turned = angle - 2 * np.pi * np.floor((angle + np.pi) / (2 * np.pi))
     far = np.abs(angle) > _FAR
     if far.any():
-        turned[far] = np.mod(angle[far] + np.pi, 2 * np.pi) - np.pi  # exact however many turns it is, and slow
+        turned[far] = (
+            np.mod(angle[far] + np.pi, 2 * np.pi) - np.pi
+        )  # exact however many turns it is, and slow
     return np.clip(turned.astype(np.float32), -_PI, _PI)

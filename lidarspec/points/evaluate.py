@@ -1,7 +1,8 @@
 """Packets to points: by plans where `points` can be traced, else by its plain evaluation.
 
-What a batch is asked for at once is what later batches need: values that remember other packets, and whether the plans hold. What the
-columns of its cloud cost is paid when they are read. The values of a packet do not depend on the batch it is in.
+What a batch is asked for at once is what later batches need: values that remember other packets,
+and whether the plans hold. What the columns of its cloud cost is paid when they are read. The
+values of a packet do not depend on the batch it is in.
 """
 
 from __future__ import annotations
@@ -27,22 +28,38 @@ from lidarspec.points.plan import MODERATE, REMEMBERING, Plan, plan_for
 _AT_ONCE = 1 << 15
 
 
-def evaluated(packets: PacketBatch, carry: Carry | None = None, *, final: bool = True, epoch: int | None = None) -> Evaluated:
-    """The points of a batch, quickly where that can be; the columns are those of `plain.evaluate`, within a few units in the last place.
+def evaluated(
+    packets: PacketBatch,
+    carry: Carry | None = None,
+    *,
+    final: bool = True,
+    epoch: int | None = None,
+) -> Evaluated:
+    """The points of a batch, quickly where that can be; the columns are those of `plain.evaluate`,
+    within a few units in the last place.
 
     Args:
         carry: what the batch before left.
-        final: nothing follows; what depends on it becomes nan (by `following`), and no packet waits.
+        final: nothing follows; what depends on it becomes nan (by `following`), and no packet
+            waits.
         epoch: the time that the cloud's stamp is, int64 ns; by default that of the first packet.
 
     Raises:
-        PluginError: where the plugin's function fails or returns columns that do not fit; the cause is chained.
+        PluginError: where the plugin's function fails or returns columns that do not fit; the cause
+            is chained.
     """
     planned = _planned(packets, carry, final=final, epoch=epoch)
     return planned if planned is not None else evaluate(packets, carry, final=final, epoch=epoch)
 
 
-def _planned(packets: PacketBatch, carry: Carry | None, *, final: bool, epoch: int | None, alone: bool = False) -> Evaluated | None:
+def _planned(
+    packets: PacketBatch,
+    carry: Carry | None,
+    *,
+    final: bool,
+    epoch: int | None,
+    alone: bool = False,
+) -> Evaluated | None:
     """The points of a batch by plans; None where there is none for these packets.
 
     Args:
@@ -54,7 +71,11 @@ def _planned(packets: PacketBatch, carry: Carry | None, *, final: bool, epoch: i
     batch = packets.batch(carry)
     function = packets.sensor.points_of(packets.frame)
     try:
-        plans = [plan for group in table.groups if isinstance(plan := plan_for(function, batch, group), Plan)]
+        plans = [
+            plan
+            for group in table.groups
+            if isinstance(plan := plan_for(function, batch, group), Plan)
+        ]
     except Exception:
         return None  # the plain evaluation says what is wrong
     if len(plans) < len(table.groups):
@@ -62,43 +83,70 @@ def _planned(packets: PacketBatch, carry: Carry | None, *, final: bool, epoch: i
     whole = Plain(batch)
     try:
         simple = alone and len(plans) == 1 and ascends(table.groups[0].where)
-        remembered = {n.number: whole.column(n) for n in plans[0].eager if n.kind in (("state",) if simple else REMEMBERING)}
-        shares = [_share(plan, batch, group, whole, remembered) for plan, group in zip(plans, table.groups, strict=True)]
+        remembered = {
+            n.number: whole.column(n)
+            for n in plans[0].eager
+            if n.kind in (("state",) if simple else REMEMBERING)
+        }
+        shares = [
+            _share(plan, batch, group, whole, remembered)
+            for plan, group in zip(plans, table.groups, strict=True)
+        ]
         if not all(_holds(share) for share in shares):
             return None
     except (SpecError, ValueError):
         return None
-    ready = len(packets) if final else min((column.ready for column in remembered.values()), default=len(packets))
+    ready = (
+        len(packets)
+        if final
+        else min((column.ready for column in remembered.values()), default=len(packets))
+    )
     cloud = _cloud_of(packets, shares, batch, ready, stamp_of(packets, epoch))
     counts = np.empty(0, np.intp) if alone else _counts(shares, len(packets))[:ready]
     return Evaluated(cloud, ready, batch.carried(ready), counts, Fields(batch), plans[0].axes)
 
 
-def _share(plan: Plan, batch: Batch, group: Group, whole: Plain, remembered: Mapping[int, Column]) -> Share:
+def _share(
+    plan: Plan, batch: Batch, group: Group, whole: Plain, remembered: Mapping[int, Column]
+) -> Share:
     """A group with its plain results; those that remember other packets are of the whole batch."""
     is_whole = len(group.where) == len(batch) and ascends(group.where)
-    return Share(plan, group, whole, batch) if is_whole else Share.part(plan, batch, group, remembered)
+    return (
+        Share(plan, group, whole, batch) if is_whole else Share.part(plan, batch, group, remembered)
+    )
 
 
 def _holds(share: Share) -> bool:
-    """Whether a plan holds for its packets: made for their counts, and for what factors and floating-point fields have in them."""
-    if any(len(share.known.column(node).steps()) != number for node, number in share.plan.tape.steps):
+    """Whether a plan holds for its packets: made for their counts, and for what factors and
+    floating-point fields have in them.
+    """
+    if any(
+        len(share.known.column(node).steps()) != number for node, number in share.plan.tape.steps
+    ):
         return False
     lows = (share.known.array(node) for node in share.plan.positive)
-    return all(bool(((low > 0) & np.isfinite(low)).all()) for low in lows) and all(_moderate(share, node) for node in share.plan.floats)
+    return all(bool(((low > 0) & np.isfinite(low)).all()) for low in lows) and all(
+        _moderate(share, node) for node in share.plan.floats
+    )
 
 
 def _moderate(share: Share, node: Node) -> bool:
-    """Whether all numbers of a floating-point field are finite, and neither so small nor so large that float32 would lose them."""
+    """Whether all numbers of a floating-point field are finite, and neither so small nor so large
+    that float32 would lose them.
+    """
     leaf = share.plan.layout.leaves.get(node.path)
     if leaf is None:
         return False
     rows, step = share.group.rows, max(_AT_ONCE // max(math.prod(leaf.shape), 1), 1)
-    return all(_all_moderate(leaf.load(rows[start : start + step])) for start in range(0, len(rows), step))
+    return all(
+        _all_moderate(leaf.load(rows[start : start + step])) for start in range(0, len(rows), step)
+    )
 
 
 def _all_moderate(values: NDArray[Any]) -> bool:
-    """Whether floating-point numbers are all 0 or of moderate size: their bits without the sign are integers in the same order."""
+    """Whether floating-point numbers are all 0 or of moderate size: their bits without the sign are
+    integers in the same order.
+    """
     kind = np.dtype(f"u{values.dtype.itemsize}")
     least, most = np.clip(MODERATE, 0, np.finfo(values.dtype).max).astype(values.dtype).view(kind)
     sizes = values.view(kind) & np.array(np.iinfo(kind).max >> 1, kind)
@@ -106,7 +154,9 @@ def _all_moderate(values: NDArray[Any]) -> bool:
     return not (odd.any() and sizes[odd].any())
 
 
-def _cloud_of(packets: PacketBatch, shares: list[Share], batch: Batch, ready: int, stamp_ns: int) -> LazyCloud:
+def _cloud_of(
+    packets: PacketBatch, shares: list[Share], batch: Batch, ready: int, stamp_ns: int
+) -> LazyCloud:
     """The cloud of the first `ready` packets."""
     plan, grids = shares[0].plan, None
     size = ready * plan.width
@@ -114,18 +164,29 @@ def _cloud_of(packets: PacketBatch, shares: list[Share], batch: Batch, ready: in
         widths, which = np.zeros((2, len(packets)), np.intp)
         for number, share in enumerate(shares):
             widths[share.group.where], which[share.group.where] = share.plan.width, number
-        grids = Grids(np.cumsum(widths), which, [grid_of(share.plan.shape, share.plan.axes) for share in shares])
+        grids = Grids(
+            np.cumsum(widths),
+            which,
+            [grid_of(share.plan.shape, share.plan.axes) for share in shares],
+        )
         starts, size = grids.ends - widths, int(widths[:ready].sum())
         for share in shares:
             share.first = np.where(share.group.where < ready, starts[share.group.where], -1)
-    return LazyCloud.of(BatchColumns(packets, shares, size, stamp_ns, grids=grids, nominal=batch.nominal or plan.nominal), stamp_ns)
+    return LazyCloud.of(
+        BatchColumns(
+            packets, shares, size, stamp_ns, grids=grids, nominal=batch.nominal or plan.nominal
+        ),
+        stamp_ns,
+    )
 
 
 def _counts(shares: list[Share], number: int) -> NDArray[Any]:
     """1 for each point, with the axes of the arrays, 0 in the padding of shorter ones."""
     if all(share.plan.shape == shares[0].plan.shape for share in shares):
         return np.broadcast_to(np.intp(1), (number, *shares[0].plan.shape))
-    shape = tuple(max(lengths) for lengths in zip(*(share.plan.shape for share in shares), strict=True))
+    shape = tuple(
+        max(lengths) for lengths in zip(*(share.plan.shape for share in shares), strict=True)
+    )
     counts = np.zeros((number, *shape), np.bool_)
     for share in shares:
         corner: Any = (share.group.where, *(slice(0, length) for length in share.plan.shape))
@@ -133,8 +194,11 @@ def _counts(shares: list[Share], number: int) -> NDArray[Any]:
     return counts
 
 
-def guarded(packets: PacketBatch, carry: Carry | None = None, *, final: bool, epoch: int) -> Evaluated | None:
-    """The points of a batch of a stream, which raises on nothing: a failing plugin is counted in its `Counters`, and gives None.
+def guarded(
+    packets: PacketBatch, carry: Carry | None = None, *, final: bool, epoch: int
+) -> Evaluated | None:
+    """The points of a batch of a stream, which raises on nothing: a failing plugin is counted in
+    its `Counters`, and gives None.
 
     Args:
         carry: what the batch before left.

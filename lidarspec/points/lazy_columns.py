@@ -1,11 +1,15 @@
-"""The columns of planned points, made when they are asked for: of a batch, or of a scan over several batches.
+"""The columns of planned points, made when they are asked for: of a batch, or of a scan over
+several batches.
 
-`Share` is the packets of one layout in a batch: their plan, and what is known of them plainly (`Plain`). It has its columns made by what
-a back end compiles from the plan: `points.numpy_plan`, or `points.numba_kernels` where that is asked for or pays.
+`Share` is the packets of one layout in a batch: their plan, and what is known of them plainly
+(`Plain`). It has its columns made by what a back end compiles from the plan: `points.numpy_plan`,
+or `points.numba_kernels` where that is asked for or pays.
 
-`BatchColumns` is the source of a batch. A column is made for all its points at once, and slices share it. Scans are stretches of batches
-(`cloud.Stretches`): small ones share the columns of a block of points around them, large ones have theirs made for the packets that they
-are of and no others, straight into arrays of their own, also where these packets are of several batches (`Computed`).
+`BatchColumns` is the source of a batch. A column is made for all its points at once, and slices
+share it. Scans are stretches of batches (`cloud.Stretches`): small ones share the columns of a
+block of points around them, large ones have theirs made for the packets that they are of and no
+others, straight into arrays of their own, also where these packets are of several batches
+(`Computed`).
 """
 
 from __future__ import annotations
@@ -24,20 +28,32 @@ from lidarspec.frames.arrays import deep
 from lidarspec.frames.frame_table import Group
 from lidarspec.points import numpy_plan
 from lidarspec.points.cloud import ColumnSource, Stretch, later
-from lidarspec.points.conventions import TYPES, Grids, grid_of, narrowed, numbers_of, seconds_since, turned_azimuth, vendor_turn
+from lidarspec.points.conventions import (
+    TYPES,
+    Grids,
+    grid_of,
+    narrowed,
+    numbers_of,
+    seconds_since,
+    turned_azimuth,
+    vendor_turn,
+)
 from lidarspec.points.plain import PacketBatch
 from lidarspec.points.plan import REMEMBERING, Maker, Plan
 
 _MAIN = ("x", "y", "z", "intensity")
 
-#: points of a scan from which on its columns are made for itself; smaller ones share those of so many points.
+#: points of a scan from which on its columns are made for itself; smaller ones share those of so
+#: many points.
 LEAST, SHARED = 1 << 14, 1 << 16
 #: bytes of a whole number that float64 holds exactly.
 EXACT = 4
 
 
 class Plain:
-    """The plain results of nodes for one batch, each computed once: as columns where axes have to be named, else as arrays."""
+    """The plain results of nodes for one batch, each computed once: as columns where axes have to
+    be named, else as arrays.
+    """
 
     def __init__(self, batch: Batch) -> None:
         self._fields, self._table = Fields(batch), batch.table
@@ -59,16 +75,27 @@ class Plain:
         return self._arrays[node]  # type: ignore[no-any-return]
 
     def sent(self, node: Node, first: int, stop: int) -> NDArray[Any] | None:
-        """Whole numbers of a field as they were sent, in the packets from `first` to `stop`, (n, ...).
+        """Whole numbers of a field as they were sent, in the packets from `first` to `stop`, (n,
+        ...).
 
         None for what is no such field, or not in every packet.
         """
         info = self._table.schema.fields.get(node.path) if node.kind == "field" else None
-        if info is None or info.scaled or info.dtype is None or info.dtype.kind not in "iu" or info.dtype.itemsize > EXACT:
+        if (
+            info is None
+            or info.scaled
+            or info.dtype is None
+            or info.dtype.kind not in "iu"
+            or info.dtype.itemsize > EXACT
+        ):
             return None
         if self._table.present(info.path) is not None:
             return None
-        some = self._table if stop - first == len(self._table) else self._table.take(np.arange(first, stop))
+        some = (
+            self._table
+            if stop - first == len(self._table)
+            else self._table.take(np.arange(first, stop))
+        )
         return field_array(info, some, self._table.schema.depth(), raw=True)
 
     def know(self, node: Node, column: Column) -> None:
@@ -82,13 +109,17 @@ class Plain:
         if node in self._columns:
             return self._columns[node].array
         if node.kind == "field":
-            return field_array(self._table.schema.fields[node.path], self._table, self._table.schema.depth())
+            return field_array(
+                self._table.schema.fields[node.path], self._table, self._table.schema.depth()
+            )
         return None if node.kind == "call" else self.column(node).array
 
 
 @dataclass(eq=False)
 class Share:
-    """The packets of one layout in a batch: their plan, the plain results, and where the first point of each goes, -1 for nowhere."""
+    """The packets of one layout in a batch: their plan, the plain results, and where the first
+    point of each goes, -1 for nowhere.
+    """
 
     plan: Plan
     group: Group
@@ -99,7 +130,9 @@ class Share:
     def __len__(self) -> int:
         return len(self.group.where)
 
-    def fill(self, maker: Maker, columns: Mapping[str, NDArray[Any]], first: int, stop: int) -> None:
+    def fill(
+        self, maker: Maker, columns: Mapping[str, NDArray[Any]], first: int, stop: int
+    ) -> None:
         """Fill the columns of the packets from `first` to `stop`."""
 
         def values(node: Node) -> NDArray[Any]:
@@ -112,23 +145,35 @@ class Share:
             maker.run(self.group.rows[first:stop], values, columns)
 
     def plain(self, name: str, first: int = 0, stop: int | None = None) -> NDArray[Any]:
-        """A part of what `points` returned, for every point of the packets from `first` to `stop` (None: all), evaluated plainly.
+        """A part of what `points` returned, for every point of the packets from `first` to `stop`
+        (None: all), evaluated plainly.
 
         Its shape is that of the plan, behind the packets.
 
-        A further column of whole numbers that is a field as it stands is of their type, all others of float64.
+        A further column of whole numbers that is a field as it stands is of their type, all others
+        of float64.
         """
         stop = len(self) if stop is None else stop
         part, shape = self.plan.parts[name], (stop - first, *self.plan.shape)
-        array = self.known.sent(part, first, stop) if isinstance(part, Node) and name in self.plan.extra else None
+        array = (
+            self.known.sent(part, first, stop)
+            if isinstance(part, Node) and name in self.plan.extra
+            else None
+        )
         if array is None:
             array = self.known.array(part) if isinstance(part, Node) else np.asarray(part)
             array = array[first:stop] if isinstance(part, Node) and len(array) > 1 else array
-        return np.broadcast_to(deep(array, len(shape) - 1) if isinstance(part, Node) else array, shape)
+        return np.broadcast_to(
+            deep(array, len(shape) - 1) if isinstance(part, Node) else array, shape
+        )
 
     @classmethod
-    def part(cls, plan: Plan, batch: Batch, group: Group, remembered: Mapping[int, Column]) -> Share:
-        """The share of some packets of a batch; `remembered`: the results of all its packets that remember others, by the node's number."""
+    def part(
+        cls, plan: Plan, batch: Batch, group: Group, remembered: Mapping[int, Column]
+    ) -> Share:
+        """The share of some packets of a batch; `remembered`: the results of all its packets that
+        remember others, by the node's number.
+        """
         own = batch.of(group)
         share = cls(plan, group, Plain(own), own)
         for number, column in remembered.items():
@@ -140,12 +185,23 @@ class Share:
 
     def some(self, which: NDArray[np.intp]) -> Share:
         """The share of some of the packets, by index, with what is known of them plainly."""
-        remembered = {node.number: self.known.column(node) for node in self.plan.eager if node.kind in REMEMBERING}
-        return Share.part(self.plan, self.batch, Group(self.group.layout, which, self.group.rows[which]), remembered)
+        remembered = {
+            node.number: self.known.column(node)
+            for node in self.plan.eager
+            if node.kind in REMEMBERING
+        }
+        return Share.part(
+            self.plan,
+            self.batch,
+            Group(self.group.layout, which, self.group.rows[which]),
+            remembered,
+        )
 
 
 def maker_of(plan: Plan, names: tuple[str, ...], backend: str, number: int) -> Maker:
-    """What makes columns of so many frames: a kernel where `backend` asks for one, or where it is free to and that pays."""
+    """What makes columns of so many frames: a kernel where `backend` asks for one, or where it is
+    free to and that pays.
+    """
     if backend in ("auto", "jit"):
         try:
             from lidarspec.points import numba_kernels
@@ -163,14 +219,21 @@ class Computed(ColumnSource):
     """Columns made for these points alone, each once.
 
     Args:
-        parts: stretches of batches of one plan whose packets are whole but for the first and the last one; or all points of one batch.
+        parts: stretches of batches of one plan whose packets are whole but for the first and the
+            last one; or all points of one batch.
         made: columns made before, to be added to.
     """
 
-    def __init__(self, parts: Sequence[tuple[BatchColumns, int, int]], made: dict[str, NDArray[Any]]) -> None:
+    def __init__(
+        self, parts: Sequence[tuple[BatchColumns, int, int]], made: dict[str, NDArray[Any]]
+    ) -> None:
         self._parts, self._made = parts, made
         self.size, self.base = sum(stop - start for _, start, stop in parts), parts[0][0].base
-        self._packets, self._shares, self.extra = parts[0][0].packets, parts[0][0].shares, parts[0][0].extra
+        self._packets, self._shares, self.extra = (
+            parts[0][0].packets,
+            parts[0][0].shares,
+            parts[0][0].extra,
+        )
         self._turn = vendor_turn(self._packets.sensor)
 
     def column(self, name: str) -> NDArray[Any] | None:
@@ -183,7 +246,11 @@ class Computed(ColumnSource):
 
     def prepare(self, names: Sequence[str]) -> None:
         plans = [share.plan for share in self._shares]
-        sent = [name for name in names if name not in self._made and all(name in plan.sent for plan in plans)]
+        sent = [
+            name
+            for name in names
+            if name not in self._made and all(name in plan.sent for plan in plans)
+        ]
         main = self._main_names if set(_MAIN).intersection(names) - self._made.keys() else ()
         if sent and len(sent) + len(main) > 1 and self._turn is None:
             self._made |= self._compiled((*main, *sent))
@@ -196,10 +263,21 @@ class Computed(ColumnSource):
         if name == "valid":
             return {name: ~np.isnan(self._x())}
         if name in self._shares[0].plan.expressions and name not in self._shares[0].plan.sent:
-            columns = self._compiled(("range", "azimuth") if name in ("range", "azimuth") and self._packets.backend == "jit" else (name,))
-            return columns | {"azimuth": self._azimuth(columns["azimuth"])} if "azimuth" in columns else columns
+            columns = self._compiled(
+                ("range", "azimuth")
+                if name in ("range", "azimuth") and self._packets.backend == "jit"
+                else (name,)
+            )
+            return (
+                columns | {"azimuth": self._azimuth(columns["azimuth"])}
+                if "azimuth" in columns
+                else columns
+            )
         if name == "time":
-            times = [batch.times_of(share, *packets) + later(batch, self.base) for batch, share, packets in self._pieces()]
+            times = [
+                batch.times_of(share, *packets) + later(batch, self.base)
+                for batch, share, packets in self._pieces()
+            ]
             return {name: self._joined(times, np.float64)}
         if name not in self._shares[0].plan.parts:
             return {}
@@ -211,7 +289,9 @@ class Computed(ColumnSource):
         return {name: numbers_of(column, TYPES[name]) if extra is None else extra.column(column)}
 
     def _main(self, name: str) -> dict[str, NDArray[Any]]:
-        """The columns that are made together; where all points are level, the height only when it is asked for."""
+        """The columns that are made together; where all points are level, the height only when it
+        is asked for.
+        """
         if name not in self._main_names and name == "z":
             x = self._x()
             return {"z": np.where(np.isnan(x), x, np.float32(0))}
@@ -219,7 +299,9 @@ class Computed(ColumnSource):
         if self._turn is None:
             return columns
         turned = dict(columns)
-        for axis, row in zip("xyz", self._turn, strict=True):  # each is one of REP-103's, or its opposite
+        for axis, row in zip(
+            "xyz", self._turn, strict=True
+        ):  # each is one of REP-103's, or its opposite
             source = int(np.flatnonzero(row)[0])
             turned[axis] = columns["xyz"[source]] * np.float32(row[source])
         return turned
@@ -228,7 +310,9 @@ class Computed(ColumnSource):
     def _main_names(self) -> tuple[str, ...]:
         """The columns that are made together, whichever of them is asked for."""
         level = self._turn is None and all(share.plan.level for share in self._shares)
-        return tuple(n for n in _MAIN if n in self._shares[0].plan.expressions and not (n == "z" and level))
+        return tuple(
+            n for n in _MAIN if n in self._shares[0].plan.expressions and not (n == "z" and level)
+        )
 
     def _x(self) -> NDArray[Any]:
         return cast("NDArray[Any]", self.column("x"))
@@ -248,14 +332,19 @@ class Computed(ColumnSource):
                 maker = maker_of(share.plan, names, backend, stop - first)
                 each.append(maker.columns(stop - first))
                 share.fill(maker, each[-1], first, stop)
-            return {name: self._joined([columns[name] for columns in each], each[0][name].dtype) for name in names}
+            return {
+                name: self._joined([columns[name] for columns in each], each[0][name].dtype)
+                for name in names
+            }
         plan = self._shares[0].plan
         number = sum(stop - first for _, _, (first, stop) in pieces)
         maker = maker_of(plan, names, backend, number)
         columns, start = maker.columns(number), 0
         for _, share, (first, stop) in pieces:
             end = start + (stop - first) * plan.width
-            share.fill(maker, {name: column[start:end] for name, column in columns.items()}, first, stop)
+            share.fill(
+                maker, {name: column[start:end] for name, column in columns.items()}, first, stop
+            )
             start = end
         return {name: self._trimmed(column) for name, column in columns.items()}
 
@@ -265,18 +354,25 @@ class Computed(ColumnSource):
         return self._parts[0][0].even is not None
 
     def _pieces(self) -> list[tuple[BatchColumns, Share, tuple[int, int]]]:
-        """The shares that the points are of, and the packets of each: the first one, and the one after the last."""
+        """The shares that the points are of, and the packets of each: the first one, and the one
+        after the last.
+        """
         if not self._is_even:
             batch = self._parts[0][0]
             return [(batch, share, (0, len(share))) for share in batch.shares]
         width = self._shares[0].plan.width
-        return [(batch, batch.shares[0], (start // width, -(-stop // width))) for batch, start, stop in self._parts]
+        return [
+            (batch, batch.shares[0], (start // width, -(-stop // width)))
+            for batch, start, stop in self._parts
+        ]
 
     def _joined(self, parts: Sequence[NDArray[Any]], dtype: Any) -> NDArray[Any]:
         """What each piece has, in stream order, the points of packets that wait left out."""
         flat = [part.reshape(-1) for part in parts]
         if self._is_even:
-            return self._trimmed(flat[0] if len(flat) == 1 else np.concatenate(flat)).astype(dtype, copy=False)
+            return self._trimmed(flat[0] if len(flat) == 1 else np.concatenate(flat)).astype(
+                dtype, copy=False
+            )
         column = np.empty(self.size, dtype)
         for share, values in zip(self._shares, flat, strict=True):
             assert share.first is not None
@@ -289,15 +385,21 @@ class Computed(ColumnSource):
         return column[skipped : skipped + self.size]
 
 
-def spread_out(values: NDArray[Any], first: NDArray[np.intp], width: int, column: NDArray[Any]) -> None:
-    """Write the points of packets, `width` each, to where the first of each packet goes; -1 leaves a packet out."""
+def spread_out(
+    values: NDArray[Any], first: NDArray[np.intp], width: int, column: NDArray[Any]
+) -> None:
+    """Write the points of packets, `width` each, to where the first of each packet goes; -1 leaves
+    a packet out.
+    """
     kept = first >= 0
     rows, starts = np.ascontiguousarray(values.reshape(len(first), width), column.dtype), first
     if not kept.all():
         rows, starts = rows[kept], first[kept]
     if rows.size:
         piece = np.dtype((np.void, rows.shape[1] * rows.itemsize))
-        windows: NDArray[Any] = np.ndarray((len(column) - width + 1,), piece, column.data, 0, column.strides)
+        windows: NDArray[Any] = np.ndarray(
+            (len(column) - width + 1,), piece, column.data, 0, column.strides
+        )
         windows[starts] = rows.view(piece).reshape(-1)
 
 
@@ -320,10 +422,21 @@ class BatchColumns(ColumnSource):
         grids, nominal: as of all sources.
     """
 
-    def __init__(self, packets: PacketBatch, shares: Sequence[Share], size: int, base: int, *, grids: Grids | None, nominal: bool) -> None:
+    def __init__(
+        self,
+        packets: PacketBatch,
+        shares: Sequence[Share],
+        size: int,
+        base: int,
+        *,
+        grids: Grids | None,
+        nominal: bool,
+    ) -> None:
         self.packets, self.shares, self.extra = packets, shares, shares[0].plan.extra
         self.size, self.base, self.grids, self.nominal = size, base, grids, nominal
-        self.grid = grids.between(0, size) if grids else grid_of(shares[0].plan.shape, shares[0].plan.axes)
+        self.grid = (
+            grids.between(0, size) if grids else grid_of(shares[0].plan.shape, shares[0].plan.axes)
+        )
         self._made: dict[str, NDArray[Any]] = {}
         self._blocks: list[Block] = []
 
@@ -344,7 +457,9 @@ class BatchColumns(ColumnSource):
         Computed([(self, 0, self.size)], self._made).prepare(names)
 
     def part(self, name: str, start: int, stop: int) -> NDArray[Any] | None:
-        """A column of some points; those behind them have it made too, for whoever asks for them next."""
+        """A column of some points; those behind them have it made too, for whoever asks for them
+        next.
+        """
         if self.even is None or self.holds(name) or self.size <= SHARED:
             return super().part(name, start, stop)
         pieces: list[NDArray[Any]] = []
@@ -371,27 +486,43 @@ class BatchColumns(ColumnSource):
         return block
 
     def together(self, parts: Sequence[Stretch]) -> ColumnSource | None:
-        """What makes columns for stretches alone: where they are many points, of packets of one layout, in order."""
+        """What makes columns for stretches alone: where they are many points, of packets of one
+        layout, in order.
+        """
         sources = [part.source for part in parts]
-        batches = [source for source in sources if isinstance(source, BatchColumns) and source.even is not None]
+        batches = [
+            source
+            for source in sources
+            if isinstance(source, BatchColumns) and source.even is not None
+        ]
         if len(batches) < len(parts) or sum(part.size for part in parts) < LEAST:
             return None
         plan = self.shares[0].plan
         inner = [*(part.stop for part in parts[:-1]), *(part.start for part in parts[1:])]
-        if any(batch.shares[0].plan is not plan for batch in batches) or any(at % plan.width for at in inner):
+        if any(batch.shares[0].plan is not plan for batch in batches) or any(
+            at % plan.width for at in inner
+        ):
             return None
-        return Computed([(batch, part.start, part.stop) for batch, part in zip(batches, parts, strict=True)], {})
+        return Computed(
+            [(batch, part.start, part.stop) for batch, part in zip(batches, parts, strict=True)], {}
+        )
 
     def times_at(self, indices: NDArray[np.intp]) -> NDArray[np.float64]:
         share = self.even
         if share is None or self.holds("time"):
             return super().times_at(indices)
         packets, places = np.divmod(indices, share.plan.width)
-        few = share.some(packets).plain("time") if isinstance(share.plan.parts["time"], Node) else share.plain("time")[packets]
+        few = (
+            share.some(packets).plain("time")
+            if isinstance(share.plan.parts["time"], Node)
+            else share.plain("time")[packets]
+        )
         offsets = seconds_since(self.packets.time_ns[packets], self.base)
         return np.asarray(few.reshape(len(packets), -1)[np.arange(len(packets)), places] + offsets)
 
     def times_of(self, share: Share, first: int, stop: int) -> NDArray[np.float64]:
-        """The times of all points of some packets of a share, seconds since `base`: (packets, *shape of the plan)."""
+        """The times of all points of some packets of a share, seconds since `base`: (packets,
+        *shape of the plan).
+        """
         offsets = seconds_since(self.packets.time_ns[share.group.where[first:stop]], self.base)
         return np.asarray(share.plain("time", first, stop) + deep(offsets, len(share.plan.shape)))

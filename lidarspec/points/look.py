@@ -1,6 +1,8 @@
-"""How a cloud is looked at: what a picture of it takes in, what colours show, and the values that they stand for.
+"""How a cloud is looked at: what a picture of it takes in, what colours show, and the values that
+they stand for.
 
-Whatever draws points asks here, so that a scan looks alike in a terminal, on paper and in other tools.
+Whatever draws points asks here, so that a scan looks alike in a terminal, on paper and in other
+tools.
 """
 
 from __future__ import annotations
@@ -29,7 +31,8 @@ WITHIN = 98.0
 STEPS = 20
 #: share of the points that a fitted picture shows.
 CENTRAL = 0.98
-#: share of the values of an axis at each end that does not count for its scale, by which distant points are found.
+#: share of the values of an axis at each end that does not count for its scale, by which distant
+#: points are found.
 TAIL = 0.05
 #: how much more than these points a fitted picture shows.
 MARGIN = 1.08
@@ -47,7 +50,8 @@ class Look:
         full: the range in metres, the intensity, or the value at the end of the ramp.
         middle: what is in the middle, metres forward and left of the sensor.
         flat: from above only.
-        low, unit: the value at the beginning of the ramp, and what values are in, where they are no ranges.
+        low, unit: the value at the beginning of the ramp, and what values are in, where they are no
+            ranges.
     """
 
     ramp: str
@@ -71,7 +75,8 @@ def ramps(cloud: PointCloud) -> list[str]:
 
 
 def look(points: PointCloud, *, ramp: str = "range", reach: float | None = None) -> Look:
-    """How to draw a cloud so that all of it is seen; intensity is shown only where the cloud has some.
+    """How to draw a cloud so that all of it is seen; intensity is shown only where the cloud has
+    some.
 
     Raises:
         UnknownName: for a column that the cloud does not have.
@@ -88,7 +93,14 @@ def look(points: PointCloud, *, ramp: str = "range", reach: float | None = None)
     values = values[np.isfinite(values)]
     weak, strong = np.percentile(values, (100 - WITHIN, WITHIN)) if len(values) else (0.0, 0.0)
     low = -rounded_up(-float(weak)) if weak < 0 else 0.0
-    return Look(ramp, found, rounded_up(max(float(strong), 1e-3)), flat=is_flat(cloud), low=low, unit=cloud.units.get(ramp, ""))
+    return Look(
+        ramp,
+        found,
+        rounded_up(max(float(strong), 1e-3)),
+        flat=is_flat(cloud),
+        low=low,
+        unit=cloud.units.get(ramp, ""),
+    )
 
 
 def is_flat(cloud: PointCloud) -> bool:
@@ -97,7 +109,9 @@ def is_flat(cloud: PointCloud) -> bool:
 
 
 def reach_of(cloud: PointCloud) -> float:
-    """The range that shows a cloud of valid points: the farthest one's, or most points' where a few are far beyond; rounded up."""
+    """The range that shows a cloud of valid points: the farthest one's, or most points' where a few
+    are far beyond; rounded up.
+    """
     if not len(cloud):
         return 1.0
     distance = np.hypot(cloud.x, cloud.y)
@@ -125,7 +139,8 @@ def bounds(cloud: PointCloud) -> tuple[NDArray[np.float64], NDArray[np.float64]]
         cloud: valid points.
 
     Returns:
-        Two arrays (3,) in metres, zeros if there are no points. 2 % of the points, the farthest from the others, may be outside.
+        Two arrays (3,) in metres, zeros if there are no points. 2 % of the points, the farthest
+        from the others, may be outside.
     """
     if not len(cloud):
         return np.zeros(3), np.zeros(3)

@@ -1,7 +1,9 @@
-"""From packets to points, plainly: the sensor's `points` function evaluated once per batch with ordinary NumPy, and its result flattened.
+"""From packets to points, plainly: the sensor's `points` function evaluated once per batch with
+ordinary NumPy, and its result flattened.
 
-This is the reference. It serves where `points` cannot be traced, and the tests as the second engine; plans (`points.plan`) take the
-parts of a result and the meaning of columns from here and from `points.conventions`.
+This is the reference. It serves where `points` cannot be traced, and the tests as the second
+engine; plans (`points.plan`) take the parts of a result and the meaning of columns from here and
+from `points.conventions`.
 """
 
 from __future__ import annotations
@@ -47,7 +49,9 @@ class PacketBatch(Protocol):
     def __len__(self) -> int: ...
 
     def batch(self, carry: Carry | None = None) -> Batch:
-        """The packets as a plugin's functions are given them, through `Fields`; `carry`: what the batch before left."""
+        """The packets as a plugin's functions are given them, through `Fields`; `carry`: what the
+        batch before left.
+        """
 
 
 @dataclass(frozen=True, eq=False)
@@ -58,7 +62,8 @@ class Evaluated:
         cloud: they, flat, in stream order.
         ready: how many packets they are of; the others wait for what follows.
         carry: what the evaluation of the next batch needs, which starts with packet `ready`.
-        counts: (ready, ...) points of each packet, with an axis for each array level, padding left out.
+        counts: (ready, ...) points of each packet, with an axis for each array level, padding left
+            out.
         fields: the columns of the batch, for the splitting into scans.
         axes: names of the axes of `counts` after the first.
     """
@@ -71,20 +76,31 @@ class Evaluated:
     axes: tuple[str | None, ...]
 
 
-def evaluate(packets: PacketBatch, carry: Carry | None = None, *, final: bool = True, epoch: int | None = None) -> Evaluated:
+def evaluate(
+    packets: PacketBatch,
+    carry: Carry | None = None,
+    *,
+    final: bool = True,
+    epoch: int | None = None,
+) -> Evaluated:
     """The points of a batch.
 
     Args:
         carry: what the batch before left.
-        final: nothing follows; what depends on it becomes nan (by `following`), and no packet waits.
+        final: nothing follows; what depends on it becomes nan (by `following`), and no packet
+            waits.
         epoch: the time that the cloud's stamp is, int64 ns; by default that of the first packet.
 
     Raises:
-        PluginError: where the plugin's function fails or returns columns that do not fit; the cause is chained.
+        PluginError: where the plugin's function fails or returns columns that do not fit; the cause
+            is chained.
     """
     batch = packets.batch(carry)
     function = packets.sensor.points_of(packets.frame)
-    with plugin_errors(f"points of {packets.frame}", packets.sensor.id, function), np.errstate(all="ignore"):
+    with (
+        plugin_errors(f"points of {packets.frame}", packets.sensor.id, function),
+        np.errstate(all="ignore"),
+    ):
         result = function(Fields(batch))
         if not isinstance(result, Polar | Cartesian):
             raise TypeError(f"has to return Polar or Cartesian, not {type(result).__name__}")
@@ -97,8 +113,14 @@ def stamp_of(packets: PacketBatch, epoch: int | None) -> int:
 
 
 def parts_of(result: Points) -> dict[str, Any]:
-    """What a `points` function returned, by the names of its parts, as far as the sensor has them; the origin as ox, oy and oz."""
-    parts = {f.name: getattr(result, f.name) for f in fields(result) if f.name not in ("nominal", "extra")}
+    """What a `points` function returned, by the names of its parts, as far as the sensor has them;
+    the origin as ox, oy and oz.
+    """
+    parts = {
+        f.name: getattr(result, f.name)
+        for f in fields(result)
+        if f.name not in ("nominal", "extra")
+    }
     if isinstance(result, Polar):
         parts |= dict(zip(("ox", "oy", "oz"), parts.pop("origin"), strict=True))
     parts |= {name: extra.values for name, extra in result.extra.items()}
@@ -110,12 +132,16 @@ def kinds_of(result: Points, parts: Mapping[str, Any]) -> dict[str, Kind]:
     return {name: Kind.of(extra, parts[name]) for name, extra in result.extra.items()}
 
 
-def _flattened(packets: PacketBatch, result: Points, batch: Batch, stamp_ns: int, *, final: bool) -> Evaluated:
+def _flattened(
+    packets: PacketBatch, result: Points, batch: Batch, stamp_ns: int, *, final: bool
+) -> Evaluated:
     parts = parts_of(result)
     arrays, axes, ready, shape = of_points(parts, batch)
     ready = len(packets) if final else ready
     mask = unpadded(axes, shape, batch)
-    every = {name: flat(array, shape, mask, ready) for name, array in zip(parts, arrays, strict=True)}
+    every = {
+        name: flat(array, shape, mask, ready) for name, array in zip(parts, arrays, strict=True)
+    }
     offsets = conventions.seconds_since(packets.time_ns, stamp_ns).reshape(-1, *(1,) * len(axes))
     every["time"] = every["time"] + flat(offsets, shape, mask, ready)
     inside = np.ones(shape, np.bool_) if mask is None else mask.reshape(shape)
@@ -129,13 +155,23 @@ def _flattened(packets: PacketBatch, result: Points, batch: Batch, stamp_ns: int
     )
     if mask is not None:
         cloud = LazyCloud.of(CloudColumns(cloud, _grids(inside, axes)), stamp_ns)
-    return Evaluated(cloud, ready, batch.carried(ready), inside[:ready].astype(np.intp), Fields(batch), axes)
+    return Evaluated(
+        cloud, ready, batch.carried(ready), inside[:ready].astype(np.intp), Fields(batch), axes
+    )
 
 
 def _grids(inside: NDArray[np.bool_], axes: tuple[str | None, ...]) -> conventions.Grids:
-    """How the points of packets are organised, by which elements of their arrays, (n, ...), are not padding."""
+    """How the points of packets are organised, by which elements of their arrays, (n, ...), are not
+    padding.
+    """
     inner = range(1, inside.ndim)
-    lengths = np.stack([inside.any(axis=tuple(other for other in inner if other != axis)).sum(axis=1) for axis in inner], axis=1)
+    lengths = np.stack(
+        [
+            inside.any(axis=tuple(other for other in inner if other != axis)).sum(axis=1)
+            for axis in inner
+        ],
+        axis=1,
+    )
     counts = inside.sum(axis=tuple(inner))
     lengths[lengths.prod(axis=1) != counts] = 0  # rows of several lengths in one packet are no grid
     shapes, which = np.unique(lengths, axis=0, return_inverse=True)
@@ -143,13 +179,22 @@ def _grids(inside: NDArray[np.bool_], axes: tuple[str | None, ...]) -> conventio
     return conventions.Grids(np.cumsum(counts), which.reshape(-1), grids)
 
 
-def flat(array: NDArray[Any], shape: tuple[int, ...], mask: NDArray[np.bool_] | None, ready: int) -> NDArray[Any]:
-    """What an array that broadcasts to a shape, (n, ...), has for the first `ready` packets, without padding: (N,)."""
+def flat(
+    array: NDArray[Any], shape: tuple[int, ...], mask: NDArray[np.bool_] | None, ready: int
+) -> NDArray[Any]:
+    """What an array that broadcasts to a shape, (n, ...), has for the first `ready` packets,
+    without padding: (N,).
+    """
     full = np.broadcast_to(array, shape)[:ready]
     return full.reshape(-1) if mask is None else full.reshape(mask[:ready].shape)[mask[:ready]]
 
 
-def make_cloud(flat: dict[str, NDArray[Any]], turn: NDArray[np.float64] | None, kinds: Mapping[str, Kind], **facts: Any) -> PointCloud:
+def make_cloud(
+    flat: dict[str, NDArray[Any]],
+    turn: NDArray[np.float64] | None,
+    kinds: Mapping[str, Kind],
+    **facts: Any,
+) -> PointCloud:
     """A cloud from flat columns.
 
     Args:
@@ -159,17 +204,32 @@ def make_cloud(flat: dict[str, NDArray[Any]], turn: NDArray[np.float64] | None, 
         facts: `stamp_ns`, `shape` and `nominal` of the cloud.
     """
     with np.errstate(all="ignore"):
-        distance, azimuth, elevation, xyz = (_by_coordinates if "x" in flat else _by_direction)(flat, flat["invalid"].astype(np.bool_))
+        distance, azimuth, elevation, xyz = (_by_coordinates if "x" in flat else _by_direction)(
+            flat, flat["invalid"].astype(np.bool_)
+        )
         known = np.isfinite(azimuth) & np.isfinite(elevation) & np.isfinite(xyz).all(axis=0)
         valid = known & (np.abs(distance) <= conventions.FARTHEST)
         if turn is not None:
             xyz, azimuth = turn @ np.where(valid, xyz, 0), conventions.turned_azimuth(azimuth, turn)
-        angles = {"azimuth": conventions.narrowed(azimuth), "elevation": elevation.astype(np.float32)}
-        columns = dict(zip("xyz", np.where(valid, xyz, np.nan).astype(np.float32), strict=True)) | angles
-        columns |= {name: conventions.numbers_of(flat[name], conventions.TYPES[name]) for name in _OPTIONAL if name in flat}
+        angles = {
+            "azimuth": conventions.narrowed(azimuth),
+            "elevation": elevation.astype(np.float32),
+        }
+        columns = (
+            dict(zip("xyz", np.where(valid, xyz, np.nan).astype(np.float32), strict=True)) | angles
+        )
+        columns |= {
+            name: conventions.numbers_of(flat[name], conventions.TYPES[name])
+            for name in _OPTIONAL
+            if name in flat
+        }
         extra = {name: kind.column(flat[name]) for name, kind in kinds.items()}
         units = {name: kind.unit for name, kind in kinds.items()}
-        columns |= {"range": distance.astype(np.float32), "time": np.array(flat["time"], np.float64), "valid": valid}
+        columns |= {
+            "range": distance.astype(np.float32),
+            "time": np.array(flat["time"], np.float64),
+            "valid": valid,
+        }
         return PointCloud(**columns, extra=extra, units=units, **facts)
 
 
@@ -178,13 +238,22 @@ _Places = tuple[NDArray[Any], NDArray[Any], NDArray[Any], NDArray[np.float64]]
 
 
 def _by_direction(flat: dict[str, NDArray[Any]], invalid: NDArray[np.bool_]) -> _Places:
-    measured, azimuth, elevation = (flat[name].astype(np.float64) for name in ("range", "azimuth", "elevation"))
+    measured, azimuth, elevation = (
+        flat[name].astype(np.float64) for name in ("range", "azimuth", "elevation")
+    )
     distance = conventions.shown_range(measured, invalid)
-    places = conventions.coordinates(distance, azimuth, elevation, [flat[name] for name in ("ox", "oy", "oz")])
+    places = conventions.coordinates(
+        distance, azimuth, elevation, [flat[name] for name in ("ox", "oy", "oz")]
+    )
     return distance, azimuth, elevation, np.stack(places) + 0.0  # no -0.0
 
 
 def _by_coordinates(flat: dict[str, NDArray[Any]], invalid: NDArray[np.bool_]) -> _Places:
     places = [flat[name].astype(np.float64) for name in "xyz"]
     measured, azimuth, elevation = conventions.direction_of(*places)
-    return conventions.shown_range(measured, invalid), azimuth, elevation, np.stack(conventions.placed(places, invalid))
+    return (
+        conventions.shown_range(measured, invalid),
+        azimuth,
+        elevation,
+        np.stack(conventions.placed(places, invalid)),
+    )

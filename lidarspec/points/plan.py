@@ -1,14 +1,16 @@
 """The plan of a sensor's points: `points` traced once for a layout, and its columns as expressions.
 
-`Plan` knows how points become coordinates (by `points.conventions`, as the plain evaluation does), and which values have to be known of
-a batch before they are computed. It computes nothing: a `Maker` does, which a back end compiles from it (`points.numpy_plan`,
-`points.numba_kernels`). Plans are kept with the layout that they are for, so a stream of packets traces nothing again.
+`Plan` knows how points become coordinates (by `points.conventions`, as the plain evaluation does),
+and which values have to be known of a batch before they are computed. It computes nothing: a
+`Maker` does, which a back end compiles from it (`points.numpy_plan`, `points.numba_kernels`). Plans
+are kept with the layout that they are for, so a stream of packets traces nothing again.
 
-Points by coordinates are three expressions and a mask (`conventions.placed`), their range and angles further ones. They are exact:
-computed in float64 as they are written, whatever floating-point fields hold. Points by direction are computed in another order and partly
-in float32: their plan holds where what a batch has in floating-point fields is of moderate size (`MODERATE`). Columns under names of a
-sensor's own are further expressions where they are float32, exact too, or whole numbers of a field as it was sent; others are what `points`
-says, in their type.
+Points by coordinates are three expressions and a mask (`conventions.placed`), their range and
+angles further ones. They are exact: computed in float64 as they are written, whatever
+floating-point fields hold. Points by direction are computed in another order and partly in float32:
+their plan holds where what a batch has in floating-point fields is of moderate size (`MODERATE`).
+Columns under names of a sensor's own are further expressions where they are float32, exact too, or
+whole numbers of a field as it was sent; others are what `points` says, in their type.
 """
 
 from __future__ import annotations
@@ -27,7 +29,15 @@ from lidarspec.expressions.columns import Batch, of_points
 from lidarspec.expressions.graph import Node, Traced, Untraceable, is_full, only_field
 from lidarspec.frames.frame_table import Group
 from lidarspec.frames.layout import Bytes2D, Layout, Leaf
-from lidarspec.points.conventions import coordinates, direction_of, is_zero, marked, placed, returned_range, shown_range
+from lidarspec.points.conventions import (
+    coordinates,
+    direction_of,
+    is_zero,
+    marked,
+    placed,
+    returned_range,
+    shown_range,
+)
 from lidarspec.points.plain import kinds_of, parts_of
 from lidarspec.points.windows import is_number
 from lidarspec.spec.results import Cartesian, Polar
@@ -41,7 +51,8 @@ Values = Callable[[Node], NDArray[Any]]
 #: steps that remember something between packets or batches, or that other frames decide.
 REMEMBERING = ("shift", "latest", "state")
 
-#: the least and the most that a floating-point field may hold, if it is not 0, where float32 and another order of sums have to do no harm.
+#: the least and the most that a floating-point field may hold, if it is not 0, where float32 and
+#: another order of sums have to do no harm.
 MODERATE = 2.0**-60, 2.0**60
 
 
@@ -72,8 +83,10 @@ class Plan:
         shape: of the points of a packet, one length for each axis in `axes`.
         expressions: the columns that back ends make, by name, as nodes or as what no data decides.
         extra: what the columns under names of the sensor's own hold, by name.
-        sent: those of `extra` that are whole numbers of a field as they were sent, and the field's place.
-        exact: whether coordinates and range are computed in float64 as they are written, as all other columns are.
+        sent: those of `extra` that are whole numbers of a field as they were sent, and the field's
+            place.
+        exact: whether coordinates and range are computed in float64 as they are written, as all
+            other columns are.
         positive: nodes whose values have to be positive numbers, or the plan does not hold.
         nominal: whether a default calibration stands in for the sensor's own.
         varying: the arrays whose lengths differ from frame to frame.
@@ -91,10 +104,16 @@ class Plan:
             raise Untraceable(f"points that are {type(result).__name__}")
         self.function, self.layout, self.nominal = function, layout, result.nominal
         given = parts_of(result)
-        samples = {name: part.node.sample if isinstance(part, Traced) else part for name, part in given.items()}
+        samples = {
+            name: part.node.sample if isinstance(part, Traced) else part
+            for name, part in given.items()
+        }
         arrays, self.axes, _, shape = of_points(samples, sample)
         self.extra = kinds_of(result, samples)
-        given = {name: part if isinstance(part, Traced) else array for (name, part), array in zip(given.items(), arrays, strict=True)}
+        given = {
+            name: part if isinstance(part, Traced) else array
+            for (name, part), array in zip(given.items(), arrays, strict=True)
+        }
         self.parts = {name: graph.node_of(part) for name, part in given.items()}
         self.shape = shape[1:]
         self.varying = {name for name, count in schema.arrays.items() if not isinstance(count, int)}
@@ -104,16 +123,30 @@ class Plan:
         if 0 in self.shape:
             raise Untraceable("packets without points")
         self.exact = isinstance(result, Cartesian)
-        if not any(is_full(self.parts[name], self.width) for name in ("xyz" if self.exact else ["range"])):
-            raise Untraceable(f"not every point has {'coordinates' if self.exact else 'a range'} of its own")
+        if not any(
+            is_full(self.parts[name], self.width) for name in ("xyz" if self.exact else ["range"])
+        ):
+            raise Untraceable(
+                f"not every point has {'coordinates' if self.exact else 'a range'} of its own"
+            )
         self.positive = list[Node]()
         named = {name: part for name, part in parts_of(result).items() if isinstance(part, Along)}
-        expressions = self._by_coordinates(given) if self.exact else self._by_direction(given, named)
+        expressions = (
+            self._by_coordinates(given) if self.exact else self._by_direction(given, named)
+        )
         intensity = given.get("intensity")
         if intensity is not None:
-            expressions["intensity"] = np.nan_to_num(intensity) if self._may_be_nan(intensity) else intensity
-        expressions |= {name: self.parts[name] for name, kind in self.extra.items() if kind.dtype == np.float32}
-        self.sent = {name: leaf for name, kind in self.extra.items() if (leaf := self._sent(self.parts[name], kind.dtype)) is not None}
+            expressions["intensity"] = (
+                np.nan_to_num(intensity) if self._may_be_nan(intensity) else intensity
+            )
+        expressions |= {
+            name: self.parts[name] for name, kind in self.extra.items() if kind.dtype == np.float32
+        }
+        self.sent = {
+            name: leaf
+            for name, kind in self.extra.items()
+            if (leaf := self._sent(self.parts[name], kind.dtype)) is not None
+        }
         expressions |= {name: self.parts[name] for name in self.sent}
         self.expressions = {name: graph.node_of(value) for name, value in expressions.items()}
 
@@ -130,71 +163,137 @@ class Plan:
 
     @cached_property
     def floats(self) -> list[Node]:
-        """The floating-point fields whose values have to be of moderate size, or the plan does not hold."""
-        return [] if self.exact else self._floats_of(*(part for name, part in self.parts.items() if not self.is_exact(name)))
+        """The floating-point fields whose values have to be of moderate size, or the plan does not
+        hold.
+        """
+        return (
+            []
+            if self.exact
+            else self._floats_of(
+                *(part for name, part in self.parts.items() if not self.is_exact(name))
+            )
+        )
 
     def is_exact(self, name: str) -> bool:
         """Whether a column is computed in float64 as it is written, and rounded then."""
         return self.exact or name == "intensity" or name in self.extra
 
     def _sent(self, part: Any, dtype: np.dtype[Any]) -> Leaf | None:
-        """The place of the field that a further column is, where each point has its own; None where it is none, or of another type."""
-        leaf = self.layout.leaves.get(part.path) if isinstance(part, Node) and part.kind == "field" else None
-        if leaf is None or not is_full(part, self.width) or leaf.info.scaled or leaf.info.kind != "int":
+        """The place of the field that a further column is, where each point has its own; None where
+        it is none, or of another type.
+        """
+        leaf = (
+            self.layout.leaves.get(part.path)
+            if isinstance(part, Node) and part.kind == "field"
+            else None
+        )
+        if (
+            leaf is None
+            or not is_full(part, self.width)
+            or leaf.info.scaled
+            or leaf.info.kind != "int"
+        ):
             return None
-        return leaf if leaf.info.dtype == dtype and len(leaf.shape) == len(leaf.strides) and dtype.itemsize <= 4 else None
+        return (
+            leaf
+            if leaf.info.dtype == dtype
+            and len(leaf.shape) == len(leaf.strides)
+            and dtype.itemsize <= 4
+            else None
+        )
 
     def _floats_of(self, *values: Any) -> list[Node]:
         """The floating-point fields that values are made of."""
-        return [node for node in graph.traverse(*values) if node.kind == "field" and self._schema.fields[node.path].kind == "float"]
+        return [
+            node
+            for node in graph.traverse(*values)
+            if node.kind == "field" and self._schema.fields[node.path].kind == "float"
+        ]
 
     def _may_be_nan(self, value: Any) -> bool:
-        return isinstance(value, Traced) and (bool(self._floats_of(value)) or not is_number(value.node, self.layout.leaves))
+        return isinstance(value, Traced) and (
+            bool(self._floats_of(value)) or not is_number(value.node, self.layout.leaves)
+        )
 
     @cached_property
     def eager(self) -> list[Node]:
-        """What has to be computed for every batch: whatever remembers something between batches, and what that needs."""
+        """What has to be computed for every batch: whatever remembers something between batches,
+        and what that needs.
+        """
         wanted = [node for node in self.tape.nodes if node.kind in REMEMBERING]
         wanted += [node for node, _ in self.tape.steps] + self.positive
         return sorted(graph.traverse(*wanted), key=lambda node: node.number)
 
     def _by_direction(self, given: Mapping[str, Any], named: Mapping[str, Along]) -> dict[str, Any]:
-        """The columns that back ends make, of the parts of `Polar`; `named`: those that say along which arrays they are."""
+        """The columns that back ends make, of the parts of `Polar`; `named`: those that say along
+        which arrays they are.
+        """
         distance = marked(self._distance(given["range"]), given["invalid"])
-        azimuth, elevation, *origin = (named.get(name, given[name]) for name in ("azimuth", "elevation", "ox", "oy", "oz"))
+        azimuth, elevation, *origin = (
+            named.get(name, given[name]) for name in ("azimuth", "elevation", "ox", "oy", "oz")
+        )
         places = coordinates(distance, azimuth, elevation, origin)
-        columns = {"range": shown_range(given["range"], given["invalid"]), "azimuth": given["azimuth"]}
+        columns = {
+            "range": shown_range(given["range"], given["invalid"]),
+            "azimuth": given["azimuth"],
+        }
         return dict(zip("xyz", places, strict=True)) | columns
 
     def _by_coordinates(self, given: Mapping[str, Any]) -> dict[str, Any]:
         """The columns that back ends make, of the parts of `Cartesian`."""
         places = given["x"], given["y"], given["z"]
         measured, azimuth, elevation = direction_of(*places)
-        columns = {"range": shown_range(measured, given["invalid"]), "azimuth": azimuth, "elevation": elevation}
+        columns = {
+            "range": shown_range(measured, given["invalid"]),
+            "azimuth": azimuth,
+            "elevation": elevation,
+        }
         return dict(zip("xyz", placed(places, given["invalid"]), strict=True)) | columns
 
     def _distance(self, measured: Traced) -> Any:
-        """The distance of a return, nan where there is none; where a low value only scales it, that value has to be positive."""
+        """The distance of a return, nan where there is none; where a low value only scales it, that
+        value has to be positive.
+        """
         node = measured.node
         if only_field(node) is None and node.kind == "call" and node.function is np.multiply:
             for full, low in (node.args, node.args[::-1]):
-                if is_full(full, self.width) and only_field(full) is not None and isinstance(low, Node) and not is_full(low, self.width):
+                if (
+                    is_full(full, self.width)
+                    and only_field(full) is not None
+                    and isinstance(low, Node)
+                    and not is_full(low, self.width)
+                ):
                     self.positive.append(low)
                     return returned_range(Traced(full, self.tape)) * Traced(low, self.tape)
         return returned_range(measured)
 
     def safe(self, values: Callable[[Node], NDArray[Any]]) -> bool:
-        """Whether all directions are numbers where everything that they are made of is: then a nan marks all coordinates alike."""
-        if not self._may_be_safe or not all(np.isfinite(values(term.low)).all() for term in self._directions if term.low is not None):
+        """Whether all directions are numbers where everything that they are made of is: then a nan
+        marks all coordinates alike.
+        """
+        if not self._may_be_safe or not all(
+            np.isfinite(values(term.low)).all() for term in self._directions if term.low is not None
+        ):
             return False
-        rows = [term.full.args for term in self._directions if term.full is not None and term.full.kind == "rows"]
-        return all((row_numbers(values(index), len(table)) < len(table) - 1).all() for index, table in rows)
+        rows = [
+            term.full.args
+            for term in self._directions
+            if term.full is not None and term.full.kind == "rows"
+        ]
+        return all(
+            (row_numbers(values(index), len(table)) < len(table) - 1).all() for index, table in rows
+        )
 
     @cached_property
     def _may_be_safe(self) -> bool:
         """Whether everything in the directions is a number but for what is known of a batch only."""
-        fixed = all(isinstance(part, Node) or np.isfinite(part).all() for part in self._directions_given)
-        return fixed and all(np.isfinite(term.row).all() and (term.full is None or self._finite(term.full)) for term in self._directions)
+        fixed = all(
+            isinstance(part, Node) or np.isfinite(part).all() for part in self._directions_given
+        )
+        return fixed and all(
+            np.isfinite(term.row).all() and (term.full is None or self._finite(term.full))
+            for term in self._directions
+        )
 
     @cached_property
     def _directions(self) -> list[graph.Term]:
@@ -215,11 +314,15 @@ class Plan:
             return bool(np.isfinite(node.args[1][:-1]).all())
         options = graph.chosen(node, self.width)
         if options is not None:
-            return all(self._finite(option) if isinstance(option, Node) else bool(np.isfinite(option)) for option in options[1:])
+            return all(
+                self._finite(option) if isinstance(option, Node) else bool(np.isfinite(option))
+                for option in options[1:]
+            )
         return is_number(node, self.layout.leaves)
 
 
-#: tables by what they are of, shared by the plans of a `points` function, which several sensors may have: a field is told by its info.
+#: tables by what they are of, shared by the plans of a `points` function, which several sensors may
+#: have: a field is told by its info.
 _TABLES: WeakKeyDictionary[PointsFunction, dict[Any, NDArray[Any]]] = WeakKeyDictionary()
 
 

@@ -1,8 +1,10 @@
-"""Fields by the one or two bytes that they stand in: their windows, and what expressions of one field come to for all that these can hold.
+"""Fields by the one or two bytes that they stand in: their windows, and what expressions of one
+field come to for all that these can hold.
 
-An expression of one such field is a table of at most 65,536 entries by the raw value of its window, made by evaluating the expression for
-every value: byte order, bits, scale, "0 is no return", sines and cosines then cost nothing while decoding, and need no rule each. Both
-compilers of points use these tables, and the plan asks them whether an expression can be anything but a number.
+An expression of one such field is a table of at most 65,536 entries by the raw value of its window,
+made by evaluating the expression for every value: byte order, bits, scale, "0 is no return", sines
+and cosines then cost nothing while decoding, and need no rule each. Both compilers of points use
+these tables, and the plan asks them whether an expression can be anything but a number.
 
 Text and other wire forms (M4) have no windows of their own: their slots do.
 """
@@ -20,8 +22,20 @@ from lidarspec.expressions.graph import Expression, Node, is_nan_where, only_fie
 from lidarspec.frames.layout import Layout, Leaf
 from lidarspec.points.conventions import returned_range
 
-#: what costs hardly more than looking its result up; with these, whatever is made of numbers stays a number.
-CHEAP: set[Any] = {np.add, np.subtract, np.multiply, np.negative, np.positive, np.absolute, np.deg2rad, np.radians, np.minimum, np.maximum}
+#: what costs hardly more than looking its result up; with these, whatever is made of numbers stays
+#: a number.
+CHEAP: set[Any] = {
+    np.add,
+    np.subtract,
+    np.multiply,
+    np.negative,
+    np.positive,
+    np.absolute,
+    np.deg2rad,
+    np.radians,
+    np.minimum,
+    np.maximum,
+}
 CHEAP |= {np.less, np.less_equal, np.greater, np.greater_equal, np.equal, np.not_equal, np.where}
 #: bits of whole numbers whose multiples by a step, in float32, are told apart.
 SHORT = 21
@@ -31,7 +45,9 @@ _DIVISIONS = {np.true_divide, np.mod}
 
 @dataclass(frozen=True)
 class Window:
-    """The bytes of a field in its element: from `offset` of the frame, `size` bytes, little-endian; 1 or 2 to look up by."""
+    """The bytes of a field in its element: from `offset` of the frame, `size` bytes, little-endian;
+    1 or 2 to look up by.
+    """
 
     offset: int
     size: int
@@ -43,9 +59,15 @@ class Window:
 
 
 def window(leaf: Leaf) -> Window | None:
-    """The window of a field; None where it takes more than two bytes, or stands inside a bit block as an array."""
+    """The window of a field; None where it takes more than two bytes, or stands inside a bit block
+    as an array.
+    """
     if leaf.wire is not None:
-        return Window(leaf.offset, leaf.wire.itemsize) if leaf.wire.itemsize <= 2 and leaf.wire.kind in "iu" else None
+        return (
+            Window(leaf.offset, leaf.wire.itemsize)
+            if leaf.wire.itemsize <= 2 and leaf.wire.kind in "iu"
+            else None
+        )
     if len(leaf.shape) > len(leaf.strides):
         return None
     start, stop = leaf.held
@@ -63,7 +85,9 @@ def raw_values(leaf: Leaf, seen: Window) -> NDArray[Any]:
 
 
 def shift_of(leaf: Leaf, seen: Window) -> tuple[int, int] | None:
-    """By how much a window is shifted right, and what is masked then, to give the raw value of a field; None where that is not all."""
+    """By how much a window is shifted right, and what is masked then, to give the raw value of a
+    field; None where that is not all.
+    """
     raw = raw_values(leaf, seen).astype(np.int64)
     ones = np.flatnonzero(raw[1 << np.arange(8 * seen.size)] == 1)
     if not len(ones):
@@ -73,30 +97,54 @@ def shift_of(leaf: Leaf, seen: Window) -> tuple[int, int] | None:
 
 
 def run_of(leaf: Leaf) -> tuple[str, int, int, int] | None:
-    """Byte order, first byte, number of bytes, and lowest bit of a field of unsigned bits in a row of up to four bytes; None for others."""
+    """Byte order, first byte, number of bytes, and lowest bit of a field of unsigned bits in a row
+    of up to four bytes; None for others.
+    """
     if len(leaf.shape) > len(leaf.strides):
         return None
     if leaf.wire is not None:
         is_whole = leaf.wire.kind == "u" and leaf.size <= 4
-        return (">" if leaf.wire.byteorder == ">" else "<", leaf.offset, leaf.size, 0) if is_whole else None
+        return (
+            (">" if leaf.wire.byteorder == ">" else "<", leaf.offset, leaf.size, 0)
+            if is_whole
+            else None
+        )
     run = None if len(leaf.elements) != 1 or leaf.elements[0].signed else leaf.elements[0].run
     return None if run is None or run[2] > 4 else (run[0], leaf.offset + run[1], run[2], run[3])
 
 
 def word_of(leaf: Leaf, layout: Layout) -> tuple[int, int, int] | None:
-    """Which four bytes of its element a field stands in, as a little-endian word: place, shift and mask; None where there are no such."""
+    """Which four bytes of its element a field stands in, as a little-endian word: place, shift and
+    mask; None where there are no such.
+    """
     run = run_of(leaf)
     if run is None or (run[0] == ">" and run[2] > 1) or not leaf.strides or leaf.strides[-1] % 4:
         return None
-    beside = [other for other in layout.leaves.values() if (other.info.axes, other.shape) == (leaf.info.axes, leaf.shape)]
+    beside = [
+        other
+        for other in layout.leaves.values()
+        if (other.info.axes, other.shape) == (leaf.info.axes, leaf.shape)
+    ]
     _, first, count, lowest = run
     start = first - (first - min(other.offset for other in beside)) % 4
-    last = start + sum((length - 1) * stride for length, stride in zip(leaf.shape, leaf.strides, strict=True)) + 4
-    return (start, 8 * (first - start) + lowest, (1 << leaf.info.bits) - 1) if first + count <= start + 4 and last <= layout.size else None
+    last = (
+        start
+        + sum(
+            (length - 1) * stride for length, stride in zip(leaf.shape, leaf.strides, strict=True)
+        )
+        + 4
+    )
+    return (
+        (start, 8 * (first - start) + lowest, (1 << leaf.info.bits) - 1)
+        if first + count <= start + 4 and last <= layout.size
+        else None
+    )
 
 
 def every_value(node: Node, leaf: Leaf) -> NDArray[Any] | None:
-    """An expression of one field for every value of the field's window, (256,) or (65536,); None where it has no window."""
+    """An expression of one field for every value of the field's window, (256,) or (65536,); None
+    where it has no window.
+    """
     seen = window(leaf)
     if seen is None:
         return None
@@ -105,14 +153,18 @@ def every_value(node: Node, leaf: Leaf) -> NDArray[Any] | None:
 
 
 def possible(node: Node, leaves: Mapping[str, Leaf]) -> NDArray[Any] | None:
-    """All values that an expression can have, whatever the bytes are: (256,) or (65536,); None where it is not of one such field."""
+    """All values that an expression can have, whatever the bytes are: (256,) or (65536,); None
+    where it is not of one such field.
+    """
     source = only_field(node)
     leaf = leaves.get(source.path) if source is not None else None
     return every_value(node, leaf) if leaf is not None else None
 
 
 def is_number(value: Any, leaves: Any) -> bool:
-    """Whether an expression is finite wherever its fields are: made of some that the layout has, by safe operations."""
+    """Whether an expression is finite wherever its fields are: made of some that the layout has, by
+    safe operations.
+    """
     if not isinstance(value, Node):
         return bool(np.isfinite(value).all())
     if value.kind == "field":
@@ -124,12 +176,19 @@ def is_number(value: Any, leaves: Any) -> bool:
         return bool(np.isfinite(found).all())
     if value.function in _DIVISIONS:
         divisor = value.args[1]
-        return not isinstance(divisor, Node) and bool(np.all(divisor)) and is_number(value.args[0], leaves)
-    return (value.function in CHEAP or value.function in (np.sin, np.cos)) and all(is_number(arg, leaves) for arg in value.args)
+        return (
+            not isinstance(divisor, Node)
+            and bool(np.all(divisor))
+            and is_number(value.args[0], leaves)
+        )
+    return (value.function in CHEAP or value.function in (np.sin, np.cos)) and all(
+        is_number(arg, leaves) for arg in value.args
+    )
 
 
 class Beam(NamedTuple):
-    """A coordinate of points along beams: a measured distance times a row of a table, and the row of another where the beams start.
+    """A coordinate of points along beams: a measured distance times a row of a table, and the row
+    of another where the beams start.
 
     Attributes:
         distance: as the sensor sent it, in such steps of metres; or nan.
@@ -143,11 +202,17 @@ class Beam(NamedTuple):
 
 
 def beam_of(node: Node, leaves: Mapping[str, Leaf]) -> Beam | None:
-    """The beam that a sum goes along; None where it is another sum, or float32 does not tell apart the steps of the distance."""
+    """The beam that a sum goes along; None where it is another sum, or float32 does not tell apart
+    the steps of the distance.
+    """
     if node.function is not np.add or not all(isinstance(arg, Node) for arg in node.args):
         return None
     product, start = node.args
-    if product.function is not np.multiply or start.kind != "rows" or not all(isinstance(arg, Node) for arg in product.args):
+    if (
+        product.function is not np.multiply
+        or start.kind != "rows"
+        or not all(isinstance(arg, Node) for arg in product.args)
+    ):
         return None
     distance, direction = product.args
     field = distance

@@ -1,9 +1,11 @@
-"""A file that grows by whole records, written by a thread of its own, so that a slow disk holds up no capture.
+"""A file that grows by whole records, written by a thread of its own, so that a slow disk holds up
+no capture.
 
 A file that is overwritten stays until the new one has its first record.
 
-What is put in waits in memory. The thread writes it out every 0.2 s or 64 KiB, and has it put on the disk every second. Short
-writes are gone on with; what a full disk takes of a record that it does not take whole is cut off again.
+What is put in waits in memory. The thread writes it out every 0.2 s or 64 KiB, and has it put on
+the disk every second. Short writes are gone on with; what a full disk takes of a record that it
+does not take whole is cut off again.
 """
 
 from __future__ import annotations
@@ -38,7 +40,8 @@ class RecordFile:
     """A new file, opened at once; one that it is to replace stays in its place until `settle`.
 
     Args:
-        size_at: how long records are, since a piece of the file may be cut behind each; None where it may be anywhere.
+        size_at: how long records are, since a piece of the file may be cut behind each; None where
+            it may be anywhere.
 
     Raises:
         UsageError: where it exists, and is not to be overwritten.
@@ -47,7 +50,9 @@ class RecordFile:
 
     def __init__(self, path: str, size_at: Size | None, *, overwrite: bool) -> None:
         self._place = Path(os.path.realpath(path))
-        self.replaces = overwrite and self._place.is_file() and os.name != "nt"  # where open files keep their names
+        self.replaces = (
+            overwrite and self._place.is_file() and os.name != "nt"
+        )  # where open files keep their names
         self._opened = self._place
         if self.replaces:
             remove_abandoned(self._place)
@@ -55,7 +60,9 @@ class RecordFile:
         try:
             self._file = open(self._opened, "wb" if overwrite else "xb", buffering=0)  # noqa: SIM115  closed by `close`
         except FileExistsError:
-            raise UsageError(f"{path} exists already; it is not overwritten unless asked for") from None
+            raise UsageError(
+                f"{path} exists already; it is not overwritten unless asked for"
+            ) from None
         except OSError as error:
             raise SourceError(f"{path}: {failure_reason(path, error)}") from None
         self.size, self._size_at = 0, size_at
@@ -84,7 +91,9 @@ class RecordFile:
     def _whole(self, records: bytes | bytearray, limit: int) -> int:
         """The bytes of those records that end within the limit."""
         end = limit if self._size_at is None else 0
-        while self._size_at is not None and 0 < (size := self._size_at(records, end)) <= limit - end:
+        while (
+            self._size_at is not None and 0 < (size := self._size_at(records, end)) <= limit - end
+        ):
             end += size
         return end
 
@@ -112,7 +121,9 @@ class RecordFile:
                 raise
 
     def close(self) -> None:
-        """Close the file; without `settle`, the one that it was to replace stays, and this one is gone."""
+        """Close the file; without `settle`, the one that it was to replace stays, and this one is
+        gone.
+        """
         with contextlib.suppress(OSError):
             self._file.close()
             if not self.is_settled:
@@ -133,7 +144,9 @@ class Log(Protocol):
         """Take what was received, or sent, with its arrival time."""
 
     def event(self, name: str, at: int | None = None, **details: Any) -> None:
-        """Take down what happened to the line, such as "disconnect" or "reconnect"; now, unless `at` says when."""
+        """Take down what happened to the line, such as "disconnect" or "reconnect"; now, unless
+        `at` says when.
+        """
 
     def close(self) -> None:
         """End it.
@@ -144,10 +157,12 @@ class Log(Protocol):
 
 
 class Appender:
-    """Takes records for a file, from any thread, and is a context manager; kinds of recordings are made of it.
+    """Takes records for a file, from any thread, and is a context manager; kinds of recordings are
+    made of it.
 
-    Nothing that goes wrong with the file is raised while records are taken: the capture goes on. It is kept in `error`, and
-    raised once, by the next `sync` or by `close`; the file is then valid to its last whole record.
+    Nothing that goes wrong with the file is raised while records are taken: the capture goes on. It
+    is kept in `error`, and raised once, by the next `sync` or by `close`; the file is then valid to
+    its last whole record.
 
     Args:
         path, size_at, overwrite: as in `RecordFile`.
@@ -163,7 +178,11 @@ class Appender:
         self.error: SourceError | None = None
         self._changed, self._waiting = threading.Condition(), bytearray()
         self._untold, self._raised, self._closing = 0, False, False
-        self._taken, self._asked, self._kept = 0, 0, 0  # pieces: in memory or further, asked to be on the disk, and there
+        self._taken, self._asked, self._kept = (
+            0,
+            0,
+            0,
+        )  # pieces: in memory or further, asked to be on the disk, and there
         self._file = RecordFile(self.path, size_at, overwrite=overwrite)
         self._thread = threading.Thread(target=self._work, name=f"recorder of {path}", daemon=True)
         self._thread.start()
@@ -185,8 +204,12 @@ class Appender:
         with self._changed:
             target = self._asked = self._taken
             self._changed.notify_all()
-            if not self._changed.wait_for(lambda: self._kept >= target or self.error or not self._thread.is_alive(), PATIENCE):
-                raise SourceTimeout(f"{self.path}: the disk has not taken the recording within {PATIENCE:.0f} s")
+            if not self._changed.wait_for(
+                lambda: self._kept >= target or self.error or not self._thread.is_alive(), PATIENCE
+            ):
+                raise SourceTimeout(
+                    f"{self.path}: the disk has not taken the recording within {PATIENCE:.0f} s"
+                )
         self._complain()
 
     def keep_up(self) -> None:
@@ -208,7 +231,9 @@ class Appender:
         self._complain()
 
     def discard(self) -> bool:
-        """Take away a closed file that got no record; False where one that it was to replace stays in its place."""
+        """Take away a closed file that got no record; False where one that it was to replace stays
+        in its place.
+        """
         if not self._file.replaces:
             with contextlib.suppress(OSError):
                 os.unlink(self.path)
@@ -217,16 +242,26 @@ class Appender:
     def __enter__(self) -> Self:
         return self
 
-    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None) -> None:
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
+    ) -> None:
         self._finish()
         if error is None:
             self._complain()
 
     def __repr__(self) -> str:
-        return f"{type(self).__name__}({self.path}: {self.records} records, {self.bytes} bytes{f'; {self.error}' if self.error else ''})"
+        return (
+            f"{type(self).__name__}({self.path}: {self.records} records, {self.bytes}"
+            f" bytes{f'; {self.error}' if self.error else ''})"
+        )
 
     def _put(self, record: bytes, size: int | None = None) -> None:
-        """Let a record wait for the thread, with so many bytes of the wire in it; what has none is not counted."""
+        """Let a record wait for the thread, with so many bytes of the wire in it; what has none is
+        not counted.
+        """
         with self._changed:
             if self.error or self._closing or len(self._waiting) + len(record) > BACKLOG:
                 self.dropped += 1
@@ -261,12 +296,16 @@ class Appender:
         atexit.unregister(self._finish)
 
     def _work(self) -> None:
-        """The thread: what waits is written, and put on the disk when that is due, until the end or a failure."""
+        """The thread: what waits is written, and put on the disk when that is due, until the end or
+        a failure.
+        """
         try:
             due = time.monotonic() + DISK_SECONDS
             while not (self._closing and not self._waiting and self._kept == self._taken):
                 with self._changed:
-                    self._changed.wait_for(lambda: self._waiting or self._kept < self._taken or self._closing)
+                    self._changed.wait_for(
+                        lambda: self._waiting or self._kept < self._taken or self._closing
+                    )
                     self._changed.wait_for(self._is_urgent, FLUSH_SECONDS)
                     waiting, self._waiting, taken = self._waiting, bytearray(), self._taken
                     asked, is_begun = self._asked > self._kept or self._closing, self.records > 0
@@ -282,7 +321,11 @@ class Appender:
         except Exception as error:
             with self._changed:
                 reason = (error.strerror if isinstance(error, OSError) else None) or error
-                held = f"the recording is whole up to byte {self._file.size}" if self._file.is_settled else "what was there before is kept"
+                held = (
+                    f"the recording is whole up to byte {self._file.size}"
+                    if self._file.is_settled
+                    else "what was there before is kept"
+                )
                 self.error = WriteError(self.path, str(reason), held)
                 self._changed.notify_all()
         finally:

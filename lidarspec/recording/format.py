@@ -1,4 +1,5 @@
-"""The bytes of an .lsr recording: records, each complete in itself, packed and found again; the first says what it is, in JSON.
+"""The bytes of an .lsr recording: records, each complete in itself, packed and found again; the
+first says what it is, in JSON.
 
     offset  size  of a record, little-endian
     0       4     mark b"\xb5LS\x1e"
@@ -11,14 +12,17 @@
     17+a    n     data
     17+a+n  4     CRC-32 (zlib) of everything before
 
-An event is a JSON object, with its name as "event": "disconnect", "reconnect", "dropped" (so many "records"), or "clock": the wall clock
-was set, and is "ahead_ns" ahead of the arrival times, which go on evenly. What a reader does not know it passes over.
+An event is a JSON object, with its name as "event": "disconnect", "reconnect", "dropped" (so many
+"records"), or "clock": the wall clock was set, and is "ahead_ns" ahead of the arrival times, which
+go on evenly. What a reader does not know it passes over.
 
-Theory of operation: a length is at most what its one or two bytes can say, so no record claims more than 66 kB, and none is
-believed before its checksum passes. The reader keeps a window of the file that holds one record and what was read with it. It stops at
-the first damaged record, or salvages what lies behind it; what a killed process leaves behind is whole records and at most one that is
-not. A time is found by bisection (`Recording.seek`): arrival times do not go back, and from anywhere in the file the next mark with a
-good checksum is a record. So no index is kept, which a crash could lose, and every recording can be sought in.
+Theory of operation: a length is at most what its one or two bytes can say, so no record claims more
+than 66 kB, and none is believed before its checksum passes. The reader keeps a window of the file
+that holds one record and what was read with it. It stops at the first damaged record, or salvages
+what lies behind it; what a killed process leaves behind is whole records and at most one that is
+not. A time is found by bisection (`Recording.seek`): arrival times do not go back, and from
+anywhere in the file the next mark with a good checksum is a record. So no index is kept, which a
+crash could lose, and every recording can be sought in.
 """
 
 from __future__ import annotations
@@ -89,26 +93,44 @@ class Header:
     version: int = VERSION
 
     def to_json(self) -> bytes:
-        """The header as it stands in the file; an option that JSON does not know stands as its text."""
-        return json.dumps({item.name: getattr(self, item.name) for item in fields(self)}, default=_plain).encode()
+        """The header as it stands in the file; an option that JSON does not know stands as its
+        text.
+        """
+        return json.dumps(
+            {item.name: getattr(self, item.name) for item in fields(self)}, default=_plain
+        ).encode()
 
     def known_sensor(self, folder: Path) -> Sensor:
-        """The installed sensor that it names, with the options of then, as far as anybody may give them.
+        """The installed sensor that it names, with the options of then, as far as anybody may give
+        them.
 
         Args:
-            folder: where the recording is; of paths in it those alone are opened that lead to a file there.
+            folder: where the recording is; of paths in it those alone are opened that lead to a
+                file there.
 
         Raises:
-            UsageError: where it names none, or one with an option that only the caller should give, such as a file elsewhere.
+            UsageError: where it names none, or one with an option that only the caller should give,
+                such as a file elsewhere.
             UnknownSensor: where that one is not installed.
         """
         if not _ID.fullmatch(self.sensor):
-            raise UsageError(f"its header gives {self.sensor[:40]!r} for the id of a sensor" if self.sensor else "it names no sensor")
+            raise UsageError(
+                f"its header gives {self.sensor[:40]!r} for the id of a sensor"
+                if self.sensor
+                else "it names no sensor"
+            )
         found = named_sensor(self.sensor)
         try:
-            return found.configure(**found.configure.options_of_file(self.options, folder)) if self.options else found
+            return (
+                found.configure(**found.configure.options_of_file(self.options, folder))
+                if self.options
+                else found
+            )
         except UsageError as error:
-            raise UsageError(f"it was recorded with an option that has to be given again, as -s {self.sensor} -O ...: {error}") from None
+            raise UsageError(
+                f"it was recorded with an option that has to be given again, as -s {self.sensor} -O"
+                f" ...: {error}"
+            ) from None
 
 
 _BLANK = Header()
@@ -126,16 +148,26 @@ def read_header(data: bytes) -> Header:
         values = None
     if not isinstance(values, dict):
         raise WireError("the header of the recording is no JSON object", data=data[:16])
-    known = {item.name: values.get(item.name, getattr(_BLANK, item.name)) for item in fields(Header)}
+    known = {
+        item.name: values.get(item.name, getattr(_BLANK, item.name)) for item in fields(Header)
+    }
     for name, value in known.items():
         kind = (int, type(None)) if name == "baud" else type(getattr(_BLANK, name))
         if not isinstance(value, kind) or (isinstance(value, bool) and kind is not bool):
-            raise WireError(f"the header of the recording has {name} = {shown(value)}", path=name, got=value)
+            raise WireError(
+                f"the header of the recording has {name} = {shown(value)}", path=name, got=value
+            )
     return Header(**known)
 
 
 def _plain(value: Any) -> Any:
-    return dict(value) if isinstance(value, Mapping) else value.to_dict() if isinstance(value, Learned) else str(value)
+    return (
+        dict(value)
+        if isinstance(value, Mapping)
+        else value.to_dict()
+        if isinstance(value, Learned)
+        else str(value)
+    )
 
 
 @dataclass(frozen=True, slots=True)
@@ -163,7 +195,13 @@ class Record:
 
 
 def packed(
-    kind: int, data: bytes, at: int | None = None, *, flags: int = 0, sender: Address | None = None, receiver: Address | None = None
+    kind: int,
+    data: bytes,
+    at: int | None = None,
+    *,
+    flags: int = 0,
+    sender: Address | None = None,
+    receiver: Address | None = None,
 ) -> bytes:
     """The bytes of a record.
 
@@ -172,15 +210,22 @@ def packed(
     """
     addresses = _endpoint(sender) + _endpoint(receiver) if sender or receiver else b""
     try:
-        head = _HEAD.pack(MARK, kind, flags, len(addresses), len(data), _UNKNOWN if at is None else at)
+        head = _HEAD.pack(
+            MARK, kind, flags, len(addresses), len(data), _UNKNOWN if at is None else at
+        )
     except struct.error:
-        raise UsageError(f"a record of {len(data)} bytes at {at} ns from {sender} to {receiver}: no record can hold that") from None
+        raise UsageError(
+            f"a record of {len(data)} bytes at {at} ns from {sender} to {receiver}: no record can"
+            " hold that"
+        ) from None
     body = b"".join((head, addresses, data))
     return body + _CRC.pack(zlib.crc32(body))
 
 
 def size_at(buffer: bytes | bytearray | memoryview, start: int = 0) -> int:
-    """The length that a record claims; 0 where its first bytes are not all there, -1 where it is none."""
+    """The length that a record claims; 0 where its first bytes are not all there, -1 where it is
+    none.
+    """
     mark = bytes(buffer[start : start + len(MARK)])
     if mark != MARK[: len(mark)]:
         return -1
@@ -191,20 +236,25 @@ def size_at(buffer: bytes | bytearray | memoryview, start: int = 0) -> int:
 
 
 class Recording(Closing):
-    """A recording, read in order: an iterable of `Record`s that goes on where the last loop stopped, and a context manager.
+    """A recording, read in order: an iterable of `Record`s that goes on where the last loop
+    stopped, and a context manager.
 
     Memory is bounded by a block and a record.
 
     Args:
         path: the file; "-" is standard input.
-        file: it, where it is open already, or is read in another way than as it stands; closed with this one.
-        salvage: look for the next good record behind a damaged place, even the header, instead of stopping there.
+        file: it, where it is open already, or is read in another way than as it stands; closed with
+            this one.
+        salvage: look for the next good record behind a damaged place, even the header, instead of
+            stopping there.
 
     Attributes:
         header: what it says of itself.
         records: good records so far, the header and events among them.
-        damaged: places so far that hold no good record; a record that is not whole at the end is one.
-        leftover: bytes in damaged places; without `salvage` all that are behind the last good record.
+        damaged: places so far that hold no good record; a record that is not whole at the end is
+            one.
+        leftover: bytes in damaged places; without `salvage` all that are behind the last good
+            record.
         is_cut: whether the last damaged place is a record that the file ends in.
         offset: file offset of the next record, or of the damage that ended the reading.
 
@@ -213,7 +263,9 @@ class Recording(Closing):
         WireError: where its header is damaged, and `salvage` is not asked for.
     """
 
-    def __init__(self, path: str | Path, file: BinaryIO | None = None, *, salvage: bool = False) -> None:
+    def __init__(
+        self, path: str | Path, file: BinaryIO | None = None, *, salvage: bool = False
+    ) -> None:
         self.path, self.salvage = str(path), salvage
         self._window, self._place = b"", 0
         self.records = self.damaged = self.leftover = 0
@@ -235,12 +287,14 @@ class Recording(Closing):
         return self._records
 
     def seek(self, at: int) -> bool:
-        """Go on close before the first record that was received at a time, ns since 1970, or later, a few blocks away at most.
+        """Go on close before the first record that was received at a time, ns since 1970, or later,
+        a few blocks away at most.
 
         Damaged places that are passed over are not counted.
 
         Returns:
-            False where that is behind here, where nobody knows when records arrived, and for a pipe: it then goes on where it was.
+            False where that is behind here, where nobody knows when records arrived, and for a
+            pipe: it then goes on where it was.
         """
         here = low = self.offset
         if not self._file.seekable():
@@ -258,7 +312,9 @@ class Recording(Closing):
         return low > here
 
     def _received(self, start: int, stop: int) -> tuple[int, int] | None:
-        """Time and offset of the first record between two places that was received, and when is known."""
+        """Time and offset of the first record between two places that was received, and when is
+        known.
+        """
         self._go(start)
         while self.offset < stop and self._holds(1):
             size, place = self._good(), self._place
@@ -287,11 +343,16 @@ class Recording(Closing):
         if first is not None and first[0] == HEADER:
             self.header = read_header(first[1].data)
             if self.header.version > VERSION:
-                raise SourceError(f"{self.path}: written in format {self.header.version}, and this lidarspec knows {VERSION}")
+                raise SourceError(
+                    f"{self.path}: written in format {self.header.version}, and this lidarspec"
+                    f" knows {VERSION}"
+                )
             return self._known(pairs)
         if not self.salvage:
             damage = WireError(f"{self.path}: the header of the recording is damaged or cut off")
-            raise suggest(damage, f"lidarspec record {quote(str(self.path))} --salvage -o mended.lsr")
+            raise suggest(
+                damage, f"lidarspec record {quote(str(self.path))} --salvage -o mended.lsr"
+            )
         self.header = Header()
         return self._known(itertools.chain([] if first is None else [first], pairs))
 
@@ -322,12 +383,20 @@ class Recording(Closing):
         if size < 0 or self.is_cut:
             return 0
         end = self._place + size - _CRC.size
-        passes = zlib.crc32(self._window[self._place : end]) == _CRC.unpack_from(self._window, end)[0]
+        passes = (
+            zlib.crc32(self._window[self._place : end]) == _CRC.unpack_from(self._window, end)[0]
+        )
         start = self._place + _HEAD.size
-        return size if passes and _endpoints(self._window[start : start + self._window[self._place + 6]]) else 0
+        return (
+            size
+            if passes and _endpoints(self._window[start : start + self._window[self._place + 6]])
+            else 0
+        )
 
     def _holds(self, number: int) -> bool:
-        """Whether so many bytes are in the window from the place on, after reading more where it takes that."""
+        """Whether so many bytes are in the window from the place on, after reading more where it
+        takes that.
+        """
         while len(self._window) - self._place < number:
             block = self._file.read(_BLOCK)
             if not block:
@@ -386,12 +455,17 @@ def _endpoint(address: Address | None) -> bytes:
 
 @lru_cache(maxsize=256)
 def _endpoints(data: bytes) -> list[Address | None] | None:
-    """Sender and receiver as they stand in a record; None where they are not two, or do not fill their place."""
+    """Sender and receiver as they stand in a record; None where they are not two, or do not fill
+    their place.
+    """
     found: list[Address | None] = []
     place = 0
     while len(found) < 2 and place < len(data):
         length = data[place]
-        host, end = data[place + 1 : place + 1 + length].decode("utf-8", "replace"), place + 1 + length + 2 * bool(length)
+        host, end = (
+            data[place + 1 : place + 1 + length].decode("utf-8", "replace"),
+            place + 1 + length + 2 * bool(length),
+        )
         found.append((host, int.from_bytes(data[end - 2 : end], "little")) if length else None)
         place = end
     return (found or [None, None]) if place == len(data) and len(found) != 1 else None

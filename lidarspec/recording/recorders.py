@@ -1,7 +1,9 @@
-"""Recorders: what arrives over a link, and what is sent, taken at the speed of the capture and brought into a file.
+"""Recorders: what arrives over a link, and what is sent, taken at the speed of the capture and
+brought into a file.
 
-The suffix of the file says which: .lsr holds everything, .pcap and .pcapng packets for Wireshark, .bin the bytes alone. All of them grow by
-whole records, which a thread of their own writes (`appending`).
+The suffix of the file says which: .lsr holds everything, .pcap and .pcapng packets for Wireshark,
+.bin the bytes alone. All of them grow by whole records, which a thread of their own writes
+(`appending`).
 """
 
 from __future__ import annotations
@@ -23,7 +25,20 @@ from lidarspec.framing.decoder import Decoder
 from lidarspec.framing.results import Found
 from lidarspec.plugins import registry, sensor as named_sensor
 from lidarspec.recording.appending import Appender, Log
-from lidarspec.recording.format import DATAGRAM, EVENT, GAP, HEADER, LARGEST, MAGIC, QUIET, RECEIVED, SENT, Header, packed, size_at
+from lidarspec.recording.format import (
+    DATAGRAM,
+    EVENT,
+    GAP,
+    HEADER,
+    LARGEST,
+    MAGIC,
+    QUIET,
+    RECEIVED,
+    SENT,
+    Header,
+    packed,
+    size_at,
+)
 from lidarspec.spec.description import Spec
 from lidarspec.spec.links import Udp
 from lidarspec.transports.protocol import Chunk, Transport
@@ -35,7 +50,9 @@ LARGEST_GAP = 1 << 16
 
 @dataclass(frozen=True)
 class MadeFor:
-    """What makes a recorder of the open transport and the sensor, as it is read: configured with what was learned of it."""
+    """What makes a recorder of the open transport and the sensor, as it is read: configured with
+    what was learned of it.
+    """
 
     make: Callable[[Transport, Spec | str | None], Log]
 
@@ -47,8 +64,9 @@ RecordTo = str | Path | Appender | Callable[[Transport], Log] | MadeFor
 class Recorder(Appender):
     """Writes an .lsr recording, from any thread; a context manager.
 
-    Nothing that goes wrong with the file is raised by `write`: the capture goes on. It is kept in `error`, and raised once,
-    by the next `sync` or by `close`; the file is then valid to its last whole record.
+    Nothing that goes wrong with the file is raised by `write`: the capture goes on. It is kept in
+    `error`, and raised once, by the next `sync` or by `close`; the file is then valid to its last
+    whole record.
 
     Args:
         path: the file, new unless `overwrite`.
@@ -64,7 +82,8 @@ class Recorder(Appender):
         error: what went wrong with the file, None where nothing did.
 
     Raises:
-        UsageError: where the file exists, or the sensor is not installed and nothing else says what the link carries.
+        UsageError: where the file exists, or the sensor is not installed and nothing else says what
+            the link carries.
         SourceError: where it cannot be made.
     """
 
@@ -88,15 +107,26 @@ class Recorder(Appender):
             raise
 
     def write(self, chunk: Chunk, direction: Literal["in", "out"] = "in") -> None:
-        """Take what was received or sent, with its arrival time; more than 65,535 bytes of a stream become several records."""
+        """Take what was received or sent, with its arrival time; more than 65,535 bytes of a stream
+        become several records.
+        """
         kind = RECEIVED if direction == "in" else SENT
         for start in range(0, len(chunk.data) or 1, LARGEST):
             data = chunk.data[start : start + LARGEST]
-            flags = DATAGRAM * self.header.datagrams | (GAP * chunk.gap | QUIET * chunk.quiet) * (not start)
-            self._put(packed(kind, data, chunk.at, flags=flags, sender=chunk.sender, receiver=chunk.receiver), len(data))
+            flags = DATAGRAM * self.header.datagrams | (GAP * chunk.gap | QUIET * chunk.quiet) * (
+                not start
+            )
+            self._put(
+                packed(
+                    kind, data, chunk.at, flags=flags, sender=chunk.sender, receiver=chunk.receiver
+                ),
+                len(data),
+            )
 
     def event(self, name: str, at: int | None = None, **details: Any) -> None:
-        """Take down what happened to the line, such as "disconnect" or "reconnect"; now, unless `at` says when."""
+        """Take down what happened to the line, such as "disconnect" or "reconnect"; now, unless
+        `at` says when.
+        """
         self._put(_event(name, time.time_ns() if at is None else at, details))
 
     def _told(self, dropped: int) -> bytes:
@@ -118,13 +148,16 @@ class PcapRecorder(Appender):
         self._put(self._writing.head(ETHERNET))
 
     def write(self, chunk: Chunk, direction: Literal["in", "out"] = "in") -> None:
-        """Take a datagram that was received; one that was sent is none of the sensor's, and is left out.
+        """Take a datagram that was received; one that was sent is none of the sensor's, and is left
+        out.
 
         Raises:
             UsageError: for addresses that are none.
         """
         if direction == "in":
-            datagram = Datagram(chunk.data, chunk.at or 0, chunk.sender or NOBODY, chunk.receiver or self._receiver)
+            datagram = Datagram(
+                chunk.data, chunk.at or 0, chunk.sender or NOBODY, chunk.receiver or self._receiver
+            )
             self._put(self._writing.record(datagram_frame(datagram), datagram.at), len(chunk.data))
 
 
@@ -235,17 +268,31 @@ def recorder(
     suffix = check_suffix(path)
     if suffix in WRITINGS and not datagrams:
         if not sensor:
-            raise UsageError(f"{path}: a capture of a byte stream has a packet for each frame: name the sensor with -s, or record an .lsr")
-        return FrameRecorder(path, sensor if isinstance(sensor, Spec) else named_sensor(sensor), overwrite=overwrite)
+            raise UsageError(
+                f"{path}: a capture of a byte stream has a packet for each frame: name the sensor"
+                " with -s, or record an .lsr"
+            )
+        return FrameRecorder(
+            path, sensor if isinstance(sensor, Spec) else named_sensor(sensor), overwrite=overwrite
+        )
     if suffix == ".bin" and datagrams:
-        raise UsageError(f"{path}: bytes alone do not say where a datagram ends: record datagrams in an .lsr or .pcap file")
+        raise UsageError(
+            f"{path}: bytes alone do not say where a datagram ends: record datagrams in an .lsr or"
+            " .pcap file"
+        )
     if suffix == ".lsr":
         return Recorder(path, sensor, source, datagrams=datagrams, baud=baud, overwrite=overwrite)
     port = declared_port(sensor if isinstance(sensor, Spec) else None)
-    return PcapRecorder(path, port=port, overwrite=overwrite) if suffix in WRITINGS else RawRecorder(path, overwrite=overwrite)
+    return (
+        PcapRecorder(path, port=port, overwrite=overwrite)
+        if suffix in WRITINGS
+        else RawRecorder(path, overwrite=overwrite)
+    )
 
 
-def recorder_for(target: RecordTo, sensor: Spec | str | None, source: str | Path, opened: Transport) -> tuple[Log, bool]:
+def recorder_for(
+    target: RecordTo, sensor: Spec | str | None, source: str | Path, opened: Transport
+) -> tuple[Log, bool]:
     """The recorder that a caller asks for, and whether it was made here, and has to be closed here."""
     if isinstance(target, str | Path):
         return recorder(target, sensor, source, datagrams=opened.datagrams, baud=opened.baud), True
@@ -254,10 +301,22 @@ def recorder_for(target: RecordTo, sensor: Spec | str | None, source: str | Path
     return target.make(opened, sensor) if isinstance(target, MadeFor) else target(opened), True
 
 
-def _header(sensor: Spec | str | None, source: str, *, datagrams: bool | None, baud: int | None) -> Header:
-    known = named_sensor(sensor) if isinstance(sensor, str) and sensor and datagrams is None else sensor
-    name, options, link = (known.id, dict(known.options), known.datagrams) if isinstance(known, Spec) else (known or "", {}, False)
-    homes = {plugin.distribution: plugin.version for plugin in registry().plugins if name in plugin.sensors}
+def _header(
+    sensor: Spec | str | None, source: str, *, datagrams: bool | None, baud: int | None
+) -> Header:
+    known = (
+        named_sensor(sensor) if isinstance(sensor, str) and sensor and datagrams is None else sensor
+    )
+    name, options, link = (
+        (known.id, dict(known.options), known.datagrams)
+        if isinstance(known, Spec)
+        else (known or "", {}, False)
+    )
+    homes = {
+        plugin.distribution: plugin.version
+        for plugin in registry().plugins
+        if name in plugin.sensors
+    }
     return Header(
         sensor=name,
         options=options,
@@ -276,5 +335,7 @@ def _event(name: str, at: int, details: dict[str, Any]) -> bytes:
 
 
 def _record_size(data: bytes | bytearray, at: int) -> int:
-    """The length of the record that begins there in a piece of a recording, or of the magic bytes, which the first piece begins with."""
+    """The length of the record that begins there in a piece of a recording, or of the magic bytes,
+    which the first piece begins with.
+    """
     return len(MAGIC) if data.startswith(MAGIC, at) else size_at(data, at)

@@ -1,4 +1,5 @@
-"""Scans: one revolution or frame period each, cut out of the points of a stream by the sensor's declared rule.
+"""Scans: one revolution or frame period each, cut out of the points of a stream by the sensor's
+declared rule.
 
 In: batches of packets. Out: `Scan`, and `LaserScan` with ROS's names. Modules in reading order:
 

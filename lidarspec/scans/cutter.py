@@ -1,4 +1,6 @@
-"""Where one scan ends and the next begins, by the sensor's declared rule; remembers the value before each batch."""
+"""Where one scan ends and the next begins, by the sensor's declared rule; remembers the value
+before each batch.
+"""
 
 from __future__ import annotations
 
@@ -17,12 +19,14 @@ from lidarspec.points.plain import Evaluated
 from lidarspec.spec.description import Spec
 from lidarspec.spec.timing import Every, OnChange, OnFlag, OnJump, OnRewind, OnWrap, Split
 
-#: an angle has to have been this part of a turn away from the cut before it cuts again, so that jitter does not.
+#: an angle has to have been this part of a turn away from the cut before it cuts again, so that
+#: jitter does not.
 AWAY = 1 / 8
 
 
 class Turning:
-    """Which way an angle turns: the way of the last half turn, and at the start of what it has turned so far.
+    """Which way an angle turns: the way of the last half turn, and at the start of what it has
+    turned so far.
 
     Each step is judged by those before it alone, so that batches do not change where scans are cut.
     """
@@ -31,7 +35,9 @@ class Turning:
         self._direction, self._total, self._furthest = 0, 0.0, 0.0
 
     def push(self, steps: NDArray[np.float64]) -> NDArray[np.float64]:
-        """1 or -1 for each of the next steps, (k,), given in turns; of length 1 where it is the same for all."""
+        """1 or -1 for each of the next steps, (k,), given in turns; of length 1 where it is the
+        same for all.
+        """
         totals = steps.copy()
         totals[:1] += self._total
         np.cumsum(totals, out=totals)
@@ -70,8 +76,13 @@ class Turning:
         return np.array([float(first or 1)]) if found is None else found[:1]
 
     def _only_ahead(self, total: float, steps: NDArray[np.float64]) -> bool:
-        """Whether the angle has come further than ever with this total, and all steps after it go on the same way."""
-        if self._direction * total < self._furthest or float((self._direction * steps).min(initial=0.0)) < 0:
+        """Whether the angle has come further than ever with this total, and all steps after it go
+        on the same way.
+        """
+        if (
+            self._direction * total < self._furthest
+            or float((self._direction * steps).min(initial=0.0)) < 0
+        ):
             return False
         self._furthest = self._direction * self._total
         return True
@@ -82,8 +93,10 @@ class End(NamedTuple):
 
     Attributes:
         point: the index in its batch of the point before which it ends.
-        packet: the one that says so, which may be without points; None where it is the point that does.
-        leaps: whether the angle leaps by more than `AWAY`, and twice as far as at the end before: something is missing there, or no angle.
+        packet: the one that says so, which may be without points; None where it is the point that
+            does.
+        leaps: whether the angle leaps by more than `AWAY`, and twice as far as at the end before:
+            something is missing there, or no angle.
     """
 
     point: int
@@ -113,14 +126,20 @@ class Cutter:
         """The ends in this batch, ascending."""
         rule, steps = self._rule, None
         if self.sector is not None:
-            return self._ends_at(packets, found, self.sector.middle if self._cut is None else self._cut)
+            return self._ends_at(
+                packets, found, self.sector.middle if self._cut is None else self._cut
+            )
         if self._cut is not None and isinstance(rule, OnChange):
             return self._ends_at(packets, found, self._cut)
         if isinstance(rule, Every):
             which = self._periods(rule, packets, found)
             return self._ends(first_points(found)[which], which)
         if isinstance(rule, OnWrap) and rule.name in COLUMNS:
-            points, steps = self._wraps(np.asarray(getattr(found.cloud, rule.name), np.float64), 2 * np.pi, self._at(rule, 2 * np.pi))
+            points, steps = self._wraps(
+                np.asarray(getattr(found.cloud, rule.name), np.float64),
+                2 * np.pi,
+                self._at(rule, 2 * np.pi),
+            )
             return self._ends(points, steps=steps)
         path = _own_path(packets, rule.name)
         column = _field(found, path)
@@ -129,8 +148,12 @@ class Cutter:
             full = _turn(packets, path) or 2 * np.pi
             rows, steps = self._wraps(values, full, self._at(rule, full))
         else:
-            rows = self._changes(rule, values, _turn(packets, path) if isinstance(rule, OnJump) else None)
-        return self._ends(starts[rows], rows if all(name is None for name in column.axes) else None, steps)
+            rows = self._changes(
+                rule, values, _turn(packets, path) if isinstance(rule, OnJump) else None
+            )
+        return self._ends(
+            starts[rows], rows if all(name is None for name in column.axes) else None, steps
+        )
 
     def _at(self, rule: OnWrap, full: float) -> float:
         """Return the angle at which scans are cut, in the unit in which a turn is `full`."""
@@ -178,7 +201,10 @@ class Cutter:
         return self._ends(starts[picked], picked if rows_are_packets else None)
 
     def _ends(
-        self, points: NDArray[np.intp], packets: NDArray[np.intp] | None = None, steps: NDArray[np.float64] | None = None
+        self,
+        points: NDArray[np.intp],
+        packets: NDArray[np.intp] | None = None,
+        steps: NDArray[np.float64] | None = None,
     ) -> list[End]:
         """The ends at some points; `steps`: by how much of a turn the angle goes on at each."""
         which = itertools.repeat(None) if packets is None else packets.tolist()
@@ -189,7 +215,12 @@ class Cutter:
         before, self._leap = self._leap, step
         return before > 0 and step > max(AWAY, 2 * before)
 
-    def _changes(self, rule: OnFlag | OnChange | OnJump | OnRewind, values: NDArray[np.float64], full: float | None) -> NDArray[np.intp]:
+    def _changes(
+        self,
+        rule: OnFlag | OnChange | OnJump | OnRewind,
+        values: NDArray[np.float64],
+        full: float | None,
+    ) -> NDArray[np.intp]:
         if isinstance(rule, OnFlag):
             return np.flatnonzero(values != 0 if rule.value is None else values == rule.value)
         if not len(values):
@@ -197,12 +228,20 @@ class Cutter:
         before = _before(values, self._before)
         self._before = float(values[-1])
         if isinstance(rule, OnJump):
-            steps = values - before if full is None else _folded(values - before + full / 2, full) - full / 2
+            steps = (
+                values - before
+                if full is None
+                else _folded(values - before + full / 2, full) - full / 2
+            )
             return np.flatnonzero(np.abs(steps) > rule.by)
         return np.flatnonzero(values < before if isinstance(rule, OnRewind) else values != before)
 
-    def _wraps(self, angles: NDArray[np.float64], full: float, at: float) -> tuple[NDArray[np.intp], NDArray[np.float64]]:
-        """Places where the angle has gone on past `at`, in whichever direction the sensor turns; and by how much of a turn at each."""
+    def _wraps(
+        self, angles: NDArray[np.float64], full: float, at: float
+    ) -> tuple[NDArray[np.intp], NDArray[np.float64]]:
+        """Places where the angle has gone on past `at`, in whichever direction the sensor turns;
+        and by how much of a turn at each.
+        """
         finite = np.isfinite(angles)
         known = None if finite.all() else np.flatnonzero(finite)
         values = angles if known is None else angles[known]
@@ -210,7 +249,9 @@ class Cutter:
             return np.empty(0, np.intp), np.empty(0)
         before = _before(values, self._before)
         self._before = float(values[-1])
-        direction = self._turning.push((_folded(values - before + full / 2, full) - full / 2) / full)
+        direction = self._turning.push(
+            (_folded(values - before + full / 2, full) - full / 2) / full
+        )
         if len(direction) == 1:
             turned = _folded(direction * (values - at), full)
             earlier = _before(turned, float(_folded(direction * (before[:1] - at), full)[0]))
@@ -220,7 +261,9 @@ class Cutter:
         found = np.array(self._armed_at(passed, turned, full), np.intp)
         return found if known is None else known[found], 1 - (earlier[found] - turned[found]) / full
 
-    def _armed_at(self, passed: NDArray[np.intp], turned: NDArray[np.float64], full: float) -> list[int]:
+    def _armed_at(
+        self, passed: NDArray[np.intp], turned: NDArray[np.float64], full: float
+    ) -> list[int]:
         """The places, of those where an angle passes, that come after it was far away."""
         found: list[int] = []
         since = 0
@@ -252,7 +295,13 @@ def _turn(packets: Packets, path: str) -> float | None:
 def _own_path(packets: Packets, path: str) -> str:
     """The path of a field of the frame as packets that are parts of it have it."""
     _, _, parts = packets.frame.partition(".")
-    return path if not parts else path.removeprefix(f"{parts}.") if path.startswith(f"{parts}.") else f"frame.{path}"
+    return (
+        path
+        if not parts
+        else path.removeprefix(f"{parts}.")
+        if path.startswith(f"{parts}.")
+        else f"frame.{path}"
+    )
 
 
 def _field(found: Evaluated, path: str) -> Column:
@@ -268,15 +317,23 @@ def _field(found: Evaluated, path: str) -> Column:
 
 
 def _rows(column: Column, found: Evaluated) -> tuple[NDArray[np.float64], NDArray[np.intp]]:
-    """The values of a field row by row in stream order, and the index of the first point of each row."""
-    levels = 1 + max((index for index, name in enumerate(column.axes) if name is not None), default=-1)
+    """The values of a field row by row in stream order, and the index of the first point of each
+    row.
+    """
+    levels = 1 + max(
+        (index for index, name in enumerate(column.axes) if name is not None), default=-1
+    )
     counts = found.counts
     array = column.array[: found.ready]
     if not levels and len(array) == len(counts):
         return array.reshape(-1), _starts(_sums(counts, 1))
-    shape = np.broadcast_shapes((found.ready, *array.shape[1 : 1 + levels]), counts.shape[: 1 + levels])
+    shape = np.broadcast_shapes(
+        (found.ready, *array.shape[1 : 1 + levels]), counts.shape[: 1 + levels]
+    )
     numbers = _sums(np.broadcast_to(counts, (*shape, *counts.shape[1 + levels :])), 1 + levels)
-    values = np.broadcast_to(array.reshape(len(array), *array.shape[1 : 1 + levels]), shape).reshape(-1)
+    values = np.broadcast_to(
+        array.reshape(len(array), *array.shape[1 : 1 + levels]), shape
+    ).reshape(-1)
     if numbers.size and not any(numbers.strides) and (each := int(numbers.flat[0])):
         return values, np.arange(len(values)) * each
     points = numbers.reshape(-1)
@@ -297,7 +354,11 @@ def _sums(counts: NDArray[Any], kept: int) -> NDArray[np.intp]:
         repeats = counts.strides[-1] == 0 and counts.shape[-1] > 0
         times *= counts.shape[-1] if repeats else 1
         counts = counts[..., 0] if repeats else counts.sum(axis=-1)
-    return np.broadcast_to(counts.flat[0] * times, counts.shape) if counts.size and not any(counts.strides) else counts * times
+    return (
+        np.broadcast_to(counts.flat[0] * times, counts.shape)
+        if counts.size and not any(counts.strides)
+        else counts * times
+    )
 
 
 def _was_far(angles: NDArray[np.float64], full: float) -> bool:

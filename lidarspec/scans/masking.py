@@ -1,8 +1,9 @@
-"""Finds the masked sector of a rotating sensor, by which its scans are cut, in the first turns of a stream.
+"""Finds the masked sector of a rotating sensor, by which its scans are cut, in the first turns of a
+stream.
 
-Packets pass at once until the angle leaps. Then they are held until the leap recurs, which takes a turn, or until all
-angles have been seen, so that the first scans are cut as all others. Behind the first whole turn without a leap, and
-behind a sector that was found, nothing is held.
+Packets pass at once until the angle leaps. Then they are held until the leap recurs, which takes a
+turn, or until all angles have been seen, so that the first scans are cut as all others. Behind the
+first whole turn without a leap, and behind a sector that was found, nothing is held.
 """
 
 from __future__ import annotations
@@ -11,7 +12,16 @@ import copy
 
 import numpy as np
 
-from lidarspec.packets.masked_sector import JITTER, MIN_WIDTH, MIN_WIDTH_STEPS, VARYING_PACKETS, AngleReader, Angles, Sector, SectorFinder
+from lidarspec.packets.masked_sector import (
+    JITTER,
+    MIN_WIDTH,
+    MIN_WIDTH_STEPS,
+    VARYING_PACKETS,
+    AngleReader,
+    Angles,
+    Sector,
+    SectorFinder,
+)
 from lidarspec.packets.packets import Packets, joined
 from lidarspec.spec.description import Spec
 
@@ -30,13 +40,16 @@ class Masking:
         sensor: of the packets.
 
     Attributes:
-        angle_before_sector: of the last packet before the first one that is marked, in turns; None if there is none.
+        angle_before_sector: of the last packet before the first one that is marked, in turns; None
+            if there is none.
     """
 
     def __init__(self, sensor: Spec) -> None:
         self._reader = AngleReader(sensor)
         self._is_settled = not self._reader.is_available
-        self._longest_ns = int(MAX_TURNS / (sensor.turn[0] if sensor.turn else 1 / SLOWEST_TURN_S) * 1e9)
+        self._longest_ns = int(
+            MAX_TURNS / (sensor.turn[0] if sensor.turn else 1 / SLOWEST_TURN_S) * 1e9
+        )
         self._finder: SectorFinder | None = None
         self._turned = 0.0  # turns since the start
         self._smallest_step = np.inf
@@ -183,6 +196,6 @@ def describe(sector: Sector) -> str:
     if sector.contains(0.0):
         angles.reverse()
     return (
-        f"nothing comes from about {angles[0]:.0f} to {angles[1]:.0f} degrees of each turn: taken for a masked sector, "
-        "which is no loss, and scans are cut there"
+        f"nothing comes from about {angles[0]:.0f} to {angles[1]:.0f} degrees of each turn: taken"
+        " for a masked sector, which is no loss, and scans are cut there"
     )

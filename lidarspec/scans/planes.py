@@ -1,7 +1,9 @@
-"""Planar scans: those of a sensor of one plane, or one ring or layer of another's, all on one grid of angles.
+"""Planar scans: those of a sensor of one plane, or one ring or layer of another's, all on one grid
+of angles.
 
-The first complete scan shows the grid: how many beams, and from where to where they look, which is where the sensor's scans begin, so that
-one line of times fits all beams. Of a sensor that sees less than a turn it is what it sees.
+The first complete scan shows the grid: how many beams, and from where to where they look, which is
+where the sensor's scans begin, so that one line of times fits all beams. Of a sensor that sees less
+than a turn it is what it sees.
 """
 
 from __future__ import annotations
@@ -14,7 +16,8 @@ from lidarspec.errors import UsageError
 from lidarspec.points.cloud import PointCloud
 from lidarspec.scans.scans import LaserScan, Scan
 
-#: radians from the horizon up to which points are in its plane: what rounding leaves of a mount's turns.
+#: radians from the horizon up to which points are in its plane: what rounding leaves of a mount's
+#: turns.
 LEVEL = 1e-5
 #: share of a turn from which on a scan is one of the whole turn.
 TURN = 0.98
@@ -24,8 +27,10 @@ class Planes:
     """Makes planar scans of one sensor's.
 
     Args:
-        beams: of each; by default as many as the scans or the sensor say, else as the first complete scan has points.
-        field: where the first and the last beam look, radians, in the place of what the sensor sees.
+        beams: of each; by default as many as the scans or the sensor say, else as the first
+            complete scan has points.
+        field: where the first and the last beam look, radians, in the place of what the sensor
+            sees.
         ring: the one that is taken of a sensor of several.
         heights: from and up to which z, metres, points are taken of a sensor of several rings.
     """
@@ -62,10 +67,18 @@ class Planes:
             if self._is_flat is None and (valid := cloud.valid).any():
                 self._is_flat = bool((np.abs(cloud.elevation[valid]) < LEVEL).all())
             return scan if self._is_flat else None
-        if self._ring is not None and (cloud.ring is None or (self._grid is None and not (cloud.ring == self._ring).any())):
+        if self._ring is not None and (
+            cloud.ring is None or (self._grid is None and not (cloud.ring == self._ring).any())
+        ):
             rings = "none" if cloud.ring is None else f"{cloud.ring.min()} to {cloud.ring.max()}"
-            raise UsageError(f"{scan.sensor.id}: ring {self._ring} is asked for, and its points have {rings}")
-        wanted = np.ones(len(cloud), np.bool_) if self._ring is None else np.asarray(cloud.ring == self._ring)
+            raise UsageError(
+                f"{scan.sensor.id}: ring {self._ring} is asked for, and its points have {rings}"
+            )
+        wanted = (
+            np.ones(len(cloud), np.bool_)
+            if self._ring is None
+            else np.asarray(cloud.ring == self._ring)
+        )
         if self._heights is not None:
             wanted &= (cloud.z >= self._heights[0]) & (cloud.z < self._heights[1])
         return replace(scan, points=_level_with(cloud[wanted]))
@@ -73,14 +86,17 @@ class Planes:
     def _grid_of(self, scan: Scan) -> tuple[int, tuple[float, float]]:
         """How many beams, and where the first and the last one look."""
         azimuth, _ = scan.swept()
-        begin, end, low, high = (float(angle) for angle in (azimuth[0], azimuth[-1], azimuth.min(), azimuth.max()))
+        begin, end, low, high = (
+            float(angle) for angle in (azimuth[0], azimuth[-1], azimuth.min(), azimuth.max())
+        )
         if low == high:  # it looks one way
             return 1, (low, high)
         count, turn = self._beams or scan.beams or scan.sensor.beams or len(scan), 2 * np.pi
         step = (high - low) / (len(azimuth) - 1)
         if high - low > TURN * turn:
             step = turn / count
-            # what is measured first stands first in the order of the angles, or last, in front of what is measured last
+            # what is measured first stands first in the order of the angles, or last, in front of
+            # what is measured last
             low = (round((begin + np.pi) / step) + (end < begin)) * step % turn - np.pi
             high = low + turn - step
         if self._wanted is not None:

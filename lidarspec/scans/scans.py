@@ -18,7 +18,15 @@ from lidarspec.frames.arrays import alike, repeated
 from lidarspec.packets.imu import ImuSamples, Waiting
 from lidarspec.packets.packets import Packets, joined as joined_packets
 from lidarspec.packets.reorder import Reorder
-from lidarspec.points.cloud import ColumnSource, LazyCloud, Mount, PointCloud, Stretch, Stretches, source_of
+from lidarspec.points.cloud import (
+    ColumnSource,
+    LazyCloud,
+    Mount,
+    PointCloud,
+    Stretch,
+    Stretches,
+    source_of,
+)
 from lidarspec.points.conventions import axes_of
 from lidarspec.points.evaluate import guarded
 from lidarspec.points.plain import Evaluated
@@ -28,9 +36,11 @@ from lidarspec.spec.description import Spec
 from lidarspec.spec.links import Serial
 from lidarspec.spec.timing import Every, OnFlag, OnRewind, OnWrap, Split
 
-#: seconds that a turn takes at the slowest where no sensor says so; of a scan at least where packets bear the host's time, which may pause.
+#: seconds that a turn takes at the slowest where no sensor says so; of a scan at least where
+#: packets bear the host's time, which may pause.
 SLOWEST, UNTIMED = 1.0, 1.0
-#: bytes of a scan at the most where neither points nor a line say so, and packets looked at together.
+#: bytes of a scan at the most where neither points nor a line say so, and packets looked at
+#: together.
 LARGEST, TOGETHER = 1 << 26, 1024
 #: the frame that the points are in, by its usual name: x forward, y left, z up (REP-103).
 FRAME_ID = "laser"
@@ -40,15 +50,18 @@ LONGER = 1.125
 
 @dataclass(frozen=True, eq=False)
 class LaserScan:
-    """A planar scan with ROS's names: `ranges[i]` is at ``angle_min + i * angle_increment``, inf where there is no return.
+    """A planar scan with ROS's names: `ranges[i]` is at ``angle_min + i * angle_increment``, inf
+    where there is no return.
 
     Attributes:
         ranges, intensities: (n,) float32.
-        angle_min, angle_max, angle_increment: radians, counter-clockwise; ``angle_max = angle_min + (n - 1) * angle_increment``.
+        angle_min, angle_max, angle_increment: radians, counter-clockwise; ``angle_max = angle_min +
+            (n - 1) * angle_increment``.
         time_increment: seconds from beam to beam, negative where the angle falls with time.
         scan_time: seconds from scan to scan.
         range_min, range_max: metres, the sensor's.
-        stamp_ns: when `ranges[0]` was measured; of `ranges[i]` that is ``i * time_increment`` later.
+        stamp_ns: when `ranges[0]` was measured; of `ranges[i]` that is ``i * time_increment``
+            later.
         host_ns: as in `Scan`.
     """
 
@@ -74,7 +87,8 @@ class Place(NamedTuple):
         host_ns: when it arrived, ns since 1970; 0 where nobody knows it.
         part: which of the frame's parts that have points, from 0; 0 where it has them itself.
         number: which point of the frame, or of that part.
-        data: the bytes of the frame; those that its fields stand in, where the wire has another form of them (`Frame.wire`).
+        data: the bytes of the frame; those that its fields stand in, where the wire has another
+            form of them (`Frame.wire`).
     """
 
     frame: str
@@ -92,7 +106,9 @@ class Provenance:
         self._size, self._batches = 0, list[tuple[int, int, Packets, Evaluated, int]]()
 
     def add(self, packets: Packets, points: Evaluated, start: int, stop: int, before: int) -> None:
-        """Further points, from `start` to `stop` of those of a batch; `before`: parts of the first frame that an earlier batch had."""
+        """Further points, from `start` to `stop` of those of a batch; `before`: parts of the first
+        frame that an earlier batch had.
+        """
         self._batches.append((self._size, start, packets, points, before))
         self._size += stop - start
 
@@ -104,10 +120,16 @@ class Provenance:
         """
         if not 0 <= point < self._size:
             raise IndexError(f"point {point} of {self._size}")
-        first, start, packets, points, before = next(batch for batch in reversed(self._batches) if batch[0] <= point)
+        first, start, packets, points, before = next(
+            batch for batch in reversed(self._batches) if batch[0] <= point
+        )
         starts, local = first_points(points), start + point - first
         row = int(starts.searchsorted(local, side="right")) - 1
-        frame, offset, at = packets.frame.partition(".")[0], int(packets.offset[row]), int(packets.host_ns[row])
+        frame, offset, at = (
+            packets.frame.partition(".")[0],
+            int(packets.offset[row]),
+            int(packets.host_ns[row]),
+        )
         table, which = packets.frames
         data = table.frame(row if isinstance(which, slice) else int(which[row]))
         return Place(frame, offset, at, rank(packets, row, before), local - int(starts[row]), data)
@@ -117,7 +139,9 @@ class Provenance:
 
 
 def rank(packets: Packets, row: int, before: int) -> int:
-    """Which of its frame's parts a packet is, from 0; `before`: how many of the first one's frame an earlier batch had."""
+    """Which of its frame's parts a packet is, from 0; `before`: how many of the first one's frame
+    an earlier batch had.
+    """
     _, which = packets.frames
     if isinstance(which, slice):
         return 0
@@ -130,17 +154,22 @@ class Scan:
 
     Attributes:
         points: in stream order.
-        rate_hz: one over the time to the next scan; nan where that is not known, or the scan is not whole.
-        complete: whether both ends were seen, and nothing is missing between them; the first and the last piece of a stream are not
-            complete.
+        rate_hz: one over the time to the next scan; nan where that is not known, or the scan is not
+            whole.
+        complete: whether both ends were seen, and nothing is missing between them; the first and
+            the last piece of a stream are not complete.
         sensor: whose.
         whole: whether both ends were seen, and no more is missing between them than is there.
-        imu: what the IMU felt from the first point up to that of the next scan; None without an IMU, or where it has another clock.
-        host_ns: when the packet of the first point arrived, int64 ns since 1970 by the computer's clock; 0 where nobody knows it.
-        beams: how many `to_laserscan` gives where it is not told; None: as many as the sensor declares, else as there are points.
+        imu: what the IMU felt from the first point up to that of the next scan; None without an
+            IMU, or where it has another clock.
+        host_ns: when the packet of the first point arrived, int64 ns since 1970 by the computer's
+            clock; 0 where nobody knows it.
+        beams: how many `to_laserscan` gives where it is not told; None: as many as the sensor
+            declares, else as there are points.
         frame_id: what ROS's messages call the frame of the points.
         number: which of its file it is, where that is read in pieces.
-        mount: how the sensor is mounted: the points are in its carrier's axes; None where they are in its own.
+        mount: how the sensor is mounted: the points are in its carrier's axes; None where they are
+            in its own.
         provenance: the frame that each point came from.
     """
 
@@ -177,13 +206,21 @@ class Scan:
 
     @property
     def facts(self) -> dict[str, str]:
-        """What files say of where points are from: `sensor`, `source` (what is known of its format), `frame` (where x, y and z point),
-        `calibration` ("nominal" or "own")."""
-        frame = ", ".join(f"{name} {way}" for name, way in zip("xyz", axes_of(self.sensor), strict=True))
-        return {"sensor": self.sensor.id, "source": self.sensor.source, "frame": frame, "calibration": self.points.calibration}
+        """What files say of where points are from: `sensor`, `source` (what is known of its
+        format), `frame` (where x, y and z point), `calibration` ("nominal" or "own")."""
+        frame = ", ".join(
+            f"{name} {way}" for name, way in zip("xyz", axes_of(self.sensor), strict=True)
+        )
+        return {
+            "sensor": self.sensor.id,
+            "source": self.sensor.source,
+            "frame": frame,
+            "calibration": self.points.calibration,
+        }
 
     def to_arrow(self) -> Any:
-        """The `pyarrow.Table` of the points (see `PointCloud.to_arrow`) with `facts` in the schema's metadata.
+        """The `pyarrow.Table` of the points (see `PointCloud.to_arrow`) with `facts` in the
+        schema's metadata.
 
         Raises:
             UsageError: where pyarrow is not installed.
@@ -195,7 +232,8 @@ class Scan:
         return self.to_arrow().__arrow_c_stream__(requested_schema)
 
     def to_bins(self, n: int) -> NDArray[np.float32]:
-        """The nearest return in each of n equal sectors from -pi on: (n,) float32 metres, inf where there is none.
+        """The nearest return in each of n equal sectors from -pi on: (n,) float32 metres, inf where
+        there is none.
 
         Raises:
             UsageError: for a number of sectors that is none.
@@ -203,35 +241,61 @@ class Scan:
         step = 2 * np.pi / _sectors(n, "to_bins")
         return self._binned(n, step / 2 - np.pi, step)[0]
 
-    def to_laserscan(self, beams: int | None = None, field: tuple[float, float] | None = None) -> LaserScan:
+    def to_laserscan(
+        self, beams: int | None = None, field: tuple[float, float] | None = None
+    ) -> LaserScan:
         """The scan on an even grid of so many angles, by default as `beams` says.
 
         Args:
-            field: where the first and the last of them look, radians; by default they go round the whole turn from -pi on. The times of
-                the beams are right where no scan begins within it: `Planes` finds such a field.
+            field: where the first and the last of them look, radians; by default they go round the
+                whole turn from -pi on. The times of the beams are right where no scan begins within
+                it: `Planes` finds such a field.
 
         Raises:
             UsageError: for a number of angles that is none.
         """
-        count = _sectors(beams, "to_laserscan") if beams is not None else self.beams or self.sensor.beams or max(len(self), 1)
+        count = (
+            _sectors(beams, "to_laserscan")
+            if beams is not None
+            else self.beams or self.sensor.beams or max(len(self), 1)
+        )
         first, last = field or (-np.pi, np.pi - 2 * np.pi / count)
         step = (last - first) / (count - 1) if count > 1 else 2 * np.pi
         ranges, intensities = self._binned(count, first, step)
         begin, slope = self._times(first, last)
-        period = 1 / self.rate_hz if np.isfinite(self.rate_hz) and self.rate_hz > 0 else abs(slope) * 2 * np.pi
+        period = (
+            1 / self.rate_hz
+            if np.isfinite(self.rate_hz) and self.rate_hz > 0
+            else abs(slope) * 2 * np.pi
+        )
         near, far = self.sensor.range_limits
         stamp_ns = self.stamp_ns + round(begin * 1e9)
-        return LaserScan(first, last, step, slope * step, period, near, far, ranges, intensities, stamp_ns, self.host_ns)
+        return LaserScan(
+            first,
+            last,
+            step,
+            slope * step,
+            period,
+            near,
+            far,
+            ranges,
+            intensities,
+            stamp_ns,
+            self.host_ns,
+        )
 
     def swept(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Of the points with a direction azimuths that go on over the turn, radians, and times, seconds since the stamp."""
+        """Of the points with a direction azimuths that go on over the turn, radians, and times,
+        seconds since the stamp.
+        """
         azimuth = self.points.azimuth.astype(np.float64)
         known = np.isfinite(azimuth)
         return np.unwrap(azimuth[known]), self.points.time[known]
 
     def _times(self, first: float, last: float) -> tuple[float, float]:
-        """When a beam that looks at `first` was measured, seconds since the stamp, and by how much later one is a radian on: the straight
-        line that is nearest to the points, in the turn that most of those up to `last` are of."""
+        """When a beam that looks at `first` was measured, seconds since the stamp, and by how much
+        later one is a radian on: the straight line that is nearest to the points, in the turn that
+        most of those up to `last` are of."""
         azimuth, time = self.swept()
         if len(azimuth) < 2 or not (spread := azimuth - azimuth.mean()).any():
             return 0.0, 0.0
@@ -239,11 +303,17 @@ class Scan:
         turns = round((float(np.median(azimuth)) - (first + last) / 2) / (2 * np.pi))
         return float(time.mean() + slope * (first + turns * 2 * np.pi - azimuth.mean())), slope
 
-    def _binned(self, n: int, first: float, step: float) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-        """The nearest return within half a step of each of n angles from `first` on, and its intensity."""
+    def _binned(
+        self, n: int, first: float, step: float
+    ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+        """The nearest return within half a step of each of n angles from `first` on, and its
+        intensity.
+        """
         points, turn = self.points, 2 * np.pi
         ahead = (points.azimuth[points.valid].astype(np.float64) - first + step / 2) % turn
-        bins = (ahead % turn / step).astype(np.intp)  # a second time: of what is just below 0 the first is the whole turn
+        bins = (ahead % turn / step).astype(
+            np.intp
+        )  # a second time: of what is just below 0 the first is the whole turn
         inside = bins < n
         valid = np.flatnonzero(points.valid)[inside]
         bins, ranges = bins[inside], points.range[valid]
@@ -260,12 +330,16 @@ class Scan:
 
 def _sectors(number: Any, place: str) -> int:
     if isinstance(number, bool) or not isinstance(number, int | np.integer) or number < 1:
-        raise UsageError(f"{place} takes how many sectors the turn has, a whole number from 1 on, not {number!r}")
+        raise UsageError(
+            f"{place} takes how many sectors the turn has, a whole number from 1 on, not {number!r}"
+        )
     return int(number)
 
 
 class Cut(NamedTuple):
-    """Where one scan ends and the next begins: before which point, and what the one is that ends there (see `Scan`)."""
+    """Where one scan ends and the next begins: before which point, and what the one is that ends
+    there (see `Scan`).
+    """
 
     point: int
     whole: bool
@@ -292,39 +366,68 @@ class Underway:
 
 
 class Progress:
-    """How far the scan under way has come: when it ends, whether it is complete then, and when its end is waited for no longer.
+    """How far the scan under way has come: when it ends, whether it is complete then, and when its
+    end is waited for no longer.
 
-    A scan becomes no longer than twice the slowest turn, by the packets' time; and no larger than twice the points of a scan where their
-    number is constant, else the bytes that a serial line carries in that time, else `LARGEST`. Where packets are missing, and with them
-    maybe the end, it becomes little longer than the scan before. What is missing follows from the index of the packets, and their breaks.
+    A scan becomes no longer than twice the slowest turn, by the packets' time; and no larger than
+    twice the points of a scan where their number is constant, else the bytes that a serial line
+    carries in that time, else `LARGEST`. Where packets are missing, and with them maybe the end, it
+    becomes little longer than the scan before. What is missing follows from the index of the
+    packets, and their breaks.
     """
 
     def __init__(self, sensor: Spec) -> None:
         rule, link, counter = sensor.scan, sensor.links.get("data"), sensor.sequence
-        turn = rule.seconds if isinstance(rule, Every) else 1 / sensor.turn[0] if sensor.turn else SLOWEST
+        turn = (
+            rule.seconds
+            if isinstance(rule, Every)
+            else 1 / sensor.turn[0]
+            if sensor.turn
+            else SLOWEST
+        )
         self.seconds = 2 * turn if sensor.clock is not None else max(2 * turn, UNTIMED)
         self._longest, self._by_points = int(self.seconds * 1e9), sensor.beams is not None
-        self._most = 2 * sensor.beams if sensor.beams else self.seconds * link.baud / 10 if isinstance(link, Serial) else LARGEST
+        self._most = (
+            2 * sensor.beams
+            if sensor.beams
+            else self.seconds * link.baud / 10
+            if isinstance(link, Serial)
+            else LARGEST
+        )
         self._reason, self._starts_are_seen = _without_end(rule), isinstance(rule, OnFlag)
-        self._may_pass = isinstance(rule, OnWrap | OnFlag)  # whether an end that is missing leaves no trace
-        self._counter = counter if counter is not None and isinstance(rule, OnRewind) and rule.name == counter.field else None
+        self._may_pass = isinstance(
+            rule, OnWrap | OnFlag
+        )  # whether an end that is missing leaves no trace
+        self._counter = (
+            counter
+            if counter is not None and isinstance(rule, OnRewind) and rule.name == counter.field
+            else None
+        )
         self._scan, self._has_ended = Underway(), False
         self._last: tuple[int, int] | None = None  # time and index of the last packet
         self._turn = math.inf  # packets of the last whole scan, at first of the first piece
 
     def cuts(self, packets: Packets, points: Evaluated, ends: Sequence[End]) -> list[Cut]:
-        """The cuts of a batch in order: at the ends, of which those that leap may be none, and where none came in time."""
+        """The cuts of a batch in order: at the ends, of which those that leap may be none, and
+        where none came in time.
+        """
         number, found, start = points.ready, list[Cut](), 0
         if not number:
             return found
         first = first_points(points) if len(ends) or self._by_points else np.empty(0, np.intp)
-        batch = self._batch(packets, number, np.diff(first, append=source_of(points.cloud).size) if self._by_points else None)
+        batch = self._batch(
+            packets,
+            number,
+            np.diff(first, append=source_of(points.cloud).size) if self._by_points else None,
+        )
         for end, packet, leaps in ends:
             edge = int(np.searchsorted(first, end, side="right")) - 1 if packet is None else packet
             begins = bool(first[edge] == end)
             found += self._without_end(packets, batch, start, edge + (not begins), points)
             is_shared = begins and not self._shows_start(packets, edge)
-            found.append(self._ended(batch, edge, end, begins=begins, is_shared=is_shared, is_seen=not leaps))
+            found.append(
+                self._ended(batch, edge, end, begins=begins, is_shared=is_shared, is_seen=not leaps)
+            )
             if not self._has_ended:  # a rotor that spun up
                 packets.stats.unended, self._has_ended = "", True
             start = edge
@@ -333,33 +436,61 @@ class Progress:
         return found
 
     def _batch(self, packets: Packets, number: int, points: NDArray[np.intp] | None) -> Batch:
-        """What is looked at of the first packets, by the number of points of each, (n,), or their bytes; a frame of parts counts once."""
-        times, index, broken = packets.time_ns[:number], packets.index[:number], packets.breaks[:number]
-        before, (frames, which) = int(index[0]) - 1 if self._last is None else self._last[1], packets.frames
+        """What is looked at of the first packets, by the number of points of each, (n,), or their
+        bytes; a frame of parts counts once.
+        """
+        times, index, broken = (
+            packets.time_ns[:number],
+            packets.index[:number],
+            packets.breaks[:number],
+        )
+        before, (frames, which) = (
+            int(index[0]) - 1 if self._last is None else self._last[1],
+            packets.frames,
+        )
         if frames is packets.table and int(index[-1]) - before == number and packets.masked is None:
             sizes = frames.sizes[:number] if points is None else points
-            return Batch(times, repeated(1, number), sizes, repeated(0, number), broken.copy() if broken.any() else broken)
+            return Batch(
+                times,
+                repeated(1, number),
+                sizes,
+                repeated(0, number),
+                broken.copy() if broken.any() else broken,
+            )
         steps = np.diff(index, prepend=before)
-        counts, missing = (steps != 0).astype(np.int64) if frames is not packets.table else repeated(1, number), np.maximum(steps - 1, 0)
+        counts, missing = (
+            (steps != 0).astype(np.int64) if frames is not packets.table else repeated(1, number),
+            np.maximum(steps - 1, 0),
+        )
         if packets.masked is not None:
             masked = packets.masked[:number]
             missing = np.maximum(missing - masked, 0)
             broken = broken & (masked == 0)
-        return Batch(times, counts, counts * frames.sizes[which][:number] if points is None else points, missing, broken | (missing > 0))
+        return Batch(
+            times,
+            counts,
+            counts * frames.sizes[which][:number] if points is None else points,
+            missing,
+            broken | (missing > 0),
+        )
 
     def _shows_start(self, packets: Packets, edge: int) -> bool:
         """Whether a packet says that it is the first of a scan."""
         frames, which = packets.frames
         return self._starts_are_seen or (
-            self._counter is not None and int(frames.raw(self._counter.field)[which][edge]) == self._counter.first
+            self._counter is not None
+            and int(frames.raw(self._counter.field)[which][edge]) == self._counter.first
         )
 
-    def _ended(self, batch: Batch, edge: int, end: int, *, begins: bool, is_shared: bool, is_seen: bool) -> Cut:
+    def _ended(
+        self, batch: Batch, edge: int, end: int, *, begins: bool, is_shared: bool, is_seen: bool
+    ) -> Cut:
         """A scan ends at a point of a packet, and the next one begins.
 
         Args:
             begins: whether it is the first point of the packet.
-            is_shared: whether nobody knows to which of the two belongs what is missing before that packet.
+            is_shared: whether nobody knows to which of the two belongs what is missing before that
+                packet.
         """
         if begins:
             self._add(batch, slice(edge, edge + 1), gap_only=True)
@@ -367,11 +498,17 @@ class Progress:
         whole = scan.begun and is_seen and scan.lost <= scan.packets
         if whole or (self._turn == math.inf and scan.packets and self._may_pass):
             self._turn = scan.packets + scan.lost
-        self._scan = Underway(is_seen and (scan.begun or scan.packets > 0), lost=missing * is_shared, broken=is_broken and is_shared)
+        self._scan = Underway(
+            is_seen and (scan.begun or scan.packets > 0),
+            lost=missing * is_shared,
+            broken=is_broken and is_shared,
+        )
         batch.forget(edge)
         return Cut(end, whole, whole and not scan.lost and not scan.broken)
 
-    def _without_end(self, packets: Packets, batch: Batch, start: int, stop: int, points: Evaluated) -> list[Cut]:
+    def _without_end(
+        self, packets: Packets, batch: Batch, start: int, stop: int, points: Evaluated
+    ) -> list[Cut]:
         """The cuts in a part of one scan where it has become too long, or too large."""
         found = list[int]()
         if start < stop and not self._within(batch, slice(start, stop)):
@@ -385,12 +522,24 @@ class Progress:
                 self._add(batch, slice(start, start + spot))
                 start += spot
                 found.append(start)
-                step = batch.times.item(start) - (batch.times.item(start - 1) if start or self._last is None else self._last[0])
+                step = batch.times.item(start) - (
+                    batch.times.item(start - 1) if start or self._last is None else self._last[0]
+                )
                 if is_endless and abs(step) < self._longest / 2:  # else nothing came for so long
                     packets.stats.unended = f"{self._reason} within {self.seconds:.3g} s"
-                self._scan, self._turn = Underway(), self._turn * (1 if is_endless else 2)  # lest it be wrong for ever
+                self._scan, self._turn = (
+                    Underway(),
+                    self._turn * (1 if is_endless else 2),
+                )  # lest it be wrong for ever
                 batch.forget(start)
-        return [Cut(point, whole=False, complete=False) for point in first_points(points)[found].tolist()] if found else []
+        return (
+            [
+                Cut(point, whole=False, complete=False)
+                for point in first_points(points)[found].tolist()
+            ]
+            if found
+            else []
+        )
 
     def _within(self, batch: Batch, part: slice) -> bool:
         """Whether the scan may go on over all of these packets, which are then counted."""
@@ -405,12 +554,19 @@ class Progress:
         return False
 
     def _over(self, batch: Batch, part: slice) -> tuple[int | None, bool]:
-        """Before which of some packets the scan is over, None where it is not; and whether for want of an end, else for a gap."""
+        """Before which of some packets the scan is over, None where it is not; and whether for want
+        of an end, else for a gap.
+        """
         scan, times = self._scan, batch.times[part]
         since = scan.since if scan.packets else times.item(0)
-        endless = (np.abs(times - since) > self._longest) | (scan.size + np.cumsum(batch.sizes[part]) > self._most)
+        endless = (np.abs(times - since) > self._longest) | (
+            scan.size + np.cumsum(batch.sizes[part]) > self._most
+        )
         lost = scan.lost + np.cumsum(batch.missing[part])
-        over = endless | ((lost > 0) & (scan.packets + np.cumsum(batch.counts[part]) - 1 + lost > LONGER * self._turn))
+        over = endless | (
+            (lost > 0)
+            & (scan.packets + np.cumsum(batch.counts[part]) - 1 + lost > LONGER * self._turn)
+        )
         over[0] &= bool(scan.packets)
         spot = int(over.argmax())
         return (spot, bool(endless[spot])) if over[spot] else (None, False)
@@ -422,14 +578,21 @@ class Progress:
             return
         if not gap_only:
             scan.since = scan.since if scan.packets else batch.times.item(part.start)
-            scan.packets, scan.size = scan.packets + _sum(batch.counts[part]), scan.size + _sum(batch.sizes[part])
-        scan.lost, scan.broken = scan.lost + _sum(batch.missing[part]), scan.broken or bool(batch.broken[part].any())
+            scan.packets, scan.size = (
+                scan.packets + _sum(batch.counts[part]),
+                scan.size + _sum(batch.sizes[part]),
+            )
+        scan.lost, scan.broken = (
+            scan.lost + _sum(batch.missing[part]),
+            scan.broken or bool(batch.broken[part].any()),
+        )
 
 
 @dataclass(frozen=True, eq=False)
 class Batch:
-    """What `Progress` looks at of some packets, (n,) each: their times, ns, how many each counts for (a frame of parts with the first of
-    them), their sizes, how many are missing before each, and breaks."""
+    """What `Progress` looks at of some packets, (n,) each: their times, ns, how many each counts
+    for (a frame of parts with the first of them), their sizes, how many are missing before each,
+    and breaks."""
 
     times: NDArray[np.int64]
     counts: NDArray[np.int64]
@@ -438,7 +601,9 @@ class Batch:
     broken: NDArray[np.bool_]
 
     def forget(self, place: int) -> None:
-        """What is missing before a packet has been counted; itself, or the frame that it is part of, is in the scan behind it as well."""
+        """What is missing before a packet has been counted; itself, or the frame that it is part
+        of, is in the scan behind it as well.
+        """
         if not self.counts[place]:
             self.counts[place] = 1
         if self.broken[place]:
@@ -455,7 +620,10 @@ def _sum(values: NDArray[np.int64]) -> int:
 def _without_end(rule: Split) -> str:
     """What did not come where a scan has no end."""
     if isinstance(rule, OnWrap):
-        return f"the angle does not pass {rule.at:g} ({rule.name}): is the rotor blocked? No scan has ended"
+        return (
+            f"the angle does not pass {rule.at:g} ({rule.name}): is the rotor blocked? No scan has"
+            " ended"
+        )
     return f"no scan has begun or ended by {'time' if isinstance(rule, Every) else rule.name}"
 
 
@@ -468,19 +636,33 @@ class ScanStream:
         imu: what its IMU felt, added to before the packets that came with it.
     """
 
-    def __init__(self, sensor: Spec, mount: Mount | None = None, imu: Waiting | None = None) -> None:
+    def __init__(
+        self, sensor: Spec, mount: Mount | None = None, imu: Waiting | None = None
+    ) -> None:
         self._sensor, self._mount, self._imu = sensor, mount, imu
-        self._reorder = Reorder(enabled=sensor.sequence is not None or (sensor.clock is not None and sensor.datagrams))
+        self._reorder = Reorder(
+            enabled=sensor.sequence is not None or (sensor.clock is not None and sensor.datagrams)
+        )
         self._masking = Masking(sensor)
         self._cutter = Cutter(sensor)
         self._waiting: Packets | None = None
         self._carry: Carry = {}
         self._parts: list[Stretch] = []
-        self._provenance, self._split = Provenance(), 0  # parts of a frame that were ready before others of it
+        self._provenance, self._split = (
+            Provenance(),
+            0,
+        )  # parts of a frame that were ready before others of it
         self._epoch: int | None = None
         self._progress = Progress(sensor)
-        self._empty, self._broken = 0, False  # frames without parts that have points, and whether there is a break before those at the end
-        self._begins: int | None = None  # time of the first point of the scan under way, ns, where it is known
+        self._empty, self._broken = (
+            0,
+            False,
+            # frames without parts that have points, and whether there is a break before those at the
+            # end
+        )
+        self._begins: int | None = (
+            None  # time of the first point of the scan under way, ns, where it is known
+        )
         self._host: int | None = None  # when its packet arrived
         self._left_out = False  # whether the scan under way is another's
 
@@ -491,15 +673,26 @@ class ScanStream:
 
     def __getstate__(self) -> dict[str, Any]:
         """What is pickled goes on behind the scan under way, whose points it does not have."""
-        return {**vars(self), "_parts": [], "_provenance": Provenance(), "_left_out": self._left_out or bool(self._parts)}
+        return {
+            **vars(self),
+            "_parts": [],
+            "_provenance": Provenance(),
+            "_left_out": self._left_out or bool(self._parts),
+        }
 
     def add(self, packets: Packets) -> list[Scan]:
         """The scans that these packets complete."""
-        return [scan for batch in self._reorder.push(packets) for scan in self._push_ordered(self._masking.push(batch))]
+        return [
+            scan
+            for batch in self._reorder.push(packets)
+            for scan in self._push_ordered(self._masking.push(batch))
+        ]
 
     def finish(self) -> list[Scan]:
         """The scans that waited for more, and the piece that is left."""
-        held = [batch for ordered in self._reorder.finish() for batch in self._masking.push(ordered)]
+        held = [
+            batch for ordered in self._reorder.finish() for batch in self._masking.push(ordered)
+        ]
         scans = [*self._push_ordered(held), *self._push_ordered(self._masking.finish())]
         if self._waiting is not None and len(self._waiting):
             waiting, self._waiting = self._waiting, None
@@ -526,19 +719,26 @@ class ScanStream:
         if not len(packets):
             return []
         if self._epoch is None:
-            self._epoch = int(packets.time_ns[0])  # one for the whole stream, so that batches do not change a bit of any time
+            self._epoch = int(
+                packets.time_ns[0]
+            )  # one for the whole stream, so that batches do not change a bit of any time
         points = guarded(packets, self._carry, final=final, epoch=self._epoch)
         if points is None:
             return []
         self._carry, before = points.carry, self._split
         if points.ready < len(packets):
-            self._waiting, self._split = packets.take(slice(points.ready, None)), rank(packets, points.ready, before)
+            self._waiting, self._split = (
+                packets.take(slice(points.ready, None)),
+                rank(packets, points.ready, before),
+            )
         else:
             self._split = 0
         return list(self._cut(packets, points, before))
 
     def _with_points(self, packets: Packets) -> Packets:
-        """The packets that points are made of: these, or the parts in them; a frame without any leaves no gap."""
+        """The packets that points are made of: these, or the parts in them; a frame without any
+        leaves no gap.
+        """
         parts = packets.with_points
         if parts is not packets:
             spots = np.searchsorted(packets.index, parts.index)
@@ -554,7 +754,9 @@ class ScanStream:
         cuts = self._progress.cuts(packets, points, self._cutter.ends(packets, points))
         starts = [0, *(cut.point for cut in cuts)]
         first, *times = _times_ns(source, starts)
-        arrived, *hosts = _hosts_ns(packets, points, starts) if cuts or self._host is None else [None]
+        arrived, *hosts = (
+            _hosts_ns(packets, points, starts) if cuts or self._host is None else [None]
+        )
         self._begins = first if self._begins is None else self._begins
         self._host = arrived if self._host is None else self._host
         for cut, time, host in zip(cuts, times, hosts, strict=True):
@@ -565,12 +767,16 @@ class ScanStream:
                 yield scan
         self._take(packets, points, start, source.size, before)
 
-    def _take(self, packets: Packets, points: Evaluated, start: int, stop: int, before: int) -> None:
+    def _take(
+        self, packets: Packets, points: Evaluated, start: int, stop: int, before: int
+    ) -> None:
         if start < stop:
             self._parts.append(Stretch(source_of(points.cloud), start, stop))
             self._provenance.add(packets, points, start, stop, before)
 
-    def _close(self, ends: int | None, *, whole: bool = False, complete: bool = False) -> Scan | None:
+    def _close(
+        self, ends: int | None, *, whole: bool = False, complete: bool = False
+    ) -> Scan | None:
         """The scan of the points so far; `ends`: the time of the first point after it, ns."""
         parts, self._parts = self._parts, []
         provenance, self._provenance = self._provenance, Provenance()
@@ -587,16 +793,31 @@ class ScanStream:
         cloud: PointCloud = LazyCloud.of(Stretches(parts, from_first=True), begins)
         samples = None if self._imu is None else self._imu.until(ends)
         if self._mount is not None:
-            cloud, samples = self._mount.applied(cloud), None if samples is None else samples.turned(self._mount.rotation)
+            cloud, samples = (
+                self._mount.applied(cloud),
+                None if samples is None else samples.turned(self._mount.rotation),
+            )
         rate = float(rate) if whole else np.nan
-        return Scan(cloud, rate, complete, self._sensor, whole, samples, self._host or 0, mount=self._mount, provenance=provenance)
+        return Scan(
+            cloud,
+            rate,
+            complete,
+            self._sensor,
+            whole,
+            samples,
+            self._host or 0,
+            mount=self._mount,
+            provenance=provenance,
+        )
 
 
 def _times_ns(source: ColumnSource, indices: Sequence[int]) -> list[int | None]:
     """The times of some points in order, ns; None for those past the end."""
     known = [index for index in indices if index < source.size]
     times = source.times_at(np.array(known, np.intp)).tolist() if known else []
-    return [source.base + round(time * 1e9) for time in times] + [None] * (len(indices) - len(known))
+    return [source.base + round(time * 1e9) for time in times] + [None] * (
+        len(indices) - len(known)
+    )
 
 
 def _hosts_ns(packets: Packets, points: Evaluated, indices: Sequence[int]) -> list[int | None]:
@@ -606,7 +827,9 @@ def _hosts_ns(packets: Packets, points: Evaluated, indices: Sequence[int]) -> li
     return [*packets.host_ns[known].tolist(), *[None] * (len(indices) - len(known))]
 
 
-def scans_of(sensor: Spec, batches: Iterable[Packets], imu: Waiting | None = None) -> Iterator[Scan]:
+def scans_of(
+    sensor: Spec, batches: Iterable[Packets], imu: Waiting | None = None
+) -> Iterator[Scan]:
     """Every scan of batches of one stream; `imu`: the samples that go with them."""
     stream = ScanStream(sensor, imu=imu)
     for batch in batches:
@@ -615,7 +838,9 @@ def scans_of(sensor: Spec, batches: Iterable[Packets], imu: Waiting | None = Non
 
 
 def handed_out(scans: list[Scan]) -> Iterator[Scan]:
-    """Scans one by one, each of which is forgotten then, and with it the columns that are made of it."""
+    """Scans one by one, each of which is forgotten then, and with it the columns that are made of
+    it.
+    """
     scans.reverse()
     while scans:
         yield scans.pop()

@@ -1,8 +1,9 @@
 """What is wanted of the scans of a source: from when to when, which of them, and what of each.
 
-A `Selection` is a value; a `Sieve` carries it out on one stream, scan by scan as they come, and says when no further one is wanted. Where
-a source can be moved on, what lies before a slice is passed over without being read: up to so long before it that the clocks of sensor
-and host may differ, and that a whole scan comes first.
+A `Selection` is a value; a `Sieve` carries it out on one stream, scan by scan as they come, and
+says when no further one is wanted. Where a source can be moved on, what lies before a slice is
+passed over without being read: up to so long before it that the clocks of sensor and host may
+differ, and that a whole scan comes first.
 """
 
 from __future__ import annotations
@@ -25,7 +26,8 @@ from lidarspec.transports.protocol import Chunk, Transport
 #: a time: seconds from the first scan, or a date.
 Moment = float | datetime
 Times = tuple[Moment | None, Moment | None]
-#: seconds before a slice from which on is read, of its distance the share by which clocks differ, and seconds that passing over is worth.
+#: seconds before a slice from which on is read, of its distance the share by which clocks differ,
+#: and seconds that passing over is worth.
 BEFORE, DRIFT, WORTH = 5.0, 1e-3, 5.0
 #: ns since 1970 from which on a time is a date, and not that of a clock that began with the sensor.
 DATED = 10**18
@@ -36,14 +38,16 @@ class Selection:
     """Which scans are wanted, and what of each.
 
     Args:
-        times: from which time on, and up to which: seconds from the first scan, or a `datetime`, in UTC where it names no zone; None
-            leaves an end open.
-        scans: from which scan on, and up to which, counted from 0, pieces among them: (5, 10) has five. Both have to be met.
+        times: from which time on, and up to which: seconds from the first scan, or a `datetime`, in
+            UTC where it names no zone; None leaves an end open.
+        scans: from which scan on, and up to which, counted from 0, pieces among them: (5, 10) has
+            five. Both have to be met.
         every: each so manieth of those, from the first of them on.
-        ranges: metres, from and up to: a return from elsewhere counts as none; its range is -inf where it is nearer, inf where it is
-            farther (REP-117).
+        ranges: metres, from and up to: a return from elsewhere counts as none; its range is -inf
+            where it is nearer, inf where it is farther (REP-117).
         columns: of the points, by name, in this order; all where there are none.
-        time: whose clock stamps of scans and `times` are by: the "device"'s, or the "host"'s, when the first packet of a scan arrived.
+        time: whose clock stamps of scans and `times` are by: the "device"'s, or the "host"'s, when
+            the first packet of a scan arrived.
         beams, frame_id: as in `Scan`.
 
     Raises:
@@ -62,8 +66,14 @@ class Selection:
     def __post_init__(self) -> None:
         start, stop = self.scans
         if min(start, stop or 0) < 0:
-            raise UsageError("a scan is counted from the first one: from the last, all of a source would have to be read first")
-        times = (moment.replace(tzinfo=moment.tzinfo or UTC) if isinstance(moment, datetime) else moment for moment in self.times)
+            raise UsageError(
+                "a scan is counted from the first one: from the last, all of a source would have to"
+                " be read first"
+            )
+        times = (
+            moment.replace(tzinfo=moment.tzinfo or UTC) if isinstance(moment, datetime) else moment
+            for moment in self.times
+        )
         object.__setattr__(self, "times", tuple(times))
         for low, high in (self.scans, self.times, self.ranges):
             if low is not None and high is not None:
@@ -119,16 +129,23 @@ class Slice:
         return wanted if end is None else wanted & (at < end)
 
     def missed(self, source: object, number: str = "data") -> UsageError:
-        """That none of the times of a source was wanted, and which there are; `number`: how many, in words."""
+        """That none of the times of a source was wanted, and which there are; `number`: how many,
+        in words.
+        """
         first, last = self.first or 0, self.last or 0
         dates = f" ({dated(first)} to {dated(last)})" if first > DATED else ""
-        text = f"{source} has {number} from 0 s to {(last - first) * 1e-9:.3f} s{dates}, and nothing of that is asked for"
+        text = (
+            f"{source} has {number} from 0 s to {(last - first) * 1e-9:.3f} s{dates}, and nothing"
+            " of that is asked for"
+        )
         return suggest(UsageError(text), f"lidarspec info {quote(str(source))}")
 
     @property
     def ahead(self) -> int:
         """Nanoseconds from the first time to where the slice begins."""
-        return (self.ns(self._times[0]) or 0) - (self.first or 0) if self._times[0] is not None else 0
+        return (
+            (self.ns(self._times[0]) or 0) - (self.first or 0) if self._times[0] is not None else 0
+        )
 
     def ns(self, moment: Moment | None) -> int | None:
         """A moment as a time of the stream, of which one has come."""
@@ -177,14 +194,20 @@ class Sieve:
 
     Args:
         source: what it is called in messages.
-        skip: moves the source on to what arrived at a time, ns since 1970, where it can: whether it did.
+        skip: moves the source on to what arrived at a time, ns since 1970, where it can: whether it
+            did.
 
     Attributes:
         ended: whether no further scan is wanted.
         slice: the times that are.
     """
 
-    def __init__(self, selection: Selection, source: object = "the source", skip: Callable[[int], bool] = never) -> None:
+    def __init__(
+        self,
+        selection: Selection,
+        source: object = "the source",
+        skip: Callable[[int], bool] = never,
+    ) -> None:
         self._selection, self._source, self._skip = selection, source, skip
         self._seen = self._kept = 0
         self._skipped, self.ended, self.slice = False, False, Slice(selection.times)
@@ -210,12 +233,16 @@ class Sieve:
         """What is wanted of the next scan, None where it is not.
 
         Raises:
-            UsageError: where nobody knows the time that is asked for, or the points have not the columns.
+            UsageError: where nobody knows the time that is asked for, or the points have not the
+                columns.
         """
         selection, number = self._selection, self._seen
         start, stop = selection.scans
         self._seen += 1
-        wanted, self.ended = start <= number and (stop is None or number < stop), stop is not None and self._seen >= stop
+        wanted, self.ended = (
+            start <= number and (stop is None or number < stop),
+            stop is not None and self._seen >= stop,
+        )
         if selection.is_timed:
             wanted &= bool(self.slice.holds(np.array([self._time(scan)]))[0])
             self.ended = self.ended or self.slice.ended
@@ -234,20 +261,33 @@ class Sieve:
         number = f"{self._seen} scan{'s' * (self._seen != 1)}"
         if self._selection.is_timed:
             return self.slice.missed(self._source, "scans" if self._skipped else f"{number},")
-        return UsageError(f"{self._source} has {number}, from 0 to {self._seen - 1}, and none of them is asked for")
+        return UsageError(
+            f"{self._source} has {number}, from 0 to {self._seen - 1}, and none of them is"
+            " asked for"
+        )
 
     def _time(self, scan: Scan) -> int:
         by_host = self._selection.time == "host"
         if not scan.host_ns and (by_host or scan.sensor.clock is None):
-            raise suggest(UsageError(f"{self._source} does not say when its bytes arrived"), "the same with --scans 5:10")
+            raise suggest(
+                UsageError(f"{self._source} does not say when its bytes arrived"),
+                "the same with --scans 5:10",
+            )
         return scan.host_ns if by_host else scan.stamp_ns
 
     def _pass_over(self, scan: Scan) -> None:
         """Move the source on to a little before the slice."""
         ahead, clock = self.slice.ahead * 1e-9, scan.sensor.clock
         near = BEFORE + DRIFT * ahead
-        is_followed = clock is None or not clock.wraps_at or clock.wraps_at >= 1  # a quicker one cannot be followed over a gap
-        if ahead - near > WORTH and scan.host_ns and is_followed and self._selection.scans == (0, None):
+        is_followed = (
+            clock is None or not clock.wraps_at or clock.wraps_at >= 1
+        )  # a quicker one cannot be followed over a gap
+        if (
+            ahead - near > WORTH
+            and scan.host_ns
+            and is_followed
+            and self._selection.scans == (0, None)
+        ):
             self._skipped = self._skip(scan.host_ns + round((ahead - near) * 1e9))
 
     def _shaped(self, scan: Scan) -> Scan:
@@ -260,7 +300,12 @@ class Sieve:
             cloud = LazyCloud.of(CloudColumns(cloud), stamp_ns)
         if selection.columns:
             cloud = cloud.only(*selection.columns)
-        return replace(scan, points=cloud, beams=selection.beams or scan.beams, frame_id=selection.frame_id or scan.frame_id)
+        return replace(
+            scan,
+            points=cloud,
+            beams=selection.beams or scan.beams,
+            frame_id=selection.frame_id or scan.frame_id,
+        )
 
 
 class _Within(CloudColumns):

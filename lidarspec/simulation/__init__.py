@@ -1,6 +1,7 @@
 """A sensor that is not there, made from its spec.
 
-In: a sensor, a scene, commands. Out: the bytes that it would send, and when. No port, clock or thread in here. Modules in reading order:
+In: a sensor, a scene, commands. Out: the bytes that it would send, and when. No port, clock or
+thread in here. Modules in reading order:
 
 * `scenes`: what a beam meets, and how far away.
 * `frame_maker`: frames out of physical values.

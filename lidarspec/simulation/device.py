@@ -1,8 +1,8 @@
 """A simulated sensor as a device, sans-IO: bytes in, bytes out, in real time or any other.
 
-It behaves as its spec says and knows no sensor: data frames come at the pace of the sensor's clock, commands are answered with the
-documented replies (`Answering`), start and stop are honoured, other frames come at their own rate. A sensor that no command of `on_open`
-starts sends from power-on.
+It behaves as its spec says and knows no sensor: data frames come at the pace of the sensor's clock,
+commands are answered with the documented replies (`Answering`), start and stop are honoured, other
+frames come at their own rate. A sensor that no command of `on_open` starts sends from power-on.
 
 All times are the caller's, in ns of one monotonic clock.
 """
@@ -33,7 +33,8 @@ from lidarspec.spec.tree import FieldInfo
 SECOND = 1_000_000_000
 #: ns of the device's time for which data is made in one go, and the most packets.
 AHEAD, MOST = SECOND // 4, 128
-#: frames of one type that the sensor sends by itself, such as those of an IMU, that are made together.
+#: frames of one type that the sensor sends by itself, such as those of an IMU, that are made
+#: together.
 UNASKED_BATCH = 50
 #: fillers that are sent in a pause.
 FILLERS = 14
@@ -55,7 +56,9 @@ class Request:
 
 
 class Answered(NamedTuple):
-    """A piece of an answer: the name of a frame and its bytes; no name for bytes that are no frame. Or seconds of a pause."""
+    """A piece of an answer: the name of a frame and its bytes; no name for bytes that are no frame.
+    Or seconds of a pause.
+    """
 
     frame: str = ""
     data: bytes = b""
@@ -63,7 +66,9 @@ class Answered(NamedTuple):
 
 
 class Answering:
-    """One sensor's side of the conversation; `shake`: the noise on what an IMU feels, m/s2 and rad/s."""
+    """One sensor's side of the conversation; `shake`: the noise on what an IMU feels, m/s2 and
+    rad/s.
+    """
 
     def __init__(self, sensor: Spec, shake: float = 0.0) -> None:
         self._sensor, self._shake = sensor, shake
@@ -72,7 +77,9 @@ class Answering:
         links = {command.link for command in sensor.commands.values() if command.frame}
         self._decoders = {link: _listening(sensor, link) for link in links}
         self._makers: dict[str, FrameMaker] = {}
-        self._unasked: dict[str, tuple[int, list[bytes]]] = {}  # by type: the number of the first frame of a batch, and the batch
+        self._unasked: dict[
+            str, tuple[int, list[bytes]]
+        ] = {}  # by type: the number of the first frame of a batch, and the batch
 
     def requests(self, data: bytes, now: int, link: str) -> list[Request]:
         """The commands that these bytes complete; what is none is ignored."""
@@ -94,7 +101,9 @@ class Answering:
         return [self._answer(answer, request) for answer in chosen]
 
     def frame(self, name: str, values: Mapping[str, Any]) -> bytes:
-        """Return a frame of a type other than data: the defaults of the spec, its `sweep`, and these physical values."""
+        """Return a frame of a type other than data: the defaults of the spec, its `sweep`, and
+        these physical values.
+        """
         return self._make(name, range(1), values)[0]
 
     def unasked_frame(self, name: str, number: int) -> bytes:
@@ -132,25 +141,45 @@ class Answering:
     def _agreed(self, name: str, request: Request) -> dict[str, Any]:
         """The physical values that tie a reply to its request."""
         fields = codec(self._sensor.frames[name]).schema.fields
-        raw = {path: request.values[path] for path in request.command.echoes if path in request.values} | dict(request.command.matches)
-        return {path: _physical(fields[path], value) for path, value in raw.items() if path in fields}
+        raw = {
+            path: request.values[path] for path in request.command.echoes if path in request.values
+        } | dict(request.command.matches)
+        return {
+            path: _physical(fields[path], value) for path, value in raw.items() if path in fields
+        }
 
     def _request(self, frame: str, data: bytes, link: str) -> Request | None:
         """The command that a frame is: of several that fit, the one that says most about it."""
         values = dict(_flat(parse(self._sensor, data, frame=frame)))
-        sent = [one for one in self._sensor.commands.items() if (one[1].frame, one[1].link) == (frame, link)]
-        fitting = [one for one in sent if all(values.get(path) == value for path, value in one[1].fixed.items())]
-        return Request(*max(fitting, key=lambda one: len(one[1].fixed)), values) if fitting else None
+        sent = [
+            one
+            for one in self._sensor.commands.items()
+            if (one[1].frame, one[1].link) == (frame, link)
+        ]
+        fitting = [
+            one
+            for one in sent
+            if all(values.get(path) == value for path, value in one[1].fixed.items())
+        ]
+        return (
+            Request(*max(fitting, key=lambda one: len(one[1].fixed)), values) if fitting else None
+        )
 
 
 def _listening(sensor: Spec, link: str) -> Decoder:
     """A decoder of what is sent to the sensor: the outgoing frames, seen from its side."""
-    frames = {name: replace(frame, direction="in") for name, frame in sensor.frames.items() if frame.direction == "out"}
+    frames = {
+        name: replace(frame, direction="in")
+        for name, frame in sensor.frames.items()
+        if frame.direction == "out"
+    }
     return Decoder(with_frames(sensor, frames), stream=not is_datagram(sensor.links.get(link)))
 
 
 def _physical(info: FieldInfo, value: Any) -> Any:
-    """A parsed value in the unit of its field; bytes as they are, the number of a name, the numbers of an array."""
+    """A parsed value in the unit of its field; bytes as they are, the number of a name, the numbers
+    of an array.
+    """
     if isinstance(value, bytes) or (isinstance(value, list) and info.kind == "bytes"):
         return value
     if isinstance(value, list | tuple):
@@ -167,7 +196,9 @@ def _flat(values: Mapping[str, Any], prefix: str = "") -> Iterable[tuple[str, An
 
 
 class _Due(NamedTuple):
-    """Something to be sent at a time, ns since the device was switched on; what was planned first goes first."""
+    """Something to be sent at a time, ns since the device was switched on; what was planned first
+    goes first.
+    """
 
     at: float
     number: int
@@ -183,7 +214,9 @@ class _Stream:
         due: when the next one is sent.
     """
 
-    def __init__(self, made: Simulation, frame: str, scene: Scene, began: float, shake: float) -> None:
+    def __init__(
+        self, made: Simulation, frame: str, scene: Scene, began: float, shake: float
+    ) -> None:
         self._made, self._scene, self.frame, self._shake = made, scene, frame, shake
         self._next, self._end = 0, began
         self._frames: list[bytes] = []
@@ -198,7 +231,9 @@ class _Stream:
             if self._spot == len(self._frames):
                 self._more()
             first, self._spot = self._spot, bisect.bisect_right(self._times, upto)
-            taken += zip(self._times[first : self._spot], self._frames[first : self._spot], strict=True)
+            taken += zip(
+                self._times[first : self._spot], self._frames[first : self._spot], strict=True
+            )
             self.due = self._times[self._spot] if self._spot < len(self._frames) else self._end
         return taken
 
@@ -231,7 +266,15 @@ class SimulatedDevice:
         SpecError: where nothing says how fast it sends.
     """
 
-    def __init__(self, sensor: Spec, *, scene: Scene | None = None, seed: int = 0, rate: float = 1.0, faults: Faults | None = None) -> None:
+    def __init__(
+        self,
+        sensor: Spec,
+        *,
+        scene: Scene | None = None,
+        seed: int = 0,
+        rate: float = 1.0,
+        faults: Faults | None = None,
+    ) -> None:
         self.sensor, self.rate, self.faults = sensor, rate, faults or Faults()
         self.present, self.heard, self.sent = True, list[str](), Counter[str]()
         self.lines = {name: self._line(name, seed) for name in sensor.links}
@@ -246,9 +289,13 @@ class SimulatedDevice:
         self._simulation(sensor.data_frame)
 
     def _line(self, name: str, seed: int) -> Line:
-        """The way of a link; one beside the data over which bytes come in order is TCP or HTTP, which bring them all."""
+        """The way of a link; one beside the data over which bytes come in order is TCP or HTTP,
+        which bring them all.
+        """
         stream = not is_datagram(self.sensor.links[name])
-        return Line(Faults() if stream and name != "data" else self.faults, seed=seed, stream=stream)
+        return Line(
+            Faults() if stream and name != "data" else self.faults, seed=seed, stream=stream
+        )
 
     def start(self, now: int) -> None:
         """Switch it on, or off and on again."""
@@ -261,9 +308,11 @@ class SimulatedDevice:
             self._begin(0.0, self.sensor.data_frame)
 
     def _waits_for_a_command(self) -> bool:
-        """Return whether it sends no data until a command starts it: one that every program sends when it opens the sensor.
+        """Return whether it sends no data until a command starts it: one that every program sends
+        when it opens the sensor.
 
-        A sensor with a start command that `on_open` leaves out sends from power-on: nothing else would start it for a program.
+        A sensor with a start command that `on_open` leaves out sends from power-on: nothing else
+        would start it for a program.
         """
         opening = [self.sensor.commands[name] for name in self.sensor.on_open]
         return any(command.starts and command.frame for command in opening)
@@ -280,11 +329,15 @@ class SimulatedDevice:
                 self._obey(request, self._clock(now))
 
     def outgoing(self, now: int) -> list[tuple[str, bytes]]:
-        """What leaves the device by now: for each link its bytes, or its datagrams one by one, in order."""
+        """What leaves the device by now: for each link its bytes, or its datagrams one by one, in
+        order.
+        """
         return [(link, data) for link, _, data in self.sendings(now)]
 
     def sendings(self, now: int) -> list[tuple[str, str, bytes]]:
-        """What leaves the device by now, with its type: (link, type, bytes) a datagram; of a byte stream all in one, without a type."""
+        """What leaves the device by now, with its type: (link, type, bytes) a datagram; of a byte
+        stream all in one, without a type.
+        """
         self._plugged(now)
         if not self.present:
             return []
@@ -304,7 +357,9 @@ class SimulatedDevice:
 
     @property
     def deadline(self) -> int | None:
-        """When `outgoing` next has something to give, or the plug is pulled or put in; None if nothing will happen by itself."""
+        """When `outgoing` next has something to give, or the plug is pulled or put in; None if
+        nothing will happen by itself.
+        """
         times = [self._plug] if self._plug is not None else []
         if self.present:
             due = [self._plan[0].at] if self._plan else []
@@ -313,7 +368,9 @@ class SimulatedDevice:
         return min(times, default=None)
 
     def _clock(self, now: int) -> float:
-        """The device's own time, ns since it was switched on; one that has no pace goes on whenever it is asked for data."""
+        """The device's own time, ns since it was switched on; one that has no pace goes on whenever
+        it is asked for data.
+        """
         if math.isinf(self.rate):
             return self._time
         late = int((now - self._powered) - self._time / self.rate) - BEHIND
@@ -329,7 +386,9 @@ class SimulatedDevice:
             self._again(due)
         planned = len(found)
         if self._stream is not None:
-            found += [(at, "data", self._stream.frame, data) for at, data in self._stream.take(upto)]
+            found += [
+                (at, "data", self._stream.frame, data) for at, data in self._stream.take(upto)
+            ]
         if planned and len(found) > planned:
             found.sort(key=lambda item: item[0])
         return [item[1:] for item in found]
@@ -339,17 +398,28 @@ class SimulatedDevice:
         rate = self.sensor.frames[due.frame].simulation.rate if due.frame else 0.0
         if rate:
             number = round(due.at * rate / SECOND) + 1
-            self._put(due.at + SECOND / rate, due.link, due.frame, self._answering.unasked_frame(due.frame, number))
+            self._put(
+                due.at + SECOND / rate,
+                due.link,
+                due.frame,
+                self._answering.unasked_frame(due.frame, number),
+            )
 
     def _obey(self, request: Request, now: float) -> None:
-        """Answer a command, unless it has to wait until the data stop; where it starts the sensor, data follows the answer."""
+        """Answer a command, unless it has to wait until the data stop; where it starts the sensor,
+        data follows the answer.
+        """
         self.heard.append(request.name)
         command, at, mode = request.command, now, None
         if command.only_stopped and self._stream is not None:
             return
         if command.starts or command.stops:
             self._stream = None
-            self._plan = [due for due in self._plan if due.frame and self.sensor.frames[due.frame].simulation.rate]
+            self._plan = [
+                due
+                for due in self._plan
+                if due.frame and self.sensor.frames[due.frame].simulation.rate
+            ]
             heapq.heapify(self._plan)
         announcing = {frame.after for frame in self.sensor.frames.values() if frame.after}
         for answer in self._answering.answers(request):
@@ -359,8 +429,16 @@ class SimulatedDevice:
                 self._put(at, command.link, answer.frame, answer.data)
                 mode = answer.frame if answer.frame in announcing else mode
         if command.starts:
-            kinds = [name for name, frame in self.sensor.frames.items() if frame.data and frame.after == mode]
-            chosen = self.sensor.data_frame if self.sensor.data_frame in kinds else next(iter(kinds), None)
+            kinds = [
+                name
+                for name, frame in self.sensor.frames.items()
+                if frame.data and frame.after == mode
+            ]
+            chosen = (
+                self.sensor.data_frame
+                if self.sensor.data_frame in kinds
+                else next(iter(kinds), None)
+            )
             if chosen is not None:
                 self._begin(at, chosen)
 
@@ -377,7 +455,11 @@ class SimulatedDevice:
     def _simulation(self, frame: str) -> Simulation:
         made = simulation(self.sensor, frame, blocked=bool(self.faults.rotor))
         if not made.interval:
-            raise SpecError("nothing says how often it is sent: declare its `rate`", path=frame, sensor=self.sensor.id)
+            raise SpecError(
+                "nothing says how often it is sent: declare its `rate`",
+                path=frame,
+                sensor=self.sensor.id,
+            )
         return made
 
     def _put(self, at: float, link: str, frame: str, data: bytes) -> None:

@@ -1,5 +1,5 @@
-"""What goes wrong with a simulated sensor, and between it and its reader, on request: damaged bytes, lost and reordered packets, a
-pulled plug, a blocked rotor.
+"""What goes wrong with a simulated sensor, and between it and its reader, on request: damaged
+bytes, lost and reordered packets, a pulled plug, a blocked rotor.
 
 The same seed does the same harm to the same packets, however they are cut into batches.
 """
@@ -33,7 +33,8 @@ class Faults:
         reorder: how many places late a datagram may come, one in ten does.
         unplug: seconds after which the sensor is unplugged, again and again; 0: never.
         absent: seconds that it is away then.
-        shake: standard deviation of the noise on what an IMU feels, m/s2 and rad/s; 0: it is at rest.
+        shake: standard deviation of the noise on what an IMU feels, m/s2 and rad/s; 0: it is at
+            rest.
         rotor: "blocked": it does not turn, and the angles stay as they are; "" where it does.
 
     Raises:
@@ -119,7 +120,9 @@ class Line:
         self.sent = self.intact = self.lost = 0
 
     def carry(self, packets: Sequence[tuple[str, bytes]]) -> list[tuple[str, bytes]]:
-        """What arrives of these packets, each a name and its bytes; those that are late come with a later call."""
+        """What arrives of these packets, each a name and its bytes; those that are late come with a
+        later call.
+        """
         self.sent += len(packets)
         if not (self._faults.errors or self._faults.loss or self._faults.reorder):
             self.intact += len(packets)
@@ -133,7 +136,9 @@ class Line:
                 if data in harmed:  # a byte inserted after the frame leaves it whole
                     self.intact += 1
                 depth = self._faults.reorder
-                delay = self._source.randint(1, depth) if depth and self._source.random() < LATE else 0
+                delay = (
+                    self._source.randint(1, depth) if depth and self._source.random() < LATE else 0
+                )
                 heapq.heappush(self._late, (self._number + delay, self._number, name, harmed))
             while self._late and self._late[0][0] <= self._number:
                 arrived.append(heapq.heappop(self._late)[2:])
@@ -160,4 +165,8 @@ class Line:
 
     def _byte(self, byte: int) -> bytes:
         changed = bytes([byte ^ 1 << self._source.randrange(8)])
-        return self._source.choice((b"", changed, bytes([byte, self._source.randrange(256)]))) if self._stream else changed
+        return (
+            self._source.choice((b"", changed, bytes([byte, self._source.randrange(256)])))
+            if self._stream
+            else changed
+        )

@@ -1,7 +1,9 @@
-"""Frames made of physical values by path: everything else is 0, constants and checksums are in place.
+"""Frames made of physical values by path: everything else is 0, constants and checksums are in
+place.
 
-This is `build` for many frames at once, and without asking for every field: what a sensor sends is declared by the values that
-matter (a `sweep`, an answer to a command), and counts and options in the header decide the layout as they do for a decoder.
+This is `build` for many frames at once, and without asking for every field: what a sensor sends is
+declared by the values that matter (a `sweep`, an answer to a command), and counts and options in
+the header decide the layout as they do for a decoder.
 """
 
 from __future__ import annotations
@@ -39,7 +41,11 @@ class FrameMaker:
         engine = known.compiled
         if engine is None:
             reason = known.reason if isinstance(known, InterpretedCodec) else ""
-            raise SpecError(f"cannot be simulated, since it is not compiled: {reason}", path=frame, sensor=sensor.id)
+            raise SpecError(
+                f"cannot be simulated, since it is not compiled: {reason}",
+                path=frame,
+                sensor=sensor.id,
+            )
         others = sensor.data_frames if sensor.frames[frame].data else ()
         elsewhere = {path for other in others for path in codec(sensor.frames[other]).schema.fields}
         self.engine = engine
@@ -54,29 +60,51 @@ class FrameMaker:
         maker._makes(sensor, root, limit, given, set())
         return maker
 
-    def _makes(self, sensor: str, root: Node, limit: int, given: Mapping[str, int], elsewhere: set[str]) -> None:
-        self._sensor, self._root, self._limit, self._given, self._elsewhere = sensor, root, limit, given, elsewhere
+    def _makes(
+        self, sensor: str, root: Node, limit: int, given: Mapping[str, int], elsewhere: set[str]
+    ) -> None:
+        self._sensor, self._root, self._limit, self._given, self._elsewhere = (
+            sensor,
+            root,
+            limit,
+            given,
+            elsewhere,
+        )
         self.schema = schema(root)
-        formulas = {axis: [ref.path for ref in refs(count)] for axis, count in self.schema.arrays.items() if count is not None}
-        self._counts = {axis: asked[0] for axis, asked in formulas.items() if asked and asked[0] in self.schema.fields}
+        formulas = {
+            axis: [ref.path for ref in refs(count)]
+            for axis, count in self.schema.arrays.items()
+            if count is not None
+        }
+        self._counts = {
+            axis: asked[0]
+            for axis, asked in formulas.items()
+            if asked and asked[0] in self.schema.fields
+        }
         self._layouts: dict[tuple[int, ...], Layout] = {}
         self._asked: list[str] = []
         self._makers: dict[tuple[Any, ...], FrameMaker] = {}
 
     def table(self, frames: Sequence[Values]) -> Rows:
-        """One frame for each mapping of field paths to physical values; arrays may be given as bytes, too, and parts as such mappings.
+        """One frame for each mapping of field paths to physical values; arrays may be given as
+        bytes, too, and parts as such mappings.
 
         Raises:
             SpecError: where a value is given to a field that the frame does not have.
         """
         members: dict[int, tuple[Layout, list[int]]] = {}
         given = [self._with_counts(values) for values in frames] if self._counts else frames
-        filled = [self._with_parts(values) for values in given] if self.schema.parts else [(values, {}) for values in given]
+        filled = (
+            [self._with_parts(values) for values in given]
+            if self.schema.parts
+            else [(values, {}) for values in given]
+        )
         for index, (values, _) in enumerate(filled):
             layout = self._layout(values)
             members.setdefault(id(layout), (layout, []))[1].append(index)
         groups = [
-            Group(layout, np.array(which, np.intp), self._rows(layout, [filled[i] for i in which])) for layout, which in members.values()
+            Group(layout, np.array(which, np.intp), self._rows(layout, [filled[i] for i in which]))
+            for layout, which in members.values()
         ]
         return Rows(self.schema, groups)
 
@@ -94,34 +122,57 @@ class FrameMaker:
         if self._recoder is None:
             return frames
         for group in table.groups:
-            for place, data in zip(group.where.tolist(), self._recoder.written(group.rows, group.layout), strict=True):
+            for place, data in zip(
+                group.where.tolist(), self._recoder.written(group.rows, group.layout), strict=True
+            ):
                 if data is None:
-                    raise SpecError(f"{self._recoder.form} cannot write these values", path="simulation", sensor=self._sensor)
+                    raise SpecError(
+                        f"{self._recoder.form} cannot write these values",
+                        path="simulation",
+                        sensor=self._sensor,
+                    )
                 frames[place] = data
         return frames
 
     def _with_counts(self, values: Values) -> Values:
-        """The values of a frame with the counts that follow from arrays and bytes, where these are left out."""
-        missing = [axis for axis, asked in self._counts.items() if axis in values and asked not in values]
+        """The values of a frame with the counts that follow from arrays and bytes, where these are
+        left out.
+        """
+        missing = [
+            axis for axis, asked in self._counts.items() if axis in values and asked not in values
+        ]
         given = dict(values) if missing else values
         for axis in missing:
             self._fill_in(self.schema.arrays[axis], given, len(values[axis]), axis)  # type: ignore[arg-type]  # a dict by now
         return given
 
     def _with_parts(self, values: Values) -> tuple[Values, dict[str, bytes]]:
-        """The values of a frame with what follows from its parts, and the bytes of these, by their axis."""
+        """The values of a frame with what follows from its parts, and the bytes of these, by their
+        axis.
+        """
         given, made = dict(values), dict[str, bytes]()
         for axis, node in self.schema.parts.items():
             parts = [dict(part) for part in given.pop(axis, ())]
             kinds = [kind_of(node, part) for part in parts]
             around = {ref.path: self._raw(given, ref.path) for ref in node.outer}
             makers = [self._maker(kind, around) for kind in kinds]
-            sizes = [maker._layout(maker._with_parts(part)[0]).size for maker, part in zip(makers, parts, strict=True)]
-            for kind, maker, part, after in zip(kinds, makers, parts, [*sizes[1:], 0], strict=False):
+            sizes = [
+                maker._layout(maker._with_parts(part)[0]).size
+                for maker, part in zip(makers, parts, strict=True)
+            ]
+            for kind, maker, part, after in zip(
+                kinds, makers, parts, [*sizes[1:], 0], strict=False
+            ):
                 maker._fill_in(kind.following, part, after, axis)
-            for formula, number in ((node.count, len(parts)), (node.size, sizes[0] if sizes else 0), (node.within, sum(sizes))):
+            for formula, number in (
+                (node.count, len(parts)),
+                (node.size, sizes[0] if sizes else 0),
+                (node.within, sum(sizes)),
+            ):
                 self._fill_in(formula, given, number, axis)
-            made[axis] = b"".join(maker.frame(part) for maker, part in zip(makers, parts, strict=True))
+            made[axis] = b"".join(
+                maker.frame(part) for maker, part in zip(makers, parts, strict=True)
+            )
             given[node.total.path] = len(made[axis])
         return given, made
 
@@ -131,9 +182,17 @@ class FrameMaker:
             self._makers[key] = FrameMaker._of_parts(self._sensor, kind.root, self._limit, around)
         return self._makers[key]
 
-    def _fill_in(self, formula: Formula | None, values: dict[str, Any], number: int, axis: str) -> None:
-        """Set the field that a formula depends on, where it is not given, so that the formula gives a number."""
-        asked = [] if formula is None else [ref.path for ref in refs(formula) if ref.path in self.schema.fields]
+    def _fill_in(
+        self, formula: Formula | None, values: dict[str, Any], number: int, axis: str
+    ) -> None:
+        """Set the field that a formula depends on, where it is not given, so that the formula gives
+        a number.
+        """
+        asked = (
+            []
+            if formula is None
+            else [ref.path for ref in refs(formula) if ref.path in self.schema.fields]
+        )
         if asked and asked[0] not in values:
             raw: dict[str, Any] = {}
             for path in asked[1:]:
@@ -158,26 +217,38 @@ class FrameMaker:
 
     def _too_long(self, values: Values, path: str) -> SpecError:
         fields = self.schema.fields
-        left_out = [path for path in self._asked if path not in values and fields[path].const is None]
+        left_out = [
+            path for path in self._asked if path not in values and fields[path].const is None
+        ]
         given = ", ".join(f"{path} = {values[path]}" for path in self._asked if path in values)
         reason = f"with {given} there is no frame of at most {self._limit} bytes (max_length)"
         if left_out:
             reason = f"sweep has to give {left_out[0]!r}, which the length of the frame depends on"
         return SpecError(reason, path=path, sensor=self._sensor)
 
-    def _rows(self, layout: Layout, frames: Sequence[tuple[Values, Mapping[str, bytes]]]) -> NDArray[np.uint8]:
+    def _rows(
+        self, layout: Layout, frames: Sequence[tuple[Values, Mapping[str, bytes]]]
+    ) -> NDArray[np.uint8]:
         rows = np.zeros((len(frames), layout.size), np.uint8)
         totals = {node.total.path for node in self.schema.parts.values()}
-        for path in dict.fromkeys(path for values, _ in frames for path in values if path not in totals):
+        for path in dict.fromkeys(
+            path for values, _ in frames for path in values if path not in totals
+        ):
             leaf = layout.leaves.get(path)
             if leaf is None and path in self._elsewhere:
                 continue
             if leaf is None:
-                raise SpecError("sweep gives a value to a field that the frame does not have", path=path, sensor=self._sensor)
+                raise SpecError(
+                    "sweep gives a value to a field that the frame does not have",
+                    path=path,
+                    sensor=self._sensor,
+                )
             leaf.store(rows, leaf.raw([values.get(path, 0) for values, _ in frames]))
         for axis, region in layout.regions.items():
             parts = b"".join(made[axis] for _, made in frames)
-            rows[:, region.start : region.start + region.size] = np.frombuffer(parts, np.uint8).reshape(len(frames), region.size)
+            rows[:, region.start : region.start + region.size] = np.frombuffer(
+                parts, np.uint8
+            ).reshape(len(frames), region.size)
         for leaf in layout.leaves.values():
             if leaf.info.initial and all(leaf.info.path not in values for values, _ in frames):
                 leaf.store(rows, leaf.info.initial)

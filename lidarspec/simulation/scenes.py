@@ -1,7 +1,9 @@
 """Scenes for simulated sensors: what a beam in a direction meets, and how far away.
 
-Everything is upright boxes in the sensor's axes: x forward, y left, z up, metres, the sensor at the origin. Beams may begin beside
-the origin, and what moves stands elsewhere at another time, so both can be given for each beam. A scene is read from a small TOML file:
+Everything is upright boxes in the sensor's axes: x forward, y left, z up, metres, the sensor at the
+origin. Beams may begin beside
+the origin, and what moves stands elsewhere at another time, so both can be given for each beam. A
+scene is read from a small TOML file:
 
     [room]                                  # walls, floor and ceiling; left out: in the open
     low = [-3.0, -2.2, -1.2]                # metres, in the sensor's axes: x forward, y left, z up
@@ -43,7 +45,9 @@ ORIGIN: Vector = (0.0, 0.0, 0.0)
 class Scene(Protocol):
     """Something that can be measured."""
 
-    def measure(self, azimuth: Floats, elevation: Floats, origin: Vector = ORIGIN, time: Value = 0.0) -> Floats:
+    def measure(
+        self, azimuth: Floats, elevation: Floats, origin: Vector = ORIGIN, time: Value = 0.0
+    ) -> Floats:
         """Metres along each beam to what it meets, inf where it meets nothing.
 
         Args:
@@ -95,7 +99,11 @@ class Mover:
         gone = np.minimum(gone, 2 * whole - gone)
         x, y = (np.interp(gone, along, column) for column in places.T)
         half = [side / 2 for side in self.size]
-        return (x - half[0], y - half[1], self.floor), (x + half[0], y + half[1], self.floor + self.size[2])
+        return (x - half[0], y - half[1], self.floor), (
+            x + half[0],
+            y + half[1],
+            self.floor + self.size[2],
+        )
 
     @property
     def radius(self) -> float:
@@ -105,7 +113,8 @@ class Mover:
 
 @dataclass(frozen=True)
 class Room:
-    """Walls, floor and ceiling around the sensor, and boxes in it; no symmetry, so that a mirrored picture shows.
+    """Walls, floor and ceiling around the sensor, and boxes in it; no symmetry, so that a mirrored
+    picture shows.
 
     Args:
         walls: None in the open, where only the boxes are met.
@@ -113,10 +122,15 @@ class Room:
     """
 
     walls: Box | None = Box((-3.0, -2.2, -1.2), (4.6, 3.1, 1.6))
-    boxes: tuple[Box, ...] = (Box((2.0, 0.8, -1.2), (2.7, 1.6, 0.9)), Box((-1.6, -1.5, -1.2), (-1.1, -0.9, 1.2)))
+    boxes: tuple[Box, ...] = (
+        Box((2.0, 0.8, -1.2), (2.7, 1.6, 0.9)),
+        Box((-1.6, -1.5, -1.2), (-1.1, -0.9, 1.2)),
+    )
     movers: tuple[Mover, ...] = ()
 
-    def measure(self, azimuth: Floats, elevation: Floats, origin: Vector = ORIGIN, time: Value = 0.0) -> Floats:
+    def measure(
+        self, azimuth: Floats, elevation: Floats, origin: Vector = ORIGIN, time: Value = 0.0
+    ) -> Floats:
         """Metres along each beam to what it meets, inf where it meets nothing.
 
         Args:
@@ -130,8 +144,14 @@ class Room:
         found = np.full(shape, np.inf)
         with np.errstate(divide="ignore", invalid="ignore"):
             if self.walls is not None:
-                for low, high, start, beam in zip(self.walls.low, self.walls.high, origin, beams, strict=True):
-                    np.minimum(found, np.where(beam >= 0, high - start, start - low) / np.abs(beam), out=found)
+                for low, high, start, beam in zip(
+                    self.walls.low, self.walls.high, origin, beams, strict=True
+                ):
+                    np.minimum(
+                        found,
+                        np.where(beam >= 0, high - start, start - low) / np.abs(beam),
+                        out=found,
+                    )
             bodies: tuple[Box | Mover, ...] = (*self.boxes, *self.movers)
             for body in bodies:
                 _meet(found, body, beams, origin, time)
@@ -147,11 +167,16 @@ def _meet(found: Floats, body: Box | Mover, beams: Vector, origin: Vector, time:
         return
 
     def chosen(value: Value) -> Any:
-        return value if np.ndim(value) == 0 else np.broadcast_to(value, found.shape).reshape(-1)[where]
+        return (
+            value if np.ndim(value) == 0 else np.broadcast_to(value, found.shape).reshape(-1)[where]
+        )
 
     enter, leave = np.full(len(where), -np.inf), np.full(len(where), np.inf)
     for corner, other, start, beam in zip(low, high, origin, beams, strict=True):
-        first, second = (chosen(corner) - chosen(start)) / chosen(beam), (chosen(other) - chosen(start)) / chosen(beam)
+        first, second = (
+            (chosen(corner) - chosen(start)) / chosen(beam),
+            (chosen(other) - chosen(start)) / chosen(beam),
+        )
         np.fmax(enter, np.fmin(first, second), out=enter)
         np.fmin(leave, np.fmax(first, second), out=leave)
     hit = (enter > 0) & (enter <= leave)
@@ -175,10 +200,15 @@ def furnished(seed: int = 0) -> Room:
         return Room(movers=(walker,))
     source = random.Random(f"scene {seed}")
     spread = source.uniform
-    walls = Box((-spread(2.5, 4), -spread(2, 3.5), -1.2), (spread(3, 6), spread(2.5, 4.5), spread(1.3, 2)))
+    walls = Box(
+        (-spread(2.5, 4), -spread(2, 3.5), -1.2), (spread(3, 6), spread(2.5, 4.5), spread(1.3, 2))
+    )
     boxes = []
     for _ in range(source.randint(2, 4)):
-        x, y = source.choice((spread(-2.2, -1.2), spread(1.6, 2.6))), source.choice((spread(-1.7, -1), spread(1.2, 2)))
+        x, y = (
+            source.choice((spread(-2.2, -1.2), spread(1.6, 2.6))),
+            source.choice((spread(-1.7, -1), spread(1.2, 2))),
+        )
         wide, deep = spread(0.2, 0.5), spread(0.2, 0.5)
         boxes.append(Box((x - wide, y - deep, -1.2), (x + wide, y + deep, spread(-0.3, 1.2))))
     return Room(walls, tuple(boxes), (walker,))
@@ -220,7 +250,10 @@ def _box(table: Mapping[str, Any], place: str) -> Box:
     _known(table, ("low", "high"), place)
     low, high = (_numbers(table, name, 3, place) for name in ("low", "high"))
     if not all(a < b for a, b in zip(low, high, strict=True)):
-        raise UsageError(f"{place}: every number of high has to be above that of low, and {low} and {high} are not so")
+        raise UsageError(
+            f"{place}: every number of high has to be above that of low, and {low} and {high} are"
+            " not so"
+        )
     return Box((low[0], low[1], low[2]), (high[0], high[1], high[2]))
 
 
@@ -232,14 +265,23 @@ def _mover(table: Mapping[str, Any], place: str) -> Mover:
     path = table.get("path")
     if not isinstance(path, list) or len(path) < 2:
         raise UsageError(f"{place}.path: two places or more, such as [[1, -1], [1, 1]]")
-    places = [_numbers({f"path[{index}]": spot}, f"path[{index}]", 2, place) for index, spot in enumerate(path)]
+    places = [
+        _numbers({f"path[{index}]": spot}, f"path[{index}]", 2, place)
+        for index, spot in enumerate(path)
+    ]
     if len(set(map(tuple, places))) < 2:
         raise UsageError(f"{place}.path: it leads nowhere")
-    others = {name: _number(table[name], f"{place}.{name}") for name in ("speed", "floor") if name in table}
+    others = {
+        name: _number(table[name], f"{place}.{name}")
+        for name in ("speed", "floor")
+        if name in table
+    }
     return Mover((size[0], size[1], size[2]), tuple((x, y) for x, y in places), **others)
 
 
-def _entries(table: Mapping[str, Any], name: str, place: str) -> list[tuple[Mapping[str, Any], str]]:
+def _entries(
+    table: Mapping[str, Any], name: str, place: str
+) -> list[tuple[Mapping[str, Any], str]]:
     entries = table.get(name, [])
     if not isinstance(entries, list) or not all(isinstance(entry, Mapping) for entry in entries):
         raise UsageError(f"{place}: {name}: tables in double brackets, [[{name}]]")

@@ -1,16 +1,21 @@
-"""Frames that a sensor would send from a scene, made from its own spec, and when it would send them.
+"""Frames that a sensor would send from a scene, made from its own spec, and when it would send
+them.
 
-The sensor's `sweep` says what is not measured (angles, counters, time). The packets are filled with that, `points` says where the
-beams go, the scene says how far, and the ranges go back through the scale of the fields that they come from (`Measurement`): no inverse of
-`points` is written anywhere, but by giving each field in metres a probing value it is found out which points answer to it. Where
-direction depends on range the measurement is repeated; a beam that finds no fixed point is a no-return. A frame type with an `encode` of
-its own is given the measured points and returns the values of its fields.
+The sensor's `sweep` says what is not measured (angles, counters, time). The packets are filled with
+that, `points` says where the beams go, the scene says how far, and the ranges go back through the
+scale of the fields that they come from (`Measurement`): no inverse of `points` is written anywhere,
+but by giving each field in metres a probing value it is found out which points answer to it. Where
+direction depends on range the measurement is repeated; a beam that finds no fixed point is a
+no-return. A frame type with an `encode` of its own is given the measured points and returns the
+values of its fields.
 
-When each packet is sent follows from what the spec says of time, in this order: the rate that is declared; the sensor's clock, which
-its `sweep` sets; the times of the points, which say how long one takes; the speed of its serial line, which no sensor outruns.
+When each packet is sent follows from what the spec says of time, in this order: the rate that is
+declared; the sensor's clock, which its `sweep` sets; the times of the points, which say how long
+one takes; the speed of its serial line, which no sensor outruns.
 
-Where points are given by coordinates, nothing says where a beam would go: the spec declares the directions, and the raw values that the
-coordinates are linear in are solved for the place that is met (`Placement`).
+Where points are given by coordinates, nothing says where a beam would go: the spec declares the
+directions, and the raw values that the coordinates are linear in are solved for the place that is
+met (`Placement`).
 """
 
 from __future__ import annotations
@@ -60,7 +65,8 @@ ROUNDS = 8
 _MEASURED = ("range", "azimuth", "elevation", "ox", "oy", "oz", "x", "y", "z", "time")
 #: raw value that a range field is given to see which points answer to it.
 PROBE = 100
-#: by how much of itself a range may be off the field that it is read from, for the arithmetic alone.
+#: by how much of itself a range may be off the field that it is read from, for the arithmetic
+#: alone.
 EXACT = 1e-9
 #: m/s2, standard gravity.
 GRAVITY = 9.80665
@@ -73,7 +79,8 @@ class Target:
     Attributes:
         path: of the field.
         inner: index of the innermost axes of the points that belongs to it.
-        step, zero: metres of one raw step and of raw 0; no step where packets have their own, such as the header's or a calibration's.
+        step, zero: metres of one raw step and of raw 0; no step where packets have their own, such
+            as the header's or a calibration's.
     """
 
     path: str
@@ -104,7 +111,9 @@ class Beams:
 
     def unit(self) -> Floats:
         """x, y and z of where the beams go, one metre on: (3, n, ...)."""
-        return np.stack(np.broadcast_arrays(*coordinates(np.ones(()), self.azimuth, self.elevation, (0, 0, 0))))
+        return np.stack(
+            np.broadcast_arrays(*coordinates(np.ones(()), self.azimuth, self.elevation, (0, 0, 0)))
+        )
 
 
 class Measurement:
@@ -114,13 +123,16 @@ class Measurement:
         SpecError: where ranges cannot be traced back to fields and there is no `encode`.
 
     Args:
-        given: paths of the fields that the sensor's `sweep` gives, which are left as they are where they are not ranges.
+        given: paths of the fields that the sensor's `sweep` gives, which are left as they are where
+            they are not ranges.
     """
 
     def __init__(self, sensor: Spec, frame: str, table: Rows, given: Container[str] = ()) -> None:
         self._sensor, self._frame = sensor, frame
         self._points = sensor.points_of(_name(frame, table))
-        self._encode: Callable[[Polar], Mapping[str, Any]] | None = sensor.simulation_of(frame).encode
+        self._encode: Callable[[Polar], Mapping[str, Any]] | None = sensor.simulation_of(
+            frame
+        ).encode
         intensity = self.beams(table).intensity
         self._given, self._intensity = given, "" if intensity in given else intensity
         self._targets = () if self._encode else self._traced(table)
@@ -129,7 +141,9 @@ class Measurement:
     @classmethod
     def of(cls, sensor: Spec, frame: str, table: Rows, given: Container[str]) -> Measurement:
         """The measurement of a sensor's points, as they are given by direction or by coordinates."""
-        return (Placement if _result(sensor, frame, table)[0].__class__ is Cartesian else Measurement)(sensor, frame, table, given)
+        return (
+            Placement if _result(sensor, frame, table)[0].__class__ is Cartesian else Measurement
+        )(sensor, frame, table, given)
 
     def fill(self, table: Rows, numbers: Sequence[int], scene: Scene, times: Floats) -> None:
         """Measure a table's ranges in the scene, and write them.
@@ -165,35 +179,59 @@ class Measurement:
     def beams(self, table: Rows) -> Beams:
         """Where the beams of a table go as it stands."""
         result, batch = _result(self._sensor, self._frame, table)
-        with np.errstate(all="ignore"), plugin_errors(f"points of {self._frame}", self._sensor.id, self._points):
+        with (
+            np.errstate(all="ignore"),
+            plugin_errors(f"points of {self._frame}", self._sensor.id, self._points),
+        ):
             parts = {name: part for name, part in parts_of(result).items() if name in _MEASURED}
             arrays, axes, _, shape = of_points(parts, batch)
         depth = len(shape)
-        full = {name: _as_deep(np.asarray(array, np.float64), depth) for name, array in zip(parts, arrays, strict=True)}
+        full = {
+            name: _as_deep(np.asarray(array, np.float64), depth)
+            for name, array in zip(parts, arrays, strict=True)
+        }
         places = None
         if isinstance(result, Cartesian):
             places = np.stack([np.broadcast_to(full[name], shape) for name in "xyz"])
             full |= dict(zip(("range", "azimuth", "elevation"), direction_of(*places), strict=True))
         origin = [full.get(name, np.zeros((1,) * depth)) for name in ("ox", "oy", "oz")]
         intensity = result.intensity.source if isinstance(result.intensity, Column) else ""
-        own = {name: full[name] for name in ("range", "azimuth", "elevation")} | {"time": np.nan_to_num(full["time"])}
+        own = {name: full[name] for name in ("range", "azimuth", "elevation")} | {
+            "time": np.nan_to_num(full["time"])
+        }
         return Beams(
-            **own, origin=(origin[0], origin[1], origin[2]), counts=_counts(shape, axes, batch), intensity=intensity, places=places
+            **own,
+            origin=(origin[0], origin[1], origin[2]),
+            counts=_counts(shape, axes, batch),
+            intensity=intensity,
+            places=places,
         )
 
     def _measured(self, beams: Beams, scene: Scene, times: Floats) -> Floats:
-        """Metres along each beam; 0 where the sensor does not reach, or nobody knows where the beam goes."""
+        """Metres along each beam; 0 where the sensor does not reach, or nobody knows where the beam
+        goes.
+        """
         known = np.isfinite(beams.azimuth) & np.isfinite(beams.elevation)
         at = times.reshape(-1, *(1,) * (beams.range.ndim - 1)) + beams.time
-        metres = scene.measure(np.nan_to_num(beams.azimuth), np.nan_to_num(beams.elevation), beams.origin, at)
+        metres = scene.measure(
+            np.nan_to_num(beams.azimuth), np.nan_to_num(beams.elevation), beams.origin, at
+        )
         near, far = self._sensor.range_limits
         metres = np.where(known & (metres >= near) & (metres <= far), metres, 0)
-        return np.asarray(np.broadcast_to(metres, np.broadcast_shapes(metres.shape, beams.range.shape)))
+        return np.asarray(
+            np.broadcast_to(metres, np.broadcast_shapes(metres.shape, beams.range.shape))
+        )
 
-    def _values(self, table: Rows, beams: Beams, ranges: Floats, steps: list[Any]) -> dict[str, NDArray[Any]]:
+    def _values(
+        self, table: Rows, beams: Beams, ranges: Floats, steps: list[Any]
+    ) -> dict[str, NDArray[Any]]:
         """The raw values of the fields that carry these ranges."""
         if self._encode is not None:
-            polar = Polar(ranges, np.broadcast_to(beams.azimuth, ranges.shape), np.broadcast_to(beams.elevation, ranges.shape))
+            polar = Polar(
+                ranges,
+                np.broadcast_to(beams.azimuth, ranges.shape),
+                np.broadcast_to(beams.elevation, ranges.shape),
+            )
             with plugin_errors(f"encode of {self._frame}", self._sensor.id, self._encode):
                 return {path: np.asarray(values) for path, values in self._encode(polar).items()}
         found: dict[str, NDArray[Any]] = {}
@@ -202,43 +240,58 @@ class Measurement:
             part = _part(ranges, target.inner)
             with np.errstate(all="ignore"):
                 raw = whole(info, (part - zero) / step)
-            found[target.path] = np.where((part > 0) & (raw > 0) & (raw <= self._most(table, target.path)), raw, 0)
+            found[target.path] = np.where(
+                (part > 0) & (raw > 0) & (raw <= self._most(table, target.path)), raw, 0
+            )
         return found
 
     def _most(self, table: Rows, path: str) -> float:
         """The largest raw value that a field holds, and that the frame's wire form can write."""
         most, form = table.schema.fields[path].limits[1], self._sensor.frames[self._frame].wire
-        leaves = [group.layout.leaves[path] for group in table.groups if path in group.layout.leaves]
-        return most if form is None else min(most, *(form.largest(slot_of(leaf)) for leaf in leaves))
+        leaves = [
+            group.layout.leaves[path] for group in table.groups if path in group.layout.leaves
+        ]
+        return (
+            most if form is None else min(most, *(form.largest(slot_of(leaf)) for leaf in leaves))
+        )
 
     def _traced(self, table: Rows) -> tuple[Target, ...]:
         """The fields in metres that the ranges of the points answer to."""
         found: list[Target] = []
         for path, info in table.schema.fields.items():
-            if factor(info.unit, "m") is None or not any(path in group.layout.leaves for group in table.groups):
+            if factor(info.unit, "m") is None or not any(
+                path in group.layout.leaves for group in table.groups
+            ):
                 continue
             answer = self._probed(table, [path], PROBE)[0].range
             expected = info.physical(PROBE)
             for spot in self._inner(table, answer):
                 part = _part(answer, spot)
-                near = part[np.isclose(part, expected)]  # a direction whose length is 1 but for its own steps is part of the range
+                near = part[
+                    np.isclose(part, expected)
+                ]  # a direction whose length is 1 but for its own steps is part of the range
                 step = info.scale if np.allclose(near, expected, EXACT, 0) else None
                 found += [Target(path, spot, step, info.offset)] if near.size else []
         found = found or self._linear(table)
         if not found:
-            reason = "no field in metres makes the range of a point: the sensor has to give `encode`"
+            reason = (
+                "no field in metres makes the range of a point: the sensor has to give `encode`"
+            )
             raise SpecError(reason, path="points", sensor=self._sensor.id)
         return tuple(found)
 
     def _linear(self, table: Rows) -> list[Target]:
-        """The fields that ranges are linear in, not by their own scale: those in metres, shifted or stretched by a correction; and
-        the elements of arrays without a unit to which ranges are in proportion, since the header has the unit."""
+        """The fields that ranges are linear in, not by their own scale: those in metres, shifted or
+        stretched by a correction; and the elements of arrays without a unit to which ranges are in
+        proportion, since the header has the unit."""
         found = []
         for path, info in table.schema.fields.items():
             metres = factor(info.unit, "m") is not None
             if not metres and (info.unit or info.kind != "int" or not info.axes):
                 continue
-            answers = [beams.range for beams in self._probed(table, [path], PROBE, 2 * PROBE, 3 * PROBE)]
+            answers = [
+                beams.range for beams in self._probed(table, [path], PROBE, 2 * PROBE, 3 * PROBE)
+            ]
             for spot in self._inner(table, answers[0]):
                 once, twice, thrice = (_part(answer, spot) for answer in answers)
                 even = np.isclose(thrice - twice, twice - once) & (twice > once) & (once > 0)
@@ -261,7 +314,10 @@ class Measurement:
         """Metres of one raw step and of raw 0, numbers or for each point."""
         if target.step is not None:
             return target.step, target.zero
-        once, twice = (_part(beams.range, target.inner) for beams in self._probed(table, [target.path], PROBE, 2 * PROBE))
+        once, twice = (
+            _part(beams.range, target.inner)
+            for beams in self._probed(table, [target.path], PROBE, 2 * PROBE)
+        )
         return (twice - once) / PROBE, 2 * once - twice
 
     def _inner(self, table: Rows, answer: Floats) -> list[tuple[int, ...]]:
@@ -271,13 +327,19 @@ class Measurement:
 
     def _turning(self, table: Rows) -> bool:
         """Whether directions depend on ranges."""
-        first, second = self._probed(table, [target.path for target in self._targets], PROBE, 2 * PROBE)
-        same = (np.array_equal(getattr(first, name), getattr(second, name), equal_nan=True) for name in ("azimuth", "elevation"))
+        first, second = self._probed(
+            table, [target.path for target in self._targets], PROBE, 2 * PROBE
+        )
+        same = (
+            np.array_equal(getattr(first, name), getattr(second, name), equal_nan=True)
+            for name in ("azimuth", "elevation")
+        )
         return not all(same)
 
 
 class Placement(Measurement):
-    """How one frame type of a sensor carries coordinates: its fields are solved for the place that a beam in a declared direction meets.
+    """How one frame type of a sensor carries coordinates: its fields are solved for the place that
+    a beam in a declared direction meets.
 
     Raises:
         SpecError: where no directions are declared, or no field makes a coordinate of a point.
@@ -294,23 +356,39 @@ class Placement(Measurement):
             self._shine(table, _part(ranges, self._targets[0].inner) * 1000)
 
     def _directions(self, numbers: Sequence[int], shape: tuple[int, ...]) -> tuple[Floats, Floats]:
-        """The declared azimuths and elevations of packets, (n, *shape) each; nan beyond those of a packet that has fewer points."""
+        """The declared azimuths and elevations of packets, (n, *shape) each; nan beyond those of a
+        packet that has fewer points.
+        """
         declared = self._sensor.simulation_of(self._frame).directions
         if declared is None:
-            reason = "points by coordinates are simulated along Simulation(directions=...), and none are declared"
+            reason = (
+                "points by coordinates are simulated along Simulation(directions=...), and none are"
+                " declared"
+            )
             raise SpecError(reason, path="simulation", sensor=self._sensor.id)
         found = np.full((2, len(numbers), *shape), np.nan)
         with plugin_errors(f"directions of {self._frame}", self._sensor.id, declared):
             for index, number in enumerate(numbers):
                 azimuth, elevation = np.broadcast_arrays(*declared(number))
-                given = np.stack([azimuth, elevation]).reshape(2, *(1,) * (len(shape) - azimuth.ndim), *azimuth.shape)
-                if any(own > length for own, length in zip(given.shape[1:], shape, strict=False)) or given.ndim > 1 + len(shape):
-                    raise SpecError(f"azimuth and elevation {azimuth.shape} do not broadcast to the points of frame {number}, {shape}")
-                corner: Any = tuple(slice(0, length if length > 1 else None) for length in given.shape[1:])
+                given = np.stack([azimuth, elevation]).reshape(
+                    2, *(1,) * (len(shape) - azimuth.ndim), *azimuth.shape
+                )
+                if any(
+                    own > length for own, length in zip(given.shape[1:], shape, strict=False)
+                ) or given.ndim > 1 + len(shape):
+                    raise SpecError(
+                        f"azimuth and elevation {azimuth.shape} do not broadcast to the points of"
+                        f" frame {number}, {shape}"
+                    )
+                corner: Any = tuple(
+                    slice(0, length if length > 1 else None) for length in given.shape[1:]
+                )
                 found[:, index][(slice(None), *corner)] = given
         return found[0], found[1]
 
-    def _values(self, table: Rows, beams: Beams, ranges: Floats, steps: list[Any]) -> dict[str, NDArray[Any]]:
+    def _values(
+        self, table: Rows, beams: Beams, ranges: Floats, steps: list[Any]
+    ) -> dict[str, NDArray[Any]]:
         if self._encode is not None:
             return super()._values(table, beams, ranges, steps)
         found: dict[str, NDArray[Any]] = {}
@@ -320,15 +398,28 @@ class Placement(Measurement):
             infos = [table.schema.fields[path] for path in paths]
             zero, *ones = (_part(places, inner) for places in self._moved(table, paths))
             slopes = np.stack([(one - zero) / PROBE for one in ones])
-            raw = [whole(info, column) for info, column in zip(infos, _solved(slopes, _part(aims, inner) - zero), strict=True)]
+            raw = [
+                whole(info, column)
+                for info, column in zip(
+                    infos, _solved(slopes, _part(aims, inner) - zero), strict=True
+                )
+            ]
             kept = _part(ranges, inner) > 0
             for info, column in zip(infos, raw, strict=True):
-                kept = kept & ((column >= info.limits[0]) & (column <= info.limits[1]) if info.kind == "int" else np.isfinite(column))
-            found |= {path: np.where(kept, column, 0) for path, column in zip(paths, raw, strict=True)}
+                kept = kept & (
+                    (column >= info.limits[0]) & (column <= info.limits[1])
+                    if info.kind == "int"
+                    else np.isfinite(column)
+                )
+            found |= {
+                path: np.where(kept, column, 0) for path, column in zip(paths, raw, strict=True)
+            }
         return found
 
     def _moved(self, table: Rows, paths: Sequence[str]) -> list[Floats]:
-        """The coordinates while all of these fields are 0, and with each of them at its probing value; (3, n, ...) each."""
+        """The coordinates while all of these fields are 0, and with each of them at its probing
+        value; (3, n, ...) each.
+        """
         before = {path: table.raw(path) for path in paths}
         for path in paths:
             store(table, path, np.array(0))
@@ -342,9 +433,18 @@ class Placement(Measurement):
         found = []
         for path, info in table.schema.fields.items():
             metres = not info.unit or factor(info.unit, "m") is not None
-            if not metres or info.kind not in ("int", "float") or path in self._given or len(info.axes) < table.schema.depth():
+            if (
+                not metres
+                or info.kind not in ("int", "float")
+                or path in self._given
+                or len(info.axes) < table.schema.depth()
+            ):
                 continue
-            places = [beams.places for beams in self._probed(table, [path], PROBE, 2 * PROBE, 3 * PROBE) if beams.places is not None]
+            places = [
+                beams.places
+                for beams in self._probed(table, [path], PROBE, 2 * PROBE, 3 * PROBE)
+                if beams.places is not None
+            ]
             for spot in self._inner(table, places[0][0]):
                 once, twice, thrice = (_part(place, spot) for place in places)
                 if (twice != once).any() and np.allclose(thrice - twice, twice - once):
@@ -359,7 +459,9 @@ class Placement(Measurement):
 
 
 def _solved(slopes: Floats, aims: Floats) -> Floats:
-    """What fields have to be, (k, n, ...), that move values by `slopes`, (k, m, n, ...), for these to be at `aims`, (m, n, ...)."""
+    """What fields have to be, (k, n, ...), that move values by `slopes`, (k, m, n, ...), for these
+    to be at `aims`, (m, n, ...).
+    """
     matrices, wanted = np.moveaxis(slopes, (0, 1), (-1, -2)), np.moveaxis(aims, 0, -1)
     first = matrices[(0,) * (matrices.ndim - 2)]
     inverse = np.linalg.pinv(first if (matrices == first).all() else matrices)
@@ -379,7 +481,11 @@ def _result(sensor: Spec, frame: str, table: Rows) -> tuple[Points, Batch]:
         result = points(Fields(batch))
     measured = [getattr(result, name, None) for name in ("range", "x", "y", "z")]
     if not any(isinstance(part, Column) for part in measured):
-        raise SpecError("no field makes the range of a point: it cannot be simulated", path="points", sensor=sensor.id)
+        raise SpecError(
+            "no field makes the range of a point: it cannot be simulated",
+            path="points",
+            sensor=sensor.id,
+        )
     return result, batch
 
 
@@ -411,7 +517,10 @@ class PartRows(Rows):
             raise SpecError("the frame has no such parts", path=path)
         self.place, self.frames = place[:2], frames
         own, self.which = frames.parts(*self.place)
-        super().__init__(own.schema, [Group(group.layout, group.where, group.rows.copy()) for group in own.groups])
+        super().__init__(
+            own.schema,
+            [Group(group.layout, group.where, group.rows.copy()) for group in own.groups],
+        )
 
     def put_back(self) -> None:
         """Write the parts into their frames, sealed."""
@@ -420,8 +529,13 @@ class PartRows(Rows):
         spots = list[tuple[int, int, NDArray[np.uint8]]]()
         for group, buffer, walked in self.frames.walks(axis):
             kinds = [one.node.name for one in group.layout.regions[axis].kinds]
-            for piece in (piece for pieces in walked.rounds for piece in pieces if kinds[piece.kind] == kind):
-                spots += [(int(group.where[owner]), int(spot), buffer) for owner, spot in zip(piece.owners, piece.spots, strict=True)]
+            for piece in (
+                piece for pieces in walked.rounds for piece in pieces if kinds[piece.kind] == kind
+            ):
+                spots += [
+                    (int(group.where[owner]), int(spot), buffer)
+                    for owner, spot in zip(piece.owners, piece.spots, strict=True)
+                ]
         for _, spot, buffer in sorted(spots, key=lambda found: found[:2]):
             part = next(left)
             buffer[spot : spot + len(part)] = np.frombuffer(part, np.uint8)
@@ -435,7 +549,9 @@ def store(table: Rows, path: str, values: NDArray[Any]) -> None:
             continue
         own = values if values.ndim == 0 else values[group.where]
         if own.ndim:
-            own = own.reshape(own.shape[: 1 + len(leaf.shape)])[(slice(None), *(slice(0, length) for length in leaf.shape))]
+            own = own.reshape(own.shape[: 1 + len(leaf.shape)])[
+                (slice(None), *(slice(0, length) for length in leaf.shape))
+            ]
         leaf.store(group.rows, own)
 
 
@@ -452,12 +568,15 @@ def _counts(shape: tuple[int, ...], axes: tuple[str | None, ...], batch: Batch) 
     """How many points each packet has."""
     counts = np.ones(len(batch), np.intp)
     for length, name in zip(shape[1:], axes, strict=True):
-        counts = counts * (length if name is None or name.startswith("<") else batch.table.counts(name))
+        counts = counts * (
+            length if name is None or name.startswith("<") else batch.table.counts(name)
+        )
     return counts
 
 
 class Rest:
-    """What an IMU feels in a sensor that stands level and still, written into the fields that the `imu` of a frame type answers to.
+    """What an IMU feels in a sensor that stands level and still, written into the fields that the
+    `imu` of a frame type answers to.
 
     Args:
         given: paths of the fields that the frame's `sweep` gives.
@@ -488,11 +607,23 @@ class Rest:
             store(table, path, np.array(0))
         zero = self._felt(table)
         slopes = np.stack([self._probed(table, path) - zero for path in self._targets]) / PROBE
-        aims = np.random.default_rng(seed).normal(0.0, shake, zero.shape) if shake else np.zeros(zero.shape)
+        aims = (
+            np.random.default_rng(seed).normal(0.0, shake, zero.shape)
+            if shake
+            else np.zeros(zero.shape)
+        )
         aims[5] += GRAVITY
         for path, raw in zip(self._targets, _solved(slopes, aims - zero), strict=True):
             info = table.schema.fields[path]
-            store(table, path, np.clip(whole(info, raw), *info.limits).reshape(before[path].shape) if info.kind == "int" else raw)
+            store(
+                table,
+                path,
+                (
+                    np.clip(whole(info, raw), *info.limits).reshape(before[path].shape)
+                    if info.kind == "int"
+                    else raw
+                ),
+            )
         if isinstance(table, PartRows):
             table.put_back()
 
@@ -512,7 +643,11 @@ class Rest:
             if (once != none).any() and np.allclose(twice - once, once - none):
                 found.append(path)
         if not found or zero.shape[0] != 6:
-            raise SpecError("no field makes what the IMU feels: it cannot be simulated", path=f"{self._frame}.imu", sensor=self._sensor.id)
+            raise SpecError(
+                "no field makes what the IMU feels: it cannot be simulated",
+                path=f"{self._frame}.imu",
+                sensor=self._sensor.id,
+            )
         return found
 
     def _probed(self, table: Rows, path: str) -> Floats:
@@ -526,11 +661,21 @@ class Rest:
         """Angular velocities, then accelerations: (6, n, ...)."""
         batch = _batch(self._sensor, table)
         function = self._sensor.imu_of(_name(self._frame, table))
-        with np.errstate(all="ignore"), plugin_errors(f"imu of {self._frame}", self._sensor.id, function):
+        with (
+            np.errstate(all="ignore"),
+            plugin_errors(f"imu of {self._frame}", self._sensor.id, function),
+        ):
             result = function(Fields(batch))
             parts = dict(enumerate((*result.angular_velocity, *result.linear_acceleration)))
-            arrays, _, _, shape = of_points({str(number): part for number, part in parts.items()}, batch)
-        return np.stack([np.broadcast_to(_as_deep(np.asarray(array, np.float64), len(shape)), shape) for array in arrays])
+            arrays, _, _, shape = of_points(
+                {str(number): part for number, part in parts.items()}, batch
+            )
+        return np.stack(
+            [
+                np.broadcast_to(_as_deep(np.asarray(array, np.float64), len(shape)), shape)
+                for array in arrays
+            ]
+        )
 
 
 class Pace:
@@ -546,12 +691,16 @@ class Pace:
     def __init__(self, sensor: Spec, frame: str, table: Rows, beams: Beams) -> None:
         self._sensor, self._rate = sensor, sensor.simulation_of(frame).rate
         self._point = _seconds_per_point(beams)
-        self._baud = next((link.baud for link in (sensor.links.get("data"),) if isinstance(link, Serial)), 0)
+        self._baud = next(
+            (link.baud for link in (sensor.links.get("data"),) if isinstance(link, Serial)), 0
+        )
         times = self.times(table, lambda: beams)
         self.interval = float(times[-1]) / (len(times) - 1)
 
     def times(self, table: Rows, beams: Callable[[], Beams]) -> Times:
-        """(n,) ns of each packet of a batch after its first; `beams` gives those of the batch where they are needed."""
+        """(n,) ns of each packet of a batch after its first; `beams` gives those of the batch where
+        they are needed.
+        """
         if self._rate:
             return np.asarray(np.rint(np.arange(len(table)) * 1e9 / self._rate), np.int64)
         if self._sensor.clock:
@@ -589,7 +738,9 @@ def _sizes(table: Rows) -> NDArray[np.intp]:
 
 @dataclass(frozen=True, eq=False)
 class Block:
-    """Packets in a row: their bytes, and (n + 1,) int64 ns from the first one to each, and to the one after them."""
+    """Packets in a row: their bytes, and (n + 1,) int64 ns from the first one to each, and to the
+    one after them.
+    """
 
     frames: list[bytes]
     times: NDArray[np.int64]
@@ -599,7 +750,8 @@ class Simulation:
     """A data frame type of a sensor, ready to be simulated.
 
     Args:
-        blocked: whether the rotor stands still: angles, and what else a scan is cut by, stay as in the second frame.
+        blocked: whether the rotor stands still: angles, and what else a scan is cut by, stay as in
+            the second frame.
 
     Attributes:
         interval: ns from one packet to the next, on average; 0 where the spec says nothing of time.
@@ -612,7 +764,9 @@ class Simulation:
     def __init__(self, sensor: Spec, frame: str, *, blocked: bool = False) -> None:
         sweep = sensor.simulation_of(frame).sweep
         if sweep is None:
-            raise UsageError(f"{sensor.id} declares no sweep for {frame!r} frames, and cannot be simulated")
+            raise UsageError(
+                f"{sensor.id} declares no sweep for {frame!r} frames, and cannot be simulated"
+            )
         self._sensor, self._frame, self._sweep = sensor, frame, sweep
         self._maker = FrameMaker(sensor, frame)
         self._stuck = self._turning(sweep(1)) if blocked else {}
@@ -620,13 +774,25 @@ class Simulation:
         swept = self._swept(range(min(PROBED, max(PROBED_BYTES // length, LEAST_PROBED))))
         table = self._maker.table(swept)
         self._parts = sensor.parts_with("points", frame)
-        given = [part for values in swept for part in values[self._parts.partition(".")[0]]] if self._parts else swept
-        self._measurement = Measurement.of(sensor, frame, self._with_points(table), {path for values in given for path in values})
+        given = (
+            [part for values in swept for part in values[self._parts.partition(".")[0]]]
+            if self._parts
+            else swept
+        )
+        self._measurement = Measurement.of(
+            sensor, frame, self._with_points(table), {path for values in given for path in values}
+        )
         self._pace = Pace(sensor, frame, table, self._beams(table))
-        self._rest = Rest(sensor, frame, {path for values in swept for path in values}) if sensor.frames[frame].imu else None
+        self._rest = (
+            Rest(sensor, frame, {path for values in swept for path in values})
+            if sensor.frames[frame].imu
+            else None
+        )
         self.interval = self._pace.interval
 
-    def block(self, start: int, count: int, scene: Scene, since: float = 0.0, shake: float = 0.0) -> Block:
+    def block(
+        self, start: int, count: int, scene: Scene, since: float = 0.0, shake: float = 0.0
+    ) -> Block:
         """The packets from number `start` on.
 
         Args:
@@ -638,7 +804,12 @@ class Simulation:
         times = self._pace.times(table, functools.partial(self._beams, table))
         seconds, measured = since + times / 1e9, self._with_points(table)
         if isinstance(measured, PartRows):
-            self._measurement.fill(measured, [numbers[frame] for frame in measured.which], scene, seconds[measured.which])
+            self._measurement.fill(
+                measured,
+                [numbers[frame] for frame in measured.which],
+                scene,
+                seconds[measured.which],
+            )
             measured.put_back()
         else:
             self._measurement.fill(table, numbers, scene, seconds)
@@ -668,16 +839,24 @@ class Simulation:
         """Those of a frame's values that change because the rotor turns."""
         fields, rule = codec(self._sensor.frames[self._frame]).schema.fields, self._sensor.scan
         cut_by = "" if isinstance(rule, Every) else rule.name
-        return {path: value for path, value in values.items() if path == cut_by or fields[path].unit in ("deg", "rad")}
+        return {
+            path: value
+            for path, value in values.items()
+            if path == cut_by or fields[path].unit in ("deg", "rad")
+        }
 
 
 @functools.lru_cache(maxsize=64)
 def simulation(sensor: Spec, frame: str, *, blocked: bool = False) -> Simulation:
-    """The simulation of a data frame type; kept, since it takes a while to find out how a sensor carries its ranges."""
+    """The simulation of a data frame type; kept, since it takes a while to find out how a sensor
+    carries its ranges.
+    """
     return Simulation(sensor, frame, blocked=blocked)
 
 
-def simulate(sensor: Spec, packets: int = 100, *, start: int = 0, scene: Scene | None = None) -> list[bytes]:
+def simulate(
+    sensor: Spec, packets: int = 100, *, start: int = 0, scene: Scene | None = None
+) -> list[bytes]:
     """The data frames that a sensor standing in a scene sends, one after another.
 
     Args:
@@ -694,6 +873,8 @@ def simulate(sensor: Spec, packets: int = 100, *, start: int = 0, scene: Scene |
 
 
 def opening(sensor: Spec) -> bytes:
-    """What the sensor sends before its data frames: the frame that they come after; empty where they need none."""
+    """What the sensor sends before its data frames: the frame that they come after; empty where
+    they need none.
+    """
     after = sensor.frames[sensor.data_frame].after
     return b"" if after is None else example(sensor, after)

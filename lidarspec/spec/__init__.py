@@ -1,12 +1,16 @@
 """What a sensor is: the names of those who write one.
 
-    from lidarspec.spec import Checksummed, Clock, Crc, Fields, Frame, OnWrap, Polar, Scaled, Sensor, Serial, Simulation, hookimpl, spread
+    from lidarspec.spec import Checksummed, Clock, Crc, Fields, Frame, OnWrap, Polar, Scaled,
+    Sensor, Serial, Simulation, hookimpl, spread
 
-A plugin imports from here and from `lidarspec` alone. In: a manual, as values. Out: a `Sensor`, checked as it is made, of which every
-other package is a function. Nothing in this package reads bytes of a stream. Modules in reading order:
+A plugin imports from here and from `lidarspec` alone. In: a manual, as values. Out: a `Sensor`,
+checked as it is made, of which every
+other package is a function. Nothing in this package reads bytes of a stream. Modules in reading
+order:
 
 * `description`: `Spec`, `Frame`, `Command`, `Simulation`: what must fit together.
-* `sensor`: a `Spec` with everything that can be done with it as methods; it stands above the stations that do it.
+* `sensor`: a `Spec` with everything that can be done with it as methods; it stands above the
+  stations that do it.
 * `arguments`: what a command is told, and what is found out when it is sent.
 * `fields`: units and seals, as parts of a struct.
 * `checksums`: algorithms as values; of one message.
@@ -36,7 +40,12 @@ if TYPE_CHECKING:
         Xor as Xor,
         ZeroPadded as ZeroPadded,
     )
-    from lidarspec.spec.description import Command as Command, Frame as Frame, Relative as Relative, Simulation as Simulation
+    from lidarspec.spec.description import (
+        Command as Command,
+        Frame as Frame,
+        Relative as Relative,
+        Simulation as Simulation,
+    )
     from lidarspec.spec.fields import (
         Checksummed as Checksummed,
         HttpReply as HttpReply,
@@ -45,8 +54,21 @@ if TYPE_CHECKING:
         Scaled as Scaled,
         SizeOf as SizeOf,
     )
-    from lidarspec.spec.links import Assembled as Assembled, Http as Http, Link as Link, Serial as Serial, Tcp as Tcp, Udp as Udp
-    from lidarspec.spec.results import Cartesian as Cartesian, Extra as Extra, Imu as Imu, Points as Points, Polar as Polar
+    from lidarspec.spec.links import (
+        Assembled as Assembled,
+        Http as Http,
+        Link as Link,
+        Serial as Serial,
+        Tcp as Tcp,
+        Udp as Udp,
+    )
+    from lidarspec.spec.results import (
+        Cartesian as Cartesian,
+        Extra as Extra,
+        Imu as Imu,
+        Points as Points,
+        Polar as Polar,
+    )
     from lidarspec.spec.sensor import Learned as Learned, Sensor as Sensor
     from lidarspec.spec.timing import (
         Clock as Clock,
@@ -98,11 +120,43 @@ _NAMES = {
     "spec.fields": ("Scaled", "Checksummed", "Parts", "SizeOf", "HttpRequest", "HttpReply"),
     "spec.checksums": ("Checksum", "Crc", "Xor", "Sum", "WordXor", "Fold15", "ZeroPadded"),
     "spec.links": ("Assembled", "Serial", "Udp", "Tcp", "Http", "Link"),
-    "spec.timing": ("Clock", "Sequence", "OnWrap", "OnFlag", "OnChange", "OnJump", "OnRewind", "Every"),
+    "spec.timing": (
+        "Clock",
+        "Sequence",
+        "OnWrap",
+        "OnFlag",
+        "OnChange",
+        "OnJump",
+        "OnRewind",
+        "Every",
+    ),
     "expressions.columns": ("Fields", "Column"),
     "spec.results": ("Points", "Polar", "Cartesian", "Extra", "Imu"),
-    "spec.vocabulary": ("along", "spread", "wrap", "following", "previous", "between_blocks", "last", "running", "stack", "steps", "take"),
-    "spec.wire_forms": ("Tokens", "Lines", "SixBits", "Echoes", "Scip", "Escaped", "WireForm", "Reading", "Slot", "Unescaped"),
+    "spec.vocabulary": (
+        "along",
+        "spread",
+        "wrap",
+        "following",
+        "previous",
+        "between_blocks",
+        "last",
+        "running",
+        "stack",
+        "steps",
+        "take",
+    ),
+    "spec.wire_forms": (
+        "Tokens",
+        "Lines",
+        "SixBits",
+        "Echoes",
+        "Scip",
+        "Escaped",
+        "WireForm",
+        "Reading",
+        "Slot",
+        "Unescaped",
+    ),
     "plugins": ("hookimpl",),
     "transports.protocol": ("Format", "Transport", "LiveTransport", "Chunk", "Disconnected"),
 }

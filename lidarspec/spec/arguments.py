@@ -1,7 +1,9 @@
-"""What a command is told: the kinds of its arguments, and the values that are found out when it is sent.
+"""What a command is told: the kinds of its arguments, and the values that are found out when it is
+sent.
 
-An argument is a number in a range, a text, an address or bytes; each kind says in words what it takes, and as which bytes that stands in
-the frame. `Count` and `Address` among the `values` of a command are filled in by the conversation: a running number, and where we are.
+An argument is a number in a range, a text, an address or bytes; each kind says in words what it
+takes, and as which bytes that stands in the frame. `Count` and `Address` among the `values` of a
+command are filled in by the conversation: a running number, and where we are.
 """
 
 from __future__ import annotations
@@ -14,7 +16,9 @@ from lidarspec.errors import SpecError
 
 @dataclass(frozen=True)
 class Range:
-    """A number from `low` to `high`, in the unit of its field; written as two numbers behind the path."""
+    """A number from `low` to `high`, in the unit of its field; written as two numbers behind the
+    path.
+    """
 
     low: float
     high: float
@@ -22,7 +26,8 @@ class Range:
 
 @dataclass(frozen=True)
 class Text:
-    """A text of at most `size` bytes; where its field has a fixed size, it is filled up with `fill`.
+    """A text of at most `size` bytes; where its field has a fixed size, it is filled up with
+    `fill`.
 
     Raises:
         SpecError: for a size below 1, and a fill that is not one byte.
@@ -34,11 +39,15 @@ class Text:
 
     def __post_init__(self) -> None:
         if self.size < 1 or len(self.fill) != 1:
-            raise SpecError("Text(size, fill) has room for a byte at least, and is filled up with one")
+            raise SpecError(
+                "Text(size, fill) has room for a byte at least, and is filled up with one"
+            )
 
     def words(self, room: int | None) -> str:
         """What it takes."""
-        return f"a text of up to {min(self.size, room or self.size)} bytes in {self.encoding.upper()}"
+        return (
+            f"a text of up to {min(self.size, room or self.size)} bytes in {self.encoding.upper()}"
+        )
 
     def packed(self, value: Any, room: int | None) -> bytes:
         """The bytes of a text; ValueError for what it does not take."""
@@ -89,7 +98,8 @@ Taken = Range | Text | Address | Octets
 
 @dataclass(frozen=True)
 class Count:
-    """A running number of so many bits in `Command.values`, of which each command that is sent has the next; `first` is that of the first.
+    """A running number of so many bits in `Command.values`, of which each command that is sent has
+    the next; `first` is that of the first.
 
     Raises:
         SpecError: for a number of bits below 1, or a first number that they cannot hold.
@@ -100,7 +110,9 @@ class Count:
 
     def __post_init__(self) -> None:
         if self.bits < 1 or not 0 <= self.first < 1 << self.bits:
-            raise SpecError("Count(bits, first) has a bit at least, and begins with a number that its bits hold")
+            raise SpecError(
+                "Count(bits, first) has a bit at least, and begins with a number that its bits hold"
+            )
 
     def at(self, index: int) -> int:
         """The number of the command that is sent as the `index`-th one, from 0."""
@@ -113,19 +125,29 @@ Filled = Count | Address
 
 @dataclass(frozen=True)
 class Argument:
-    """An argument of a command: the path of its field, with the indices of elements of arrays ("ports[1]"), and what it takes."""
+    """An argument of a command: the path of its field, with the indices of elements of arrays
+    ("ports[1]"), and what it takes.
+    """
 
     path: str
     kind: Taken
 
     def to_dict(self) -> dict[str, Any]:
         """As data: its field, and the ends of its range or what else it takes."""
-        own = {name: value.decode("latin-1") if isinstance(value, bytes) else value for name, value in vars(self.kind).items()}
-        return {"field": self.path, **({} if isinstance(self.kind, Range) else {"kind": type(self.kind).__name__.lower()}), **own}
+        own = {
+            name: value.decode("latin-1") if isinstance(value, bytes) else value
+            for name, value in vars(self.kind).items()
+        }
+        return {
+            "field": self.path,
+            **({} if isinstance(self.kind, Range) else {"kind": type(self.kind).__name__.lower()}),
+            **own,
+        }
 
 
 def argument(given: Any) -> Argument:
-    """What ("motor.speed", 5, 15), ("data.host", Address()), ("name", Text(16)) or ("key", bytes) declares.
+    """What ("motor.speed", 5, 15), ("data.host", Address()), ("name", Text(16)) or ("key", bytes)
+    declares.
 
     Raises:
         SpecError: for anything else.
@@ -137,4 +159,7 @@ def argument(given: Any) -> Argument:
             return Argument(path, kind)
         case (str(path), kind) if kind is bytes:
             return Argument(path, Octets())
-    raise SpecError(f"an argument is (path, lowest, highest), (path, Text(16)), (path, Address()) or (path, bytes), not {given!r:.60}")
+    raise SpecError(
+        "an argument is (path, lowest, highest), (path, Text(16)), (path, Address()) or (path,"
+        f" bytes), not {given!r:.60}"
+    )

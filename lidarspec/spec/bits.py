@@ -1,8 +1,10 @@
-"""Bit blocks, found out by probing: which bits of a block of bytes make up each value that is parsed from it.
+"""Bit blocks, found out by probing: which bits of a block of bytes make up each value that is
+parsed from it.
 
-A block (``BitStruct``, ``ByteSwapped``, ``BitsSwapped``, ``BytesInteger``, in any nesting) is linear in its bits:
-value = sum of bit * weight. Parsing it once with no bit set and once with each single bit set gives the weights;
-random blocks then confirm them. So no rule about bit order stands anywhere but in the parser that is probed.
+A block (``BitStruct``, ``ByteSwapped``, ``BitsSwapped``, ``BytesInteger``, in any nesting) is
+linear in its bits: value = sum of bit * weight. Parsing it once with no bit set and once with each
+single bit set gives the weights; random blocks then confirm them. So no rule about bit order stands
+anywhere but in the parser that is probed.
 """
 
 from __future__ import annotations
@@ -18,7 +20,9 @@ CONFIRMATIONS = 24
 
 @dataclass(frozen=True)
 class Segment:
-    """A run of bits of one byte that lands in a value: ``((byte & mask) >> low) << target`` is added to it."""
+    """A run of bits of one byte that lands in a value: ``((byte & mask) >> low) << target`` is
+    added to it.
+    """
 
     byte: int
     mask: int
@@ -46,7 +50,9 @@ class BitField:
 
     @cached_property
     def run(self) -> tuple[str, int, int, int] | None:
-        """The value as bits in a row of a number of whole bytes, if it is: "<" or ">", the first byte, how many, and the lowest bit."""
+        """The value as bits in a row of a number of whole bytes, if it is: "<" or ">", the first
+        byte, how many, and the lowest bit.
+        """
         parts = sorted(self.segments, key=lambda part: part.byte)
         first, count = parts[0].byte, parts[-1].byte - parts[0].byte + 1
         for order, places in (("<", range(count)), (">", range(count - 1, -1, -1))):
@@ -77,7 +83,12 @@ class BitField:
 def whole_bytes(size: int, order: Literal["little", "big"], *, signed: bool) -> BitField:
     """An integer of so many whole bytes."""
     targets = [8 * (byte if order == "little" else size - 1 - byte) for byte in range(size)]
-    return BitField((), tuple(Segment(byte, 0xFF, 0, target) for byte, target in enumerate(targets)), 8 * size, signed)
+    return BitField(
+        (),
+        tuple(Segment(byte, 0xFF, 0, target) for byte, target in enumerate(targets)),
+        8 * size,
+        signed,
+    )
 
 
 #: from a block of bytes to its values, by where the parsed block holds them.
@@ -98,19 +109,25 @@ def probe(parse: Parse, size: int) -> list[BitField] | None:
         for keys, value in parse((1 << bit).to_bytes(size, "little")).items():
             if value:
                 weights[keys].append((bit, int(value)))
-    fields = [_field(keys, pairs, flag=isinstance(base[keys], bool)) for keys, pairs in weights.items()]
+    fields = [
+        _field(keys, pairs, flag=isinstance(base[keys], bool)) for keys, pairs in weights.items()
+    ]
     known = [field for field in fields if field is not None]
     return known if len(known) == len(fields) and _confirmed(parse, size, known) else None
 
 
-def _field(keys: tuple[str | int, ...], pairs: list[tuple[int, int]], *, flag: bool) -> BitField | None:
+def _field(
+    keys: tuple[str | int, ...], pairs: list[tuple[int, int]], *, flag: bool
+) -> BitField | None:
     """A field from (bit of the block, weight); None unless the weights are 1, 2, 4 ... each once."""
     width = len(pairs)
     signed = any(weight < 0 for _, weight in pairs)
     targets = {}
     for bit, weight in pairs:
         magnitude = abs(weight)
-        if magnitude & (magnitude - 1) or (weight < 0) != (signed and magnitude == 1 << (width - 1)):
+        if magnitude & (magnitude - 1) or (weight < 0) != (
+            signed and magnitude == 1 << (width - 1)
+        ):
             return None
         targets[bit] = magnitude.bit_length() - 1
     if sorted(targets.values()) != list(range(width)) or not width:

@@ -1,10 +1,13 @@
-"""Checksum algorithms as values, each a function of one message; and the CRCs in common use by their names.
+"""Checksum algorithms as values, each a function of one message; and the CRCs in common use by
+their names.
 
-An algorithm is immutable, hashable and equal to another by its parameters. `single` is its function by itself, made once and called for one
-message after another; `lidarspec.frames.row_checksums` computes those of many frames at once. `CRCS` has the names that catalogues give.
+An algorithm is immutable, hashable and equal to another by its parameters. `single` is its function
+by itself, made once and called for one message after another; `lidarspec.frames.row_checksums`
+computes those of many frames at once. `CRCS` has the names that catalogues give.
 
-A CRC's register is kept in wire order, where the low byte is the one that meets the next data byte: for `refin` the usual reflected
-register, otherwise the usual register aligned left with its bytes swapped. One formula serves both.
+A CRC's register is kept in wire order, where the low byte is the one that meets the next data byte:
+for `refin` the usual reflected register, otherwise the usual register aligned left with its bytes
+swapped. One formula serves both.
 """
 
 from __future__ import annotations
@@ -35,7 +38,8 @@ MIRROR = bytes(int(f"{byte:08b}"[::-1], 2) for byte in range(256))
 class Checksum(ABC):
     """A checksum algorithm: an immutable value, hashable, equal to another by its parameters.
 
-    `width` is its size in bits; `order` is its byte order where its field is plain bytes (an integer field has its own).
+    `width` is its size in bits; `order` is its byte order where its field is plain bytes (an
+    integer field has its own).
     """
 
     width: int
@@ -50,18 +54,22 @@ class Checksum(ABC):
         """A short phrase for people, such as "XOR-8"."""
 
     def batch(self, rows: NDArray[np.uint8]) -> Values:
-        """The checksum of each row, shape (n,), for frames of one length, shape (n, m); one by one, unless overridden."""
+        """The checksum of each row, shape (n,), for frames of one length, shape (n, m); one by one,
+        unless overridden.
+        """
         return np.fromiter((self(row.tobytes()) for row in rows), np.uint64, len(rows))
 
 
 @dataclass(frozen=True)
 class Crc(Checksum):
-    """A cyclic redundancy check, its parameters as CRC catalogues print them; a wrong one raises ValueError.
+    """A cyclic redundancy check, its parameters as CRC catalogues print them; a wrong one raises
+    ValueError.
 
     Args:
         width: bits of the register, 1 to 64.
         poly: the polynomial without its highest term, highest power first.
-        init, xorout: the register before the first byte, not reflected, and what is XORed onto it as it leaves.
+        init, xorout: the register before the first byte, not reflected, and what is XORed onto it
+            as it leaves.
         refin, refout: each byte enters, and the register leaves, with the lowest bit first.
     """
 
@@ -75,15 +83,27 @@ class Crc(Checksum):
 
     def __post_init__(self) -> None:
         _require(self, width=range(1, 65))
-        _require(self, poly=range(1, 1 << self.width), init=range(1 << self.width), xorout=range(1 << self.width))
+        _require(
+            self,
+            poly=range(1, 1 << self.width),
+            init=range(1 << self.width),
+            xorout=range(1 << self.width),
+        )
         _require(self, refin=(False, True), refout=(False, True), order=("little", "big"))
 
     def __call__(self, data: Bytes) -> int:
         return _single_crc(self)(bytes(data))
 
     def describe(self) -> str:
-        digits, order = -(-self.width // 4), ("", " refin", " refout", " reflected")[self.refin + 2 * self.refout]
-        values = (f" {name} 0x{getattr(self, name):0{digits}x}" for name in ("poly", "init", "xorout") if getattr(self, name))
+        digits, order = (
+            -(-self.width // 4),
+            ("", " refin", " refout", " reflected")[self.refin + 2 * self.refout],
+        )
+        values = (
+            f" {name} 0x{getattr(self, name):0{digits}x}"
+            for name in ("poly", "init", "xorout")
+            if getattr(self, name)
+        )
         return f"CRC-{self.width}{''.join(values)}{order}"
 
     @property
@@ -96,8 +116,12 @@ class Crc(Checksum):
         """What leaves the register, in wire order, after the last byte."""
         if not self.refin:
             size = REGISTER_BYTES[self.width]
-            register = int.from_bytes(register.to_bytes(size, "little"), "big") >> 8 * size - self.width
-        return (register if self.refin == self.refout else reflected(register, self.width)) ^ self.xorout
+            register = (
+                int.from_bytes(register.to_bytes(size, "little"), "big") >> 8 * size - self.width
+            )
+        return (
+            register if self.refin == self.refout else reflected(register, self.width)
+        ) ^ self.xorout
 
 
 @dataclass(frozen=True)
@@ -132,11 +156,13 @@ class Sum(Checksum):
 
 @dataclass(frozen=True)
 class WordXor(Checksum):
-    """The XOR of words of one or two bytes, low byte first, extended to 16 bits by zeros; wrong sizes raise ValueError.
+    """The XOR of words of one or two bytes, low byte first, extended to 16 bits by zeros; wrong
+    sizes raise ValueError.
 
     Args:
         head: bytes in front that are two-byte words, whatever the groups.
-        groups: sizes of the words after them, 1 or 2 bytes each, repeated; a word cut short by the end counts as one byte.
+        groups: sizes of the words after them, 1 or 2 bytes each, repeated; a word cut short by the
+            end counts as one byte.
     """
 
     head: int = 0
@@ -145,14 +171,22 @@ class WordXor(Checksum):
 
     def __post_init__(self) -> None:
         _require(self, head=range(1 << 31))
-        if type(self.groups) is not tuple or not self.groups or any(type(size) is not int or size not in (1, 2) for size in self.groups):
-            raise ValueError(f"WordXor: groups must be a tuple of sizes, each 1 or 2, not {self.groups!r}")
+        if (
+            type(self.groups) is not tuple
+            or not self.groups
+            or any(type(size) is not int or size not in (1, 2) for size in self.groups)
+        ):
+            raise ValueError(
+                f"WordXor: groups must be a tuple of sizes, each 1 or 2, not {self.groups!r}"
+            )
 
     def __call__(self, data: Bytes) -> int:
         return _single_word_xor(self)(bytes(data))
 
     def describe(self) -> str:
-        return f"XOR-16 of {'+'.join(map(str, self.groups))}-byte words" + (f" after a head of {self.head} bytes" if self.head else "")
+        return f"XOR-16 of {'+'.join(map(str, self.groups))}-byte words" + (
+            f" after a head of {self.head} bytes" if self.head else ""
+        )
 
     @cached_property
     def halves(self) -> tuple[list[slice], list[slice]]:
@@ -167,9 +201,11 @@ class WordXor(Checksum):
 
 @dataclass(frozen=True)
 class Fold15(Checksum):
-    """Little-endian words, each added to twice the total so far; then what is above bit 14 is added to the low 15 bits.
+    """Little-endian words, each added to twice the total so far; then what is above bit 14 is added
+    to the low 15 bits.
 
-    The last word of an odd length is extended by a zero byte. Bits shifted past bit 29 are lost: of longer data the last 30 words count.
+    The last word of an odd length is extended by a zero byte. Bits shifted past bit 29 are lost: of
+    longer data the last 30 words count.
 
     Source: the trailer of many vacuum cleaners' lidars; agrees with captures of two makes.
     """
@@ -188,7 +224,9 @@ class Fold15(Checksum):
 
 @dataclass(frozen=True)
 class ZeroPadded(Checksum):
-    """Another algorithm over the data and as many zero bytes as make its length a multiple of `to`, as hardware that takes words has it."""
+    """Another algorithm over the data and as many zero bytes as make its length a multiple of `to`,
+    as hardware that takes words has it.
+    """
 
     algorithm: Checksum
     to: int
@@ -202,14 +240,18 @@ class ZeroPadded(Checksum):
         return self.algorithm(bytes(data) + bytes(-len(data) % self.to))
 
     def describe(self) -> str:
-        return f"{self.algorithm.describe()} of the bytes padded with zeros to a multiple of {self.to}"
+        return (
+            f"{self.algorithm.describe()} of the bytes padded with zeros to a multiple of {self.to}"
+        )
 
 
 def _require(checksum: Checksum, **allowed: range | tuple[object, ...]) -> None:
     for name, values in allowed.items():
         value = getattr(checksum, name)
         if type(value) is not type(values[0]) or value not in values:
-            raise ValueError(f"{type(checksum).__name__}: {name} must be in {values}, not {value!r}")
+            raise ValueError(
+                f"{type(checksum).__name__}: {name} must be in {values}, not {value!r}"
+            )
 
 
 def _xor(data: Bytes) -> int:
@@ -222,7 +264,9 @@ def _xor(data: Bytes) -> int:
 
 @lru_cache(maxsize=4096)
 def _powers(bits: int, count: int) -> tuple[int, ...]:
-    """By how much an integer is shifted and XORed onto itself until its lowest part is the XOR of so many parts."""
+    """By how much an integer is shifted and XORed onto itself until its lowest part is the XOR of
+    so many parts.
+    """
     return tuple(bits << power for power in reversed(range(max(count - 1, 0).bit_length())))
 
 
@@ -232,7 +276,9 @@ def reflected(value: int, width: int) -> int:
 
 
 def mirrored_bytes(register: int) -> int:
-    """The register with the bits of each byte mirrored, which leads from one bit order to the other."""
+    """The register with the bits of each byte mirrored, which leads from one bit order to the
+    other.
+    """
     return int.from_bytes(register.to_bytes(8, "little").translate(MIRROR), "little")
 
 
@@ -315,12 +361,23 @@ def single(algorithm: Checksum) -> Single:
     if kind is Sum:
         mask = (1 << algorithm.width) - 1
         return lambda data: sum(data) & mask
-    return _single_crc(algorithm) if kind is Crc else _single_word_xor(algorithm) if kind is WordXor else algorithm
+    return (
+        _single_crc(algorithm)
+        if kind is Crc
+        else _single_word_xor(algorithm)
+        if kind is WordXor
+        else algorithm
+    )
 
 
 def _zlib_crc(algorithm: Crc) -> Single | None:
     """A CRC by zlib, some gigabytes a second; None where its polynomial is another."""
-    if (algorithm.width, algorithm.poly, algorithm.refin, algorithm.refout) != (32, 0x04C11DB7, True, True):
+    if (algorithm.width, algorithm.poly, algorithm.refin, algorithm.refout) != (
+        32,
+        0x04C11DB7,
+        True,
+        True,
+    ):
         return None
     start, end = reflected(algorithm.init, 32) ^ 0xFFFFFFFF, algorithm.xorout ^ 0xFFFFFFFF
     return lambda data: zlib.crc32(data, start) ^ end
@@ -331,7 +388,12 @@ def _single_crc(algorithm: Crc) -> Single:
     init, xorout, known = algorithm.init, algorithm.xorout, _zlib_crc(algorithm)
     if known is not None:
         return known
-    if (algorithm.width, algorithm.poly, algorithm.refin, algorithm.refout) == (16, 0x1021, False, False):
+    if (algorithm.width, algorithm.poly, algorithm.refin, algorithm.refout) == (
+        16,
+        0x1021,
+        False,
+        False,
+    ):
         return lambda data: binascii.crc_hqx(data, init) ^ xorout
     table = byte_table(algorithm.width, algorithm.poly, algorithm.refin)
     if algorithm.width > 8:
@@ -340,7 +402,12 @@ def _single_crc(algorithm: Crc) -> Single:
     leaving = [register if algorithm.refin else register >> spare for register in range(256)]
     if algorithm.refin != algorithm.refout:
         leaving = [MIRROR[register] >> spare for register in leaving]
-    return functools.partial(_narrow_crc, table, algorithm.start, bytes(register ^ algorithm.xorout for register in leaving))
+    return functools.partial(
+        _narrow_crc,
+        table,
+        algorithm.start,
+        bytes(register ^ algorithm.xorout for register in leaving),
+    )
 
 
 def _narrow_crc(table: tuple[int, ...], register: int, leaving: bytes, data: bytes) -> int:
@@ -357,10 +424,14 @@ def _wide_crc(algorithm: Crc, table: tuple[int, ...], register: int, data: bytes
 
 @lru_cache(maxsize=256)
 def _single_word_xor(algorithm: WordXor) -> Single:
-    """Groups of words are XORed as a whole, whatever their sizes, and only their XOR is taken apart."""
+    """Groups of words are XORed as a whole, whatever their sizes, and only their XOR is taken
+    apart.
+    """
     head, groups = algorithm.head, algorithm.groups
     size, head_powers = sum(groups), _powers(16, head + 1 >> 1)
-    words = [(8 * sum(groups[:number]), (1 << 8 * width) - 1) for number, width in enumerate(groups)]
+    words = [
+        (8 * sum(groups[:number]), (1 << 8 * width) - 1) for number, width in enumerate(groups)
+    ]
 
     def word_xor(data: bytes) -> int:
         total = int.from_bytes(data[:head], "little")

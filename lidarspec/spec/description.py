@@ -1,7 +1,9 @@
-"""What a sensor is, as values: message types, commands, links, clock, geometry, and what a simulation needs.
+"""What a sensor is, as values: message types, commands, links, clock, geometry, and what a
+simulation needs.
 
-A `Spec` holds what the manual says, and checks that its parts fit together. Everything here is immutable, knows nothing of streams or
-arrays, and has no engine: engines are functions of a `Spec`. `lidarspec.spec.sensor.Sensor` is a `Spec` with these functions as methods.
+A `Spec` holds what the manual says, and checks that its parts fit together. Everything here is
+immutable, knows nothing of streams or arrays, and has no engine: engines are functions of a `Spec`.
+`lidarspec.spec.sensor.Sensor` is a `Spec` with these functions as methods.
 """
 
 from __future__ import annotations
@@ -67,7 +69,10 @@ def _unknown_argument(owner: str, name: str, known: Iterable[str]) -> str:
 
 def _check_simulation(simulation: object) -> None:
     if not isinstance(simulation, Simulation):
-        raise SpecError(f"expected a Simulation(...), got {simulation!r}; leave it out if nothing is needed", path="simulation")
+        raise SpecError(
+            f"expected a Simulation(...), got {simulation!r}; leave it out if nothing is needed",
+            path="simulation",
+        )
 
 
 @dataclass(frozen=True, eq=False)
@@ -75,15 +80,18 @@ class Simulation:
     """What only a simulated sensor needs; of a sensor, or of one frame type of its own.
 
     Args:
-        sweep: the physical values, by path, of frame number i that are not measured: angles, counters, time.
-        encode: the measured `Polar` of a batch to the raw values of its fields, by path, where ranges have no field of their own.
-        rate: how many frames a second are sent; of data, where neither the clock nor the times of the points tell; of other frames,
-            where they are sent again and again by themselves.
-        answers: command -> all that the sensor sends for it before any data, in order: frames by name, or (name, values) with physical
-            values by path, bytes as they are, and seconds of a pause, in which it sends its fillers; or a function from the raw fields
-            of the request to these. A command that is left out is answered by its reply. Of a sensor only.
-        directions: the azimuths and elevations, radians, of the points of frame number i where these are `Cartesian`: two arrays that
-            broadcast to the points of a frame.
+        sweep: the physical values, by path, of frame number i that are not measured: angles,
+            counters, time.
+        encode: the measured `Polar` of a batch to the raw values of its fields, by path, where
+            ranges have no field of their own.
+        rate: how many frames a second are sent; of data, where neither the clock nor the times of
+            the points tell; of other frames, where they are sent again and again by themselves.
+        answers: command -> all that the sensor sends for it before any data, in order: frames by
+            name, or (name, values) with physical values by path, bytes as they are, and seconds of
+            a pause, in which it sends its fillers; or a function from the raw fields of the request
+            to these. A command that is left out is answered by its reply. Of a sensor only.
+        directions: the azimuths and elevations, radians, of the points of frame number i where
+            these are `Cartesian`: two arrays that broadcast to the points of a frame.
     """
 
     sweep: Callable[[int], Mapping[str, Any]] | None = None
@@ -105,31 +113,42 @@ class Frame:
         struct: its construct, most often a `Checksummed` Struct.
         direction: "in" from the sensor to us, "out" from us to it.
         data: whether it carries the points.
-        points: a `points` function of its own, for sensors that can answer in several data frames; for points that stand in parts of the
-            frame (`Parts`), their path and a function of these, {"modules": points}, {"tlvs.points": points}.
-        imu: a function of `Fields` that returns what the sensor's IMU felt, beside points or in a frame of its own; with its path where it
-            stands in parts, as for `points`.
+        points: a `points` function of its own, for sensors that can answer in several data frames;
+            for points that stand in parts of the frame (`Parts`), their path and a function of
+            these, {"modules": points}, {"tlvs.points": points}.
+        imu: a function of `Fields` that returns what the sensor's IMU felt, beside points or in a
+            frame of its own; with its path where it stands in parts, as for `points`.
         clock: the time in a frame that is not data, where that of the sensor is not in it.
-        max_length: the longest it can be, in bytes; longer candidates are not frames. Left out, it is the size of the struct, where that
-            is fixed.
-        plausible: a function of `Fields`: False where no sensor would send such values, reduced with `all` per packet.
-        after: name of the frame that has to be the last seen, of all named by any `after`, for this one to be looked for.
+        max_length: the longest it can be, in bytes; longer candidates are not frames. Left out, it
+            is the size of the struct, where that is fixed.
+        plausible: a function of `Fields`: False where no sensor would send such values, reduced
+            with `all` per packet.
+        after: name of the frame that has to be the last seen, of all named by any `after`, for this
+            one to be looked for.
         confirm: how many in an unbroken run it takes to believe any of them.
-        simulation: what a simulated sensor needs for this frame alone, where the sensor can answer in several data frames, or sends
-            others that random values never make, or again and again by themselves.
-        acknowledged: findings of `lidarspec check` that are true and meant, as "LS204" or "LS205 path.of.a.field" -> the reason.
-        wire: how the frame stands on the wire, where its fields have no fixed places there: `Tokens`, `Lines`, `Escaped`, or a form of a
-            plugin. The struct then describes what is read out of it, and `max_length`, in bytes on the wire, is always needed.
+        simulation: what a simulated sensor needs for this frame alone, where the sensor can answer
+            in several data frames, or sends others that random values never make, or again and
+            again by themselves.
+        acknowledged: findings of `lidarspec check` that are true and meant, as "LS204" or "LS205
+            path.of.a.field" -> the reason.
+        wire: how the frame stands on the wire, where its fields have no fixed places there:
+            `Tokens`, `Lines`, `Escaped`, or a form of a plugin. The struct then describes what is
+            read out of it, and `max_length`, in bytes on the wire, is always needed.
 
     Raises:
-        SpecError: if the struct cannot describe a frame: a part without an end, with bytes that are lost, or names that clash.
+        SpecError: if the struct cannot describe a frame: a part without an end, with bytes that are
+            lost, or names that clash.
     """
 
     struct: Construct
     direction: Literal["in", "out"] = field(default="in", kw_only=True)
     data: bool = field(default=False, kw_only=True)
-    points: Callable[[Any], Points] | Mapping[str, Callable[[Any], Points]] | None = field(default=None, kw_only=True)
-    imu: Callable[[Any], Imu] | Mapping[str, Callable[[Any], Imu]] | None = field(default=None, kw_only=True)
+    points: Callable[[Any], Points] | Mapping[str, Callable[[Any], Points]] | None = field(
+        default=None, kw_only=True
+    )
+    imu: Callable[[Any], Imu] | Mapping[str, Callable[[Any], Imu]] | None = field(
+        default=None, kw_only=True
+    )
     clock: Clock | None = field(default=None, kw_only=True)
     max_length: int = field(default=0, kw_only=True)
     plausible: Callable[[Any], Any] | None = field(default=None, kw_only=True)
@@ -149,7 +168,10 @@ class Frame:
         _freeze(self, "acknowledged")
         for name in ("points", "imu"):
             if isinstance(own := getattr(self, name), Mapping) and len(own) != 1:
-                raise SpecError(f"{name} stand in parts of one kind, not in {', '.join(own) or 'none'}", path=name)
+                raise SpecError(
+                    f"{name} stand in parts of one kind, not in {', '.join(own) or 'none'}",
+                    path=name,
+                )
         if self.data and self.clock is not None:
             raise SpecError("data have the clock of the sensor: give it there", path="clock")
         longest = self.max_length or (0 if self.wire is not None else fixed_size(self.struct))
@@ -157,18 +179,26 @@ class Frame:
         object.__setattr__(self, "prepared", prepare(self.struct, self.room or sys.maxsize))
         check_struct(self.prepared)
         if not longest:
-            raise SpecError("max_length may be left out only where the struct has a fixed size, and no wire form")
+            raise SpecError(
+                "max_length may be left out only where the struct has a fixed size, and no wire"
+                " form"
+            )
 
     def __repr__(self) -> str:
         size = 0 if self.wire is not None else fixed_size(self.prepared)
         kind = "data, " if self.data else "out, " if self.direction == "out" else ""
         root = self.tree.struct if isinstance(self.tree, Sealed) else self.tree
         names = [member.name for member in children(root) if member.name]
-        return f"Frame({kind}{size or f'up to {self.max_length}'} bytes{': ' * bool(names)}{', '.join(names)})"
+        return (
+            f"Frame({kind}{size or f'up to {self.max_length}'}"
+            f" bytes{': ' * bool(names)}{', '.join(names)})"
+        )
 
     @property
     def room(self) -> int:
-        """The most bytes that the struct can have: those of the frame, of which any two may be a number of eight in a wire form."""
+        """The most bytes that the struct can have: those of the frame, of which any two may be a
+        number of eight in a wire form.
+        """
         return self.max_length * (1 if self.wire is None else 4)
 
     @cached_property
@@ -187,29 +217,39 @@ class Command:
 
     Args:
         frame: the outgoing frame that asks it; None for a command that only moves lines.
-        values: values of its fields, by path; `Count(16)` is a running number, `Address()` this computer's own address.
-        args: argument name -> (field path, lowest, highest), in the field's unit; (path, Text(16)), (path, Address()) or (path, bytes). A
-            path may lead to an element of an array, "ports[1]".
-        reply: the frame that answers, or a tuple of those that may; None where no answer is documented.
-        matches: values that fields of the reply must have for it to be the answer to this command; of several frames, each is
-            asked for the fields that it has.
+        values: values of its fields, by path; `Count(16)` is a running number, `Address()` this
+            computer's own address.
+        args: argument name -> (field path, lowest, highest), in the field's unit; (path, Text(16)),
+            (path, Address()) or (path, bytes). A path may lead to an element of an array,
+            "ports[1]".
+        reply: the frame that answers, or a tuple of those that may; None where no answer is
+            documented.
+        matches: values that fields of the reply must have for it to be the answer to this command;
+            of several frames, each is asked for the fields that it has.
         echoes: fields of the reply that repeat the field of the same path in the request.
-        refusal: the frame that comes in place of any reply where the sensor refuses; what it says is told, names of an `Enum` in words.
+        refusal: the frame that comes in place of any reply where the sensor refuses; what it says
+            is told, names of an `Enum` in words.
         timeout: seconds to wait for the reply, each time that it is sent.
-        retries: how often it is sent again when no reply comes; only for what does no harm when it arrives twice.
+        retries: how often it is sent again when no reply comes; only for what does no harm when it
+            arrives twice.
         settle: seconds that the sensor needs after it before the next command.
         link: the link it goes over.
         lines: levels of control lines, {"dtr": False}, set with it.
         starts, stops: whether the sensor sends data after it, or no longer does.
-        only_stopped: whether it is answered only while the sensor sends no data, and passed over otherwise.
-        learns: a function of the reply, as `Sensor.parse` gives it, that returns options for `configure`, by name: numbers, or bytes and
-            texts, which become `Learned`. They are applied where the command is among `on_open`.
-        every: seconds after which it is sent once more, again and again from its first time on (a heartbeat); 0: never.
+        only_stopped: whether it is answered only while the sensor sends no data, and passed over
+            otherwise.
+        learns: a function of the reply, as `Sensor.parse` gives it, that returns options for
+            `configure`, by name: numbers, or bytes and texts, which become `Learned`. They are
+            applied where the command is among `on_open`.
+        every: seconds after which it is sent once more, again and again from its first time on (a
+            heartbeat); 0: never.
     """
 
     frame: str | None = None
     values: Mapping[str, Any] = field(default_factory=dict)
-    args: Mapping[str, tuple[str, float, float] | tuple[str, Text | Address | type[bytes]]] = field(default_factory=dict)
+    args: Mapping[str, tuple[str, float, float] | tuple[str, Text | Address | type[bytes]]] = field(
+        default_factory=dict
+    )
     reply: str | tuple[str, ...] | None = None
     matches: Mapping[str, Any] = field(default_factory=dict)
     echoes: tuple[str, ...] = ()
@@ -229,16 +269,24 @@ class Command:
     def __post_init__(self) -> None:
         _freeze(self, "values", "args", "matches", "lines")
         object.__setattr__(self, "echoes", tuple(self.echoes))
-        object.__setattr__(self, "arguments", MappingProxyType({name: argument(given) for name, given in self.args.items()}))
+        object.__setattr__(
+            self,
+            "arguments",
+            MappingProxyType({name: argument(given) for name, given in self.args.items()}),
+        )
 
     @property
     def filled(self) -> Mapping[str, Filled]:
         """The values that are found out when it is sent, by path."""
-        return {path: value for path, value in self.values.items() if isinstance(value, Count | Address)}
+        return {
+            path: value for path, value in self.values.items() if isinstance(value, Count | Address)
+        }
 
     @property
     def fixed(self) -> Mapping[str, Any]:
-        """The values that every frame of it has, by path: none that is found out, or that an argument goes into."""
+        """The values that every frame of it has, by path: none that is found out, or that an
+        argument goes into.
+        """
         taken = {*self.filled, *(one.path.partition("[")[0] for one in self.arguments.values())}
         return {path: value for path, value in self.values.items() if path not in taken}
 
@@ -254,7 +302,8 @@ class Relative:
 
     Args:
         told_by: what tells it apart, in words.
-        sends: a function of the data frame's `Fields`: whether a packet is the other's, and cannot be this sensor's.
+        sends: a function of the data frame's `Fields`: whether a packet is the other's, and cannot
+            be this sensor's.
     """
 
     told_by: str
@@ -297,7 +346,9 @@ class Spec:
     state: Mapping[str, Mapping[str, Any]] = field(default_factory=dict, kw_only=True)
     simulation: Simulation = field(default_factory=Simulation, kw_only=True)
     configure: Any = field(default=None, kw_only=True)
-    recognise: Callable[[tuple[bytes, ...]], Mapping[str, Any]] | None = field(default=None, kw_only=True)
+    recognise: Callable[[tuple[bytes, ...]], Mapping[str, Any]] | None = field(
+        default=None, kw_only=True
+    )
     on_open: tuple[str, ...] = field(default=(), kw_only=True)
     on_close: tuple[str, ...] = field(default=(), kw_only=True)
     range_limits: tuple[float, float] = field(kw_only=True)
@@ -330,13 +381,17 @@ class Spec:
         """
         names = self.data_frames
         if not names:
-            raise UnknownFrame("data", self.frames, place=self.id, hint="; configure the sensor first")
+            raise UnknownFrame(
+                "data", self.frames, place=self.id, hint="; configure the sensor first"
+            )
         answer = self.options.get("answer")
         return answer if answer in names else names[0]
 
     @cached_property
     def incoming(self) -> Mapping[str, Frame]:
-        """The frame types that the sensor sends, by name, in the order that decides where several fit."""
+        """The frame types that the sensor sends, by name, in the order that decides where several
+        fit.
+        """
         return {name: frame for name, frame in self.frames.items() if frame.direction == "in"}
 
     @cached_property
@@ -352,7 +407,11 @@ class Spec:
         """
         name, _, parts = frame.partition(".")
         own = self.frames[name].points
-        function = own.get(parts) if isinstance(own, Mapping) else own or (self.points if self.frames[name].data and not parts else None)
+        function = (
+            own.get(parts)
+            if isinstance(own, Mapping)
+            else own or (self.points if self.frames[name].data and not parts else None)
+        )
         if function is None:
             raise SpecError("this frame type has no points", path=frame, sensor=self.id)
         return function
@@ -367,8 +426,14 @@ class Spec:
         own = self.frames[name].imu
         function = own.get(parts) if isinstance(own, Mapping) else own
         if function is None:
-            having = f"those of {', '.join(self.imu_frames)} have" if self.imu_frames else "no frame of the sensor has"
-            raise SpecError(f"this frame type has nothing of an IMU; {having}", path=frame, sensor=self.id)
+            having = (
+                f"those of {', '.join(self.imu_frames)} have"
+                if self.imu_frames
+                else "no frame of the sensor has"
+            )
+            raise SpecError(
+                f"this frame type has nothing of an IMU; {having}", path=frame, sensor=self.id
+            )
         return function
 
     @cached_property
@@ -377,13 +442,20 @@ class Spec:
         return tuple(name for name, frame in self.incoming.items() if frame.imu is not None)
 
     def parts_with(self, what: str, frame: str) -> str:
-        """The path of the parts of a frame type that have its "points" or its "imu"; "" where the frame itself has them."""
+        """The path of the parts of a frame type that have its "points" or its "imu"; "" where the
+        frame itself has them.
+        """
         own = getattr(self.frames[frame], what) if frame in self.frames else None
         return next(iter(own)) if isinstance(own, Mapping) else ""
 
     def simulation_of(self, frame: str) -> Simulation:
-        """What a simulation of one frame type needs: the frame's own, and for data the sensor's where the frame has none."""
-        own, shared = self.frames[frame].simulation, self.simulation if self.frames[frame].data else Simulation()
+        """What a simulation of one frame type needs: the frame's own, and for data the sensor's
+        where the frame has none.
+        """
+        own, shared = (
+            self.frames[frame].simulation,
+            self.simulation if self.frames[frame].data else Simulation(),
+        )
         fields = ("sweep", "encode", "rate", "directions")
         return Simulation(**{name: getattr(own, name) or getattr(shared, name) for name in fields})
 
@@ -394,18 +466,25 @@ class Spec:
 
     def __repr__(self) -> str:
         options = "".join(f", {name}={value!r}" for name, value in self.options.items())
-        return f"Sensor({self.id}, {self.vendor} {self.model}, frames: {', '.join(self.frames) or 'none yet'}{options})"
+        return (
+            f"Sensor({self.id}, {self.vendor} {self.model}, frames:"
+            f" {', '.join(self.frames) or 'none yet'}{options})"
+        )
 
 
 _AnySpec = TypeVar("_AnySpec", bound=Spec)
 
 
 def with_frames(sensor: _AnySpec, frames: Mapping[str, Frame]) -> _AnySpec:
-    """A sensor with these frame types alone, and without what names others: commands, state, what frames say of the device."""
+    """A sensor with these frame types alone, and without what names others: commands, state, what
+    frames say of the device.
+    """
     clock = sensor.clock
     if clock is not None and clock.told is not None and clock.told[0] not in frames:
         clock = replace(clock, told=None)
-    return replace(sensor, frames=frames, clock=clock, commands={}, state={}, info={}, on_open=(), on_close=())
+    return replace(
+        sensor, frames=frames, clock=clock, commands={}, state={}, info={}, on_open=(), on_close=()
+    )
 
 
 def _freeze(value: object, *names: str) -> None:
@@ -416,44 +495,87 @@ def _freeze(value: object, *names: str) -> None:
 def _check_spec(sensor: Spec) -> None:
     _check_simulation(sensor.simulation)
     if not _ID.fullmatch(sensor.id):
-        raise SpecError("an id is vendor-model in lower case with hyphens", path="id", sensor=sensor.id)
+        raise SpecError(
+            "an id is vendor-model in lower case with hyphens", path="id", sensor=sensor.id
+        )
     if sensor.status not in STATUSES:
-        raise SpecError(f"status is one of {', '.join(STATUSES)}, not {sensor.status!r}", path="status", sensor=sensor.id)
+        raise SpecError(
+            f"status is one of {', '.join(STATUSES)}, not {sensor.status!r}",
+            path="status",
+            sensor=sensor.id,
+        )
     if not API - 1 <= sensor.api <= API:
-        raise SpecError(f"written for interface {sensor.api}; this engine reads {API - 1} and {API}", path="api", sensor=sensor.id)
+        raise SpecError(
+            f"written for interface {sensor.api}; this engine reads {API - 1} and {API}",
+            path="api",
+            sensor=sensor.id,
+        )
     for name, frame in sensor.frames.items():
         _known(sensor, f"frames.{name}.after", [frame.after], sensor.frames)
     for name, command in sensor.commands.items():
-        _known(sensor, f"commands.{name}", [command.frame, *command.replies, command.refusal], sensor.frames)
+        _known(
+            sensor,
+            f"commands.{name}",
+            [command.frame, *command.replies, command.refusal],
+            sensor.frames,
+        )
         _known(sensor, f"commands.{name}.link", [command.link], sensor.links)
-        if command.only_stopped and not any(other.starts or other.stops for other in sensor.commands.values()):
-            raise SpecError("it is answered only while the sensor is stopped, and no command starts or stops it", path=f"commands.{name}")
+        if command.only_stopped and not any(
+            other.starts or other.stops for other in sensor.commands.values()
+        ):
+            raise SpecError(
+                "it is answered only while the sensor is stopped, and no command starts or"
+                " stops it",
+                path=f"commands.{name}",
+            )
         if command.learns is not None and not (command.replies and sensor.configure is not None):
-            raise SpecError("what it learns comes with a reply, and goes to `configure`: both are needed", path=f"commands.{name}.learns")
+            raise SpecError(
+                "what it learns comes with a reply, and goes to `configure`: both are needed",
+                path=f"commands.{name}.learns",
+            )
         if "timeout" in command.args:
-            raise SpecError("'timeout' is how long its reply is waited for, and cannot be an argument", path=f"commands.{name}.args")
+            raise SpecError(
+                "'timeout' is how long its reply is waited for, and cannot be an argument",
+                path=f"commands.{name}.args",
+            )
     if sensor.commands:
         _known(sensor, "simulation.answers", sensor.simulation.answers, sensor.commands)
     _known(sensor, "state", sensor.state, sensor.frames)
     if sensor.clock is not None and sensor.clock.told is not None:
         _known(sensor, "clock.told", sensor.clock.told[:1], sensor.frames)
         if sensor.clock.wraps_at is None or callable(sensor.clock.source):
-            raise SpecError("what is told completes a clock of fields that starts again at `wraps_at`", path="clock.told", sensor=sensor.id)
+            raise SpecError(
+                "what is told completes a clock of fields that starts again at `wraps_at`",
+                path="clock.told",
+                sensor=sensor.id,
+            )
     _known(sensor, "info", [path.partition(".")[0] for path in sensor.info.values()], sensor.frames)
     if unknown := sorted(set(sensor.info) - set(ROLES)):
-        raise SpecError(f"{unknown[0]!r} is not among {', '.join(ROLES)}", path="info", sensor=sensor.id)
+        raise SpecError(
+            f"{unknown[0]!r} is not among {', '.join(ROLES)}", path="info", sensor=sensor.id
+        )
     if unknown := sorted(set(sensor.vendor_axes or ()) - set(DIRECTIONS)):
         raise SpecError(f"no direction {unknown[0]!r}", path="vendor_axes", sensor=sensor.id)
     if sensor.beams is not None and sensor.beams < 1:
-        raise SpecError(f"a scan has at least 1 point, not {sensor.beams}", path="beams", sensor=sensor.id)
+        raise SpecError(
+            f"a scan has at least 1 point, not {sensor.beams}", path="beams", sensor=sensor.id
+        )
     if sensor.turn is not None and not 0 < sensor.turn[0] <= sensor.turn[1]:
-        raise SpecError(f"the slowest and the fastest number of scans a second, not {sensor.turn}", path="turn", sensor=sensor.id)
+        raise SpecError(
+            f"the slowest and the fastest number of scans a second, not {sensor.turn}",
+            path="turn",
+            sensor=sensor.id,
+        )
     _known(sensor, "on_open, on_close", [*sensor.on_open, *sensor.on_close], sensor.commands)
-    if sensor.points is None and any(frame.data and frame.points is None for frame in sensor.frames.values()):
+    if sensor.points is None and any(
+        frame.data and frame.points is None for frame in sensor.frames.values()
+    ):
         raise SpecError("a data frame without a points function", path="points", sensor=sensor.id)
 
 
 def _known(sensor: Spec, path: str, names: Iterable[str | None], table: Mapping[str, Any]) -> None:
     for name in names:
         if name is not None and name not in table and sensor.frames:
-            raise SpecError(f"{name!r} is not among {', '.join(table) or 'none'}", path=path, sensor=sensor.id)
+            raise SpecError(
+                f"{name!r} is not among {', '.join(table) or 'none'}", path=path, sensor=sensor.id
+            )

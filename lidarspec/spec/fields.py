@@ -1,7 +1,8 @@
-"""What a struct needs beyond construct: a unit on a field, a checksum that seals a struct, and parts that each have a size of their own.
+"""What a struct needs beyond construct: a unit on a field, a checksum that seals a struct, and
+parts that each have a size of their own.
 
-All are ordinary parts of a struct, so that they nest in anything; none changes the raw integers of the wire. Units go by name, and
-those few that someone may type are converted exactly.
+All are ordinary parts of a struct, so that they nest in anything; none changes the raw integers of
+the wire. Units go by name, and those few that someone may type are converted exactly.
 """
 
 from __future__ import annotations
@@ -38,7 +39,8 @@ from lidarspec.spec import syntax as layer
 from lidarspec.spec.checksums import Checksum
 from lidarspec.spec.tree import FieldInfo
 
-#: A request over a link `Http`, and the reply to it, as messages: what HTTP says besides is the link's business.
+#: A request over a link `Http`, and the reply to it, as messages: what HTTP says besides is the
+#: link's business.
 HttpRequest = Struct(
     "mark" / Const(b"HTTP"),
     "method" / Enum(Int8ub, GET=1, PUT=2, POST=3, DELETE=4),
@@ -47,11 +49,18 @@ HttpRequest = Struct(
     "size" / Int32ub,
     "body" / Bytes(this.size),
 )
-HttpReply = Struct("mark" / Const(b"HTTP"), "status" / Int16ub, "size" / Int32ub, "body" / Bytes(this.size))
+HttpReply = Struct(
+    "mark" / Const(b"HTTP"), "status" / Int16ub, "size" / Int32ub, "body" / Bytes(this.size)
+)
 #: unit -> how many of the SI unit it is; only units that someone may type on the command line.
 _FACTORS: dict[str, dict[str, Fraction]] = {
     "m": {"m": Fraction(1), "cm": Fraction(1, 100), "mm": Fraction(1, 1000)},
-    "s": {"s": Fraction(1), "ms": Fraction(1, 1000), "us": Fraction(1, 10**6), "ns": Fraction(1, 10**9)},
+    "s": {
+        "s": Fraction(1),
+        "ms": Fraction(1, 1000),
+        "us": Fraction(1, 10**6),
+        "ns": Fraction(1, 10**9),
+    },
     "deg": {"deg": Fraction(1)},
     "rad": {"rad": Fraction(1)},
     "deg/s": {"deg/s": Fraction(1), "Hz": Fraction(360), "rpm": Fraction(6)},
@@ -100,7 +109,15 @@ def duration(text: str) -> float:
     Raises:
         UsageError: where it is no duration, or a negative one.
     """
-    for unit, seconds in (("min", 60.0), ("m", 60.0), ("ms", 1e-3), ("us", 1e-6), ("h", 3600.0), ("s", 1.0), ("", 1.0)):
+    for unit, seconds in (
+        ("min", 60.0),
+        ("m", 60.0),
+        ("ms", 1e-3),
+        ("us", 1e-6),
+        ("h", 3600.0),
+        ("s", 1.0),
+        ("", 1.0),
+    ):
         number = text.strip().removesuffix(unit)
         if text.strip().endswith(unit) and _is_number(number) and 0 <= float(number) < float("inf"):
             return float(number) * seconds
@@ -119,7 +136,8 @@ def share(text: str) -> float:
 class Scaled(layer.Describing):
     """A number on the wire with what it measures: ``physical = raw * scale + offset`` in `unit`.
 
-    Parses and builds the raw number; the unit is used where physical values are asked for, and never twice.
+    Parses and builds the raw number; the unit is used where physical values are asked for, and
+    never twice.
 
     Args:
         subcon: a construct field that parses to a number.
@@ -132,10 +150,19 @@ class Scaled(layer.Describing):
     """
 
     def __init__(self, subcon: Construct, scale: float, unit: str, offset: float = 0) -> None:
-        given = ["a field" if hasattr(value, "parse") else repr(value) for value in (subcon, scale, unit, offset)]
-        steps = [value for value in (scale, offset) if isinstance(value, numbers.Real) and math.isfinite(value)]
+        given = [
+            "a field" if hasattr(value, "parse") else repr(value)
+            for value in (subcon, scale, unit, offset)
+        ]
+        steps = [
+            value
+            for value in (scale, offset)
+            if isinstance(value, numbers.Real) and math.isfinite(value)
+        ]
         if given[0] != "a field" or len(steps) < 2 or not scale or not isinstance(unit, str):
-            wanted = 'a field, the size of a step, its unit and an offset, Scaled(Int16ul, 0.001, "m")'
+            wanted = (
+                'a field, the size of a step, its unit and an offset, Scaled(Int16ul, 0.001, "m")'
+            )
             raise SpecError(f"Scaled takes {wanted}, not {', '.join(given)}")
         super().__init__(subcon)
         self.scale, self.unit, self.offset = scale, unit, offset
@@ -145,13 +172,14 @@ class Scaled(layer.Describing):
 
 
 class SizeOf(layer.Sizing):
-    """A number that says how many bytes a part of the frame has: filled in by `build`, whatever value is given, and wrong on a frame that
-    comes where the part is longer or shorter.
+    """A number that says how many bytes a part of the frame has: filled in by `build`, whatever
+    value is given, and wrong on a frame that comes where the part is longer or shorter.
 
     Args:
         subcon: a field that parses to an integer, Int16ub.
-        part: the part, a member of the struct that the field stands in, or in one of it, "body", "body.tags"; "" for that struct itself;
-            of the struct around it with "_.", "_.body", and "_" for that itself.
+        part: the part, a member of the struct that the field stands in, or in one of it, "body",
+            "body.tags"; "" for that struct itself; of the struct around it with "_.", "_.body", and
+            "_" for that itself.
         plus: what the number has beyond these bytes; less than 0 where it does not count them all.
 
     Raises:
@@ -160,20 +188,25 @@ class SizeOf(layer.Sizing):
 
     def __init__(self, subcon: Construct, part: str = "", plus: int = 0) -> None:
         if not hasattr(subcon, "parse") or not isinstance(part, str) or not isinstance(plus, int):
-            raise SpecError(f'SizeOf takes a field, the name of a part and a number, SizeOf(Int16ub, "body", 2), not {part!r} and {plus!r}')
+            raise SpecError(
+                'SizeOf takes a field, the name of a part and a number, SizeOf(Int16ub, "body",'
+                f" 2), not {part!r} and {plus!r}"
+            )
         super().__init__(subcon, tuple(filter(None, part.split("."))), plus)
 
 
 class Checksummed(layer.Sealing):
-    """A struct sealed by one of its own fields, wherever in it that field stands. May nest, around one struct too, each with its own field.
+    """A struct sealed by one of its own fields, wherever in it that field stands. May nest, around
+    one struct too, each with its own field.
 
     Args:
         struct: a construct Struct.
         field: dotted name of the field (or fields, low bits first) that holds the checksum.
         algorithm: a `Checksum`; where left out, a ``lidarspec_checksum`` hook has to supply it.
-        over: names of consecutive fields that the checksum covers; by default every byte of the struct except
-            those that hold a bit of `field`.
-        absent: values of the field that mean "not filled": they pass, and stay as they are when built.
+        over: names of consecutive fields that the checksum covers; by default every byte of the
+            struct except those that hold a bit of `field`.
+        absent: values of the field that mean "not filled": they pass, and stay as they are when
+            built.
     """
 
     def __init__(
@@ -211,7 +244,13 @@ class Checksummed(layer.Sealing):
             width = (sum(layer.bit_width(self._field(name)) for name in self.fields) + 3) // 4
             expected, got = (f"0x{value:0{width}x}" for value in (computed, stored))
             reason = "checksum"
-            raise layer.Mismatch(f"{path} -> {name.replace('.', ' -> ')}", self._span(obj, name)[0], expected, got, reason)
+            raise layer.Mismatch(
+                f"{path} -> {name.replace('.', ' -> ')}",
+                self._span(obj, name)[0],
+                expected,
+                got,
+                reason,
+            )
         return obj
 
     def _build(self, obj: Any, stream: Any, context: Any, path: str) -> Any:
@@ -222,23 +261,37 @@ class Checksummed(layer.Sealing):
         con, trial = self._marked, io.BytesIO()
         con._build(blank, trial, context, path)
         data = trial.getvalue()
-        unverified = Container({**context, "_params": Container(_verify=False)})  # what was just built is parsed back
+        unverified = Container(
+            {**context, "_params": Container(_verify=False)}
+        )  # what was just built is parsed back
         parsed = con._parsereport(io.BytesIO(data), unverified, path)
         if None not in given and self._stored(parsed) in self.absent:
             return con._build(blank, stream, context, path)
-        return con._build(self._filled(blank, self._computed(data, parsed, 0)), stream, context, path)
+        return con._build(
+            self._filled(blank, self._computed(data, parsed, 0)), stream, context, path
+        )
 
     @property
     def _marked(self) -> Construct:
-        """The struct as a frame has it, which notes where its members stand; an author may also parse with it alone."""
-        return self.subcon if isinstance(layer.unwrap(self.subcon), layer.MarkedStruct) else layer.prepare(self.subcon)
+        """The struct as a frame has it, which notes where its members stand; an author may also
+        parse with it alone.
+        """
+        return (
+            self.subcon
+            if isinstance(layer.unwrap(self.subcon), layer.MarkedStruct)
+            else layer.prepare(self.subcon)
+        )
 
     def verdict(self, data: bytes, obj: Any, base: int = 0) -> tuple[int, int]:
-        """The checksum that stands in one parsed struct and the one that should, for its bytes, which began at `base`."""
+        """The checksum that stands in one parsed struct and the one that should, for its bytes,
+        which began at `base`.
+        """
         return self._stored(obj), self._computed(data, obj, base)
 
     def covered(self, obj: Any, size: int, base: int = 0) -> list[tuple[int, int]]:
-        """The byte ranges (start, end) within the struct that the checksum covers, for one parsed frame."""
+        """The byte ranges (start, end) within the struct that the checksum covers, for one parsed
+        frame.
+        """
         if self.over is not None:
             spans = [self._span(obj, name) for name in self.over]
             return [(spans[0][0] - base, spans[-1][1] - base)]
@@ -248,7 +301,13 @@ class Checksummed(layer.Sealing):
 
     def _computed(self, data: bytes, obj: Any, base: int) -> int:
         if self.algorithm is None:
-            raise layer.Mismatch("", 0, "a checksum algorithm", "none; a lidarspec_checksum hook has to supply it", "checksum")
+            raise layer.Mismatch(
+                "",
+                0,
+                "a checksum algorithm",
+                "none; a lidarspec_checksum hook has to supply it",
+                "checksum",
+            )
         return self.algorithm(b"".join(data[a:b] for a, b in self.covered(obj, len(data), base)))
 
     def _stored(self, obj: Any) -> int:
@@ -283,7 +342,9 @@ class Checksummed(layer.Sealing):
         return self._field(name).parse(bytes(8 * layer.bit_width(self._field(name))))  # type: ignore[no-any-return]
 
     def _span(self, obj: Any, name: str) -> tuple[int, int]:
-        """Where a dotted field stands, in bytes of the stream that was parsed; a bit field by the bytes that hold it."""
+        """Where a dotted field stands, in bytes of the stream that was parsed; a bit field by the
+        bytes that hold it.
+        """
         con, parts = self._marked, name.split(".")
         for depth, part in enumerate(parts):
             start, end = obj["_marks"][part]
@@ -295,22 +356,27 @@ class Checksummed(layer.Sealing):
 
 
 class Parts(layer.Partition):
-    """Structs one after another, each of a size of its own: the modules of a telegram, or its tags with a type and a length.
+    """Structs one after another, each of a size of its own: the modules of a telegram, or its tags
+    with a type and a length.
 
-    In the struct they are a list. In `points` each is a packet of its own (``Frame(points={"modules": points})``), whose fields are
-    ``f.distance``, and those of the frame around it ``f.frame.counter``; expressions of a part see these as ``this._.counter``.
-    Behind them, ``this.modules.size`` is how many bytes all of them take.
+    In the struct they are a list. In `points` each is a packet of its own
+    (``Frame(points={"modules": points})``), whose fields are ``f.distance``, and those of the frame
+    around it ``f.frame.counter``; expressions of a part see these as ``this._.counter``. Behind
+    them, ``this.modules.size`` is how many bytes all of them take.
 
     Args:
-        kinds: a Struct; or several by name, for parts that are told apart by their constants: the first one is taken whose constants
-            are right, so that a struct without any, as the last, takes what nobody knows.
+        kinds: a Struct; or several by name, for parts that are told apart by their constants: the
+            first one is taken whose constants are right, so that a struct without any, as the last,
+            takes what nobody knows.
         count: how many there are.
         size: the bytes of the first part of a chain, 0 for none; with `following`.
-        following: an expression of a part's own fields, the bytes of the next part, 0 behind the last.
+        following: an expression of a part's own fields, the bytes of the next part, 0 behind the
+            last.
         within: the bytes of all parts, which fill them.
 
     Raises:
-        SpecError: where what is said is not just one of `count`, `size` with `following`, and `within`, or a part is no struct.
+        SpecError: where what is said is not just one of `count`, `size` with `following`, and
+            `within`, or a part is no struct.
     """
 
     def __init__(
@@ -323,8 +389,13 @@ class Parts(layer.Partition):
         within: Any = None,
     ) -> None:
         super().__init__()
-        if sum(rule is not None for rule in (count, size, within)) != 1 or (size is None) != (following is None):
-            raise SpecError("Parts takes one of count=, within=, and size= with following=: what says where the last part is")
+        if sum(rule is not None for rule in (count, size, within)) != 1 or (size is None) != (
+            following is None
+        ):
+            raise SpecError(
+                "Parts takes one of count=, within=, and size= with following=: what says where the"
+                " last part is"
+            )
         self.cases = dict(kinds) if isinstance(kinds, Mapping) else {"": kinds}
         if not self.cases or not all(map(layer.is_struct, self.cases.values())):
             raise SpecError("a part is a Struct, or one of several Structs by name")
@@ -350,38 +421,60 @@ class Parts(layer.Partition):
         for index, part in enumerate(obj):
             announced, place = goes_on(built), f"{path}[{index}]"
             kind, value, data = self._built(part, context, place)
-            self._take(built, kind, value, (stream.tell(), stream.tell() + len(data)), announced, place)
+            self._take(
+                built, kind, value, (stream.tell(), stream.tell() + len(data)), announced, place
+            )
             stream.write(data)
         if goes_on(built) != 0:
-            raise RangeError(f"more parts are announced than the {len(built)} that are given", path=path)
+            raise RangeError(
+                f"more parts are announced than the {len(built)} that are given", path=path
+            )
         return built
 
     def _sizeof(self, context: Any, path: str) -> int:
         raise SizeofError("the size of parts is theirs", path=path)
 
     def _rule(self, context: Any, path: str) -> Callable[[layer.Pieces], int]:
-        """From the parts so far to the bytes of the next one, 0 where there is none, -1 where its own struct says it."""
+        """From the parts so far to the bytes of the next one, 0 where there is none, -1 where its
+        own struct says it.
+        """
         rules = ((self.count, "count"), (self.size, "length"), (self.within, "length"))
-        known = (None if rule is None else layer.bounded(evaluate(rule, context), self.limit, what, path) for rule, what in rules)
+        known = (
+            None if rule is None else layer.bounded(evaluate(rule, context), self.limit, what, path)
+            for rule, what in rules
+        )
         count, size, within = known
 
         def goes_on(found: layer.Pieces) -> int:
             if count is not None:
                 return -1 if len(found) < count else 0
             if within is not None:
-                return -1 if found.size < within else layer.bounded(found.size, within, "length of parts", path) - within
+                return (
+                    -1
+                    if found.size < within
+                    else layer.bounded(found.size, within, "length of parts", path) - within
+                )
             assert size is not None
             if not found:
                 return size
-            return layer.bounded(evaluate(self.following, Container({**found[-1], "_": context})), self.limit, "length", path)
+            return layer.bounded(
+                evaluate(self.following, Container({**found[-1], "_": context})),
+                self.limit,
+                "length",
+                path,
+            )
 
         return goes_on
 
     @staticmethod
-    def _take(found: layer.Pieces, kind: str, part: Any, span: tuple[int, int], announced: int, place: str) -> None:
+    def _take(
+        found: layer.Pieces, kind: str, part: Any, span: tuple[int, int], announced: int, place: str
+    ) -> None:
         size = span[1] - span[0]
         if announced == 0 or size == 0 or announced not in (-1, size):
-            wanted = {0: "no further part", -1: "a part of at least one byte"}.get(announced, f"{announced} bytes")
+            wanted = {0: "no further part", -1: "a part of at least one byte"}.get(
+                announced, f"{announced} bytes"
+            )
             raise RangeError(f"expected {wanted}, found {size} bytes", path=place)
         found.append(part)
         found.spans.append((kind, *span))
@@ -393,20 +486,29 @@ class Parts(layer.Partition):
             Mismatch: where those of no kind are.
         """
         spot, names = stream.tell(), list(self.cases)
-        trial = Container({**context, "_params": Container({**context._params, "_verify": "constants", "_trail": None})})
+        trial = Container(
+            {
+                **context,
+                "_params": Container({**context._params, "_verify": "constants", "_trail": None}),
+            }
+        )
         for name in names if len(names) > 1 else ():
             try:
                 self.cases[name]._parsereport(stream, trial, path)
             except (layer.Mismatch, ConstError) as fault:
                 if getattr(fault, "reason", "constant") == "constant":
                     continue
-            except Exception:  # an expression may raise anything: the part is of this kind, and fails again when it is parsed
+            # an expression may raise anything: the part is of this kind, and fails again when it is
+            # parsed
+            except Exception:
                 pass
             finally:
                 stream.seek(spot)
             return name
         if len(names) > 1 and layer.verifying(context):
-            raise layer.Mismatch(path, spot, f"one of {', '.join(names)}", "none of these", "constant")
+            raise layer.Mismatch(
+                path, spot, f"one of {', '.join(names)}", "none of these", "constant"
+            )
         return names[-1]
 
     def _built(self, part: Any, context: Any, path: str) -> tuple[str, Any, bytes]:

@@ -10,7 +10,8 @@ from lidarspec.spec.syntax import has_member
 
 
 class Link:
-    """How bytes come and go: a kind of one's own derives from it, and the hook `lidarspec_link` opens it.
+    """How bytes come and go: a kind of one's own derives from it, and the hook `lidarspec_link`
+    opens it.
 
     Attributes:
         datagrams: whether frames come one to a datagram.
@@ -54,12 +55,15 @@ class Assembled:
 
     Args:
         struct: the construct Struct of a fragment, or of its header alone.
-        key: the field, or fields, that tell messages apart, such as a counter; no two of 16 messages in a row have the same.
+        key: the field, or fields, that tell messages apart, such as a counter; no two of 16
+            messages in a row have the same.
         index: the field with the number of the fragment in its message.
         count: the field with the number of fragments of the message.
-        payload: the field of bytes that is a part of the message; "" where that is all that stands behind the struct.
+        payload: the field of bytes that is a part of the message; "" where that is all that stands
+            behind the struct.
         first: the index of the first fragment.
-        in_bytes: `index` is the place of the fragment in the message in bytes, and `count` the bytes of the message.
+        in_bytes: `index` is the place of the fragment in the message in bytes, and `count` the
+            bytes of the message.
 
     Raises:
         SpecError: for a field that the struct does not have.
@@ -90,13 +94,18 @@ class Assembled:
 
 @dataclass(frozen=True, init=False)
 class Udp(Link):
-    """UDP datagrams, one frame each, or with `stream` a byte stream cut into datagrams (telegrams that span several).
+    """UDP datagrams, one frame each, or with `stream` a byte stream cut into datagrams (telegrams
+    that span several).
 
     Args:
-        ports: the default destination ports; of data hints only, since magic and length decide; of commands the sensor's.
-        assembled: what says how datagrams are joined to a message, where one does not fit into one; others pass as they are.
-        broadcast: the port to which commands are broadcast while nobody knows the address of the sensor: whoever answers is it.
-        local: the port here that commands are sent from, where the sensor asks for one; any by default.
+        ports: the default destination ports; of data hints only, since magic and length decide; of
+            commands the sensor's.
+        assembled: what says how datagrams are joined to a message, where one does not fit into one;
+            others pass as they are.
+        broadcast: the port to which commands are broadcast while nobody knows the address of the
+            sensor: whoever answers is it.
+        local: the port here that commands are sent from, where the sensor asks for one; any by
+            default.
     """
 
     ports: tuple[int, ...]
@@ -105,12 +114,27 @@ class Udp(Link):
     broadcast: int = 0
     local: int = 0
 
-    def __init__(self, *ports: int, stream: bool = False, assembled: Assembled | None = None, broadcast: int = 0, local: int = 0) -> None:
-        if any(not 0 < port < 65536 for port in ports) or not (0 <= broadcast < 65536 and 0 <= local < 65536):
+    def __init__(
+        self,
+        *ports: int,
+        stream: bool = False,
+        assembled: Assembled | None = None,
+        broadcast: int = 0,
+        local: int = 0,
+    ) -> None:
+        if any(not 0 < port < 65536 for port in ports) or not (
+            0 <= broadcast < 65536 and 0 <= local < 65536
+        ):
             raise SpecError("a UDP port is a number from 1 to 65535")
         if stream and assembled is not None:
             raise SpecError("datagrams are fragments of messages, or pieces of a stream, not both")
-        given = {"ports": tuple(ports), "stream": stream, "assembled": assembled, "broadcast": broadcast, "local": local}
+        given = {
+            "ports": tuple(ports),
+            "stream": stream,
+            "assembled": assembled,
+            "broadcast": broadcast,
+            "local": local,
+        }
         for name, value in given.items():
             object.__setattr__(self, name, value)
 
@@ -129,7 +153,8 @@ class Tcp(Link):
 
 @dataclass(frozen=True)
 class Http(Link):
-    """Requests to the web server of the sensor: the frames of its commands are `HttpRequest`, those of its replies `HttpReply`.
+    """Requests to the web server of the sensor: the frames of its commands are `HttpRequest`, those
+    of its replies `HttpReply`.
 
     Args:
         port: of the server.

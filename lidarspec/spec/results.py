@@ -1,8 +1,8 @@
 """What a sensor's `points` function returns: columns of a batch of packets, not yet flattened.
 
-The engine turns them into a `PointCloud`: coordinates, masks, REP-103 and REP-117 are its work. Conventions of the
-columns: metres, radians, seconds; azimuth counter-clockwise from the manual's zero direction, elevation from the
-horizon; a range of 0 is no return.
+The engine turns them into a `PointCloud`: coordinates, masks, REP-103 and REP-117 are its work.
+Conventions of the columns: metres, radians, seconds; azimuth counter-clockwise from the manual's
+zero direction, elevation from the horizon; a range of 0 is no return.
 """
 
 from __future__ import annotations
@@ -22,8 +22,38 @@ Array = Any
 
 #: what a further column of points may be called, and what it may not, since something beside it is.
 _NAME = re.compile(r"[a-z][a-z0-9_]*")
-TAKEN = frozenset(("x", "y", "z", "xyz", "range", "azimuth", "elevation", "origin", "ox", "oy", "oz", "time", "intensity", "ring"))
-TAKEN |= {"return_index", "column", "invalid", "valid", "nominal", "extra", "units", "shape", "columns", "scan", "stamp_ns", "rate_hz"}
+TAKEN = frozenset(
+    (
+        "x",
+        "y",
+        "z",
+        "xyz",
+        "range",
+        "azimuth",
+        "elevation",
+        "origin",
+        "ox",
+        "oy",
+        "oz",
+        "time",
+        "intensity",
+        "ring",
+    )
+)
+TAKEN |= {
+    "return_index",
+    "column",
+    "invalid",
+    "valid",
+    "nominal",
+    "extra",
+    "units",
+    "shape",
+    "columns",
+    "scan",
+    "stamp_ns",
+    "rate_hz",
+}
 TAKEN |= {"complete"}
 
 
@@ -33,9 +63,11 @@ class Extra:
 
     Args:
         values: as those of any other column; nan where a point has none.
-        unit: "m/s"; "" for a plain number. By default that of the field, where the values are a field as it stands.
-        dtype: of the column: a NumPy type of numbers. By default that of the wire, where the values are a field as it stands that is
-            a whole number; bool for conditions, else float32. In a type of integers nan is 0.
+        unit: "m/s"; "" for a plain number. By default that of the field, where the values are a
+            field as it stands.
+        dtype: of the column: a NumPy type of numbers. By default that of the wire, where the values
+            are a field as it stands that is a whole number; bool for conditions, else float32. In a
+            type of integers nan is 0.
     """
 
     values: Array
@@ -57,9 +89,15 @@ def _named(extra: Mapping[str, Any]) -> Mapping[str, Extra]:
     """
     for name in extra:
         if not _NAME.fullmatch(name) or name in TAKEN:
-            reason = "is the name of something else" if name in TAKEN else "is no name: small letters, digits and _"
+            reason = (
+                "is the name of something else"
+                if name in TAKEN
+                else "is no name: small letters, digits and _"
+            )
             raise SpecError(f"{name!r} {reason}", path="extra")
-    return MappingProxyType({name: value if isinstance(value, Extra) else Extra(value) for name, value in extra.items()})
+    return MappingProxyType(
+        {name: value if isinstance(value, Extra) else Extra(value) for name, value in extra.items()}
+    )
 
 
 @dataclass(frozen=True, eq=False)
@@ -76,8 +114,10 @@ class Polar:
         return_index: 0 for the first or only return, 1 for the second ...; None where there is one.
         invalid: True where the sensor marks a point as wrong (becomes nan).
         origin: (x, y, z) in metres of where the beam starts, columns allowed, in REP-103 axes.
-        nominal: True where a default calibration stands in for the sensor's own, which the cloud then says.
-        column: number of the column in its turn, from 0, where points are columns of rows; `PointCloud.organised` places it by that.
+        nominal: True where a default calibration stands in for the sensor's own, which the cloud
+            then says.
+        column: number of the column in its turn, from 0, where points are columns of rows;
+            `PointCloud.organised` places it by that.
         extra: further columns by name: values, or an `Extra` with their unit and type.
 
     Raises:
@@ -106,14 +146,17 @@ class Cartesian:
     """Points given by coordinates.
 
     Args:
-        x, y, z: metres, x forward, y left, z up; all three 0 is no return, one that is nan or infinite makes the point invalid.
+        x, y, z: metres, x forward, y left, z up; all three 0 is no return, one that is nan or
+            infinite makes the point invalid.
         intensity: the wire's number; None where the sensor has none.
         time: seconds after the packet's clock.
         ring: number of the laser or channel, None where there is none.
         return_index: 0 for the first or only return, 1 for the second ...; None where there is one.
         invalid: True where the sensor marks a point as wrong (becomes nan).
-        nominal: True where a default calibration stands in for the sensor's own, which the cloud then says.
-        column: number of the column in its turn, from 0, where points are columns of rows; `PointCloud.organised` places it by that.
+        nominal: True where a default calibration stands in for the sensor's own, which the cloud
+            then says.
+        column: number of the column in its turn, from 0, where points are columns of rows;
+            `PointCloud.organised` places it by that.
         extra: further columns by name: values, or an `Extra` with their unit and type.
 
     Raises:
@@ -141,11 +184,13 @@ Points = Polar | Cartesian
 
 @dataclass(frozen=True, eq=False)
 class Imu:
-    """What an inertial measurement unit in the sensor feels, in SI and in the axes of the points (REP-145): x forward, y left, z up.
+    """What an inertial measurement unit in the sensor feels, in SI and in the axes of the points
+    (REP-145): x forward, y left, z up.
 
     Args:
         angular_velocity: about x, y and z, rad/s, right-handed: positive about z turns to the left.
-        linear_acceleration: along x, y and z, m/s2, gravity in it: a level sensor at rest has +9.80665 along z.
+        linear_acceleration: along x, y and z, m/s2, gravity in it: a level sensor at rest has
+            +9.80665 along z.
         time: seconds after the packet's clock.
 
     Raises:

@@ -1,7 +1,8 @@
 """A sensor: its `Spec`, and what can be done with it as methods.
 
-Each method hands over to the station that does it: wire (parse, build), simulation (example), framing (decoder, split), packets (decode),
-scans. They are imported when a method is called first: a sensor is found and looked at far more often than all of them are needed.
+Each method hands over to the station that does it: wire (parse, build), simulation (example),
+framing (decoder, split), packets (decode), scans. They are imported when a method is called first:
+a sensor is found and looked at far more often than all of them are needed.
 """
 
 from __future__ import annotations
@@ -46,9 +47,11 @@ _WORD = re.compile(r"[A-Za-z0-9_+-]{1,40}")
 
 
 class Learned(bytes):
-    """What a sensor said of itself, as the value of an option: the content of what else is a file, never a path.
+    """What a sensor said of itself, as the value of an option: the content of what else is a file,
+    never a path.
 
-    An option takes it where its parameter is annotated with it, ``calibration: str | Path | Learned``.
+    An option takes it where its parameter is annotated with it, ``calibration: str | Path |
+    Learned``.
     """
 
     def __repr__(self) -> str:
@@ -76,7 +79,8 @@ class Learned(bytes):
 
     @classmethod
     def content(cls, value: str | PathLike[str] | Learned) -> bytes:
-        """The bytes that an option stands for: learned ones themselves, those of a file for its path.
+        """The bytes that an option stands for: learned ones themselves, those of a file for its
+        path.
 
         Raises:
             UsageError: for a file that cannot be read.
@@ -96,8 +100,10 @@ class Sensor(Spec):
     Args:
         id: vendor-model in lower case with hyphens; the same everywhere and for ever.
         vendor, model: as people write them.
-        frames: every message type by name, in both directions; where several fit at one place, their order decides.
-        points: a function of `Fields` that returns `Polar` or `Cartesian`; None where each data frame has its own.
+        frames: every message type by name, in both directions; where several fit at one place,
+            their order decides.
+        points: a function of `Fields` that returns `Polar` or `Cartesian`; None where each data
+            frame has its own.
         scan: where one scan ends and the next begins.
         links: by name; the data come over "data", commands over the link that they name.
         commands: what can be asked of it, by name.
@@ -107,23 +113,29 @@ class Sensor(Spec):
         state: defaults of other frames' fields for ``f.state``, by frame and path, in units.
         simulation: what a simulated sensor needs beyond all this.
         configure: a function of the sensor and its options, by name, that returns another sensor.
-        recognise: where data frames do not say how they are laid out: a function of datagrams that returns the options of `configure` with
-            which they are read, {} where they are of no such sensor.
+        recognise: where data frames do not say how they are laid out: a function of datagrams that
+            returns the options of `configure` with which they are read, {} where they are of no
+            such sensor.
         on_open, on_close: names of the commands that are sent when it is opened and closed.
         range_limits: the shortest and the longest range that it can measure, metres.
-        vendor_axes: where the vendor's x, y and z point, of forward, back, left, right, up and down, for ``frame="vendor"``.
+        vendor_axes: where the vendor's x, y and z point, of forward, back, left, right, up and
+            down, for ``frame="vendor"``.
         beams: points of a scan, where their number is constant.
         turn: the slowest and the fastest number of scans a second.
-        relatives: ids of sensors that it can be mistaken for, installed or not -> what tells them apart: a text, where it is the pace of
-            the clock or what `info` names as model; a `Relative`, where single packets show it.
-        info: what frames say of the device ("serial", "firmware", "model", "temperature") -> the field, as "frame.path".
+        relatives: ids of sensors that it can be mistaken for, installed or not -> what tells them
+            apart: a text, where it is the pace of the clock or what `info` names as model; a
+            `Relative`, where single packets show it.
+        info: what frames say of the device ("serial", "firmware", "model", "temperature") -> the
+            field, as "frame.path".
         status: how far it is proven: "manual", "vectors", "capture" or "hardware".
         source: the manual with its revision and sections, the captures.
         aliases: other ids that it is known by.
         api: the version of this interface that it was written for.
-        acknowledged: findings of `lidarspec check` about the sensor as a whole that are true and meant, as "LS401" -> the reason.
+        acknowledged: findings of `lidarspec check` about the sensor as a whole that are true and
+            meant, as "LS401" -> the reason.
         options: what it was configured with; not for plugins to set.
-        hooked: applies the hooks of installed plugins to a value like this one; not for plugins to set.
+        hooked: applies the hooks of installed plugins to a value like this one; not for plugins to
+            set.
 
     Raises:
         SpecError: for an id, status or reference between its parts that cannot be.
@@ -133,25 +145,33 @@ class Sensor(Spec):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        function = self.configure.function if isinstance(self.configure, Configure) else self.configure
+        function = (
+            self.configure.function if isinstance(self.configure, Configure) else self.configure
+        )
         object.__setattr__(self, "configure", Configure(self, function))
 
-    def parse(self, data: bytes, frame: str | None = None, *, verify: bool = True, units: bool = False) -> Any:
+    def parse(
+        self, data: bytes, frame: str | None = None, *, verify: bool = True, units: bool = False
+    ) -> Any:
         """Exactly one frame as a construct Container of raw wire integers.
 
         Args:
             frame: its type; found out where left out.
             verify: False accepts wrong constants, a wrong checksum and trailing bytes.
-            units: physical values, as ``build(units=True)`` takes them: those of scaled fields in their units, others as they are.
+            units: physical values, as ``build(units=True)`` takes them: those of scaled fields in
+                their units, others as they are.
 
         Raises:
-            WireError: where the bytes are not such a frame: sensor, offset, field path, expected and got.
+            WireError: where the bytes are not such a frame: sensor, offset, field path, expected
+                and got.
         """
         from lidarspec.frames.parse import parse
 
         return parse(self, data, frame=frame, verify=verify, units=units)
 
-    def build(self, frame: str, value: Any = None, /, *, units: bool = False, **values: Any) -> bytes:
+    def build(
+        self, frame: str, value: Any = None, /, *, units: bool = False, **values: Any
+    ) -> bytes:
         """The bytes of one frame; constants, counts and the checksum are filled in.
 
         Args:
@@ -189,11 +209,13 @@ class Sensor(Spec):
         """A new incremental decoder, sans-IO and independent of every other.
 
         Args:
-            stream: True reads a byte stream, False one datagram for each `feed`; by default what the data link says.
+            stream: True reads a byte stream, False one datagram for each `feed`; by default what
+                the data link says.
             backend: "auto", "numpy", "jit" or "construct": the same results.
 
         Raises:
-            UsageError: for an unknown back end, or a sensor that has no frames before it is configured.
+            UsageError: for an unknown back end, or a sensor that has no frames before it is
+                configured.
         """
         from lidarspec.framing.decoder import Decoder, backend as checked_backend
 
@@ -209,11 +231,13 @@ class Sensor(Spec):
         """Every incoming frame of all types, in stream order. Raises on no bytes whatever.
 
         Args:
-            data: bytes (a stream), an iterable of datagrams, or an (n, size) uint8 array of datagrams.
+            data: bytes (a stream), an iterable of datagrams, or an (n, size) uint8 array of
+                datagrams.
             backend: "auto", "numpy", "jit" or "construct": the same results.
 
         Raises:
-            UsageError: for a text or a path, an unknown back end, or a sensor that has no frames before it is configured.
+            UsageError: for a text or a path, an unknown back end, or a sensor that has no frames
+                before it is configured.
         """
         from lidarspec.framing.decoder import frames_of, is_stream
 
@@ -224,17 +248,22 @@ class Sensor(Spec):
         """The data frames, or those of another type, as columns. Raises on no bytes whatever.
 
         Args:
-            data: bytes (a stream), an iterable of datagrams, or an (n, size) uint8 array of datagrams.
-            frame: the name of a frame type; of several data frames, the first that arrives where left out.
+            data: bytes (a stream), an iterable of datagrams, or an (n, size) uint8 array of
+                datagrams.
+            frame: the name of a frame type; of several data frames, the first that arrives where
+                left out.
             backend: "auto", "numpy", "jit" or "construct": the same results.
 
         Raises:
             UnknownFrame: for a frame type that the sensor does not have.
-            UsageError: for a text or a path, an unknown back end, or a sensor that has no frames before it is configured.
+            UsageError: for a text or a path, an unknown back end, or a sensor that has no frames
+                before it is configured.
         """
         return self._decoded(data, frame, backend)[0]
 
-    def _decoded(self, data: Any, frame: str | None, backend: str) -> tuple[Packets, Waiting | None]:
+    def _decoded(
+        self, data: Any, frame: str | None, backend: str
+    ) -> tuple[Packets, Waiting | None]:
         """The packets of a frame type; and where none is named, what an IMU felt by their clock."""
         from lidarspec.framing.decoder import frames_of, is_stream
         from lidarspec.packets.stream import ImuStream, PacketStream, data_frame
@@ -243,33 +272,46 @@ class Sensor(Spec):
         frames = frames_of(decoder, data)
         name = frame or data_frame(self, frames) or self.data_frame
         stream = PacketStream(self, name, decoder.stats, backend=decoder.backend)
-        packets, imu = stream.add(frames, whole=True), ImuStream(self, decoder.stats, backend=decoder.backend) if frame is None else None
+        packets, imu = (
+            stream.add(frames, whole=True),
+            ImuStream(self, decoder.stats, backend=decoder.backend) if frame is None else None,
+        )
         if imu is not None:
             imu.add(frames, packets, whole=True)
         return packets, None if imu is None else imu.waiting
 
-    def scans(self, data: Any, *, backend: str = "auto", select: Selection | None = None) -> Iterator[Scan]:
+    def scans(
+        self, data: Any, *, backend: str = "auto", select: Selection | None = None
+    ) -> Iterator[Scan]:
         """Every scan of the data; the first and last piece are marked ``complete=False``.
 
-        Where there is no data frame in the data, or `points` raises at some of the packets, a Python warning says so.
+        Where there is no data frame in the data, or `points` raises at some of the packets, a
+        Python warning says so.
 
         Args:
-            data: bytes (a stream), an iterable of datagrams, or an (n, size) uint8 array of datagrams.
+            data: bytes (a stream), an iterable of datagrams, or an (n, size) uint8 array of
+                datagrams.
             backend: "auto", "numpy", "jit" or "construct": the same results.
             select: which scans, and what of each.
 
         Raises:
-            UsageError: for a text or a path, an unknown back end, a sensor that has no frames before it is configured, or where none of
-                the scans is wanted.
+            UsageError: for a text or a path, an unknown back end, a sensor that has no frames
+                before it is configured, or where none of the scans is wanted.
         """
         from lidarspec.scans.scans import scans_of
         from lidarspec.scans.selection import Sieve
 
         packets, imu = self._decoded(data, None, backend)
         if packets.stats.bytes_in and not len(packets):
-            warnings.warn(f"{self.id}: no {packets.frame} frame in the data ({packets.stats}): is it of another sensor?", stacklevel=2)
+            warnings.warn(
+                f"{self.id}: no {packets.frame} frame in the data ({packets.stats}): is it of"
+                " another sensor?",
+                stacklevel=2,
+            )
         found = scans_of(self, [packets], imu)
-        return self._followed(found if select is None else Sieve(select, "the data").of(found), packets)
+        return self._followed(
+            found if select is None else Sieve(select, "the data").of(found), packets
+        )
 
     def _followed(self, scans: Iterator[Any], packets: Packets) -> Iterator[Scan]:
         """Scans, and behind them what the plugin failed at, and that they have no end."""
@@ -282,7 +324,9 @@ class Sensor(Spec):
 
 @dataclass(frozen=True)
 class Configure:
-    """``sensor.configure(...)``: the options of every sensor, then the sensor's own function, on a new value."""
+    """``sensor.configure(...)``: the options of every sensor, then the sensor's own function, on a
+    new value.
+    """
 
     sensor: Sensor
     function: Callable[..., Sensor] | None
@@ -307,12 +351,19 @@ class Configure:
         return tuple(name for name, kinds in self._kinds.items() if "Path" in kinds)
 
     def takes(self, name: str, value: object) -> bool:
-        """Whether a value is of a type that the option is declared with, by the annotation of its parameter; of others nobody knows."""
+        """Whether a value is of a type that the option is declared with, by the annotation of its
+        parameter; of others nobody knows.
+        """
         kinds = self._kinds.get(name, {""})
-        return "Learned" in kinds if isinstance(value, Learned) else any(_TYPES.get(kind, _anything)(value) for kind in kinds)
+        return (
+            "Learned" in kinds
+            if isinstance(value, Learned)
+            else any(_TYPES.get(kind, _anything)(value) for kind in kinds)
+        )
 
     def options_of_file(self, options: Mapping[str, Any], folder: Path) -> dict[str, Any]:
-        """The options that stand in a file in `folder` that anybody may have written: numbers, words, what was learned, files beside it.
+        """The options that stand in a file in `folder` that anybody may have written: numbers,
+        words, what was learned, files beside it.
 
         Raises:
             UsageError: for a path that leads anywhere else, and for other values.
@@ -326,7 +377,9 @@ class Configure:
                     given[name] = beside(folder, value)
                 except UsageError as error:
                     raise UsageError(f"{name}: {error}") from None
-            elif not isinstance(value, bool | int | float | None) and not (isinstance(value, str) and _WORD.fullmatch(value)):
+            elif not isinstance(value, bool | int | float | None) and not (
+                isinstance(value, str) and _WORD.fullmatch(value)
+            ):
                 raise UsageError(f"{name}: {shown(value)} is neither a number nor a word")
         return given
 
@@ -342,10 +395,15 @@ class Configure:
         try:
             inspect.signature(self.function).bind(self.sensor, **options)
         except TypeError as error:
-            raise UnknownOption(min(options), OPTIONS, place=self.sensor.id, hint=f": {error}") from None
+            raise UnknownOption(
+                min(options), OPTIONS, place=self.sensor.id, hint=f": {error}"
+            ) from None
         for name, value in options.items():
             if not self.takes(name, value):
-                kinds = " or ".join(_TOLD[kind] for kind in sorted(self._kinds[name]) if kind in _TOLD) or "no content"
+                kinds = (
+                    " or ".join(_TOLD[kind] for kind in sorted(self._kinds[name]) if kind in _TOLD)
+                    or "no content"
+                )
                 raise UsageError(f"{self.sensor.id}: {name} is {kinds}, not {shown(value)}")
             if name in self.files and value is not None and not isinstance(value, Learned):
                 _refuse_pipe(value)
@@ -354,7 +412,9 @@ class Configure:
         except (LidarSpecError, OSError):
             raise
         except Exception as error:
-            raise PluginError.of(error, "configure", sensor=self.sensor.id, function=self.function) from error
+            raise PluginError.of(
+                error, "configure", sensor=self.sensor.id, function=self.function
+            ) from error
         hooked: Sensor = self.sensor.hooked(configured) if self.sensor.hooked else configured
         return hooked
 
@@ -362,14 +422,17 @@ class Configure:
 def _refuse_pipe(path: str | PathLike[str]) -> None:
     """Raise UsageError for a pipe or device, which may never end."""
     if os.path.exists(path) and not os.path.isfile(path) and not os.path.isdir(path):
-        raise UsageError(f"{path!s}: a pipe or device is not read as a file; write its content to a file first")
+        raise UsageError(
+            f"{path!s}: a pipe or device is not read as a file; write its content to a file first"
+        )
 
 
 def _anything(value: object) -> bool:
     return True
 
 
-#: a type that an option is declared with -> whether a value is of it; what it is called, in the order of the alphabet.
+#: a type that an option is declared with -> whether a value is of it; what it is called, in the
+#: order of the alphabet.
 _TYPES: dict[str, Callable[[object], bool]] = {
     "Path": lambda value: isinstance(value, str | PathLike),
     "Learned": lambda value: False,
@@ -401,20 +464,31 @@ def _type_names(annotation: object) -> set[str]:
 
 def _check_cut(sensor: Spec, degrees: object) -> None:
     """Raise UsageError unless scans of a sensor can be cut at an angle, and it is one."""
-    has_angle = isinstance(sensor.scan, OnWrap) or (isinstance(sensor.scan, OnChange) and bool(sensor.scan.angle))
+    has_angle = isinstance(sensor.scan, OnWrap) or (
+        isinstance(sensor.scan, OnChange) and bool(sensor.scan.angle)
+    )
     if not has_angle:
         raise UsageError(f"{sensor.id}: its scans are not cut at an angle, so cut cannot be set")
-    if isinstance(degrees, bool) or not isinstance(degrees, Real) or not math.isfinite(float(degrees)):
+    if (
+        isinstance(degrees, bool)
+        or not isinstance(degrees, Real)
+        or not math.isfinite(float(degrees))
+    ):
         raise UsageError(f"{sensor.id}: cut is an angle in degrees, not {shown(degrees)}")
 
 
 def _check_shared(sensor: Spec, options: Mapping[str, Any]) -> None:
     frame = options.get("frame", FRAMES_OF_REFERENCE[0])
     if frame not in FRAMES_OF_REFERENCE:
-        raise UsageError(f"{sensor.id}: frame is one of {', '.join(FRAMES_OF_REFERENCE)}, not {frame!r}")
+        raise UsageError(
+            f"{sensor.id}: frame is one of {', '.join(FRAMES_OF_REFERENCE)}, not {frame!r}"
+        )
     if frame == "vendor" and sensor.vendor_axes is None:
         raise UsageError(f"{sensor.id} declares no axes of its vendor")
     if "cut" in options:
         _check_cut(sensor, options["cut"])
     if "answer" in options and options["answer"] not in sensor.data_frames:
-        raise UsageError(f"{sensor.id}: answer is one of {', '.join(sensor.data_frames)}, not {options['answer']!r}")
+        raise UsageError(
+            f"{sensor.id}: answer is one of {', '.join(sensor.data_frames)}, not"
+            f" {options['answer']!r}"
+        )

@@ -1,4 +1,6 @@
-"""Where a scan ends, what the clock is and how packets are counted: declared rules, carried out by the engine."""
+"""Where a scan ends, what the clock is and how packets are counted: declared rules, carried out by
+the engine.
+"""
 
 from __future__ import annotations
 
@@ -10,7 +12,8 @@ from lidarspec.errors import SpecError
 
 #: times are counted in 64-bit nanoseconds: 292 years.
 MAX_CLOCK_S = 2**63 / 1e9
-#: a field path, several that add up, or a function of the frame's `Fields` (returning a column or several).
+#: a field path, several that add up, or a function of the frame's `Fields` (returning a column or
+#: several).
 Source = str | tuple[str, ...] | Callable[[Any], Any]
 
 
@@ -19,8 +22,8 @@ class OnWrap:
     """Cut where a circular column passes `at`.
 
     Args:
-        name: a field path of an angle ("blocks.azimuth": cut between the rows of that array) or a point column
-            ("azimuth": cut between points).
+        name: a field path of an angle ("blocks.azimuth": cut between the rows of that array) or a
+            point column ("azimuth": cut between points).
         at: the angle, in the unit of the field; radians for a point column.
     """
 
@@ -30,7 +33,9 @@ class OnWrap:
 
 @dataclass(frozen=True)
 class OnFlag:
-    """Cut before every packet (or row of an array) in which the field `name` is not 0, or is `value` where that is given."""
+    """Cut before every packet (or row of an array) in which the field `name` is not 0, or is
+    `value` where that is given.
+    """
 
     name: str
     value: float | None = None
@@ -42,8 +47,9 @@ class OnChange:
 
     Args:
         name: a field path.
-        angle: the path of a field that grows evenly as a rotating sensor turns, the angle at which a packet begins. By it a masked
-            sector is found, in which scans are cut then, and `configure(cut=)` cuts. "" if there is none.
+        angle: the path of a field that grows evenly as a rotating sensor turns, the angle at which
+            a packet begins. By it a masked sector is found, in which scans are cut then, and
+            `configure(cut=)` cuts. "" if there is none.
         full: how much `angle` grows in a turn, in its unit.
     """
 
@@ -54,7 +60,8 @@ class OnChange:
 
 @dataclass(frozen=True)
 class OnJump:
-    """Cut before every packet (or row) in which the field `name` is farther than `by` from the one before, either way.
+    """Cut before every packet (or row) in which the field `name` is farther than `by` from the one
+    before, either way.
 
     Args:
         name: a field path; an angle goes the short way around the circle.
@@ -87,15 +94,18 @@ class Clock:
     """The sensor's own clock.
 
     Args:
-        source: the field, the fields that add up (seconds and microseconds), or a function of `Fields` that returns
-            a column, or several that add up, in seconds. Terms are summed as integer nanoseconds.
+        source: the field, the fields that add up (seconds and microseconds), or a function of
+            `Fields` that returns a column, or several that add up, in seconds. Terms are summed as
+            integer nanoseconds.
         wraps_at: seconds after which it starts again at 0; None if it does not.
-        pace: a function of `Fields`: by how many seconds it advances from a packet to the next. It says what is missing where there is no
-            counter, and is learned from the stream where it is left out. It tells relatives apart, left out by the pace of a simulation,
-            and is needed where it depends on a mode that the packets name.
-        told: what completes a clock that starts again: another frame type that has the clock's field too, and a function of its `Fields`
-            to the seconds since 1970 that it tells, nan where it tells none. The turn of the clock is the one closest to what the first
-            frame that tells it says: from the start of a file, and of live packets from that frame on.
+        pace: a function of `Fields`: by how many seconds it advances from a packet to the next. It
+            says what is missing where there is no counter, and is learned from the stream where it
+            is left out. It tells relatives apart, left out by the pace of a simulation, and is
+            needed where it depends on a mode that the packets name.
+        told: what completes a clock that starts again: another frame type that has the clock's
+            field too, and a function of its `Fields` to the seconds since 1970 that it tells, nan
+            where it tells none. The turn of the clock is the one closest to what the first frame
+            that tells it says: from the start of a file, and of live packets from that frame on.
 
     Raises:
         SpecError: if `wraps_at` is not positive, or too long to ever be reached.
@@ -110,10 +120,13 @@ class Clock:
         if self.wraps_at is None:
             return
         if not self.wraps_at > 0:
-            raise SpecError(f"expected a positive number of seconds, got {self.wraps_at}", path="clock.wraps_at")
+            raise SpecError(
+                f"expected a positive number of seconds, got {self.wraps_at}", path="clock.wraps_at"
+            )
         if self.wraps_at >= MAX_CLOCK_S:
             raise SpecError(
-                f"{self.wraps_at:.4g} s is longer than 292 years; leave wraps_at out, as this clock never wraps",
+                f"{self.wraps_at:.4g} s is longer than 292 years; leave wraps_at out, as this clock"
+                " never wraps",
                 path="clock.wraps_at",
             )
 
@@ -124,8 +137,8 @@ class Sequence:
 
     Args:
         field: path of the counter.
-        first, last: its lowest and highest value; `last` may be a function of `Fields`, and is the field's largest
-            value where it is left out.
+        first, last: its lowest and highest value; `last` may be a function of `Fields`, and is the
+            field's largest value where it is left out.
     """
 
     field: str

@@ -1,8 +1,10 @@
-"""A frame type as a tree of nodes: what stands on the wire, in order, with formulas where fields of the header decide.
+"""A frame type as a tree of nodes: what stands on the wire, in order, with formulas where fields of
+the header decide.
 
-`lidarspec.spec.syntax` makes it from an author's struct, once for each frame; schema, layouts, examples, wire tables, explain
-and exports walk it (`children`, `nodes`) and know nothing of construct. Everything here is immutable. A node says what it is
-(`FieldInfo` for what carries a value) and how it is stored; where it begins is the sum of what stands before it.
+`lidarspec.spec.syntax` makes it from an author's struct, once for each frame; schema, layouts,
+examples, wire tables, explain and exports walk it (`children`, `nodes`) and know nothing of
+construct. Everything here is immutable. A node says what it is (`FieldInfo` for what carries a
+value) and how it is stored; where it begins is the sum of what stands before it.
 
     Struct          members in a row
     Sealed          a Struct with a checksum
@@ -18,15 +20,19 @@ and exports walk it (`children`, `nodes`) and know nothing of construct. Everyth
     Never           what no frame has
     Opaque          what construct alone can read
 
-Counts, lengths, conditions and keys are formulas: numbers, references to fields (`Ref`) and operations on both (`Op`). What only Python
-can calculate is `Code`, which can be evaluated, but not be written down in another language.
+Counts, lengths, conditions and keys are formulas: numbers, references to fields (`Ref`) and
+operations on both (`Op`). What only Python can calculate is `Code`, which can be evaluated, but not
+be written down in another language.
 
-Parts stand in the tree twice: as they are described, with paths from the top of the frame (`Kind.element`), and as frames in themselves,
-with paths from their own start (`Kind.root`), which layouts and tables are made of.
+Parts stand in the tree twice: as they are described, with paths from the top of the frame
+(`Kind.element`), and as frames in themselves, with paths from their own start (`Kind.root`), which
+layouts and tables are made of.
 
-A field that says how long a part is (`FieldInfo.held`) follows from what the nodes of that part add up to (`size`), and what pads a part is
-so many bytes: both are formulas like all others. An axis has its name in `Repeat.axis` and `FieldInfo.axes`; one element of an array is an
-index in `Ref`. A wire form, which recodes the bytes before they have places, is a value of the `Frame`, beside its tree.
+A field that says how long a part is (`FieldInfo.held`) follows from what the nodes of that part add
+up to (`size`), and what pads a part is so many bytes: both are formulas like all others. An axis
+has its name in `Repeat.axis` and `FieldInfo.axes`; one element of an array is an index in `Ref`. A
+wire form, which recodes the bytes before they have places, is a value of the `Frame`, beside its
+tree.
 """
 
 from __future__ import annotations
@@ -64,8 +70,10 @@ class FieldInfo:
         scale, offset, unit: ``physical = raw * scale + offset``.
         bits: width in bits; 0 where not fixed.
         const: the value it must have, None where free.
-        allowed: the raw values that it may have (construct's OneOf, NoneOf and Mapping), in their order; None for any.
-        rebuilt: what its value in a frame that is made follows from, None where it is given (construct's Rebuild).
+        allowed: the raw values that it may have (construct's OneOf, NoneOf and Mapping), in their
+            order; None for any.
+        rebuilt: what its value in a frame that is made follows from, None where it is given
+            (construct's Rebuild).
         held: whether a frame that comes is held to that (`SizeOf`).
         labels: meanings of raw values (construct's Enum).
         optional: whether some headers leave it out.
@@ -106,7 +114,8 @@ class FieldInfo:
             raw: a number, or an array of any shape.
 
         Returns:
-            The same kind of thing; raw values themselves where no scale is declared. A Fraction is scaled exactly.
+            The same kind of thing; raw values themselves where no scale is declared. A Fraction is
+            scaled exactly.
         """
         if not self.scaled:
             return raw
@@ -115,13 +124,15 @@ class FieldInfo:
         return raw * self.scale + self.offset
 
     def raw(self, physical: Any) -> Any:
-        """The raw values nearest to physical ones, halfway to the even one; of a float field those that are equal.
+        """The raw values nearest to physical ones, halfway to the even one; of a float field those
+        that are equal.
 
         Args:
             physical: a number in the field's unit, or an array of any shape.
 
         Returns:
-            An int, or int64 of the same shape; floats for a float field. They may be beyond the field's limits.
+            An int, or int64 of the same shape; floats for a float field. They may be beyond the
+            field's limits.
         """
         if isinstance(physical, Fraction):
             steps: Any = (physical - exact(self.offset)) / exact(self.scale)
@@ -135,7 +146,11 @@ class FieldInfo:
     def limits(self) -> tuple[int, int]:
         """The lowest and highest raw value of an integer field."""
         signed = self.dtype is not None and self.dtype.kind == "i"
-        return (-(1 << (self.bits - 1)), (1 << (self.bits - 1)) - 1) if signed else (0, (1 << self.bits) - 1)
+        return (
+            (-(1 << (self.bits - 1)), (1 << (self.bits - 1)) - 1)
+            if signed
+            else (0, (1 << self.bits) - 1)
+        )
 
     @property
     def initial(self) -> int:
@@ -145,14 +160,24 @@ class FieldInfo:
 
 def runs_of(values: Sequence[int]) -> list[tuple[int, int]]:
     """The first and last of each run of values that follow one another; they ascend."""
-    ends = [index for index, value in enumerate(values) if index + 1 == len(values) or values[index + 1] != value + 1]
-    return [(values[first], values[last]) for first, last in zip([0, *(end + 1 for end in ends)], ends, strict=False)]
+    ends = [
+        index
+        for index, value in enumerate(values)
+        if index + 1 == len(values) or values[index + 1] != value + 1
+    ]
+    return [
+        (values[first], values[last])
+        for first, last in zip([0, *(end + 1 for end in ends)], ends, strict=False)
+    ]
 
 
 def listed(values: Sequence[int]) -> str:
     """Some raw values in words: "1, 3, 5 to 7"."""
     between = {0: "{0}", 1: "{0}, {1}"}
-    return ", ".join(between.get(last - first, "{0} to {1}").format(first, last) for first, last in runs_of(values))
+    return ", ".join(
+        between.get(last - first, "{0} to {1}").format(first, last)
+        for first, last in runs_of(values)
+    )
 
 
 @dataclass(frozen=True)
@@ -160,7 +185,8 @@ class Ref:
     """The raw value of a field that stands before the formula.
 
     Attributes:
-        path: from the top of the frame, dotted, without indices; within an array it is the field of the same element.
+        path: from the top of the frame, dotted, without indices; within an array it is the field of
+            the same element.
         info: the field.
     """
 
@@ -170,7 +196,8 @@ class Ref:
 
 @dataclass(frozen=True)
 class Op:
-    """An operation on integers as Python does it: ``//`` and ``%`` round down, comparisons give 1 or 0.
+    """An operation on integers as Python does it: ``//`` and ``%`` round down, comparisons give 1
+    or 0.
 
     Attributes:
         symbol: + - * // % & | ^ << >> == != < <= > >= with two arguments; - and not with one.
@@ -188,8 +215,10 @@ class Code:
         function: from what reads a field (see `Read`) to the value.
         refs: fields that it is known to ask for; which others depends on their values.
         reason: why it cannot be written down, with the path of the part that it belongs to.
-        text: as the author wrote it, with fields by their whole paths; "?" where that cannot be read.
-        blind: whether it asks for something that is no field before it, which construct alone may know.
+        text: as the author wrote it, with fields by their whole paths; "?" where that cannot be
+            read.
+        blind: whether it asks for something that is no field before it, which construct alone may
+            know.
     """
 
     function: Callable[[Read], Any]
@@ -200,13 +229,28 @@ class Code:
 
 
 Formula = int | Ref | Op | Code
-#: from the path of a field to what it is and its raw value; to its path for a struct, to None for a part that the header leaves out.
+#: from the path of a field to what it is and its raw value; to its path for a struct, to None for a
+#: part that the header leaves out.
 Read = Callable[[str], "tuple[FieldInfo, int] | str | None"]
 
 _OPERATIONS: dict[str, Callable[..., Any]] = {
-    **{"+": operator.add, "*": operator.mul, "//": operator.floordiv, "%": operator.mod, "&": operator.and_, "|": operator.or_},
+    **{
+        "+": operator.add,
+        "*": operator.mul,
+        "//": operator.floordiv,
+        "%": operator.mod,
+        "&": operator.and_,
+        "|": operator.or_,
+    },
     **{"^": operator.xor, "<<": operator.lshift, ">>": operator.rshift, "not": operator.not_},
-    **{"==": operator.eq, "!=": operator.ne, "<": operator.lt, "<=": operator.le, ">": operator.gt, ">=": operator.ge},
+    **{
+        "==": operator.eq,
+        "!=": operator.ne,
+        "<": operator.lt,
+        "<=": operator.le,
+        ">": operator.gt,
+        ">=": operator.ge,
+    },
     "-": lambda first, *second: first - second[0] if second else -first,
 }
 
@@ -222,7 +266,8 @@ def evaluated(formula: Formula, read: Read) -> Any:
     """The value of a formula.
 
     Args:
-        read: what gives the values of fields; a field that the header leaves out counts as None, as in construct.
+        read: what gives the values of fields; a field that the header leaves out counts as None, as
+            in construct.
 
     Raises:
         Exception: whatever the operation or the author's function raises on these values.
@@ -232,7 +277,9 @@ def evaluated(formula: Formula, read: Read) -> Any:
             value = read(formula.path)
             return value[1] if isinstance(value, tuple) else value
         case Op("*", (condition, _)) if _is_condition(condition) and not evaluated(condition, read):
-            return 0  # the size of an alternative that is not there, whose fields nobody can ask for
+            return (
+                0  # the size of an alternative that is not there, whose fields nobody can ask for
+            )
         case Op():
             return _OPERATIONS[formula.symbol](*(evaluated(arg, read) for arg in formula.args))
         case Code():
@@ -241,7 +288,9 @@ def evaluated(formula: Formula, read: Read) -> Any:
 
 
 def arrays(formula: Formula, columns: Mapping[str, Any], dtype: Any) -> Any:
-    """The values of a formula without `Code`, by arrays of its fields of a type that holds all it comes to; truths stay truths."""
+    """The values of a formula without `Code`, by arrays of its fields of a type that holds all it
+    comes to; truths stay truths.
+    """
     match formula:
         case Ref():
             return columns[formula.path]
@@ -250,7 +299,10 @@ def arrays(formula: Formula, columns: Mapping[str, Any], dtype: Any) -> Any:
         case Op(symbol, args):
             values = [arrays(arg, columns, dtype) for arg in args]
             if symbol not in _OF_TRUTHS:
-                values = [np.asarray(value, dtype) if isinstance(value, np.ndarray) else value for value in values]
+                values = [
+                    np.asarray(value, dtype) if isinstance(value, np.ndarray) else value
+                    for value in values
+                ]
             return _OPERATIONS[symbol](*values)
     return formula
 
@@ -263,7 +315,10 @@ _OF_TRUTHS = COMPARISONS | {"&", "|", "^"}
 
 
 def _is_condition(formula: Formula) -> bool:
-    return isinstance(formula, Op) and (formula.symbol in COMPARISONS or (formula.symbol == "*" and all(map(_is_condition, formula.args))))
+    return isinstance(formula, Op) and (
+        formula.symbol in COMPARISONS
+        or (formula.symbol == "*" and all(map(_is_condition, formula.args)))
+    )
 
 
 def written(formula: Formula, named: Callable[[Ref], str], operations: Mapping[str, str]) -> str:
@@ -271,7 +326,8 @@ def written(formula: Formula, named: Callable[[Ref], str], operations: Mapping[s
 
     Args:
         named: what gives the text of a field.
-        operations: symbol -> text with "{}" for each argument, where the language says it in another way than Python.
+        operations: symbol -> text with "{}" for each argument, where the language says it in
+            another way than Python.
     """
     match formula:
         case Ref():
@@ -279,7 +335,9 @@ def written(formula: Formula, named: Callable[[Ref], str], operations: Mapping[s
         case Op("-", (operand,)):
             return f"(-{written(operand, named, operations)})"
         case Op(symbol, args):
-            text = operations.get(symbol, "(not {})" if symbol == "not" else f"({{}} {symbol} {{}})")
+            text = operations.get(
+                symbol, "(not {})" if symbol == "not" else f"({{}} {symbol} {{}})"
+            )
             return text.format(*(written(arg, named, operations) for arg in args))
         case Code():
             raise ValueError(formula.reason)
@@ -287,12 +345,20 @@ def written(formula: Formula, named: Callable[[Ref], str], operations: Mapping[s
 
 
 def element_of(info: FieldInfo, path: str, indices: Mapping[str, int]) -> FieldInfo | None:
-    """A field by its place in some of its arrays, as a field of its own; None where it is not in these."""
+    """A field by its place in some of its arrays, as a field of its own; None where it is not in
+    these.
+    """
     if not indices.keys() <= set(info.axes):
         return None
     is_byte = info.kind == "bytes" and info.path in indices
     kind, bits = ("int", 8) if is_byte else (info.kind, info.bits)
-    return replace(info, path=path, axes=tuple(axis for axis in info.axes if axis not in indices), kind=kind, bits=bits)
+    return replace(
+        info,
+        path=path,
+        axes=tuple(axis for axis in info.axes if axis not in indices),
+        kind=kind,
+        bits=bits,
+    )
 
 
 def parts(formula: Formula) -> Iterator[Formula]:
@@ -305,7 +371,11 @@ def parts(formula: Formula) -> Iterator[Formula]:
 
 def refs(formula: Formula) -> tuple[Ref, ...]:
     """The fields that a formula depends on, in the order in which it names them, each once."""
-    found = ((part,) if isinstance(part, Ref) else part.refs for part in parts(formula) if isinstance(part, Ref | Code))
+    found = (
+        (part,) if isinstance(part, Ref) else part.refs
+        for part in parts(formula)
+        if isinstance(part, Ref | Code)
+    )
     return tuple(dict.fromkeys(itertools.chain.from_iterable(found)))
 
 
@@ -328,7 +398,13 @@ def width(formula: Formula) -> int:
         case "*":
             return sum(args)
         case "<<":
-            most = formula.args[1] if isinstance(formula.args[1], int) else (1 << args[1]) - 1 if args[1] < 8 else 99
+            most = (
+                formula.args[1]
+                if isinstance(formula.args[1], int)
+                else (1 << args[1]) - 1
+                if args[1] < 8
+                else 99
+            )
             return args[0] + most
         case "//" | ">>":
             return args[0] + 1
@@ -371,7 +447,10 @@ class Number:
     def encoded(self, value: float) -> bytes:
         """The bytes that a raw value is on the wire."""
         if self.kind == "float":
-            order, code = "<" if self.order == "little" else ">", {2: "e", 4: "f", 8: "d"}[self.size]
+            order, code = (
+                "<" if self.order == "little" else ">",
+                {2: "e", 4: "f", 8: "d"}[self.size],
+            )
             return struct.pack(order + code, value)
         return int(value).to_bytes(self.size, self.order, signed=self.kind == "int")
 
@@ -405,7 +484,9 @@ class Part:
 
 @dataclass(frozen=True, eq=False)
 class Block:
-    """So many bytes whose bits make up its parts; a block of one part without names is a plain field of odd width or order."""
+    """So many bytes whose bits make up its parts; a block of one part without names is a plain
+    field of odd width or order.
+    """
 
     name: str
     info: FieldInfo
@@ -415,7 +496,9 @@ class Block:
 
 @dataclass(frozen=True, eq=False)
 class Struct:
-    """Members in a row; `path` is "" for the frame itself, `docs` is the author's text on all of them."""
+    """Members in a row; `path` is "" for the frame itself, `docs` is the author's text on all of
+    them.
+    """
 
     name: str
     path: str
@@ -435,7 +518,8 @@ class Sealed:
     Attributes:
         body: the struct, which may be sealed by other fields too.
         fields: paths of what holds the checksum, low bits first.
-        over: paths of the first and last member that it covers; None: all bytes of the body that hold no bit of `fields`.
+        over: paths of the first and last member that it covers; None: all bytes of the body that
+            hold no bit of `fields`.
         declared: the algorithm, None where a hook has to supply it.
         absent: values that mean "not filled", and pass.
     """
@@ -454,7 +538,10 @@ class Sealed:
             SpecError: where there is none.
         """
         if self.declared is None:
-            raise SpecError("a checksum without algorithm, and no lidarspec_checksum hook supplies one", path=self.fields[0])
+            raise SpecError(
+                "a checksum without algorithm, and no lidarspec_checksum hook supplies one",
+                path=self.fields[0],
+            )
         return self.declared
 
     @property
@@ -470,7 +557,9 @@ class Sealed:
 
 @dataclass(frozen=True, eq=False)
 class Repeat:
-    """One element `count` times; `axis` is the name of the array, its path, with brackets where it is directly in an array."""
+    """One element `count` times; `axis` is the name of the array, its path, with brackets where it
+    is directly in an array.
+    """
 
     name: str
     axis: str
@@ -486,7 +575,8 @@ class Kind:
         name: by which it is asked for; "" where all parts are of one kind.
         element: it as it stands in the frame.
         root: it as a frame in itself; a field of the frame around it is "_." and its path there.
-        following: of fields of `root`: the bytes of the part behind it, 0 behind the last; None where parts are no chain.
+        following: of fields of `root`: the bytes of the part behind it, 0 behind the last; None
+            where parts are no chain.
     """
 
     name: str
@@ -497,7 +587,8 @@ class Kind:
 
 @dataclass(frozen=True, eq=False)
 class Parts:
-    """Frames within the frame: `count` of them, a chain whose first is `size` bytes long, or as many as fill `within` bytes.
+    """Frames within the frame: `count` of them, a chain whose first is `size` bytes long, or as
+    many as fill `within` bytes.
 
     Attributes:
         axis: its path, the name of the array that parts are elements of.
@@ -516,7 +607,9 @@ class Parts:
     total: FieldInfo
 
     def following(self, kind: Kind) -> Formula | None:
-        """The bytes of the part behind one of a kind, by the paths that its fields have in the frame."""
+        """The bytes of the part behind one of a kind, by the paths that its fields have in the
+        frame.
+        """
         return None if kind.following is None else moved(kind.following, self.axis)
 
 
@@ -532,7 +625,9 @@ class When:
 
 @dataclass(frozen=True, eq=False)
 class Select:
-    """What stands there for each value of the key, and for all others; integers, unless the key is `Code`."""
+    """What stands there for each value of the key, and for all others; integers, unless the key is
+    `Code`.
+    """
 
     name: str
     key: Formula
@@ -572,7 +667,8 @@ class Opaque:
         info: the field, where it is one.
         kind: the name of construct's class, or of the author's.
         reason: why no node stands for it.
-        inside: the parts of a bit block, or of a struct, that cannot be read as one; they have no places.
+        inside: the parts of a bit block, or of a struct, that cannot be read as one; they have no
+            places.
         size: in bytes, None where only the bytes themselves tell.
         form: how a field stands on the wire: "text up to" its terminator, else its kind.
         in_bits: whether it is a bit block.
@@ -588,7 +684,21 @@ class Opaque:
     in_bits: bool = False
 
 
-Node = Number | Blob | Block | Struct | Sealed | Repeat | Parts | When | Select | Empty | Check | Never | Opaque
+Node = (
+    Number
+    | Blob
+    | Block
+    | Struct
+    | Sealed
+    | Repeat
+    | Parts
+    | When
+    | Select
+    | Empty
+    | Check
+    | Never
+    | Opaque
+)
 
 
 def children(node: Node) -> tuple[Node, ...]:
@@ -647,14 +757,29 @@ def size(node: Node) -> Formula | None:
             return Ref(node.total.path, node.total)
         case When():
             return _chosen(
-                [(calculated("!=", node.condition, 0), size(node.then)), (calculated("==", node.condition, 0), size(node.otherwise))]
+                [
+                    (calculated("!=", node.condition, 0), size(node.then)),
+                    (calculated("==", node.condition, 0), size(node.otherwise)),
+                ]
             )
         case Select():
-            cases = [(calculated("==", node.key, value), size(case)) for value, case in node.cases if not isinstance(case, Never)]
+            cases = [
+                (calculated("==", node.key, value), size(case))
+                for value, case in node.cases
+                if not isinstance(case, Never)
+            ]
             others = [calculated("!=", node.key, value) for value, _ in node.cases]
             if isinstance(node.default, Never):
                 return _chosen(cases)
-            return _chosen([*cases, (functools.reduce(functools.partial(calculated, "*"), others), size(node.default))])
+            return _chosen(
+                [
+                    *cases,
+                    (
+                        functools.reduce(functools.partial(calculated, "*"), others),
+                        size(node.default),
+                    ),
+                ]
+            )
     return total(size(below) for below in children(node))
 
 
@@ -667,7 +792,9 @@ def total(sizes: Iterable[Formula | None]) -> Formula | None:
 
 
 def joined(symbol: str, one: Formula | None, other: Formula | None) -> Formula | None:
-    """A sum, difference or product, as short as it can be written; None where one of both is not known."""
+    """A sum, difference or product, as short as it can be written; None where one of both is not
+    known.
+    """
     if one is None or other is None:
         return None
     neutral = 1 if symbol == "*" else 0
@@ -687,11 +814,17 @@ def joined(symbol: str, one: Formula | None, other: Formula | None) -> Formula |
 def _chosen(cases: Sequence[tuple[Formula, Formula | None]]) -> Formula | None:
     """The size of alternatives, each with the condition under which it is there."""
     first = cases[0][1] if cases else 0
-    return first if all(each == first for _, each in cases) else total(joined("*", holds, each) for holds, each in cases)
+    return (
+        first
+        if all(each == first for _, each in cases)
+        else total(joined("*", holds, each) for holds, each in cases)
+    )
 
 
 def infos(node: Node) -> tuple[FieldInfo, ...]:
-    """The fields that a node is: one, or those of the parts of a block; none for a struct, an array or a choice."""
+    """The fields that a node is: one, or those of the parts of a block; none for a struct, an array
+    or a choice.
+    """
     match node:
         case Number() | Blob() | Opaque():
             return (node.info,)
@@ -701,7 +834,8 @@ def infos(node: Node) -> tuple[FieldInfo, ...]:
 
 
 class Scope:
-    """What an expression of a struct sees of the fields before it, as symbols, so that what it does with them can be written down.
+    """What an expression of a struct sees of the fields before it, as symbols, so that what it does
+    with them can be written down.
 
     Args:
         asked: to which the fields are added that an expression asks for.
@@ -716,7 +850,11 @@ class Scope:
     def add(self, name: str, part: Ref | Scope) -> None:
         """Make a field or struct known from here on."""
         known = self.names.get(name)
-        if known is not None and not (isinstance(known, Ref) and isinstance(part, Ref) and known.info.labels == part.info.labels):
+        if known is not None and not (
+            isinstance(known, Ref)
+            and isinstance(part, Ref)
+            and known.info.labels == part.info.labels
+        ):
             self.several.add(name)
         self.names[name] = part
 
@@ -815,7 +953,9 @@ def _traced_operation(symbol: str, left: Any, right: Any) -> Symbol:
     wrong = next((part for part in pair if not isinstance(part, int | Ref | Op)), None)
     if wrong is not None:
         raise Untraceable(f"an expression with {wrong!r}")
-    return Symbol(calculated(symbol, *(int(part) if isinstance(part, bool) else part for part in pair)))
+    return Symbol(
+        calculated(symbol, *(int(part) if isinstance(part, bool) else part for part in pair))
+    )
 
 
 def _no_integer(sign: str) -> Any:
@@ -823,13 +963,32 @@ def _no_integer(sign: str) -> Any:
 
 
 _SYMBOLS = {
-    **{"add": "+", "sub": "-", "mul": "*", "floordiv": "//", "mod": "%", "and": "&", "or": "|", "xor": "^", "lshift": "<<", "rshift": ">>"},
+    **{
+        "add": "+",
+        "sub": "-",
+        "mul": "*",
+        "floordiv": "//",
+        "mod": "%",
+        "and": "&",
+        "or": "|",
+        "xor": "^",
+        "lshift": "<<",
+        "rshift": ">>",
+    },
     **{"eq": "==", "ne": "!=", "lt": "<", "le": "<=", "gt": ">", "ge": ">="},
 }
 for _name, _symbol in _SYMBOLS.items():
-    setattr(Symbol, f"__{_name}__", lambda self, other, symbol=_symbol: _traced_operation(symbol, self, other))
+    setattr(
+        Symbol,
+        f"__{_name}__",
+        lambda self, other, symbol=_symbol: _traced_operation(symbol, self, other),
+    )
     if _symbol not in COMPARISONS:
-        setattr(Symbol, f"__r{_name}__", lambda self, other, symbol=_symbol: _traced_operation(symbol, other, self))
+        setattr(
+            Symbol,
+            f"__r{_name}__",
+            lambda self, other, symbol=_symbol: _traced_operation(symbol, other, self),
+        )
 for _name, _symbol in {"truediv": "/", "pow": "**", "divmod": "divmod", "matmul": "@"}.items():
     for _full in (f"__{_name}__", f"__r{_name}__"):
         setattr(Symbol, _full, lambda self, other, sign=_symbol: _no_integer(sign))

@@ -1,7 +1,9 @@
-"""The vocabulary of `points` functions: what NumPy's ufuncs do not say about angles, order and tables.
+"""The vocabulary of `points` functions: what NumPy's ufuncs do not say about angles, order and
+tables.
 
-Each works on NumPy arrays and on the columns that the engine passes; a column knows where packets and losses are, an
-array is taken as one run of values. The engine's other evaluators understand the same names.
+Each works on NumPy arrays and on the columns that the engine passes; a column knows where packets
+and losses are, an array is taken as one run of values. The engine's other evaluators understand the
+same names.
 """
 
 from __future__ import annotations
@@ -22,7 +24,8 @@ ELEMENTWISE = {np.where, np.clip, np.nan_to_num, np.round, np.isclose, np.real_i
 
 
 class Along(NDArrayOperatorsMixin):
-    """Numbers that all packets share, along arrays of the frame; NumPy's ufuncs apply, among themselves and with columns.
+    """Numbers that all packets share, along arrays of the frame; NumPy's ufuncs apply, among
+    themselves and with columns.
 
     Attributes:
         axes: the arrays, by the last part of their paths or the whole of it.
@@ -45,29 +48,47 @@ class Along(NDArrayOperatorsMixin):
     def __array_ufunc__(self, ufunc: np.ufunc, method: str, *inputs: Any, **kwargs: Any) -> Any:
         if method != "__call__" or kwargs.get("out") is not None:
             return getattr(ufunc, method)(*map(np.asarray, inputs), **kwargs)
-        return self.applied((lambda *arrays: ufunc(*arrays, **kwargs)) if kwargs else ufunc, *inputs)
+        return self.applied(
+            (lambda *arrays: ufunc(*arrays, **kwargs)) if kwargs else ufunc, *inputs
+        )
 
-    def __array_function__(self, function: Callable[..., Any], types: Any, args: Any, kwargs: Any) -> Any:
+    def __array_function__(
+        self, function: Callable[..., Any], types: Any, args: Any, kwargs: Any
+    ) -> Any:
         if function in ELEMENTWISE:
-            return self.applied((lambda *arrays: function(*arrays, **kwargs)) if kwargs else function, *args)
-        return function(*(np.asarray(value) if isinstance(value, Along) else value for value in args), **kwargs)
+            return self.applied(
+                (lambda *arrays: function(*arrays, **kwargs)) if kwargs else function, *args
+            )
+        return function(
+            *(np.asarray(value) if isinstance(value, Along) else value for value in args), **kwargs
+        )
 
     def applied(self, function: Callable[..., Any], *values: Any) -> Any:
-        """`function` of arrays, lined up by the arrays that they are along; of columns too, if one is among the values."""
+        """`function` of arrays, lined up by the arrays that they are along; of columns too, if one
+        is among the values.
+        """
         for value in values:
             if hasattr(value, "applied") and not isinstance(value, Along):
                 return value.applied(function, *values)
         axes: dict[str, str] = {}
         for name in (name for value in values if isinstance(value, Along) for name in value.axes):
             axes.setdefault(name.rpartition(".")[2], name)
-        arrays = [value.lined_up(tuple(axes)) if isinstance(value, Along) else np.asarray(value) for value in values]
+        arrays = [
+            value.lined_up(tuple(axes)) if isinstance(value, Along) else np.asarray(value)
+            for value in values
+        ]
         array = np.asarray(function(*arrays))
         if array.ndim != len(axes):
-            raise SpecError(f"an array of shape {array.shape} beside numbers along {', '.join(axes)}: say what it is along with along(...)")
+            raise SpecError(
+                f"an array of shape {array.shape} beside numbers along {', '.join(axes)}: say what"
+                " it is along with along(...)"
+            )
         return Along(tuple(axes.values()), array)
 
     def lined_up(self, names: tuple[str, ...]) -> NDArray[Any]:
-        """The numbers with an axis for each of these names, last parts of paths, among which its own are."""
+        """The numbers with an axis for each of these names, last parts of paths, among which its
+        own are.
+        """
         own = [name.rpartition(".")[2] for name in self.axes]
         ordered = self.array.transpose([own.index(name) for name in names if name in own])
         lengths = iter(ordered.shape)
@@ -89,7 +110,10 @@ def along(axis: str | tuple[str, ...], values: Array) -> Any:
     """
     axes, array = (axis,) if isinstance(axis, str) else tuple(axis), np.asarray(values)
     if array.ndim != len(axes):
-        raise SpecError(f"along({axis!r}, ...) takes an array with an axis for each name, not one of shape {array.shape}")
+        raise SpecError(
+            f"along({axis!r}, ...) takes an array with an axis for each name, not one of shape"
+            f" {array.shape}"
+        )
     return Along(axes, array)
 
 
@@ -102,11 +126,12 @@ def spread(start: Array, end: Array, count: Array, *, full: float) -> Array:
         full: the whole circle in that unit; an end below the start is one turn further.
 
     Returns:
-        float64, shape (n, count), not wrapped, so that differences stay positive; with a column as `count`, the
-        longest one, and what is beyond a packet's own count is never used.
+        float64, shape (n, count), not wrapped, so that differences stay positive; with a column as
+        `count`, the longest one, and what is beyond a packet's own count is never used.
 
     Raises:
-        SpecError: where every end that differs from its start is whole turns away, so that all points have one angle.
+        SpecError: where every end that differs from its start is whole turns away, so that all
+            points have one angle.
     """
     turn = end - start
     _refuse_folded(turn, full)
@@ -116,19 +141,24 @@ def spread(start: Array, end: Array, count: Array, *, full: float) -> Array:
 
 
 def steps(count: Array) -> Array:
-    """The index of each sample of a packet: 0, 1, 2 ... up to the largest count, such as for times, ``steps(f.count) / RATE``.
+    """The index of each sample of a packet: 0, 1, 2 ... up to the largest count, such as for times,
+    ``steps(f.count) / RATE``.
 
     Args:
-        count: samples of each packet, a number or a column; it has to be that of the innermost array.
+        count: samples of each packet, a number or a column; it has to be that of the innermost
+            array.
 
     Returns:
-        Integers, shape (count,); with a column as `count` as many as the longest packet of the batch has, as its arrays do.
+        Integers, shape (count,); with a column as `count` as many as the longest packet of the
+        batch has, as its arrays do.
     """
     return count.steps() if hasattr(count, "steps") else np.arange(int(np.max(count, initial=0)))
 
 
 def wrap(a: Array, full: float) -> Array:
-    """Angles within [0, full), float64, the shape of `a`; `full` is the whole circle in the unit of `a`."""
+    """Angles within [0, full), float64, the shape of `a`; `full` is the whole circle in the unit of
+    `a`.
+    """
     turned = np.mod(a, full)
     return np.where(turned >= full, 0.0, turned)
 
@@ -137,7 +167,8 @@ def following(a: Array, step: int = 1) -> Array:
     """The value `step` places later in stream order, over packet borders, padding left out.
 
     Returns:
-        float64, the shape of `a`; nan across a loss (a jump of the sequence, skipped bytes) and at the end.
+        float64, the shape of `a`; nan across a loss (a jump of the sequence, skipped bytes) and at
+        the end.
     """
     return _shifted(a, step)
 
@@ -146,7 +177,8 @@ def previous(a: Array, step: int = 1) -> Array:
     """The value `step` places earlier in stream order, over packet borders, padding left out.
 
     Returns:
-        float64, the shape of `a`; nan across a loss (a jump of the sequence, skipped bytes) and at the beginning.
+        float64, the shape of `a`; nan across a loss (a jump of the sequence, skipped bytes) and at
+        the beginning.
     """
     return _shifted(a, -step)
 
@@ -173,17 +205,19 @@ def last(a: Array, where: Array | None = None) -> Array:
 def between_blocks(azimuth: Array, ahead: Array, *, limit: float, full: float = 360.0) -> Array:
     """Return how far a rotor turns from each block to the next one.
 
-    A step of `limit` or more is a loss or a masked sector: the last good step in stream order is taken instead.
+    A step of `limit` or more is a loss or a masked sector: the last good step in stream order is
+    taken instead.
 
     Args:
         azimuth: azimuth of each block, in the unit of `full`.
         ahead: azimuth of the next block that does not share it, such as ``following(azimuth)``.
-        limit: steps have to be smaller than this: what the sensor turns in this time at its fastest.
+        limit: steps have to be smaller than this: what the sensor turns in this time at its
+            fastest.
         full: the whole circle in the unit of `azimuth`.
 
     Returns:
-        float64, the shape of `azimuth`; the shorter way round, so negative where readings jitter; nan before the
-        first good step.
+        float64, the shape of `azimuth`; the shorter way round, so negative where readings jitter;
+        nan before the first good step.
     """
     step = ahead - azimuth
     step = step - full * np.rint(step / full)
@@ -201,7 +235,9 @@ def side_by_side(*arrays: Any) -> Any:
 
 
 def running(a: Array) -> Array:
-    """The sum of the values so far along the innermost array that they are in, for differences on the wire: float64, the shape of `a`."""
+    """The sum of the values so far along the innermost array that they are in, for differences on
+    the wire: float64, the shape of `a`.
+    """
     return a.running() if hasattr(a, "running") else np.cumsum(np.asarray(a, np.float64), axis=-1)
 
 
@@ -209,20 +245,28 @@ def take(table: Array, index: Array) -> Array:
     """The entries of a table at `index`; nan where the index is not in the table.
 
     Args:
-        table: (m,), a number for each index; or (m, k), a row for each, along the array of k elements that stands in those of `index`.
+        table: (m,), a number for each index; or (m, k), a row for each, along the array of k
+            elements that stands in those of `index`.
 
     Returns:
-        float64, the shape of `index`; of rows with k in place of that array's length: of columns numbered (n, 16, 1), (n, 16, k).
+        float64, the shape of `index`; of rows with k in place of that array's length: of columns
+        numbered (n, 16, 1), (n, 16, k).
     """
     entries = np.asarray(table, np.float64)
     if entries.ndim == 1:
         return _applied(LookUp(entries), index)
     rows = np.concatenate([entries, np.full((1, entries.shape[1]), np.nan)])
-    return index.gathered(rows) if hasattr(index, "gathered") else rows[row_numbers(np.asarray(index), len(rows))]
+    return (
+        index.gathered(rows)
+        if hasattr(index, "gathered")
+        else rows[row_numbers(np.asarray(index), len(rows))]
+    )
 
 
 def row_numbers(index: NDArray[Any], rows: int) -> NDArray[np.intp]:
-    """The rows of a table for indices, of their shape; the last one, which is nan, for those that it does not have."""
+    """The rows of a table for indices, of their shape; the last one, which is nan, for those that
+    it does not have.
+    """
     return np.where((index >= 0) & (index < rows - 1), index, rows - 1).astype(np.intp)
 
 
@@ -234,7 +278,11 @@ class LookUp:
 
     def __call__(self, spots: Any) -> Any:
         inside = (spots >= 0) & (spots < len(self.entries))
-        found = self.entries[np.where(inside, spots, 0).astype(np.intp)] if len(self.entries) else np.zeros(np.shape(spots))
+        found = (
+            self.entries[np.where(inside, spots, 0).astype(np.intp)]
+            if len(self.entries)
+            else np.zeros(np.shape(spots))
+        )
         return np.where(inside, found, np.nan)
 
 
@@ -242,8 +290,15 @@ def _refuse_folded(turn: Array, full: float) -> None:
     angles = np.asarray(turn.seen if hasattr(turn, "seen") else turn, np.float64)
     moved = angles[angles != 0]
     if moved.size and not np.mod(moved, full).any():
-        reason = f"spread(start, end): every end is whole turns of {full:g} from its start, and all points would have one angle"
-        raise SpecError(f"{reason}; full= is the circle in the unit of the angles, and the index of a sample is steps(count)", rule="LS215")
+        reason = (
+            f"spread(start, end): every end is whole turns of {full:g} from its start, and all"
+            " points would have one angle"
+        )
+        raise SpecError(
+            f"{reason}; full= is the circle in the unit of the angles, and the index of a sample is"
+            " steps(count)",
+            rule="LS215",
+        )
 
 
 def _shifted(a: Array, step: int) -> Array:
@@ -252,7 +307,9 @@ def _shifted(a: Array, step: int) -> Array:
     values = np.asarray(a, np.float64)
     flat = np.full(values.size, np.nan)
     if abs(step) < values.size:
-        flat[max(-step, 0) : values.size - max(step, 0)] = values.ravel()[max(step, 0) : values.size - max(-step, 0)]
+        flat[max(-step, 0) : values.size - max(step, 0)] = values.ravel()[
+            max(step, 0) : values.size - max(-step, 0)
+        ]
     return flat.reshape(values.shape)
 
 

@@ -1,11 +1,13 @@
-"""A test kit for authors: what a sensor's declaration has to keep, as a class for pytest and as `lidarspec check`.
+"""A test kit for authors: what a sensor's declaration has to keep, as a class for pytest and as
+`lidarspec check`.
 
     from lidarspec.testing import SensorConformance
 
     class TestMine(SensorConformance):
         sensor = "acme-x1"        # an id, a Sensor value, or a file such as "./acme.py"
 
-In: a sensor. Out: passed tests, or findings with place, reason and what to write. Modules in reading order:
+In: a sensor. Out: passed tests, or findings with place, reason and what to write. Modules in
+reading order:
 
 * `properties`: the table of properties that every sensor must have.
 * `conformance`: everything that `check` checks, as one test for pytest.

@@ -1,9 +1,12 @@
-"""What has to agree: the ways through the engine, two runs over the same bytes, single packets and batches.
+"""What has to agree: the ways through the engine, two runs over the same bytes, single packets and
+batches.
 
-First when two results count as equal, as functions that fail where they do not; then the properties of a sensor that rest on them. A
-sensor's own functions (expressions of the struct, `plausible`, `points`, `clock`) may look at nothing but the frame that they are given:
-one with a memory, or one that looks at the whole batch, gives other results where packets come in another way. That is what is looked for
-here; one property, `parse_decode_and_any_cutting_agree`, is the canary of the engine itself.
+First when two results count as equal, as functions that fail where they do not; then the properties
+of a sensor that rest on them. A
+sensor's own functions (expressions of the struct, `plausible`, `points`, `clock`) may look at
+nothing but the frame that they are given: one with a memory, or one that looks at the whole batch,
+gives other results where packets come in another way. That is what is looked for here; one
+property, `parse_decode_and_any_cutting_agree`, is the canary of the engine itself.
 """
 
 from __future__ import annotations
@@ -28,14 +31,17 @@ from lidarspec.testing import subject as material
 from lidarspec.testing.findings import Violation, require
 from lidarspec.testing.subject import MANY, Subject
 
-#: units in the last place by which coordinates of two evaluations may differ, at the size of the range.
+#: units in the last place by which coordinates of two evaluations may differ, at the size of the
+#: range.
 ULPS = 4
-#: how often the canary cuts a stream with the usual number of examples and at least, and how often it damages one.
+#: how often the canary cuts a stream with the usual number of examples and at least, and how often
+#: it damages one.
 CUTS, LEAST_CUTS, DAMAGED = 8, 2, 1
-#: rounds of a conversation if a shorter one has no scan, since few random frames of a sensor have points.
+#: rounds of a conversation if a shorter one has no scan, since few random frames of a sensor have
+#: points.
 MORE_ROUNDS = 12
-#: Bytes that construct parses again, at most, while streams come in chunks: it parses an incomplete frame from its start with each
-#: further chunk.
+#: Bytes that construct parses again, at most, while streams come in chunks: it parses an incomplete
+#: frame from its start with each further chunk.
 REREAD_BYTES = 1_000_000
 #: streams up to this length are also fed byte by byte, with the usual number of examples.
 SHORT_STREAM = 4000
@@ -73,27 +79,37 @@ def _lengths(packets: Packets, array: str) -> NDArray[np.intp]:
 
 
 def assert_same_points(one: PointCloud, other: PointCloud, *, ulps: int = ULPS) -> None:
-    """Fail unless both clouds have the same points, masks, times and places, directions within so many units in the last place."""
+    """Fail unless both clouds have the same points, masks, times and places, directions within so
+    many units in the last place.
+    """
     assert_same_places(one, other, ulps=ulps)
     assert np.allclose(one.time, other.time, rtol=0, atol=1e-11, equal_nan=True)
     assert (one.stamp_ns, bool(one.nominal)) == (other.stamp_ns, bool(other.nominal))
 
 
 def assert_same_places(one: PointCloud, other: PointCloud, *, ulps: int = ULPS) -> None:
-    """Fail unless both clouds have the same points and masks, places and directions within so many units in the last place.
+    """Fail unless both clouds have the same points and masks, places and directions within so many
+    units in the last place.
 
-    Coordinates are compared at the size of the range, azimuths on the circle, times to the microsecond, since batches round them
-    differently; everything else is equal.
+    Coordinates are compared at the size of the range, azimuths on the circle, times to the
+    microsecond, since batches round them differently; everything else is equal.
     """
     assert one.columns.keys() == other.columns.keys()
     assert same(one.valid, other.valid)
     with np.errstate(invalid="ignore"):
-        size = np.nanmax(np.abs(np.stack([one.range, one.x, one.y, one.z, np.ones(len(one))])), axis=0, initial=0).astype(np.float32)
+        size = np.nanmax(
+            np.abs(np.stack([one.range, one.x, one.y, one.z, np.ones(len(one))])), axis=0, initial=0
+        ).astype(np.float32)
         reach = np.where(np.isfinite(size), size, 1).astype(np.float32)
     for name in one.columns.keys() - {"time"}:
         first, second = one.columns[name], other.columns[name]
         if name in ("x", "y", "z", "range"):
-            near = _close(first, second, ulps * np.spacing(np.minimum(reach, np.abs(one.range)) if name == "range" else reach))
+            near = _close(
+                first,
+                second,
+                ulps
+                * np.spacing(np.minimum(reach, np.abs(one.range)) if name == "range" else reach),
+            )
         elif name in ("azimuth", "elevation"):
             near = _close(first, second, ulps * np.spacing(np.float32(np.pi)), full=2 * np.pi)
         else:
@@ -106,7 +122,9 @@ def assert_same_places(one: PointCloud, other: PointCloud, *, ulps: int = ULPS) 
 
 
 def _close(one: NDArray[Any], other: NDArray[Any], within: Any, full: float = 0.0) -> bool:
-    """Whether numbers are as near to each other, on a circle if `full` is given; nan and infinities equal themselves."""
+    """Whether numbers are as near to each other, on a circle if `full` is given; nan and infinities
+    equal themselves.
+    """
     if one.dtype != other.dtype or one.shape != other.shape:
         return False
     with np.errstate(invalid="ignore"):
@@ -116,7 +134,9 @@ def _close(one: NDArray[Any], other: NDArray[Any], within: Any, full: float = 0.
 
 
 def assert_well_formed(cloud: PointCloud) -> None:
-    """Fail unless the cloud keeps the conventions: types, angles, REP-117, and no place without a return."""
+    """Fail unless the cloud keeps the conventions: types, angles, REP-117, and no place without a
+    return.
+    """
     valid = cloud.valid
     assert cloud.x.dtype == cloud.y.dtype == cloud.z.dtype == cloud.range.dtype == np.float32
     assert cloud.time.dtype == np.float64
@@ -131,21 +151,30 @@ def assert_well_formed(cloud: PointCloud) -> None:
 
 def same(one: NDArray[Any], other: NDArray[Any]) -> bool:
     """Whether two arrays are equal in shape, type and value; nan equals nan."""
-    return one.dtype == other.dtype and one.shape == other.shape and np.array_equal(one, other, equal_nan=one.dtype.kind == "f")
+    return (
+        one.dtype == other.dtype
+        and one.shape == other.shape
+        and np.array_equal(one, other, equal_nan=one.dtype.kind == "f")
+    )
 
 
 def assert_backends_agree(sensor: Sensor, data: Any) -> None:
-    """Fail unless the compiled and the interpreted path give the same frames, packets, points and counters, and no plugin failed.
+    """Fail unless the compiled and the interpreted path give the same frames, packets, points and
+    counters, and no plugin failed.
 
     Args:
         data: bytes, or a list of datagrams.
     """
-    decoders = [sensor.decoder(stream=is_stream(data), backend=backend) for backend in ("auto", "construct")]
+    decoders = [
+        sensor.decoder(stream=is_stream(data), backend=backend) for backend in ("auto", "construct")
+    ]
     found = [frames_of(decoder, data) for decoder in decoders]
     split = [cuts(frame for frames in each for frame in frames.found()) for each in found]
     assert split[0] == split[1]
     for name in dict.fromkeys((sensor.data_frame, *(name for name, _, _ in split[0]))):
-        compiled, interpreted = (_packets(decoder, name, each) for decoder, each in zip(decoders, found, strict=True))
+        compiled, interpreted = (
+            _packets(decoder, name, each) for decoder, each in zip(decoders, found, strict=True)
+        )
         assert not compiled.stats.plugin_errors, compiled.stats.tracebacks[0]
         assert_same_packets(compiled, interpreted)
         if sensor.frames[name].data:
@@ -155,7 +184,9 @@ def assert_backends_agree(sensor: Sensor, data: Any) -> None:
 
 
 def _packets(decoder: Decoder, name: str, found: Sequence[Frames]) -> Packets:
-    """The packets of one type among the frames of a whole input, which is framed once for all types."""
+    """The packets of one type among the frames of a whole input, which is framed once for all
+    types.
+    """
     stats = copy.deepcopy(decoder.stats)
     return PacketStream(decoder.sensor, name, stats, backend=decoder.backend).add(found, whole=True)
 
@@ -165,14 +196,33 @@ def a_clean_input_loses_nothing(subject: Subject) -> None:
     frames = subject.conversation()
     data = material.delivery(subject.sensor, frames)
     found = [(found.frame, found.data) for found in subject.sensor.split(data)]
-    wrong = next((index for index, pair in enumerate(zip(found, frames, strict=False)) if pair[0] != pair[1]), min(len(found), len(frames)))
+    wrong = next(
+        (
+            index
+            for index, pair in enumerate(zip(found, frames, strict=False))
+            if pair[0] != pair[1]
+        ),
+        min(len(found), len(frames)),
+    )
     if found != frames:
         name = frames[min(wrong, len(frames) - 1)][0]
-        took = f"; a {found[wrong][0]!r} frame is found there" if wrong < len(found) and found[wrong][0] != name else ""
-        raise Violation("LS306" if took else "LS401", f"of {len(frames)} frames, number {wrong} is not found{took}", name)
+        took = (
+            f"; a {found[wrong][0]!r} frame is found there"
+            if wrong < len(found) and found[wrong][0] != name
+            else ""
+        )
+        raise Violation(
+            "LS306" if took else "LS401",
+            f"of {len(frames)} frames, number {wrong} is not found{took}",
+            name,
+        )
     stats = subject.sensor.decode(data).stats
     require(not stats.plugin_errors, "LS414", str(stats.failure("")))
-    require((stats.bytes_skipped, stats.pending) == (0, 0), "LS401", f"{stats.bytes_skipped} bytes skipped, {stats.pending} pending")
+    require(
+        (stats.bytes_skipped, stats.pending) == (0, 0),
+        "LS401",
+        f"{stats.bytes_skipped} bytes skipped, {stats.pending} pending",
+    )
 
 
 def the_same_bytes_give_the_same_points(subject: Subject) -> None:
@@ -183,15 +233,25 @@ def the_same_bytes_give_the_same_points(subject: Subject) -> None:
         require(len(one) == len(other), "LS415", "two runs give different numbers of points")
         for name, column in one.columns.items():
             equal = column.tobytes() == other.columns[name].tobytes()
-            require(equal, "LS415", f"two runs give another {name}", f"{subject.sensor.data_frame}.points")
+            require(
+                equal,
+                "LS415",
+                f"two runs give another {name}",
+                f"{subject.sensor.data_frame}.points",
+            )
 
 
 def parse_decode_and_any_cutting_agree(subject: Subject) -> None:
-    """Clean and damaged input gives the same values parsed and decoded, on both engines, and however a stream is cut."""
+    """Clean and damaged input gives the same values parsed and decoded, on both engines, and
+    however a stream is cut.
+    """
     sensor, source = subject.sensor, subject.source("agree")
     frames = subject.conversation(rounds=1)
     for damaged in range(1 + DAMAGED):
-        parts = [(name, material.mutated(data, source) if damaged and source.random() < 0.4 else data) for name, data in frames]
+        parts = [
+            (name, material.mutated(data, source) if damaged and source.random() < 0.4 else data)
+            for name, data in frames
+        ]
         data = material.delivery(sensor, parts)
         assert_backends_agree(sensor, data)
         if not sensor.datagrams:
@@ -203,24 +263,44 @@ def parse_decode_and_any_cutting_agree(subject: Subject) -> None:
 def _read_alike(sensor: Sensor, name: str, data: bytes) -> None:
     """Hold the numbers of a parsed frame to those of the same frame in a table."""
     try:
-        row = sensor.decode([data] if sensor.datagrams else data * sensor.frames[name].confirm, name).raw[:1]
+        row = sensor.decode(
+            [data] if sensor.datagrams else data * sensor.frames[name].confirm, name
+        ).raw[:1]
     except SpecError:  # an array in one branch alone has no raw form
         return
     for number in row:
         path = _differing(sensor.parse(data, frame=name), number)
-        require(path is None, "LS402", "it is parsed as another number than it is decoded", f"{name}.{path}")
+        require(
+            path is None,
+            "LS402",
+            "it is parsed as another number than it is decoded",
+            f"{name}.{path}",
+        )
 
 
 def _differing(parsed: Any, raw: Any, path: str = "") -> str | None:
-    """The path of the first number of a parsed frame that is another one in a row of `Packets.raw`; None where there is none."""
+    """The path of the first number of a parsed frame that is another one in a row of `Packets.raw`;
+    None where there is none.
+    """
     if isinstance(parsed, dict):
-        entries = [(f"{path}.{key}".lstrip("."), value, raw[key]) for key, value in parsed.items() if key in (raw.dtype.names or ())]
+        entries = [
+            (f"{path}.{key}".lstrip("."), value, raw[key])
+            for key, value in parsed.items()
+            if key in (raw.dtype.names or ())
+        ]
     elif isinstance(parsed, list):
         entries = [(f"{path}[{index}]", value, raw[index]) for index, value in enumerate(parsed)]
     else:
         number = isinstance(parsed, int | float) and np.ndim(raw) == 0
         return path if number and parsed == parsed and parsed != raw else None
-    return next((found for name, value, other in entries if (found := _differing(value, other, name)) is not None), None)
+    return next(
+        (
+            found
+            for name, value, other in entries
+            if (found := _differing(value, other, name)) is not None
+        ),
+        None,
+    )
 
 
 def _cut_anywhere(subject: Subject, data: bytes) -> None:
@@ -232,25 +312,44 @@ def _cut_anywhere(subject: Subject, data: bytes) -> None:
     number = subject.scale_rounds(rounds, LEAST_CUTS)
     scale = _chunk_scale(subject, number * len(data))
     splits = [list(material.pieces(data, source, scale)) for _ in range(number)]
-    splits += [[data[spot : spot + 1] for spot in range(len(data))]] if len(data) <= subject.scale_rounds(SHORT_STREAM) else []
+    splits += (
+        [[data[spot : spot + 1] for spot in range(len(data))]]
+        if len(data) <= subject.scale_rounds(SHORT_STREAM)
+        else []
+    )
     for split in splits:
         decoder = sensor.decoder()
         found = cuts([frame for chunk in split for frame in decoder.feed(chunk)] + decoder.finish())
-        lost = next((frame for frame in expected if frame not in found), (found or expected or [("", 0, b"")])[0])
-        require(found == expected, "LS405", f"in {len(split)} pieces, the frame at byte {lost[1]} is not found as in one", lost[0])
+        lost = next(
+            (frame for frame in expected if frame not in found),
+            (found or expected or [("", 0, b"")])[0],
+        )
+        require(
+            found == expected,
+            "LS405",
+            f"in {len(split)} pieces, the frame at byte {lost[1]} is not found as in one",
+            lost[0],
+        )
         require(decoder.stats == whole.stats, "LS405", "the counters depend on the split")
 
 
 def _chunk_scale(subject: Subject, length: int) -> int:
-    """Return the factor by which chunks are longer than usual: 1 unless construct alone reads long frames.
+    """Return the factor by which chunks are longer than usual: 1 unless construct alone reads long
+    frames.
 
     Args:
         length: bytes of all streams together.
     """
     incoming = subject.sensor.incoming
-    interpreted = [subject.length(name) for name, frame in incoming.items() if isinstance(codec(frame), InterpretedCodec)]
+    interpreted = [
+        subject.length(name)
+        for name, frame in incoming.items()
+        if isinstance(codec(frame), InterpretedCodec)
+    ]
     chunks = length / material.MEAN_CHUNK
-    reread_bytes = chunks * max(interpreted, default=0) / 2  # on average half of a frame has arrived
+    reread_bytes = (
+        chunks * max(interpreted, default=0) / 2
+    )  # on average half of a frame has arrived
     return max(round(reread_bytes / REREAD_BYTES), 1)
 
 
@@ -260,7 +359,9 @@ def single_packets_equal_a_batch(subject: Subject) -> None:
     for name in subject.sensor.incoming:
         stats = [Decoder(subject.sensor, stream=True).stats for _ in range(2)]
         single, batch = (PacketStream(subject.sensor, name, each) for each in stats)
-        assert_same_packets(joined([single.add([packed([item])]) for item in found]), batch.add([packed(found)]))
+        assert_same_packets(
+            joined([single.add([packed([item])]) for item in found]), batch.add([packed(found)])
+        )
 
 
 def scans_do_not_depend_on_batches(subject: Subject) -> None:
@@ -269,7 +370,10 @@ def scans_do_not_depend_on_batches(subject: Subject) -> None:
     def scans(found: list[Found], size: int) -> list[Scan]:
         stats = Decoder(subject.sensor, stream=True).stats
         stream = PacketStream(subject.sensor, subject.sensor.data_frame, stats)
-        batches = [stream.add([packed(found[start : start + size])]) for start in range(0, len(found), size)]
+        batches = [
+            stream.add([packed(found[start : start + size])])
+            for start in range(0, len(found), size)
+        ]
         scans = list(scans_of(subject.sensor, batches))
         require(not stats.plugin_errors, "LS414", str(stats.failure("")))
         return scans
@@ -277,14 +381,18 @@ def scans_do_not_depend_on_batches(subject: Subject) -> None:
     found: list[Found] = []
     whole: list[Scan] = []
     for rounds in (None, MORE_ROUNDS):
-        found = subject.sensor.split(material.delivery(subject.sensor, subject.conversation(rounds=rounds)))
+        found = subject.sensor.split(
+            material.delivery(subject.sensor, subject.conversation(rounds=rounds))
+        )
         whole = scans(found, len(found))
         if whole:
             break
     require(whole, "LS404", "there is no scan")
     for size in (1, 3):
         parts = scans(found, size)
-        alike = [(len(scan), scan.whole, scan.complete) for scan in parts] == [(len(scan), scan.whole, scan.complete) for scan in whole]
+        alike = [(len(scan), scan.whole, scan.complete) for scan in parts] == [
+            (len(scan), scan.whole, scan.complete) for scan in whole
+        ]
         require(alike, "LS404", f"{size} packets at a time give other scans than all at once")
         for part, other in zip(parts, whole, strict=True):
             assert_well_formed(part.points)

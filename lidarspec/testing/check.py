@@ -1,10 +1,12 @@
-"""`lidarspec check` without the command line: every property and every rule over a sensor, a file or a distribution.
+"""`lidarspec check` without the command line: every property and every rule over a sensor, a file
+or a distribution.
 
-A name is made a `Target` first: the sensors that it stands for, what kept others from being loaded, and the modules that they are written
-in. The text of these modules is read twice: for mistakes that show in it alone (what Python accepts, and what then does something else
-than it says), and for where fields, frames, functions, commands and sensors stand, so that a finding names file and line (`Places`). Then
-each sensor is held to its declaration and to the properties of `properties`, in their order, and what it acknowledges is left out of the
-`Report`.
+A name is made a `Target` first: the sensors that it stands for, what kept others from being loaded,
+and the modules that they are written in. The text of these modules is read twice: for mistakes that
+show in it alone (what Python accepts, and what then does something else than it says), and for
+where fields, frames, functions, commands and sensors stand, so that a finding names file and line
+(`Places`). Then each sensor is held to its declaration and to the properties of `properties`, in
+their order, and what it acknowledges is left out of the `Report`.
 """
 
 from __future__ import annotations
@@ -54,7 +56,8 @@ class Target:
         sensors: that were found in it.
         findings: what kept others from being found.
         files: the modules that it is written in.
-        vectors: its golden vectors: beside its modules, or in the folder of its distribution's source or the tests there.
+        vectors: its golden vectors: beside its modules, or in the folder of its distribution's
+            source or the tests there.
         family: the ids of the sensors that share them: of the file, or of the whole distribution.
     """
 
@@ -66,10 +69,12 @@ class Target:
 
 
 def target(text: str | Path) -> Target:
-    """What a name stands for: a file, one sensor of it ("FILE.py:id"), the id or alias of an installed one, a distribution or its folder.
+    """What a name stands for: a file, one sensor of it ("FILE.py:id"), the id or alias of an
+    installed one, a distribution or its folder.
 
     Raises:
-        SourceError: for a file that is not there, and for the folder of a distribution that is not installed.
+        SourceError: for a file that is not there, and for the folder of a distribution that is not
+            installed.
         UnknownSensor: for a name that is nothing of all this.
     """
     name = str(text)
@@ -83,9 +88,14 @@ def target(text: str | Path) -> Target:
         return _distribution(entries)
     sensor = registry().sensor(name)
     homes = [plugin for plugin in registry().plugins if sensor.id in plugin.sensors]
-    files = [file for plugin in homes for file in module_files(plugin.entry_point.partition(" = ")[2])]
+    files = [
+        file for plugin in homes for file in module_files(plugin.entry_point.partition(" = ")[2])
+    ]
     family = [
-        one for plugin in registry().plugins if plugin.distribution in {home.distribution for home in homes} for one in plugin.sensors
+        one
+        for plugin in registry().plugins
+        if plugin.distribution in {home.distribution for home in homes}
+        for one in plugin.sensors
     ]
     return Target([sensor], _rivals([sensor]), files, _vectors(files), tuple(family))
 
@@ -97,7 +107,9 @@ def _file(file: Path, wanted: str) -> Target:
         found.family = tuple(sensor.id for sensor in found.sensors[1:] and found.sensors)
         found.findings += _holders(found.sensors, file)
         if not found.sensors:
-            raise SpecError("there is no function lidarspec_sensors, marked @hookimpl, that returns a sensor")
+            raise SpecError(
+                "there is no function lidarspec_sensors, marked @hookimpl, that returns a sensor"
+            )
     except SourceError:
         raise
     except (Exception, SystemExit) as error:
@@ -127,7 +139,12 @@ def _folder(folder: Path) -> Target:
 def _vectors(files: Iterable[Path]) -> Path | None:
     """The golden vectors of some modules."""
     beside = dict.fromkeys(file.resolve().parent for file in files)
-    sources = [home for folder in beside for home in (folder, *folder.parents[:2]) if (home / "pyproject.toml").is_file()]
+    sources = [
+        home
+        for folder in beside
+        for home in (folder, *folder.parents[:2])
+        if (home / "pyproject.toml").is_file()
+    ]
     folders = [*beside, *sources, *(home / "tests" for home in sources)]
     return next((folder / VECTORS for folder in folders if (folder / VECTORS).is_file()), None)
 
@@ -145,32 +162,62 @@ def _distribution(entries: list[EntryPoint]) -> Target:
             sensors = _added(entry.load(), entry.value)
         except (Exception, SystemExit) as error:
             finding = loading(error, module_files(entry.value))
-            found.findings.append(replace(finding, path=finding.path or f"{entry.name} = {entry.value}"))
+            found.findings.append(
+                replace(finding, path=finding.path or f"{entry.name} = {entry.value}")
+            )
             continue
         found.files += [file for file in module_files(entry.value) if file not in found.files]
-        found.sensors += [sensor for sensor in sensors if sensor.id not in {one.id for one in found.sensors}]
-    found.vectors, found.family = _vectors(found.files), tuple(sensor.id for sensor in found.sensors)
+        found.sensors += [
+            sensor for sensor in sensors if sensor.id not in {one.id for one in found.sensors}
+        ]
+    found.vectors, found.family = (
+        _vectors(found.files),
+        tuple(sensor.id for sensor in found.sensors),
+    )
     names = {_normal(entry.distribution) for entry in entries}
-    failing = [plugin for plugin in registry().plugins if _normal(plugin.distribution) in names and _said(plugin.error) == "LS010"]
+    failing = [
+        plugin
+        for plugin in registry().plugins
+        if _normal(plugin.distribution) in names and _said(plugin.error) == "LS010"
+    ]
     found.findings += [Finding("LS010", plugin.error, plugin.entry_point) for plugin in failing]
     found.findings += _rivals(found.sensors)
     return found
 
 
 def _rivals(sensors: list[Sensor]) -> list[Finding]:
-    """The plugins that were refused because of a name of these sensors, or that these were refused for: each with who has it."""
+    """The plugins that were refused because of a name of these sensors, or that these were refused
+    for: each with who has it.
+    """
     names = {name for sensor in sensors for name in (sensor.id, *sensor.aliases)}
-    refused = [plugin for plugin in registry().plugins if _said(plugin.error) == "LS005" and plugin.error.partition(":")[0] in names]
-    return [Finding("LS005", f"{plugin.distribution} has {plugin.error}", plugin.entry_point) for plugin in refused]
+    refused = [
+        plugin
+        for plugin in registry().plugins
+        if _said(plugin.error) == "LS005" and plugin.error.partition(":")[0] in names
+    ]
+    return [
+        Finding("LS005", f"{plugin.distribution} has {plugin.error}", plugin.entry_point)
+        for plugin in refused
+    ]
 
 
 def _holders(sensors: list[Sensor], file: Path) -> list[Finding]:
-    """The installed plugins, written in other files than this one, that have the ids of its sensors."""
+    """The installed plugins, written in other files than this one, that have the ids of its
+    sensors.
+    """
     return [
-        Finding("LS005", f"{plugin.distribution} is installed, and has it ({plugin.entry_point})", "", sensor.id)
+        Finding(
+            "LS005",
+            f"{plugin.distribution} is installed, and has it ({plugin.entry_point})",
+            "",
+            sensor.id,
+        )
         for sensor in sensors
         for plugin in registry().plugins
-        if sensor.id in plugin.sensors and not any(file.samefile(own) for own in module_files(plugin.entry_point.partition(" = ")[2]))
+        if sensor.id in plugin.sensors
+        and not any(
+            file.samefile(own) for own in module_files(plugin.entry_point.partition(" = ")[2])
+        )
     ]
 
 
@@ -192,21 +239,38 @@ def _added(plugin: Any, name: str) -> list[Sensor]:
             try:
                 hook(**{key: given[key] for key in inspect.signature(hook).parameters})
             except Exception as error:
-                raise SpecError(f"lidarspec_checksum for {sensor.id}: {type(error).__name__}: {error}", rule="LS010") from error
+                raise SpecError(
+                    f"lidarspec_checksum for {sensor.id}: {type(error).__name__}: {error}",
+                    rule="LS010",
+                ) from error
     return [registry().hooked(sensor) for sensor in sensors]
 
 
 def loading(error: BaseException, files: list[Path]) -> Finding:
     """The finding for what a plugin failed with when it was loaded."""
-    cause = error.__cause__ if isinstance(error, SpecError) and error.__cause__ is not None else error
-    spots = [(spot.filename, spot.lineno or 0) for each in (error, cause) for spot in traceback.extract_tb(each.__traceback__)]
-    own = [spot for spot in spots if any(Path(spot[0]) == file.resolve() or Path(spot[0]) == file for file in files)]
+    cause = (
+        error.__cause__ if isinstance(error, SpecError) and error.__cause__ is not None else error
+    )
+    spots = [
+        (spot.filename, spot.lineno or 0)
+        for each in (error, cause)
+        for spot in traceback.extract_tb(each.__traceback__)
+    ]
+    own = [
+        spot
+        for spot in spots
+        if any(Path(spot[0]) == file.resolve() or Path(spot[0]) == file for file in files)
+    ]
     if isinstance(cause, SyntaxError) and cause.filename:
         own = [(cause.filename, cause.lineno or 0)]
     file, line = own[-1] if own else (str(files[0]) if len(files) == 1 else "", 0)
     path = error.path if isinstance(error, SpecError) and error.rule else ""
     sensor = getattr(error, "sensor", "")
-    text = error.reason if isinstance(error, SpecError) and cause is error else f"{type(cause).__name__}: {cause}"
+    text = (
+        error.reason
+        if isinstance(error, SpecError) and cause is error
+        else f"{type(cause).__name__}: {cause}"
+    )
     return Finding(_loading_rule(error, cause), " ".join(text.split()), path, sensor, file, line)
 
 
@@ -227,7 +291,9 @@ def _said(text: str) -> str:
 
 
 def module_files(value: str) -> list[Path]:
-    """The files of the module, or of the package, that an entry point names; none where there is none."""
+    """The files of the module, or of the package, that an entry point names; none where there is
+    none.
+    """
     try:
         found = importlib.util.find_spec(value.partition("[")[0].partition(":")[0].strip())
     except (Exception, SystemExit):
@@ -255,10 +321,16 @@ Spot = tuple[str, int]
 
 
 class Places:
-    """The text of some modules by file, to be asked where things stand in it: fields by their names, all else by kind and name."""
+    """The text of some modules by file, to be asked where things stand in it: fields by their
+    names, all else by kind and name.
+    """
 
     def __init__(self, trees: Mapping[str, ast.Module]) -> None:
-        self._fields = [(chain, (file, line)) for file, tree in trees.items() for chain, line in _fields(tree, ())]
+        self._fields = [
+            (chain, (file, line))
+            for file, tree in trees.items()
+            for chain, line in _fields(tree, ())
+        ]
         self._others: dict[tuple[str, str], Spot] = {}
         for file, tree in trees.items():
             for kind, name, line in _named(tree):
@@ -268,7 +340,9 @@ class Places:
         """The finding with the file and line of what it is about, where they can be told."""
         if finding.file:
             return finding
-        spot = self._spot(finding.path, sensor) or (self._others.get(("sensor", sensor.id)) if sensor else None)
+        spot = self._spot(finding.path, sensor) or (
+            self._others.get(("sensor", sensor.id)) if sensor else None
+        )
         return replace(finding, file=spot[0], line=spot[1]) if spot else finding
 
     def _spot(self, path: str, sensor: Sensor | None) -> Spot | None:
@@ -284,7 +358,9 @@ class Places:
 
     def _field(self, parts: tuple[str, ...]) -> Spot | None:
         """The field whose names in the text are the longest end of the path."""
-        fitting = [(len(chain), spot) for chain, spot in self._fields if parts[-len(chain) :] == chain]
+        fitting = [
+            (len(chain), spot) for chain, spot in self._fields if parts[-len(chain) :] == chain
+        ]
         return max(fitting, key=lambda found: found[0])[1] if fitting else None
 
 
@@ -293,11 +369,19 @@ def _function(frame: str, name: str, sensor: Sensor | None) -> Spot | None:
     if sensor is None or frame not in sensor.frames:
         return None
     own, simulated = sensor.frames[frame], sensor.simulation_of(frame)
-    functions = {"points": own.points or sensor.points, "plausible": own.plausible, "sweep": simulated.sweep}
+    functions = {
+        "points": own.points or sensor.points,
+        "plausible": own.plausible,
+        "sweep": simulated.sweep,
+    }
     function = {**functions, "directions": simulated.directions}.get(name)
     while isinstance(function, functools.partial):
         function = function.func
-    return (function.__code__.co_filename, function.__code__.co_firstlineno) if inspect.isfunction(function) else None
+    return (
+        (function.__code__.co_filename, function.__code__.co_firstlineno)
+        if inspect.isfunction(function)
+        else None
+    )
 
 
 def _named(tree: ast.Module) -> Iterator[tuple[str, str, int]]:
@@ -308,7 +392,9 @@ def _named(tree: ast.Module) -> Iterator[tuple[str, str, int]]:
                 for key, value in zip(keys, values, strict=True):
                     if isinstance(key, ast.Constant) and isinstance(key.value, str):
                         yield "key", key.value, key.lineno
-                        if isinstance(value, ast.Call) and ast.unparse(value.func).endswith(("Frame", "replace")):
+                        if isinstance(value, ast.Call) and ast.unparse(value.func).endswith(
+                            ("Frame", "replace")
+                        ):
                             yield "frame", key.value, key.lineno
             case ast.Call(args=[ast.Constant(value=str(name)), *_]):
                 yield "sensor", name, node.lineno
@@ -329,26 +415,54 @@ def _fields(node: ast.AST, chain: tuple[str, ...]) -> Iterator[tuple[tuple[str, 
 
 #: calls that read the clock of the wall.
 WALL_CLOCKS = frozenset(
-    ["time.time", "time.time_ns", "datetime.now", "datetime.utcnow", "datetime.today", "datetime.datetime.now", "datetime.datetime.utcnow"]
+    [
+        "time.time",
+        "time.time_ns",
+        "datetime.now",
+        "datetime.utcnow",
+        "datetime.today",
+        "datetime.datetime.now",
+        "datetime.datetime.utcnow",
+    ]
 )
 BROAD = frozenset({"Exception", "BaseException"})
 
 
 def written(trees: Mapping[str, ast.Module]) -> list[Finding]:
     """The findings in the text of some modules, by file."""
-    return [Finding(code, what, file=file, line=node.lineno) for file, tree in trees.items() for code, what, node in _mistakes(tree)]
+    return [
+        Finding(code, what, file=file, line=node.lineno)
+        for file, tree in trees.items()
+        for code, what, node in _mistakes(tree)
+    ]
 
 
-def _mistakes(tree: ast.Module) -> Iterator[tuple[str, str, ast.expr | ast.stmt | ast.ExceptHandler]]:
+def _mistakes(
+    tree: ast.Module,
+) -> Iterator[tuple[str, str, ast.expr | ast.stmt | ast.ExceptHandler]]:
     expressions = _names_of_this(tree)
-    sockets = any(isinstance(node, ast.Import | ast.ImportFrom) and "socket" in ast.unparse(node) for node in ast.walk(tree))
+    sockets = any(
+        isinstance(node, ast.Import | ast.ImportFrom) and "socket" in ast.unparse(node)
+        for node in ast.walk(tree)
+    )
     for node in ast.walk(tree):
         match node:
-            case ast.ExceptHandler() if (node.type is None or _names(node.type) & BROAD) and _silent(node.body):
-                yield "LS801", f"except {ast.unparse(node.type) if node.type else ''}: {ast.unparse(node.body[0])}", node
+            case ast.ExceptHandler() if (
+                node.type is None or _names(node.type) & BROAD
+            ) and _silent(node.body):
+                yield (
+                    "LS801",
+                    (
+                        f"except {ast.unparse(node.type) if node.type else ''}:"
+                        f" {ast.unparse(node.body[0])}"
+                    ),
+                    node,
+                )
             case ast.Call() if ast.unparse(node.func) in WALL_CLOCKS:
                 yield "LS802", f"{ast.unparse(node.func)}()", node
-            case ast.Call(func=ast.Name(id="hasattr"), args=[ast.Name(id=name), *_]) if name in expressions:
+            case ast.Call(func=ast.Name(id="hasattr"), args=[ast.Name(id=name), *_]) if (
+                name in expressions
+            ):
                 yield "LS805", ast.unparse(node), node
             case ast.Expr(value=ast.Call() as call) if _short_write(call, sockets=sockets):
                 yield "LS803", f"what {ast.unparse(call.func)} returns is dropped", node
@@ -359,14 +473,23 @@ def _mistakes(tree: ast.Module) -> Iterator[tuple[str, str, ast.expr | ast.stmt 
 
 def _names_of_this(tree: ast.Module) -> set[str]:
     """The names under which construct's `this` and `obj_` are known in a module."""
-    imported = [alias for node in ast.walk(tree) if isinstance(node, ast.ImportFrom) and node.module == "construct" for alias in node.names]
-    return {alias.asname or alias.name for alias in imported if alias.name in ("this", "obj_", "len_")}
+    imported = [
+        alias
+        for node in ast.walk(tree)
+        if isinstance(node, ast.ImportFrom) and node.module == "construct"
+        for alias in node.names
+    ]
+    return {
+        alias.asname or alias.name for alias in imported if alias.name in ("this", "obj_", "len_")
+    }
 
 
 def _tests(node: ast.AST) -> list[ast.expr]:
     """The expressions whose truth Python asks for at a node."""
     match node:
-        case ast.If(test=test) | ast.While(test=test) | ast.IfExp(test=test) | ast.Assert(test=test):
+        case (
+            ast.If(test=test) | ast.While(test=test) | ast.IfExp(test=test) | ast.Assert(test=test)
+        ):
             return [test]
         case ast.BoolOp(values=values):
             return values
@@ -447,29 +570,44 @@ def reports(
     tested: Sequence[Sensor] = (),
     watch: Watch = lambda text, done, total: None,
 ) -> Iterator[Report]:
-    """A report of the text and the loading of a target, where there is something to say, and one of each of its sensors.
+    """A report of the text and the loading of a target, where there is something to say, and one of
+    each of its sensors.
 
     Args:
         name: what was asked for.
         examples: of each frame type, for each property.
-        strategies: "frame.field" -> how its raw value is drawn, for fields of which no valid value can be derived.
+        strategies: "frame.field" -> how its raw value is drawn, for fields of which no valid value
+            can be derived.
         vectors: golden vectors; by default those that the target has.
-        tested: related models that are tested too: what they share with a sensor is not tested again.
-        watch: is called with what is looked at before it is, and how many properties of how many are done.
+        tested: related models that are tested too: what they share with a sensor is not tested
+            again.
+        watch: is called with what is looked at before it is, and how many properties of how many
+            are done.
     """
-    trees = {str(file): ast.parse(file.read_text(encoding="utf-8"), str(file)) for file in target.files}
+    trees = {
+        str(file): ast.parse(file.read_text(encoding="utf-8"), str(file)) for file in target.files
+    }
     places = Places(trees)
     known = {sensor.id: sensor for sensor in target.sensors}
-    mistakes = [places.placed(finding, known.get(finding.sensor)) for finding in target.findings] + written(trees)
+    mistakes = [
+        places.placed(finding, known.get(finding.sensor)) for finding in target.findings
+    ] + written(trees)
     single = [sensor for sensor in target.sensors if len(target.sensors) == 1]
     if mistakes and not single:
         yield Report(name, mistakes)
     total = len(PROPERTIES) * len(target.sensors)
     for index, sensor in enumerate(target.sensors):
         family = () if vectors and single else target.family
-        subject = Subject(sensor, examples, strategies or {}, vectors or target.vectors, family, tested)
+        subject = Subject(
+            sensor, examples, strategies or {}, vectors or target.vectors, family, tested
+        )
         before = len(PROPERTIES) * index
-        yield _report(subject, places, mistakes if single else [], functools.partial(_watch_sensor, watch, before, total))
+        yield _report(
+            subject,
+            places,
+            mistakes if single else [],
+            functools.partial(_watch_sensor, watch, before, total),
+        )
 
 
 def _watch_sensor(watch: Watch, before: int, total: int, text: str, done: int) -> None:
@@ -482,7 +620,10 @@ def _beside(subject: Subject) -> Iterator[tuple[str, str]]:
     sensor, missing = subject.sensor, lacking(subject)
     if missing:
         yield "vectors", f"{missing}; x and y of points in two quadrants would prove the picture"
-    yield "vendor_axes", f"x, y, z are {', '.join(sensor.vendor_axes)}" if sensor.vendor_axes else "not declared"
+    yield (
+        "vendor_axes",
+        f"x, y, z are {', '.join(sensor.vendor_axes)}" if sensor.vendor_axes else "not declared",
+    )
     yield "source", sensor.source
 
 
@@ -491,7 +632,9 @@ def _watch_case(watch: Callable[[str, int], None], sensor_id: str, done: int, ca
     watch(f"{sensor_id}: {case}", done)
 
 
-def _report(subject: Subject, places: Places, mistakes: list[Finding], watch: Callable[[str, int], None]) -> Report:
+def _report(
+    subject: Subject, places: Places, mistakes: list[Finding], watch: Callable[[str, int], None]
+) -> Report:
     sensor: Sensor = subject.sensor
     report = Report(sensor.id, list(mistakes))
     if not sensor.frames:
@@ -500,7 +643,10 @@ def _report(subject: Subject, places: Places, mistakes: list[Finding], watch: Ca
     watch(f"{sensor.id}: declaration", 0)
     report.findings += declared(subject)
     for done, one in enumerate(PROPERTIES):
-        known = sorted({finding.code for finding in left_over(report.findings, sensor, whole=False)} & set(one.unless))
+        known = sorted(
+            {finding.code for finding in left_over(report.findings, sensor, whole=False)}
+            & set(one.unless)
+        )
         reason = one.lacks(subject) or (f"{', '.join(known)} is found already" if known else "")
         if reason:
             report.skipped[one.name] = reason
@@ -511,9 +657,14 @@ def _report(subject: Subject, places: Places, mistakes: list[Finding], watch: Ca
         if any(finding.code in FATAL for finding in report.findings):
             report.skipped[ELSE] = "nothing can be tried before what is found is mended"
             break
-    distinct = list({(finding.code, finding.path): finding for finding in reversed(report.findings)}.values())[::-1]
+    distinct = list(
+        {(finding.code, finding.path): finding for finding in reversed(report.findings)}.values()
+    )[::-1]
     left = left_over(distinct, sensor, whole=ELSE not in report.skipped and not subject.tested)
     report.findings = [places.placed(finding, sensor) for finding in left]
     report.measured = subject.measured
-    report.picture = subject.picture and {**dict(sorted(subject.picture.items())), **dict(_beside(subject))}
+    report.picture = subject.picture and {
+        **dict(sorted(subject.picture.items())),
+        **dict(_beside(subject)),
+    }
     return report

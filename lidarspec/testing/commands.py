@@ -1,4 +1,6 @@
-"""Commands: they parse back, hold their arguments to their ranges, and the simulated sensor answers as documented."""
+"""Commands: they parse back, hold their arguments to their ranges, and the simulated sensor answers
+as documented.
+"""
 
 from __future__ import annotations
 
@@ -24,8 +26,13 @@ STEP = 20_000_000
 
 
 def arguments(subject: Subject, name: str, share: float) -> dict[str, Any]:
-    """An argument for each that a command takes, so far between its lowest and its highest value, or as long, of its longest."""
-    return {key: _value(subject.sensor, name, key, share) for key in subject.sensor.commands[name].arguments}
+    """An argument for each that a command takes, so far between its lowest and its highest value,
+    or as long, of its longest.
+    """
+    return {
+        key: _value(subject.sensor, name, key, share)
+        for key in subject.sensor.commands[name].arguments
+    }
 
 
 def _value(sensor: Sensor, name: str, key: str, share: float) -> Any:
@@ -41,7 +48,9 @@ def _value(sensor: Sensor, name: str, key: str, share: float) -> Any:
 
 
 def a_command_parses_back(subject: Subject, name: str) -> None:
-    """The frame of a command has its fixed values, its arguments within half a step, and builds again."""
+    """The frame of a command has its fixed values, its arguments within half a step, and builds
+    again.
+    """
     for share in (0.0, 0.37, 1.0):
         try:
             _parses_back(subject.sensor, name, arguments(subject, name, share))
@@ -50,7 +59,9 @@ def a_command_parses_back(subject: Subject, name: str) -> None:
 
 
 def _parses_back(sensor: Sensor, name: str, given: dict[str, float]) -> None:
-    """Fail unless the command's frame parses back to its fixed values, and to its arguments within half a step."""
+    """Fail unless the command's frame parses back to its fixed values, and to its arguments within
+    half a step.
+    """
     command = sensor.commands[name]
     data = sensor.command(name, **given)
     if command.frame is None:
@@ -59,13 +70,20 @@ def _parses_back(sensor: Sensor, name: str, given: dict[str, float]) -> None:
     parsed = sensor.parse(data, frame=command.frame)
     assert sensor.build(command.frame, parsed) == data, "it builds as other bytes"
     for path, value in command.fixed.items():
-        assert found_at(parsed, path) == value, f"{path} is {found_at(parsed, path)}, and {value} is meant"
+        assert found_at(parsed, path) == value, (
+            f"{path} is {found_at(parsed, path)}, and {value} is meant"
+        )
     for argument, value in given.items():
         slot, declared = argument_slot(sensor, name, argument), command.arguments[argument]
-        read, raw = found_at(parsed, declared.path), raw_argument(slot, declared.kind, value, argument, name)
+        read, raw = (
+            found_at(parsed, declared.path),
+            raw_argument(slot, declared.kind, value, argument, name),
+        )
         if isinstance(declared.kind, Range):
             read = slot.info.physical(read)
-            assert abs(read - value) <= abs(slot.info.scale) * 0.5001, f"{argument} is {read:g}, and {value:g} is given"
+            assert abs(read - value) <= abs(slot.info.scale) * 0.5001, (
+                f"{argument} is {read:g}, and {value:g} is given"
+            )
         else:
             assert read == raw, f"{argument} is {read!r}, and {value!r} is given"
 
@@ -74,16 +92,28 @@ def arguments_are_held_to_their_ranges(subject: Subject, name: str) -> None:
     """An argument outside its range is refused."""
     for key, declared in subject.sensor.commands[name].arguments.items():
         kind = declared.kind
-        ends = (kind.low - 1, kind.high + 1) if isinstance(kind, Range) else ("x" * (kind.size + 1),) if isinstance(kind, Text) else ()
+        ends = (
+            (kind.low - 1, kind.high + 1)
+            if isinstance(kind, Range)
+            else ("x" * (kind.size + 1),)
+            if isinstance(kind, Text)
+            else ()
+        )
         for outside in ends:
             try:
                 subject.sensor.command(name, **{**arguments(subject, name, 0.0), key: outside})
             except UsageError:
                 continue
-            raise Violation("LS602", f"{key} = {outside} is sent, and {asked(kind)} is declared", f"commands.{name}.args.{key}")
+            raise Violation(
+                "LS602",
+                f"{key} = {outside} is sent, and {asked(kind)} is declared",
+                f"commands.{name}.args.{key}",
+            )
 
 
-def an_exchange_holds(sensor: Sensor, name: str, given: dict[str, Any], data: bytes, answer: bytes | None, place: str) -> None:
+def an_exchange_holds(
+    sensor: Sensor, name: str, given: dict[str, Any], data: bytes, answer: bytes | None, place: str
+) -> None:
     """A command with these arguments has these bytes, and these bytes are its reply.
 
     Raises:
@@ -92,7 +122,12 @@ def an_exchange_holds(sensor: Sensor, name: str, given: dict[str, Any], data: by
     command = sensor.commands[name]
     try:
         built = sensor.command(name, **given)
-        require(built == data, "LS605", f"{built.hex(' ')} is sent, and {data.hex(' ')} is printed", place)
+        require(
+            built == data,
+            "LS605",
+            f"{built.hex(' ')} is sent, and {data.hex(' ')} is printed",
+            place,
+        )
         if answer is None:
             return
         require(command.replies, "LS605", "it has a reply here, and none is declared", place)
@@ -111,11 +146,18 @@ def replies_can_match(subject: Subject, name: str) -> None:
     command = subject.sensor.commands[name]
     answers = [subject.fields(reply) for reply in command.replies]
     for path in (*command.matches, *command.echoes) if answers else ():
-        require(any(path in fields for fields in answers), "LS603", f"no reply has a field {path!r}", f"commands.{name}")
+        require(
+            any(path in fields for fields in answers),
+            "LS603",
+            f"no reply has a field {path!r}",
+            f"commands.{name}",
+        )
 
 
 def the_simulated_sensor_answers(subject: Subject, name: str) -> None:
-    """The simulated sensor gives the documented reply in time, to the lowest, a middle or the highest arguments at least."""
+    """The simulated sensor gives the documented reply in time, to the lowest, a middle or the
+    highest arguments at least.
+    """
     command = subject.sensor.commands[name]
     if command.frame is None or not command.replies:
         return
@@ -144,7 +186,11 @@ def _learn(subject: Subject, name: str, reply: Reply) -> None:
         if told := learned(sensor, reply):
             sensor.configure(**told)
     except Exception as error:  # whatever `learns` and `configure` of the plugin fail with
-        which = "its reply, as given by" if name in sensor.simulation.answers else "its reply, which is made up without"
+        which = (
+            "its reply, as given by"
+            if name in sensor.simulation.answers
+            else "its reply, which is made up without"
+        )
         what = f"{which} answers= of the Simulation, cannot be learned from: {error}"
         raise Violation("LS604", what, f"commands.{name}") from error
 
@@ -158,7 +204,14 @@ def _asked(subject: Subject, name: str, given: dict[str, float]) -> Reply:
     command, sensor = subject.sensor.commands[name], subject.sensor
     device, session = SimulatedDevice(sensor), Session(sensor)
     device.start(0)
-    stops = next((one for one, other in sensor.commands.items() if other.stops and other.frame is not None and not other.args), "")
+    stops = next(
+        (
+            one
+            for one, other in sensor.commands.items()
+            if other.stops and other.frame is not None and not other.args
+        ),
+        "",
+    )
     if command.only_stopped and stops:
         device.receive(sensor.command(stops), 0, sensor.commands[stops].link)
     pending = session.request(name, 0, **given)

@@ -1,7 +1,7 @@
 """Conformance of a sensor as a test for pytest: everything that `lidarspec check` checks.
 
-Derive a class from `SensorConformance` and name the sensor, or call `assert_conformance` in a test of
-your own. Either way it is one test, and its failure lists all findings.
+Derive a class from `SensorConformance` and name the sensor, or call `assert_conformance` in a test
+of your own. Either way it is one test, and its failure lists all findings.
 """
 
 from __future__ import annotations
@@ -30,7 +30,8 @@ def assert_conformance(
 ) -> list[Report]:
     """Fail with every finding of `lidarspec check` about the sensor; return its reports.
 
-    That another installed plugin has its id (LS005) concerns the environment and is left to `check`.
+    That another installed plugin has its id (LS005) concerns the environment and is left to
+    `check`.
 
     Args:
         sensor: an id, a `Sensor`, or a file that describes one.
@@ -53,7 +54,9 @@ def assert_conformance(
             tested=tested,
         )
     )
-    findings = [finding for report in made for finding in report.findings if finding.code != ID_TAKEN]
+    findings = [
+        finding for report in made for finding in report.findings if finding.code != ID_TAKEN
+    ]
     if findings:
         pytest.fail("\n\n".join(map(str, findings)), pytrace=False)
     return made
@@ -77,10 +80,14 @@ class SensorConformance:
     strategies: ClassVar[Mapping[str, Any]] = {}
     vectors: ClassVar[str | Path | None] = None
 
-    def test_conformance(self, request: pytest.FixtureRequest, record_property: Callable[[str, object], None]) -> None:
+    def test_conformance(
+        self, request: pytest.FixtureRequest, record_property: Callable[[str, object], None]
+    ) -> None:
         """The sensor conforms: its declaration is sound, and every property holds."""
         __tracebackhide__ = True
         vectors = request.path.parent / self.vectors if self.vectors else None
-        for report in assert_conformance(self.sensor, examples=self.examples, strategies=self.strategies, vectors=vectors):
+        for report in assert_conformance(
+            self.sensor, examples=self.examples, strategies=self.strategies, vectors=vectors
+        ):
             for name, value in (report.measured | report.picture).items():
                 record_property(name, value)

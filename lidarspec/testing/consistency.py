@@ -1,7 +1,8 @@
-"""Whether the parts of a declaration agree with each other: angles and points, clock and wrap, times of points and clock.
+"""Whether the parts of a declaration agree with each other: angles and points, clock and wrap,
+times of points and clock.
 
-Packets are made from the sensor's `sweep`, as far along it as a property needs: its first packets seldom cross the full
-circle, or the time at which the clock starts again.
+Packets are made from the sensor's `sweep`, as far along it as a property needs: its first packets
+seldom cross the full circle, or the time at which the clock starts again.
 """
 
 from __future__ import annotations
@@ -23,11 +24,13 @@ from lidarspec.testing.findings import require
 from lidarspec.testing.geometry import BACK, SMALL, make_sweep, read
 from lidarspec.testing.subject import Subject
 
-#: packets whose clock is looked at: far along the sweep, so that a clock that starts again has done so.
+#: packets whose clock is looked at: far along the sweep, so that a clock that starts again has done
+#: so.
 FAR_PACKETS = (0, *(start * 10**power for power in range(8) for start in (1, 2, 4, 7)))
 #: packets whose points' times are looked at.
 TIMED_PACKETS = 64
-#: steps of the clock, from packet to packet, over which the points of a single packet may be spread.
+#: steps of the clock, from packet to packet, over which the points of a single packet may be
+#: spread.
 MOST_STEPS = 30
 #: parts of the full circle by which a packet is turned.
 TURNS = 24
@@ -52,7 +55,9 @@ def the_clock_stays_below_its_wrap(subject: Subject, name: str) -> None:
 
 
 def times_of_points_fit_the_clock(subject: Subject, name: str) -> None:
-    """Along the sweep the points of a packet are not spread over many of the clock's steps from packet to packet."""
+    """Along the sweep the points of a packet are not spread over many of the clock's steps from
+    packet to packet.
+    """
     frames = make_sweep(subject, name, TIMED_PACKETS)
     if subject.sensor.clock is None or len(frames) < 3:
         return
@@ -62,8 +67,13 @@ def times_of_points_fit_the_clock(subject: Subject, name: str) -> None:
     step = float(packets.time_ns[-1] - packets.time_ns[0]) / (len(packets) - 1) / 1e9
     times = packets.points().time
     spread = float(np.ptp(times)) if len(times) else 0.0
-    said = f"the points of {len(packets)} packets are spread over {spread:.3g} s, and the clock runs on by {step:.3g} s a packet"
-    require(step <= 0 or spread <= (len(packets) + MOST_STEPS) * step, "LS513", said, f"{name}.points")
+    said = (
+        f"the points of {len(packets)} packets are spread over {spread:.3g} s, and the clock runs"
+        f" on by {step:.3g} s a packet"
+    )
+    require(
+        step <= 0 or spread <= (len(packets) + MOST_STEPS) * step, "LS513", said, f"{name}.points"
+    )
 
 
 def turned_angles_turn_the_points(subject: Subject, name: str) -> None:
@@ -74,7 +84,11 @@ def turned_angles_turn_the_points(subject: Subject, name: str) -> None:
     values = sweep(1)
     following = sweep(2)
     fields = codec(subject.sensor.frames[name]).schema.fields
-    known = [path for path in values if path in fields and path in following and fields[path].unit in FULL_TURNS]
+    known = [
+        path
+        for path in values
+        if path in fields and path in following and fields[path].unit in FULL_TURNS
+    ]
     angles = [path for path in known if not np.array_equal(values[path], following[path])]
     if not angles or len({(fields[path].unit, fields[path].scale) for path in angles}) > 1:
         return
@@ -83,27 +97,44 @@ def turned_angles_turn_the_points(subject: Subject, name: str) -> None:
     radians = 2 * np.pi / full
     still = _read_azimuths(subject, name, values)
     little = SMALL * info.scale
-    moved = _angles_between(_read_azimuths(subject, name, _turn_angles(values, angles, little, full)), still)
-    if moved is None or not len(moved) or not np.allclose(np.abs(moved), abs(little) * radians, rtol=0.25):
+    moved = _angles_between(
+        _read_azimuths(subject, name, _turn_angles(values, angles, little, full)), still
+    )
+    if (
+        moved is None
+        or not len(moved)
+        or not np.allclose(np.abs(moved), abs(little) * radians, rtol=0.25)
+    ):
         return  # they depend on something else
     sense = float(np.sign(moved[0])) * np.sign(little)
     for part in range(1, TURNS):
         shift = round(full * part / TURNS / info.scale) * info.scale
-        moved = _angles_between(_read_azimuths(subject, name, _turn_angles(values, angles, shift, full)), still)
+        moved = _angles_between(
+            _read_azimuths(subject, name, _turn_angles(values, angles, shift, full)), still
+        )
         if moved is None:
             continue
         wrong = np.abs(_fold(moved - sense * shift * radians))
         worst = float(wrong.max(initial=0))
         turn = f"{' and '.join(angles)} turned by {shift:g} {info.unit}"
-        require(worst <= BACK, "LS504", f"{turn} leave a point {np.rad2deg(worst):.1f} degrees from where it belongs", f"{name}.points")
+        require(
+            worst <= BACK,
+            "LS504",
+            f"{turn} leave a point {np.rad2deg(worst):.1f} degrees from where it belongs",
+            f"{name}.points",
+        )
 
 
-def _turn_angles(values: Mapping[str, Any], angles: list[str], shift: float, full: float) -> dict[str, Any]:
+def _turn_angles(
+    values: Mapping[str, Any], angles: list[str], shift: float, full: float
+) -> dict[str, Any]:
     """Return the values of a packet with `shift` added to its angles, whose full circle is `full`."""
     return {**values, **{path: (np.asarray(values[path]) + shift) % full for path in angles}}
 
 
-def _read_azimuths(subject: Subject, name: str, values: Mapping[str, Any]) -> NDArray[np.float64] | None:
+def _read_azimuths(
+    subject: Subject, name: str, values: Mapping[str, Any]
+) -> NDArray[np.float64] | None:
     """Return the azimuths of a packet with these values; None if it is not valid."""
     try:
         frame = FrameMaker(subject.sensor, name).frame(values)
@@ -113,7 +144,9 @@ def _read_azimuths(subject: Subject, name: str, values: Mapping[str, Any]) -> ND
         return None
 
 
-def _angles_between(one: NDArray[np.float64] | None, other: NDArray[np.float64] | None) -> NDArray[np.float64] | None:
+def _angles_between(
+    one: NDArray[np.float64] | None, other: NDArray[np.float64] | None
+) -> NDArray[np.float64] | None:
     """Return the angles between two sets of azimuths; None if one is missing, or has another shape."""
     if one is None or other is None or one.shape != other.shape:
         return None

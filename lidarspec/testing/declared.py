@@ -1,4 +1,6 @@
-"""What can be read off a declaration without any bytes of a sensor: units, sources, lengths, sync, coverage, tests of plausibility."""
+"""What can be read off a declaration without any bytes of a sensor: units, sources, lengths, sync,
+coverage, tests of plausibility.
+"""
 
 from __future__ import annotations
 
@@ -32,14 +34,27 @@ from lidarspec.testing.geometry import field_of, traced, used
 from lidarspec.testing.subject import Subject
 
 #: field names that stand for a measure.
-MEASURES = frozenset(["distance", "range", "radius", "angle", "azimuth", "elevation", "temperature", "voltage", "timestamp"])
+MEASURES = frozenset(
+    [
+        "distance",
+        "range",
+        "radius",
+        "angle",
+        "azimuth",
+        "elevation",
+        "temperature",
+        "voltage",
+        "timestamp",
+    ]
+)
 #: share of the places in a payload at which a sync pattern may stand by chance.
 COMMON = 1 / 200
 #: Examples whose length is looked at before a frame is simulated for it, and all of them.
 FIRST_LENGTHS, LENGTHS = 3, 12
 #: example frames in whose payloads the sync pattern is counted, with the usual number of examples.
 SYNC_EXAMPLES = 12
-#: bits of constants and checksums below which noise makes a frame every few megabytes, on a stream and in a datagram.
+#: bits of constants and checksums below which noise makes a frame every few megabytes, on a stream
+#: and in a datagram.
 WEAK, WEAK_DATAGRAM = 24, 8
 #: how many times the length of the longest random frame a longest length may be.
 FAR = 8
@@ -48,7 +63,9 @@ LONG = 7 * 86_400
 #: what points are made of, and the units of the fields that go into it.
 UNITS = {"range": ("m",), "azimuth": ("deg", "rad"), **dict.fromkeys("xyz", ("m",))}
 #: names of fields that hold how bright a return is, and of those that hold no measure.
-INTENSITY = re.compile(r"(\w+_)?(intensity|intensities|reflectivity|reflectance|rssi|amplitude|brightness|quality|signal)(_\w+)?")
+INTENSITY = re.compile(
+    r"(\w+_)?(intensity|intensities|reflectivity|reflectance|rssi|amplitude|brightness|quality|signal)(_\w+)?"
+)
 CODE = re.compile(r"(\w+_)?(code|error|fault|status|errno)(_?\d+)?")
 PLACEHOLDER = re.compile(r"\s*(\?*|-*|todo.*|tbd.*|n/?a|none|unknown)\s*", re.IGNORECASE)
 
@@ -88,11 +105,22 @@ def _sensor(sensor: Sensor) -> Findings:
 
 def _asked(sensor: Sensor) -> Findings:
     """The fields that scans, clock and counter come from have to be there."""
-    known = {path for name in sensor.data_frames for path in codec(sensor.frames[name]).schema.named}
+    known = {
+        path for name in sensor.data_frames for path in codec(sensor.frames[name]).schema.named
+    }
     cut_by = known | set(TYPES) if isinstance(sensor.scan, OnWrap) else known
     clock = sensor.clock.source if sensor.clock is not None else ()
-    asked = {"scan": getattr(sensor.scan, "name", ""), "sequence": sensor.sequence.field if sensor.sequence is not None else ""}
-    given = [*asked.items(), *(("clock", path) for path in ((clock,) if isinstance(clock, str) else () if callable(clock) else clock))]
+    asked = {
+        "scan": getattr(sensor.scan, "name", ""),
+        "sequence": sensor.sequence.field if sensor.sequence is not None else "",
+    }
+    given = [
+        *asked.items(),
+        *(
+            ("clock", path)
+            for path in ((clock,) if isinstance(clock, str) else () if callable(clock) else clock)
+        ),
+    ]
     for place, path in given:
         there = cut_by if place == "scan" else known
         if path and without_indices(path)[0] not in there:
@@ -102,40 +130,72 @@ def _asked(sensor: Sensor) -> Findings:
 def _clock(sensor: Sensor) -> Findings:
     """A clock that starts again within days has to say so."""
     clock = sensor.clock
-    if not isinstance(clock, Clock) or callable(clock.source) or clock.wraps_at is not None or not sensor.frames:
+    if (
+        not isinstance(clock, Clock)
+        or callable(clock.source)
+        or clock.wraps_at is not None
+        or not sensor.frames
+    ):
         return
     named = codec(sensor.frames[sensor.data_frame]).schema.named
     paths = (clock.source,) if isinstance(clock.source, str) else clock.source
     infos = [named.get(without_indices(path)[0]) for path in paths]
-    spans = [info.limits[1] * info.scale * float(factor(info.unit, "s") or 0) if info and info.kind == "int" else np.inf for info in infos]
+    spans = [
+        (
+            info.limits[1] * info.scale * float(factor(info.unit, "s") or 0)
+            if info and info.kind == "int"
+            else np.inf
+        )
+        for info in infos
+    ]
     if 0 < sum(spans) < LONG:
         what = f"it can count {sum(spans):g} s, then it starts again, and wraps_at is not given"
         yield "LS509", what, f"{sensor.data_frame}.{paths[0]}"
 
 
 def _options(sensor: Sensor) -> Findings:
-    """Options of `configure` that it never reads, or with all values of which it returns the sensor as it is."""
+    """Options of `configure` that it never reads, or with all values of which it returns the sensor
+    as it is.
+    """
     function = sensor.configure.function
     plain = function.func if isinstance(function, partial) else function
     if not inspect.isfunction(plain):
         return
     parameters = inspect.signature(plain).parameters.values()
-    read = {instruction.argval for instruction in dis.get_instructions(plain) if instruction.opname.startswith("LOAD_")}
+    read = {
+        instruction.argval
+        for instruction in dis.get_instructions(plain)
+        if instruction.opname.startswith("LOAD_")
+    }
     for name in [one.name for one in parameters if one.kind is inspect.Parameter.KEYWORD_ONLY]:
         if name not in read:
             yield "LS217", f"configure never reads {name!r}", f"configure.{name}"
-        elif name not in sensor.configure.files and _changes_nothing(sensor, name, _words(plain.__code__)):
-            yield "LS217", f"configure returns the same sensor whatever {name!r} is", f"configure.{name}"
+        elif name not in sensor.configure.files and _changes_nothing(
+            sensor, name, _words(plain.__code__)
+        ):
+            yield (
+                "LS217",
+                f"configure returns the same sensor whatever {name!r} is",
+                f"configure.{name}",
+            )
 
 
 def _words(code: CodeType) -> list[str]:
-    """Return the texts that a function compares or returns: among them are the values of its options."""
-    flat = [each for one in code.co_consts for each in (one if isinstance(one, tuple | frozenset) else (one,))]
+    """Return the texts that a function compares or returns: among them are the values of its
+    options.
+    """
+    flat = [
+        each
+        for one in code.co_consts
+        for each in (one if isinstance(one, tuple | frozenset) else (one,))
+    ]
     return [one for one in flat if isinstance(one, str) and re.fullmatch(r"[\w-]{1,32}", one)]
 
 
 def _changes_nothing(sensor: Sensor, name: str, values: list[str]) -> bool:
-    """Return whether `configure` accepts two values of an option at least, and returns an equal sensor for all."""
+    """Return whether `configure` accepts two values of an option at least, and returns an equal
+    sensor for all.
+    """
     accepted = 0
     for value in values:
         try:
@@ -144,7 +204,11 @@ def _changes_nothing(sensor: Sensor, name: str, values: list[str]) -> bool:
             continue
         accepted += 1
         same = replace(configured, options=sensor.options, configure=sensor.configure.function)
-        if any(getattr(same, one.name) != getattr(sensor, one.name) for one in fields(sensor) if one.name != "configure"):
+        if any(
+            getattr(same, one.name) != getattr(sensor, one.name)
+            for one in fields(sensor)
+            if one.name != "configure"
+        ):
             return False
     return accepted > 1
 
@@ -156,7 +220,11 @@ def _frame(subject: Subject, name: str, frame: Frame) -> Findings:
     if engine.compiled is None:
         yield "LS116", getattr(engine, "reason", "its layout cannot be computed"), name
     elif engine.size is not None and engine.size != frame.max_length:
-        yield "LS203", f"every frame has {engine.size} bytes, and max_length is {frame.max_length}", name
+        yield (
+            "LS203",
+            f"every frame has {engine.size} bytes, and max_length is {frame.max_length}",
+            name,
+        )
     else:
         yield from _longest(subject, name, frame)
     yield from _names(subject, name, frame)
@@ -175,7 +243,9 @@ def _frame(subject: Subject, name: str, frame: Frame) -> Findings:
 
 
 def _longest(subject: Subject, name: str, frame: Frame) -> Findings:
-    """A longest length that frames of random content do not come near to: damage is waited for that much longer."""
+    """A longest length that frames of random content do not come near to: damage is waited for that
+    much longer.
+    """
     sizes = list[int]()
     try:
         for size in _sizes(subject, name):
@@ -184,11 +254,20 @@ def _longest(subject: Subject, name: str, frame: Frame) -> Findings:
             sizes.append(size)
     except LidarSpecError:  # said elsewhere
         return
-    yield "LS203", f"the longest of {len(sizes)} random frames has {max(sizes)} bytes, and max_length is {frame.max_length}", name
+    yield (
+        "LS203",
+        (
+            f"the longest of {len(sizes)} random frames has {max(sizes)} bytes, and max_length is"
+            f" {frame.max_length}"
+        ),
+        name,
+    )
 
 
 def _sizes(subject: Subject, name: str) -> Iterator[int]:
-    """The lengths of examples, and of a simulated frame between them, whose simulation takes long and is seldom needed."""
+    """The lengths of examples, and of a simulated frame between them, whose simulation takes long
+    and is seldom needed.
+    """
     yield from (len(subject.example(name, seed=seed)) for seed in range(FIRST_LENGTHS))
     if name in subject.sensor.data_frames and subject.sensor.simulation_of(name).sweep is not None:
         yield len(simulation(subject.sensor, name).block(0, 1, Room(), 0.0).frames[0])
@@ -197,7 +276,8 @@ def _sizes(subject: Subject, name: str) -> Iterator[int]:
 
 
 def _raised_sizes(subject: Subject, name: str) -> Iterator[int]:
-    """Yield the lengths of valid frames in which one header field is raised as far as the longest length allows.
+    """Yield the lengths of valid frames in which one header field is raised as far as the longest
+    length allows.
 
     Random headers seldom have large counts, and a `sweep` may have the same count in all packets.
     """
@@ -214,23 +294,40 @@ def _raised_sizes(subject: Subject, name: str) -> Iterator[int]:
                 size = header(engine, source, raised)[0].size
                 if FAR * size < frame.max_length:
                     break
-                yield len(random_frame(subject.sensor, name, source, {**subject.drawers(name), **raised}))
+                yield len(
+                    random_frame(subject.sensor, name, source, {**subject.drawers(name), **raised})
+                )
             except SpecError:  # too long, or not plausible
                 continue
 
 
 def _names(subject: Subject, name: str, frame: Frame) -> Findings:
-    """Fields whose names stand for a measure, without a unit; `Scaled(..., "")` says that it is a pure number."""
+    """Fields whose names stand for a measure, without a unit; `Scaled(..., "")` says that it is a
+    pure number.
+    """
     pure = _measured(frame) | (_multiplied(subject, name) if frame.data else set())
     for path, info in codec(frame).schema.all_fields.items():
-        if info.name in MEASURES and info.kind in ("int", "float") and not info.unit and not info.labels and path not in pure:
-            yield "LS201", f"{info.name!r} is a measure, and no Scaled says its unit", f"{name}.{path}"
+        if (
+            info.name in MEASURES
+            and info.kind in ("int", "float")
+            and not info.unit
+            and not info.labels
+            and path not in pure
+        ):
+            yield (
+                "LS201",
+                f"{info.name!r} is a measure, and no Scaled says its unit",
+                f"{name}.{path}",
+            )
 
 
 def _multiplied(subject: Subject, name: str) -> set[str]:
     """The fields that make ranges together with another one, which has the unit."""
     try:
-        infos = [field_of(subject, name, node) for node in used(getattr(traced(subject, name), "range", None))]
+        infos = [
+            field_of(subject, name, node)
+            for node in used(getattr(traced(subject, name), "range", None))
+        ]
     except Exception:  # said elsewhere
         return set()
     known = any(info is not None and factor(info.unit, "m") is not None for info in infos)
@@ -239,7 +336,12 @@ def _multiplied(subject: Subject, name: str) -> set[str]:
 
 def _measured(frame: Frame) -> set[str]:
     """The paths of fields that are pure numbers: declared with Scaled, and no steps of anything."""
-    return {info.path for node in nodes(frame.tree) for info in infos(node) if info.measured and not info.unit and not info.scaled}
+    return {
+        info.path
+        for node in nodes(frame.tree)
+        for info in infos(node)
+        if info.measured and not info.unit and not info.scaled
+    }
 
 
 def _plausible(subject: Subject, name: str, frame: Frame) -> Findings:
@@ -251,7 +353,11 @@ def _plausible(subject: Subject, name: str, frame: Frame) -> Findings:
         with np.errstate(all="ignore"):
             answer = frame.plausible(Fields(Batch(table, np.zeros(len(table), np.bool_))))  # type: ignore[misc]
     except Exception as error:
-        text = error.reason if isinstance(error, SpecError) else f"plausible: {type(error).__name__}: {error}"
+        text = (
+            error.reason
+            if isinstance(error, SpecError)
+            else f"plausible: {type(error).__name__}: {error}"
+        )
         yield getattr(error, "rule", "") or "LS414", text, f"{name}.plausible"
         return
     if is_expression(answer):
@@ -266,15 +372,31 @@ def _covered(name: str, layouts: list[Layout]) -> Findings:
     for layout in layouts:
         if not layout.seals:
             continue
-        under = {byte for seal in layout.seals for start, end in seal.spans for byte in range(start, end)}
+        under = {
+            byte for seal in layout.seals for start, end in seal.spans for byte in range(start, end)
+        }
         sealing = {leaf.info.path for seal in layout.seals for leaf in seal.leaves}
         for path, leaf in layout.leaves.items():
-            if path in sealing or leaf.info.const is not None or leaf.info.held or path in reported or 0 in leaf.shape:
+            if (
+                path in sealing
+                or leaf.info.const is not None
+                or leaf.info.held
+                or path in reported
+                or 0 in leaf.shape
+            ):
                 continue
-            own = {leaf.offset} if leaf.wire is not None else {leaf.offset + part.byte for part in leaf.elements[0].segments}
+            own = (
+                {leaf.offset}
+                if leaf.wire is not None
+                else {leaf.offset + part.byte for part in leaf.elements[0].segments}
+            )
             if not own <= under:
                 reported.add(path)
-                yield "LS205", f"byte {min(own - under)} is under no checksum of the frame", f"{name}.{path}"
+                yield (
+                    "LS205",
+                    f"byte {min(own - under)} is under no checksum of the frame",
+                    f"{name}.{path}",
+                )
 
 
 def _sync(subject: Subject, name: str, frame: Frame, engine: CompiledCodec) -> Findings:
@@ -285,7 +407,10 @@ def _sync(subject: Subject, name: str, frame: Frame, engine: CompiledCodec) -> F
         yield "LS204", "it has no constant bytes, and every byte is a candidate", name
         return
     seeds = range(subject.scale_rounds(SYNC_EXAMPLES, least=4))
-    data = np.frombuffer(b"".join(subject.example(name, seed=seed)[max(engine.prefix) + 1 :] for seed in seeds), np.uint8)
+    data = np.frombuffer(
+        b"".join(subject.example(name, seed=seed)[max(engine.prefix) + 1 :] for seed in seeds),
+        np.uint8,
+    )
     reach = max(engine.prefix) + 1
     if len(data) < 4 * reach:
         return
@@ -293,7 +418,10 @@ def _sync(subject: Subject, name: str, frame: Frame, engine: CompiledCodec) -> F
     for offset, (mask, value) in engine.prefix.items():
         matching &= (data[offset : offset + len(matching)] & mask) == value
     expected = 2.0 ** -sum(mask.bit_count() for mask, _ in engine.prefix.values())
-    share, chance = float(matching.mean()), COMMON + 4 * (COMMON / len(matching)) ** 0.5  # beyond what chance makes of so few bytes
+    share, chance = (
+        float(matching.mean()),
+        COMMON + 4 * (COMMON / len(matching)) ** 0.5,
+    )  # beyond what chance makes of so few bytes
     share = expected if expected > COMMON else share
     if expected > COMMON or share > chance:
         yield "LS204", f"its constants stand at {share:.1%} of the places in payloads", name
@@ -303,11 +431,20 @@ def _strength(subject: Subject, name: str, frame: Frame, layouts: list[Layout]) 
     """Whether constants and checksums alone keep noise out."""
     if frame.plausible is not None or frame.confirm > 1 or not layouts:
         return
-    checked = [sum(leaf.info.bits for seal in layout.seals for leaf in seal.leaves) for layout in layouts]
+    checked = [
+        sum(leaf.info.bits for seal in layout.seals for leaf in seal.leaves) for layout in layouts
+    ]
     constant = [sum(mask.bit_count() for mask, _ in layout.known.values()) for layout in layouts]
     weakest = min(map(sum, zip(checked, constant, strict=True)))
     if weakest <= (WEAK_DATAGRAM if subject.sensor.datagrams else WEAK):
-        yield "LS206", f"its constants and checksums have {weakest} bits, and it declares neither plausible nor confirm", name
+        yield (
+            "LS206",
+            (
+                f"its constants and checksums have {weakest} bits, and it declares neither"
+                " plausible nor confirm"
+            ),
+            name,
+        )
 
 
 def _points(subject: Subject, name: str) -> Findings:
@@ -326,18 +463,33 @@ def _points(subject: Subject, name: str) -> Findings:
 
 
 def _intensity(subject: Subject, name: str, result: Any) -> Findings:
-    """An intensity that comes from a field of another name, while no column uses the field that is named so."""
+    """An intensity that comes from a field of another name, while no column uses the field that is
+    named so.
+    """
     own = [field_of(subject, name, node) for node in used(getattr(result, "intensity", None))]
     if not own or any(info is None or INTENSITY.search(info.path) for info in own):
         return
     columns = [getattr(result, one.name) for one in fields(result)]
-    taken = {info.path for value in columns for node in used(value) if (info := field_of(subject, name, node)) is not None}
-    ranges = [info for node in used(getattr(result, "range", None)) if (info := field_of(subject, name, node)) is not None]
+    taken = {
+        info.path
+        for value in columns
+        for node in used(value)
+        if (info := field_of(subject, name, node)) is not None
+    }
+    ranges = [
+        info
+        for node in used(getattr(result, "range", None))
+        if (info := field_of(subject, name, node)) is not None
+    ]
     axes = {info.axes for info in ranges if info.axes}
     for path, info in subject.fields(name).items():
         if INTENSITY.fullmatch(info.name) and info.axes in axes and path not in taken:
             others = ", ".join(info.path for info in own if info is not None)
-            yield "LS218", f"it comes from {others}, and no column from this field", f"{name}.{path}"
+            yield (
+                "LS218",
+                f"it comes from {others}, and no column from this field",
+                f"{name}.{path}",
+            )
             return
 
 
@@ -350,30 +502,62 @@ def _reach(subject: Subject) -> Findings:
         except Exception:  # said elsewhere
             return
         value = getattr(result, "range", None)
-        info = field_of(subject, name, value.node) if isinstance(value, Traced) and value.node.kind == "field" else None
+        info = (
+            field_of(subject, name, value.node)
+            if isinstance(value, Traced) and value.node.kind == "field"
+            else None
+        )
         metres = factor(info.unit, "m") if info is not None and info.kind == "int" else None
         if info is None or metres is None:
             return
         declared = "{:g} .. {:g}".format(*subject.sensor.range_limits)
         held = [info.physical(raw) * float(metres) for raw in (1, info.limits[1])]
-        subject.picture[f"{name}: range"] = f"{held[0]:.4g} .. {held[1]:.6g} m can be said, {declared} m is declared"
+        subject.picture[f"{name}: range"] = (
+            f"{held[0]:.4g} .. {held[1]:.6g} m can be said, {declared} m is declared"
+        )
         reach.append((held[1], f"{name}.{info.path}"))
     furthest, path = max(reach, default=(np.inf, ""))
     if subject.sensor.range_limits[1] > furthest * 1.001:
-        yield "LS210", f"it ends at {furthest:g} m, and range_limits at {subject.sensor.range_limits[1]:g} m", path
+        yield (
+            "LS210",
+            f"it ends at {furthest:g} m, and range_limits at {subject.sensor.range_limits[1]:g} m",
+            path,
+        )
 
 
-def _column(subject: Subject, name: str, value: Any, column: str, units: tuple[str, ...]) -> Findings:
+def _column(
+    subject: Subject, name: str, value: Any, column: str, units: tuple[str, ...]
+) -> Findings:
     """A column that no field in a unit of its kind goes into."""
     infos = [field_of(subject, name, node) for node in used(value, looked_up=False)]
     measured = [info for info in infos if info is not None and factor(info.unit, "m") is not None]
     if column == "range" and measured and all(CODE.fullmatch(info.name) for info in measured):
-        yield "LS219", "the range of points comes from it, and it is a code by its name", f"{name}.{measured[0].path}"
+        yield (
+            "LS219",
+            "the range of points comes from it, and it is a code by its name",
+            f"{name}.{measured[0].path}",
+        )
     free = [info for info in infos if info is not None and info.const is None and not info.labels]
-    if free and not any(factor(info.unit, unit) is not None for info in infos if info is not None for unit in units):
+    if free and not any(
+        factor(info.unit, unit) is not None for info in infos if info is not None for unit in units
+    ):
         bare = [info for info in free if not is_unit(info.unit)]
         if bare and not {info.path for info in bare} & _measured(subject.sensor.frames[name]):
             order = list(subject.fields(name))
-            first = min(bare, key=lambda info: (-len(info.axes), order.index(info.path) if info.path in order else len(order)))
-            said = f"{first.unit!r} is no unit of it: {' or '.join(units)}" if first.unit else f"it has no unit: {' or '.join(units)}"
-            yield "LS201", f"the {column} of points comes from it, and {said}", f"{name}.{first.path}"
+            first = min(
+                bare,
+                key=lambda info: (
+                    -len(info.axes),
+                    order.index(info.path) if info.path in order else len(order),
+                ),
+            )
+            said = (
+                f"{first.unit!r} is no unit of it: {' or '.join(units)}"
+                if first.unit
+                else f"it has no unit: {' or '.join(units)}"
+            )
+            yield (
+                "LS201",
+                f"the {column} of points comes from it, and {said}",
+                f"{name}.{first.path}",
+            )

@@ -1,7 +1,9 @@
-"""What `lidarspec check` and the test kit say of a sensor: findings, each under a rule that says why it matters and what to write.
+"""What `lidarspec check` and the test kit say of a sensor: findings, each under a rule that says
+why it matters and what to write.
 
-The rules are a table, to which a test holds the reference page. A property raises `Violation` (through `require`) where it does not hold,
-and a `Finding` is made of it; findings that a declaration acknowledges with a reason are left out last, by `left_over`.
+The rules are a table, to which a test holds the reference page. A property raises `Violation`
+(through `require`) where it does not hold, and a `Finding` is made of it; findings that a
+declaration acknowledges with a reason are left out last, by `left_over`.
 """
 
 from __future__ import annotations
@@ -23,8 +25,9 @@ class Rule(NamedTuple):
     write: str
 
 
-#: code, title, why it matters, what to write instead. LS0xx is loading, LS1xx the struct, LS2xx the declaration, LS3xx single frames,
-#: LS4xx streams, LS5xx points, LS6xx commands, LS7xx golden vectors, LS8xx the text of modules.
+#: code, title, why it matters, what to write instead. LS0xx is loading, LS1xx the struct, LS2xx the
+#: declaration, LS3xx single frames, LS4xx streams, LS5xx points, LS6xx commands, LS7xx golden
+#: vectors, LS8xx the text of modules.
 _TABLE = """
 LS001 the plugin cannot be imported | none of its sensors exists for anybody | mend the error that is printed
 LS002 a hook that does not exist | pluggy passes over a misspelt name in silence | one of the names of the hook reference
@@ -142,7 +145,10 @@ LS803 a short write is ignored | the rest of a command never arrives | sendall, 
 LS804 `this` decides in Python | `this.a == this.b` is an expression, and true | If(this.a == this.b, ...), or f.a == f.b
 LS805 hasattr(this, ...) | it is always true | a header field that says it
 """
-RULES = {texts[0]: Rule(*texts) for texts in re.findall(r"^(LS\d+) (.+?) \| (.+?)\s+\| (.+)$", _TABLE, re.MULTILINE)}
+RULES = {
+    texts[0]: Rule(*texts)
+    for texts in re.findall(r"^(LS\d+) (.+?) \| (.+?)\s+\| (.+)$", _TABLE, re.MULTILINE)
+}
 
 
 @dataclass(frozen=True)
@@ -171,7 +177,12 @@ class Finding:
 
     def to_dict(self) -> dict[str, Any]:
         """The finding and its rule as JSON has them."""
-        return {**asdict(self), "title": self.rule.title, "why": self.rule.why, "write": self.rule.write}
+        return {
+            **asdict(self),
+            "title": self.rule.title,
+            "why": self.rule.why,
+            "write": self.rule.write,
+        }
 
     def __str__(self) -> str:
         place = " ".join(part for part in (self.sensor, self.path) if part)
@@ -209,12 +220,19 @@ def left_over(findings: list[Finding], sensor: Sensor, *, whole: bool) -> list[F
     Args:
         whole: these are all findings, and an acknowledgement of none of them is one more.
     """
-    given = {"": sensor.acknowledged, **{name: frame.acknowledged for name, frame in sensor.frames.items()}}
+    given = {
+        "": sensor.acknowledged,
+        **{name: frame.acknowledged for name, frame in sensor.frames.items()},
+    }
     used: set[tuple[str, str]] = set()
     left = []
     for finding in findings:
         frame, _, field = finding.path.partition(".")
-        keys = [(place, key) for place in (frame, "") for key in (finding.code, f"{finding.code} {field if place else finding.path}")]
+        keys = [
+            (place, key)
+            for place in (frame, "")
+            for key in (finding.code, f"{finding.code} {field if place else finding.path}")
+        ]
         known = [(place, key) for place, key in keys if given.get(place, {}).get(key, "").strip()]
         used.update(known)
         left += [] if known else [finding]
@@ -222,5 +240,7 @@ def left_over(findings: list[Finding], sensor: Sensor, *, whole: bool) -> list[F
         for key, reason in entries.items():
             if (place, key) not in used:
                 said = "has no reason" if not reason.strip() else "is not found"
-                left.append(Finding("LS209", f"{key!r} is acknowledged, and {said}", place, sensor.id))
+                left.append(
+                    Finding("LS209", f"{key!r} is acknowledged, and {said}", place, sensor.id)
+                )
     return left

@@ -1,8 +1,10 @@
-"""What holds for single frames: examples repeat, bytes and values survive both ways, edits are read back, types are told apart.
+"""What holds for single frames: examples repeat, bytes and values survive both ways, edits are read
+back, types are told apart.
 
-construct leaves bits out, cuts numbers and takes what does not belong together without a word; each of these shows when a frame is parsed
-and built again. Edits of fields are drawn by Hypothesis, which shrinks a failure to the field at fault. A damaged frame may be a
-`WireError`, or pass with a bit that no checksum covers, which is measured.
+construct leaves bits out, cuts numbers and takes what does not belong together without a word; each
+of these shows when a frame is parsed and built again. Edits of fields are drawn by Hypothesis,
+which shrinks a failure to the field at fault. A damaged frame may be a `WireError`, or pass with a
+bit that no checksum covers, which is measured.
 """
 
 from __future__ import annotations
@@ -27,7 +29,8 @@ from lidarspec.testing import subject as material
 from lidarspec.testing.findings import Violation, require
 from lidarspec.testing.subject import MANY, Subject
 
-#: values that each byte of a frame is changed to where construct alone reads it, with the usual number of examples.
+#: values that each byte of a frame is changed to where construct alone reads it, with the usual
+#: number of examples.
 CHANGES = 8
 #: example frames that edits begin with, and the most edits at once.
 BASES, MOST = 8, 3
@@ -40,7 +43,8 @@ CHANGED_BYTES = 300_000
 #: frames of which every bit is flipped, with the usual number of examples, and at least.
 SAMPLES = 3
 LEAST_SAMPLES = 2
-#: bytes that are checked for the flipped bits of one frame: in a longer one than this allows, some of its bytes are chosen.
+#: bytes that are checked for the flipped bits of one frame: in a longer one than this allows, some
+#: of its bytes are chosen.
 FLIPPED_BYTES = 1 << 25
 
 
@@ -50,15 +54,39 @@ def examples_are_valid_and_repeat(subject: Subject, name: str) -> None:
     try:
         found = [subject.example(name, seed=seed) for seed in subject.seeds(name)]
     except SpecError as error:
-        path = error.path if error.path.startswith(name) else f"{name}.{error.path}" if error.path else name
+        path = (
+            error.path
+            if error.path.startswith(name)
+            else f"{name}.{error.path}"
+            if error.path
+            else name
+        )
         raise Violation(error.rule or "LS301", error.reason, path) from error
-    again = [subject.sensor.example(name, seed=seed) for seed in range(min(3, len(found)))] if not subject.drawers(name) else found[:3]
+    again = (
+        [subject.sensor.example(name, seed=seed) for seed in range(min(3, len(found)))]
+        if not subject.drawers(name)
+        else found[:3]
+    )
     require(found[:3] == again, "LS311", "two examples of one seed differ", name)
     longest = max(map(len, found))
-    require(longest <= frame.max_length, "LS203", f"an example has {longest} bytes, and max_length is {frame.max_length}", name)
+    require(
+        longest <= frame.max_length,
+        "LS203",
+        f"an example has {longest} bytes, and max_length is {frame.max_length}",
+        name,
+    )
     fixed = material.seals(subject.sensor, name, found[0])
-    free = [info for info in codec(frame).schema.fields.values() if info.const is None and not info.held and info.path not in fixed]
-    require(len(set(found)) > 1 or not free or len(found) < 2, "LS301", "all examples are the same", name)
+    free = [
+        info
+        for info in codec(frame).schema.fields.values()
+        if info.const is None and not info.held and info.path not in fixed
+    ]
+    require(
+        len(set(found)) > 1 or not free or len(found) < 2,
+        "LS301",
+        "all examples are the same",
+        name,
+    )
 
 
 def bytes_survive_parsing_and_building(subject: Subject, name: str) -> None:
@@ -71,12 +99,20 @@ def bytes_survive_parsing_and_building(subject: Subject, name: str) -> None:
             if built != data:
                 _lost(subject, name, data, built, "LS302")
             again = sensor.parse(built, frame=name)
-            require(same(parsed, again), "LS302", "what is parsed a second time is something else", name)
+            require(
+                same(parsed, again), "LS302", "what is parsed a second time is something else", name
+            )
 
 
 def every_raw_value_survives(subject: Subject, name: str) -> None:
-    """Of a frame that construct alone reads: what its bytes are changed to is what is built again, apart from constants and checksums."""
-    sensor, source, engine = subject.sensor, subject.source(f"raw {name}"), codec(subject.sensor.frames[name])
+    """Of a frame that construct alone reads: what its bytes are changed to is what is built again,
+    apart from constants and checksums.
+    """
+    sensor, source, engine = (
+        subject.sensor,
+        subject.source(f"raw {name}"),
+        codec(subject.sensor.frames[name]),
+    )
     if isinstance(engine, CompiledCodec):
         return
     if isinstance(engine, InterpretedCodec):
@@ -86,10 +122,19 @@ def every_raw_value_survives(subject: Subject, name: str) -> None:
         rounds = 1
         changes = 1
     sealed = material.seals(sensor, name, b"")
-    follows = {info.path for info in engine.schema.fields.values() if info.rebuilt is not None or info.held}
+    follows = {
+        info.path for info in engine.schema.fields.values() if info.rebuilt is not None or info.held
+    }
     plain = [subject.example(name, seed=seed) for seed in range(rounds)]
-    spots = subject.limit_to_bytes(name, subject.scale_rounds(material.SPOTS, LEAST_SPOTS), CHANGED_BYTES)
-    for example, spot in ((one, spot) for one in plain for spot in material.places(len(one), source, spots) for _ in range(changes)):
+    spots = subject.limit_to_bytes(
+        name, subject.scale_rounds(material.SPOTS, LEAST_SPOTS), CHANGED_BYTES
+    )
+    for example, spot in (
+        (one, spot)
+        for one in plain
+        for spot in material.places(len(one), source, spots)
+        for _ in range(changes)
+    ):
         data = bytearray(example)
         data[spot] = source.randrange(256)
         try:
@@ -104,18 +149,28 @@ def _same_leaves(parsed: Any, again: Any, sealed: set[str], name: str) -> None:
     for (path, before), (other, after) in zip(leaves(parsed), leaves(again), strict=False):
         is_number = isinstance(before, int | float) and re.sub(r"\[\d+\]", "", path) not in sealed
         if path == other and is_number and not same(before, after):
-            raise Violation("LS303" if is_cut(before, after) else "LS302", f"{before!r} comes back as {after!r}", f"{name}.{path}")
+            raise Violation(
+                "LS303" if is_cut(before, after) else "LS302",
+                f"{before!r} comes back as {after!r}",
+                f"{name}.{path}",
+            )
 
 
 def what_follows_is_held(subject: Subject, name: str) -> None:
-    """A frame in which a field is not what its `Rebuild` says is refused: it would be built as another."""
+    """A frame in which a field is not what its `Rebuild` says is refused: it would be built as
+    another.
+    """
     sensor, engine = subject.sensor, codec(subject.sensor.frames[name])
     if not isinstance(engine, CompiledCodec):
         return
     for data in (subject.example(name, seed=seed) for seed in range(3)):
         layout = engine.tree.layout(data)
         assert isinstance(layout, Layout)
-        leaves = [leaf for leaf in layout.leaves.values() if leaf.info.rebuilt is not None and not leaf.shape and leaf.info.kind == "int"]
+        leaves = [
+            leaf
+            for leaf in layout.leaves.values()
+            if leaf.info.rebuilt is not None and not leaf.shape and leaf.info.kind == "int"
+        ]
         for leaf, step in ((leaf, step) for leaf in leaves for step in (1, -1)):
             rows = np.frombuffer(data, np.uint8).reshape(1, -1).copy()
             leaf.store(rows, leaf.scalar(data) + step)
@@ -124,14 +179,25 @@ def what_follows_is_held(subject: Subject, name: str) -> None:
             other, place = rows.tobytes(), f"{name}.{leaf.info.path}"
             if other != data and engine.survey(rows[0], np.zeros(1, np.intp)).status[0] == VALID:
                 built = sensor.build(name, sensor.parse(other, frame=name))
-                require(built == other, "LS312", f"{leaf.scalar(other)} passes, and {leaf.scalar(built)} is built", place)
+                require(
+                    built == other,
+                    "LS312",
+                    f"{leaf.scalar(other)} passes, and {leaf.scalar(built)} is built",
+                    place,
+                )
 
 
 def is_cut(before: Any, after: Any) -> bool:
     """Whether a number came back a step too low."""
-    if not isinstance(before, int | float) or not isinstance(after, int | float) or not before - after > 0:
+    if (
+        not isinstance(before, int | float)
+        or not isinstance(after, int | float)
+        or not before - after > 0
+    ):
         return False
-    return after == before - 1 if isinstance(before, int) else before - after < 0.1 * abs(before) + 1
+    return (
+        after == before - 1 if isinstance(before, int) else before - after < 0.1 * abs(before) + 1
+    )
 
 
 def values_in_units_build_the_same_bytes(subject: Subject, name: str) -> None:
@@ -150,7 +216,12 @@ def parse_finds_out_the_type(subject: Subject, name: str) -> None:
     fitting = [other for other in subject.sensor.frames if fits(subject.sensor, data, other)]
     require(name in fitting, "LS306", "its own example is not parsed as such a frame", name)
     read = [subject.sensor.parse(data, frame=other) for other in fitting]
-    require(any(same(subject.sensor.parse(data), one) for one in read), "LS306", "the type is found out wrongly", name)
+    require(
+        any(same(subject.sensor.parse(data), one) for one in read),
+        "LS306",
+        "the type is found out wrongly",
+        name,
+    )
 
 
 def same(one: Any, other: Any) -> bool:
@@ -159,19 +230,37 @@ def same(one: Any, other: Any) -> bool:
         return one.keys() == other.keys() and all(same(one[key], other[key]) for key in one)
     if isinstance(one, list) and isinstance(other, list):
         return len(one) == len(other) and all(map(same, one, other))
-    return bool(one == other) or (one != one and other != other and getattr(one, "raw", 0) == getattr(other, "raw", 0))
+    return bool(one == other) or (
+        one != one and other != other and getattr(one, "raw", 0) == getattr(other, "raw", 0)
+    )
 
 
 def _lost(subject: Subject, name: str, data: bytes, built: bytes, code: str) -> None:
     """Raise the violation for bytes that became others, with the field in which they differ."""
-    spot = next((index for index, pair in enumerate(zip(data, built, strict=False)) if pair[0] != pair[1]), min(len(data), len(built)))
+    spot = next(
+        (index for index, pair in enumerate(zip(data, built, strict=False)) if pair[0] != pair[1]),
+        min(len(data), len(built)),
+    )
     one, other = (subject.sensor.parse(part, frame=name, verify=False) for part in (data, built))
-    found = next(((path, a, b) for (path, a), (_, b) in zip(leaves(one), leaves(other), strict=False) if a != b), None)
+    found = next(
+        (
+            (path, a, b)
+            for (path, a), (_, b) in zip(leaves(one), leaves(other), strict=False)
+            if a != b
+        ),
+        None,
+    )
     if found is None:
         was, became = (part[spot : spot + 1].hex() for part in (data, built))
-        raise Violation(code, f"byte {spot} of {len(data)} is {was} and comes back as {became}", name)
+        raise Violation(
+            code, f"byte {spot} of {len(data)} is {was} and comes back as {became}", name
+        )
     path, before, after = found
-    raise Violation("LS303" if is_cut(before, after) else code, f"{before!r} comes back as {after!r}", f"{name}.{path}")
+    raise Violation(
+        "LS303" if is_cut(before, after) else code,
+        f"{before!r} comes back as {after!r}",
+        f"{name}.{path}",
+    )
 
 
 def leaves(parsed: Any, path: str = "") -> Iterator[tuple[str, Any]]:
@@ -200,12 +289,24 @@ def values_survive_building_and_parsing(subject: Subject, name: str) -> None:
 
     sensor, fields = subject.sensor, subject.fields(name)
     number = len(subject.seeds(name))
-    bases = [sensor.parse(subject.example(name, seed=base), frame=name) for base in range(min(BASES, number))]
+    bases = [
+        sensor.parse(subject.example(name, seed=base), frame=name)
+        for base in range(min(BASES, number))
+    ]
     if not any(free(fields.get(path)) for base in bases for _, _, path in material.integers(base)):
         return
-    values = {path: _values(info, subject.strategies.get(f"{name}.{path}"), st) for path, info in fields.items() if free(info)}
+    values = {
+        path: _values(info, subject.strategies.get(f"{name}.{path}"), st)
+        for path, info in fields.items()
+        if free(info)
+    }
 
-    quiet: dict[str, Any] = {"deadline": None, "database": None, "print_blob": False, "suppress_health_check": list(HealthCheck)}
+    quiet: dict[str, Any] = {
+        "deadline": None,
+        "database": None,
+        "print_blob": False,
+        "suppress_health_check": list(HealthCheck),
+    }
 
     @seed(0)
     @settings(max_examples=number, derandomize=False, report_multiple_bugs=False, **quiet)
@@ -242,34 +343,62 @@ def _check(subject: Subject, name: str, parsed: Any, spots: list[Any], edits: li
     for place in edits:
         (holder, key, path), (target, found, _) = spots[place], read[place]
         wanted, got = holder[key], target[found]
-        require(got == wanted or path in sealed, "LS305", f"{wanted} is written, and {got} is read", f"{name}.{path}")
+        require(
+            got == wanted or path in sealed,
+            "LS305",
+            f"{wanted} is written, and {got} is read",
+            f"{name}.{path}",
+        )
     path = spots[edits[0]][2]
-    require(subject.sensor.build(name, again) == built, "LS302", f"an edit of {path} builds other bytes again", f"{name}.{path}")
+    require(
+        subject.sensor.build(name, again) == built,
+        "LS302",
+        f"an edit of {path} builds other bytes again",
+        f"{name}.{path}",
+    )
 
 
 def _values(info: FieldInfo, own: Any, st: Any) -> Any:
-    """What a field's raw value is drawn from: the author's strategy, or its range and the edges of it."""
+    """What a field's raw value is drawn from: the author's strategy, or its range and the edges of
+    it.
+    """
     if own is not None and hasattr(own, "example"):
         return own
     low, high = info.limits
     if own is not None:
         return st.randoms(use_true_random=False).map(own)
-    return st.one_of(st.integers(low, high), st.sampled_from(sorted({low, min(low + 1, high), max(high - 1, low), high})))
+    return st.one_of(
+        st.integers(low, high),
+        st.sampled_from(sorted({low, min(low + 1, high), max(high - 1, low), high})),
+    )
 
 
 def free(info: FieldInfo | None) -> bool:
-    return info is not None and info.kind == "int" and info.const is None and info.rebuilt is None and not info.held
+    return (
+        info is not None
+        and info.kind == "int"
+        and info.const is None
+        and info.rebuilt is None
+        and not info.held
+    )
 
 
 def a_truncated_frame_is_a_wire_error(subject: Subject, name: str) -> None:
     """A frame that is cut short at any byte is a `WireError` with its place."""
     data = subject.example(name, seed=2)
-    spots = subject.limit_to_bytes(name, subject.scale_rounds(material.SPOTS, LEAST_SPOTS), CUT_BYTES)
+    spots = subject.limit_to_bytes(
+        name, subject.scale_rounds(material.SPOTS, LEAST_SPOTS), CUT_BYTES
+    )
     for end in material.places(len(data), subject.source("cut"), spots):
         try:
             subject.sensor.parse(data[:end], frame=name)
         except WireError as error:
-            require(0 <= error.offset <= end, "LS307", f"cut at byte {end}, and the fault is told at byte {error.offset}", name)
+            require(
+                0 <= error.offset <= end,
+                "LS307",
+                f"cut at byte {end}, and the fault is told at byte {error.offset}",
+                name,
+            )
         except Exception as error:
             raise _undocumented(error, f"cut at byte {end} of {len(data)}", name) from error
         else:
@@ -292,7 +421,9 @@ def a_damaged_frame_is_at_worst_a_wire_error(subject: Subject, name: str) -> Non
 
 
 def every_single_bit_error_is_seen(subject: Subject, name: str) -> None:
-    """Every flipped bit under a checksum makes the frame invalid; how many of the others pass is measured."""
+    """Every flipped bit under a checksum makes the frame invalid; how many of the others pass is
+    measured.
+    """
     engine = codec(subject.sensor.frames[name])
     if not isinstance(engine, CompiledCodec):
         return
@@ -311,18 +442,35 @@ def every_single_bit_error_is_seen(subject: Subject, name: str) -> None:
         passing = changes(subject.sensor.frames[name], data, ["flipped bit"], offsets=offsets)
         tried += 8 * len(offsets)
         passed += len(passing)
-        covered = {byte for seal in layout.seals if not seal.absent for start, end in seal.spans for byte in range(start, end)}
+        covered = {
+            byte
+            for seal in layout.seals
+            if not seal.absent
+            for start, end in seal.spans
+            for byte in range(start, end)
+        }
         for _, byte, bit in passing:
-            field = next((path for path, (start, end) in layout.places.items() if start <= byte < end), "")
+            field = next(
+                (path for path, (start, end) in layout.places.items() if start <= byte < end), ""
+            )
             place = f"{name}.{field}".rstrip(".")
-            require(byte not in covered, "LS310", f"bit {bit} of byte {byte} is flipped, and the frame passes", place)
+            require(
+                byte not in covered,
+                "LS310",
+                f"bit {bit} of byte {byte} is flipped, and the frame passes",
+                place,
+            )
     if tried:
         kind = "under a checksum" if sealed else "without a checksum"
-        subject.measured[f"{name}, {kind}: single-bit errors that pass"] = f"{100 * passed / tried:.3g} %"
+        subject.measured[f"{name}, {kind}: single-bit errors that pass"] = (
+            f"{100 * passed / tried:.3g} %"
+        )
 
 
 def _flipped_offsets(layout: Layout, length: int, source: random.Random) -> Sequence[int]:
-    """Return the bytes of a frame whose bits are flipped: all, or of a long frame one of each field and others by chance."""
+    """Return the bytes of a frame whose bits are flipped: all, or of a long frame one of each field
+    and others by chance.
+    """
     number = FLIPPED_BYTES // (8 * length)
     if number >= length:
         return range(length)
@@ -333,4 +481,8 @@ def _flipped_offsets(layout: Layout, length: int, source: random.Random) -> Sequ
 
 def _undocumented(error: Exception, what: str, name: str) -> Violation:
     code = "LS115" if isinstance(error, SpecError) else "LS308"
-    return Violation(code, f"{what}: {type(error).__name__}: {str(error).splitlines()[0] if str(error) else ''}", name)
+    return Violation(
+        code,
+        f"{what}: {type(error).__name__}: {str(error).splitlines()[0] if str(error) else ''}",
+        name,
+    )

@@ -1,10 +1,13 @@
-"""Whether the points of a sensor are where its manual has them, as far as that shows without the manual.
+"""Whether the points of a sensor are where its manual has them, as far as that shows without the
+manual.
 
-Four things are looked at. Of examples: clouds keep the conventions, and what `points` returns, traced, says which fields each column is
-made of. Of packets along the sensor's `sweep`: directions are radians, go one way from beam to beam, cross the full circle without a
-leap, and exist for a single point; clock and counter run on. Of a frame whose angle is moved by a few steps: which way the points turn,
-and whether the vendor's axes turn that way. Of packets simulated in a room: the points that come back lie on its walls, by a geometry of
-this module's own (`off`), not the simulator's. What is measured on the way is told (`Subject.picture`), to be held against the manual.
+Four things are looked at. Of examples: clouds keep the conventions, and what `points` returns,
+traced, says which fields each column is made of. Of packets along the sensor's `sweep`: directions
+are radians, go one way from beam to beam, cross the full circle without a leap, and exist for a
+single point; clock and counter run on. Of a frame whose angle is moved by a few steps: which way
+the points turn, and whether the vendor's axes turn that way. Of packets simulated in a room: the
+points that come back lie on its walls, by a geometry of this module's own (`off`), not the
+simulator's. What is measured on the way is told (`Subject.picture`), to be held against the manual.
 """
 
 from __future__ import annotations
@@ -57,7 +60,8 @@ SCENE_BYTES = 1 << 21
 LEAST_PACKETS = 8
 #: radians beyond which an azimuth along a sweep, or a drawn one, can only be degrees.
 TURNS, DRAWN = 4 * np.pi, 15 * np.pi
-#: share of the steps that go one way where a sensor rotates, and the step against it that is too much, radians and medians.
+#: share of the steps that go one way where a sensor rotates, and the step against it that is too
+#: much, radians and medians.
 ONE_WAY, BACK, MEDIANS = 0.8, np.deg2rad(1.5), 4
 #: raw steps by which an angle is moved to see whether the points move with it.
 SMALL = 4
@@ -67,12 +71,14 @@ BASES = 8
 SEEN = 1e-5
 #: share of a direction along one of two axes from which on it is that axis's.
 ALONG = 0.9
-#: metres by which a point may be off its surface beyond half a step: float32, and steps that a header or a code word widens.
+#: metres by which a point may be off its surface beyond half a step: float32, and steps that a
+#: header or a code word widens.
 EXACT, UNTOLD = 2e-6, 0.004
 
 
 def make_sweep(subject: Subject, name: str, packets: int, total: int = SWEEP_BYTES) -> list[bytes]:
-    """Return the first packets along the sensor's `sweep`, none if it declares none or the frame type is not compiled.
+    """Return the first packets along the sensor's `sweep`, none if it declares none or the frame
+    type is not compiled.
 
     Of long frames fewer packets are made, which have `total` bytes.
     """
@@ -86,14 +92,18 @@ def make_sweep(subject: Subject, name: str, packets: int, total: int = SWEEP_BYT
             made.append(maker.frame(sweep(0)))
         packets = min(packets, max(total // len(made[0]), LEAST_PACKETS))
         if len(made) < packets:
-            made += maker.sealed(maker.table([sweep(number) for number in range(len(made), packets)]))
+            made += maker.sealed(
+                maker.table([sweep(number) for number in range(len(made), packets)])
+            )
     except LidarSpecError:
         return []
     return made[:packets]
 
 
 def read(subject: Subject, name: str, frames: list[bytes], *, by_clock: bool = True) -> Packets:
-    """Frames of one data type, decoded, with the sensor's clock or without; a mode that another frame switches to begins with it."""
+    """Frames of one data type, decoded, with the sensor's clock or without; a mode that another
+    frame switches to begins with it.
+    """
     sensor = subject.sensor if by_clock else dataclasses.replace(subject.sensor, clock=None)
     if sum(frame.data for frame in sensor.frames.values()) > 1:
         sensor = sensor.configure(answer=name)
@@ -101,7 +111,8 @@ def read(subject: Subject, name: str, frames: list[bytes], *, by_clock: bool = T
 
 
 def traced(subject: Subject, name: str) -> Any:
-    """What `points` returns for traced columns of one example; None where the frame is not compiled.
+    """What `points` returns for traced columns of one example; None where the frame is not
+    compiled.
 
     Raises:
         Untraceable: where it cannot be traced, with the reason.
@@ -112,15 +123,22 @@ def traced(subject: Subject, name: str) -> Any:
 
 
 def _trace_points(subject: Subject, name: str) -> Any:
-    few = [subject.example(name, seed=seed) for seed in (range(8) if subject.sensor.parts_with("points", name) else (0,))]
+    few = [
+        subject.example(name, seed=seed)
+        for seed in (range(8) if subject.sensor.parts_with("points", name) else (0,))
+    ]
     packets = read(subject, name, few * subject.sensor.frames[name].confirm).with_points
     if not isinstance(packets.table, Rows) or not packets.table.groups:
         return None
-    return trace(subject.sensor.points_of(packets.frame), sample_of(packets.batch(), packets.table.groups[0]))[0]
+    return trace(
+        subject.sensor.points_of(packets.frame), sample_of(packets.batch(), packets.table.groups[0])
+    )[0]
 
 
 def used(value: Any, *, looked_up: bool = True) -> list[Node]:
-    """The fields that a traced value is made of; with `looked_up` false without those that are only looked up in a table."""
+    """The fields that a traced value is made of; with `looked_up` false without those that are only
+    looked up in a table.
+    """
     nodes = traverse(value, into=lambda node: looked_up or not isinstance(node.function, LookUp))
     return [node for node in nodes if node.kind in ("field", "state")]
 
@@ -133,13 +151,17 @@ def field_of(subject: Subject, name: str, node: Node) -> FieldInfo | None:
         _, frame, path = node.path.split(".", 2)
         return subject.fields(frame).get(path)
     parts = subject.sensor.parts_with("points", name)
-    return codec(subject.sensor.frames[name]).schema.named.get(f"{parts}.{node.path}" if parts else node.path)
+    return codec(subject.sensor.frames[name]).schema.named.get(
+        f"{parts}.{node.path}" if parts else node.path
+    )
 
 
 def directions(subject: Subject, name: str, packets: Packets) -> list[NDArray[np.float64]] | None:
-    """Azimuths and elevations of points as `points` gives them, before they are folded, padding left out.
+    """Azimuths and elevations of points as `points` gives them, before they are folded, padding
+    left out.
 
-    Those of points by coordinates are the ones that are declared for their simulation; None where there are none.
+    Those of points by coordinates are the ones that are declared for their simulation; None where
+    there are none.
     """
     packets = packets.with_points
     batch = packets.batch()
@@ -148,23 +170,37 @@ def directions(subject: Subject, name: str, packets: Packets) -> list[NDArray[np
         if not isinstance(polar, Polar):
             return _declared(subject, name)
         arrays, axes, _ = aligned((polar.azimuth, polar.elevation, polar.range), batch)
-    shape = np.broadcast_shapes((len(packets), *(1,) * len(axes)), *(array.shape for array in arrays))
+    shape = np.broadcast_shapes(
+        (len(packets), *(1,) * len(axes)), *(array.shape for array in arrays)
+    )
     mask = unpadded(axes, shape, batch)
-    whole = [np.broadcast_to(np.asarray(array, np.float64), shape).reshape(shape[0], math.prod(shape[1:])) for array in arrays[:2]]
+    whole = [
+        np.broadcast_to(np.asarray(array, np.float64), shape).reshape(
+            shape[0], math.prod(shape[1:])
+        )
+        for array in arrays[:2]
+    ]
     return whole if mask is None else [angles[mask] for angles in whole]
 
 
 def _declared(subject: Subject, name: str) -> list[NDArray[np.float64]] | None:
-    """The directions of the first frames that are declared for a simulation; None where there are none."""
+    """The directions of the first frames that are declared for a simulation; None where there are
+    none.
+    """
     declared = subject.sensor.simulation_of(name).directions
     if declared is None:
         return None
     pairs = [declared(number) for number in range(64)]
-    return [np.concatenate([np.ravel(pair[which]) for pair in pairs]).astype(np.float64) for which in (0, 1)]
+    return [
+        np.concatenate([np.ravel(pair[which]) for pair in pairs]).astype(np.float64)
+        for which in (0, 1)
+    ]
 
 
 def clouds_keep_the_conventions(subject: Subject, name: str) -> None:
-    """float32 metres and radians, azimuth in [-pi, pi), no place without a return; and `points` does not fail."""
+    """float32 metres and radians, azimuth in [-pi, pi), no place without a return; and `points`
+    does not fail.
+    """
     frames = [subject.example(name, seed=seed) for seed in range(max(len(subject.seeds(name)), 2))]
     try:
         packets = read(subject, name, frames)
@@ -175,7 +211,9 @@ def clouds_keep_the_conventions(subject: Subject, name: str) -> None:
     try:
         assert_well_formed(cloud)
     except AssertionError as error:
-        raise Violation("LS501", str(error).splitlines()[0] or "the cloud is not well formed", f"{name}.points") from error
+        raise Violation(
+            "LS501", str(error).splitlines()[0] or "the cloud is not well formed", f"{name}.points"
+        ) from error
 
 
 def directions_are_radians(subject: Subject, name: str) -> None:
@@ -189,33 +227,59 @@ def directions_are_radians(subject: Subject, name: str) -> None:
         return
     azimuth, elevation = (float(np.nanmax(np.abs(part), initial=0)) for part in angles)
     where = f"{name}.{'directions' if subject.sensor.simulation_of(name).directions else 'points'}"
-    require(azimuth <= (TURNS if along else DRAWN), "LS502", f"an azimuth of {azimuth:.4g} rad", where)
-    require(not along or elevation <= np.pi / 2 + 1e-6, "LS502", f"an elevation of {elevation:.4g} rad", where)
+    require(
+        azimuth <= (TURNS if along else DRAWN), "LS502", f"an azimuth of {azimuth:.4g} rad", where
+    )
+    require(
+        not along or elevation <= np.pi / 2 + 1e-6,
+        "LS502",
+        f"an elevation of {elevation:.4g} rad",
+        where,
+    )
 
 
 def a_single_point_has_a_direction(subject: Subject, name: str) -> None:
-    """Where the number of points is in the header, frames with one point have as sound a direction as others."""
+    """Where the number of points is in the header, frames with one point have as sound a direction
+    as others.
+    """
     engine, source = codec(subject.sensor.frames[name]), random.Random(subject.sensor.id)
     if not isinstance(engine, CompiledCodec) or engine.schema.parts:
         return
-    counts = [path for path in header(engine, source)[1] if engine.schema.fields[path].const is None]
+    counts = [
+        path for path in header(engine, source)[1] if engine.schema.fields[path].const is None
+    ]
     for path in counts:
         try:
-            single = random_frame(subject.sensor, name, source, {**subject.drawers(name), path: lambda _: 1})
+            single = random_frame(
+                subject.sensor, name, source, {**subject.drawers(name), path: lambda _: 1}
+            )
         except SpecError:
             continue
         try:
-            cloud = read(subject, name, [single] * max(3, subject.sensor.frames[name].confirm)).points()
+            cloud = read(
+                subject, name, [single] * max(3, subject.sensor.frames[name].confirm)
+            ).points()
         except SpecError as error:
-            raise Violation("LS503", f"with {path} = 1: {error.reason}", f"{name}.{path}") from error
+            raise Violation(
+                "LS503", f"with {path} = 1: {error.reason}", f"{name}.{path}"
+            ) from error
         if not len(cloud) or not np.isnan(cloud.azimuth).all():
             continue
-        known = read(subject, name, [subject.example(name, seed=seed) for seed in range(12)]).points()
-        require(np.isnan(known.azimuth).all(), "LS503", f"with {path} = 1 every azimuth is nan", f"{name}.{path}")
+        known = read(
+            subject, name, [subject.example(name, seed=seed) for seed in range(12)]
+        ).points()
+        require(
+            np.isnan(known.azimuth).all(),
+            "LS503",
+            f"with {path} = 1 every azimuth is nan",
+            f"{name}.{path}",
+        )
 
 
 def the_full_circle_is_the_same_as_none(subject: Subject, name: str) -> None:
-    """A frame with an angle of exactly 360 degrees, where it is plausible, has the points of the one with 0."""
+    """A frame with an angle of exactly 360 degrees, where it is plausible, has the points of the
+    one with 0.
+    """
     for path, info in subject.fields(name).items():
         full = _full_circle(info)
         if full is None:
@@ -224,18 +288,29 @@ def the_full_circle_is_the_same_as_none(subject: Subject, name: str) -> None:
             clouds = _with_values(subject, name, path, (full[0], full[0] + SMALL, full[1]))
         except SpecError as error:
             raise Violation(
-                "LS505", f"{path} of exactly {FULL_TURNS[info.unit]:g} {info.unit}: {error.reason}", f"{name}.{path}"
+                "LS505",
+                f"{path} of exactly {FULL_TURNS[info.unit]:g} {info.unit}: {error.reason}",
+                f"{name}.{path}",
             ) from error
         if not clouds or not _turn(info, clouds[0], clouds[1]):
             continue
         nought, _, circle = clouds
-        apart = np.nanmax(np.abs(nought.xyz - circle.xyz) / (1 + np.abs(nought.range))[:, None], initial=0)
+        apart = np.nanmax(
+            np.abs(nought.xyz - circle.xyz) / (1 + np.abs(nought.range))[:, None], initial=0
+        )
         same = np.array_equal(nought.valid, circle.valid) and apart < 1e-3
-        require(same, "LS505", f"{path} of exactly {FULL_TURNS[info.unit]:g} {info.unit} gives other points than 0", f"{name}.{path}")
+        require(
+            same,
+            "LS505",
+            f"{path} of exactly {FULL_TURNS[info.unit]:g} {info.unit} gives other points than 0",
+            f"{name}.{path}",
+        )
 
 
 def the_points_turn_as_the_axes_do(subject: Subject, name: str) -> None:
-    """With the angle on the wire, points turn from the vendor's axis at its zero towards the other one; what is seen of it is told."""
+    """With the angle on the wire, points turn from the vendor's axis at its zero towards the other
+    one; what is seen of it is told.
+    """
     for path, info in subject.fields(name).items():
         zero = _zero(info)
         clouds = [] if zero is None else _with_values(subject, name, path, (zero, zero + SMALL))
@@ -245,18 +320,23 @@ def the_points_turn_as_the_axes_do(subject: Subject, name: str) -> None:
         first = float(clouds[0].azimuth[np.isfinite(clouds[0].azimuth)][0])
         words = {1: "counter-clockwise", -1: "clockwise"}
         subject.picture[f"{name}: sense"] = f"{words[sense]} as {path} grows, seen from above"
-        subject.picture[f"{name}: first beam"] = f"at azimuth {np.rad2deg(first) + 0:.1f} deg where {path} is 0 (0 is ahead, 90 is left)"
+        subject.picture[f"{name}: first beam"] = (
+            f"at azimuth {np.rad2deg(first) + 0:.1f} deg where {path} is 0 (0 is ahead, 90 is left)"
+        )
         axes = subject.sensor.vendor_axes
         expected = _sense_of(axes, first) if axes else 0
         said = (
-            f"points turn {words[sense]} as {path} grows, and with vendor_axes of {', '.join(axes or ())} angles run {words.get(expected)}"
+            f"points turn {words[sense]} as {path} grows, and with vendor_axes of"
+            f" {', '.join(axes or ())} angles run {words.get(expected)}"
         )
         require(expected in (0, sense), "LS511", said, f"{name}.points")
         return
 
 
 def _sense_of(axes: tuple[str, str, str], zero: float) -> int:
-    """Which way angles run, 1 counter-clockwise, that begin at the azimuth `zero` on one axis and go to the other; 0: nobody can tell."""
+    """Which way angles run, 1 counter-clockwise, that begin at the azimuth `zero` on one axis and
+    go to the other; 0: nobody can tell.
+    """
     x, y, _ = axis_matrix(axes)
     along = np.abs([x, y]) @ [np.cos(zero), np.sin(zero), 0]
     turning = round(float(np.cross(x, y)[2]))
@@ -264,12 +344,22 @@ def _sense_of(axes: tuple[str, str, str], zero: float) -> int:
 
 
 def angles_are_in_order(subject: Subject, name: str) -> None:
-    """Along the sweep of a sensor that rotates, the azimuths of each laser go one way, also across the full circle."""
-    frames = make_sweep(subject, name, PACKETS if subject.sensor.frames[name].max_length <= material.SHORT else PACKETS // 4)
+    """Along the sweep of a sensor that rotates, the azimuths of each laser go one way, also across
+    the full circle.
+    """
+    frames = make_sweep(
+        subject,
+        name,
+        PACKETS if subject.sensor.frames[name].max_length <= material.SHORT else PACKETS // 4,
+    )
     if not frames:
         return
     found = evaluate(read(subject, name, frames).with_points)
-    counts = found.counts.reshape(len(found.counts), -1).sum(axis=1) if found.counts.ndim > 1 else found.counts
+    counts = (
+        found.counts.reshape(len(found.counts), -1).sum(axis=1)
+        if found.counts.ndim > 1
+        else found.counts
+    )
     cloud, packet = found.cloud, np.repeat(np.arange(found.ready), counts)
     rings = cloud.ring if cloud.ring is not None else np.zeros(len(cloud))
     for ring in np.unique(rings)[:4]:
@@ -282,38 +372,74 @@ def angles_are_in_order(subject: Subject, name: str) -> None:
         median = float(np.median(steps[moving]))
         turning = "counter-clockwise" if median > 0 else "clockwise"
         if abs(median) > SEEN:
-            subject.picture.setdefault(f"{name}: step", f"{abs(np.rad2deg(median)):.3g} deg {turning} from point to point along the sweep")
+            subject.picture.setdefault(
+                f"{name}: step",
+                f"{abs(np.rad2deg(median)):.3g} deg {turning} from point to point along the sweep",
+            )
         one_way = float((np.sign(steps[moving]) == np.sign(median)).mean())
         back = steps * np.sign(median) < -max(BACK, MEDIANS * abs(median))
         if one_way < ONE_WAY:
-            said = f"only {one_way:.0%} of the steps go the same way, and scans are cut where it wraps"
+            said = (
+                f"only {one_way:.0%} of the steps go the same way, and scans are cut where it wraps"
+            )
             require(not isinstance(subject.sensor.scan, OnWrap), "LS506", said, f"{name}.points")
         elif back.any():
             spot = int(np.flatnonzero(back)[0])
             before, after = np.rad2deg(angle[spot : spot + 2])
-            said = f"from {before:.1f} to {after:.1f} degrees in packet {number[spot + 1]} of the sweep"
-            raise Violation("LS504" if number[spot] == number[spot + 1] else "LS506", said, f"{name}.points")
+            said = (
+                f"from {before:.1f} to {after:.1f} degrees in packet {number[spot + 1]} of the"
+                " sweep"
+            )
+            raise Violation(
+                "LS504" if number[spot] == number[spot + 1] else "LS506", said, f"{name}.points"
+            )
 
 
 def counters_run_on(subject: Subject, name: str) -> None:
     """Along the sweep no packet counts as lost, late or doubled, and time does not run back."""
-    frames = make_sweep(subject, name, 700 if subject.sensor.frames[name].max_length <= LONG_FRAME_BYTES else 260, COUNTER_BYTES)
+    frames = make_sweep(
+        subject,
+        name,
+        700 if subject.sensor.frames[name].max_length <= LONG_FRAME_BYTES else 260,
+        COUNTER_BYTES,
+    )
     if not frames or name != subject.sensor.data_frame:
         return
     packets = read(subject, name, frames)
     if subject.sensor.sequence is not None:
-        stats = read(subject, name, frames, by_clock=False).stats  # the clock would make up for the counter
-        said = f"along the sweep {stats.lost} packets are lost, {stats.late} late, {stats.duplicates} doubled"
-        require((stats.lost, stats.late, stats.duplicates) == (0, 0, 0), "LS510", said, f"{name}.{subject.sensor.sequence.field}")
+        stats = read(
+            subject, name, frames, by_clock=False
+        ).stats  # the clock would make up for the counter
+        said = (
+            f"along the sweep {stats.lost} packets are lost, {stats.late} late, {stats.duplicates}"
+            " doubled"
+        )
+        require(
+            (stats.lost, stats.late, stats.duplicates) == (0, 0, 0),
+            "LS510",
+            said,
+            f"{name}.{subject.sensor.sequence.field}",
+        )
     if subject.sensor.clock is not None and len(packets) > 1:
         back = np.diff(packets.time_ns)
         spot = int(back.argmin())
-        require(back.min() >= 0, "LS509", f"packet {spot + 1} of the sweep is {-back.min() / 1e9:g} s before the one in front of it", name)
+        require(
+            back.min() >= 0,
+            "LS509",
+            f"packet {spot + 1} of the sweep is {-back.min() / 1e9:g} s before the one in front"
+            " of it",
+            name,
+        )
 
 
 def _zero(info: FieldInfo) -> int | None:
     """The raw value of no angle, nearly; None where the field is no angle or has none."""
-    if info.kind != "int" or info.const is not None or info.unit not in FULL_TURNS or not info.scale:
+    if (
+        info.kind != "int"
+        or info.const is not None
+        or info.unit not in FULL_TURNS
+        or not info.scale
+    ):
         return None
     raw = round(-info.offset / info.scale)
     return raw if info.limits[0] <= raw <= info.limits[1] - SMALL else None
@@ -323,12 +449,20 @@ def _full_circle(info: FieldInfo) -> tuple[int, int] | None:
     """The raw values of no angle and of the full circle; None where the field cannot hold both."""
     zero = _zero(info)
     circle = (FULL_TURNS[info.unit] - info.offset) / info.scale if zero is not None else math.nan
-    whole = zero is not None and abs(circle - round(circle)) < 1e-6 and round(circle) <= info.limits[1] and not info.physical(zero)
+    whole = (
+        zero is not None
+        and abs(circle - round(circle)) < 1e-6
+        and round(circle) <= info.limits[1]
+        and not info.physical(zero)
+    )
     return (zero, round(circle)) if zero is not None and whole else None
 
 
-def _with_values(subject: Subject, name: str, path: str, values: tuple[int, ...]) -> list[PointCloud]:
-    """The points of an example with each of these values in a field; none where no example can carry them all, with as many points.
+def _with_values(
+    subject: Subject, name: str, path: str, values: tuple[int, ...]
+) -> list[PointCloud]:
+    """The points of an example with each of these values in a field; none where no example can
+    carry them all, with as many points.
 
     Raises:
         SpecError: where `points` fails on them.
@@ -337,25 +471,42 @@ def _with_values(subject: Subject, name: str, path: str, values: tuple[int, ...]
         parsed = subject.sensor.parse(subject.example(name, seed=seed), frame=name)
         if all(own != path for _, _, own in material.integers(parsed)):
             continue
-        frames = list(itertools.takewhile(bool, (_with(subject, name, path, value, parsed) for value in values)))
+        frames = list(
+            itertools.takewhile(
+                bool, (_with(subject, name, path, value, parsed) for value in values)
+            )
+        )
         if len(frames) < len(values):
             continue
-        packets = [read(subject, name, [frame] * max(2, subject.sensor.frames[name].confirm)) for frame in frames]
+        packets = [
+            read(subject, name, [frame] * max(2, subject.sensor.frames[name].confirm))
+            for frame in frames
+        ]
         clouds = [each.points() for each in packets if len(each)]
-        if len(clouds) == len(values) and len(clouds[0]) and len({len(cloud) for cloud in clouds}) == 1:
+        if (
+            len(clouds) == len(values)
+            and len(clouds[0])
+            and len({len(cloud) for cloud in clouds}) == 1
+        ):
             return clouds
     return []
 
 
 def _turn(info: FieldInfo, nought: PointCloud, turned: PointCloud) -> int:
-    """Which way points turned with a field, 1 counter-clockwise; 0 where they did not: a rate, or another angle than the azimuth."""
+    """Which way points turned with a field, 1 counter-clockwise; 0 where they did not: a rate, or
+    another angle than the azimuth.
+    """
     moved = (turned.azimuth - nought.azimuth + np.pi) % (2 * np.pi) - np.pi
-    most = float(max(moved[np.isfinite(moved)], key=abs, default=0)) / (SMALL * info.scale * 2 * np.pi / FULL_TURNS[info.unit])
+    most = float(max(moved[np.isfinite(moved)], key=abs, default=0)) / (
+        SMALL * info.scale * 2 * np.pi / FULL_TURNS[info.unit]
+    )
     return int(np.sign(most)) if 0.5 < abs(most) < 1.5 else 0
 
 
 def _with(subject: Subject, name: str, path: str, value: int, parsed: Any) -> bytes:
-    """Return a frame with every element of one field of `parsed` set, which changes it; no bytes if no frame can carry the value."""
+    """Return a frame with every element of one field of `parsed` set, which changes it; no bytes if
+    no frame can carry the value.
+    """
     for holder, key, own in list(material.integers(parsed)):
         if own == path:
             holder[key] = value
@@ -367,7 +518,9 @@ def _with(subject: Subject, name: str, path: str, value: int, parsed: Any) -> by
 
 
 def off(room: Room, xyz: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Metres from points, (n, 3), to the nearest surface of a room, (n,): nothing of the simulator's own geometry is used."""
+    """Metres from points, (n, 3), to the nearest surface of a room, (n,): nothing of the
+    simulator's own geometry is used.
+    """
     found = np.full(len(xyz), np.inf)
     for body in (room.walls, *room.boxes):
         if body is None:
@@ -380,9 +533,15 @@ def off(room: Room, xyz: NDArray[np.float64]) -> NDArray[np.float64]:
 
 
 def half_step(subject: Subject, name: str) -> float:
-    """Half a step of the coarsest range field, at least what a header or a code word may widen it to."""
+    """Half a step of the coarsest range field, at least what a header or a code word may widen it
+    to.
+    """
     fields = subject.fields(name).values()
-    metres = [abs(info.scale) * float(factor(info.unit, "m") or 0) for info in fields if factor(info.unit, "m") is not None]
+    metres = [
+        abs(info.scale) * float(factor(info.unit, "m") or 0)
+        for info in fields
+        if factor(info.unit, "m") is not None
+    ]
     return max([UNTOLD, *metres]) / 2 if max(metres, default=0) > UNTOLD else UNTOLD
 
 
@@ -394,7 +553,10 @@ def a_simulated_scene_comes_back(subject: Subject, name: str) -> None:
     try:
         made = simulation(subject.sensor, name)
         length = len(made.block(0, 1, room).frames[0])
-        packets = min(LONG_SCENE_PACKETS if is_long else SCENE_PACKETS, max(SCENE_BYTES // length, LEAST_PACKETS))
+        packets = min(
+            LONG_SCENE_PACKETS if is_long else SCENE_PACKETS,
+            max(SCENE_BYTES // length, LEAST_PACKETS),
+        )
         block = made.block(5, packets, room)
     except UsageError:
         return
@@ -402,17 +564,36 @@ def a_simulated_scene_comes_back(subject: Subject, name: str) -> None:
         raise Violation("LS508", str(error), f"{name}.sweep") from error
     cloud = read(subject, name, block.frames).points()
     seconds = float(block.times[-1]) / 1e9
-    subject.picture[f"{name}: rate"] = f"{len(cloud) / seconds:.0f} points a second, simulated" if seconds else "nothing tells it"
-    known = len(cloud) - 2 * len(cloud) // len(block.frames)  # directions of the last packet may ask for what follows
+    subject.picture[f"{name}: rate"] = (
+        f"{len(cloud) / seconds:.0f} points a second, simulated" if seconds else "nothing tells it"
+    )
+    known = len(cloud) - 2 * len(cloud) // len(
+        block.frames
+    )  # directions of the last packet may ask for what follows
     valid = cloud.valid[:known]
     share = float(valid.mean()) if known else 0.0
-    require(share > 0.5, "LS507", f"{share:.0%} of the beams in a closed room return", f"{name}.points")
+    require(
+        share > 0.5, "LS507", f"{share:.0%} of the beams in a closed room return", f"{name}.points"
+    )
     apart = off(room, cloud.xyz[:known][valid].astype(np.float64))
     worst = float(apart.max(initial=0))
-    each = np.sqrt(3) if subject.sensor.simulation_of(name).directions else 1  # coordinates are rounded one by one
+    each = (
+        np.sqrt(3) if subject.sensor.simulation_of(name).directions else 1
+    )  # coordinates are rounded one by one
     near_enough = worst < half_step(subject, name) * each + EXACT
-    require(near_enough, "LS507", f"a point lies {worst:.4f} m from every surface of the scene", f"{name}.points")
+    require(
+        near_enough,
+        "LS507",
+        f"a point lies {worst:.4f} m from every surface of the scene",
+        f"{name}.points",
+    )
     near, far = subject.sensor.range_limits
     ranges = cloud.range[:known][valid]
     inside = not len(ranges) or (ranges.min() >= near - UNTOLD and ranges.max() <= far + UNTOLD)
-    require(inside, "LS507", f"ranges of {ranges.min() if len(ranges) else 0:.3f} to {ranges.max() if len(ranges) else 0:.3f} m", name)
+    require(
+        inside,
+        "LS507",
+        f"ranges of {ranges.min() if len(ranges) else 0:.3f} to"
+        f" {ranges.max() if len(ranges) else 0:.3f} m",
+        name,
+    )

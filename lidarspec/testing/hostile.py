@@ -1,10 +1,13 @@
-"""Hostile streams: what costs a sensor's frames most to find, made of its own frames, and what they cost.
+"""Hostile streams: what costs a sensor's frames most to find, made of its own frames, and what they
+cost.
 
-The engine's work is linear in the input, whatever that is; how much a byte costs depends on the declaration, on frame types that follow one
-another, on headers that make a new layout each, on functions of the author's own that are called for every false header. So streams are
-made for each sensor of all that: frames of all types in any order, announcements alone and with what they announce, heads of frames,
-random headers, damaged frames, and of all of these in turn. Their cost is counted, in function calls and in bytes of memory: a time would
-depend on what else the machine does.
+The engine's work is linear in the input, whatever that is; how much a byte costs depends on the
+declaration, on frame types that follow one another, on headers that make a new layout each, on
+functions of the author's own that are called for every false header. So streams are made for each
+sensor of all that: frames of all types in any order, announcements alone and with what they
+announce, heads of frames, random headers, damaged frames, and of all of these in turn. Their cost
+is counted, in function calls and in bytes of memory: a time would depend on what else the machine
+does.
 """
 
 from __future__ import annotations
@@ -29,8 +32,8 @@ from lidarspec.testing.subject import Subject
 #: bytes of a stream, with the usual number of examples, and at least.
 LENGTH = 12_000
 LEAST_LENGTH = 4_000
-#: function calls that a stream may take per byte. The engine needs up to 16 for the sensors that exist, and 40 where construct
-#: reads every frame.
+#: function calls that a stream may take per byte. The engine needs up to 16 for the sensors that
+#: exist, and 40 where construct reads every frame.
 MAX_CALLS_PER_BYTE = 100
 #: bytes of memory that frames may be kept in per byte of the stream.
 MAX_KEPT_PER_BYTE = 64
@@ -44,18 +47,30 @@ ANNOUNCED = 40
 
 
 def no_stream_costs_much_more_than_frames(subject: Subject) -> None:
-    """No stream takes more than 100 function calls for each of its bytes, or is kept in more than 64 bytes of memory."""
+    """No stream takes more than 100 function calls for each of its bytes, or is kept in more than
+    64 bytes of memory.
+    """
     length = min(subject.scale_rounds(LENGTH, LEAST_LENGTH), LENGTH)
     first = streams(subject, length=length)
     calls = {name: calls_per_byte(subject.sensor, parts) for name, parts in first.items()}
     dear = [name for name in calls if calls[name] >= MAX_CALLS_PER_BYTE]
-    if dear:  # a second stream does not pay for layouts that the engine remembers, and its own layouts are others
+    # a second stream does not pay for layouts that the engine remembers, and its own layouts are
+    # others
+    if dear:
         second = streams(subject, seed=1, length=length)
-        calls |= {name: min(calls[name], calls_per_byte(subject.sensor, second[name])) for name in dear}
+        calls |= {
+            name: min(calls[name], calls_per_byte(subject.sensor, second[name])) for name in dear
+        }
     name = max(calls, key=lambda name: calls[name])
     subject.measured["the dearest stream"] = f"{name}, {calls[name]:.1f} calls a byte"
-    require(calls[name] < MAX_CALLS_PER_BYTE, "LS416", f"{name}: {calls[name]:.0f} function calls for each byte")
-    held, name = max((kept_per_byte(subject.sensor, first[name]), name) for name in calls if name != SMOOTH)
+    require(
+        calls[name] < MAX_CALLS_PER_BYTE,
+        "LS416",
+        f"{name}: {calls[name]:.0f} function calls for each byte",
+    )
+    held, name = max(
+        (kept_per_byte(subject.sensor, first[name]), name) for name in calls if name != SMOOTH
+    )
     require(held < MAX_KEPT_PER_BYTE, "LS416", f"{name}: {held:.0f} bytes are kept for each byte")
 
 
@@ -63,10 +78,16 @@ SMOOTH = "data frames"
 
 
 def streams(subject: Subject, seed: int = 0, *, length: int = LENGTH) -> dict[str, list[bytes]]:
-    """Streams of at least so many bytes by what they are made of, in pieces: frames, and what looks like them; one of data frames alone."""
+    """Streams of at least so many bytes by what they are made of, in pieces: frames, and what looks
+    like them; one of data frames alone.
+    """
     source, makers = subject.source(f"hostile {seed}"), _makers(subject)
-    found = {name: _of_length(length, functools.partial(make, source)) for name, make in makers.items()}
-    found["all of these in turn"] = _of_length(length, lambda: source.choice(list(makers.values()))(source))
+    found = {
+        name: _of_length(length, functools.partial(make, source)) for name, make in makers.items()
+    }
+    found["all of these in turn"] = _of_length(
+        length, lambda: source.choice(list(makers.values()))(source)
+    )
     sensor = subject.sensor
     data = sensor.frames[sensor.data_frame]
     seeds = itertools.cycle(range(_seeds(subject)))
@@ -95,7 +116,8 @@ def calls_per_byte(sensor: Sensor, parts: list[bytes]) -> float:
 def kept_per_byte(sensor: Sensor, parts: list[bytes]) -> float:
     """Return how many bytes the frames of a stream take, apart from its own bytes, per byte.
 
-    If these are too many, the stream is read again, because layouts that the engine remembers count only the first time.
+    If these are too many, the stream is read again, because layouts that the engine remembers count
+    only the first time.
     """
     length = sum(map(len, parts))
     gc.freeze()  # collections are to look at what is made from here on, and at nothing else
@@ -120,7 +142,11 @@ def _held(sensor: Sensor, parts: list[bytes]) -> int:
 
 def _frames(sensor: Sensor, parts: list[bytes]) -> list[Frames]:
     decoder = sensor.decoder()
-    return [decoder.datagrams(parts)] if sensor.datagrams else [*decoder.frames(b"".join(parts)), *decoder.rest()]
+    return (
+        [decoder.datagrams(parts)]
+        if sensor.datagrams
+        else [*decoder.frames(b"".join(parts)), *decoder.rest()]
+    )
 
 
 def _seeds(subject: Subject) -> int:
@@ -151,18 +177,29 @@ def _makers(subject: Subject) -> dict[str, Callable[[random.Random], bytes]]:
     def behind(source: random.Random, name: str, data: bytes) -> bytes:
         """Some bytes like a frame, once in a while behind the announcement that they need."""
         announced = after[name]
-        return example(source, announced) + data if announced and not source.randrange(ANNOUNCED) else data
+        return (
+            example(source, announced) + data
+            if announced and not source.randrange(ANNOUNCED)
+            else data
+        )
 
     def any_frame(source: random.Random) -> bytes:
         return example(source, source.choice(names))
 
     def announced(source: random.Random) -> bytes:
         name = source.choice([name for name in names if after[name]])
-        return example(source, after[name] or "") + example(source, name) * source.choice((1, incoming[name].confirm))
+        return example(source, after[name] or "") + example(source, name) * source.choice(
+            (1, incoming[name].confirm)
+        )
 
     def head(source: random.Random) -> bytes:
         name = source.choice(names)
-        return behind(source, name, example(source, name)[: source.randint(1, HEAD)] + source.randbytes(source.randint(0, NOISE)))
+        return behind(
+            source,
+            name,
+            example(source, name)[: source.randint(1, HEAD)]
+            + source.randbytes(source.randint(0, NOISE)),
+        )
 
     def header(source: random.Random) -> bytes:
         name = source.choice(names)
@@ -178,18 +215,35 @@ def _makers(subject: Subject) -> dict[str, Callable[[random.Random], bytes]]:
         return behind(source, name, bytes(data))
 
     makers: dict[str, Callable[[random.Random], bytes]]
-    makers = {"frames of all types": any_frame, "heads of frames": head, "random headers": header, "damaged frames": damaged}
+    makers = {
+        "frames of all types": any_frame,
+        "heads of frames": head,
+        "random headers": header,
+        "damaged frames": damaged,
+    }
     if announcing:
-        makers |= {"announcements": lambda source: example(source, source.choice(announcing)), "what was announced": announced}
+        makers |= {
+            "announcements": lambda source: example(source, source.choice(announcing)),
+            "what was announced": announced,
+        }
     if with_headers:
-        makers["frames with random headers"] = lambda source: of_header(*source.choice(with_headers))
+        makers["frames with random headers"] = lambda source: of_header(
+            *source.choice(with_headers)
+        )
     return makers
 
 
 def _of_random_header(subject: Subject, name: str, seed: int) -> bytes:
-    """A frame of a type whose header says how long it is, or what is in it; none where it is not so, or only those along the sweep are."""
+    """A frame of a type whose header says how long it is, or what is in it; none where it is not
+    so, or only those along the sweep are.
+    """
     engine = codec(subject.sensor.frames[name])
     if isinstance(engine, CompiledCodec) and engine.size is None:
         with contextlib.suppress(SpecError):
-            return random_frame(subject.sensor, name, subject.source(f"header {seed} of {name}"), subject.drawers(name))
+            return random_frame(
+                subject.sensor,
+                name,
+                subject.source(f"header {seed} of {name}"),
+                subject.drawers(name),
+            )
     return b""

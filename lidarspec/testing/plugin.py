@@ -1,4 +1,6 @@
-"""The pytest plugin: fixtures for tests of sensors. It imports nothing of the engine before one of them is asked for."""
+"""The pytest plugin: fixtures for tests of sensors. It imports nothing of the engine before one of
+them is asked for.
+"""
 
 from __future__ import annotations
 
@@ -16,7 +18,10 @@ if TYPE_CHECKING:
 
 def pytest_configure(config: pytest.Config) -> None:
     """Make the marker known."""
-    config.addinivalue_line("markers", "lidarspec(sensor): the sensor that the `sensor` fixture gives: an id, a Sensor or a file")
+    config.addinivalue_line(
+        "markers",
+        "lidarspec(sensor): the sensor that the `sensor` fixture gives: an id, a Sensor or a file",
+    )
 
 
 @pytest.fixture
@@ -28,29 +33,38 @@ def sensor(request: pytest.FixtureRequest) -> Sensor:
     marker = request.node.get_closest_marker("lidarspec")
     wanted = marker.args[0] if marker else getattr(request.cls, "sensor", None)
     if not wanted:
-        raise pytest.UsageError('which sensor? mark the test with @pytest.mark.lidarspec("acme-x1"), or give its class a `sensor`')
+        raise pytest.UsageError(
+            'which sensor? mark the test with @pytest.mark.lidarspec("acme-x1"), or give its class'
+            " a `sensor`"
+        )
     return wanted if isinstance(wanted, Sensor) else named(wanted)
 
 
 @pytest.fixture
 def virtual_port(request: pytest.FixtureRequest) -> Iterator[Callable[..., Served]]:
-    """A function that puts a simulated sensor on a real port until the test ends: `lidarspec.testing.fixtures.virtual_port`.
+    """A function that puts a simulated sensor on a real port until the test ends:
+    `lidarspec.testing.fixtures.virtual_port`.
 
-    Its first argument is an id or a Sensor; without one it is the test's own `sensor`. What comes back has a `path` to open.
+    Its first argument is an id or a Sensor; without one it is the test's own `sensor`. What comes
+    back has a `path` to open.
     """
     from lidarspec.testing import fixtures as ports
 
     with ExitStack() as stack:
 
         def opened(wanted: Any = None, **more: Any) -> Served:
-            return stack.enter_context(ports.virtual_port(wanted or request.getfixturevalue("sensor"), **more))
+            return stack.enter_context(
+                ports.virtual_port(wanted or request.getfixturevalue("sensor"), **more)
+            )
 
         yield opened
 
 
 @pytest.fixture
 def bare_registry() -> Iterator[Registry]:
-    """An empty registry in the place of that of this environment: no installed plugin is seen, and `add` adds one."""
+    """An empty registry in the place of that of this environment: no installed plugin is seen, and
+    `add` adds one.
+    """
     from lidarspec.plugins import Registry, standing_in
 
     with standing_in(Registry()) as registry:

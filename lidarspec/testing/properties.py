@@ -44,13 +44,14 @@ class Property:
     """Something that has to hold.
 
     Attributes:
-        function: of the subject, and of a name where it holds for each frame, data frame, command or vector.
+        function: of the subject, and of a name where it holds for each frame, data frame, command
+            or vector.
         each: "sensor", "frame", "data", "command" or "vector".
         rule: that a plain assertion in it falls under.
         lacks: why it does not apply to a sensor, "" where it does.
         unless: rules that say it better; where one of them is broken, this is not looked at.
-        depends_on: attributes of a sensor that decide the result; if a related model that is tested too has
-            the same ones, it is not tested again. Without any it is tested for each sensor.
+        depends_on: attributes of a sensor that decide the result; if a related model that is tested
+            too has the same ones, it is not tested again. Without any it is tested for each sensor.
     """
 
     function: Callable[..., None]
@@ -71,7 +72,11 @@ class Property:
             return [] if self._is_tested_elsewhere(subject) else [()]
         if self.each == "vector":
             return [(place,) for place in vectors.places(subject)]
-        names = {"frame": subject.frames, "data": subject.sensor.data_frames, "command": subject.sensor.commands}
+        names = {
+            "frame": subject.frames,
+            "data": subject.sensor.data_frames,
+            "command": subject.sensor.commands,
+        }
         return [(name,) for name in names[self.each]]
 
     def _is_tested_elsewhere(self, subject: Subject) -> bool:
@@ -79,10 +84,17 @@ class Property:
         if not self.depends_on:
             return False
         wanted = [getattr(subject.sensor, name) for name in self.depends_on]
-        return any(wanted == [getattr(sensor, name) for name in self.depends_on] for sensor in subject.tested)
+        return any(
+            wanted == [getattr(sensor, name) for name in self.depends_on]
+            for sensor in subject.tested
+        )
 
-    def findings(self, subject: Subject, watch: Callable[[str], None] = lambda text: None) -> list[Finding]:
-        """Return the findings of every case that fails; `watch` is called with the name of each case before it begins."""
+    def findings(
+        self, subject: Subject, watch: Callable[[str], None] = lambda text: None
+    ) -> list[Finding]:
+        """Return the findings of every case that fails; `watch` is called with the name of each
+        case before it begins.
+        """
         found = []
         for case in self.cases(subject):
             watch(" ".join((self.name, *case)))
@@ -97,7 +109,9 @@ class Property:
             except SpecError as error:
                 place = ".".join(case)
                 path = error.path if error.path.startswith(place) else place
-                found.append(Finding(error.rule or _rule_of(error), error.reason, path, subject.sensor.id))
+                found.append(
+                    Finding(error.rule or _rule_of(error), error.reason, path, subject.sensor.id)
+                )
             except Exception as error:
                 found.append(_unexpected(error, ".".join(case), subject))
         return found
@@ -114,8 +128,12 @@ PROPERTIES = (
     Property(frames.bytes_survive_parsing_and_building, "frame", "LS302"),
     Property(frames.every_raw_value_survives, "frame", "LS302", unless=("LS302", "LS303")),
     Property(frames.what_follows_is_held, "frame", "LS312", unless=("LS302", "LS303")),
-    Property(frames.values_in_units_build_the_same_bytes, "frame", "LS304", unless=("LS302", "LS303")),
-    Property(frames.values_survive_building_and_parsing, "frame", "LS305", unless=("LS302", "LS303")),
+    Property(
+        frames.values_in_units_build_the_same_bytes, "frame", "LS304", unless=("LS302", "LS303")
+    ),
+    Property(
+        frames.values_survive_building_and_parsing, "frame", "LS305", unless=("LS302", "LS303")
+    ),
     Property(frames.parse_finds_out_the_type, "frame", "LS306"),
     Property(frames.a_truncated_frame_is_a_wire_error, "frame", "LS307"),
     Property(frames.a_damaged_frame_is_at_worst_a_wire_error, "frame", "LS308"),
@@ -123,19 +141,59 @@ PROPERTIES = (
     Property(vectors.every_checksum_is_checked, "frame", "LS212"),
     Property(vectors.the_status_is_proven, "sensor", "LS710"),
     Property(vectors.vectors_hold, "vector", "LS706", lacks=vectors.lacking),
-    Property(vectors.every_data_field_is_pinned_down, "data", "LS711", lacks=vectors.lacking, unless=("LS702", "LS703", "LS707")),
-    Property(vectors.points_stand_in_two_quadrants, "data", "LS712", lacks=vectors.lacking, unless=("LS702", "LS703", "LS707")),
+    Property(
+        vectors.every_data_field_is_pinned_down,
+        "data",
+        "LS711",
+        lacks=vectors.lacking,
+        unless=("LS702", "LS703", "LS707"),
+    ),
+    Property(
+        vectors.points_stand_in_two_quadrants,
+        "data",
+        "LS712",
+        lacks=vectors.lacking,
+        unless=("LS702", "LS703", "LS707"),
+    ),
     Property(geometry.clouds_keep_the_conventions, "data", "LS501"),
     Property(geometry.directions_are_radians, "data", "LS502", unless=FAILS),
     Property(geometry.a_single_point_has_a_direction, "data", "LS503", unless=FAILS),
-    Property(geometry.the_full_circle_is_the_same_as_none, "data", "LS505", unless=(*FAILS, "LS503")),
+    Property(
+        geometry.the_full_circle_is_the_same_as_none, "data", "LS505", unless=(*FAILS, "LS503")
+    ),
     Property(geometry.the_points_turn_as_the_axes_do, "data", "LS511", unless=(*FAILS, "LS502")),
-    Property(geometry.angles_are_in_order, "data", "LS506", lacks=_no_sweep, unless=(*FAILS, "LS502")),
+    Property(
+        geometry.angles_are_in_order, "data", "LS506", lacks=_no_sweep, unless=(*FAILS, "LS502")
+    ),
     Property(geometry.counters_run_on, "data", "LS509", lacks=_no_sweep, unless=FAILS),
-    Property(consistency.turned_angles_turn_the_points, "data", "LS504", lacks=_no_sweep, unless=(*FAILS, "LS502", "LS504", "LS506")),
-    Property(consistency.the_clock_stays_below_its_wrap, "data", "LS512", lacks=_no_sweep, unless=(*FAILS, "LS509")),
-    Property(consistency.times_of_points_fit_the_clock, "data", "LS513", lacks=_no_sweep, unless=(*FAILS, "LS509")),
-    Property(agreement.the_same_bytes_give_the_same_points, "sensor", "LS415", unless=FAILS, depends_on=READING),
+    Property(
+        consistency.turned_angles_turn_the_points,
+        "data",
+        "LS504",
+        lacks=_no_sweep,
+        unless=(*FAILS, "LS502", "LS504", "LS506"),
+    ),
+    Property(
+        consistency.the_clock_stays_below_its_wrap,
+        "data",
+        "LS512",
+        lacks=_no_sweep,
+        unless=(*FAILS, "LS509"),
+    ),
+    Property(
+        consistency.times_of_points_fit_the_clock,
+        "data",
+        "LS513",
+        lacks=_no_sweep,
+        unless=(*FAILS, "LS509"),
+    ),
+    Property(
+        agreement.the_same_bytes_give_the_same_points,
+        "sensor",
+        "LS415",
+        unless=FAILS,
+        depends_on=READING,
+    ),
     Property(agreement.a_clean_input_loses_nothing, "sensor", "LS401", depends_on=READING),
     Property(
         agreement.parse_decode_and_any_cutting_agree,
@@ -144,9 +202,27 @@ PROPERTIES = (
         unless=("LS308", "LS306", "LS401", *FAILS, "LS415"),
         depends_on=READING,
     ),
-    Property(hostile.no_stream_costs_much_more_than_frames, "sensor", "LS416", unless=("LS301", *FAILS), depends_on=("frames",)),
-    Property(agreement.single_packets_equal_a_batch, "sensor", "LS403", unless=("LS415",), depends_on=READING),
-    Property(agreement.scans_do_not_depend_on_batches, "sensor", "LS404", unless=(*FAILS, "LS415"), depends_on=READING),
+    Property(
+        hostile.no_stream_costs_much_more_than_frames,
+        "sensor",
+        "LS416",
+        unless=("LS301", *FAILS),
+        depends_on=("frames",),
+    ),
+    Property(
+        agreement.single_packets_equal_a_batch,
+        "sensor",
+        "LS403",
+        unless=("LS415",),
+        depends_on=READING,
+    ),
+    Property(
+        agreement.scans_do_not_depend_on_batches,
+        "sensor",
+        "LS404",
+        unless=(*FAILS, "LS415"),
+        depends_on=READING,
+    ),
     Property(
         geometry.a_simulated_scene_comes_back,
         "data",
@@ -158,7 +234,11 @@ PROPERTIES = (
     Property(commands.arguments_are_held_to_their_ranges, "command", "LS602", lacks=_no_commands),
     Property(commands.replies_can_match, "command", "LS603", lacks=_no_commands),
     Property(
-        commands.the_simulated_sensor_answers, "command", "LS604", lacks=_no_device, unless=(*FAILS, "LS201", "LS508", "LS601", "LS603")
+        commands.the_simulated_sensor_answers,
+        "command",
+        "LS604",
+        lacks=_no_device,
+        unless=(*FAILS, "LS201", "LS508", "LS601", "LS603"),
     ),
 )
 
@@ -170,18 +250,35 @@ def _gist(error: BaseException) -> str:
 
 
 def _rule_of(error: SpecError) -> str:
-    return "LS115" if "expression of the struct" in error.reason else "LS301" if "random frame" in error.reason else "LS414"
+    return (
+        "LS115"
+        if "expression of the struct" in error.reason
+        else "LS301"
+        if "random frame" in error.reason
+        else "LS414"
+    )
 
 
 def _unexpected(error: Exception, path: str, subject: Subject) -> Finding:
-    """The finding for an exception that nobody documented, at the plugin's own line where it comes from one."""
+    """The finding for an exception that nobody documented, at the plugin's own line where it comes
+    from one.
+    """
     spots = [spot for spot in traceback.extract_tb(error.__traceback__) if not _ours(spot.filename)]
     spot = spots[-1] if spots else None
     text = f"{type(error).__name__}: {str(error).splitlines()[0] if str(error) else ''}"
-    return Finding("LS308", text, path, subject.sensor.id, spot.filename if spot else "", (spot.lineno or 0) if spot else 0)
+    return Finding(
+        "LS308",
+        text,
+        path,
+        subject.sensor.id,
+        spot.filename if spot else "",
+        (spot.lineno or 0) if spot else 0,
+    )
 
 
 def _ours(file: str) -> bool:
     """Whether a file is the engine's, or a library's that it stands on."""
     package = Path(__file__).resolve().parents[1]
-    return package in Path(file).parents or any(part in Path(file).parts for part in ("construct", "numpy", "hypothesis", "_pytest"))
+    return package in Path(file).parents or any(
+        part in Path(file).parts for part in ("construct", "numpy", "hypothesis", "_pytest")
+    )

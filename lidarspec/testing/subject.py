@@ -1,7 +1,9 @@
-"""A sensor under test, and what it is fed: conversations out of its own examples, their edits, cuts and noise.
+"""A sensor under test, and what it is fed: conversations out of its own examples, their edits, cuts
+and noise.
 
-A `Subject` has the sensor, its examples (drawn by the author's own strategies where there are some) and what was measured along the way.
-Everything that is drawn is seeded, so that what fails once fails again.
+A `Subject` has the sensor, its examples (drawn by the author's own strategies where there are some)
+and what was measured along the way. Everything that is drawn is seeded, so that what fails once
+fails again.
 """
 
 from __future__ import annotations
@@ -18,7 +20,8 @@ from lidarspec.framing.frame_engine import codec
 from lidarspec.spec import Frame, Sensor
 from lidarspec.spec.tree import FieldInfo, Sealed, nodes
 
-#: frames up to this length are cut at every byte, longer ones at both ends and at so many places by chance.
+#: frames up to this length are cut at every byte, longer ones at both ends and at so many places by
+#: chance.
 SHORT, SPOTS = 300, 50
 
 
@@ -54,16 +57,24 @@ def pieces(data: bytes, source: random.Random, scale: int = 1) -> Iterator[bytes
         start += size
 
 
-def mutated(data: bytes, source: random.Random, words: Sequence[bytes] = (), spots: Sequence[int] = ()) -> bytes:
+def mutated(
+    data: bytes, source: random.Random, words: Sequence[bytes] = (), spots: Sequence[int] = ()
+) -> bytes:
     """The bytes with a few of them changed, dropped, doubled or put in, or cut short.
 
     Args:
-        words: what is put in or written over as a whole, such as values at the edge of a range, or pieces of other inputs.
-        spots: where half of the changes are made, such as the offsets of fields; without them anywhere.
+        words: what is put in or written over as a whole, such as values at the edge of a range, or
+            pieces of other inputs.
+        spots: where half of the changes are made, such as the offsets of fields; without them
+            anywhere.
     """
     found = bytearray(data)
     for _ in range(source.choice((1, 1, 2, 4))):
-        spot = source.choice(spots) if spots and source.random() < 0.5 else source.randrange(len(found) + 1)
+        spot = (
+            source.choice(spots)
+            if spots and source.random() < 0.5
+            else source.randrange(len(found) + 1)
+        )
         kind = source.randrange(6 if words else 5)
         if kind == 0:
             found[spot : spot + 1] = source.randbytes(1)
@@ -81,9 +92,15 @@ def mutated(data: bytes, source: random.Random, words: Sequence[bytes] = (), spo
     return bytes(found)
 
 
-def integers(parsed: Any, path: str = "", kinds: tuple[type, ...] = (int,)) -> Iterator[tuple[Any, Any, str]]:
-    """The integers, or the values of other types, of a parsed frame: (container, key in it, field path)."""
-    entries: Iterable[tuple[Any, Any]] = parsed.items() if isinstance(parsed, dict) else enumerate(parsed)
+def integers(
+    parsed: Any, path: str = "", kinds: tuple[type, ...] = (int,)
+) -> Iterator[tuple[Any, Any, str]]:
+    """The integers, or the values of other types, of a parsed frame: (container, key in it, field
+    path).
+    """
+    entries: Iterable[tuple[Any, Any]] = (
+        parsed.items() if isinstance(parsed, dict) else enumerate(parsed)
+    )
     for key, value in entries:
         below = path if isinstance(parsed, list) else f"{path}.{key}" if path else key
         if isinstance(value, dict | list):
@@ -93,14 +110,20 @@ def integers(parsed: Any, path: str = "", kinds: tuple[type, ...] = (int,)) -> I
 
 
 def physical(sensor: Sensor, name: str, data: bytes) -> Any:
-    """A parsed frame with its scaled numbers in units; None where one is too wide for a float to hold exactly."""
+    """A parsed frame with its scaled numbers in units; None where one is too wide for a float to
+    hold exactly.
+    """
     fields = codec(sensor.frames[name]).schema.all_fields
     parsed = sensor.parse(data, frame=name)
     for holder, key, path in list(integers(parsed, kinds=(int, float))):
         info = fields.get(path)
         if info is not None and info.scaled:
             value = info.physical(holder[key])
-            if info.kind == "float" and info.dtype is not None and info.dtype.type(info.raw(value)) != holder[key]:
+            if (
+                info.kind == "float"
+                and info.dtype is not None
+                and info.dtype.type(info.raw(value)) != holder[key]
+            ):
                 return None
             if info.kind == "int" and info.bits > 48:
                 return None
@@ -113,12 +136,18 @@ def seals(sensor: Sensor, name: str, data: bytes) -> set[str]:
     engine = codec(sensor.frames[name])
     layout = getattr(engine, "tree", None)
     if layout is None or engine.schema.parts:
-        return {path for node in nodes(sensor.frames[name].tree) if isinstance(node, Sealed) for path in node.fields}
+        return {
+            path
+            for node in nodes(sensor.frames[name].tree)
+            if isinstance(node, Sealed)
+            for path in node.fields
+        }
     found = layout.layout(data)
     return {leaf.info.path for seal in getattr(found, "seals", ()) for leaf in seal.leaves}
 
 
-#: examples of each frame type that a property tries, and those for which numbers of rounds are stated.
+#: examples of each frame type that a property tries, and those for which numbers of rounds are
+#: stated.
 USUAL_EXAMPLES = 40
 #: Rounds of a conversation with the usual number of examples, and at least.
 USUAL_ROUNDS, LEAST_ROUNDS = 3, 2
@@ -142,13 +171,16 @@ class Subject:
     Attributes:
         sensor: it.
         examples: how many examples of each frame type a property tries.
-        strategies: "frame.field" -> how its raw value is drawn: a hypothesis strategy, or a function of `random.Random`.
+        strategies: "frame.field" -> how its raw value is drawn: a hypothesis strategy, or a
+            function of `random.Random`.
         vectors: the file of golden vectors, None where there is none.
         family: the ids of the sensors that share that file; none where it is this sensor's alone.
-        tested: related models that are tested too; frame types that they share are not tested one by one again.
+        tested: related models that are tested too; frame types that they share are not tested one
+            by one again.
         measured: what was measured of frames, in words, by what it is of.
         picture: what was measured of points, likewise: to be held against the manual.
-        traced: what `points` returns for traced columns of each data frame, as far as it could be traced.
+        traced: what `points` returns for traced columns of each data frame, as far as it could be
+            traced.
         swept: packets along the `sweep` of each data frame, as far as a property needed them.
     """
 
@@ -163,13 +195,17 @@ class Subject:
     traced: dict[str, Any] = field(default_factory=dict, repr=False)
     swept: dict[str, list[bytes]] = field(default_factory=dict, repr=False)
     _known: dict[tuple[str, int], bytes] = field(default_factory=dict, repr=False)
-    _drawers: dict[str, dict[str, Callable[[random.Random], int]]] = field(default_factory=dict, repr=False)
+    _drawers: dict[str, dict[str, Callable[[random.Random], int]]] = field(
+        default_factory=dict, repr=False
+    )
 
     @property
     def frames(self) -> dict[str, Frame]:
         """The frame types that are tested one by one."""
         tested = {id(frame) for sensor in self.tested for frame in sensor.frames.values()}
-        return {name: frame for name, frame in self.sensor.frames.items() if id(frame) not in tested}
+        return {
+            name: frame for name, frame in self.sensor.frames.items() if id(frame) not in tested
+        }
 
     def fields(self, frame: str) -> Mapping[str, FieldInfo]:
         """The fields of a frame type, by path."""
@@ -182,14 +218,19 @@ class Subject:
     def seeds(self, name: str, share: float = 1.0) -> range:
         """Return the seeds of the examples of a frame type that are tried.
 
-        They are fewer for long frames, since each field takes its time, and if the sensor has many frame types.
+        They are fewer for long frames, since each field takes its time, and if the sensor has many
+        frame types.
         """
         few = 8 if self.sensor.frames[name].max_length > SHORT else 1
         few *= 2 if len(self.sensor.frames) > MANY else 1
         return range(self.limit_to_bytes(name, max(int(self.examples * share) // few, 3)))
 
-    def limit_to_bytes(self, name: str, number: int, total: int = EXAMPLE_BYTES, least: int = 1) -> int:
-        """Return how many of `number` frames of a type are tried, so that they have at most `total` bytes, or are the `least`."""
+    def limit_to_bytes(
+        self, name: str, number: int, total: int = EXAMPLE_BYTES, least: int = 1
+    ) -> int:
+        """Return how many of `number` frames of a type are tried, so that they have at most `total`
+        bytes, or are the `least`.
+        """
         return min(number, max(total // self.length(name), least))
 
     def length(self, name: str) -> int:
@@ -197,38 +238,60 @@ class Subject:
         return max(1, *(len(self.example(name, seed=seed)) for seed in range(MEASURED_SEEDS)))
 
     def scale_rounds(self, rounds: int, least: int = 1) -> int:
-        """Return a number of rounds that is meant for the usual number of examples, scaled to `examples`."""
+        """Return a number of rounds that is meant for the usual number of examples, scaled to
+        `examples`.
+        """
         return max(rounds * self.examples // USUAL_EXAMPLES, least)
 
     def example(self, frame: str, *, seed: int = 0) -> bytes:
-        """The bytes of a valid frame with seeded content, drawn by the author's strategies where there are some."""
+        """The bytes of a valid frame with seeded content, drawn by the author's strategies where
+        there are some.
+        """
         if (frame, seed) not in self._known:
             drawn, source = self.drawers(frame), random.Random(f"{self.sensor.id} {frame} {seed}")
-            example = random_frame(self.sensor, frame, source, drawn) if drawn else self.sensor.example(frame, seed=seed)
+            example = (
+                random_frame(self.sensor, frame, source, drawn)
+                if drawn
+                else self.sensor.example(frame, seed=seed)
+            )
             self._known[frame, seed] = example
         return self._known[frame, seed]
 
     def drawers(self, frame: str) -> dict[str, Callable[[random.Random], int]]:
         """How raw values of fields of this frame are drawn, by path, where the author says so."""
         if frame not in self._drawers:
-            mine = {path.removeprefix(f"{frame}."): how for path, how in self.strategies.items() if path.partition(".")[0] == frame}
-            self._drawers[frame] = {path: _pooled(how) if hasattr(how, "example") else how for path, how in mine.items()}
+            mine = {
+                path.removeprefix(f"{frame}."): how
+                for path, how in self.strategies.items()
+                if path.partition(".")[0] == frame
+            }
+            self._drawers[frame] = {
+                path: _pooled(how) if hasattr(how, "example") else how for path, how in mine.items()
+            }
         return self._drawers[frame]
 
     def conversation(self, *, seed: int = 0, rounds: int | None = None) -> list[tuple[str, bytes]]:
-        """Frames of all incoming types as the sensor could send them: (type, bytes), each where it is looked for and believed."""
+        """Frames of all incoming types as the sensor could send them: (type, bytes), each where it
+        is looked for and believed.
+        """
         frames: list[tuple[str, bytes]] = []
         size = 0
-        for turn in range(self.scale_rounds(USUAL_ROUNDS, LEAST_ROUNDS) if rounds is None else rounds):
+        for turn in range(
+            self.scale_rounds(USUAL_ROUNDS, LEAST_ROUNDS) if rounds is None else rounds
+        ):
             if size > CONVERSATION_BYTES:
                 break
             for name in self.sensor.incoming:
                 frame = self.sensor.frames[name]
                 number = frame.confirm + 2 if frame.data or frame.confirm > 1 else 1
-                first = seed * 1000 + turn * number  # the lowest seeds, whose examples other properties use as well
+                first = (
+                    seed * 1000 + turn * number
+                )  # the lowest seeds, whose examples other properties use as well
                 if frame.after is not None:
                     frames.append((frame.after, self.example(frame.after, seed=first)))
-                frames += [(name, self.example(name, seed=first + index)) for index in range(number)]
+                frames += [
+                    (name, self.example(name, seed=first + index)) for index in range(number)
+                ]
             size = sum(len(data) for _, data in frames)
         return frames
 
@@ -242,7 +305,11 @@ def _pooled(strategy: Any) -> Callable[[random.Random], int]:
     from hypothesis import HealthCheck, Phase, given, settings
 
     pool: list[int] = []
-    quiet: dict[str, Any] = {"database": None, "deadline": None, "suppress_health_check": list(HealthCheck)}
+    quiet: dict[str, Any] = {
+        "database": None,
+        "deadline": None,
+        "suppress_health_check": list(HealthCheck),
+    }
 
     @settings(max_examples=POOL, derandomize=True, phases=[Phase.generate], **quiet)
     @given(strategy)

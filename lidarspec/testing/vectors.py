@@ -5,13 +5,15 @@
       "units": {"start_angle": 324.27},
       "points": {"0": {"range": 0.224, "x": 0.18186, "y": 0.13078}}}]
 
-`values` are raw integers of the wire, `units` the same in the fields' units, `points` what becomes of single points (range, x, y, z,
-azimuth and elevation in radians, intensity, ring, or a further column under its name). All three may be left out: then the bytes have to
-be such a frame, and build again.
-`sensor` is the id, or a list of ids, of the sensors that an entry is of; where one sensor alone has the file, it may be left out.
-An entry with `command` is what is sent for a command with `args`, by name in units; `reply` is what answers it.
+`values` are raw integers of the wire, `units` the same in the fields' units, `points` what becomes
+of single points (range, x, y, z, azimuth and elevation in radians, intensity, ring, or a further
+column under its name). All three may be left out: then the bytes have to be such a frame, and build
+again. `sensor` is the id, or a list of ids, of the sensors that an entry is of; where one sensor
+alone has the file, it may be left out. An entry with `command` is what is sent for a command with
+`args`, by name in units; `reply` is what answers it.
 
-What the vectors leave open is looked at as well: a status that claims more than there is, and fields of the data that none pins down.
+What the vectors leave open is looked at as well: a status that claims more than there is, and
+fields of the data that none pins down.
 """
 
 from __future__ import annotations
@@ -47,7 +49,8 @@ LAYOUT_EXAMPLES = 8
 CHECK = re.compile(
     r"(\w+_)?(crc|checksum|check_?sum|check|chk|chksum|cksum|cs|bcc|lrc|fcs|xor|sum)_?(8|16|32)?(_(lo|hi|low|high|lsb|msb))?"
 )
-#: doubt at which a field of any other name can only be a checksum: one wrong guess in four thousand looks like that.
+#: doubt at which a field of any other name can only be a checksum: one wrong guess in four thousand
+#: looks like that.
 PROVEN = 12
 #: names of fields that say nothing, and have nothing to be pinned down to.
 IDLE = re.compile(r"reserved|unused|unknown|spare|padding|filler", re.IGNORECASE)
@@ -68,7 +71,9 @@ def _is_table(value: object, one: Callable[[object], bool]) -> bool:
 
 
 def _are_points(value: object) -> bool:
-    return _is_table(value, lambda one: _is_table(one, _is_number)) and all(re.fullmatch(r"-?\d{1,9}", index) for index in cast(Any, value))
+    return _is_table(value, lambda one: _is_table(one, _is_number)) and all(
+        re.fullmatch(r"-?\d{1,9}", index) for index in cast(Any, value)
+    )
 
 
 def _is_text(value: object) -> bool:
@@ -77,20 +82,28 @@ def _is_text(value: object) -> bool:
 
 #: the keys of an entry -> what may stand there, in words and as a test.
 KEYS: dict[str, tuple[str, Callable[[object], bool]]] = {
-    "sensor": ("an id, or a list of ids", lambda one: _is_text(one) or (isinstance(one, list) and all(map(_is_text, one)))),
+    "sensor": (
+        "an id, or a list of ids",
+        lambda one: _is_text(one) or (isinstance(one, list) and all(map(_is_text, one))),
+    ),
     **dict.fromkeys(("command", "reply", "source", "frame", "hex"), ("a text", _is_text)),
     "note": ("anything", lambda one: True),
-    **dict.fromkeys(("args", "values"), ("an object of numbers and texts", lambda one: _is_table(one, _is_value))),
+    **dict.fromkeys(
+        ("args", "values"),
+        ("an object of numbers and texts", lambda one: _is_table(one, _is_value)),
+    ),
     "units": ("an object of numbers", lambda one: _is_table(one, _is_number)),
     "points": ("an object of points, by their numbers, with numbers", _are_points),
 }
 
 
 def vectors_hold(subject: Subject, only: str = "") -> None:
-    """Each golden vector parses to its values, builds again, and has its points where they are said to be.
+    """Each golden vector parses to its values, builds again, and has its points where they are said
+    to be.
 
     Args:
-        only: the place of the one vector that is tried; by default all are, up to the first that fails.
+        only: the place of the one vector that is tried; by default all are, up to the first that
+            fails.
     """
     read_entries = _read_entries(subject)
     chosen = {only: read_entries[only]} if only else read_entries
@@ -102,20 +115,38 @@ def vectors_hold(subject: Subject, only: str = "") -> None:
         name = vector["frame"]
         parsed = _parsed(subject, name, data, place)
         _values(subject, name, data, parsed, vector, place)
-        require(subject.sensor.build(name, parsed) == data, "LS302", "its bytes do not survive parsing and building", f"{place} {name}")
+        require(
+            subject.sensor.build(name, parsed) == data,
+            "LS302",
+            "its bytes do not survive parsing and building",
+            f"{place} {name}",
+        )
         if "command" in vector:
             answer = unhexed(vector["reply"]) if "reply" in vector else None
-            an_exchange_holds(subject.sensor, vector["command"], vector.get("args", {}), data, answer, f"{place} {vector['command']}")
+            an_exchange_holds(
+                subject.sensor,
+                vector["command"],
+                vector.get("args", {}),
+                data,
+                answer,
+                f"{place} {vector['command']}",
+            )
         if vector.get("points"):
             _points(subject, name, data, vector["points"], place)
 
 
 def lacking(subject: Subject) -> str:
-    """Why there are no vectors of this sensor; "" where there are, and where `vectors_hold` says what is wrong with them."""
+    """Why there are no vectors of this sensor; "" where there are, and where `vectors_hold` says
+    what is wrong with them.
+    """
     if subject.vectors is None:
         return "there is no file of golden vectors"
     try:
-        return "" if _read_entries(subject) else f"{Path(subject.vectors).name} has none of {subject.sensor.id}"
+        return (
+            ""
+            if _read_entries(subject)
+            else f"{Path(subject.vectors).name} has none of {subject.sensor.id}"
+        )
     except Violation:
         return ""
 
@@ -145,8 +176,14 @@ def every_data_field_is_pinned_down(subject: Subject, name: str) -> None:
             plain = re.sub(r"\[\d+\]", "", path)
             pinned[plain] = pinned.get(plain, False) or bool(read_as.get(path))
     sealing = _sealing_fields(subject, name)
-    free = [path for path, info in subject.fields(name).items() if info.const is None and info.kind in ("int", "float")]
-    asked = [path for path in free if path not in sealing and not IDLE.search(path.rpartition(".")[2])]
+    free = [
+        path
+        for path, info in subject.fields(name).items()
+        if info.const is None and info.kind in ("int", "float")
+    ]
+    asked = [
+        path for path in free if path not in sealing and not IDLE.search(path.rpartition(".")[2])
+    ]
     said = {"no vector gives a value of": [path for path in asked if path not in pinned]}
     said["0 alone is given of"] = [path for path in asked if pinned.get(path) is False]
     told = "; ".join(f"{words} {', '.join(paths)}" for words, paths in said.items() if paths)
@@ -154,15 +191,27 @@ def every_data_field_is_pinned_down(subject: Subject, name: str) -> None:
 
 
 def points_stand_in_two_quadrants(subject: Subject, name: str) -> None:
-    """Points that the vectors place lie in two quadrants at least, and all points of their frames within the sensor's reach."""
+    """Points that the vectors place lie in two quadrants at least, and all points of their frames
+    within the sensor's reach.
+    """
     vectors = [vector for vector in entries(subject).values() if vector["frame"] == name]
-    placed = [point for vector in vectors for point in vector.get("points", {}).values() if {"x", "y"} <= point.keys()]
+    placed = [
+        point
+        for vector in vectors
+        for point in vector.get("points", {}).values()
+        if {"x", "y"} <= point.keys()
+    ]
     quadrants = {(point["x"] > 0, point["y"] > 0) for point in placed if point["x"] and point["y"]}
-    clouds = [read(subject, name, [unhexed(vector["hex"])] * subject.sensor.frames[name].confirm).points() for vector in vectors]
+    clouds = [
+        read(subject, name, [unhexed(vector["hex"])] * subject.sensor.frames[name].confirm).points()
+        for vector in vectors
+    ]
     ranges = np.concatenate([np.empty(0), *(cloud.range[cloud.valid] for cloud in clouds)])
     seen = f"{ranges.min():.4g} .. {ranges.max():.4g} m" if len(ranges) else "no returns"
     number = f"{len(quadrants)} quadrant{'s' * (len(quadrants) != 1)}"
-    subject.picture[f"{name}: vectors"] = f"{seen} in {len(vectors)} of them, which say x and y in {number}"
+    subject.picture[f"{name}: vectors"] = (
+        f"{seen} in {len(vectors)} of them, which say x and y in {number}"
+    )
     far = subject.sensor.range_limits[1]
     require(
         not len(ranges) or ranges.max() <= far * (1 + NEAR),
@@ -171,45 +220,80 @@ def points_stand_in_two_quadrants(subject: Subject, name: str) -> None:
         name,
     )
     if vectors:
-        require(len(quadrants) > 1, "LS712", f"they say x and y of points in {number}", f"{name}.points")
+        require(
+            len(quadrants) > 1, "LS712", f"they say x and y of points in {number}", f"{name}.points"
+        )
 
 
 def every_checksum_is_checked(subject: Subject, name: str) -> None:
-    """No field that no `Checksummed` names is a checksum, by its own name or by what the search finds over the vectors."""
+    """No field that no `Checksummed` names is a checksum, by its own name or by what the search
+    finds over the vectors.
+    """
     sealing = _sealing_fields(subject, name)
-    free = [path for path, info in subject.fields(name).items() if info.const is None and path not in sealing]
+    free = [
+        path
+        for path, info in subject.fields(name).items()
+        if info.const is None and path not in sealing
+    ]
     named = [path for path in free if CHECK.fullmatch(path.rpartition(".")[2])]
     try:
-        frames = [unhexed(vector["hex"]) for vector in entries(subject).values() if vector["frame"] == name]
+        frames = [
+            unhexed(vector["hex"])
+            for vector in entries(subject).values()
+            if vector["frame"] == name
+        ]
     except Violation:  # said by `vectors_hold`
         frames = []
-    is_told = isinstance(codec(subject.sensor.frames[name]), CompiledCodec)  # else nobody says which field a checksum would stand in
+    is_told = isinstance(
+        codec(subject.sensor.frames[name]), CompiledCodec
+    )  # else nobody says which field a checksum would stand in
     for match in _common(frames) if is_told and not sealing else []:
         path = _standing(subject, name, match, frames[0])
         if path in (named or free) and (named or match.doubt >= PROVEN):
             fits = f"{_in_words(match, len(frames[0]))} fits every vector"
-            raise Violation("LS212", f"{fits}, and no Checksummed holds a frame to it", f"{name}.{path}")
-    require(not named, "LS212", "it is a checksum by its name, and no Checksummed holds a frame to it", f"{name}.{''.join(named[:1])}")
+            raise Violation(
+                "LS212", f"{fits}, and no Checksummed holds a frame to it", f"{name}.{path}"
+            )
+    require(
+        not named,
+        "LS212",
+        "it is a checksum by its name, and no Checksummed holds a frame to it",
+        f"{name}.{''.join(named[:1])}",
+    )
 
 
 def _sealing_fields(subject: Subject, name: str) -> set[str]:
-    """Return the fields that hold a checksum in any of several examples, since a header may leave a part out with its checksum."""
+    """Return the fields that hold a checksum in any of several examples, since a header may leave a
+    part out with its checksum.
+    """
     if not any(isinstance(node, Sealed) for node in nodes(subject.sensor.frames[name].tree)):
         return set()
-    return set().union(*(seals(subject.sensor, name, subject.example(name, seed=seed)) for seed in range(LAYOUT_EXAMPLES)))
+    return set().union(
+        *(
+            seals(subject.sensor, name, subject.example(name, seed=seed))
+            for seed in range(LAYOUT_EXAMPLES)
+        )
+    )
 
 
-def _fitting(subject: Subject, name: str, path: str, frames: list[bytes], frame: bytes) -> list[Match]:
-    """Return the checksums that fit frames and stand in the field at `path` of one of them, as wide as it is.
+def _fitting(
+    subject: Subject, name: str, path: str, frames: list[bytes], frame: bytes
+) -> list[Match]:
+    """Return the checksums that fit frames and stand in the field at `path` of one of them, as wide
+    as it is.
 
-    If some are of the library, those that need a class of their own are left out: they fit because these do.
+    If some are of the library, those that need a class of their own are left out: they fit because
+    these do.
     """
     engine = codec(subject.sensor.frames[name])
     layout = engine.tree.layout(frame) if isinstance(engine, CompiledCodec) else None
     leaf = layout.leaves.get(path) if isinstance(layout, Layout) else None
 
     def stands(place: Place) -> bool:
-        return leaf is None or (place.start(len(frame)), 8 * place.size) == (leaf.offset, leaf.info.bits)
+        return leaf is None or (place.start(len(frame)), 8 * place.size) == (
+            leaf.offset,
+            leaf.info.bits,
+        )
 
     matches = search(frames, stands=stands)
     return [match for match in matches if not _needs_class(match)] or matches
@@ -227,11 +311,20 @@ def _in_words(match: Match, length: int) -> str:
 
 
 def _common(frames: list[bytes]) -> list[Match]:
-    """The checksums that fit all of some frames; long ones are searched one by one, for what stands where checksums usually do."""
+    """The checksums that fit all of some frames; long ones are searched one by one, for what stands
+    where checksums usually do.
+    """
     if max(map(len, frames), default=0) <= SHORT:
         return search(frames)
-    first, *others = [{(match.paste, match.place, match.span): match for match in search([frame])} for frame in frames]
-    return [replace(match, doubt=match.doubt * len(frames)) for key, match in first.items() if all(key in other for other in others)]
+    first, *others = [
+        {(match.paste, match.place, match.span): match for match in search([frame])}
+        for frame in frames
+    ]
+    return [
+        replace(match, doubt=match.doubt * len(frames))
+        for key, match in first.items()
+        if all(key in other for other in others)
+    ]
 
 
 def _standing(subject: Subject, name: str, match: Match, frame: bytes) -> str:
@@ -240,7 +333,14 @@ def _standing(subject: Subject, name: str, match: Match, frame: bytes) -> str:
     layout = engine.tree.layout(frame) if isinstance(engine, CompiledCodec) else None
     start = match.place.start(len(frame))
     leaves = layout.leaves.items() if isinstance(layout, Layout) else ()
-    return next((path for path, leaf in leaves if leaf.offset in range(start, start + match.place.size) and not leaf.shape), "")
+    return next(
+        (
+            path
+            for path, leaf in leaves
+            if leaf.offset in range(start, start + match.place.size) and not leaf.shape
+        ),
+        "",
+    )
 
 
 def entries(subject: Subject) -> dict[str, Any]:
@@ -249,11 +349,17 @@ def entries(subject: Subject) -> dict[str, Any]:
     Raises:
         Violation: if the file cannot be read.
     """
-    return {place: vector for place, vector in _read_entries(subject).items() if not isinstance(vector, Violation)}
+    return {
+        place: vector
+        for place, vector in _read_entries(subject).items()
+        if not isinstance(vector, Violation)
+    }
 
 
 def _read_entries(subject: Subject) -> dict[str, Any]:
-    """Return the vectors of the sensor by their places in the file; for an entry that is none, its `Violation`."""
+    """Return the vectors of the sensor by their places in the file; for an entry that is none, its
+    `Violation`.
+    """
     if subject.vectors is None:
         return {}
     try:
@@ -292,7 +398,12 @@ def _check_entry(subject: Subject, vector: Any, place: str) -> bool:
         vector.setdefault("frame", known.frame if known is not None else None)
         sends = known is not None and known.frame == vector["frame"]
         require(sends, "LS702", f"no command {vector['command']!r} sends such a frame", place)
-    require(vector.get("frame") in subject.sensor.frames, "LS702", f"there is no frame {vector.get('frame')!r}", place)
+    require(
+        vector.get("frame") in subject.sensor.frames,
+        "LS702",
+        f"there is no frame {vector.get('frame')!r}",
+        place,
+    )
     try:
         unhexed(vector.get("hex", "-"))
         unhexed(vector.get("reply", ""))
@@ -302,13 +413,23 @@ def _check_entry(subject: Subject, vector: Any, place: str) -> bool:
 
 
 def _is_of(subject: Subject, vector: Mapping[str, Any], place: str) -> bool:
-    """Whether an entry is of the sensor; one that could be of nobody, or of any of several, is a finding."""
+    """Whether an entry is of the sensor; one that could be of nobody, or of any of several, is a
+    finding.
+    """
     named, family = vector.get("sensor", []), subject.family
     ids = [named] if isinstance(named, str) else named
-    told = f'it names no sensor, and the file is shared by {", ".join(family)}: "sensor": "{subject.sensor.id}"'
+    told = (
+        f'it names no sensor, and the file is shared by {", ".join(family)}: "sensor":'
+        f' "{subject.sensor.id}"'
+    )
     require(ids or len(family) < 2, "LS702", told, place)
     nobody = [one for one in ids if family and one not in family]
-    require(not nobody, "LS702", f"there is no sensor {', '.join(map(repr, nobody))} here, but {', '.join(family)}", place)
+    require(
+        not nobody,
+        "LS702",
+        f"there is no sensor {', '.join(map(repr, nobody))} here, but {', '.join(family)}",
+        place,
+    )
     return not ids or subject.sensor.id in ids
 
 
@@ -320,14 +441,19 @@ def _parsed(subject: Subject, name: str, data: bytes, place: str) -> Any:
         if ": checksum " not in error.reason:
             raise Violation("LS707", error.reason, f"{place} {name}.{error.path}") from error
         same = [unhexed(one["hex"]) for one in entries(subject).values() if one["frame"] == name]
-        fitting = [_in_words(match, len(data)) for match in _fitting(subject, name, error.path, same, data)[:2]]
+        fitting = [
+            _in_words(match, len(data))
+            for match in _fitting(subject, name, error.path, same, data)[:2]
+        ]
         fits = f"; {' or '.join(fitting)} fits" if fitting else ""
         raise Violation("LS703", f"{error.reason}{fits}", f"{place} {name}.{error.path}") from error
     except LidarSpecError as error:
         raise Violation("LS707", str(error), f"{place} {name}") from error
 
 
-def _values(subject: Subject, name: str, data: bytes, parsed: Any, vector: Mapping[str, Any], place: str) -> None:
+def _values(
+    subject: Subject, name: str, data: bytes, parsed: Any, vector: Mapping[str, Any], place: str
+) -> None:
     """Hold the fields of a vector to its values, raw and in units."""
     fields, found = subject.fields(name), dict(leaves(parsed))
     wanted = [(path, value, False) for path, value in vector.get("values", {}).items()]
@@ -335,12 +461,26 @@ def _values(subject: Subject, name: str, data: bytes, parsed: Any, vector: Mappi
     for path, value, in_units in wanted:
         require(path in found, "LS702", f"the frame has no field {path!r}", f"{place} {name}")
         info, raw = fields.get(re.sub(r"\[\d+\]", "", path)), found[path]
-        plain: Any = raw.hex(" ") if isinstance(raw, bytes) else info.physical(raw) if in_units and info is not None else raw
+        plain: Any = (
+            raw.hex(" ")
+            if isinstance(raw, bytes)
+            else info.physical(raw)
+            if in_units and info is not None
+            else raw
+        )
         near = abs(info.scale) * 0.5001 if in_units and info is not None else 0
-        if plain == value or (isinstance(value, int | float) and isinstance(plain, int | float) and abs(plain - value) <= near):
+        if plain == value or (
+            isinstance(value, int | float)
+            and isinstance(plain, int | float)
+            and abs(plain - value) <= near
+        ):
             continue
         expected = info.raw(value) if in_units and info is not None else value
-        raise Violation(_reading(info, raw, expected), f"{plain} is read, and {value} is printed", f"{place} {name}.{path}")
+        raise Violation(
+            _reading(info, raw, expected),
+            f"{plain} is read, and {value} is printed",
+            f"{place} {name}.{path}",
+        )
 
 
 def _reading(info: FieldInfo | None, raw: Any, wanted: Any) -> str:
@@ -355,18 +495,39 @@ def _reading(info: FieldInfo | None, raw: Any, wanted: Any) -> str:
     return "LS704" if size > 1 and swapped % top == wanted % top else "LS706"
 
 
-def _points(subject: Subject, name: str, data: bytes, wanted: Mapping[str, Mapping[str, float]], place: str) -> None:
+def _points(
+    subject: Subject, name: str, data: bytes, wanted: Mapping[str, Mapping[str, float]], place: str
+) -> None:
     """Hold single points of a vector's frame to where they are said to be."""
     cloud = read(subject, name, [data] * subject.sensor.frames[name].confirm).points()
     known = cloud.columns.keys() - {"time"}
     for index, columns in wanted.items():
         spot = int(index)
-        require(-len(cloud) <= spot < len(cloud), "LS708", f"there is no point {spot} among {len(cloud)}", f"{place} {name}")
+        require(
+            -len(cloud) <= spot < len(cloud),
+            "LS708",
+            f"there is no point {spot} among {len(cloud)}",
+            f"{place} {name}",
+        )
         got = {}
         for column in columns:
             require(column in known, "LS702", f"points have no {column!r}", f"{place} {name}")
             got[column] = float(cloud.columns[column][spot])
-        wrong = [column for column, value in columns.items() if not np.isclose(got[column], value, rtol=NEAR, atol=NEAR)]
-        mirrored = all(column in ("y", "azimuth") and np.isclose(got[column], -columns[column], atol=NEAR) for column in wrong)
-        said = ", ".join(f"{column} is {got[column]:.5g}, and {columns[column]:g} is printed" for column in wrong)
-        require(not wrong, "LS709" if mirrored else "LS708", f"point {spot}: {said}", f"{place} {name}.points")
+        wrong = [
+            column
+            for column, value in columns.items()
+            if not np.isclose(got[column], value, rtol=NEAR, atol=NEAR)
+        ]
+        mirrored = all(
+            column in ("y", "azimuth") and np.isclose(got[column], -columns[column], atol=NEAR)
+            for column in wrong
+        )
+        said = ", ".join(
+            f"{column} is {got[column]:.5g}, and {columns[column]:g} is printed" for column in wrong
+        )
+        require(
+            not wrong,
+            "LS709" if mirrored else "LS708",
+            f"point {spot}: {said}",
+            f"{place} {name}.points",
+        )

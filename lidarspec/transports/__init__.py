@@ -1,6 +1,7 @@
 """Where bytes come from, and go to.
 
-In: a SOURCE as text. Out: an open `Transport`, which gives `Chunk`s and takes bytes to send. Modules in reading order:
+In: a SOURCE as text. Out: an open `Transport`, which gives `Chunk`s and takes bytes to send.
+Modules in reading order:
 
 * `protocol`: what a transport is, live or not; plugins derive from it.
 * `open_url`: from a SOURCE to the transport that opens it.

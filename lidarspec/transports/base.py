@@ -1,4 +1,6 @@
-"""What transports share: addresses with options, the host's clock, waiting for a descriptor, failures with the next command."""
+"""What transports share: addresses with options, the host's clock, waiting for a descriptor,
+failures with the next command.
+"""
 
 from __future__ import annotations
 
@@ -21,20 +23,24 @@ from lidarspec.spec.links import Link
 from lidarspec.spec.sensor import Sensor
 from lidarspec.transports.protocol import Chunk, Disconnected, LiveTransport, Origin
 
-#: options that every live SOURCE takes: the address of the link that commands go over, where it is not that of the data, and of everybody.
+#: options that every live SOURCE takes: the address of the link that commands go over, where it is
+#: not that of the data, and of everybody.
 COMMON = frozenset({"control", "broadcast"})
-#: seconds between two reads, in which a fast line gathers some bytes: it would wake us for every one.
+#: seconds between two reads, in which a fast line gathers some bytes: it would wake us for every
+#: one.
 PAUSE = 0.002
 #: ns by which a wall clock may go differently; more is a clock that was set.
 PARTED = 50_000_000
 #: times that both are read where something comes between; what may come between is a part of that.
 TRIES = 10
-#: ns between two readings of a clock after which a thread was held up: a reading takes less than a thousandth of it.
+#: ns between two readings of a clock after which a thread was held up: a reading takes less than a
+#: thousandth of it.
 HELD_UP_NS = 200_000
 _BOOTTIME: int | None = getattr(time, "CLOCK_BOOTTIME", None)
 L = TypeVar("L", bound=Link)
 _Descriptor = int | socket.socket
-#: `select` knows no descriptor above 1,023; Windows, which has nothing else, does not number them so.
+#: `select` knows no descriptor above 1,023; Windows, which has nothing else, does not number them
+#: so.
 _Poll = getattr(selectors, "PollSelector", selectors.SelectSelector)
 _SWITCH = {"0": False, "1": True, "false": False, "true": True, "off": False, "on": True}
 
@@ -60,11 +66,23 @@ class Address:
         """The address that a text stands for.
 
         Args:
-            text: "udp://:2368?src=10.0.0.5", or a port's name with options, where `scheme` says what it is.
+            text: "udp://:2368?src=10.0.0.5", or a port's name with options, where `scheme` says
+                what it is.
         """
-        begin, mark, rest = text.partition("://") if "://" in text else text.partition(":") if not scheme else (scheme, "", text)
+        begin, mark, rest = (
+            text.partition("://")
+            if "://" in text
+            else text.partition(":")
+            if not scheme
+            else (scheme, "", text)
+        )
         place, _, query = (rest if mark else text).partition("?")
-        return cls(text, scheme or begin, place, {name: values[-1] for name, values in parse_qs(query, keep_blank_values=True).items()})
+        return cls(
+            text,
+            scheme or begin,
+            place,
+            {name: values[-1] for name, values in parse_qs(query, keep_blank_values=True).items()},
+        )
 
     def check(self, known: Collection[str]) -> None:
         """Refuse options that the source does not take.
@@ -100,7 +118,8 @@ class Address:
         return None if text is None else _SWITCH[text.lower()]
 
     def host_and_port(self) -> tuple[str, int | None]:
-        """Host and port of the place, "" and None where they are left out; an IPv6 host stands in brackets.
+        """Host and port of the place, "" and None where they are left out; an IPv6 host stands in
+        brackets.
 
         Raises:
             UsageError: where the place is no host and port.
@@ -117,7 +136,9 @@ class Address:
 def with_option(source: str | Path, name: str, value: object) -> str:
     """A SOURCE with an option behind its question mark, in the place of one that is there."""
     place, _, query = str(source).partition("?")
-    options = [option for option in query.split("&") if option and not option.startswith(f"{name}=")]
+    options = [
+        option for option in query.split("&") if option and not option.startswith(f"{name}=")
+    ]
     return f"{place}?{'&'.join([*options, f'{name}={value}'])}"
 
 
@@ -147,12 +168,15 @@ def numeric(host: str, place: str) -> str:
         for family in (socket.AF_INET, socket.AF_INET6):
             with contextlib.suppress(OSError, ValueError):
                 return str(socket.getaddrinfo(host, None, family, socket.SOCK_DGRAM)[0][4][0])
-    error = UsageError(f"{place}: there is no host {host!r}; name one, or its address, such as 192.168.1.200")
+    error = UsageError(
+        f"{place}: there is no host {host!r}; name one, or its address, such as 192.168.1.200"
+    )
     raise suggest(error, "lidarspec detect udp://")
 
 
 class HostClock:
-    """Times of the wall clock that a steady clock carries on: none of their intervals jumps when the clock is set, or lacks a suspend.
+    """Times of the wall clock that a steady clock carries on: none of their intervals jumps when
+    the clock is set, or lacks a suspend.
 
     Args:
         wall: the wall clock, ns since 1970.
@@ -172,7 +196,8 @@ class HostClock:
     def now_and_wall(self) -> tuple[int, int]:
         """Return the time of this clock and of the wall clock at one moment, ns since 1970.
 
-        A thread may be held up between the two readings: then both are taken again, and the closest ones are returned.
+        A thread may be held up between the two readings: then both are taken again, and the closest
+        ones are returned.
         """
         closest: tuple[int, int, int] | None = None
         for _ in range(TRIES):
@@ -187,7 +212,9 @@ class HostClock:
         return closest[1:]
 
     def parted(self) -> int | None:
-        """By how many ns the wall clock is ahead of these times, where it was set by more than 50 ms since the last call; else None."""
+        """By how many ns the wall clock is ahead of these times, where it was set by more than 50
+        ms since the last call; else None.
+        """
         difference, doubt = self._difference()
         ahead = difference - self._offset
         if abs(ahead - self._ahead) <= PARTED or doubt > PARTED // TRIES:
@@ -196,18 +223,24 @@ class HostClock:
         return ahead
 
     def _difference(self) -> tuple[int, int]:
-        """By how much the wall clock is ahead of the steady one, and how wrong that may be: one is read after the other."""
+        """By how much the wall clock is ahead of the steady one, and how wrong that may be: one is
+        read after the other.
+        """
         before, wall = steady_ns(), self._wall()
         return wall - before, steady_ns() - before
 
 
 def steady_ns() -> int:
-    """A clock that nobody sets, in ns; where the system has one, one that goes on while it is suspended."""
+    """A clock that nobody sets, in ns; where the system has one, one that goes on while it is
+    suspended.
+    """
     return time.monotonic_ns() if _BOOTTIME is None else time.clock_gettime_ns(_BOOTTIME)
 
 
 def own_address(host: str) -> str | None:
-    """The address of this computer on the way to a host; None where there is no way. Nothing is sent."""
+    """The address of this computer on the way to a host; None where there is no way. Nothing is
+    sent.
+    """
     family = socket.AF_INET6 if ":" in host else socket.AF_INET
     with contextlib.suppress(OSError), socket.socket(family, socket.SOCK_DGRAM) as probe:
         probe.setsockopt(socket.SOL_SOCKET, socket.SO_BROADCAST, 1)
@@ -217,7 +250,9 @@ def own_address(host: str) -> str | None:
 
 
 def rest(until: float) -> None:
-    """Returns at a time of the monotonic clock: between two reads some bytes gather, so that not each of them wakes us."""
+    """Returns at a time of the monotonic clock: between two reads some bytes gather, so that not
+    each of them wakes us.
+    """
     if (pause := until - time.monotonic()) > 0:
         time.sleep(pause)
 
@@ -255,13 +290,23 @@ def readable(descriptor: int, timeout: float) -> bool:
     return bool(ready([descriptor], [], timeout)[0])
 
 
-def ready(reading: Collection[_Descriptor], writing: Collection[_Descriptor], timeout: float) -> tuple[list[Any], list[Any]]:
-    """What of these can be read, or has hung up, and what can be written to, within so many seconds; descriptors may have any number."""
+def ready(
+    reading: Collection[_Descriptor], writing: Collection[_Descriptor], timeout: float
+) -> tuple[list[Any], list[Any]]:
+    """What of these can be read, or has hung up, and what can be written to, within so many
+    seconds; descriptors may have any number.
+    """
     with _Poll() as poll:
         for one in {*reading, *writing}:
-            poll.register(one, selectors.EVENT_READ * (one in reading) | selectors.EVENT_WRITE * (one in writing))
+            poll.register(
+                one,
+                selectors.EVENT_READ * (one in reading) | selectors.EVENT_WRITE * (one in writing),
+            )
         found = poll.select(timeout)
-    to_read, to_write = ([key.fileobj for key, events in found if events & kind] for kind in (selectors.EVENT_READ, selectors.EVENT_WRITE))
+    to_read, to_write = (
+        [key.fileobj for key, events in found if events & kind]
+        for kind in (selectors.EVENT_READ, selectors.EVENT_WRITE)
+    )
     return to_read, to_write
 
 
@@ -276,7 +321,9 @@ def lost(label: str, error: BaseException | str) -> Disconnected:
 
 
 def reason(error: BaseException | str) -> str:
-    """What the system says, in its own words, also where pyserial wraps it in a sentence of its own."""
+    """What the system says, in its own words, also where pyserial wraps it in a sentence of its
+    own.
+    """
     numbers = error_numbers(error) if isinstance(error, BaseException) else []
     return os.strerror(numbers[0]) if numbers else str(error)
 

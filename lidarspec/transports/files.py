@@ -1,7 +1,9 @@
-"""Files and standard input as transports: recordings, captures, logs (see `bags`), raw bytes, hexadecimal text.
+"""Files and standard input as transports: recordings, captures, logs (see `bags`), raw bytes,
+hexadecimal text.
 
-A file ends, and is read as fast as it is asked for. Recordings and captures give what was received at the times of then, and count
-what they leave out; bytes alone have no times. `open_file` tells them apart by what they hold.
+A file ends, and is read as fast as it is asked for. Recordings and captures give what was received
+at the times of then, and count what they leave out; bytes alone have no times. `open_file` tells
+them apart by what they hold.
 """
 
 from __future__ import annotations
@@ -37,7 +39,8 @@ HEX_SUFFIXES, TEXT_SUFFIXES = {".hex", ".txt"}, {".log", ".csv", ".asc"}
 
 
 class RecordingTransport(Transport):
-    """What was received, as it arrived; commands that were sent and events are passed over, and leave their gap.
+    """What was received, as it arrived; commands that were sent and events are passed over, and
+    leave their gap.
 
     Args:
         path: the file.
@@ -49,11 +52,21 @@ class RecordingTransport(Transport):
         header: what the recording says of itself.
     """
 
-    def __init__(self, path: str, file: BinaryIO | None = None, *, sender: str | None = None, salvage: bool = False) -> None:
+    def __init__(
+        self,
+        path: str,
+        file: BinaryIO | None = None,
+        *,
+        sender: str | None = None,
+        salvage: bool = False,
+    ) -> None:
         self._file = file or (sys.stdin.buffer if path == "-" else opened(path))
         self._recording = Recording(path, self._file, salvage=salvage)
         self.header: Header = self._recording.header
-        self.datagrams, self._origin = self.header.datagrams, None if sender is None else origin(sender)
+        self.datagrams, self._origin = (
+            self.header.datagrams,
+            None if sender is None else origin(sender),
+        )
         self.warnings: list[str] = []
         self._no_events, self._was_set, self._has_skipped = 0, False, False
 
@@ -80,13 +93,23 @@ class RecordingTransport(Transport):
             if record.direction == "event":
                 interrupted = self._interrupts(record) or interrupted
             elif record.direction == "in" and self._wanted(record):
-                yield Chunk(record.data, record.at, record.sender, record.receiver, interrupted or record.gap, record.quiet)
+                yield Chunk(
+                    record.data,
+                    record.at,
+                    record.sender,
+                    record.receiver,
+                    interrupted or record.gap,
+                    record.quiet,
+                )
                 interrupted = False
         if _is_whole(self, self._file) and self._recording.damaged:
             self.warnings.append(_damage(self._recording))
             self.unread = 0 if self._recording.is_cut else self._recording.leftover
         if self._no_events:
-            self.warnings.append(f"{self._recording.path}: {self._no_events} events were passed over, which have no name")
+            self.warnings.append(
+                f"{self._recording.path}: {self._no_events} events were passed over, which have no"
+                " name"
+            )
 
     def skip(self, at: int) -> bool:
         self._has_skipped = self._recording.seek(at)
@@ -105,7 +128,9 @@ class RecordingTransport(Transport):
         return False
 
     def _interrupts(self, record: Record) -> bool:
-        """Whether an event says that the line was interrupted; counts disconnects, and takes down that the clock was set."""
+        """Whether an event says that the line was interrupted; counts disconnects, and takes down
+        that the clock was set.
+        """
         try:
             event = json.loads(record.data)
             name = event["event"]
@@ -116,7 +141,10 @@ class RecordingTransport(Transport):
             return False
         if name == "clock" and not self._was_set:
             self._was_set = True
-            text = "the clock of the computer was set while it recorded; the arrival times go on evenly, as it was at first"
+            text = (
+                "the clock of the computer was set while it recorded; the arrival times go on"
+                " evenly, as it was at first"
+            )
             self.warnings.append(f"{self._recording.path}: {text}")
         return is_interruption
 
@@ -134,11 +162,16 @@ def _damage(recording: Recording) -> str:
 
 def _passed_over(path: str, places: int, size: int) -> str:
     """How much of a file was not read between what was."""
-    return f"{path} is damaged in {places} place{'s' * (places > 1)}: {size} bytes were not read, everything else was"
+    return (
+        f"{path} is damaged in {places} place{'s' * (places > 1)}: {size} bytes were not read,"
+        " everything else was"
+    )
 
 
 def _is_whole(transport: FileTransport | RecordingTransport, file: BinaryIO) -> bool:
-    """Whether a file that was unpacked ended as it should; its transport takes down where it did not."""
+    """Whether a file that was unpacked ended as it should; its transport takes down where it did
+    not.
+    """
     fault = damage(file)
     if fault is not None:
         transport.warnings.append(fault.text)
@@ -159,8 +192,13 @@ class FileTransport(Transport):
 
     @property
     def can_go_on(self) -> bool:
-        """Whether another one can begin where this one stands: of bytes as they are, and batches of a capture."""
-        return type(self) in (FileTransport, CaptureTransport, StreamCaptureTransport) and self.file.seekable()
+        """Whether another one can begin where this one stands: of bytes as they are, and batches of
+        a capture.
+        """
+        return (
+            type(self) in (FileTransport, CaptureTransport, StreamCaptureTransport)
+            and self.file.seekable()
+        )
 
     def chunks(self) -> Iterator[Chunk]:
         with system_errors(self._path):
@@ -181,24 +219,37 @@ class FileTransport(Transport):
         if stats.damaged:
             self.warnings.append(_passed_over(self._path, stats.damaged, stats.lost))
         if _is_whole(self, self.file) and stats.truncated_tail:
-            self.warnings.append(f"{self._path} is cut off in its last record; everything before it was read")
+            self.warnings.append(
+                f"{self._path} is cut off in its last record; everything before it was read"
+            )
         if stats.snapped:
-            self.warnings.append(f"{self._path}: {stats.snapped} packets were cut by the capture's snap length")
+            self.warnings.append(
+                f"{self._path}: {stats.snapped} packets were cut by the capture's snap length"
+            )
         if stats.other > stats.datagrams:
             kinds = ", ".join(f"{number} {what}" for what, number in stats.others.most_common())
-            self.warnings.append(f"{self._path}: {stats.other} of {stats.packets} packets are no UDP over IP, and were not read: {kinds}")
+            self.warnings.append(
+                f"{self._path}: {stats.other} of {stats.packets} packets are no UDP over IP, and"
+                f" were not read: {kinds}"
+            )
         if not stats.packets:
             self.warnings.append(f"{self._path} is a capture without a packet")
         if stats.incomplete_fragments:
             self.warnings.append(
-                f"{self._path}: {stats.incomplete_fragments} IP fragments were left out, others of their datagrams are missing"
+                f"{self._path}: {stats.incomplete_fragments} IP fragments were left out, others of"
+                " their datagrams are missing"
             )
         if contradicting := stats.malformed - stats.damaged:
-            self.warnings.append(f"{self._path}: {contradicting} packets were left out, since their headers contradict themselves")
+            self.warnings.append(
+                f"{self._path}: {contradicting} packets were left out, since their headers"
+                " contradict themselves"
+            )
 
 
 class HexTransport(FileTransport):
-    """Bytes written as hexadecimal text, at the times that it tells; lines without digits are passed over."""
+    """Bytes written as hexadecimal text, at the times that it tells; lines without digits are
+    passed over.
+    """
 
     def chunks(self) -> Iterator[Chunk]:
         yield from hex_chunks(self._path, self.file.readline)
@@ -227,7 +278,9 @@ class CaptureTransport(FileTransport):
             if self._origin is not None and datagram.source not in self._origin:
                 self.foreign += 1
                 continue
-            yield Chunk(datagram.data, datagram.at, datagram.source, datagram.destination, self._gap())
+            yield Chunk(
+                datagram.data, datagram.at, datagram.source, datagram.destination, self._gap()
+            )
         self._warn(reader.stats)
 
     def batches(self) -> Iterator[Batch]:
@@ -267,8 +320,11 @@ class StreamCaptureTransport(CaptureTransport):
         self._warn(reader.stats)
 
 
-def open_file(path: str, *, sender: str | None = None, member: str = "") -> FileTransport | RecordingTransport | BagTransport:
-    """The transport for a file, by what it holds; "-" is standard input, which is told by its beginning too; a folder is a bag's.
+def open_file(
+    path: str, *, sender: str | None = None, member: str = ""
+) -> FileTransport | RecordingTransport | BagTransport:
+    """The transport for a file, by what it holds; "-" is standard input, which is told by its
+    beginning too; a folder is a bag's.
 
     Args:
         sender: only what comes from this address, or topic.
@@ -276,21 +332,31 @@ def open_file(path: str, *, sender: str | None = None, member: str = "") -> File
 
     Raises:
         SourceError: where it cannot be opened, or is a file of another kind.
-        UsageError: where a library is missing that reads it, and for an archive of several captures.
+        UsageError: where a library is missing that reads it, and for an archive of several
+            captures.
     """
     if (log := log_of(path)) is not None:
         return BagTransport(path, log, sender=sender)
     name = "standard input" if path == "-" else path
     with system_errors(path), contextlib.ExitStack() as undo:
-        plain = sys.stdin.buffer if path == "-" else undo.enter_context(contextlib.closing(file_of(path)))
+        plain = (
+            sys.stdin.buffer
+            if path == "-"
+            else undo.enter_context(contextlib.closing(file_of(path)))
+        )
         file = unpacked(name, plain, member)
         start = head(file)
         log = log_of(path, start)
         if log is not None and (file is not plain or path == "-"):
-            raise SourceError(f"{name} is {log.what}{' in a compressed file' * (file is not plain)}, and is not read: give the file itself")
+            raise SourceError(
+                f"{name} is {log.what}{' in a compressed file' * (file is not plain)}, and is not"
+                " read: give the file itself"
+            )
         refuse_container(name, start)
         if log is not None and is_stored(path):
-            raise SourceError(f"{path} is {log.what}, which is read from this computer alone: copy it here")
+            raise SourceError(
+                f"{path} is {log.what}, which is read from this computer alone: copy it here"
+            )
         if log is not None:
             return BagTransport(path, log, sender=sender)
         undo.pop_all()  # the transport closes it
@@ -299,7 +365,9 @@ def open_file(path: str, *, sender: str | None = None, member: str = "") -> File
     return found
 
 
-def _by_content(path: str, name: str, file: BinaryIO, start: bytes, sender: str | None) -> FileTransport | RecordingTransport:
+def _by_content(
+    path: str, name: str, file: BinaryIO, start: bytes, sender: str | None
+) -> FileTransport | RecordingTransport:
     """The transport for what a file begins with."""
     if start.startswith(MAGIC):
         return RecordingTransport(path, file, sender=sender)
@@ -308,5 +376,7 @@ def _by_content(path: str, name: str, file: BinaryIO, start: bytes, sender: str 
     if is_capture(start):
         return CaptureTransport(name, file, sender=sender)
     suffixes = set(Path(path.lower()).suffixes[-2:])  # that of a compressed file is behind it
-    is_text = suffixes & HEX_SUFFIXES or (suffixes & TEXT_SUFFIXES and is_hexadecimal(start, whole=len(start) < HEAD))
+    is_text = suffixes & HEX_SUFFIXES or (
+        suffixes & TEXT_SUFFIXES and is_hexadecimal(start, whole=len(start) < HEAD)
+    )
     return HexTransport(name, file) if is_text else FileTransport(name, file)

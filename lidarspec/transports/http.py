@@ -1,7 +1,8 @@
 """HTTP: the web server of a sensor as a link, and that of a simulated one.
 
-A message is what `HttpRequest` and `HttpReply` describe: method, path and body; status and body. A request is bounded in time, and its
-reply in size, whatever the other side sends. Requests wait for one another.
+A message is what `HttpRequest` and `HttpReply` describe: method, path and body; status and body. A
+request is bounded in time, and its reply in size, whatever the other side sends. Requests wait for
+one another.
 """
 
 from __future__ import annotations
@@ -25,7 +26,8 @@ BODY, PATIENCE = 1 << 20, 2.0
 
 
 class HttpTransport(LiveTransport):
-    """Requests to a host, each in the thread that reads; what goes wrong with one is said in `warnings`, and it stays unanswered.
+    """Requests to a host, each in the thread that reads; what goes wrong with one is said in
+    `warnings`, and it stays unanswered.
 
     Args:
         host: name or address of the sensor.
@@ -36,7 +38,10 @@ class HttpTransport(LiveTransport):
 
     def __init__(self, host: str, link: Http) -> None:
         self._host, self._link, self._clock = host, link, HostClock()
-        self.label, self.warnings = f"http://{f'[{host}]' if ':' in host else host}:{link.port}", list[str]()
+        self.label, self.warnings = (
+            f"http://{f'[{host}]' if ':' in host else host}:{link.port}",
+            list[str](),
+        )
         self._requests = queue.SimpleQueue[bytes]()
 
     def read(self, timeout: float) -> list[Chunk]:
@@ -53,7 +58,9 @@ class HttpTransport(LiveTransport):
             return []
         self.warnings = []
         if location:
-            self.warnings = [f"{self.label}{path}: status {status}, moved to {location}, which is not followed"]
+            self.warnings = [
+                f"{self.label}{path}: status {status}, moved to {location}, which is not followed"
+            ]
         reply = HttpReply.build({"status": status, "size": len(body), "body": body})
         return [Chunk(reply, self._clock.now(), (self._host, self._link.port))]
 
@@ -61,7 +68,10 @@ class HttpTransport(LiveTransport):
         try:
             HttpRequest.parse(data)
         except Exception:
-            raise UsageError(f"{self.label}: over HTTP go messages as HttpRequest describes them, not {data[:16].hex(' ')}") from None
+            raise UsageError(
+                f"{self.label}: over HTTP go messages as HttpRequest describes them, not"
+                f" {data[:16].hex(' ')}"
+            ) from None
         self._requests.put(data)
 
     def reopen(self) -> None:
@@ -75,7 +85,9 @@ class HttpTransport(LiveTransport):
 
     def _request(self, method: str, path: str, body: bytes) -> tuple[int, bytes, str]:
         """Return the status and the body of a reply, and where a redirection leads."""
-        connection = http.client.HTTPConnection(self._host, self._link.port, timeout=self._link.timeout)
+        connection = http.client.HTTPConnection(
+            self._host, self._link.port, timeout=self._link.timeout
+        )
         with contextlib.closing(connection):
             connection.connect()
             limit = threading.Timer(self._link.timeout, _hang_up, [connection.sock])
@@ -90,7 +102,10 @@ class HttpTransport(LiveTransport):
             if len(found) > self._link.largest:
                 raise ValueError(f"the reply is longer than {self._link.largest} bytes")
             if reply.length:
-                raise ValueError(f"the reply ends {reply.length} bytes too early, or took longer than {self._link.timeout:g} s")
+                raise ValueError(
+                    f"the reply ends {reply.length} bytes too early, or took longer than"
+                    f" {self._link.timeout:g} s"
+                )
             location = reply.getheader("Location", "") if 300 <= reply.status < 400 else ""
             return reply.status, found, location
 
@@ -101,7 +116,8 @@ def _hang_up(connection: socket.socket) -> None:
 
 
 class Server(ThreadingHTTPServer):
-    """The web server of a simulated sensor, in threads of its own: what is not answered in time has the status 504.
+    """The web server of a simulated sensor, in threads of its own: what is not answered in time has
+    the status 504.
 
     Args:
         host, port: where to listen; port 0 takes any that is free.
@@ -120,7 +136,12 @@ class Server(ThreadingHTTPServer):
         self.asked, self.waiting = queue.SimpleQueue[bytes](), deque[queue.SimpleQueue[bytes]]()
         self.order = threading.Lock()
         super().__init__((host, port), _Handler)
-        threading.Thread(target=self.serve_forever, kwargs={"poll_interval": 0.05}, name=f"http://{host}:{port}", daemon=True).start()
+        threading.Thread(
+            target=self.serve_forever,
+            kwargs={"poll_interval": 0.05},
+            name=f"http://{host}:{port}",
+            daemon=True,
+        ).start()
 
     def server_close(self) -> None:
         """End it."""
@@ -138,7 +159,13 @@ class _Handler(BaseHTTPRequestHandler):
         size = self.headers.get("Content-Length", "0")
         body = self.rfile.read(int(size)) if size.isdecimal() and int(size) <= BODY else b""
         path, answer = self.path.encode("latin-1"), queue.SimpleQueue[bytes]()
-        request = {"method": self.command, "path_size": len(path), "path": path, "size": len(body), "body": body}
+        request = {
+            "method": self.command,
+            "path_size": len(path),
+            "path": path,
+            "size": len(body),
+            "body": body,
+        }
         with self.server.order:
             self.server.waiting.append(answer)
             self.server.asked.put(HttpRequest.build(request))

@@ -34,10 +34,12 @@ def transport(source: str | Path, sensor: Sensor | None = None) -> Transport:
     """The open transport for a SOURCE.
 
     Args:
-        sensor: whose declared link says what the source leaves out: baud rate, control lines, ports.
+        sensor: whose declared link says what the source leaves out: baud rate, control lines,
+            ports.
 
     Raises:
-        UsageError: for a scheme that neither the package nor a plugin knows, and what each kind of source does not take.
+        UsageError: for a scheme that neither the package nor a plugin knows, and what each kind of
+            source does not take.
         SourceError: where it cannot be opened.
         SpecError: where a plugin gives something that is no `Transport`.
     """
@@ -50,7 +52,11 @@ def transport(source: str | Path, sensor: Sensor | None = None) -> Transport:
         options = parse_qs(query, keep_blank_values=True)
         if unknown := set(options) - FILE_OPTIONS:
             raise UnknownOption(min(unknown), FILE_OPTIONS, place=text)
-        return open_file(path, sender=options["src"][-1] if "src" in options else None, member=options.get("file", [""])[-1])
+        return open_file(
+            path,
+            sender=options["src"][-1] if "src" in options else None,
+            member=options.get("file", [""])[-1],
+        )
     return open_file(text)
 
 
@@ -58,10 +64,12 @@ def live(source: str | Path, sensor: Sensor | None = None) -> LiveTransport:
     """The open transport for a SOURCE that does not end by itself.
 
     Args:
-        sensor: whose declared link says what the source leaves out: baud rate, control lines, ports.
+        sensor: whose declared link says what the source leaves out: baud rate, control lines,
+            ports.
 
     Raises:
-        UsageError: for a file, a scheme that nobody knows, and what its kind of source does not take.
+        UsageError: for a file, a scheme that nobody knows, and what its kind of source does not
+            take.
         SourceError: where it cannot be opened.
     """
     opened = transport(source, sensor)
@@ -83,7 +91,9 @@ def is_live(source: str | Path) -> bool:
 
 
 def live_address(source: str | Path) -> Address | None:
-    """What a SOURCE says where it is no file: its scheme, place and options; None for files and standard input."""
+    """What a SOURCE says where it is no file: its scheme, place and options; None for files and
+    standard input.
+    """
     text = str(source)
     if is_port(text):
         return Address.parse(text, scheme="serial")
@@ -112,7 +122,8 @@ def control_link(source: str | Path, name: str, link: Link, host: str | None) ->
 
     Args:
         name, link: the link as the sensor declares it.
-        host: the sensor's address as far as it is known; ``control=HOST[:PORT]`` of the source comes before it.
+        host: the sensor's address as far as it is known; ``control=HOST[:PORT]`` of the source
+            comes before it.
 
     Raises:
         UsageError: where nobody says the address.
@@ -133,18 +144,39 @@ def control_link(source: str | Path, name: str, link: Link, host: str | None) ->
     if isinstance(link, Udp) and (known or link.broadcast):
         from lidarspec.transports.udp import UdpTransport
 
-        everybody = address.options.get("broadcast", "255.255.255.255") if address is not None else ""
-        remote = (numeric(known or everybody, str(source)), port or (link.ports[0] if known and link.ports else link.broadcast))
+        everybody = (
+            address.options.get("broadcast", "255.255.255.255") if address is not None else ""
+        )
+        remote = (
+            numeric(known or everybody, str(source)),
+            port or (link.ports[0] if known and link.ports else link.broadcast),
+        )
         own, label = "::" if ":" in remote[0] else "", f"udp://{_bracketed(remote[0])}:{remote[1]}"
-        return UdpTransport(label, [link.local], host=own, sender=remote[0] if known else None, remote=remote, broadcast=not known)
+        return UdpTransport(
+            label,
+            [link.local],
+            host=own,
+            sender=remote[0] if known else None,
+            remote=remote,
+            broadcast=not known,
+        )
     opened = registry().call("lidarspec_link", source=str(source), link=link, host=known)
     if isinstance(opened, LiveTransport):
         return opened
     if opened is not None:
-        raise SpecError(f"{name} link: what a plugin gives has to derive from LiveTransport, and is a {type(opened).__name__}")
+        raise SpecError(
+            f"{name} link: what a plugin gives has to derive from LiveTransport, and is a"
+            f" {type(opened).__name__}"
+        )
     if not isinstance(link, Tcp | Udp | Http):
-        raise UsageError(f"{source}: no plugin is installed that opens a {type(link).__name__} link, which {name} is")
-    raise failure(f"{source}: nobody knows the address of the {name} link", f"the same with ?control=ADDRESS in {source}")
+        raise UsageError(
+            f"{source}: no plugin is installed that opens a {type(link).__name__} link, which"
+            f" {name} is"
+        )
+    raise failure(
+        f"{source}: nobody knows the address of the {name} link",
+        f"the same with ?control=ADDRESS in {source}",
+    )
 
 
 def _opened(address: Address, sensor: Sensor | None) -> Transport:
@@ -156,9 +188,15 @@ def _opened(address: Address, sensor: Sensor | None) -> Transport:
     plugged = registry().call("lidarspec_source", url=address.text, sensor=sensor)
     if plugged is None:
         known = ", ".join(f"{scheme}:" for scheme in SCHEMES)
-        raise UsageError(f"no transport is installed for {address.scheme!r} sources; known are files, - (standard input), {known}")
+        raise UsageError(
+            f"no transport is installed for {address.scheme!r} sources; known are files, -"
+            f" (standard input), {known}"
+        )
     if not isinstance(plugged, Transport):
-        raise SpecError(f"{address.scheme!r} sources: what a plugin gives has to derive from Transport, and is a {type(plugged).__name__}")
+        raise SpecError(
+            f"{address.scheme!r} sources: what a plugin gives has to derive from Transport, and is"
+            f" a {type(plugged).__name__}"
+        )
     return plugged
 
 

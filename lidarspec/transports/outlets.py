@@ -1,8 +1,10 @@
-"""Outlets: where bytes go in the place of a sensor: a pseudo-terminal, datagrams, TCP connections, a file.
+"""Outlets: where bytes go in the place of a sensor: a pseudo-terminal, datagrams, TCP connections,
+a file.
 
-One mechanism for simulated sensors and for replays; `serving` drives both by the clock. As a real sensor would, an outlet takes
-what it is sent whether somebody listens or not, and counts what nobody took. Only where `patient` is asked for it waits for its
-reader: a replay, which is to arrive whole, and a simulated sensor without a pace of its own.
+One mechanism for simulated sensors and for replays; `serving` drives both by the clock. As a real
+sensor would, an outlet takes what it is sent whether somebody listens or not, and counts what
+nobody took. Only where `patient` is asked for it waits for its reader: a replay, which is to arrive
+whole, and a simulated sensor without a pace of its own.
 """
 
 from __future__ import annotations
@@ -33,10 +35,12 @@ try:
 except ImportError:  # no POSIX
     termios = None  # type: ignore[assignment]
 
-#: bytes of commands read at once, and bytes that wait for a slow reader at most: of a connection, and of a pseudo-terminal.
+#: bytes of commands read at once, and bytes that wait for a slow reader at most: of a connection,
+#: and of a pseudo-terminal.
 BLOCK, BACKLOG, PTY_BACKLOG = 1 << 16, 1 << 20, 1 << 18
 HERE, EVERYBODY_HERE, NOBODY = "127.0.0.1", "127.255.255.255", ("127.0.0.1", 9)
-#: seconds between two looks at whether somebody listens; what a listener takes to settle, since many drop what came while they opened.
+#: seconds between two looks at whether somebody listens; what a listener takes to settle, since
+#: many drop what came while they opened.
 LOOK, SETTLE = 0.02, 0.25
 #: seconds between two looks at a pseudo-terminal that nobody has open.
 UNHEARD = 0.005
@@ -52,7 +56,8 @@ class Outlet:
         heard: whether somebody listens, as far as that can be known.
         unsent: bytes that nobody took in time.
         port: where it listens, 0 where it does not.
-        controls: the outlets of the sensor's other links, by name, over which it is asked and answers.
+        controls: the outlets of the sensor's other links, by name, over which it is asked and
+            answers.
     """
 
     place: str = ""
@@ -69,7 +74,11 @@ class Outlet:
     def _controlled(self, source: str) -> str:
         """A SOURCE with the address that commands go to: with its port where there is one only."""
         ports = {control.port for control in self.controls.values()}
-        return with_option(source, "control", f"{HERE}:{ports.pop()}" if len(ports) == 1 else HERE) if ports else source
+        return (
+            with_option(source, "control", f"{HERE}:{ports.pop()}" if len(ports) == 1 else HERE)
+            if ports
+            else source
+        )
 
     def send(self, chunks: Sequence[Chunk], *, patient: bool) -> None:
         """Send, in order, and where `patient`, wait until there is room.
@@ -86,7 +95,9 @@ class Outlet:
         return []
 
     def await_listener(self) -> None:
-        """Returns when somebody listens who can have everything from its beginning on, where that can be known."""
+        """Returns when somebody listens who can have everything from its beginning on, where that
+        can be known.
+        """
 
     def unplug(self) -> None:
         """The device is gone: nobody can listen."""
@@ -109,7 +120,8 @@ class UdpOutlet(Outlet):
 
     Args:
         host: the name or address of a computer.
-        ports: one port takes everything; otherwise each datagram goes to the one that it was sent to.
+        ports: one port takes everything; otherwise each datagram goes to the one that it was sent
+            to.
         port: for datagrams that do not say where they went.
 
     Attributes:
@@ -121,13 +133,25 @@ class UdpOutlet(Outlet):
 
     def __init__(self, host: str = HERE, ports: Sequence[int] = (), *, port: int = 0) -> None:
         self._only, self._port = ports[0] if len(ports) == 1 else 0, port
-        listed = f":{ports[0]}" if len(ports) == 1 else f"?port={','.join(map(str, ports))}" if ports else ""
+        listed = (
+            f":{ports[0]}"
+            if len(ports) == 1
+            else f"?port={','.join(map(str, ports))}"
+            if ports
+            else ""
+        )
         try:
-            family, kind, _, _, address = socket.getaddrinfo(host, self._only or 9, type=socket.SOCK_DGRAM)[0]
+            family, kind, _, _, address = socket.getaddrinfo(
+                host, self._only or 9, type=socket.SOCK_DGRAM
+            )[0]
         except OSError as error:
-            raise failure(f"udp://{host}{listed}: there is no host {host!r} ({reason(error)})", f"ping {host}") from None
+            raise failure(
+                f"udp://{host}{listed}: there is no host {host!r} ({reason(error)})", f"ping {host}"
+            ) from None
         self.host = str(address[0])
-        self.place = f"udp://[{self.host}]{listed}" if ":" in self.host else f"udp://{self.host}{listed}"
+        self.place = (
+            f"udp://[{self.host}]{listed}" if ":" in self.host else f"udp://{self.host}{listed}"
+        )
         self._socket = socket.socket(family, kind)
         self._socket.setblocking(False)
         with contextlib.suppress(OSError):
@@ -135,12 +159,20 @@ class UdpOutlet(Outlet):
 
     @property
     def source(self) -> str:
-        """The SOURCE by which a program on that computer listens: datagrams from elsewhere come in at every interface."""
-        return self._controlled(self.place if self.host == HERE else "udp://" + self.place.removeprefix(f"udp://{self.host}"))
+        """The SOURCE by which a program on that computer listens: datagrams from elsewhere come in
+        at every interface.
+        """
+        return self._controlled(
+            self.place
+            if self.host == HERE
+            else "udp://" + self.place.removeprefix(f"udp://{self.host}")
+        )
 
     def receive(self, wait: float) -> list[bytes]:
         if ready([self._socket], [], wait)[0]:
-            with contextlib.suppress(OSError):  # what a destination that does not listen is told with
+            with contextlib.suppress(
+                OSError
+            ):  # what a destination that does not listen is told with
                 data, sender = self._socket.recvfrom(BLOCK)
                 return [data] if sender[0] == self.host else []
         return []
@@ -235,7 +267,8 @@ class TcpOutlet(Outlet):
         self._listener = listener(*self._address)
 
     def finish(self) -> None:
-        """Hang up when the last bytes have been sent: closing with something unread would take back what is on its way.
+        """Hang up when the last bytes have been sent: closing with something unread would take back
+        what is on its way.
 
         Whoever goes on sending is not waited for longer than who keeps silent.
         """
@@ -288,7 +321,8 @@ class AnsweringOutlet(Outlet):
     """Datagrams that are answered: what is sent goes to whoever asked last.
 
     Args:
-        host, port: where to listen; port 0 takes any that is free. What is broadcast within this computer is heard too.
+        host, port: where to listen; port 0 takes any that is free. What is broadcast within this
+            computer is heard too.
 
     Raises:
         OSError: where the address cannot be had.
@@ -338,12 +372,16 @@ class HttpOutlet(Outlet):
 
     def receive(self, wait: float) -> list[bytes]:
         with contextlib.suppress(queue.Empty):
-            return [self._server.asked.get(timeout=wait) if wait else self._server.asked.get_nowait()]
+            return [
+                self._server.asked.get(timeout=wait) if wait else self._server.asked.get_nowait()
+            ]
         return []
 
     def send(self, chunks: Sequence[Chunk], *, patient: bool) -> None:
         for chunk in chunks:
-            with contextlib.suppress(IndexError):  # who asked has been told already that there is no answer
+            with contextlib.suppress(
+                IndexError
+            ):  # who asked has been told already that there is no answer
                 self._server.waiting.popleft().put(chunk.data)
 
     def close(self) -> None:
@@ -362,7 +400,8 @@ def _bound(host: str, port: int) -> socket.socket:
 
 
 class PtyOutlet(Outlet):
-    """A serial port that programs open by its path, POSIX only; bytes sent while nobody has it open are lost, as on a wire.
+    """A serial port that programs open by its path, POSIX only; bytes sent while nobody has it open
+    are lost, as on a wire.
 
     Args:
         link: a symbolic link that leads to it, and comes and goes with it.
@@ -382,11 +421,16 @@ class PtyOutlet(Outlet):
     def plug(self) -> None:
         """Make the port, in raw mode, with nobody on it."""
         if not has_terminals():
-            raise failure("this system has no pseudo-terminals", f"the same with --to tcp://{HERE}:2111")
+            raise failure(
+                "this system has no pseudo-terminals", f"the same with --to tcp://{HERE}:2111"
+            )
         try:
             self._master, slave = os.openpty()
         except OSError as error:
-            raise failure(f"no pseudo-terminal can be had: {reason(error)}", f"the same with --to tcp://{HERE}:2111") from None
+            raise failure(
+                f"no pseudo-terminal can be had: {reason(error)}",
+                f"the same with --to tcp://{HERE}:2111",
+            ) from None
         self.path = os.ttyname(slave)
         self.place = str(self._link or self.path)
         tty.setraw(slave)
@@ -398,7 +442,11 @@ class PtyOutlet(Outlet):
 
     def unplug(self) -> None:
         """Hang up, and take the link away."""
-        if self._link is not None and self._link.is_symlink() and os.readlink(self._link) == self.path:
+        if (
+            self._link is not None
+            and self._link.is_symlink()
+            and os.readlink(self._link) == self.path
+        ):
             self._link.unlink()
         if self._master >= 0:
             os.close(self._master)
@@ -499,7 +547,9 @@ class PtyOutlet(Outlet):
         except OSError as error:
             self._link = None
             self.unplug()
-            raise failure(f"{link}: the link cannot be made: {reason(error)}", f"ls -l {link}") from None
+            raise failure(
+                f"{link}: the link cannot be made: {reason(error)}", f"ls -l {link}"
+            ) from None
 
 
 class FileOutlet(Outlet):
@@ -528,11 +578,16 @@ def listener(host: str, port: int) -> socket.socket:
         SourceError: where the address cannot be had.
     """
     try:
-        server = socket.create_server((host, port), family=socket.AF_INET6 if ":" in host else socket.AF_INET)
+        server = socket.create_server(
+            (host, port), family=socket.AF_INET6 if ":" in host else socket.AF_INET
+        )
     except OSError as error:
         text = f"tcp://{host}:{port}: cannot listen there: {reason(error)}"
         is_taken = error.errno == errno.EADDRINUSE
-        raise failure(text, f"ss -ltnp 'sport = :{port}'" if is_taken else f"the same with tcp://{HERE}:{port}") from None
+        raise failure(
+            text,
+            f"ss -ltnp 'sport = :{port}'" if is_taken else f"the same with tcp://{HERE}:{port}",
+        ) from None
     server.setblocking(False)
     return server
 
@@ -543,7 +598,9 @@ def has_terminals() -> bool:
 
 
 def _controls(sensor: Sensor) -> dict[str, Outlet]:
-    """Where a simulated sensor is asked over its other links: on this computer, at the declared ports, or free ones if these are taken."""
+    """Where a simulated sensor is asked over its other links: on this computer, at the declared
+    ports, or free ones if these are taken.
+    """
     found: dict[str, Outlet] = {}
     for name in {command.link for command in sensor.commands.values()} - {"data"}:
         declared = sensor.links[name]
@@ -561,7 +618,13 @@ def _controls(sensor: Sensor) -> dict[str, Outlet]:
 
 def declared_port(link: Link) -> int:
     """The port at which a sensor is asked over a link, 0 where it declares none."""
-    return link.port if isinstance(link, Tcp | Http) else (*link.ports, link.broadcast)[0] if isinstance(link, Udp) else 0
+    return (
+        link.port
+        if isinstance(link, Tcp | Http)
+        else (*link.ports, link.broadcast)[0]
+        if isinstance(link, Udp)
+        else 0
+    )
 
 
 def simulated_outlet(sensor: Sensor, place: str, link: str | Path | None = None) -> Outlet:
@@ -580,9 +643,11 @@ def simulated_outlet(sensor: Sensor, place: str, link: str | Path | None = None)
 
 
 def _data_outlet(sensor: Sensor, place: str, link: str | Path | None) -> Outlet:
-    """The outlet of a simulated sensor: "pty", "udp://HOST:PORT" or "tcp://HOST:PORT"; TCP port 0 takes one that is free.
+    """The outlet of a simulated sensor: "pty", "udp://HOST:PORT" or "tcp://HOST:PORT"; TCP port 0
+    takes one that is free.
 
-    Without a UDP port, data goes to the first one that the sensor declares and the rest to its second.
+    Without a UDP port, data goes to the first one that the sensor declares and the rest to its
+    second.
 
     Args:
         link: a path that leads to the pseudo-terminal.
@@ -593,11 +658,17 @@ def _data_outlet(sensor: Sensor, place: str, link: str | Path | None) -> Outlet:
     """
     if place == "pty":
         if sensor.datagrams:
-            raise UsageError(f"{sensor.id} sends datagrams, which a serial port cannot carry: simulate it to udp://{HERE}")
+            raise UsageError(
+                f"{sensor.id} sends datagrams, which a serial port cannot carry: simulate it to"
+                f" udp://{HERE}"
+            )
         return PtyOutlet(link)
     scheme = place.partition("://")[0] if "://" in place else ""
     if scheme not in ("udp", "tcp"):
-        raise UsageError(f"{place!r} is no destination: pty, udp://HOST:PORT, tcp://HOST:PORT, or a file (.lsr, .pcap, .pcapng, .bin)")
+        raise UsageError(
+            f"{place!r} is no destination: pty, udp://HOST:PORT, tcp://HOST:PORT, or a file (.lsr,"
+            " .pcap, .pcapng, .bin)"
+        )
     if link is not None:
         raise UsageError("a link leads to a pseudo-terminal: it goes with pty alone")
     host, port = _host_and_port(place)
@@ -608,7 +679,9 @@ def _data_outlet(sensor: Sensor, place: str, link: str | Path | None) -> Outlet:
             raise UsageError(f"{sensor.id} declares no TCP port: name one, as in tcp://{host}:2111")
         return TcpOutlet(host, port)
     if not isinstance(declared, Udp) or not sensor.datagrams:
-        raise UsageError(f"{sensor.id} sends a stream of bytes, no datagrams: simulate it to pty or tcp://")
+        raise UsageError(
+            f"{sensor.id} sends a stream of bytes, no datagrams: simulate it to pty or tcp://"
+        )
     ports = (port,) if port else declared.ports[:2]
     if not ports:
         raise UsageError(f"{sensor.id} declares no port: name one, as in udp://{host}:2368")
@@ -616,25 +689,36 @@ def _data_outlet(sensor: Sensor, place: str, link: str | Path | None) -> Outlet:
 
 
 def replay_outlet(place: str, *, datagrams: bool, port: int = 0) -> Outlet:
-    """The outlet of a replay: "pty", "udp://HOST" or "tcp://HOST:PORT"; TCP port 0 takes one that is free.
+    """The outlet of a replay: "pty", "udp://HOST" or "tcp://HOST:PORT"; TCP port 0 takes one that
+    is free.
 
     Args:
-        datagrams: whether datagrams were recorded. Without a UDP port, each goes to the one that it was sent to then.
+        datagrams: whether datagrams were recorded. Without a UDP port, each goes to the one that it
+            was sent to then.
         port: for datagrams that do not say where they went.
 
     Raises:
-        UsageError: for what is no destination, and one that cannot take the place of what was recorded.
+        UsageError: for what is no destination, and one that cannot take the place of what was
+            recorded.
         SourceError: where it cannot be had.
     """
     if place == "pty" or place.startswith("tcp:"):
         if datagrams:
-            raise UsageError(f"datagrams were recorded, and {place} is a byte stream: play them to udp://{HERE}")
+            raise UsageError(
+                f"datagrams were recorded, and {place} is a byte stream: play them to udp://{HERE}"
+            )
         if place == "pty":
             return PtyOutlet()
     elif not place.startswith("udp:"):
-        raise UsageError(f"a replay goes to pty, udp://host:port, tcp://host:port or a new file, not to {place!r}")
+        raise UsageError(
+            "a replay goes to pty, udp://host:port, tcp://host:port or a new file, not to"
+            f" {place!r}"
+        )
     elif not datagrams:
-        raise UsageError(f"a byte stream was recorded, and {place} takes datagrams: play it to pty or tcp://{HERE}:PORT")
+        raise UsageError(
+            f"a byte stream was recorded, and {place} takes datagrams: play it to pty or"
+            f" tcp://{HERE}:PORT"
+        )
     host, named = _host_and_port(place)
     if place.startswith("udp:"):
         return UdpOutlet(host, (named,) if named else (), port=port)
@@ -644,7 +728,9 @@ def replay_outlet(place: str, *, datagrams: bool, port: int = 0) -> Outlet:
 
 
 def _host_and_port(place: str) -> tuple[str, int | None]:
-    """Host, this computer where it is left out, and port of a destination; 0 where any free one will do."""
+    """Host, this computer where it is left out, and port of a destination; 0 where any free one
+    will do.
+    """
     address = Address.parse(place)
     address.check(())
     if address.scheme == "tcp" and address.place.endswith(":0"):

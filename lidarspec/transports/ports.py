@@ -1,4 +1,6 @@
-"""The serial and UDP ports of this computer: which there are, who may open them, and who has them open."""
+"""The serial and UDP ports of this computer: which there are, who may open them, and who has them
+open.
+"""
 
 from __future__ import annotations
 
@@ -57,14 +59,20 @@ def serial_ports() -> list[SerialPort]:
         description = port.description if port.description not in (None, "n/a") else ""
         maker = f" by {port.manufacturer}" if port.manufacturer else ""
         path = port.device
-        found.append(SerialPort(path, f"{description}{maker}".strip(), lasting(path), allowed(path), users(path)))
+        found.append(
+            SerialPort(
+                path, f"{description}{maker}".strip(), lasting(path), allowed(path), users(path)
+            )
+        )
     return found
 
 
 def lasting(port: str) -> str:
     """The name under /dev/serial/by-id that leads to a port, "" where there is none."""
     links = sorted(Path("/dev/serial/by-id").glob("*"))
-    return next((str(link) for link in links if os.path.realpath(link) == os.path.realpath(port)), "")
+    return next(
+        (str(link) for link in links if os.path.realpath(link) == os.path.realpath(port)), ""
+    )
 
 
 def allowed(port: str) -> bool:
@@ -83,9 +91,15 @@ def group(port: str) -> str:
 
 
 def users(port: str) -> tuple[User, ...]:
-    """The programs that have a port open, this one left out; without root's rights only one's own are seen."""
+    """The programs that have a port open, this one left out; without root's rights only one's own
+    are seen.
+    """
     path = os.path.realpath(port)
-    return tuple(sorted(set(_holding(lambda target: target == path)), key=lambda user: user.pid)) if os.path.exists(path) else ()
+    return (
+        tuple(sorted(set(_holding(lambda target: target == path)), key=lambda user: user.pid))
+        if os.path.exists(path)
+        else ()
+    )
 
 
 def udp_users(port: int) -> tuple[User, ...] | None:
@@ -100,7 +114,11 @@ def udp_users(port: int) -> tuple[User, ...] | None:
                 columns = line.split()
                 if int(columns[1].rpartition(":")[2], 16) == port:
                     inodes.add(f"socket:[{columns[9]}]")
-    return tuple(sorted(set(_holding(inodes.__contains__)), key=lambda user: user.pid)) if inodes else None
+    return (
+        tuple(sorted(set(_holding(inodes.__contains__)), key=lambda user: user.pid))
+        if inodes
+        else None
+    )
 
 
 def _holding(wanted: Callable[[str], bool]) -> Iterator[User]:
@@ -110,7 +128,9 @@ def _holding(wanted: Callable[[str], bool]) -> Iterator[User]:
             continue
         with contextlib.suppress(OSError):
             if any(wanted(target) for target in _targets(process / "fd")):
-                yield User(int(process.name), (process / "comm").read_text(encoding="utf-8").strip())
+                yield User(
+                    int(process.name), (process / "comm").read_text(encoding="utf-8").strip()
+                )
 
 
 def _targets(folder: Path) -> Iterator[str]:
@@ -121,7 +141,9 @@ def _targets(folder: Path) -> Iterator[str]:
 
 
 def received() -> dict[str, int]:
-    """Packets that each network interface has received so far; empty where the system does not tell."""
+    """Packets that each network interface has received so far; empty where the system does not
+    tell.
+    """
     found = {}
     with contextlib.suppress(OSError, ValueError, IndexError):
         for line in Path("/proc/net/dev").read_text(encoding="ascii").splitlines()[2:]:
@@ -131,8 +153,13 @@ def received() -> dict[str, int]:
 
 
 def filters_senders(interface: str) -> bool:
-    """Whether the system throws away packets from addresses that it would not answer over this interface (strict rp_filter)."""
+    """Whether the system throws away packets from addresses that it would not answer over this
+    interface (strict rp_filter).
+    """
     with contextlib.suppress(OSError):
-        values = [Path(f"/proc/sys/net/ipv4/conf/{name}/rp_filter").read_text(encoding="ascii").strip() for name in ("all", interface)]
+        values = [
+            Path(f"/proc/sys/net/ipv4/conf/{name}/rp_filter").read_text(encoding="ascii").strip()
+            for name in ("all", interface)
+        ]
         return max(values) == "1"
     return False

@@ -1,7 +1,8 @@
 """What a plugin can add besides sensors: file formats and sources.
 
-A `Transport` is the only place for input and output: it gives `Chunk`s and takes bytes. What it can do is said by its class
-(a `LiveTransport` does not end by itself) and by its attributes, all of which have a default here.
+A `Transport` is the only place for input and output: it gives `Chunk`s and takes bytes. What it can
+do is said by its class (a `LiveTransport` does not end by itself) and by its attributes, all of
+which have a default here.
 """
 
 from __future__ import annotations
@@ -26,7 +27,9 @@ Sender = tuple[str, int]
 
 @dataclass(frozen=True)
 class Origin:
-    """Whose datagrams are wanted: those of an address, or of one of its ports; a sender is `in` it, or not."""
+    """Whose datagrams are wanted: those of an address, or of one of its ports; a sender is `in` it,
+    or not.
+    """
 
     host: str
     port: int | None = None
@@ -56,17 +59,22 @@ def endpoint(sender: Sender) -> str:
 
 
 def sender_names(ends: Iterable[tuple[Sender | None, Sender | None]]) -> dict[Sender | None, str]:
-    """What to call each sender: by its address, and its port where several of one address send to one port; "" where nobody knows it.
+    """What to call each sender: by its address, and its port where several of one address send to
+    one port; "" where nobody knows it.
 
     Args:
-        ends: sender and receiver of datagrams; a sensor may send from several ports, but not the same.
+        ends: sender and receiver of datagrams; a sensor may send from several ports, but not the
+            same.
     """
     known, ports = dict.fromkeys(ends), defaultdict[tuple[str, int | None], set[int]](set)
     for sender, receiver in known:
         if sender is not None:
             ports[sender[0], receiver and receiver[1]].add(sender[1])
     shared = {host for (host, _), sending in ports.items() if len(sending) > 1}
-    return {sender: "" if sender is None else endpoint(sender) if sender[0] in shared else sender[0] for sender, _ in known}
+    return {
+        sender: "" if sender is None else endpoint(sender) if sender[0] in shared else sender[0]
+        for sender, _ in known
+    }
 
 
 @dataclass(frozen=True)
@@ -77,9 +85,10 @@ class Format:
         suffix: with its dot, ".csv".
         description: a few words for lists.
         write: writes scans to a path; `every_point` also those without a return.
-        holds: what it has a place for that not every format has: "organized" points, as rows and columns, where `write` is given
-            `organized=True` with a single scan; "scans" each by itself, organised ones always; "beams" and "frame-id" of ROS's messages;
-            "packets" as they came, which `write` is given as `packets=`.
+        holds: what it has a place for that not every format has: "organized" points, as rows and
+            columns, where `write` is given `organized=True` with a single scan; "scans" each by
+            itself, organised ones always; "beams" and "frame-id" of ROS's messages; "packets" as
+            they came, which `write` is given as `packets=`.
     """
 
     suffix: str
@@ -102,7 +111,8 @@ class Chunk:
         sender: (address, port) of a datagram, else None.
         receiver: (address, port) that a datagram was sent to, where it is known.
         gap: whether the line was interrupted before it: a frame begun earlier does not go on here.
-        quiet: whether the line had fallen silent before it: what waited there for more bytes was given up.
+        quiet: whether the line had fallen silent before it: what waited there for more bytes was
+            given up.
     """
 
     data: bytes
@@ -123,7 +133,12 @@ class Closing:
     def __enter__(self) -> Self:
         return self
 
-    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None) -> None:
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
+    ) -> None:
         self.close()
 
 
@@ -133,9 +148,11 @@ class Transport(ABC):
     Attributes:
         datagrams: whether each chunk is one datagram.
         baud: of a serial line; None for anything else.
-        warnings: what is to be said of it so far, such as where a file is damaged, or that a receive buffer is too small.
+        warnings: what is to be said of it so far, such as where a file is damaged, or that a
+            receive buffer is too small.
         foreign: datagrams from other senders than the one asked for, so far.
-        kernel_drops: datagrams that the system threw away, so far, since nobody fetched them in time.
+        kernel_drops: datagrams that the system threw away, so far, since nobody fetched them in
+            time.
         disconnects: interruptions of the line that a recording tells of, so far.
         unread: bytes of a damaged file that could not be read, so far.
         stored: the file that is read, as it is stored: one that unpacks it stands before it.
@@ -160,15 +177,21 @@ class Transport(ABC):
 
     @property
     def place(self) -> tuple[int, int] | None:
-        """How many bytes of the stored file were read, and how many there are; None where nobody knows."""
+        """How many bytes of the stored file were read, and how many there are; None where nobody
+        knows.
+        """
         stored: Any = self.stored
         if stored is None or not stored.seekable():
             return None
-        size: int = stored.size if hasattr(stored, "size") else os.fstat(stored.fileno()).st_size  # in a store, or here
+        size: int = (
+            stored.size if hasattr(stored, "size") else os.fstat(stored.fileno()).st_size
+        )  # in a store, or here
         return stored.tell(), size
 
     def skip(self, at: int) -> bool:
-        """Pass over what arrived before a time, ns since 1970, where that can be done without reading it: whether it was."""
+        """Pass over what arrived before a time, ns since 1970, where that can be done without
+        reading it: whether it was.
+        """
         return False
 
     @abstractmethod
@@ -190,7 +213,9 @@ def no_bytes(source: str | Path, warnings: Sequence[str]) -> str:
 
 
 class Disconnected(SourceError):
-    """The device behind a live source went away; `LiveTransport.reopen` finds it again when it comes back."""
+    """The device behind a live source went away; `LiveTransport.reopen` finds it again when it
+    comes back.
+    """
 
 
 class LiveTransport(Transport):
@@ -199,8 +224,10 @@ class LiveTransport(Transport):
     Attributes:
         label: how the user called it, for messages.
         closed: whether it was closed, which ends `chunks`.
-        overflow: what a reader's queue should do when it is full: "drop_oldest", or "block" for a source without a pace of its own.
-        silence: seconds without a byte after which nothing of a frame can be under way: what waits for more is given up then.
+        overflow: what a reader's queue should do when it is full: "drop_oldest", or "block" for a
+            source without a pace of its own.
+        silence: seconds without a byte after which nothing of a frame can be under way: what waits
+            for more is given up then.
         addressed: whether what is written has somewhere to go.
         stranger: who sent the last of the datagrams that are `foreign`.
     """
@@ -213,15 +240,20 @@ class LiveTransport(Transport):
 
     @property
     def addressed(self) -> bool:
-        """Whether what is written has somewhere to go: always, but for datagrams while nobody knows where the sensor is."""
+        """Whether what is written has somewhere to go: always, but for datagrams while nobody knows
+        where the sensor is.
+        """
         return True
 
     def accept(self, sender: Sender) -> None:
-        """Take a sender for the sensor: what is written goes there. Lines that know their other end have nothing to learn."""
+        """Take a sender for the sensor: what is written goes there. Lines that know their other end
+        have nothing to learn.
+        """
 
     @abstractmethod
     def read(self, timeout: float) -> list[Chunk]:
-        """What has arrived; an empty list where nothing did for `timeout` seconds, or it was closed.
+        """What has arrived; an empty list where nothing did for `timeout` seconds, or it was
+        closed.
 
         Raises:
             Disconnected: where the device went away.
@@ -250,7 +282,9 @@ class LiveTransport(Transport):
         raise UsageError(f"{self.label}: only a serial port has control lines")
 
     def link(self, name: str) -> LiveTransport | None:
-        """The open transport of another link of the same device; None where it has an address of its own."""
+        """The open transport of another link of the same device; None where it has an address of
+        its own.
+        """
         return None
 
     def peer(self) -> str | None:

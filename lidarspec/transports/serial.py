@@ -1,8 +1,10 @@
-"""Serial ports: opened for one program alone, read as bytes come, found again when they were unplugged.
+"""Serial ports: opened for one program alone, read as bytes come, found again when they were
+unplugged.
 
-After a hang-up pyserial raises SerialException, a bare OSError, `termios.error` (no OSError), or TypeError out of a port that
-is closed meanwhile; all of them mean that the device is gone. On POSIX the port is read through its descriptor: waiting, then
-one `read` of everything there, with a short pause after each so that a fast line does not wake us for every byte.
+After a hang-up pyserial raises SerialException, a bare OSError, `termios.error` (no OSError), or
+TypeError out of a port that is closed meanwhile; all of them mean that the device is gone. On POSIX
+the port is read through its descriptor: waiting, then one `read` of everything there, with a short
+pause after each so that a fast line does not wake us for every byte.
 """
 
 from __future__ import annotations
@@ -18,7 +20,18 @@ import serial
 from lidarspec.errors import SourceError, UsageError
 from lidarspec.spec.links import Serial
 from lidarspec.spec.sensor import Sensor
-from lidarspec.transports.base import Address, StreamTransport, data_link, error_numbers, failure, lost, named, readable, ready, reason
+from lidarspec.transports.base import (
+    Address,
+    StreamTransport,
+    data_link,
+    error_numbers,
+    failure,
+    lost,
+    named,
+    readable,
+    ready,
+    reason,
+)
 
 try:
     from termios import error as TermiosError
@@ -49,11 +62,23 @@ class SerialTransport(StreamTransport):
     baud: int
     gone = GONE
 
-    def __init__(self, port: str, baud: int, *, dtr: bool | None = None, rts: bool | None = None, sensor: Sensor | None = None) -> None:
+    def __init__(
+        self,
+        port: str,
+        baud: int,
+        *,
+        dtr: bool | None = None,
+        rts: bool | None = None,
+        sensor: Sensor | None = None,
+    ) -> None:
         super().__init__(port, sensor)
         self.baud, self._levels = baud, {"dtr": dtr, "rts": rts}
-        longest = max((frame.max_length for frame in sensor.frames.values()), default=0) if sensor else 0
-        self.silence = max(self.silence, 2 * longest * 10 / baud)  # longer than a frame takes on the line
+        longest = (
+            max((frame.max_length for frame in sensor.frames.values()), default=0) if sensor else 0
+        )
+        self.silence = max(
+            self.silence, 2 * longest * 10 / baud
+        )  # longer than a frame takes on the line
         self._port = self._open()
 
     def write(self, data: bytes) -> None:
@@ -66,7 +91,9 @@ class SerialTransport(StreamTransport):
             raise lost(self.label, error) from None
 
     def _send(self, descriptor: int, left: memoryview) -> None:
-        """Write through the descriptor, of whatever number: pyserial asks `select`, which knows none above 1,023."""
+        """Write through the descriptor, of whatever number: pyserial asks `select`, which knows
+        none above 1,023.
+        """
         limit = time.monotonic() + WRITE_TIMEOUT
         while left:
             if not ready([], [descriptor], max(limit - time.monotonic(), 0.0))[1]:
@@ -82,7 +109,9 @@ class SerialTransport(StreamTransport):
             try:
                 setattr(self._port, name, level)
             except GONE as error:
-                if not {errno.ENOTTY, errno.EINVAL} & set(error_numbers(error)):  # of a port without such lines, as a pseudo-terminal
+                if not {errno.ENOTTY, errno.EINVAL} & set(
+                    error_numbers(error)
+                ):  # of a port without such lines, as a pseudo-terminal
                     raise lost(self.label, error) from None
 
     def reopen(self) -> None:
@@ -98,7 +127,9 @@ class SerialTransport(StreamTransport):
             self._port.close()
 
     def _open(self) -> serial.Serial:
-        port = serial.Serial(baudrate=self.baud, timeout=0, write_timeout=WRITE_TIMEOUT, exclusive=True)
+        port = serial.Serial(
+            baudrate=self.baud, timeout=0, write_timeout=WRITE_TIMEOUT, exclusive=True
+        )
         port.port = self.label
         for name, level in self._levels.items():
             if level is not None:
@@ -113,15 +144,27 @@ class SerialTransport(StreamTransport):
 
     def _refused(self, error: Exception) -> SourceError:
         """Why the port does not open, and what to type."""
-        number, source = error.errno if isinstance(error, OSError) else None, f"serial://{self.label}{named(self._sensor)}"
+        number, source = (
+            error.errno if isinstance(error, OSError) else None,
+            f"serial://{self.label}{named(self._sensor)}",
+        )
         if number == errno.ENOENT or "FileNotFoundError" in str(error):
             return failure(f"{self.label}: no such port", "lidarspec ports")
         if number == errno.EACCES:
             return failure(f"{self.label}: permission denied", f"lidarspec doctor {quote(source)}")
-        if number in (errno.EBUSY, errno.EAGAIN) or "exclusively lock" in str(error) or "PermissionError" in str(error):
-            return failure(f"{self.label}: in use by another program", f"lidarspec doctor {quote(source)}")
+        if (
+            number in (errno.EBUSY, errno.EAGAIN)
+            or "exclusively lock" in str(error)
+            or "PermissionError" in str(error)
+        ):
+            return failure(
+                f"{self.label}: in use by another program", f"lidarspec doctor {quote(source)}"
+            )
         if isinstance(error, ValueError) or "baud" in str(error).lower():
-            return failure(f"{self.label}: it cannot run at {self.baud} baud: {error}", f"lidarspec detect {quote(self.label)}")
+            return failure(
+                f"{self.label}: it cannot run at {self.baud} baud: {error}",
+                f"lidarspec detect {quote(self.label)}",
+            )
         return failure(f"{self.label}: {reason(error)}", "lidarspec ports")
 
     def _received(self, timeout: float) -> bytes:
@@ -131,7 +174,9 @@ class SerialTransport(StreamTransport):
         descriptor = self._port.fileno()
         with contextlib.suppress(BlockingIOError):
             if data := os.read(descriptor, BLOCK):
-                return data  # as a rule, after the pause; nothing may mean a hang-up, which the system tells only who waits
+                # as a rule, after the pause; nothing may mean a hang-up, which the system tells
+                # only who waits
+                return data
         if not readable(descriptor, timeout):
             return b""
         data = os.read(descriptor, BLOCK)
@@ -141,7 +186,8 @@ class SerialTransport(StreamTransport):
 
 
 def connect(address: Address, sensor: Sensor | None = None) -> SerialTransport:
-    """The open port of a serial SOURCE: "serial:///dev/ttyUSB0?baud=230400&dtr=0", "/dev/ttyUSB0" or "COM4".
+    """The open port of a serial SOURCE: "serial:///dev/ttyUSB0?baud=230400&dtr=0", "/dev/ttyUSB0"
+    or "COM4".
 
     Args:
         sensor: whose baud rate and control lines are taken where the source does not say.
@@ -156,7 +202,13 @@ def connect(address: Address, sensor: Sensor | None = None) -> SerialTransport:
     if not address.place:
         raise UsageError(f"{address.text}: it names no port, as in serial:///dev/ttyUSB0")
     if baud is None:
-        raise UsageError(f"{address.text}: how fast is it? Name the sensor with -s, or say {address.text}?baud=115200")
+        raise UsageError(
+            f"{address.text}: how fast is it? Name the sensor with -s, or say"
+            f" {address.text}?baud=115200"
+        )
     dtr, rts = (declared.dtr, declared.rts) if declared else (None, None)
-    levels = {name: default if (level := address.switch(name)) is None else level for name, default in (("dtr", dtr), ("rts", rts))}
+    levels = {
+        name: default if (level := address.switch(name)) is None else level
+        for name, default in (("dtr", dtr), ("rts", rts))
+    }
     return SerialTransport(address.place, baud, sensor=sensor, **levels)

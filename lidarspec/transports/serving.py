@@ -1,8 +1,9 @@
 """What sends through an outlet, by the clock: a simulated sensor, and the replay of a recording.
 
-A simulated device is asked again and again what it sends by now, and told what has arrived. Of a replay every chunk has a deadline
-on the monotonic clock, reckoned from the first one and not from the one before, so that what a wait oversleeps is not added up; a
-chunk that is late goes out at once. Into a file a device is written without waiting: the times in it are the device's own.
+A simulated device is asked again and again what it sends by now, and told what has arrived. Of a
+replay every chunk has a deadline on the monotonic clock, reckoned from the first one and not from
+the one before, so that what a wait oversleeps is not added up; a chunk that is late goes out at
+once. Into a file a device is written without waiting: the times in it are the device's own.
 """
 
 from __future__ import annotations
@@ -26,7 +27,15 @@ from lidarspec.simulation.device import SECOND, SimulatedDevice
 from lidarspec.spec.links import Udp
 from lidarspec.transports.open_url import transport
 from lidarspec.transports.outlets import HERE, Outlet
-from lidarspec.transports.protocol import POLL, Chunk, Closing, Disconnected, Sender, Transport, sender_names
+from lidarspec.transports.protocol import (
+    POLL,
+    Chunk,
+    Closing,
+    Disconnected,
+    Sender,
+    Transport,
+    sender_names,
+)
 
 #: seconds at least between two sendings.
 PAUSE = 0.001
@@ -39,9 +48,11 @@ LATE = 20_000_000
 
 
 class Turns:
-    """Whose turn it is to compute, of the threads that simulate: one at a time, in the order in which they asked.
+    """Whose turn it is to compute, of the threads that simulate: one at a time, in the order in
+    which they asked.
 
-    Left to themselves a hundred of them hardly go on, and do not end: each waits for all others whenever it wants the interpreter back.
+    Left to themselves a hundred of them hardly go on, and do not end: each waits for all others
+    whenever it wants the interpreter back.
     """
 
     def __init__(self) -> None:
@@ -99,7 +110,11 @@ def serve(
     Raises:
         SourceError: where nothing can be sent any more.
     """
-    stop, early, outlets = stop or threading.Event(), list[bytes](), {"data": outlet, **outlet.controls}
+    stop, early, outlets = (
+        stop or threading.Event(),
+        list[bytes](),
+        {"data": outlet, **outlet.controls},
+    )
     while patient and not outlet.heard and not stop.is_set():
         early = outlet.receive(POLL)
     began, present, endless = time.monotonic_ns(), True, math.isinf(device.rate)
@@ -126,7 +141,9 @@ def serve(
         pause = 0.0 if endless and outlet.heard else PAUSE
         wait = POLL if due is None else min(POLL, max((due - time.monotonic_ns()) / SECOND, pause))
         for name, end_of_link in outlets.items():
-            for data in end_of_link.receive((min(wait, ASKED) if outlet.controls else wait) if name == "data" else 0.0):
+            for data in end_of_link.receive(
+                (min(wait, ASKED) if outlet.controls else wait) if name == "data" else 0.0
+            ):
                 device.receive(data, time.monotonic_ns(), name)
 
 
@@ -146,7 +163,9 @@ class Served(Closing):
         self._stop, self._failure = threading.Event(), list[BaseException]()
         self._orders, self._done = queue.SimpleQueue[Callable[[], None]](), threading.Semaphore(0)
         self._carried = 0
-        self._thread = threading.Thread(target=self._run, name=f"simulated {device.sensor.id}", daemon=True)
+        self._thread = threading.Thread(
+            target=self._run, name=f"simulated {device.sensor.id}", daemon=True
+        )
         self._thread.start()
 
     @property
@@ -201,17 +220,21 @@ class Served(Closing):
             self._failure.append(error)
 
 
-def write_file(device: SimulatedDevice, path: str | Path, seconds: float, *, overwrite: bool = False) -> int:
-    """The number of bytes written: what a device sends in so many seconds, from its start on, as a recording of it would be.
+def write_file(
+    device: SimulatedDevice, path: str | Path, seconds: float, *, overwrite: bool = False
+) -> int:
+    """The number of bytes written: what a device sends in so many seconds, from its start on, as a
+    recording of it would be.
 
-    Nothing waits: the times in the file are the device's. The commands that open the device are sent to it, and recorded too.
-    The file is made when there is something to write.
+    Nothing waits: the times in the file are the device's. The commands that open the device are
+    sent to it, and recorded too. The file is made when there is something to write.
 
     Args:
         path: an .lsr, .pcap, .pcapng or .bin file.
 
     Raises:
-        UnknownFormat, UsageError: for a file that cannot hold it, or exists; for a time in which nothing is sent.
+        UnknownFormat, UsageError: for a file that cannot hold it, or exists; for a time in which
+            nothing is sent.
         SpecError: if the sensor, as it is declared, never sends anything.
         SourceError: where it cannot be written.
     """
@@ -225,7 +248,9 @@ def write_file(device: SimulatedDevice, path: str | Path, seconds: float, *, ove
         raise _nothing_sent(device, seconds)
     sensor = device.sensor
     written = 0
-    with contextlib.closing(recorder(path, sensor, f"sim:{sensor.id}", datagrams=sensor.datagrams, overwrite=overwrite)) as out:
+    with contextlib.closing(
+        recorder(path, sensor, f"sim:{sensor.id}", datagrams=sensor.datagrams, overwrite=overwrite)
+    ) as out:
         for chunk, direction in itertools.chain(first, chunks):
             out.write(chunk, direction)
             out.keep_up()
@@ -233,8 +258,12 @@ def write_file(device: SimulatedDevice, path: str | Path, seconds: float, *, ove
     return written
 
 
-def _simulate_opened(device: SimulatedDevice, seconds: float) -> Iterator[tuple[Chunk, Literal["in", "out"]]]:
-    """Yield what goes over the data link of a device that is switched on and opened, with the commands that open it."""
+def _simulate_opened(
+    device: SimulatedDevice, seconds: float
+) -> Iterator[tuple[Chunk, Literal["in", "out"]]]:
+    """Yield what goes over the data link of a device that is switched on and opened, with the
+    commands that open it.
+    """
     sensor = device.sensor
     began = time.time_ns()
     opening = [name for name in sensor.on_open if sensor.commands[name].frame]
@@ -257,18 +286,34 @@ def _nothing_sent(device: SimulatedDevice, seconds: float) -> LidarSpecError:
     sent = {name: device.sent[name] for name in sensor.data_frames if device.sent[name]}
     if sent:
         frames = ", ".join(f"{number} {name}" for name, number in sent.items())
-        return UsageError(f"nothing was written: {frames} frames were sent, and all of them were lost")
+        return UsageError(
+            f"nothing was written: {frames} frames were sent, and all of them were lost"
+        )
     if device.deadline is not None:
         due = f"its next frame is due after {device.deadline / SECOND:g} s"
-        return UsageError(f"nothing was written: the simulated {sensor.id} sends nothing in the first {seconds:g} s; {due}")
-    missed = [name for name in sensor.on_open if sensor.commands[name].frame and name not in device.heard]
+        return UsageError(
+            f"nothing was written: the simulated {sensor.id} sends nothing in the first {seconds:g}"
+            f" s; {due}"
+        )
+    missed = [
+        name for name in sensor.on_open if sensor.commands[name].frame and name not in device.heard
+    ]
     heard = ", ".join(device.heard) or "no command"
-    reason = f"{missed[0]!r} was sent to it, and it recognized {heard}" if missed else f"nothing starts its data after {heard}"
-    return SpecError(f"nothing was written: the simulated sensor sends nothing; {reason}", path="on_open", sensor=sensor.id)
+    reason = (
+        f"{missed[0]!r} was sent to it, and it recognized {heard}"
+        if missed
+        else f"nothing starts its data after {heard}"
+    )
+    return SpecError(
+        f"nothing was written: the simulated sensor sends nothing; {reason}",
+        path="on_open",
+        sensor=sensor.id,
+    )
 
 
 def _chunks(device: SimulatedDevice, now: int, at: int | None = None) -> dict[str, list[Chunk]]:
-    """What a device sends by now, by link; a datagram with the port that it goes to, the sensor's second one if it is no data frame.
+    """What a device sends by now, by link; a datagram with the port that it goes to, the sensor's
+    second one if it is no data frame.
 
     Args:
         at: the arrival time that is noted.
@@ -278,7 +323,11 @@ def _chunks(device: SimulatedDevice, now: int, at: int | None = None) -> dict[st
     ports = link.ports[:2] if isinstance(link, Udp) and link.ports else (0,)
     ends = {True: (HERE, ports[0]), False: (HERE, ports[-1])}
     for name, frame, data in device.sendings(now):
-        end = ends[not frame or sensor.frames[frame].data] if sensor.datagrams and name == "data" else None
+        end = (
+            ends[not frame or sensor.frames[frame].data]
+            if sensor.datagrams and name == "data"
+            else None
+        )
         found.setdefault(name, []).append(Chunk(data, at, end, end))
     return found
 
@@ -286,8 +335,9 @@ def _chunks(device: SimulatedDevice, now: int, at: int | None = None) -> dict[st
 class Deadlines:
     """When each chunk of a replay is due, in ns of the monotonic clock.
 
-    Times that go back a little, as those of datagrams that overtook each other, are due at once; behind a step back of more than
-    a second, as when a clock was set, time is reckoned on from there.
+    Times that go back a little, as those of datagrams that overtook each other, are due at once;
+    behind a step back of more than a second, as when a clock was set, time is reckoned on from
+    there.
 
     Args:
         speed: 2.0 is twice as fast; None as fast as possible.
@@ -300,7 +350,9 @@ class Deadlines:
         self._latest = 0
 
     def due(self, at: int | None) -> int:
-        """When something that arrived at this time is due; at once, where nobody knows when that was."""
+        """When something that arrived at this time is due; at once, where nobody knows when that
+        was.
+        """
         if self._speed is None or at is None:
             return self._start
         if self._origin is None:
@@ -319,7 +371,8 @@ def replayed(
     now: Callable[[], int] = time.monotonic_ns,
     sleep: Callable[[float], None] = time.sleep,
 ) -> Iterator[tuple[Chunk, int]]:
-    """Each chunk once it has been sent, and by how many ns it was late; what listeners send is passed over.
+    """Each chunk once it has been sent, and by how many ns it was late; what listeners send is
+    passed over.
 
     Args:
         chunks: with their arrival times.
@@ -350,9 +403,11 @@ class Replay:
         file: the SOURCE of the recording, capture or raw file.
         outlet: where it goes; it stays open.
         speed: 2.0 is twice as fast; None as fast as possible.
-        needs_times: whether a file without times is refused, rather than sent as fast as it is taken.
+        needs_times: whether a file without times is refused, rather than sent as fast as it is
+            taken.
         loop: begin again at the end, for every listener from the beginning.
-        source: the file where it is open already, as standard input has to be; read first, and closed then.
+        source: the file where it is open already, as standard input has to be; read first, and
+            closed then.
         times: only what arrived then, as in `Selection`.
 
     Attributes:
@@ -375,10 +430,20 @@ class Replay:
         source: Transport | None = None,
         times: Times = (None, None),
     ) -> None:
-        self._file, self._outlet, self._speed, self._needs_times, self._loop = file, outlet, speed, needs_times, loop
+        self._file, self._outlet, self._speed, self._needs_times, self._loop = (
+            file,
+            outlet,
+            speed,
+            needs_times,
+            loop,
+        )
         self._times = times
         self.chunks = self.bytes = self.late = self.latest = 0
-        self._ends, self.is_timed, self.digest = set[tuple[Sender | None, Sender | None]](), True, hashlib.sha256()
+        self._ends, self.is_timed, self.digest = (
+            set[tuple[Sender | None, Sender | None]](),
+            True,
+            hashlib.sha256(),
+        )
         self._began, self._source = time.monotonic(), source
 
     @property
@@ -400,7 +465,11 @@ class Replay:
             opened, self._source = self._source or transport(self._file), None
             with contextlib.closing(opened) as source:
                 try:
-                    for chunk, late in replayed(self._checked(received(source, self._times, self._file)), self._outlet, speed=self._speed):
+                    for chunk, late in replayed(
+                        self._checked(received(source, self._times, self._file)),
+                        self._outlet,
+                        speed=self._speed,
+                    ):
                         self._count(chunk, late)
                         yield ""
                 except Disconnected as gone:
@@ -417,7 +486,10 @@ class Replay:
         for chunk in chunks:
             if chunk.at is None and self._speed is not None and self.is_timed:
                 if self._needs_times:
-                    raise UsageError(f"{self._file} does not say when its bytes arrived: only --speed max can be kept")
+                    raise UsageError(
+                        f"{self._file} does not say when its bytes arrived: only --speed max can be"
+                        " kept"
+                    )
                 self.is_timed = False
             yield chunk
 

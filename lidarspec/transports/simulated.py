@@ -23,7 +23,8 @@ PAUSE = 2_000_000
 
 
 class SimulatedTransport(LiveTransport):
-    """A link of a simulated device; that of the data switches it on, and reading it makes time pass for all.
+    """A link of a simulated device; that of the data switches it on, and reading it makes time pass
+    for all.
 
     Args:
         name: of the link.
@@ -35,7 +36,12 @@ class SimulatedTransport(LiveTransport):
     """
 
     def __init__(
-        self, label: str, sensor: Sensor, device: SimulatedDevice, name: str = "data", data: SimulatedTransport | None = None
+        self,
+        label: str,
+        sensor: Sensor,
+        device: SimulatedDevice,
+        name: str = "data",
+        data: SimulatedTransport | None = None,
     ) -> None:
         self.label, self.device, self.sensor, self._name = label, device, sensor, name
         link = sensor.links.get(name)
@@ -103,7 +109,8 @@ class SimulatedTransport(LiveTransport):
 
 
 def simulated_device(sensor: Sensor, options: Mapping[str, str]) -> SimulatedDevice:
-    """The device that options name by text: ``{"rate": "2", "scene": "hall.toml", "errors": "0.01"}``.
+    """The device that options name by text: ``{"rate": "2", "scene": "hall.toml", "errors":
+    "0.01"}``.
 
     Raises:
         UsageError: for a value that is not of its kind, and where the sensor cannot be simulated.
@@ -114,7 +121,9 @@ def simulated_device(sensor: Sensor, options: Mapping[str, str]) -> SimulatedDev
     seed = options.get("seed", "0")
     if not seed.isdecimal():
         raise UsageError(f"seed is a whole number, not {seed!r}")
-    return SimulatedDevice(sensor, scene=scene, seed=int(seed), rate=rate_of(options.get("rate", "1")), faults=faults)
+    return SimulatedDevice(
+        sensor, scene=scene, seed=int(seed), rate=rate_of(options.get("rate", "1")), faults=faults
+    )
 
 
 def rate_of(text: str) -> float:
@@ -143,7 +152,9 @@ def connect(address: Address, sensor: Sensor | None = None) -> SimulatedTranspor
     """
     address.check(OPTIONS)
     if not address.place and sensor is None:
-        raise UsageError(f"{address.text}: name the sensor, as in sim:ID; lidarspec sensors lists them")
+        raise UsageError(
+            f"{address.text}: name the sensor, as in sim:ID; lidarspec sensors lists them"
+        )
     if sensor is None or (address.place and named_sensor(address.place).id != sensor.id):
         sensor = named_sensor(address.place)
     return SimulatedTransport(address.text, sensor, simulated_device(sensor, address.options))

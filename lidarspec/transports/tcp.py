@@ -10,14 +10,24 @@ from shlex import quote
 from lidarspec.errors import SourceError, SourceTimeout, UsageError, suggest
 from lidarspec.spec.links import Tcp
 from lidarspec.spec.sensor import Sensor
-from lidarspec.transports.base import Address, StreamTransport, data_link, failure, lost, named, readable, reason
+from lidarspec.transports.base import (
+    Address,
+    StreamTransport,
+    data_link,
+    failure,
+    lost,
+    named,
+    readable,
+    reason,
+)
 from lidarspec.transports.protocol import Disconnected
 
 #: bytes read at once.
 BLOCK = 1 << 18
 #: seconds that a connection may take at first, and when it is tried again.
 PATIENCE, AGAIN = 5.0, 0.5
-#: seconds without a byte that a connection may need to bring what was sent: lost segments are sent again after 0.2 s, 0.4 s, 0.8 s ...
+#: seconds without a byte that a connection may need to bring what was sent: lost segments are sent
+#: again after 0.2 s, 0.4 s, 0.8 s ...
 SILENCE = 10.0
 
 
@@ -79,7 +89,10 @@ class TcpTransport(StreamTransport):
         if error.errno == errno.ECONNREFUSED:
             return failure(f"{self.label}: {host} refuses connections to TCP port {port}", doctor)
         if isinstance(error, TimeoutError) or error.errno in (errno.ETIMEDOUT, errno.EHOSTUNREACH):
-            return suggest(SourceTimeout(f"{self.label}: {host} does not answer on TCP port {port}"), f"ping {host}")
+            return suggest(
+                SourceTimeout(f"{self.label}: {host} does not answer on TCP port {port}"),
+                f"ping {host}",
+            )
         return failure(f"{self.label}: TCP port {port} of {host}: {reason(error)}", doctor)
 
 
@@ -98,5 +111,7 @@ def connect(address: Address, sensor: Sensor | None = None) -> TcpTransport:
     link = data_link(sensor, Tcp)
     port = port or (link.port if link else None)
     if not host or port is None:
-        raise UsageError(f"{address.text}: host and port are needed, as in tcp://192.168.1.200:2111")
+        raise UsageError(
+            f"{address.text}: host and port are needed, as in tcp://192.168.1.200:2111"
+        )
     return TcpTransport(address.text, host, port, sensor=sensor)

@@ -1,13 +1,16 @@
-"""UDP: datagrams from a sensor, as many as there are at each wake-up, with what the kernel knows of each.
+"""UDP: datagrams from a sensor, as many as there are at each wake-up, with what the kernel knows of
+each.
 
-A sensor sends to this computer's address or to everybody, so that the sockets have to be bound to all interfaces ("udp://"),
-unless one is named ("udp://127.0.0.1:2368"). Nothing is sent, and nobody is answered, before a command is.
+A sensor sends to this computer's address or to everybody, so that the sockets have to be bound to
+all interfaces ("udp://"), unless one is named ("udp://127.0.0.1:2368"). Nothing is sent, and nobody
+is answered, before a command is.
 
-Linux says with each datagram when it arrived, however late we fetch it, and how many the socket has dropped before it; so a
-short pause after each reading, in which some gather, costs no accuracy. The receive buffer is what a stalled program lives on;
-what the kernel really gives is read back. Many datagrams are fetched in one system call, recvmmsg, which Python does not have
-(`Slots`): each call of Python gives the interpreter away and has to win it back, which takes milliseconds beside a thread that
-computes, and with a call for each datagram a fast sensor is lost.
+Linux says with each datagram when it arrived, however late we fetch it, and how many the socket has
+dropped before it; so a short pause after each reading, in which some gather, costs no accuracy. The
+receive buffer is what a stalled program lives on; what the kernel really gives is read back. Many
+datagrams are fetched in one system call, recvmmsg, which Python does not have (`Slots`): each call
+of Python gives the interpreter away and has to win it back, which takes milliseconds beside a
+thread that computes, and with a call for each datagram a fast sensor is lost.
 """
 
 from __future__ import annotations
@@ -29,7 +32,18 @@ from shlex import quote
 from lidarspec.errors import SourceError, UsageError
 from lidarspec.spec.links import Udp, is_datagram
 from lidarspec.spec.sensor import Sensor
-from lidarspec.transports.base import Address, HostClock, failure, lost, named, numeric, origin, reason, rest, with_option
+from lidarspec.transports.base import (
+    Address,
+    HostClock,
+    failure,
+    lost,
+    named,
+    numeric,
+    origin,
+    reason,
+    rest,
+    with_option,
+)
 from lidarspec.transports.protocol import Chunk, LiveTransport, Sender
 
 #: datagrams in one call, and the room for each: memory that is not written to costs nothing.
@@ -41,7 +55,8 @@ _ALIGN = struct.calcsize("@N")
 BUFFER = 8 << 20
 #: datagrams of one socket that are fetched before the others have their turn.
 TOGETHER = 1024
-#: seconds between two readings, where the kernel keeps the times: a wake-up for each datagram would cost more than all the rest.
+#: seconds between two readings, where the kernel keeps the times: a wake-up for each datagram would
+#: cost more than all the rest.
 PAUSE = 0.002
 #: ns that a datagram may have waited in the kernel, at most; more is a clock that was set.
 LATEST = 60_000_000_000
@@ -71,9 +86,16 @@ class _Datagram(ctypes.Structure):
     _fields_ = (("message", _Message), ("size", ctypes.c_uint))
 
 
-#: where the size of the first datagram, and of what is told with it, stand in the headers, and how far on the next ones do, in words.
-_SIZE, _SIZE_STEP = (part // ctypes.sizeof(ctypes.c_uint) for part in (_Datagram.size.offset, ctypes.sizeof(_Datagram)))
-_TOLD, _TOLD_STEP = (part // ctypes.sizeof(ctypes.c_size_t) for part in (_Message.control_size.offset, ctypes.sizeof(_Datagram)))
+#: where the size of the first datagram, and of what is told with it, stand in the headers, and how
+#: far on the next ones do, in words.
+_SIZE, _SIZE_STEP = (
+    part // ctypes.sizeof(ctypes.c_uint)
+    for part in (_Datagram.size.offset, ctypes.sizeof(_Datagram))
+)
+_TOLD, _TOLD_STEP = (
+    part // ctypes.sizeof(ctypes.c_size_t)
+    for part in (_Message.control_size.offset, ctypes.sizeof(_Datagram))
+)
 
 
 class Slots:
@@ -88,20 +110,38 @@ class Slots:
             self._call = ctypes.CDLL(None, use_errno=True).recvmmsg
         except (AttributeError, TypeError):
             raise OSError("this system has no recvmmsg") from None
-        self._call.argtypes = (ctypes.c_int, ctypes.c_void_p, ctypes.c_uint, ctypes.c_int, ctypes.c_void_p)
-        self._payload, self._names, self._control = (ctypes.create_string_buffer(MANY * size) for size in (LARGEST, NAME, CONTROL))
-        self._data, self._senders, self._said = (memoryview(part).cast("B") for part in (self._payload, self._names, self._control))
+        self._call.argtypes = (
+            ctypes.c_int,
+            ctypes.c_void_p,
+            ctypes.c_uint,
+            ctypes.c_int,
+            ctypes.c_void_p,
+        )
+        self._payload, self._names, self._control = (
+            ctypes.create_string_buffer(MANY * size) for size in (LARGEST, NAME, CONTROL)
+        )
+        self._data, self._senders, self._said = (
+            memoryview(part).cast("B") for part in (self._payload, self._names, self._control)
+        )
         self._vectors = (_Vector * MANY)()
         self._headers = ctypes.create_string_buffer(MANY * ctypes.sizeof(_Datagram))
         self._datagrams = (_Datagram * MANY).from_buffer(self._headers)
         # An access to a field by its name costs more than a datagram should.
-        self._sizes, self._told = memoryview(self._headers).cast("B").cast("I"), memoryview(self._headers).cast("B").cast("P")
+        self._sizes, self._told = (
+            memoryview(self._headers).cast("B").cast("I"),
+            memoryview(self._headers).cast("B").cast("P"),
+        )
         for index in range(MANY):
-            self._vectors[index] = _Vector(ctypes.addressof(self._payload) + index * LARGEST, LARGEST)
+            self._vectors[index] = _Vector(
+                ctypes.addressof(self._payload) + index * LARGEST, LARGEST
+            )
             message = self._datagrams[index].message
             message.name, message.name_size = ctypes.addressof(self._names) + index * NAME, NAME
             message.vectors, message.vectors_number = ctypes.pointer(self._vectors[index]), 1
-            message.control, message.control_size = ctypes.addressof(self._control) + index * CONTROL, CONTROL
+            message.control, message.control_size = (
+                ctypes.addressof(self._control) + index * CONTROL,
+                CONTROL,
+            )
         self._fresh = self._headers.raw
         self._known: dict[bytes, tuple[str, int]] = {}
 
@@ -111,7 +151,9 @@ class Slots:
         Raises:
             OSError: what the system says.
         """
-        ctypes.memmove(self._headers, self._fresh, len(self._fresh))  # the kernel wrote over the sizes
+        ctypes.memmove(
+            self._headers, self._fresh, len(self._fresh)
+        )  # the kernel wrote over the sizes
         number: int = self._call(descriptor, self._datagrams, MANY, socket.MSG_DONTWAIT, None)
         if number < 0:
             code = ctypes.get_errno()
@@ -133,7 +175,9 @@ class Slots:
         return data, sender
 
     def numbers(self, index: int) -> tuple[int, int, int] | None:
-        """What the socket layer said with a datagram, if it is one value of two numbers: its type, and these; else None."""
+        """What the socket layer said with a datagram, if it is one value of two numbers: its type,
+        and these; else None.
+        """
         if self._told[_TOLD + index * _TOLD_STEP] != _TWO.size:
             return None
         size, level, kind, first, second = _TWO.unpack_from(self._said, index * CONTROL)
@@ -171,7 +215,8 @@ class UdpTransport(LiveTransport):
         sender: only datagrams from this host, or "HOST:PORT"; others are counted as foreign.
         datagrams: whether each is a whole frame, not a piece of a stream.
         sensor: for the next command in messages.
-        remote: where to send to; by default the sender that is asked for with its port, or accepted.
+        remote: where to send to; by default the sender that is asked for with its port, or
+            accepted.
         broadcast: whether that may be everybody.
 
     Attributes:
@@ -196,7 +241,11 @@ class UdpTransport(LiveTransport):
     ) -> None:
         self.clock = HostClock()
         self.label, self.datagrams = label, datagrams
-        self._origin, self._remote, self._sensor = None if sender is None else origin(sender), remote, sensor
+        self._origin, self._remote, self._sensor = (
+            None if sender is None else origin(sender),
+            remote,
+            sensor,
+        )
         if self._origin is not None and self._origin.port is not None:
             self._remote = (self._origin.host, self._origin.port)
         self._selector = selectors.DefaultSelector()
@@ -208,7 +257,9 @@ class UdpTransport(LiveTransport):
         try:
             for port in ports:
                 self._sockets.append(_Socket(self._bound(host, port, group), slots))
-                self._selector.register(self._sockets[-1].socket, selectors.EVENT_READ, self._sockets[-1])
+                self._selector.register(
+                    self._sockets[-1].socket, selectors.EVENT_READ, self._sockets[-1]
+                )
                 if broadcast:
                     self._sockets[-1].socket.setsockopt(socket.SOL_SOCKET, socket.SO_BROADCAST, 1)
         except BaseException:
@@ -231,7 +282,9 @@ class UdpTransport(LiveTransport):
 
     def write(self, data: bytes) -> None:
         if self._remote is None:
-            text = f"{self.label}: no frame of the sensor has arrived yet, so nobody knows its address"
+            text = (
+                f"{self.label}: no frame of the sensor has arrived yet, so nobody knows its address"
+            )
             raise failure(text, f"the same with {with_option(self.label, 'src', 'ADDRESS:PORT')}")
         try:
             self._sockets[0].socket.sendto(data, self._remote)
@@ -240,7 +293,9 @@ class UdpTransport(LiveTransport):
 
     @property
     def addressed(self) -> bool:
-        """Whether what is written has somewhere to go: to the address that was given, or a sender that was accepted."""
+        """Whether what is written has somewhere to go: to the address that was given, or a sender
+        that was accepted.
+        """
         return self._remote is not None
 
     def accept(self, sender: Sender) -> None:
@@ -296,11 +351,20 @@ class UdpTransport(LiveTransport):
         if error.errno == errno.EADDRINUSE:
             return failure(f"{self.label}: UDP port {port} is in use by another program", doctor)
         if error.errno == errno.EACCES:
-            return failure(f"{self.label}: UDP port {port} needs rights that you do not have", doctor)
+            return failure(
+                f"{self.label}: UDP port {port} needs rights that you do not have", doctor
+            )
         if error.errno == errno.EADDRNOTAVAIL:
-            return failure(f"{self.label}: {host or group} is no address of this computer", f"lidarspec doctor udp://:{port}")
+            return failure(
+                f"{self.label}: {host or group} is no address of this computer",
+                f"lidarspec doctor udp://:{port}",
+            )
         if group is not None and error.errno in (errno.ENODEV, errno.ENETUNREACH):
-            return failure(f"{self.label}: no interface has a route to the group {group}; name one, as in udp://ADDRESS:{port}", doctor)
+            return failure(
+                f"{self.label}: no interface has a route to the group {group}; name one, as in"
+                f" udp://ADDRESS:{port}",
+                doctor,
+            )
         return failure(f"{self.label}: UDP port {port}: {reason(error)}", doctor)
 
 
@@ -376,7 +440,8 @@ class _Socket:
 def _order_times(chunks: list[Chunk], start: int) -> None:
     """Give no datagram, from `start` on, a later time than those that were queued behind it.
 
-    For some milliseconds after a socket was opened Linux stamps datagrams when they are fetched instead of when they arrive.
+    For some milliseconds after a socket was opened Linux stamps datagrams when they are fetched
+    instead of when they arrive.
     """
     times = [chunk.at or 0 for chunk in chunks[start:]]
     if times == sorted(times):
@@ -388,12 +453,15 @@ def _order_times(chunks: list[Chunk], start: int) -> None:
 
 
 def _carried(seconds: int, nanoseconds: int, now: int, wall: int) -> int:
-    """A time of the wall clock, which reads `wall` now, as one of a clock that reads `now`; of the last minute, whatever it says."""
+    """A time of the wall clock, which reads `wall` now, as one of a clock that reads `now`; of the
+    last minute, whatever it says.
+    """
     return now - min(max(wall - seconds * 1_000_000_000 - nanoseconds, 0), LATEST)
 
 
 def connect(address: Address, sensor: Sensor | None = None) -> UdpTransport:
-    """The open sockets of a UDP SOURCE: "udp://", "udp://:2368", "udp://?port=6699,7788&group=239.255.0.1&src=192.168.1.200".
+    """The open sockets of a UDP SOURCE: "udp://", "udp://:2368",
+    "udp://?port=6699,7788&group=239.255.0.1&src=192.168.1.200".
 
     Args:
         sensor: whose ports are taken where the source names none.
@@ -406,29 +474,50 @@ def connect(address: Address, sensor: Sensor | None = None) -> UdpTransport:
     host, port = address.host_and_port()
     host = host and numeric(host, address.text)
     link = sensor.links.get("data") if sensor is not None else None
-    ports = _ports(address) or ([port] if port else list(link.ports) if isinstance(link, Udp) else [])
+    ports = _ports(address) or (
+        [port] if port else list(link.ports) if isinstance(link, Udp) else []
+    )
     if not ports:
         raise UsageError(f"{address.text}: which port? Name the sensor with -s, or say udp://:2368")
     group = address.options.get("group")
     if group is None and host and _is_multicast(host):
         host, group = "", host
     if group is not None and not _is_multicast(group):
-        raise UsageError(f"{address.text}: {group} is no multicast group (224.0.0.0 to 239.255.255.255)")
+        raise UsageError(
+            f"{address.text}: {group} is no multicast group (224.0.0.0 to 239.255.255.255)"
+        )
     whole = link is None or is_datagram(link)
-    return UdpTransport(address.text, ports, host=host, group=group, sender=address.options.get("src"), datagrams=whole, sensor=sensor)
+    return UdpTransport(
+        address.text,
+        ports,
+        host=host,
+        group=group,
+        sender=address.options.get("src"),
+        datagrams=whole,
+        sensor=sensor,
+    )
 
 
 def shortfall(asked: int, granted: int) -> list[str]:
-    """A warning where the kernel gave less receive buffer than was asked for, with the command that mends it; else nothing."""
+    """A warning where the kernel gave less receive buffer than was asked for, with the command that
+    mends it; else nothing.
+    """
     if granted >= asked:
         return []
-    text = f"the system gave a receive buffer of {granted >> 10} KiB of {asked >> 10}: a busy computer will lose packets"
+    text = (
+        f"the system gave a receive buffer of {granted >> 10} KiB of {asked >> 10}: a busy computer"
+        " will lose packets"
+    )
     return [f"{text}; next: sudo sysctl -w net.core.rmem_max={asked}"]
 
 
 def _enlarged(found: socket.socket) -> int:
-    """Ask for a larger receive buffer; the bytes that there are in the end. Linux says twice what it gives."""
-    for option in (socket.SO_RCVBUF, SO_RCVBUFFORCE) if sys.platform == "linux" else (socket.SO_RCVBUF,):
+    """Ask for a larger receive buffer; the bytes that there are in the end. Linux says twice what
+    it gives.
+    """
+    for option in (
+        (socket.SO_RCVBUF, SO_RCVBUFFORCE) if sys.platform == "linux" else (socket.SO_RCVBUF,)
+    ):
         if _granted(found) < BUFFER:
             with contextlib.suppress(OSError):
                 found.setsockopt(socket.SOL_SOCKET, option, BUFFER)
@@ -436,14 +525,19 @@ def _enlarged(found: socket.socket) -> int:
 
 
 def _granted(found: socket.socket) -> int:
-    return found.getsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF) // (2 if sys.platform == "linux" else 1)
+    return found.getsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF) // (
+        2 if sys.platform == "linux" else 1
+    )
 
 
 def _ports(address: Address) -> list[int]:
     text = address.options.get("port", "")
     ports = [part for part in text.split(",") if part]
     if any(not part.isdecimal() or not 0 < int(part) < 65536 for part in ports):
-        raise UsageError(f"{address.text}: port is one number from 1 to 65535, or several with commas, not {text!r}")
+        raise UsageError(
+            f"{address.text}: port is one number from 1 to 65535, or several with commas, not"
+            f" {text!r}"
+        )
     return [int(part) for part in ports]
 
 
@@ -456,6 +550,14 @@ def _is_multicast(host: str) -> bool:
 
 def _join(found: socket.socket, group: str, interface: str) -> None:
     if found.family == socket.AF_INET6:
-        found.setsockopt(socket.IPPROTO_IPV6, socket.IPV6_JOIN_GROUP, socket.inet_pton(socket.AF_INET6, group) + struct.pack("@I", 0))
+        found.setsockopt(
+            socket.IPPROTO_IPV6,
+            socket.IPV6_JOIN_GROUP,
+            socket.inet_pton(socket.AF_INET6, group) + struct.pack("@I", 0),
+        )
         return
-    found.setsockopt(socket.IPPROTO_IP, socket.IP_ADD_MEMBERSHIP, socket.inet_aton(group) + socket.inet_aton(interface or "0.0.0.0"))
+    found.setsockopt(
+        socket.IPPROTO_IP,
+        socket.IP_ADD_MEMBERSHIP,
+        socket.inet_aton(group) + socket.inet_aton(interface or "0.0.0.0"),
+    )

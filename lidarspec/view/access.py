@@ -1,10 +1,10 @@
 """Who may reach the page: the token of its link, and the Host and Origin of each request.
 
-Each server makes a token, and each request needs it in its query: pages, scripts, downloads, socket.
-Other users of this computer can connect to the server, but do not know the token. It is not kept in
-a cookie: browsers send the cookies of one port to all ports of this computer, so a server of another
-user would receive it. Host and Origin stop other pages in the same browser, also those whose name
-was made to point to this computer.
+Each server makes a token, and each request needs it in its query: pages, scripts, downloads,
+socket. Other users of this computer can connect to the server, but do not know the token. It is not
+kept in a cookie: browsers send the cookies of one port to all ports of this computer, so a server
+of another user would receive it. Host and Origin stop other pages in the same browser, also those
+whose name was made to point to this computer.
 """
 
 from __future__ import annotations

@@ -45,7 +45,9 @@ class Answers:
         self.broadcast, self.duration = broadcast, _duration(broadcast)
         self.why_no_control = _why_no_control(broadcast, control=control)
         self._frame = functools.lru_cache(maxsize=KEPT)(self._explained)
-        self._verdict = functools.lru_cache(maxsize=DAMAGED)(lambda piece: piece.verdict(broadcast.device.sensor))
+        self._verdict = functools.lru_cache(maxsize=DAMAGED)(
+            lambda piece: piece.verdict(broadcast.device.sensor)
+        )
 
     def hello(self) -> dict[str, Any]:
         """What a page is told first."""
@@ -56,7 +58,10 @@ class Answers:
             "title": f"{sensor.vendor} {sensor.model}",
             "source": broadcast.source,
             "live": broadcast.is_live,
-            "planar": broadcast.shown is not None and is_flat(broadcast.shown.scan.points[broadcast.shown.scan.points.valid]),
+            "planar": (
+                broadcast.shown is not None
+                and is_flat(broadcast.shown.scan.points[broadcast.shown.scan.points.valid])
+            ),
             "duration": self.duration,
             "control": not self.why_no_control,
             "why_no_control": self.why_no_control,
@@ -112,27 +117,45 @@ class Answers:
     def numbered(self, number: int, backlog: Backlog) -> dict[str, Any]:
         """A frame by its number."""
         taken = backlog.frame(number)
-        return {"is": "gone", "what": f"frame {number}"} if taken is None else self.frame(taken, "number")
+        return (
+            {"is": "gone", "what": f"frame {number}"}
+            if taken is None
+            else self.frame(taken, "number")
+        )
 
-    def origin(self, shown: Shown | None, number: int, index: int, backlog: Backlog) -> dict[str, Any]:
+    def origin(
+        self, shown: Shown | None, number: int, index: int, backlog: Backlog
+    ) -> dict[str, Any]:
         """The frame that a point of a scan came from, and which of its fields the point is."""
         if shown is None or index >= len(shown.scan):
             return {"is": "gone", "what": f"point {index} of scan {number}"}
         place = shown.scan.provenance(index)
         taken = backlog.at(place)
-        return {"is": "gone", "what": f"the frame of point {index}"} if taken is None else self.frame(taken, "point", place)
+        return (
+            {"is": "gone", "what": f"the frame of point {index}"}
+            if taken is None
+            else self.frame(taken, "point", place)
+        )
 
     def damaged(self, number: int, backlog: Backlog) -> dict[str, Any]:
         """A damaged piece with what would explain the damage."""
         if (piece := backlog.broken(number)) is None:
             return {"is": "gone", "what": f"damaged piece {number}"}
-        facts = {"is": "frame", "number": number, "position": self._position(piece.at), "hex": piece.data.hex()}
+        facts = {
+            "is": "frame",
+            "number": number,
+            "position": self._position(piece.at),
+            "hex": piece.data.hex(),
+        }
         return {**facts, "why": "damaged", "value": None, "explanation": backlog.mended(piece)}
 
     def composed(self, name: str, words: Mapping[str, str]) -> dict[str, Any]:
         """The bytes of a command, explained."""
         sensor = self.broadcast.device.sensor
-        data = sensor.command(name, **arguments(sensor, name, [f"{argument}={text}" for argument, text in words.items()]))
+        data = sensor.command(
+            name,
+            **arguments(sensor, name, [f"{argument}={text}" for argument, text in words.items()]),
+        )
         explanation = explain(data, sensor, sensor.commands[name].frame).to_dict() if data else None
         return {"is": "composed", "command": name, "hex": data.hex(), "explanation": explanation}
 
@@ -141,9 +164,16 @@ class Answers:
         if self.why_no_control:
             raise UsageError(self.why_no_control)
         device = self.broadcast.device
-        found = arguments(device.sensor, name, [f"{argument}={text}" for argument, text in words.items()])
+        found = arguments(
+            device.sensor, name, [f"{argument}={text}" for argument, text in words.items()]
+        )
         reply = device.send(name, **found)
-        return {"is": "replied", "command": name, "text": reply_text(device.sensor, reply), "hex": reply.data.hex()}
+        return {
+            "is": "replied",
+            "command": name,
+            "text": reply_text(device.sensor, reply),
+            "hex": reply.data.hex(),
+        }
 
     def _explained(self, frame: str, data: bytes) -> Explanation:
         return explain(data, self.broadcast.device.sensor, frame)
@@ -204,7 +234,9 @@ def form(sensor: Sensor, name: str) -> dict[str, Any]:
 
 
 def _group(sensor: Sensor, name: str) -> str:
-    """Return "switch" for a command that starts or stops the data, "ask" for one that changes nothing, else "set"."""
+    """Return "switch" for a command that starts or stops the data, "ask" for one that changes
+    nothing, else "set".
+    """
     command = sensor.commands[name]
     if command.starts or command.stops:
         return "switch"
@@ -212,7 +244,9 @@ def _group(sensor: Sensor, name: str) -> str:
 
 
 def restart(sensor: Sensor) -> dict[str, str] | None:
-    """Return the commands that stop the data and start it again, as on opening; None if there are none without arguments."""
+    """Return the commands that stop the data and start it again, as on opening; None if there are
+    none without arguments.
+    """
     names = [*sensor.on_open, *sensor.commands]
     plain = [name for name in names if not sensor.commands[name].args]
     stop = next((name for name in plain if sensor.commands[name].stops), None)
@@ -221,10 +255,23 @@ def restart(sensor: Sensor) -> dict[str, str] | None:
 
 
 def _argument(sensor: Sensor, name: str, argument: str) -> dict[str, Any]:
-    kind, info = sensor.commands[name].arguments[argument].kind, argument_slot(sensor, name, argument).info
+    kind, info = (
+        sensor.commands[name].arguments[argument].kind,
+        argument_slot(sensor, name, argument).info,
+    )
     facts = {"name": argument, "unit": info.unit, "default": None}
     if not isinstance(kind, Range):
-        return {**facts, "text": ": ".join(filter(None, (info.docs, asked(kind)))), "low": None, "high": None, "choices": []}
+        return {
+            **facts,
+            "text": ": ".join(filter(None, (info.docs, asked(kind)))),
+            "low": None,
+            "high": None,
+            "choices": [],
+        }
     labels = {float(info.physical(raw)): label for raw, label in info.labels.items()}
-    choices = [{"value": f"{value:g}", "text": label} for value, label in labels.items() if kind.low <= value <= kind.high]
+    choices = [
+        {"value": f"{value:g}", "text": label}
+        for value, label in labels.items()
+        if kind.low <= value <= kind.high
+    ]
     return {**facts, "text": info.docs, "low": kind.low, "high": kind.high, "choices": choices}

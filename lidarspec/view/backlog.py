@@ -1,7 +1,9 @@
-"""The newest bytes of a source, and what they say: frames by number and place, and those that were damaged on their way.
+"""The newest bytes of a source, and what they say: frames by number and place, and those that were
+damaged on their way.
 
-What is decoded is kept as it came, up to a bound; no frame is looked at before somebody asks for it. Damaged bytes are where the decoder
-passed some over: only then they are cut out and kept, so that they can be explained later.
+What is decoded is kept as it came, up to a bound; no frame is looked at before somebody asks for
+it. Damaged bytes are where the decoder passed some over: only then they are cut out and kept, so
+that they can be explained later.
 """
 
 from __future__ import annotations
@@ -29,7 +31,8 @@ from lidarspec.spec.sensor import Sensor
 #: bytes, and decodings, that are kept; and of what was damaged how many pieces, and bytes of each.
 BYTES, DECODINGS = 1 << 23, 1024
 DAMAGED, LONGEST = 500, 1 << 13
-#: bytes that are in no frame which stand at the beginning of a stream: whoever begins to listen hears the end of a frame.
+#: bytes that are in no frame which stand at the beginning of a stream: whoever begins to listen
+#: hears the end of a frame.
 _BEGINNING = "the end of a frame that began before"
 
 
@@ -89,7 +92,9 @@ class Backlog:
         self._broken = deque[Damaged](maxlen=DAMAGED)
         self._size = self._number = self._end = 0
 
-    def fed(self, decoder: Decoder, buffer: NDArray[np.uint8], starts: Numbers, sizes: NDArray[np.intp]) -> None:
+    def fed(
+        self, decoder: Decoder, buffer: NDArray[np.uint8], starts: Numbers, sizes: NDArray[np.intp]
+    ) -> None:
         """What a decoder is fed."""
         with self._lock:
             self._stream, self._joins = decoder.stream, decoder.joins
@@ -98,7 +103,9 @@ class Backlog:
             while self._size > BYTES and len(self._raw) > 1:
                 self._size -= int(self._raw.popleft()[3].sum())
             oldest = self._raw[0][0]
-            while len(self._found) > 1 and (len(self._found) > DECODINGS or self._found[0][1].places[-1] < oldest):
+            while len(self._found) > 1 and (
+                len(self._found) > DECODINGS or self._found[0][1].places[-1] < oldest
+            ):
                 self._found.popleft()
             while len(self._raw) > 2 * DECODINGS:
                 self._size -= int(self._raw.popleft()[3].sum())
@@ -139,18 +146,31 @@ class Backlog:
         with self._lock:
             spot = bisect_right(self._found, number, key=lambda entry: entry[0]) - 1
             first, frames = self._found[spot] if spot >= 0 else (0, None)
-        return None if frames is None or not 0 <= number - first < len(frames) else _taken(first, frames, number - first)
+        return (
+            None
+            if frames is None or not 0 <= number - first < len(frames)
+            else _taken(first, frames, number - first)
+        )
 
     def at(self, place: Place) -> Taken | None:
-        """The frame that a point came from; None where it is not kept any more, and the scan has its bytes in another form."""
+        """The frame that a point came from; None where it is not kept any more, and the scan has
+        its bytes in another form.
+        """
         with self._lock:
-            spot = bisect_right(self._found, place.offset, key=lambda entry: int(entry[1].places[0])) - 1
+            spot = (
+                bisect_right(self._found, place.offset, key=lambda entry: int(entry[1].places[0]))
+                - 1
+            )
             first, frames = self._found[spot] if spot >= 0 else (0, None)
         if frames is not None:
             index = int(frames.offsets.searchsorted(place.offset))
             if index < len(frames) and frames.offsets[index] == place.offset:
                 return _taken(first, frames, index)
-        return Taken(None, place.frame, place.host_ns or -1, place.data) if self.sensor.frames[place.frame].wire is None else None
+        return (
+            Taken(None, place.frame, place.host_ns or -1, place.data)
+            if self.sensor.frames[place.frame].wire is None
+            else None
+        )
 
     def broken(self, number: int) -> Damaged | None:
         """A damaged piece by its number; None where it is not kept any more."""
@@ -162,17 +182,26 @@ class Backlog:
             return [piece for piece in self._broken if piece.number >= number]
 
     def mended(self, piece: Damaged) -> dict[str, Any]:
-        """A damaged piece in one explanation: what was a frame in it, with what would explain the damage, and what is between these."""
+        """A damaged piece in one explanation: what was a frame in it, with what would explain the
+        damage, and what is between these.
+        """
         parts = list(explained(self.sensor, Piece(piece.offset, piece.data, "", piece.datagram)))
         whole = [part for _, part in parts if part.frame]
-        rows = [row.to_dict() | {"offset": row.offset + place.offset - piece.offset} for place, part in parts for row in part.rows]
+        rows = [
+            row.to_dict() | {"offset": row.offset + place.offset - piece.offset}
+            for place, part in parts
+            for row in part.rows
+        ]
         named = whole[0] if whole else Explanation(self.sensor.id, "", piece.data, ())
         notes = [note for part in whole for note in part.notes]
         return named.to_dict() | {"size": len(piece.data), "notes": notes, "rows": rows}
 
     def _note(self, frames: Frames) -> None:
         """Keep the bytes that were passed over before some of these frames."""
-        offsets, ends = frames.offsets, np.concatenate([[self._end], (frames.offsets + frames.sizes)[:-1]])
+        offsets, ends = (
+            frames.offsets,
+            np.concatenate([[self._end], (frames.offsets + frames.sizes)[:-1]]),
+        )
         for index in np.flatnonzero(frames.gaps).tolist()[-DAMAGED:]:
             at, end = int(frames.at[index]), int(offsets[index])
             if self._joins:
@@ -186,9 +215,15 @@ class Backlog:
         self.damaged += 1
 
     def _between(self, start: int, end: int) -> Iterator[tuple[int, int, bytes]]:
-        """The bytes from one place of the input to another, each datagram by itself: where, how many, and they."""
+        """The bytes from one place of the input to another, each datagram by itself: where, how
+        many, and they.
+        """
         if self._stream:
-            parts = [bytes(buffer[max(start - first, 0) : end - first]) for first, buffer, _, _ in self._raw if first < end]
+            parts = [
+                bytes(buffer[max(start - first, 0) : end - first])
+                for first, buffer, _, _ in self._raw
+                if first < end
+            ]
             yield start, end - start, b"".join(parts)[:LONGEST]
             return
         for first, buffer, starts, sizes in self._raw:
@@ -199,4 +234,9 @@ class Backlog:
 
 
 def _taken(first: int, frames: Frames, index: int) -> Taken:
-    return Taken(first + index, frames.names[int(frames.kinds[index])], int(frames.at[index]), frames.data(index))
+    return Taken(
+        first + index,
+        frames.names[int(frames.kinds[index])],
+        int(frames.at[index]),
+        frames.data(index),
+    )

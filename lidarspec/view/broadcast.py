@@ -1,7 +1,9 @@
-"""A source that is read once and shown to any number of viewers: the newest scan, how the sensor is doing, its newest bytes.
+"""A source that is read once and shown to any number of viewers: the newest scan, how the sensor is
+doing, its newest bytes.
 
-One thread reads, and whoever asks in another sees what has come by then. A file is played: it can be paused, moved through, and played
-at another speed, for all viewers together. What is live goes on whatever they do.
+One thread reads, and whoever asks in another sees what has come by then. A file is played: it can
+be paused, moved through, and played at another speed, for all viewers together. What is live goes
+on whatever they do.
 """
 
 from __future__ import annotations
@@ -47,7 +49,9 @@ class Shown:
     def message(self, most: int) -> bytes:
         """The scan as a message of so many points at most, made once for all who ask alike."""
         if most != self._most:
-            self._message = message(self.scan, self.number, position=self.position, sent=self.sent, most=most)
+            self._message = message(
+                self.scan, self.number, position=self.position, sent=self.sent, most=most
+            )
             self._most = most
         return self._message
 
@@ -172,7 +176,9 @@ class Broadcast(Closing):
         """Play so many times as fast as it was."""
         self._refuse_live("comes as fast as it does")
         if not SLOWEST <= times <= FASTEST:
-            raise UsageError(f"a file is played {SLOWEST:g} to {FASTEST:g} times as fast, not {times:g} times")
+            raise UsageError(
+                f"a file is played {SLOWEST:g} to {FASTEST:g} times as fast, not {times:g} times"
+            )
         self.speed = times
 
     def run(self, until: float) -> None:
@@ -231,7 +237,9 @@ class Broadcast(Closing):
         self.device, self._moved = device, target > 0
         self.backlog.forget()
         self._seen = 0
-        self._feed = self._fed(replace(self._select, times=(target, None)) if target else self._select)
+        self._feed = self._fed(
+            replace(self._select, times=(target, None)) if target else self._select
+        )
         self._guarded(self._feed.step)
 
     def _fed(self, select: Selection) -> Feed:
@@ -244,7 +252,9 @@ class Broadcast(Closing):
         if feed.scan is not None and feed.number != self._seen:
             self._seen, is_new = feed.number, True
             self._first = self._first or next(iter(feed.scans), feed.scan)
-            self.shown = Shown(feed.scan, self._number, self._position(feed.scan), self._sent(feed.scan))
+            self.shown = Shown(
+                feed.scan, self._number, self._position(feed.scan), self._sent(feed.scan)
+            )
             self._numbered[self._number] = self.shown
             self._number += 1
         if now - self._measured >= FIGURES:
@@ -262,7 +272,13 @@ class Broadcast(Closing):
         reading = self._feed.meter.reading(stats, seconds if self.is_live else None).to_dict()
         at = self.now()
         latency = at - self.shown.sent if self.is_live and self.shown is not None else None
-        return {"at": at, **reading, "lost": stats.lost, "disconnects": stats.disconnects, "latency_s": latency}
+        return {
+            "at": at,
+            **reading,
+            "lost": stats.lost,
+            "disconnects": stats.disconnects,
+            "latency_s": latency,
+        }
 
     def _sent(self, scan: Scan) -> float:
         """When the last packet of a scan arrived; of a file: now."""
@@ -270,7 +286,9 @@ class Broadcast(Closing):
         return arrived * 1e-9 if arrived else self.now()
 
     def _position(self, scan: Scan) -> float:
-        """Seconds from the first scan: by arrival, of a file as its scans are selected, or by their number where they bear no times."""
+        """Seconds from the first scan: by arrival, of a file as its scans are selected, or by their
+        number where they bear no times.
+        """
         assert self._first is not None
         if self.is_live:
             return (scan.host_ns - self._first.host_ns) * 1e-9

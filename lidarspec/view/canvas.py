@@ -1,7 +1,8 @@
-"""Pictures in character cells: two by four dots of braille in each, square where a cell is twice as high as wide.
+"""Pictures in character cells: two by four dots of braille in each, square where a cell is twice as
+high as wide.
 
-Pictures hold the numbers of inks, so that two of them are compared cell by cell; only the terminal knows what it can show, and what
-each ink looks like with true colour, 256 colours, 16, or none.
+Pictures hold the numbers of inks, so that two of them are compared cell by cell; only the terminal
+knows what it can show, and what each ink looks like with true colour, 256 colours, 16, or none.
 """
 
 from __future__ import annotations
@@ -31,13 +32,28 @@ BITS = np.array([[0x01, 0x08], [0x02, 0x10], [0x04, 0x20], [0x40, 0x80]], np.int
 BLANK = 0x2800
 _SPACE = ord(" ")
 #: what stands for a character where only ASCII can be shown; braille by the number of its dots.
-ASCII = {"▲": "^", "▶": ">", "▼": "v", "◀": "<", "│": "|", "─": "-", "━": "#", "°": "d", "●": "*", "‖": "=", "±": "+", "·": "."}
+ASCII = {
+    "▲": "^",
+    "▶": ">",
+    "▼": "v",
+    "◀": "<",
+    "│": "|",
+    "─": "-",
+    "━": "#",
+    "°": "d",
+    "●": "*",
+    "‖": "=",
+    "±": "+",
+    "·": ".",
+}
 _BY_DOTS = " ..::oo##"
 
 
 @dataclass(frozen=True)
 class Ink:
-    """A colour and weight; `rgb` None is the terminal's own colour, `standard` the SGR number of the nearest of 16."""
+    """A colour and weight; `rgb` None is the terminal's own colour, `standard` the SGR number of
+    the nearest of 16.
+    """
 
     rgb: Rgb | None = None
     standard: int | None = None
@@ -55,7 +71,10 @@ _FIXED = (
 )
 #: the first ink of the scale, for its lowest values.
 FIRST_STEP = len(_FIXED)
-_SCALE = tuple(Ink(rgb, _STANDARD[step * len(_STANDARD) // STEPS]) for step, rgb in enumerate(make_ramp("dark", STEPS)))
+_SCALE = tuple(
+    Ink(rgb, _STANDARD[step * len(_STANDARD) // STEPS])
+    for step, rgb in enumerate(make_ramp("dark", STEPS))
+)
 INKS: tuple[Ink, ...] = (*_FIXED, *_SCALE)
 
 
@@ -121,7 +140,10 @@ class Cells:
 
     def paste(self, row: int, column: int, other: Cells) -> None:
         """Another picture with its upper left corner in a cell; what does not fit is cut off."""
-        width, height = min(other.size[0], self.size[0] - column), min(other.size[1], self.size[1] - row)
+        width, height = (
+            min(other.size[0], self.size[0] - column),
+            min(other.size[1], self.size[1] - row),
+        )
         if width > 0 and height > 0:
             self.codes[row : row + height, column : column + width] = other.codes[:height, :width]
             self.inks[row : row + height, column : column + width] = other.inks[:height, :width]
@@ -149,7 +171,11 @@ class Cells:
         for character in set(np.unique(codes).tolist()):
             if character > 0x7E:
                 dots = (character - BLANK).bit_count()
-                codes[codes == character] = ord(_BY_DOTS[dots] if BLANK <= character < BLANK + 256 else ASCII.get(chr(character), "?"))
+                codes[codes == character] = ord(
+                    _BY_DOTS[dots]
+                    if BLANK <= character < BLANK + 256
+                    else ASCII.get(chr(character), "?")
+                )
         return Cells(codes, self.inks)
 
 
@@ -175,7 +201,8 @@ class Canvas:
         """Set dots of points at fractional dot coordinates; what is outside is left out.
 
         Args:
-            shade: (n,) from 0 to 1, where on the ramp each is: of several in a cell the nearest, or the strongest, gives the colour.
+            shade: (n,) from 0 to 1, where on the ramp each is: of several in a cell the nearest, or
+                the strongest, gives the colour.
         """
         across, down, inside = self._places(column, row)
         self.dots[down, across] = True
@@ -188,8 +215,11 @@ class Canvas:
         across, down, _ = self._places(column, row)
         self.lines[down, across] = True
 
-    def label(self, row: int, column: int, text: str, ink: int = LABEL, *, over: bool = False) -> bool:
-        """Write text from a cell on, unless it would leave the canvas or hide something; whether it was written.
+    def label(
+        self, row: int, column: int, text: str, ink: int = LABEL, *, over: bool = False
+    ) -> bool:
+        """Write text from a cell on, unless it would leave the canvas or hide something; whether it
+        was written.
 
         Args:
             over: it may hide points.
@@ -205,13 +235,19 @@ class Canvas:
     def cells(self) -> Cells:
         """The picture."""
         points, lines = _braille(self.dots), _braille(self.lines)
-        codes = np.where(points > 0, BLANK + points, np.where(lines > 0, BLANK + lines, _SPACE)).astype(np.int32)
-        inks = np.where(points > 0, FIRST_STEP + self.steps, np.where(lines > 0, FAINT, PLAIN)).astype(np.int16)
+        codes = np.where(
+            points > 0, BLANK + points, np.where(lines > 0, BLANK + lines, _SPACE)
+        ).astype(np.int32)
+        inks = np.where(
+            points > 0, FIRST_STEP + self.steps, np.where(lines > 0, FAINT, PLAIN)
+        ).astype(np.int16)
         for cell, (character, ink) in self.labels.items():
             codes[cell], inks[cell] = ord(character), ink
         return Cells(codes, inks)
 
-    def _places(self, column: NDArray[Any], row: NDArray[Any]) -> tuple[NDArray[np.intp], NDArray[np.intp], NDArray[np.bool_]]:
+    def _places(
+        self, column: NDArray[Any], row: NDArray[Any]
+    ) -> tuple[NDArray[np.intp], NDArray[np.intp], NDArray[np.bool_]]:
         height, width = self.dots.shape
         inside = (column >= 0) & (column < width) & (row >= 0) & (row < height)
         return column[inside].astype(np.intp), row[inside].astype(np.intp), inside

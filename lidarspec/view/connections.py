@@ -117,7 +117,10 @@ class Connections:
             self._close_waiting(next(iter(self._waiting)))
         if not self._has_reported:
             self._has_reported = True
-            self._report(f"more than {MAX_CONNECTIONS} connections at once: those without the token are closed first")
+            self._report(
+                f"more than {MAX_CONNECTIONS} connections at once: those without the token are"
+                " closed first"
+            )
 
     def _close_waiting(self, client: Client) -> None:
         self._waiting.pop(client).transport.abort()

@@ -1,6 +1,8 @@
-"""What a device delivers, taken in between two pictures or two lines of figures: the newest scan kept, and everything counted.
+"""What a device delivers, taken in between two pictures or two lines of figures: the newest scan
+kept, and everything counted.
 
-`Meter` says how the sensor is doing: speed, rates, losses and jitter over the last moments, and over everything.
+`Meter` says how the sensor is doing: speed, rates, losses and jitter over the last moments, and
+over everything.
 """
 
 from __future__ import annotations
@@ -25,7 +27,8 @@ from lidarspec.scans.selection import Selection, Sieve, Slice
 #: scans kept for means and medians.
 KEPT = 1 << 12
 Seconds = NDArray[np.float64]
-#: seconds from scan to scan of a file where their times do not say it, and the longest pause that is kept.
+#: seconds from scan to scan of a file where their times do not say it, and the longest pause that
+#: is kept.
 STEP, LONGEST = 0.1, 2.0
 #: seconds that one look at a live source waits for data.
 LOOK = 0.04
@@ -45,7 +48,8 @@ class Reading:
         points, valid: points per scan, and those with a return among them.
         error_rate: frames whose checksum, length or values were wrong, of all, from 0 to 1.
         skipped_rate: bytes that are in no frame and no declared filler, of all.
-        loss_rate: packets that are missing by the sensor's counter or clock, of all; None where it has neither.
+        loss_rate: packets that are missing by the sensor's counter or clock, of all; None where it
+            has neither.
         jitter_s: standard deviation of the time between packets' arrivals.
         longest_gap_s: the longest time between two arrivals.
         bytes_per_s: of input.
@@ -85,7 +89,9 @@ class Tally:
         self._by_host = True
 
     def arrived(self, number: int, gaps: Seconds, *, by_host: bool) -> None:
-        """Count packets, and the seconds from each to the next, (n,), by their arrival or else by the sensor's clock."""
+        """Count packets, and the seconds from each to the next, (n,), by their arrival or else by
+        the sensor's clock.
+        """
         self.packets += number
         self._by_host = by_host
         if len(gaps):
@@ -106,7 +112,8 @@ class Tally:
 
         Args:
             counters: now.
-            seconds: how long it was by the caller's clock; taken from the arrivals where it is left out.
+            seconds: how long it was by the caller's clock; taken from the arrivals where it is left
+                out.
             sequenced: whether the sensor numbers its packets, or says when they were sent.
         """
         spanned = self._spanned or None
@@ -118,13 +125,19 @@ class Tally:
             speed_hz=float(np.median(self._rates)) if self._rates else None,
             scans=self.scans,
             packets=self.packets,
-            packet_rate_hz=self._gaps / spanned if spanned else self.packets / lasted if lasted else None,
+            packet_rate_hz=self._gaps / spanned
+            if spanned
+            else self.packets / lasted
+            if lasted
+            else None,
             points=_mean([size for size, _ in self._sizes]),
             valid=_mean([valid for _, valid in self._sizes]),
             error_rate=_share(change["rejected"], change["frames"]),
             skipped_rate=_share(change["skipped"], change["bytes_in"] - change["skipped"]),
             loss_rate=_share(change["lost"], self.packets) if sequenced else None,
-            jitter_s=math.sqrt(max(self._squares / self._gaps - mean * mean, 0.0)) if spanned and self._by_host else None,
+            jitter_s=math.sqrt(max(self._squares / self._gaps - mean * mean, 0.0))
+            if spanned and self._by_host
+            else None,
             longest_gap_s=self._longest if spanned and self._by_host else None,
             bytes_per_s=change["bytes_in"] / lasted if lasted else None,
         )
@@ -171,7 +184,10 @@ def totals(counters: Counters) -> dict[str, int]:
     return {
         "bytes_in": counters.bytes_in,
         "frames": sum(counters.frames.values()),
-        "rejected": counters.bad_checksum + counters.bad_length + counters.bad_constant + counters.implausible,
+        "rejected": counters.bad_checksum
+        + counters.bad_length
+        + counters.bad_constant
+        + counters.implausible,
         "skipped": counters.bytes_skipped - counters.bytes_filler,
         "lost": counters.lost,
     }
@@ -198,8 +214,8 @@ class Feed:
         played: scans of a file come at the times that they bear; else as fast as they are read.
         speed: how many times faster than that; may be set while it plays.
         select: which scans, and what of each; packets at these times.
-        ahead: seconds of a file that is played that are read at once, so that figures and bytes are those of what is seen; None: as much
-            as is decoded quickest.
+        ahead: seconds of a file that is played that are read at once, so that figures and bytes are
+            those of what is seen; None: as much as is decoded quickest.
 
     Attributes:
         packets: the batch that the last look took in, None where it took none.
@@ -221,13 +237,19 @@ class Feed:
     ) -> None:
         self.device, self.number, self.speed = device, 0, speed
         self._select = select or Selection()
-        self._sieve, self._slice = Sieve(self._select, device.source, device.skip), Slice(self._select.times)
+        self._sieve, self._slice = (
+            Sieve(self._select, device.source, device.skip),
+            Slice(self._select.times),
+        )
         self.scan: Scan | None = None
         self.packets: Packets | None = None
         self.scans: list[Scan] = []
         self.meter = self._meter()
         self._played = played and not device.is_live
-        self._batches, self._stream = device.packets(wait=LOOK), ScanStream(device.sensor, device.mount)
+        self._batches, self._stream = (
+            device.packets(wait=LOOK),
+            ScanStream(device.sensor, device.mount),
+        )
         self._waiting: deque[Scan] = deque()
         self._disconnects, self._read_out, self._metered = 0, False, False
         self._due: float | None = None
@@ -256,7 +278,8 @@ class Feed:
                 return
 
     def step(self) -> None:
-        """Show the next scan of a file that is played, whenever it is due; none where that has ended.
+        """Show the next scan of a file that is played, whenever it is due; none where that has
+        ended.
 
         Raises:
             LidarSpecError: where the source fails.
@@ -298,7 +321,9 @@ class Feed:
                 self._pace((int(packets.time_ns[-1]) - int(packets.time_ns[0])) * 1e-9, self._ahead)
 
     def _pace(self, seconds: float, ahead: float) -> None:
-        """Read about as much of a file at once as is shown in a moment; `seconds`: what was read lasted so long."""
+        """Read about as much of a file at once as is shown in a moment; `seconds`: what was read
+        lasted so long.
+        """
         portion = self._portion
         if seconds < ahead / 2 and portion < BATCH_BYTES:
             self._portion *= 2
@@ -310,17 +335,25 @@ class Feed:
     def _meter(self) -> Meter:
         """One that counts from here on."""
         sensor = self.device.sensor
-        return Meter(self.device.stats, sequenced=sensor.sequence is not None or sensor.clock is not None)
+        return Meter(
+            self.device.stats, sequenced=sensor.sequence is not None or sensor.clock is not None
+        )
 
     def _within(self, packets: Packets) -> Packets:
         """Those of some packets that are wanted by their times."""
         if not self._select.is_timed:
             return packets
-        which = self._slice.holds(packets.host_ns if self._select.time == "host" else packets.time_ns)
+        which = self._slice.holds(
+            packets.host_ns if self._select.time == "host" else packets.time_ns
+        )
         return packets if which.all() else packets.take(which)
 
     def _keep(self, scans: list[Scan]) -> None:
-        scans = [wanted for scan in scans if not self._sieve.ended and (wanted := self._sieve.take(scan)) is not None]
+        scans = [
+            wanted
+            for scan in scans
+            if not self._sieve.ended and (wanted := self._sieve.take(scan)) is not None
+        ]
         if self._played:
             self._waiting += scans
         else:
@@ -341,7 +374,10 @@ class Feed:
             self._due = time.monotonic()
         else:
             step = (scan.stamp_ns - self._stamp) * 1e-9
-            due = max(self._due + (step if 0 < step <= LONGEST else STEP) / self.speed, time.monotonic() - LONGEST)
+            due = max(
+                self._due + (step if 0 < step <= LONGEST else STEP) / self.speed,
+                time.monotonic() - LONGEST,
+            )
             if due > until:
                 time.sleep(max(until - time.monotonic(), 0.0))
                 return

@@ -1,4 +1,6 @@
-"""Figures for reports, by matplotlib: a scan to scale, its intensities, ranges over time, and how a source did over time."""
+"""Figures for reports, by matplotlib: a scan to scale, its intensities, ranges over time, and how a
+source did over time.
+"""
 
 from __future__ import annotations
 
@@ -20,7 +22,8 @@ from lidarspec.view.feed import Feed, totals
 
 #: what `save` writes, by suffix.
 SUFFIXES = (".png", ".pdf", ".svg")
-#: inches: the width of a figure, the height of one panel, and of the view from the side at least and at most; dots an inch.
+#: inches: the width of a figure, the height of one panel, and of the view from the side at least
+#: and at most; dots an inch.
 WIDTH, PANEL, LOWEST, HIGHEST, DPI = 7.0, 4.2, 0.7, 3.0, 160
 #: bins of a histogram, of ranges, and of time at most; seconds of the narrowest of these.
 BINS, NEAR, MOMENTS, NARROWEST = 128, 200, 400, 0.1
@@ -58,21 +61,43 @@ def _styled(draw: _Drawing) -> _Drawing:
 @_styled
 def save(figure: Any, target: Any, suffix: str) -> None:
     """Write a figure to a path or a binary file, in the format of a suffix."""
-    figure.savefig(target, format=suffix.removeprefix("."), dpi=DPI, metadata={"Date": None} if suffix == ".svg" else None)
+    figure.savefig(
+        target,
+        format=suffix.removeprefix("."),
+        dpi=DPI,
+        metadata={"Date": None} if suffix == ".svg" else None,
+    )
 
 
 @_styled
 def of_scan(scan: Scan, look: Look, title: str) -> Any:
-    """A scan from above, forward up, and where it is not flat from its right side, all metres alike."""
+    """A scan from above, forward up, and where it is not flat from its right side, all metres
+    alike.
+    """
     cloud = scan.points[scan.points.valid]
-    column = cloud.range if look.ramp == "range" else cloud.intensity if look.ramp == "intensity" else cloud.extra[look.ramp]
+    column = (
+        cloud.range
+        if look.ramp == "range"
+        else cloud.intensity
+        if look.ramp == "intensity"
+        else cloud.extra[look.ramp]
+    )
     unit = "m" if look.ramp == "range" else look.unit
     lowest, highest = bounds(cloud)
     low = min(float(lowest[2]), 0.0)
     high = max(float(highest[2]), 0.0)
-    tall = 0.0 if look.flat else float(np.clip((high - low) / (2 * look.reach) * WIDTH * 0.85, LOWEST, HIGHEST))
+    tall = (
+        0.0
+        if look.flat
+        else float(np.clip((high - low) / (2 * look.reach) * WIDTH * 0.85, LOWEST, HIGHEST))
+    )
     figure = _figure(title, WIDTH * 0.92 + tall)
-    rows = figure.subplots(1 if look.flat else 2, 1, squeeze=False, height_ratios=[WIDTH * 0.75, *[tall] * (not look.flat)])[:, 0]
+    rows = figure.subplots(
+        1 if look.flat else 2,
+        1,
+        squeeze=False,
+        height_ratios=[WIDTH * 0.75, *[tall] * (not look.flat)],
+    )[:, 0]
     dots = {
         "c": column,
         "cmap": colour_map(),
@@ -93,7 +118,9 @@ def of_scan(scan: Scan, look: Look, title: str) -> Any:
         side.plot(0, 0, "k>", markersize=6)
         side.set(xlim=seen, ylim=(low - 0.1, high + 0.1), aspect="equal")
         side.set(xlabel="x [m], forward", ylabel="z [m], up")
-    figure.colorbar(shown, ax=rows, label=f"{look.ramp} [{unit}]" if unit else look.ramp, shrink=0.6, pad=0.02)
+    figure.colorbar(
+        shown, ax=rows, label=f"{look.ramp} [{unit}]" if unit else look.ramp, shrink=0.6, pad=0.02
+    )
     return figure
 
 
@@ -107,7 +134,9 @@ def of_intensities(scans: Iterable[Scan], title: str) -> Any:
     counted = Counter[float]()
     for scan in scans:
         if scan.points.intensity is not None:
-            values, numbers = np.unique(np.rint(scan.points.intensity[scan.points.valid]), return_counts=True)
+            values, numbers = np.unique(
+                np.rint(scan.points.intensity[scan.points.valid]), return_counts=True
+            )
             counted.update(dict(zip(values.tolist(), numbers.tolist(), strict=True)))
     if not counted:
         raise UsageError("there are no intensities to count")
@@ -119,14 +148,21 @@ def of_intensities(scans: Iterable[Scan], title: str) -> Any:
     width = max(np.ceil((high - low) / BINS), 1.0)
     axes.hist(strengths, bins=np.arange(low, high + width, width), weights=counts, color="C0")
     axes.axvline(float(middle) + 0.5, color="C1", label=f"median {middle:g}")
-    axes.set(xlabel="intensity, as the sensor gives it", ylabel="returns", yscale="log", xlim=(low, high + width), ylim=(0.5, None))
+    axes.set(
+        xlabel="intensity, as the sensor gives it",
+        ylabel="returns",
+        yscale="log",
+        xlim=(low, high + width),
+        ylim=(0.5, None),
+    )
     _legend(axes)
     return figure
 
 
 @_styled
 def of_ranges(scans: Iterable[Scan], title: str) -> Any:
-    """How many returns there are at each range, over time, and the median; of many scans an even choice is shown.
+    """How many returns there are at each range, over time, and the median; of many scans an even
+    choice is shown.
 
     Args:
         scans: one at least.
@@ -139,19 +175,32 @@ def of_ranges(scans: Iterable[Scan], title: str) -> Any:
             every, step = every[::2], 2 * step
     every = [one for one in every if one[2]] or every  # pieces have fewer returns
     farthest = (
-        np.percentile(np.concatenate([ranges for _, ranges, _ in every]), MOST) if any(len(ranges) for _, ranges, _ in every) else 1.0
+        np.percentile(np.concatenate([ranges for _, ranges, _ in every]), MOST)
+        if any(len(ranges) for _, ranges, _ in every)
+        else 1.0
     )
     edges = np.linspace(0, float(farthest) * 1.05, NEAR + 1)
     times = np.array([(stamp - every[0][0]) * 1e-9 for stamp, *_ in every])
     order = np.argsort(times, kind="stable")
     last = float(np.median(np.diff(times[order]))) if len(times) > 1 else NARROWEST
     counts = np.stack([np.histogram(every[which][1], edges)[0] for which in order], axis=1)
-    figure = _figure(f"{title}: {number:,} scans" + f", of which one in {step} is shown" * (step > 1))
+    figure = _figure(
+        f"{title}: {number:,} scans" + f", of which one in {step} is shown" * (step > 1)
+    )
     axes = figure.subplots()
     colours = import_library("matplotlib.colors", "plot").LogNorm(1, max(int(counts.max()), 2))
     begins = np.append(times[order], times[order][-1] + last)
-    shown = axes.pcolormesh(begins, edges, np.ma.masked_equal(counts, 0), norm=colours, cmap=colour_map(), rasterized=True)
-    medians = [float(np.median(every[which][1])) if len(every[which][1]) else np.nan for which in order]
+    shown = axes.pcolormesh(
+        begins,
+        edges,
+        np.ma.masked_equal(counts, 0),
+        norm=colours,
+        cmap=colour_map(),
+        rasterized=True,
+    )
+    medians = [
+        float(np.median(every[which][1])) if len(every[which][1]) else np.nan for which in order
+    ]
     axes.plot(times[order] + last / 2, medians, color="C3", linewidth=1, label="median")
     axes.set(xlabel="time from the first scan [s]", ylabel="range [m]", ylim=(0, edges[-1]))
     _legend(axes)
@@ -176,15 +225,24 @@ def of_rates(rates: Rates, title: str) -> Any:
     ):
         axes.stairs(values, seconds, baseline=None, color="C0", linewidth=1.2, clip_on=False)
         axes.set(ylabel=label, ylim=(0, max(float(np.nanmax(values, initial=0)) * 1.15, 1.0)))
-    panels[1].plot(*zip(*rates.scans, strict=True) if rates.scans else ([], []), ".", markersize=3, color="C0")
-    panels[1].set(ylabel="scans [1/s]", ylim=(0, max([rate for _, rate in rates.scans if np.isfinite(rate)], default=1) * 1.3))
-    panels[3].set(xlabel=f"time from the first packet [s], in steps of {rates.width:g} s", xlim=(0, seconds[-1]))
+    panels[1].plot(
+        *zip(*rates.scans, strict=True) if rates.scans else ([], []), ".", markersize=3, color="C0"
+    )
+    panels[1].set(
+        ylabel="scans [1/s]",
+        ylim=(0, max([rate for _, rate in rates.scans if np.isfinite(rate)], default=1) * 1.3),
+    )
+    panels[3].set(
+        xlabel=f"time from the first packet [s], in steps of {rates.width:g} s",
+        xlim=(0, seconds[-1]),
+    )
     figure.align_ylabels(panels)
     return figure
 
 
 class Rates:
-    """Packets, and what is lost and wrong, in even steps of the time of their arrival, or else of the sensor's clock.
+    """Packets, and what is lost and wrong, in even steps of the time of their arrival, or else of
+    the sensor's clock.
 
     Args:
         feed: read to its end, or up to a time.
@@ -192,8 +250,8 @@ class Rates:
 
     Attributes:
         width: of a step, seconds.
-        totals: (3, n): packets, lost ones, and frames that were wrong, in each step. What is lost or wrong is known for each batch of
-            packets, over which it is spread.
+        totals: (3, n): packets, lost ones, and frames that were wrong, in each step. What is lost
+            or wrong is known for each batch of packets, over which it is spread.
         scans: seconds from the first packet and rate of each whole scan.
     """
 
@@ -204,7 +262,11 @@ class Rates:
         while not feed.ended and time.monotonic() < until:
             feed.pump(0.0)
             self._take()
-            self.scans += [(self._seconds(scan.host_ns or scan.stamp_ns), scan.rate_hz) for scan in feed.scans if scan.whole]
+            self.scans += [
+                (self._seconds(scan.host_ns or scan.stamp_ns), scan.rate_hz)
+                for scan in feed.scans
+                if scan.whole
+            ]
 
     def _seconds(self, at: int) -> float:
         """A time as seconds from the first packet."""
@@ -228,9 +290,13 @@ class Rates:
         self.totals = grown + np.outer((1, lost / len(packets), wrong / len(packets)), counted)
 
     def series(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """The edges of the steps, (n + 1,) seconds, and the counts in them, (3, n); not the last step, which is not full."""
+        """The edges of the steps, (n + 1,) seconds, and the counts in them, (3, n); not the last
+        step, which is not full.
+        """
         if self._last < self.width:
-            raise UsageError(f"{self._feed.device.source}: its packets bear no times, or all the same")
+            raise UsageError(
+                f"{self._feed.device.source}: its packets bear no times, or all the same"
+            )
         full = max(int(self._last / self.width), 1)
         joined = -(-full // MOMENTS)
         counts = self.totals[:, : max(full // joined, 1) * joined]
@@ -257,6 +323,8 @@ def _share(some: NDArray[np.float64], others: NDArray[np.float64]) -> NDArray[np
 
 
 def _figure(title: str, height: float = PANEL) -> Any:
-    figure = import_library("matplotlib.figure", "plot").Figure(figsize=(WIDTH, height), layout="constrained")
+    figure = import_library("matplotlib.figure", "plot").Figure(
+        figsize=(WIDTH, height), layout="constrained"
+    )
     figure.suptitle(title, x=0.01, ha="left", fontsize=10)
     return figure

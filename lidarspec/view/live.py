@@ -1,6 +1,7 @@
 """The window that shows a sensor at work: keys in, pictures out, a dozen times a second at most.
 
-Around the picture stand title, figures, the meaning of the colours and the keys. A `Switch` records the source while it is on.
+Around the picture stand title, figures, the meaning of the colours and the keys. A `Switch` records
+the source while it is on.
 """
 
 from __future__ import annotations
@@ -138,9 +139,14 @@ class Switch:
         opened = self._opened
         assert opened is not None
         begin = f"{self.sensor_id}-{time.strftime('%Y%m%d-%H%M%S')}"
-        paths = (self._folder / f"{begin}{f'-{number}' if number else ''}.lsr" for number in itertools.count())
+        paths = (
+            self._folder / f"{begin}{f'-{number}' if number else ''}.lsr"
+            for number in itertools.count()
+        )
         path = next(path for path in paths if not path.exists())
-        self._recorder = recorder(path, self.sensor_id, self._source, datagrams=opened.datagrams, baud=opened.baud)
+        self._recorder = recorder(
+            path, self.sensor_id, self._source, datagrams=opened.datagrams, baud=opened.baud
+        )
 
     def _end(self) -> None:
         current = self._recorder
@@ -155,7 +161,9 @@ class Switch:
             else:
                 current.discard()
         if not current.records:
-            self.trouble = f"nothing came while {Path(current.path).name} was recorded: it is removed"
+            self.trouble = (
+                f"nothing came while {Path(current.path).name} was recorded: it is removed"
+            )
 
 
 def _write_beside(whole: Cells, left: int, figures: Sequence[Figure], look: Look) -> None:
@@ -198,7 +206,13 @@ def message(columns: int, text: str) -> Cells:
 
 def _write_title(whole: Cells, sensor: str, source: str, state: str, ink: int) -> None:
     room = whole.size[0] - len(sensor) - len(state) - 6
-    shown = source if len(source) <= room else "..." + source[len(source) - room + 3 :] if room > 8 else ""
+    shown = (
+        source
+        if len(source) <= room
+        else "..." + source[len(source) - room + 3 :]
+        if room > 8
+        else ""
+    )
     whole.write(0, 1, sensor, STRONG)
     whole.write(0, len(sensor) + 3, shown, LABEL)
     whole.write(0, whole.size[0] - len(state) - 1, state, ink)
@@ -239,7 +253,8 @@ class Choice:
         ramp: what colours show.
         zoom: how many times larger than all of it.
         middle: what is in the middle, metres forward and left of the sensor.
-        paused, helped, done: whether the picture stands, the keys are listed, the window is to close.
+        paused, helped, done: whether the picture stands, the keys are listed, the window is to
+            close.
     """
 
     ramp: str = "range"
@@ -249,8 +264,12 @@ class Choice:
     helped: bool = False
     done: bool = False
 
-    def after(self, key: str, reach: float, ramps: Sequence[str] = ("range", "intensity")) -> Choice:
-        """The choice after a key press; `reach` is what is shown now, in metres, and `ramps` what colours can show."""
+    def after(
+        self, key: str, reach: float, ramps: Sequence[str] = ("range", "intensity")
+    ) -> Choice:
+        """The choice after a key press; `reach` is what is shown now, in metres, and `ramps` what
+        colours can show.
+        """
         if key in ("q", "Q"):
             return replace(self, done=True)
         if key == " ":
@@ -265,7 +284,9 @@ class Choice:
         if key == "0":
             return replace(self, zoom=1.0, middle=(0.0, 0.0))
         if key in _MOVES:
-            forward, left = (self.middle[axis] + _MOVES[key][axis] * MOVE * reach for axis in (0, 1))
+            forward, left = (
+                self.middle[axis] + _MOVES[key][axis] * MOVE * reach for axis in (0, 1)
+            )
             return replace(self, middle=(forward, left))
         if key in ("?", "h"):
             return replace(self, helped=not self.helped)
@@ -283,7 +304,13 @@ class Window:
     """
 
     def __init__(
-        self, feed: Feed, source: str, *, ramp: str = "range", record: Switch | None = None, duration: float | None = None
+        self,
+        feed: Feed,
+        source: str,
+        *,
+        ramp: str = "range",
+        record: Switch | None = None,
+        duration: float | None = None,
     ) -> None:
         self._feed, self._source, self._record = feed, source, record
         self._live = feed.device.is_live
@@ -321,12 +348,21 @@ class Window:
         return screen.keys.read(0)
 
     def cells(self, columns: int, lines: int) -> Cells:
-        """The window as it is now; the figures stand beside the picture, or below it in one line where the window is narrow."""
+        """The window as it is now; the figures stand beside the picture, or below it in one line
+        where the window is narrow.
+        """
         self._take()
         is_wide = columns >= NARROWEST + BESIDE + 1 and lines >= 14
-        width, height = columns - BESIDE - 1 if is_wide else columns, max(lines - (1 if is_wide else 2), 1)
+        width, height = (
+            columns - BESIDE - 1 if is_wide else columns,
+            max(lines - (1 if is_wide else 2), 1),
+        )
         look, scan, complaint = self._current_look(), self._scan, self._complaint()
-        drawn = Cells.blank(width, height) if scan is None else picture(scan.points, width=width, height=height, look=look)
+        drawn = (
+            Cells.blank(width, height)
+            if scan is None
+            else picture(scan.points, width=width, height=height, look=look)
+        )
         if complaint:
             note = message(width, complaint)
             drawn.paste(max((height - note.size[1]) // 2, 0), (width - note.size[0]) // 2, note)
@@ -339,7 +375,9 @@ class Window:
             _write_line(whole, self._figures())
         if self.choice.helped:
             page = help_page(columns, lines)
-            whole.paste(max((lines - page.size[1]) // 2, 0), max((columns - page.size[0]) // 2, 0), page)
+            whole.paste(
+                max((lines - page.size[1]) // 2, 0), max((columns - page.size[0]) // 2, 0), page
+            )
         return whole
 
     def _press(self, key: str) -> None:
@@ -352,9 +390,15 @@ class Window:
         """The newest scan and figures."""
         now, newest = time.monotonic(), self._feed.scan
         if now - self._read_at >= FIGURES:
-            self._reading = self._feed.meter.reading(self._feed.device.stats, now - self._read_at if self._live else None)
+            self._reading = self._feed.meter.reading(
+                self._feed.device.stats, now - self._read_at if self._live else None
+            )
             self._read_at = now
-        if newest is None or newest is self._scan or (self.choice.paused and self._scan is not None):
+        if (
+            newest is None
+            or newest is self._scan
+            or (self.choice.paused and self._scan is not None)
+        ):
             return
         self._scan = newest
         found, before = look(self._scan.points, ramp=self.choice.ramp), self._look
@@ -372,7 +416,9 @@ class Window:
             found = look(self._scan.points, ramp=self.choice.ramp)
             self._look = replace(found, reach=self._look.reach)
             self.choice = replace(self.choice, ramp=found.ramp)
-        return replace(self._look, reach=self._look.reach / self.choice.zoom, middle=self.choice.middle)
+        return replace(
+            self._look, reach=self._look.reach / self.choice.zoom, middle=self.choice.middle
+        )
 
     def _state(self) -> tuple[str, int]:
         """What is going on, in a word, and the ink of it."""
@@ -389,23 +435,37 @@ class Window:
         """The figures of the last moments and of the scan that is shown, each with its ink."""
         device, reading = self._feed.device, self._reading or NOTHING
         points = len(self._scan) if self._scan is not None else 0
-        valid = self._scan.points.range[self._scan.points.valid] if self._scan is not None else np.empty(0)
+        valid = (
+            self._scan.points.range[self._scan.points.valid]
+            if self._scan is not None
+            else np.empty(0)
+        )
         near = float(valid.min()) if len(valid) else math.nan
         lost = device.stats.lost
         figures = [
             ("speed", told(reading.speed_hz, "{:.1f} Hz"), STRONG),
             ("packets", told(reading.packet_rate_hz, "{:.0f} /s"), PLAIN),
             ("input", told(reading.bytes_per_s, "{:.1f} kB/s", 1e-3), PLAIN),
-            *([("calibration", "nominal", ALARM)] if self._scan is not None and self._scan.points.nominal else []),
+            *(
+                [("calibration", "nominal", ALARM)]
+                if self._scan is not None and self._scan.points.nominal
+                else []
+            ),
             ("points", str(points), PLAIN),
             ("valid", told(len(valid) / points if points else None, "{:.1f} %", 100), PLAIN),
             ("nearest", told(near, "{:.2f} m"), PLAIN),
             _rate("errors", reading.error_rate if self._reading else None),
             _rate("skipped", reading.skipped_rate if self._reading else None),
-            ("lost", str(lost) if lost or reading.loss_rate is not None else "-", ALARM if lost else PLAIN),
+            (
+                "lost",
+                str(lost) if lost or reading.loss_rate is not None else "-",
+                ALARM if lost else PLAIN,
+            ),
             ("jitter", told(reading.jitter_s, "{:.2f} ms", 1e3), PLAIN),
         ]
-        return figures if device.queued is None else [*figures, ("queue", str(device.queued), PLAIN)]
+        return (
+            figures if device.queued is None else [*figures, ("queue", str(device.queued), PLAIN)]
+        )
 
     def _complaint(self) -> str:
         """What is to be said in place of points."""
@@ -416,7 +476,11 @@ class Window:
         if failure is not None:
             return str(failure)
         if self._feed.ended:
-            return "" if self._scan is not None else (device.warnings or ["the input ended without a scan"])[-1]
+            return (
+                ""
+                if self._scan is not None
+                else (device.warnings or ["the input ended without a scan"])[-1]
+            )
         troubled = self._live and device.state not in ("streaming", "waiting")
         return device.warnings[-1] if troubled and device.warnings else ""
 

@@ -1,7 +1,9 @@
-"""What a notebook shows: a scan and a cloud as a picture, packets and an explained frame as tables, a sensor as its packet diagrams.
+"""What a notebook shows: a scan and a cloud as a picture, packets and an explained frame as tables,
+a sensor as its packet diagrams.
 
-`lidarspec.display` calls what is named here after the kind of value. All are bounded in size, escaped, and readable on light and dark
-pages: pictures have their own ground, tables take the page's letters.
+`lidarspec.display` calls what is named here after the kind of value. All are bounded in size,
+escaped, and readable on light and dark pages: pictures have their own ground, tables take the
+page's letters.
 """
 
 from __future__ import annotations
@@ -28,9 +30,11 @@ from lidarspec.view.svg import svg
 
 #: pixels of a side of a picture, and the dots of each of its views at most.
 SIDE, DOTS = 520, 12_000
-#: rows of packets at the beginning and at the end, their fields at most, and rows of an explanation.
+#: rows of packets at the beginning and at the end, their fields at most, and rows of an
+#: explanation.
 ENDS, FIELDS, ROWS = 5, 24, 200
-#: degrees of hue from one field to the next, and the most pixels that a table is high before it scrolls.
+#: degrees of hue from one field to the next, and the most pixels that a table is high before it
+#: scrolls.
 HUE, TALL = 67, 640
 _CELL = "text-align:{align};white-space:nowrap;padding:1px 8px;vertical-align:top"
 
@@ -46,10 +50,14 @@ def cloud(value: PointCloud) -> str | None:
 
 
 def packets(value: Packets) -> str:
-    """The first and the last packets as an HTML table: offset, times, fields in their units; of arrays number and span."""
+    """The first and the last packets as an HTML table: offset, times, fields in their units; of
+    arrays number and span.
+    """
     fields = {path: info for path, info in value.table.schema.fields.items() if info.const is None}
     shown = dict(list(fields.items())[:FIELDS])
-    columns: dict[str, list[str]] = {"offset": [str(place) for place in value.offset[_ends(len(value))].tolist()]}
+    columns: dict[str, list[str]] = {
+        "offset": [str(place) for place in value.offset[_ends(len(value))].tolist()]
+    }
     columns["time [s]"] = _since(value.time_ns)
     if value.host_ns.any():
         columns["arrival [s]"] = _since(value.host_ns)
@@ -60,8 +68,17 @@ def packets(value: Packets) -> str:
     if len(value) > 2 * ENDS:
         rows.insert(ENDS, ["⋮"] * len(columns))
     more = f"; {len(fields) - len(shown)} further fields" * (len(fields) > len(shown))
-    first = f"; first at {np.datetime64(int(value.time_ns[0]), 'ns')} by the {_clock(value)} clock" if len(value) else ""
-    return _table(f"{value}{first}{more}", list(columns), [[escape(cell) for cell in row] for row in rows], align="right")
+    first = (
+        f"; first at {np.datetime64(int(value.time_ns[0]), 'ns')} by the {_clock(value)} clock"
+        if len(value)
+        else ""
+    )
+    return _table(
+        f"{value}{first}{more}",
+        list(columns),
+        [[escape(cell) for cell in row] for row in rows],
+        align="right",
+    )
 
 
 def explanation(value: Explanation) -> str:
@@ -71,20 +88,42 @@ def explanation(value: Explanation) -> str:
         indent = "&nbsp;" * 2 * len(parents(row.path))
         name, meaning = escape(row.path.rpartition(".")[2]), escape(printable(row.meaning))
         tint = f"hsl({number * HUE % 360} 70% 50% / .25)" if row.right else "hsl(0 90% 50% / .55)"
-        data = "<br>".join(row.data[start : start + 16].hex(" ") for start in range(0, len(row.data), 16))
-        code = f'<code style="background:{tint};padding:1px 3px;color:inherit">{data}</code>' if data else ""
+        data = "<br>".join(
+            row.data[start : start + 16].hex(" ") for start in range(0, len(row.data), 16)
+        )
+        code = (
+            f'<code style="background:{tint};padding:1px 3px;color:inherit">{data}</code>'
+            if data
+            else ""
+        )
         meaning = meaning if row.right else f"<b>{meaning}</b>"
-        rows.append([f"<code>{row.offset:04x}</code>", code, f"{indent}{name}", f'<span style="white-space:normal">{meaning}</span>'])
-    notes = [*value.notes, *[f"{len(value.rows) - ROWS} further rows: print(...) shows them"] * (len(value.rows) > ROWS)]
+        rows.append(
+            [
+                f"<code>{row.offset:04x}</code>",
+                code,
+                f"{indent}{name}",
+                f'<span style="white-space:normal">{meaning}</span>',
+            ]
+        )
+    notes = [
+        *value.notes,
+        *[f"{len(value.rows) - ROWS} further rows: print(...) shows them"]
+        * (len(value.rows) > ROWS),
+    ]
     title = f"{value.sensor} {value.frame or 'skipped'}, {len(value.data)} bytes: {value.verdict}"
     return _table("; ".join([title, *notes]), ["offset", "bytes", "field", "meaning"], rows)
 
 
 def sensor(value: Sensor) -> str:
     """The packet diagrams of a sensor as HTML, those of data open and others folded."""
-    head = f"<b>{escape(printable(f'{value.vendor} {value.model}'))}</b> <code>{escape(value.id)}</code>, proven by {escape(value.status)}"
+    head = (
+        f"<b>{escape(printable(f'{value.vendor} {value.model}'))}</b>"
+        f" <code>{escape(value.id)}</code>, proven by {escape(value.status)}"
+    )
     source = f'<div style="opacity:.75">{escape(printable(value.source))}</div>'
-    return "\n".join([f"<div>{head}{source}</div>", *(_diagram(value, name) for name in value.frames)])
+    return "\n".join(
+        [f"<div>{head}{source}</div>", *(_diagram(value, name) for name in value.frames)]
+    )
 
 
 def _diagram(sensor: Sensor, name: str) -> str:
@@ -94,7 +133,9 @@ def _diagram(sensor: Sensor, name: str) -> str:
     except UsageError as refused:
         drawn = f"<div>{escape(str(refused))}</div>"
     title = f'<summary style="cursor:pointer">{escape(name)}</summary>'
-    return f'<details{" open" * frame.data}>{title}<div style="overflow:auto">{drawn}</div></details>'
+    return (
+        f'<details{" open" * frame.data}>{title}<div style="overflow:auto">{drawn}</div></details>'
+    )
 
 
 def _picture(points: PointCloud, title: str) -> str:
@@ -103,7 +144,9 @@ def _picture(points: PointCloud, title: str) -> str:
 
 def _ends(number: int) -> NDArray[np.intp]:
     """The first and the last of so many."""
-    return np.array([index for index in range(number) if index < ENDS or index >= number - ENDS], np.intp)
+    return np.array(
+        [index for index in range(number) if index < ENDS or index >= number - ENDS], np.intp
+    )
 
 
 def _clock(packets: Packets) -> str:
@@ -111,8 +154,13 @@ def _clock(packets: Packets) -> str:
 
 
 def _since(times: NDArray[np.int64]) -> list[str]:
-    """Times of the first and the last packets as seconds since the first, "-" where one is not known."""
-    return [f"{(at - int(times[0])) * 1e-9:.6f}" if at else "-" for at in times[_ends(len(times))].tolist()]
+    """Times of the first and the last packets as seconds since the first, "-" where one is not
+    known.
+    """
+    return [
+        f"{(at - int(times[0])) * 1e-9:.6f}" if at else "-"
+        for at in times[_ends(len(times))].tolist()
+    ]
 
 
 def _values(column: NDArray[np.float64], info: FieldInfo) -> list[str]:
@@ -124,19 +172,30 @@ def _values(column: NDArray[np.float64], info: FieldInfo) -> list[str]:
 
 def _span(values: NDArray[np.float64]) -> str:
     known = values[np.isfinite(values)]
-    return f"{len(known)} x {_number(float(known.min()))} to {_number(float(known.max()))}" if len(known) else "-"
+    return (
+        f"{len(known)} x {_number(float(known.min()))} to {_number(float(known.max()))}"
+        if len(known)
+        else "-"
+    )
 
 
 def _number(value: float) -> str:
     return f"{value:.10g}" if math.isfinite(value) else "-"
 
 
-def _table(caption: str, heads: Iterable[str], rows: Iterable[Sequence[str]], *, align: str = "left") -> str:
+def _table(
+    caption: str, heads: Iterable[str], rows: Iterable[Sequence[str]], *, align: str = "left"
+) -> str:
     """A table; the cells are HTML, caption and heads are text."""
     cell = _CELL.format(align=align)
     head = "".join(f'<th style="{cell}">{escape(printable(name))}</th>' for name in heads)
-    body = "\n".join(f"<tr>{''.join(f'<td style={chr(34)}{cell}{chr(34)}>{text}</td>' for text in row)}</tr>" for row in rows)
+    body = "\n".join(
+        f"<tr>{''.join(f'<td style={chr(34)}{cell}{chr(34)}>{text}</td>' for text in row)}</tr>"
+        for row in rows
+    )
     return (
-        f'<div style="overflow:auto;max-height:{TALL}px;font-size:90%"><div style="padding:0 8px 4px">{escape(printable(caption))}</div>'
-        f'<table style="border-collapse:collapse"><thead><tr>{head}</tr></thead>\n<tbody>{body}</tbody></table></div>'
+        f'<div style="overflow:auto;max-height:{TALL}px;font-size:90%"><div style="padding:0 8px'
+        f' 4px">{escape(printable(caption))}</div>'
+        "<table"
+        f' style="border-collapse:collapse"><thead><tr>{head}</tr></thead>\n<tbody>{body}</tbody></table></div>'
     )

@@ -1,8 +1,8 @@
 """The requests of one page: how many are taken a second, and those that take a while.
 
-A page that asks without end waits for itself: the server reads its next message later. Requests that
-take a while are done in threads, for each page one after another, so that no page has more than its
-share of the threads.
+A page that asks without end waits for itself: the server reads its next message later. Requests
+that take a while are done in threads, for each page one after another, so that no page has more
+than its share of the threads.
 """
 
 from __future__ import annotations

@@ -1,4 +1,6 @@
-"""Clouds in character cells: from above with range rings, forward up and left left; 3D ones from the right side as well."""
+"""Clouds in character cells: from above with range rings, forward up and left left; 3D ones from
+the right side as well.
+"""
 
 from __future__ import annotations
 
@@ -15,19 +17,24 @@ from lidarspec.view.canvas import ACROSS, DOWN, FAINT, LABEL, STRONG, Canvas, Ce
 RING_GAP = 4
 #: share of the height that the view from above gets where there are two.
 ABOVE = 0.62
-#: by how much heights may be drawn larger than lengths, and the share of the side view that they then fill at most.
+#: by how much heights may be drawn larger than lengths, and the share of the side view that they
+#: then fill at most.
 HEIGHTS, FILLED = (1, 2, 5, 10), 0.9
 
 
 def picture(points: PointCloud, *, width: int, height: int, look: Look) -> Cells:
-    """The cloud in `width` by `height` cells: from above, and below that from its right side unless the look is flat."""
+    """The cloud in `width` by `height` cells: from above, and below that from its right side unless
+    the look is flat.
+    """
     cloud = points[points.valid]
     if look.flat:
         return _from_above(cloud, width, height, look)
     above = max(round((height - 1) * ABOVE), 1)
     whole = Cells.blank(width, height)
     whole.paste(0, 0, _from_above(cloud, width, above, look))
-    side, scale = _from_side(cloud, width, max(height - 1 - above, 1), look, _scale(width, above, look.reach))
+    side, scale = _from_side(
+        cloud, width, max(height - 1 - above, 1), look, _scale(width, above, look.reach)
+    )
     title = "─ from the right, forward is right" + (f", heights x{scale} " if scale > 1 else " ")
     whole.write(above, 0, title.ljust(width, "─"), FAINT)
     whole.write(above, 2, title[2:].rstrip("─ "), LABEL)
@@ -47,9 +54,14 @@ def _from_above(cloud: PointCloud, width: int, height: int, look: Look) -> Cells
     across, down = middle[0] + look.middle[1] * scale, middle[1] + look.middle[0] * scale
     canvas.plot(across - cloud.y * scale, down - cloud.x * scale, shade(cloud, look))
     step = ring_step(look.reach)
-    radii = [step * number for number in range(1, int((look.reach + math.hypot(*look.middle)) / step * 1.001) + 1)]
+    radii = [
+        step * number
+        for number in range(1, int((look.reach + math.hypot(*look.middle)) / step * 1.001) + 1)
+    ]
     for radius in radii:
-        turn = np.linspace(0, 2 * np.pi, max(round(2 * np.pi * radius * scale / RING_GAP), 8), endpoint=False)
+        turn = np.linspace(
+            0, 2 * np.pi, max(round(2 * np.pi * radius * scale / RING_GAP), 8), endpoint=False
+        )
         canvas.line(across + radius * scale * np.sin(turn), down - radius * scale * np.cos(turn))
     home = (math.floor(down) // DOWN, math.floor(across) // ACROSS)
     canvas.label(*home, "▲", STRONG, over=True)
@@ -69,22 +81,38 @@ def _label_directions(canvas: Canvas, home: tuple[int, int]) -> None:
 
 
 def _label_ring(canvas: Canvas, home: tuple[int, int], radius: float, scale: float) -> None:
-    """The range of a ring where it crosses an axis, on the first of its four crossings that is free."""
+    """The range of a ring where it crosses an axis, on the first of its four crossings that is
+    free.
+    """
     text = f"{radius:g} m"
     across, down = round(radius * scale / ACROSS), round(radius * scale / DOWN)
     row, column = home
-    places = [(row, column + across - len(text)), (row - down, column + 1), (row + down, column + 1), (row, column - across + 1)]
+    places = [
+        (row, column + across - len(text)),
+        (row - down, column + 1),
+        (row + down, column + 1),
+        (row, column - across + 1),
+    ]
     any(canvas.label(*place, text) for place in places)
 
 
-def _from_side(cloud: PointCloud, width: int, height: int, look: Look, scale: float) -> tuple[Cells, int]:
-    """Forward to the right and up up, and by how much heights are drawn larger; the height is centred on the points."""
+def _from_side(
+    cloud: PointCloud, width: int, height: int, look: Look, scale: float
+) -> tuple[Cells, int]:
+    """Forward to the right and up up, and by how much heights are drawn larger; the height is
+    centred on the points.
+    """
     canvas = Canvas(width, height, look.ramp)
     inside = np.abs(cloud.x - look.middle[0]) <= canvas.dots.shape[1] / 2 / scale
     low, high = _heights(cloud.z[inside])
-    larger = max((n for n in HEIGHTS if (high - low) * scale * n <= canvas.dots.shape[0] * FILLED), default=1)
+    larger = max(
+        (n for n in HEIGHTS if (high - low) * scale * n <= canvas.dots.shape[0] * FILLED), default=1
+    )
     middle = _middle(canvas)
-    across, level = middle[0] - look.middle[0] * scale, middle[1] + (low + high) / 2 * scale * larger
+    across, level = (
+        middle[0] - look.middle[0] * scale,
+        middle[1] + (low + high) / 2 * scale * larger,
+    )
     canvas.plot(across + cloud.x * scale, level - cloud.z * scale * larger, shade(cloud, look))
     step = ring_step(canvas.dots.shape[0] / scale / larger)
     half = canvas.dots.shape[0] / scale / larger / 2
@@ -94,13 +122,17 @@ def _from_side(cloud: PointCloud, width: int, height: int, look: Look, scale: fl
         gap = RING_GAP if number == 0 else 4 * RING_GAP
         columns = np.arange(0, canvas.dots.shape[1], gap, dtype=np.float64)
         canvas.line(columns, np.full(len(columns), line))
-        canvas.label(math.floor(line) // DOWN, 0, "z 0 m" if number == 0 else f"{number * step:+.4g} m")
+        canvas.label(
+            math.floor(line) // DOWN, 0, "z 0 m" if number == 0 else f"{number * step:+.4g} m"
+        )
     canvas.label(math.floor(level) // DOWN, math.floor(across) // ACROSS, "▶", STRONG, over=True)
     return canvas.cells(), larger
 
 
 def _heights(z: NDArray[np.float32]) -> tuple[float, float]:
-    """The lowest and highest that the side view has to show: those of most points, and the sensor's own."""
+    """The lowest and highest that the side view has to show: those of most points, and the sensor's
+    own.
+    """
     if not len(z):
         return 0.0, 0.0
     low, high = (float(value) for value in np.percentile(z, (100 - MOST, MOST)))

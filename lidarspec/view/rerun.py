@@ -19,7 +19,8 @@ SCHEMES = ("rerun://", "rerun+http://", "rerun+https://")
 
 
 def show(feed: Feed, target: str, *, ramp: str = "range", until: float) -> None:
-    """Log scans as they come, and figures, until the feed ends or a time of `time.monotonic` has come.
+    """Log scans as they come, and figures, until the feed ends or a time of `time.monotonic` has
+    come.
 
     Args:
         target: a file to write, the URL of a viewer that runs, or "" to open one here.
@@ -37,7 +38,9 @@ def show(feed: Feed, target: str, *, ramp: str = "range", until: float) -> None:
                 log.scan(scan)
                 if last is None or not 0 <= scan.stamp_ns - last < FIGURES * 1e9:
                     now, is_live = time.monotonic(), feed.device.is_live
-                    reading = feed.meter.reading(feed.device.stats, now - read_at if is_live else None)
+                    reading = feed.meter.reading(
+                        feed.device.stats, now - read_at if is_live else None
+                    )
                     log.figures({name: getattr(reading, name) for name in FIGURED})
                     read_at, last = now, scan.stamp_ns
 
@@ -47,10 +50,18 @@ def _open(log: Log, target: str) -> None:
         log.stream.connect_grpc(target)
     elif target:
         log.save(target)
-    elif sys.platform == "linux" and not (os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY")):
-        raise suggest(UsageError("there is no display for Rerun's viewer"), "lidarspec view SOURCE --rerun -o scans.rrd")
+    elif sys.platform == "linux" and not (
+        os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY")
+    ):
+        raise suggest(
+            UsageError("there is no display for Rerun's viewer"),
+            "lidarspec view SOURCE --rerun -o scans.rrd",
+        )
     else:
         try:
             log.stream.spawn(hide_welcome_screen=True)
         except Exception as error:
-            raise suggest(UsageError(f"Rerun's viewer cannot be opened: {error}"), "lidarspec view SOURCE --rerun -o scans.rrd") from error
+            raise suggest(
+                UsageError(f"Rerun's viewer cannot be opened: {error}"),
+                "lidarspec view SOURCE --rerun -o scans.rrd",
+            ) from error

@@ -42,7 +42,9 @@ class Saves:
         drop: closes the connection of a client that does not read its file.
     """
 
-    def __init__(self, folder: TemporaryFolder, worker: Executor, drop: Callable[[Client | None], None]) -> None:
+    def __init__(
+        self, folder: TemporaryFolder, worker: Executor, drop: Callable[[Client | None], None]
+    ) -> None:
         self._folder = folder
         self._worker = worker
         self._drop = drop
@@ -55,7 +57,9 @@ class Saves:
         """Return the response that writes and sends a scan."""
         return _SavedScan(self, shown, suffix)
 
-    async def serve(self, shown: Shown, suffix: str, scope: Scope, receive: Receive, send: Send) -> None:
+    async def serve(
+        self, shown: Shown, suffix: str, scope: Scope, receive: Receive, send: Send
+    ) -> None:
         """Write a scan and send it, or say why that is not possible."""
         if self._count >= MAX_SAVES:
             text = f"{MAX_SAVES} scans are being saved already: try again in a moment"
@@ -67,7 +71,9 @@ class Saves:
         finally:
             self._count -= 1
 
-    async def _write_and_send(self, shown: Shown, suffix: str, scope: Scope, receive: Receive, send: Send) -> None:
+    async def _write_and_send(
+        self, shown: Shown, suffix: str, scope: Scope, receive: Receive, send: Send
+    ) -> None:
         try:
             path = self._folder.path / f"{next(self._numbers)}.{suffix}"
             await self._write(path, shown)

@@ -1,7 +1,9 @@
-"""A terminal taken over for a while: the alternate screen, of which only the cells that changed are written, and single keys.
+"""A terminal taken over for a while: the alternate screen, of which only the cells that changed are
+written, and single keys.
 
-rich would draw every cell of every picture anew, 50 times what changes; so pictures go out from here, and rich serves
-for what is printed once. Keys come without waiting for a line: termios on POSIX, msvcrt on Windows, behind one class.
+rich would draw every cell of every picture anew, 50 times what changes; so pictures go out from
+here, and rich serves for what is printed once. Keys come without waiting for a line: termios on
+POSIX, msvcrt on Windows, behind one class.
 """
 
 from __future__ import annotations
@@ -22,14 +24,26 @@ from lidarspec.transports.base import readable
 from lidarspec.view.canvas import Cells, Depth, sgr
 
 #: what the cursor keys send on POSIX, after escape, and on Windows, after a byte of their own.
-_POSIX = {"[A": "up", "[B": "down", "[C": "right", "[D": "left", "OA": "up", "OB": "down", "OC": "right", "OD": "left"}
+_POSIX = {
+    "[A": "up",
+    "[B": "down",
+    "[C": "right",
+    "[D": "left",
+    "OA": "up",
+    "OB": "down",
+    "OC": "right",
+    "OD": "left",
+}
 #: a cursor key, the sequence of another one, or a character.
 _KEY = re.compile(r"\x1b([\[O][A-D])|\x1b[\[O][^A-Za-z~]*.?|(.)", re.DOTALL)
 _WINDOWS = {"H": "up", "P": "down", "M": "right", "K": "left"}
 #: seconds between two looks at the keyboard on Windows, which has nothing to wait on.
 _LOOK = 0.02
 #: the alternate screen, no cursor, no wrapping at the edge; and all of it back.
-ENTER, LEAVE = "\x1b[?1049h\x1b[?25l\x1b[?7l\x1b[2J", "\x1b[?2026l\x1b[0m\x1b[?7h\x1b[?25h\x1b[?1049l"
+ENTER, LEAVE = (
+    "\x1b[?1049h\x1b[?25l\x1b[?7l\x1b[2J",
+    "\x1b[?2026l\x1b[0m\x1b[?7h\x1b[?25h\x1b[?1049l",
+)
 #: the terminal holds a picture back until all of it is there, where it knows how to.
 BEGIN, END = "\x1b[?2026h", "\x1b[?2026l"
 #: unchanged cells between two changed ones that are written along: moving the cursor costs as much.
@@ -37,24 +51,37 @@ BRIDGED = 4
 
 
 class Keys:
-    """A keyboard: a context manager that gives the terminal back as it was. This one has no keys, but time passes."""
+    """A keyboard: a context manager that gives the terminal back as it was. This one has no keys,
+    but time passes.
+    """
 
     def read(self, timeout: float) -> list[str]:
-        """The keys that came within some seconds: characters, "up" "down" "left" "right", "escape"; empty where none did."""
+        """The keys that came within some seconds: characters, "up" "down" "left" "right", "escape";
+        empty where none did.
+        """
         time.sleep(timeout)
         return []
 
     def __enter__(self) -> Self:
         return self
 
-    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, traceback: TracebackType | None) -> None:
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        traceback: TracebackType | None,
+    ) -> None:
         """Give the terminal back."""
 
 
 def decoded(text: str) -> list[str]:
     """The keys in what a POSIX terminal sent; sequences of other keys are left out."""
     keys = _KEY.finditer(text)
-    return [_POSIX[key[1]] if key[1] else "escape" if key[2] == "\x1b" else key[2] for key in keys if key[1] or key[2]]
+    return [
+        _POSIX[key[1]] if key[1] else "escape" if key[2] == "\x1b" else key[2]
+        for key in keys
+        if key[1] or key[2]
+    ]
 
 
 if sys.platform == "win32":
@@ -104,7 +131,12 @@ else:
             tty.setcbreak(self._descriptor, termios.TCSANOW)
             return self
 
-        def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, traceback: TracebackType | None) -> None:
+        def __exit__(
+            self,
+            kind: type[BaseException] | None,
+            error: BaseException | None,
+            traceback: TracebackType | None,
+        ) -> None:
             with contextlib.suppress(termios.error):
                 termios.tcsetattr(self._descriptor, termios.TCSANOW, self._before)
 
@@ -115,7 +147,11 @@ else:
             taken: standard input is the data: keys come from the terminal itself.
         """
         try:
-            return Keyboard(sys.stdin.fileno()) if sys.stdin.isatty() and not taken else Keyboard(os.open("/dev/tty", os.O_RDONLY))
+            return (
+                Keyboard(sys.stdin.fileno())
+                if sys.stdin.isatty() and not taken
+                else Keyboard(os.open("/dev/tty", os.O_RDONLY))
+            )
         except (OSError, ValueError, termios.error):
             return Keys()
 
@@ -160,7 +196,9 @@ class Screen:
         self._stream, self.keys = stream, keys
         self._depth, self._plain = depth(stream), not encodable(stream)
         self._shown: Cells | None = None
-        self._taken = 0  # how often the terminal was taken over: what was shown before is gone, also in the middle of `show`
+        # how often the terminal was taken over: what was shown before is gone, also in the middle
+        # of `show`
+        self._taken = 0
         self._handlers: dict[int, Any] = {}
 
     def size(self) -> tuple[int, int]:
@@ -190,7 +228,12 @@ class Screen:
                 self._handlers[number] = signal.signal(number, function)
         return self
 
-    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, traceback: TracebackType | None) -> None:
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        traceback: TracebackType | None,
+    ) -> None:
         try:
             self._write(LEAVE)
         except OSError:
@@ -225,7 +268,9 @@ class Screen:
 
 
 def changes(before: Cells | None, after: Cells, depth: Depth) -> str:
-    """What to write to a terminal that shows `before` for it to show `after`; None is an empty screen."""
+    """What to write to a terminal that shows `before` for it to show `after`; None is an empty
+    screen.
+    """
     old = before if before is not None else Cells.blank(*after.size)
     changed = (old.codes != after.codes) | (old.inks != after.inks)
     parts: list[str] = []
@@ -233,9 +278,16 @@ def changes(before: Cells | None, after: Cells, depth: Depth) -> str:
     for row in np.flatnonzero(changed.any(axis=1)).tolist():
         columns = np.flatnonzero(changed[row])
         starts = np.flatnonzero(np.diff(columns, prepend=-BRIDGED - 2) > BRIDGED)
-        for first, last in zip(columns[starts].tolist(), columns[np.append(starts[1:], len(columns)) - 1].tolist(), strict=True):
+        for first, last in zip(
+            columns[starts].tolist(),
+            columns[np.append(starts[1:], len(columns)) - 1].tolist(),
+            strict=True,
+        ):
             parts.append(f"\x1b[{row + 1};{first + 1}H")
-            codes, inks = after.codes[row, first : last + 1].tolist(), after.inks[row, first : last + 1].tolist()
+            codes, inks = (
+                after.codes[row, first : last + 1].tolist(),
+                after.inks[row, first : last + 1].tolist(),
+            )
             for code, chosen in zip(codes, inks, strict=True):
                 if chosen != ink:
                     parts.append(sgr(chosen, depth))

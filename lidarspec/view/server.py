@@ -1,7 +1,8 @@
-"""A broadcast as a page: the files of the page, a WebSocket for each one that is open, and scans to be saved.
+"""A broadcast as a page: the files of the page, a WebSocket for each one that is open, and scans to
+be saved.
 
-One event loop in a thread of its own serves them all. A page is sent a scan only where it has asked for one, so that a slow or hidden one
-costs nothing. `access` says which requests are served.
+One event loop in a thread of its own serves them all. A page is sent a scan only where it has asked
+for one, so that a slow or hidden one costs nothing. `access` says which requests are served.
 """
 
 from __future__ import annotations
@@ -53,11 +54,14 @@ LARGEST, WAITING = 1 << 16, 16
 BUSY = 0.05
 #: seconds from one state to the next, and from one frame that is watched to the next.
 STATE, WATCHED = 0.5, 0.5
-#: seconds after which a page that takes nothing, or does not answer a ping, is dropped; and that pages are given at the end.
+#: seconds after which a page that takes nothing, or does not answer a ping, is dropped; and that
+#: pages are given at the end.
 STALLED, PING, FAREWELL = 20.0, 10.0, 1
-#: seconds that a page waits for a first scan before it is told what there is; how a page ends that is closed; and how many may be open.
+#: seconds that a page waits for a first scan before it is told what there is; how a page ends that
+#: is closed; and how many may be open.
 GREETING, CLOSED, PAGES = 3.0, (1000, 1001, 1012), 64
-#: points of a message at most, and the scans that a page may still ask about: the one that is drawn, and the one that is on its way.
+#: points of a message at most, and the scans that a page may still ask about: the one that is
+#: drawn, and the one that is on its way.
 POINTS, HELD = 1 << 24, 2
 #: the largest number in a message, and one digit more than a scan's number has.
 LONGEST, DIGITS = 1e12, 12
@@ -128,7 +132,9 @@ class Page:
             message = await self._next()
             try:
                 if message is None:
-                    await asyncio.wait_for(self._stirred.wait(), max(min(self._due.values()) - time.monotonic(), 0.0))
+                    await asyncio.wait_for(
+                        self._stirred.wait(), max(min(self._due.values()) - time.monotonic(), 0.0)
+                    )
                 else:
                     await asyncio.wait_for(self._send(message), STALLED)
             except TimeoutError:
@@ -162,7 +168,9 @@ class Page:
         if self._most is not None and (shown := self._unseen()) is not None:
             most, self._most = self._most, None
             self._held.append(shown)
-            return shown.message(most)  # here: the large blocks of further threads would stay in arenas of theirs
+            return shown.message(
+                most
+            )  # here: the large blocks of further threads would stay in arenas of theirs
         if broadcast.has_ended != self._has_ended:
             self._has_ended = broadcast.has_ended
             return {"is": "ended", "text": broadcast.ending} if self._has_ended else None
@@ -179,7 +187,9 @@ class Page:
             self._due["state"] = now + STATE
             self._sent_recording = recording
             frozen = self._frozen is not None
-            state = self._answers.state(frozen=frozen, since=self._known, at=self._held[-1] if frozen else None)
+            state = self._answers.state(
+                frozen=frozen, since=self._known, at=self._held[-1] if frozen else None
+            )
             self._known = state["damaged"]["total"]
             return state
         return None
@@ -195,7 +205,11 @@ class Page:
     def _unseen(self) -> Shown | None:
         """The newest scan, where the page has not had it yet and wants to see it go on."""
         shown = self._broadcast.shown if self._frozen is None else None
-        return shown if shown is not None and not (self._held and self._held[-1].number == shown.number) else None
+        return (
+            shown
+            if shown is not None and not (self._held and self._held[-1].number == shown.number)
+            else None
+        )
 
     @property
     def _bytes(self) -> Backlog:
@@ -216,14 +230,18 @@ class Page:
 
     def _refuse(self, word: str, error: LidarSpecError, command: str = "") -> None:
         facts = {"is": "refused", "of": word, "text": str(error)}
-        facts |= {name: text for name, text in (("command", command), ("next", suggestion(error))) if text}
+        facts |= {
+            name: text for name, text in (("command", command), ("next", suggestion(error))) if text
+        }
         self._answer(facts)
 
     def _answer(self, reply: dict[str, Any]) -> None:
         self._replies.append(reply)
         self.stir()
 
-    def _later(self, word: str, work: Callable[[], dict[str, Any] | None], command: str = "") -> None:
+    def _later(
+        self, word: str, work: Callable[[], dict[str, Any] | None], command: str = ""
+    ) -> None:
         """Answer a question that takes a while, after those before it."""
         self._questions.add(Request(word, command, work))
 
@@ -278,7 +296,10 @@ class Page:
     def _frame(self, message: Mapping[str, Any]) -> None:
         backlog, point = self._bytes, message.get("point")
         if isinstance(point, dict):
-            number, index = round(_number(point, "scan", 0, LONGEST)), round(_number(point, "index", 0, POINTS))
+            number, index = (
+                round(_number(point, "scan", 0, LONGEST)),
+                round(_number(point, "index", 0, POINTS)),
+            )
             shown = next((one for one in self._held if one.number == number), None)
             self._later("frame", lambda: self._answers.origin(shown, number, index, backlog))
         elif "damaged" in message:
@@ -299,7 +320,9 @@ class Page:
     def _record(self, message: Mapping[str, Any]) -> None:
         switch = self._broadcast.switch
         if switch is None:
-            raise UsageError(f"{self._broadcast.source} is a file already: there is nothing to record")
+            raise UsageError(
+                f"{self._broadcast.source} is a file already: there is nothing to record"
+            )
         on = message.get("on")
         if not isinstance(on, bool | None):
             raise UsageError("on is true or false")
@@ -341,9 +364,15 @@ def _number(message: Mapping[str, Any], name: str, low: float, high: float) -> f
 
 
 def _command(message: Mapping[str, Any]) -> tuple[str, dict[str, str]]:
-    """The name of a command, and its arguments as they were typed; those that were left empty are left out."""
+    """The name of a command, and its arguments as they were typed; those that were left empty are
+    left out.
+    """
     name, words = message.get("command"), message.get("arguments", {})
-    if not isinstance(name, str) or not isinstance(words, dict) or not all(isinstance(text, str) for text in words.values()):
+    if (
+        not isinstance(name, str)
+        or not isinstance(words, dict)
+        or not all(isinstance(text, str) for text in words.values())
+    ):
         raise UsageError("a command has a name, and arguments that are texts")
     return name, {argument: text for argument, text in words.items() if text}
 
@@ -375,7 +404,11 @@ class Site:
         page: Path | None = None,
         say: Callable[[str], None] = lambda text: None,
     ) -> None:
-        self._broadcast, self._say, self._answers = broadcast, say, Answers(broadcast, control=control)
+        self._broadcast, self._say, self._answers = (
+            broadcast,
+            say,
+            Answers(broadcast, control=control),
+        )
         self._open, self._pages = set[Page](), 0
         self._socket = _listening(host, port)
         port = self._socket.getsockname()[1]
@@ -436,7 +469,12 @@ class Site:
         self._thread.start()
         return self
 
-    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None) -> None:
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
+    ) -> None:
         self._broadcast.news = lambda: None
         self._server.should_exit = True
         self._thread.join()
@@ -474,7 +512,10 @@ class Site:
         number = self._pages + 1
         self._open.add(page)
         self._pages = number
-        self._say(f"page {number} opened by {socket.client.host if socket.client else 'nobody'}; {len(self._open)} open")
+        self._say(
+            f"page {number} opened by {socket.client.host if socket.client else 'nobody'};"
+            f" {len(self._open)} open"
+        )
         became = "closed"
         try:
             became = await page.serve()
@@ -487,7 +528,11 @@ class Site:
     async def _saved(self, request: HttpRequest) -> Response:
         """A scan as a file, by the number that a page knows it by."""
         number, _, suffix = request.path_params["name"].partition(".")
-        shown = self._broadcast.numbered(int(number)) if number.isdecimal() and len(number) < DIGITS else None
+        shown = (
+            self._broadcast.numbered(int(number))
+            if number.isdecimal() and len(number) < DIGITS
+            else None
+        )
         if suffix not in saves():
             return PlainTextResponse(f"a scan is saved as {', '.join(saves())}", 404)
         if shown is None:
@@ -504,9 +549,16 @@ def _name_of(host: str) -> str:
 
 def _listening(host: str, port: int) -> socket.socket:
     try:
-        found = socket.create_server((host, port), family=socket.AF_INET6 if ":" in host else socket.AF_INET)
+        found = socket.create_server(
+            (host, port), family=socket.AF_INET6 if ":" in host else socket.AF_INET
+        )
     except OSError as error:
-        raise SourceError(f"no page can be served at {host}:{port}: {os.strerror(error.errno) if error.errno else error}") from error
-    if hasattr(socket, "TCP_USER_TIMEOUT"):  # so that the system gives up what a page never takes; connections have it from here
+        raise SourceError(
+            f"no page can be served at {host}:{port}:"
+            f" {os.strerror(error.errno) if error.errno else error}"
+        ) from error
+    if hasattr(
+        socket, "TCP_USER_TIMEOUT"
+    ):  # so that the system gives up what a page never takes; connections have it from here
         found.setsockopt(socket.IPPROTO_TCP, socket.TCP_USER_TIMEOUT, round(STALLED * 1000))
     return found

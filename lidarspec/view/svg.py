@@ -1,4 +1,6 @@
-"""A cloud as an SVG picture: the same views as in the terminal, for a page, light or dark as its reader wishes."""
+"""A cloud as an SVG picture: the same views as in the terminal, for a page, light or dark as its
+reader wishes.
+"""
 
 from __future__ import annotations
 
@@ -14,9 +16,11 @@ from lidarspec.points.cloud import PointCloud
 from lidarspec.points.colours import make_ramp, to_hex
 from lidarspec.points.look import STEPS, Look, bounds, ring_step, steps
 
-#: pixels: of each side of the view from above, of the margins, of the lines above it, of one above each view, and of a dot.
+#: pixels: of each side of the view from above, of the margins, of the lines above it, of one above
+#: each view, and of a dot.
 SIDE, MARGIN, HEAD, LINE, DOT = 720, 24, 58, 18, 1.6
-#: share of a side that heights take at most, and how near to dots and to the sensor the view from above ends, pixels.
+#: share of a side that heights take at most, and how near to dots and to the sensor the view from
+#: above ends, pixels.
 HIGHEST, NEAR = 0.45, 24
 #: pixels above the base line of a text, and of a character of it.
 FONT_HEIGHT = 11
@@ -28,7 +32,9 @@ _LIGHT, _DARK = ("#fff", "#ddd", "#555", "#222"), ("#14161b", "#34373f", "#9ea3a
 _PARTS = ("ground", "line", "text", "head")
 
 
-def svg(points: PointCloud, look: Look, title: str, *, side: int = SIDE, most: int | None = None) -> str:
+def svg(
+    points: PointCloud, look: Look, title: str, *, side: int = SIDE, most: int | None = None
+) -> str:
     """The cloud from above and, unless the look is flat, from its right side, as an SVG document.
 
     Args:
@@ -43,12 +49,18 @@ def svg(points: PointCloud, look: Look, title: str, *, side: int = SIDE, most: i
     for view in shown:
         body.append(f'<text x="{MARGIN}" y="{top + 12}" {_as("text")}>{view.told}</text>')
         box = f'viewBox="0 {view.top:.0f} {side} {view.height:.0f}"'
-        body += [f'<svg x="{MARGIN}" y="{top + LINE}" width="{side}" height="{view.height:.0f}" {box}>', *view.parts, "</svg>"]
+        body += [
+            f'<svg x="{MARGIN}" y="{top + LINE}" width="{side}" height="{view.height:.0f}" {box}>',
+            *view.parts,
+            "</svg>",
+        ]
         top += round(view.height) + LINE + MARGIN
     drawn = " and ".join(f"{view.dots:,}" for view in shown)
     head = [
-        f'<svg xmlns="http://www.w3.org/2000/svg" viewBox="0 0 {width} {top}" width="{width}" height="{top}" '
-        'font-family="system-ui, sans-serif" font-size="12">',
+        (
+            f'<svg xmlns="http://www.w3.org/2000/svg" viewBox="0 0 {width} {top}" width="{width}"'
+            f' height="{top}" font-family="system-ui, sans-serif" font-size="12">'
+        ),
         f"<style>{_style()}</style>",
         f'<rect width="100%" height="100%" {_as("ground")}/>',
         f'<text x="{MARGIN}" y="26" font-size="14" {_as("head")}>{escape(title)}</text>',
@@ -60,7 +72,9 @@ def svg(points: PointCloud, look: Look, title: str, *, side: int = SIDE, most: i
 
 @dataclass(frozen=True)
 class _View:
-    """A view: what it is, what is drawn, where that begins and how high it is in pixels, how many dots there are."""
+    """A view: what it is, what is drawn, where that begins and how high it is in pixels, how many
+    dots there are.
+    """
 
     told: str
     parts: list[str]
@@ -71,7 +85,9 @@ class _View:
 
 @dataclass(frozen=True)
 class _Views:
-    """The views of a cloud of valid points, in pixels; `colours`: the step of the ramp of each, (n,)."""
+    """The views of a cloud of valid points, in pixels; `colours`: the step of the ramp of each,
+    (n,).
+    """
 
     cloud: PointCloud
     look: Look
@@ -91,11 +107,19 @@ class _Views:
         reach = self.look.reach
         nearest = math.hypot(max(abs(forward) - reach, 0.0), max(abs(left) - reach, 0.0))
         farthest = math.hypot(abs(forward) + reach, abs(left) + reach)
-        radii = [step * number for number in range(max(int(nearest / step), 1), int(farthest / step) + 1)]
-        circles = "".join(f'<circle cx="{across:.1f}" cy="{down:.1f}" r="{radius * scale:.1f}"/>' for radius in radii)
+        radii = [
+            step * number for number in range(max(int(nearest / step), 1), int(farthest / step) + 1)
+        ]
+        circles = "".join(
+            f'<circle cx="{across:.1f}" cy="{down:.1f}" r="{radius * scale:.1f}"/>'
+            for radius in radii
+        )
         rows = down - self.cloud.x * scale
         dots, paths = self._dots(across - self.cloud.y * scale, rows, side)
-        top, bottom = max(min(float(rows.min(initial=down)), down) - NEAR, 0), min(max(float(rows.max(initial=down)), down) + NEAR, side)
+        top, bottom = (
+            max(min(float(rows.min(initial=down)), down) - NEAR, 0),
+            min(max(float(rows.max(initial=down)), down) + NEAR, side),
+        )
         labels = _Labels(side, top, bottom)
         labels.write("0°", [(across + 6, top + 12)])
         labels.write("90°", [(2, down - 4)])
@@ -108,7 +132,10 @@ class _Views:
             ahead = (across + 6, down - away + 14)
             behind = (across + 6, down + away - 4)
             share = away / max(math.hypot(forward, left) * scale, 1e-9)
-            towards_middle = (across + share * (side / 2 - across), down + share * (side / 2 - down))
+            towards_middle = (
+                across + share * (side / 2 - across),
+                down + share * (side / 2 - down),
+            )
             labels.write(text, [right, leftward, ahead, behind, towards_middle])
         axes = f'<path d="M{across:.1f} 0V{side}M0 {down:.1f}H{side}"/>'
         parts = [
@@ -130,13 +157,18 @@ class _Views:
         steep, top, height = scale * larger, high + 0.05 * span, span * 1.1 * scale * larger
         across, level = side / 2 - self.look.middle[0] * scale, top * steep
         step = ring_step(height / steep)
-        marks = [number * step for number in range(math.ceil((level - height) / steep / step), int(top / step) + 1)]
+        marks = [
+            number * step
+            for number in range(math.ceil((level - height) / steep / step), int(top / step) + 1)
+        ]
         lines = "".join(f"M0 {level - mark * steep:.1f}H{side}" for mark in marks)
         labels = _Labels(side, 0, height)
         for mark in marks:
             labels.write(f"z {mark:.4g} m", [(2, level - mark * steep - 3)])
         told = f"from the right, forward is right{f', heights x{larger}' if larger > 1 else ''}"
-        dots, paths = self._dots(across + self.cloud.x * scale, level - self.cloud.z * steep, height)
+        dots, paths = self._dots(
+            across + self.cloud.x * scale, level - self.cloud.z * steep, height
+        )
         parts = [
             f'<path d="{lines}" {_as("line", "stroke")}/>',
             *paths,
@@ -145,26 +177,39 @@ class _Views:
         ]
         return _View(told, parts, 0, height, dots)
 
-    def _dots(self, across: NDArray[np.float32], down: NDArray[np.float32], height: float) -> tuple[int, list[str]]:
-        """How many round dots points make, one path for each colour, on the finest grid that holds no more than are wanted."""
-        inside = np.flatnonzero((across >= 0) & (across <= self.side) & (down >= 0) & (down <= height))
+    def _dots(
+        self, across: NDArray[np.float32], down: NDArray[np.float32], height: float
+    ) -> tuple[int, list[str]]:
+        """How many round dots points make, one path for each colour, on the finest grid that holds
+        no more than are wanted.
+        """
+        inside = np.flatnonzero(
+            (across >= 0) & (across <= self.side) & (down >= 0) & (down <= height)
+        )
         for grid in GRIDS:
-            places = np.rint(np.stack([down[inside], across[inside]], axis=1) / grid).astype(np.int64)
+            places = np.rint(np.stack([down[inside], across[inside]], axis=1) / grid).astype(
+                np.int64
+            )
             _, first = np.unique(places @ (1 << 20, 1), return_index=True)
             if self.most is None or len(first) <= self.most:
                 break
         places, colours = places[first], self.colours[inside[first]]
         width = max(DOT, grid * 1.3) / grid
         paths = [
-            f'<path class="dots{step}" d="{_path(places[colours == step])}" stroke="{_COLOURS[step]}"/>'
+            f'<path class="dots{step}" d="{_path(places[colours == step])}"'
+            f' stroke="{_COLOURS[step]}"/>'
             for step in np.unique(colours).tolist()
         ]
-        group = f'<g transform="scale({grid:g})" fill="none" stroke-width="{width:.2g}" stroke-linecap="round">'
+        group = (
+            f'<g transform="scale({grid:g})" fill="none" stroke-width="{width:.2g}"'
+            ' stroke-linecap="round">'
+        )
         return len(first), [group, *paths, "</g>"]
 
 
 class _Labels:
-    """Texts of a view that neither leave it nor touch each other; those for which there is no room are left out.
+    """Texts of a view that neither leave it nor touch each other; those for which there is no room
+    are left out.
 
     Attributes:
         parts: the texts that were written, as SVG.
@@ -184,7 +229,10 @@ class _Labels:
             top = base - FONT_HEIGHT
             if left < 0 or right > self._side or top < self._top or base > self._bottom:
                 continue
-            if any(left < other[2] and other[0] < right and top < other[3] and other[1] < base for other in self._taken):
+            if any(
+                left < other[2] and other[0] < right and top < other[3] and other[1] < base
+                for other in self._taken
+            ):
                 continue
             self._taken.append((left, top, right, base))
             self.parts.append(f'<text x="{left:.1f}" y="{base:.1f}">{text}</text>')
@@ -206,22 +254,35 @@ def _legend(look: Look, right: int) -> Iterator[str]:
     """A bar of the ramp, with what it shows and the values at its ends, which ends at `right`."""
     low, high = (escape(text) for text in look.ends)
     left = right - 7 * len(high) - 12 - STEPS * 6
-    yield f'<g {_as("text")}><text x="{left - 8}" y="48" text-anchor="end">{escape(look.ramp)}, {low}</text>'
+    yield (
+        f'<g {_as("text")}><text x="{left - 8}" y="48" text-anchor="end">{escape(look.ramp)},'
+        f" {low}</text>"
+    )
     yield f'<text x="{right}" y="48" text-anchor="end">{high}</text></g>'
     for step in range(STEPS):
-        yield f'<rect class="ramp{step}" x="{left + step * 6}" y="40" width="6" height="8" fill="{_COLOURS[step]}"/>'
+        yield (
+            f'<rect class="ramp{step}" x="{left + step * 6}" y="40" width="6" height="8"'
+            f' fill="{_COLOURS[step]}"/>'
+        )
 
 
 def _as(part: str, attribute: str = "fill") -> str:
-    """The attributes of a part of the picture: its colour on white, and the class that has that on a dark ground."""
+    """The attributes of a part of the picture: its colour on white, and the class that has that on
+    a dark ground.
+    """
     return f'class="{part}" {attribute}="{_LIGHT[_PARTS.index(part)]}"'
 
 
 def _style() -> str:
     """What is different where a dark page is preferred."""
     inks = [to_hex(rgb) for rgb in make_ramp("dark", STEPS)]
-    dots = [f".dots{step}{{stroke:{ink}}}.ramp{step}{{fill:{ink}}}" for step, ink in enumerate(inks)]
-    parts = [f".{part}{{{'stroke' if part == 'line' else 'fill'}:{colour}}}" for part, colour in zip(_PARTS, _DARK, strict=True)]
+    dots = [
+        f".dots{step}{{stroke:{ink}}}.ramp{step}{{fill:{ink}}}" for step, ink in enumerate(inks)
+    ]
+    parts = [
+        f".{part}{{{'stroke' if part == 'line' else 'fill'}:{colour}}}"
+        for part, colour in zip(_PARTS, _DARK, strict=True)
+    ]
     return f"@media(prefers-color-scheme:dark){{{''.join([*parts, *dots])}}}"
 
 

@@ -1,8 +1,8 @@
 """The temporary folder of a server, which the next server removes if this one is killed.
 
-Each server locks its folder. The system releases the lock when the process ends, however it ends, so
-a folder that can be locked belongs to no server any more. On systems without such locks (Windows) a
-folder is removed by its own server only.
+Each server locks its folder. The system releases the lock when the process ends, however it ends,
+so a folder that can be locked belongs to no server any more. On systems without such locks
+(Windows) a folder is removed by its own server only.
 """
 
 from __future__ import annotations

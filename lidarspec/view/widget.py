@@ -20,14 +20,17 @@ from lidarspec.view.answers import Answers
 from lidarspec.view.broadcast import Broadcast
 from lidarspec.view.feed import LOOK
 
-#: what draws, as it was built; the height of the picture in pixels; and seconds from one state to the next.
+#: what draws, as it was built; the height of the picture in pixels; and seconds from one state to
+#: the next.
 DRAWING, HEIGHT, STATE = Path(__file__).parent / "page" / "dist" / "widget.js", 420, 0.5
 
 
 class Viewer(Closing):
-    """A source in the cell whose value this is: ``Viewer("/dev/ttyUSB0", "vendor-model")``; a file is played.
+    """A source in the cell whose value this is: ``Viewer("/dev/ttyUSB0", "vendor-model")``; a file
+    is played.
 
-    It reads in a thread of its own until it is closed, by `close` or with its cell. What is wrong with the source stands in the cell.
+    It reads in a thread of its own until it is closed, by `close` or with its cell. What is wrong
+    with the source stands in the cell.
 
     Args:
         source: port, socket, file or ``sim:`` URL.
@@ -40,14 +43,21 @@ class Viewer(Closing):
     """
 
     def __init__(
-        self, source: str | Path, sensor: str | Sensor | None = None, *, select: Selection = EVERYTHING, height: int = HEIGHT
+        self,
+        source: str | Path,
+        sensor: str | Sensor | None = None,
+        *,
+        select: Selection = EVERYTHING,
+        height: int = HEIGHT,
     ) -> None:
         self._source, self._sensor, self._select = str(source), sensor, select
         self._lock, self._closed = threading.RLock(), False
         self._broadcast: Broadcast | None = None
         self._answers: Answers | None = None
         self._greets, self._most, self._sent, self._failure, self._ending = False, 0, -1, "", ""
-        self._due = math.inf  # when the cell, once it has asked who it is, is told how that is doing
+        self._due = (
+            math.inf
+        )  # when the cell, once it has asked who it is, is told how that is doing
         self._widget = _widget(height)
         self._widget.on_msg(lambda widget, message, buffers: self._hear(message))
         self._thread = threading.Thread(target=self._run, name=f"viewer of {source}", daemon=True)
@@ -74,7 +84,9 @@ class Viewer(Closing):
         try:
             device = open_device(self._source, self._sensor, period=LOOK)
             reopened = functools.partial(open_device, self._source, device.sensor)
-            with Broadcast(self._source, device, reopened=reopened, select=self._select) as broadcast:
+            with Broadcast(
+                self._source, device, reopened=reopened, select=self._select
+            ) as broadcast:
                 broadcast.news = self._tell
                 self._broadcast, self._answers = broadcast, Answers(broadcast, control=False)
                 if not self._closed:
@@ -98,7 +110,9 @@ class Viewer(Closing):
         self._tell()
 
     def _tell(self) -> None:
-        """Answer with what there is: who it is with the first scan, then each scan that was asked for."""
+        """Answer with what there is: who it is with the first scan, then each scan that was asked
+        for.
+        """
         with self._lock:
             shown = self._broadcast.shown if self._broadcast is not None else None
             if shown is not None and self._answers is not None:
@@ -107,7 +121,11 @@ class Viewer(Closing):
                     self._say(self._answers.hello())
                 if time.monotonic() >= self._due:
                     self._due = time.monotonic() + STATE
-                    self._say(self._answers.state(frozen=False, since=self._answers.broadcast.backlog.damaged))
+                    self._say(
+                        self._answers.state(
+                            frozen=False, since=self._answers.broadcast.backlog.damaged
+                        )
+                    )
                 if self._most and shown.number != self._sent:
                     most, self._most, self._sent = self._most, 0, shown.number
                     self._say({"is": "scan"}, shown.message(most))

@@ -22,4 +22,11 @@ def directions(i):
 @hookimpl
 def lidarspec_sensors():
     placed = frame(sealed(samples=Array(this.count, SAMPLE)), max_length=SIZE + 2 * LONGEST)
-    return [sensor(placed, points=points, scan=Every(0.1), simulation=Simulation(sweep, directions=directions))]
+    return [
+        sensor(
+            placed,
+            points=points,
+            scan=Every(0.1),
+            simulation=Simulation(sweep, directions=directions),
+        )
+    ]

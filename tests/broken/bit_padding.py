@@ -10,4 +10,10 @@ from tests.broken.sound import SIZE, frame, sealed, sensor
 
 @hookimpl
 def lidarspec_sensors():
-    return [sensor(frame(sealed(status=BitStruct("dirty" / BitsInteger(1), Padding(7))), max_length=SIZE + 8))]
+    return [
+        sensor(
+            frame(
+                sealed(status=BitStruct("dirty" / BitsInteger(1), Padding(7))), max_length=SIZE + 8
+            )
+        )
+    ]

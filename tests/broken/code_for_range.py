@@ -8,7 +8,11 @@ from construct import Array, Int8ul, Int16ul, Struct, this
 from lidarspec.spec import Polar, Scaled, hookimpl, spread
 from tests.broken.sound import frame, sealed, sensor
 
-CODED = sealed(samples=Array(this.count, Struct("error_code" / Scaled(Int16ul, 0.001, "m"), "quality" / Int8ul)))
+CODED = sealed(
+    samples=Array(
+        this.count, Struct("error_code" / Scaled(Int16ul, 0.001, "m"), "quality" / Int8ul)
+    )
+)
 
 
 def points(f):

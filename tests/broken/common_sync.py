@@ -10,4 +10,13 @@ from tests.broken.sound import SIZE, frame, sealed, sensor
 
 @hookimpl
 def lidarspec_sensors():
-    return [sensor(frame(sealed(header=BitStruct("sync" / Const(1, BitsInteger(1)), "kind" / BitsInteger(7))), max_length=SIZE - 2))]
+    return [
+        sensor(
+            frame(
+                sealed(
+                    header=BitStruct("sync" / Const(1, BitsInteger(1)), "kind" / BitsInteger(7))
+                ),
+                max_length=SIZE - 2,
+            )
+        )
+    ]

@@ -11,7 +11,9 @@ from tests.broken.sound import sensor
 def points(f):
     step = (f.last - f.first) % 360 / (f.count - 1)
     place = spread(f.count * 0, f.count - 1, f.count, full=1e9)
-    return Polar(f.samples.distance, np.deg2rad(f.first + place * step), intensity=f.samples.quality)
+    return Polar(
+        f.samples.distance, np.deg2rad(f.first + place * step), intensity=f.samples.quality
+    )
 
 
 @hookimpl

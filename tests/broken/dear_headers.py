@@ -1,4 +1,6 @@
-"""A count that Python computes from a number with some billion values: it is computed for each false header."""
+"""A count that Python computes from a number with some billion values: it is computed for each
+false header.
+"""
 
 from __future__ import annotations
 
@@ -14,6 +16,17 @@ def digits(this):
 
 @hookimpl
 def lidarspec_sensors():
-    fields = {"header": sound.FIELDS["header"], "serial": Int32ul, "extra": Array(digits, Int8ul), **sound.FIELDS}
+    fields = {
+        "header": sound.FIELDS["header"],
+        "serial": Int32ul,
+        "extra": Array(digits, Int8ul),
+        **sound.FIELDS,
+    }
     struct = Struct(*(name / part for name, part in fields.items()))
-    return [sound.sensor(sound.frame(Checksummed(struct, field="sum", algorithm=Sum(16)), max_length=sound.SIZE + 8))]
+    return [
+        sound.sensor(
+            sound.frame(
+                Checksummed(struct, field="sum", algorithm=Sum(16)), max_length=sound.SIZE + 8
+            )
+        )
+    ]

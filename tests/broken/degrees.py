@@ -9,7 +9,9 @@ from tests.broken.sound import sensor
 
 
 def points(f, full):
-    return Polar(f.samples.distance, spread(f.first, f.last, f.count, full=full), intensity=f.samples.quality)
+    return Polar(
+        f.samples.distance, spread(f.first, f.last, f.count, full=full), intensity=f.samples.quality
+    )
 
 
 @hookimpl

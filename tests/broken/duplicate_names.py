@@ -7,7 +7,12 @@ from construct import Const, Int8ul, Int16ul, Struct
 from lidarspec.spec import Scaled, hookimpl
 from tests.broken.sound import frame, sensor
 
-DATA = Struct("header" / Const(b"\xaa\x55"), "reserved" / Int8ul, "distance" / Scaled(Int16ul, 0.001, "m"), "reserved" / Int8ul)
+DATA = Struct(
+    "header" / Const(b"\xaa\x55"),
+    "reserved" / Int8ul,
+    "distance" / Scaled(Int16ul, 0.001, "m"),
+    "reserved" / Int8ul,
+)
 
 
 @hookimpl

@@ -11,7 +11,9 @@ OFFSETS = np.full(360, 0.25)  # degrees
 
 
 def plausible(f):
-    return (f.count >= 1) & (f.count <= LONGEST) & (f.first <= 360) & (f.last <= 360) & (f.time < WRAP)
+    return (
+        (f.count >= 1) & (f.count <= LONGEST) & (f.first <= 360) & (f.last <= 360) & (f.time < WRAP)
+    )
 
 
 def points(f):

@@ -7,7 +7,9 @@ from construct import Const, ExprAdapter, Int16ul, Struct
 from lidarspec.spec import Frame, hookimpl
 from tests.broken.sound import sensor
 
-CENTIMETRES = ExprAdapter(Int16ul, lambda value, context: value * 0.01, lambda value, context: int(value / 0.01))
+CENTIMETRES = ExprAdapter(
+    Int16ul, lambda value, context: value * 0.01, lambda value, context: int(value / 0.01)
+)
 
 
 ACK = Struct("header" / Const(b"\x17\x71\x44\x99"), "height" / CENTIMETRES)

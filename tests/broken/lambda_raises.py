@@ -12,4 +12,11 @@ LENGTHS = {1: 1, 2: 2, 3: 3}
 
 @hookimpl
 def lidarspec_sensors():
-    return [sensor(frame(sealed(kind=Int8ul, extra=Bytes(lambda this: LENGTHS[this.kind])), max_length=SIZE + 4))]
+    return [
+        sensor(
+            frame(
+                sealed(kind=Int8ul, extra=Bytes(lambda this: LENGTHS[this.kind])),
+                max_length=SIZE + 4,
+            )
+        )
+    ]

@@ -10,4 +10,8 @@ PLAIN = sensor()
 
 @hookimpl
 def lidarspec_sensors():
-    return [sensor(frames={**PLAIN.frames, "ack": Frame(ACK, max_length=8, plausible=lambda f: f.code < 8)})]
+    return [
+        sensor(
+            frames={**PLAIN.frames, "ack": Frame(ACK, max_length=8, plausible=lambda f: f.code < 8)}
+        )
+    ]

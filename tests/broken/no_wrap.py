@@ -1,4 +1,6 @@
-"""Angles from the first to the last without a wrap: backwards in the packet that crosses 360 degrees."""
+"""Angles from the first to the last without a wrap: backwards in the packet that crosses 360
+degrees.
+"""
 
 from __future__ import annotations
 
@@ -10,7 +12,11 @@ from tests.broken.sound import sensor
 
 def points(f):
     share = spread(f.first * 0, f.first * 0 + 1, f.count, full=1e9)
-    return Polar(f.samples.distance, np.deg2rad(f.first + (f.last - f.first) * share), intensity=f.samples.quality)
+    return Polar(
+        f.samples.distance,
+        np.deg2rad(f.first + (f.last - f.first) * share),
+        intensity=f.samples.quality,
+    )
 
 
 @hookimpl

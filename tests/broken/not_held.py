@@ -10,4 +10,11 @@ from tests.broken.sound import FIELDS, SIZE, frame, sealed, sensor
 
 @hookimpl
 def lidarspec_sensors():
-    return [sensor(frame(sealed(count=FIELDS["count"], length=Rebuild(Int16ul, this.count * 3 + 17)), max_length=SIZE + 2))]
+    return [
+        sensor(
+            frame(
+                sealed(count=FIELDS["count"], length=Rebuild(Int16ul, this.count * 3 + 17)),
+                max_length=SIZE + 2,
+            )
+        )
+    ]

@@ -9,7 +9,11 @@ from tests.broken.sound import sensor
 
 
 def points(f):
-    return Polar(f.samples.distance, np.deg2rad(spread(f.first, f.last, f.count - 1, full=360.0)), intensity=f.samples.quality)
+    return Polar(
+        f.samples.distance,
+        np.deg2rad(spread(f.first, f.last, f.count - 1, full=360.0)),
+        intensity=f.samples.quality,
+    )
 
 
 @hookimpl

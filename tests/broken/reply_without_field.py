@@ -8,4 +8,12 @@ from tests.broken.sound import sensor
 
 @hookimpl
 def lidarspec_sensors():
-    return [sensor(commands={"start": Command("order", {"code": 1}, reply="ack", matches={"mode": 1}, starts=True)})]
+    return [
+        sensor(
+            commands={
+                "start": Command(
+                    "order", {"code": 1}, reply="ack", matches={"mode": 1}, starts=True
+                )
+            }
+        )
+    ]

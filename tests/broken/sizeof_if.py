@@ -7,7 +7,9 @@ from construct import Const, If, Int8ul, Struct, this
 from lidarspec.spec import hookimpl
 from tests.broken.sound import frame, sensor
 
-EXTENDED = Struct("header" / Const(b"\xaa\x55"), "kind" / Int8ul, "extra" / If(this.kind == 1, Int8ul))
+EXTENDED = Struct(
+    "header" / Const(b"\xaa\x55"), "kind" / Int8ul, "extra" / If(this.kind == 1, Int8ul)
+)
 
 
 @hookimpl

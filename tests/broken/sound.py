@@ -1,4 +1,6 @@
-"""The sensor that each broken plugin is, but for its mistake: headers, a count, an angle from first to last, a sum."""
+"""The sensor that each broken plugin is, but for its mistake: headers, a count, an angle from first
+to last, a sum.
+"""
 
 from __future__ import annotations
 
@@ -46,7 +48,9 @@ FIELDS: dict[str, Any] = {
 
 
 def struct(**changes: Any) -> Struct:
-    """The fields of the data frame, some of them changed, or new in front of the sum; None takes one away."""
+    """The fields of the data frame, some of them changed, or new in front of the sum; None takes
+    one away.
+    """
     fields = {**FIELDS, **changes}
     fields["sum"] = fields.pop("sum")
     return Struct(*(name / con for name, con in fields.items() if con is not None))
@@ -59,7 +63,9 @@ def sealed(**changes: Any) -> Checksummed:
 
 def plausible(f: Fields) -> Any:
     """A sample at least, angles below 360 degrees, a time below its wrap."""
-    return (f.count >= 1) & (f.count <= LONGEST) & (f.first < 360) & (f.last < 360) & (f.time < WRAP)
+    return (
+        (f.count >= 1) & (f.count <= LONGEST) & (f.first < 360) & (f.last < 360) & (f.time < WRAP)
+    )
 
 
 def points(f: Fields) -> Polar:
@@ -72,17 +78,29 @@ def sweep(i: int) -> dict[str, float]:
     """Packets of 24 samples, 10 a turn."""
     first = (10 + i * LONGEST * STEP) % 360
     last = (first + (LONGEST - 1) * STEP) % 360
-    return dict(number=i % 256, time=i * PERIOD % WRAP, tilt=0, first=first, last=last, count=LONGEST)
+    return dict(
+        number=i % 256, time=i * PERIOD % WRAP, tilt=0, first=first, last=last, count=LONGEST
+    )
 
 
-ORDER = Checksummed(Struct("header" / Const(b"\x16\x61"), "code" / Int8ul, "check" / Int8ul), field="check", algorithm=Xor())
-ACK = Checksummed(Struct("header" / Const(b"\x17\x71\x44"), "code" / Int8ul, "check" / Int8ul), field="check", algorithm=Xor())
+ORDER = Checksummed(
+    Struct("header" / Const(b"\x16\x61"), "code" / Int8ul, "check" / Int8ul),
+    field="check",
+    algorithm=Xor(),
+)
+ACK = Checksummed(
+    Struct("header" / Const(b"\x17\x71\x44"), "code" / Int8ul, "check" / Int8ul),
+    field="check",
+    algorithm=Xor(),
+)
 SIZE = 15 + 3 * LONGEST
 
 
 def frame(con: Any = None, **changes: Any) -> Frame:
     """The data frame."""
-    return Frame(**(dict(struct=con or sealed(), data=True, max_length=SIZE, plausible=plausible) | changes))
+    return Frame(
+        **(dict(struct=con or sealed(), data=True, max_length=SIZE, plausible=plausible) | changes)
+    )
 
 
 def sensor(data: Frame | None = None, kind: type[Sensor] = Sensor, **changes: Any) -> Sensor:
@@ -95,7 +113,9 @@ def sensor(data: Frame | None = None, kind: type[Sensor] = Sensor, **changes: An
             "ack": Frame(ACK, max_length=5, plausible=lambda f: f.code < 8),
             "order": Frame(ORDER, direction="out", max_length=4),
         },
-        commands={"start": Command("order", {"code": 1}, reply="ack", matches={"code": 1}, starts=True)},
+        commands={
+            "start": Command("order", {"code": 1}, reply="ack", matches={"code": 1}, starts=True)
+        },
         points=points,
         scan=OnWrap("azimuth"),
         links={"data": Serial(115_200)},

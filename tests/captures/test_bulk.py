@@ -1,4 +1,6 @@
-"""Captures read in batches: the same datagrams, order and counts as one by one, whatever is in the file; and whose the bytes are."""
+"""Captures read in batches: the same datagrams, order and counts as one by one, whatever is in the
+file; and whose the bytes are.
+"""
 
 from __future__ import annotations
 
@@ -22,7 +24,13 @@ import pytest
 import lidarspec as ls
 from lidarspec.captures.bulk import Batch, CaptureBatches, StreamBatches
 from lidarspec.captures.ip import ETHERNET
-from lidarspec.captures.pcap import USER_LINKS, CaptureReader, Datagram, StreamReader, datagram_record
+from lidarspec.captures.pcap import (
+    USER_LINKS,
+    CaptureReader,
+    Datagram,
+    StreamReader,
+    datagram_record,
+)
 from lidarspec.captures.records import capture_head
 from lidarspec.simulation.simulator import simulate
 from lidarspec.transports.files import CaptureTransport, open_file
@@ -44,7 +52,9 @@ def in_batches(file: BinaryIO | Path, kind: type[CaptureBatches] = CaptureBatche
 
 
 def rows(batch: Batch) -> list[tuple[bytes, int, tuple[str, int]]]:
-    return [(batch.data(i), int(batch.at[i]), batch.names[batch.senders[i]]) for i in range(len(batch))]
+    return [
+        (batch.data(i), int(batch.at[i]), batch.names[batch.senders[i]]) for i in range(len(batch))
+    ]
 
 
 def check(capture: bytes) -> Read:
@@ -61,13 +71,21 @@ def frame(data: bytes, *, port: int = 2368, ident: int = 7, host: int = 201) -> 
 
 
 def stream(count: int, size: int = 100, *, port: int = 2368, host: int = 201) -> list[bytes]:
-    return [frame(bytes([index & 0xFF]) * size, port=port, ident=index & 0xFFFF, host=host) for index in range(count)]
+    return [
+        frame(bytes([index & 0xFF]) * size, port=port, ident=index & 0xFFFF, host=host)
+        for index in range(count)
+    ]
 
 
 def fragments(data: bytes, ident: int) -> list[bytes]:
     body = made.udp(data)
-    places = [(at, at // 8 | (0x2000 if at + 48 < len(body) else 0)) for at in range(0, len(body), 48)]
-    parts = [made.ethernet(made.ipv4(body[at : at + 48], ident=ident, place=place)) for at, place in places]
+    places = [
+        (at, at // 8 | (0x2000 if at + 48 < len(body) else 0)) for at in range(0, len(body), 48)
+    ]
+    parts = [
+        made.ethernet(made.ipv4(body[at : at + 48], ident=ident, place=place))
+        for at, place in places
+    ]
     return parts
 
 
@@ -86,7 +104,12 @@ MIXED = shuffled(
     stream(40, 100, host=202),
     [made.ethernet(b"arp", ethertype=0x0806)] * 5,
     [made.ethernet(made.ipv4(b"tcp", protocol=6))] * 5,
-    [made.ethernet(struct.pack(">HH", 5, 0x0800) + made.ipv4(made.udp(b"tagged")), ethertype=0x8100)] * 20,
+    [
+        made.ethernet(
+            struct.pack(">HH", 5, 0x0800) + made.ipv4(made.udp(b"tagged")), ethertype=0x8100
+        )
+    ]
+    * 20,
     [made.ethernet(made.ipv6(made.udp(b"six")), ethertype=0x86DD)] * 20,
     [made.ethernet(made.ipv4(made.udp(b"options"), options=bytes(8)))] * 20,
     [frame(b"cut short")[:-3]] * 3,
@@ -105,8 +128,12 @@ def test_a_stream_comes_in_few_batches() -> None:
 @pytest.mark.parametrize("sizes", [[47], [47, 9, 130]], ids=["one size", "sizes"])
 def test_a_byte_stream_in_batches_is_what_it_is_packet_by_packet(sizes: list[int]) -> None:
     packets = [bytes([index & 0xFF]) * sizes[index // 40 % len(sizes)] for index in range(900)]
-    records = [made.record(data, seconds=made.SECONDS + index // 9) for index, data in enumerate(packets)]
-    records[300:305] = [made.record(bytes(47), original=90)] * 5  # cut where the file says, as long as others
+    records = [
+        made.record(data, seconds=made.SECONDS + index // 9) for index, data in enumerate(packets)
+    ]
+    records[300:305] = [
+        made.record(bytes(47), original=90)
+    ] * 5  # cut where the file says, as long as others
     capture = made.pcap_head(link=USER_LINKS[0], snap_length=47) + b"".join(records)
     found, stats = in_batches(io.BytesIO(capture), StreamBatches)
     assert (found, stats) == one_by_one(io.BytesIO(capture), StreamReader)
@@ -120,7 +147,10 @@ def test_a_byte_stream_in_batches_is_what_it_is_packet_by_packet(sizes: list[int
 @pytest.mark.parametrize("order", ["<", ">"])
 @pytest.mark.parametrize("magic", [0xA1B2C3D4, 0xA1B23C4D])
 def test_pcap_of_either_order_and_unit(order: str, magic: int) -> None:
-    records = [made.record(each, order, seconds=made.SECONDS + index // 100) for index, each in enumerate(MIXED)]
+    records = [
+        made.record(each, order, seconds=made.SECONDS + index // 100)
+        for index, each in enumerate(MIXED)
+    ]
     found, stats = check(made.pcap_head(order, magic=magic) + b"".join(records))
     assert len(found) == 300 + 80 + 40 + 20 * 4 + 6
     assert getattr(stats, "snapped", None) == 0  # all kept as many bytes as the records say
@@ -143,15 +173,27 @@ def test_pcapng_of_all_kinds_of_blocks_and_times(options: str, kind: int) -> Non
     ticks = [3_000_000_007 + index * 1_000_003 for index in range(len(MIXED))]
     ticks[50:60] = [(1 << 64) - 1 - index for index in range(10)]
     ticks[70:80] = [(1 << 62) + index for index in range(10)]
-    packets = [made.packet(each, kind=kind, ticks=at) for each, at in zip(MIXED, ticks, strict=True)]
+    packets = [
+        made.packet(each, kind=kind, ticks=at) for each, at in zip(MIXED, ticks, strict=True)
+    ]
     check(made.section() + made.interface(options=OPTIONS[options]) + b"".join(packets))
 
 
 def test_sections_interfaces_and_damage_between_packets() -> None:
     packets = [made.packet(each, ticks=index) for index, each in enumerate(stream(400))]
-    other = [made.packet(each[14:], ">", ticks=index, number=1) for index, each in enumerate(stream(200))]
-    packets[100:100] = [made.interface(link=101), made.packet(stream(1)[0][14:], number=1), made.packet(stream(1)[0], number=7)]
-    packets[200:200] = [made.block(0x0BAD, bytes(40)), made.block(6, bytes(8)), made.packet(stream(1)[0], captured=9999)]
+    other = [
+        made.packet(each[14:], ">", ticks=index, number=1) for index, each in enumerate(stream(200))
+    ]
+    packets[100:100] = [
+        made.interface(link=101),
+        made.packet(stream(1)[0][14:], number=1),
+        made.packet(stream(1)[0], number=7),
+    ]
+    packets[200:200] = [
+        made.block(0x0BAD, bytes(40)),
+        made.block(6, bytes(8)),
+        made.packet(stream(1)[0], captured=9999),
+    ]
     packets[300] = packets[300][:-4] + struct.pack("<I", len(packets[300]) + 4)
     second = [made.section(">"), made.interface(">"), made.interface(">", link=101), *other]
     third = [made.section(), made.interface(options=made.option(9, b"\x09")), *packets[:50]]
@@ -176,7 +218,10 @@ def test_link_layers(link: int) -> None:
         1: bytes(12) + b"\x08\x00",
         9: b"\xff\x03\x00\x21",
         51: bytes.fromhex("11000001003f0021"),
-        127: bytes.fromhex("0000080000000000") + b"\x08\x01" + bytes(22) + bytes.fromhex("aaaa030000000800"),
+        127: bytes.fromhex("0000080000000000")
+        + b"\x08\x01"
+        + bytes(22)
+        + bytes.fromhex("aaaa030000000800"),
     }
     frames = [heads.get(link, b"") + each[14:] for each in stream(200)]
     found, _ = check(made.pcap_head(link=link) + b"".join(map(made.record, frames)))
@@ -201,17 +246,31 @@ def test_records_longer_than_the_first_buffer_and_files_longer_than_the_largest(
     long = [frame(bytes([index]) * 60_000) for index in range(3)]
     check(made.pcap(*stream(3), *long, *stream(2200, 1248), *long))
     block = made.block(0x0BAD, bytes(900_000))
-    check(made.section() + made.interface() + b"".join(block + made.packet(each) for each in stream(4)))
+    check(
+        made.section()
+        + made.interface()
+        + b"".join(block + made.packet(each) for each in stream(4))
+    )
     passed_over = made.block(0x0BAD, bytes(3_000_000))
-    check(made.section() + made.interface() + b"".join(passed_over + made.packet(each) for each in stream(4)))
+    check(
+        made.section()
+        + made.interface()
+        + b"".join(passed_over + made.packet(each) for each in stream(4))
+    )
 
 
 def parts(form: str, number: int) -> list[bytes]:
-    """Return the records of a capture in which fragments interrupt a stream, after the head of the file."""
+    """Return the records of a capture in which fragments interrupt a stream, after the head of the
+    file.
+    """
     frames = [*stream(number, 8), *fragments(bytes(60), 1), *stream(number, 8)]
     if form == "pcap":
         return [made.pcap_head(), *map(made.record, frames)]
-    return [made.section(), made.interface(), *(made.packet(each, ticks=at) for at, each in enumerate(frames))]
+    return [
+        made.section(),
+        made.interface(),
+        *(made.packet(each, ticks=at) for at, each in enumerate(frames)),
+    ]
 
 
 FORMS = ["pcap", "pcapng"]
@@ -242,7 +301,9 @@ def test_mutations_give_the_same_as_one_by_one(form: str, inputs: int) -> None:
             if edit == 0:
                 data[at] ^= 1 << draw.randrange(8)
             elif edit == 1:
-                data[at : at + 4] = draw.choice([bytes(4), b"\xff" * 4, b"\0\0\0\x80", b"\x04\0\0\0"])
+                data[at : at + 4] = draw.choice(
+                    [bytes(4), b"\xff" * 4, b"\0\0\0\x80", b"\x04\0\0\0"]
+                )
             elif edit == 2:
                 del data[at : at + draw.randint(1, 9)]
             else:
@@ -290,7 +351,11 @@ def test_packets_of_a_pipe_come_as_soon_as_they_are_whole() -> None:
         assert not list(batches)
 
 
-@pytest.mark.parametrize("path", sorted(made.CAPTURES.rglob("*.pcap*")) or [None], ids=lambda path: path and path.parent.name)
+@pytest.mark.parametrize(
+    "path",
+    sorted(made.CAPTURES.rglob("*.pcap*")) or [None],
+    ids=lambda path: path and path.parent.name,
+)
 def test_real_captures(path: Path | None) -> None:
     if path is None:
         pytest.skip(f"no captures in {made.CAPTURES} (set LIDARSPEC_CAPTURES)")
@@ -310,7 +375,9 @@ def address(batch: Batch) -> int:
     return int(batch.buffer.__array_interface__["data"][0])
 
 
-def test_buffers_are_used_again_once_nobody_holds_them(long_capture: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_buffers_are_used_again_once_nobody_holds_them(
+    long_capture: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.setattr(CaptureBatches, "largest", 1 << 21)
     places = [address(batch) for batch in CaptureBatches(long_capture).batches()]
     assert len(places) > 12
@@ -329,8 +396,17 @@ def test_a_reader_that_is_done_is_gone_at_once_with_its_buffers(long_capture: Pa
         gc.enable()
 
 
-@pytest.mark.parametrize("hold", [lambda batch: batch.buffer, lambda batch: batch.buffer[5:90], lambda batch: memoryview(batch.buffer)])
-def test_whoever_holds_a_view_of_a_buffer_keeps_it(hold: Callable[[Batch], object], long_capture: Path) -> None:
+@pytest.mark.parametrize(
+    "hold",
+    [
+        lambda batch: batch.buffer,
+        lambda batch: batch.buffer[5:90],
+        lambda batch: memoryview(batch.buffer),
+    ],
+)
+def test_whoever_holds_a_view_of_a_buffer_keeps_it(
+    hold: Callable[[Batch], object], long_capture: Path
+) -> None:
     held, copies, places = [], [], []
     for batch in CaptureBatches(long_capture).batches():
         held.append(hold(batch))
@@ -338,10 +414,14 @@ def test_whoever_holds_a_view_of_a_buffer_keeps_it(hold: Callable[[Batch], objec
         places.append(address(batch))
         assert not batch.buffer.flags.writeable
     assert len(set(places)) == len(places)
-    assert all(np.array_equal(np.asarray(view), copy) for view, copy in zip(held, copies, strict=True))
+    assert all(
+        np.array_equal(np.asarray(view), copy) for view, copy in zip(held, copies, strict=True)
+    )
 
 
-def test_packets_of_a_file_stay_right_while_the_file_is_read_on(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_packets_of_a_file_stay_right_while_the_file_is_read_on(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.setattr(CaptureBatches, "largest", 1 << 21)
     from tests.captures.test_memory import SENSOR, written
 
@@ -356,7 +436,9 @@ def test_packets_of_a_file_stay_right_while_the_file_is_read_on(tmp_path: Path, 
     assert np.array_equal(np.concatenate([packets.raw for packets in kept]), whole.raw)
     with ls.open(path, SENSOR) as device:
         scans = list(device.scans())
-    assert np.array_equal(np.concatenate([scan.points.x for scan in scans]), whole.points().x, equal_nan=True)
+    assert np.array_equal(
+        np.concatenate([scan.points.x for scan in scans]), whole.points().x, equal_nan=True
+    )
 
 
 def test_one_sender_of_several(tmp_path: Path) -> None:
@@ -381,7 +463,13 @@ def test_frames_of_two_senders_are_not_mixed(other: tuple[str, int], tmp_path: P
     with path.open("wb") as file:
         file.write(capture_head(ETHERNET))
         for index, data in enumerate(simulate(ls.sensor("robosense-m1"), 40)):
-            file.write(datagram_record(Datagram(data, index, other if index % 2 else ("10.0.0.1", 6699), made.DESTINATION)))
+            file.write(
+                datagram_record(
+                    Datagram(
+                        data, index, other if index % 2 else ("10.0.0.1", 6699), made.DESTINATION
+                    )
+                )
+            )
     one, two = ("10.0.0.1", "10.0.0.2") if other[1] == 6699 else ("10.0.0.1:6699", "10.0.0.1:6700")
     said = "({0} and {1}|{1} and {0}).*src=({0}|{1})".format(re.escape(one), re.escape(two))
     with ls.open(path, "robosense-m1") as device, pytest.raises(ls.UsageError, match=said):
@@ -393,10 +481,18 @@ def test_frames_of_two_senders_are_not_mixed(other: tuple[str, int], tmp_path: P
 
 def test_a_calibration_of_another_address_is_not_mixed_in(tmp_path: Path) -> None:
     sensor, path = SHAPES["shape-datagrams"], tmp_path / "two.pcap"
-    sent = [(turning(sensor, 1)[0], "10.0.0.1"), (sensor.build("info", elevation=[1, 2, 3]), "10.0.0.2")]
-    data = [datagram_record(Datagram(frame, 0, (host, 7001), made.DESTINATION)) for frame, host in sent]
+    sent = [
+        (turning(sensor, 1)[0], "10.0.0.1"),
+        (sensor.build("info", elevation=[1, 2, 3]), "10.0.0.2"),
+    ]
+    data = [
+        datagram_record(Datagram(frame, 0, (host, 7001), made.DESTINATION)) for frame, host in sent
+    ]
     path.write_bytes(capture_head(ETHERNET) + b"".join(data))
-    with ls.open(path, sensor) as device, pytest.raises(ls.UsageError, match=r"10\.0\.0\.1 and 10\.0\.0\.2 both send frames"):
+    with (
+        ls.open(path, sensor) as device,
+        pytest.raises(ls.UsageError, match=r"10\.0\.0\.1 and 10\.0\.0\.2 both send frames"),
+    ):
         list(device.packets())
     with ls.open(f"{path}?src=10.0.0.1", sensor) as device:
         assert sum(map(len, device.packets())) == 1
@@ -407,7 +503,9 @@ HOSTILE = {
     "pcapng of 12 bytes": b"\x0a\x0d\x0d\x0a" + HUGE + b"\x4d\x3c\x2b\x1a",
     "pcapng block": made.section() + made.interface() + struct.pack("<I", 6) + HUGE + bytes(4),
     "pcap record": made.pcap_head() + bytes(8) + HUGE + HUGE,
-    "pcap record within the limit": made.pcap_head() + bytes(8) + struct.pack("<II", 1 << 18, 1 << 18),
+    "pcap record within the limit": made.pcap_head()
+    + bytes(8)
+    + struct.pack("<II", 1 << 18, 1 << 18),
 }
 
 
@@ -426,7 +524,12 @@ def test_a_long_block_takes_bounded_memory() -> None:
 @pytest.mark.slow
 def test_many_senders_and_empty_records_take_bounded_memory() -> None:
     assert peak_memory(io.BytesIO(made.pcap_head() + bytes(16) * 60_000)) < 7 << 20
-    assert peak_memory(io.BytesIO(made.pcap(*(frame(b"", ident=index, port=index) for index in range(6_000))))) < 7 << 20
+    assert (
+        peak_memory(
+            io.BytesIO(made.pcap(*(frame(b"", ident=index, port=index) for index in range(6_000))))
+        )
+        < 7 << 20
+    )
 
 
 def peak_memory(file: BinaryIO | Path) -> int:
@@ -460,5 +563,7 @@ def test_a_section_among_blocks_of_its_own_length_is_seen() -> None:
     options = bytes(len(packets[0]) - len(made.section()))
     section = made.block(0x0A0D0D0A, struct.pack("<IHHq", 0x1A2B3C4D, 1, 0, -1) + options)
     assert len(section) == len(packets[0])
-    found, stats = check(made.section() + made.interface() + b"".join([*packets, section, *packets]))
+    found, stats = check(
+        made.section() + made.interface() + b"".join([*packets, section, *packets])
+    )
     assert (len(found), getattr(stats, "malformed", None)) == (40, 40)

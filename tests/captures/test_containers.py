@@ -1,4 +1,6 @@
-"""Captures and recordings in compressed files: the same packets, and what is said of files that are cut off, damaged or of other kinds."""
+"""Captures and recordings in compressed files: the same packets, and what is said of files that are
+cut off, damaged or of other kinds.
+"""
 
 from __future__ import annotations
 
@@ -41,7 +43,9 @@ def zipped(data: bytes, *names: str) -> bytes:
     path = Path("made.zip")
     with zipfile.ZipFile(path, "w", zipfile.ZIP_DEFLATED) as archive:
         for name in names or ("drives/", "drives/a"):
-            archive.writestr(name, b"" if name.endswith("/") else b"no capture" if name.endswith(".md") else data)
+            archive.writestr(
+                name, b"" if name.endswith("/") else b"no capture" if name.endswith(".md") else data
+            )
     return path.read_bytes()
 
 
@@ -57,7 +61,10 @@ PACKED: dict[str, Callable[[bytes], bytes]] = {
 
 
 #: one in the quick tier: what follows the decompression is the same for all.
-COMPRESSIONS = ["gzip", *(pytest.param(name, marks=pytest.mark.slow) for name in ("bzip2", "xz", "zstd"))]
+COMPRESSIONS = [
+    "gzip",
+    *(pytest.param(name, marks=pytest.mark.slow) for name in ("bzip2", "xz", "zstd")),
+]
 
 
 @pytest.fixture(autouse=True)
@@ -94,7 +101,9 @@ def test_what_is_compressed_is_read_as_it_was(packing: str) -> None:
             assert chunks == read(plain)
         with contextlib.closing(transport("it.x")) as opened:
             if isinstance(opened, CaptureTransport):
-                assert [batch.data(number) for batch in opened.batches() for number in range(len(batch))] == [item.data for item in chunks]
+                assert [
+                    batch.data(number) for batch in opened.batches() for number in range(len(batch))
+                ] == [item.data for item in chunks]
     Path("it.x").write_bytes(PACKED[packing](capture()))
     assert [datagram.data for datagram in CaptureReader("it.x")] == simulate(ls.sensor(SENSOR), 40)
 
@@ -107,15 +116,21 @@ def test_verbs_take_compressed_files_and_pipes() -> None:
         ran("convert", name, f"{name}.csv", "-s", SENSOR)
     assert Path("a.pcap.csv").read_bytes() == Path("a.pcap.gz.csv").read_bytes()
     assert SENSOR in ran("detect", "a.pcap.gz").output
-    piped = process("read", "-", "--packets", "--json", "-s", SENSOR, given=gzip.compress(capture()))
-    assert piped.stdout.decode() == ran("read", "a.pcap", "--packets", "--json", "-s", SENSOR).stdout
+    piped = process(
+        "read", "-", "--packets", "--json", "-s", SENSOR, given=gzip.compress(capture())
+    )
+    assert (
+        piped.stdout.decode() == ran("read", "a.pcap", "--packets", "--json", "-s", SENSOR).stdout
+    )
     refused = process("read", "-", "--packets", "-s", SENSOR, given=zipped(capture()))
     assert (refused.returncode, b"give its file, not a pipe" in refused.stderr) == (3, True)
 
 
 @pytest.mark.slow
 def test_one_file_of_an_archive_is_named_where_several_are_captures() -> None:
-    Path("one.zip").write_bytes(zipped(capture(), "read.md", "__MACOSX/drives/a.pcap", "drives/a.pcap", "notes.md"))
+    Path("one.zip").write_bytes(
+        zipped(capture(), "read.md", "__MACOSX/drives/a.pcap", "drives/a.pcap", "notes.md")
+    )
     assert len(read("one.zip")) == 40
     Path("two.zip").write_bytes(zipped(capture(), "read.md", "drives/a b.pcap", "drives/b.pcap"))
     said = ran("convert", "two.zip", "out.csv", "-s", SENSOR, code=2).stderr
@@ -124,13 +139,22 @@ def test_one_file_of_an_archive_is_named_where_several_are_captures() -> None:
     assert len(read("two.zip?file=drives/a b.pcap")) == 40
     ran("convert", "two.zip?file=drives/b.pcap", "out.csv", "-s", SENSOR)
     assert SENSOR in ran("detect", "two.zip?file=drives/b.pcap").output
-    assert "unknown name 'drives/c.pcap'; did you mean 'drives/b.pcap'" in ran("read", "two.zip?file=drives/c.pcap", code=2).stderr
+    assert (
+        "unknown name 'drives/c.pcap'; did you mean 'drives/b.pcap'"
+        in ran("read", "two.zip?file=drives/c.pcap", code=2).stderr
+    )
     Path("none.zip").write_bytes(zipped(capture(), "read.md", "notes.md"))
     said = ran("read", "none.zip", "-s", SENSOR, code=3).stderr
-    assert "none.zip is a zip archive, and is not read: there is no capture in it, but read.md, notes.md" in said
+    assert (
+        "none.zip is a zip archive, and is not read: there is no capture in it, but read.md,"
+        " notes.md" in said
+    )
     Path("cut.zip").write_bytes(zipped(capture())[:3000])
     said = ran("read", "cut.zip", "-s", SENSOR, code=3).stderr
-    assert "cut.zip is a zip archive, and is not read: File is not a zip file\n  next: zip -FF cut.zip --out mended.zip" in said
+    assert (
+        "cut.zip is a zip archive, and is not read: File is not a zip file\n  next: zip -FF cut.zip"
+        " --out mended.zip" in said
+    )
     locked = bytearray(zipped(capture()))
     for place in (locked.rindex(b"PK\x03\x04") + 6, locked.rindex(b"PK\x01\x02") + 8):
         locked[place] |= 1  # the flag of a file with a password
@@ -139,7 +163,10 @@ def test_one_file_of_an_archive_is_named_where_several_are_captures() -> None:
     assert "is encrypted, password required" in said
     assert "next: unzip locked.zip" in said
     Path("it.pcap").write_bytes(capture())
-    assert "it.pcap is no zip archive: there is no a.pcap in it" in ran("read", "it.pcap?file=a.pcap", "-s", SENSOR, code=2).stderr
+    assert (
+        "it.pcap is no zip archive: there is no a.pcap in it"
+        in ran("read", "it.pcap?file=a.pcap", "-s", SENSOR, code=2).stderr
+    )
 
 
 @pytest.mark.parametrize("packing", COMPRESSIONS)
@@ -170,7 +197,10 @@ def test_what_came_before_damage_is_read_and_it_is_said_once(packing: str) -> No
     with contextlib.closing(transport("it.pcap.x")) as opened:
         packets = [chunk.data for chunk in opened.chunks()]
         assert packets[:900] == sent[:900]
-        assert sum(said.startswith("it.pcap.x is damaged before byte") for said in opened.warnings) == 1
+        assert (
+            sum(said.startswith("it.pcap.x is damaged before byte") for said in opened.warnings)
+            == 1
+        )
         assert opened.unread > 0
     assert "it.pcap.x is damaged before byte" in ran("record", "it.pcap.x", "-o", "it.lsr").stderr
 
@@ -184,7 +214,9 @@ OTHERS = {
     "an HDF5 file": [b"\x89HDF\r\n\x1a\n"],
     "a file of points": [b"LASF", b"# .PCD v0.7\n", b"ply\n", b"ASTM-E57"],
     "an XML or HTML page": [b"<!DOCTYPE html>", b"<?xml version='1.0'?>"],
-    "a pointer of Git LFS, in the place of the file itself": [b"version https://git-lfs.github.com/spec/v1\n"],
+    "a pointer of Git LFS, in the place of the file itself": [
+        b"version https://git-lfs.github.com/spec/v1\n"
+    ],
     "compressed by gzip again and again": [gzip.compress(gzip.compress(gzip.compress(b"packets")))],
 }
 
@@ -195,13 +227,18 @@ def test_files_of_other_kinds_are_named_whatever_they_are_called_and_packed_in(w
         for name, held in (("it.bin", data), ("it.hex", data), ("it.bin.gz", gzip.compress(data))):
             if "again" not in what or name == "it.bin":
                 Path(name).write_bytes(held)
-                assert f"{name} is {what}, and is not read" in ran("convert", name, "out.csv", "-s", SENSOR, code=3).stderr
+                assert (
+                    f"{name} is {what}, and is not read"
+                    in ran("convert", name, "out.csv", "-s", SENSOR, code=3).stderr
+                )
 
 
 def test_a_missing_library_is_said_with_what_installs_it(monkeypatch: pytest.MonkeyPatch) -> None:
     Path("it.zst").write_bytes(b"\x28\xb5\x2f\xfd")
     monkeypatch.setitem(sys.modules, ZSTD, None)
-    assert "next: pip install 'lidarspec[zstd]'" in ran("read", "it.zst", "-s", SENSOR, code=2).stderr
+    assert (
+        "next: pip install 'lidarspec[zstd]'" in ran("read", "it.zst", "-s", SENSOR, code=2).stderr
+    )
 
 
 @pytest.mark.slow
@@ -209,7 +246,13 @@ def test_a_missing_library_is_said_with_what_installs_it(monkeypatch: pytest.Mon
 def test_a_compressed_capture_is_decoded_in_bounded_memory(tmp_path: Path) -> None:
     written(tmp_path / "long.pcap", 60)
     subprocess.run(["gzip", "-1", "long.pcap"], check=True)
-    done = subprocess.run([sys.executable, "-c", CHILD, "long.pcap.gz", SENSOR], capture_output=True, text=True, check=True, timeout=500)
+    done = subprocess.run(
+        [sys.executable, "-c", CHILD, "long.pcap.gz", SENSOR],
+        capture_output=True,
+        text=True,
+        check=True,
+        timeout=500,
+    )
     count, first, most = map(int, done.stdout.split())
     assert count > 5_000_000
     assert most - first < 40_000, f"from {first} to {most} KiB"

@@ -1,4 +1,6 @@
-"""From captured frames to UDP payloads: link layers, IPv4, IPv6, fragments; always through whole captures."""
+"""From captured frames to UDP payloads: link layers, IPv4, IPv6, fragments; always through whole
+captures.
+"""
 
 from __future__ import annotations
 
@@ -26,14 +28,27 @@ def extension(following: int, *, units: int = 0) -> bytes:
     return bytes([following, units]) + bytes(6 + 8 * units)
 
 
-def fragment4(start: int, stop: int, *, more: bool | None = None, ident: int = 7, body: bytes = BODY) -> bytes:
+def fragment4(
+    start: int, stop: int, *, more: bool | None = None, ident: int = 7, body: bytes = BODY
+) -> bytes:
     more = stop < len(body) if more is None else more
     return made.ipv4(body[start:stop], ident=ident, place=start // 8 | more << 13)
 
 
-def fragment6(start: int, stop: int, *, more: bool | None = None, ident: int = 7, body: bytes = BODY, following: int = 17) -> bytes:
+def fragment6(
+    start: int,
+    stop: int,
+    *,
+    more: bool | None = None,
+    ident: int = 7,
+    body: bytes = BODY,
+    following: int = 17,
+) -> bytes:
     more = stop < len(body) if more is None else more
-    return made.ipv6(struct.pack(">BBHI", following, 0xAA, start | 6 | more, ident) + body[start:stop], following=FRAGMENT)
+    return made.ipv6(
+        struct.pack(">BBHI", following, 0xAA, start | 6 | more, ident) + body[start:stop],
+        following=FRAGMENT,
+    )
 
 
 def read(*packets: bytes, link: int = 101) -> tuple[list[bytes], CaptureStats]:
@@ -41,7 +56,10 @@ def read(*packets: bytes, link: int = 101) -> tuple[list[bytes], CaptureStats]:
 
 
 def read_at(records: Sequence[tuple[int, bytes]]) -> tuple[list[bytes], CaptureStats]:
-    return made.payloads(made.pcap_head(link=101) + b"".join(made.record(packet, seconds=seconds) for seconds, packet in records))
+    return made.payloads(
+        made.pcap_head(link=101)
+        + b"".join(made.record(packet, seconds=seconds) for seconds, packet in records)
+    )
 
 
 def wifi(control: int, flags: int, *, padding: int = 0) -> bytes:
@@ -58,7 +76,12 @@ LINKS = [
     *((1, made.ethernet(PACKET)), (1, made.ethernet(PACKET6, ethertype=0x86DD))),
     (1, made.ethernet(struct.pack(">HH", 5, 0x0800) + PACKET, ethertype=0x8100)),
     (1, made.ethernet(struct.pack(">HHHH", 5, 0x8100, 6, 0x86DD) + PACKET6, ethertype=0x88A8)),
-    (1, made.ethernet(struct.pack(">HHHHHH", 5, 0x9100, 6, 0x8100, 7, 0x0800) + PACKET, ethertype=0x8100)),
+    (
+        1,
+        made.ethernet(
+            struct.pack(">HHHHHH", 5, 0x9100, 6, 0x8100, 7, 0x0800) + PACKET, ethertype=0x8100
+        ),
+    ),
     (113, struct.pack(">HHH8sH", 0, 1, 6, bytes(range(8)), 0x0800) + PACKET),
     (113, struct.pack(">HHH8sH", 4, 1, 6, bytes(range(8)), 0x86DD) + PACKET6),
     (113, struct.pack(">HHH8sHHH", 0, 1, 6, bytes(range(8)), 0x8100, 5, 0x0800) + PACKET),
@@ -66,19 +89,37 @@ LINKS = [
     (276, struct.pack(">HHIHBB8s", 0x86DD, 0, 2, 1, 0, 6, bytes(range(8))) + PACKET6),
     *((link, struct.pack(order + "I", 2) + PACKET) for link in (0, 108) for order in "<>"),
     *((0, struct.pack("<I", family) + PACKET6) for family in (10, 24, 28, 30)),
-    *((link, head + PACKET) for link in (9, 50) for head in (b"\xff\x03\x00\x21", b"\x00\x21", b"\xff\x03\x21", b"\x21")),
+    *(
+        (link, head + PACKET)
+        for link in (9, 50)
+        for head in (b"\xff\x03\x00\x21", b"\x00\x21", b"\xff\x03\x21", b"\x21")
+    ),
     (9, b"\xff\x03\x00\x57" + PACKET6),
     (51, PPPOE + PACKET),
     (1, made.ethernet(PPPOE + PACKET, ethertype=0x8864)),
-    (1, made.ethernet(struct.pack(">HH", 5, 0x8864) + PPPOE[:-1] + b"\x57" + PACKET6, ethertype=0x8100)),
+    (
+        1,
+        made.ethernet(
+            struct.pack(">HH", 5, 0x8864) + PPPOE[:-1] + b"\x57" + PACKET6, ethertype=0x8100
+        ),
+    ),
     (1, made.ethernet(LABELS + PACKET, ethertype=0x8847)),
     (1, made.ethernet(LABELS[8:] + PACKET6, ethertype=0x8848)),
     (1, made.ethernet(made.ipv4(made.udp(b"one"), total=0))),
     (105, wifi(0x08, 0x01) + PACKET),
     (105, wifi(0x88, 0x03) + PACKET),
     (127, bytes.fromhex("0000080000000000") + wifi(0x88, 0x82) + PACKET),
-    # present: the sensor's time and flags, which say that the 26 bytes of the header are padded; and flags behind a second word
-    (127, bytes.fromhex("0000180003000000") + bytes(8) + b"\x20" + bytes(7) + wifi(0x88, 0x02, padding=2) + PACKET),
+    # present: the sensor's time and flags, which say that the 26 bytes of the header are padded;
+    # and flags behind a second word
+    (
+        127,
+        bytes.fromhex("0000180003000000")
+        + bytes(8)
+        + b"\x20"
+        + bytes(7)
+        + wifi(0x88, 0x02, padding=2)
+        + PACKET,
+    ),
     (127, bytes.fromhex("00000d0002000080" + "00000000" + "00") + wifi(0x08, 0x02) + PACKET),
 ]
 
@@ -86,8 +127,12 @@ LINKS = [
 @pytest.mark.parametrize(("link", "frame"), LINKS)
 def test_link_layers(link: int, frame: bytes) -> None:
     datagrams, stats = made.read(made.pcap(frame, link=link))
-    ends = (made.SOURCE6, made.DESTINATION6) if PACKET6 in frame else (made.SOURCE, made.DESTINATION)
-    assert [(datagram.data, datagram.source, datagram.destination) for datagram in datagrams] == [(b"one", *ends)]
+    ends = (
+        (made.SOURCE6, made.DESTINATION6) if PACKET6 in frame else (made.SOURCE, made.DESTINATION)
+    )
+    assert [(datagram.data, datagram.source, datagram.destination) for datagram in datagrams] == [
+        (b"one", *ends)
+    ]
     assert stats == CaptureStats(packets=1, datagrams=1)
 
 
@@ -97,12 +142,18 @@ def test_frames_cut_at_every_byte_are_snapped_or_malformed(link: int, frame: byt
         cut = frame[:length]
         snapped = made.payloads(made.pcap_head(link=link) + made.record(cut, original=len(frame)))
         assert snapped == ([], CaptureStats(packets=1, snapped=1))
-        assert made.payloads(made.pcap(cut, link=link)) == ([], CaptureStats(packets=1, malformed=1))
+        assert made.payloads(made.pcap(cut, link=link)) == (
+            [],
+            CaptureStats(packets=1, malformed=1),
+        )
 
 
 OTHERS = {
     "ARP": (1, made.ethernet(bytes(28), ethertype=0x0806)),
-    "802.3 without EtherType": (1, made.ethernet(b"\xaa\xaa\x03" + PACKET, ethertype=len(PACKET) + 3)),
+    "802.3 without EtherType": (
+        1,
+        made.ethernet(b"\xaa\xaa\x03" + PACKET, ethertype=len(PACKET) + 3),
+    ),
     "ARP in VLAN": (1, made.ethernet(struct.pack(">HH", 5, 0x0806) + bytes(28), ethertype=0x8100)),
     "EtherType 0x1234": (1, made.ethernet(bytes(28), ethertype=0x1234)),
     "loopback without IP": (0, struct.pack("<I", 7) + PACKET),
@@ -127,7 +178,9 @@ OTHERS = {
 def test_everything_else_is_other_and_named(what: str) -> None:
     link, frame = OTHERS[what]
     stats = read(frame, link=link)[1]
-    assert stats.others == {what.split(maxsplit=1)[0] if what.startswith(("TCP", "ARP")) else what: 1}
+    assert stats.others == {
+        what.split(maxsplit=1)[0] if what.startswith(("TCP", "ARP")) else what: 1
+    }
     assert read(frame, link=link) == ([], CaptureStats(packets=1, other=1))
 
 
@@ -143,11 +196,17 @@ def test_everything_else_is_other_and_named(what: str) -> None:
         made.ipv6(made.udp(b"one"), length=1234),
         made.ipv6(extension(17) + made.udp(b"one"), following=HOP_BY_HOP),
         made.ipv6(
-            extension(ROUTING) + extension(DESTINATION_OPTIONS, units=3) + extension(17, units=1) + made.udp(b"one"), following=HOP_BY_HOP
+            extension(ROUTING)
+            + extension(DESTINATION_OPTIONS, units=3)
+            + extension(17, units=1)
+            + made.udp(b"one"),
+            following=HOP_BY_HOP,
         ),
         made.ipv6(struct.pack(">BBHI", 17, 0, 0, 7) + made.udp(b"one"), following=FRAGMENT),
         made.ipv6(struct.pack(">BBHI", 17, 0, 6, 7) + made.udp(b"one"), following=FRAGMENT),
-        made.ipv6(struct.pack(">BBHI", 60, 0, 0, 7) + extension(17) + made.udp(b"one"), following=FRAGMENT),
+        made.ipv6(
+            struct.pack(">BBHI", 60, 0, 0, 7) + extension(17) + made.udp(b"one"), following=FRAGMENT
+        ),
     ],
 )
 def test_whole_packets(packet: bytes) -> None:
@@ -185,8 +244,20 @@ def test_whole_packets(packet: bytes) -> None:
             "UDP length 0",
             "UDP length too long",
         ),
-        *("UDP longer than IPv4", "IPv6 length 0", "UDP longer than IPv6", "extension beyond the packet", "fragment not in eights"),
-        *("empty fragment", "fragment beyond 65535", "fragment longer than the frame", "empty fragment 6", "fragment 6 not in eights"),
+        *(
+            "UDP longer than IPv4",
+            "IPv6 length 0",
+            "UDP longer than IPv6",
+            "extension beyond the packet",
+            "fragment not in eights",
+        ),
+        *(
+            "empty fragment",
+            "fragment beyond 65535",
+            "fragment longer than the frame",
+            "empty fragment 6",
+            "fragment 6 not in eights",
+        ),
     ],
 )
 def test_malformed_packets(packet: bytes) -> None:
@@ -195,7 +266,9 @@ def test_malformed_packets(packet: bytes) -> None:
 
 def test_what_the_snap_length_leaves() -> None:
     def snapped(packet: bytes, kept: int) -> tuple[list[bytes], CaptureStats]:
-        return made.payloads(made.pcap_head(link=101) + made.record(packet[:kept], original=len(packet)))
+        return made.payloads(
+            made.pcap_head(link=101) + made.record(packet[:kept], original=len(packet))
+        )
 
     padded = PACKET + bytes(10)
     assert snapped(padded, len(PACKET)) == ([b"one"], CaptureStats(packets=1, datagrams=1))
@@ -209,17 +282,27 @@ def test_what_the_snap_length_leaves() -> None:
 @pytest.mark.parametrize("fragment", [fragment4, fragment6])
 def test_fragments_in_any_order(fragment: Callable[..., bytes]) -> None:
     for order in permutations(CUTS):
-        assert read(*(fragment(*cut) for cut in order)) == ([BODY[8:]], CaptureStats(packets=4, datagrams=1, fragments=4))
+        assert read(*(fragment(*cut) for cut in order)) == (
+            [BODY[8:]],
+            CaptureStats(packets=4, datagrams=1, fragments=4),
+        )
 
 
 def test_extension_header_after_the_fragment_header() -> None:
     body = extension(17) + BODY
-    packets = fragment6(0, 24, body=body, following=DESTINATION_OPTIONS), fragment6(24, 56, body=body, following=17)
+    packets = (
+        fragment6(0, 24, body=body, following=DESTINATION_OPTIONS),
+        fragment6(24, 56, body=body, following=17),
+    )
     assert read(*packets)[0] == read(*packets[::-1])[0] == [BODY[8:]]
 
 
 def test_datagram_of_fragments_bears_the_time_of_the_last_to_come() -> None:
-    capture = made.pcap_head(link=101) + made.record(fragment4(16, 48)) + made.record(fragment4(0, 16), seconds=made.SECONDS + 2)
+    capture = (
+        made.pcap_head(link=101)
+        + made.record(fragment4(16, 48))
+        + made.record(fragment4(0, 16), seconds=made.SECONDS + 2)
+    )
     at = (made.SECONDS + 2) * 10**9 + made.FRACTION * 1000
     assert made.read(capture)[0] == [Datagram(BODY[8:], at, made.SOURCE, made.DESTINATION)]
 
@@ -229,9 +312,22 @@ def test_interleaved_datagrams_are_told_apart() -> None:
         return packet[:15] + b"\x63" + packet[16:]
 
     other = made.udp(bytes(40))
-    packets = [fragment4(0, 24), fragment4(0, 24, ident=8, body=other), from_elsewhere(fragment4(0, 24)), fragment6(0, 24)]
-    packets += [fragment4(24, 48, ident=8, body=other), fragment6(24, 48), from_elsewhere(fragment4(24, 48)), fragment4(24, 48)]
-    assert read(*packets) == ([bytes(40), BODY[8:], BODY[8:], BODY[8:]], CaptureStats(packets=8, datagrams=4, fragments=8))
+    packets = [
+        fragment4(0, 24),
+        fragment4(0, 24, ident=8, body=other),
+        from_elsewhere(fragment4(0, 24)),
+        fragment6(0, 24),
+    ]
+    packets += [
+        fragment4(24, 48, ident=8, body=other),
+        fragment6(24, 48),
+        from_elsewhere(fragment4(24, 48)),
+        fragment4(24, 48),
+    ]
+    assert read(*packets) == (
+        [bytes(40), BODY[8:], BODY[8:], BODY[8:]],
+        CaptureStats(packets=8, datagrams=4, fragments=8),
+    )
 
 
 OVERLAPS = {  # the last one contradicts the others
@@ -249,7 +345,10 @@ OVERLAPS = {  # the last one contradicts the others
 @pytest.mark.parametrize("case", OVERLAPS)
 def test_overlapping_or_contradicting_fragments_are_refused(case: str) -> None:
     count = len(OVERLAPS[case])
-    assert read(*OVERLAPS[case]) == ([], CaptureStats(packets=count, fragments=count, incomplete_fragments=count))
+    assert read(*OVERLAPS[case]) == (
+        [],
+        CaptureStats(packets=count, fragments=count, incomplete_fragments=count),
+    )
     data, stats = read(*OVERLAPS[case], fragment4(0, 24), fragment4(24, 48))
     assert data == [BODY[8:]], "nothing may be left of what was refused"
     assert stats.incomplete_fragments == count
@@ -267,18 +366,25 @@ def test_incomplete_fragments_are_counted_at_the_end() -> None:
 
 def test_reassembled_packets_can_be_malformed() -> None:
     long = made.udp(bytes(40), length=49)
-    assert read(fragment4(0, 24, body=long), fragment4(24, 48, body=long)) == ([], CaptureStats(packets=2, fragments=2, malformed=1))
+    assert read(fragment4(0, 24, body=long), fragment4(24, 48, body=long)) == (
+        [],
+        CaptureStats(packets=2, fragments=2, malformed=1),
+    )
 
 
 def test_fragment_header_within_a_reassembled_packet_is_malformed() -> None:
     body = extension(FRAGMENT) + struct.pack(">BBHI", 17, 0, 0, 7) + BODY
-    packets = [fragment6(*cut, body=body, following=DESTINATION_OPTIONS) for cut in ((0, 24), (24, 64))]
+    packets = [
+        fragment6(*cut, body=body, following=DESTINATION_OPTIONS) for cut in ((0, 24), (24, 64))
+    ]
     assert read(*packets) == ([], CaptureStats(packets=2, fragments=2, malformed=1))
 
 
 def test_reassembled_packets_can_be_other_than_udp() -> None:
     body = extension(TCP) + BODY
-    packets = [fragment6(*cut, body=body, following=DESTINATION_OPTIONS) for cut in ((0, 24), (24, 56))]
+    packets = [
+        fragment6(*cut, body=body, following=DESTINATION_OPTIONS) for cut in ((0, 24), (24, 56))
+    ]
     assert read(*packets) == ([], CaptureStats(packets=2, fragments=2, other=1))
 
 
@@ -300,7 +406,10 @@ def test_waiting_fragments_take_bounded_memory(size: int, monkeypatch: pytest.Mo
     monkeypatch.setattr(Reassembly, "MOST_BYTES", Reassembly.MOST_BYTES // 8)
     count = min(4000, (3 << 20) // size)
     places = 65_000 // size // 2 or 1  # every second one, so that nothing touches
-    packets = (made.ipv4(bytes(size), ident=i // places, place=0x2000 | i % places * size // 4) for i in range(count))
+    packets = (
+        made.ipv4(bytes(size), ident=i // places, place=0x2000 | i % places * size // 4)
+        for i in range(count)
+    )
     capture = io.BytesIO(made.pcap_head(link=101) + b"".join(map(made.record, packets)))
     reader = CaptureReader(capture)
     tracemalloc.start()
@@ -315,13 +424,19 @@ def test_waiting_fragments_take_bounded_memory(size: int, monkeypatch: pytest.Mo
 @pytest.mark.parametrize("inputs", [1500, pytest.param(20_000, marks=pytest.mark.slow)])
 def test_mutations_raise_nothing(inputs: int) -> None:
     draw = random.Random(14)
-    frames = [(link, frame) for link, frame in LINKS] + [(101, fragment(*cut)) for fragment in (fragment4, fragment6) for cut in CUTS]
+    frames = [(link, frame) for link, frame in LINKS] + [
+        (101, fragment(*cut)) for fragment in (fragment4, fragment6) for cut in CUTS
+    ]
     for _ in range(inputs):
         link = draw.choice([link for link, _ in LINKS])
-        chosen = [bytearray(frame) for other, frame in draw.choices(frames, k=8) if other == link] or [bytearray(PACKET)]
+        chosen = [
+            bytearray(frame) for other, frame in draw.choices(frames, k=8) if other == link
+        ] or [bytearray(PACKET)]
         for frame in chosen:
             for _ in range(draw.randrange(4)):
-                frame[draw.randrange(len(frame))] = draw.choice([draw.randrange(256), 0, 0xFF, 44, 60])
+                frame[draw.randrange(len(frame))] = draw.choice(
+                    [draw.randrange(256), 0, 0xFF, 44, 60]
+                )
         datagrams, stats = read(*map(bytes, chosen), link=link)
         assert stats.packets == len(chosen)
         refused = stats.other + stats.snapped + stats.malformed

@@ -60,7 +60,9 @@ def test_a_capture_of_any_length_is_decoded_below_200_mb(megabytes: int, tmp_pat
         [sys.executable, "-c", CHILD, str(path), SENSOR],
         {**os.environ, "LIDARSPEC_BACKEND": "numpy"},
     )  # without Numba's own 100 MB
-    done = subprocess.run(command, capture_output=True, text=True, check=True, timeout=500, env=alone)
+    done = subprocess.run(
+        command, capture_output=True, text=True, check=True, timeout=500, env=alone
+    )
     count, first, most = map(int, done.stdout.split())
     assert count == packets * 125
     assert most * 1024 < 200_000_000, f"{most} KiB"

@@ -1,4 +1,6 @@
-"""Reading captures: file formats, pipes, paths, real files. What the frames hold is tested in test_ip.py."""
+"""Reading captures: file formats, pipes, paths, real files. What the frames hold is tested in
+test_ip.py.
+"""
 
 from __future__ import annotations
 
@@ -23,10 +25,17 @@ FRAME = made.frame(b"one")
 @pytest.mark.parametrize("order", ["<", ">"])
 @pytest.mark.parametrize(("magic", "unit"), [(0xA1B2C3D4, 1000), (0xA1B23C4D, 1)])
 def test_pcap_of_either_order_and_unit(order: str, magic: int, unit: int) -> None:
-    capture = made.pcap_head(order, magic=magic) + made.record(FRAME, order) + made.record(made.frame(b""), order)
+    capture = (
+        made.pcap_head(order, magic=magic)
+        + made.record(FRAME, order)
+        + made.record(made.frame(b""), order)
+    )
     at = made.SECONDS * 10**9 + made.FRACTION * unit
     datagrams, stats = made.read(capture)
-    assert datagrams == [Datagram(b"one", at, made.SOURCE, made.DESTINATION), Datagram(b"", at, made.SOURCE, made.DESTINATION)]
+    assert datagrams == [
+        Datagram(b"one", at, made.SOURCE, made.DESTINATION),
+        Datagram(b"", at, made.SOURCE, made.DESTINATION),
+    ]
     assert stats == CaptureStats(packets=2, datagrams=2)
     assert is_capture(capture)
 
@@ -39,17 +48,32 @@ def test_link_type_beside_frame_check_sequence_length() -> None:
 @pytest.mark.parametrize("order", ["<", ">"])
 def test_pcapng_packet_blocks(order: str, kind: int) -> None:
     ticks = 1_700_000_000_123_456
-    capture = made.section(order) + made.interface(order) + made.packet(FRAME, order, kind=kind, ticks=ticks)
+    capture = (
+        made.section(order)
+        + made.interface(order)
+        + made.packet(FRAME, order, kind=kind, ticks=ticks)
+    )
     at = 0 if kind == made.SIMPLE else ticks * 1000
-    assert made.read(capture) == ([Datagram(b"one", at, made.SOURCE, made.DESTINATION)], CaptureStats(packets=1, datagrams=1))
+    assert made.read(capture) == (
+        [Datagram(b"one", at, made.SOURCE, made.DESTINATION)],
+        CaptureStats(packets=1, datagrams=1),
+    )
     assert is_capture(capture)
 
 
 def test_sections_of_both_orders_forget_the_interfaces_before() -> None:
     first = made.section("<") + made.interface("<", link=101) + made.packet(FRAME[14:], "<")
-    second = made.section(">") + made.interface(">") + made.interface(">", link=101) + made.packet(FRAME[14:], ">", number=1)
+    second = (
+        made.section(">")
+        + made.interface(">")
+        + made.interface(">", link=101)
+        + made.packet(FRAME[14:], ">", number=1)
+    )
     third = made.section("<") + made.packet(FRAME, "<")
-    assert made.payloads(first + second + third) == ([b"one", b"one"], CaptureStats(packets=2, datagrams=2, malformed=1))
+    assert made.payloads(first + second + third) == (
+        [b"one", b"one"],
+        CaptureStats(packets=2, datagrams=2, malformed=1),
+    )
 
 
 @pytest.mark.parametrize(
@@ -84,7 +108,9 @@ def test_sections_of_both_orders_forget_the_interfaces_before() -> None:
     ],
 )
 def test_time_options(options: bytes, expected: int) -> None:
-    capture = made.section() + made.interface(options=options) + made.packet(FRAME, ticks=3_000_000_007)
+    capture = (
+        made.section() + made.interface(options=options) + made.packet(FRAME, ticks=3_000_000_007)
+    )
     assert [datagram.at for datagram in made.read(capture)[0]] == [expected]
 
 
@@ -93,7 +119,12 @@ def test_simple_packets_are_cut_at_the_snap_length_of_the_first_interface() -> N
     padded = made.packet(FRAME + bytes(9), kind=made.SIMPLE)
     block = struct.pack("<I", len(FRAME) + 1) + FRAME[:-1] + bytes(-(len(FRAME) - 1) % 4)
     assert made.payloads(head + padded)[0] == [b"one"]
-    assert made.payloads(made.section() + made.interface(snap_length=len(FRAME) - 1) + made.block(3, block))[1].snapped == 1
+    assert (
+        made.payloads(
+            made.section() + made.interface(snap_length=len(FRAME) - 1) + made.block(3, block)
+        )[1].snapped
+        == 1
+    )
 
 
 def test_packets_of_a_pipe_come_as_soon_as_they_are_whole() -> None:
@@ -153,7 +184,10 @@ def test_failing_reads_are_source_errors() -> None:
 
 REAL = {
     "velodyne/hdl32e/sample_velodyne_hdl32.pcap": {(1206, 2368): 500},
-    "velodyne/vlp16_old_firmware/vlp-16-test-90deg-1-50-frames.pcap": {(1206, 2368): 1902, (512, 8308): 367},
+    "velodyne/vlp16_old_firmware/vlp-16-test-90deg-1-50-frames.pcap": {
+        (1206, 2368): 1902,
+        (512, 8308): 367,
+    },
     "velodyne/vlp16_dual/packets.derived.pcap": {(1206, 2368): 603},
     "robosense/helios16p/packets.derived.pcap": {(1248, 2368): 751},
     "hesai/40p/packets.derived.pcap": {(1262, 2368): 1439},
@@ -174,8 +208,13 @@ def test_real_capture(name: str) -> None:
         pytest.skip(f"no capture {name} in {made.CAPTURES} (set LIDARSPEC_CAPTURES)")
     with CaptureReader(path) as reader:
         datagrams = list(reader)
-    assert Counter((len(datagram.data), datagram.destination[1]) for datagram in datagrams) == REAL[name]
+    assert (
+        Counter((len(datagram.data), datagram.destination[1]) for datagram in datagrams)
+        == REAL[name]
+    )
     fragments = 21 if "fragments" in name else 0
     packets = len(datagrams) + (fragments - 2 if fragments else 0)
-    assert reader.stats == CaptureStats(packets=packets, datagrams=len(datagrams), fragments=fragments)
+    assert reader.stats == CaptureStats(
+        packets=packets, datagrams=len(datagrams), fragments=fragments
+    )
     assert all(0 <= later.at - earlier.at < 1e9 for earlier, later in pairwise(datagrams))

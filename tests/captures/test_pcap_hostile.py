@@ -1,4 +1,6 @@
-"""Captures that are damaged, cut, mutated or made to do harm: what can be read is read, the rest is counted, memory is bounded."""
+"""Captures that are damaged, cut, mutated or made to do harm: what can be read is read, the rest is
+counted, memory is bounded.
+"""
 
 from __future__ import annotations
 
@@ -23,7 +25,9 @@ FRAME = made.frame(b"one")
 HEAD = made.section() + made.interface()
 GOOD = made.packet(FRAME)
 END = len(HEAD + GOOD)
-DAMAGE: dict[str, tuple[bytes, int, dict[str, Any]]] = {  # block: datagrams read of GOOD, the block and GOOD; what is counted
+DAMAGE: dict[
+    str, tuple[bytes, int, dict[str, Any]]
+] = {  # block: datagrams read of GOOD, the block and GOOD; what is counted
     "unknown kind": (made.block(0x80001234, b"private!"), 2, {}),
     "unknown kind, longer than is ever held": (made.block(0x0BAD, bytes(3 << 20)), 2, {}),
     "name resolution and statistics": (made.block(4, bytes(4)) + made.block(5, bytes(12)), 2, {}),
@@ -37,13 +41,37 @@ DAMAGE: dict[str, tuple[bytes, int, dict[str, Any]]] = {  # block: datagrams rea
         1,
         {"malformed": 1, "damaged": 1, "lost": 12 + (3 << 20) + len(GOOD), "stopped_at": END},
     ),
-    "length 0": (made.block(made.ENHANCED, b"", length=0), 2, {"malformed": 1, "damaged": 1, "lost": 12}),
+    "length 0": (
+        made.block(made.ENHANCED, b"", length=0),
+        2,
+        {"malformed": 1, "damaged": 1, "lost": 12},
+    ),
     "length 8": (made.block(0x0BAD, b"", length=8), 2, {"malformed": 1, "damaged": 1, "lost": 12}),
-    "length not a multiple of 4": (made.block(0x0BAD, b"ab"), 2, {"malformed": 1, "damaged": 1, "lost": 14}),
-    "length beyond the file": (made.block(0x0BAD, b"", length=0x8000), 2, {"malformed": 1, "damaged": 1, "lost": 12}),
-    "length of 4 GiB": (made.block(0x0BAD, b"", length=0xFFFFFFFC), 2, {"malformed": 1, "damaged": 1, "lost": 12}),
-    "lengths differ": (made.block(0x0BAD, b"", trailer=16), 2, {"malformed": 1, "damaged": 1, "lost": 12}),
-    "lengths differ, packet": (made.block(made.ENHANCED, GOOD[8:-4], trailer=12), 2, {"malformed": 1, "damaged": 1, "lost": len(GOOD)}),
+    "length not a multiple of 4": (
+        made.block(0x0BAD, b"ab"),
+        2,
+        {"malformed": 1, "damaged": 1, "lost": 14},
+    ),
+    "length beyond the file": (
+        made.block(0x0BAD, b"", length=0x8000),
+        2,
+        {"malformed": 1, "damaged": 1, "lost": 12},
+    ),
+    "length of 4 GiB": (
+        made.block(0x0BAD, b"", length=0xFFFFFFFC),
+        2,
+        {"malformed": 1, "damaged": 1, "lost": 12},
+    ),
+    "lengths differ": (
+        made.block(0x0BAD, b"", trailer=16),
+        2,
+        {"malformed": 1, "damaged": 1, "lost": 12},
+    ),
+    "lengths differ, packet": (
+        made.block(made.ENHANCED, GOOD[8:-4], trailer=12),
+        2,
+        {"malformed": 1, "damaged": 1, "lost": len(GOOD)},
+    ),
     "lengths differ, interface": (
         made.block(made.INTERFACE, bytes(8), trailer=12),
         1,
@@ -59,12 +87,28 @@ DAMAGE: dict[str, tuple[bytes, int, dict[str, Any]]] = {  # block: datagrams rea
         1,
         {"malformed": 1, "damaged": 1, "lost": 20 + len(GOOD), "stopped_at": END + 1023 * 20},
     ),
-    "byte order magic": (made.block(0x0A0D0D0A, bytes(16)), 2, {"malformed": 1, "damaged": 1, "lost": 28}),
+    "byte order magic": (
+        made.block(0x0A0D0D0A, bytes(16)),
+        2,
+        {"malformed": 1, "damaged": 1, "lost": 28},
+    ),
     "unknown interface": (made.packet(FRAME, number=1), 2, {"malformed": 1}),
-    "unknown interface, obsolete": (made.packet(FRAME, number=1, kind=made.OBSOLETE), 2, {"malformed": 1}),
-    "more captured than the block holds": (made.packet(FRAME, captured=len(FRAME) + 4), 2, {"malformed": 1}),
+    "unknown interface, obsolete": (
+        made.packet(FRAME, number=1, kind=made.OBSOLETE),
+        2,
+        {"malformed": 1},
+    ),
+    "more captured than the block holds": (
+        made.packet(FRAME, captured=len(FRAME) + 4),
+        2,
+        {"malformed": 1},
+    ),
     "more captured, 4 GiB": (made.packet(FRAME, captured=0xFFFFFFFF), 2, {"malformed": 1}),
-    "less captured than the block holds": (made.packet(FRAME, captured=len(FRAME) - 1), 2, {"packets": 3, "snapped": 1}),
+    "less captured than the block holds": (
+        made.packet(FRAME, captured=len(FRAME) - 1),
+        2,
+        {"packets": 3, "snapped": 1},
+    ),
     "packet without its fields": (made.block(made.ENHANCED, bytes(16)), 2, {"malformed": 1}),
     "simple packet without its field": (made.block(made.SIMPLE, b""), 2, {"malformed": 1}),
     "simple packet beyond its block": (made.block(made.SIMPLE, b"\x0c\0\0\0"), 2, {"malformed": 1}),
@@ -86,7 +130,10 @@ def test_record_too_long_for_a_packet_ends_the_reading_where_none_follows() -> N
     counted = CaptureStats(packets=1, datagrams=1, malformed=1, damaged=1, lost=len(long))
     assert made.payloads(capture + long) == ([b"one"], replace(counted, stopped_at=len(capture)))
     following = made.record(FRAME) * 2
-    assert made.payloads(capture + long + following) == ([b"one"] * 3, replace(counted, packets=3, datagrams=3))
+    assert made.payloads(capture + long + following) == (
+        [b"one"] * 3,
+        replace(counted, packets=3, datagrams=3),
+    )
 
 
 @pytest.mark.parametrize("is_pcapng", [False, True], ids=["pcap", "pcapng"])
@@ -99,11 +146,18 @@ def test_a_damaged_length_costs_its_own_packet_alone(is_pcapng: bool) -> None:
         at = draw.randrange(len(records))
         whole = records[at]
         place, length = (4, len(whole)) if is_pcapng else (8, len(whole) - 16)
-        wrong = draw.choice([length ^ 1 << draw.randrange(32), draw.randrange(300_000), draw.randrange(1 << 32)])
+        wrong = draw.choice(
+            [length ^ 1 << draw.randrange(32), draw.randrange(300_000), draw.randrange(1 << 32)]
+        )
         damaged = whole[:place] + struct.pack("<I", wrong) + whole[place + 4 :]
         found, stats = made.payloads(head + b"".join([*records[:at], damaged, *records[at + 1 :]]))
         others = [bytes([number]) * 1200 for number in range(200) if number != at]
-        assert (found, stats.damaged, stats.lost, stats.stopped_at) == (others, 1, len(whole), None if at < 199 else stats.stopped_at)
+        assert (found, stats.damaged, stats.lost, stats.stopped_at) == (
+            others,
+            1,
+            len(whole),
+            None if at < 199 else stats.stopped_at,
+        )
 
 
 def test_bytes_missing_from_a_file_and_a_hole_in_it_cost_the_packets_they_touch() -> None:
@@ -115,19 +169,25 @@ def test_bytes_missing_from_a_file_and_a_hole_in_it_cost_the_packets_they_touch(
         assert (stats.damaged, stats.stopped_at) == (1, None)
         assert len(found) >= 200 - 2 - -(-gone // size)
     hole = bytes(4096)
-    found, stats = made.payloads(capture[: size * 50 + 300] + hole + capture[size * 50 + 300 + len(hole) :])
+    found, stats = made.payloads(
+        capture[: size * 50 + 300] + hole + capture[size * 50 + 300 + len(hole) :]
+    )
     assert (len(found), stats.damaged, stats.stopped_at) == (197, 1, None)
 
 
 def test_packets_cut_by_a_tool_that_does_not_say_so_in_the_head_are_no_damage() -> None:
-    cut = [made.record(made.frame(bytes(400))[: 100 + number], original=442) for number in range(50)]
+    cut = [
+        made.record(made.frame(bytes(400))[: 100 + number], original=442) for number in range(50)
+    ]
     stats = made.read(made.pcap_head() + b"".join([*cut, made.record(FRAME), *cut]))[1]
     assert stats == CaptureStats(packets=101, datagrams=1, snapped=100)
 
 
 def test_long_files_tell_where_they_are_cut() -> None:
     capture = made.pcap(*[made.frame(bytes(1248))] * 300)
-    expected = CaptureStats(packets=299, datagrams=299, truncated_tail=True, stopped_at=24 + 299 * 1306)
+    expected = CaptureStats(
+        packets=299, datagrams=299, truncated_tail=True, stopped_at=24 + 299 * 1306
+    )
     assert made.read(capture[:-1])[1] == expected
 
 
@@ -139,10 +199,23 @@ def test_foreign_file_is_refused_with_what_it_begins_with(head: bytes) -> None:
 
 
 PORTS = struct.pack(">HH", made.SOURCE[1], made.DESTINATION[1])  # in each part that is a packet
-PCAP_PARTS = [made.pcap_head(), *(made.record(made.frame(data)) for data in (b"one", b"", b"three"))]
+PCAP_PARTS = [
+    made.pcap_head(),
+    *(made.record(made.frame(data)) for data in (b"one", b"", b"three")),
+]
 PCAPNG_PARTS = [
-    *(made.section(), made.interface(options=made.option(9, b"\x09")), GOOD, made.block(5, bytes(8))),
-    *(made.packet(FRAME, kind=made.SIMPLE), made.section(">"), made.interface(">"), made.packet(FRAME, ">", kind=made.OBSOLETE)),
+    *(
+        made.section(),
+        made.interface(options=made.option(9, b"\x09")),
+        GOOD,
+        made.block(5, bytes(8)),
+    ),
+    *(
+        made.packet(FRAME, kind=made.SIMPLE),
+        made.section(">"),
+        made.interface(">"),
+        made.packet(FRAME, ">", kind=made.OBSOLETE),
+    ),
 ]
 
 
@@ -180,7 +253,9 @@ def test_mutations_raise_nothing_but_source_error(parts: list[bytes], inputs: in
             if edit == 0:
                 data[at] = draw.randrange(256)
             elif edit == 1:
-                data[at : at + 4] = draw.choice([bytes(4), b"\xff" * 4, b"\0\0\0\x80", b"\x04\0\0\0"])
+                data[at : at + 4] = draw.choice(
+                    [bytes(4), b"\xff" * 4, b"\0\0\0\x80", b"\x04\0\0\0"]
+                )
             elif edit == 2:
                 del data[at : at + draw.randint(1, 9)]
             else:
@@ -194,8 +269,18 @@ def test_mutations_raise_nothing_but_source_error(parts: list[bytes], inputs: in
         assert stats.packets <= len(data) // 16
         assert stats.datagrams + stats.other + stats.snapped <= stats.packets
         assert stats.truncated_tail <= (stats.stopped_at is not None)
-        outcomes.update(name for name in ("datagrams", "truncated_tail", "malformed", "stopped_at") if getattr(stats, name))
-    assert min(outcomes[name] for name in ("refused", "datagrams", "truncated_tail", "malformed", "stopped_at")) > inputs / 50
+        outcomes.update(
+            name
+            for name in ("datagrams", "truncated_tail", "malformed", "stopped_at")
+            if getattr(stats, name)
+        )
+    assert (
+        min(
+            outcomes[name]
+            for name in ("refused", "datagrams", "truncated_tail", "malformed", "stopped_at")
+        )
+        > inputs / 50
+    )
 
 
 HUGE = struct.pack("<I", 0x7FFFFFFC)
@@ -203,7 +288,9 @@ HOSTILE = {
     "pcapng of 12 bytes": b"\x0a\x0d\x0d\x0a" + HUGE + b"\x4d\x3c\x2b\x1a",
     "pcapng block": HEAD + struct.pack("<I", 6) + HUGE + bytes(4),
     "pcap record": made.pcap_head() + bytes(8) + HUGE + HUGE,
-    "pcap record within the limit": made.pcap_head() + bytes(8) + struct.pack("<II", 1 << 18, 1 << 18),
+    "pcap record within the limit": made.pcap_head()
+    + bytes(8)
+    + struct.pack("<II", 1 << 18, 1 << 18),
     "option": made.section() + made.interface(options=struct.pack("<HH", 2, 0xFFFF)) + GOOD,
 }
 

@@ -27,8 +27,10 @@ def chunk(datagram: Datagram) -> Chunk:
 
 def test_writer_bytes() -> None:
     assert (capture_head(ETHERNET) + datagram_record(DATAGRAM)).hex(" ") == (
-        "4d 3c b2 a1 02 00 04 00 00 00 00 00 00 00 00 00 00 00 04 00 01 00 00 00 "  # pcap header
-        "00 f1 53 65 15 cd 5b 07 2d 00 00 00 2d 00 00 00 "  # time 1700000000 s, 123456789 ns; 45 bytes
+        # pcap header
+        "4d 3c b2 a1 02 00 04 00 00 00 00 00 00 00 00 00 00 00 04 00 01 00 00 00 "
+        # time 1700000000 s, 123456789 ns; 45 bytes
+        "00 f1 53 65 15 cd 5b 07 2d 00 00 00 2d 00 00 00 "
         "02 00 00 00 00 01 02 00 00 00 00 02 08 00 "  # Ethernet
         "45 00 00 1f 00 00 40 00 40 11 b6 aa c0 a8 01 c9 c0 a8 01 0a "  # IPv4
         "09 40 1a 2b 00 0b 00 00 12 34 56"  # UDP
@@ -39,23 +41,42 @@ def test_written_datagrams_come_back_with_right_checksums() -> None:
     draw = random.Random(1)
     written = []
     for size in [0, 1, 1248, 65_507, *(draw.randrange(100) for _ in range(300))]:
-        source, destination = ((".".join(str(draw.randrange(256)) for _ in range(4)), draw.randrange(1 << 16)) for _ in range(2))
-        written.append(Datagram(draw.randbytes(size), draw.randrange(10**9 << 32), source, destination))
+        source, destination = (
+            (".".join(str(draw.randrange(256)) for _ in range(4)), draw.randrange(1 << 16))
+            for _ in range(2)
+        )
+        written.append(
+            Datagram(draw.randbytes(size), draw.randrange(10**9 << 32), source, destination)
+        )
     records = list(map(datagram_record, written))
     for record in records:
         total = sum(struct.unpack_from(">10H", record, 16 + 14))
         assert (total & 0xFFFF) + (total >> 16) == 0xFFFF
-    assert made.read(capture_head(ETHERNET) + b"".join(records)) == (written, CaptureStats(packets=len(written), datagrams=len(written)))
+    assert made.read(capture_head(ETHERNET) + b"".join(records)) == (
+        written,
+        CaptureStats(packets=len(written), datagrams=len(written)),
+    )
 
 
 def test_ipv6_is_written_with_its_checksum() -> None:
     draw = random.Random(2)
     some = [(draw.randrange(99), "::1") for _ in range(99)]
-    for size, destination in [(0, "::"), (3, "ff02::1"), (1248, "10.0.0.1"), (65_527, "0.0.0.0"), *some]:
+    for size, destination in [
+        (0, "::"),
+        (3, "ff02::1"),
+        (1248, "10.0.0.1"),
+        (65_527, "0.0.0.0"),
+        *some,
+    ]:
         datagram = Datagram(draw.randbytes(size), 10**18, ("fe80::1:2", 2368), (destination, 6699))
         record = datagram_record(datagram)
         ((read,), _) = made.read(capture_head(ETHERNET) + record)
-        assert (read.data, read.at, read.source, read.destination[1]) == (datagram.data, datagram.at, datagram.source, 6699)
+        assert (read.data, read.at, read.source, read.destination[1]) == (
+            datagram.data,
+            datagram.at,
+            datagram.source,
+            6699,
+        )
         assert read.destination[0] in (destination, "::", "::ffff:a00:1", "::ffff:10.0.0.1")
         packet = record[16 + 14 :]
         words = packet[8:40] + struct.pack(">II", size + 8, 17) + packet[40:] + bytes(size % 2)
@@ -74,7 +95,9 @@ def test_ipv6_is_written_with_its_checksum() -> None:
         (Datagram(b"", 10**9 << 32, made.SOURCE, made.DESTINATION), "2106"),
     ],
 )
-def test_writer_refuses_what_no_record_can_hold(datagram: Datagram, reason: str, tmp_path: Path) -> None:
+def test_writer_refuses_what_no_record_can_hold(
+    datagram: Datagram, reason: str, tmp_path: Path
+) -> None:
     path = tmp_path / "it.pcap"
     with recorder(path, datagrams=True) as writer:
         with pytest.raises(UsageError, match=reason):
@@ -132,4 +155,7 @@ def test_real_capture_written_again_reads_the_same() -> None:
     if not path.exists():
         pytest.skip(f"no capture {path.name} in {made.CAPTURES} (set LIDARSPEC_CAPTURES)")
     datagrams = list(CaptureReader(path))
-    assert made.read(capture_head(ETHERNET) + b"".join(map(datagram_record, datagrams)))[0] == datagrams
+    assert (
+        made.read(capture_head(ETHERNET) + b"".join(map(datagram_record, datagrams)))[0]
+        == datagrams
+    )

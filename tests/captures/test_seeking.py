@@ -24,7 +24,8 @@ from tests import made_captures as made
 START = 1_700_000_000_000_000_000
 STEP = 10_000_000
 NUMBER = 2000
-#: bytes before the time that is looked for that a reader may read: fewer than usual, so that the captures can be short.
+#: bytes before the time that is looked for that a reader may read: fewer than usual, so that the
+#: captures can be short.
 NEAR = 1 << 18
 #: of a capture of a byte stream.
 USER0 = 147
@@ -38,7 +39,9 @@ def _near(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(contents, "LOOKED_AT", 4 * NEAR)
 
 
-def written(path: Path, *, first: int = 0, number: int = NUMBER, link: int = ETHERNET, head: bool = True) -> Path:
+def written(
+    path: Path, *, first: int = 0, number: int = NUMBER, link: int = ETHERNET, head: bool = True
+) -> Path:
     """Twenty seconds of datagrams of 1000 bytes, or of pieces of a byte stream."""
     writing = WRITINGS[path.suffix]
     with path.open("ab") as file:
@@ -64,14 +67,20 @@ def rest(source: CaptureTransport, to: int, *, in_batches: bool) -> list[int]:
         assert source.skip(to)
         left = list(chunks)
         assert [chunk.gap for chunk in left[:3]] == [True, False, False]
-        assert all(int.from_bytes(chunk.data[:4], "big") * STEP == (chunk.at or 0) - START for chunk in left)
+        assert all(
+            int.from_bytes(chunk.data[:4], "big") * STEP == (chunk.at or 0) - START
+            for chunk in left
+        )
         return [chunk.at or 0 for chunk in left]
     batches = source.batches()
     assert not next(batches).gap
     assert source.skip(to)
     parts = list(batches)
     assert [batch.gap for batch in parts] == [True, *[False] * (len(parts) - 1)]
-    assert all(batch.data(0)[:4] == ((int(batch.at[0]) - START) // STEP).to_bytes(4, "big") for batch in parts)
+    assert all(
+        batch.data(0)[:4] == ((int(batch.at[0]) - START) // STEP).to_bytes(4, "big")
+        for batch in parts
+    )
     return np.concatenate([batch.at for batch in parts]).tolist()
 
 
@@ -105,7 +114,10 @@ def test_damage_on_the_way_is_no_hindrance(tmp_path: Path) -> None:
 
 def test_damage_that_was_passed_over_is_not_counted(tmp_path: Path) -> None:
     path = written(tmp_path / "drive.pcapng")
-    data, size = bytearray(path.read_bytes()), len(WRITINGS[".pcapng"].record(datagram_frame(SENT), START))
+    data, size = (
+        bytearray(path.read_bytes()),
+        len(WRITINGS[".pcapng"].record(datagram_frame(SENT), START)),
+    )
     place = len(WRITINGS[".pcapng"].head(ETHERNET)) + 50 * size
     data[place + 4 : place + 8] = (2 * size).to_bytes(4, "little")  # a block as long as two
     path.write_bytes(data)
@@ -133,7 +145,12 @@ def test_nothing_is_passed_over_where_times_are_counted_otherwise(tmp_path: Path
     ticks = made.interface(options=made.option(9, bytes([6])))
     packet = datagram_frame(SENT)
     end = START + NUMBER * STEP
-    path.write_bytes(path.read_bytes() + made.section() + ticks + made.packet(packet, ticks=end // 1000) * (NUMBER // 2))
+    path.write_bytes(
+        path.read_bytes()
+        + made.section()
+        + ticks
+        + made.packet(packet, ticks=end // 1000) * (NUMBER // 2)
+    )
     with contextlib.closing(opened(path)) as source:
         batches = source.batches()
         next(batches)
@@ -186,7 +203,12 @@ def test_a_slice_of_a_capture_has_the_scans_that_reading_all_of_it_gives(
     for source in (captured, packed):
         with ls.open(source, "velodyne-vlp16") as device:
             scans = device.scans(select=selection.Selection(times=(3.0, 3.5)))
-            found.append([(scan.host_ns, scan.complete, len(scan), float(scan.points.range.sum())) for scan in scans])
+            found.append(
+                [
+                    (scan.host_ns, scan.complete, len(scan), float(scan.points.range.sum()))
+                    for scan in scans
+                ]
+            )
             read.append(device.stats.bytes_in)
     assert len(found[0]) >= 4
     assert found[0] == found[1]
@@ -223,7 +245,9 @@ def test_no_frame_goes_on_behind_what_was_passed_over(tmp_path: Path) -> None:
         stats = device.stats
     assert stats.lost <= 1  # the one that is torn
     assert 0 < number < 40_000
-    assert stats.bad_checksum <= 1  # of the two halves that meet there, the first may be taken for the beginning of a frame
+    assert (
+        stats.bad_checksum <= 1
+    )  # of the two halves that meet there, the first may be taken for the beginning of a frame
     assert stats.bytes_skipped < 2 * 47
     assert stats.pending == 0
 

@@ -1,4 +1,6 @@
-"""Places where no sensor is: real ports and sockets with something wrong, each a context manager that gives its SOURCE."""
+"""Places where no sensor is: real ports and sockets with something wrong, each a context manager
+that gives its SOURCE.
+"""
 
 from __future__ import annotations
 
@@ -79,7 +81,9 @@ def refused() -> Iterator[str]:
 
 @contextlib.contextmanager
 def nobody() -> Iterator[None]:
-    """Without the rights of root, who may read everything; the verbs are loaded before, from folders that may be root's alone."""
+    """Without the rights of root, who may read everything; the verbs are loaded before, from
+    folders that may be root's alone.
+    """
     for verb in VERBS:
         main.get_command(click.Context(main), verb)
     user = os.geteuid()

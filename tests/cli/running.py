@@ -13,19 +13,31 @@ from click.testing import CliRunner, Result
 
 from lidarspec.cli.root import main
 
-LD06, COIN_D4 = "ldrobot/ld06_3_consecutive_frames.bin", "cspc/coin_d4_ludovatech_issue2_partial.bin"
-#: one frame of the STL-27L's format, so that tests need no capture: the example of the vendor's manual.
-EXAMPLE = bytes.fromhex("542c6808ab7ee000e4dc00e2d900e5d500e3d300e4d000e9cd00e4ca00e2c700e9c500e5c200e5c000e5be823a1a50")
+LD06, COIN_D4 = (
+    "ldrobot/ld06_3_consecutive_frames.bin",
+    "cspc/coin_d4_ludovatech_issue2_partial.bin",
+)
+#: one frame of the STL-27L's format, so that tests need no capture: the example of the vendor's
+#: manual.
+EXAMPLE = bytes.fromhex(
+    "542c6808ab7ee000e4dc00e2d900e5d500e3d300e4d000e9cd00e4ca00e2c700e9c500e5c200e5c000e5be823a1a50"
+)
 
 
 #: what keeps both streams apart, which click 8.1 does where it is told to and later ones always.
-APART: dict[str, Any] = {"mix_stderr": False} if "mix_stderr" in inspect.signature(CliRunner).parameters else {}
+APART: dict[str, Any] = (
+    {"mix_stderr": False} if "mix_stderr" in inspect.signature(CliRunner).parameters else {}
+)
 
 
-def process(*words: object, given: bytes = b"", cwd: Path | None = None) -> subprocess.CompletedProcess[bytes]:
+def process(
+    *words: object, given: bytes = b"", cwd: Path | None = None
+) -> subprocess.CompletedProcess[bytes]:
     """``python -m lidarspec`` with these words; no failure may show a traceback."""
     command = [sys.executable, "-m", "lidarspec", *map(str, words)]
-    done = subprocess.run(command, input=given, capture_output=True, cwd=cwd, check=False, timeout=120)
+    done = subprocess.run(
+        command, input=given, capture_output=True, cwd=cwd, check=False, timeout=120
+    )
     assert b"Traceback" not in done.stderr, done.stderr.decode()
     return done
 

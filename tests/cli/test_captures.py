@@ -1,4 +1,6 @@
-"""What verbs say of captures and files that give less than they hold: damage, packets not read, several senders, containers."""
+"""What verbs say of captures and files that give less than they hold: damage, packets not read,
+several senders, containers.
+"""
 
 from __future__ import annotations
 
@@ -27,7 +29,9 @@ def records(number: int, *sources: tuple[str, int]) -> list[bytes]:
     packets = simulate(ls.sensor(M1), number)
     ends = sources or (made.SOURCE,)
     return [
-        datagram_record(Datagram(data, 10**18 + index * 158_730, ends[index % len(ends)], made.DESTINATION))
+        datagram_record(
+            Datagram(data, 10**18 + index * 158_730, ends[index % len(ends)], made.DESTINATION)
+        )
         for index, data in enumerate(packets)
     ]
 
@@ -37,14 +41,24 @@ def capture(path: Path, *records: bytes, link: int = ETHERNET) -> Path:
     return path
 
 
-@pytest.mark.parametrize("verb", ["convert", pytest.param("read", marks=pytest.mark.slow), "stats", "plot"])
+@pytest.mark.parametrize(
+    "verb", ["convert", pytest.param("read", marks=pytest.mark.slow), "stats", "plot"]
+)
 def test_a_damaged_capture_is_read_on_and_said_to_be_damaged(verb: str, tmp_path: Path) -> None:
     some = records(1300)
     some[700] = some[700][:10] + b"\x7f" + some[700][11:]
     path = capture(tmp_path / "it.pcap", *some)
-    target = {"convert": [tmp_path / "out.csv"], "plot": ["-o", tmp_path / "out.svg", "--scan", 9]}.get(verb, [])
-    done = ran(verb, path, *target, "-s", M1, *(["--packets", "--json"] if verb == "read" else []), code=1)
-    assert f"{path} is damaged in 1 place: {len(some[700])} bytes were not read, everything else was" in done.stderr
+    target = {
+        "convert": [tmp_path / "out.csv"],
+        "plot": ["-o", tmp_path / "out.svg", "--scan", 9],
+    }.get(verb, [])
+    done = ran(
+        verb, path, *target, "-s", M1, *(["--packets", "--json"] if verb == "read" else []), code=1
+    )
+    assert (
+        f"{path} is damaged in 1 place: {len(some[700])} bytes were not read, everything else was"
+        in done.stderr
+    )
     if verb == "read":
         assert done.stdout.count("\n") == 1299
 
@@ -74,7 +88,9 @@ ARP = made.ethernet(bytes(28), ethertype=0x0806)
     ],
     ids=lambda value: value[0] + str(len(value)) if isinstance(value, tuple) else "",
 )
-def test_every_verb_says_what_is_in_a_capture_of_which_nothing_is_read(words: tuple[str, ...], code: int, tmp_path: Path) -> None:
+def test_every_verb_says_what_is_in_a_capture_of_which_nothing_is_read(
+    words: tuple[str, ...], code: int, tmp_path: Path
+) -> None:
     path = capture(tmp_path / "tcp.pcap", *(made.record(each) for each in (TCP, ARP, TCP)))
     done = ran(*(word.format(path=path, target=tmp_path / "out") for word in words), code=code)
     said = f"{path}: 3 of 3 packets are no UDP over IP, and were not read: 2 TCP, 1 ARP"
@@ -89,10 +105,19 @@ def test_what_is_beside_the_datagrams_is_said_where_it_is_the_most(tmp_path: Pat
     background = capture(tmp_path / "some.pcap", *some, *(made.record(ARP) for _ in range(2)))
     assert "packets" not in ran("parse", background, "-s", M1).stderr
     mostly = capture(tmp_path / "mostly.pcap", *some, *(made.record(ARP) for _ in range(3)))
-    assert "3 of 5 packets are no UDP over IP, and were not read: 3 ARP" in ran("parse", mostly, "-s", M1).stderr
+    assert (
+        "3 of 5 packets are no UDP over IP, and were not read: 3 ARP"
+        in ran("parse", mostly, "-s", M1).stderr
+    )
     assert f"{empty} is a capture without a packet" in ran("parse", empty, "-s", M1, code=4).stderr
-    cut = capture(tmp_path / "cut.pcap", *(made.record(made.frame(bytes(400))[:90], original=442) for _ in range(3)))
-    assert f"{cut}: 3 packets were cut by the capture's snap length" in ran("view", cut, "-s", M1, code=4).stderr
+    cut = capture(
+        tmp_path / "cut.pcap",
+        *(made.record(made.frame(bytes(400))[:90], original=442) for _ in range(3)),
+    )
+    assert (
+        f"{cut}: 3 packets were cut by the capture's snap length"
+        in ran("view", cut, "-s", M1, code=4).stderr
+    )
 
 
 @pytest.mark.slow
@@ -102,21 +127,37 @@ def test_senders_of_one_address_are_told_apart_by_their_ports(tmp_path: Path) ->
     ran("record", path, "-o", recording)
     for source in (path, recording):
         said = ran("convert", source, tmp_path / "out.csv", "-s", M1, code=2).stderr
-        assert "10.0.0.1:40001 and 10.0.0.1:40002" in said or "10.0.0.1:40002 and 10.0.0.1:40001" in said
+        assert (
+            "10.0.0.1:40001 and 10.0.0.1:40002" in said
+            or "10.0.0.1:40002 and 10.0.0.1:40001" in said
+        )
         found = [f"{source} from 10.0.0.1:4000{number}" for number in (1, 2)]
         assert all(each in ran("detect", source).output for each in found)
         doctor = ran("doctor", source, code=1).output
         assert f"10.0.0.1:40001 and 10.0.0.1:40002 all send frames of {M1}" in doctor
         assert f"lidarspec view '{source}?src=10.0.0.1:40001' -s {M1}" in doctor
-        assert ran("read", f"{source}?src=10.0.0.1:40002", "-s", M1, "--packets", "--json").stdout.count("\n") == 20
-    assert "2 senders were recorded" in ran("replay", recording, "--to", "udp://127.0.0.1:9", "--speed", "max").stderr
+        assert (
+            ran(
+                "read", f"{source}?src=10.0.0.1:40002", "-s", M1, "--packets", "--json"
+            ).stdout.count("\n")
+            == 20
+        )
+    assert (
+        "2 senders were recorded"
+        in ran("replay", recording, "--to", "udp://127.0.0.1:9", "--speed", "max").stderr
+    )
 
 
 @pytest.mark.slow
 def test_a_sensor_that_sends_from_several_ports_to_several_is_one_sender(tmp_path: Path) -> None:
     data = records(20, ("10.0.0.1", 6699))
-    status = [datagram_record(Datagram(b"status", 10**18, ("10.0.0.1", 7788), ("10.0.0.2", 7788))) for _ in range(20)]
-    path = capture(tmp_path / "one.pcap", *(each for pair in zip(data, status, strict=True) for each in pair))
+    status = [
+        datagram_record(Datagram(b"status", 10**18, ("10.0.0.1", 7788), ("10.0.0.2", 7788)))
+        for _ in range(20)
+    ]
+    path = capture(
+        tmp_path / "one.pcap", *(each for pair in zip(data, status, strict=True) for each in pair)
+    )
     assert "10.0.0.1" not in ran("detect", path).output
     assert "choose" not in ran("doctor", path).output
     ran("convert", path, tmp_path / "out.csv", "-s", M1)
@@ -138,7 +179,11 @@ def container(name: str, path: Path) -> Path:
         with path.open("wb") as file:
             np.save(file, np.arange(3))
     else:
-        begun = {"ROS 1 bag": b"#ROSBAG V2.0\n", "MCAP": b"\x89MCAP0\r\n", "points": b"# .PCD v0.7\n"}
+        begun = {
+            "ROS 1 bag": b"#ROSBAG V2.0\n",
+            "MCAP": b"\x89MCAP0\r\n",
+            "points": b"# .PCD v0.7\n",
+        }
         path.write_bytes(begun[name] + packets)
     return path
 
@@ -173,23 +218,37 @@ def recorded(path: Path) -> list[Record]:
 @pytest.mark.slow
 def test_captures_and_recordings_on_standard_input_are_read_as_from_files(tmp_path: Path) -> None:
     number = 6
-    path, recording, copy = capture(tmp_path / "it.pcap", *records(number)), tmp_path / "it.lsr", tmp_path / "copy.lsr"
+    path, recording, copy = (
+        capture(tmp_path / "it.pcap", *records(number)),
+        tmp_path / "it.lsr",
+        tmp_path / "copy.lsr",
+    )
     blocks = tmp_path / "it.pcapng"
     blocks.write_bytes(
-        made.section() + made.interface() + b"".join(made.packet(made.frame(each)) for each in simulate(ls.sensor(M1), number))
+        made.section()
+        + made.interface()
+        + b"".join(made.packet(made.frame(each)) for each in simulate(ls.sensor(M1), number))
     )
     ran("record", path, "-o", recording, "-s", M1)
     for file in (path, blocks, recording):
         held = file.read_bytes()
-        for words in (("read", "-", "--packets", "--json"), ("parse", "-", "--json"), ("explain", "-", "--json")):
+        for words in (
+            ("read", "-", "--packets", "--json"),
+            ("parse", "-", "--json"),
+            ("explain", "-", "--json"),
+        ):
             named = [str(file) if word == "-" else word for word in words]
-            assert ran(*words, "-s", M1, given=held).stdout == ran(*named, "-s", M1).stdout.replace(str(file), "-"), words
+            assert ran(*words, "-s", M1, given=held).stdout == ran(*named, "-s", M1).stdout.replace(
+                str(file), "-"
+            ), words
         ran("record", "-", "-o", copy, "--force", given=held)
         ran("record", file, "-o", recording, "--force") if file != recording else None
         assert recorded(copy) == recorded(recording)
         said = ran("replay", "-", "--to", tmp_path / "played.lsr", "--force", given=held).stderr
         assert f"{number} chunks" in said
-        assert [each.data for each in recorded(tmp_path / "played.lsr")] == [each.data for each in recorded(recording)]
+        assert [each.data for each in recorded(tmp_path / "played.lsr")] == [
+            each.data for each in recorded(recording)
+        ]
     assert "only once" in ran("replay", "-", "--loop", given=held, code=2).stderr
     done = process("read", "-", "--packets", "--json", "-s", M1, given=path.read_bytes())
     assert done.stdout.decode() == ran("read", path, "--packets", "--json", "-s", M1).stdout
@@ -197,11 +256,21 @@ def test_captures_and_recordings_on_standard_input_are_read_as_from_files(tmp_pa
 
 def test_what_is_cut_off_on_standard_input_is_said(tmp_path: Path) -> None:
     path = capture(tmp_path / "it.pcap", *records(3))
-    assert "standard input is cut off in its last record" in ran("read", "-", "--packets", "-s", M1, given=path.read_bytes()[:-5]).stderr
+    assert (
+        "standard input is cut off in its last record"
+        in ran("read", "-", "--packets", "-s", M1, given=path.read_bytes()[:-5]).stderr
+    )
 
 
 def test_bytes_that_only_begin_a_little_like_an_archive_are_bytes(tmp_path: Path) -> None:
     path = tmp_path / "it.bin"
-    for begun in (b"\x1f\x8b", b"PK", b"BZh9", b"\x1f\x8b\x08\xff", b"#", io.DEFAULT_BUFFER_SIZE * b"\0"):
+    for begun in (
+        b"\x1f\x8b",
+        b"PK",
+        b"BZh9",
+        b"\x1f\x8b\x08\xff",
+        b"#",
+        io.DEFAULT_BUFFER_SIZE * b"\0",
+    ):
         path.write_bytes(begun + bytes(8))
         assert ran("record", path, "-o", tmp_path / "it.lsr", "--force").stderr

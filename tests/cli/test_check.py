@@ -26,7 +26,9 @@ def ldrobot_ids() -> list[str]:
 def test_a_clean_file_says_so() -> None:
     done = ran("check", STRANGER, "--max-examples", "8", "-v")
     assert "acme-x1: clean" in done.output
-    assert re.search(r"measured  data, under a checksum: single-bit errors that pass: 0 %", done.output)
+    assert re.search(
+        r"measured  data, under a checksum: single-bit errors that pass: 0 %", done.output
+    )
     assert "skipped   vectors_hold: there is no file of golden vectors" in done.output
 
 
@@ -34,14 +36,21 @@ def test_a_clean_file_says_so() -> None:
 def test_a_finding_says_what_where_why_and_what_to_write(tmp_path: Path) -> None:
     file = tmp_path / "mine.py"
     text = STRANGER.read_text(encoding="utf-8")
-    bare = text.replace('"distance" / Scaled(BitsInteger(16), 0.001, "m")', '"distance" / BitsInteger(16)')
+    bare = text.replace(
+        '"distance" / Scaled(BitsInteger(16), 0.001, "m")', '"distance" / BitsInteger(16)'
+    )
     assert bare != text
     file.write_text(bare, encoding="utf-8")
     done = ran("check", file, "--max-examples", "8", code=1)
     line = next(number for number, row in enumerate(bare.splitlines(), 1) if '"distance" /' in row)
-    assert f"LS201 {RULES['LS201'].title}\n  where  acme-x1 data.samples.distance ({file}:{line})\n  what   " in done.output
+    assert (
+        f"LS201 {RULES['LS201'].title}\n  where  acme-x1 data.samples.distance ({file}:{line})\n  what   "
+        in done.output
+    )
     assert f"  why    {RULES['LS201'].why}\n  write  {RULES['LS201'].write}" in done.output
-    assert [line for line in done.output.splitlines() if line[:1] != " "][-1].startswith("acme-x1: 1 finding, ")
+    assert [line for line in done.output.splitlines() if line[:1] != " "][-1].startswith(
+        "acme-x1: 1 finding, "
+    )
 
 
 def test_json_has_the_same(tmp_path: Path) -> None:
@@ -69,7 +78,10 @@ def test_what_was_measured_stands_beside_what_it_is_held_against() -> None:
     ]
     assert re.fullmatch(r"  data: rate: 21[56]\d\d points a second, simulated", lines[3])
     unproven = ran("check", STRANGER, "--max-examples", "3").output
-    assert "  vectors: there is no file of golden vectors; x and y of points in two quadrants would prove the picture" in unproven
+    assert (
+        "  vectors: there is no file of golden vectors; x and y of points in two quadrants would prove the picture"
+        in unproven
+    )
 
 
 @pytest.mark.slow
@@ -77,8 +89,13 @@ def test_a_file_with_the_id_of_an_installed_sensor_is_told_whose_it_is(tmp_path:
     installed = ROOT / "plugins" / "lidarspec-camsense" / "lidarspec_camsense" / "__init__.py"
     shutil.copy(installed, tmp_path / "mine.py")
     shutil.copy(installed.with_name("vectors.json"), tmp_path)
-    (loading, *others) = json.loads(ran("check", tmp_path / "mine.py", "--max-examples", "3", "--json", code=1).stdout)
-    assert sorted(finding["sensor"] for finding in loading["findings"]) == ["camsense-lds08rr", "camsense-x1"]
+    (loading, *others) = json.loads(
+        ran("check", tmp_path / "mine.py", "--max-examples", "3", "--json", code=1).stdout
+    )
+    assert sorted(finding["sensor"] for finding in loading["findings"]) == [
+        "camsense-lds08rr",
+        "camsense-x1",
+    ]
     assert {finding["code"] for finding in loading["findings"]} == {"LS005"}
     said = "lidarspec-camsense is installed, and has it (lidarspec.sensors = lidarspec_camsense)"
     assert loading["findings"][0]["what"] == said
@@ -88,17 +105,26 @@ def test_a_file_with_the_id_of_an_installed_sensor_is_told_whose_it_is(tmp_path:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("name", ["ldrobot-ld06", "lidarspec-ldrobot", ROOT / "plugins" / "lidarspec-ldrobot"])
+@pytest.mark.parametrize(
+    "name", ["ldrobot-ld06", "lidarspec-ldrobot", ROOT / "plugins" / "lidarspec-ldrobot"]
+)
 def test_a_sensor_or_all_of_a_distribution_are_checked_with_their_vectors(name: str | Path) -> None:
     reports = json.loads(ran("check", name, "--max-examples", "3", "--json").stdout)
-    assert sorted(report["name"] for report in reports) == ([name] if name == "ldrobot-ld06" else ldrobot_ids())
+    assert sorted(report["name"] for report in reports) == (
+        [name] if name == "ldrobot-ld06" else ldrobot_ids()
+    )
     for report in reports:
         assert not {"vectors_hold", "every_data_field_is_pinned_down"} & report["skipped"].keys()
 
 
 def test_a_folder_of_a_distribution_that_is_not_installed_is_named(tmp_path: Path) -> None:
-    (tmp_path / "pyproject.toml").write_text('[project]\nname = "lidarspec-nobody-has"\n', encoding="utf-8")
-    assert f"lidarspec-nobody-has is not installed, or has no sensors: pip install -e {tmp_path}" in ran("check", tmp_path, code=3).stderr
+    (tmp_path / "pyproject.toml").write_text(
+        '[project]\nname = "lidarspec-nobody-has"\n', encoding="utf-8"
+    )
+    assert (
+        f"lidarspec-nobody-has is not installed, or has no sensors: pip install -e {tmp_path}"
+        in ran("check", tmp_path, code=3).stderr
+    )
 
 
 def test_every_rule_has_its_heading() -> None:
@@ -112,7 +138,14 @@ def test_every_rule_has_its_heading() -> None:
 @pytest.mark.slow
 def test_one_sensor_of_a_file_is_checked_by_its_id(tmp_path: Path) -> None:
     file = tmp_path / "two.py"
-    text = STRANGER.read_text(encoding="utf-8").replace("return [X1]", "return [X1, dataclasses.replace(X1, id='acme-x2', aliases=())]")
+    text = STRANGER.read_text(encoding="utf-8").replace(
+        "return [X1]", "return [X1, dataclasses.replace(X1, id='acme-x2', aliases=())]"
+    )
     file.write_text(text, encoding="utf-8")
-    assert ran("check", f"{file}:acme-x2", "--max-examples", "4").output.startswith("acme-x2: clean")
-    assert "unknown sensor 'acme-x3'; did you mean 'acme-x2'?" in ran("check", f"{file}:acme-x3", code=2).stderr
+    assert ran("check", f"{file}:acme-x2", "--max-examples", "4").output.startswith(
+        "acme-x2: clean"
+    )
+    assert (
+        "unknown sensor 'acme-x3'; did you mean 'acme-x2'?"
+        in ran("check", f"{file}:acme-x3", code=2).stderr
+    )

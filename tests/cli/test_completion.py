@@ -53,12 +53,16 @@ def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
         ("nonsense fr", set()),
     ],
 )
-def test_what_can_stand_there_is_offered(words: str, offered: set[str], folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_what_can_stand_there_is_offered(
+    words: str, offered: set[str], folder: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.setenv("_LIDARSPEC_COMPLETE", "bash_complete")
     monkeypatch.setenv("COMP_WORDS", f"lidarspec {words}")
     monkeypatch.setenv("COMP_CWORD", str(words.count(" ") + 1))
     lines = ran(code=1 if "nobody" in words else 0).stdout.split("\n")
-    assert {line.removeprefix("plain,").replace("file,", "file ") for line in lines if line} == offered
+    assert {
+        line.removeprefix("plain,").replace("file,", "file ") for line in lines if line
+    } == offered
 
 
 @pytest.mark.slow
@@ -68,7 +72,14 @@ def test_bash_takes_what_is_printed(folder: Path) -> None:
         COMP_WORDS=(lidarspec build ldrobot-ld06 data sp); COMP_CWORD=4
         _lidarspec_completion lidarspec 2>/dev/null; echo "${COMPREPLY[@]}"; complete -p lidarspec; declare -f _lidarspec_completion"""
     place = {**os.environ, "PATH": f"{Path(sys.executable).parent}{os.pathsep}{os.environ['PATH']}"}
-    done = subprocess.run(["bash", "--norc", "-c", script], capture_output=True, text=True, env=place, check=True, timeout=120)
+    done = subprocess.run(
+        ["bash", "--norc", "-c", script],
+        capture_output=True,
+        text=True,
+        env=place,
+        check=True,
+        timeout=120,
+    )
     lines = done.stdout.splitlines()
     assert lines[0] == "speed="
     assert "-F _lidarspec_completion lidarspec" in lines[1]
@@ -88,7 +99,11 @@ def test_the_command_alone_is_a_guide_to_what_is_here(folder: Path) -> None:
 
 def guide_commands(lines: list[str]) -> list[str]:
     """Return the commands that the guide prints, without the name of the program."""
-    return [line.removeprefix("  lidarspec ").partition("  ")[0] for line in lines if line.startswith("  lidarspec ")]
+    return [
+        line.removeprefix("  lidarspec ").partition("  ")[0]
+        for line in lines
+        if line.startswith("  lidarspec ")
+    ]
 
 
 @pytest.mark.slow

@@ -40,9 +40,15 @@ def read(path: Path) -> Mapping[str, np.ndarray]:
 def test_the_coin_d4_dump(tmp_path: Path) -> None:
     target = tmp_path / "out.csv"
     assert ran("convert", capture(COIN_D4), target, "-s", "cspc-coin-d4").stdout == ""
-    packets = json.loads(capture(COIN_D4.replace("_partial.bin", "_expected.json")).read_text(encoding="utf-8"))
-    angle = np.concatenate([np.linspace(packet["fsa_deg"], packet["lsa_deg"], 25) for packet in packets])
-    rounded, distance = np.array([pair for packet in packets for pair in packet["lds2d_angle_dist"]]).T
+    packets = json.loads(
+        capture(COIN_D4.replace("_partial.bin", "_expected.json")).read_text(encoding="utf-8")
+    )
+    angle = np.concatenate(
+        [np.linspace(packet["fsa_deg"], packet["lsa_deg"], 25) for packet in packets]
+    )
+    rounded, distance = np.array(
+        [pair for packet in packets for pair in packet["lds2d_angle_dist"]]
+    ).T
     np.testing.assert_allclose(angle, rounded, atol=0.3)  # that decoder steps by whole 1/64 degrees
     quality = np.concatenate([packet["vendor_quality"] for packet in packets])
     angle, distance, quality = (column[distance > 0] for column in (angle, distance, quality))
@@ -83,19 +89,30 @@ def test_npz_holds_the_same_columns_and_the_stamps(tmp_path: Path) -> None:
         for name in COLUMNS:
             np.testing.assert_allclose(rows[name], arrays[name], rtol=1e-6, atol=1e-9)
         assert arrays["stamp_ns"].dtype == np.int64
-        assert len(arrays["stamp_ns"]) == len(arrays["complete"]) == len(arrays["rate_hz"]) == int(arrays["scan"].max()) + 1
+        assert (
+            len(arrays["stamp_ns"])
+            == len(arrays["complete"])
+            == len(arrays["rate_hz"])
+            == int(arrays["scan"].max()) + 1
+        )
 
 
 def test_all_keeps_points_without_a_return(tmp_path: Path) -> None:
     target = tmp_path / "out.csv"
-    assert printed("convert", capture(COIN_D4), target, "-s", "cspc-coin-d4", "--all")["points"] == 100
+    assert (
+        printed("convert", capture(COIN_D4), target, "-s", "cspc-coin-d4", "--all")["points"] == 100
+    )
     assert np.isinf(read(target)["range"]).sum() == 3
     assert np.isnan(read(target)["x"]).sum() == 3
 
 
 def test_json_sums_up(tmp_path: Path) -> None:
     found = printed("convert", capture(COIN_D4), tmp_path / "out.npz", "-s", "cspc-coin-d4")
-    assert (found["sensor"], found["points"], found["stats"]["frames"]["data"]) == ("cspc-coin-d4", 97, 4)
+    assert (found["sensor"], found["points"], found["stats"]["frames"]["data"]) == (
+        "cspc-coin-d4",
+        97,
+        4,
+    )
     assert found["stats"]["bytes_in"] == 396
 
 
@@ -105,7 +122,10 @@ def test_hexadecimal_text_and_standard_input_are_read(tmp_path: Path) -> None:
     text.write_text("\n".join([EXAMPLE[:20].hex(" "), EXAMPLE[20:].hex(" ")]), encoding="ascii")
     ran("convert", text, target, "-s", "ldrobot-stl27l")
     first = target.read_bytes()
-    assert process("convert", "-", target, "--force", "-s", "ldrobot-stl27l", given=EXAMPLE).returncode == 0
+    assert (
+        process("convert", "-", target, "--force", "-s", "ldrobot-stl27l", given=EXAMPLE).returncode
+        == 0
+    )
     assert target.read_bytes() == first
     assert len(read(target)["x"]) == 12
 
@@ -114,12 +134,16 @@ def test_several_sensors_with_the_same_frames_have_to_be_chosen_from(tmp_path: P
     source = tmp_path / "in.bin"
     source.write_bytes(b"".join(simulate(ls.sensor("ydlidar-tmini"), 30)))
     result = ran("convert", source, tmp_path / "out.csv", code=2)
-    assert "ydlidar-tmini, ydlidar-tmini-plus, ydlidar-tmini-pro send the same frames" in result.stderr
+    assert (
+        "ydlidar-tmini, ydlidar-tmini-plus, ydlidar-tmini-pro send the same frames" in result.stderr
+    )
 
 
 def test_points_of_a_sensor_that_the_frames_contradict_come_with_a_word(tmp_path: Path) -> None:
     (tmp_path / "vlp16.bin").write_bytes(b"".join(simulate(ls.sensor("velodyne-vlp16"), 60)))
-    told = ran("convert", tmp_path / "vlp16.bin", tmp_path / "out.csv", "-s", "velodyne-hdl32e").stderr
+    told = ran(
+        "convert", tmp_path / "vlp16.bin", tmp_path / "out.csv", "-s", "velodyne-hdl32e"
+    ).stderr
     assert "the frames are those of velodyne-vlp16 (its clock advances by 1.33 ms a packet)" in told
 
 
@@ -140,10 +164,15 @@ def test_every_verb_that_shows_points_says_where_their_angles_are_nominal(tmp_pa
 def test_a_log_without_its_descriptor_is_led_to_the_option_that_reads_it(tmp_path: Path) -> None:
     sensor, log, out = ls.sensor("slamtec-rplidar-a1"), tmp_path / "nodes.bin", tmp_path / "out.csv"
     log.write_bytes(b"".join(simulate(sensor, 900)))
-    assert "name one, as with -s slamtec-rplidar-a1 -O answer=node" in ran("convert", log, out, code=2).stderr
+    assert (
+        "name one, as with -s slamtec-rplidar-a1 -O answer=node"
+        in ran("convert", log, out, code=2).stderr
+    )
     told = ran("convert", log, out, "-s", "slamtec-rplidar-s2", code=4).stderr
     assert "they are found with answer=node" in told
-    following = next(line for line in told.splitlines() if "next: " in line).split("next: lidarspec ")[1]
+    following = next(line for line in told.splitlines() if "next: " in line).split(
+        "next: lidarspec "
+    )[1]
     ran(*following.split())
     assert len(out.read_text().splitlines()) > 700
     assert "-s slamtec-rplidar-a1 -O answer=node" in ran("detect", log).stderr
@@ -155,7 +184,10 @@ def test_a_log_without_its_descriptor_is_led_to_the_option_that_reads_it(tmp_pat
         (["-O", "answer=node"], "name the sensor with -s"),
         (["-s", "slamtec-rplidar-a1", "-O", "answer"], "an option has a value: NAME=VALUE"),
         (["-s", "slamtec-rplidar-a1", "-O", "answr=node"], "answr"),
-        (["-s", "slamtec-rplidar-a1", "-O", "mode=7000"], "mode is a number from 0 to 255, not 7000"),
+        (
+            ["-s", "slamtec-rplidar-a1", "-O", "mode=7000"],
+            "mode is a number from 0 to 255, not 7000",
+        ),
     ],
 )
 def test_options_of_a_sensor_that_cannot_be(tmp_path: Path, options: list[str], said: str) -> None:
@@ -180,16 +212,27 @@ def test_scans_can_be_limited(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("name", ["in.csv", "link.csv", "same.csv"])
 @pytest.mark.parametrize(
-    ("words"), [("convert", "--force", "IN"), ("parse", "IN", "-o"), ("explain", "54", "2c", "--diff", "IN", "-o"), ("plot", "IN", "-o")]
+    ("words"),
+    [
+        ("convert", "--force", "IN"),
+        ("parse", "IN", "-o"),
+        ("explain", "54", "2c", "--diff", "IN", "-o"),
+        ("plot", "IN", "-o"),
+    ],
 )
-def test_the_input_is_never_overwritten_by_whatever_name(tmp_path: Path, words: tuple[str, ...], name: str) -> None:
+def test_the_input_is_never_overwritten_by_whatever_name(
+    tmp_path: Path, words: tuple[str, ...], name: str
+) -> None:
     name = name.replace("csv", "svg") if words[0] == "plot" else name
     source = tmp_path / f"in{name[-4:]}"
     source.write_bytes(EXAMPLE)
     (tmp_path / f"link{name[-4:]}").symlink_to(source)
     os.link(source, tmp_path / f"same{name[-4:]}")
     typed = [source if word == "IN" else word for word in words]
-    assert "would be overwritten" in ran(*typed, tmp_path / name, "-s", "ldrobot-stl27l", code=2).stderr
+    assert (
+        "would be overwritten"
+        in ran(*typed, tmp_path / name, "-s", "ldrobot-stl27l", code=2).stderr
+    )
     assert source.read_bytes() == EXAMPLE
 
 
@@ -197,13 +240,38 @@ def test_the_input_is_never_overwritten_by_whatever_name(tmp_path: Path, words: 
 def test_files_of_options_and_standard_input_are_inputs_too(tmp_path: Path) -> None:
     source, angles = tmp_path / "in.bin", tmp_path / "angles.csv"
     source.write_bytes(EXAMPLE)
-    angles.write_text("channel,elevation,azimuth\n" + "".join(f"{channel},{2 * channel - 17},0\n" for channel in range(1, 17)))
-    words = ("convert", source, angles, "--force", "-s", "hesai-xt16", "-O", f"calibration={angles}")
+    angles.write_text(
+        "channel,elevation,azimuth\n"
+        + "".join(f"{channel},{2 * channel - 17},0\n" for channel in range(1, 17))
+    )
+    words = (
+        "convert",
+        source,
+        angles,
+        "--force",
+        "-s",
+        "hesai-xt16",
+        "-O",
+        f"calibration={angles}",
+    )
     assert "would be overwritten" in ran(*words, code=2).stderr
     with source.open("rb") as given:
-        command = [sys.executable, "-m", "lidarspec", "parse", "-", "-o", str(source), "-s", "ldrobot-stl27l"]
+        command = [
+            sys.executable,
+            "-m",
+            "lidarspec",
+            "parse",
+            "-",
+            "-o",
+            str(source),
+            "-s",
+            "ldrobot-stl27l",
+        ]
         done = subprocess.run(command, stdin=given, capture_output=True, check=False)
-    assert (done.returncode, b"is standard input: it would be overwritten" in done.stderr) == (2, True)
+    assert (done.returncode, b"is standard input: it would be overwritten" in done.stderr) == (
+        2,
+        True,
+    )
     assert source.read_bytes() == EXAMPLE
 
 
@@ -224,13 +292,18 @@ def test_files_for_each_scan_are_overwritten_when_it_is_asked_for_alone(tmp_path
     source, target = tmp_path / "00001.bin", tmp_path / "%05d.bin"
     source.write_bytes(b"".join(simulate(ls.sensor("ldrobot-stl27l"), 300)))
     before = source.read_bytes()
-    assert f"{source} is read: it would be overwritten" in ran("convert", "--force", source, target, "-s", "ldrobot-stl27l", code=2).stderr
+    assert (
+        f"{source} is read: it would be overwritten"
+        in ran("convert", "--force", source, target, "-s", "ldrobot-stl27l", code=2).stderr
+    )
     assert source.read_bytes() == before
     ran("convert", source, tmp_path / "points" / "%05d.bin", "-s", "ldrobot-stl27l")
     files = sorted((tmp_path / "points").iterdir())
     assert [file.name for file in files] == ["00000.bin", "00001.bin"]
     files[0].unlink()
-    said = ran("convert", source, tmp_path / "points" / "%05d.bin", "-s", "ldrobot-stl27l", code=2).stderr
+    said = ran(
+        "convert", source, tmp_path / "points" / "%05d.bin", "-s", "ldrobot-stl27l", code=2
+    ).stderr
     assert f"{files[1]} exists already" in said
     ran("convert", source, tmp_path / "points" / "%05d.bin", "--force", "-s", "ldrobot-stl27l")
     assert files[0].exists()
@@ -243,10 +316,14 @@ def test_a_terminal_shows_how_far_it_is(tmp_path: Path) -> None:
 
     (tmp_path / "drive.bin").write_bytes(b"".join(simulate(ls.sensor("ldrobot-stl27l"), 900)))
     for more in ((), ("-q", "--force")):
-        with Terminal("convert", "drive.bin", "out.npz", "-s", "ldrobot-stl27l", *more, cwd=tmp_path) as terminal:
+        with Terminal(
+            "convert", "drive.bin", "out.npz", "-s", "ldrobot-stl27l", *more, cwd=tmp_path
+        ) as terminal:
             assert terminal.ended() == 0
             shown = terminal.text()
-        assert bool(re.search(r"out\.npz: \d+ points of 1 scan .*\d+%.*\d:\d|--:--", terminal.raw)) is not bool(more)
+        assert bool(
+            re.search(r"out\.npz: \d+ points of 1 scan .*\d+%.*\d:\d|--:--", terminal.raw)
+        ) is not bool(more)
         assert "%" not in shown
         assert ("out.npz: 10800 points of" in shown) is not bool(more)
 
@@ -273,7 +350,10 @@ def test_packets_go_from_container_to_container_as_they_are(name: str, tmp_path:
     for one, other in itertools.pairwise(files):
         assert f"{other}: " in ran("convert", one, other).stderr
     for file in files[1:]:
-        with contextlib.closing(transport(files[0])) as before, contextlib.closing(transport(file)) as after:
+        with (
+            contextlib.closing(transport(files[0])) as before,
+            contextlib.closing(transport(file)) as after,
+        ):
             assert list(after.chunks()) == list(before.chunks())
     assert files[3].read_bytes() == files[0].read_bytes()
     part = tmp_path / "part.pcapng"
@@ -289,8 +369,14 @@ def test_packets_go_from_container_to_container_as_they_are(name: str, tmp_path:
 def test_files_of_packets_are_of_packets_alone_and_of_files(tmp_path: Path) -> None:
     ran("sim", "ldrobot-stl27l", "--to", tmp_path / "drive.lsr", "-t", "100ms")
     out = tmp_path / "out.pcapng"
-    assert "selected by --slice alone" in ran("convert", tmp_path / "drive.lsr", out, "--scans", "1:2", code=2).stderr
-    assert f"lidarspec record sim:ldrobot-stl27l -o {out}" in ran("convert", "sim:ldrobot-stl27l", out, code=2).stderr
+    assert (
+        "selected by --slice alone"
+        in ran("convert", tmp_path / "drive.lsr", out, "--scans", "1:2", code=2).stderr
+    )
+    assert (
+        f"lidarspec record sim:ldrobot-stl27l -o {out}"
+        in ran("convert", "sim:ldrobot-stl27l", out, code=2).stderr
+    )
     (tmp_path / "empty.pcap").write_bytes(WRITINGS[".pcap"].head(1))
     assert "without a packet" in ran("convert", tmp_path / "empty.pcap", out, code=4).stderr
     assert not out.exists()
@@ -305,13 +391,21 @@ def test_more_and_less_is_said(tmp_path: Path) -> None:
     assert ran(*words, "-q").stderr == ""
     assert "points of" in ran(*words).stderr
     assert (
-        "no/out.npz: there is no folder" in ran("convert", path, tmp_path / "no" / "out.npz", "-s", "ldrobot-stl27l", "-q", code=3).stderr
+        "no/out.npz: there is no folder"
+        in ran(
+            "convert", path, tmp_path / "no" / "out.npz", "-s", "ldrobot-stl27l", "-q", code=3
+        ).stderr
     )
 
 
 def test_further_columns_are_written_and_printed_with_their_units(tmp_path: Path) -> None:
     plugin, bytes_, target = tmp_path / "extras.py", tmp_path / "in.bin", tmp_path / "out.csv"
-    hook = ["from lidarspec.spec import hookimpl", "from tests.shapes.extras import SENSOR", "@hookimpl", "def lidarspec_sensors():"]
+    hook = [
+        "from lidarspec.spec import hookimpl",
+        "from tests.shapes.extras import SENSOR",
+        "@hookimpl",
+        "def lidarspec_sensors():",
+    ]
     plugin.write_text("\n".join([*hook, "    return [SENSOR]", ""]), encoding="ascii")
     bytes_.write_bytes(b"".join(simulate(SHAPES["shape-extras"], 60)))
     told = ran("convert", bytes_, target, "-s", plugin).stderr
@@ -319,13 +413,24 @@ def test_further_columns_are_written_and_printed_with_their_units(tmp_path: Path
     assert set(read(target)["signal"]) == {2**24 + 1 + number for number in range(4)}
     assert printed("convert", bytes_, target, "-s", plugin, "--force")["units"]["velocity"] == "m/s"
     assert "velocity [m/s]" in ran("read", bytes_, "-s", plugin, "-n", 1).stdout
-    assert "colours: velocity 0 to 0.001 m/s" in ran("view", bytes_, "-s", plugin, "--once", "--colour", "velocity").stdout
-    assert "did you mean 'velocity'" in ran("view", bytes_, "-s", plugin, "--once", "--colour", "velocty", code=2).stderr
+    assert (
+        "colours: velocity 0 to 0.001 m/s"
+        in ran("view", bytes_, "-s", plugin, "--once", "--colour", "velocity").stdout
+    )
+    assert (
+        "did you mean 'velocity'"
+        in ran("view", bytes_, "-s", plugin, "--once", "--colour", "velocty", code=2).stderr
+    )
 
 
 def test_what_an_imu_felt_is_written_in_place_of_the_points(tmp_path: Path) -> None:
     plugin, bytes_ = tmp_path / "inertia.py", tmp_path / "in.bin"
-    hook = ["from lidarspec.spec import hookimpl", "from tests.shapes.inertia import SENSOR", "@hookimpl", "def lidarspec_sensors():"]
+    hook = [
+        "from lidarspec.spec import hookimpl",
+        "from tests.shapes.inertia import SENSOR",
+        "@hookimpl",
+        "def lidarspec_sensors():",
+    ]
     plugin.write_text("\n".join([*hook, "    return [SENSOR]", ""]), encoding="ascii")
     sensor = SHAPES["shape-inertia"]
     bytes_.write_bytes(b"".join(simulate(sensor, 40)))
@@ -334,18 +439,28 @@ def test_what_an_imu_felt_is_written_in_place_of_the_points(tmp_path: Path) -> N
     rows = read(tmp_path / "imu.csv")
     assert next(iter(rows)) == "time_ns"
     np.testing.assert_allclose(rows["linear_acceleration_z"], 9.80665)
-    assert printed("convert", bytes_, tmp_path / "imu.npz", "-s", plugin, "--imu", "-n", 10)["samples"] == 10
+    assert (
+        printed("convert", bytes_, tmp_path / "imu.npz", "-s", plugin, "--imu", "-n", 10)["samples"]
+        == 10
+    )
     with np.load(tmp_path / "imu.npz") as arrays:
         assert arrays["time_ns"].tolist() == rows["time_ns"][:10].tolist()
-    assert "unknown format '.pcd' (known: .csv, .npz)" in ran("convert", bytes_, tmp_path / "imu.pcd", "-s", plugin, "--imu", code=2).stderr
+    assert (
+        "unknown format '.pcd' (known: .csv, .npz)"
+        in ran("convert", bytes_, tmp_path / "imu.pcd", "-s", plugin, "--imu", code=2).stderr
+    )
     assert (
         "no frame says what an IMU felt"
-        in ran("convert", capture(COIN_D4), tmp_path / "b.csv", "-s", "cspc-coin-d4", "--imu", code=2).stderr
+        in ran(
+            "convert", capture(COIN_D4), tmp_path / "b.csv", "-s", "cspc-coin-d4", "--imu", code=2
+        ).stderr
     )
 
 
 @pytest.mark.parametrize("suffix", [".lsr", ".pcap", ".pcapng"])
-def test_full_disk_names_the_output_and_leaves_nothing(suffix: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_full_disk_names_the_output_and_leaves_nothing(
+    suffix: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     def append(self: RecordFile, records: bytes) -> None:
         raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
 

@@ -19,7 +19,12 @@ PASTE = "Crc(width=8, poly=0x4D)"
 def test_words() -> None:
     told = printed("crc", *(frame.hex() for frame in FRAMES))
     best = told["matches"][0]
-    assert (told["frames"], best["paste"], best["field"]["offset"], best["right"]) == (20, PASTE, -1, 20)
+    assert (told["frames"], best["paste"], best["field"]["offset"], best["right"]) == (
+        20,
+        PASTE,
+        -1,
+        20,
+    )
     assert best["over"] == {"part": "all", "head": 0, "tail": 0}
     assert best["evidence_bits"] > 80
 
@@ -30,11 +35,19 @@ def test_one_frame_with_spaces_is_one_frame() -> None:
 
 @pytest.mark.slow
 @pytest.mark.parametrize(
-    "words", [("frames.hex",), ("raw.bin",), ("raw.bin", "--period", "47"), ("cut.bin", "--period", "47", "--offset", "5")]
+    "words",
+    [
+        ("frames.hex",),
+        ("raw.bin",),
+        ("raw.bin", "--period", "47"),
+        ("cut.bin", "--period", "47", "--offset", "5"),
+    ],
 )
 def test_files(tmp_path: Path, words: tuple[str, ...], monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
-    Path("frames.hex").write_text("".join(f"# a frame\n{frame.hex(' ')}\n" for frame in FRAMES), encoding="ascii")
+    Path("frames.hex").write_text(
+        "".join(f"# a frame\n{frame.hex(' ')}\n" for frame in FRAMES), encoding="ascii"
+    )
     Path("raw.bin").write_bytes(b"".join(FRAMES))
     Path("cut.bin").write_bytes(FRAMES[0][-5:] + b"".join(FRAMES[1:]))
     text = ran("crc", *words).stdout
@@ -54,13 +67,19 @@ def test_a_checksum_without_a_name_comes_as_a_class() -> None:
 
 @pytest.mark.slow
 def test_few_frames_are_weak() -> None:
-    assert "this may be chance: give more frames" in ran("crc", *(frame.hex() for frame in FRAMES[:2])).stderr
+    assert (
+        "this may be chance: give more frames"
+        in ran("crc", *(frame.hex() for frame in FRAMES[:2])).stderr
+    )
 
 
 @pytest.mark.slow
 def test_none_is_found_and_nothing_is_no_input(tmp_path: Path) -> None:
     source = random.Random(2)
-    assert "no checksum of 9 frames was found" in ran("crc", *(source.randbytes(14).hex() for _ in range(9)), code=1).stderr
+    assert (
+        "no checksum of 9 frames was found"
+        in ran("crc", *(source.randbytes(14).hex() for _ in range(9)), code=1).stderr
+    )
     ran("crc", code=2)
     ran("crc", "xyz", code=2)
     ran("crc", tmp_path / "none.bin", code=3)

@@ -1,4 +1,6 @@
-"""Wrong input: one clear message with its place and the next command on stderr, nothing on stdout, the documented exit code."""
+"""Wrong input: one clear message with its place and the next command on stderr, nothing on stdout,
+the documented exit code.
+"""
 
 from __future__ import annotations
 
@@ -23,7 +25,11 @@ SENSOR = ("-s", "ldrobot-stl27l")
 
 def test_a_process_prints_and_exits_as_a_call_does(tmp_path: Path) -> None:
     done = process("shw", cwd=tmp_path)
-    assert (done.returncode, done.stdout, done.stderr.decode()) == (2, b"", ran("shw", code=2).stderr)
+    assert (done.returncode, done.stdout, done.stderr.decode()) == (
+        2,
+        b"",
+        ran("shw", code=2).stderr,
+    )
 
 
 @pytest.mark.slow
@@ -32,7 +38,13 @@ def test_every_verb_says_that_checksums_are_never_right(tmp_path: Path) -> None:
     frames = simulate(ls.sensor("ldrobot-stl27l"), 20)
     path.write_bytes(b"".join(frame[:46] + bytes([crc(frame[1:46])]) for frame in frames))
     out = tmp_path / "out.csv"
-    for words in (["detect", path], ["convert", path, out], ["parse", path], ["parse", path, *chosen], ["read", path, *chosen]):
+    for words in (
+        ["detect", path],
+        ["convert", path, out],
+        ["parse", path],
+        ["parse", path, *chosen],
+        ["read", path, *chosen],
+    ):
         told = ran(*words, code=4).stderr
         assert "over 45 of the 46 other bytes" in told
         assert f"next: lidarspec crc {path}" in told
@@ -57,7 +69,9 @@ def test_the_next_command_can_be_typed() -> None:
 )
 def test_a_closed_pipe_ends_quietly(words: tuple[str, ...]) -> None:
     command = [sys.executable, "-m", "lidarspec", *words]
-    with subprocess.Popen(command, stdin=subprocess.DEVNULL, stdout=subprocess.PIPE, stderr=subprocess.PIPE) as running:
+    with subprocess.Popen(
+        command, stdin=subprocess.DEVNULL, stdout=subprocess.PIPE, stderr=subprocess.PIPE
+    ) as running:
         assert running.stdout is not None
         assert running.stderr is not None
         running.stdout.close()
@@ -68,10 +82,20 @@ def test_a_closed_pipe_ends_quietly(words: tuple[str, ...]) -> None:
 
 @pytest.mark.skipif(os.name != "posix", reason="signals are sent as on POSIX")
 def test_an_interrupt_ends_with_130() -> None:
-    # a test run in the background of a shell has interrupts switched off, and its children inherit that
+    # a test run in the background of a shell has interrupts switched off, and its children inherit
+    # that
     restored = "import signal; signal.signal(signal.SIGINT, signal.default_int_handler)"
-    command = [sys.executable, "-c", f"{restored}; from lidarspec.cli import main; main()", "parse", "-", *SENSOR]
-    with subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=subprocess.PIPE) as running:
+    command = [
+        sys.executable,
+        "-c",
+        f"{restored}; from lidarspec.cli import main; main()",
+        "parse",
+        "-",
+        *SENSOR,
+    ]
+    with subprocess.Popen(
+        command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=subprocess.PIPE
+    ) as running:
         deadline = time.monotonic() + 60
         while not _reads_standard_input(running.pid) and time.monotonic() < deadline:
             time.sleep(0.05)
@@ -82,7 +106,9 @@ def test_an_interrupt_ends_with_130() -> None:
 
 
 def _reads_standard_input(pid: int) -> bool:
-    """Whether a process has loaded what `parse` needs and now sleeps; where that cannot be seen, time has to do."""
+    """Whether a process has loaded what `parse` needs and now sleeps; where that cannot be seen,
+    time has to do.
+    """
     try:
         maps = Path(f"/proc/{pid}/maps").read_text(encoding="utf-8")
         state = Path(f"/proc/{pid}/stat").read_text(encoding="utf-8").rpartition(") ")[2]
@@ -116,12 +142,20 @@ RAISES = Path(points_fail.__file__)
     ],
     ids=lambda words: words[0],
 )
-def test_a_plugin_that_raises_is_named_alike_by_every_verb(words: tuple[str, ...], tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Its id, what raised, the file and line, the number of packets where some were read; exit code 1."""
+def test_a_plugin_that_raises_is_named_alike_by_every_verb(
+    words: tuple[str, ...], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Its id, what raised, the file and line, the number of packets where some were read; exit code
+    1.
+    """
     monkeypatch.chdir(tmp_path)
     Path("frames.bin").write_bytes(b"".join(ls.simulate(sound.sensor(), 12)))
     said = ran(*words, *(() if words[0] == "sim" else ("-s", RAISES)), code=1).stderr
-    line = next(number for number, text in enumerate(RAISES.read_text(encoding="utf-8").splitlines(), 1) if "distnace" in text)
+    line = next(
+        number
+        for number, text in enumerate(RAISES.read_text(encoding="utf-8").splitlines(), 1)
+        if "distnace" in text
+    )
     assert "broken-one: points of data: UnknownField: unknown field 'samples.distnace'" in said
     assert f"points_fail.py:{line})" in said
     assert "frames.bin" not in words or f":{line}), at 12 packets\n" in said
@@ -143,9 +177,13 @@ def lidarspec_sensors():
 """
 
 
-def test_a_plugin_that_raises_now_and_then_ends_with_its_message_and_in_python_is_a_warning(tmp_path: Path) -> None:
+def test_a_plugin_that_raises_now_and_then_ends_with_its_message_and_in_python_is_a_warning(
+    tmp_path: Path,
+) -> None:
     (file := tmp_path / "sometimes.py").write_text(SOMETIMES, encoding="utf-8")
-    (tmp_path / "packets.hex").write_text("\n".join(frame.hex() for frame in ls.simulate(sound.sensor(), 12)), encoding="utf-8")
+    (tmp_path / "packets.hex").write_text(
+        "\n".join(frame.hex() for frame in ls.simulate(sound.sensor(), 12)), encoding="utf-8"
+    )
     said = ran("plot", tmp_path / "packets.hex", "-o", "-", "-s", file, code=1).stderr
     assert f"broken-one: points of data: ArithmeticError: by hand ({file}:7), at " in said
     with ls.open(tmp_path / "packets.hex", str(file)) as device:
@@ -159,5 +197,6 @@ def test_what_a_sweep_raises_is_the_plugins(tmp_path: Path) -> None:
     )
     (file := tmp_path / "sweeping.py").write_text(text, encoding="utf-8")
     assert (
-        f"sweep of data: ZeroDivisionError: division by zero ({file}:12)" in ran("sim", file, "--to", tmp_path / "new.bin", code=1).stderr
+        f"sweep of data: ZeroDivisionError: division by zero ({file}:12)"
+        in ran("sim", file, "--to", tmp_path / "new.bin", code=1).stderr
     )

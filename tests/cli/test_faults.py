@@ -1,4 +1,6 @@
-"""Every verb at every kind of broken source: one clear line, the next command, the documented exit code; Ctrl-C and closed pipes."""
+"""Every verb at every kind of broken source: one clear line, the next command, the documented exit
+code; Ctrl-C and closed pipes.
+"""
 
 from __future__ import annotations
 
@@ -56,9 +58,13 @@ def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     return tmp_path
 
 
-@pytest.mark.parametrize(("place", "code", "told"), BROKEN, ids=lambda value: getattr(value, "__name__", ""))
+@pytest.mark.parametrize(
+    ("place", "code", "told"), BROKEN, ids=lambda value: getattr(value, "__name__", "")
+)
 @pytest.mark.parametrize("verb", VERBS)
-def test_a_broken_source_ends_in_one_line_and_its_code(folder: Path, verb: str, place: Place, code: int, told: str) -> None:
+def test_a_broken_source_ends_in_one_line_and_its_code(
+    folder: Path, verb: str, place: Place, code: int, told: str
+) -> None:
     if (verb, place) == ("send", babbling):
         code, told = 5, "no ack frame came"
     if (verb, place) == ("send", silent):
@@ -67,7 +73,9 @@ def test_a_broken_source_ends_in_one_line_and_its_code(folder: Path, verb: str, 
         result = ran(*(source if word == "SOURCE" else word for word in VERBS[verb]), code=code)
     lines = result.stderr.splitlines()
     said = [line for line in lines if not line.lstrip().startswith("next: ")]
-    kept = verb == "record" and place is babbling  # the file that nobody can decode yet is kept, and said
+    kept = (
+        verb == "record" and place is babbling
+    )  # the file that nobody can decode yet is kept, and said
     assert told in said[-1]
     assert len(said) == (2 if kept or (verb, place) == ("detect", silent) else 1), said
     assert lines[-1].lstrip().startswith("next: lidarspec "), lines
@@ -75,7 +83,9 @@ def test_a_broken_source_ends_in_one_line_and_its_code(folder: Path, verb: str, 
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(("place", "told"), [(place, told) for place, _, told in BROKEN if place is not forbidden])
+@pytest.mark.parametrize(
+    ("place", "told"), [(place, told) for place, _, told in BROKEN if place is not forbidden]
+)
 def test_doctor_says_the_same_as_a_finding(folder: Path, place: Place, told: str) -> None:
     with place() as source:
         result = ran("doctor", source, *STL, *BRIEF, code=1)
@@ -102,8 +112,9 @@ def test_an_address_in_use_cannot_be_played_to(folder: Path, words: tuple[str, .
 
 #: A sensor that is simulated slowly, because all verbs at work share the processor.
 SLOW_SIM = f"{SIM}?rate=0.1"
-#: verbs at work, which Ctrl-C ends; SILENT is a port behind which nobody says anything. Interrupts of `view`, `stats` and `read` while they
-#: print are in tests/view/test_window.py and test_live_verbs, of `parse` in test_failures.
+#: verbs at work, which Ctrl-C ends; SILENT is a port behind which nobody says anything. Interrupts
+#: of `view`, `stats` and `read` while they print are in tests/view/test_window.py and
+#: test_live_verbs, of `parse` in test_failures.
 WORKING: tuple[tuple[str, ...], ...] = (
     ("view", "SILENT", *STL),
     ("stats", "SILENT", *STL),
@@ -137,22 +148,36 @@ def worked(tmp_path: Path) -> Iterator[list[tuple[str, Terminal]]]:
 
 
 def seen_by_a_shell(code: int) -> int:
-    """The exit code in a shell's `$?`: 128 and the signal, where a program was ended by one while it was still being loaded."""
+    """The exit code in a shell's `$?`: 128 and the signal, where a program was ended by one while
+    it was still being loaded.
+    """
     return code if code >= 0 else 128 - code
 
 
 @pytest.mark.slow
-def test_an_interrupt_ends_every_verb_with_130(worked: list[tuple[str, Terminal]], tmp_path: Path) -> None:
+def test_an_interrupt_ends_every_verb_with_130(
+    worked: list[tuple[str, Terminal]], tmp_path: Path
+) -> None:
     for _, terminal in worked:
         terminal.loaded()
     for _, terminal in worked:
         terminal.type("\x03")
-    ends = {words: (seen_by_a_shell(terminal.ended()), "Traceback" in terminal.raw, terminal.is_as_before()) for words, terminal in worked}
+    ends = {
+        words: (
+            seen_by_a_shell(terminal.ended()),
+            "Traceback" in terminal.raw,
+            terminal.is_as_before(),
+        )
+        for words, terminal in worked
+    }
     assert ends == dict.fromkeys(ends, (130, False, True))
-    assert {"points.csv", "scan.svg", "three.lsr"}.isdisjoint(os.listdir(tmp_path)), "nothing half made is left"
+    assert {"points.csv", "scan.svg", "three.lsr"}.isdisjoint(os.listdir(tmp_path)), (
+        "nothing half made is left"
+    )
 
 
-#: verbs whose output is cut off after its first line as by ``| head -1``; those of files are in test_failures.
+#: verbs whose output is cut off after its first line as by ``| head -1``; those of files are in
+#: test_failures.
 PRINTING: tuple[tuple[str, ...], ...] = (
     ("view", SIM, *STL),
     ("stats", SIM, *STL, "--interval", "50ms"),
@@ -181,4 +206,11 @@ def test_a_closed_pipe_ends_every_verb_quietly(tmp_path: Path) -> None:
 
 def _started(words: tuple[str, ...], folder: Path) -> subprocess.Popen[str]:
     command = [sys.executable, "-u", "-m", "lidarspec", *words]
-    return subprocess.Popen(command, stdin=subprocess.DEVNULL, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, cwd=folder)
+    return subprocess.Popen(
+        command,
+        stdin=subprocess.DEVNULL,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+        cwd=folder,
+    )

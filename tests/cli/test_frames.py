@@ -62,9 +62,16 @@ def test_a_frame_is_parsed_from_a_file_and_from_standard_input(tmp_path: Path) -
 def test_json_holds_the_integers_of_the_wire() -> None:
     found = printed("parse", EXAMPLE.hex(), *SENSOR)
     (frame,) = found["frames"]
-    assert (found["sensor"], frame["frame"], frame["offset"], frame["size"]) == ("ldrobot-stl27l", "data", 0, 47)
+    assert (found["sensor"], frame["frame"], frame["offset"], frame["size"]) == (
+        "ldrobot-stl27l",
+        "data",
+        0,
+        47,
+    )
     assert frame["fields"]["start_angle"] == 32427
-    assert [(point["distance"], point["intensity"]) for point in frame["fields"]["points"]] == POINTS
+    assert [
+        (point["distance"], point["intensity"]) for point in frame["fields"]["points"]
+    ] == POINTS
     assert frame["fields"]["header"] == "54 2c"
 
 
@@ -72,8 +79,13 @@ def test_the_sensors_that_fit_are_found_and_listed() -> None:
     result = ran("parse", EXAMPLE.hex())
     assert "ldrobot-ld06" in result.stderr
     assert "ldrobot-stl27l" in result.stderr
-    assert printed("parse", EXAMPLE.hex())["fits"] == [name for name in ls.sensors() if name.startswith("ldrobot-")]
-    assert printed("parse", ls.sensor("robosense-m1").example("data").hex())["sensor"] == "robosense-m1"
+    assert printed("parse", EXAMPLE.hex())["fits"] == [
+        name for name in ls.sensors() if name.startswith("ldrobot-")
+    ]
+    assert (
+        printed("parse", ls.sensor("robosense-m1").example("data").hex())["sensor"]
+        == "robosense-m1"
+    )
 
 
 def test_a_stream_is_parsed_frame_by_frame_and_gaps_are_told() -> None:
@@ -89,7 +101,13 @@ def test_explain_names_every_byte_of_a_stream() -> None:
     frames = printed("explain", data.hex(), *SENSOR)["frames"]
     named = b"".join(bytes.fromhex(row["hex"]) for frame in frames for row in frame["rows"])
     assert named == data
-    assert [(frame["frame"], frame["offset"]) for frame in frames] == [("", 0), ("data", 2), ("", 49), ("data", 51), ("", 98)]
+    assert [(frame["frame"], frame["offset"]) for frame in frames] == [
+        ("", 0),
+        ("data", 2),
+        ("", 49),
+        ("data", 51),
+        ("", 98),
+    ]
 
 
 def test_explain_prints_as_the_conventions_say() -> None:
@@ -101,7 +119,10 @@ def test_explain_prints_as_the_conventions_say() -> None:
         "0004  ab 7e     start_angle  324.27 deg",
         "0006  e0 00 e4  points[0]    0.224 m, intensity 228, at 35.73 deg -> x 0.182 y 0.131",
     ]
-    assert text.splitlines()[-1] == "002e  50        crc          0x50 ok (CRC-8 poly 0x4d over 46 bytes)"
+    assert (
+        text.splitlines()[-1]
+        == "002e  50        crc          0x50 ok (CRC-8 poly 0x4d over 46 bytes)"
+    )
 
 
 def test_explain_takes_the_frame_type_where_bytes_do_not_tell() -> None:
@@ -118,12 +139,22 @@ def test_explain_shows_what_is_damaged_alone(tmp_path: Path) -> None:
     (tmp_path / "drive.bin").write_bytes(b"".join(frames))
     result = ran("explain", tmp_path / "drive.bin", "--bad", *SENSOR, code=1)
     assert [line for line in result.stdout.splitlines() if not line.startswith("00")] == [
-        "ldrobot-stl27l data at byte 940, 46 bytes: frame ends at byte 46 of 47: crc needs 1 byte, 0 left",
-        *(line for line in result.stdout.splitlines() if line.startswith("note: one lost byte would explain it")),
+        (
+            "ldrobot-stl27l data at byte 940, 46 bytes: frame ends at byte 46 of 47: crc needs 1"
+            " byte, 0 left"
+        ),
+        *(
+            line
+            for line in result.stdout.splitlines()
+            if line.startswith("note: one lost byte would explain it")
+        ),
     ]
     assert result.stderr == "29 frames, 1 damaged, 0 bytes in no frame\n"
     filled = b"\xff\xfe".join(ls.simulate(ls.sensor("cspc-m1c1-mini"), 9))  # fillers are no damage
-    assert "9 frames, 0 damaged, 0 bytes in no frame" in ran("explain", filled.hex(), "--bad", "-s", "cspc-m1c1-mini").stderr
+    assert (
+        "9 frames, 0 damaged, 0 bytes in no frame"
+        in ran("explain", filled.hex(), "--bad", "-s", "cspc-m1c1-mini").stderr
+    )
     clean = ran("explain", frames[0].hex(), "--bad", *SENSOR)
     assert (clean.stdout, clean.stderr) == ("", "1 frame, 0 damaged, 0 bytes in no frame\n")
 
@@ -134,16 +165,29 @@ def test_explain_shows_what_stands_at_some_bytes_alone(tmp_path: Path) -> None:
     assert ran("explain", path, "--at", "0x3b2", *SENSOR).stdout.startswith(
         "ldrobot-stl27l data at byte 940, 47 bytes; byte 946 is in points[0].distance\n"
     )
-    assert [frame["offset"] for frame in printed("explain", path, "--bytes", "46:95", *SENSOR)["frames"]] == [0, 47, 94]
+    assert [
+        frame["offset"] for frame in printed("explain", path, "--bytes", "46:95", *SENSOR)["frames"]
+    ] == [0, 47, 94]
     assert len(printed("explain", path, "--bytes", "14000:", *SENSOR)["frames"]) == 3
-    assert "14100 bytes: there is no byte 14100" in ran("explain", path, "--at", 14100, *SENSOR, code=2).stderr
-    for words in (("--bytes", "9"), ("--bytes", "9:8"), ("--bytes", "a:"), ("--at", "-1"), ("--at", 1, "--bytes", "1:2")):
+    assert (
+        "14100 bytes: there is no byte 14100"
+        in ran("explain", path, "--at", 14100, *SENSOR, code=2).stderr
+    )
+    for words in (
+        ("--bytes", "9"),
+        ("--bytes", "9:8"),
+        ("--bytes", "a:"),
+        ("--at", "-1"),
+        ("--at", 1, "--bytes", "1:2"),
+    ):
         ran("explain", path, *words, *SENSOR, code=2)
 
 
 def test_explain_takes_one_frame_type_out_of_a_stream() -> None:
     sensor = ls.sensor("cspc-coin-d4")
-    data = b"".join(sensor.example(name, seed=seed) for seed in range(6) for name in ("info", "data"))
+    data = b"".join(
+        sensor.example(name, seed=seed) for seed in range(6) for name in ("info", "data")
+    )
     result = ran("explain", data.hex(), "-f", "info", "-s", sensor.id)
     assert result.stdout.count("cspc-coin-d4 info") == 6
     assert "cspc-coin-d4 data" not in result.stdout
@@ -155,7 +199,9 @@ def test_explain_takes_one_frame_type_out_of_a_stream() -> None:
 @pytest.mark.slow
 def test_explain_answers_while_its_input_goes_on_and_stops_with_its_reader() -> None:
     command = [sys.executable, "-m", "lidarspec", "explain", "-", *SENSOR]
-    with subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=subprocess.PIPE) as running:
+    with subprocess.Popen(
+        command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=subprocess.PIPE
+    ) as running:
         assert running.stdin is not None
         assert running.stdout is not None
         running.stdin.write(EXAMPLE * 3000)
@@ -170,8 +216,20 @@ def test_explain_answers_while_its_input_goes_on_and_stops_with_its_reader() -> 
 
 def test_captures_are_explained() -> None:
     frames = printed("explain", capture(COIN_D4), "-s", "cspc-coin-d4")["frames"]
-    assert b"".join(bytes.fromhex(row["hex"]) for frame in frames for row in frame["rows"]) == capture(COIN_D4).read_bytes()
-    assert [frame["frame"] for frame in frames] == ["", "info", "scan_start", "data", "data", "data", "data", "data"]
+    assert (
+        b"".join(bytes.fromhex(row["hex"]) for frame in frames for row in frame["rows"])
+        == capture(COIN_D4).read_bytes()
+    )
+    assert [frame["frame"] for frame in frames] == [
+        "",
+        "info",
+        "scan_start",
+        "data",
+        "data",
+        "data",
+        "data",
+        "data",
+    ]
     assert [frame["fault"] is None for frame in frames[1:]] == [True] * 6 + [False]
     assert "3 data" not in ran("parse", capture(LD06), *SENSOR).stderr
 
@@ -182,16 +240,27 @@ def test_build_makes_the_frame_of_the_manual() -> None:
         for index, pair in enumerate(POINTS)
         for name, value in zip(("distance", "intensity"), pair, strict=True)
     ]
-    assert ran("build", "ldrobot-stl27l", "data", *FIELDS, *points).stdout.strip() == EXAMPLE.hex(" ")
+    assert ran("build", "ldrobot-stl27l", "data", *FIELDS, *points).stdout.strip() == EXAMPLE.hex(
+        " "
+    )
 
 
 def test_build_fills_arrays_and_later_values_win() -> None:
-    words = ("points[3].intensity=7", "points[*].distance=1m", "points[*].intensity=0x05", "points[11].distance=12.5cm")
-    frame = ls.sensor("ldrobot-stl27l").parse(bytes.fromhex(ran("build", "ldrobot-stl27l", "data", *FIELDS, *words).stdout))
+    words = (
+        "points[3].intensity=7",
+        "points[*].distance=1m",
+        "points[*].intensity=0x05",
+        "points[11].distance=12.5cm",
+    )
+    frame = ls.sensor("ldrobot-stl27l").parse(
+        bytes.fromhex(ran("build", "ldrobot-stl27l", "data", *FIELDS, *words).stdout)
+    )
     assert [point.distance for point in frame.points] == [1000] * 11 + [125]
     assert {point.intensity for point in frame.points} == {5}
     words = (*words, "points[3].intensity=7")
-    frame = ls.sensor("ldrobot-stl27l").parse(bytes.fromhex(ran("build", "ldrobot-stl27l", "data", *FIELDS, *words).stdout))
+    frame = ls.sensor("ldrobot-stl27l").parse(
+        bytes.fromhex(ran("build", "ldrobot-stl27l", "data", *FIELDS, *words).stdout)
+    )
     assert frame.points[3].intensity == 7
 
 
@@ -199,9 +268,15 @@ def test_build_takes_the_length_of_an_array_from_its_count_or_its_elements() -> 
     common = ("mt.frequency=5.5Hz", "mt.start=0", "fsa.angle=10deg", "lsa.angle=12deg")
     every = ("samples[*].distance=1m", "samples[*].intensity=3", "samples[*].exposure=1")
     sensor = ls.sensor("cspc-coin-d4")
-    frame = sensor.parse(bytes.fromhex(ran("build", sensor.id, "data", *common, *every, "lsn=3").stdout))
+    frame = sensor.parse(
+        bytes.fromhex(ran("build", sensor.id, "data", *common, *every, "lsn=3").stdout)
+    )
     assert (frame.lsn, [sample.distance for sample in frame.samples]) == (3, [1000] * 3)
-    ones = [f"samples[{index}].{field}" for index in range(2) for field in ("distance=5", "intensity=6", "exposure=1")]
+    ones = [
+        f"samples[{index}].{field}"
+        for index in range(2)
+        for field in ("distance=5", "intensity=6", "exposure=1")
+    ]
     frame = sensor.parse(bytes.fromhex(ran("build", sensor.id, "data", *common, *ones).stdout))
     assert (frame.lsn, [sample.intensity for sample in frame.samples]) == (2, [6, 6])
     assert "is not known" in ran("build", sensor.id, "data", *common, *every, code=2).stderr
@@ -229,8 +304,13 @@ def test_built_frames_go_to_files_and_back(tmp_path: Path) -> None:
     raw, text = tmp_path / "start.bin", tmp_path / "start.hex"
     for target in (raw, text):
         ran("build", "cspc-m1c1-mini", "command", "mode=0xf0", "-o", target)
-    assert raw.read_bytes() == bytes.fromhex(text.read_text(encoding="ascii")) == b"\xaa\x55\xf0\x0f"
-    assert ran("build", "cspc-m1c1-mini", "command", "mode=0xf0", "-o", "-").stdout_bytes == raw.read_bytes()
+    assert (
+        raw.read_bytes() == bytes.fromhex(text.read_text(encoding="ascii")) == b"\xaa\x55\xf0\x0f"
+    )
+    assert (
+        ran("build", "cspc-m1c1-mini", "command", "mode=0xf0", "-o", "-").stdout_bytes
+        == raw.read_bytes()
+    )
     assert printed("build", "cspc-m1c1-mini", "command", "mode=240")["hex"] == "aa 55 f0 0f"
     assert "0x0f ok (XOR-8 over 3 bytes)" in ran("explain", raw, "-s", "cspc-m1c1-mini").stdout
 
@@ -249,20 +329,32 @@ def test_built_frames_go_to_files_and_back(tmp_path: Path) -> None:
         (("crc", "zeros.hex"), 2),
     ],
 )
-def test_an_input_is_held_in_pieces(words: tuple[str, ...], code: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Of a file, of hexadecimal text in one line, and of what comes through a pipe, no more is held than a piece."""
+def test_an_input_is_held_in_pieces(
+    words: tuple[str, ...], code: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Of a file, of hexadecimal text in one line, and of what comes through a pipe, no more is held
+    than a piece.
+    """
     monkeypatch.chdir(tmp_path)
     for data in (bytes(2000), bytes(MEGABYTE)):  # first what is imported and remembered
         text = data.hex().encode()
-        for name, given in (("zeros.bin", data), ("zeros.hex", text), ("few.bin", data[: MEGABYTE // 4])):
+        for name, given in (
+            ("zeros.bin", data),
+            ("zeros.hex", text),
+            ("few.bin", data[: MEGABYTE // 4]),
+        ):
             Path(name).write_bytes(given)
         most = peak(lambda given=text if "-" in words else b"": ran(*words, code=code, given=given))
-    # the whole at once would be 75 MB: a piece is looked through for every kind of frame of a sensor, and some have a dozen
+    # the whole at once would be 75 MB: a piece is looked through for every kind of frame of a
+    # sensor, and some have a dozen
     assert most - len(text) * ("-" in words) < 32 * MEGABYTE, f"{most} bytes"
 
 
 def test_parts_are_built_shown_and_explained(tmp_path: Path) -> None:
-    file, fields = tmp_path / "tags.py", ["tags[0].type=1", "tags[0].points[0].distance=1m", "tags[0].points[0].angle=90deg"]
+    file, fields = (
+        tmp_path / "tags.py",
+        ["tags[0].type=1", "tags[0].points[0].distance=1m", "tags[0].points[0].angle=90deg"],
+    )
     file.write_text(
         "from lidarspec.spec import hookimpl\nfrom tests.shapes.tags import SENSOR\n\n\n"
         "@hookimpl\ndef lidarspec_sensors():\n    return [SENSOR]\n",
@@ -273,7 +365,10 @@ def test_parts_are_built_shown_and_explained(tmp_path: Path) -> None:
     explained = ran("explain", data, "-s", file).stdout
     assert "points[0]  1.00 m, 90.00 deg, at 90.00 deg -> x 0.000 y 1.000" in explained
     assert "tags[i].points[j].angle" in ran("show", file).stdout
-    assert "unknown field 'tags[0].tipe'" in ran("build", file, "data", "tags[0].tipe=1", code=2).stderr
+    assert (
+        "unknown field 'tags[0].tipe'"
+        in ran("build", file, "data", "tags[0].tipe=1", code=2).stderr
+    )
 
 
 def test_json_has_the_fields_of_a_frame_and_not_how_they_were_spelled() -> None:

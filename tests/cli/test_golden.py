@@ -55,7 +55,9 @@ VARIABLE_TEXTS = (
 
 click_version = importlib.metadata.version("click")
 pytestmark = [
-    pytest.mark.skipif(os.name != "posix", reason="the golden files have the system messages of POSIX"),
+    pytest.mark.skipif(
+        os.name != "posix", reason="the golden files have the system messages of POSIX"
+    ),
     pytest.mark.skipif(
         release_numbers(click_version) < LEAST_CLICK_VERSION,
         reason=f"click {click_version} words its own messages differently",
@@ -96,7 +98,9 @@ def run_command(line: str, folder: Path) -> str:
     names_before = sorted(os.listdir(folder))
     result = CliRunner(**APART).invoke(main, words, input=standard_input)
     if result.exit_code > 1:
-        assert sorted(os.listdir(folder)) == names_before, f"{line}: a command that fails leaves no file"
+        assert sorted(os.listdir(folder)) == names_before, (
+            f"{line}: a command that fails leaves no file"
+        )
     lines = [line]
     if result.exit_code:
         lines.append(f"exit {result.exit_code}")
@@ -125,7 +129,9 @@ def run_golden_file(text: str, folder: Path) -> str:
 
 
 @pytest.mark.parametrize("name", sorted(path.stem for path in GOLDEN.glob("*.txt")))
-def test_golden(name: str, example_files: dict[str, bytes], tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_golden(
+    name: str, example_files: dict[str, bytes], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     for file, content in example_files.items():
         (tmp_path / file).write_bytes(content)
     monkeypatch.chdir(tmp_path)
@@ -136,7 +142,9 @@ def test_golden(name: str, example_files: dict[str, bytes], tmp_path: Path, monk
     if os.environ.get("LIDARSPEC_UPDATE_GOLDEN"):
         path.write_text(actual, encoding="utf-8")
     elif actual != expected:
-        lines = difflib.unified_diff(expected.splitlines(), actual.splitlines(), f"golden/{name}.txt", "now", lineterm="")
+        lines = difflib.unified_diff(
+            expected.splitlines(), actual.splitlines(), f"golden/{name}.txt", "now", lineterm=""
+        )
         pytest.fail("\n".join(lines), pytrace=False)
 
 

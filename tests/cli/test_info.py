@@ -28,7 +28,9 @@ def frames() -> list[bytes]:
 
 
 @pytest.mark.slow
-def test_a_capture_of_two_sensors_of_which_one_lost_a_packet(frames: list[bytes], tmp_path: Path) -> None:
+def test_a_capture_of_two_sensors_of_which_one_lost_a_packet(
+    frames: list[bytes], tmp_path: Path
+) -> None:
     path, senders = tmp_path / "drive.pcap", [("10.0.0.1", 2368), ("10.0.0.2", 2368)]
     datagrams = [
         Datagram(data, START + number * STEP, sender, ("255.255.255.255", 2368))
@@ -46,7 +48,9 @@ def test_a_capture_of_two_sensors_of_which_one_lost_a_packet(frames: list[bytes]
         assert content["sensors"] == ["velodyne-vlp16"]
         assert content["share"] == 1
         assert content["command"] == f"lidarspec view '{path}?src={sender[0]}' -s velodyne-vlp16"
-        assert content["reading"]["loss_rate"] == pytest.approx(lost / (content["reading"]["packets"] + lost))
+        assert content["reading"]["loss_rate"] == pytest.approx(
+            lost / (content["reading"]["packets"] + lost)
+        )
         assert content["reading"]["speed_hz"] == pytest.approx(10, abs=0.1)
     text = ran("info", path).stdout
     assert "2023-11-14T22:13:20.000Z to 2023-11-14T22:13:20.395Z, 0.395 s" in text
@@ -88,7 +92,11 @@ def test_a_file_without_times_and_one_of_nobody(tmp_path: Path) -> None:
     noise.write_bytes(bytes(range(256)) * 4)
     empty.write_bytes(b"")
     told = printed("info", raw)
-    assert (told["kind"], told["first_ns"], told["flows"][0]["sender"]) == ("bytes as a sensor sent them", None, None)
+    assert (told["kind"], told["first_ns"], told["flows"][0]["sender"]) == (
+        "bytes as a sensor sent them",
+        None,
+        None,
+    )
     assert "it does not say when its bytes arrived" in ran("info", raw).stdout
     assert "none that is installed sends such bytes" in ran("info", noise, code=4).stdout
     ran("info", empty, code=4)

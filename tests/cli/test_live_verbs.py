@@ -1,4 +1,6 @@
-"""`view`, `stats`, `read` and `plot` on files, simulated sensors and real ports; each kind of failure ends in one line and its code."""
+"""`view`, `stats`, `read` and `plot` on files, simulated sensors and real ports; each kind of
+failure ends in one line and its code.
+"""
 
 from __future__ import annotations
 
@@ -31,7 +33,11 @@ def capture(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Two seconds of a sensor, of which one frame in fifty is damaged."""
     path = tmp_path_factory.mktemp("live") / "two.bin"
     frames = simulate(ls.sensor(ID), 3600)
-    path.write_bytes(b"".join(frame[:-1] + b"\0" if number % 50 == 0 else frame for number, frame in enumerate(frames)))
+    path.write_bytes(
+        b"".join(
+            frame[:-1] + b"\0" if number % 50 == 0 else frame for number, frame in enumerate(frames)
+        )
+    )
     return path
 
 
@@ -52,8 +58,18 @@ def test_no_permission_is_said(capture: Path, tmp_path: Path, words: tuple[str, 
 @pytest.mark.parametrize("words", [("stats",), ("read",)])
 def test_an_interrupt_ends_with_130(words: tuple[str, ...]) -> None:
     restored = "import signal; signal.signal(signal.SIGINT, signal.default_int_handler)"
-    command = [sys.executable, "-u", "-c", f"{restored}; from lidarspec.cli import main; main()", *words, SIM, *SENSOR]
-    with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as running:
+    command = [
+        sys.executable,
+        "-u",
+        "-c",
+        f"{restored}; from lidarspec.cli import main; main()",
+        *words,
+        SIM,
+        *SENSOR,
+    ]
+    with subprocess.Popen(
+        command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
+    ) as running:
         assert running.stdout is not None
         assert running.stderr is not None
         for _ in range(3):
@@ -67,7 +83,9 @@ def test_an_interrupt_ends_with_130(words: tuple[str, ...]) -> None:
 
 @pytest.mark.slow
 def test_stats_of_a_simulated_sensor() -> None:
-    done = process("stats", f"sim:{ID}?errors=0.001", *SENSOR, "-t", "1.2", "--interval", "400ms", "--json")
+    done = process(
+        "stats", f"sim:{ID}?errors=0.001", *SENSOR, "-t", "1.2", "--interval", "400ms", "--json"
+    )
     *intervals, summary = [json.loads(line) for line in done.stdout.splitlines()]
     assert done.returncode == 0
     assert {line["kind"] for line in intervals} == {"interval"}
@@ -82,7 +100,12 @@ def test_stats_of_a_simulated_sensor() -> None:
 
 
 def test_stats_of_a_file(capture: Path) -> None:
-    lines = [json.loads(line) for line in ran("stats", capture, *SENSOR, "--json", "--interval", "500ms").stdout.splitlines()]
+    lines = [
+        json.loads(line)
+        for line in ran(
+            "stats", capture, *SENSOR, "--json", "--interval", "500ms"
+        ).stdout.splitlines()
+    ]
     summary = lines[-1]
     assert summary["packets"] == 3600 - 72
     assert summary["error_rate"] == pytest.approx(0.02)
@@ -104,14 +127,26 @@ def test_too_many_errors_are_a_finding(capture: Path, limit: str, code: int) -> 
 @pytest.mark.slow
 def test_read_prints_the_points_that_the_scans_have(capture: Path) -> None:
     header, *lines = ran("read", capture, *SENSOR, "-n", "5").stdout.splitlines()
-    assert " ".join(header.split()) == "scan x [m] y [m] z [m] range [m] azimuth [rad] elevation [rad] intensity time [s]"
+    assert (
+        " ".join(header.split())
+        == "scan x [m] y [m] z [m] range [m] azimuth [rad] elevation [rad] intensity time [s]"
+    )
     assert len({len(line) for line in [header, *lines]}) == 1
-    rows = [json.loads(line) for line in ran("read", capture, *SENSOR, "--json").stdout.splitlines()]
+    rows = [
+        json.loads(line) for line in ran("read", capture, *SENSOR, "--json").stdout.splitlines()
+    ]
     with ls.open(capture, ID) as device:
         clouds = [scan.points[scan.points.valid] for scan in device.scans()]
-    assert [row["scan"] for row in rows] == [number for number, cloud in enumerate(clouds) for _ in range(len(cloud))]
-    np.testing.assert_array_equal(np.array([row["x"] for row in rows], np.float32), np.concatenate([cloud.x for cloud in clouds]))
-    assert [float(value) for value in lines[0].split()[1:3]] == pytest.approx([rows[0]["x"], rows[0]["y"]], abs=1e-3)
+    assert [row["scan"] for row in rows] == [
+        number for number, cloud in enumerate(clouds) for _ in range(len(cloud))
+    ]
+    np.testing.assert_array_equal(
+        np.array([row["x"] for row in rows], np.float32),
+        np.concatenate([cloud.x for cloud in clouds]),
+    )
+    assert [float(value) for value in lines[0].split()[1:3]] == pytest.approx(
+        [rows[0]["x"], rows[0]["y"]], abs=1e-3
+    )
 
 
 def test_read_prints_packets_with_units(capture: Path) -> None:
@@ -154,13 +189,23 @@ def test_view_of_a_live_source_waits_for_a_whole_scan() -> None:
 def test_plot_writes_a_picture(capture: Path, tmp_path: Path) -> None:
     import xml.etree.ElementTree as ET
 
-    ran("plot", capture, *SENSOR, "-o", tmp_path / "scan.svg", "--scan", "3", "--color", "intensity")
+    ran(
+        "plot", capture, *SENSOR, "-o", tmp_path / "scan.svg", "--scan", "3", "--color", "intensity"
+    )
     root = ET.fromstring((tmp_path / "scan.svg").read_text(encoding="utf-8"))
-    dots = [place for path in root.findall(".//{*}path") if "dots" in path.get("class", "") for place in path.get("d", "").split("m")[1:]]
+    dots = [
+        place
+        for path in root.findall(".//{*}path")
+        if "dots" in path.get("class", "")
+        for place in path.get("d", "").split("m")[1:]
+    ]
     assert 500 < len(dots) <= 2160
     assert "10.0 Hz, " in "".join(text.text or "" for text in root.findall(".//{*}text"))
     assert ran("plot", capture, *SENSOR, "-o", "-").stdout.startswith("<svg")
-    assert "pictures are written as" in ran("plot", capture, *SENSOR, "-o", tmp_path / "scan.gif", code=2).stderr
+    assert (
+        "pictures are written as"
+        in ran("plot", capture, *SENSOR, "-o", tmp_path / "scan.gif", code=2).stderr
+    )
 
 
 @pytest.mark.parametrize(
@@ -173,7 +218,12 @@ def test_plot_writes_a_picture(capture: Path, tmp_path: Path) -> None:
     ],
 )
 def test_a_missing_library_is_named_with_its_extra(
-    capture: Path, tmp_path: Path, library: str, words: Sequence[str], extra: str, monkeypatch: pytest.MonkeyPatch
+    capture: Path,
+    tmp_path: Path,
+    library: str,
+    words: Sequence[str],
+    extra: str,
+    monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     for name in [name for name in sys.modules if name.partition(".")[0] == library]:
         monkeypatch.delitem(sys.modules, name)

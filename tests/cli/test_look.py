@@ -26,7 +26,9 @@ def test_help_imports_neither_numpy_nor_construct() -> None:
         "try:\n    main(['--help'])\nexcept SystemExit as done:\n    assert done.code == 0\n"
         "print(sorted({'numpy', 'construct', 'rich', 'pluggy', 'serial'} & set(sys.modules)))"
     )
-    done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, check=True, timeout=60)
+    done = subprocess.run(
+        [sys.executable, "-c", script], capture_output=True, text=True, check=True, timeout=60
+    )
     assert done.stdout.splitlines()[-1] == "[]"
 
 
@@ -48,9 +50,17 @@ def test_sensors_lists_what_is_installed() -> None:
     known = {item["id"]: item for item in printed("sensors")}
     assert list(known) == list(ls.sensors())
     stl = known["ldrobot-stl27l"]
-    assert (stl["vendor"], stl["model"], stl["status"], stl["distribution"]) == ("LDROBOT", "STL-27L", "vectors", "lidarspec-ldrobot")
+    assert (stl["vendor"], stl["model"], stl["status"], stl["distribution"]) == (
+        "LDROBOT",
+        "STL-27L",
+        "vectors",
+        "lidarspec-ldrobot",
+    )
     assert stl["links"] == {"data": {"kind": "serial", "bauds": [921600], "dtr": None, "rts": None}}
-    assert any(line.split()[0] == "robosense-m1" and "udp 6699/7788" in line for line in ran("sensors").stdout.splitlines())
+    assert any(
+        line.split()[0] == "robosense-m1" and "udp 6699/7788" in line
+        for line in ran("sensors").stdout.splitlines()
+    )
 
 
 def test_show_draws_the_wire_table_of_every_frame() -> None:
@@ -64,7 +74,13 @@ def test_show_draws_the_wire_table_of_every_frame() -> None:
 
 def test_show_tells_commands_and_their_bytes() -> None:
     found = printed("show", "cspc-m1c1-mini")
-    assert found["commands"]["start"] == {"frame": "command", "arguments": {}, "hex": "aa 55 f0 0f", "reply": "ack", "only_stopped": False}
+    assert found["commands"]["start"] == {
+        "frame": "command",
+        "arguments": {},
+        "hex": "aa 55 f0 0f",
+        "reply": "ack",
+        "only_stopped": False,
+    }
     assert found["frames"]["data"]["size"] == "10 + 3*lsn"
     assert "command start: aa 55 f0 0f, answered by ack" in ran("show", "cspc-m1c1-mini").stdout
 
@@ -91,7 +107,9 @@ def check_shown_sensor(sensor: str) -> None:
 @pytest.mark.slow
 def test_plugins_names_distributions() -> None:
     found = {plugin["distribution"]: plugin for plugin in printed("plugins")}
-    assert found["lidarspec-ldrobot"]["sensors"] == [name for name in ls.sensors() if name.startswith("ldrobot-")]
+    assert found["lidarspec-ldrobot"]["sensors"] == [
+        name for name in ls.sensors() if name.startswith("ldrobot-")
+    ]
 
 
 def test_output_goes_to_a_file(tmp_path) -> None:  # type: ignore[no-untyped-def]
@@ -152,7 +170,11 @@ def test_demo_counts_what_the_line_did(sensor: str) -> None:
     ],
 )
 def test_without_sensors_every_verb_says_what_to_install(
-    words: tuple[str, ...], code: int, bare_registry: Registry, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    words: tuple[str, ...],
+    code: int,
+    bare_registry: Registry,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     (tmp_path / "x.bin").write_bytes(EXAMPLE * 3)
     monkeypatch.chdir(tmp_path)
@@ -177,18 +199,26 @@ def test_on_a_terminal_of_80_columns_ids_and_fields_stay_whole() -> None:
             assert window.ended() == 0
             shown[words[0]] = window.raw.replace("\r", "").splitlines()
     assert set(ls.sensors()) <= {line.partition(" ")[0] for line in shown["sensors"]}
-    assert all(len(line) <= 80 for lines in shown.values() for line in lines if not line.startswith("  "))
+    assert all(
+        len(line) <= 80 for lines in shown.values() for line in lines if not line.startswith("  ")
+    )
     place = next(place for place, line in enumerate(shown["show"]) if "samples[i].distance" in line)
     assert shown["show"][place].split("  ")[0] == "10 + 3*i"
     assert "      0: no return" in shown["show"][place + 1 : place + 3]
 
 
 def test_the_limits_of_a_command_are_printed_with_every_digit() -> None:
-    assert "command get_config key=0..4294967295, answered" in ran("show", "slamtec-rplidar-a1").stdout
+    assert (
+        "command get_config key=0..4294967295, answered" in ran("show", "slamtec-rplidar-a1").stdout
+    )
 
 
-@pytest.mark.parametrize("words", [("explain", EXAMPLE.hex()), ("view", "x.bin", "--color", "range")])
-def test_colours_go_through_a_pipe_where_that_is_asked_for(words: tuple[str, ...], tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+@pytest.mark.parametrize(
+    "words", [("explain", EXAMPLE.hex()), ("view", "x.bin", "--color", "range")]
+)
+def test_colours_go_through_a_pipe_where_that_is_asked_for(
+    words: tuple[str, ...], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     (tmp_path / "x.bin").write_bytes(b"".join(ls.simulate(ls.sensor("ldrobot-stl27l"), 400)))
     monkeypatch.chdir(tmp_path)
     monkeypatch.delenv("NO_COLOR", raising=False)
@@ -199,7 +229,11 @@ def test_colours_go_through_a_pipe_where_that_is_asked_for(words: tuple[str, ...
 
 def test_a_share_is_written_in_per_cent_or_as_a_number_everywhere() -> None:
     for text in ("1%", "0.01"):
-        assert SHARE.convert(text, None, None) == faults_of({"errors": text, "loss": text}).errors == 0.01
+        assert (
+            SHARE.convert(text, None, None)
+            == faults_of({"errors": text, "loss": text}).errors
+            == 0.01
+        )
     assert "[default: 1%]" in ran("demo", "--help").stdout
     assert "errors" in ran("stats", "sim:ldrobot-stl27l?errors=200%", code=2).stderr
 

@@ -1,4 +1,6 @@
-"""`ports`, `detect`, `doctor` and `send` at real ports: pseudo-terminals with simulated sensors, sockets, files; and their exit codes."""
+"""`ports`, `detect`, `doctor` and `send` at real ports: pseudo-terminals with simulated sensors,
+sockets, files; and their exit codes.
+"""
 
 from __future__ import annotations
 
@@ -42,22 +44,53 @@ class TestSend:
 
     def test_what_is_not_documented_is_said(self) -> None:
         with virtual_port("cspc-m1c1-mini") as made:
-            assert "no answer is documented" in ran("send", made.path, "low_exposure", "-s", "cspc-m1c1-mini").stdout
-            assert printed("send", made.path, "high_exposure", "-s", "cspc-m1c1-mini")["confirmed"] is False
+            assert (
+                "no answer is documented"
+                in ran("send", made.path, "low_exposure", "-s", "cspc-m1c1-mini").stdout
+            )
+            assert (
+                printed("send", made.path, "high_exposure", "-s", "cspc-m1c1-mini")["confirmed"]
+                is False
+            )
 
     def test_arguments_bring_their_units(self) -> None:
         with virtual_port("slamtec-rplidar-s2") as made:
             ran("send", made.path, "motor_speed", "speed=10Hz", "-s", "slamtec-rplidar-s2")
-            told = printed("send", made.path, "get_max_distance", "mode=0x1", "-s", "slamtec-rplidar-s2")
-            assert {value["path"]: value.get("unit") for value in told["values"]}["value.max_distance"] == "m"
-            for words in (["motor_speed", "speed=3m"], ["motor_speed", "speed"], ["motor_speed", "speed=fast"], ["motor_speed", "pace=1"]):
+            told = printed(
+                "send", made.path, "get_max_distance", "mode=0x1", "-s", "slamtec-rplidar-s2"
+            )
+            assert {value["path"]: value.get("unit") for value in told["values"]}[
+                "value.max_distance"
+            ] == "m"
+            for words in (
+                ["motor_speed", "speed=3m"],
+                ["motor_speed", "speed"],
+                ["motor_speed", "speed=fast"],
+                ["motor_speed", "pace=1"],
+            ):
                 ran("send", made.path, *words, "-s", "slamtec-rplidar-s2", code=2)
-            assert "did you mean 'motor_speed'" in ran("send", made.path, "motor_sped", "-s", "slamtec-rplidar-s2", code=2).stderr
-            assert "outside" in ran("send", made.path, "motor_speed", "speed=70000", "-s", "slamtec-rplidar-s2", code=2).stderr
+            assert (
+                "did you mean 'motor_speed'"
+                in ran("send", made.path, "motor_sped", "-s", "slamtec-rplidar-s2", code=2).stderr
+            )
+            assert (
+                "outside"
+                in ran(
+                    "send",
+                    made.path,
+                    "motor_speed",
+                    "speed=70000",
+                    "-s",
+                    "slamtec-rplidar-s2",
+                    code=2,
+                ).stderr
+            )
 
     def test_a_dead_device_is_its_own_fault(self, tmp_path: Path) -> None:
         with port(tmp_path) as made:
-            found = ran("send", made.name, "start", "-s", "cspc-m1c1-mini", "--timeout", "200ms", code=5)
+            found = ran(
+                "send", made.name, "start", "-s", "cspc-m1c1-mini", "--timeout", "200ms", code=5
+            )
         assert "no ack frame came within 0.2 s" in found.stderr
         assert f"next: lidarspec doctor {made.name} -s cspc-m1c1-mini" in found.stderr
 
@@ -71,7 +104,9 @@ class TestSend:
 
     def test_a_port_in_use(self) -> None:
         with virtual_port("ldrobot-stl27l") as made, ls.open(made.path, "ldrobot-stl27l"):
-            assert "in use" in ran("send", made.path, "start", "-s", "cspc-m1c1-mini", code=3).stderr
+            assert (
+                "in use" in ran("send", made.path, "start", "-s", "cspc-m1c1-mini", code=3).stderr
+            )
 
 
 class TestDetect:
@@ -84,7 +119,9 @@ class TestDetect:
         row = next(line.split() for line in found.stdout.splitlines() if "stl27l" in line)
         assert row[1:3] == ["ldrobot-stl27l", "yes"]
         assert told["sources"][0]["sensor"] == "ldrobot-stl27l"
-        alike = {f"ldrobot-{name}" for name in ("stl27l", "ld06", "ld14", "ld14p", "ld20", "stl06p")}
+        alike = {
+            f"ldrobot-{name}" for name in ("stl27l", "ld06", "ld14", "ld14p", "ld20", "stl06p")
+        }
         assert {fit["sensor"] for fit in told["sources"][0]["fits"]} == alike
 
     @pytest.mark.slow
@@ -93,20 +130,28 @@ class TestDetect:
             found = ran("detect", made.path, "-t", "300ms", code=5)
             assert "nothing came" in found.stderr
             assert f"next: lidarspec detect {made.path} --start" in found.stderr
-            assert "info.model says M1C1_Mini" in ran("detect", made.path, "-t", "300ms", "--start").stdout
+            assert (
+                "info.model says M1C1_Mini"
+                in ran("detect", made.path, "-t", "300ms", "--start").stdout
+            )
 
     @pytest.mark.slow
     def test_unknown_bytes_are_taken_apart(self, tmp_path: Path) -> None:
         source = random.Random(3)
         bodies = [b"\x99\x88\x77" + bytes([index]) + source.randbytes(20) for index in range(60)]
         path = tmp_path / "unknown.bin"
-        path.write_bytes(b"".join(body + Crc(16, 0x8005, 0xFFFF, True, True)(body).to_bytes(2, "little") for body in bodies))
+        path.write_bytes(
+            b"".join(
+                body + Crc(16, 0x8005, 0xFFFF, True, True)(body).to_bytes(2, "little")
+                for body in bodies
+            )
+        )
         found = ran("detect", path, code=4)
         assert "sync      99 88 77" in found.stdout
         assert "26 bytes each: 60 of them" in found.stdout
         assert (
-            "checksum  Crc(width=16, poly=0x8005, init=0xFFFF, refin=True, refout=True) in the last 2 bytes: right in 60 of 60"
-            in found.stdout
+            "checksum  Crc(width=16, poly=0x8005, init=0xFFFF, refin=True, refout=True) in the last"
+            " 2 bytes: right in 60 of 60" in found.stdout
         )
         told = json.loads(ran("detect", path, "--json", code=4).stdout)
         assert (told["sources"][0]["sensor"], told["structure"]["period"]) == (None, 26)
@@ -114,7 +159,10 @@ class TestDetect:
 
     def test_noise_is_noise(self, tmp_path: Path) -> None:
         (tmp_path / "noise.bin").write_bytes(random.Random(9).randbytes(9000))
-        assert "nor can frames of one kind be seen" in ran("detect", tmp_path / "noise.bin", code=4).stderr
+        assert (
+            "nor can frames of one kind be seen"
+            in ran("detect", tmp_path / "noise.bin", code=4).stderr
+        )
         (tmp_path / "empty.bin").write_bytes(b"")
         ran("detect", tmp_path / "empty.bin", code=4)
         ran("detect", tmp_path / "none.bin", code=3)
@@ -122,13 +170,17 @@ class TestDetect:
 
     def test_sources_with_the_same_frames_are_a_question(self, tmp_path: Path) -> None:
         sensor = ls.sensor("slamtec-rplidar-s2")
-        (tmp_path / "nodes.bin").write_bytes(sensor.build("scan_descriptor") + b"".join(simulate(sensor, 300)))
+        (tmp_path / "nodes.bin").write_bytes(
+            sensor.build("scan_descriptor") + b"".join(simulate(sensor, 300))
+        )
         found = ran("detect", tmp_path / "nodes.bin")
         assert "slamtec-rplidar-a1, slamtec-rplidar-a2, " in found.stderr
         assert "slamtec-rplidar-t1 send the same frames" in found.stderr
         assert found.stdout.count("perhaps") == 9
 
-    def test_all_ports_are_listened_to_at_the_same_time(self, monkeypatch: pytest.MonkeyPatch) -> None:
+    def test_all_ports_are_listened_to_at_the_same_time(
+        self, monkeypatch: pytest.MonkeyPatch
+    ) -> None:
         both = threading.Barrier(2)
 
         def listened(source: str, duration: float, *, start: bool) -> list[Verdict]:
@@ -136,7 +188,10 @@ class TestDetect:
             return [Verdict(Heard(source))]
 
         monkeypatch.setattr("lidarspec.cli.finding._one", listened)
-        monkeypatch.setattr("lidarspec.cli.finding.serial_ports", lambda: [SerialPort("/dev/ttyUSB0", "", "", True, ())])
+        monkeypatch.setattr(
+            "lidarspec.cli.finding.serial_ports",
+            lambda: [SerialPort("/dev/ttyUSB0", "", "", True, ())],
+        )
         monkeypatch.setattr("lidarspec.cli.finding.udp_ports", lambda: [2368])
         told = json.loads(ran("detect", "--json", code=5).stdout)
         assert [one["source"] for one in told["sources"]] == ["/dev/ttyUSB0", "udp://:2368"]
@@ -145,7 +200,11 @@ class TestDetect:
     def test_all_udp_ports_without_a_source(self) -> None:
         with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as sender:
             frames = simulate(ls.sensor("robosense-m1"), 40)
-            with working(lambda stop: paced(lambda data: sender.sendto(data, ("127.0.0.1", 6699)), frames, 200, stop)):
+            with working(
+                lambda stop: paced(
+                    lambda data: sender.sendto(data, ("127.0.0.1", 6699)), frames, 200, stop
+                )
+            ):
                 found = ran("detect", "-t", "400ms")
         assert "next: lidarspec view udp://:6699 -s robosense-m1" in found.stderr
 
@@ -159,7 +218,9 @@ class TestPorts:
             "import socket; s = socket.socket(socket.AF_INET, socket.SOCK_DGRAM); "
             "s.bind(('127.0.0.1', 7788)); print(1, flush=True); input()"
         )
-        with subprocess.Popen([sys.executable, "-c", script], stdin=subprocess.PIPE, stdout=subprocess.PIPE) as other:
+        with subprocess.Popen(
+            [sys.executable, "-c", script], stdin=subprocess.PIPE, stdout=subprocess.PIPE
+        ) as other:
             assert other.stdout is not None
             other.stdout.readline()
             busy = {one["port"]: one for one in printed("ports")["udp"]}[7788]
@@ -198,15 +259,23 @@ class TestDoctor:
     def test_a_file_is_held_against_the_sensor_that_is_named(self, tmp_path: Path) -> None:
         path = tmp_path / "vlp16.bin"
         path.write_bytes(b"".join(simulate(ls.sensor("velodyne-vlp16"), 60)))
-        assert "ok     velodyne-vlp16 sends: 60 data frames" in ran("doctor", path, "-s", "velodyne-vlp16").stdout
+        assert (
+            "ok     velodyne-vlp16 sends: 60 data frames"
+            in ran("doctor", path, "-s", "velodyne-vlp16").stdout
+        )
         for name in ("velodyne-hdl32e", "robosense-m1"):
             assert f", not of {name}\n" in ran("doctor", path, "-s", name, code=1).stdout
 
     @pytest.mark.parametrize(("damaged", "code"), [(0.03, 0), (0.3, 1), (0.6, 1)])
-    def test_a_line_is_bad_where_more_than_a_tenth_of_its_bytes_is_in_no_frame(self, tmp_path: Path, damaged: float, code: int) -> None:
+    def test_a_line_is_bad_where_more_than_a_tenth_of_its_bytes_is_in_no_frame(
+        self, tmp_path: Path, damaged: float, code: int
+    ) -> None:
         frames = simulate(ls.sensor("ldrobot-stl27l"), 60)
         for size in (60, 300):
-            data = [bytes(47) if (i * damaged) % 1 < damaged else frame for i, frame in enumerate((frames * 5)[:size])]
+            data = [
+                bytes(47) if (i * damaged) % 1 < damaged else frame
+                for i, frame in enumerate((frames * 5)[:size])
+            ]
             (tmp_path / "line.bin").write_bytes(b"".join(data))
             said = ran("doctor", tmp_path / "line.bin", "-s", "ldrobot-stl27l", code=code).stdout
             assert said.startswith("wrong" if code else "ok")
@@ -220,11 +289,22 @@ class TestDoctor:
     @pytest.mark.slow
     def test_a_missing_port_and_one_in_use(self) -> None:
         assert self._told("/dev/ttyNONE7") == [
-            {"ok": False, "text": "/dev/ttyNONE7: no such port; it is not plugged in, or its driver is missing", "mend": "lidarspec ports"}
+            {
+                "ok": False,
+                "text": (
+                    "/dev/ttyNONE7: no such port; it is not plugged in, or its driver is missing"
+                ),
+                "mend": "lidarspec ports",
+            }
         ]
         with virtual_port("ldrobot-stl27l") as made:
-            script = f"import lidarspec as ls; d = ls.open({made.path!r}, 'ldrobot-stl27l'); print(1, flush=True); input()"
-            with subprocess.Popen([sys.executable, "-c", script], stdin=subprocess.PIPE, stdout=subprocess.PIPE) as other:
+            script = (
+                f"import lidarspec as ls; d = ls.open({made.path!r}, 'ldrobot-stl27l'); print(1,"
+                " flush=True); input()"
+            )
+            with subprocess.Popen(
+                [sys.executable, "-c", script], stdin=subprocess.PIPE, stdout=subprocess.PIPE
+            ) as other:
                 assert other.stdout is not None
                 assert other.stdin is not None
                 other.stdout.readline()
@@ -235,7 +315,12 @@ class TestDoctor:
     @pytest.mark.slow
     def test_bytes_of_nobody(self, tmp_path: Path) -> None:
         source = random.Random(8)
-        with port(tmp_path) as made, working(lambda stop: paced(made.offer, [source.randbytes(90) for _ in range(40)], 200, stop)):
+        with (
+            port(tmp_path) as made,
+            working(
+                lambda stop: paced(made.offer, [source.randbytes(90) for _ in range(40)], 200, stop)
+            ),
+        ):
             found = ran("doctor", made.name, "-t", "300ms", code=1).stdout
         assert "no frame of an installed sensor" in found
         assert f"next: lidarspec detect {made.name}" in found
@@ -253,17 +338,28 @@ class TestDoctor:
             number = free.getsockname()[1]
         silent = self._told(f"udp://127.0.0.1:{number}", "-t", "300ms")
         assert any("nothing came" in finding["text"] for finding in silent)
-        assert any("only packets to 127.0.0.1 are listened to" in finding["text"] for finding in silent)
+        assert any(
+            "only packets to 127.0.0.1 are listened to" in finding["text"] for finding in silent
+        )
         with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as sender:
             frames = simulate(ls.sensor("robosense-m1"), 40)
-            with working(lambda stop: paced(lambda data: sender.sendto(data, ("127.0.0.1", number)), frames, 200, stop)):
+            with working(
+                lambda stop: paced(
+                    lambda data: sender.sendto(data, ("127.0.0.1", number)), frames, 200, stop
+                )
+            ):
                 well = self._told(f"udp://127.0.0.1:{number}", "-t", "500ms")
                 other = f"udp://127.0.0.1:{number}?src=127.0.0.9"
-                instead, detected = self._told(other, "-t", "500ms"), ran("detect", other, "-t", "500ms", code=5).stderr
+                instead, detected = (
+                    self._told(other, "-t", "500ms"),
+                    ran("detect", other, "-t", "500ms", code=5).stderr,
+                )
         assert any(finding["ok"] and "robosense-m1 sends" in finding["text"] for finding in well)
         for said in (detected, "".join(finding["text"] for finding in instead)):
             assert re.search(
-                r"nothing came from the sender that is asked for, and \d+ datagrams came from others, such as 127.0.0.1:", said
+                r"nothing came from the sender that is asked for, and \d+ datagrams came from"
+                r" others, such as 127.0.0.1:",
+                said,
             )
 
     @pytest.mark.slow
@@ -285,7 +381,10 @@ def test_bytes_sent_by_hand_are_answered_and_the_answer_is_explained() -> None:
     assert said.stdout.startswith("slamtec-rplidar-a1 info, 27 bytes\n0000  a5 5a ")
     assert said.stderr == "sent 2 bytes: a5 50\n"
     told = printed("send", "sim:cspc-m1c1-mini", "--hex", "aa55f00f", "-s", "cspc-m1c1-mini")
-    assert (told["sent"], told["frames"][0]["frame"]) == ("aa 55 f0 0f", "ack")  # what follows it comes sooner or later
+    assert (told["sent"], told["frames"][0]["frame"]) == (
+        "aa 55 f0 0f",
+        "ack",
+    )  # what follows it comes sooner or later
     streaming = ran("send", "sim:ldrobot-stl27l", "--hex", "00", "--timeout", "300ms")
     assert streaming.stdout == ""
     assert "data frames came meanwhile\nnothing came back\n" in streaming.stderr
@@ -294,7 +393,11 @@ def test_bytes_sent_by_hand_are_answered_and_the_answer_is_explained() -> None:
 
 
 @pytest.mark.parametrize("source", [(), ("udp://:45999",)])
-def test_detect_exits_with_5_if_live_sources_are_silent(source: tuple[str, ...], monkeypatch: pytest.MonkeyPatch) -> None:
+def test_detect_exits_with_5_if_live_sources_are_silent(
+    source: tuple[str, ...], monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.setattr("lidarspec.cli.finding._everywhere", lambda duration, start: iter([]))
-    monkeypatch.setattr("lidarspec.cli.finding._one", lambda source, duration, start, tell: [Verdict(Heard(source))])
+    monkeypatch.setattr(
+        "lidarspec.cli.finding._one", lambda source, duration, start, tell: [Verdict(Heard(source))]
+    )
     assert ran("detect", *source, code=5).stderr.startswith("nothing came\n")

@@ -50,7 +50,14 @@ def datagrams(tmp_path: Path) -> Path:
     some = frames(DATAGRAMS, 3)
     with Recorder(path, DATAGRAMS, "udp://") as kept:
         for number in range(30):
-            kept.write(Chunk(some[number % 3], 10**18 + number * 5_000_000, ("10.0.0.1", 2368), ("10.0.0.2", 2368)))
+            kept.write(
+                Chunk(
+                    some[number % 3],
+                    10**18 + number * 5_000_000,
+                    ("10.0.0.1", 2368),
+                    ("10.0.0.2", 2368),
+                )
+            )
     return path
 
 
@@ -60,7 +67,9 @@ class Running:
     def __init__(self, *words: object, folder: Path) -> None:
         command = [sys.executable, "-m", "lidarspec", *map(str, words)]
         self._said, self._lines = "", threading.Condition()
-        self.child = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, cwd=folder, text=True)
+        self.child = subprocess.Popen(
+            command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, cwd=folder, text=True
+        )
         self._listener = threading.Thread(target=self._listen)
         self._listener.start()
 
@@ -124,25 +133,44 @@ def test_a_simulated_sensor_is_known_and_started(tmp_path: Path) -> None:
 
 
 def test_nothing_is_sent_to_a_simulated_sensor_where_that_is_asked_for(tmp_path: Path) -> None:
-    ran("record", "sim:slamtec-rplidar-a1", "-o", tmp_path / "a.lsr", "-t", "0.2", "--no-start", code=5)
+    ran(
+        "record",
+        "sim:slamtec-rplidar-a1",
+        "-o",
+        tmp_path / "a.lsr",
+        "-t",
+        "0.2",
+        "--no-start",
+        code=5,
+    )
 
 
 @pytest.mark.slow
 @posix
-def test_recorded_replayed_and_recorded_again_it_is_the_same(stream: Path, tmp_path: Path, started: Callable[..., Running]) -> None:
+def test_recorded_replayed_and_recorded_again_it_is_the_same(
+    stream: Path, tmp_path: Path, started: Callable[..., Running]
+) -> None:
     player = started("replay", stream, "--json")
     place = player.hears(r"playing \S+ to (/dev/\S+),")[1]
     assert player.hears("next: (.*)")[1] == f"lidarspec view {place} -s {STREAM}"
     again = tmp_path / "again.lsr"
     ran("record", place, "-s", STREAM, "-o", again, "-n", 40)
     assert player.ended(0)
-    assert hashlib.sha256(received(again)).hexdigest() == hashlib.sha256(received(stream)).hexdigest()
+    assert (
+        hashlib.sha256(received(again)).hexdigest() == hashlib.sha256(received(stream)).hexdigest()
+    )
     with Recording(again) as recording:
-        assert (recording.header.sensor, recording.header.source, recording.header.baud) == (STREAM, place, 921600)
+        assert (recording.header.sensor, recording.header.source, recording.header.baud) == (
+            STREAM,
+            place,
+            921600,
+        )
         times = [item.at for item in recording if item.direction == "in" and item.at]
     assert 0.19 < (times[-1] - times[0]) / 1e9 < 0.2 * SLACK
     with ls.open(stream) as one, ls.open(again) as other:
-        assert [p.raw.tobytes() for p in one.packets()] == [p.raw.tobytes() for p in other.packets()]
+        assert [p.raw.tobytes() for p in one.packets()] == [
+            p.raw.tobytes() for p in other.packets()
+        ]
 
 
 @pytest.mark.slow
@@ -158,7 +186,9 @@ def test_datagrams_recorded_from_a_socket_as_capture_and_recording(
         ran("replay", datagrams, "--to", place)
         assert "30 packets, 30 records" in taker.ended(0)
         with ls.open(datagrams) as one, ls.open(tmp_path / name, DATAGRAMS) as other:
-            before, after = (b"".join(p.raw.tobytes() for p in device.packets()) for device in (one, other))
+            before, after = (
+                b"".join(p.raw.tobytes() for p in device.packets()) for device in (one, other)
+            )
         assert before == after
 
 
@@ -190,7 +220,9 @@ def received_so_far(path: Path) -> int:
 
 @pytest.mark.slow
 @posix
-def test_without_a_sensor_bytes_are_recorded_as_they_come(tmp_path: Path, started: Callable[..., Running]) -> None:
+def test_without_a_sensor_bytes_are_recorded_as_they_come(
+    tmp_path: Path, started: Callable[..., Running]
+) -> None:
     with port(tmp_path) as line:
         taker = started("record", f"{line.name}?baud=115200", "-o", "raw.lsr", "-t", "1s")
         deadline = time.monotonic() + 60
@@ -222,7 +254,9 @@ def test_standard_input_gets_the_times_of_its_arrival(tmp_path: Path) -> None:
     before = time.time_ns()
     ran("record", "-", "-o", tmp_path / "it.lsr", given=b"abc")
     with Recording(tmp_path / "it.lsr") as recording:
-        assert [(item.data, before <= (item.at or 0) <= time.time_ns()) for item in recording] == [(b"abc", True)]
+        assert [(item.data, before <= (item.at or 0) <= time.time_ns()) for item in recording] == [
+            (b"abc", True)
+        ]
 
 
 def test_damaged_recordings_are_mended(stream: Path, tmp_path: Path) -> None:
@@ -232,7 +266,10 @@ def test_damaged_recordings_are_mended(stream: Path, tmp_path: Path) -> None:
     said = ran("record", stream, "-o", tmp_path / "stopped.lsr").stderr
     assert "damaged at byte" in said
     assert f"next: lidarspec record {stream} --salvage" in said
-    assert "damaged in 1 place" in ran("record", stream, "--salvage", "-o", tmp_path / "mended.lsr").stderr
+    assert (
+        "damaged in 1 place"
+        in ran("record", stream, "--salvage", "-o", tmp_path / "mended.lsr").stderr
+    )
     with ls.open(tmp_path / "mended.lsr") as device:
         assert sum(len(packets) for packets in device.packets()) == 39
 
@@ -249,7 +286,9 @@ def test_an_old_recording_stays_where_the_source_is_silent(tmp_path: Path) -> No
 
 
 @pytest.mark.parametrize("verb", [("record", "-o"), ("replay", "--to")])
-def test_nothing_is_overwritten_without_force(stream: Path, tmp_path: Path, verb: tuple[str, str]) -> None:
+def test_nothing_is_overwritten_without_force(
+    stream: Path, tmp_path: Path, verb: tuple[str, str]
+) -> None:
     target = tmp_path / "it.lsr"
     target.write_bytes(b"precious")
     result = ran(verb[0], stream, verb[1], target, code=2)
@@ -264,28 +303,57 @@ def test_nothing_is_overwritten_without_force(stream: Path, tmp_path: Path, verb
 
 def test_what_cannot_be_recorded_says_why(stream: Path, datagrams: Path, tmp_path: Path) -> None:
     ran("record", stream, "-o", tmp_path / "raw.bin")
-    assert "byte stream" in ran("record", tmp_path / "raw.bin", "-o", tmp_path / "it.pcap", code=2).stderr
-    assert "where a datagram ends" in ran("record", datagrams, "-o", tmp_path / "it.bin", code=2).stderr
-    assert "unknown format '.csv'" in ran("record", stream, "-o", tmp_path / "it.csv", code=2).stderr
-    assert "-n counts packets" in ran("record", stream, "-o", tmp_path / "it.lsr", "-n", 3, code=2).stderr
-    assert "No such file" in ran("record", tmp_path / "nowhere.lsr", "-o", tmp_path / "it.lsr", code=3).stderr
-    assert "next: lidarspec" in ran("record", "/dev/ttyNONE", "-s", STREAM, "-o", tmp_path / "it.lsr", code=3).stderr
+    assert (
+        "byte stream"
+        in ran("record", tmp_path / "raw.bin", "-o", tmp_path / "it.pcap", code=2).stderr
+    )
+    assert (
+        "where a datagram ends"
+        in ran("record", datagrams, "-o", tmp_path / "it.bin", code=2).stderr
+    )
+    assert (
+        "unknown format '.csv'" in ran("record", stream, "-o", tmp_path / "it.csv", code=2).stderr
+    )
+    assert (
+        "-n counts packets"
+        in ran("record", stream, "-o", tmp_path / "it.lsr", "-n", 3, code=2).stderr
+    )
+    assert (
+        "No such file"
+        in ran("record", tmp_path / "nowhere.lsr", "-o", tmp_path / "it.lsr", code=3).stderr
+    )
+    assert (
+        "next: lidarspec"
+        in ran("record", "/dev/ttyNONE", "-s", STREAM, "-o", tmp_path / "it.lsr", code=3).stderr
+    )
     assert not (tmp_path / "it.lsr").exists()
     (tmp_path / "empty.bin").touch()
-    assert "holds nothing" in ran("record", tmp_path / "empty.bin", "-o", tmp_path / "it.lsr", code=4).stderr
+    assert (
+        "holds nothing"
+        in ran("record", tmp_path / "empty.bin", "-o", tmp_path / "it.lsr", code=4).stderr
+    )
     assert not (tmp_path / "it.lsr").exists()
 
 
 def test_a_silent_source_leaves_no_empty_file(tmp_path: Path) -> None:
-    assert "sent nothing" in ran("record", "udp://127.0.0.1:45671", "-t", "0.2", "-o", tmp_path / "it.lsr", code=5).stderr
+    assert (
+        "sent nothing"
+        in ran(
+            "record", "udp://127.0.0.1:45671", "-t", "0.2", "-o", tmp_path / "it.lsr", code=5
+        ).stderr
+    )
     assert not (tmp_path / "it.lsr").exists()
 
 
-@pytest.mark.skipif(not hasattr(os, "geteuid") or os.geteuid() != 0, reason="only root may mount a small disk")
+@pytest.mark.skipif(
+    not hasattr(os, "geteuid") or os.geteuid() != 0, reason="only root may mount a small disk"
+)
 def test_a_full_disk_ends_it_with_one_line_and_a_whole_file(tmp_path: Path, stream: Path) -> None:
     disk = tmp_path / "disk"
     disk.mkdir()
-    made = subprocess.run(["mount", "-t", "tmpfs", "-o", "size=64k", "tmpfs", disk], capture_output=True, check=False)
+    made = subprocess.run(
+        ["mount", "-t", "tmpfs", "-o", "size=64k", "tmpfs", disk], capture_output=True, check=False
+    )
     if made.returncode:
         pytest.skip(f"no disk can be mounted here: {made.stderr.decode().strip()}")
     try:
@@ -293,7 +361,10 @@ def test_a_full_disk_ends_it_with_one_line_and_a_whole_file(tmp_path: Path, stre
         with open(tmp_path / "long.bin", "wb") as file:
             file.write(received(stream) * 100)
         result = ran("record", tmp_path / "long.bin", "-s", STREAM, "-o", disk / "it.lsr", code=3)
-        assert re.fullmatch(r".*No space left on device; the recording is whole up to byte \d+\n  next: .*\n", result.stderr), result.stderr
+        assert re.fullmatch(
+            r".*No space left on device; the recording is whole up to byte \d+\n  next: .*\n",
+            result.stderr,
+        ), result.stderr
         with Recording(disk / "it.lsr") as recording:
             list(recording)
             assert recording.leftover == 0
@@ -303,23 +374,39 @@ def test_a_full_disk_ends_it_with_one_line_and_a_whole_file(tmp_path: Path, stre
 
 def test_replays_say_what_they_cannot_do(stream: Path, datagrams: Path, tmp_path: Path) -> None:
     assert "datagrams were recorded" in ran("replay", datagrams, "--to", "pty", code=2).stderr
-    assert "a byte stream was recorded" in ran("replay", stream, "--to", "udp://127.0.0.1:9", code=2).stderr
+    assert (
+        "a byte stream was recorded"
+        in ran("replay", stream, "--to", "udp://127.0.0.1:9", code=2).stderr
+    )
     assert "is live" in ran("replay", "udp://:2368", code=2).stderr
     assert "no speed" in ran("replay", stream, "--speed", "0", code=2).stderr
-    assert "never ends" in ran("replay", stream, "--to", tmp_path / "it.lsr", "--loop", code=2).stderr
+    assert (
+        "never ends" in ran("replay", stream, "--to", tmp_path / "it.lsr", "--loop", code=2).stderr
+    )
     raw = tmp_path / "it.bin"
     raw.write_bytes(received(stream))
-    assert "when its bytes arrived" in ran("replay", raw, "--speed", "1", "--to", tmp_path / "it.lsr", code=2).stderr
+    assert (
+        "when its bytes arrived"
+        in ran("replay", raw, "--speed", "1", "--to", tmp_path / "it.lsr", code=2).stderr
+    )
 
 
 def test_a_replay_sums_up_with_a_digest(datagrams: Path) -> None:
-    found = json.loads(ran("replay", datagrams, "--to", "udp://127.0.0.1:45672", "--speed", "10x", "--json").stdout)
-    assert (found["chunks"], found["bytes"], found["sha256"]) == (30, 36180, hashlib.sha256(received(datagrams)).hexdigest())
+    found = json.loads(
+        ran("replay", datagrams, "--to", "udp://127.0.0.1:45672", "--speed", "10x", "--json").stdout
+    )
+    assert (found["chunks"], found["bytes"], found["sha256"]) == (
+        30,
+        36180,
+        hashlib.sha256(received(datagrams)).hexdigest(),
+    )
 
 
 @pytest.mark.slow
 @posix
-def test_a_loop_serves_one_reader_after_another_until_ctrl_c(stream: Path, tmp_path: Path, started: Callable[..., Running]) -> None:
+def test_a_loop_serves_one_reader_after_another_until_ctrl_c(
+    stream: Path, tmp_path: Path, started: Callable[..., Running]
+) -> None:
     player = started("replay", stream, "--loop")
     place = player.hears(r"playing \S+ to (/dev/\S+),")[1]
     for number, name in enumerate(("one.lsr", "two.lsr"), start=1):

@@ -1,4 +1,6 @@
-"""The same words select in every verb that reads; what selects nothing is said in one line, and nothing is written."""
+"""The same words select in every verb that reads; what selects nothing is said in one line, and
+nothing is written.
+"""
 
 from __future__ import annotations
 
@@ -26,14 +28,26 @@ def drive(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 def test_convert_writes_what_is_selected(drive: Path, tmp_path: Path) -> None:
     target = tmp_path / "out.csv"
-    words = ("--slice", "500ms:1.5s", "--every", "4", "--range", "1.5m:300cm", "--columns", "range,ring")
+    words = (
+        "--slice",
+        "500ms:1.5s",
+        "--every",
+        "4",
+        "--range",
+        "1.5m:300cm",
+        "--columns",
+        "range,ring",
+    )
     assert "of 3 scans" in ran("convert", drive, target, *words).stderr
     with target.open(encoding="ascii", newline="") as file:
         rows = list(csv.DictReader(file))
     assert list(rows[0]) == ["range", "ring", "scan"]
     ranges = [float(row["range"]) for row in rows]
     assert 1.5 <= min(ranges) < max(ranges) <= 3
-    assert printed("convert", drive, tmp_path / "all.npz", "--scans", "3:5", "--all")["points"] == 57888
+    assert (
+        printed("convert", drive, tmp_path / "all.npz", "--scans", "3:5", "--all")["points"]
+        == 57888
+    )
 
 
 def test_an_organised_scan_is_rows_and_columns(drive: Path, tmp_path: Path) -> None:
@@ -58,7 +72,9 @@ def test_messages_have_the_beams_and_the_frame(tmp_path: Path) -> None:
     ran("sim", "ldrobot-stl27l", "--to", source, "-t", "1s")
     ran("convert", source, target, "--beams", "450", "--frame-id", "front", "--time", "host")
     with rosbags.AnyReader([target]) as log:
-        messages = [log.deserialize(raw, link.msgtype) for link, _, raw in log.messages(log.connections)]
+        messages = [
+            log.deserialize(raw, link.msgtype) for link, _, raw in log.messages(log.connections)
+        ]
     assert {message.header.frame_id for message in messages} == {"front"}
     planar = [message for message in messages if hasattr(message, "ranges")]
     assert {len(message.ranges) for message in planar} == {450}
@@ -68,16 +84,34 @@ def test_messages_have_the_beams_and_the_frame(tmp_path: Path) -> None:
 
 @pytest.mark.slow
 def test_every_verb_takes_the_same_slice(drive: Path, tmp_path: Path) -> None:
-    rows = [json.loads(line) for line in ran("read", drive, "--slice", "1s:1.02s", "--columns", "x", "--json").stdout.splitlines()]
+    rows = [
+        json.loads(line)
+        for line in ran(
+            "read", drive, "--slice", "1s:1.02s", "--columns", "x", "--json"
+        ).stdout.splitlines()
+    ]
     assert {row["scan"] for row in rows} == {0}
     assert {*rows[0]} == {"scan", "x"}
-    packets = [json.loads(line) for line in ran("read", drive, "--packets", "--slice", "1s:1.02s", "--json").stdout.splitlines()]
+    packets = [
+        json.loads(line)
+        for line in ran(
+            "read", drive, "--packets", "--slice", "1s:1.02s", "--json"
+        ).stdout.splitlines()
+    ]
     assert 13 < len(packets) < 17
-    figures = json.loads(ran("stats", drive, "--slice", "1s:1.5s", "--json").stdout.splitlines()[-1])
+    figures = json.loads(
+        ran("stats", drive, "--slice", "1s:1.5s", "--json").stdout.splitlines()[-1]
+    )
     assert figures["scans"] == 5
     assert 370 < figures["packets"] < 380
-    for selecting in (["--slice", "1s:1.5s", "--range", ":2m"], ["--scans", "12:13", "--range", ":2m"]):
-        assert re.search(r"\.\.1\.9\d m, complete\); colours: range 0 to 2 m", ran("view", drive, "--once", *selecting).stdout)
+    for selecting in (
+        ["--slice", "1s:1.5s", "--range", ":2m"],
+        ["--scans", "12:13", "--range", ":2m"],
+    ):
+        assert re.search(
+            r"\.\.1\.9\d m, complete\); colours: range 0 to 2 m",
+            ran("view", drive, "--once", *selecting).stdout,
+        )
         ran("plot", drive, "-o", tmp_path / "out.svg", *selecting)
     frames = printed("parse", drive, "--slice", "1s:1.02s")["frames"]
     assert [frame["frame"] for frame in frames].count("data") in range(13, 17)
@@ -86,7 +120,9 @@ def test_every_verb_takes_the_same_slice(drive: Path, tmp_path: Path) -> None:
     with Recording(drive) as whole, Recording(tmp_path / "part.lsr") as part:
         records = list(whole)
         first = records[0].at or 0
-        assert list(part) == [record for record in records if 5 * 10**8 <= (record.at or 0) - first < 10**9]
+        assert list(part) == [
+            record for record in records if 5 * 10**8 <= (record.at or 0) - first < 10**9
+        ]
 
 
 def test_organised_points_of_several_scans_and_of_none(drive: Path, tmp_path: Path) -> None:
@@ -94,7 +130,9 @@ def test_organised_points_of_several_scans_and_of_none(drive: Path, tmp_path: Pa
     assert "holds the rows and columns of one scan, and there are several" in failed.stderr
     source = tmp_path / "in.bin"
     source.write_bytes(EXAMPLE * 3)
-    failed = ran("convert", source, tmp_path / "out.npy", "--organized", "-s", "ldrobot-stl27l", code=2)
+    failed = ran(
+        "convert", source, tmp_path / "out.npy", "--organized", "-s", "ldrobot-stl27l", code=2
+    )
     assert "its points have no rows and columns" in failed.stderr
     assert [path.name for path in tmp_path.iterdir()] == ["in.bin"]
 
@@ -102,6 +140,27 @@ def test_organised_points_of_several_scans_and_of_none(drive: Path, tmp_path: Pa
 def test_a_unit_has_its_calibration(drive: Path, tmp_path: Path) -> None:
     wrong = tmp_path / "unit.xml"
     wrong.write_text("none", encoding="ascii")
-    by_option = ran("convert", drive, tmp_path / "out.csv", "-s", "velodyne-hdl64e-s2", "-O", f"calibration={wrong}", code=2).stderr
+    by_option = ran(
+        "convert",
+        drive,
+        tmp_path / "out.csv",
+        "-s",
+        "velodyne-hdl64e-s2",
+        "-O",
+        f"calibration={wrong}",
+        code=2,
+    ).stderr
     assert str(wrong) in by_option
-    assert ran("convert", drive, tmp_path / "out.csv", "-s", "velodyne-hdl64e-s2", "--calibration", wrong, code=2).stderr == by_option
+    assert (
+        ran(
+            "convert",
+            drive,
+            tmp_path / "out.csv",
+            "-s",
+            "velodyne-hdl64e-s2",
+            "--calibration",
+            wrong,
+            code=2,
+        ).stderr
+        == by_option
+    )

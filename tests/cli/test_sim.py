@@ -34,8 +34,12 @@ def begun(*words: object) -> tuple[subprocess.Popen[str], str]:
 
 
 @posix
-@pytest.mark.parametrize("number", [signal.SIGINT, pytest.param(signal.SIGTERM, marks=pytest.mark.slow)])
-def test_it_is_read_by_another_program_and_ends_cleanly(number: signal.Signals, tmp_path: Path) -> None:
+@pytest.mark.parametrize(
+    "number", [signal.SIGINT, pytest.param(signal.SIGTERM, marks=pytest.mark.slow)]
+)
+def test_it_is_read_by_another_program_and_ends_cleanly(
+    number: signal.Signals, tmp_path: Path
+) -> None:
     link = tmp_path / "ttyLIDAR"
     running, where = begun("cspc-m1c1-mini", "--link", link, "--rate", "3")
     try:
@@ -61,20 +65,26 @@ def test_a_port_is_the_default_of_a_serial_sensor_and_datagrams_of_the_others() 
     assert ran("sim", STL, "-t", "100ms").stdout.startswith("/dev/")
     result = ran("sim", "velodyne-vlp16", "-t", "100ms")
     assert result.stdout == "udp://127.0.0.1?port=2368,8308\n"
-    assert "next: lidarspec view 'udp://127.0.0.1?port=2368,8308' -s velodyne-vlp16" in result.stderr
+    assert (
+        "next: lidarspec view 'udp://127.0.0.1?port=2368,8308' -s velodyne-vlp16" in result.stderr
+    )
     assert " data" in result.stderr
 
 
 def test_a_sensor_is_simulated_as_it_is_configured(tmp_path: Path) -> None:
     path = tmp_path / "two echoes.bin"
-    said = ran("sim", "hokuyo-utm30lxew", "-O", "content=echoes", "--to", path, "-t", "200ms").stderr
+    said = ran(
+        "sim", "hokuyo-utm30lxew", "-O", "content=echoes", "--to", path, "-t", "200ms"
+    ).stderr
     assert f"next: lidarspec view '{path}' -s hokuyo-utm30lxew -O content=echoes" in said
     read = ran("read", path, "-s", "hokuyo-utm30lxew", "-O", "content=echoes", "-n", 3).stdout
     assert "return_index" in read
 
 
 def test_the_place_as_json() -> None:
-    made = json.loads(ran("sim", "velodyne-vlp16", "-t", "50ms", "--to", "udp://127.0.0.1:2999", "--json").stdout)
+    made = json.loads(
+        ran("sim", "velodyne-vlp16", "-t", "50ms", "--to", "udp://127.0.0.1:2999", "--json").stdout
+    )
     assert made == {
         "sensor": "velodyne-vlp16",
         "place": "udp://127.0.0.1:2999",
@@ -103,8 +113,21 @@ def test_a_file_is_written_at_once_and_can_be_read(tmp_path: Path) -> None:
 
 
 def test_the_plug_is_pulled_and_said_to_be(tmp_path: Path) -> None:
-    result = ran("sim", "velodyne-vlp16", "-t", "1s", "--unplug", "300ms", "--absent", "200ms", "--to", "udp://127.0.0.1:2998")
-    assert [line.partition(" s: ")[2] for line in result.stderr.splitlines() if " s: " in line][:2] == [
+    result = ran(
+        "sim",
+        "velodyne-vlp16",
+        "-t",
+        "1s",
+        "--unplug",
+        "300ms",
+        "--absent",
+        "200ms",
+        "--to",
+        "udp://127.0.0.1:2998",
+    )
+    assert [line.partition(" s: ")[2] for line in result.stderr.splitlines() if " s: " in line][
+        :2
+    ] == [
         "unplugged",
         "plugged in again, udp://127.0.0.1:2998",
     ]
@@ -122,12 +145,19 @@ def test_a_link_that_stands_already_is_the_systems_fault(tmp_path: Path) -> None
 
 @pytest.mark.parametrize("text", ["2m", "2min", "1.5h", "300ms", "20us", "3s", "7"])
 def test_a_duration_reads_the_same_as_an_option_and_in_a_source(text: str) -> None:
-    assert DURATION.convert(text, None, None) == duration(text) == faults_of({"unplug": text}).unplug
-    assert connect(Address.parse(f"sim:ldrobot-stl27l?unplug={text}")).device.faults.unplug == duration(text)
+    assert (
+        DURATION.convert(text, None, None) == duration(text) == faults_of({"unplug": text}).unplug
+    )
+    assert connect(
+        Address.parse(f"sim:ldrobot-stl27l?unplug={text}")
+    ).device.faults.unplug == duration(text)
 
 
 def test_a_blocked_rotor_is_simulated_and_said_at_the_end_of_its_file(tmp_path: Path) -> None:
     path = tmp_path / "blocked.bin"
     ran("sim", "ldrobot-ld06", "--rotor", "blocked", "--to", path, "-t", "1.5s")
     done = ran("convert", path, tmp_path / "points.csv", "-s", "ldrobot-ld06")
-    assert "the angle does not pass 0 (azimuth): is the rotor blocked? No scan has ended within 0.4 s" in " ".join(done.stderr.split())
+    assert (
+        "the angle does not pass 0 (azimuth): is the rotor blocked? No scan has ended within 0.4 s"
+        in " ".join(done.stderr.split())
+    )

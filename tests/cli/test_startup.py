@@ -1,4 +1,6 @@
-"""One sensor loads one plugin, and no verb imports parts that it does not use: modules are counted, not seconds."""
+"""One sensor loads one plugin, and no verb imports parts that it does not use: modules are counted,
+not seconds.
+"""
 
 from __future__ import annotations
 
@@ -47,32 +49,64 @@ def plugins_in(modules: set[str]) -> set[str]:
 def test_sensors_loads_no_plugin() -> None:
     modules = modules_after("sensors")
     assert not plugins_in(modules)
-    assert not {"numpy", "construct", "rich", "serial", "lidarspec.plugins", "lidarspec.spec", "lidarspec.device"} & modules
+    assert (
+        not {
+            "numpy",
+            "construct",
+            "rich",
+            "serial",
+            "lidarspec.plugins",
+            "lidarspec.spec",
+            "lidarspec.device",
+        }
+        & modules
+    )
 
 
 def test_show_loads_one_plugin_and_no_device() -> None:
     modules = modules_after("show", SENSOR)
     assert plugins_in(modules) == {PLUGIN}
-    assert not {"rich", "serial", "lidarspec.framing.decoder", "lidarspec.points", "lidarspec.device.settings"} & modules
+    assert (
+        not {
+            "rich",
+            "serial",
+            "lidarspec.framing.decoder",
+            "lidarspec.points",
+            "lidarspec.device.settings",
+        }
+        & modules
+    )
 
 
 def test_explain_of_a_named_sensor_loads_one_plugin_and_no_source() -> None:
     modules = modules_after("explain", "-s", SENSOR, ls.sensor(SENSOR).example("data").hex())
     assert plugins_in(modules) == {PLUGIN}
-    unused = {"rich", "serial", "lidarspec.detect.identification", "lidarspec.transports.open_url", "lidarspec.device.device"}
+    unused = {
+        "rich",
+        "serial",
+        "lidarspec.detect.identification",
+        "lidarspec.transports.open_url",
+        "lidarspec.device.device",
+    }
     assert not unused & modules
 
 
 @pytest.mark.parametrize("source", ["file", pytest.param("simulation", marks=pytest.mark.slow)])
-def test_reading_a_named_sensor_loads_no_plugin_but_that_of_its_relatives(source: str, tmp_path: Path) -> None:
+def test_reading_a_named_sensor_loads_no_plugin_but_that_of_its_relatives(
+    source: str, tmp_path: Path
+) -> None:
     stream = tmp_path / "line.bin"
     stream.write_bytes(b"".join(map(bytes, ls.simulate(ls.sensor(SENSOR), FRAMES))))
-    words = ("stats", stream, "-s", SENSOR) if source == "file" else ("view", f"sim:{SENSOR}", "--once")
+    words = (
+        ("stats", stream, "-s", SENSOR) if source == "file" else ("view", f"sim:{SENSOR}", "--once")
+    )
     assert plugins_in(modules_after(*words)) == {PLUGIN}
 
 
 def test_loading_a_sensor_builds_no_frame_tree() -> None:
-    done = subprocess.run([sys.executable, "-c", COUNT_TREES, SENSOR], capture_output=True, text=True, check=True)
+    done = subprocess.run(
+        [sys.executable, "-c", COUNT_TREES, SENSOR], capture_output=True, text=True, check=True
+    )
     frames, trees = map(int, done.stdout.split())
     assert frames
     assert trees == 0

@@ -1,4 +1,6 @@
-"""What verbs print steers no terminal, can be typed again, and is lost without harm where nobody reads it."""
+"""What verbs print steers no terminal, can be typed again, and is lost without harm where nobody
+reads it.
+"""
 
 from __future__ import annotations
 
@@ -73,21 +75,31 @@ def test_the_next_command_can_be_typed_whatever_a_file_is_called(folder: Path) -
         (EXAMPLE[:-1] + b"\0", ("plot", name, "-s", SENSOR, "-o", "x.svg")),
     ):
         (folder / name).write_bytes(data)
-        following = shlex.split(ran(*words, code=2 if data == twins else 4).stderr.rpartition("next: ")[2])
+        following = shlex.split(
+            ran(*words, code=2 if data == twins else 4).stderr.rpartition("next: ")[2]
+        )
         assert following[0] == "lidarspec"
         assert name in following
 
 
 def test_nothing_is_printed_past_the_one_place() -> None:
     for path in Path(lidarspec.cli.__file__).parent.glob("*.py"):
-        calls = [node.func for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))) if isinstance(node, ast.Call)]
-        assert path.stem == "terminal" or not {"print", "click.echo", "click.secho"} & set(map(ast.unparse, calls)), path
+        calls = [
+            node.func
+            for node in ast.walk(ast.parse(path.read_text(encoding="utf-8")))
+            if isinstance(node, ast.Call)
+        ]
+        assert path.stem == "terminal" or not {"print", "click.echo", "click.secho"} & set(
+            map(ast.unparse, calls)
+        ), path
 
 
 def shell(command: str, stderr: int = subprocess.PIPE) -> subprocess.CompletedProcess[bytes]:
     """A command line of the shell, with `lidarspec` in it."""
     command = command.replace("lidarspec", f"{shlex.quote(sys.executable)} -m lidarspec")
-    return subprocess.run(["sh", "-c", command], stdout=subprocess.PIPE, stderr=stderr, check=False, timeout=120)
+    return subprocess.run(
+        ["sh", "-c", command], stdout=subprocess.PIPE, stderr=stderr, check=False, timeout=120
+    )
 
 
 @pytest.mark.slow
@@ -112,11 +124,16 @@ def test_data_that_cannot_be_printed_are_a_failure(folder: Path) -> None:
     (folder / "x.bin").write_bytes(EXAMPLE)
     for lost, why in ((">&-", "Bad file descriptor"), (">/dev/full", "No space left on device")):
         done = shell(f"lidarspec parse x.bin -s {SENSOR} {lost}")
-        assert (done.returncode, done.stderr.decode().splitlines()[0]) == (3, f"standard output: {why}")
+        assert (done.returncode, done.stderr.decode().splitlines()[0]) == (
+            3,
+            f"standard output: {why}",
+        )
     assert not shell("lidarspec sensors | true").stderr
 
 
 @pytest.mark.slow
 def test_warnings_are_remarks(folder: Path) -> None:
-    (folder / "acme.py").write_text("import warnings\nwarnings.warn('the plugin is young')" + PLUGIN)
+    (folder / "acme.py").write_text(
+        "import warnings\nwarnings.warn('the plugin is young')" + PLUGIN
+    )
     assert process("show", "./acme.py").stderr == b"the plugin is young\n"

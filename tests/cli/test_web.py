@@ -28,13 +28,17 @@ sys.exit(main())"""
 
 
 @contextlib.contextmanager
-def served(folder: Path, *words: object, **variables: str) -> Iterator[tuple[subprocess.Popen[str], str]]:
+def served(
+    folder: Path, *words: object, **variables: str
+) -> Iterator[tuple[subprocess.Popen[str], str]]:
     """The verb at work, with environment variables, and its link."""
     (folder / "page").mkdir(exist_ok=True)
     (folder / "page" / "index.html").write_text("<!doctype html><title>page</title>")
     command = [sys.executable, "-c", MAIN, str(folder / "page"), "view", *map(str, words), "--web"]
     names = {**os.environ, "TMPDIR": str(folder), "PYTHONUNBUFFERED": "1", **variables}
-    running = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, cwd=folder, env=names)
+    running = subprocess.Popen(
+        command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, cwd=folder, env=names
+    )
     try:
         assert running.stdout is not None
         yield running, running.stdout.readline().strip()
@@ -43,7 +47,9 @@ def served(folder: Path, *words: object, **variables: str) -> Iterator[tuple[sub
         running.communicate()
 
 
-def ended(running: subprocess.Popen[str], by: signal.Signals | None = None) -> tuple[int, str, list[str]]:
+def ended(
+    running: subprocess.Popen[str], by: signal.Signals | None = None
+) -> tuple[int, str, list[str]]:
     """The exit code, what else went to standard output, and the lines on standard error."""
     if by is not None:
         running.send_signal(by)
@@ -52,7 +58,9 @@ def ended(running: subprocess.Popen[str], by: signal.Signals | None = None) -> t
     return running.returncode, out, err.splitlines()
 
 
-@pytest.mark.parametrize("by", [signal.SIGINT, pytest.param(signal.SIGTERM, marks=pytest.mark.slow)])
+@pytest.mark.parametrize(
+    "by", [signal.SIGINT, pytest.param(signal.SIGTERM, marks=pytest.mark.slow)]
+)
 def test_it_prints_its_link_and_ends_when_it_is_told_to(tmp_path: Path, by: signal.Signals) -> None:
     with served(tmp_path, f"sim:{FLAT}") as (running, link), Page(link) as page:
         assert re.fullmatch(r"http://127\.0\.0\.1:\d+/\?token=[\w-]{32}", link)
@@ -83,9 +91,14 @@ def test_a_file_that_has_ended_is_still_shown(tmp_path: Path) -> None:
 def test_a_recording_is_told_of_at_the_end(tmp_path: Path) -> None:
     with served(tmp_path, f"sim:{FLAT}") as (running, link), Page(link) as page:
         page.say("record")
-        name = page.state(lambda state: state["recording"] and state["recording"]["bytes"])["recording"]["name"]
+        name = page.state(lambda state: state["recording"] and state["recording"]["bytes"])[
+            "recording"
+        ]["name"]
         _, _, lines = ended(running, signal.SIGINT)
-    assert any(line.startswith("recorded ") and line.endswith(f"next: lidarspec view {name}") for line in lines), lines
+    assert any(
+        line.startswith("recorded ") and line.endswith(f"next: lidarspec view {name}")
+        for line in lines
+    ), lines
     assert "bytes" in ran("info", tmp_path / name).stdout
 
 
@@ -114,7 +127,10 @@ def test_the_browser_is_led_to_the_link(tmp_path: Path) -> None:
     browser = tmp_path / "browser"
     browser.write_text(f'#!/bin/sh\necho "$@" > {tmp_path}/words\n')
     browser.chmod(0o700)
-    with served(tmp_path, f"sim:{FLAT}", "--open", BROWSER=f"{browser} %s") as (_, link), Page(link) as page:
+    with (
+        served(tmp_path, f"sim:{FLAT}", "--open", BROWSER=f"{browser} %s") as (_, link),
+        Page(link) as page,
+    ):
         page.scan()
         words = (tmp_path / "words").read_text().strip()
         assert link.partition("?token=")[2] not in words
@@ -122,9 +138,13 @@ def test_the_browser_is_led_to_the_link(tmp_path: Path) -> None:
 
 
 @pytest.mark.slow
-@pytest.mark.skipif(sys.platform != "linux", reason="the limit of another process is set on Linux alone")
+@pytest.mark.skipif(
+    sys.platform != "linux", reason="the limit of another process is set on Linux alone"
+)
 def test_more_idle_connections_than_files_can_be_open(tmp_path: Path) -> None:
-    """1,100 of another user, without the token: the page stays reachable, and no traceback is printed."""
+    """1,100 of another user, without the token: the page stays reachable, and no traceback is
+    printed.
+    """
     resource = pytest.importorskip("resource")
     soft, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
     resource.setrlimit(resource.RLIMIT_NOFILE, (min(hard, 2048), hard))
@@ -132,7 +152,9 @@ def test_more_idle_connections_than_files_can_be_open(tmp_path: Path) -> None:
         with served(tmp_path, f"sim:{FLAT}") as (running, link), contextlib.ExitStack() as stack:
             resource.prlimit(running.pid, resource.RLIMIT_NOFILE, (256, hard))
             for _ in range(1100):
-                stack.enter_context(socket.create_connection(("127.0.0.1", urlsplit(link).port), DEADLINE))
+                stack.enter_context(
+                    socket.create_connection(("127.0.0.1", urlsplit(link).port), DEADLINE)
+                )
             with Page(link) as page:
                 assert page.scan()[1]["x"].size
             _, _, lines = ended(running, signal.SIGINT)
@@ -151,7 +173,9 @@ def test_a_source_that_fails_ends_it_with_its_code(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("missing", ["uvicorn", "starlette", "websockets"])
-def test_without_the_extra_it_says_how_to_get_it(missing: str, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_without_the_extra_it_says_how_to_get_it(
+    missing: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.setitem(sys.modules, missing, None)
     result = ran("view", f"sim:{FLAT}", "--web", code=2)
     assert result.stderr.endswith("next: pip install 'lidarspec[web]'\n")
@@ -179,7 +203,9 @@ def test_a_port_that_vanishes_and_comes_back_goes_on(tmp_path: Path) -> None:
             gone = page.state(lambda state: state["state"] == "disconnected" and state["warnings"])
             assert "the device is gone" in gone["warnings"][0]
             sim = begin()
-            back = page.state(lambda state: state["state"] == "streaming" and state["figures"]["disconnects"])
+            back = page.state(
+                lambda state: state["state"] == "streaming" and state["figures"]["disconnects"]
+            )
             assert back["figures"]["disconnects"] == 1
             page.scan()
             assert page.scan()[1]["x"].size

@@ -1,4 +1,6 @@
-"""Whose bytes: captures, live ports, twins that only their clock or a name tells apart, and bytes of nobody."""
+"""Whose bytes: captures, live ports, twins that only their clock or a name tells apart, and bytes
+of nobody.
+"""
 
 from __future__ import annotations
 
@@ -41,14 +43,19 @@ CAPTURED = {
     "velodyne/vlp16_raw/recording.bin": "velodyne-vlp16",
     "velodyne/vlp16_raw/packet.bin": "velodyne-vlp16",
 }
-RPLIDARS = {f"slamtec-rplidar-{model}" for model in ("a1", "a2", "a3", "c1", "s1", "s2", "s2l", "s3", "t1")}
+RPLIDARS = {
+    f"slamtec-rplidar-{model}" for model in ("a1", "a2", "a3", "c1", "s1", "s2", "s2l", "s3", "t1")
+}
 TMINIS = {"ydlidar-tmini", "ydlidar-tmini-plus", "ydlidar-tmini-pro"}
 OUSTERS = {"ouster-os0", "ouster-os1", "ouster-os2", "ouster-osdome"}
 TIMS = {"sick-tim561", "sick-tim571", "sick-tim781", "sick-tim781s", "sick-tim871s"}
 #: capture -> those that send the same.
 ALIKE = {
     "sick/20210113_tim871s_elephant.tcpstream.bin": TIMS,
-    "sick/multiscan_compact_test01_udp_scandata.telegrams.bin": {"sick-multiscan136", "sick-picoscan150"},
+    "sick/multiscan_compact_test01_udp_scandata.telegrams.bin": {
+        "sick-multiscan136",
+        "sick-picoscan150",
+    },
     "ydlidar/packets_checksum_ok_concat.bin": TMINIS,
     "ouster/OS-0-32-U1_v2.2.0_1024x10.pcap": OUSTERS,
     "ouster/OS-1-128_v2.3.0_1024x10_lb_n3.pcap": OUSTERS,
@@ -58,7 +65,12 @@ ALIKE = {
 
 
 #: the representatives, and related models that only a checksum, clock or name tells apart.
-FEW = (*REPRESENTATIVES, *(f"ldrobot-{name}" for name in ("ld06", "ld14", "ld14p", "ld20", "stl06p")), "velodyne-hdl32e", "hesai-xt32")
+FEW = (
+    *REPRESENTATIVES,
+    *(f"ldrobot-{name}" for name in ("ld06", "ld14", "ld14p", "ld20", "stl06p")),
+    "velodyne-hdl32e",
+    "hesai-xt32",
+)
 
 
 @pytest.fixture
@@ -76,7 +88,9 @@ def patient(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 @pytest.mark.usefixtures("few_installed")
-@pytest.mark.parametrize("name", ["ldrobot/ld06_3_consecutive_frames.bin", "velodyne/hdl32e/sample_velodyne_hdl32.pcap"])
+@pytest.mark.parametrize(
+    "name", ["ldrobot/ld06_3_consecutive_frames.bin", "velodyne/hdl32e/sample_velodyne_hdl32.pcap"]
+)
 def test_a_capture_is_its_sensors_among_a_few(name: str) -> None:
     assert detected(capture(name)).id == CAPTURED[name]
 
@@ -89,7 +103,11 @@ def test_every_capture_is_its_sensors(name: str) -> None:
 
 def test_no_capture_is_left_out() -> None:
     folder = capture(next(iter(CAPTURED))).parents[1]
-    there = {str(path.relative_to(folder)) for path in folder.rglob("*") if path.suffix in (".pcap", ".pcapng", ".bin")}
+    there = {
+        str(path.relative_to(folder))
+        for path in folder.rglob("*")
+        if path.suffix in (".pcap", ".pcapng", ".bin")
+    }
     assert there == {*CAPTURED, *ALIKE}
 
 
@@ -106,7 +124,9 @@ def test_captures_of_others_are_nobodys(name: str, monkeypatch: pytest.MonkeyPat
 @pytest.mark.slow
 @pytest.mark.parametrize("name", ALIKE)
 def test_the_same_frames_without_a_difference_are_said_to_be_the_same(name: str) -> None:
-    for found in (one for one in verdicts(capture(name)) if one.scores):  # an IMU sends on a port of its own
+    for found in (
+        one for one in verdicts(capture(name)) if one.scores
+    ):  # an IMU sends on a port of its own
         assert found.sensor is None
         assert {score.sensor.id for score in found.alike} == ALIKE[name]
     with pytest.raises(UsageError, match="send the same frames"):
@@ -114,7 +134,9 @@ def test_the_same_frames_without_a_difference_are_said_to_be_the_same(name: str)
 
 
 @pytest.mark.usefixtures("few_installed")
-@pytest.mark.parametrize("name", ["ldrobot-stl27l", "ldrobot-ld06", "velodyne-vlp16", "velodyne-hdl32e"])
+@pytest.mark.parametrize(
+    "name", ["ldrobot-stl27l", "ldrobot-ld06", "velodyne-vlp16", "velodyne-hdl32e"]
+)
 def test_clocks_tell_twins_apart(name: str) -> None:
     sensor = ls.sensor(name)
     data = simulate(sensor, 60, start=7)
@@ -123,10 +145,17 @@ def test_clocks_tell_twins_apart(name: str) -> None:
     assert "its clock advances by" in found.alike[0].why
 
 
-def old_firmware(number: int, *, period: float = 12 * 110.592e-6, mode: int = 0x37, product: int = 0x21) -> list[bytes]:
-    """Packets of the Velodyne form with the product byte that both an HDL-32E and a VLP-16 with old firmware send."""
+def old_firmware(
+    number: int, *, period: float = 12 * 110.592e-6, mode: int = 0x37, product: int = 0x21
+) -> list[bytes]:
+    """Packets of the Velodyne form with the product byte that both an HDL-32E and a VLP-16 with old
+    firmware send.
+    """
     data = simulate(ls.sensor("velodyne-vlp16"), number)
-    tails = (round(i * period * 1e6).to_bytes(4, "little") + bytes([mode, product]) for i in range(number))
+    tails = (
+        round(i * period * 1e6).to_bytes(4, "little") + bytes([mode, product])
+        for i in range(number)
+    )
     return [packet[:1200] + tail for packet, tail in zip(data, tails, strict=True)]
 
 
@@ -145,9 +174,14 @@ def swapped(data: list[bytes]) -> list[bytes]:
     ],
     ids=["a tenth lost", "doubled", "swapped"],
 )
-def test_a_network_does_not_change_what_the_clock_says(as_it_comes: Callable[[list[bytes]], list[bytes]]) -> None:
+def test_a_network_does_not_change_what_the_clock_says(
+    as_it_comes: Callable[[list[bytes]], list[bytes]],
+) -> None:
     found = verdict(Heard("", tuple(as_it_comes(old_firmware(200))), datagrams=True))
-    assert (found.sensor and found.sensor.id, found.alike[0].why) == ("velodyne-vlp16", "its clock advances by 1.33 ms a packet")
+    assert (found.sensor and found.sensor.id, found.alike[0].why) == (
+        "velodyne-vlp16",
+        "its clock advances by 1.33 ms a packet",
+    )
 
 
 @pytest.mark.usefixtures("few_installed")
@@ -160,19 +194,27 @@ def test_the_pace_of_a_clock_is_that_of_the_mode_that_the_packets_name() -> None
 @pytest.mark.slow
 def test_a_name_that_is_not_to_be_trusted_tells_nothing() -> None:
     found = verdict(Heard("", tuple(old_firmware(2)), datagrams=True))
-    assert (found.sensor, {score.sensor.id for score in found.alike}) == (None, {"velodyne-hdl32e", "velodyne-vlp16"})
+    assert (found.sensor, {score.sensor.id for score in found.alike}) == (
+        None,
+        {"velodyne-hdl32e", "velodyne-vlp16"},
+    )
 
 
 @pytest.mark.slow
 def test_relatives_that_are_not_installed_are_recognised(tmp_path: Path) -> None:
     xt32 = ls.sensor("hesai-xt32")
-    xt32m = [xt32.build("data", xt32.parse(packet), block_count=6, blocks=xt32.parse(packet).blocks[:6]) for packet in simulate(xt32, 5)]
+    xt32m = [
+        xt32.build("data", xt32.parse(packet), block_count=6, blocks=xt32.parse(packet).blocks[:6])
+        for packet in simulate(xt32, 5)
+    ]
     assert verdict(Heard("", tuple(xt32m), datagrams=True)).sensor is ls.sensor("hesai-xt32m")
     data, name = old_firmware(60, period=6 * 110.592e-6, product=0x23), "velodyne-vlp32a"
     found = verdict(Heard("", tuple(data), datagrams=True))
     assert (found.alike, [*found.others]) == ((), [name])
     (tmp_path / "one.bin").write_bytes(data[0])
-    with pytest.raises(WireError, match=f"these are frames of {name} .*, which no installed plugin reads"):
+    with pytest.raises(
+        WireError, match=f"these are frames of {name} .*, which no installed plugin reads"
+    ):
         detected(tmp_path / "one.bin")
 
 
@@ -183,7 +225,15 @@ def test_a_relative_that_only_its_start_would_tell_leaves_a_doubt() -> None:
     at_its_baud_rate = verdict(Heard("", (data,), baud=230_400))
     left = {score.sensor.id for score in at_its_baud_rate.alike}
     assert left == {"cspc-coin-d4", "cspc-coin-d4a", "cspc-coin-d6", "ydlidar-g2", *TMINIS}
-    named = sensor.build("info", model=b"COIN-D4".ljust(12, b"\0"), zero_angle=0, direction=0, correction=0, reserved=bytes(3), revision=1)
+    named = sensor.build(
+        "info",
+        model=b"COIN-D4".ljust(12, b"\0"),
+        zero_angle=0,
+        direction=0,
+        correction=0,
+        reserved=bytes(3),
+        revision=1,
+    )
     assert verdict(Heard("", (named + data,))).sensor is sensor
 
 
@@ -193,24 +243,35 @@ def test_a_baud_rate_decides_where_the_bytes_do_not() -> None:
     data = (sensor.build("scan_descriptor"), *simulate(sensor, 300))
     assert {score.sensor.id for score in verdict(Heard("", data)).alike} == RPLIDARS
     found = verdict(Heard("", data, baud=1_000_000))
-    assert {score.sensor.id for score in found.alike} == {f"slamtec-rplidar-{name}" for name in ("s2", "s2l", "s3")}
+    assert {score.sensor.id for score in found.alike} == {
+        f"slamtec-rplidar-{name}" for name in ("s2", "s2l", "s3")
+    }
     assert found.alike[0].why == "it runs at 1000000 baud"
-    named = sensor.build("info", model=0x81, firmware_minor=1, firmware_major=1, hardware=1, serial=bytes(16))
+    named = sensor.build(
+        "info", model=0x81, firmware_minor=1, firmware_major=1, hardware=1, serial=bytes(16)
+    )
     found = verdict(Heard("", (named, *data), baud=1_000_000))
-    assert (found.sensor and found.sensor.id, found.alike[0].why) == ("slamtec-rplidar-s3", "info.model says RPLIDAR S3")
+    assert (found.sensor and found.sensor.id, found.alike[0].why) == (
+        "slamtec-rplidar-s3",
+        "info.model says RPLIDAR S3",
+    )
 
 
 @pytest.mark.usefixtures("few_installed")
 def test_a_scan_that_is_met_in_its_middle_is_known_all_the_same() -> None:
     sensor = ls.sensor("slamtec-rplidar-a1")
-    assert "slamtec-rplidar-a1" in {score.sensor.id for score in scores([b"".join(simulate(sensor, 300))], datagrams=False)}
+    assert "slamtec-rplidar-a1" in {
+        score.sensor.id for score in scores([b"".join(simulate(sensor, 300))], datagrams=False)
+    }
 
 
 @pytest.mark.slow
 def test_the_middle_of_a_scan_is_read_with_the_answer_that_began_it() -> None:
     data = b"".join(simulate(ls.sensor("slamtec-rplidar-a1"), 300))
     found = verdict(Heard("", (data,)))
-    assert {(score.sensor.id, score.sensor.options["answer"]) for score in found.alike} == {(name, "node") for name in RPLIDARS}
+    assert {(score.sensor.id, score.sensor.options["answer"]) for score in found.alike} == {
+        (name, "node") for name in RPLIDARS
+    }
     assert len(found.alike[0].sensor.decode(data)) == 300
 
 
@@ -225,7 +286,10 @@ def test_what_is_no_fit_for_one_question_is_none_for_another() -> None:
 def firmware_bug(number: int) -> list[bytes]:
     """Frames of an STL-27L whose checksum leaves out their first byte."""
     crc = Crc(width=8, poly=0x4D)
-    return [frame[:46] + bytes([crc(frame[1:46])]) for frame in simulate(ls.sensor("ldrobot-stl27l"), number)]
+    return [
+        frame[:46] + bytes([crc(frame[1:46])])
+        for frame in simulate(ls.sensor("ldrobot-stl27l"), number)
+    ]
 
 
 @pytest.mark.slow
@@ -234,16 +298,26 @@ def test_frames_whose_checksums_are_never_right_are_found_and_answered(tmp_path:
     data, path = b"".join(firmware_bug(60)), tmp_path / "bug.bin"
     found = verdict(Heard("", (data,)))
     assert (found.scores, found.sensor) == ((), None)
-    alike = " or ".join(f"ldrobot-{name}" for name in ("ld06", "ld14", "ld14p", "ld20", "stl06p", "stl27l"))
-    assert found.fault.startswith(f"60 data frames of {alike} by their constants, lengths and rhythm")
-    assert "CRC-8 poly 0x4d in the last byte is right in 60 of 60, over 45 of the 46 other bytes" in found.fault
+    alike = " or ".join(
+        f"ldrobot-{name}" for name in ("ld06", "ld14", "ld14p", "ld20", "stl06p", "stl27l")
+    )
+    assert found.fault.startswith(
+        f"60 data frames of {alike} by their constants, lengths and rhythm"
+    )
+    assert (
+        "CRC-8 poly 0x4d in the last byte is right in 60 of 60, over 45 of the 46 other bytes"
+        in found.fault
+    )
     path.write_bytes(data)
     with pytest.raises(WireError, match="their checksums are never right") as error:
         detected(path)
     assert error.value.__notes__ == [f"next: lidarspec crc {path}"]
     noise = random.Random(2)
     sealed_by_chance = [frame[:46] + noise.randbytes(1) for frame in firmware_bug(60)]
-    assert "no other checksum was found" in verdict(Heard("", (b"".join(sealed_by_chance[:12]),))).fault
+    assert (
+        "no other checksum was found"
+        in verdict(Heard("", (b"".join(sealed_by_chance[:12]),))).fault
+    )
 
 
 @pytest.mark.usefixtures("few_installed")
@@ -272,7 +346,9 @@ def test_damage_does_not_hide_a_sensor() -> None:
 
 
 @pytest.mark.usefixtures("few_installed", "patient")
-@pytest.mark.parametrize("name", ["ldrobot-stl27l", pytest.param("ldrobot-ld06", marks=pytest.mark.slow)])
+@pytest.mark.parametrize(
+    "name", ["ldrobot-stl27l", pytest.param("ldrobot-ld06", marks=pytest.mark.slow)]
+)
 def test_a_simulated_port_is_its_sensors(name: str) -> None:
     with virtual_port(name) as made:
         assert detected(made.path).id == name
@@ -290,14 +366,20 @@ def test_a_sensor_that_has_to_be_started_first() -> None:
         assert made.device.heard == []
         heard = next(heard for heard in probe(made.path) if heard.size)
         found = verdict(heard)
-        assert (found.sensor and found.sensor.id, found.alike[0].why) == ("cspc-m1c1-mini", "info.model says M1C1_Mini")
+        assert (found.sensor and found.sensor.id, found.alike[0].why) == (
+            "cspc-m1c1-mini",
+            "info.model says M1C1_Mini",
+        )
         until(lambda: made.device.heard[-1] == "stop")
 
 
 @pytest.mark.usefixtures("few_installed", "patient")
 def test_udp_datagrams_of_two_senders_are_told_apart() -> None:
     vlp, xt = simulate(ls.sensor("velodyne-vlp16"), 40), simulate(ls.sensor("hesai-xt32"), 40)
-    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as first, socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as second:
+    with (
+        socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as first,
+        socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as second,
+    ):
         first.bind(("127.0.0.1", 0))
         second.bind(("127.0.0.2", 0))
         with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe_socket:
@@ -312,7 +394,10 @@ def test_udp_datagrams_of_two_senders_are_told_apart() -> None:
                     time.sleep(0.002)
 
         with working(send):
-            found = {one.heard.sender: one.sensor and one.sensor.id for one in verdicts(f"udp://127.0.0.1:{target}")}
+            found = {
+                one.heard.sender: one.sensor and one.sensor.id
+                for one in verdicts(f"udp://127.0.0.1:{target}")
+            }
             with pytest.raises(UsageError, match="several sensors send"):
                 detected(f"udp://127.0.0.1:{target}")
             assert detected(f"udp://127.0.0.1:{target}?src=127.0.0.2").id == "hesai-xt32"
@@ -357,20 +442,31 @@ def test_a_pseudo_terminal_is_listened_to_once() -> None:
     assert heard.size > 47
 
 
-def test_of_sensors_with_the_same_frames_those_of_the_vendor_with_most_of_them_come_first(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_of_sensors_with_the_same_frames_those_of_the_vendor_with_most_of_them_come_first(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     few = {name: ls.sensor(name) for name in ("cspc-coin-d4", "ydlidar-s4b", "ydlidar-tmini")}
     monkeypatch.setattr(detect, "sensors", lambda: few)
     found = verdict(Heard("", tuple(simulate(few["cspc-coin-d4"], 30))))
-    assert [score.sensor.id for score in found.alike] == ["ydlidar-s4b", "ydlidar-tmini", "cspc-coin-d4"]
+    assert [score.sensor.id for score in found.alike] == [
+        "ydlidar-s4b",
+        "ydlidar-tmini",
+        "cspc-coin-d4",
+    ]
 
 
 @pytest.mark.parametrize(("sends", "listened"), [(False, 3), (True, None)])
 def test_a_line_that_is_silent_at_three_rates_is_not_listened_to_at_others(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, sends: bool, listened: int | None
 ) -> None:
-    monkeypatch.setattr("lidarspec.detect.listen.has_no_baud", lambda port: False)  # as of a real port
+    monkeypatch.setattr(
+        "lidarspec.detect.listen.has_no_baud", lambda port: False
+    )  # as of a real port
     told: list[str] = []
-    with port(tmp_path) as made, working(lambda stop: _noise(made, random.Random(4), stop) if sends else None) as stop:
+    with (
+        port(tmp_path) as made,
+        working(lambda stop: _noise(made, random.Random(4), stop) if sends else None) as stop,
+    ):
         heard = list(hear(made.name, seconds=0.1, tell=told.append))
         stop.set()
         made.discard()
@@ -390,7 +486,9 @@ class TestStructure:
 
     def test_bytes_that_are_alike_by_chance_are_no_frames(self) -> None:
         assert structure([random.Random(1).randbytes(10_000)], datagrams=False) is None
-        few = b"".join(b"\xde\xad\xbe\xef" + random.Random(seed).randbytes(996) for seed in range(3))
+        few = b"".join(
+            b"\xde\xad\xbe\xef" + random.Random(seed).randbytes(996) for seed in range(3)
+        )
         found = structure([few], datagrams=False)
         assert found is not None
         assert (found.sync, found.period) == (b"\xde\xad\xbe\xef", 1000)
@@ -410,14 +508,18 @@ class TestStructure:
         monkeypatch.setattr("lidarspec.drafting.crc_search.QUICK_WORK", QUICK_WORK // 64)
         samples = Samples(make_bodies(size, number))
         assert list(crc_matches(samples, quick=True)) == []
-        assert 0 < divided <= 2 * QUICK_WORK // 64 // DIVISION_WORK  # the steps of Euclid's algorithm pass over the bytes twice
+        assert (
+            0 < divided <= 2 * QUICK_WORK // 64 // DIVISION_WORK
+        )  # the steps of Euclid's algorithm pass over the bytes twice
         quick = divided
         assert list(crc_matches(samples)) == []
         assert divided - quick > 2 * quick
 
     @pytest.mark.parametrize(("size", "number"), [(60, 40), (600, 8)])
     def test_a_quick_search_finds_a_usual_crc(self, size: int, number: int) -> None:
-        sealed = Samples(body + zlib.crc32(body).to_bytes(4, "little") for body in make_bodies(size, number))
+        sealed = Samples(
+            body + zlib.crc32(body).to_bytes(4, "little") for body in make_bodies(size, number)
+        )
         assert next(crc_matches(sealed, quick=True)).name == "CRC-32"
 
     @pytest.mark.slow
@@ -426,12 +528,21 @@ class TestStructure:
         found = structure([data[:1000], data[1000:]], datagrams=False)
         assert found is not None
         assert (found.sync[:2], found.period, len(found.frames)) == (b"\x54\x2c", 47, 59)
-        assert (found.checksums[0].paste, found.checksums[0].right) == ("Crc(width=8, poly=0x4D)", 59)
+        assert (found.checksums[0].paste, found.checksums[0].right) == (
+            "Crc(width=8, poly=0x4D)",
+            59,
+        )
 
     def test_frames_that_say_how_long_they_are(self) -> None:
-        found = structure([b"\xfe" + b"".join(simulate(ls.sensor("cspc-m1c1-mini"), 60))], datagrams=False)
+        found = structure(
+            [b"\xfe" + b"".join(simulate(ls.sensor("cspc-m1c1-mini"), 60))], datagrams=False
+        )
         assert found is not None
-        assert (found.sync, found.period, str(found.length)) == (b"\xaa\x55", None, "10 + 3 x byte at 3")
+        assert (found.sync, found.period, str(found.length)) == (
+            b"\xaa\x55",
+            None,
+            "10 + 3 x byte at 3",
+        )
         assert found.checksums[0].paste == "WordXor(head=8, groups=(1, 2))"
 
     @pytest.mark.slow
@@ -445,7 +556,10 @@ class TestStructure:
         assert found is not None
         assert (found.sync[:4].hex(), found.period, found.share) == ("55aa5aa5", 1210, 1.0)
 
-    @pytest.mark.parametrize("data", [b"", b"\x00" * 5000, random.Random(7).randbytes(20_000), b"a line of some text\n" * 3])
+    @pytest.mark.parametrize(
+        "data",
+        [b"", b"\x00" * 5000, random.Random(7).randbytes(20_000), b"a line of some text\n" * 3],
+    )
     def test_nothing_is_seen_where_nothing_is(self, data: bytes) -> None:
         assert structure([data], datagrams=False) is None
         assert structure([data] if data else [], datagrams=True) is None

@@ -1,4 +1,6 @@
-"""What a device says of itself: the fields that its `info` names, in text, in Python and where a source is examined."""
+"""What a device says of itself: the fields that its `info` names, in text, in Python and where a
+source is examined.
+"""
 
 from __future__ import annotations
 
@@ -42,4 +44,7 @@ def test_a_device_and_doctor_tell_what_was_said_last(tmp_path: Path) -> None:
 
 
 def test_show_says_where_it_stands_and_in_which_unit() -> None:
-    assert "says    temperature (position.top_board_temperature, degC)" in ran("show", "velodyne-vlp16").stdout
+    assert (
+        "says    temperature (position.top_board_temperature, degC)"
+        in ran("show", "velodyne-vlp16").stdout
+    )

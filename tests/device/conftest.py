@@ -1,4 +1,6 @@
-"""No warning of silence unless a test asks for it: a busy machine may not serve a line for a second."""
+"""No warning of silence unless a test asks for it: a busy machine may not serve a line for a
+second.
+"""
 
 from __future__ import annotations
 

@@ -1,4 +1,6 @@
-"""Commands over live lines: started on opening, stopped on closing, whatever ends the program; a control link of its own."""
+"""Commands over live lines: started on opening, stopped on closing, whatever ends the program; a
+control link of its own.
+"""
 
 from __future__ import annotations
 
@@ -34,7 +36,10 @@ IMPATIENT = SHAPES["shape-commands"]
 #: the same, which waits for a reply as long as a busy machine may need.
 SENSOR = dataclasses.replace(
     IMPATIENT,
-    commands={name: dataclasses.replace(command, timeout=TIMEOUT_S) for name, command in IMPATIENT.commands.items()},
+    commands={
+        name: dataclasses.replace(command, timeout=TIMEOUT_S)
+        for name, command in IMPATIENT.commands.items()
+    },
 )
 START, STOP, SPEED = 1, 2, 3
 ROOT = Path(__file__).parents[2]
@@ -115,7 +120,9 @@ def test_a_reply_among_data_and_the_data_go_on(line: Port, tmp_path: Path) -> No
         with pytest.raises(OutOfRange):
             opened.send("speed", rate=100.0, trim=0.0)
         assert opened.send("spin").confirmed is False
-        angles = np.concatenate([batch["angle"] for batch, _ in zip(opened.packets(), range(3), strict=False)])
+        angles = np.concatenate(
+            [batch["angle"] for batch, _ in zip(opened.packets(), range(3), strict=False)]
+        )
         assert len(angles) > 3
         assert set(np.diff(angles) % 360) == {20.0}, "nothing is missing"
     assert opened.stats.bytes_skipped == opened.stats.bytes_filler + 2 * opened.stats.frames["ack"]
@@ -124,8 +131,13 @@ def test_a_reply_among_data_and_the_data_go_on(line: Port, tmp_path: Path) -> No
     assert [SENSOR.parse(data, "order").code for data in sent] == [START, SPEED, STOP]
 
 
-def test_an_answer_that_has_come_is_taken_before_the_command_is_given_up(line: Port, monkeypatch: pytest.MonkeyPatch) -> None:
-    with working(Obedient(line).work), ls.open(f"serial://{line.name}", SENSOR, start=False) as opened:
+def test_an_answer_that_has_come_is_taken_before_the_command_is_given_up(
+    line: Port, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    with (
+        working(Obedient(line).work),
+        ls.open(f"serial://{line.name}", SENSOR, start=False) as opened,
+    ):
         clock, calls = opened._input._clock, itertools.count()  # type: ignore[attr-defined]
         now = clock.now
 
@@ -141,19 +153,32 @@ def test_an_answer_that_has_come_is_taken_before_the_command_is_given_up(line: P
 
 def test_bytes_by_hand_go_out_as_they_are(line: Port, tmp_path: Path) -> None:
     device = Obedient(line)
-    with working(device.work), ls.open(f"serial://{line.name}", SENSOR, start=False, record=tmp_path / "all.lsr") as opened:
+    with (
+        working(device.work),
+        ls.open(
+            f"serial://{line.name}", SENSOR, start=False, record=tmp_path / "all.lsr"
+        ) as opened,
+    ):
         opened.write(SENSOR.command("start"))
         assert opened.latest(TIMEOUT_S).complete
-        for wrong, reason in ((lambda: opened.write("a5 50"), "bytes are taken"), (lambda: opened.write(b"1", "power"), "no link 'power'")):
+        for wrong, reason in (
+            (lambda: opened.write("a5 50"), "bytes are taken"),
+            (lambda: opened.write(b"1", "power"), "no link 'power'"),
+        ):
             with pytest.raises(UsageError, match=reason):
                 wrong()
     assert device.heard == [START]
     with Recording(tmp_path / "all.lsr") as recording:
-        assert [record.data for record in recording if record.direction == "out"] == [SENSOR.command("start")]
+        assert [record.data for record in recording if record.direction == "out"] == [
+            SENSOR.command("start")
+        ]
     with pytest.raises(SourceError, match="closed"):
         opened.write(b"1")
     (tmp_path / "drive.bin").write_bytes(b"")
-    with ls.open(tmp_path / "drive.bin", SENSOR) as file, pytest.raises(SourceError, match="is a file"):
+    with (
+        ls.open(tmp_path / "drive.bin", SENSOR) as file,
+        pytest.raises(SourceError, match="is a file"),
+    ):
         file.write(b"1")
 
 
@@ -161,7 +186,9 @@ def test_a_command_from_another_thread_while_scans_are_read(line: Port) -> None:
     device = Obedient(line)
     with working(device.work), ls.open(f"serial://{line.name}", SENSOR) as opened:
         replies = []
-        thread = threading.Thread(target=lambda: replies.append(opened.send("speed", rate=10.0, trim=0.0)))
+        thread = threading.Thread(
+            target=lambda: replies.append(opened.send("speed", rate=10.0, trim=0.0))
+        )
         for number, _ in enumerate(opened.scans()):
             if number == 1:
                 thread.start()
@@ -222,7 +249,9 @@ def test_a_command_under_way_fails_when_the_device_goes_away(line: Port) -> None
     assert not isinstance(caught.value, ReplyTimeout)
 
 
-def test_closing_without_a_device_waits_for_no_reply(line: Port, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_closing_without_a_device_waits_for_no_reply(
+    line: Port, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.setattr(live_input, "FAREWELL", 10 * TIMEOUT_S)
     device = Obedient(line)
     with working(device.work), ls.open(f"serial://{line.name}", SENSOR) as opened:
@@ -281,11 +310,19 @@ def server() -> Iterator[socket.socket]:
         yield made
 
 
-@pytest.mark.parametrize("named", ["src=127.0.0.1", "control=127.0.0.1:{port}", "control=tcp://127.0.0.1:{port}"])
+@pytest.mark.parametrize(
+    "named", ["src=127.0.0.1", "control=127.0.0.1:{port}", "control=tcp://127.0.0.1:{port}"]
+)
 def test_commands_over_a_link_of_their_own(server: socket.socket, named: str) -> None:
     number, data = server.getsockname()[1], free_port()
-    commands = {name: dataclasses.replace(command, link="control") for name, command in SENSOR.commands.items() if name != "spin"}
-    sensor = dataclasses.replace(SENSOR, links={"data": Udp(data), "control": Tcp(number)}, commands=commands)
+    commands = {
+        name: dataclasses.replace(command, link="control")
+        for name, command in SENSOR.commands.items()
+        if name != "spin"
+    }
+    sensor = dataclasses.replace(
+        SENSOR, links={"data": Udp(data), "control": Tcp(number)}, commands=commands
+    )
     heard: list[int] = []
 
     def obey(stop: threading.Event) -> None:
@@ -297,18 +334,28 @@ def test_commands_over_a_link_of_their_own(server: socket.socket, named: str) ->
                     peer.sendall(SENSOR.build("ack", code=heard[-1], result=0))
 
     with working(obey):
-        with ls.open(f"udp://127.0.0.1:{data}?{named.format(port=number)}", sensor) as opened, udp() as sender:
+        with (
+            ls.open(f"udp://127.0.0.1:{data}?{named.format(port=number)}", sensor) as opened,
+            udp() as sender,
+        ):
             assert heard == [START]
             for frame in turning(SENSOR, 3):
                 sender.sendto(frame, ("127.0.0.1", data))
-            assert sum(len(batch) for batch, _ in zip(opened.packets(wait=0.3), range(1), strict=False)) > 0
+            assert (
+                sum(
+                    len(batch) for batch, _ in zip(opened.packets(wait=0.3), range(1), strict=False)
+                )
+                > 0
+            )
             assert opened.send("speed", rate=10.0, trim=0.0).confirmed
         until(lambda: heard == [START, SPEED, STOP])
 
 
 @contextlib.contextmanager
 def silent_at_first(number: int, seconds: float, heard: list[str]) -> Iterator[None]:
-    """A device that sends datagrams to a port, the first one after some seconds, and answers whoever sends it an order."""
+    """A device that sends datagrams to a port, the first one after some seconds, and answers
+    whoever sends it an order.
+    """
 
     def work(stop: threading.Event) -> None:
         with udp() as own:
@@ -321,7 +368,10 @@ def silent_at_first(number: int, seconds: float, heard: list[str]) -> Iterator[N
                 with contextlib.suppress(TimeoutError):
                     order, sender = own.recvfrom(100)
                     heard.append("order")
-                    own.sendto(SENSOR.build("ack", code=SENSOR.parse(order, "order").code, result=0), sender)
+                    own.sendto(
+                        SENSOR.build("ack", code=SENSOR.parse(order, "order").code, result=0),
+                        sender,
+                    )
 
     with working(work):
         yield
@@ -333,10 +383,16 @@ def datagram_sensor(number: int) -> ls.Sensor:
 
 def test_a_command_waits_for_the_first_datagram_that_says_where_the_sensor_is() -> None:
     number, heard = free_port(), list[str]()
-    with silent_at_first(number, 0.3, heard), ls.open(f"udp://127.0.0.1:{number}", datagram_sensor(number), start=False) as opened:
+    with (
+        silent_at_first(number, 0.3, heard),
+        ls.open(f"udp://127.0.0.1:{number}", datagram_sensor(number), start=False) as opened,
+    ):
         assert opened.send("speed", rate=10.0, trim=0.0, timeout=TIMEOUT_S).confirmed
         assert heard
-        assert sum(len(batch) for batch, _ in zip(opened.packets(wait=0.3), range(3), strict=False)) > 0
+        assert (
+            sum(len(batch) for batch, _ in zip(opened.packets(wait=0.3), range(3), strict=False))
+            > 0
+        )
 
 
 def test_a_command_goes_to_the_sensor_and_a_strangers_answer_is_none() -> None:
@@ -358,7 +414,10 @@ def test_a_command_goes_to_the_sensor_and_a_strangers_answer_is_none() -> None:
             own.sendto(SENSOR.build("ack", code=SPEED, result=7), who)
 
         own.settimeout(TIMEOUT_S)
-        with working(answer), pytest.raises(CommandError, match="result 7 instead of 0"):  # which is the sensor's own
+        with (
+            working(answer),
+            pytest.raises(CommandError, match="result 7 instead of 0"),
+        ):  # which is the sensor's own
             opened.send("speed", rate=10.0, trim=0.0, timeout=1.0)
         other.setblocking(False)
         with pytest.raises(BlockingIOError):
@@ -375,18 +434,30 @@ def test_a_sensor_that_nothing_was_heard_of_cannot_be_sent_to() -> None:
 
 
 def test_an_unknown_control_address_is_asked_for() -> None:
-    commands = {"start": dataclasses.replace(SENSOR.commands["start"], link="control", timeout=0.2, retries=0)}
+    commands = {
+        "start": dataclasses.replace(
+            SENSOR.commands["start"], link="control", timeout=0.2, retries=0
+        )
+    }
     links: dict[str, Udp | Tcp] = {"data": Udp(7009), "control": Tcp(7010)}
     sensor = dataclasses.replace(SENSOR, links=links, commands=commands, on_close=())
-    with pytest.raises((SourceError, CommandError), match="nobody knows the address of the control link"):
+    with pytest.raises(
+        (SourceError, CommandError), match="nobody knows the address of the control link"
+    ):
         ls.open(f"udp://127.0.0.1:{free_port()}", sensor)
 
 
 @pytest.mark.parametrize("source", ["sim:", "sim:?rate=max"])
 def test_a_simulated_sensor_is_asked_over_its_control_link(source: str) -> None:
-    start = Command("order", {"code": 1}, reply="ack", echoes=("code",), link="control", starts=True)
+    start = Command(
+        "order", {"code": 1}, reply="ack", echoes=("code",), link="control", starts=True
+    )
     links = {"data": Serial(115_200), "control": Tcp(7010)}
-    sensor = sound.sensor(links=links, commands={"start": start, "again": dataclasses.replace(start, starts=False)}, on_open=("start",))
+    sensor = sound.sensor(
+        links=links,
+        commands={"start": start, "again": dataclasses.replace(start, starts=False)},
+        on_open=("start",),
+    )
     with ls.open(source, sensor) as device:
         assert len(next(iter(device.scans())).points.x) > 0
         assert device.send("again").confirmed

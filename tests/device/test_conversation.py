@@ -1,4 +1,6 @@
-"""Sensors that are talked to over links of their own: TCP, UDP, a broadcast and HTTP, each a real socket of a simulated sensor."""
+"""Sensors that are talked to over links of their own: TCP, UDP, a broadcast and HTTP, each a real
+socket of a simulated sensor.
+"""
 
 from __future__ import annotations
 
@@ -41,11 +43,26 @@ from lidarspec.testing.fixtures import virtual_port
 from tests.lines import TIMEOUT_S, free_port, read_until, udp, working
 from tests.shapes.conversation import SENSOR
 
-PAGES = {"page": Frame(HttpReply, max_length=4096), "ask": Frame(HttpRequest, direction="out", max_length=4096)}
+PAGES = {
+    "page": Frame(HttpReply, max_length=4096),
+    "ask": Frame(HttpRequest, direction="out", max_length=4096),
+}
 STATUS = Command(
-    "ask", {"method": "GET", "path": b"/status", "body": b""}, reply="page", matches={"status": 200}, link="web", timeout=TIMEOUT_S
+    "ask",
+    {"method": "GET", "path": b"/status", "body": b""},
+    reply="page",
+    matches={"status": 200},
+    link="web",
+    timeout=TIMEOUT_S,
 )
-SET = Command("ask", {"method": "PUT", "path": b"/mode"}, args={"mode": ("body", Text(40))}, reply="page", link="web", timeout=TIMEOUT_S)
+SET = Command(
+    "ask",
+    {"method": "PUT", "path": b"/mode"},
+    args={"mode": ("body", Text(40))},
+    reply="page",
+    link="web",
+    timeout=TIMEOUT_S,
+)
 
 
 def linked(control: Link, **more: Any) -> Sensor:
@@ -55,20 +72,39 @@ def linked(control: Link, **more: Any) -> Sensor:
 
 def with_pages(answers: dict[str, Any], link: Http | None = None) -> Sensor:
     """The shape with a web server."""
-    links = {"data": Udp(free_port()), "control": Udp(free_port()), "web": link or Http(free_port())}
+    links = {
+        "data": Udp(free_port()),
+        "control": Udp(free_port()),
+        "web": link or Http(free_port()),
+    }
     commands = {**SENSOR.commands, "status": STATUS, "set_mode": SET}
     simulation = dataclasses.replace(SENSOR.simulation, answers=answers)
-    return dataclasses.replace(SENSOR, frames={**SENSOR.frames, **PAGES}, links=links, commands=commands, simulation=simulation)
+    return dataclasses.replace(
+        SENSOR,
+        frames={**SENSOR.frames, **PAGES},
+        links=links,
+        commands=commands,
+        simulation=simulation,
+    )
 
 
 @pytest.mark.parametrize("kind", [Udp, Tcp])
 def test_a_simulated_sensor_answers_over_a_link_of_its_own(kind: type[Udp | Tcp]) -> None:
     sensor = linked(kind(free_port()))
     data = sensor.links["data"].ports[0]
-    with virtual_port(sensor, to=f"udp://127.0.0.1:{data}") as port, ls.open(port.path, sensor) as device:
-        assert port.path == f"udp://127.0.0.1:{data}?control=127.0.0.1:{port.outlet.controls['control'].port}"
+    with (
+        virtual_port(sensor, to=f"udp://127.0.0.1:{data}") as port,
+        ls.open(port.path, sensor) as device,
+    ):
+        assert (
+            port.path
+            == f"udp://127.0.0.1:{data}?control=127.0.0.1:{port.outlet.controls['control'].port}"
+        )
         assert device.send("call", name="anna").values.head == {"number": 7, "code": 3}
-        assert device.send("send_to", host="10.0.0.9", port=2000).values.head == {"number": 8, "code": 2}
+        assert device.send("send_to", host="10.0.0.9", port=2000).values.head == {
+            "number": 8,
+            "code": 2,
+        }
         assert device.send("hello").values.head.number == 9
         assert port.device.heard == ["call", "send_to", "hello"]
         assert device.latest(TIMEOUT_S).complete
@@ -105,7 +141,9 @@ def test_what_a_sensor_says_of_itself_configures_it_and_its_recording(tmp_path: 
     with standing_in(registry):
         with ls.open(path) as replay:
             assert repr(replay.sensor.options["table"]) == "Learned(11 bytes)"
-            again = [scan.points.azimuth for scan in replay.scans() if scan.stamp_ns == live.stamp_ns]
+            again = [
+                scan.points.azimuth for scan in replay.scans() if scan.stamp_ns == live.stamp_ns
+            ]
         assert np.array_equal(again[0], live.points.azimuth)
         kept = Header(sensor.id, {"table": {"learned": "bm90aGluZw=="}})
         with pytest.raises(UsageError, match="is nothing that a sensor said"):
@@ -116,8 +154,16 @@ def test_what_a_sensor_says_of_itself_configures_it_and_its_recording(tmp_path: 
     ("said", "learns", "error"),
     [
         (b"1 2 3", None, "what it says of itself cannot be: 3 angles, and there are 4 samples"),
-        (b"", lambda reply: {"table": reply.nothing}, "nothing can be learned from the reply: AttributeError"),
-        (b"", lambda reply: {"table": [1.0]}, "table is learned as a number, bytes or a text, not as list"),
+        (
+            b"",
+            lambda reply: {"table": reply.nothing},
+            "nothing can be learned from the reply: AttributeError",
+        ),
+        (
+            b"",
+            lambda reply: {"table": [1.0]},
+            "table is learned as a number, bytes or a text, not as list",
+        ),
         (b"", lambda reply: {"tables": b""}, "unknown option 'tables'"),
         (b"", lambda reply: {"frame": b"rep103"}, "frame is one of rep103, vendor"),
     ],
@@ -125,9 +171,14 @@ def test_what_a_sensor_says_of_itself_configures_it_and_its_recording(tmp_path: 
 def test_what_cannot_be_learned_is_the_sensors_fault(said: bytes, learns: Any, error: str) -> None:
     asked = SENSOR.commands["get_table"]
     commands = {"get_table": dataclasses.replace(asked, learns=learns or asked.learns)}
-    simulation = dataclasses.replace(SENSOR.simulation, answers={"get_table": [("table", {"angles": said})]})
+    simulation = dataclasses.replace(
+        SENSOR.simulation, answers={"get_table": [("table", {"angles": said})]}
+    )
     sensor = teaching(commands=commands, simulation=simulation)
-    with virtual_port(sensor, to=f"udp://127.0.0.1:{sensor.links['data'].ports[0]}") as port, pytest.raises(CommandError, match=error):
+    with (
+        virtual_port(sensor, to=f"udp://127.0.0.1:{sensor.links['data'].ports[0]}") as port,
+        pytest.raises(CommandError, match=error),
+    ):
         ls.open(port.path, sensor)
 
 
@@ -143,7 +194,10 @@ def of_no_type(sensor: Sensor, *, table) -> Sensor:  # type: ignore[no-untyped-d
 def test_what_is_learned_is_no_path(configure: Any) -> None:
     sensor = teaching(configure=configure)
     refused = pytest.raises(CommandError, match=r"table is .*, not Learned\(11 bytes\)")
-    with virtual_port(sensor, to=f"udp://127.0.0.1:{sensor.links['data'].ports[0]}") as port, refused:
+    with (
+        virtual_port(sensor, to=f"udp://127.0.0.1:{sensor.links['data'].ports[0]}") as port,
+        refused,
+    ):
         ls.open(port.path, sensor)
 
 
@@ -154,7 +208,11 @@ def test_what_learns_has_a_reply_and_somewhere_to_go() -> None:
 
 def test_a_sensor_that_comes_back_with_another_table_is_another_one() -> None:
     said = [b"0.5 1 1.5 2", b"1 2 3 4"]
-    answers = {"get_table": lambda request: [("table", {"angles": said.pop(0) if len(said) > 1 else said[0]})]}
+    answers = {
+        "get_table": lambda request: [
+            ("table", {"angles": said.pop(0) if len(said) > 1 else said[0]})
+        ]
+    }
     sensor = dataclasses.replace(
         SENSOR,
         links={"data": Serial(115_200), "control": Tcp(free_port())},
@@ -171,15 +229,26 @@ def test_a_sensor_that_comes_back_with_another_table_is_another_one() -> None:
 
 def silent(device: ls.Device) -> bool:
     """Whether it is said that the heartbeat is not answered."""
-    return any("beat: no ack frame came" in said and "started again" in said for said in device.warnings)
+    return any(
+        "beat: no ack frame came" in said and "started again" in said for said in device.warnings
+    )
 
 
 def test_a_sensor_that_no_longer_answers_its_heartbeat_is_started_again() -> None:
     order = SENSOR.commands["hello"]
-    beat = dataclasses.replace(order, values={**order.values, "head.code": 9}, every=0.1, timeout=1.0)
-    commands = {**SENSOR.commands, "hello": dataclasses.replace(order, starts=True, timeout=1.0), "beat": beat}
+    beat = dataclasses.replace(
+        order, values={**order.values, "head.code": 9}, every=0.1, timeout=1.0
+    )
+    commands = {
+        **SENSOR.commands,
+        "hello": dataclasses.replace(order, starts=True, timeout=1.0),
+        "beat": beat,
+    }
     sensor = linked(Udp(free_port()), commands=commands, on_open=("hello", "beat"))
-    with virtual_port(sensor, to=f"udp://127.0.0.1:{sensor.links['data'].ports[0]}") as port, ls.open(port.path, sensor) as device:
+    with (
+        virtual_port(sensor, to=f"udp://127.0.0.1:{sensor.links['data'].ports[0]}") as port,
+        ls.open(port.path, sensor) as device,
+    ):
         device.latest(TIMEOUT_S)
         read_until(device, lambda: port.device.heard.count("beat") > 2)
         assert not silent(device)
@@ -234,9 +303,15 @@ def test_a_plugin_opens_a_link_of_its_own_kind() -> None:
     sensor, plugin = linked(Loop()), Plugin()
     source, plugins = f"udp://127.0.0.1:{free_port()}?control=127.0.0.1", Registry()
     with standing_in(plugins):
-        for opened, error, said in [(None, UsageError, "no plugin .* opens a Loop link, which control is"), (3, SpecError, "and is a int")]:
+        for opened, error, said in [
+            (None, UsageError, "no plugin .* opens a Loop link, which control is"),
+            (3, SpecError, "and is a int"),
+        ]:
             plugin.opened = opened
-            with ls.open(source, sensor) as device, pytest.raises((CommandError, error), match=said):
+            with (
+                ls.open(source, sensor) as device,
+                pytest.raises((CommandError, error), match=said),
+            ):
                 device.send("hello")
             if opened is None:
                 plugins.add(plugin, name="loops")
@@ -248,7 +323,10 @@ def test_a_plugin_opens_a_link_of_its_own_kind() -> None:
 def test_a_port_that_is_taken_is_replaced_and_said(server: socket.socket) -> None:
     taken = server.getsockname()[1]
     sensor = linked(Tcp(taken))
-    with virtual_port(sensor, to=f"udp://127.0.0.1:{sensor.links['data'].ports[0]}") as port, ls.open(port.path, sensor) as device:
+    with (
+        virtual_port(sensor, to=f"udp://127.0.0.1:{sensor.links['data'].ports[0]}") as port,
+        ls.open(port.path, sensor) as device,
+    ):
         assert port.outlet.controls["control"].port != taken
         assert device.send("hello").confirmed
 
@@ -260,7 +338,9 @@ def server() -> Iterator[socket.socket]:
         yield made
 
 
-@pytest.mark.skipif(sys.platform != "linux", reason="other systems have no broadcast on the loopback")
+@pytest.mark.skipif(
+    sys.platform != "linux", reason="other systems have no broadcast on the loopback"
+)
 def test_a_sensor_is_found_by_a_broadcast_and_told_our_address() -> None:
     sensor = linked(Udp(broadcast=free_port()))
     data = sensor.links["data"].ports[0]
@@ -273,14 +353,20 @@ def test_a_sensor_is_found_by_a_broadcast_and_told_our_address() -> None:
         assert port.device.heard == ["hello", "call"]
 
 
-@pytest.mark.skipif(sys.platform != "linux", reason="other systems have no broadcast on the loopback")
+@pytest.mark.skipif(
+    sys.platform != "linux", reason="other systems have no broadcast on the loopback"
+)
 def test_of_several_that_answer_a_broadcast_the_first_is_the_sensor() -> None:
     number = free_port()
     sensor = linked(Udp(broadcast=number))
     orders = list[Any]()
 
     def answer(stop: threading.Event) -> None:
-        with udp("127.255.255.255") as everybody, udp("127.0.0.2") as first, udp("127.0.0.3") as second:
+        with (
+            udp("127.255.255.255") as everybody,
+            udp("127.0.0.2") as first,
+            udp("127.0.0.3") as second,
+        ):
             everybody.close()
             with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as heard:
                 heard.bind(("127.255.255.255", number))
@@ -296,11 +382,17 @@ def test_of_several_that_answer_a_broadcast_the_first_is_the_sensor() -> None:
             first.sendto(sensor.build("ack", head=orders[1].head, result=0), sender)
 
     data = sensor.links["data"].ports[0]
-    with working(answer), ls.open(f"udp://127.0.0.1:{data}?broadcast=127.255.255.255", sensor) as device:
+    with (
+        working(answer),
+        ls.open(f"udp://127.0.0.1:{data}?broadcast=127.255.255.255", sensor) as device,
+    ):
         assert device.send("hello", timeout=TIMEOUT_S).confirmed
         assert device.send("call", name="anna").confirmed
         read_until(device, lambda: device.stats.foreign == 1)
-        assert any("127.0.0.2" in said and "127.0.0.3" in said and "left out" in said for said in device.warnings)
+        assert any(
+            "127.0.0.2" in said and "127.0.0.3" in said and "left out" in said
+            for said in device.warnings
+        )
         with udp("127.0.0.2") as own, udp("127.0.0.3") as other:
             other.sendto(sensor.example("data"), ("127.0.0.1", data))
             read_until(device, lambda: device.stats.foreign == 2)
@@ -314,16 +406,26 @@ def test_pages_of_a_web_server_are_read_and_written() -> None:
     body = b'{"serial": "007"}'
 
     def set_mode(request: Any) -> list[Any]:
-        return [("page", {"status": 200 if request["body"] == b"fast" else 400, "body": request["body"]})]
+        return [
+            (
+                "page",
+                {"status": 200 if request["body"] == b"fast" else 400, "body": request["body"]},
+            )
+        ]
 
     sensor = with_pages({"status": [("page", {"status": 200, "body": body})], "set_mode": set_mode})
-    with virtual_port(sensor, to=f"udp://127.0.0.1:{sensor.links['data'].ports[0]}") as port, ls.open(port.path, sensor) as device:
+    with (
+        virtual_port(sensor, to=f"udp://127.0.0.1:{sensor.links['data'].ports[0]}") as port,
+        ls.open(port.path, sensor) as device,
+    ):
         reply = device.send("status")
         assert (reply.values.status, reply.values.body) == (200, body)
         assert device.send("set_mode", mode="fast").values.status == 200
         assert device.send("set_mode", mode="slow").values.status == 400
         assert port.device.heard == ["status", "set_mode", "set_mode"]
-        asked = http.client.HTTPConnection("127.0.0.1", port.outlet.controls["web"].port, timeout=TIMEOUT_S)
+        asked = http.client.HTTPConnection(
+            "127.0.0.1", port.outlet.controls["web"].port, timeout=TIMEOUT_S
+        )
         asked.request("GET", "/status")
         assert asked.getresponse().read() == body, "it is a web server like any other"
         asked.close()
@@ -334,15 +436,29 @@ def test_pages_of_a_web_server_are_read_and_written() -> None:
 @pytest.mark.parametrize(
     ("sent", "link", "said"),
     [
-        (b"HTTP/1.1 404 Not Found\r\nContent-Length: 4\r\n\r\nnone", Http(1), "page with status 404 instead of 200"),
-        (b"HTTP/1.1 302 Found\r\nLocation: /login\r\nContent-Length: 0\r\n\r\n", Http(1), "/status: status 302, moved to /login"),
-        (b"HTTP/1.1 200 OK\r\nContent-Length: 99\r\n\r\n" + bytes(99), Http(1, largest=98), "the reply is longer than 98 bytes"),
+        (
+            b"HTTP/1.1 404 Not Found\r\nContent-Length: 4\r\n\r\nnone",
+            Http(1),
+            "page with status 404 instead of 200",
+        ),
+        (
+            b"HTTP/1.1 302 Found\r\nLocation: /login\r\nContent-Length: 0\r\n\r\n",
+            Http(1),
+            "/status: status 302, moved to /login",
+        ),
+        (
+            b"HTTP/1.1 200 OK\r\nContent-Length: 99\r\n\r\n" + bytes(99),
+            Http(1, largest=98),
+            "the reply is longer than 98 bytes",
+        ),
         (b"HTTP/1.1 200 OK\r\nContent-Length: 99\r\n\r\nshort", Http(1), "94 bytes too early"),
         (b"something else\r\n\r\n", Http(1), "/status: something else"),
         (b"", Http(1, timeout=0.1), "/status: "),
     ],
 )
-def test_what_a_web_server_does_wrong_is_said(server: socket.socket, sent: bytes, link: Http, said: str) -> None:
+def test_what_a_web_server_does_wrong_is_said(
+    server: socket.socket, sent: bytes, link: Http, said: str
+) -> None:
     def answer(stop: threading.Event) -> None:
         with server.accept()[0] as peer:
             peer.recv(1000)
@@ -351,7 +467,10 @@ def test_what_a_web_server_does_wrong_is_said(server: socket.socket, sent: bytes
                 stop.wait(TIMEOUT_S)
 
     sensor = with_pages({}, dataclasses.replace(link, port=server.getsockname()[1]))
-    with working(answer), ls.open(f"udp://127.0.0.1:{free_port()}?control=127.0.0.1", sensor) as device:
+    with (
+        working(answer),
+        ls.open(f"udp://127.0.0.1:{free_port()}?control=127.0.0.1", sensor) as device,
+    ):
         with pytest.raises(CommandError, match=said):
             device.send("status", timeout=0.5)
         assert device.state != "closed"
@@ -359,6 +478,9 @@ def test_what_a_web_server_does_wrong_is_said(server: socket.socket, sent: bytes
 
 def test_a_web_server_that_is_not_there_is_said() -> None:
     sensor = with_pages({})
-    said = pytest.raises(ReplyTimeout, match=r"no page frame came within 0.3 s; http://127.0.0.1:\d+/status: Connection refused")
+    said = pytest.raises(
+        ReplyTimeout,
+        match=r"no page frame came within 0.3 s; http://127.0.0.1:\d+/status: Connection refused",
+    )
     with ls.open(f"udp://127.0.0.1:{free_port()}?control=127.0.0.1", sensor) as device, said:
         device.send("status", timeout=0.3)

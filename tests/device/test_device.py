@@ -1,4 +1,6 @@
-"""A device on a live line: scans as they come, silence, a slow consumer, unplugging; through real pseudo terminals and sockets."""
+"""A device on a live line: scans as they come, silence, a slow consumer, unplugging; through real
+pseudo terminals and sockets.
+"""
 
 from __future__ import annotations
 
@@ -25,7 +27,18 @@ from lidarspec.spec import Chunk, Udp
 from lidarspec.testing.fixtures import virtual_port
 from lidarspec.transports.serial import SerialTransport
 from lidarspec.transports.udp import UdpTransport
-from tests.lines import TIMEOUT_S, Port, free_port, paced, port, read_until, turning, udp, until, working
+from tests.lines import (
+    TIMEOUT_S,
+    Port,
+    free_port,
+    paced,
+    port,
+    read_until,
+    turning,
+    udp,
+    until,
+    working,
+)
 from tests.shapes import SHAPES
 
 pytestmark = pytest.mark.skipif(os.name != "posix", reason="pseudo terminals are POSIX")
@@ -111,7 +124,9 @@ def test_datagrams_and_their_gaps(line: Port) -> None:
 
 
 def test_a_frame_is_out_when_the_line_falls_silent(line: Port) -> None:
-    """A false header in front claims more bytes than ever come: only silence gives the frame behind it up."""
+    """A false header in front claims more bytes than ever come: only silence gives the frame behind
+    it up.
+    """
     sensor = SHAPES["shape-count"]
     frame = sensor.example("data", seed=3)
     prefix = b"\xaa\x55\x20"
@@ -123,13 +138,19 @@ def test_a_frame_is_out_when_the_line_falls_silent(line: Port) -> None:
         assert device.stats.pending == 0
 
 
-def test_a_pause_inside_a_frame_costs_it_on_a_line_and_not_over_tcp(line: Port, tmp_path: Path) -> None:
-    """TCP brings every byte, a lost segment 0.2 s later or more; what a serial line has lost never comes."""
+def test_a_pause_inside_a_frame_costs_it_on_a_line_and_not_over_tcp(
+    line: Port, tmp_path: Path
+) -> None:
+    """TCP brings every byte, a lost segment 0.2 s later or more; what a serial line has lost never
+    comes.
+    """
     first, second = turning(TURNING, 2)
     recorded = tmp_path / "turn.lsr"
     with (
         socket.create_server(("127.0.0.1", 0)) as server,
-        ls.open(f"tcp://127.0.0.1:{server.getsockname()[1]}", TURNING, start=False, record=recorded) as device,
+        ls.open(
+            f"tcp://127.0.0.1:{server.getsockname()[1]}", TURNING, start=False, record=recorded
+        ) as device,
         server.accept()[0] as peer,
     ):
         _paused(peer.sendall, first, second)
@@ -248,7 +269,11 @@ TILTED = WHOLE.build("info", elevation=[20.0, 21.0, 22.0])
 def test_strangers_change_no_cloud_and_end_nothing(tmp_path: Path) -> None:
     number, frames, recording = free_port(), turning(WHOLE, 60), tmp_path / "all.lsr"
     calibration = WHOLE.build("info", elevation=[1.0, 2.0, 3.0])
-    with udp("127.0.0.2") as own, udp("127.0.0.3") as other, ls.open(f"udp://:{number}", WHOLE, record=recording) as device:
+    with (
+        udp("127.0.0.2") as own,
+        udp("127.0.0.3") as other,
+        ls.open(f"udp://:{number}", WHOLE, record=recording) as device,
+    ):
         other.sendto(TILTED, ("127.0.0.1", number))  # before anybody knows who the sensor is
         read_until(device, lambda: device.stats.frames)
         for frame in [frames[0], calibration, *frames[1:30]]:
@@ -259,13 +284,21 @@ def test_strangers_change_no_cloud_and_end_nothing(tmp_path: Path) -> None:
                 other.sendto(stranger, ("127.0.0.1", number))
             own.sendto(frames[index], ("127.0.0.1", number))
         found += packets(device, 30)
-        first = WHOLE.decode(frames[:1]).points().xyz  # by the nominal calibration, and not by a stranger's
-        assert np.array_equal(points(found), np.concatenate([first, WHOLE.decode([calibration, *frames[1:]]).points().xyz]))
+        first = (
+            WHOLE.decode(frames[:1]).points().xyz
+        )  # by the nominal calibration, and not by a stranger's
+        assert np.array_equal(
+            points(found),
+            np.concatenate([first, WHOLE.decode([calibration, *frames[1:]]).points().xyz]),
+        )
         assert device.stats.lost == device.stats.duplicates == 0
         read_until(device, lambda: device.stats.foreign == 120)
         (said,) = (warning for warning in device.warnings if "left out" in warning)
         senders = [":".join(map(str, each.getsockname())) for each in (own, other)]
-        assert f"udp://:{number}: {senders[0]} is read; {senders[1]} sends as well, and is left out" in said
+        assert (
+            f"udp://:{number}: {senders[0]} is read; {senders[1]} sends as well, and is left out"
+            in said
+        )
         assert f"'udp://:{number}?src={senders[1]}'" in said
     with Recording(recording) as read:
         assert sum(record.direction == "in" for record in read) == 61 + 121
@@ -274,13 +307,20 @@ def test_strangers_change_no_cloud_and_end_nothing(tmp_path: Path) -> None:
 @pytest.mark.usefixtures("impatient")
 def test_the_one_that_is_named_is_read_and_others_count_for_nothing() -> None:
     number, frames = free_port(), turning(WHOLE, 4)
-    with udp("127.0.0.2") as other, udp("127.0.0.3") as own, ls.open(f"udp://:{number}?src=127.0.0.3", WHOLE) as device:
+    with (
+        udp("127.0.0.2") as other,
+        udp("127.0.0.3") as own,
+        ls.open(f"udp://:{number}?src=127.0.0.3", WHOLE) as device,
+    ):
         for frame in frames:
             other.sendto(frame, ("127.0.0.1", number))
         read_until(device, lambda: device.stats.foreign == 4)
         read_until(device, lambda: device.state == "silent")
         said, stranger = device.warnings[-1], other.getsockname()[1]
-        assert f"nothing has arrived from the sensor, and 4 datagrams from others, such as 127.0.0.2:{stranger}, for" in said
+        assert (
+            "nothing has arrived from the sensor, and 4 datagrams from others, such as"
+            f" 127.0.0.2:{stranger}, for" in said
+        )
         for frame in frames:
             own.sendto(frame, ("127.0.0.1", number))
         packets(device, 4)
@@ -290,7 +330,11 @@ def test_the_one_that_is_named_is_read_and_others_count_for_nothing() -> None:
 @pytest.mark.usefixtures("impatient")
 def test_a_sensor_that_falls_silent_is_not_replaced_by_a_stranger() -> None:
     number, frames = free_port(), turning(WHOLE, 4)
-    with udp("127.0.0.2") as own, udp("127.0.0.3") as other, ls.open(f"udp://:{number}", WHOLE) as device:
+    with (
+        udp("127.0.0.2") as own,
+        udp("127.0.0.3") as other,
+        ls.open(f"udp://:{number}", WHOLE) as device,
+    ):
         own.sendto(frames[0], ("127.0.0.1", number))
         packets(device, 1)
 
@@ -309,14 +353,20 @@ def test_a_sensor_that_falls_silent_is_not_replaced_by_a_stranger() -> None:
 
 def test_two_senders_of_one_address_are_told_apart_by_their_ports() -> None:
     number, frames = free_port(), turning(WHOLE, 30)
-    with udp("127.0.0.2") as own, udp("127.0.0.2") as other, ls.open(f"udp://:{number}", WHOLE) as device:
+    with (
+        udp("127.0.0.2") as own,
+        udp("127.0.0.2") as other,
+        ls.open(f"udp://:{number}", WHOLE) as device,
+    ):
         own.sendto(frames[0], ("127.0.0.1", number))
         packets(device, 1)
         for frame in frames[1:]:
             other.sendto(frames[5], ("127.0.0.1", number))
             own.sendto(frame, ("127.0.0.1", number))
         found = packets(device, 29)
-        read_until(device, lambda: device.stats.foreign >= 28)  # the very first may be that of a restarted sensor
+        read_until(
+            device, lambda: device.stats.foreign >= 28
+        )  # the very first may be that of a restarted sensor
         assert sum(map(len, found)) <= 30
         assert f"127.0.0.2:{other.getsockname()[1]} sends as well" in device.warnings[-1]
 
@@ -334,7 +384,11 @@ def test_a_sensor_that_comes_back_with_another_port_is_read_on() -> None:
 def test_a_stream_in_datagrams_of_two_ports_is_not_joined() -> None:
     sensor = dataclasses.replace(TURNING, links={"data": Udp(7009, stream=True)})
     number, frames = free_port(), turning(sensor, 12)
-    with ls.open(f"udp://:{number}", sensor) as device, udp("127.0.0.2") as one, udp("127.0.0.2") as two:
+    with (
+        ls.open(f"udp://:{number}", sensor) as device,
+        udp("127.0.0.2") as one,
+        udp("127.0.0.2") as two,
+    ):
         for frame in frames:
             for each in (one, two):
                 each.sendto(frame, ("127.0.0.1", number))
@@ -343,16 +397,24 @@ def test_a_stream_in_datagrams_of_two_ports_is_not_joined() -> None:
 
 
 def test_a_stream_in_datagrams_is_joined_by_sender(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(UdpTransport, "silence", TIMEOUT_S)  # the sender may be held up between two pieces of a frame
+    monkeypatch.setattr(
+        UdpTransport, "silence", TIMEOUT_S
+    )  # the sender may be held up between two pieces of a frame
     sensor = dataclasses.replace(TURNING, links={"data": Udp(7009, stream=True)})
     number, frames = free_port(), turning(sensor, 12)
     stream = b"".join(frames)
-    with ls.open(f"udp://:{number}", sensor) as device, udp("127.0.0.2") as one, udp("127.0.0.3") as two:
+    with (
+        ls.open(f"udp://:{number}", sensor) as device,
+        udp("127.0.0.2") as one,
+        udp("127.0.0.3") as two,
+    ):
         for start in range(0, len(stream), 7):
             one.sendto(stream[start : start + 7], ("127.0.0.1", number))
             two.sendto(b"\xaa\xbb", ("127.0.0.1", number))
         found = packets(device, 12)
-        assert np.array_equal(np.concatenate([batch.raw for batch in found]), sensor.decode(stream).raw)
+        assert np.array_equal(
+            np.concatenate([batch.raw for batch in found]), sensor.decode(stream).raw
+        )
         assert device.stats.foreign == -(-len(stream) // 7)
         for frame in frames:
             two.sendto(frame, ("127.0.0.1", number))
@@ -389,7 +451,9 @@ def test_unplugged_and_plugged_in_again(line: Port, cycles: int) -> None:
     assert threading.active_count() == threads
 
 
-def test_an_absent_device_is_looked_for_less_and_less_often(line: Port, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_an_absent_device_is_looked_for_less_and_less_often(
+    line: Port, monkeypatch: pytest.MonkeyPatch
+) -> None:
     tries = list[float]()
     reopen = SerialTransport.reopen
 
@@ -430,10 +494,16 @@ def test_everything_is_recorded_before_the_queue(line: Port, tmp_path: Path) -> 
         for number, frame in enumerate(frames):
             line.send(frame)
             wait_for_chunks(device, number + 1)
-        until(lambda: device._own_recorders and device._own_recorders[0].bytes == sum(map(len, frames)))
+        until(
+            lambda: (
+                device._own_recorders and device._own_recorders[0].bytes == sum(map(len, frames))
+            )
+        )
         assert device.stats.queue_dropped == device._input.queue.produced - 1 > 0  # type: ignore[union-attr]
     with Recording(path) as recording:
-        assert b"".join(record.data for record in recording if record.direction == "in") == b"".join(frames)
+        assert b"".join(
+            record.data for record in recording if record.direction == "in"
+        ) == b"".join(frames)
         assert recording.header.sensor == TURNING.id
         assert recording.header.baud == 115_200
 
@@ -452,12 +522,20 @@ def test_a_recording_knows_where_the_line_was_interrupted(line: Port, tmp_path: 
     with Recording(path) as recording:
         found = list(recording)
     assert [record.gap for record in found if record.direction == "in"].count(True) == 1
-    assert [b"disconnect" in record.data for record in found if record.direction == "event"] == [True, False]
+    assert [b"disconnect" in record.data for record in found if record.direction == "event"] == [
+        True,
+        False,
+    ]
     with ls.open(path, TURNING) as again:
         replayed = list(again.packets())
         assert again.stats.disconnects == 1
     for name in ("raw", "host_ns", "breaks"):
-        assert np.array_equal(*(np.concatenate([getattr(batch, name) for batch in batches]) for batches in (live, replayed))), name
+        assert np.array_equal(
+            *(
+                np.concatenate([getattr(batch, name) for batch in batches])
+                for batches in (live, replayed)
+            )
+        ), name
 
 
 def test_a_file_is_not_recorded(tmp_path: Path) -> None:
@@ -475,7 +553,10 @@ def test_a_sensor_that_the_frames_contradict_is_told_of(tmp_path: Path, number: 
     with ls.open(path, "velodyne-hdl32e") as device:
         assert list(device.scans())
         (warning,) = (warning for warning in device.warnings if "read as" in warning)
-        assert f"{path}: read as velodyne-hdl32e, and the frames are those of velodyne-vlp16 (" in warning
+        assert (
+            f"{path}: read as velodyne-hdl32e, and the frames are those of velodyne-vlp16 ("
+            in warning
+        )
         assert f"next: lidarspec detect {path}" in warning
     with ls.open(path, "velodyne-vlp16") as device:
         assert list(device.scans())
@@ -489,7 +570,9 @@ def test_a_live_sensor_that_the_frames_contradict_is_told_of() -> None:
         assert any("those of ldrobot-stl27l" in warning for warning in device.warnings)
 
 
-def test_a_nominal_calibration_is_told_of_once_with_the_way_to_give_the_units_own(tmp_path: Path) -> None:
+def test_a_nominal_calibration_is_told_of_once_with_the_way_to_give_the_units_own(
+    tmp_path: Path,
+) -> None:
     path, angles = tmp_path / "xt32.bin", tmp_path / "angles.csv"
     path.write_bytes(b"".join(ls.simulate(ls.sensor("hesai-xt32"), 300)))
     rows = (f"{channel + 1},{15 - channel},0.1" for channel in range(32))
@@ -512,7 +595,10 @@ def test_a_file_without_a_frame_of_the_sensor_says_so(tmp_path: Path) -> None:
     path.write_bytes(b"".join(ls.simulate(ls.sensor("velodyne-vlp16"), 5)))
     with ls.open(path, "robosense-m1") as device:
         assert list(device.scans()) == []
-        assert device.warnings == [f"{path}: 6030 bytes, and no data frame of robosense-m1 among them; next: lidarspec detect {path}"]
+        assert device.warnings == [
+            f"{path}: 6030 bytes, and no data frame of robosense-m1 among them; next: lidarspec"
+            f" detect {path}"
+        ]
 
 
 def test_a_file_gives_one_scan_after_another(tmp_path: Path) -> None:
@@ -550,7 +636,9 @@ def test_packets_and_scans_of_a_file_go_on_where_its_scan_was_found(tmp_path: Pa
         assert sum(len(packets) for packets in device.packets("data")) == len(frames)
 
 
-def test_a_long_file_goes_on_behind_what_was_read_before(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_long_file_goes_on_behind_what_was_read_before(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.setattr(lidarspec.transports.files, "BLOCK", 1 << 13)
     monkeypatch.setattr(lidarspec.device.arrivals, "BATCH_BYTES", 1 << 13)
     path = tmp_path / "raw.bin"
@@ -600,10 +688,19 @@ def test_what_fails_while_opening_leaves_nothing_behind(tmp_path: Path, line: Po
 
 @pytest.mark.parametrize("given", ["scans", "packets"])
 def test_the_caller_has_its_turn_though_something_else_comes_all_the_time(given: str) -> None:
-    """No scan ends where the rotor is blocked, and frames of another type are no packets of the data."""
+    """No scan ends where the rotor is blocked, and frames of another type are no packets of the
+    data.
+    """
     with ls.open("sim:slamtec-rplidar-a1?rotor=blocked") as device:
-        came = (device.scans if given == "scans" else lambda wait: device.packets("health", wait=wait))(wait=0.05)
-        assert all(item is None or not len(item) for item in itertools.takewhile(lambda _: device.stats.frames.get("node", 0) < 500, came))
+        came = (
+            device.scans if given == "scans" else lambda wait: device.packets("health", wait=wait)
+        )(wait=0.05)
+        assert all(
+            item is None or not len(item)
+            for item in itertools.takewhile(
+                lambda _: device.stats.frames.get("node", 0) < 500, came
+            )
+        )
         assert not next(came)
         with pytest.raises(TimeoutError, match="no scan in time"):
             device.latest(0.05)
@@ -613,5 +710,8 @@ def test_a_blocked_rotor_is_said() -> None:
     with ls.open("sim:ldrobot-ld06?rotor=blocked&rate=max") as device:
         scans = list(itertools.islice(device.scans(wait=1.0), 3))
         assert [scan is not None and scan.complete for scan in scans] == [False] * 3
-        said = "the angle does not pass 0 (azimuth): is the rotor blocked? No scan has ended within 0.4 s"
+        said = (
+            "the angle does not pass 0 (azimuth): is the rotor blocked? No scan has ended within"
+            " 0.4 s"
+        )
         assert device.warnings == [f"sim:ldrobot-ld06?rotor=blocked&rate=max: {said}"]

@@ -1,4 +1,6 @@
-"""The pieces of a file have the scans of one pass, bit for bit, whatever sensor it is of and however often it is cut."""
+"""The pieces of a file have the scans of one pass, bit for bit, whatever sensor it is of and
+however often it is cut.
+"""
 
 from __future__ import annotations
 
@@ -23,7 +25,8 @@ from lidarspec.packets.reorder import START_WINDOW
 from tests.made_captures import DESTINATION, SOURCE, pcap_head
 from tests.shapes import SHAPES
 
-#: they differ in what they remember between packets: look-ahead, an IMU, text, streams of datagrams, modes of a header.
+#: they differ in what they remember between packets: look-ahead, an IMU, text, streams of
+#: datagrams, modes of a header.
 NAMES = [
     "shape-headed",
     "shape-inertia",
@@ -32,7 +35,8 @@ NAMES = [
     "ldrobot-stl27l",
     "velodyne-vlp16",
 ]
-#: the same in more forms: data in parts, calibration in other frames, messages of several datagrams.
+#: the same in more forms: data in parts, calibration in other frames, messages of several
+#: datagrams.
 MORE = [
     "shape-joined",
     "cepton-vista",
@@ -55,12 +59,18 @@ CAPTURED = {"ydlidar-g4"}
 
 
 def made(sensor: ls.Sensor, path: Path, *, most: int = 120_000, longest: int = 900) -> None:
-    """A file of frames, some lost, doubled, late or damaged, with frames of all other types and noise between them."""
+    """A file of frames, some lost, doubled, late or damaged, with frames of all other types and
+    noise between them.
+    """
     chance, frames = random.Random(3), list[bytes]()
     others = [sensor.example(name) for name, frame in sensor.incoming.items() if not frame.data]
     if sensor.state:  # a calibration that is not the nominal one, and another each time
-        others = [frame[:300] + chance.randbytes(600) + frame[900:] for frame in others for _ in range(5)]
-    for frame in itertools.chain.from_iterable(ls.simulate(sensor, 500, start=start) for start in itertools.count(0, 500)):
+        others = [
+            frame[:300] + chance.randbytes(600) + frame[900:] for frame in others for _ in range(5)
+        ]
+    for frame in itertools.chain.from_iterable(
+        ls.simulate(sensor, 500, start=start) for start in itertools.count(0, 500)
+    ):
         what = chance.random()
         if what < 0.01:
             continue
@@ -73,23 +83,46 @@ def made(sensor: ls.Sensor, path: Path, *, most: int = 120_000, longest: int = 9
             break
     if sensor.datagrams or path.suffix == ".pcap":
         times = itertools.count(1_700_000_000 * 10**9, 1_000_000)
-        record = (lambda frame, at: datagram_record(Datagram(frame, at, SOURCE, DESTINATION))) if sensor.datagrams else packet_record
+        record = (
+            (lambda frame, at: datagram_record(Datagram(frame, at, SOURCE, DESTINATION)))
+            if sensor.datagrams
+            else packet_record
+        )
         head = pcap_head() if sensor.datagrams else capture_head(USER_LINKS[0])
         path.write_bytes(head + b"".join(map(record, frames, times)))
     else:
-        path.write_bytes(b"".join(frame + chance.randbytes(chance.randrange(90) * (chance.random() < 0.01)) for frame in frames))
+        path.write_bytes(
+            b"".join(
+                frame + chance.randbytes(chance.randrange(90) * (chance.random() < 0.01))
+                for frame in frames
+            )
+        )
 
 
 def told(scan: ls.Scan) -> list[object]:
     """All that a scan says, as bytes."""
-    columns = [(name, np.ascontiguousarray(column).tobytes()) for name, column in scan.points.columns.items()]
-    felt = [] if scan.imu is None else [scan.imu.time_ns.tobytes(), scan.imu.angular_velocity.tobytes()]
+    columns = [
+        (name, np.ascontiguousarray(column).tobytes())
+        for name, column in scan.points.columns.items()
+    ]
+    felt = (
+        []
+        if scan.imu is None
+        else [scan.imu.time_ns.tobytes(), scan.imu.angular_velocity.tobytes()]
+    )
     return [columns, felt, scan.stamp_ns, scan.complete, scan.whole, repr(scan.rate_hz)]
 
 
-@pytest.mark.parametrize("name", [*NAMES, *(pytest.param(name, marks=pytest.mark.slow) for name in MORE)])
-def test_pieces_have_the_scans_of_one_pass(name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    for module, size in ((lidarspec.captures.bulk.CaptureBatches, "largest"), (lidarspec.transports.files, "BLOCK")):
+@pytest.mark.parametrize(
+    "name", [*NAMES, *(pytest.param(name, marks=pytest.mark.slow) for name in MORE)]
+)
+def test_pieces_have_the_scans_of_one_pass(
+    name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    for module, size in (
+        (lidarspec.captures.bulk.CaptureBatches, "largest"),
+        (lidarspec.transports.files, "BLOCK"),
+    ):
         monkeypatch.setattr(module, size, 1 << 13)
     monkeypatch.setattr(lidarspec.device.arrivals, "BATCH_BYTES", 1 << 13)
     sensor = SHAPES[name] if name in SHAPES else ls.sensor(name)
@@ -104,7 +137,10 @@ def test_pieces_have_the_scans_of_one_pass(name: str, tmp_path: Path, monkeypatc
         with FileScans(path, sensor, bookmark) as piece:
             number, following = piece.survey(path.stat().st_size // 6)
         with FileScans(path, sensor, bookmark) as piece:
-            pieces += [told(scan) for scan in itertools.islice(piece, None if following is None else number)]
+            pieces += [
+                told(scan)
+                for scan in itertools.islice(piece, None if following is None else number)
+            ]
         if following is None:
             break
         bookmark = following
@@ -128,10 +164,13 @@ def test_another_process_goes_on_behind_a_bookmark(tmp_path: Path) -> None:
     with ls.open(path, sensor) as device:
         stamps = [scan.stamp_ns for scan in itertools.islice(device.scans(), number, None)]
     code = (
-        "import sys, lidarspec as ls; from pathlib import Path; from lidarspec.device.file_scans import FileScans;"
-        "print([s.stamp_ns for s in FileScans(sys.argv[1], ls.sensor(sys.argv[2]), Path(sys.argv[3]).read_bytes())])"
+        "import sys, lidarspec as ls; from pathlib import Path; from lidarspec.device.file_scans"
+        " import FileScans;print([s.stamp_ns for s in FileScans(sys.argv[1],"
+        " ls.sensor(sys.argv[2]), Path(sys.argv[3]).read_bytes())])"
     )
-    done = subprocess.run([sys.executable, "-c", code, path, name, mark], capture_output=True, text=True, check=True)
+    done = subprocess.run(
+        [sys.executable, "-c", code, path, name, mark], capture_output=True, text=True, check=True
+    )
     assert done.stdout.strip() == str(stamps)
 
 

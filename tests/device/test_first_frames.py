@@ -44,7 +44,9 @@ def test_packets_before_the_first_position_have_its_date(tmp_path: Path, before:
     data = simulate(PACED, 200, start=FIRST)
     told = position(10 + before * FAST_S, MINUTES)
     frames = [(number * FAST_S, frame) for number, frame in enumerate(data)]
-    path = write_recording(tmp_path / "gps.lsr", [*frames[:before], (before * FAST_S, told), *frames[before:]])
+    path = write_recording(
+        tmp_path / "gps.lsr", [*frames[:before], (before * FAST_S, told), *frames[before:]]
+    )
     found = stamps(path)
     assert found[0] == pytest.approx(BEGIN_S + 10)
     assert np.all(np.diff(found) < 1)
@@ -52,8 +54,13 @@ def test_packets_before_the_first_position_have_its_date(tmp_path: Path, before:
 
 def test_a_reference_more_than_half_a_turn_later_is_placed_by_arrival(tmp_path: Path) -> None:
     """The clock turns once a minute, and the position comes 50 s after the first packet."""
-    early = [(number * FAST_S, frame) for number, frame in enumerate(simulate(PACED, 60, start=FIRST))]
-    later = [(50 + second, frame) for second, frame in enumerate(simulate(PACED, 3, start=FIRST + round(50 / FAST_S)))]
+    early = [
+        (number * FAST_S, frame) for number, frame in enumerate(simulate(PACED, 60, start=FIRST))
+    ]
+    later = [
+        (50 + second, frame)
+        for second, frame in enumerate(simulate(PACED, 3, start=FIRST + round(50 / FAST_S)))
+    ]
     told = position(0.0, MINUTES + 1)
     path = write_recording(tmp_path / "late.lsr", [*early, (50.0, told), *later])
     assert stamps(path)[0] == pytest.approx(BEGIN_S + 10)

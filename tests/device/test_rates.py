@@ -1,4 +1,6 @@
-"""Full rates without loss: UDP with a consumer that stalls, and a serial line; by count here, by the second in `make soak`."""
+"""Full rates without loss: UDP with a consumer that stalls, and a serial line; by count here, by
+the second in `make soak`.
+"""
 
 from __future__ import annotations
 
@@ -18,7 +20,9 @@ from lidarspec.transports.udp import BUFFER
 from tests.lines import Port, free_port, port, turning, udp, until, working
 from tests.shapes import SHAPES
 
-pytestmark = pytest.mark.skipif(sys.platform != "linux", reason="counts what the kernel of Linux drops")
+pytestmark = pytest.mark.skipif(
+    sys.platform != "linux", reason="counts what the kernel of Linux drops"
+)
 
 SENDING = Path(__file__).parents[2] / "benchmarks" / "sending.py"
 M1_RATE = 6300
@@ -34,7 +38,9 @@ def skip_without_buffer(device: ls.Device) -> None:
         pytest.skip(short[0])
 
 
-def test_bursts_of_datagrams_are_all_read_and_recorded_while_the_consumer_stalls(tmp_path: Path) -> None:
+def test_bursts_of_datagrams_are_all_read_and_recorded_while_the_consumer_stalls(
+    tmp_path: Path,
+) -> None:
     sensor, number, path = SHAPES["shape-datagrams"], free_port(), tmp_path / "all.lsr"
     frames = turning(sensor, 200) * 7
     with ls.open(f"udp://127.0.0.1:{number}", sensor, record=path) as device, udp() as sender:
@@ -76,14 +82,22 @@ def test_a_line_that_is_always_full_loses_nothing(tmp_path: Path) -> None:
 
 @contextlib.contextmanager
 def sending(
-    folder: Path, frames: Sequence[bytes], rate: float, seconds: float, *where: object, burst: int = 1, descriptor: int | None = None
+    folder: Path,
+    frames: Sequence[bytes],
+    rate: float,
+    seconds: float,
+    *where: object,
+    burst: int = 1,
+    descriptor: int | None = None,
 ) -> Iterator[subprocess.Popen[bytes]]:
     """Run a process that sends; its output is the number of frames."""
     path = folder / "frames.bin"
     path.write_bytes(b"".join(frames))
     words = [path, len(frames[0]), rate, seconds, burst, "-", *where]
     kept = () if descriptor is None else (descriptor,)
-    with subprocess.Popen([sys.executable, SENDING, *map(str, words)], stdout=subprocess.PIPE, pass_fds=kept) as process:
+    with subprocess.Popen(
+        [sys.executable, SENDING, *map(str, words)], stdout=subprocess.PIPE, pass_fds=kept
+    ) as process:
         try:
             yield process
         finally:
@@ -91,7 +105,9 @@ def sending(
 
 
 def drain(device: ls.Device, process: subprocess.Popen[bytes], stall: float) -> int:
-    """Decode until the sender is done and the line silent, with a pause each second; return the number sent."""
+    """Decode until the sender is done and the line silent, with a pause each second; return the
+    number sent.
+    """
     due = time.monotonic() + 1
     for batch in device.packets(wait=0.3):
         if len(batch):
@@ -111,7 +127,9 @@ def drain(device: ls.Device, process: subprocess.Popen[bytes], stall: float) -> 
     [(2.0, 1, False), (10.0, 1, False), (60.0, BURST, True)],
     ids=["2s", "10s", "60s in bursts beside a thread that computes"],
 )
-def test_udp_at_full_rate_with_a_consumer_that_stalls(tmp_path: Path, seconds: float, burst: int, hog: bool) -> None:
+def test_udp_at_full_rate_with_a_consumer_that_stalls(
+    tmp_path: Path, seconds: float, burst: int, hog: bool
+) -> None:
     m1, number, path = ls.sensor("robosense-m1"), free_port(), tmp_path / "all.lsr"
     frames = ls.simulate(m1, 630)
     stop = threading.Event()
@@ -144,7 +162,9 @@ def test_a_serial_line_at_full_rate(tmp_path: Path, seconds: float) -> None:
     frames = ls.simulate(stl, 1800)
     with port(tmp_path) as line, ls.open(f"serial://{line.name}", stl) as device:
         assert isinstance(line, Port)
-        with sending(tmp_path, frames, STL_RATE, seconds, "fd", line._master, descriptor=line._master) as process:
+        with sending(
+            tmp_path, frames, STL_RATE, seconds, "fd", line._master, descriptor=line._master
+        ) as process:
             sent = drain(device, process, 0.0)
         assert sent == int(STL_RATE * seconds)
         assert device.stats.frames == {"data": sent}

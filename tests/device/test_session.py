@@ -1,4 +1,6 @@
-"""`Session`: whose answer a frame is, when something is sent, and when one gives up. The clock is the test's own."""
+"""`Session`: whose answer a frame is, when something is sent, and when one gives up. The clock is
+the test's own.
+"""
 
 from __future__ import annotations
 
@@ -43,13 +45,26 @@ def test_the_reply_is_found_among_data_and_fillers_and_has_its_values() -> None:
     pending = session.request("start", 0)
     assert sent(session) == ["aa55f00f"]
     assert not pending.done
-    received(sensor, session, b"\xfe\xff\xfe" + sensor.example("data") + b"\xff" + sensor.example("info"), 10)
+    received(
+        sensor,
+        session,
+        b"\xfe\xff\xfe" + sensor.example("data") + b"\xff" + sensor.example("info"),
+        10,
+    )
     assert not pending.done
-    received(sensor, session, b"\xfe" + bytes.fromhex("a55a500703000000000000ab") + sensor.example("data"), 20)
+    received(
+        sensor,
+        session,
+        b"\xfe" + bytes.fromhex("a55a500703000000000000ab") + sensor.example("data"),
+        20,
+    )
     reply = pending.result()
     assert (reply.command, reply.frame, reply.confirmed, reply.at) == ("start", "ack", True, 20)
     assert (reply.values.firmware, reply["firmware"], reply["mode"]) == (3, 3, 0x50)
-    assert repr(reply) == f"Reply(start, ack: mode 80, firmware 3, reserved {bytes(6)!r}, checksum 171)"
+    assert (
+        repr(reply)
+        == f"Reply(start, ack: mode 80, firmware 3, reserved {bytes(6)!r}, checksum 171)"
+    )
     with pytest.raises(UnknownField):
         reply["firmwar"]
     assert session.deadline is None
@@ -59,9 +74,14 @@ def test_an_answer_in_units_and_in_arrays() -> None:
     sensor = ls.sensor("slamtec-rplidar-a1")
     session = Session(sensor)
     pending = session.request("get_us_per_sample", 0, mode=1)
-    answer = sensor.build("config", {"descriptor": {"length": 8}, "key": 0x71, "value": {"us_per_sample": 127 * 256}})
+    answer = sensor.build(
+        "config", {"descriptor": {"length": 8}, "key": 0x71, "value": {"us_per_sample": 127 * 256}}
+    )
     session.receive([Found("config", 0, answer)], 1)
-    assert (pending.result()["value.us_per_sample"], pending.result().values.value.us_per_sample) == (127.0, 32512)
+    assert (
+        pending.result()["value.us_per_sample"],
+        pending.result().values.value.us_per_sample,
+    ) == (127.0, 32512)
 
 
 def test_what_is_not_documented_is_not_confirmed() -> None:
@@ -94,7 +114,11 @@ def test_a_wrong_request_sends_nothing() -> None:
 
 def test_requests_go_out_one_at_a_time_and_after_the_settling() -> None:
     session = Session(SENSOR)
-    first, second, third = session.request("start", 0), session.request("stop", 0), session.request("speed", 0, rate=10.0, trim=0)
+    first, second, third = (
+        session.request("start", 0),
+        session.request("stop", 0),
+        session.request("speed", 0, rate=10.0, trim=0),
+    )
     assert len(session.outgoing()) == 1
     session.receive([ack(1)], 300)
     assert first.done
@@ -119,7 +143,9 @@ def test_silence_ends_in_a_timeout_and_the_link_goes_on() -> None:
     with pytest.raises(UsageError, match="not answered yet"):
         first.result()
     session.tick(SECOND)
-    with pytest.raises(TimeoutError, match=r"shape-commands start: no ack frame came within 1 s") as caught:
+    with pytest.raises(
+        TimeoutError, match=r"shape-commands start: no ack frame came within 1 s"
+    ) as caught:
         first.result()
     assert isinstance(caught.value, ReplyTimeout)
     assert second.done
@@ -130,7 +156,13 @@ def test_the_caller_can_wait_longer_or_shorter() -> None:
     session = Session(SENSOR)
     session.request("start", 0, timeout=0.25)
     assert session.deadline == SECOND // 4
-    session = Session(with_commands(ask=Command("order", SENSOR.commands["start"].values, reply="ack", timeout=0.1, retries=2)))
+    session = Session(
+        with_commands(
+            ask=Command(
+                "order", SENSOR.commands["start"].values, reply="ack", timeout=0.1, retries=2
+            )
+        )
+    )
     session.request("ask", 0, timeout=0.15)
     session.tick(SECOND // 10)
     assert len(session.outgoing()) == 2
@@ -138,7 +170,13 @@ def test_the_caller_can_wait_longer_or_shorter() -> None:
 
 
 def test_what_may_be_repeated_is_sent_again_and_then_given_up() -> None:
-    session = Session(with_commands(ask=Command("order", SENSOR.commands["start"].values, reply="ack", timeout=0.1, retries=2)))
+    session = Session(
+        with_commands(
+            ask=Command(
+                "order", SENSOR.commands["start"].values, reply="ack", timeout=0.1, retries=2
+            )
+        )
+    )
     pending = session.request("ask", 0)
     for now in (0, 100_000_000, 200_000_000):
         session.tick(now)
@@ -154,7 +192,9 @@ def test_a_late_answer_is_not_the_next_ones() -> None:
     session.request("start", 0)
     session.tick(SECOND)
     again = session.request("start", SECOND + 1)
-    assert len(session.outgoing()) == 1  # the second one is held back: the answer to the first would be taken for its own
+    assert (
+        len(session.outgoing()) == 1
+    )  # the second one is held back: the answer to the first would be taken for its own
     session.receive([ack(1)], SECOND + 2)
     assert not again.done
     assert session.late == 1
@@ -192,7 +232,9 @@ def test_an_answer_that_can_be_told_apart_holds_nothing_back() -> None:
 
 
 def test_the_second_answer_to_what_was_sent_twice_is_nobodys() -> None:
-    session = Session(with_commands(ask=Command("order", SENSOR.commands["start"].values, reply="ack", retries=1)))
+    session = Session(
+        with_commands(ask=Command("order", SENSOR.commands["start"].values, reply="ack", retries=1))
+    )
     first = session.request("ask", 0)
     session.tick(SECOND)
     session.receive([ack(1, result=1)], SECOND + 1)
@@ -220,7 +262,9 @@ def test_another_answer_than_expected_is_told() -> None:
     pending = session.request("speed", 0, rate=10.0, trim=0.0)
     session.receive([ack(3, result=7)], 1)
     session.tick(SECOND)
-    with pytest.raises(CommandError, match=r"the device answered with ack with result 7 instead of 0") as error:
+    with pytest.raises(
+        CommandError, match=r"the device answered with ack with result 7 instead of 0"
+    ) as error:
         pending.result()
     assert not isinstance(error.value, ReplyTimeout)
 
@@ -229,12 +273,19 @@ def test_links_do_not_wait_for_each_other() -> None:
     sensor = dataclasses.replace(
         SENSOR,
         links={**SENSOR.links, "control": Udp(7000)},
-        commands={**SENSOR.commands, "ask": Command("order", SENSOR.commands["start"].values, reply="ack", link="control")},
+        commands={
+            **SENSOR.commands,
+            "ask": Command("order", SENSOR.commands["start"].values, reply="ack", link="control"),
+        },
     )
     session = Session(sensor)
     start, ask = session.request("start", 0), session.request("ask", 0)
     assert [out.link for out in session.outgoing()] == ["data", "control"]
-    assert (session.awaited(), session.awaited("control"), session.awaited("none")) == (frozenset({"ack"}), frozenset({"ack"}), frozenset())
+    assert (session.awaited(), session.awaited("control"), session.awaited("none")) == (
+        frozenset({"ack"}),
+        frozenset({"ack"}),
+        frozenset(),
+    )
     session.receive([ack(1)], 1, link="control")
     assert (start.done, ask.done) == (False, True)
     session.receive([ack(1)], 2)
@@ -257,14 +308,18 @@ def test_what_the_reply_repeats_of_the_request_tells_answers_apart() -> None:
     pending = session.request("get_config", SECOND, key=0x7C)
     assert len(session.outgoing()) == 2  # the answer to another key is no danger
     for key, name in ((0x70, "mode_count"), (0x7C, "typical_mode")):
-        answer = sensor.build("config", {"descriptor": {"length": 6}, "key": key, "value": {name: 3}})
+        answer = sensor.build(
+            "config", {"descriptor": {"length": 6}, "key": key, "value": {name: 3}}
+        )
         session.receive([Found("config", 0, answer)], SECOND + key)
     assert pending.result()["value.typical_mode"] == 3
     assert session.late == 1
 
 
 def test_a_heartbeat_goes_on_until_it_is_abandoned() -> None:
-    session = Session(with_commands(beat=Command("order", SENSOR.commands["start"].values, every=1.0)))
+    session = Session(
+        with_commands(beat=Command("order", SENSOR.commands["start"].values, every=1.0))
+    )
     session.request("beat", 0)
     for second in (1, 2, 3):
         assert session.deadline == second * SECOND
@@ -279,7 +334,9 @@ def test_a_heartbeat_goes_on_until_it_is_abandoned() -> None:
 
 def test_a_heartbeat_without_an_answer_does_not_pile_up() -> None:
     values = SENSOR.commands["start"].values
-    session = Session(with_commands(beat=Command("order", values, reply="ack", matches={"code": 1}, every=0.1)))
+    session = Session(
+        with_commands(beat=Command("order", values, reply="ack", matches={"code": 1}, every=0.1))
+    )
     first = session.request("beat", 0)
     for step in range(1, 10):
         session.tick(step * SECOND // 10)
@@ -313,15 +370,21 @@ def test_an_argument_cannot_be_called_like_the_time_to_wait() -> None:
         with_commands(ask=Command("order", {"code": 1}, args={"timeout": ("motor.speed", 0, 1)}))
 
 
-@pytest.mark.parametrize("seed", [*range(6), *(pytest.param(seed, marks=pytest.mark.slow) for seed in range(6, 40))])
+@pytest.mark.parametrize(
+    "seed", [*range(6), *(pytest.param(seed, marks=pytest.mark.slow) for seed in range(6, 40))]
+)
 def test_however_late_and_lossy_the_device_each_reply_is_the_requests_own(seed: int) -> None:
-    """The device numbers the requests that it has seen in its answers, so that a wrong pairing shows."""
+    """The device numbers the requests that it has seen in its answers, so that a wrong pairing
+    shows.
+    """
     source = random.Random(seed)
     values = SENSOR.commands["start"].values
     sensor = with_commands(
         once=Command("order", values, reply="ack", timeout=0.1),
         twice=Command("order", values, reply="ack", timeout=0.1, retries=1),
-        other=Command("order", {**values, "code": 2}, reply="ack", matches={"code": 2}, timeout=0.1),
+        other=Command(
+            "order", {**values, "code": 2}, reply="ack", matches={"code": 2}, timeout=0.1
+        ),
     )
     session = Session(sensor)
     coming: list[tuple[int, int, int]] = []
@@ -333,7 +396,9 @@ def test_however_late_and_lossy_the_device_each_reply_is_the_requests_own(seed: 
             for out in session.outgoing():
                 if source.random() < 0.8:
                     delay = source.choice((10, 90, 110, 150, 199)) * SECOND // 1000
-                    heapq.heappush(coming, (now + delay, number, sensor.parse(out.data, "order").code))
+                    heapq.heappush(
+                        coming, (now + delay, number, sensor.parse(out.data, "order").code)
+                    )
             now, due = _next_event(session, coming, now)
             session.receive([ack(code, result=asked) for _, asked, code in due], now)
             session.tick(now)
@@ -346,9 +411,13 @@ def test_however_late_and_lossy_the_device_each_reply_is_the_requests_own(seed: 
     assert session.late > 0
 
 
-def _next_event(session: Session, coming: list[tuple[int, int, int]], now: int) -> tuple[int, Sequence[tuple[int, int, int]]]:
+def _next_event(
+    session: Session, coming: list[tuple[int, int, int]], now: int
+) -> tuple[int, Sequence[tuple[int, int, int]]]:
     """The time of the next answer or deadline, and the answers of that time."""
-    times = [time for time in (session.deadline, coming[0][0] if coming else None) if time is not None]
+    times = [
+        time for time in (session.deadline, coming[0][0] if coming else None) if time is not None
+    ]
     now = max(now, min(times))
     due = []
     while coming and coming[0][0] <= now:
@@ -361,7 +430,9 @@ def test_a_command_that_is_answered_only_while_the_sensor_is_stopped_says_so() -
     session = Session(with_commands(ask=asking))
     pending = session.request("ask", 0)
     session.tick(10 * SECOND)
-    with pytest.raises(ReplyTimeout, match="answered only while the sensor is stopped: send 'stop' first"):
+    with pytest.raises(
+        ReplyTimeout, match="answered only while the sensor is stopped: send 'stop' first"
+    ):
         pending.result()
     with pytest.raises(ls.SpecError, match="no command starts or stops it"):
         dataclasses.replace(SENSOR, commands={"ask": asking}, on_open=(), on_close=())
@@ -376,12 +447,19 @@ def conversed(session: Session) -> list[tuple[int, list[int]]]:
 def test_a_running_number_goes_on_and_tells_the_reply() -> None:
     hello = dataclasses.replace(CONVERSATION.commands["hello"], retries=1)
     counting = {**hello.values, "head.number": Count(3, 6)}
-    sensor = dataclasses.replace(CONVERSATION, commands={**CONVERSATION.commands, "hello": dataclasses.replace(hello, values=counting)})
+    sensor = dataclasses.replace(
+        CONVERSATION,
+        commands={**CONVERSATION.commands, "hello": dataclasses.replace(hello, values=counting)},
+    )
     session = Session(sensor)
     session.host = "10.0.0.7"
 
     def answered(number: int, now: int) -> None:
-        session.receive([Found("ack", 0, sensor.build("ack", head={"number": number, "code": 1}, result=0))], now, link="control")
+        session.receive(
+            [Found("ack", 0, sensor.build("ack", head={"number": number, "code": 1}, result=0))],
+            now,
+            link="control",
+        )
 
     first = session.request("hello", 0)
     assert conversed(session) == [(6, [10, 0, 0, 7])]
@@ -402,14 +480,23 @@ def test_a_running_number_goes_on_and_tells_the_reply() -> None:
 
 def test_what_is_found_out_can_be_given() -> None:
     assert CONVERSATION.parse(CONVERSATION.command("hello"), "order").head.number == 7
-    given = CONVERSATION.parse(CONVERSATION.command("hello", **{"head.number": 9, "host": "1.2.3.4"}), "order")
+    given = CONVERSATION.parse(
+        CONVERSATION.command("hello", **{"head.number": 9, "host": "1.2.3.4"}), "order"
+    )
     assert (given.head.number, list(given.host)) == (9, [1, 2, 3, 4])
     with pytest.raises(UsageError, match="host is an IPv4 address, not '::1'"):
         CONVERSATION.command("hello", host="::1")
 
 
 def test_a_refusal_is_told_in_words_and_a_late_one_is_not_the_next_commands() -> None:
-    refused = Command("order", {"code": 3, "motor.speed": 0, "motor.trim": 0}, reply="data", refusal="ack", timeout=1.0, retries=1)
+    refused = Command(
+        "order",
+        {"code": 3, "motor.speed": 0, "motor.trim": 0},
+        reply="data",
+        refusal="ack",
+        timeout=1.0,
+        retries=1,
+    )
     session = Session(with_commands(ask=refused))
     first = session.request("ask", 0)
     session.receive([ack(1, result=2)], 1)

@@ -1,4 +1,6 @@
-"""`lidarspec.toml`: devices by name, in Python and in every verb; mistakes are named with file, table and key."""
+"""`lidarspec.toml`: devices by name, in Python and in every verb; mistakes are named with file,
+table and key.
+"""
 
 from __future__ import annotations
 
@@ -29,7 +31,9 @@ source = "udp://:6699"
 
 @pytest.fixture
 def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    """A folder with a settings file and a capture, which is the working directory; the user has none of his own."""
+    """A folder with a settings file and a capture, which is the working directory; the user has
+    none of his own.
+    """
     home, here = tmp_path / "home", tmp_path / "project" / "deep"
     here.mkdir(parents=True)
     monkeypatch.setenv("XDG_CONFIG_HOME", str(home))
@@ -84,7 +88,10 @@ def test_every_verb_takes_a_name(folder: Path, words: tuple[str, ...]) -> None:
 
 
 def test_a_live_device_by_name_is_live(folder: Path) -> None:
-    assert "rear is live: only what was recorded can be replayed" in ran("replay", "rear", code=2).stderr
+    assert (
+        "rear is live: only what was recorded can be replayed"
+        in ran("replay", "rear", code=2).stderr
+    )
     assert "udp://:6699 is live: this takes bytes or a file" in ran("parse", "rear", code=2).stderr
 
 
@@ -101,7 +108,10 @@ def settings_of_the_user(folder: Path, text: str) -> Path:
 
 
 def test_the_users_own_file_comes_first_and_the_nearest_one_adds_to_it(folder: Path) -> None:
-    user = settings_of_the_user(folder, '[device.front]\nsource = "sim:ldrobot-stl27l"\n[device.desk]\nsource = "tcp://desk:2"\n')
+    user = settings_of_the_user(
+        folder,
+        '[device.front]\nsource = "sim:ldrobot-stl27l"\n[device.desk]\nsource = "tcp://desk:2"\n',
+    )
     found = settings.devices()
     assert list(found) == ["front", "desk", "rear"]
     assert found["front"].sensor is None
@@ -115,11 +125,16 @@ def test_the_users_own_file_comes_first_and_the_nearest_one_adds_to_it(folder: P
     assert list(settings.devices()) == ["front", "desk"]
 
 
-@pytest.mark.parametrize("text", ["[device.front", "x = " + "[" * 10_000, "[" + "a." * 20_000 + "b]", "#" * (1 << 18) + "\n"])
+@pytest.mark.parametrize(
+    "text",
+    ["[device.front", "x = " + "[" * 10_000, "[" + "a." * 20_000 + "b]", "#" * (1 << 18) + "\n"],
+)
 def test_a_file_with_a_mistake_takes_away_its_own_devices_alone(folder: Path, text: str) -> None:
     broken = folder / "lidarspec.toml"
     broken.write_text(text, encoding="utf-8")
-    settings_of_the_user(folder, f'[device.desk]\nsource = "{folder / "front.bin"}"\nsensor = "{SENSOR}"\n')
+    settings_of_the_user(
+        folder, f'[device.desk]\nsource = "{folder / "front.bin"}"\nsensor = "{SENSOR}"\n'
+    )
     with pytest.warns(UserWarning, match=rf"{broken}: not TOML: .*; its devices are left out"):
         assert ls.open("desk").sensor.id == SENSOR
     assert ran("stats", "desk").stderr.count(f"{broken}: not TOML") == 1
@@ -128,7 +143,9 @@ def test_a_file_with_a_mistake_takes_away_its_own_devices_alone(folder: Path, te
 
 
 @pytest.mark.parametrize("whose", ["another's", "everybody's", "everybody's folder"])
-def test_a_file_that_is_not_the_users_is_passed_over_and_said_once(folder: Path, whose: str) -> None:
+def test_a_file_that_is_not_the_users_is_passed_over_and_said_once(
+    folder: Path, whose: str
+) -> None:
     file = folder / "deep" / "lidarspec.toml"
     file.write_text('[device.front]\nsource = "sim:velodyne-vlp16"\n', encoding="utf-8")
     if whose == "another's":
@@ -151,15 +168,32 @@ EVIL = "from pathlib import Path\nPath(__file__).with_name('ran').touch()\nfrom 
 
 
 @pytest.mark.parametrize("how", ["verb", "variable"])
-def test_a_project_runs_no_python_until_its_folder_is_allowed(folder: Path, monkeypatch: pytest.MonkeyPatch, how: str) -> None:
-    (folder / "evil.py").write_text(EVIL.format("tests.shapes.stranger.acme_lidars"), encoding="utf-8")
-    (folder / "lidarspec.toml").write_text('[device.front]\nsource = "./front.bin"\nsensor = "./evil.py"\n', encoding="utf-8")
-    for verb, *words in (["stats"], ["view"], ["record", "-o", "x.lsr"], ["detect"], ["doctor"], ["parse"]):
+def test_a_project_runs_no_python_until_its_folder_is_allowed(
+    folder: Path, monkeypatch: pytest.MonkeyPatch, how: str
+) -> None:
+    (folder / "evil.py").write_text(
+        EVIL.format("tests.shapes.stranger.acme_lidars"), encoding="utf-8"
+    )
+    (folder / "lidarspec.toml").write_text(
+        '[device.front]\nsource = "./front.bin"\nsensor = "./evil.py"\n', encoding="utf-8"
+    )
+    for verb, *words in (
+        ["stats"],
+        ["view"],
+        ["record", "-o", "x.lsr"],
+        ["detect"],
+        ["doctor"],
+        ["parse"],
+    ):
         said = ran(verb, "front", *words, code=2).stderr
         assert f"{folder / 'lidarspec.toml'}: [device.front]: sensor" in said
         assert f"next: lidarspec trust {folder}" in said
     with monkeypatch.context() as shell:
-        for name, value in {"_LIDARSPEC_COMPLETE": "bash_complete", "COMP_WORDS": "lidarspec send front ", "COMP_CWORD": "3"}.items():
+        for name, value in {
+            "_LIDARSPEC_COMPLETE": "bash_complete",
+            "COMP_WORDS": "lidarspec send front ",
+            "COMP_CWORD": "3",
+        }.items():
             shell.setenv(name, value)
         assert ran(code=1).output == ""
     with pytest.raises(ls.UsageError, match="is Python, which would run"):
@@ -168,7 +202,9 @@ def test_a_project_runs_no_python_until_its_folder_is_allowed(folder: Path, monk
     if how == "verb":
         assert str(folder) in ran("trust", folder).stdout
         ran("trust", folder)
-        assert (folder.parent / "home" / "lidarspec" / "trusted").read_text(encoding="utf-8") == f"{folder}\n"
+        assert (folder.parent / "home" / "lidarspec" / "trusted").read_text(
+            encoding="utf-8"
+        ) == f"{folder}\n"
     else:
         monkeypatch.setenv("LIDARSPEC_TRUST", str(folder))
     with ls.open("front") as device:
@@ -177,7 +213,9 @@ def test_a_project_runs_no_python_until_its_folder_is_allowed(folder: Path, monk
 
 
 @pytest.mark.parametrize("place", ["/etc/hostname", "../outside.csv", "./link.csv", "/dev/stdin"])
-def test_a_project_names_no_files_elsewhere_until_its_folder_is_allowed(folder: Path, place: str) -> None:
+def test_a_project_names_no_files_elsewhere_until_its_folder_is_allowed(
+    folder: Path, place: str
+) -> None:
     (folder.parent / "outside.csv").write_text("-10 0 10 20", encoding="utf-8")
     (folder / "inside.csv").write_text("-10 0 10 20", encoding="utf-8")
     (folder / "link.csv").symlink_to(folder.parent / "outside.csv")
@@ -195,7 +233,13 @@ def test_a_project_names_no_files_elsewhere_until_its_folder_is_allowed(folder: 
 
 
 @pytest.mark.parametrize(
-    "url", ["file:///etc/hostname", "http://127.0.0.1:9/drive.pcap", "ftp://127.0.0.1:9/drive.pcap", "s3://bucket/drive.pcap"]
+    "url",
+    [
+        "file:///etc/hostname",
+        "http://127.0.0.1:9/drive.pcap",
+        "ftp://127.0.0.1:9/drive.pcap",
+        "s3://bucket/drive.pcap",
+    ],
 )
 def test_urls_of_a_project_need_a_trusted_folder(folder: Path, url: str) -> None:
     (folder / "lidarspec.toml").write_text(f'[device.front]\nsource = "{url}"\n', encoding="utf-8")
@@ -207,7 +251,10 @@ def test_urls_of_a_project_need_a_trusted_folder(folder: Path, url: str) -> None
 def test_only_a_folder_of_ones_own_can_be_allowed(folder: Path) -> None:
     folder.chmod(0o777)
     said = ran("trust", folder, code=2).stderr
-    assert f"{folder} is open to others: chmod 775 makes it yours; whoever writes there could run programs as you" in said
+    assert (
+        f"{folder} is open to others: chmod 775 makes it yours; whoever writes there could run programs as you"
+        in said
+    )
     assert "is no folder" in ran("trust", folder / "front.bin", code=2).stderr
 
 
@@ -226,7 +273,10 @@ def test_a_path_is_no_name(folder: Path) -> None:
 
 
 def test_a_word_that_is_nothing_gets_a_suggestion(folder: Path) -> None:
-    with pytest.raises(ls.UsageError, match=r"'frnt' is no file, and no device of .*lidarspec.toml; did you mean 'front'\?"):
+    with pytest.raises(
+        ls.UsageError,
+        match=r"'frnt' is no file, and no device of .*lidarspec.toml; did you mean 'front'\?",
+    ):
         ls.open("frnt")
 
 
@@ -244,16 +294,37 @@ def test_without_settings_a_word_is_a_file(tmp_path: Path, monkeypatch: pytest.M
         ("[devices.front]", r"unknown table 'devices'; did you mean 'device'\?"),
         ("[device]\nfront = 1", r"devices are tables of their own: \[device.front\]"),
         ("[device.front]", r"\[device.front\]: source is missing"),
-        ('[device.front]\nsorce = "x.bin"', r"\[device.front\]: unknown key 'sorce'; did you mean 'source'\?"),
+        (
+            '[device.front]\nsorce = "x.bin"',
+            r"\[device.front\]: unknown key 'sorce'; did you mean 'source'\?",
+        ),
         ("[device.front]\nsource = 3", r"\[device.front\]: source is text, not 3"),
-        ('[device.front]\nsource = "x.bin"\nsensor = ["a"]', r"\[device.front\]: sensor is text, not \['a'\]"),
-        ('[device.front]\nsource = "x.bin"\nmount = 90', r"\[device.front\]: mount is a table, not 90"),
-        ('[device.front]\nsource = "x.bin"\nmount = {yaw = 90}', r"\[device.front\] mount: unknown key 'yaw'; did you mean 'yaw_deg'\?"),
-        ('[device.front]\nsource = "x.bin"\nmount = {yaw_deg = "90"}', r"\[device.front\]: mount.yaw_deg is a number, not '90'"),
+        (
+            '[device.front]\nsource = "x.bin"\nsensor = ["a"]',
+            r"\[device.front\]: sensor is text, not \['a'\]",
+        ),
+        (
+            '[device.front]\nsource = "x.bin"\nmount = 90',
+            r"\[device.front\]: mount is a table, not 90",
+        ),
+        (
+            '[device.front]\nsource = "x.bin"\nmount = {yaw = 90}',
+            r"\[device.front\] mount: unknown key 'yaw'; did you mean 'yaw_deg'\?",
+        ),
+        (
+            '[device.front]\nsource = "x.bin"\nmount = {yaw_deg = "90"}',
+            r"\[device.front\]: mount.yaw_deg is a number, not '90'",
+        ),
         ('[device.front]\nsource = "x.bin"\nmount = {x = true}', r"mount.x is a number, not True"),
         ('[device.front]\nsource = "x.bin"\nmount = {x = inf}', r"mount.x is a number, not inf"),
-        ('[device.front]\nsource = "x.bin"\nmount = {inverted = 1}', r"mount.inverted is true or false, not 1"),
-        ('[device.front]\nsource = "x.bin"\noptions = {zero = 1}', r"options are a sensor's: name the sensor as well"),
+        (
+            '[device.front]\nsource = "x.bin"\nmount = {inverted = 1}',
+            r"mount.inverted is true or false, not 1",
+        ),
+        (
+            '[device.front]\nsource = "x.bin"\noptions = {zero = 1}',
+            r"options are a sensor's: name the sensor as well",
+        ),
         ('[device.front]\nsource = "rear"', r"source 'rear' is a name again"),
         ('[device.COM4]\nsource = "x.bin"', r"\[device.COM4\]: a name is a letter"),
         ('[device."a.bin"]\nsource = "x.bin"', r"\[device.a.bin\]: a name is a letter"),
@@ -295,7 +366,10 @@ def test_a_mount_turns_and_moves(mount: Mount, expected: tuple[float, float, flo
     reach, level = np.linalg.norm(direction), np.hypot(1.0, 2.0)
     one = {"time": np.zeros(1), "valid": np.ones(1, np.bool_), "stamp_ns": 5}
     polar = {"range": reach, "azimuth": np.arctan2(2.0, 1.0), "elevation": np.arctan2(3.0, level)}
-    columns = {name: np.array([value], np.float32) for name, value in {"x": 1, "y": 2, "z": 3, **polar}.items()}
+    columns = {
+        name: np.array([value], np.float32)
+        for name, value in {"x": 1, "y": 2, "z": 3, **polar}.items()
+    }
     found = mount.applied(ls.PointCloud(**columns, **one))
     np.testing.assert_allclose(found.xyz[0], expected, atol=1e-5)
     beam = np.array(expected) - (mount.x, mount.y, mount.z)

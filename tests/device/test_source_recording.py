@@ -36,7 +36,11 @@ def test_a_recording_goes_on_whatever_decoding_says_and_whoever_sends(tmp_path: 
     frames = {**good.frames, "data": replace(good.frames["data"], plausible=fails)}
     task = SourceRecording(f"udp://:{number}", str(path), replace(good, frames=frames))
     said, sent = "", turning(good, 50)
-    with udp("127.0.0.2") as own, udp("127.0.0.3") as other, contextlib.closing(task.run()) as running:
+    with (
+        udp("127.0.0.2") as own,
+        udp("127.0.0.3") as other,
+        contextlib.closing(task.run()) as running,
+    ):
         said += next(running)
         for frame in sent:
             own.sendto(frame, ("127.0.0.1", number))
@@ -46,18 +50,36 @@ def test_a_recording_goes_on_whatever_decoding_says_and_whoever_sends(tmp_path: 
             if task.recorder is not None and task.recorder.records >= 100:
                 break
         said += next(running)
-    assert said.count("decoding fails (SystemExit: nothing that a plugin should do); the recording goes on") == 1
+    assert (
+        said.count(
+            "decoding fails (SystemExit: nothing that a plugin should do); the recording goes on"
+        )
+        == 1
+    )
     with Recording(path) as recording:
-        kept = [record.data for record in recording if record.sender is not None and record.sender[0] == "127.0.0.2"]
+        kept = [
+            record.data
+            for record in recording
+            if record.sender is not None and record.sender[0] == "127.0.0.2"
+        ]
     assert kept == sent
 
 
 @pytest.mark.parametrize("knows", [True, False])
-def test_what_it_says_is_what_is_in_the_file_and_it_ends_at_the_time_asked(tmp_path: Path, knows: bool) -> None:
+def test_what_it_says_is_what_is_in_the_file_and_it_ends_at_the_time_asked(
+    tmp_path: Path, knows: bool
+) -> None:
     sensor, number, path = SHAPES["shape-datagrams"], free_port(), tmp_path / "all.lsr"
     frames = turning(sensor, 50)
     task = SourceRecording(f"udp://:{number}", str(path), sensor if knows else None, seconds=0.3)
-    with udp() as sender, working(lambda stop: paced(lambda data: sender.sendto(data, ("127.0.0.1", number)), frames, 500, stop)):
+    with (
+        udp() as sender,
+        working(
+            lambda stop: paced(
+                lambda data: sender.sendto(data, ("127.0.0.1", number)), frames, 500, stop
+            )
+        ),
+    ):
         for _ in task.run():
             pass
     with Recording(path) as recording:
@@ -69,7 +91,11 @@ def test_what_it_says_is_what_is_in_the_file_and_it_ends_at_the_time_asked(tmp_p
 def test_strangers_are_told_of_once_while_a_recording_goes_on(tmp_path: Path) -> None:
     sensor, number, path = SHAPES["shape-datagrams"], free_port(), tmp_path / "all.lsr"
     task, said = SourceRecording(f"udp://:{number}", str(path), sensor, count=60), list[str]()
-    with udp("127.0.0.2") as own, udp("127.0.0.3") as other, contextlib.closing(task.run()) as running:
+    with (
+        udp("127.0.0.2") as own,
+        udp("127.0.0.3") as other,
+        contextlib.closing(task.run()) as running,
+    ):
         said.append(next(running))
         for frame in turning(sensor, 60):
             own.sendto(frame, ("127.0.0.1", number))
@@ -87,7 +113,9 @@ def test_a_sensor_that_sends_over_ipv6_is_recorded_for_wireshark(tmp_path: Path)
         except OSError:
             pytest.skip("this system has no IPv6")
         number, sent = free_port(), turning(sensor, 20)
-        with contextlib.closing(SourceRecording(f"udp://[::1]:{number}", str(path), sensor, count=20).run()) as running:
+        with contextlib.closing(
+            SourceRecording(f"udp://[::1]:{number}", str(path), sensor, count=20).run()
+        ) as running:
             next(running)
             for frame in sent:
                 sender.sendto(frame, ("::1", number))
@@ -102,7 +130,9 @@ def test_a_clock_that_is_set_changes_no_time_and_is_recorded(tmp_path: Path) -> 
     frames, queue = turning(sensor, 4), BoundedQueue()
     with udp() as sender, Recorder(path, sensor) as kept:
         clock = HostClock(wall=lambda: time.time_ns() + wall[0])
-        with contextlib.closing(Capture(live(f"udp://:{number}", sensor), queue, log=kept, clock=clock)) as capture:
+        with contextlib.closing(
+            Capture(live(f"udp://:{number}", sensor), queue, log=kept, clock=clock)
+        ) as capture:
             for index, step in enumerate((0, 20_000_000, 3_000_000_000, 3_000_000_000)):
                 wall[0] = step
                 sender.sendto(frames[index], ("127.0.0.1", number))
@@ -119,13 +149,30 @@ def test_a_clock_that_is_set_changes_no_time_and_is_recorded(tmp_path: Path) -> 
     with ls.open(path, sensor) as device:
         assert sum(map(len, device.packets())) == 4
         (said,) = (warning for warning in device.warnings if "clock" in warning)
-        assert said == f"{path}: the clock of the computer was set while it recorded; the arrival times go on evenly, as it was at first"
+        assert (
+            said
+            == f"{path}: the clock of the computer was set while it recorded; the arrival times go"
+            " on evenly, as it was at first"
+        )
 
 
 def test_arrival_times_count_a_suspend() -> None:
     """In a namespace in which the computer seems to have slept for 100 s."""
     slept = ["unshare", "--fork", "--user", "--map-root-user", "--time", "--boottime", "100"]
-    if shutil.which("unshare") is None or subprocess.run([*slept, "true"], capture_output=True, check=False).returncode:
+    if (
+        shutil.which("unshare") is None
+        or subprocess.run([*slept, "true"], capture_output=True, check=False).returncode
+    ):
         pytest.skip("this system has no namespaces of time")
-    program = "import time; from lidarspec.transports.base import steady_ns; print((steady_ns() - time.monotonic_ns()) // 10**9)"
-    assert int(subprocess.run([*slept, sys.executable, "-c", program], capture_output=True, check=True).stdout) >= 99
+    program = (
+        "import time; from lidarspec.transports.base import steady_ns; print((steady_ns() -"
+        " time.monotonic_ns()) // 10**9)"
+    )
+    assert (
+        int(
+            subprocess.run(
+                [*slept, sys.executable, "-c", program], capture_output=True, check=True
+            ).stdout
+        )
+        >= 99
+    )

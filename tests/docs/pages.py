@@ -1,9 +1,11 @@
-"""Pages of the documentation as their readers follow them: files written, shells and Python run, what is printed compared.
+"""Pages of the documentation as their readers follow them: files written, shells and Python run,
+what is printed compared.
 
-A block with ``title="NAME"`` is the file of that name; a second one with the same name is added below the first. A block with
-``title="Output"`` is what the block before it prints, with ``...`` for whatever is there. Of the others, ``sh`` and ``python`` are run in
-the order of the page, all Python of a page as one session; other languages (``text``, ``console``) are for reading. Python that imports a
-library which is not installed is left out, and what it prints, and said.
+A block with ``title="NAME"`` is the file of that name; a second one with the same name is added
+below the first. A block with ``title="Output"`` is what the block before it prints, with ``...``
+for whatever is there. Of the others, ``sh`` and ``python`` are run in the order of the page, all
+Python of a page as one session; other languages (``text``, ``console``) are for reading. Python
+that imports a library which is not installed is left out, and what it prints, and said.
 """
 
 from __future__ import annotations
@@ -30,12 +32,16 @@ OUTPUT = "Output"
 SEPARATOR = "\n\n"
 #: pip takes the build backend from what is installed, and needs no package index.
 OFFLINE = {"PIP_NO_INDEX": "1", "PIP_NO_BUILD_ISOLATION": "0", "PIP_DISABLE_PIP_VERSION_CHECK": "1"}
-_FENCE = re.compile(r"^( *)```(\w+)(?: title=\"([^\"]+)\")?\n(.*?)^\1```$", re.MULTILINE | re.DOTALL)
+_FENCE = re.compile(
+    r"^( *)```(\w+)(?: title=\"([^\"]+)\")?\n(.*?)^\1```$", re.MULTILINE | re.DOTALL
+)
 
 
 @dataclass(frozen=True)
 class Block:
-    """A fenced block: its language, its title ("" without), its text, and where on the page it begins."""
+    """A fenced block: its language, its title ("" without), its text, and where on the page it
+    begins.
+    """
 
     language: str
     title: str
@@ -48,12 +54,20 @@ def blocks(page: str) -> list[Block]:
     """The fenced blocks of a page under docs/, in order."""
     text = (DOCS / page).read_text(encoding="utf-8")
     return [
-        Block(found[2], found[3] or "", textwrap.dedent(found[4]), page, text.count("\n", 0, found.start()) + 2)
+        Block(
+            found[2],
+            found[3] or "",
+            textwrap.dedent(found[4]),
+            page,
+            text.count("\n", 0, found.start()) + 2,
+        )
         for found in _FENCE.finditer(text)
     ]
 
 
-def follow(page: str, place: Path, environment: Mapping[str, str] | None = None) -> tuple[int, list[str]]:
+def follow(
+    page: str, place: Path, environment: Mapping[str, str] | None = None
+) -> tuple[int, list[str]]:
     """The number of blocks that ran, of a page followed in an empty folder, and why others did not.
 
     Raises:
@@ -76,7 +90,10 @@ def follow(page: str, place: Path, environment: Mapping[str, str] | None = None)
         elif block.language == "sh":
             printed, ran = shell(block, place, environment), ran + 1
         elif block.language == "python" and (missing := lacking(block)):
-            printed, left_out = None, [*left_out, f"{', '.join(missing)} is not installed ({block.place}:{block.line})"]
+            printed, left_out = (
+                None,
+                [*left_out, f"{', '.join(missing)} is not installed ({block.place}:{block.line})"],
+            )
         elif block.language == "python":
             printed, ran = python(block, place, session), ran + 1
     return ran, left_out
@@ -84,9 +101,19 @@ def follow(page: str, place: Path, environment: Mapping[str, str] | None = None)
 
 def lacking(block: Block) -> list[str]:
     """The libraries that a Python block imports and that are not installed, or do not load."""
-    imports = [node for node in ast.walk(ast.parse(block.text)) if isinstance(node, ast.Import | ast.ImportFrom)]
+    imports = [
+        node
+        for node in ast.walk(ast.parse(block.text))
+        if isinstance(node, ast.Import | ast.ImportFrom)
+    ]
     names = [
-        name for node in imports for name in ([node.module or ""] if isinstance(node, ast.ImportFrom) else [one.name for one in node.names])
+        name
+        for node in imports
+        for name in (
+            [node.module or ""]
+            if isinstance(node, ast.ImportFrom)
+            else [one.name for one in node.names]
+        )
     ]
     return [name for name in (name.partition(".")[0] for name in names) if not _loads(name)]
 
@@ -104,15 +131,28 @@ def shell(block: Block, place: Path, environment: Mapping[str, str] | None = Non
     command = ["bash", "-euo", "pipefail", "-c", block.text]
     given = {**os.environ, **OFFLINE, "COLUMNS": "140", "NO_COLOR": "1", **(environment or {})}
     done = subprocess.run(
-        command, check=False, cwd=place, env=given, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True, timeout=120
+        command,
+        check=False,
+        cwd=place,
+        env=given,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.STDOUT,
+        text=True,
+        timeout=120,
     )
-    assert done.returncode == 0, f"{block.place}:{block.line}: exit code {done.returncode}\n{done.stdout}"
+    assert done.returncode == 0, (
+        f"{block.place}:{block.line}: exit code {done.returncode}\n{done.stdout}"
+    )
     return done.stdout
 
 
 def python(block: Block, place: Path, session: dict[str, Any]) -> str:
-    """What a Python block prints, run in the names of those before it; a fault says which line of the page it is in."""
-    code = compile("\n" * (block.line - 1) + block.text, str(DOCS / block.place), "exec", dont_inherit=True)
+    """What a Python block prints, run in the names of those before it; a fault says which line of
+    the page it is in.
+    """
+    code = compile(
+        "\n" * (block.line - 1) + block.text, str(DOCS / block.place), "exec", dont_inherit=True
+    )
     out = io.StringIO()
     with contextlib.redirect_stdout(out), contextlib.chdir(place):
         exec(code, session)
@@ -121,22 +161,34 @@ def python(block: Block, place: Path, session: dict[str, Any]) -> str:
 
 def assert_printed(block: Block, printed: str) -> None:
     """Hold what was printed against the page, where trailing blanks do not count."""
-    expected, got = ("".join(f"{line.rstrip()}\n" for line in text.splitlines()) for text in (block.text, printed))
+    expected, got = (
+        "".join(f"{line.rstrip()}\n" for line in text.splitlines())
+        for text in (block.text, printed)
+    )
     same = doctest.OutputChecker().check_output(expected, got, doctest.ELLIPSIS)
     assert same, f"{block.place}:{block.line}: the page says\n{expected}\nbut there comes\n{got}"
 
 
 def clean_environment(place: Path) -> dict[str, str]:
-    """The variables of an environment of its own, which sees what is installed here and keeps what is installed into it."""
+    """The variables of an environment of its own, which sees what is installed here and keeps what
+    is installed into it.
+    """
     venv.create(place, with_pip=False, symlinks=os.name != "nt")
     scripts = place / ("Scripts" if os.name == "nt" else "bin")
     inner = subprocess.run(
-        [scripts / "python", "-c", "import sysconfig; print(sysconfig.get_path('purelib'))"], capture_output=True, text=True, check=True
+        [scripts / "python", "-c", "import sysconfig; print(sysconfig.get_path('purelib'))"],
+        capture_output=True,
+        text=True,
+        check=True,
     ).stdout.strip()
     outer = [path for path in sys.path if path.endswith("site-packages")]
-    Path(inner, "outer.pth").write_text("".join(f"import site; site.addsitedir({path!r})\n" for path in outer), encoding="utf-8")
+    Path(inner, "outer.pth").write_text(
+        "".join(f"import site; site.addsitedir({path!r})\n" for path in outer), encoding="utf-8"
+    )
     for name, module in (("pip", "pip"), ("pytest", "pytest"), ("lidarspec", "lidarspec")):
         script = scripts / name
-        script.write_text(f'#!/bin/sh\nexec "{scripts / "python"}" -m {module} "$@"\n', encoding="utf-8")
+        script.write_text(
+            f'#!/bin/sh\nexec "{scripts / "python"}" -m {module} "$@"\n', encoding="utf-8"
+        )
         script.chmod(0o755)
     return {"PATH": f"{scripts}{os.pathsep}{os.environ['PATH']}", "VIRTUAL_ENV": str(place)}

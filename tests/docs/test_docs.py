@@ -27,28 +27,42 @@ from tests.docs.pages import DOCS
 
 #: pages that `make docs` generates, not tracked.
 GENERATED = "reference/sensors/"
-PAGES = sorted(page for page in (path.relative_to(DOCS).as_posix() for path in DOCS.rglob("*.md")) if not page.startswith(GENERATED))
+PAGES = sorted(
+    page
+    for page in (path.relative_to(DOCS).as_posix() for path in DOCS.rglob("*.md"))
+    if not page.startswith(GENERATED)
+)
 MANUAL = bytes.fromhex(
     "542c6808ab7ee000e4dc00e2d900e5d500e3d300e4d000e9cd00e4ca00e2c700e9c500e5c200e5c000e5be823a1a50"
 )  # STL-27L development manual, section 3.3
 
 
 def headings(page: str) -> set[str]:
-    return set(re.findall(r"^## (\S+)$", (DOCS / page).read_text(encoding="utf-8"), flags=re.MULTILINE))
+    return set(
+        re.findall(r"^## (\S+)$", (DOCS / page).read_text(encoding="utf-8"), flags=re.MULTILINE)
+    )
 
 
 #: pages with something to run.
-FOLLOWED = [page for page in PAGES if any(block.language in ("sh", "python") for block in pages.blocks(page))]
+FOLLOWED = [
+    page
+    for page in PAGES
+    if any(block.language in ("sh", "python") for block in pages.blocks(page))
+]
 
 
 @pytest.mark.slow
-@pytest.mark.skipif(os.name == "nt", reason="shell blocks are for bash, and some use a pseudo-terminal")
+@pytest.mark.skipif(
+    os.name == "nt", reason="shell blocks are for bash, and some use a pseudo-terminal"
+)
 @pytest.mark.parametrize("page", FOLLOWED)
 def test_a_page_can_be_followed_to_its_end(page: str, tmp_path: Path) -> None:
     (tmp_path / "here").mkdir()
     shells = any(block.language == "sh" for block in pages.blocks(page))
     environment = pages.clean_environment(tmp_path / "environment") if shells else {}
-    ran, left_out = pages.follow(page, tmp_path / "here", {**environment, "LIDARSPEC_EXAMPLES": "8"})
+    ran, left_out = pages.follow(
+        page, tmp_path / "here", {**environment, "LIDARSPEC_EXAMPLES": "8"}
+    )
     assert ran
     if left_out:
         pytest.skip("; ".join(left_out))
@@ -68,11 +82,26 @@ def test_a_page_that_is_wrong_is_found(tmp_path: Path) -> None:
 
 
 def test_the_plugin_of_the_tutorial_decodes_the_manuals_frame(tmp_path: Path) -> None:
-    (plugin,) = [block for block in pages.blocks("tutorial/first-sensor.md") if block.title == "stl27l.py"]
+    (plugin,) = [
+        block for block in pages.blocks("tutorial/first-sensor.md") if block.title == "stl27l.py"
+    ]
     (tmp_path / plugin.title).write_text(plugin.text, encoding="utf-8")
     packets = ls.sensor(tmp_path / plugin.title).decode(MANUAL)
     assert packets["start_angle"].tolist() == [pytest.approx(324.27)]
-    assert packets.raw["points"]["distance"][0].tolist() == [224, 220, 217, 213, 211, 208, 205, 202, 199, 197, 194, 192]
+    assert packets.raw["points"]["distance"][0].tolist() == [
+        224,
+        220,
+        217,
+        213,
+        211,
+        208,
+        205,
+        202,
+        199,
+        197,
+        194,
+        192,
+    ]
     cloud = packets.points()
     assert cloud.x[0] == pytest.approx(0.224 * 0.81186, abs=1e-4)  # cos 324.27 deg
     assert cloud.y[0] == pytest.approx(0.224 * 0.58384, abs=1e-4)  # 35.73 deg to the left
@@ -84,7 +113,9 @@ def test_the_readme_says_what_is_printed() -> None:
     assert not done.failed
 
 
-HOOKS = {name: function for name, function in vars(hookspecs).items() if name.startswith("lidarspec_")}
+HOOKS = {
+    name: function for name, function in vars(hookspecs).items() if name.startswith("lidarspec_")
+}
 
 
 def test_every_hook_has_its_heading() -> None:
@@ -93,26 +124,42 @@ def test_every_hook_has_its_heading() -> None:
 
 @pytest.mark.parametrize("name", HOOKS)
 def test_every_hook_is_written_with_its_arguments(name: str) -> None:
-    found = re.search(rf"^`{name}\((.*?)\) -> .+?`", (DOCS / "reference/hooks.md").read_text(encoding="utf-8"), flags=re.MULTILINE)
+    found = re.search(
+        rf"^`{name}\((.*?)\) -> .+?`",
+        (DOCS / "reference/hooks.md").read_text(encoding="utf-8"),
+        flags=re.MULTILINE,
+    )
     assert found
     assert re.findall(r"(\w+):", found[1]) == list(inspect.signature(HOOKS[name]).parameters)
 
 
 def test_every_public_name_is_on_the_pages_of_the_python_interface() -> None:
-    listed = (DOCS / "reference/python.md").read_text(encoding="utf-8").partition("## Every name")[2]
+    listed = (
+        (DOCS / "reference/python.md").read_text(encoding="utf-8").partition("## Every name")[2]
+    )
     public = {*ls.__all__, *spec.__all__, *public_errors()}
     assert set(re.findall(r"`([A-Za-z]\w+)`", listed)) - {"lidarspec"} == public
-    shown = re.findall(r"^::: (lidarspec[\w.]*)\.(\w+)$", (DOCS / "reference/api.md").read_text(encoding="utf-8"), re.MULTILINE)
+    shown = re.findall(
+        r"^::: (lidarspec[\w.]*)\.(\w+)$",
+        (DOCS / "reference/api.md").read_text(encoding="utf-8"),
+        re.MULTILINE,
+    )
     assert sorted(name for _, name in shown) == sorted(public)
     assert all(hasattr(importlib.import_module(module), name) for module, name in shown)
 
 
 def public_errors() -> set[str]:
-    classes = {name for name, value in vars(errors).items() if isinstance(value, type) and issubclass(value, errors.LidarSpecError)}
+    classes = {
+        name
+        for name, value in vars(errors).items()
+        if isinstance(value, type) and issubclass(value, errors.LidarSpecError)
+    }
     return classes - {"UnknownName"}
 
 
-@pytest.mark.parametrize("value", [ls.Sensor, Frame, Command, Scaled, Checksummed, Clock, Sequence, Polar])
+@pytest.mark.parametrize(
+    "value", [ls.Sensor, Frame, Command, Scaled, Checksummed, Clock, Sequence, Polar]
+)
 def test_what_authors_write_says_what_each_argument_is(value: type) -> None:
     arguments = (inspect.getdoc(value) or "").partition("Args:")[2]
     named = set(re.findall(r"\w+", " ".join(re.findall(r"^ +([\w, ]+):", arguments, re.MULTILINE))))
@@ -143,13 +190,27 @@ def test_every_page_is_in_the_contents_of_the_site() -> None:
 HOUSE = Path(ls.__file__).parent
 
 
-@pytest.mark.parametrize("package", sorted(path.parent.relative_to(HOUSE).as_posix() for path in HOUSE.glob("*/**/__init__.py")))
+@pytest.mark.parametrize(
+    "package",
+    sorted(path.parent.relative_to(HOUSE).as_posix() for path in HOUSE.glob("*/**/__init__.py")),
+)
 def test_a_package_says_what_comes_in_and_out_and_names_its_modules(package: str) -> None:
-    text = ast.get_docstring(ast.parse((HOUSE / package / "__init__.py").read_text(encoding="utf-8"))) or ""
+    text = (
+        ast.get_docstring(ast.parse((HOUSE / package / "__init__.py").read_text(encoding="utf-8")))
+        or ""
+    )
     assert "In: " in text
     assert "Out: " in text
-    modules = {path.stem for path in (HOUSE / package).iterdir() if path.suffix == ".py" or (path / "__init__.py").is_file()}
-    listed = {name for line in re.findall(r"^\* (.*?): ", text, re.MULTILINE) for name in re.findall(r"`(\w+)`", line)}
+    modules = {
+        path.stem
+        for path in (HOUSE / package).iterdir()
+        if path.suffix == ".py" or (path / "__init__.py").is_file()
+    }
+    listed = {
+        name
+        for line in re.findall(r"^\* (.*?): ", text, re.MULTILINE)
+        for name in re.findall(r"`(\w+)`", line)
+    }
     assert listed == modules - {"__init__"}
 
 
@@ -157,7 +218,9 @@ CONTRIBUTING = (DOCS.parent / "CONTRIBUTING.md").read_text(encoding="utf-8")
 
 
 def opened(section: str) -> list[tuple[str, str]]:
-    """Module and name of everything that a table of CONTRIBUTING says to open; a name belongs to the module that was named last."""
+    """Module and name of everything that a table of CONTRIBUTING says to open; a name belongs to
+    the module that was named last.
+    """
     text = CONTRIBUTING.partition(f"## {section}\n")[2].partition("\n## ")[0]
     named = []
     for row in re.findall(r"^\|.*`.*\|$", text, re.MULTILINE):
@@ -172,7 +235,9 @@ def opened(section: str) -> list[tuple[str, str]]:
     return named
 
 
-@pytest.mark.parametrize(("module", "name"), [*opened("Where things are"), *opened("The way of a byte")])
+@pytest.mark.parametrize(
+    ("module", "name"), [*opened("Where things are"), *opened("The way of a byte")]
+)
 def test_what_contributing_says_to_open_is_there(module: str, name: str) -> None:
     assert operator.attrgetter(name)(importlib.import_module(f"lidarspec.{module}"))
 
@@ -184,7 +249,12 @@ def test_a_byte_goes_the_way_that_contributing_says() -> None:
 
     def profile(frame: FrameType, event: str, _: object) -> None:
         if event == "call":
-            passed.add((frame.f_globals.get("__name__", "").removeprefix("lidarspec."), frame.f_code.co_qualname))
+            passed.add(
+                (
+                    frame.f_globals.get("__name__", "").removeprefix("lidarspec."),
+                    frame.f_code.co_qualname,
+                )
+            )
 
     threading.setprofile(profile)
     sys.setprofile(profile)

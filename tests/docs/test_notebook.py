@@ -1,4 +1,6 @@
-"""The notebook of the documentation runs from its first cell to its last, in a kernel of its own, and shows what it says."""
+"""The notebook of the documentation runs from its first cell to its last, in a kernel of its own,
+and shows what it says.
+"""
 
 from __future__ import annotations
 
@@ -13,7 +15,10 @@ import pytest
 from tests.docs.pages import DOCS
 from tests.libraries import Library, needs
 
-pytestmark = [pytest.mark.slow, needs("nbclient", "nbformat", "ipykernel", "matplotlib", "pandas", "pyarrow")]
+pytestmark = [
+    pytest.mark.slow,
+    needs("nbclient", "nbformat", "ipykernel", "matplotlib", "pandas", "pyarrow"),
+]
 nbclient = Library("nbclient")
 nbformat = Library("nbformat")
 PAGE = DOCS / "how-to" / "notebook.ipynb"
@@ -21,22 +26,33 @@ PAGE = DOCS / "how-to" / "notebook.ipynb"
 
 def shown(cell: Any) -> dict[str, str]:
     """What a cell shows, by kind."""
-    outputs = {"text": "".join(output.text for output in cell.outputs if output.output_type == "stream")}
+    outputs = {
+        "text": "".join(output.text for output in cell.outputs if output.output_type == "stream")
+    }
     for output in cell.outputs:
         outputs |= dict(output.get("data", {}))
     return outputs
 
 
 @pytest.mark.skipif(os.name == "nt", reason="some cells are for a shell")
-def test_the_notebook_runs_to_its_end_and_shows_what_it_says(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_notebook_runs_to_its_end_and_shows_what_it_says(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.setenv("PATH", f"{Path(sys.executable).parent}{os.pathsep}{os.environ['PATH']}")
     monkeypatch.setenv("IPYTHONDIR", str(tmp_path / "ipython"))
     notebook = nbformat.read(PAGE, as_version=4)
-    nbclient.NotebookClient(notebook, timeout=120, resources={"metadata": {"path": str(tmp_path)}}).execute()
+    nbclient.NotebookClient(
+        notebook, timeout=120, resources={"metadata": {"path": str(tmp_path)}}
+    ).execute()
     cells = [shown(cell) for cell in notebook.cells if cell.cell_type == "code"]
     assert len([cell for cell in cells if cell.get("image/svg+xml", "").startswith("<svg")]) == 3
     tables = [cell["text/html"] for cell in cells if "text/html" in cell]
-    assert [word in table for word, table in zip(("50%", "blocks.azimuth [deg]", "expected 0x", "<svg"), tables, strict=True)] == [True] * 4
+    assert [
+        word in table
+        for word, table in zip(
+            ("50%", "blocks.azimuth [deg]", "expected 0x", "<svg"), tables, strict=True
+        )
+    ] == [True] * 4
     assert any("image/png" in cell for cell in cells)
     texts = "".join(cell["text"] for cell in cells)
     assert re.search(r"\(2160, 3\) 1\.\d+ 5\.\d+", texts)
@@ -54,8 +70,14 @@ def test_what_is_kept_of_the_notebook_is_its_input() -> None:
 
 
 def test_links_of_the_notebook_lead_somewhere_and_it_is_in_the_contents() -> None:
-    text = "".join(cell.source for cell in nbformat.read(PAGE, as_version=4).cells if cell.cell_type == "markdown")
-    links = re.findall(r"\]\(\.\./([^)#:]+)/\)", text)  # as the site has them, which turns no links of a notebook around
+    text = "".join(
+        cell.source
+        for cell in nbformat.read(PAGE, as_version=4).cells
+        if cell.cell_type == "markdown"
+    )
+    links = re.findall(
+        r"\]\(\.\./([^)#:]+)/\)", text
+    )  # as the site has them, which turns no links of a notebook around
     assert len(links) == text.count("](")
     assert all((PAGE.parent / f"{link}.md").is_file() for link in links)
     assert ": how-to/notebook.ipynb" in (DOCS.parent / "mkdocs.yml").read_text(encoding="utf-8")

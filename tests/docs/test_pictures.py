@@ -1,4 +1,6 @@
-"""The pictures of the front page are what their script makes of simulated sensors, and small; pages and README show them all."""
+"""The pictures of the front page are what their script makes of simulated sensors, and small; pages
+and README show them all.
+"""
 
 from __future__ import annotations
 
@@ -27,14 +29,19 @@ def made(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def test_the_script_makes_the_same_pictures_again(made: Path) -> None:
     assert sorted(path.name for path in made.iterdir()) == sorted(NAMES)
     for name in NAMES:
-        kept, fresh = ((folder / name).read_text(encoding="utf-8") for folder in (DOCS / "pictures", made))
+        kept, fresh = (
+            (folder / name).read_text(encoding="utf-8") for folder in (DOCS / "pictures", made)
+        )
         # another processor may round a coordinate of a dot the other way
         assert TOLD.sub("", DOTS.sub("", kept)) == TOLD.sub("", DOTS.sub("", fresh)), name
         assert fresh.count("h0") == pytest.approx(kept.count("h0"), rel=0.01), name
 
 
 def test_pictures_are_small_and_all_of_them_are_shown() -> None:
-    start, readme = ((folder).read_text(encoding="utf-8") for folder in (DOCS / "index.md", DOCS.parent / "README.md"))
+    start, readme = (
+        (folder).read_text(encoding="utf-8")
+        for folder in (DOCS / "index.md", DOCS.parent / "README.md")
+    )
     for path in (DOCS / "pictures").iterdir():
         assert path.stat().st_size < 100_000, path.name
         assert f"(pictures/{path.name})" in start

@@ -48,7 +48,9 @@ def test_the_index_links_every_page() -> None:
     assert all(f"({sensor.id}.md)" in index for sensor in sensors)
 
 
-def test_files_of_sensors_that_are_gone_are_removed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_files_of_sensors_that_are_gone_are_removed(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     sensor = ls.sensor("ldrobot-stl27l")
     monkeypatch.setattr(ls, "sensors", lambda: {sensor.id: sensor})
     script = load_script("reference_pages")
@@ -62,7 +64,9 @@ def test_files_of_sensors_that_are_gone_are_removed(tmp_path: Path, monkeypatch:
 
 def test_the_generated_parts_of_the_reference_are_up_to_date() -> None:
     pages = load_script("command_pages").update_pages()
-    stale = [path for path, text in pages.items() if text != (DOCS / path).read_text(encoding="utf-8")]
+    stale = [
+        path for path, text in pages.items() if text != (DOCS / path).read_text(encoding="utf-8")
+    ]
     assert not stale, f"out of date, run `make reference`: {', '.join(stale)}"
     assert "| `--scan NUMBER` |" in pages["reference/command-line.md"]
 

@@ -1,4 +1,6 @@
-"""The terminal screens on the pages are what the verbs print: word for word where the moment does not matter, else in their headings."""
+"""The terminal screens on the pages are what the verbs print: word for word where the moment does
+not matter, else in their headings.
+"""
 
 from __future__ import annotations
 
@@ -16,7 +18,11 @@ PAGES = Path(__file__).parents[2] / "docs" / "how-to"
 def screens() -> dict[str, str]:
     """What stands below each command on the pages."""
     pages = [(PAGES / name).read_text(encoding="utf-8") for name in ("find.md", "view.md")]
-    return {command: text for page in pages for command, text in re.findall(r"```text\n\$ lidarspec (.*)\n((?:.*\n)*?)```", page)}
+    return {
+        command: text
+        for page in pages
+        for command, text in re.findall(r"```text\n\$ lidarspec (.*)\n((?:.*\n)*?)```", page)
+    }
 
 
 def test_every_verb_that_shows_something_has_its_screen() -> None:
@@ -27,18 +33,29 @@ def test_every_verb_that_shows_something_has_its_screen() -> None:
 
 
 def test_explain_prints_what_the_page_shows() -> None:
-    ((command, text),) = [(command, text) for command, text in screens().items() if command.startswith("explain")]
+    ((command, text),) = [
+        (command, text) for command, text in screens().items() if command.startswith("explain")
+    ]
     assert ran(*command.split()).stdout == text
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("verb", ["detect", "doctor", "stats"])
 def test_the_columns_are_those_of_the_page(verb: str, tmp_path: Path) -> None:
-    command, text = next((command, text) for command, text in screens().items() if command.startswith(f"{verb} /dev/ttyUSB0"))
+    command, text = next(
+        (command, text)
+        for command, text in screens().items()
+        if command.startswith(f"{verb} /dev/ttyUSB0")
+    )
     words = [word for word in command.split() if word not in ("-t", "3")]
     with virtual_port("ldrobot-stl27l", link=tmp_path / "port") as port:
         place = str(tmp_path / "port")
         assert port.path == place
-        printed = ran(*(place if word == "/dev/ttyUSB0" else word for word in words), "-t", "600ms", code=int(verb == "doctor")).stdout
+        printed = ran(
+            *(place if word == "/dev/ttyUSB0" else word for word in words),
+            "-t",
+            "600ms",
+            code=int(verb == "doctor"),
+        ).stdout
     heading = next(line.split() for line in text.splitlines() if not line.startswith("listening"))
     assert printed.replace(place, "/dev/ttyUSB0").splitlines()[0].split() == heading

@@ -1,4 +1,6 @@
-"""The search for a checksum: frames sealed with a known one, and whether it is found, where it stands, and at what price."""
+"""The search for a checksum: frames sealed with a known one, and whether it is found, where it
+stands, and at what price.
+"""
 
 from __future__ import annotations
 
@@ -12,7 +14,14 @@ import pytest
 import lidarspec
 import lidarspec.spec
 from lidarspec.drafting.checksum_search import Changed, WordSum, search
-from lidarspec.drafting.crc_search import common_divisor, crc_matches, divisors, quotient, remainder, solve
+from lidarspec.drafting.crc_search import (
+    common_divisor,
+    crc_matches,
+    divisors,
+    quotient,
+    remainder,
+    solve,
+)
 from lidarspec.drafting.samples import Match, Place, Samples, best_first
 from lidarspec.simulation.simulator import simulate
 from lidarspec.spec import Checksum, Crc, Fold15, Sum, WordXor, Xor
@@ -21,11 +30,23 @@ from lidarspec.spec.checksums import CRCS, name_of
 HEAD = b"\xaa\x55"
 
 
-def sealed(checksum: Checksum, number: int = 12, length: int = 30, *, order: str = "little", skip: int = 0, vary: int = 1) -> list[bytes]:
-    """Frames of random content with a header, and a checksum at the end over all but the first `skip` bytes."""
+def sealed(
+    checksum: Checksum,
+    number: int = 12,
+    length: int = 30,
+    *,
+    order: str = "little",
+    skip: int = 0,
+    vary: int = 1,
+) -> list[bytes]:
+    """Frames of random content with a header, and a checksum at the end over all but the first
+    `skip` bytes.
+    """
     source = random.Random(number * length)
     bodies = [HEAD + source.randbytes(length + source.randrange(vary)) for _ in range(number)]
-    return [body + checksum(body[skip:]).to_bytes(-(-checksum.width // 8), order) for body in bodies]  # type: ignore[arg-type]
+    return [
+        body + checksum(body[skip:]).to_bytes(-(-checksum.width // 8), order) for body in bodies
+    ]  # type: ignore[arg-type]
 
 
 def found(frames: list[bytes]) -> Match:
@@ -41,16 +62,28 @@ def found_among_crcs(frames: list[bytes]) -> Match:
 def assert_found_by_name(find: Callable[[list[bytes]], Match], name: str, length: int) -> None:
     crc = CRCS[name]
     match = find(sealed(crc, length=length, order="big" if len(name) % 2 else "little", vary=3))
-    assert (match.algorithm, match.name, match.place) == (crc, name, Place(-crc.width // 8, crc.width // 8))
+    assert (match.algorithm, match.name, match.place) == (
+        crc,
+        name,
+        Place(-crc.width // 8, crc.width // 8),
+    )
     assert (match.right, match.total) == (12, 12)
     assert match.order == ("big" if len(name) % 2 and crc.width > 8 else "little")
 
 
 #: those of the catalogue that a search tells from others; one in six in the quick tier.
-TOLD_APART = [name for name in CRCS if name not in ("CRC-8/I-CODE", "CRC-16/AUG-CCITT", "CRC-8/ITU")]
+TOLD_APART = [
+    name for name in CRCS if name not in ("CRC-8/I-CODE", "CRC-16/AUG-CCITT", "CRC-8/ITU")
+]
 
 
-@pytest.mark.parametrize("name", [pytest.param(name, marks=pytest.mark.slow if index % 6 else ()) for index, name in enumerate(TOLD_APART)])
+@pytest.mark.parametrize(
+    "name",
+    [
+        pytest.param(name, marks=pytest.mark.slow if index % 6 else ())
+        for index, name in enumerate(TOLD_APART)
+    ],
+)
 def test_every_crc_of_the_catalogue_is_found_by_name(name: str) -> None:
     assert_found_by_name(found_among_crcs, name, 16)
 
@@ -74,7 +107,10 @@ def test_the_catalogue_agrees_with_crccheck() -> None:
     ("width", "reflected"),
     [
         (16, True),
-        *(pytest.param(*pair, marks=pytest.mark.slow) for pair in ((8, False), (8, True), (16, False), (32, False), (32, True))),
+        *(
+            pytest.param(*pair, marks=pytest.mark.slow)
+            for pair in ((8, False), (8, True), (16, False), (32, False), (32, True))
+        ),
     ],
 )
 def test_a_crc_that_no_catalogue_knows(width: int, *, reflected: bool) -> None:
@@ -86,8 +122,12 @@ def test_a_crc_that_no_catalogue_knows(width: int, *, reflected: bool) -> None:
     match = found_among_crcs(frames)
     assert isinstance(match.algorithm, Crc)
     assert (match.algorithm.poly, match.algorithm.refin, match.right) == (poly, reflected, 24)
-    assert all(match.algorithm(frame[: -width // 8]) == crc(frame[: -width // 8]) for frame in frames)
-    assert match.algorithm == crc or match.open  # several pairs of init and xorout can be the same function
+    assert all(
+        match.algorithm(frame[: -width // 8]) == crc(frame[: -width // 8]) for frame in frames
+    )
+    assert (
+        match.algorithm == crc or match.open
+    )  # several pairs of init and xorout can be the same function
 
 
 @pytest.mark.slow
@@ -105,7 +145,11 @@ def test_frames_of_one_length_leave_init_and_xorout_open_and_say_so() -> None:
 @pytest.mark.slow
 def test_what_the_checksum_leaves_out_in_front() -> None:
     match = found(sealed(CRCS["CRC-16/MODBUS"], skip=2))
-    assert (match.name, match.span.head, match.span.told(match.place, 34)) == ("CRC-16/MODBUS", 2, "all other bytes but the first 2")
+    assert (match.name, match.span.head, match.span.told(match.place, 34)) == (
+        "CRC-16/MODBUS",
+        2,
+        "all other bytes but the first 2",
+    )
 
 
 @pytest.mark.parametrize(
@@ -136,19 +180,29 @@ def test_plain_checksums(checksum: Checksum) -> None:
         WordSum("big", carry=True),
         *(
             pytest.param(checksum, marks=pytest.mark.slow)
-            for checksum in (Changed(Sum(8), 0x5A), Changed(Sum(16), 0, negative=True), Changed(Sum(16), 0x1234))
+            for checksum in (
+                Changed(Sum(8), 0x5A),
+                Changed(Sum(16), 0, negative=True),
+                Changed(Sum(16), 0x1234),
+            )
         ),
     ],
 )
 def test_what_is_pasted_computes_the_same(checksum: Checksum) -> None:
     frames = sealed(checksum, 40, 27)
     match = found(frames)
-    scope: dict[str, Any] = vars(lidarspec) | {name: getattr(lidarspec.spec, name) for name in ("Checksum", "Xor", "WordXor")}
+    scope: dict[str, Any] = vars(lidarspec) | {
+        name: getattr(lidarspec.spec, name) for name in ("Checksum", "Xor", "WordXor")
+    }
     exec(match.paste, scope)
     pasted = scope["Check"]()
     for frame in frames:
         first, last = match.span.ranges(match.place, len(frame))[0]
-        assert pasted(frame[first:last]) == match.algorithm(frame[first:last]) == int.from_bytes(frame[-match.place.size :], match.order)
+        assert (
+            pasted(frame[first:last])
+            == match.algorithm(frame[first:last])
+            == int.from_bytes(frame[-match.place.size :], match.order)
+        )
 
 
 @pytest.mark.parametrize("number", [5, pytest.param(40, marks=pytest.mark.slow)])
@@ -177,7 +231,10 @@ def test_an_xor_in_two_nibbles() -> None:
 @pytest.mark.slow
 def test_damaged_frames_do_not_hide_it() -> None:
     frames = sealed(Crc(8, 0x4D), 60, 44)
-    damaged = [bytes([*frame[:9], frame[9] ^ 0x40, *frame[10:]]) if index % 5 == 0 else frame for index, frame in enumerate(frames)]
+    damaged = [
+        bytes([*frame[:9], frame[9] ^ 0x40, *frame[10:]]) if index % 5 == 0 else frame
+        for index, frame in enumerate(frames)
+    ]
     match = found(damaged)
     assert (match.algorithm, match.right, match.total) == (Crc(8, 0x4D), 48, 60)
 
@@ -233,6 +290,11 @@ def test_linear_equations_and_their_freedom() -> None:
 
 def test_batches_of_the_checksums_without_a_name() -> None:
     rows = np.frombuffer(random.Random(3).randbytes(60), np.uint8).reshape(4, 15)
-    for checksum in (WordSum("big"), WordSum("little", carry=True), Changed(Sum(8), 7, negative=True), Changed(Xor(), 9)):
+    for checksum in (
+        WordSum("big"),
+        WordSum("little", carry=True),
+        Changed(Sum(8), 7, negative=True),
+        Changed(Xor(), 9),
+    ):
         assert checksum.batch(rows).tolist() == [checksum(row.tobytes()) for row in rows]
         assert checksum.describe()

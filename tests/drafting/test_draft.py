@@ -1,4 +1,6 @@
-"""Drafts of unknown frames: what stands in real captures is found, and the draft reads the capture that it came from."""
+"""Drafts of unknown frames: what stands in real captures is found, and the draft reads the capture
+that it came from.
+"""
 
 from __future__ import annotations
 
@@ -24,7 +26,10 @@ from tests.cli.running import ran
 from tests.evidence import capture
 from tests.shapes import SHAPES
 
-LD06, COIN_D4 = "ldrobot/ld06_3_consecutive_frames.bin", "cspc/coin_d4_ludovatech_issue2_partial.bin"
+LD06, COIN_D4 = (
+    "ldrobot/ld06_3_consecutive_frames.bin",
+    "cspc/coin_d4_ludovatech_issue2_partial.bin",
+)
 VLP16, VLP16_RAW, HELIOS = (
     "velodyne/vlp16_dual/packets.derived.pcap",
     "velodyne/vlp16_raw/recording.bin",
@@ -51,7 +56,9 @@ def rising(found: Draft) -> dict[str, tuple[int, str, int]]:
 def module(tmp_path: Path, source: Path, *more: str) -> ls.Sensor:
     """The sensor that `new --from-capture` writes."""
     ran("new", "acme-x9", "--into", tmp_path, "--from-capture", source, *more)
-    return ls.sensor(tmp_path / Names("acme-x9").distribution / Names("acme-x9").module / "__init__.py")
+    return ls.sensor(
+        tmp_path / Names("acme-x9").distribution / Names("acme-x9").module / "__init__.py"
+    )
 
 
 def share(sensor: ls.Sensor, source: Path) -> float:
@@ -68,14 +75,23 @@ def test_three_frames_of_one_length_and_a_crc() -> None:
     found = drafted(LD06)
     assert (found.sync, found.size, len(found.frames), found.share) == (b"\x54\x2c", 47, 3, 1.0)
     assert found.seal is not None
-    assert (found.seal.algorithm, found.seal.place, found.seal.right) == (Crc(8, 0x4D), Place(-1, 1), 3)
+    assert (found.seal.algorithm, found.seal.place, found.seal.right) == (
+        Crc(8, 0x4D),
+        Place(-1, 1),
+        3,
+    )
     assert rising(found) == {"rising_4": (2, "little", 0), "rising_42": (2, "little", 0)}
 
 
 @pytest.mark.slow
 def test_a_count_that_only_the_frame_cut_off_gives_away() -> None:
     found = drafted(COIN_D4)
-    assert (found.sync, found.size, str(found.length), len(found.frames)) == (b"\xaa\x55", None, "10 + 3 x byte at 3", 4)
+    assert (found.sync, found.size, str(found.length), len(found.frames)) == (
+        b"\xaa\x55",
+        None,
+        "10 + 3 x byte at 3",
+        4,
+    )
     assert found.seal is not None
     assert (found.seal.algorithm, found.seal.place) == (WordXor(head=8, groups=(1, 2)), Place(8, 2))
     assert rising(found) == {"rising_4": (2, "little", 0), "rising_6": (2, "little", 0)}
@@ -83,23 +99,48 @@ def test_a_count_that_only_the_frame_cut_off_gives_away() -> None:
 
 @pytest.mark.slow
 @pytest.mark.parametrize(
-    ("name", "frames", "clock"), [(VLP16, 603, "rising_1200"), pytest.param(VLP16_RAW, 1000, "rising_1200", marks=pytest.mark.slow)]
+    ("name", "frames", "clock"),
+    [
+        (VLP16, 603, "rising_1200"),
+        pytest.param(VLP16_RAW, 1000, "rising_1200", marks=pytest.mark.slow),
+    ],
 )
-def test_blocks_with_a_little_endian_angle_and_no_checksum(name: str, frames: int, clock: str) -> None:
+def test_blocks_with_a_little_endian_angle_and_no_checksum(
+    name: str, frames: int, clock: str
+) -> None:
     found = drafted(name)
-    assert (found.sync, found.size, len(found.frames), found.seal) == (b"\xff\xee", 1206, frames, None)
+    assert (found.sync, found.size, len(found.frames), found.seal) == (
+        b"\xff\xee",
+        1206,
+        frames,
+        None,
+    )
     assert found.blocks is not None
-    assert (found.blocks.start, found.blocks.size, found.blocks.count, found.blocks.flag) == (0, 100, 12, b"\xff\xee")
+    assert (found.blocks.start, found.blocks.size, found.blocks.count, found.blocks.flag) == (
+        0,
+        100,
+        12,
+        b"\xff\xee",
+    )
     assert rising(found) == {"angle_2": (2, "little", 36_000), clock: (4, "little", 0)}
 
 
 @pytest.mark.slow
 def test_blocks_with_a_big_endian_angle_among_packets_of_another_kind() -> None:
     found = drafted(HELIOS)
-    assert (found.sync, found.size, len(found.frames), found.seal) == (b"\x55\xaa\x05\x5a", 1248, 750, None)
+    assert (found.sync, found.size, len(found.frames), found.seal) == (
+        b"\x55\xaa\x05\x5a",
+        1248,
+        750,
+        None,
+    )
     assert found.blocks is not None
     assert (found.blocks.start, found.blocks.size, found.blocks.count) == (42, 100, 12)
-    assert rising(found) == {"angle_2": (2, "big", 36_000), "counter_14": (2, "big", 0), "rising_26": (4, "big", 0)}
+    assert rising(found) == {
+        "angle_2": (2, "big", 36_000),
+        "counter_14": (2, "big", 0),
+        "rising_26": (4, "big", 0),
+    }
 
 
 @pytest.mark.slow
@@ -113,11 +154,15 @@ def test_blocks_with_a_big_endian_angle_among_packets_of_another_kind() -> None:
         pytest.param(HELIOS, 0.998, marks=pytest.mark.slow),
     ],
 )
-def test_the_draft_reads_the_capture_that_it_came_from(tmp_path: Path, name: str, least: float) -> None:
+def test_the_draft_reads_the_capture_that_it_came_from(
+    tmp_path: Path, name: str, least: float
+) -> None:
     sensor = module(tmp_path, capture(name))
     assert share(sensor, capture(name)) >= least
     assert len(sensor.decode(transport_data(name)).points()) > 0
-    text = (tmp_path / "lidarspec-acme-x9" / "lidarspec_acme_x9" / "__init__.py").read_text(encoding="utf-8")
+    text = (tmp_path / "lidarspec-acme-x9" / "lidarspec_acme_x9" / "__init__.py").read_text(
+        encoding="utf-8"
+    )
     assert "unknown_" in text
     assert capture(name).name in text
     assert ("# No checksum was found" in text) == ("Checksummed" not in text)
@@ -134,9 +179,17 @@ def transport_data(name: str) -> bytes | list[bytes]:
 def test_the_evidence_stands_beside_each_field(tmp_path: Path) -> None:
     (tmp_path / "some.bin").write_bytes(b"".join(simulate(ls.sensor("ldrobot-stl27l"), 400)))
     sensor = module(tmp_path, tmp_path / "some.bin")
-    text = (tmp_path / "lidarspec-acme-x9" / "lidarspec_acme_x9" / "__init__.py").read_text(encoding="utf-8")
-    assert "# rises by 200 from frame to frame, in 399 of 399, wraps at 36000: hundredths of a degree?\n" in text
-    assert "# lies between this frame's angle_4 and the next one's: the angle of the last sample?\n" in text
+    text = (tmp_path / "lidarspec-acme-x9" / "lidarspec_acme_x9" / "__init__.py").read_text(
+        encoding="utf-8"
+    )
+    assert (
+        "# rises by 200 from frame to frame, in 399 of 399, wraps at 36000: hundredths of a"
+        " degree?\n" in text
+    )
+    assert (
+        "# lies between this frame's angle_4 and the next one's: the angle of the last sample?\n"
+        in text
+    )
     assert "# right in 256 of 256 frames, a wrong one would be so once in " in text
     assert "algorithm=Crc(width=8, poly=0x4D),\n" in text
     assert 'scan=OnWrap("angle_4"),' in text
@@ -145,7 +198,9 @@ def test_the_evidence_stands_beside_each_field(tmp_path: Path) -> None:
 
 @pytest.mark.slow
 def test_a_draft_is_written_as_the_projects_own_sensors_are(tmp_path: Path) -> None:
-    """With everything that a draft can have: blocks, a count, a class for the checksum, angles, a counter."""
+    """With everything that a draft can have: blocks, a count, a class for the checksum, angles, a
+    counter.
+    """
     sources = {
         "blocks": b"".join(simulate(ls.sensor("velodyne-vlp16"), 60)),
         "count": b"".join(simulate(ls.sensor("cspc-coin-d4"), 60)),
@@ -156,22 +211,47 @@ def test_a_draft_is_written_as_the_projects_own_sensors_are(tmp_path: Path) -> N
     for name, data in sources.items():
         (tmp_path / f"{name}.bin").write_bytes(data)
         ran("new", f"acme-{name}", "--into", tmp_path, "--from-capture", tmp_path / f"{name}.bin")
-    text = "".join(path.read_text(encoding="utf-8") for path in tmp_path.glob("*/lidarspec_acme_*/__init__.py"))
-    for mark in ("/ Array(\n        12,", "this.count", "class Check(Checksum):", "deg2rad(f.angle_4)", "Sequence(", "confirm=2", "over=("):
+    text = "".join(
+        path.read_text(encoding="utf-8") for path in tmp_path.glob("*/lidarspec_acme_*/__init__.py")
+    )
+    for mark in (
+        "/ Array(\n        12,",
+        "this.count",
+        "class Check(Checksum):",
+        "deg2rad(f.angle_4)",
+        "Sequence(",
+        "confirm=2",
+        "over=(",
+    ):
         assert mark in text
     config = ["--config", str(ROOT / "pyproject.toml")]
     for words in (["check"], ["format", "--check"]):
         ruff = [sys.executable, "-m", "ruff", *words, *config, str(tmp_path)]
-        done = subprocess.run(ruff, cwd=ROOT, capture_output=True, text=True, check=False)  # where lidarspec is first party
+        done = subprocess.run(
+            ruff, cwd=ROOT, capture_output=True, text=True, check=False
+        )  # where lidarspec is first party
         assert done.returncode == 0, done.stdout
 
 
-def made(body: bytes, checksum: Checksum, *, number: int = 60, skip: int = 0, order: str = "little", vary: int = 0) -> bytes:
+def made(
+    body: bytes,
+    checksum: Checksum,
+    *,
+    number: int = 60,
+    skip: int = 0,
+    order: str = "little",
+    vary: int = 0,
+) -> bytes:
     """Frames with a counter and random content behind a header, sealed at the end."""
     source = random.Random(number)
     counts = [source.randrange(vary + 1) for _ in range(number)]
-    frames = [body + bytes([i % 256, 9 + count]) + source.randbytes(27 + 3 * count) for i, count in enumerate(counts)]
-    return b"".join(one + checksum(one[skip:]).to_bytes(checksum.width // 8, order) for one in frames)  # type: ignore[arg-type]
+    frames = [
+        body + bytes([i % 256, 9 + count]) + source.randbytes(27 + 3 * count)
+        for i, count in enumerate(counts)
+    ]
+    return b"".join(
+        one + checksum(one[skip:]).to_bytes(checksum.width // 8, order) for one in frames
+    )  # type: ignore[arg-type]
 
 
 SEALED = [
@@ -193,15 +273,23 @@ SEALED = [
     ],
     ids=lambda value: value.describe() if isinstance(value, Checksum) else str(value),
 )
-def test_made_frames_are_drafted_to_a_module_that_reads_them(tmp_path: Path, checksum: Checksum, skip: int, order: str, vary: int) -> None:
-    (tmp_path / "some.bin").write_bytes(b"\x00\x11" + made(b"\x5a\xc3", checksum, skip=skip, order=order, vary=vary) + b"\x5a\xc3\x01")
+def test_made_frames_are_drafted_to_a_module_that_reads_them(
+    tmp_path: Path, checksum: Checksum, skip: int, order: str, vary: int
+) -> None:
+    (tmp_path / "some.bin").write_bytes(
+        b"\x00\x11"
+        + made(b"\x5a\xc3", checksum, skip=skip, order=order, vary=vary)
+        + b"\x5a\xc3\x01"
+    )
     sensor = module(tmp_path, tmp_path / "some.bin")
     data = (tmp_path / "some.bin").read_bytes()
     found = sensor.split(data)
     assert len(found) == 60
     damaged = bytearray(data)
     damaged[found[5].offset + len(found[5].data) - 8] ^= 0x10
-    assert [one.offset for one in sensor.split(bytes(damaged))] == [one.offset for one in found if one is not found[5]]
+    assert [one.offset for one in sensor.split(bytes(damaged))] == [
+        one.offset for one in found if one is not found[5]
+    ]
     assert sensor.build("data", sensor.parse(found[5].data)) == found[5].data
 
 
@@ -211,40 +299,68 @@ def test_an_index_that_starts_again_is_a_counter_with_its_limits(tmp_path: Path)
     data = b"".join(frame + Sum(16)(frame).to_bytes(2, "little") for frame in frames)
     (tmp_path / "some.bin").write_bytes(data)
     sensor = module(tmp_path, tmp_path / "some.bin")
-    assert (sensor.sequence, share(sensor, tmp_path / "some.bin")) == (Sequence("counter_1", first=0xA0, last=0xF9), 1.0)
+    assert (sensor.sequence, share(sensor, tmp_path / "some.bin")) == (
+        Sequence("counter_1", first=0xA0, last=0xF9),
+        1.0,
+    )
     assert sensor.decode(data[: 22 * 50] + data[22 * 53 :]).stats.lost == 3
 
 
 @pytest.mark.slow
 def test_turns_of_an_index_are_not_taken_for_one_frame(tmp_path: Path) -> None:
-    """Ninety packets a turn that begin with one constant byte, over a scene that stands still: the format of old vacuum cleaners."""
-    rows = [np.array([1500 + 40 * (i % 90) + j for j in range(8)], "<u2").tobytes() for i in range(900)]
+    """Ninety packets a turn that begin with one constant byte, over a scene that stands still: the
+    format of old vacuum cleaners.
+    """
+    rows = [
+        np.array([1500 + 40 * (i % 90) + j for j in range(8)], "<u2").tobytes() for i in range(900)
+    ]
     frames = [bytes([0xFA, 0xA0 + i % 90, 0x00, 0x4B]) + row for i, row in enumerate(rows)]
     data = b"".join(frame + Fold15()(frame).to_bytes(2, "little") for frame in frames)
     found = draft([data[9:]], datagrams=False)
     assert (found.sync[:1], found.size, len(found.frames)) == (b"\xfa", 22, 899)
     assert found.seal is not None
     assert (found.seal.algorithm, found.seal.place) == (Fold15(), Place(-2, 2))
-    assert [(one.name, one.first, one.circle) for one in found.candidates if one.kind == "counter"] == [("counter_1", 0xA0, 0xFA)]
+    assert [
+        (one.name, one.first, one.circle) for one in found.candidates if one.kind == "counter"
+    ] == [("counter_1", 0xA0, 0xFA)]
 
 
 @pytest.mark.slow
 def test_a_length_in_bytes_with_short_frames_of_another_kind_between(tmp_path: Path) -> None:
-    """A header of fields, then samples of three bytes, and a big-endian sum; now and then a frame of eleven bytes."""
+    """A header of fields, then samples of three bytes, and a big-endian sum; now and then a frame
+    of eleven bytes.
+    """
     source = random.Random(7)
 
     def frame(i: int) -> bytes:
         samples = source.randbytes(3 * source.randrange(40, 44))
-        data = bytes([130]) if i % 50 == 49 else bytes([130, 0, 0]) + (i % 16 * 2250).to_bytes(2, "big") + samples
-        head = b"\xaa" + (8 + len(data)).to_bytes(2, "big") + b"\x01\x61" + (b"\xae" if len(data) == 1 else b"\xad")
+        data = (
+            bytes([130])
+            if i % 50 == 49
+            else bytes([130, 0, 0]) + (i % 16 * 2250).to_bytes(2, "big") + samples
+        )
+        head = (
+            b"\xaa"
+            + (8 + len(data)).to_bytes(2, "big")
+            + b"\x01\x61"
+            + (b"\xae" if len(data) == 1 else b"\xad")
+        )
         whole = head + len(data).to_bytes(2, "big") + data
         return whole + Sum(16)(whole).to_bytes(2, "big")
 
     (tmp_path / "some.bin").write_bytes(b"".join(map(frame, range(300))))
     found = draft([(tmp_path / "some.bin").read_bytes()], datagrams=False)
-    assert (found.sync, str(found.length), len(found.frames)) == (b"\xaa\x00", "2 + 1 x byte at 2", 294)
+    assert (found.sync, str(found.length), len(found.frames)) == (
+        b"\xaa\x00",
+        "2 + 1 x byte at 2",
+        294,
+    )
     assert found.seal is not None
-    assert (found.seal.algorithm, found.seal.place, found.seal.order) == (Sum(16), Place(-2, 2), "big")
+    assert (found.seal.algorithm, found.seal.place, found.seal.order) == (
+        Sum(16),
+        Place(-2, 2),
+        "big",
+    )
     assert rising(found) == {"angle_11": (2, "big", 36_000)}
     assert share(module(tmp_path, tmp_path / "some.bin"), tmp_path / "some.bin") > 0.99
 
@@ -254,9 +370,18 @@ def test_a_length_in_bytes_with_short_frames_of_another_kind_between(tmp_path: P
 def test_angles_are_told_by_what_they_wrap_at(circle: int, order: str) -> None:
     source = random.Random(circle)
     turned = np.cumsum([circle // 40 + source.randrange(-1, 2) for _ in range(300)]) % circle
-    rows = [source.randbytes(5) + int(value).to_bytes(2, order) + source.randbytes(6) for value in turned]  # type: ignore[arg-type]
+    rows = [
+        source.randbytes(5) + int(value).to_bytes(2, order) + source.randbytes(6)
+        for value in turned
+    ]  # type: ignore[arg-type]
     (one,) = candidates(np.frombuffer(b"".join(rows), np.uint8).reshape(300, 13))
-    assert (one.name, one.size, one.order, one.circle, one.kind) == ("angle_5", 2, order, circle, "angle")
+    assert (one.name, one.size, one.order, one.circle, one.kind) == (
+        "angle_5",
+        2,
+        order,
+        circle,
+        "angle",
+    )
 
 
 def test_noise_has_no_candidates() -> None:
@@ -264,17 +389,31 @@ def test_noise_has_no_candidates() -> None:
     assert not candidates(rows)
 
 
-@pytest.mark.parametrize("data", [random.Random(1).randbytes(5000), bytes(3000), b"\x55"], ids=["noise", "zeros", "a byte"])
+@pytest.mark.parametrize(
+    "data",
+    [random.Random(1).randbytes(5000), bytes(3000), b"\x55"],
+    ids=["noise", "zeros", "a byte"],
+)
 def test_bytes_without_frames_are_refused(tmp_path: Path, data: bytes) -> None:
     with pytest.raises(WireError, match="no frames of one kind"):
         draft([data], datagrams=False)
     (tmp_path / "some.bin").write_bytes(data)
-    assert "no frames of one kind" in ran("new", "acme-x9", "--into", tmp_path, "--from-capture", tmp_path / "some.bin", code=4).stderr
+    assert (
+        "no frames of one kind"
+        in ran(
+            "new", "acme-x9", "--into", tmp_path, "--from-capture", tmp_path / "some.bin", code=4
+        ).stderr
+    )
     assert not (tmp_path / "lidarspec-acme-x9").exists()
 
 
 def test_a_capture_that_is_not_there_is_named(tmp_path: Path) -> None:
-    assert "no.bin" in ran("new", "acme-x9", "--into", tmp_path, "--from-capture", tmp_path / "no.bin", code=3).stderr
+    assert (
+        "no.bin"
+        in ran(
+            "new", "acme-x9", "--into", tmp_path, "--from-capture", tmp_path / "no.bin", code=3
+        ).stderr
+    )
 
 
 def test_names_are_refused_before_a_capture_is_read() -> None:
@@ -292,7 +431,11 @@ def test_points_may_depend_on_no_field() -> None:
 
 def written(frames: list[bytes], *, datagrams: bool = False) -> dict[str, str]:
     """The texts of a draft of these frames."""
-    return text_of(draft(frames if datagrams else [b"".join(frames)], datagrams=datagrams), origin="the tests", link="")
+    return text_of(
+        draft(frames if datagrams else [b"".join(frames)], datagrams=datagrams),
+        origin="the tests",
+        link="",
+    )
 
 
 @pytest.mark.slow
@@ -306,14 +449,26 @@ def test_fields_alike_at_equal_distances_are_an_array() -> None:
 @pytest.mark.slow
 def test_the_counter_that_never_jumps_is_taken_and_the_others_are_offered() -> None:
     draw = random.Random(1)
-    frames = [b"\x0f\x55" + bytes([(i + i // 50 * 3) % 256, 0]) + i.to_bytes(2, "little") + draw.randbytes(10) for i in range(200)]
-    assert 'sequence=Sequence("counter_4"),  # a jump in it is a loss; or counter_2' in written(frames)["arguments"]
+    frames = [
+        b"\x0f\x55"
+        + bytes([(i + i // 50 * 3) % 256, 0])
+        + i.to_bytes(2, "little")
+        + draw.randbytes(10)
+        for i in range(200)
+    ]
+    assert (
+        'sequence=Sequence("counter_4"),  # a jump in it is a loss; or counter_2'
+        in written(frames)["arguments"]
+    )
 
 
 @pytest.mark.slow
 def test_other_checksums_that_fit_and_other_angles_are_offered() -> None:
     text = written(simulate(ls.sensor("ldrobot-ld06"), 300))
-    assert "# or Crc(width=8, poly=0x4D, xorout=0x18) at byte 46 over all other bytes but the first 1" in text["struct"]
+    assert (
+        "# or Crc(width=8, poly=0x4D, xorout=0x18) at byte 46 over all other bytes but the first 1"
+        in text["struct"]
+    )
     assert 'scan=OnWrap("angle_4"),  # or angle_42' in text["arguments"]
 
 

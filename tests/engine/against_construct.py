@@ -1,6 +1,8 @@
-"""Whether construct's own parse of an author's struct and ours agree: frame by frame, and as columns on both paths.
+"""Whether construct's own parse of an author's struct and ours agree: frame by frame, and as
+columns on both paths.
 
-The judge here is construct itself with the tree as the author wrote it; nothing of the engine takes part in what is expected.
+The judge here is construct itself with the tree as the author wrote it; nothing of the engine takes
+part in what is expected.
 """
 
 from __future__ import annotations
@@ -47,7 +49,9 @@ def sensor(struct: Construct, *, max_length: int = 200) -> Sensor:
 
 
 def expected(struct: Construct, data: bytes, *, max_length: int = 200) -> Any:
-    """What construct reads from the author's struct; None where it does not read exactly these bytes."""
+    """What construct reads from the author's struct; None where it does not read exactly these
+    bytes.
+    """
     stream = io.BytesIO(data)
     try:
         parsed = struct.parse_stream(stream)
@@ -65,11 +69,15 @@ def plain(value: Any) -> Any:
     return value
 
 
-def agree(struct: Construct, frames: Iterable[bytes], *, max_length: int = 200, kept: bool = True) -> int:
-    """Assert that every engine reads these bytes as construct does; the number of those that are frames.
+def agree(
+    struct: Construct, frames: Iterable[bytes], *, max_length: int = 200, kept: bool = True
+) -> int:
+    """Assert that every engine reads these bytes as construct does; the number of those that are
+    frames.
 
     Args:
-        kept: whether what is built of what was read has to be the same bytes, as it is not where `Rebuild` fills in another value.
+        kept: whether what is built of what was read has to be the same bytes, as it is not where
+            `Rebuild` fills in another value.
     """
     ours = sensor(struct, max_length=max_length)
     whole = list[tuple[bytes, Any]]()
@@ -90,7 +98,9 @@ def agree(struct: Construct, frames: Iterable[bytes], *, max_length: int = 200, 
             assert ours.build("data", found) == data
     for backend in BACKENDS:
         accepted = ours.decode(invalid, backend=backend)
-        assert len(accepted) == 0, f"{backend}: frame at byte {accepted.offset[0]} of {b''.join(invalid).hex()}"
+        assert len(accepted) == 0, (
+            f"{backend}: frame at byte {accepted.offset[0]} of {b''.join(invalid).hex()}"
+        )
         packets = ours.decode([data for data, _ in whole], backend=backend)
         assert len(packets) == len(whole), backend
         assert packets.stats.plugin_errors == 0, packets.stats.tracebacks
@@ -102,7 +112,9 @@ def agree(struct: Construct, frames: Iterable[bytes], *, max_length: int = 200, 
 
 
 def column_of(packets: Packets, path: str) -> Sequence[Any]:
-    """The raw values of a field; none where its branches go not together in a column, which is said."""
+    """The raw values of a field; none where its branches go not together in a column, which is
+    said.
+    """
     try:
         return packets.table.raw(path)
     except SpecError as error:
@@ -119,8 +131,15 @@ def has_raw_form(packets: Packets) -> bool:
         return False
 
 
-def clouds_agree(struct: Construct, frames: Iterable[bytes], *, max_length: int = 200, backends: Sequence[str] = BACKENDS) -> int:
-    """Assert that a cloud has the values of a field of all elements in order, and no padding; the number of fields tried.
+def clouds_agree(
+    struct: Construct,
+    frames: Iterable[bytes],
+    *,
+    max_length: int = 200,
+    backends: Sequence[str] = BACKENDS,
+) -> int:
+    """Assert that a cloud has the values of a field of all elements in order, and no padding; the
+    number of fields tried.
 
     Of those of the deepest arrays, whose lengths differ from frame to frame but not within one.
     """
@@ -132,13 +151,24 @@ def clouds_agree(struct: Construct, frames: Iterable[bytes], *, max_length: int 
     table, tried = schema(frame_tree(struct)), 0
     for path, info in table.fields.items():
         is_small = info.kind == "int" and info.bits <= 16 and not info.scaled
-        if not is_small or not info.axes or info.axes != table.chain or any(path.startswith(f"{other}.") for other in table.fields):
+        if (
+            not is_small
+            or not info.axes
+            or info.axes != table.chain
+            or any(path.startswith(f"{other}.") for other in table.fields)
+        ):
             continue
         ours = dataclasses.replace(plain_sensor, points=functools.partial(_ranges, path=path))
-        values = [value for _, wanted in kept for value in flat(at(wanted, path.split(".")), len(info.axes))]
+        values = [
+            value
+            for _, wanted in kept
+            for value in flat(at(wanted, path.split(".")), len(info.axes))
+        ]
         for backend in backends:
             cloud = ours.decode([data for data, _ in kept], backend=backend).points()
-            np.testing.assert_array_equal(cloud.range, np.array(values, np.float32) + AWAY, err_msg=f"{backend} {path}")
+            np.testing.assert_array_equal(
+                cloud.range, np.array(values, np.float32) + AWAY, err_msg=f"{backend} {path}"
+            )
         tried += 1
     return tried
 
@@ -157,11 +187,15 @@ def flat(value: Any, depth: int) -> Iterable[float]:
 
 
 def at(value: Any, names: Sequence[str]) -> Any:
-    """The value under a path, nested lists of them where arrays are passed; None where there is none."""
+    """The value under a path, nested lists of them where arrays are passed; None where there is
+    none.
+    """
     if isinstance(value, list):
         return [at(part, names) for part in value]
     if not names:
-        return list(value) if isinstance(value, bytes) else None if isinstance(value, dict) else value
+        return (
+            list(value) if isinstance(value, bytes) else None if isinstance(value, dict) else value
+        )
     return at(value.get(names[0]), names[1:]) if isinstance(value, dict) else None
 
 
@@ -178,7 +212,9 @@ def same(column: Any, wanted: Any, where: str) -> None:
     else:
         number = int(wanted) if isinstance(wanted, construct.EnumIntegerString) else wanted
         assert not np.shape(column), where
-        assert column == number or (column != column and number != number) or column == float(number), where
+        assert (
+            column == number or (column != column and number != number) or column == float(number)
+        ), where
 
 
 def is_nothing(wanted: Any) -> bool:

@@ -1,6 +1,8 @@
-"""Compiled and interpreted engine of a sensor: which one a frame type has, and checks that both give the same.
+"""Compiled and interpreted engine of a sensor: which one a frame type has, and checks that both
+give the same.
 
-The checks are functions of a sensor that fail where the engines differ: on damaged input, and on values at the edges of their fields.
+The checks are functions of a sensor that fail where the engines differ: on damaged input, and on
+values at the edges of their fields.
 """
 
 from __future__ import annotations
@@ -29,18 +31,24 @@ def interpreted_reason(frame: Frame) -> str:
 
 
 def assert_damaged_input_reads_alike(sensor: Sensor, count: int = DAMAGED_CONVERSATIONS) -> None:
-    """Fail unless a conversation, and `count` with damaged frames in them, give the same on both engines."""
+    """Fail unless a conversation, and `count` with damaged frames in them, give the same on both
+    engines.
+    """
     subject = Subject(sensor)
     source = subject.source("agree")
     frames = subject.conversation(rounds=1)
     assert_backends_agree(sensor, material.delivery(sensor, frames))
     for _ in range(count):
-        noisy = [(name, material.mutated(data, source) if source.random() < 0.4 else data) for name, data in frames]
+        noisy = [
+            (name, material.mutated(data, source) if source.random() < 0.4 else data)
+            for name, data in frames
+        ]
         assert_backends_agree(sensor, material.delivery(sensor, noisy))
 
 
 def assert_edge_values_read_alike(sensor: Sensor, count: int = EDGE_EXAMPLES) -> None:
-    """Fail unless frames with values at the edges of their fields' ranges give the same on both engines.
+    """Fail unless frames with values at the edges of their fields' ranges give the same on both
+    engines.
 
     Long frames are left out, since construct takes its time for each field.
     """

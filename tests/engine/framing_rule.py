@@ -1,8 +1,9 @@
 """The framing rule as functions of a sensor that fail if it is broken.
 
-Each function compares the decoder with the oracle, or with itself on other input, on data that has broken other parsers. They are
-functions, not tests, so that parsers with a planted mistake are held to them too. `length` is the size of the streams in bytes: the
-quick tier uses short streams, the slow one `streams.LENGTH`.
+Each function compares the decoder with the oracle, or with itself on other input, on data that has
+broken other parsers. They are functions, not tests, so that parsers with a planted mistake are held
+to them too. `length` is the size of the streams in bytes: the quick tier uses short streams, the
+slow one `streams.LENGTH`.
 """
 
 from __future__ import annotations
@@ -12,7 +13,15 @@ from lidarspec.testing import subject as material
 from lidarspec.testing.agreement import cuts
 from lidarspec.testing.subject import Subject
 from tests.engine.oracle import Cut, Oracle
-from tests.engine.streams import LENGTH, MANY_HEADERS, Books, clean, damaged, decoded, longest_example
+from tests.engine.streams import (
+    LENGTH,
+    MANY_HEADERS,
+    Books,
+    clean,
+    damaged,
+    decoded,
+    longest_example,
+)
 
 ERROR_RATES = (0.0, 1e-4, 1e-3, 5e-3)
 BURST_BYTES = (8, 16, 64)
@@ -60,8 +69,12 @@ def _assert_same_in_pieces(sensor: Sensor, data: bytes, splits: list[list[bytes]
         parts = Books(sensor)
         for chunk in split:
             parts.feed(chunk)
-        assert parts.finish() == expected, f"{len(split)} pieces, the first of {len(split[0])} bytes"
-        assert parts.decoder.stats == whole.stats, f"{len(split)} pieces, the first of {len(split[0])} bytes"
+        assert parts.finish() == expected, (
+            f"{len(split)} pieces, the first of {len(split[0])} bytes"
+        )
+        assert parts.decoder.stats == whole.stats, (
+            f"{len(split)} pieces, the first of {len(split[0])} bytes"
+        )
 
 
 def every_recoverable_frame_is_recovered(subject: Subject, length: int = LENGTH) -> None:
@@ -75,20 +88,30 @@ def every_recoverable_frame_is_recovered(subject: Subject, length: int = LENGTH)
 
 
 def _part(subject: Subject, length: int, purpose: str) -> bytes:
-    """Return part of a conversation, from a random offset: one round of a sensor with many frame types is long."""
+    """Return part of a conversation, from a random offset: one round of a sensor with many frame
+    types is long.
+    """
     data = clean(subject, length=length)
     start = subject.source(purpose).randrange(max(len(data) - length, 1))
     return data[start : start + length]
 
 
 def a_claimed_length_costs_no_frame(subject: Subject, length: int = LENGTH) -> None:
-    """Check that neither the head of a frame nor a frame with a bad end costs one of the frames behind it."""
+    """Check that neither the head of a frame nor a frame with a bad end costs one of the frames
+    behind it.
+    """
     whole = subject.stream(rounds=1)[:length]
     heads = 50 if length >= LENGTH else 12
     for frame in dict(subject.conversation(rounds=1)).values():
-        assert_like_oracle(subject, frame[:-1] + bytes([frame[-1] ^ 1]) + whole, "behind a frame with a damaged end")
+        assert_like_oracle(
+            subject,
+            frame[:-1] + bytes([frame[-1] ^ 1]) + whole,
+            "behind a frame with a damaged end",
+        )
         for end in range(1, min(len(frame), heads)):
-            assert_like_oracle(subject, frame[:end] + whole, f"behind the first {end} bytes of a frame")
+            assert_like_oracle(
+                subject, frame[:end] + whole, f"behind the first {end} bytes of a frame"
+            )
 
 
 def a_header_may_start_at_every_byte(subject: Subject, length: int = LENGTH) -> None:
@@ -106,18 +129,30 @@ def noise_is_cut_by_the_rule(subject: Subject, length: int = LENGTH) -> None:
     whole = subject.stream(rounds=1)[:length]
     idle_bytes = length // 5
     for byte in (b"\x00", b"\xff"):
-        assert_like_oracle(subject, byte * idle_bytes + whole + byte * idle_bytes, f"between {idle_bytes} bytes {byte.hex()}")
+        assert_like_oracle(
+            subject,
+            byte * idle_bytes + whole + byte * idle_bytes,
+            f"between {idle_bytes} bytes {byte.hex()}",
+        )
     starts = {frame[:size] for _, frame in subject.conversation(rounds=1) for size in (1, 2, 3, 4)}
     for start in sorted(starts):
-        assert_like_oracle(subject, start * (length // 8 // len(start)), f"headers of {len(start)} bytes alone")
-    heads = [frame[: source.randint(1, 6)] for _, frame in subject.conversation(rounds=2)] + [b"\x00", b"\xff", b"\xfe"]
+        assert_like_oracle(
+            subject, start * (length // 8 // len(start)), f"headers of {len(start)} bytes alone"
+        )
+    heads = [frame[: source.randint(1, 6)] for _, frame in subject.conversation(rounds=2)] + [
+        b"\x00",
+        b"\xff",
+        b"\xfe",
+    ]
     weights = [*[9] * len(heads), 2 * len(heads)]
     data = b"".join(source.choices([*heads, whole], weights, k=60))[:length]
     assert_like_oracle(subject, data, "noise made of headers")
 
 
 def announcements_may_change_with_every_frame(subject: Subject, length: int = LENGTH) -> None:
-    """Check announcements in any order, frames behind their own and behind others', whole, cut off and damaged."""
+    """Check announcements in any order, frames behind their own and behind others', whole, cut off
+    and damaged.
+    """
     sensor = subject.sensor
     source = subject.source("changes")
     announcing = sorted({frame.after for frame in sensor.incoming.values() if frame.after})
@@ -126,8 +161,12 @@ def announcements_may_change_with_every_frame(subject: Subject, length: int = LE
     data = b""
     while len(data) < length:
         name = source.choice([*sensor.incoming, *announcing, *announcing])
-        frame = subject.example(name, seed=source.randrange(6)) * source.choice((1, sensor.frames[name].confirm))
-        data += source.choice((frame, frame, frame[: source.randint(1, 5)], material.mutated(frame, source)))
+        frame = subject.example(name, seed=source.randrange(6)) * source.choice(
+            (1, sensor.frames[name].confirm)
+        )
+        data += source.choice(
+            (frame, frame, frame[: source.randint(1, 5)], material.mutated(frame, source))
+        )
     assert_like_oracle(subject, data, "announcements in any order")
     _assert_same_in_pieces(sensor, data, [list(material.pieces(data, source)) for _ in range(10)])
 
@@ -142,7 +181,9 @@ def the_longest_frame_is_a_frame(subject: Subject, length: int = LENGTH) -> None
 
 
 def idle_gives_up_pending_bytes(subject: Subject, length: int = LENGTH) -> None:
-    """Check that pending bytes are given up when the line falls silent, and never joined to later ones."""
+    """Check that pending bytes are given up when the line falls silent, and never joined to later
+    ones.
+    """
     frames = subject.conversation(rounds=2)
     whole = b"".join(data for _, data in frames)
     _, last = frames[-1]

@@ -1,4 +1,6 @@
-"""Parsers as vendors write them, in the place of the engine's decoder: one that is right, and one for each mistake put in on purpose."""
+"""Parsers as vendors write them, in the place of the engine's decoder: one that is right, and one
+for each mistake put in on purpose.
+"""
 
 from __future__ import annotations
 
@@ -51,7 +53,11 @@ class Parser:
             size = self.size(self.buffer[spot : spot + LONGEST])
             if size is None and not final:
                 break
-            name = self.frame(self.buffer[spot : spot + size]) if size and spot + size <= len(self.buffer) else ""
+            name = (
+                self.frame(self.buffer[spot : spot + size])
+                if size and spot + size <= len(self.buffer)
+                else ""
+            )
             if name and size:
                 found.append(Found(name, self.base + spot, self.buffer[spot : spot + size]))
                 self.stats.frames[name] = self.stats.frames.get(name, 0) + 1
@@ -69,7 +75,9 @@ class Parser:
         self.stats.pending = len(self.buffer)
 
     def size(self, data: bytes) -> int | None:
-        """The length of the frame that these bytes begin with; 0 where none does, None where more are needed."""
+        """The length of the frame that these bytes begin with; 0 where none does, None where more
+        are needed.
+        """
         for header, name in HEADERS.items():
             if data.startswith(header):
                 size = 5 if name == "ack" else 15 + 3 * data[COUNT] if len(data) > COUNT else None
@@ -180,7 +188,9 @@ class BufferCopied(Parser):
         return found
 
     def step(self, spot: int, size: int) -> int:
-        self.buffer = self.buffer[:spot] + self.buffer[spot:]  # as above, after a header that was none
+        self.buffer = (
+            self.buffer[:spot] + self.buffer[spot:]
+        )  # as above, after a header that was none
         return 1
 
 
@@ -202,7 +212,9 @@ class Indexless(Sensor):
             return super().parse(data, frame, verify=verify)
         except WireError as error:
             path = re.sub(r"\[[0-9]+\]", "", error.path)
-            raise WireError(error.reason, sensor=self.id, frame=error.frame, offset=error.offset, path=path) from error
+            raise WireError(
+                error.reason, sensor=self.id, frame=error.frame, offset=error.offset, path=path
+            ) from error
 
 
 def read_by(parser: type[Parser]) -> Sensor:

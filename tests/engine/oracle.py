@@ -1,7 +1,9 @@
-"""What the framing rule of the documentation says, byte by byte and by brute force; it shares no code with the engine's framing.
+"""What the framing rule of the documentation says, byte by byte and by brute force; it shares no
+code with the engine's framing.
 
-construct parses the author's own struct at one offset, the frame's own test of plausibility judges what came out, and nothing is done in
-bulk, so that the engine's bulk work has something to be held against.
+construct parses the author's own struct at one offset, the frame's own test of plausibility judges
+what came out, and nothing is done in bulk, so that the engine's bulk work has something to be held
+against.
 """
 
 from __future__ import annotations
@@ -26,8 +28,12 @@ class Oracle:
     """The frames of one stream, found by trying every type at every offset."""
 
     def __init__(self, sensor: Sensor, data: bytes) -> None:
-        self._frames = {name: frame for name, frame in sensor.frames.items() if frame.direction == "in"}
-        self._codecs = {name: codec(frame, interpreted=True) for name, frame in self._frames.items()}
+        self._frames = {
+            name: frame for name, frame in sensor.frames.items() if frame.direction == "in"
+        }
+        self._codecs = {
+            name: codec(frame, interpreted=True) for name, frame in self._frames.items()
+        }
         self._named = {frame.after for frame in self._frames.values()} - {None}
         answer = sensor.options.get("answer")
         self._mode = self._frames[answer].after if answer else None
@@ -35,7 +41,9 @@ class Oracle:
         self._known: dict[tuple[str, int], int] = {}
 
     def frames(self) -> list[Cut]:
-        """The leftmost valid candidate, then on after its last byte; one byte further where there is none."""
+        """The leftmost valid candidate, then on after its last byte; one byte further where there
+        is none.
+        """
         found: list[Cut] = []
         spot, run = 0, ("", -1)
         while spot < len(self._data):
@@ -51,7 +59,9 @@ class Oracle:
         return found
 
     def _accepted(self, name: str, spot: int, run: tuple[str, int]) -> bool:
-        """Whether a type stands here: valid, and if it is weak, within a long enough run of its kind."""
+        """Whether a type stands here: valid, and if it is weak, within a long enough run of its
+        kind.
+        """
         for _ in range(1 if run == (name, spot) else self._frames[name].confirm):
             if not self._valid(name, spot) or self._earlier(name, spot, run):
                 return False
@@ -72,7 +82,11 @@ class Oracle:
 
     def _size(self, name: str, frame: Frame, spot: int) -> int:
         data = self._data[spot : spot + frame.max_length]
-        row, size = (data, 0) if frame.wire is None else plain_row(frame.wire, frame.struct, data) or (b"", 0)
+        row, size = (
+            (data, 0)
+            if frame.wire is None
+            else plain_row(frame.wire, frame.struct, data) or (b"", 0)
+        )
         stream = io.BytesIO(row)
         try:
             frame.prepared.parse_stream(stream)
@@ -81,8 +95,21 @@ class Oracle:
         if frame.wire is not None and stream.tell() != len(row):
             return 0
         size = size or stream.tell()
-        return size if frame.plausible is None or self._sensible(name, frame.plausible, self._data[spot : spot + size]) else 0
+        return (
+            size
+            if frame.plausible is None
+            or self._sensible(name, frame.plausible, self._data[spot : spot + size])
+            else 0
+        )
 
     def _sensible(self, name: str, plausible: Any, data: bytes) -> bool:
         with np.errstate(all="ignore"):
-            return bool(np.all(np.asarray(plausible(Fields(Batch(self._codecs[name].table([data]), np.zeros(1, np.bool_)))))))
+            return bool(
+                np.all(
+                    np.asarray(
+                        plausible(
+                            Fields(Batch(self._codecs[name].table([data]), np.zeros(1, np.bool_)))
+                        )
+                    )
+                )
+            )

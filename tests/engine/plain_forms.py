@@ -1,16 +1,33 @@
-"""Wire forms read by hand, one character after another, for the oracle: nothing is shared with `lidarspec.spec.wire_forms`."""
+"""Wire forms read by hand, one character after another, for the oracle: nothing is shared with
+`lidarspec.spec.wire_forms`.
+"""
 
 from __future__ import annotations
 
 from typing import Any
 
-from construct import Array, Bytes, BytesInteger, Const, Construct, Container, FormatField, IfThenElse, Pass, Renamed, Struct, evaluate
+from construct import (
+    Array,
+    Bytes,
+    BytesInteger,
+    Const,
+    Construct,
+    Container,
+    FormatField,
+    IfThenElse,
+    Pass,
+    Renamed,
+    Struct,
+    evaluate,
+)
 
 from lidarspec.spec import Echoes, Escaped, Lines, Tokens
 
 
 def plain_row(form: Any, struct: Construct, data: bytes) -> tuple[bytes, int] | None:
-    """The row of the frame that some bytes begin with, and its bytes on the wire; None where they begin with none."""
+    """The row of the frame that some bytes begin with, and its bytes on the wire; None where they
+    begin with none.
+    """
     if isinstance(form, Tokens):
         return _tokens(form, struct, data)
     return _escaped(form, data) if isinstance(form, Escaped) else _lines(form, struct, data)
@@ -45,7 +62,11 @@ def _lines(form: Lines, struct: Construct, data: bytes) -> tuple[bytes, int] | N
             if check != bytes([(sum(line) & 63) + 48]):
                 return None
         wanted = form.head[number] if number < len(form.head) else form.width
-        if not line or len(line) > wanted or (len(line) < wanted and (number < len(form.head) or number < len(lines) - 1)):
+        if (
+            not line
+            or len(line) > wanted
+            or (len(line) < wanted and (number < len(form.head) or number < len(lines) - 1))
+        ):
             return None
         row += line
     if len(lines) < len(form.head):
@@ -100,12 +121,18 @@ class _Reader:
             for member in part.subcons:
                 self.read(member, inner, "")
             context[name] = inner
-            context.update({key: value for key, value in inner.items() if key != "_"} if not name else {})
+            context.update(
+                {key: value for key, value in inner.items() if key != "_"} if not name else {}
+            )
         elif isinstance(part, Array):
             for _ in range(evaluate(part.count, context)):
                 self.read(part.subcon, context, "")
         elif isinstance(part, IfThenElse):
-            self.read(part.thensubcon if evaluate(part.condfunc, context) else part.elsesubcon, context, name)
+            self.read(
+                part.thensubcon if evaluate(part.condfunc, context) else part.elsesubcon,
+                context,
+                name,
+            )
         elif isinstance(part, Const):
             self._text(len(part.value))
         elif isinstance(part, Bytes):
@@ -126,7 +153,9 @@ class _Reader:
         self.row += text
 
     def _number(self, field: FormatField) -> int:
-        stops = [self.left.find(mark) for mark in (self._form.sep, self._form.end) if mark in self.left]
+        stops = [
+            self.left.find(mark) for mark in (self._form.sep, self._form.end) if mark in self.left
+        ]
         if not stops:
             raise ValueError("no token")
         token, self.left = self.left[: min(stops)].decode("latin-1"), self.left[min(stops) + 1 :]
@@ -148,7 +177,9 @@ class _Reader:
 
 
 class _SixBitReader(_Reader):
-    """Numbers of as many characters as the field has bytes, of which each is six bits; anything else is text."""
+    """Numbers of as many characters as the field has bytes, of which each is six bits; anything
+    else is text.
+    """
 
     def _text(self, size: int) -> None:
         self.row += self.left[:size]

@@ -1,6 +1,8 @@
-"""Structs drawn at random, as Python text: what an author may write, in combinations that nobody thought of.
+"""Structs drawn at random, as Python text: what an author may write, in combinations that nobody
+thought of.
 
-A spec that fails is printed as it could be typed. Sizes grow with the number of a spec, so that the first to fail is a small one.
+A spec that fails is printed as it could be typed. Sizes grow with the number of a spec, so that the
+first to fail is a small one.
 """
 
 from __future__ import annotations
@@ -14,18 +16,47 @@ import construct
 from lidarspec import spec as vocabulary
 
 #: what the text may name.
-NAMES: dict[str, Any] = {**vars(construct), **{name: getattr(vocabulary, name) for name in ("Scaled", "Checksummed", "Xor", "Sum", "Crc")}}
+NAMES: dict[str, Any] = {
+    **vars(construct),
+    **{name: getattr(vocabulary, name) for name in ("Scaled", "Checksummed", "Xor", "Sum", "Crc")},
+}
 
-WORDS = ("Int8ub", "Int8sb", "Int16ub", "Int16ul", "Int16sl", "Int24ub", "Int24ul", "Int24sl", "Int32ub", "Int32sl", "Int64ub", "Int64sl")
-ODD = ("BytesInteger(5)", "BytesInteger(3, signed=True)", "BytesInteger(7, swapped=True)", "BytesInteger(2, signed=True, swapped=True)")
+WORDS = (
+    "Int8ub",
+    "Int8sb",
+    "Int16ub",
+    "Int16ul",
+    "Int16sl",
+    "Int24ub",
+    "Int24ul",
+    "Int24sl",
+    "Int32ub",
+    "Int32sl",
+    "Int64ub",
+    "Int64sl",
+)
+ODD = (
+    "BytesInteger(5)",
+    "BytesInteger(3, signed=True)",
+    "BytesInteger(7, swapped=True)",
+    "BytesInteger(2, signed=True, swapped=True)",
+)
 FLOATS = ("Float16b", "Float32l", "Float32b", "Float64l")
 LABELS = "idle=0, busy=1, lost=7"
-SCALES = ('0.01, "deg"', '0.25, "m", offset=3', '1 / 64, "rpm"', '1e-9, "s"', '0.0625, "degC", offset=-40')
+SCALES = (
+    '0.01, "deg"',
+    '0.25, "m", offset=3',
+    '1 / 64, "rpm"',
+    '1e-9, "s"',
+    '0.0625, "degC", offset=-40',
+)
 
 
 @dataclass
 class Known:
-    """A field that expressions may ask for: its path from the struct that it is in, and whether its values have names."""
+    """A field that expressions may ask for: its path from the struct that it is in, and whether its
+    values have names.
+    """
 
     path: str
     named: bool = False
@@ -78,7 +109,10 @@ class Drawn:
         self.levels[-1] += [Known(f"{name}.{one.path}", one.named) for one in inside]
         if self.source.random() < 0.3:
             algorithm = self.source.choice(("Xor()", "Sum(8)", "Crc(8, 0x4D)"))
-            return f'"{name}" / Checksummed(Struct({", ".join(parts)}, "sum" / Int8ub), "sum", {algorithm})'
+            return (
+                f'"{name}" / Checksummed(Struct({", ".join(parts)}, "sum" / Int8ub), "sum",'
+                f" {algorithm})"
+            )
         return f'"{name}" / Struct({", ".join(parts)})'
 
     def control(self, name: str) -> str:
@@ -95,7 +129,10 @@ class Drawn:
         elif kind < 0.46:
             text = f"Const({self.source.randint(0, 100)}, {word})"
         elif kind < 0.5:
-            known.named, text = True, f'Const("{self.source.choice(("idle", "busy"))}", Enum({word}, {LABELS}))'
+            known.named, text = (
+                True,
+                f'Const("{self.source.choice(("idle", "busy"))}", Enum({word}, {LABELS}))',
+            )
         elif kind < 0.53:
             known.named, text = True, f"Enum(Const(1, {word}), {LABELS})"
         elif kind < 0.56 and self.asked() is not None:
@@ -114,7 +151,9 @@ class Drawn:
 
     def word(self, depth: int) -> str:
         word, scale = self.source.choice((*WORDS, *ODD)), self.source.choice(SCALES)
-        return self.source.choice((word, word, f"Scaled({word}, {scale})", f"Enum({word}, {LABELS})", f"Const(5, {word})"))
+        return self.source.choice(
+            (word, word, f"Scaled({word}, {scale})", f"Enum({word}, {LABELS})", f"Const(5, {word})")
+        )
 
     def floating(self, depth: int) -> str:
         return self.source.choice(FLOATS)
@@ -123,7 +162,13 @@ class Drawn:
         return f"Bytes({self.count() if self.source.random() < 0.5 else self.source.randint(0, 4)})"
 
     def text(self, depth: int) -> str:
-        return self.source.choice(("NullTerminated(GreedyBytes)", "Prefixed(Int8ub, GreedyBytes)", "FixedSized(3, GreedyBytes)"))
+        return self.source.choice(
+            (
+                "NullTerminated(GreedyBytes)",
+                "Prefixed(Int8ub, GreedyBytes)",
+                "FixedSized(3, GreedyBytes)",
+            )
+        )
 
     def computed(self, depth: int) -> str:
         return f"Computed({self.count()})"
@@ -145,12 +190,26 @@ class Drawn:
         if asked is None:
             return self.word(depth)
         path, known = asked
-        tests = [f"{path} == 1", f"{path} > 100", f"{path} & 1", f"{path} % 3 == 2", f"{self.function(path)} % 2 == 0"]
+        tests = [
+            f"{path} == 1",
+            f"{path} > 100",
+            f"{path} & 1",
+            f"{path} % 3 == 2",
+            f"{self.function(path)} % 2 == 0",
+        ]
         if known.named:
-            tests = [f'{path} == "busy"', f'{path} != "idle"', f'{self.function(path)} in ("idle", "lost")']
+            tests = [
+                f'{path} == "busy"',
+                f'{path} != "idle"',
+                f'{self.function(path)} in ("idle", "lost")',
+            ]
         test = self.source.choice(tests)
         then = self.element(depth + 1)
-        return f"If({test}, {then})" if kind < 0.5 else f"IfThenElse({test}, {then}, {self.element(depth + 1)})"
+        return (
+            f"If({test}, {then})"
+            if kind < 0.5
+            else f"IfThenElse({test}, {then}, {self.element(depth + 1)})"
+        )
 
     def switch(self, depth: int) -> str:
         asked = self.asked()
@@ -170,7 +229,11 @@ class Drawn:
         order = self.source.choice(("", "", "ByteSwapped", "BitsSwapped"))
         while left:
             self.number += 1
-            inner, width, kind = f"b{self.number}", self.source.randint(1, min(left, 17)), self.source.random()
+            inner, width, kind = (
+                f"b{self.number}",
+                self.source.randint(1, min(left, 17)),
+                self.source.random(),
+            )
             left -= width
             field, known = f"BitsInteger({width})", Known(f"{name}.{inner}")
             if kind < 0.15:
@@ -218,12 +281,19 @@ class Drawn:
         path, known = asked
         if known.named:
             return f"lambda found: int(found{path.removeprefix('this')}) % 3"
-        forms = [f"{path} % 4", f"{path} & 3", f"({path} + 1) // 2 % 5", f"{self.function(path)} % 3"]
+        forms = [
+            f"{path} % 4",
+            f"{path} & 3",
+            f"({path} + 1) // 2 % 5",
+            f"{self.function(path)} % 3",
+        ]
         return self.source.choice(forms)
 
 
 def spec(number: int, *, interpreted: bool = False) -> str:
-    """The text of the spec of this number; with `interpreted` it may hold what construct alone can read."""
+    """The text of the spec of this number; with `interpreted` it may hold what construct alone can
+    read.
+    """
     source = Random(f"spec {number} {interpreted}")
     return Drawn(source, 2 + number % 7, interpreted).struct(0)
 

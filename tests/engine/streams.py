@@ -1,4 +1,6 @@
-"""Streams that the framing is held to, damaged by seed or made of false headers; decoders whose books are kept; what a task holds."""
+"""Streams that the framing is held to, damaged by seed or made of false headers; decoders whose
+books are kept; what a task holds.
+"""
 
 from __future__ import annotations
 
@@ -23,7 +25,9 @@ MANY_HEADERS = 200
 
 
 def damaged(data: bytes, rate: float, seed: int, *, burst: int = 1) -> bytes:
-    """The stream with about this share of its bytes damaged, in runs of `burst`; at least one run, unless the rate is 0."""
+    """The stream with about this share of its bytes damaged, in runs of `burst`; at least one run,
+    unless the rate is 0.
+    """
     if not rate:
         return data
     source = random.Random(f"{seed} {rate} {burst}")
@@ -38,12 +42,16 @@ def damaged(data: bytes, rate: float, seed: int, *, burst: int = 1) -> bytes:
         elif kind == "insert":
             found[spot:spot] = noise
         else:
-            found[spot : spot + burst] = bytes(a ^ (1 << b % 8) for a, b in zip(found[spot : spot + burst], noise, strict=False))
+            found[spot : spot + burst] = bytes(
+                a ^ (1 << b % 8) for a, b in zip(found[spot : spot + burst], noise, strict=False)
+            )
     return bytes(found)
 
 
 def worst(sensor: Sensor, length: int) -> bytes:
-    """Headers that claim the longest frame, and two random bytes: candidates without end, as long as they can be."""
+    """Headers that claim the longest frame, and two random bytes: candidates without end, as long
+    as they can be.
+    """
     source = random.Random(sensor.id)
     longest = max((sensor.example(sensor.data_frame, seed=seed) for seed in range(40)), key=len)
     unit = b"".join(longest[: source.randint(3, 8)] + source.randbytes(2) for _ in range(64))
@@ -55,7 +63,8 @@ NOISE_BYTES = (0, 2, 6)
 
 
 def hostile_streams(subject: Subject, length: int) -> Iterator[tuple[str, bytes]]:
-    """Generate streams of about this length that cost a decoder much for each byte, each with a description.
+    """Generate streams of about this length that cost a decoder much for each byte, each with a
+    description.
 
     Those of one frame type begin with the frame after which the type is looked for.
     """
@@ -68,12 +77,23 @@ def hostile_streams(subject: Subject, length: int) -> Iterator[tuple[str, bytes]
         frames = [subject.example(name, seed=seed) for seed in range(6)]
         longest = max(frames, key=len)
         for size in NOISE_BYTES:
-            headers = _repeat(lambda name=name, size=size: _header(sensor, name, source) + source.randbytes(size), length)  # type: ignore[misc]
+            headers = _repeat(
+                lambda name=name, size=size: _header(sensor, name, source) + source.randbytes(size),
+                length,
+            )  # type: ignore[misc]
             yield f"headers of {name} and {size} random bytes", lead + headers
-        one_length = _repeat(lambda longest=longest: longest[: source.randint(3, 8)] + source.randbytes(2), length)  # type: ignore[misc]
+        one_length = _repeat(
+            lambda longest=longest: longest[: source.randint(3, 8)] + source.randbytes(2), length
+        )  # type: ignore[misc]
         yield f"headers of one length of {name}", lead + one_length
-        yield f"cut frames of {name}", lead + _repeat(lambda frames=frames: _cut(source.choice(frames), source), length)  # type: ignore[misc]
-    yield "headers of all types in turn", _repeat(lambda: b"".join(_header(sensor, name, source) for name in names), length)
+        yield (
+            f"cut frames of {name}",
+            lead + _repeat(lambda frames=frames: _cut(source.choice(frames), source), length),
+        )  # type: ignore[misc]
+    yield (
+        "headers of all types in turn",
+        _repeat(lambda: b"".join(_header(sensor, name, source) for name in names), length),
+    )
     examples = [subject.example(name, seed=seed) for name in names for seed in range(4)]
     yield "cut frames of all types", _repeat(lambda: _cut(source.choice(examples), source), length)
     yield "types in turn", (subject.stream(rounds=2) * length)[:length]
@@ -88,7 +108,9 @@ def _repeat(make: Callable[[], bytes], length: int) -> bytes:
 
 
 def _header(sensor: Sensor, name: str, source: random.Random) -> bytes:
-    """Return the bytes up to the last constant at the start of a frame type, random where they are no constants."""
+    """Return the bytes up to the last constant at the start of a frame type, random where they are
+    no constants.
+    """
     prefix = codec(sensor.frames[name]).prefix
     header = bytearray(source.randbytes(max(prefix, default=-1) + 1))
     for offset, (mask, value) in prefix.items():
@@ -112,20 +134,27 @@ def longest_example(subject: Subject, name: str, headers: int = MANY_HEADERS) ->
 
     With few headers, headers of frames with parts are not drawn: those have thousands of fields.
     """
-    found = [subject.example(name, seed=seed) for seed in range(8 if headers < MANY_HEADERS else 20)]
+    found = [
+        subject.example(name, seed=seed) for seed in range(8 if headers < MANY_HEADERS else 20)
+    ]
     engine = codec(subject.sensor.frames[name])
     source = subject.source(f"longest {name}")
     is_drawn = isinstance(engine, CompiledCodec) and engine.size is None
     if is_drawn and (headers >= MANY_HEADERS or not engine.schema.parts):
         with contextlib.suppress(SpecError):
-            _, longest = max((header(engine, source, subject.drawers(name)) for _ in range(headers)), key=lambda chosen: chosen[0].size)
+            _, longest = max(
+                (header(engine, source, subject.drawers(name)) for _ in range(headers)),
+                key=lambda chosen: chosen[0].size,
+            )
             drawn = {path: (lambda _, value=value: value) for path, value in longest.items()}
             found.append(random_frame(subject.sensor, name, source, subject.drawers(name) | drawn))
     return max(found, key=len)
 
 
 class Books:
-    """A decoder whose books are checked after every call: each byte is in a frame, skipped or pending."""
+    """A decoder whose books are checked after every call: each byte is in a frame, skipped or
+    pending.
+    """
 
     def __init__(self, sensor: Sensor, *, backend: str = "auto") -> None:
         self.decoder = sensor.decoder(backend=backend)
@@ -158,7 +187,9 @@ def decoded(sensor: Sensor, data: bytes) -> list[Cut]:
 
 def peak(task: Callable[[], object]) -> int:
     """Bytes that a task holds at most beyond those held before."""
-    gc.freeze()  # collections are to look at what is made from here on, and not at all that the tests before have left
+    # collections are to look at what is made from here on, and not at all that the tests before
+    # have left
+    gc.freeze()
     tracemalloc.start()
     try:
         before = tracemalloc.get_traced_memory()[0]

@@ -1,4 +1,6 @@
-"""Both engines read alike: damaged input, values at the edges of their fields, faults in elements of arrays."""
+"""Both engines read alike: damaged input, values at the edges of their fields, faults in elements
+of arrays.
+"""
 
 from __future__ import annotations
 
@@ -9,12 +11,18 @@ import pytest
 from lidarspec import Sensor, WireError
 from lidarspec.framing.frame_engine import codec
 from tests.broken import sound
-from tests.engine.engines import assert_damaged_input_reads_alike, assert_edge_values_read_alike, is_compiled
+from tests.engine.engines import (
+    assert_damaged_input_reads_alike,
+    assert_edge_values_read_alike,
+    is_compiled,
+)
 from tests.engine.mutants import Indexless
 from tests.representatives import REPRESENTATIVES, load_sensor
 from tests.shapes import SHAPES
 
-COMPILED_SHAPES = [name for name, sensor in SHAPES.items() if all(map(is_compiled, sensor.frames.values()))]
+COMPILED_SHAPES = [
+    name for name, sensor in SHAPES.items() if all(map(is_compiled, sensor.frames.values()))
+]
 
 
 @pytest.mark.parametrize("name", COMPILED_SHAPES)
@@ -28,7 +36,10 @@ def test_values_at_the_edges_read_alike(name: str) -> None:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("name", [*(pytest.param(name, marks=pytest.mark.soak) for name in COMPILED_SHAPES), *REPRESENTATIVES])
+@pytest.mark.parametrize(
+    "name",
+    [*(pytest.param(name, marks=pytest.mark.soak) for name in COMPILED_SHAPES), *REPRESENTATIVES],
+)
 def test_much_damaged_input_reads_alike(name: str) -> None:
     assert_damaged_input_reads_alike(load_sensor(name), count=2)
     assert_edge_values_read_alike(load_sensor(name), count=3)
@@ -39,7 +50,9 @@ MAX_CUTS = 20
 
 
 def fault_paths_in_arrays(sensor: Sensor, name: str) -> tuple[list[str], list[str]]:
-    """Return the paths of faults within arrays in a frame cut short: with an index, and without one."""
+    """Return the paths of faults within arrays in a frame cut short: with an index, and without
+    one.
+    """
     indexed, unindexed = list[str](), list[str]()
     schema = codec(sensor.frames[name]).schema
     data = sensor.example(name, seed=2)

@@ -1,4 +1,6 @@
-"""The framing rule (P1, P2, P18) on the shapes and against an oracle; parsers with a planted mistake are caught."""
+"""The framing rule (P1, P2, P18) on the shapes and against an oracle; parsers with a planted
+mistake are caught.
+"""
 
 from __future__ import annotations
 
@@ -32,12 +34,25 @@ FRAMING_SHAPES = (
     "shape-lines",
     "shape-escaped",
 )
-#: Shapes that are held to all rules on long streams: counts, options, weak frames, switched types, tags, text and escapes.
-LONG_SHAPES = ("shape-count", "shape-options", "shape-weak", "shape-modes", "shape-tags", "shape-tokens", "shape-escaped")
+#: Shapes that are held to all rules on long streams: counts, options, weak frames, switched types,
+#: tags, text and escapes.
+LONG_SHAPES = (
+    "shape-count",
+    "shape-options",
+    "shape-weak",
+    "shape-modes",
+    "shape-tags",
+    "shape-tokens",
+    "shape-escaped",
+)
 #: Shapes whose large frames take the oracle long.
 LARGE_SHAPES = ("shape-joined", "shape-channels")
 #: Rules that every shape is held to in the quick tier.
-QUICK_RULES = (rule.any_split_gives_the_same, rule.every_recoverable_frame_is_recovered, rule.idle_gives_up_pending_bytes)
+QUICK_RULES = (
+    rule.any_split_gives_the_same,
+    rule.every_recoverable_frame_is_recovered,
+    rule.idle_gives_up_pending_bytes,
+)
 #: Bytes of a stream in the quick tier.
 QUICK_LENGTH = 200
 
@@ -64,7 +79,13 @@ def subject_of(name: str) -> Subject:
 each_rule = pytest.mark.parametrize("holds", rule.RULES, ids=lambda holds: holds.__name__)
 
 
-@pytest.mark.parametrize("name", [pytest.param(name, marks=pytest.mark.slow if name in LARGE_SHAPES else ()) for name in STREAM_SHAPES])
+@pytest.mark.parametrize(
+    "name",
+    [
+        pytest.param(name, marks=pytest.mark.slow if name in LARGE_SHAPES else ())
+        for name in STREAM_SHAPES
+    ],
+)
 def test_the_rule_holds_on_every_shape(name: str) -> None:
     for holds in rule.RULES if name in FRAMING_SHAPES else QUICK_RULES:
         holds(subject_of(name), QUICK_LENGTH)
@@ -79,19 +100,31 @@ def test_the_remaining_rules_hold_on_shapes_that_differ_in_their_content(name: s
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("name", [pytest.param(name, marks=() if name in LONG_SHAPES else pytest.mark.soak) for name in STREAM_SHAPES])
+@pytest.mark.parametrize(
+    "name",
+    [
+        pytest.param(name, marks=() if name in LONG_SHAPES else pytest.mark.soak)
+        for name in STREAM_SHAPES
+    ],
+)
 def test_the_rule_holds_on_long_streams(name: str) -> None:
     for holds in rule.RULES:
         holds(subject_of(name), LENGTH)
 
 
 @pytest.mark.parametrize(
-    "name", [pytest.param(name, marks=pytest.mark.slow if name in LONG_FRAMES else ()) for name in STREAM_REPRESENTATIVES]
+    "name",
+    [
+        pytest.param(name, marks=pytest.mark.slow if name in LONG_FRAMES else ())
+        for name in STREAM_REPRESENTATIVES
+    ],
 )
 def test_every_recoverable_frame_of_a_representative_is_recovered(name: str) -> None:
     sensor = load_sensor(name)
     longest = len(sensor.example(sensor.data_frame))
-    rule.every_recoverable_frame_is_recovered(Subject(sensor), max(2 * QUICK_LENGTH, 5 * longest // 2))
+    rule.every_recoverable_frame_is_recovered(
+        Subject(sensor), max(2 * QUICK_LENGTH, 5 * longest // 2)
+    )
 
 
 @pytest.mark.soak

@@ -1,6 +1,8 @@
-"""Hostile input raises only documented exceptions (P3): 20,000 mutated inputs in sum, on shapes and representatives.
+"""Hostile input raises only documented exceptions (P3): 20,000 mutated inputs in sum, on shapes and
+representatives.
 
-Parsing one frame raises `WireError` alone; decoding raises on nothing. `tests.fuzz` does the same a million times and longer.
+Parsing one frame raises `WireError` alone; decoding raises on nothing. `tests.fuzz` does the same a
+million times and longer.
 """
 
 from __future__ import annotations
@@ -28,7 +30,11 @@ def test_a_mutated_frame_is_parsed_or_is_a_wire_error(name: str, times: int) -> 
     sensor = load_sensor(name)
     subject = Subject(sensor)
     source = subject.source(f"hostile frames {times}")
-    examples = [(frame, subject.example(frame, seed=seed)) for frame in sensor.frames for seed in range(SEEDS)]
+    examples = [
+        (frame, subject.example(frame, seed=seed))
+        for frame in sensor.frames
+        for seed in range(SEEDS)
+    ]
     for _ in range(times * (SHAPE_FRAMES if name in SHAPES else REPRESENTATIVE_FRAMES)):
         frame, data = source.choice(examples)
         mutated = material.mutated(data, source)
@@ -42,7 +48,10 @@ def test_decoding_mutated_frames_raises_nothing(name: str) -> None:
     subject = Subject(sensor)
     source = subject.source("hostile streams")
     frames = subject.conversation(rounds=1)
-    mutated = [(frame, material.mutated(data, source)) for frame, data in source.choices(frames, k=DECODED_FRAMES)]
+    mutated = [
+        (frame, material.mutated(data, source))
+        for frame, data in source.choices(frames, k=DECODED_FRAMES)
+    ]
     mutated += frames
     packets = sensor.decode(material.delivery(sensor, mutated))
     packets.points()

@@ -20,8 +20,17 @@ STREAM_SHAPES = [name for name, sensor in SHAPES.items() if not sensor.datagrams
 STREAMS = (*STREAM_SHAPES, *STREAM_REPRESENTATIVES)
 #: Sensors of which a stream of some frames takes seconds.
 LONG_FRAMES = ("shape-joined", "shape-channels", "hokuyo-ust10lx")
-#: Sensors whose peak memory is measured in the quick tier, one of each way to make frames: of one size, counted, announced, text.
-MEASURED = ("shape-middle", "shape-count", "shape-modes", "shape-tokens", "ldrobot-stl27l", "cspc-m1c1-mini", "slamtec-rplidar-a1")
+#: Sensors whose peak memory is measured in the quick tier, one of each way to make frames: of one
+#: size, counted, announced, text.
+MEASURED = (
+    "shape-middle",
+    "shape-count",
+    "shape-modes",
+    "shape-tokens",
+    "ldrobot-stl27l",
+    "cspc-m1c1-mini",
+    "slamtec-rplidar-a1",
+)
 
 
 def garbage(length: int, seed: int = 0) -> bytes:
@@ -37,11 +46,16 @@ def fed(sensor: Sensor, data: bytes, times: int = 1, chunk: int = 4096) -> None:
 
 
 def pending_bound(sensor: Sensor) -> int:
-    """Return the bytes below which the pending ones stay: the longest frame, times the run of a weak one."""
+    """Return the bytes below which the pending ones stay: the longest frame, times the run of a
+    weak one.
+    """
     return max(frame.max_length * frame.confirm for frame in sensor.incoming.values())
 
 
-@pytest.mark.parametrize("name", [pytest.param(name, marks=pytest.mark.slow if name in LONG_FRAMES else ()) for name in STREAMS])
+@pytest.mark.parametrize(
+    "name",
+    [pytest.param(name, marks=pytest.mark.slow if name in LONG_FRAMES else ()) for name in STREAMS],
+)
 def test_a_decoder_holds_less_than_its_longest_frame(name: str) -> None:
     sensor = load_sensor(name)
     for data in (garbage(2_000), worst(sensor, 2_000), Subject(sensor).stream(rounds=1)[:6_000]):
@@ -84,7 +98,9 @@ def test_megabytes_of_garbage_take_no_memory(name: str, times: int) -> None:
 
 @pytest.mark.parametrize("name", STREAMS)
 def test_a_frame_is_out_before_one_longest_frame_more_has_come(name: str) -> None:
-    """Feed pieces of two percent of the longest frame, and see how many bytes after its own last one each frame is out."""
+    """Feed pieces of two percent of the longest frame, and see how many bytes after its own last
+    one each frame is out.
+    """
     sensor = load_sensor(name)
     data = b"".join(part for _, part in Subject(sensor).conversation(rounds=1))
     bound = pending_bound(sensor)

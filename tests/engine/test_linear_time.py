@@ -19,7 +19,9 @@ from tests.shapes import SHAPES
 #: One shape of each way to find frames: counted, announced, up to a terminator, in runs.
 QUICK_SHAPES = ("shape-count", "shape-modes", "shape-text", "shape-weak")
 STREAM_SHAPES = [
-    pytest.param(name, marks=() if name in QUICK_SHAPES else pytest.mark.slow) for name, sensor in SHAPES.items() if not sensor.datagrams
+    pytest.param(name, marks=() if name in QUICK_SHAPES else pytest.mark.slow)
+    for name, sensor in SHAPES.items()
+    if not sensor.datagrams
 ]
 COMPILED_BYTES = 240_000
 INTERPRETED_BYTES = 12_000

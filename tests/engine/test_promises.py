@@ -1,4 +1,6 @@
-"""Promises on live work that need several modules together: P9 exact replay, P12 the queue, P15 whole files, P16 clocks."""
+"""Promises on live work that need several modules together: P9 exact replay, P12 the queue, P15
+whole files, P16 clocks.
+"""
 
 from __future__ import annotations
 
@@ -64,7 +66,11 @@ class TestReplay:
     """P9: what was recorded decodes to what it was when it came, again and again."""
 
     def test_a_frame_that_a_silence_cut_is_cut_again(self, line: Port, tmp_path: Path) -> None:
-        frames, first, second = turning(TURNING, 12), tmp_path / "first.lsr", tmp_path / "second.lsr"
+        frames, first, second = (
+            turning(TURNING, 12),
+            tmp_path / "first.lsr",
+            tmp_path / "second.lsr",
+        )
         with ls.open(f"serial://{line.name}", TURNING, start=False, record=first) as device:
             line.send(b"".join(frames[:6]) + frames[6][:5])
             live = received(device, 6)
@@ -91,7 +97,10 @@ class TestQueue:
 
         def produce() -> None:
             for start in range(0, number, 10):
-                queue.put("data", [Chunk(index.to_bytes(8, "little") * 10) for index in range(start, start + 10)])
+                queue.put(
+                    "data",
+                    [Chunk(index.to_bytes(8, "little") * 10) for index in range(start, start + 10)],
+                )
             queue.close()
 
         producer = threading.Thread(target=produce)
@@ -115,7 +124,9 @@ class TestFiles:
     """P15: what stood under a name stays until its successor is whole."""
 
     @pytest.mark.parametrize("suffix", [".csv", ".npz"])
-    def test_an_export_that_fails_half_way_changes_nothing(self, tmp_path: Path, suffix: str) -> None:
+    def test_an_export_that_fails_half_way_changes_nothing(
+        self, tmp_path: Path, suffix: str
+    ) -> None:
         sensor, path = ls.sensor("ldrobot-stl27l"), tmp_path / f"points{suffix}"
         path.write_bytes(b"of yesterday")
 
@@ -133,37 +144,63 @@ class TestFiles:
         os.link(target, tmp_path / "before.json")
         ran("sensors", "--json", "-o", target)
         assert target.read_text().startswith("[")
-        assert (tmp_path / "before.json").read_text() == "of yesterday", "it was not written over in place"
+        assert (tmp_path / "before.json").read_text() == "of yesterday", (
+            "it was not written over in place"
+        )
         assert len(list(tmp_path.iterdir())) == 2
         assert "/dev/full: No space left" in ran("sensors", "-o", "/dev/full", code=3).stderr
 
 
 class TestClocks:
-    """P16: over a hundred turns without an error, late packets included; no duration by the wall clock."""
+    """P16: over a hundred turns without an error, late packets included; no duration by the wall
+    clock.
+    """
 
     @pytest.mark.parametrize("turn", [30, 3600])
     def test_a_clock_runs_on(self, turn: int) -> None:
         rng = np.random.default_rng(turn)
         true = np.cumsum(rng.integers(1, turn * SECOND // 8, 1900)) + 7
-        order = np.argsort(np.arange(len(true)) + rng.choice([0, 0, 0, 2.5], len(true)), kind="stable")
+        order = np.argsort(
+            np.arange(len(true)) + rng.choice([0, 0, 0, 2.5], len(true)), kind="stable"
+        )
         order[order == 0], order[0] = order[0], 0
         assert true[-1] > 100 * turn * SECOND
         assert (np.diff(true[order]) < 0).any()
         clock, late = Unwrapper(turn), true[order]
-        found = np.concatenate([clock.push(part % (turn * SECOND), np.zeros(len(part), np.int64)) for part in np.array_split(late, 71)])
+        found = np.concatenate(
+            [
+                clock.push(part % (turn * SECOND), np.zeros(len(part), np.int64))
+                for part in np.array_split(late, 71)
+            ]
+        )
         assert (found - found[0] == late - late[0]).all()
 
     def test_a_sequence_of_16_bits_runs_on(self) -> None:
         rng, sensor = np.random.default_rng(16), SHAPES["shape-headed"]
-        true = 65_000 + np.cumsum(np.where(rng.random(2500) < 0.25, rng.integers(5000, 20_000, 2500), 1))
+        true = 65_000 + np.cumsum(
+            np.where(rng.random(2500) < 0.25, rng.integers(5000, 20_000, 2500), 1)
+        )
         late = true.copy()
-        swapped = [place for place in range(1, len(true) - 1, 2) if true[place + 1] - true[place] == 1]
-        late[swapped], late[[place + 1 for place in swapped]] = true[[place + 1 for place in swapped]], true[swapped]
+        swapped = [
+            place for place in range(1, len(true) - 1, 2) if true[place + 1] - true[place] == 1
+        ]
+        late[swapped], late[[place + 1 for place in swapped]] = (
+            true[[place + 1 for place in swapped]],
+            true[swapped],
+        )
         assert (true[-1] >> 16) > 100
         block = {"azimuth": 0, "channels": [{"distance": 400, "strength": 7}] * 3}
-        packets = sensor.decode([sensor.build("data", unit=4, counted=1, counter=int(n) & 0xFFFF, blocks=[block]) for n in late])
+        packets = sensor.decode(
+            [
+                sensor.build("data", unit=4, counted=1, counter=int(n) & 0xFFFF, blocks=[block])
+                for n in late
+            ]
+        )
         assert (packets.index - packets.index[0] == late - late[0]).all()
-        assert (packets.stats.lost, packets.stats.late) == (true[-1] - true[0] + 1 - len(true), len(swapped))
+        assert (packets.stats.lost, packets.stats.late) == (
+            true[-1] - true[0] + 1 - len(true),
+            len(swapped),
+        )
 
     def test_the_wall_clock_stamps_and_measures_nothing(self) -> None:
         package = Path(ls.__file__).parent

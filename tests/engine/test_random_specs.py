@@ -1,4 +1,6 @@
-"""Random specs: what construct itself reads is what we read, frame by frame and in bulk, compiled and interpreted."""
+"""Random specs: what construct itself reads is what we read, frame by frame and in bulk, compiled
+and interpreted.
+"""
 
 from __future__ import annotations
 
@@ -24,7 +26,9 @@ JIT = ("jit",) if importlib.util.find_spec("numba") else ()
 
 
 def frames(ours: Sensor, struct: Construct, number: int) -> list[bytes]:
-    """Bytes to try a spec on: its examples, damaged ones, and what construct reads from random bytes."""
+    """Bytes to try a spec on: its examples, damaged ones, and what construct reads from random
+    bytes.
+    """
     source, found = Random(number), [b""]
     for seed in range(4):
         try:
@@ -34,10 +38,14 @@ def frames(ours: Sensor, struct: Construct, number: int) -> list[bytes]:
         found += [example, example[:-1], example + b"\0"]
         for _ in range(3):
             damaged = bytearray(example or b"\0")
-            damaged[source.randrange(len(damaged))] = source.choice((0, 1, 2, 7, 255, source.randrange(256)))
+            damaged[source.randrange(len(damaged))] = source.choice(
+                (0, 1, 2, 7, 255, source.randrange(256))
+            )
             found.append(bytes(damaged))
     for _ in range(12):
-        stream = io.BytesIO(bytes(source.choice((0, 1, 2, 7, source.randrange(256))) for _ in range(LONGEST + 10)))
+        stream = io.BytesIO(
+            bytes(source.choice((0, 1, 2, 7, source.randrange(256))) for _ in range(LONGEST + 10))
+        )
         try:
             struct.parse_stream(stream)
         except construct.ConstructError:
@@ -56,7 +64,9 @@ def declared(struct: Construct) -> Sensor | None:
         return None
 
 
-def tried(number: int, *, interpreted: bool = False, backends: Sequence[str] = ("numpy", "construct")) -> None:
+def tried(
+    number: int, *, interpreted: bool = False, backends: Sequence[str] = ("numpy", "construct")
+) -> None:
     """Try a spec, and put its text before what fails."""
     text = spec(number, interpreted=interpreted)
     struct = made(text)
@@ -78,7 +88,10 @@ def tried(number: int, *, interpreted: bool = False, backends: Sequence[str] = (
 
 def numbers(quick: int, whole: int) -> list[Any]:
     """Return the numbers of specs, of which the first few are in the quick tier."""
-    return [pytest.param(number, marks=() if number < quick else pytest.mark.slow) for number in range(whole)]
+    return [
+        pytest.param(number, marks=() if number < quick else pytest.mark.slow)
+        for number in range(whole)
+    ]
 
 
 @pytest.mark.parametrize("number", numbers(12, 35))
@@ -101,23 +114,42 @@ def test_many_more_are_read_alike(block: int) -> None:
 
 def test_most_random_specs_are_compiled_and_have_frames() -> None:
     """Else the tests above would try little."""
-    structs = [struct for struct in (made(spec(number)) for number in range(65)) if declared(struct) is not None]
+    structs = [
+        struct
+        for struct in (made(spec(number)) for number in range(65))
+        if declared(struct) is not None
+    ]
     sensors = [sensor(struct, max_length=LONGEST) for struct in structs]
     assert sum(is_compiled(one.frames["data"]) for one in sensors) > 50
     valid = [
-        sum(expected(struct, data) is not None for data in frames(one, struct, 0)) for one, struct in zip(sensors, structs, strict=True)
+        sum(expected(struct, data) is not None for data in frames(one, struct, 0))
+        for one, struct in zip(sensors, structs, strict=True)
     ]
     assert sum(number > 5 for number in valid) > 50
 
 
-@pytest.mark.parametrize("part", ["FlagsEnum(Int8ub, a=1, b=2)", "Padded(4, Int8ub)", "Padding(3)", "GreedyBytes", "RawCopy(Int8ub)"])
+@pytest.mark.parametrize(
+    "part",
+    [
+        "FlagsEnum(Int8ub, a=1, b=2)",
+        "Padded(4, Int8ub)",
+        "Padding(3)",
+        "GreedyBytes",
+        "RawCopy(Int8ub)",
+    ],
+)
 def test_what_loses_bits_is_refused_and_not_drawn(part: str) -> None:
     with pytest.raises(SpecError):
         sensor(made(f'Struct("a" / Int8ub, "b" / {part})'))
 
 
 @pytest.mark.parametrize(
-    "text", ['Struct("a" / Array(0, Int8ub))', 'Struct("a" / Array(0, Struct("n" / Int8ub, "x" / Bytes(this.n))))', "Struct()"]
+    "text",
+    [
+        'Struct("a" / Array(0, Int8ub))',
+        'Struct("a" / Array(0, Struct("n" / Int8ub, "x" / Bytes(this.n))))',
+        "Struct()",
+    ],
 )
 def test_a_frame_without_a_byte_is_never_found(text: str) -> None:
     ours = sensor(made(text))
@@ -126,7 +158,10 @@ def test_a_frame_without_a_byte_is_never_found(text: str) -> None:
 
 
 def test_constants_of_an_element_that_is_not_there_are_asked_of_no_frame() -> None:
-    element = 'Struct(Const(b"M"), "x" / Switch(this._.n, {7: Struct("y" / Int8ub)}, default=Array(this._.n % 4, Const(5, Int16ul))))'
+    element = (
+        'Struct(Const(b"M"), "x" / Switch(this._.n, {7: Struct("y" / Int8ub)},'
+        " default=Array(this._.n % 4, Const(5, Int16ul))))"
+    )
     ours = sensor(made(f'Struct("n" / Int8ub, "a" / Array(0, {element}), "z" / Int16ub)'))
     for backend in BACKENDS:
         assert len(ours.decode([b"\x01\x02\x03", b"\x07M\x03"], backend=backend)) == 2

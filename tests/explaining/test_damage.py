@@ -15,7 +15,11 @@ from tests.shapes import SHAPES
 STL = ls.sensor("ldrobot-stl27l")
 STL_FRAME = STL.frames["data"]
 #: Shapes with short frames: every byte of a frame is tried in every place.
-SHORT_SHAPES = [name for name, sensor in SHAPES.items() if "data" in sensor.frames and sensor.frames["data"].max_length <= 60]
+SHORT_SHAPES = [
+    name
+    for name, sensor in SHAPES.items()
+    if "data" in sensor.frames and sensor.frames["data"].max_length <= 60
+]
 
 
 def flipped(offset: int, bit: int) -> Change:
@@ -45,9 +49,15 @@ def test_a_lost_and_an_inserted_byte_are_found(offset: int) -> None:
 
 
 def test_a_lost_and_an_inserted_byte_are_told() -> None:
-    assert explain(EXAMPLE[1:], STL, "data").notes == ("one lost byte would explain it: 0x54 before byte 0, in header",)
+    assert explain(EXAMPLE[1:], STL, "data").notes == (
+        "one lost byte would explain it: 0x54 before byte 0, in header",
+    )
     (note,) = explain(EXAMPLE[:20] + EXAMPLE[21:], STL).notes
-    assert re.fullmatch(r"one lost byte would explain it, but in any of \d+ places, so that nothing can be said of where", note)
+    assert re.fullmatch(
+        r"one lost byte would explain it, but in any of \d+ places, so that nothing can be said of"
+        r" where",
+        note,
+    )
     assert "byte 20, 0x9b" in " ".join(explain(EXAMPLE[:20] + b"\x9b" + EXAMPLE[20:], STL).notes)
     assert explain(EXAMPLE[:20] + EXAMPLE[23:], STL).notes == ()
     assert explain(EXAMPLE + b"abc", STL).notes == ()
@@ -68,7 +78,10 @@ def test_what_is_said_to_mend_a_frame_mends_it(name: str) -> None:
 def test_damage_that_one_bit_explains_is_told_with_the_field() -> None:
     notes = explain(flipped(46, 0).mended(EXAMPLE), STL).notes
     assert "a flipped bit would explain it: byte 46 bit 0, crc 81, sent as 80" in notes
-    assert "a flipped bit would explain it: byte 15 bit 7, points[3].distance 0.213 m, sent as 0.085 m" in notes
+    assert (
+        "a flipped bit would explain it: byte 15 bit 7, points[3].distance 0.213 m, sent as 0.085 m"
+        in notes
+    )
     assert explain(EXAMPLE[:20], STL).notes == ()
 
 
@@ -76,4 +89,8 @@ def test_where_any_bit_may_have_flipped_only_that_is_told() -> None:
     sensor = ls.sensor("cspc-m1c1-mini")
     data = max((sensor.example("data", seed=seed) for seed in range(9)), key=len)
     (note,) = explain(flipped(20, 2).mended(data), sensor, "data").notes
-    assert re.fullmatch(r"one flipped bit would explain it, but in any of \d+ places, so that nothing can be said of where", note)
+    assert re.fullmatch(
+        r"one flipped bit would explain it, but in any of \d+ places, so that nothing can be said"
+        r" of where",
+        note,
+    )

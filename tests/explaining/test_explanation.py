@@ -1,4 +1,6 @@
-"""Explanations name every byte once, of whole, damaged and truncated frames, and say what the engine says."""
+"""Explanations name every byte once, of whole, damaged and truncated frames, and say what the
+engine says.
+"""
 
 from __future__ import annotations
 
@@ -35,7 +37,9 @@ from lidarspec.spec import Checksummed, Frame, Polar, Scaled, Simulation, Sum, X
 from tests.representatives import each_sensor, each_shape, load_sensor
 from tests.shapes import SHAPES
 
-EXAMPLE = bytes.fromhex("542c6808ab7ee000e4dc00e2d900e5d500e3d300e4d000e9cd00e4ca00e2c700e9c500e5c200e5c000e5be823a1a50")
+EXAMPLE = bytes.fromhex(
+    "542c6808ab7ee000e4dc00e2d900e5d500e3d300e4d000e9cd00e4ca00e2c700e9c500e5c200e5c000e5be823a1a50"
+)
 #: At about so many bytes frames are cut; the search for the damage takes its time.
 CUTS = 40
 #: Shapes whose frames are cut at many bytes, or at each if they are short.
@@ -87,13 +91,22 @@ def test_a_truncated_frame_is_explained_as_far_as_it_goes(name: str) -> None:
     for frame in sensor.frames:
         whole = explain_example(name, frame)
         data = whole.data
-        for end in range(0, len(data), 1 + len(data) // CUTS) if name in CUT_AT_MANY_BYTES else (len(data) // 2,):
+        for end in (
+            range(0, len(data), 1 + len(data) // CUTS)
+            if name in CUT_AT_MANY_BYTES
+            else (len(data) // 2,)
+        ):
             found = explain(data[:end], sensor, frame)
             assert bytes_of_rows(found) == data[:end]
             assert found.fault is not None
             assert not found.rows[-1].right
             for row, same in zip(found.rows[:-2], whole.rows, strict=False):
-                assert (row.offset, row.data, row.path, row.values) == (same.offset, same.data, same.path, same.values)
+                assert (row.offset, row.data, row.path, row.values) == (
+                    same.offset,
+                    same.data,
+                    same.path,
+                    same.values,
+                )
 
 
 @each_sensor
@@ -175,7 +188,11 @@ def test_points_stand_in_the_rows_that_they_come_from() -> None:
     values = sensor.parse(bytes(data))
     channel = values.blocks[24].channels[3]
     channel.radius, channel.elevation, channel.azimuth = 2000, 32768, 32768 + 9000
-    row = next(row for row in explain(sensor.build("data", values), sensor).rows if row.path == "blocks[24].channels[3]")
+    row = next(
+        row
+        for row in explain(sensor.build("data", values), sensor).rows
+        if row.path == "blocks[24].channels[3]"
+    )
     (point,) = row.points
     assert (round(point.x, 4), round(point.y, 4), round(point.z, 4)) == (0, 10, 0)
     assert point.azimuth_deg == pytest.approx(90)
@@ -189,10 +206,17 @@ def test_text_is_as_the_conventions_say() -> None:
     values.points[1].distance = 0
     lines = str(explain(sensor.build("data", values), sensor)).splitlines()
     assert lines[1] == "0002  10 0e     speed        3600 deg/s = 10.0 Hz"
-    assert lines[3] == "0006  e8 03 c8  points[0]    1.000 m, intensity 200, at 0.00 deg -> x 1.000 y 0.000"
-    assert lines[4] == "0009  00 00 e2  points[1]    0.000 m, intensity 226, at -0.20 deg -> no return"
+    assert (
+        lines[3]
+        == "0006  e8 03 c8  points[0]    1.000 m, intensity 200, at 0.00 deg -> x 1.000 y 0.000"
+    )
+    assert (
+        lines[4] == "0009  00 00 e2  points[1]    0.000 m, intensity 226, at -0.20 deg -> no return"
+    )
     assert lines[-2] == "002c  3a 1a     timestamp    6.714 s; restarts at 30 s"
-    assert re.fullmatch(r"002e  (..)        crc          0x\1 ok \(CRC-8 poly 0x4d over 46 bytes\)", lines[-1])
+    assert re.fullmatch(
+        r"002e  (..)        crc          0x\1 ok \(CRC-8 poly 0x4d over 46 bytes\)", lines[-1]
+    )
 
 
 def test_a_wrong_checksum_is_told_with_the_right_one_and_gives_no_points() -> None:
@@ -224,10 +248,16 @@ def test_checksums_of_every_kind_are_judged() -> None:
         "ok (CRC-32 poly 0x04c11db7 init 0xffffffff xorout 0xffffffff reflected over 11 bytes)",
     ]
     assert said["shape-nibbles"] == ["ok (XOR-8 over 12 bytes)"]
-    assert said["shape-middle"] == ["ok (XOR-16 of 1+2-byte words after a head of 4 bytes over 16 bytes)"]
+    assert said["shape-middle"] == [
+        "ok (XOR-16 of 1+2-byte words after a head of 4 bytes over 16 bytes)"
+    ]
     values = SHAPES["shape-numbers"].parse(SHAPES["shape-numbers"].example("data", seed=5))
-    row = explain(SHAPES["shape-numbers"].build("data", values, crc=0), SHAPES["shape-numbers"]).rows[-1]
-    assert row.remarks == ("0x0000 means not filled (CRC-16 poly 0x1021 init 0xffff over 55 bytes)",)
+    row = explain(
+        SHAPES["shape-numbers"].build("data", values, crc=0), SHAPES["shape-numbers"]
+    ).rows[-1]
+    assert row.remarks == (
+        "0x0000 means not filled (CRC-16 poly 0x1021 init 0xffff over 55 bytes)",
+    )
     assert row.right
 
 
@@ -241,19 +271,36 @@ def test_bit_fields_show_their_bits() -> None:
         "intensity": (0x0A5738 >> 2 & 0xFF, "byte 1 bits 1-0, byte 0 bits 7-2"),
         "exposure": (0x0A5738 & 3, "byte 0 bits 1-0"),
     }
-    assert "angle 10.00 deg (byte 1 bits 7-0, byte 0 bits 7-1), check 1 (byte 0 bit 0)" in rows["fsa"].meaning
+    assert (
+        "angle 10.00 deg (byte 1 bits 7-0, byte 0 bits 7-1), check 1 (byte 0 bit 0)"
+        in rows["fsa"].meaning
+    )
 
 
 def variant(*fields: object) -> Sensor:
     """The sensor of a shape with another struct in its place."""
     struct = Checksummed(Struct(*fields), field="check", algorithm=Xor())
     frame = Frame(struct, data=True, max_length=9)
-    return dataclasses.replace(SHAPES["shape-count"], frames={"data": frame}, points=lambda f: Polar(range=f.far, azimuth=0))
+    return dataclasses.replace(
+        SHAPES["shape-count"],
+        frames={"data": frame},
+        points=lambda f: Polar(range=f.far, azimuth=0),
+    )
 
 
 def test_renamed_and_reordered_fields_are_followed() -> None:
-    first = variant("sync" / Const(b"\x01\x02"), "far" / Scaled(Int16ul, 0.01, "m"), "mode" / Enum(Int8ul, slow=1), "check" / Int8ul)
-    other = variant("pace" / Enum(Int8ul, slow=1), "check" / Int8ul, "sync" / Const(b"\x01\x02"), "far" / Scaled(Int16ub, 0.01, "m"))
+    first = variant(
+        "sync" / Const(b"\x01\x02"),
+        "far" / Scaled(Int16ul, 0.01, "m"),
+        "mode" / Enum(Int8ul, slow=1),
+        "check" / Int8ul,
+    )
+    other = variant(
+        "pace" / Enum(Int8ul, slow=1),
+        "check" / Int8ul,
+        "sync" / Const(b"\x01\x02"),
+        "far" / Scaled(Int16ub, 0.01, "m"),
+    )
     before = explain(first.build("data", far=4660, mode=1), first)
     after = explain(other.build("data", far=4660, pace=1), other)
     assert [(row.offset, row.path, row.data.hex()) for row in before.rows] == [
@@ -268,37 +315,75 @@ def test_renamed_and_reordered_fields_are_followed() -> None:
         (2, "sync", "0102"),
         (4, "far", "1234"),
     ]
-    assert [str(row.values[0]) for row in (before.rows[1], before.rows[2], after.rows[0])] == ["46.60 m", "1 slow", "1 slow"]
+    assert [str(row.values[0]) for row in (before.rows[1], before.rows[2], after.rows[0])] == [
+        "46.60 m",
+        "1 slow",
+        "1 slow",
+    ]
 
 
 def test_constants_without_a_name_and_documented_elements_keep_their_places() -> None:
-    sensor = variant(Const(b"\x77"), "far" / Scaled(Int16ul, 0.01, "m"), "pairs" / Array(2, Struct("a" / Int8ul) * "one"), "check" / Int8ul)
+    sensor = variant(
+        Const(b"\x77"),
+        "far" / Scaled(Int16ul, 0.01, "m"),
+        "pairs" / Array(2, Struct("a" / Int8ul) * "one"),
+        "check" / Int8ul,
+    )
     found = explain(sensor.build("data", far=1, pairs=[{"a": 3}, {"a": 4}]), sensor)
-    assert [(row.offset, row.path) for row in found.rows] == [(0, "(constant)"), (1, "far"), (3, "pairs[0]"), (4, "pairs[1]"), (5, "check")]
+    assert [(row.offset, row.path) for row in found.rows] == [
+        (0, "(constant)"),
+        (1, "far"),
+        (3, "pairs[0]"),
+        (4, "pairs[1]"),
+        (5, "check"),
+    ]
 
 
 def test_bit_blocks_in_arrays_of_arrays_have_rows_of_their_own_and_groups_give_their_text() -> None:
     grid = Array(2, Array(2, BitStruct("high" / Nibble, "low" / Nibble)))
-    sensor = variant("far" / Int8ul, "grid" / grid, "group" / Struct("a" / Int8ul * "its own", "b" / Int8ul) * "both", "check" / Int8ul)
+    sensor = variant(
+        "far" / Int8ul,
+        "grid" / grid,
+        "group" / Struct("a" / Int8ul * "its own", "b" / Int8ul) * "both",
+        "check" / Int8ul,
+    )
     found = explain(bytes([1, 0x12, 0x34, 0x56, 0x78, 5, 6, 2 ^ 0x12 ^ 0x34 ^ 0x56 ^ 0x78]), sensor)
     assert found.verdict == "valid"
-    assert [row.path for row in found.rows[1:5]] == ["grid[0][0]", "grid[0][1]", "grid[1][0]", "grid[1][1]"]
-    assert [(value.raw, value.bits) for value in found.rows[4].values] == [(7, "byte 0 bits 7-4"), (8, "byte 0 bits 3-0")]
+    assert [row.path for row in found.rows[1:5]] == [
+        "grid[0][0]",
+        "grid[0][1]",
+        "grid[1][0]",
+        "grid[1][1]",
+    ]
+    assert [(value.raw, value.bits) for value in found.rows[4].values] == [
+        (7, "byte 0 bits 7-4"),
+        (8, "byte 0 bits 3-0"),
+    ]
     assert [found.fields[path].docs for path in ("group.a", "group.b")] == ["its own", "both"]
 
 
 def test_a_bit_block_that_decides_on_its_bits_is_explained_without_them() -> None:
-    block = BitStruct("kind" / Nibble, "value" / IfThenElse(this.kind == 1, Nibble, BitsInteger(4, signed=True)))
+    block = BitStruct(
+        "kind" / Nibble, "value" / IfThenElse(this.kind == 1, Nibble, BitsInteger(4, signed=True))
+    )
     sensor = variant("far" / Int8ul, "block" / block, "check" / Int8ul)
     found = explain(bytes([1, 0x2F, 1 ^ 0x2F]), sensor, "data")
     assert [(row.offset, row.path) for row in found.rows[:2]] == [(0, "far"), (1, "block")]
-    assert [(value.path, value.raw, value.bits) for value in found.rows[1].values] == [("block.kind", 2, ""), ("block.value", -1, "")]
+    assert [(value.path, value.raw, value.bits) for value in found.rows[1].values] == [
+        ("block.kind", 2, ""),
+        ("block.value", -1, ""),
+    ]
 
 
 def test_a_checksum_within_a_frame_is_judged_over_its_own_bytes() -> None:
-    inner = Checksummed(Struct("far" / Scaled(Int16ul, 0.01, "m"), "sum" / Int8ul), field="sum", algorithm=Sum(8))
+    inner = Checksummed(
+        Struct("far" / Scaled(Int16ul, 0.01, "m"), "sum" / Int8ul), field="sum", algorithm=Sum(8)
+    )
     sensor = variant("sync" / Const(b"\x01\x02"), "far" / Int8ul, "inner" / inner, "check" / Int8ul)
-    rows = {row.path: row for row in explain(sensor.build("data", far=1, inner={"far": 0x1234}), sensor).rows}
+    rows = {
+        row.path: row
+        for row in explain(sensor.build("data", far=1, inner={"far": 0x1234}), sensor).rows
+    }
     assert rows["inner.sum"].remarks == ("0x46 ok (8-bit sum over 2 bytes)",)
     assert rows["check"].remarks[0].endswith("ok (XOR-8 over 6 bytes)")
 
@@ -334,8 +419,17 @@ def fault(data: bytes) -> WireError:
         ),
         ("542d100e", ["  0000  54 2d 10 0e", "        ^^^^^ header"]),
         ("54", ["  0000  54", "        ^^ header"]),
-        (EXAMPLE[:8].hex(), ["  0000  54 2c 68 08 ab 7e e0 00", " " * 33 + "^^ points[0].intensity"]),
-        (EXAMPLE[:16].hex(), ["  0000  54 2c 68 08 ab 7e e0 00  e4 dc 00 e2 d9 00 e5 d5", " " * 54 + "^^ points[3].distance"]),
+        (
+            EXAMPLE[:8].hex(),
+            ["  0000  54 2c 68 08 ab 7e e0 00", " " * 33 + "^^ points[0].intensity"],
+        ),
+        (
+            EXAMPLE[:16].hex(),
+            [
+                "  0000  54 2c 68 08 ab 7e e0 00  e4 dc 00 e2 d9 00 e5 d5",
+                " " * 54 + "^^ points[3].distance",
+            ],
+        ),
         (
             (EXAMPLE[:-1] + b"\0").hex(),
             [
@@ -353,7 +447,13 @@ def test_hexdumps_mark_the_place(data: str, lines: list[str]) -> None:
 
 def test_hexdumps_of_long_frames_show_the_lines_before_the_place() -> None:
     error = WireError("here", offset=100, path="x", data=bytes(range(200)))
-    assert [line[:8].strip() for line in hexdump(error).splitlines()] == ["...", "0040", "0050", "0060", ""]
+    assert [line[:8].strip() for line in hexdump(error).splitlines()] == [
+        "...",
+        "0040",
+        "0050",
+        "0060",
+        "",
+    ]
     assert hexdump(WireError("nothing")) == ""
 
 
@@ -361,7 +461,12 @@ def test_numbers_are_shown_with_the_steps_of_their_scale() -> None:
     found = explain(SHAPES["shape-numbers"].example("data", seed=3), SHAPES["shape-numbers"])
     serial = next(value for row in found.rows for value in row.values if value.name == "serial")
     assert str(serial) == str(serial.raw)
-    assert not any(math.isinf(value.physical) for row in found.rows for value in row.values if value.name == "serial")
+    assert not any(
+        math.isinf(value.physical)
+        for row in found.rows
+        for value in row.values
+        if value.name == "serial"
+    )
 
 
 @pytest.mark.parametrize(
@@ -382,12 +487,23 @@ def test_numbers_are_shown_with_the_steps_of_their_scale() -> None:
         (2**-32, 0, "0.0000044706"),
     ],
 )
-def test_a_value_has_the_decimals_that_its_steps_need(scale: float, offset: float, shown: str) -> None:
+def test_a_value_has_the_decimals_that_its_steps_need(
+    scale: float, offset: float, shown: str
+) -> None:
     """One raw step more shows another number, and what is shown is built as it was read."""
     shape = SHAPES["shape-numbers"]
-    frame = Frame(Struct("magic" / Const(b"\xf0\x0d"), "x" / Scaled(Int16ul, scale, "u", offset)), data=True, max_length=4)
+    frame = Frame(
+        Struct("magic" / Const(b"\xf0\x0d"), "x" / Scaled(Int16ul, scale, "u", offset)),
+        data=True,
+        max_length=4,
+    )
     sensor = dataclasses.replace(
-        shape, frames={"data": frame}, points=lambda f: Polar(f.x, 0), sequence=None, clock=None, simulation=Simulation()
+        shape,
+        frames={"data": frame},
+        points=lambda f: Polar(f.x, 0),
+        sequence=None,
+        clock=None,
+        simulation=Simulation(),
     )
 
     def said(raw: int) -> str:

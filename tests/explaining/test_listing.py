@@ -1,4 +1,6 @@
-"""Listings: nested parts indented, bit fields drawn, damage told to the bit, differences between frames, colours on a terminal alone."""
+"""Listings: nested parts indented, bit fields drawn, damage told to the bit, differences between
+frames, colours on a terminal alone.
+"""
 
 from __future__ import annotations
 
@@ -24,7 +26,10 @@ def lines(sensor: str, data: bytes, frame: str | None = None) -> list[str]:
 
 def test_parts_are_indented_below_what_holds_them() -> None:
     data = ls.sensor("robosense-m1").example("data", seed=1)
-    found = [re.sub(r"^([0-9a-f]{4})  .{23}  ", r"\1 ", line).split("  ")[0:3] for line in lines("robosense-m1", data)]
+    found = [
+        re.sub(r"^([0-9a-f]{4})  .{23}  ", r"\1 ", line).split("  ")[0:3]
+        for line in lines("robosense-m1", data)
+    ]
     assert ["0020 blocks[0]"] in found
     heads = [line for line in lines("robosense-m1", data) if line.endswith("blocks[1]")]
     assert heads == [f"004f  {'':23}  blocks[1]"]
@@ -35,7 +40,10 @@ def test_bit_fields_are_drawn_in_the_first_element_and_on_request_in_all() -> No
     found = explain(M1C1, ls.sensor("cspc-m1c1-mini"), "data")
     listed = [text(line) for line in found.lines()]
     told = {" ".join(line.split()) for line in listed}
-    assert "000a .. 001010.. 00001010 distance 0.650 m (byte 2 bits 7-0, byte 1 bits 7-2); 0: no return" in told
+    assert (
+        "000a .. 001010.. 00001010 distance 0.650 m (byte 2 bits 7-0, byte 1 bits 7-2); 0: no"
+        " return" in told
+    )
     assert "000a ......00 .. .. exposure 0; 1 high, 2 low" in told
     assert not any(line.startswith("000d  ..") for line in listed)
     assert sum(text(line).startswith("000d") for line in found.lines(every=True)) == 4
@@ -62,12 +70,20 @@ def test_fields_that_one_frame_alone_has_are_told_together() -> None:
     sensor = ls.sensor("cspc-m1c1-mini")
     samples = [dict(distance=1000, intensity=9, exposure=2)] * 3
     head = dict(mt=dict(frequency=0, start=0), fsa=dict(angle=64), lsa=dict(angle=640))
-    parts = [explain(sensor.build("data", **head, samples=samples[:count]), sensor) for count in (1, 3)]
-    shown = [text(line) for line in told(parts[0].differences(parts[1]), (len(parts[0].data), len(parts[1].data)))]
+    parts = [
+        explain(sensor.build("data", **head, samples=samples[:count]), sensor) for count in (1, 3)
+    ]
+    shown = [
+        text(line)
+        for line in told(parts[0].differences(parts[1]), (len(parts[0].data), len(parts[1].data)))
+    ]
     assert "      samples[1].distance to samples[2].exposure  in the second frame alone" in shown
 
 
-@pytest.mark.parametrize("name", ["shape-count", "shape-bits", "shape-nibbles", "shape-twins", "shape-choices", "shape-scales"])
+@pytest.mark.parametrize(
+    "name",
+    ["shape-count", "shape-bits", "shape-nibbles", "shape-twins", "shape-choices", "shape-scales"],
+)
 def test_differences_count_every_bit_of_frames_of_one_layout(name: str) -> None:
     sensor = load_sensor(name)
     for frame in sensor.frames:
@@ -75,8 +91,13 @@ def test_differences_count_every_bit_of_frames_of_one_layout(name: str) -> None:
         other = data[:-1] + bytes([data[-1] ^ 0x41])
         first = explain(data, sensor, frame)
         second = explain(other, sensor, frame)
-        if second.rows[-1].values and [row.path for row in first.rows] == [row.path for row in second.rows]:
-            assert sum(mask.bit_count() for part in first.differences(second) for mask in part.masks) == 2
+        if second.rows[-1].values and [row.path for row in first.rows] == [
+            row.path for row in second.rows
+        ]:
+            assert (
+                sum(mask.bit_count() for part in first.differences(second) for mask in part.masks)
+                == 2
+            )
 
 
 def test_the_verb_compares_with_another_frame_or_the_next() -> None:
@@ -86,11 +107,16 @@ def test_the_verb_compares_with_another_frame_or_the_next() -> None:
     assert ran("explain", (EXAMPLE + other).hex(), "--diff", "next", "-s", STL.id).stdout == said
     listed = printed("explain", EXAMPLE.hex(), "--diff", other.hex(), "-s", STL.id)["differences"]
     assert [part["path"] for part in listed] == ["speed", "crc"]
-    assert "no second data frame" in ran("explain", EXAMPLE.hex(), "--diff", "next", "-s", STL.id, code=2).stderr
+    assert (
+        "no second data frame"
+        in ran("explain", EXAMPLE.hex(), "--diff", "next", "-s", STL.id, code=2).stderr
+    )
 
 
 def test_damaged_frames_in_a_stream_are_explained_beside_the_others() -> None:
-    frames = printed("explain", (b"\x01" + DAMAGED + EXAMPLE + EXAMPLE[:9]).hex(), "-s", STL.id)["frames"]
+    frames = printed("explain", (b"\x01" + DAMAGED + EXAMPLE + EXAMPLE[:9]).hex(), "-s", STL.id)[
+        "frames"
+    ]
     assert [(part["frame"], part["offset"], part["fault"] is None) for part in frames] == [
         ("", 0, True),
         ("data", 1, False),
@@ -100,14 +126,24 @@ def test_damaged_frames_in_a_stream_are_explained_beside_the_others() -> None:
 
 
 def test_long_lines_are_folded_below_their_text() -> None:
-    line = (Span("0000  "), Span("aa  "), Span("name  "), Span("some words that are too many for it"))
-    assert text(folded(line, 44)) == "0000  aa  name  some words that are too many\n                for it"
+    line = (
+        Span("0000  "),
+        Span("aa  "),
+        Span("name  "),
+        Span("some words that are too many for it"),
+    )
+    assert (
+        text(folded(line, 44))
+        == "0000  aa  name  some words that are too many\n                for it"
+    )
     assert folded(line, 20) == line
 
 
 @pytest.mark.slow
 def test_colours_are_for_terminals_and_not_with_no_color() -> None:
-    terminal = pytest.importorskip("tests.view.terminal", reason="no pseudo-terminals on this system")
+    terminal = pytest.importorskip(
+        "tests.view.terminal", reason="no pseudo-terminals on this system"
+    )
     words = ("explain", DAMAGED.hex(), "-s", STL.id)
     assert b"\x1b[" not in process(*words).stdout
     shown = {}

@@ -1,4 +1,6 @@
-"""A stream in pieces: frames as they come, and what was a frame before it was damaged, cut where it was sent."""
+"""A stream in pieces: frames as they come, and what was a frame before it was damaged, cut where it
+was sent.
+"""
 
 from __future__ import annotations
 
@@ -19,22 +21,34 @@ FRAMES = ls.simulate(STL, 40)
 SPOT = 20
 
 
-def told(sent: Iterable[bytes], *, sensor: ls.Sensor = STL, datagrams: bool = False) -> list[tuple[str, int, str]]:
-    """The type, length and verdict of each piece that is not a valid frame; all together are what was sent, in order."""
+def told(
+    sent: Iterable[bytes], *, sensor: ls.Sensor = STL, datagrams: bool = False
+) -> list[tuple[str, int, str]]:
+    """The type, length and verdict of each piece that is not a valid frame; all together are what
+    was sent, in order.
+    """
     sent = list(sent)
     found = pieces(sensor, map(Chunk, sent), datagrams=datagrams)
     parts = [part for piece in found for part in explained(sensor, piece)]
     assert b"".join(piece.data for piece, _ in parts) == b"".join(sent)
-    assert [piece.offset for piece, _ in parts] == [0, *itertools.accumulate(len(piece.data) for piece, _ in parts)][:-1]
+    assert [piece.offset for piece, _ in parts] == [
+        0,
+        *itertools.accumulate(len(piece.data) for piece, _ in parts),
+    ][:-1]
     damaged = [(piece, part) for piece, part in parts if part.fault is not None or not part.frame]
-    return [(part.frame, len(piece.data), " ".join((part.verdict, *part.notes))) for piece, part in damaged]
+    return [
+        (part.frame, len(piece.data), " ".join((part.verdict, *part.notes)))
+        for piece, part in damaged
+    ]
 
 
 def sent(damaged: Iterable[bytes]) -> list[bytes]:
     return [*FRAMES[:5], *damaged, *FRAMES[5:20]]
 
 
-def test_a_flipped_bit_a_lost_and_an_inserted_byte_and_a_truncated_frame_are_told_from_each_other() -> None:
+def test_a_flipped_bit_a_lost_and_an_inserted_byte_and_a_truncated_frame_are_told_from_each_other() -> (
+    None
+):
     data = FRAMES[30]
     flipped = data[:SPOT] + bytes([data[SPOT] ^ 4]) + data[SPOT + 1 :]
     headless = bytes([data[0] ^ 1]) + data[1:]
@@ -54,20 +68,34 @@ def test_a_flipped_bit_a_lost_and_an_inserted_byte_and_a_truncated_frame_are_tol
 def test_damaged_frames_in_a_row_are_told_one_by_one() -> None:
     lost, flipped = (FRAMES[number][:SPOT] for number in (30, 31))
     lost, flipped = lost + FRAMES[30][SPOT + 1 :], flipped + b"\xfe" + FRAMES[31][SPOT + 1 :]
-    assert [size for _, size, _ in told(sent([lost, flipped, lost, FRAMES[32][:11]]))] == [46, 47, 46, 11]
+    assert [size for _, size, _ in told(sent([lost, flipped, lost, FRAMES[32][:11]]))] == [
+        46,
+        47,
+        46,
+        11,
+    ]
     assert told(sent([b"\x01\x02\x03", flipped]))[0] == ("", 3, "valid")
 
 
 def test_a_damaged_datagram_is_one_piece_whatever_is_in_it() -> None:
     sensor = ls.sensor("velodyne-vlp16")
     packets = ls.simulate(sensor, 4)
-    ((frame, size, said),) = told([packets[0], packets[1][:1000], packets[2]], sensor=sensor, datagrams=True)
+    ((frame, size, said),) = told(
+        [packets[0], packets[1][:1000], packets[2]], sensor=sensor, datagrams=True
+    )
     assert (frame, size) == ("data", 1000)
     assert "frame ends at byte 1000 of 1206" in said
-    assert [size for _, size, _ in told([packets[0], b"abc", b"defg", packets[2]], sensor=sensor, datagrams=True)] == [3, 4]
+    assert [
+        size
+        for _, size, _ in told(
+            [packets[0], b"abc", b"defg", packets[2]], sensor=sensor, datagrams=True
+        )
+    ] == [3, 4]
 
 
-@pytest.mark.parametrize("sensor", ["shape-count", "shape-ahead", "cspc-m1c1-mini", "slamtec-rplidar-a1"])
+@pytest.mark.parametrize(
+    "sensor", ["shape-count", "shape-ahead", "cspc-m1c1-mini", "slamtec-rplidar-a1"]
+)
 def test_every_byte_of_a_damaged_stream_is_in_one_piece(sensor: str) -> None:
     value = load_sensor(sensor)
     chance = random.Random(4)
@@ -80,7 +108,9 @@ def test_every_byte_of_a_damaged_stream_is_in_one_piece(sensor: str) -> None:
 
 def test_pieces_come_before_the_input_ends() -> None:
     endless = map(Chunk, itertools.cycle(FRAMES))
-    assert [piece.offset for piece in itertools.islice(pieces(STL, endless, datagrams=False), 3)] == [0, 47, 94]
+    assert [
+        piece.offset for piece in itertools.islice(pieces(STL, endless, datagrams=False), 3)
+    ] == [0, 47, 94]
     noise = map(Chunk, itertools.repeat(bytes(1 << 12)))
     assert next(pieces(STL, noise, datagrams=False)).frame == ""
 
@@ -88,7 +118,9 @@ def test_pieces_come_before_the_input_ends() -> None:
 def test_a_frame_type_is_looked_for_in_the_whole_input() -> None:
     sensor = ls.sensor("slamtec-rplidar-a1")
     node = sensor.example("node")
-    found = list(pieces(sensor, [Chunk(node * 600)], datagrams=False, frame="node"))  # no descriptor before it
+    found = list(
+        pieces(sensor, [Chunk(node * 600)], datagrams=False, frame="node")
+    )  # no descriptor before it
     assert [piece.frame for piece in found] == ["node"] * 600
     (short,) = pieces(STL, [Chunk(b"\x00" + FRAMES[0][1:])], datagrams=False, frame="data")
     assert short.frame == NEAREST

@@ -1,4 +1,6 @@
-"""Frames decoded by nothing but the JSON of a spec, to show that it says enough; written from docs/reference/spec-json.md."""
+"""Frames decoded by nothing but the JSON of a spec, to show that it says enough; written from
+docs/reference/spec-json.md.
+"""
 
 from __future__ import annotations
 
@@ -58,14 +60,19 @@ class Decoder:
         return found
 
     def read_uint(self, part: dict[str, Any], *, signed: bool = False) -> int:
-        self.known[part["path"]] = int.from_bytes(self.taken(part["bytes"]), part["order"], signed=signed)
+        self.known[part["path"]] = int.from_bytes(
+            self.taken(part["bytes"]), part["order"], signed=signed
+        )
         return self.known[part["path"]]
 
     def read_int(self, part: dict[str, Any]) -> int:
         return self.read_uint(part, signed=True)
 
     def read_float(self, part: dict[str, Any]) -> float:
-        (value,) = struct.unpack(("<" if part["order"] == "little" else ">") + FLOATS[part["bytes"]], self.taken(part["bytes"]))
+        (value,) = struct.unpack(
+            ("<" if part["order"] == "little" else ">") + FLOATS[part["bytes"]],
+            self.taken(part["bytes"]),
+        )
         return value
 
     def read_bytes(self, part: dict[str, Any]) -> bytes:
@@ -75,7 +82,10 @@ class Decoder:
         block = self.taken(part["bytes"])
         found: Any = {}
         for bits in part["parts"]:
-            value = sum((block[run["byte"]] >> run["low"]) % (1 << run["width"]) << run["target"] for run in bits["runs"])
+            value = sum(
+                (block[run["byte"]] >> run["low"]) % (1 << run["width"]) << run["target"]
+                for run in bits["runs"]
+            )
             if bits["signed"] and value >> bits["width"] - 1:
                 value -= 1 << bits["width"]
             self.known[bits["path"]] = value
@@ -89,8 +99,17 @@ class Decoder:
 
     def read_parts(self, part: dict[str, Any]) -> Any:
         found, start = list[Any](), self.at
-        count, following, within = (None if part[rule] is None else self.value(part[rule]) for rule in ("count", "size", "within"))
-        while len(found) < count if count is not None else following if within is None else self.at - start < within:
+        count, following, within = (
+            None if part[rule] is None else self.value(part[rule])
+            for rule in ("count", "size", "within")
+        )
+        while (
+            len(found) < count
+            if count is not None
+            else following
+            if within is None
+            else self.at - start < within
+        ):
             begun = self.at
             value, kind = self.read_one(part["kinds"])
             found.append(value)
@@ -109,7 +128,11 @@ class Decoder:
                 value = self.read(kind["part"])
             except AssertionError:  # it would be longer than what is left
                 continue
-            constants = {member["name"]: member.get("const") for member in kind["part"]["members"] if member.get("const") is not None}
+            constants = {
+                member["name"]: member.get("const")
+                for member in kind["part"]["members"]
+                if member.get("const") is not None
+            }
             if all(value[name] == const for name, const in constants.items()):
                 return value, kind
         raise AssertionError("a part of no kind")
@@ -119,7 +142,9 @@ class Decoder:
 
     def read_switch(self, part: dict[str, Any]) -> Any:
         key = self.value(part["key"])
-        return self.read(next((case["part"] for case in part["cases"] if case["value"] == key), part["default"]))
+        return self.read(
+            next((case["part"] for case in part["cases"] if case["value"] == key), part["default"])
+        )
 
     def read_check(self, part: dict[str, Any]) -> None:
         assert self.value(part["condition"])

@@ -21,12 +21,15 @@ from lidarspec.exports.ksy import identifier
 from tests.exports.trees import number
 
 HERE = Path(__file__).parent
-#: the compiler of Kaitai's own packages, by path or on PATH; without it the npm package is looked for, as node does (NODE_PATH).
+#: the compiler of Kaitai's own packages, by path or on PATH; without it the npm package is looked
+#: for, as node does (NODE_PATH).
 COMPILER = os.environ.get("LIDARSPEC_KSC", "kaitai-struct-compiler")
 
 
 def compile_all(sensors: Iterable[Sensor], folder: Path) -> None:
-    """A Python module for the export of each sensor; the test is skipped where there is no compiler."""
+    """A Python module for the export of each sensor; the test is skipped where there is no
+    compiler.
+    """
     specs = []
     for sensor in sensors:
         specs.append(folder / f"{sensor.id}.ksy")
@@ -36,7 +39,10 @@ def compile_all(sensors: Iterable[Sensor], folder: Path) -> None:
     elif _has_packages():
         command = ["node", str(HERE / "compile_ksy.js"), str(folder), *map(str, specs)]
     else:
-        pytest.skip("no Kaitai compiler: npm install kaitai-struct-compiler js-yaml, and name its node_modules in NODE_PATH")
+        pytest.skip(
+            "no Kaitai compiler: npm install kaitai-struct-compiler js-yaml, and name its"
+            " node_modules in NODE_PATH"
+        )
     done = subprocess.run(command, capture_output=True, text=True, check=False, timeout=300)
     assert done.returncode == 0, done.stdout + done.stderr
 
@@ -45,7 +51,12 @@ def _has_packages() -> bool:
     if not shutil.which("node"):
         return False
     script = "require.resolve('kaitai-struct-compiler'); require.resolve('js-yaml')"
-    return subprocess.run(["node", "-e", script], capture_output=True, check=False, timeout=60).returncode == 0
+    return (
+        subprocess.run(
+            ["node", "-e", script], capture_output=True, check=False, timeout=60
+        ).returncode
+        == 0
+    )
 
 
 def module(sensor: Sensor, folder: Path) -> ModuleType:
@@ -71,14 +82,26 @@ def camel(name: str) -> str:
 
 
 def differences(parsed: Any, read: Any, path: str = "") -> list[str]:
-    """Where what construct parsed is not what Kaitai's class read; blocks and arrays inside it by their flattened names."""
+    """Where what construct parsed is not what Kaitai's class read; blocks and arrays inside it by
+    their flattened names.
+    """
     if isinstance(parsed, Mapping):
-        return [place for name, value in parsed.items() for place in differences(value, _member(read, name), f"{path}.{name}")]
+        return [
+            place
+            for name, value in parsed.items()
+            for place in differences(value, _member(read, name), f"{path}.{name}")
+        ]
     if isinstance(parsed, list):
-        read = [] if read is None else getattr(read, "value", read)  # a chain without any part is not there
+        read = (
+            [] if read is None else getattr(read, "value", read)
+        )  # a chain without any part is not there
         if len(parsed) != len(read):
             return [f"{path}: {len(parsed)} elements, and {len(read)} in Kaitai"]
-        return [place for index, value in enumerate(parsed) for place in differences(value, read[index], f"{path}[{index}]")]
+        return [
+            place
+            for index, value in enumerate(parsed)
+            for place in differences(value, read[index], f"{path}[{index}]")
+        ]
     value = read
     while hasattr(value, "value"):  # of an array, and then of one of its alternatives
         value = value.value

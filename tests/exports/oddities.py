@@ -1,4 +1,6 @@
-"""A sensor whose frames hold what no other one does, so that exports are tried on it: formulas of every kind, odd numbers, names."""
+"""A sensor whose frames hold what no other one does, so that exports are tried on it: formulas of
+every kind, odd numbers, names.
+"""
 
 from __future__ import annotations
 
@@ -33,7 +35,22 @@ from construct import (
 )
 
 from lidarspec import Sensor
-from lidarspec.spec import Checksummed, Crc, Fields, Fold15, Frame, OnWrap, Polar, Scaled, Serial, Sum, Tcp, WordXor, Xor, ZeroPadded
+from lidarspec.spec import (
+    Checksummed,
+    Crc,
+    Fields,
+    Fold15,
+    Frame,
+    OnWrap,
+    Polar,
+    Scaled,
+    Serial,
+    Sum,
+    Tcp,
+    WordXor,
+    Xor,
+    ZeroPadded,
+)
 
 FORMULAS = Struct(
     "magic" / Const(b"\xf0\x01"),
@@ -44,8 +61,22 @@ FORMULAS = Struct(
     "floor" / Bytes((this.a - this.b) // 7 % 5),
     "shifts" / Bytes(((this.a >> 6) << 1) + (this.b & 3) ^ (this.a | 1) & 1),
     "negated" / If(~(this.a > 128), Int16ub),
-    "either" / IfThenElse((this.c < 0) & (this.b != 7), Struct("low" / Int8ub, "wide" / Int16ub), Struct("low" / Int16ub)),
-    "rows" / Array(this.b % 3, Struct("cells" / Array(this._.a % 3 + 1, Struct("x" / Int8ub, "y" / Scaled(Int16sl, 0.5, "mm", offset=3))))),
+    "either"
+    / IfThenElse(
+        (this.c < 0) & (this.b != 7),
+        Struct("low" / Int8ub, "wide" / Int16ub),
+        Struct("low" / Int16ub),
+    ),
+    "rows"
+    / Array(
+        this.b % 3,
+        Struct(
+            "cells"
+            / Array(
+                this._.a % 3 + 1, Struct("x" / Int8ub, "y" / Scaled(Int16sl, 0.5, "mm", offset=3))
+            )
+        ),
+    ),
 )
 KINDS = Struct(
     "magic" / Const(b"\xf0\x02"),
@@ -53,7 +84,10 @@ KINDS = Struct(
     "body"
     / Switch(
         this.kind,
-        {"plain": Struct("value" / Int8ub), "fancy": Struct("value" / Int32ul, "size" / Int8ub, "data" / Bytes(this.size % 4))},
+        {
+            "plain": Struct("value" / Int8ub),
+            "fancy": Struct("value" / Int32ul, "size" / Int8ub, "data" / Bytes(this.size % 4)),
+        },
         default=Struct("other" / Float32l),
     ),
     "length" / Int8ub,
@@ -69,11 +103,20 @@ NUMBERS = Struct(
     "uint56" / BytesInteger(7, swapped=True),
     "uint64" / Int64ub,
     "bits"
-    / BitStruct("few" / Array(3, BitsInteger(5)), "flag" / BitsInteger(1), "wide" / BitsInteger(56), "end" / BitsInteger(8, signed=True)),
+    / BitStruct(
+        "few" / Array(3, BitsInteger(5)),
+        "flag" / BitsInteger(1),
+        "wide" / BitsInteger(56),
+        "end" / BitsInteger(8, signed=True),
+    ),
     "pairs"
     / Array(
         2,
-        Struct("mark" / Const(0x5A, Int8ub), Const(b"\x77"), "tail" / ByteSwapped(BitStruct("u" / BitsInteger(12), "v" / BitsInteger(4)))),
+        Struct(
+            "mark" / Const(0x5A, Int8ub),
+            Const(b"\x77"),
+            "tail" / ByteSwapped(BitStruct("u" / BitsInteger(12), "v" / BitsInteger(4))),
+        ),
     ),
 )
 
@@ -81,13 +124,20 @@ NUMBERS = Struct(
 def sealed(number: int, algorithm: Any, field: Any) -> Checksummed:
     """A frame with a checksum in the middle."""
     body = Struct(
-        "magic" / Const(bytes([0xF1, number])), "count" / Int8ub, "data" / Bytes(this.count % 90), "sum" / field, "rest" / Bytes(3)
+        "magic" / Const(bytes([0xF1, number])),
+        "count" / Int8ub,
+        "data" / Bytes(this.count % 90),
+        "sum" / field,
+        "rest" / Bytes(3),
     )
     return Checksummed(body, field="sum", algorithm=algorithm)
 
 
 ALGORITHMS = [
-    (Crc(64, 0x42F0E1EBA9EA3693, init=2**64 - 1, refin=True, refout=True, xorout=2**64 - 1), Int64ub),
+    (
+        Crc(64, 0x42F0E1EBA9EA3693, init=2**64 - 1, refin=True, refout=True, xorout=2**64 - 1),
+        Int64ub,
+    ),
     (Crc(40, 0x0004820009, init=0x123456789A, order="big"), BytesInteger(5)),
     (Crc(32, 0x04C11DB7, init=0xFFFFFFFF), Int32ul),
     (Crc(24, 0x864CFB, init=0xB704CE), Int24ub),
@@ -105,7 +155,11 @@ ALGORITHMS = [
     (ZeroPadded(WordXor(1, (1, 2)), 8), Int16ub),
 ]
 
-DATA = Struct("magic" / Const(b"\xf0\x00"), "angle" / Scaled(Int16ub, 0.01, "deg"), "distance" / Scaled(Int16ub, 0.001, "m"))
+DATA = Struct(
+    "magic" / Const(b"\xf0\x00"),
+    "angle" / Scaled(Int16ub, 0.01, "deg"),
+    "distance" / Scaled(Int16ub, 0.001, "m"),
+)
 
 
 def points(f: Fields) -> Polar:
@@ -121,7 +175,10 @@ SENSOR = Sensor(
         "formulas": Frame(FORMULAS, max_length=80),
         "kinds": Frame(KINDS, max_length=20),
         "numbers": Frame(NUMBERS, max_length=70),
-        **{f"sealed{number}": Frame(sealed(number, *pair), max_length=110) for number, pair in enumerate(ALGORITHMS)},
+        **{
+            f"sealed{number}": Frame(sealed(number, *pair), max_length=110)
+            for number, pair in enumerate(ALGORITHMS)
+        },
     },
     points=points,
     scan=OnWrap("angle"),

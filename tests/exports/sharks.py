@@ -22,7 +22,9 @@ _needs_tshark = pytest.mark.skipif(TSHARK is None, reason="tshark is not install
 
 
 def judged(test: Callable[..., None]) -> Callable[..., None]:
-    """Mark a test that runs tshark: left to `make test-all`, and skipped if tshark is not installed."""
+    """Mark a test that runs tshark: left to `make test-all`, and skipped if tshark is not
+    installed.
+    """
     return pytest.mark.slow(_needs_tshark(test))  # type: ignore[no-any-return]
 
 
@@ -30,16 +32,33 @@ def tshark(capture: Path, *arguments: str, scripts: Iterable[Path] = ()) -> str:
     """What tshark prints; it must complain of nothing but being root."""
     assert TSHARK is not None
     loaded = [option for script in scripts for option in ("-X", f"lua_script:{script}")]
-    done = subprocess.run([TSHARK, *loaded, "-r", capture, *arguments], check=False, capture_output=True, text=True)
-    complaints = [line for line in done.stderr.splitlines() if line.strip() and "Running as user" not in line]
+    done = subprocess.run(
+        [TSHARK, *loaded, "-r", capture, *arguments], check=False, capture_output=True, text=True
+    )
+    complaints = [
+        line for line in done.stderr.splitlines() if line.strip() and "Running as user" not in line
+    ]
     assert not done.returncode and not complaints, "\n".join(complaints)[:2000]  # noqa: PT018
     return done.stdout
 
 
-def columns(capture: Path, script: Path, names: Sequence[str], *arguments: str) -> Iterator[list[list[str]]]:
+def columns(
+    capture: Path, script: Path, names: Sequence[str], *arguments: str
+) -> Iterator[list[list[str]]]:
     """For each packet the values of each of these fields, in the order in which they stand in it."""
     wanted = [option for name in names for option in ("-e", name)]
-    printed = tshark(capture, "-T", "fields", "-E", "separator=/t", "-E", "aggregator=;", *wanted, *arguments, scripts=[script])
+    printed = tshark(
+        capture,
+        "-T",
+        "fields",
+        "-E",
+        "separator=/t",
+        "-E",
+        "aggregator=;",
+        *wanted,
+        *arguments,
+        scripts=[script],
+    )
     for line in printed.splitlines():
         yield [column.split(";") if column else [] for column in line.split("\t")]
 
@@ -65,7 +84,13 @@ def captured(sensor: Sensor, frames: Iterable[bytes], path: Path) -> Path:
         for number, frame in enumerate(frames):
             if isinstance(link, Udp) and sensor.datagrams:
                 port = link.ports[0] if link.ports else 9
-                file.write(datagram_record(Datagram(frame, number * 1_000_000, ("192.0.2.1", port), ("192.0.2.2", port))))
+                file.write(
+                    datagram_record(
+                        Datagram(
+                            frame, number * 1_000_000, ("192.0.2.1", port), ("192.0.2.2", port)
+                        )
+                    )
+                )
             else:
                 file.write(packet_record(frame, number * 1_000_000))
     return path

@@ -1,4 +1,6 @@
-"""C headers from specs: compiled as strictly as compilers can, and read by them, frame by frame, as by lidarspec itself."""
+"""C headers from specs: compiled as strictly as compilers can, and read by them, frame by frame, as
+by lidarspec itself.
+"""
 
 from __future__ import annotations
 
@@ -21,7 +23,14 @@ from lidarspec.exports import Refused, beginning, export
 from lidarspec.frames.schema import Schema
 from lidarspec.framing.frame_engine import codec
 from lidarspec.testing import subject as material
-from tests.exports.trees import SHAPED, distinct_frames, distinct_sensors, installed_sensors, recoded, values
+from tests.exports.trees import (
+    SHAPED,
+    distinct_frames,
+    distinct_sensors,
+    installed_sensors,
+    recoded,
+    values,
+)
 
 GCC = shutil.which("gcc")
 needs_gcc = pytest.mark.skipif(GCC is None, reason="gcc is not installed")
@@ -81,7 +90,11 @@ def subjects() -> dict[str, Sensor]:
     """Load every sensor that C can say, one for each set of frames, by id."""
     refused = {*REFUSED, *REFUSED_INSTALLED}
     sensors = distinct_sensors()
-    return {name: sensor for name, sensor in sensors.items() if name not in refused and name not in recoded([sensor])}
+    return {
+        name: sensor
+        for name, sensor in sensors.items()
+        if name not in refused and name not in recoded([sensor])
+    }
 
 
 @pytest.mark.parametrize("name", [name for name in SHAPED if name not in REFUSED])
@@ -123,7 +136,10 @@ def test_every_header_compiles_without_a_warning(tmp_path: Path) -> None:
 @needs_gcc
 def test_an_id_that_begins_with_a_digit_makes_names_all_the_same(tmp_path: Path) -> None:
     (tmp_path / "it.h").write_text(export(replace(SHAPED["shape-count"], id="3acme-x1"), "c"))
-    (tmp_path / "it.c").write_text('#include "it.h"\nint main(void) { return lidar_3acme_x1_data_count((const uint8_t *)"abc") != 99; }\n')
+    (tmp_path / "it.c").write_text(
+        '#include "it.h"\nint main(void) { return lidar_3acme_x1_data_count((const uint8_t *)"abc")'
+        " != 99; }\n"
+    )
     subprocess.run([str(GCC), *STRICT, "-o", "it", "it.c"], cwd=tmp_path, check=True)
     subprocess.run([tmp_path / "it"], check=True)
 
@@ -134,19 +150,24 @@ def test_every_header_is_cplusplus_too(tmp_path: Path) -> None:
     source = tmp_path / "all.cpp"
     source.write_text(_included(tmp_path) + "int main() { return 0; }\n")
     done = subprocess.run(
-        ["g++", "-std=c++11", "-Wall", "-Wextra", "-Werror", "-pedantic", "-fsyntax-only", source], check=False, capture_output=True
+        ["g++", "-std=c++11", "-Wall", "-Wextra", "-Werror", "-pedantic", "-fsyntax-only", source],
+        check=False,
+        capture_output=True,
     )
     assert not done.returncode, done.stderr.decode()[:2000]
 
 
 @pytest.fixture(scope="module", params=["plain", pytest.param("checked", marks=pytest.mark.soak)])
 def reader(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A program that prints all fields of the frames it is given; checked, it stops at the first byte read outside them."""
+    """A program that prints all fields of the frames it is given; checked, it stops at the first
+    byte read outside them.
+    """
     folder = tmp_path_factory.mktemp("c")
     source, program = folder / "reader.c", folder / "reader"
     dumps = [_dump(sensor, name) for sensor in subjects().values() for name in sensor.frames]
     calls = [
-        f'        if (!strcmp(name, "{sensor.id}:{name}")) dump_{_word(beginning(sensor))}_{name}(p, n);\n'
+        f'        if (!strcmp(name, "{sensor.id}:{name}"))'
+        f" dump_{_word(beginning(sensor))}_{name}(p, n);\n"
         for sensor in subjects().values()
         for name in sensor.frames
     ]
@@ -158,8 +179,14 @@ def reader(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFact
 @pytest.mark.slow
 @needs_gcc
 def test_every_field_reads_as_lidarspec_reads_it(reader: Path) -> None:
-    frames = [(sensor, name, data) for sensor, name in distinct_frames(subjects().values()) for data in _examples(sensor, name)]
-    for (sensor, name, data), (is_frame, length, found) in zip(frames, _read(reader, frames), strict=True):
+    frames = [
+        (sensor, name, data)
+        for sensor, name in distinct_frames(subjects().values())
+        for data in _examples(sensor, name)
+    ]
+    for (sensor, name, data), (is_frame, length, found) in zip(
+        frames, _read(reader, frames), strict=True
+    ):
         assert (is_frame, length) == (1, len(data)), f"{sensor.id} {name}"
         wanted = values(sensor.parse(data, frame=name))
         assert found.keys() == wanted.keys()
@@ -179,7 +206,9 @@ def test_damaged_frames_are_none_of_either_s(reader: Path) -> None:
         frames += [(sensor, name, data[:cut]) for cut in {1, len(data) // 2, len(data) - 1}]
     verdicts = [_is_frame(sensor, name, data) for sensor, name, data in frames]
     assert {True, False} <= set(verdicts)
-    for (sensor, name, data), wanted, (is_frame, length, _) in zip(frames, verdicts, _read(reader, frames), strict=True):
+    for (sensor, name, data), wanted, (is_frame, length, _) in zip(
+        frames, verdicts, _read(reader, frames), strict=True
+    ):
         assert not is_frame or length <= len(data)
         assert (is_frame == 1 and length == len(data)) == wanted, f"{sensor.id} {name} {data.hex()}"
 
@@ -197,7 +226,9 @@ def test_scaling(tmp_path: Path) -> None:
     }
     source, program = tmp_path / "scaled.c", tmp_path / "scaled"
     lines = "".join(f'    printf("%.15g\\n", {call});\n' for call in calls)
-    source.write_text(f"#include <stdio.h>\n{_included(tmp_path)}int main(void)\n{{\n{lines}    return 0;\n}}\n")
+    source.write_text(
+        f"#include <stdio.h>\n{_included(tmp_path)}int main(void)\n{{\n{lines}    return 0;\n}}\n"
+    )
     _compile(source, program, *STRICT)
     printed = subprocess.run([program], capture_output=True, text=True, check=True).stdout.split()
     assert [float(number) for number in printed] == pytest.approx(list(calls.values()), rel=1e-12)
@@ -211,7 +242,9 @@ def _included(folder: Path) -> str:
 
 def _compile(source: Path, program: Path, *options: str) -> None:
     assert GCC is not None
-    done = subprocess.run([GCC, *options, "-o", program, source], check=False, capture_output=True, text=True)
+    done = subprocess.run(
+        [GCC, *options, "-o", program, source], check=False, capture_output=True, text=True
+    )
     assert not done.returncode, done.stderr[:2000]
 
 
@@ -220,7 +253,9 @@ def _word(text: str) -> str:
 
 
 def _dump(sensor: Sensor, name: str) -> str:
-    """A function that prints the fields of one frame type: which they are, and in which arrays, comes from the schema of lidarspec."""
+    """A function that prints the fields of one frame type: which they are, and in which arrays,
+    comes from the schema of lidarspec.
+    """
     table = codec(sensor.frames[name]).schema
     prefix = f"{_word(beginning(sensor))}_{name}"
     text = export_of(sensor.id)
@@ -235,15 +270,24 @@ def _dump(sensor: Sensor, name: str) -> str:
 def _printed(table: Schema, path: str, prefix: str, text: str) -> Iterator[str]:
     info = table.fields[path]
     axes = info.axes[:-1] if info.kind == "bytes" else info.axes
-    name, indices = f"{prefix}_{_word(path)}" + "_" * (path in OWN), "".join(f", i{level}" for level in range(len(axes)))
+    name, indices = (
+        f"{prefix}_{_word(path)}" + "_" * (path in OWN),
+        "".join(f", i{level}" for level in range(len(axes))),
+    )
     kind = {"float": "whole", "bytes": "bytes"}.get(info.kind) or (
         "negative" if info.dtype is not None and info.dtype.kind == "i" else "wide"
     )
-    value = f'{kind}("{path}", {name}(p{indices}){f", {name}_size(p{indices})" if kind == "bytes" else ""});'
+    value = (
+        f'{kind}("{path}",'
+        f" {name}(p{indices}){f', {name}_size(p{indices})' if kind == 'bytes' else ''});"
+    )
     loops = ""
     for level, axis in enumerate(axes):
         outer = "".join(f", i{above}" for above in range(level))
-        loops += f"for (size_t i{level} = 0; i{level} < {prefix}_{_word(axis)}_count(p{outer}); ++i{level}) "
+        loops += (
+            f"for (size_t i{level} = 0; i{level} < {prefix}_{_word(axis)}_count(p{outer});"
+            f" ++i{level}) "
+        )
     present = f"if ({name}_present(p{indices})) " if f" {name}_present(" in text else ""
     yield f"    {loops}{present}{value}"
 
@@ -255,10 +299,15 @@ def export_of(name: str) -> str:
 
 
 def _examples(sensor: Sensor, name: str) -> list[bytes]:
-    return [sensor.example(name, seed=seed) for seed in range(6 if sensor.frames[name].max_length < 300 else 2)]
+    return [
+        sensor.example(name, seed=seed)
+        for seed in range(6 if sensor.frames[name].max_length < 300 else 2)
+    ]
 
 
-def _read(program: Path, frames: list[tuple[Sensor, str, bytes]]) -> Iterator[tuple[int, int, dict[str, list[str]]]]:
+def _read(
+    program: Path, frames: list[tuple[Sensor, str, bytes]]
+) -> Iterator[tuple[int, int, dict[str, list[str]]]]:
     given = "".join(f"{sensor.id}:{name} ={data.hex()}\n" for sensor, name, data in frames)
     done = subprocess.run([program], input=given, check=False, capture_output=True, text=True)
     assert not done.returncode, done.stderr[:2000]

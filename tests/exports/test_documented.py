@@ -25,7 +25,9 @@ def first(language: str) -> str:
 @judged
 def test_the_frame_on_the_page_is_what_tshark_prints(tmp_path: Path) -> None:
     sensor = lidarspec.sensor(NAME)
-    printed = tshark(captured(sensor, [EXAMPLE], tmp_path / "it.pcap"), "-V", scripts=[written(sensor, tmp_path)])
+    printed = tshark(
+        captured(sensor, [EXAMPLE], tmp_path / "it.pcap"), "-V", scripts=[written(sensor, tmp_path)]
+    )
     lines = iter(printed.splitlines())
     for line in first("text").splitlines():
         assert line in lines, line  # in this order, some of the points left out
@@ -36,9 +38,18 @@ def test_the_frame_on_the_page_is_what_tshark_prints(tmp_path: Path) -> None:
 def test_the_program_on_the_page_runs(tmp_path: Path) -> None:
     (tmp_path / "stl27l.h").write_text(export(lidarspec.sensor(NAME), "c"))
     array = ", ".join(map(str, b"\x54\x2c\x00" + EXAMPLE))
-    main = f"int main(void) {{ static const uint8_t bytes[] = {{{array}}}; print_distances(bytes, sizeof bytes); return 0; }}\n"
+    main = (
+        f"int main(void) {{ static const uint8_t bytes[] = {{{array}}}; print_distances(bytes,"
+        " sizeof bytes); return 0; }\n"
+    )
     (tmp_path / "it.c").write_text(first("c") + main)
-    subprocess.run(["gcc", "-std=c99", "-Wall", "-Wextra", "-Werror", "-pedantic", "-o", "it", "it.c"], cwd=tmp_path, check=True)
-    printed = subprocess.run([tmp_path / "it"], capture_output=True, text=True, check=True).stdout.split("\n")
+    subprocess.run(
+        ["gcc", "-std=c99", "-Wall", "-Wextra", "-Werror", "-pedantic", "-o", "it", "it.c"],
+        cwd=tmp_path,
+        check=True,
+    )
+    printed = subprocess.run(
+        [tmp_path / "it"], capture_output=True, text=True, check=True
+    ).stdout.split("\n")
     assert printed[:3] == ["324.27 deg", "0.224 m", "0.220 m"]
     assert len(printed) == 14

@@ -1,4 +1,6 @@
-"""The exports md, svg, json and pyi, and the verb: they say what the spec says, and their tools take them."""
+"""The exports md, svg, json and pyi, and the verb: they say what the spec says, and their tools
+take them.
+"""
 
 from __future__ import annotations
 
@@ -66,7 +68,9 @@ def assert_json_is_enough(sensor: Sensor, frames: Iterable[str]) -> None:
 
 def same(one: Any, other: Any) -> bool:
     if isinstance(other, dict):
-        return set(one) == set(other) and all(same(one[name], value) for name, value in other.items())
+        return set(one) == set(other) and all(
+            same(one[name], value) for name, value in other.items()
+        )
     if isinstance(other, list):
         return len(one) == len(other) and all(map(same, one, other))
     other = number(other)
@@ -118,9 +122,18 @@ def assert_diagram_is_complete(sensor: Sensor) -> None:
     for frame in sensor.frames.values():
         for path in schema(frame.tree).fields:
             assert any(said.split("; ")[0] == path for said in says), path
-    boxes = [box for group in root.iter("{http://www.w3.org/2000/svg}g") for box in group.iter("{http://www.w3.org/2000/svg}rect")]
+    boxes = [
+        box
+        for group in root.iter("{http://www.w3.org/2000/svg}g")
+        for box in group.iter("{http://www.w3.org/2000/svg}rect")
+    ]
     for box in boxes:
-        assert LEFT <= float(box.get("x", "0")) <= float(box.get("x", "0")) + float(box.get("width", "0")) <= LEFT + BITS * BIT
+        assert (
+            LEFT
+            <= float(box.get("x", "0"))
+            <= float(box.get("x", "0")) + float(box.get("width", "0"))
+            <= LEFT + BITS * BIT
+        )
 
 
 def test_boxes_do_not_overlap_and_fill_their_bits() -> None:
@@ -128,7 +141,10 @@ def test_boxes_do_not_overlap_and_fill_their_bits() -> None:
     seen: set[tuple[float, float]] = set()
     for box in root.iter("{http://www.w3.org/2000/svg}rect"):
         if "x" in box.attrib:
-            columns = {(float(box.attrib["y"]), float(box.attrib["x"]) + bit * BIT) for bit in range(int(float(box.attrib["width"]) / BIT))}
+            columns = {
+                (float(box.attrib["y"]), float(box.attrib["x"]) + bit * BIT)
+                for bit in range(int(float(box.attrib["width"]) / BIT))
+            }
             assert not seen & columns
             seen |= columns
     assert len(seen) == 8 * 27
@@ -184,8 +200,16 @@ mini.command("strat").nothing
 @pytest.mark.parametrize("name", SPOKEN)
 def test_stubs_are_python_that_names_every_field(name: str) -> None:
     tree = ast.parse(export(SHAPES[name], "pyi"))
-    names = {node.target.id for node in ast.walk(tree) if isinstance(node, ast.AnnAssign) and isinstance(node.target, ast.Name)}
-    fields = {field.name for frame in SHAPES[name].frames.values() for field in schema(frame.tree).fields.values()}
+    names = {
+        node.target.id
+        for node in ast.walk(tree)
+        if isinstance(node, ast.AnnAssign) and isinstance(node.target, ast.Name)
+    }
+    fields = {
+        field.name
+        for frame in SHAPES[name].frames.values()
+        for field in schema(frame.tree).fields.values()
+    }
     assert fields <= names
 
 
@@ -193,13 +217,27 @@ def test_stubs_are_python_that_names_every_field(name: str) -> None:
 def test_a_type_checker_takes_the_stubs_and_finds_misspelt_fields(tmp_path: Path) -> None:
     sensors = [*(SHAPES[name] for name in SPOKEN), *installed()]
     for sensor in sensors:
-        (tmp_path / f"{sensor.id.replace('-', '_')}.pyi").write_text(export(sensor, "pyi"), encoding="utf-8")
+        (tmp_path / f"{sensor.id.replace('-', '_')}.pyi").write_text(
+            export(sensor, "pyi"), encoding="utf-8"
+        )
     (tmp_path / "snippet.py").write_text(SNIPPET, encoding="utf-8")
     stubs = [f"{sensor.id.replace('-', '_')}.pyi" for sensor in sensors]
-    command = [sys.executable, "-m", "mypy", "--strict", "--follow-imports=silent", "snippet.py", *stubs]
-    done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, check=False, timeout=300)
+    command = [
+        sys.executable,
+        "-m",
+        "mypy",
+        "--strict",
+        "--follow-imports=silent",
+        "snippet.py",
+        *stubs,
+    ]
+    done = subprocess.run(
+        command, cwd=tmp_path, capture_output=True, text=True, check=False, timeout=300
+    )
     shown = [line.partition(": ")[2] for line in done.stdout.splitlines()]
-    assert [line.partition('"')[2].strip('"') for line in shown if line.startswith("note: Revealed")] == ["int", "bytes", "bytes", "bytes"]
+    assert [
+        line.partition('"')[2].strip('"') for line in shown if line.startswith("note: Revealed")
+    ] == ["int", "bytes", "bytes", "bytes"]
     errors = [line for line in shown if line.startswith("error")]
     assert any('"Data" has no attribute "smaples"' in line for line in errors)
     assert any('"bytes" has no attribute "nothing"' in line for line in errors)
@@ -229,15 +267,26 @@ def test_the_verb_prints_and_writes_every_kind(kind: str, tmp_path: Path) -> Non
 
 
 def test_the_verb_says_what_is_wrong() -> None:
-    result = ran("export", "json", Path(__file__).parents[1] / "shapes" / "stranger" / "acme_lidars.py", code=0)
+    result = ran(
+        "export",
+        "json",
+        Path(__file__).parents[1] / "shapes" / "stranger" / "acme_lidars.py",
+        code=0,
+    )
     assert json.loads(result.stdout)["vendor"]
-    assert "unknown frame 'dta'; did you mean 'data'?" in ran("export", "svg", "ldrobot-ld06", "--frame", "dta", code=2).stderr
+    assert (
+        "unknown frame 'dta'; did you mean 'data'?"
+        in ran("export", "svg", "ldrobot-ld06", "--frame", "dta", code=2).stderr
+    )
     assert "did you mean 'ldrobot-ld06'" in ran("export", "svg", "ldrobot-ld006", code=2).stderr
 
 
 def test_bytes_in_a_command_are_hex_in_the_json() -> None:
     order = Frame(Struct("header" / Const(b"\x16"), "key" / Bytes(2)), direction="out")
     command = Command("order", {"key": b"\xab\xcd"}, reply="ack", matches={"code": b"\x01"})
-    sensor = sound.sensor(frames={"data": sound.frame(), "ack": Frame(sound.ACK), "order": order}, commands={"start": command})
+    sensor = sound.sensor(
+        frames={"data": sound.frame(), "ack": Frame(sound.ACK), "order": order},
+        commands={"start": command},
+    )
     said = json.loads(export(sensor, "json"))["commands"]["start"]
     assert (said["values"], said["matches"]) == ({"key": "abcd"}, {"code": "01"})

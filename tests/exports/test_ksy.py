@@ -1,4 +1,6 @@
-"""Kaitai specs compile with Kaitai's own compiler, and what it makes reads the values that lidarspec reads."""
+"""Kaitai specs compile with Kaitai's own compiler, and what it makes reads the values that
+lidarspec reads.
+"""
 
 from __future__ import annotations
 
@@ -8,7 +10,20 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from construct import Array, Bytes, BytesInteger, Const, Float16b, If, IfThenElse, Int8ul, Int16ul, Int24sb, Struct, this
+from construct import (
+    Array,
+    Bytes,
+    BytesInteger,
+    Const,
+    Float16b,
+    If,
+    IfThenElse,
+    Int8ul,
+    Int16ul,
+    Int24sb,
+    Struct,
+    this,
+)
 
 import lidarspec
 from lidarspec import Sensor
@@ -58,10 +73,20 @@ def made(*fields: Any, case: str = "odd") -> Sensor:
 
 
 ODD = {
-    "alternatives": ("kind" / Int8ul, "value" / IfThenElse(this.kind > 128, Int16ul, Struct("low" / Int8ul, "high" / Int8ul))),
+    "alternatives": (
+        "kind" / Int8ul,
+        "value" / IfThenElse(this.kind > 128, Int16ul, Struct("low" / Int8ul, "high" / Int8ul)),
+    ),
     "arrays_of_arrays": ("count" / Int8ul, "grid" / Array(2, Array(3, Int16ul))),
-    "odd_integers": ("wide" / BytesInteger(5, swapped=True), "many" / Array(2, Int24sb), "plain" / Array(2, BytesInteger(3))),
-    "parts_of_arrays": ("flags" / Array(3, Struct("on_" / Int8ul, "more" / If(this.on_ > 100, Bytes(2)))), "end" / Int8ul),
+    "odd_integers": (
+        "wide" / BytesInteger(5, swapped=True),
+        "many" / Array(2, Int24sb),
+        "plain" / Array(2, BytesInteger(3)),
+    ),
+    "parts_of_arrays": (
+        "flags" / Array(3, Struct("on_" / Int8ul, "more" / If(this.on_ > 100, Bytes(2)))),
+        "end" / Int8ul,
+    ),
 }
 
 
@@ -71,7 +96,9 @@ UNUSUAL = {case: made(*fields, case=case) for case, fields in ODD.items()}
 
 @pytest.fixture(scope="module")
 def compiled(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    pytest.importorskip("kaitaistruct", reason="Kaitai's runtime is not installed: pip install kaitaistruct")
+    pytest.importorskip(
+        "kaitaistruct", reason="Kaitai's runtime is not installed: pip install kaitaistruct"
+    )
     folder = tmp_path_factory.mktemp("ksy")
     kaitai.compile_all([*subjects().values(), *UNUSUAL.values()], folder)
     return folder
@@ -85,7 +112,9 @@ def test_kaitai_reads_the_values_that_lidarspec_reads(compiled: Path) -> None:
             for seed in range(2):
                 data = sensor.example(frame, seed=seed)
                 read = kaitai.reader(found, sensor, frame).from_bytes(data)
-                assert kaitai.differences(sensor.parse(data, frame), read) == [], f"{sensor.id} {frame}"
+                assert kaitai.differences(sensor.parse(data, frame), read) == [], (
+                    f"{sensor.id} {frame}"
+                )
                 assert read._io.is_eof(), f"{sensor.id} {frame}"
 
 
@@ -112,7 +141,9 @@ def test_wrong_constants_are_noticed(compiled: Path) -> None:
     sensor = subjects()["ldrobot-stl27l"]
     data = sensor.example("data")
     with pytest.raises(Exception, match="not equal"):
-        kaitai.reader(kaitai.module(sensor, compiled), sensor, "data").from_bytes(b"\x00" + data[1:])
+        kaitai.reader(kaitai.module(sensor, compiled), sensor, "data").from_bytes(
+            b"\x00" + data[1:]
+        )
 
 
 @pytest.mark.slow
@@ -122,7 +153,12 @@ def test_unusual_structs_are_read_alike(compiled: Path, case: str) -> None:
     found = kaitai.module(sensor, compiled)
     for seed in range(6):
         data = PARTS if case == "parts_of_arrays" else sensor.example("data", seed=seed)
-        assert kaitai.differences(sensor.parse(data), kaitai.reader(found, sensor, "data").from_bytes(data)) == []
+        assert (
+            kaitai.differences(
+                sensor.parse(data), kaitai.reader(found, sensor, "data").from_bytes(data)
+            )
+            == []
+        )
 
 
 @pytest.mark.parametrize("name", list(REFUSED))
@@ -144,9 +180,25 @@ def test_other_refusals_have_reasons_too() -> None:
     with pytest.raises(Refused, match="two members that are called 'speed'"):
         export(made("speed" / Int8ul, "Speed" / Int8ul), "ksy")
     with pytest.raises(Refused, match="Python function decides"):
-        export(made("count" / Int8ul, "items_" / Array(lambda this: 2 if this.count > 3 else 1, Int8ul)), "ksy")
+        export(
+            made(
+                "count" / Int8ul, "items_" / Array(lambda this: 2 if this.count > 3 else 1, Int8ul)
+            ),
+            "ksy",
+        )
 
 
 def test_yaml_quotes_what_would_mean_something_else() -> None:
-    value = {"a": "yes", "b": "x: y", "c": [1, 2], "d": {"e": "", "f": [{"g": True}]}, "h": "#1", "i": "10", "j": []}
-    assert yaml(value) == 'a: "yes"\nb: "x: y"\nc: [1, 2]\nd:\n  e: ""\n  f:\n    - g: true\nh: "#1"\ni: "10"\nj: []\n'
+    value = {
+        "a": "yes",
+        "b": "x: y",
+        "c": [1, 2],
+        "d": {"e": "", "f": [{"g": True}]},
+        "h": "#1",
+        "i": "10",
+        "j": [],
+    }
+    assert (
+        yaml(value)
+        == 'a: "yes"\nb: "x: y"\nc: [1, 2]\nd:\n  e: ""\n  f:\n    - g: true\nh: "#1"\ni: "10"\nj: []\n'
+    )

@@ -1,4 +1,6 @@
-"""Captures that lidarspec writes, opened by tshark: nothing malformed, no warning, right checksums, and what was put in."""
+"""Captures that lidarspec writes, opened by tshark: nothing malformed, no warning, right checksums,
+and what was put in.
+"""
 
 from __future__ import annotations
 
@@ -31,12 +33,18 @@ def test_the_writer_s_captures(suffix: str, tmp_path: Path) -> None:
         file.write(writing.head(ETHERNET))
         for number, size in enumerate(sizes):
             at = 1_700_000_000_123_456_789 + number
-            datagram = Datagram(draw.randbytes(size), at, ("192.0.2.1", 49_152 + number), ("192.0.2.2", 49_000))
+            datagram = Datagram(
+                draw.randbytes(size), at, ("192.0.2.1", 49_152 + number), ("192.0.2.2", 49_000)
+            )
             file.write(writing.record(datagram_frame(datagram), at))
     fields = ["frame.time_epoch", "udp.length", "ip.src", "udp.dstport"]
-    text = tshark(capture, "-T", "fields", *(option for name in fields for option in ("-e", name)), *CHECKED)
+    text = tshark(
+        capture, "-T", "fields", *(option for name in fields for option in ("-e", name)), *CHECKED
+    )
     times = [f"1700000000.{123_456_789 + number}" for number in range(len(sizes))]
-    wanted = [[time, str(size + 8), "192.0.2.1", "49000"] for time, size in zip(times, sizes, strict=True)]
+    wanted = [
+        [time, str(size + 8), "192.0.2.1", "49000"] for time, size in zip(times, sizes, strict=True)
+    ]
     assert [line.split("\t") for line in text.splitlines()] == wanted
     assert not tshark(capture, "-Y", SERIOUS, *CHECKED)
 
@@ -45,7 +53,11 @@ def test_the_writer_s_captures(suffix: str, tmp_path: Path) -> None:
 @pytest.mark.parametrize(("name", "time"), [("velodyne-vlp16", "30ms"), ("ldrobot-stl27l", "20ms")])
 def test_simulated_and_recorded_captures(name: str, time: str, tmp_path: Path) -> None:
     sensor, script = lidarspec.sensor(name), written(lidarspec.sensor(name), tmp_path)
-    simulated, recorded, again = tmp_path / "sim.pcap", tmp_path / "it.lsr", tmp_path / "again.pcapng"
+    simulated, recorded, again = (
+        tmp_path / "sim.pcap",
+        tmp_path / "it.lsr",
+        tmp_path / "again.pcapng",
+    )
     ran("sim", name, "--to", simulated, "-t", time)
     ran("record", simulated, "-s", name, "-o", recorded)
     ran("record", recorded, "-o", again)
@@ -94,7 +106,9 @@ def test_a_long_gap_and_a_lost_line_are_kept(tmp_path: Path) -> None:
 def test_a_byte_stream_without_a_sensor_has_no_frames(tmp_path: Path) -> None:
     with pytest.raises(lidarspec.UsageError, match="name the sensor"):
         recorder(tmp_path / "it.pcap", datagrams=False)
-    assert isinstance(recorder(tmp_path / "it.pcap", "ldrobot-stl27l", datagrams=False), FrameRecorder)
+    assert isinstance(
+        recorder(tmp_path / "it.pcap", "ldrobot-stl27l", datagrams=False), FrameRecorder
+    )
 
 
 def test_a_capture_of_a_byte_stream_is_read_like_the_stream(tmp_path: Path) -> None:

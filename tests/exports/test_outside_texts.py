@@ -1,4 +1,6 @@
-"""What a stranger's plugin calls its sensor stays text in every export: no code, no mark-up, no control character."""
+"""What a stranger's plugin calls its sensor stays text in every export: no code, no mark-up, no
+control character.
+"""
 
 from __future__ import annotations
 
@@ -40,7 +42,9 @@ def test_each_language_still_reads_it(evil: Sensor) -> None:
     xml.dom.minidom.parseString(ls.export(evil, "svg"))
     assert json.loads(ls.export(evil, "json"))["vendor"].startswith("X1*/")
     assert "<script>" not in ls.export(evil, "md")
-    title = next(line for line in ls.export(evil, "ksy").splitlines() if line.startswith("  title: "))
+    title = next(
+        line for line in ls.export(evil, "ksy").splitlines() if line.startswith("  title: ")
+    )
     assert "X1*/" in json.loads(title.removeprefix("  title: "))
     lua = ls.export(evil, "wireshark").splitlines()
     assert all(line.startswith("--") for line in lua[: lua.index("")])

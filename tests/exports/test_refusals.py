@@ -40,10 +40,16 @@ def with_frame(*fields: Any, algorithm: Checksum | None = None) -> Sensor:
 @pytest.mark.parametrize(
     ("sensor", "reason"),
     [
-        (with_frame("x" / Bytes(lambda c: 1 if c.a else 2)), "x: a Python function decides on the values"),
+        (
+            with_frame("x" / Bytes(lambda c: 1 if c.a else 2)),
+            "x: a Python function decides on the values",
+        ),
         (with_frame("x" / Bytes(lambda c: {0: 1}[c.a])), "x: a Python function"),
         (with_frame("x" / Bytes(this.a / 2)), "x: an expression with '/'"),
-        (with_frame("l" / Array(2, Int8ub), "x" / Bytes(this.l[1])), "l[1]: an element of an array"),
+        (
+            with_frame("l" / Array(2, Int8ub), "x" / Bytes(this.l[1])),
+            "l[1]: an element of an array",
+        ),
         (with_frame("x" / Bytes(this.later)), "x: an expression asks for 'later'"),
         (with_frame("x" / Switch(this.a, {"word": Int8ub})), "a has no value named 'word'"),
         (with_frame(algorithm=Own()), "the checksum Own is Python code"),
@@ -63,7 +69,10 @@ def test_c_has_no_place_for_elements_that_differ_in_size_and_no_number_for_all_p
     with pytest.raises(Refused, match="parts: its elements differ in size"):
         export(chain, "c")
     assert "parts" in export(chain, "wireshark")
-    wide = with_frame(*(f"f{number}" / Int16ub for number in range(4)), "x" / Bytes(this.f0 * this.f1 * this.f2 * this.f3))
+    wide = with_frame(
+        *(f"f{number}" / Int16ub for number in range(4)),
+        "x" / Bytes(this.f0 * this.f1 * this.f2 * this.f3),
+    )
     with pytest.raises(Refused, match="64-bit"):
         export(wide, "c")
 

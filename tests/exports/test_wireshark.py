@@ -1,4 +1,6 @@
-"""Wireshark dissectors from specs, run in tshark: what it shows of each frame is what lidarspec parses."""
+"""Wireshark dissectors from specs, run in tshark: what it shows of each frame is what lidarspec
+parses.
+"""
 
 from __future__ import annotations
 
@@ -30,7 +32,11 @@ REFUSED = {
 }
 #: the shapes that tshark reads in `make test-all`; the others are for the long run.
 FEW = {"shape-oddities", "shape-options", "shape-segments", "shape-tags", "shape-channels"}
-READ = [pytest.param(name, marks=() if name in FEW else pytest.mark.soak) for name in SHAPED if name not in REFUSED]
+READ = [
+    pytest.param(name, marks=() if name in FEW else pytest.mark.soak)
+    for name in SHAPED
+    if name not in REFUSED
+]
 
 #: The representatives without the one whose frames are text, which Wireshark cannot be told.
 READ_REPRESENTATIVES = [name for name in REPRESENTATIVES if name != "hokuyo-ust10lx"]
@@ -79,14 +85,18 @@ def test_every_field_of_a_shape_reads_as_lidarspec_reads_it(name: str, tmp_path:
 
 @judged
 @pytest.mark.parametrize("name", READ_REPRESENTATIVES)
-def test_every_field_of_a_representative_reads_as_lidarspec_reads_it(name: str, tmp_path: Path) -> None:
+def test_every_field_of_a_representative_reads_as_lidarspec_reads_it(
+    name: str, tmp_path: Path
+) -> None:
     assert_fields_are_read(load_sensor(name), tmp_path, rounds=1)
 
 
 @judged
 @pytest.mark.soak
 @pytest.mark.parametrize("module", sensor_modules())
-def test_every_field_of_every_sensor_reads_as_lidarspec_reads_it(module: str, tmp_path: Path) -> None:
+def test_every_field_of_every_sensor_reads_as_lidarspec_reads_it(
+    module: str, tmp_path: Path
+) -> None:
     for sensor in distinct_sensors_in(module):
         if not is_recoded(sensor):
             assert_fields_are_read(sensor, tmp_path)
@@ -94,21 +104,40 @@ def test_every_field_of_every_sensor_reads_as_lidarspec_reads_it(module: str, tm
 
 def assert_fields_are_read(sensor: Sensor, tmp_path: Path, rounds: int | None = None) -> None:
     """Fail unless tshark reads every frame of a sensor as lidarspec does."""
-    outgoing = [(name, sensor.example(name, seed=seed)) for seed in range(3) for name in sensor.frames if name not in sensor.incoming]
-    frames = [(_answer(sensor, name, data), data) for name, data in [*Subject(sensor).conversation(rounds=rounds), *outgoing]]
+    outgoing = [
+        (name, sensor.example(name, seed=seed))
+        for seed in range(3)
+        for name in sensor.frames
+        if name not in sensor.incoming
+    ]
+    frames = [
+        (_answer(sensor, name, data), data)
+        for name, data in [*Subject(sensor).conversation(rounds=rounds), *outgoing]
+    ]
     capture = captured(sensor, [data for _, data in frames], tmp_path / "frames.pcap")
     script = written(sensor, tmp_path)
     assert_shown(sensor, capture, script, frames)
 
 
 def _answer(sensor: Sensor, name: str, data: bytes) -> str:
-    """What a dissector takes bytes for: the answer that has the very bytes of a command; of frames that only `plausible` tells apart, which
-    is Python, the first that what was announced leaves; else the frame's own name."""
+    """What a dissector takes bytes for: the answer that has the very bytes of a command; of frames
+    that only `plausible` tells apart, which is Python, the first that what was announced leaves;
+    else the frame's own name."""
     if name not in sensor.incoming:
         return next((other for other in sensor.incoming if _reads(sensor, other, data)), name)
-    in_turn = sorted(sensor.incoming, key=lambda other: -len(codec(sensor.frames[other]).prefix))  # as the dissector tries them
-    awaited = [other for other in in_turn if sensor.frames[other].after in (None, sensor.frames[name].after)]
-    untold = (other for other in awaited if other == name or (sensor.frames[other].plausible and _reads(sensor, other, data)))
+    in_turn = sorted(
+        sensor.incoming, key=lambda other: -len(codec(sensor.frames[other]).prefix)
+    )  # as the dissector tries them
+    awaited = [
+        other
+        for other in in_turn
+        if sensor.frames[other].after in (None, sensor.frames[name].after)
+    ]
+    untold = (
+        other
+        for other in awaited
+        if other == name or (sensor.frames[other].plausible and _reads(sensor, other, data))
+    )
     return next(untold, name)
 
 
@@ -120,21 +149,43 @@ def _reads(sensor: Sensor, name: str, data: bytes) -> bool:
     return True
 
 
-def assert_shown(sensor: Sensor, capture: Path, script: Path, frames: Sequence[tuple[str, bytes]], *arguments: str) -> None:
-    """Fail unless tshark shows each packet as this frame, with the values that lidarspec parses, and has nothing to say against it."""
+def assert_shown(
+    sensor: Sensor,
+    capture: Path,
+    script: Path,
+    frames: Sequence[tuple[str, bytes]],
+    *arguments: str,
+) -> None:
+    """Fail unless tshark shows each packet as this frame, with the values that lidarspec parses,
+    and has nothing to say against it.
+    """
     prefix = sensor.id.replace("-", "_")
-    paths = [(name, path) for name in dict.fromkeys(name for name, _ in frames) for path in codec(sensor.frames[name]).schema.fields]
-    wanted_names = ["_ws.expert.message", f"{prefix}.frame", *(f"{prefix}.{name}.{path}" for name, path in paths)]
+    paths = [
+        (name, path)
+        for name in dict.fromkeys(name for name, _ in frames)
+        for path in codec(sensor.frames[name]).schema.fields
+    ]
+    wanted_names = [
+        "_ws.expert.message",
+        f"{prefix}.frame",
+        *(f"{prefix}.{name}.{path}" for name, path in paths),
+    ]
     shown = list(columns(capture, script, wanted_names, *arguments))
     assert [kind for _, kind, *_ in shown] == [[name] for name, _ in frames]
-    assert not any(message for messages, *_ in shown for message in messages if UNSURE not in message)
+    assert not any(
+        message for messages, *_ in shown for message in messages if UNSURE not in message
+    )
     for (name, data), (_, _, *found) in zip(frames, shown, strict=True):
         parsed = values(sensor.parse(data, frame=name, verify=False))
         for (other, path), printed in zip(paths, found, strict=True):
             wanted = parsed.get(path, []) if other == name else []
             full = [value for value in wanted if value != b""]
-            assert len([text for text in printed if text != "<MISSING>"]) == len(full), f"{name}.{path}"
-            assert all(_same(text, value) for text, value in zip(printed, full, strict=False)), f"{name}.{path}: {printed} is not {full}"
+            assert len([text for text in printed if text != "<MISSING>"]) == len(full), (
+                f"{name}.{path}"
+            )
+            assert all(_same(text, value) for text, value in zip(printed, full, strict=False)), (
+                f"{name}.{path}: {printed} is not {full}"
+            )
 
 
 def _same(text: str, value: Any) -> bool:
@@ -148,28 +199,50 @@ def _same(text: str, value: Any) -> bool:
 @judged
 def test_physical_values_are_fields_too(tmp_path: Path) -> None:
     sensor = lidarspec.sensor("ldrobot-stl27l")
-    frame = sensor.build("data", sensor.parse(sensor.example("data")), units=False, start_angle=32427)
+    frame = sensor.build(
+        "data", sensor.parse(sensor.example("data")), units=False, start_angle=32427
+    )
     capture, script = captured(sensor, [frame], tmp_path / "it.pcap"), written(sensor, tmp_path)
-    (row,) = columns(capture, script, ["ldrobot_stl27l.data.start_angle", "ldrobot_stl27l.data.start_angle.physical"])
+    (row,) = columns(
+        capture,
+        script,
+        ["ldrobot_stl27l.data.start_angle", "ldrobot_stl27l.data.start_angle.physical"],
+    )
     assert row == [["32427"], ["324.27"]]
     assert tshark(capture, "-Y", "ldrobot_stl27l.data.start_angle.physical > 324", scripts=[script])
-    assert not tshark(capture, "-Y", "ldrobot_stl27l.data.start_angle.physical > 325", scripts=[script])
+    assert not tshark(
+        capture, "-Y", "ldrobot_stl27l.data.start_angle.physical > 325", scripts=[script]
+    )
     assert "start_angle: 32427 (324.27 deg)" in tshark(capture, "-V", scripts=[script])
 
 
 @judged
-@pytest.mark.parametrize("name", ["ldrobot-stl27l", "shape-nested", "shape-twice", "shape-nibbles", "shape-oddities"])
+@pytest.mark.parametrize(
+    "name", ["ldrobot-stl27l", "shape-nested", "shape-twice", "shape-nibbles", "shape-oddities"]
+)
 def test_a_wrong_checksum_is_marked(name: str, tmp_path: Path) -> None:
     sensor = SHAPED.get(name) or lidarspec.sensor(name)
-    sealed = [kind for kind in sensor.incoming if material.seals(sensor, kind, sensor.example(kind))]
+    sealed = [
+        kind for kind in sensor.incoming if material.seals(sensor, kind, sensor.example(kind))
+    ]
     frames = []
     for kind in sealed:
         good = sensor.example(kind, seed=3)
-        place = next(spot for spot in reversed(range(len(good))) if _only_the_checksum(sensor, kind, _flipped(good, spot)))
+        place = next(
+            spot
+            for spot in reversed(range(len(good)))
+            if _only_the_checksum(sensor, kind, _flipped(good, spot))
+        )
         frames += [good, _flipped(good, place)]
     capture, script = captured(sensor, frames, tmp_path / "it.pcap"), written(sensor, tmp_path)
     prefix = name.replace("-", "_")
-    rows = list(columns(capture, script, [f"{prefix}.frame", f"{prefix}.checksum.status", f"{prefix}.checksum.bad"]))
+    rows = list(
+        columns(
+            capture,
+            script,
+            [f"{prefix}.frame", f"{prefix}.checksum.status", f"{prefix}.checksum.bad"],
+        )
+    )
     assert [kind for kind, _, _ in rows] == [[kind] for kind in sealed for _ in range(2)]
     for number, (_, status, bad) in enumerate(rows):
         assert ("0" in status) == bool(bad) == bool(number % 2), f"packet {number + 1}"
@@ -192,11 +265,19 @@ def test_frames_one_after_another_and_bytes_between_them(tmp_path: Path) -> None
     sensor = lidarspec.sensor("ldrobot-stl27l")
     frames = [sensor.example("data", seed=seed) for seed in range(3)]
     packet = b"\x01\x02\x54" + frames[0] + frames[1] + _flipped(frames[2], 20) + b"\x54\x2c\x99"
-    capture, script = captured(sensor, [packet, bytes(40)], tmp_path / "it.pcap"), written(sensor, tmp_path)
+    capture, script = (
+        captured(sensor, [packet, bytes(40)], tmp_path / "it.pcap"),
+        written(sensor, tmp_path),
+    )
     names = ["frame", "checksum.status", "skipped", "cut_off", "data.end_angle"]
     first, second = columns(capture, script, [f"ldrobot_stl27l.{name}" for name in names])
     angles = [sensor.parse(frame).end_angle for frame in frames]
-    assert (first[0], first[1], len(first[2]), len(first[3])) == (["data"] * 4, ["1", "1", "0"], 1, 1)
+    assert (first[0], first[1], len(first[2]), len(first[3])) == (
+        ["data"] * 4,
+        ["1", "1", "0"],
+        1,
+        1,
+    )
     assert first[4] == [str(angle) for angle in angles]
     assert second == [[]] * 5
 
@@ -204,8 +285,14 @@ def test_frames_one_after_another_and_bytes_between_them(tmp_path: Path) -> None
 @judged
 def test_a_frame_that_waits_for_another_is_told_by_it(tmp_path: Path) -> None:
     sensor = SHAPED["shape-modes"]
-    frames = [(name, sensor.example(name, seed=1)) for name in ("begin_express", "express", "express", "begin_plain", "plain")]
-    capture, script = captured(sensor, [data for _, data in frames], tmp_path / "it.pcap"), written(sensor, tmp_path)
+    frames = [
+        (name, sensor.example(name, seed=1))
+        for name in ("begin_express", "express", "express", "begin_plain", "plain")
+    ]
+    capture, script = (
+        captured(sensor, [data for _, data in frames], tmp_path / "it.pcap"),
+        written(sensor, tmp_path),
+    )
     assert_shown(sensor, capture, script, frames)
     run = captured(sensor, [b"".join(data for _, data in frames)], tmp_path / "run.pcap")
     ((kinds,),) = columns(run, script, ["shape_modes.frame"])
@@ -215,9 +302,14 @@ def test_a_frame_that_waits_for_another_is_told_by_it(tmp_path: Path) -> None:
 @judged
 def test_frames_that_nothing_announced_are_said_to_be_unsure(tmp_path: Path) -> None:
     sensor = lidarspec.sensor("slamtec-rplidar-t1")
-    capsule, announcement = sensor.example("dense", seed=1), sensor.example("dense_descriptor", seed=1)
+    capsule, announcement = (
+        sensor.example("dense", seed=1),
+        sensor.example("dense_descriptor", seed=1),
+    )
     capture = captured(sensor, [capsule, announcement, capsule], tmp_path / "it.pcap")
-    before, _, behind = columns(capture, written(sensor, tmp_path), ["slamtec_rplidar_t1.frame", "_ws.expert.message"])
+    before, _, behind = columns(
+        capture, written(sensor, tmp_path), ["slamtec_rplidar_t1.frame", "_ws.expert.message"]
+    )
     assert before[0] == ["express"]
     assert [message.partition(":")[0] for message in before[1]] == ["express or dense"]
     assert behind == [["dense"], []]
@@ -227,22 +319,36 @@ def test_frames_that_nothing_announced_are_said_to_be_unsure(tmp_path: Path) -> 
 def test_frames_of_one_size_are_told_by_their_conditions(tmp_path: Path) -> None:
     sensor = lidarspec.sensor("robosense-m1")
     names = ["difop_guide", "difop", "difop_other", "difop_fov"]
-    capture = captured(sensor, [sensor.example(name, seed=2) for name in names], tmp_path / "it.pcap")
-    shown = columns(capture, written(sensor, tmp_path), ["robosense_m1.frame", "_ws.expert.message"])
+    capture = captured(
+        sensor, [sensor.example(name, seed=2) for name in names], tmp_path / "it.pcap"
+    )
+    shown = columns(
+        capture, written(sensor, tmp_path), ["robosense_m1.frame", "_ws.expert.message"]
+    )
     assert list(shown) == [[[name], []] for name in names]
 
 
 @judged
 def test_two_dissectors_share_ports_and_link_types(tmp_path: Path) -> None:
-    sensors = [lidarspec.sensor(name) for name in ("velodyne-vlp16", "hesai-xt32", "ldrobot-stl27l", "cspc-m1c1-mini")]
+    sensors = [
+        lidarspec.sensor(name)
+        for name in ("velodyne-vlp16", "hesai-xt32", "ldrobot-stl27l", "cspc-m1c1-mini")
+    ]
     scripts = [written(sensor, tmp_path) for sensor in sensors]
     for sensor in sensors:
-        capture = captured(sensor, [sensor.example(sensor.data_frame)], tmp_path / f"{sensor.id}.pcap")
-        assert f"{sensor.vendor} {sensor.model}" in tshark(capture, "-T", "fields", "-e", "_ws.col.Protocol", scripts=scripts)
+        capture = captured(
+            sensor, [sensor.example(sensor.data_frame)], tmp_path / f"{sensor.id}.pcap"
+        )
+        assert f"{sensor.vendor} {sensor.model}" in tshark(
+            capture, "-T", "fields", "-e", "_ws.col.Protocol", scripts=scripts
+        )
 
 
 @judged
-@pytest.mark.parametrize(("name", "path"), [pytest.param(*case, id=case[0], marks=LONG if case[0] in LATER else ()) for case in CAPTURES])
+@pytest.mark.parametrize(
+    ("name", "path"),
+    [pytest.param(*case, id=case[0], marks=LONG if case[0] in LATER else ()) for case in CAPTURES],
+)
 def test_real_captures(name: str, path: str, tmp_path: Path) -> None:
     capture = made.CAPTURES / path
     if not os.path.exists(capture):
@@ -255,12 +361,23 @@ def test_real_captures(name: str, path: str, tmp_path: Path) -> None:
     script = written(sensor, tmp_path)
     again = captured(sensor, [data for _, data in frames], tmp_path / "again.pcap")
     assert_shown(sensor, again, script, frames)
-    shown = tshark(capture, "-c", "12", "-T", "fields", "-e", f"{name.replace('-', '_')}.frame", scripts=[script])
+    shown = tshark(
+        capture,
+        "-c",
+        "12",
+        "-T",
+        "fields",
+        "-e",
+        f"{name.replace('-', '_')}.frame",
+        scripts=[script],
+    )
     assert {name for name, _ in frames} <= set(shown.split())
 
 
 @judged
-@pytest.mark.parametrize(("name", "path"), [("ldrobot-ld06", "ldrobot/ld06_3_consecutive_frames.bin")])
+@pytest.mark.parametrize(
+    ("name", "path"), [("ldrobot-ld06", "ldrobot/ld06_3_consecutive_frames.bin")]
+)
 def test_a_real_serial_recording(name: str, path: str, tmp_path: Path) -> None:
     source = made.CAPTURES / path
     if not source.exists():
@@ -268,7 +385,9 @@ def test_a_real_serial_recording(name: str, path: str, tmp_path: Path) -> None:
     sensor = lidarspec.sensor(name)
     frames = [(found.frame, found.data) for found in sensor.split(source.read_bytes())]
     capture = captured(sensor, [source.read_bytes()], tmp_path / "it.pcap")
-    ((kinds, angles),) = columns(capture, written(sensor, tmp_path), ["ldrobot_ld06.frame", "ldrobot_ld06.data.end_angle"])
+    ((kinds, angles),) = columns(
+        capture, written(sensor, tmp_path), ["ldrobot_ld06.frame", "ldrobot_ld06.data.end_angle"]
+    )
     assert kinds == [kind for kind, _ in frames]
     assert angles == [str(sensor.parse(data).end_angle) for _, data in frames]
 

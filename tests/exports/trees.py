@@ -22,7 +22,9 @@ RECODED = "no other language recodes"
 @functools.cache
 def installed_sensors() -> dict[str, Sensor]:
     """Load one installed sensor for each set of frames, by id."""
-    return {sensor.id: sensor for module in sensor_modules() for sensor in distinct_sensors_in(module)}
+    return {
+        sensor.id: sensor for module in sensor_modules() for sensor in distinct_sensors_in(module)
+    }
 
 
 def distinct_sensors() -> dict[str, Sensor]:

@@ -1,4 +1,6 @@
-"""Elements of arrays, numbers along them, tables over two of them, sums along them: alike by every engine."""
+"""Elements of arrays, numbers along them, tables over two of them, sums along them: alike by every
+engine.
+"""
 
 from __future__ import annotations
 
@@ -15,7 +17,9 @@ from tests.engine import against_construct
 
 ENGINES = ["construct", "numpy", pytest.param("jit", marks=pytest.mark.slow)]
 COLUMN = Struct(
-    "time" / Scaled(Int32ub, 1e-9, "s"), "number" / Int8ub, "pixels" / Array(3, Struct("range" / Scaled(Int16ub, 0.1, "m"), "tag" / Int8ub))
+    "time" / Scaled(Int32ub, 1e-9, "s"),
+    "number" / Int8ub,
+    "pixels" / Array(3, Struct("range" / Scaled(Int16ub, 0.1, "m"), "tag" / Int8ub)),
 )
 DATA = Struct(
     "header" / Const(b"\xc0\x15"),
@@ -24,15 +28,29 @@ DATA = Struct(
     "tail" / Array(this.count, Int8ub),
     "columns" / Array(4, COLUMN),
 )
-SENSOR = replace(against_construct.sensor(DATA), clock=Clock("columns[0].time"), scan=OnChange("columns[-1].number"))
+SENSOR = replace(
+    against_construct.sensor(DATA),
+    clock=Clock("columns[0].time"),
+    scan=OnChange("columns[-1].number"),
+)
 
 
 def frame(count: int, time: int = 0, number: int = 0) -> bytes:
     columns = [
-        dict(time=time + column, number=number + column, pixels=[dict(range=10 * column + pixel + 1, tag=pixel) for pixel in range(3)])
+        dict(
+            time=time + column,
+            number=number + column,
+            pixels=[dict(range=10 * column + pixel + 1, tag=pixel) for pixel in range(3)],
+        )
         for column in range(4)
     ]
-    return SENSOR.build("data", count=count, grid=[[1, 2, 3], [4, 5, 6]], tail=list(range(10, 10 + count)), columns=columns)
+    return SENSOR.build(
+        "data",
+        count=count,
+        grid=[[1, 2, 3], [4, 5, 6]],
+        tail=list(range(10, 10 + count)),
+        columns=columns,
+    )
 
 
 def cloud_of(points: Any, *frames: bytes, engine: str) -> PointCloud:
@@ -44,7 +62,9 @@ def test_elements_of_arrays_are_fields(engine: str) -> None:
     def points(f: Fields) -> Polar:
         return Polar(
             range=f.columns.pixels.range,
-            azimuth=f.columns[1].pixels[-1].range * 0.1 + f.columns[2].pixels.tag + f.grid[1].on("pixels") * 0.01,
+            azimuth=f.columns[1].pixels[-1].range * 0.1
+            + f.columns[2].pixels.tag
+            + f.grid[1].on("pixels") * 0.01,
             intensity=f.grid[1][2] + 10 * f.tail[-1] + 1000 * np.nan_to_num(f.tail[1]),
             time=f.columns.time - f.columns[0].time,
         )
@@ -60,11 +80,16 @@ def test_elements_of_arrays_are_fields(engine: str) -> None:
 def test_clocks_counters_and_cuts_are_elements_too_in_integers(engine: str) -> None:
     times = [4_000_000_001, 4_000_000_004, 4_000_000_013, 4_000_000_016]
     counted = replace(SENSOR, sequence=Sequence("columns[3].number"))
-    packets = counted.decode(b"".join(frame(1, time, number) for number, time in zip([0, 1, 4, 5], times, strict=True)), backend=engine)
+    packets = counted.decode(
+        b"".join(frame(1, time, number) for number, time in zip([0, 1, 4, 5], times, strict=True)),
+        backend=engine,
+    )
     assert packets.time_ns.tolist() == times
     assert packets.stats.lost == 2
     assert packets["columns[-1].number"].tolist() == [3, 4, 7, 8]
-    data = b"".join(frame(1, 1000 * place, number) for place, number in enumerate((0, 0, 1, 1, 1, 2, 2)))
+    data = b"".join(
+        frame(1, 1000 * place, number) for place, number in enumerate((0, 0, 1, 1, 1, 2, 2))
+    )
     assert [len(scan.points) for scan in SENSOR.scans(data, backend=engine)] == [2, 3, 2]
 
 
@@ -85,17 +110,28 @@ def test_tables_over_two_arrays_are_read_by_rows(engine: str) -> None:
     def points(f: Fields) -> Polar:
         angles = take(table, f.columns.number)
         return Polar(
-            range=f.columns.pixels.range, azimuth=angles, elevation=take(table, f.grid[0][0]), intensity=np.cos(angles * 2) + f.count
+            range=f.columns.pixels.range,
+            azimuth=angles,
+            elevation=take(table, f.grid[0][0]),
+            intensity=np.cos(angles * 2) + f.count,
         )
 
     cloud = cloud_of(points, frame(1, number=3), frame(2), engine=engine)
-    expected = np.concatenate([np.resize(np.pad(table[3:], ((0, 1), (0, 0)), constant_values=np.nan), (4, 3)), table[:4]])
+    expected = np.concatenate(
+        [np.resize(np.pad(table[3:], ((0, 1), (0, 0)), constant_values=np.nan), (4, 3)), table[:4]]
+    )
     np.testing.assert_allclose(cloud.azimuth.reshape(8, 3), expected, rtol=1e-6)
     np.testing.assert_allclose(cloud.elevation.reshape(8, 3), np.tile(table[1], (8, 1)), rtol=1e-6)
     counts = np.repeat([[1.0], [2.0]], 4, axis=0)
-    np.testing.assert_allclose(cloud.intensity.reshape(8, 3), np.nan_to_num(np.cos(expected * 2) + counts), rtol=1e-6)  # type: ignore[union-attr]
+    np.testing.assert_allclose(
+        cloud.intensity.reshape(8, 3), np.nan_to_num(np.cos(expected * 2) + counts), rtol=1e-6
+    )  # type: ignore[union-attr]
     assert not cloud.valid[9:12].any()
-    np.testing.assert_allclose(cloud.x.reshape(8, 3)[4], np.array([0.1, 0.2, 0.3]) * np.cos(table[0]) * np.cos(table[1]), rtol=1e-6)
+    np.testing.assert_allclose(
+        cloud.x.reshape(8, 3)[4],
+        np.array([0.1, 0.2, 0.3]) * np.cos(table[0]) * np.cos(table[1]),
+        rtol=1e-6,
+    )
 
 
 def test_rows_of_arrays_are_picked_from_tables() -> None:
@@ -107,7 +143,9 @@ def test_rows_of_arrays_are_picked_from_tables() -> None:
 def test_differences_are_summed_along_their_innermost_array(engine: str) -> None:
     def points(f: Fields) -> Polar:
         return Polar(
-            range=running(f.columns.pixels.range), azimuth=running(f.columns.number) * 0.01, intensity=running(f.tail).on("columns")
+            range=running(f.columns.pixels.range),
+            azimuth=running(f.columns.number) * 0.01,
+            intensity=running(f.tail).on("columns"),
         )
 
     cloud = cloud_of(points, frame(4), frame(4, number=1), engine=engine)

@@ -1,4 +1,6 @@
-"""The graph of a traced function: every field once, gone through and computed in one way, and what can be said without computing it."""
+"""The graph of a traced function: every field once, gone through and computed in one way, and what
+can be said without computing it.
+"""
 
 from __future__ import annotations
 
@@ -10,7 +12,16 @@ import pytest
 
 import lidarspec
 from lidarspec.expressions.columns import Batch
-from lidarspec.expressions.graph import Node, conjuncts, evaluate, node_of, only_field, sample_of, trace, traverse
+from lidarspec.expressions.graph import (
+    Node,
+    conjuncts,
+    evaluate,
+    node_of,
+    only_field,
+    sample_of,
+    trace,
+    traverse,
+)
 from lidarspec.points.evaluate import evaluated
 from lidarspec.points.plain import evaluate as plainly
 from lidarspec.spec import Fields, Polar, stack, take
@@ -33,16 +44,27 @@ def computed(node: Node, batch: Batch) -> Any:
 
 def test_a_field_that_is_read_twice_is_one_node() -> None:
     node = graph_of(lambda f: f.points.distance * 2 + f.points.distance)
-    assert [(n.kind, n.path) for n in traverse(node) if n.kind == "field"] == [("field", "points.distance")]
+    assert [(n.kind, n.path) for n in traverse(node) if n.kind == "field"] == [
+        ("field", "points.distance")
+    ]
     assert list(traverse(node, into=lambda n: n.kind != "call")) == [node]
 
 
 def test_columns_and_arrays_come_to_the_same() -> None:
-    node = graph_of(lambda f: np.where(f.points.intensity > 100, f.points.distance + f.start_angle, f.end_angle % 7))
+    node = graph_of(
+        lambda f: np.where(
+            f.points.intensity > 100, f.points.distance + f.start_angle, f.end_angle % 7
+        )
+    )
     column = computed(node, PACKETS.batch())
-    arrays = {"points.distance": PACKETS["points.distance"], "points.intensity": PACKETS["points.intensity"]}
+    arrays = {
+        "points.distance": PACKETS["points.distance"],
+        "points.intensity": PACKETS["points.intensity"],
+    }
     arrays |= {path: PACKETS[path][:, None] for path in ("start_angle", "end_angle")}
-    np.testing.assert_array_equal(evaluate(node, {}, lambda node: arrays.get(node.path)), column.array)
+    np.testing.assert_array_equal(
+        evaluate(node, {}, lambda node: arrays.get(node.path)), column.array
+    )
 
 
 @pytest.mark.parametrize(
@@ -63,7 +85,11 @@ def test_the_one_field_that_an_expression_is_made_of(function: Any, path: str | 
 
 def test_conditions_that_hold_together_are_told_apart() -> None:
     node = graph_of(lambda f: (f.start_angle < 360) & ((f.end_angle < 360) & (f.speed > 0)))
-    assert [only_field(part).path for part in conjuncts(node)] == ["start_angle", "end_angle", "speed"]  # type: ignore[union-attr]
+    assert [only_field(part).path for part in conjuncts(node)] == [
+        "start_angle",
+        "end_angle",
+        "speed",
+    ]  # type: ignore[union-attr]
 
 
 def echoes(f: Fields) -> Polar:
@@ -72,11 +98,16 @@ def echoes(f: Fields) -> Polar:
 
 
 def test_one_field_beside_itself_has_points() -> None:
-    packets = dataclasses.replace(STL27L, points=echoes).decode(b"".join(STL27L.example("data", seed=seed) for seed in range(5)))
+    packets = dataclasses.replace(STL27L, points=echoes).decode(
+        b"".join(STL27L.example("data", seed=seed) for seed in range(5))
+    )
     assert_same_points(evaluated(packets).cloud, plainly(packets).cloud)
 
 
 def test_a_test_of_plausibility_may_put_fields_side_by_side() -> None:
-    frame = dataclasses.replace(STL27L.frames["data"], plausible=lambda f: stack(f.points.intensity, f.points.intensity) < 256)
+    frame = dataclasses.replace(
+        STL27L.frames["data"],
+        plausible=lambda f: stack(f.points.intensity, f.points.intensity) < 256,
+    )
     sensor = dataclasses.replace(STL27L, frames={"data": frame})
     assert len(sensor.decode(STL27L.example("data") * 3)) == 3

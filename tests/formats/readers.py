@@ -1,4 +1,5 @@
-"""Readers of point cloud files, for tests: our own, written from the formats' specifications, and those of other libraries.
+"""Readers of point cloud files, for tests: our own, written from the formats' specifications, and
+those of other libraries.
 
 Each returns the columns of a file by name.
 """
@@ -18,7 +19,16 @@ Readers = Mapping[str, Callable[[Path], Columns]]
 NAMES = ["x", "y", "z", "intensity", "time"]
 #: letters of PCD's types, and those of NumPy.
 _PCD_KINDS = {"F": "f", "I": "i", "U": "u"}
-_PLY_TYPES = {"char": "i1", "uchar": "u1", "short": "i2", "ushort": "u2", "int": "i4", "uint": "u4", "float": "f4", "double": "f8"}
+_PLY_TYPES = {
+    "char": "i1",
+    "uchar": "u1",
+    "short": "i2",
+    "ushort": "u2",
+    "int": "i4",
+    "uint": "u4",
+    "float": "f4",
+    "double": "f8",
+}
 
 
 def pcd_header(path: Path) -> dict[str, list[str]]:
@@ -31,7 +41,10 @@ def pcd_header(path: Path) -> dict[str, list[str]]:
 def read_pcd(path: Path) -> Columns:
     """Read an uncompressed binary PCD file (PCL documentation, the PCD file format, version 0.7)."""
     header = pcd_header(path)
-    kinds = [f"<{_PCD_KINDS[kind]}{size}" for kind, size in zip(header["TYPE"], header["SIZE"], strict=True)]
+    kinds = [
+        f"<{_PCD_KINDS[kind]}{size}"
+        for kind, size in zip(header["TYPE"], header["SIZE"], strict=True)
+    ]
     data = path.read_bytes().partition(b"\nDATA binary\n")[2]
     points = np.frombuffer(data, np.dtype(list(zip(header["FIELDS"], kinds, strict=True))))
     assert [len(points)] == [int(number) for number in header["POINTS"]]
@@ -44,7 +57,9 @@ def read_ply(path: Path) -> Columns:
     head, _, data = path.read_bytes().partition(b"end_header\n")
     lines = [line.split() for line in head.decode("ascii").splitlines()]
     assert ["format", "binary_little_endian", "1.0"] in lines
-    properties = [(words[2], f"<{_PLY_TYPES[words[1]]}") for words in lines if words[0] == "property"]
+    properties = [
+        (words[2], f"<{_PLY_TYPES[words[1]]}") for words in lines if words[0] == "property"
+    ]
     points = np.frombuffer(data, np.dtype(properties))
     assert ["element", "vertex", str(len(points))] in lines
     return {name: points[name] for name, _ in properties}
@@ -80,11 +95,24 @@ def read_ply_by_plyfile(path: Path) -> Columns:
     return {name: vertices[name] for name in vertices.dtype.names}
 
 
-OWN: Readers = {"a.pcd": read_pcd, "a.ply": read_ply, "a.npy": read_npy, "a.bin": read_kitti, "a.xyz": read_xyz}
-FOREIGN: Readers = {"a.pcd": read_pcd_by_pypcd4, "a.lzf.pcd": read_pcd_by_pypcd4, "a.ply": read_ply_by_plyfile}
+OWN: Readers = {
+    "a.pcd": read_pcd,
+    "a.ply": read_ply,
+    "a.npy": read_npy,
+    "a.bin": read_kitti,
+    "a.xyz": read_xyz,
+}
+FOREIGN: Readers = {
+    "a.pcd": read_pcd_by_pypcd4,
+    "a.lzf.pcd": read_pcd_by_pypcd4,
+    "a.ply": read_ply_by_plyfile,
+}
 
 #: (name of a file, its reader), where those of other libraries are left to `make test-all`.
 READERS = [
     *(pytest.param(name, reader, id=name) for name, reader in OWN.items()),
-    *(pytest.param(name, reader, id=f"{name} elsewhere", marks=pytest.mark.slow) for name, reader in FOREIGN.items()),
+    *(
+        pytest.param(name, reader, id=f"{name} elsewhere", marks=pytest.mark.slow)
+        for name, reader in FOREIGN.items()
+    ),
 ]

@@ -18,18 +18,29 @@ zarr = Library("zarr")
 
 
 @pytest.mark.parametrize("every_point", [False, True])
-def test_arrays_hold_the_columns_of_the_clouds_and_the_stamps(tmp_path: Path, every_point: bool, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_arrays_hold_the_columns_of_the_clouds_and_the_stamps(
+    tmp_path: Path, every_point: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.setattr(ours, "ROWS", 1000)
-    scans = [scan(0), scan(1, points=2000), scan(2, points=0), *(scan(number, points=300) for number in range(3, 10))]
+    scans = [
+        scan(0),
+        scan(1, points=2000),
+        scan(2, points=0),
+        *(scan(number, points=300) for number in range(3, 10)),
+    ]
     write(tmp_path / "a.zarr", scans, every_point=every_point)
     group = zarr.open_group(tmp_path / "a.zarr", mode="r")
     kept = [one.points.valid | every_point for one in scans]
     assert {*group.array_keys()} == {*COLUMNS, "scan", "stamp_ns", "rate_hz", "complete"}
     for name in COLUMNS:
-        expected = np.concatenate([one.points.columns[name][k] for one, k in zip(scans, kept, strict=True)])
+        expected = np.concatenate(
+            [one.points.columns[name][k] for one, k in zip(scans, kept, strict=True)]
+        )
         assert group[name].dtype == expected.dtype
         np.testing.assert_array_equal(group[name][:], expected)
-    np.testing.assert_array_equal(group["scan"][:], np.repeat(np.arange(10), [k.sum() for k in kept]))
+    np.testing.assert_array_equal(
+        group["scan"][:], np.repeat(np.arange(10), [k.sum() for k in kept])
+    )
     assert group["stamp_ns"][:].tolist() == [10**18 + number for number in range(10)]
     assert group["rate_hz"][:].tolist() == [10 + number for number in range(10)]
     assert group["complete"][:].tolist() == [False] + [True] * 9
@@ -45,7 +56,9 @@ def test_units_stand_beside_the_arrays(tmp_path: Path) -> None:
     assert (group.attrs["sensor"], group.attrs["frame"]) == (sensor.id, "x forward, y left, z up")
     for name, column in scans[0].points.extra.items():
         assert group[name].dtype == column.dtype
-        np.testing.assert_array_equal(group[name][:-5], np.concatenate([one.points.extra[name] for one in scans]))
+        np.testing.assert_array_equal(
+            group[name][:-5], np.concatenate([one.points.extra[name] for one in scans])
+        )
     assert np.isnan(group["velocity"][-5:]).all()
 
 
@@ -53,4 +66,6 @@ def test_no_scan_is_a_group_of_empty_arrays_that_replaces_what_was_there(tmp_pat
     write(tmp_path / "a.zarr", [scan(0)])
     write(tmp_path / "a.zarr", [])
     group = zarr.open_group(tmp_path / "a.zarr", mode="r")
-    assert {name: array.shape for name, array in group.arrays()} == dict.fromkeys(["scan", "stamp_ns", "rate_hz", "complete"], (0,))
+    assert {name: array.shape for name, array in group.arrays()} == dict.fromkeys(
+        ["scan", "stamp_ns", "rate_hz", "complete"], (0,)
+    )

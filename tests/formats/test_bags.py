@@ -30,7 +30,9 @@ TYPES = {1: "i1", 2: "u1", 3: "<i2", 4: "<u2", 5: "<i4", 6: "<u4", 7: "<f4", 8: 
 def messages(path: Path) -> list[tuple[str, int, Any]]:
     """Topic, time and message of everything in a log, by rosbags."""
     with reading.AnyReader([path]) as log:
-        return [(link.topic, at, log.deserialize(raw, link.msgtype)) for link, at, raw in log.messages()]
+        return [
+            (link.topic, at, log.deserialize(raw, link.msgtype)) for link, at, raw in log.messages()
+        ]
 
 
 def points(message: Any) -> np.ndarray:
@@ -42,7 +44,9 @@ def points(message: Any) -> np.ndarray:
         "itemsize": message.point_step,
     }
     assert message.row_step == message.width * message.point_step
-    return np.frombuffer(bytes(message.data), np.dtype(fields)).reshape(message.height, message.width)
+    return np.frombuffer(bytes(message.data), np.dtype(fields)).reshape(
+        message.height, message.width
+    )
 
 
 def simulated(name: str, packets: int) -> list[Scan]:
@@ -52,15 +56,27 @@ def simulated(name: str, packets: int) -> list[Scan]:
 
 @pytest.mark.parametrize("every_point", [False, True])
 @pytest.mark.parametrize("suffix", SUFFIXES)
-def test_a_log_has_a_cloud_for_each_scan_at_its_time(tmp_path: Path, suffix: str, every_point: bool) -> None:
+def test_a_log_has_a_cloud_for_each_scan_at_its_time(
+    tmp_path: Path, suffix: str, every_point: bool
+) -> None:
     scans = [scan(0), scan(1, points=3000), scan(2, intensity=False)]
     write(tmp_path / f"a.{suffix}", scans, every_point=every_point)
-    found = [(at, message) for topic, at, message in messages(tmp_path / f"a.{suffix}") if topic == "/points"]
+    found = [
+        (at, message)
+        for topic, at, message in messages(tmp_path / f"a.{suffix}")
+        if topic == "/points"
+    ]
     assert [at for at, _ in found] == [one.stamp_ns for one in scans]
     for one, (at, message) in zip(scans, found, strict=True):
         cloud = one.points if every_point else one.points[one.points.valid]
         (row,) = points(message)
-        assert row.dtype.names == ("x", "y", "z", *(("intensity",) if cloud.intensity is not None else ()), "time")
+        assert row.dtype.names == (
+            "x",
+            "y",
+            "z",
+            *(("intensity",) if cloud.intensity is not None else ()),
+            "time",
+        )
         for name in row.dtype.names:
             np.testing.assert_array_equal(row[name], getattr(cloud, name).astype(np.float32))
         assert (message.header.frame_id, message.is_dense) == ("laser", not every_point)
@@ -70,24 +86,43 @@ def test_a_log_has_a_cloud_for_each_scan_at_its_time(tmp_path: Path, suffix: str
 
 @pytest.mark.parametrize("name", ["ldrobot-stl27l", "shape-extras"])
 def test_foxglove_has_its_own_messages(tmp_path: Path, name: str) -> None:
-    decoding = pytest.importorskip("mcap_protobuf.decoder", reason="mcap-protobuf-support is not installed")
-    pytest.importorskip("foxglove_schemas_protobuf", reason="foxglove-schemas-protobuf is not installed")
+    decoding = pytest.importorskip(
+        "mcap_protobuf.decoder", reason="mcap-protobuf-support is not installed"
+    )
+    pytest.importorskip(
+        "foxglove_schemas_protobuf", reason="foxglove-schemas-protobuf is not installed"
+    )
     scans = [dataclasses.replace(one, frame_id="front") for one in simulated(name, 120)]
     write(tmp_path / "a.foxglove.mcap", scans)
     with (tmp_path / "a.foxglove.mcap").open("rb") as file:
         log = mcap.make_reader(file, decoder_factories=[decoding.DecoderFactory()])
-        found = [(schema.name, record.log_time, message) for schema, _, record, message in log.iter_decoded_messages()]
+        found = [
+            (schema.name, record.log_time, message)
+            for schema, _, record, message in log.iter_decoded_messages()
+        ]
         told = [record.metadata for record in log.iter_metadata()]
-    assert told == ([{"velocity": "m/s", "signal": "photons", "confidence": "1"}] if name == "shape-extras" else [])
+    assert told == (
+        [{"velocity": "m/s", "signal": "photons", "confidence": "1"}]
+        if name == "shape-extras"
+        else []
+    )
     clouds = [(at, message) for kind, at, message in found if kind == "foxglove.PointCloud"]
-    assert [at for at, _ in clouds] == [message.timestamp.ToNanoseconds() for _, message in clouds] == [one.stamp_ns for one in scans]
+    assert (
+        [at for at, _ in clouds]
+        == [message.timestamp.ToNanoseconds() for _, message in clouds]
+        == [one.stamp_ns for one in scans]
+    )
     for one, (_, message) in zip(scans, clouds, strict=True):
         kinds = ["", "u1", "i1", "<u2", "<i2", "<u4", "<i4", "<f4", "<f8"]
-        fields = {field.name: (np.dtype(kinds[field.type]), field.offset) for field in message.fields}
+        fields = {
+            field.name: (np.dtype(kinds[field.type]), field.offset) for field in message.fields
+        }
         rows = np.frombuffer(message.data, np.dtype({"names": list(fields), "formats": [kind for kind, _ in fields.values()],
             "offsets": [at for _, at in fields.values()], "itemsize": message.point_stride}))  # fmt: skip
         for column in {"x", "y", "z", *one.points.extra}:
-            np.testing.assert_array_equal(rows[column], one.points.read(column)[column][one.points.valid])
+            np.testing.assert_array_equal(
+                rows[column], one.points.read(column)[column][one.points.valid]
+            )
         assert (message.frame_id, message.pose.orientation.w) == ("front", 1)
     planar = [message for kind, _, message in found if kind == "foxglove.LaserScan"]
     assert len(planar) == (len(scans) if name == "ldrobot-stl27l" else 0)
@@ -100,7 +135,10 @@ def test_foxglove_has_its_own_messages(tmp_path: Path, name: str) -> None:
 
 def test_a_folder_is_one_that_ros_2_knows(tmp_path: Path) -> None:
     write(tmp_path / "a.rosbag2", [scan(0)])
-    assert {path.name for path in (tmp_path / "a.rosbag2").iterdir()} == {"metadata.yaml", "scans.mcap"}
+    assert {path.name for path in (tmp_path / "a.rosbag2").iterdir()} == {
+        "metadata.yaml",
+        "scans.mcap",
+    }
     write(tmp_path / "a.rosbag2", [scan(0), scan(1)])
     assert len(messages(tmp_path / "a.rosbag2")) == 4
 
@@ -112,8 +150,13 @@ def test_mcap_is_read_by_its_own_reader(tmp_path: Path) -> None:
     with (tmp_path / "a.mcap").open("rb") as file:
         log = mcap.make_reader(file, decoder_factories=[decoding.DecoderFactory()])
         assert log.get_header().profile == "ros2"
-        assert [record.metadata for record in log.iter_metadata()] == [{"velocity": "m/s", "signal": "photons", "confidence": "1"}]
-        found = [(channel.topic, record.log_time, message) for _, channel, record, message in log.iter_decoded_messages()]
+        assert [record.metadata for record in log.iter_metadata()] == [
+            {"velocity": "m/s", "signal": "photons", "confidence": "1"}
+        ]
+        found = [
+            (channel.topic, record.log_time, message)
+            for _, channel, record, message in log.iter_decoded_messages()
+        ]
     assert [(topic, at) for topic, at, _ in found] == [("/points", one.stamp_ns) for one in scans]
     for one, (_, _, message) in zip(scans, found, strict=True):
         (row,) = points(message)
@@ -121,20 +164,28 @@ def test_mcap_is_read_by_its_own_reader(tmp_path: Path) -> None:
             np.testing.assert_array_equal(row[name], one.points.read(name)[name][one.points.valid])
 
 
-def test_further_columns_keep_their_types_where_ros_has_them_and_come_with_units(tmp_path: Path) -> None:
+def test_further_columns_keep_their_types_where_ros_has_them_and_come_with_units(
+    tmp_path: Path,
+) -> None:
     one = scan(0)
-    extra = {"count": np.arange(5) + 2**40, "half": np.arange(5, dtype=np.float16) / 2, "tag": np.arange(5, dtype=np.uint8)}
+    extra = {
+        "count": np.arange(5) + 2**40,
+        "half": np.arange(5, dtype=np.float16) / 2,
+        "tag": np.arange(5, dtype=np.uint8),
+    }
     cloud = dataclasses.replace(one.points, extra=extra, units={"half": "m/s"})
     write(tmp_path / "a.rosbag2", [dataclasses.replace(one, points=cloud)], every_point=True)
     (row,) = points(messages(tmp_path / "a.rosbag2")[0][2])
     assert [row.dtype[name].str for name in extra] == ["<f8", "<f8", "|u1"]
     for name, column in {**extra, "z": cloud.z}.items():
         np.testing.assert_array_equal(row[name], column)
-    assert "unit of half: m/s" in (tmp_path / "a.rosbag2" / "metadata.yaml").read_text(encoding="utf-8")
+    assert "unit of half: m/s" in (tmp_path / "a.rosbag2" / "metadata.yaml").read_text(
+        encoding="utf-8"
+    )
 
 
 def test_organised_points_have_a_row_for_each_of_the_sensor(tmp_path: Path) -> None:
-    (one, *_) = (one for one in simulated("velodyne-vlp16", 100) if one.points.shape)
+    one, *_ = (one for one in simulated("velodyne-vlp16", 100) if one.points.shape)
     rows, columns = 16, len(one) // 16  # of which two stand in a column of the packet
     write(tmp_path / "a.bag", [one], every_point=True)
     ((_, _, message),) = messages(tmp_path / "a.bag")
@@ -146,11 +197,21 @@ def test_organised_points_have_a_row_for_each_of_the_sensor(tmp_path: Path) -> N
 def test_a_scan_of_one_plane_is_a_laserscan_as_well(tmp_path: Path) -> None:
     scans = simulated("ldrobot-stl27l", 200)
     write(tmp_path / "a.mcap", scans)
-    found = [(at, message) for topic, at, message in messages(tmp_path / "a.mcap") if topic == "/scan"]
+    found = [
+        (at, message) for topic, at, message in messages(tmp_path / "a.mcap") if topic == "/scan"
+    ]
     for one, (at, message) in zip(scans, found, strict=True):
         planar = one.to_laserscan()
         assert (at, message.header.frame_id) == (one.stamp_ns, "laser")
-        for name in ("angle_min", "angle_max", "angle_increment", "time_increment", "scan_time", "range_min", "range_max"):
+        for name in (
+            "angle_min",
+            "angle_max",
+            "angle_increment",
+            "time_increment",
+            "scan_time",
+            "range_min",
+            "range_max",
+        ):
             assert getattr(message, name) == np.float32(getattr(planar, name))
         np.testing.assert_array_equal(message.ranges, planar.ranges)
         np.testing.assert_array_equal(message.intensities, planar.intensities)
@@ -164,19 +225,30 @@ def test_a_scan_of_one_plane_is_a_laserscan_as_well(tmp_path: Path) -> None:
 def test_no_scan_and_no_point_are_no_message_and_an_empty_one(tmp_path: Path, suffix: str) -> None:
     write(tmp_path / f"a.{suffix}", [])
     assert messages(tmp_path / f"a.{suffix}") == []
-    write(tmp_path / f"b.{suffix}", [dataclasses.replace(one := scan(0), points=one.points[:0]), scan(1)])
-    assert [message.width for topic, _, message in messages(tmp_path / f"b.{suffix}") if topic == "/points"] == [0, 4]
+    write(
+        tmp_path / f"b.{suffix}",
+        [dataclasses.replace(one := scan(0), points=one.points[:0]), scan(1)],
+    )
+    assert [
+        message.width
+        for topic, _, message in messages(tmp_path / f"b.{suffix}")
+        if topic == "/points"
+    ] == [0, 4]
 
 
 @pytest.mark.parametrize("suffix", SUFFIXES)
-def test_what_fails_leaves_nothing_behind(tmp_path: Path, suffix: str, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_what_fails_leaves_nothing_behind(
+    tmp_path: Path, suffix: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
     def scans() -> Iterator[Scan]:
         yield scan(0)
         raise SourceError("the line broke")
 
     with pytest.raises(SourceError, match="the line broke"):
         write(tmp_path / f"a.{suffix}", scans())
-    late: Sequence[Scan] = [dataclasses.replace(one := scan(0), points=dataclasses.replace(one.points, stamp_ns=2**61))]
+    late: Sequence[Scan] = [
+        dataclasses.replace(one := scan(0), points=dataclasses.replace(one.points, stamp_ns=2**61))
+    ]
     with pytest.raises(UsageError, match="the years 1970 to 2038"):
         write(tmp_path / f"a.{suffix}", late)
     with pytest.raises(SourceError, match=f"none.a.{suffix}: there is no folder"):
@@ -203,6 +275,10 @@ for suffix in {SUFFIXES}:
     except SourceError as error:
         print(error)
 """
-    told = subprocess.run([sys.executable, "-c", script], check=True, timeout=60, capture_output=True, text=True).stdout
-    assert [line.partition(":")[0] for line in told.splitlines()] == [str(tmp_path / f"a.{suffix}") for suffix in SUFFIXES], told
+    told = subprocess.run(
+        [sys.executable, "-c", script], check=True, timeout=60, capture_output=True, text=True
+    ).stdout
+    assert [line.partition(":")[0] for line in told.splitlines()] == [
+        str(tmp_path / f"a.{suffix}") for suffix in SUFFIXES
+    ], told
     assert not list(tmp_path.iterdir())

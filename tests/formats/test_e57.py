@@ -24,7 +24,9 @@ def field(file: Any, number: int, name: str, dtype: Any) -> np.ndarray:
     points = file.get_header(number).points
     values = np.empty(points.childCount(), dtype)
     buffers = pye57.libe57.VectorSourceDestBuffer()
-    buffers.append(pye57.libe57.SourceDestBuffer(file.image_file, name, values, len(values), True, True))
+    buffers.append(
+        pye57.libe57.SourceDestBuffer(file.image_file, name, values, len(values), True, True)
+    )
     points.reader(buffers).read()
     return values
 
@@ -39,8 +41,13 @@ def test_every_scan_has_its_header_and_points(tmp_path: Path, every_point: bool)
         cloud, header = one.points[one.points.valid], file.get_header(number)
         assert header.point_count == len(one if every_point else cloud)
         assert header["name"].value() == f"scan {number}"
-        assert (header["sensorVendor"].value(), header["sensorModel"].value()) == (one.sensor.vendor, one.sensor.model)
-        assert header.acquisitionStart_dateTimeValue == pytest.approx(10**9 - 315_964_800 + 18, abs=1e-6)
+        assert (header["sensorVendor"].value(), header["sensorModel"].value()) == (
+            one.sensor.vendor,
+            one.sensor.model,
+        )
+        assert header.acquisitionStart_dateTimeValue == pytest.approx(
+            10**9 - 315_964_800 + 18, abs=1e-6
+        )
         if not len(one):
             continue
         places = file.read_scan(number, intensity=one.points.intensity is not None)
@@ -49,15 +56,24 @@ def test_every_scan_has_its_header_and_points(tmp_path: Path, every_point: bool)
         if cloud.intensity is not None:
             np.testing.assert_array_equal(places["intensity"], cloud.intensity)
         assert (header.xMinimum, header.zMaximum) == (cloud.x.min(), cloud.z.max())
-        np.testing.assert_array_equal(field(file, number, "timeStamp", np.float64), (one.points if every_point else cloud).time)
+        np.testing.assert_array_equal(
+            field(file, number, "timeStamp", np.float64),
+            (one.points if every_point else cloud).time,
+        )
 
 
 def test_rings_returns_and_further_columns(tmp_path: Path) -> None:
     ring, order = np.arange(5, dtype=np.uint16) * 300, np.array([0, 1, 0, 1, 0], np.uint8)
     sensor = SHAPES["shape-extras"]
     extras = next(iter(sensor.scans(simulate(sensor, 60))))
-    extras = with_points(extras, extra={**extras.points.extra, "on": np.arange(len(extras)) % 3 == 0})
-    write(tmp_path / "a.e57", [with_points(scan(0), ring=ring, return_index=order), extras], every_point=True)
+    extras = with_points(
+        extras, extra={**extras.points.extra, "on": np.arange(len(extras)) % 3 == 0}
+    )
+    write(
+        tmp_path / "a.e57",
+        [with_points(scan(0), ring=ring, return_index=order), extras],
+        every_point=True,
+    )
     file = pye57.E57(str(tmp_path / "a.e57"))
     assert field(file, 0, "rowIndex", np.uint16).tolist() == ring.tolist()
     assert file.get_header(0).rowMaximum == 1200

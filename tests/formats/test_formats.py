@@ -35,13 +35,19 @@ EXTRAS = {
 }
 #: the libraries that built-in formats take, by suffix.
 LIBRARIES = {
-    **{name.removeprefix("a"): (library.partition(".")[0],) for name, (library, _) in EXTRAS.items()},
+    **{
+        name.removeprefix("a"): (library.partition(".")[0],)
+        for name, (library, _) in EXTRAS.items()
+    },
     **dict.fromkeys((".mcap", ".bag", ".rosbag2", ".db3"), ("rosbags", "mcap")),
     ".lzf.pcd": ("lzf",),
 }
 #: every built-in format; those that take a library of others are left to `make test-all`.
 BUILT_IN = [
-    pytest.param(f"a{suffix}", marks=[pytest.mark.slow, needs(*LIBRARIES[suffix])] if suffix in LIBRARIES else ())
+    pytest.param(
+        f"a{suffix}",
+        marks=[pytest.mark.slow, needs(*LIBRARIES[suffix])] if suffix in LIBRARIES else (),
+    )
     for suffix in sorted(formats())
 ]
 COLUMNS = ["x", "y", "z", "range", "azimuth", "elevation", "intensity", "time"]
@@ -68,7 +74,9 @@ def scan(number: int, points: int = 5, *, intensity: bool = True) -> Scan:
 
 def rows(path: Path) -> tuple[list[str], np.ndarray]:
     header, *lines = path.read_text(encoding="ascii").splitlines()
-    return header.split(","), np.array([[float(cell) for cell in line.split(",")] for line in lines])
+    return header.split(","), np.array(
+        [[float(cell) for cell in line.split(",")] for line in lines]
+    )
 
 
 @pytest.mark.parametrize("every_point", [False, True])
@@ -81,24 +89,32 @@ def test_csv_holds_the_columns_of_the_clouds(tmp_path: Path, every_point: bool) 
     for index, name in enumerate(COLUMNS):
         expected = np.concatenate([cloud.columns[name] for cloud in clouds])
         np.testing.assert_allclose(values[:, index], expected, rtol=5.1e-7, atol=0)
-    np.testing.assert_array_equal(values[:, -1], np.repeat([0, 1, 2], [len(cloud) for cloud in clouds]))
+    np.testing.assert_array_equal(
+        values[:, -1], np.repeat([0, 1, 2], [len(cloud) for cloud in clouds])
+    )
 
 
 def test_compressed_text_is_the_same_text_and_always_the_same_bytes(tmp_path: Path) -> None:
     for name in ("a.csv", "a.csv.gz", "b.csv.gz"):
         write(tmp_path / name, [scan(0), scan(1, points=20_000)])
-    assert gzip.decompress((tmp_path / "a.csv.gz").read_bytes()) == (tmp_path / "a.csv").read_bytes()
+    assert (
+        gzip.decompress((tmp_path / "a.csv.gz").read_bytes()) == (tmp_path / "a.csv").read_bytes()
+    )
     assert (tmp_path / "a.csv.gz").read_bytes() == (tmp_path / "b.csv.gz").read_bytes()
 
 
 @pytest.mark.parametrize("every_point", [False, True])
-def test_npz_holds_the_columns_of_the_clouds_and_the_stamps(tmp_path: Path, every_point: bool) -> None:
+def test_npz_holds_the_columns_of_the_clouds_and_the_stamps(
+    tmp_path: Path, every_point: bool
+) -> None:
     scans = [scan(0), scan(1)]
     write(tmp_path / "a.npz", scans, every_point=every_point)
     with np.load(tmp_path / "a.npz") as arrays:
         assert list(arrays) == [*COLUMNS, "scan", "stamp_ns", "rate_hz", "complete"]
         for name in COLUMNS:
-            expected = np.concatenate([one.points.columns[name][one.points.valid | every_point] for one in scans])
+            expected = np.concatenate(
+                [one.points.columns[name][one.points.valid | every_point] for one in scans]
+            )
             assert arrays[name].dtype == expected.dtype
             np.testing.assert_array_equal(arrays[name], expected)
         assert arrays["stamp_ns"].tolist() == [10**18, 10**18 + 1]
@@ -109,12 +125,17 @@ def test_npz_holds_the_columns_of_the_clouds_and_the_stamps(tmp_path: Path, ever
 def test_no_scan_at_all_is_a_file_without_points(tmp_path: Path) -> None:
     write(tmp_path / "a.npz", [])
     with np.load(tmp_path / "a.npz") as arrays:
-        assert {name: array.shape for name, array in arrays.items()} == dict.fromkeys(["scan", "stamp_ns", "rate_hz", "complete"], (0,))
+        assert {name: array.shape for name, array in arrays.items()} == dict.fromkeys(
+            ["scan", "stamp_ns", "rate_hz", "complete"], (0,)
+        )
 
 
 def test_a_column_that_a_sensor_lacks_is_left_out(tmp_path: Path) -> None:
     write(tmp_path / "a.csv", [scan(0, intensity=False)])
-    assert rows(tmp_path / "a.csv")[0] == [*(name for name in COLUMNS if name != "intensity"), "scan"]
+    assert rows(tmp_path / "a.csv")[0] == [
+        *(name for name in COLUMNS if name != "intensity"),
+        "scan",
+    ]
     write(tmp_path / "a.csv", [scan(0), scan(1, intensity=False)])
     header, values = rows(tmp_path / "a.csv")
     assert np.isnan(values[-4:, header.index("intensity")]).all()
@@ -143,13 +164,17 @@ BINARY = [case for case in BUILT_IN if case.values[0] not in ("a.csv", "a.csv.gz
 
 @pytest.mark.slow
 @pytest.mark.parametrize("name", BINARY)
-def test_the_memory_does_not_grow_with_the_number_of_scans(tmp_path: Path, name: str, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_memory_does_not_grow_with_the_number_of_scans(
+    tmp_path: Path, name: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
     for module in (tables, arrays):
         monkeypatch.setattr(module, "ROWS", 10_000)
     peaks = []
     for number in (20, 60):
         tracemalloc.start()
-        write(tmp_path / name, (scan(index, points=2000) for index in range(number)), every_point=True)
+        write(
+            tmp_path / name, (scan(index, points=2000) for index in range(number)), every_point=True
+        )
         peaks.append(tracemalloc.get_traced_memory()[1])
         tracemalloc.stop()
     assert peaks[1] < peaks[0] + 300_000, peaks  # bytes; the longer file has up to 5 MB
@@ -177,7 +202,9 @@ def test_a_full_disk_is_a_source_error_and_leaves_nothing(tmp_path: Path, name: 
 
 
 @pytest.mark.parametrize("name", EXTRAS)
-def test_a_library_that_is_missing_is_named_with_what_to_type(tmp_path: Path, name: str, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_library_that_is_missing_is_named_with_what_to_type(
+    tmp_path: Path, name: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.setitem(sys.modules, EXTRAS[name][0], None)
     with pytest.raises(LibraryError) as caught:
         write(tmp_path / name, [scan(0)])
@@ -267,13 +294,23 @@ else:
 
 
 @pytest.mark.parametrize("name", ["a.csv", "a.npz"])
-def test_further_columns_are_written_under_their_names_in_their_types(tmp_path: Path, name: str) -> None:
+def test_further_columns_are_written_under_their_names_in_their_types(
+    tmp_path: Path, name: str
+) -> None:
     sensor = SHAPES["shape-extras"]
     scans = list(sensor.scans(simulate(sensor, 60)))
     write(tmp_path / name, scans, every_point=True)
     if name == "a.csv":
         header, values = rows(tmp_path / name)
-        assert header[-7:] == ["velocity", "near_ir", "signal", "tag", "confidence", "strong", "scan"]
+        assert header[-7:] == [
+            "velocity",
+            "near_ir",
+            "signal",
+            "tag",
+            "confidence",
+            "strong",
+            "scan",
+        ]
         found = dict(zip(header, values.T, strict=True))
     else:
         with np.load(tmp_path / name) as arrays:
@@ -285,7 +322,9 @@ def test_further_columns_are_written_under_their_names_in_their_types(tmp_path: 
         }
         assert found["signal"].dtype == np.uint32
     for key in scans[0].points.extra:
-        np.testing.assert_allclose(found[key], np.concatenate([one.points.extra[key] for one in scans]), rtol=5.1e-7)
+        np.testing.assert_allclose(
+            found[key], np.concatenate([one.points.extra[key] for one in scans]), rtol=5.1e-7
+        )
 
 
 def test_text_keeps_the_digits_of_double_columns(tmp_path: Path) -> None:
@@ -310,4 +349,6 @@ def test_part_of_a_killed_process_is_removed_by_the_next_write(tmp_path: Path) -
         os.utime(path, (0, 0))
     with replacing(target) as part:
         part.touch()
-    assert {path.name for path in tmp_path.iterdir()} == {path.name for path in (target, running, recent, other)}
+    assert {path.name for path in tmp_path.iterdir()} == {
+        path.name for path in (target, running, recent, other)
+    }

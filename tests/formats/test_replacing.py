@@ -40,9 +40,9 @@ def test_folder_with_another_file_is_left_alone(tmp_path: Path, output: str, str
     fill(folder, [*OWN_FILES[output], stranger])
     with pytest.raises(UsageError, match=stranger), replacing(folder) as part:
         part.mkdir()
-    assert sorted(path.relative_to(folder).as_posix() for path in folder.rglob("*") if path.is_file()) == sorted(
-        [*OWN_FILES[output], stranger]
-    )
+    assert sorted(
+        path.relative_to(folder).as_posix() for path in folder.rglob("*") if path.is_file()
+    ) == sorted([*OWN_FILES[output], stranger])
     assert [path.name for path in tmp_path.iterdir()] == [output]
 
 

@@ -12,14 +12,22 @@ from lidarspec import Sensor, SpecError, UsageError
 from lidarspec.spec import Address, Command, Count, Frame, Parts, Text
 from tests.broken import sound
 
-FIELDS = {"key": Bytes(3), "v": Array(2, Int8ul), "s": Array(2, Struct("x" / Int8ul)), "t": Struct("u" / Int8ul, "w" / Int32ub)}
+FIELDS = {
+    "key": Bytes(3),
+    "v": Array(2, Int8ul),
+    "s": Array(2, Struct("x" / Int8ul)),
+    "t": Struct("u" / Int8ul, "w" / Int32ub),
+}
 ORDER = Frame(Struct(*(name / con for name, con in FIELDS.items())), direction="out")
 VALUES = {"key": b"abc", "v": [1, 2], "s": [{"x": 1}] * 2, "t.u": 1, "t.w": 0}
 
 
 def commanded(**args: Any) -> Sensor:
     """A sensor with a command that has these arguments."""
-    return sound.sensor(frames={"data": sound.frame(), "order": ORDER}, commands={"start": Command("order", VALUES, args=args)})
+    return sound.sensor(
+        frames={"data": sound.frame(), "order": ORDER},
+        commands={"start": Command("order", VALUES, args=args)},
+    )
 
 
 @pytest.mark.parametrize(
@@ -35,7 +43,9 @@ def commanded(**args: Any) -> Sensor:
         (("t.u", Text(3)), "'t.u'"),
     ],
 )
-def test_an_argument_that_cannot_stand_in_its_field_is_the_authors_fault(wrong: Any, named: str) -> None:
+def test_an_argument_that_cannot_stand_in_its_field_is_the_authors_fault(
+    wrong: Any, named: str
+) -> None:
     with pytest.raises(SpecError, match=named) as error:
         commanded(rate=wrong).command("start", rate=3)
     assert error.value.path == "commands.start.args.rate"
@@ -43,11 +53,16 @@ def test_an_argument_that_cannot_stand_in_its_field_is_the_authors_fault(wrong: 
 
 def test_numbers_texts_addresses_and_bytes_go_to_their_places() -> None:
     assert commanded(rate=("t.u", 0, 9)).command("start", rate=3) == b"abc\1\2\1\1\3\0\0\0\0"
-    assert commanded(a=("v[1]", 0, 9), b=("s[0].x", 0, 9)).command("start", a=7, b=8) == b"abc\1\7\x08\1\1\0\0\0\0"
+    assert (
+        commanded(a=("v[1]", 0, 9), b=("s[0].x", 0, 9)).command("start", a=7, b=8)
+        == b"abc\1\7\x08\1\1\0\0\0\0"
+    )
     assert commanded(name=("key", Text(3))).command("start", name="x")[:3] == b"x\0\0"
     assert commanded(name=("key", Text(3, b" "))).command("start", name="x")[:3] == b"x  "
     assert commanded(key=("key", bytes)).command("start", key=b"\1\2\3")[:3] == b"\1\2\3"
-    assert commanded(host=("t.w", Address())).command("start", host="192.168.1.10")[-4:] == bytes([192, 168, 1, 10])
+    assert commanded(host=("t.w", Address())).command("start", host="192.168.1.10")[-4:] == bytes(
+        [192, 168, 1, 10]
+    )
     assert VALUES["v"] == [1, 2]
 
 
@@ -60,7 +75,9 @@ def test_numbers_texts_addresses_and_bytes_go_to_their_places() -> None:
         (("key", bytes), ["abc", b"ab", 3]),
     ],
 )
-def test_a_value_that_an_argument_does_not_take_is_refused(kind: Any, wrong_values: list[Any]) -> None:
+def test_a_value_that_an_argument_does_not_take_is_refused(
+    kind: Any, wrong_values: list[Any]
+) -> None:
     sensor = commanded(rate=kind)
     for value in wrong_values:
         with pytest.raises(UsageError, match="start: rate"):
@@ -81,6 +98,13 @@ def test_a_settings_list_of_parts_takes_arguments_too() -> None:
     struct = Struct("number" / Int8ul, "settings" / Parts(setting, count=this.number))
     frames = {"data": sound.frame(), "order": Frame(struct, direction="out", max_length=99)}
     values = {"settings": [{"key": 4, "value": b"\1"}, {"key": 6}]}
-    command = Command("order", values, args={"host": ("settings[1].value", Address()), "name": ("settings[0].value", Text(9))})
+    command = Command(
+        "order",
+        values,
+        args={"host": ("settings[1].value", Address()), "name": ("settings[0].value", Text(9))},
+    )
     sensor = sound.sensor(frames=frames, commands={"start": command})
-    assert sensor.command("start", host="10.0.0.1", name="on").hex(" ") == "02 04 02 6f 6e 06 04 0a 00 00 01"
+    assert (
+        sensor.command("start", host="10.0.0.1", name="on").hex(" ")
+        == "02 04 02 6f 6e 06 04 0a 00 00 01"
+    )

@@ -1,4 +1,6 @@
-"""Byte strings in arrays and up to a terminator, elements that differ, and what is found out about a struct before bytes arrive."""
+"""Byte strings in arrays and up to a terminator, elements that differ, and what is found out about
+a struct before bytes arrive.
+"""
 
 from __future__ import annotations
 
@@ -54,7 +56,12 @@ from lidarspec import SpecError, UsageError, WireError, export
 from lidarspec.testing.properties import PROPERTIES
 from lidarspec.testing.subject import Subject
 from tests.engine.against_construct import BACKENDS, agree, plain, sensor
-from tests.engine.engines import assert_damaged_input_reads_alike, assert_edge_values_read_alike, interpreted_reason, is_compiled
+from tests.engine.engines import (
+    assert_damaged_input_reads_alike,
+    assert_edge_values_read_alike,
+    interpreted_reason,
+    is_compiled,
+)
 
 
 def inverted(data: bytes) -> bytes:
@@ -62,7 +69,11 @@ def inverted(data: bytes) -> bytes:
 
 
 TEXT = NullTerminated(GreedyBytes)
-COUNTED = [bytes([count, *range(1, 1 + size)]) for count in range(4) for size in range(0, 15, 1 + count % 2)]
+COUNTED = [
+    bytes([count, *range(1, 1 + size)])
+    for count in range(4)
+    for size in range(0, 15, 1 + count % 2)
+]
 
 COMPILED: dict[str, Any] = {
     "counted": Array(this.k, Bytes(3)),
@@ -72,7 +83,9 @@ COMPILED: dict[str, Any] = {
     "of a fixed size": FixedSized(3, GreedyBytes),
     "in a struct": Array(this.k, Struct("a" / Bytes(1), "b" / Array(2, Bytes(1)))),
     "empty elements": Array(this.k, Struct("x" / If(this._.k > 2, Int8ub))),
-    "as many as an element says": Struct("a" / Array(2, Int8ub), "b" / Array(this.a[0] % 4, Int8ub), "c" / Bytes(this.a[1] % 3)),
+    "as many as an element says": Struct(
+        "a" / Array(2, Int8ub), "b" / Array(this.a[0] % 4, Int8ub), "c" / Bytes(this.a[1] % 3)
+    ),
     "as many as a byte says": Struct("a" / Bytes(2), "b" / Array(this.a[1] % 3, Int16ub)),
     "of what is not there": If(lambda found: found.y is None, Int8ub),
 }
@@ -81,16 +94,29 @@ INTERPRETED: dict[str, Any] = {
     "terminated ones": Array(this.k, TEXT),
     "prefixed": Array(this.k, Prefixed(Int8ub, GreedyBytes)),
     "elements of several lengths": Array(this.k, Struct("n" / Int8ub, "x" / Bytes(this.n % 3))),
-    "arrays of several lengths": Array(this.k, Struct("n" / Int8ub, "x" / Array(this.n % 3, Int16ub))),
+    "arrays of several lengths": Array(
+        this.k, Struct("n" / Int8ub, "x" / Array(this.n % 3, Int16ub))
+    ),
     "a part of some elements": Array(this.k, Struct("n" / Int8ub, "x" / If(this.n % 2, Int16ub))),
     "behind a condition": If(this.k == 3, Array(2, Struct("n" / Int8ub, "x" / Bytes(this.n)))),
-    "behind a case": Switch(this.k, {3: Array(2, Struct("n" / Int8ub, "x" / Int8ub, "y" / If(this.n == 9, Int8ub)))}),
-    "the length of an array": Struct("a" / Array(this._.k, Struct("b" / Int8ub)), "c" / Array(len_(this.a), Int8ub)),
+    "behind a case": Switch(
+        this.k, {3: Array(2, Struct("n" / Int8ub, "x" / Int8ub, "y" / If(this.n == 9, Int8ub)))}
+    ),
+    "the length of an array": Struct(
+        "a" / Array(this._.k, Struct("b" / Int8ub)), "c" / Array(len_(this.a), Int8ub)
+    ),
 }
 
 
 #: structs that are held to all promises in the quick tier.
-QUICK = ("counted", "nested", "in a struct", "as many as an element says", "terminated ones", "a part of some elements")
+QUICK = (
+    "counted",
+    "nested",
+    "in a struct",
+    "as many as an element says",
+    "terminated ones",
+    "a part of some elements",
+)
 
 #: the promises that are about reading and building single frames, and frames in bulk.
 HELD = {
@@ -121,20 +147,37 @@ def frames() -> list[bytes]:
 
 @pytest.mark.parametrize("name", [*COMPILED, *INTERPRETED])
 def test_they_are_read_and_built_as_in_construct(name: str) -> None:
-    struct = Struct("k" / Int8ub, "y" / If(this.k > 2, Int8ub), "v" / {**COMPILED, **INTERPRETED}[name])
+    struct = Struct(
+        "k" / Int8ub, "y" / If(this.k > 2, Int8ub), "v" / {**COMPILED, **INTERPRETED}[name]
+    )
     frame = sensor(struct).frames["data"]
     assert is_compiled(frame) == (name in COMPILED), interpreted_reason(frame)
     assert agree(struct, frames()) >= 3
 
 
 @pytest.mark.parametrize(
-    "name", [pytest.param(name, marks=() if name in QUICK else pytest.mark.slow) for name in [*COMPILED, *INTERPRETED]]
+    "name",
+    [
+        pytest.param(name, marks=() if name in QUICK else pytest.mark.slow)
+        for name in [*COMPILED, *INTERPRETED]
+    ],
 )
 def test_such_a_frame_keeps_every_promise(name: str) -> None:
     fields: Any = {**COMPILED, **INTERPRETED}[name]
-    inner = Struct("magic" / Const(b"\xf1\x5a"), "k" / Int8ub, "y" / If(this.k > 2, Int8ub), "v" / fields, "end" / Const(b"\xe1\x77"))
+    inner = Struct(
+        "magic" / Const(b"\xf1\x5a"),
+        "k" / Int8ub,
+        "y" / If(this.k > 2, Int8ub),
+        "v" / fields,
+        "end" / Const(b"\xe1\x77"),
+    )
     subject = Subject(sensor(inner), 6)
-    found = [finding for one in PROPERTIES if one.name in HELD and not one.lacks(subject) for finding in one.findings(subject)]
+    found = [
+        finding
+        for one in PROPERTIES
+        if one.name in HELD and not one.lacks(subject)
+        for finding in one.findings(subject)
+    ]
     assert not found, found
     assert_edge_values_read_alike(subject.sensor, count=3)
     assert_damaged_input_reads_alike(subject.sensor, count=1)
@@ -143,7 +186,12 @@ def test_such_a_frame_keeps_every_promise(name: str) -> None:
 def test_numbers_are_taken_for_a_byte_string_and_nothing_else() -> None:
     ours = sensor(Struct("k" / Int8ub, "v" / Array(this.k, Bytes(2))))
     wanted = b"\x02abcd"
-    for value in ([b"ab", b"cd"], [[97, 98], [99, 100]], np.array([[97, 98], [99, 100]], np.uint8), [b"ab", [99, 100]]):
+    for value in (
+        [b"ab", b"cd"],
+        [[97, 98], [99, 100]],
+        np.array([[97, 98], [99, 100]], np.uint8),
+        [b"ab", [99, 100]],
+    ):
         assert ours.build("data", v=value) == wanted
     assert ours.build("data", v=[]) == b"\0"
     for wrong in ([[97, 300]], [[97, "b"]], [b"abc"]):
@@ -170,7 +218,9 @@ def test_a_name_that_is_an_array_in_one_branch_alone_has_no_raw_form_and_its_col
 def test_an_element_without_a_field_has_no_number_in_its_unit() -> None:
     ours = sensor(Struct("v" / Array(3, Struct("n" / Int8ub, "x" / If(this.n == 1, Int8ub)))))
     packets = ours.decode([b"\0\1\5\0", b"\1\7\1\7\1\7", b"\0\0\0"])
-    np.testing.assert_array_equal(packets["v.x"], [[np.nan, 5, np.nan], [7, 7, 7], [np.nan, np.nan, np.nan]])
+    np.testing.assert_array_equal(
+        packets["v.x"], [[np.nan, 5, np.nan], [7, 7, 7], [np.nan, np.nan, np.nan]]
+    )
 
 
 def test_there_is_no_one_length_of_arrays_that_differ() -> None:
@@ -191,7 +241,9 @@ def test_a_column_of_text_is_refused_by_name() -> None:
 
 def test_branches_that_no_column_can_hold_are_told() -> None:
     struct = Struct(
-        "k" / Int8ub, "v" / Switch(this.k, {1: Int8ub, 2: Bytes(3)}), "w" / Switch(this.k, {1: Int8ub, 2: Struct("x" / Int8ub)})
+        "k" / Int8ub,
+        "v" / Switch(this.k, {1: Int8ub, 2: Bytes(3)}),
+        "w" / Switch(this.k, {1: Int8ub, 2: Struct("x" / Int8ub)}),
     )
     packets = sensor(struct).decode([b"\1\2\3", b"\2\3\4\5\6"])
     assert packets["k"].tolist() == [1, 2]
@@ -204,7 +256,9 @@ def test_branches_that_no_column_can_hold_are_told() -> None:
 
 
 @pytest.mark.parametrize("backend", BACKENDS)
-def test_a_length_that_is_no_number_is_the_plugins_fault_and_a_negative_one_is_the_bytes(backend: str) -> None:
+def test_a_length_that_is_no_number_is_the_plugins_fault_and_a_negative_one_is_the_bytes(
+    backend: str,
+) -> None:
     for part in (Array(this.k / 2, Int8ub), Bytes(this.k / 2)):
         stats = sensor(Struct("k" / Int8ub, "v" / part)).decode([b"\2\1"], backend=backend).stats
         assert (stats.plugin_errors, stats.bad_length) == (1, 0)
@@ -220,7 +274,13 @@ def test_a_length_that_is_no_number_is_the_plugins_fault_and_a_negative_one_is_t
     ("part", "reason"),
     [
         (Computed(this.a + 1), "Computed is no field of the wire"),
-        (BitStruct("n" / BitsInteger(8), "x" / Switch(this.n, {77: BitsInteger(8)}, default=BitStruct("y" / BitsInteger(8)))), "b"),
+        (
+            BitStruct(
+                "n" / BitsInteger(8),
+                "x" / Switch(this.n, {77: BitsInteger(8)}, default=BitStruct("y" / BitsInteger(8))),
+            ),
+            "b",
+        ),
         (BitStruct("wide" / BitsInteger(72)), "its 72 bits are more than a column holds"),
     ],
 )
@@ -231,10 +291,14 @@ def test_the_reason_why_a_frame_is_not_compiled_is_true(part: Any, reason: str) 
 
 
 @pytest.mark.parametrize("backend", BACKENDS)
-def test_a_count_is_bounded_by_the_longest_frame_also_where_elements_have_no_bytes(backend: str) -> None:
+def test_a_count_is_bounded_by_the_longest_frame_also_where_elements_have_no_bytes(
+    backend: str,
+) -> None:
     """Else ten bytes of noise would cost a loop over four thousand million elements."""
     empty = Array(this.n, Struct("x" / If(this._.k > 2, Int8ub)))
-    bits = BitStruct("low" / Array(24, BitsInteger(1)))  # more elements than bytes, and they are bits
+    bits = BitStruct(
+        "low" / Array(24, BitsInteger(1))
+    )  # more elements than bytes, and they are bits
     ours = sensor(Struct("k" / Int8ub, "n" / Int32ub, "bits" / bits, "v" / empty), max_length=20)
     short, huge = b"\0\0\0\0\3\7\7\7", b"\0\xff\xff\xff\xff\7\7\7"
     stats = ours.decode([short, huge], backend=backend).stats
@@ -246,9 +310,18 @@ def test_a_count_is_bounded_by_the_longest_frame_also_where_elements_have_no_byt
 
 @pytest.mark.parametrize("backend", BACKENDS)
 def test_elements_without_a_byte_are_bounded_together(backend: str) -> None:
-    """Else arrays within arrays would multiply: two bytes would cost a loop over eight million elements."""
-    ours = sensor(Struct("k" / Int8ub, "a" / Int8ub, "v" / Array(this.a, Array(this.a, Array(this.a, Struct())))), max_length=60)
-    stats = ours.decode([b"\0\3", b"\0\xff", b"\0\x3c"], backend=backend).stats  # 3 + 9 + 27 elements; too many
+    """Else arrays within arrays would multiply: two bytes would cost a loop over eight million
+    elements.
+    """
+    ours = sensor(
+        Struct(
+            "k" / Int8ub, "a" / Int8ub, "v" / Array(this.a, Array(this.a, Array(this.a, Struct())))
+        ),
+        max_length=60,
+    )
+    stats = ours.decode(
+        [b"\0\3", b"\0\xff", b"\0\x3c"], backend=backend
+    ).stats  # 3 + 9 + 27 elements; too many
     assert (stats.frames, stats.bad_length, stats.plugin_errors) == ({"data": 1}, 2, 0)
     assert len(ours.parse(b"\0\3").v[2][2]) == 3
     with pytest.raises(WireError, match="61"):
@@ -258,7 +331,14 @@ def test_elements_without_a_byte_are_bounded_together(backend: str) -> None:
 @pytest.mark.parametrize("backend", BACKENDS)
 def test_elements_within_a_bit_block_are_no_elements_without_a_byte(backend: str) -> None:
     block = BitStruct("x" / BitsInteger(8), "no" / Array(3, Struct()))
-    assert len(sensor(Struct("v" / Array(20, block)), max_length=20).decode([bytes(20)], backend=backend)) == 1
+    assert (
+        len(
+            sensor(Struct("v" / Array(20, block)), max_length=20).decode(
+                [bytes(20)], backend=backend
+            )
+        )
+        == 1
+    )
 
 
 @pytest.mark.parametrize("part", [Array(this.n, Struct()), Array(this.n, Int8ub), Bytes(this.n)])
@@ -282,8 +362,16 @@ BOUNDED: dict[str, tuple[Any, bytes, Any]] = {
         b"\3\1a\0",
         [{"n": 1, "x": b"a"}, {"n": 0, "x": b""}],
     ),
-    "behind a field": (Prefixed(Int8ub, Struct("a" / Int8ub, "r" / GreedyRange(Int8ub))), b"\3\7\5\6", {"a": 7, "r": [5, 6]}),
-    "a rest": (Prefixed(Int8ub, Struct("a" / Int8ub, "r" / GreedyBytes)), b"\3\7\5\6", {"a": 7, "r": b"\5\6"}),
+    "behind a field": (
+        Prefixed(Int8ub, Struct("a" / Int8ub, "r" / GreedyRange(Int8ub))),
+        b"\3\7\5\6",
+        {"a": 7, "r": [5, 6]},
+    ),
+    "a rest": (
+        Prefixed(Int8ub, Struct("a" / Int8ub, "r" / GreedyBytes)),
+        b"\3\7\5\6",
+        {"a": 7, "r": b"\5\6"},
+    ),
     "a text in its place": (FixedSized(4, NullStripped(GreedyBytes)), b"ab\0\0", b"ab"),
 }
 
@@ -313,12 +401,30 @@ def test_of_a_greedy_array_no_byte_is_dropped() -> None:
     ("part", "reason"),
     [
         (GreedyRange(Int8ub), "GreedyRange has no end of its own"),
-        (Prefixed(Int8ub, Struct("r" / GreedyBytes, "a" / Int8ub)), "r: GreedyBytes has no end of its own"),
+        (
+            Prefixed(Int8ub, Struct("r" / GreedyBytes, "a" / Int8ub)),
+            "r: GreedyBytes has no end of its own",
+        ),
         (Prefixed(Int8ub, GreedyRange(GreedyBytes)), "GreedyBytes has no end of its own"),
-        (Array(2, Aligned(4, Int8ub)), "Aligned loses its padding on a round trip, unless it is a named member of a Struct"),
-        (Array(2, FixedSized(4, Int8ub)), "FixedSized loses what its content leaves of it, unless it is a named member of a Struct"),
-        (Array(2, Prefixed(Int8ub, Int16ub)), "Prefixed loses what its content leaves of it, unless it is a named member of a Struct"),
-        (Union(0, "a" / Int16ub, "b" / Int8ub), "edits of all but one are ignored on rebuild: declare one of them"),
+        (
+            Array(2, Aligned(4, Int8ub)),
+            "Aligned loses its padding on a round trip, unless it is a named member of a Struct",
+        ),
+        (
+            Array(2, FixedSized(4, Int8ub)),
+            (
+                "FixedSized loses what its content leaves of it, unless it is a named member of a"
+                " Struct"
+            ),
+        ),
+        (
+            Array(2, Prefixed(Int8ub, Int16ub)),
+            "Prefixed loses what its content leaves of it, unless it is a named member of a Struct",
+        ),
+        (
+            Union(0, "a" / Int16ub, "b" / Int8ub),
+            "edits of all but one are ignored on rebuild: declare one of them",
+        ),
         (Prefixed(Int8ub, NullStripped(GreedyBytes)), "Prefixed loses what its content leaves"),
     ],
 )
@@ -329,9 +435,14 @@ def test_what_has_no_end_or_drops_bytes_is_refused(part: Any, reason: str) -> No
 
 def test_examples_hold_what_is_checked_and_see_the_whole_frame() -> None:
     checked = Struct("ok" / Check(this._.a < 200), "x" / Array(this._root.a % 3, Int8ub))
-    ours = sensor(Struct("a" / Int8ub, "v" / Array(2, checked), "twice" / Computed(this._root.a * 2)))
+    ours = sensor(
+        Struct("a" / Int8ub, "v" / Array(2, checked), "twice" / Computed(this._root.a * 2))
+    )
     examples = [ours.parse(ours.example("data", seed=seed)) for seed in range(9)]
-    assert all(found.a < 200 and found.twice == 2 * found.a and len(found.v[1].x) == found.a % 3 for found in examples)
+    assert all(
+        found.a < 200 and found.twice == 2 * found.a and len(found.v[1].x) == found.a % 3
+        for found in examples
+    )
     with pytest.raises(WireError, match=r"v\[0\].ok"):
         ours.parse(b"\xc8\0\0\0\0")
 

@@ -1,4 +1,6 @@
-"""Parts that a named value chooses: construct looks an Enum's values up by their names, and so does every engine."""
+"""Parts that a named value chooses: construct looks an Enum's values up by their names, and so does
+every engine.
+"""
 
 from __future__ import annotations
 
@@ -39,22 +41,52 @@ KIND = Enum(Int8ub, idle=1, busy=2, lost=7)
 FLAGS = BitStruct("low" / BitsInteger(5), "kind" / Enum(BitsInteger(3), idle=1, busy=2))
 
 CHOICES: dict[str, Any] = {
-    "names": Struct("kind" / KIND, "body" / Switch(this.kind, {"idle": Int8ub, "busy": Int16ub}, default=Int32ub)),
-    "numbers": Struct("kind" / KIND, "body" / Switch(this.kind, {1: Int8ub, 2: Int16ub, 3: Int16ub}, default=Int32ub)),
-    "names and numbers": Struct("kind" / KIND, "body" / Switch(this.kind, {2: Int8ub, "busy": Int16ub, 3: Int24ub}, default=Int32ub)),
+    "names": Struct(
+        "kind" / KIND,
+        "body" / Switch(this.kind, {"idle": Int8ub, "busy": Int16ub}, default=Int32ub),
+    ),
+    "numbers": Struct(
+        "kind" / KIND,
+        "body" / Switch(this.kind, {1: Int8ub, 2: Int16ub, 3: Int16ub}, default=Int32ub),
+    ),
+    "names and numbers": Struct(
+        "kind" / KIND,
+        "body" / Switch(this.kind, {2: Int8ub, "busy": Int16ub, 3: Int24ub}, default=Int32ub),
+    ),
     "no default": Struct("kind" / KIND, "body" / Switch(this.kind, {"idle": Struct("a" / Int8ub)})),
     "a condition": Struct("kind" / KIND, "body" / IfThenElse(this.kind == "busy", Int8ub, Int16ub)),
-    "a function": Struct("kind" / KIND, "body" / If(lambda found: found.kind in ("idle", "lost"), Int8ub)),
+    "a function": Struct(
+        "kind" / KIND, "body" / If(lambda found: found.kind in ("idle", "lost"), Int8ub)
+    ),
     "its number": Struct("kind" / KIND, "body" / Array(lambda found: int(found.kind) % 4, Int8ub)),
-    "bits": Struct("flags" / FLAGS, "body" / Switch(this.flags.kind, {"idle": Int8ub, "busy": Int16ub}, default=Int32ub)),
+    "bits": Struct(
+        "flags" / FLAGS,
+        "body" / Switch(this.flags.kind, {"idle": Int8ub, "busy": Int16ub}, default=Int32ub),
+    ),
     "an array": Struct(
         "kind" / KIND,
-        "rows" / Array(2, Struct("x" / Int8ub, "y" / Switch(this._.kind, {"busy": Int16ub}, default=Int8ub))),
+        "rows"
+        / Array(
+            2, Struct("x" / Int8ub, "y" / Switch(this._.kind, {"busy": Int16ub}, default=Int8ub))
+        ),
     ),
-    "further out": Struct("head" / Struct("kind" / KIND), "body" / Struct("x" / Switch(this._.head.kind, {"lost": Int8ub}))),
-    "a constant": Struct("kind" / Const("busy", KIND), "body" / Switch(this.kind, {"busy": Int16ub}, default=Int8ub)),
-    "a constant inside": Struct("x" / Int8ub, "kind" / Enum(Const(2, Int8ub), idle=1, busy=2), "y" / If(this.kind == "busy", Int8ub)),
-    "constant bits": Struct("x" / Int8ub, "f" / BitStruct("low" / BitsInteger(4), "kind" / Const("b", Enum(BitsInteger(4), a=1, b=2)))),
+    "further out": Struct(
+        "head" / Struct("kind" / KIND),
+        "body" / Struct("x" / Switch(this._.head.kind, {"lost": Int8ub})),
+    ),
+    "a constant": Struct(
+        "kind" / Const("busy", KIND), "body" / Switch(this.kind, {"busy": Int16ub}, default=Int8ub)
+    ),
+    "a constant inside": Struct(
+        "x" / Int8ub,
+        "kind" / Enum(Const(2, Int8ub), idle=1, busy=2),
+        "y" / If(this.kind == "busy", Int8ub),
+    ),
+    "constant bits": Struct(
+        "x" / Int8ub,
+        "f"
+        / BitStruct("low" / BitsInteger(4), "kind" / Const("b", Enum(BitsInteger(4), a=1, b=2))),
+    ),
 }
 
 
@@ -63,15 +95,33 @@ def test_named_values_choose_as_in_construct(name: str) -> None:
     struct, source = CHOICES[name], random.Random(name)
     ours = sensor(struct)
     assert is_compiled(ours.frames["data"])
-    frames = {bytes([head, *source.randbytes(size)]) for head in (*range(10), 0x21, 0x22, 255) for size in range(1, 6)}
+    frames = {
+        bytes([head, *source.randbytes(size)])
+        for head in (*range(10), 0x21, 0x22, 255)
+        for size in range(1, 6)
+    }
     examples = {ours.example("data", seed=seed) for seed in range(20)}
     assert agree(struct, sorted(frames | examples)) > len(examples) / 2
 
 
 def test_headers_that_mean_the_same_have_one_layout() -> None:
-    """Some billion lengths are too long alike, and some billion keys are no key: garbage has a new one in each header."""
-    body = Switch(this.key, {5: Int8ub, 70_000: Int16ub}, default=Struct("data" / Bytes(this._.length * 2 - 3)))
-    ours = sensor(Struct("length" / Int32ub, "key" / Int32ub, "body" / body, "tail" / Array(this.length + 1, Int16ub)), max_length=100)
+    """Some billion lengths are too long alike, and some billion keys are no key: garbage has a new
+    one in each header.
+    """
+    body = Switch(
+        this.key,
+        {5: Int8ub, 70_000: Int16ub},
+        default=Struct("data" / Bytes(this._.length * 2 - 3)),
+    )
+    ours = sensor(
+        Struct(
+            "length" / Int32ub,
+            "key" / Int32ub,
+            "body" / body,
+            "tail" / Array(this.length + 1, Int16ub),
+        ),
+        max_length=100,
+    )
     engine, source = codec(ours.frames["data"]), random.Random(1)
     assert isinstance(engine, CompiledCodec)
     found = set[object]()
@@ -88,7 +138,12 @@ def test_headers_that_mean_the_same_have_one_layout() -> None:
 
 def test_a_number_is_built_as_its_name_is() -> None:
     ours = sensor(CHOICES["names"])
-    assert [ours.build("data", kind=kind, body=3) for kind in (1, "idle", 2, 4)] == [b"\1\3", b"\1\3", b"\2\0\3", b"\4\0\0\0\3"]
+    assert [ours.build("data", kind=kind, body=3) for kind in (1, "idle", 2, 4)] == [
+        b"\1\3",
+        b"\1\3",
+        b"\2\0\3",
+        b"\4\0\0\0\3",
+    ]
 
 
 @pytest.mark.parametrize("inside", [False, True])
@@ -102,7 +157,10 @@ def test_what_build_fills_in_is_not_asked_of_a_frame_that_comes(inside: bool) ->
     for backend in BACKENDS:
         found = ours.decode([right, wrong], backend=backend)
         assert found["head.length" if inside else "length"].tolist() == [3, 9]
-    assert [ours.parse(data).head.length if inside else ours.parse(data).length for data in (right, wrong)] == [3, 9]
+    assert [
+        ours.parse(data).head.length if inside else ours.parse(data).length
+        for data in (right, wrong)
+    ] == [3, 9]
 
 
 def test_examples_are_of_every_name() -> None:
@@ -112,7 +170,9 @@ def test_examples_are_of_every_name() -> None:
 
 def test_examples_of_what_construct_alone_reads_know_the_number_of_a_named_constant() -> None:
     rows = Array(lambda found: int(found.kind) % 4, Int8ub)
-    ours = sensor(Struct("kind" / Const("busy", KIND), "rows" / rows, "text" / NullTerminated(GreedyBytes)))
+    ours = sensor(
+        Struct("kind" / Const("busy", KIND), "rows" / rows, "text" / NullTerminated(GreedyBytes))
+    )
     assert {len(ours.parse(ours.example("data", seed=seed)).rows) for seed in range(5)} == {2}
 
 
@@ -124,16 +184,38 @@ def test_a_constant_is_one_of_the_names() -> None:
 def test_one_field_has_one_unit() -> None:
     """Else the column would have that of the branch that stands first."""
     fine, coarse = Scaled(Int16ub, 0.001, "m"), Scaled(Int16ub, 0.002, "m")
-    for other in (coarse, Scaled(Int16ub, 0.001, "deg"), Scaled(Int16ub, 0.001, "m", offset=1), Int16ub):
+    for other in (
+        coarse,
+        Scaled(Int16ub, 0.001, "deg"),
+        Scaled(Int16ub, 0.001, "m", offset=1),
+        Int16ub,
+    ):
         rows = [Array(2, Struct("far" / part)) for part in (fine, other)]
         with pytest.raises(SpecError, match=r"rows\.far"):
-            sensor(Struct("kind" / KIND, "rows" / Switch(this.kind, {"idle": rows[0], "busy": rows[1]})))
-    kept = sensor(Struct("kind" / KIND, "far" / Switch(this.kind, {"idle": fine, "busy": Scaled(Int32ub, 0.001, "m")})))
+            sensor(
+                Struct(
+                    "kind" / KIND, "rows" / Switch(this.kind, {"idle": rows[0], "busy": rows[1]})
+                )
+            )
+    kept = sensor(
+        Struct(
+            "kind" / KIND,
+            "far" / Switch(this.kind, {"idle": fine, "busy": Scaled(Int32ub, 0.001, "m")}),
+        )
+    )
     assert kept.decode([b"\1\0\5", b"\2\0\1\0\0"])["far"].tolist() == [0.005, 65.536]
 
 
 def test_exports_leave_out_what_is_never_chosen() -> None:
-    (found,) = [node for node in nodes(messages(sensor(CHOICES["names and numbers"]))[0].root) if isinstance(node, Select)]
+    (found,) = [
+        node
+        for node in nodes(messages(sensor(CHOICES["names and numbers"]))[0].root)
+        if isinstance(node, Select)
+    ]
     assert [key for key, _ in found.cases] == [2, 3]
-    (found,) = [node for node in nodes(messages(sensor(CHOICES["numbers"]))[0].root) if isinstance(node, Select)]
+    (found,) = [
+        node
+        for node in nodes(messages(sensor(CHOICES["numbers"]))[0].root)
+        if isinstance(node, Select)
+    ]
     assert [key for key, _ in found.cases] == [3]

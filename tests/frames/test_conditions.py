@@ -1,4 +1,6 @@
-"""What a struct asks of values: construct judges one frame after another, and every engine as it does."""
+"""What a struct asks of values: construct judges one frame after another, and every engine as it
+does.
+"""
 
 from __future__ import annotations
 
@@ -34,18 +36,45 @@ from tests.engine.against_construct import BACKENDS, agree, sensor
 from tests.engine.engines import interpreted_reason, is_compiled
 
 FIRST_BYTES = (0, 1, 5, 6, 10, 20, 51, 255)
-ANY = [bytes([first, second, third]) for first in FIRST_BYTES for second in (0, 1, 2, 9, 128, 255) for third in (0, 3, 200)]
+ANY = [
+    bytes([first, second, third])
+    for first in FIRST_BYTES
+    for second in (0, 1, 2, 9, 128, 255)
+    for third in (0, 3, 200)
+]
 CONDITIONS: dict[str, Any] = {
     "one of": Struct("a" / OneOf(Int8ub, [5, 10, 255]), "b" / Int16ub),
     "none of": Struct("a" / NoneOf(Int8sb, [5, -1]), "b" / NoneOf(Int16ub, range(0x200, 0x300))),
-    "a function": Struct("a" / ExprValidator(Int8ub, lambda value, _: value % 3 == 0), "b" / Int16ub),
-    "a named one": Struct("a" / OneOf(Enum(Int8ub, low=5, high=10), ["high", "low"]), "b" / Int16ub),
-    "bits": Struct("a" / BitStruct("x" / OneOf(BitsInteger(3), [0, 4]), "y" / BitsInteger(5)), "b" / Array(2, Int8ub)),
-    "elements": Struct("a" / Int8ub, "v" / Array(2, Struct("b" / Int8ub, "ok" / Check((this.b <= this._.a) & (this.b != 3))))),
-    "no elements": Struct("a" / Int8ub, "b" / Int16ub, "v" / Array(this.a * 0, Struct("ok" / Check(this._.a < 20)))),
-    "a branch": Struct("a" / Int8ub, "b" / Int16ub, "v" / If(this.a > 50, Struct("ok" / Check(this._.b < 512)))),
+    "a function": Struct(
+        "a" / ExprValidator(Int8ub, lambda value, _: value % 3 == 0), "b" / Int16ub
+    ),
+    "a named one": Struct(
+        "a" / OneOf(Enum(Int8ub, low=5, high=10), ["high", "low"]), "b" / Int16ub
+    ),
+    "bits": Struct(
+        "a" / BitStruct("x" / OneOf(BitsInteger(3), [0, 4]), "y" / BitsInteger(5)),
+        "b" / Array(2, Int8ub),
+    ),
+    "elements": Struct(
+        "a" / Int8ub,
+        "v" / Array(2, Struct("b" / Int8ub, "ok" / Check((this.b <= this._.a) & (this.b != 3)))),
+    ),
+    "no elements": Struct(
+        "a" / Int8ub, "b" / Int16ub, "v" / Array(this.a * 0, Struct("ok" / Check(this._.a < 20)))
+    ),
+    "a branch": Struct(
+        "a" / Int8ub, "b" / Int16ub, "v" / If(this.a > 50, Struct("ok" / Check(this._.b < 512)))
+    ),
     "an element": Struct("a" / Int8ub, "v" / Array(2, Int8ub), "ok" / Check(this.v[1] < this.a)),
-    "errors": Struct("a" / Int8ub, "v" / Switch(this.a, {5: Struct("d" / Int16ub), 10: Struct("b" / Int8ub, "c" / Int8ub)}, default=Error)),
+    "errors": Struct(
+        "a" / Int8ub,
+        "v"
+        / Switch(
+            this.a,
+            {5: Struct("d" / Int16ub), 10: Struct("b" / Int8ub, "c" / Int8ub)},
+            default=Error,
+        ),
+    ),
 }
 
 
@@ -76,16 +105,27 @@ def test_what_is_not_allowed_is_counted_shown_and_not_built(backend: str) -> Non
 
 
 def test_an_example_along_the_sweep_has_values_that_are_allowed() -> None:
-    frame = Frame(Struct("a" / OneOf(Int32ub, [7, 9]), "b" / Int32ub), data=True, plausible=lambda f: f.b == 1000)
-    ours = replace(sensor(frame.struct), frames={"data": frame}, simulation=Simulation(lambda i: {"b": 1000}))
+    frame = Frame(
+        Struct("a" / OneOf(Int32ub, [7, 9]), "b" / Int32ub),
+        data=True,
+        plausible=lambda f: f.b == 1000,
+    )
+    ours = replace(
+        sensor(frame.struct), frames={"data": frame}, simulation=Simulation(lambda i: {"b": 1000})
+    )
     assert {ours.parse(ours.example("data", seed=seed)).a for seed in range(20)} == {7, 9}
 
 
 def test_a_mapping_is_names_of_all_values_that_there_are() -> None:
-    ours = sensor(Struct("a" / Mapping(Int8ub, {"low": 5, "high": 255}), "b" / Array(this.a == "low", Int8ub)))
+    ours = sensor(
+        Struct("a" / Mapping(Int8ub, {"low": 5, "high": 255}), "b" / Array(this.a == "low", Int8ub))
+    )
     assert is_compiled(ours.frames["data"])
     assert [ours.parse(data).a for data in (b"\5\7", b"\xff")] == ["low", "high"]
-    assert [ours.build("data", a=name, b=[7] * (name == "low")) for name in ("low", "high")] == [b"\5\7", b"\xff"]
+    assert [ours.build("data", a=name, b=[7] * (name == "low")) for name in ("low", "high")] == [
+        b"\5\7",
+        b"\xff",
+    ]
     assert ours.decode([b"\5\7", b"\xff", b"\6"])["a"].tolist() == [5, 255]
     with pytest.raises(WireError) as fault:
         ours.parse(b"\6")
@@ -113,7 +153,9 @@ def test_parts_meet_their_own_conditions() -> None:
     ],
 )
 def test_what_is_no_condition_on_integers_side_by_side_says_what_to_write(check: Any) -> None:
-    struct = Struct("a" / Int32ub, "b" / Int8ub, "f" / Float32b, "v" / Array(2, Int8ub), "ok" / check)
+    struct = Struct(
+        "a" / Int32ub, "b" / Int8ub, "f" / Float32b, "v" / Array(2, Int8ub), "ok" / check
+    )
     frame = sensor(struct).frames["data"]
     assert not is_compiled(frame)
     assert "plausible=lambda f: ..." in interpreted_reason(frame)

@@ -1,4 +1,6 @@
-"""A leaf, the place of one field in the frames of a layout: what is stored there is loaded again, and nothing else changes."""
+"""A leaf, the place of one field in the frames of a layout: what is stored there is loaded again,
+and nothing else changes.
+"""
 
 from __future__ import annotations
 
@@ -16,11 +18,15 @@ from tests.shapes import SHAPES
 
 ROWS = 3
 #: No shape has an array within a bit block.
-PACKED = Frame(Struct("start" / Const(b"\xaa"), "ranges" / Bitwise(Array(4, BitsInteger(10)))), data=True)
+PACKED = Frame(
+    Struct("start" / Const(b"\xaa"), "ranges" / Bitwise(Array(4, BitsInteger(10)))), data=True
+)
 
 
 def layouts() -> list[tuple[str, Layout]]:
-    """A layout of each frame type of the shapes that a header alone decides, and of one with an array within a bit block."""
+    """A layout of each frame type of the shapes that a header alone decides, and of one with an
+    array within a bit block.
+    """
     packed = codec(PACKED)
     assert isinstance(packed, CompiledCodec)
     found = [("packed", header(packed, random.Random(1))[0])]
@@ -41,7 +47,9 @@ def numbers_of(leaf: Leaf, source: np.random.Generator) -> np.ndarray:
     return source.integers(lowest, lowest + (1 << bits), (ROWS, *leaf.shape))
 
 
-@pytest.mark.parametrize(("name", "layout"), layouts(), ids=lambda value: value if isinstance(value, str) else "")
+@pytest.mark.parametrize(
+    ("name", "layout"), layouts(), ids=lambda value: value if isinstance(value, str) else ""
+)
 def test_what_is_stored_is_loaded_and_no_other_field_changes(name: str, layout: Layout) -> None:
     source = np.random.default_rng(len(name))
     rows = source.integers(0, 256, (ROWS, layout.size), np.uint8)

@@ -74,7 +74,11 @@ def unpack(frame: Frame, data: bytes) -> Any:
     layouts = frame_layouts(frame)
     assert isinstance(layouts, HeaderTree)
     layout = layouts.layout(data)
-    return unpacked(frame.tree, layout, data) if isinstance(layout, Layout) and layout.sound(data) else None
+    return (
+        unpacked(frame.tree, layout, data)
+        if isinstance(layout, Layout) and layout.sound(data)
+        else None
+    )
 
 
 @each_shape
@@ -107,7 +111,10 @@ def test_damaged_frames_are_left_to_construct(name: str) -> None:
 
 
 TRIPLE = Struct(
-    "a" / BytesInteger(3, signed=True), "b" / Const(b"\x07"), "c" / Bytes(2), "d" / BitStruct("x" / BitsInteger(3), "y" / BitsInteger(5))
+    "a" / BytesInteger(3, signed=True),
+    "b" / Const(b"\x07"),
+    "c" / Bytes(2),
+    "d" / BitStruct("x" / BitsInteger(3), "y" / BitsInteger(5)),
 )
 
 #: arrays of every kind, written out and as loops, and loops in loops.
@@ -130,7 +137,10 @@ ARRAYS = {
 
 @pytest.mark.parametrize("name", ARRAYS)
 def test_arrays_of_all_kinds(name: str) -> None:
-    frame = Frame(Struct("head" / Const(b"\x5a"), "inside" / ARRAYS[name], "tail" / Int16ul), max_length=1 << 20)
+    frame = Frame(
+        Struct("head" / Const(b"\x5a"), "inside" / ARRAYS[name], "tail" / Int16ul),
+        max_length=1 << 20,
+    )
     size = frame.prepared.sizeof()
     layouts = frame_layouts(frame)
     assert isinstance(layouts, HeaderTree)
@@ -146,15 +156,26 @@ def test_arrays_of_all_kinds(name: str) -> None:
         assert unpack(frame, data[:-1]) is None
 
 
-def test_headers_lead_to_their_own_layout_also_after_some_were_forgotten(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_headers_lead_to_their_own_layout_also_after_some_were_forgotten(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     monkeypatch.setattr(layout_tree, "REMEMBERED", 20)
     kinds = Switch(this.kind, {1: Int8ub, 2: Int16ub}, default=Int24ul)
     rows = Array(this.count, Int16ul)
-    struct = Struct("head" / Const(b"\x5a"), "kind" / Int8ub, "count" / Int8ub, "rows" / rows, "more" / kinds, "end" / Int8ub)
+    struct = Struct(
+        "head" / Const(b"\x5a"),
+        "kind" / Int8ub,
+        "count" / Int8ub,
+        "rows" / rows,
+        "more" / kinds,
+        "end" / Int8ub,
+    )
     frame = Frame(struct, max_length=700)
     for count in [*range(60), *range(60), 3, 3]:
         for kind in range(4):
-            data = bytes([0x5A, kind, count]) + random.Random(count).randbytes(2 * count + {1: 1, 2: 2}.get(kind, 3) + 1)
+            data = bytes([0x5A, kind, count]) + random.Random(count).randbytes(
+                2 * count + {1: 1, 2: 2}.get(kind, 3) + 1
+            )
             same(unpack(frame, data), clean(frame.prepared.parse(data)))
             assert unpack(frame, data[:-1]) is None
             assert unpack(frame, b"\x5b" + data[1:]) is None
@@ -166,9 +187,15 @@ def test_units_are_those_that_build_takes() -> None:
     sensor = ls.sensor("ldrobot-stl27l")
     data = sensor.build("data", sensor.parse(sensor.example("data")), speed=3600, start_angle=32427)
     found = sensor.parse(data, units=True)
-    assert (found.speed, found.start_angle, found.header) == (3600, pytest.approx(324.27), b"\x54\x2c")
+    assert (found.speed, found.start_angle, found.header) == (
+        3600,
+        pytest.approx(324.27),
+        b"\x54\x2c",
+    )
     raw = sensor.parse(data)
-    assert [point.distance for point in found.points] == pytest.approx([point.distance / 1000 for point in raw.points])
+    assert [point.distance for point in found.points] == pytest.approx(
+        [point.distance / 1000 for point in raw.points]
+    )
     assert [point.intensity for point in found.points] == [point.intensity for point in raw.points]
     assert sensor.build("data", found, units=True) == data
     broken = data[:-1] + bytes([data[-1] ^ 1])
@@ -184,4 +211,6 @@ def test_a_frame_is_built_from_what_was_parsed_of_it(name: str) -> None:
             data = sensor.example(frame, seed=seed)
             assert sensor.build(frame, sensor.parse(data, frame)) == data
             if name != "shape-numbers":  # its numbers are wider than a float holds
-                assert sensor.build(frame, sensor.parse(data, frame, units=True), units=True) == data
+                assert (
+                    sensor.build(frame, sensor.parse(data, frame, units=True), units=True) == data
+                )

@@ -1,4 +1,6 @@
-"""Parts of sizes of their own: read, built, held to what the frame says of them, and found in many frames at once as in one."""
+"""Parts of sizes of their own: read, built, held to what the frame says of them, and found in many
+frames at once as in one.
+"""
 
 from __future__ import annotations
 
@@ -21,7 +23,13 @@ SEGMENTS, TAGS, CHANNELS = (SHAPES[f"shape-{name}"] for name in ("segments", "ta
 
 
 def tags(*parts: dict[str, Any], **values: Any) -> bytes:
-    size = 7 + sum(2 + 4 * len(part.get("points", ())) + len(part.get("content", b"")) + 2 * ("temperature" in part) for part in parts)
+    size = 7 + sum(
+        2
+        + 4 * len(part.get("points", ()))
+        + len(part.get("content", b""))
+        + 2 * ("temperature" in part)
+        for part in parts
+    )
     return TAGS.build("data", number=1, tags=list(parts), padding=bytes(-size % 8), **values)
 
 
@@ -33,10 +41,27 @@ def test_what_says_where_the_last_part_is_is_filled_in() -> None:
     data = tags(dict(type=1, points=[pair(100, 0), pair(200, -1)]), dict(type=9, content=b"abc"))
     assert data[4:-1].hex(" ") == "01 02 01 08 64 00 00 00 c8 00 ff ff 09 03 61 62 63 00 00"
     parsed = TAGS.parse(data)
-    assert (parsed.count, [tag.type for tag in parsed.tags], parsed.tags[0].points[1].distance) == (2, [1, 9], 200)
-    segment = dict(turn=1, channels=1, beams=2, time=5, start=0, elevations=[4], data=[[dict(distance=1, strength=2)]] * 2)
+    assert (parsed.count, [tag.type for tag in parsed.tags], parsed.tags[0].points[1].distance) == (
+        2,
+        [1, 9],
+        200,
+    )
+    segment = dict(
+        turn=1,
+        channels=1,
+        beams=2,
+        time=5,
+        start=0,
+        elevations=[4],
+        data=[[dict(distance=1, strength=2)]] * 2,
+    )
     chain = SEGMENTS.parse(
-        SEGMENTS.build("data", counter=7, step=15, segments=[segment, {**segment, "beams": 1, "data": segment["data"][:1]}])
+        SEGMENTS.build(
+            "data",
+            counter=7,
+            step=15,
+            segments=[segment, {**segment, "beams": 1, "data": segment["data"][:1]}],
+        )
     )
     assert (chain.first_size, [part.next_size for part in chain.segments]) == (19, [16, 0])
     assert SEGMENTS.parse(SEGMENTS.build("data", counter=7, step=15, segments=[])).first_size == 0
@@ -54,12 +79,22 @@ def test_parts_are_read_as_construct_reads_them(sensor: Sensor) -> None:
 
 
 def test_a_part_is_a_packet_without_padding_and_knows_its_frame() -> None:
-    frames = [tags(dict(type=1, points=[pair(1, 0)]), dict(type=7, content=b""), dict(type=1, points=[pair(2, 0), pair(3, 0)]))]
+    frames = [
+        tags(
+            dict(type=1, points=[pair(1, 0)]),
+            dict(type=7, content=b""),
+            dict(type=1, points=[pair(2, 0), pair(3, 0)]),
+        )
+    ]
     frames += [tags(dict(type=2, temperature=-5)), tags(dict(type=1, points=[pair(4, 0)]))]
     packets = TAGS.decode(b"".join(frames))
     parts = packets.parts("tags.points")
     assert packets.count("tags").tolist() == [3, 1, 1]
-    assert (len(parts), parts["length"].tolist(), parts.count("points").tolist()) == (3, [4, 8, 4], [1, 2, 1])
+    assert (len(parts), parts["length"].tolist(), parts.count("points").tolist()) == (
+        3,
+        [4, 8, 4],
+        [1, 2, 1],
+    )
     assert parts.offset.tolist() == [packets.offset[0]] * 2 + [packets.offset[2]]
     assert parts.frames[0] is packets.table
     assert parts.index.tolist() == [packets.index[0]] * 2 + [packets.index[2]]
@@ -73,32 +108,72 @@ def test_a_part_is_a_packet_without_padding_and_knows_its_frame() -> None:
 
 def test_the_clock_of_a_part_is_its_own() -> None:
     def segment(time: int) -> dict[str, Any]:
-        return dict(turn=0, channels=1, beams=1, time=time, start=0, elevations=[0], data=[[dict(distance=1000, strength=0)]])
+        return dict(
+            turn=0,
+            channels=1,
+            beams=1,
+            time=time,
+            start=0,
+            elevations=[0],
+            data=[[dict(distance=1000, strength=0)]],
+        )
 
     times = [[2**32 - 10, 5], [], [20, 30, 50]]
-    frames = [SEGMENTS.build("data", counter=i, step=10, segments=[segment(time) for time in own]) for i, own in enumerate(times)]
+    frames = [
+        SEGMENTS.build("data", counter=i, step=10, segments=[segment(time) for time in own])
+        for i, own in enumerate(times)
+    ]
     for backend in ("auto", "construct"):
         packets = SEGMENTS.decode(frames, backend=backend)
         first = (2**32 - 10) * 1000
         assert (packets.time_ns - first).tolist() == [0, 0, 30_000]
-        assert (packets.parts("segments").time_ns - first).tolist() == [0, 15_000, 30_000, 40_000, 60_000]
+        assert (packets.parts("segments").time_ns - first).tolist() == [
+            0,
+            15_000,
+            30_000,
+            40_000,
+            60_000,
+        ]
 
 
 FOUR = Struct("kind" / Const(4, Int8ub), "value" / Int16ub)
-SEALED = Checksummed(Struct("kind" / Const(5, Int8ub), "value" / Int8ub, "sum" / Int8ub), field="sum", algorithm=Xor())
+SEALED = Checksummed(
+    Struct("kind" / Const(5, Int8ub), "value" / Int8ub, "sum" / Int8ub),
+    field="sum",
+    algorithm=Xor(),
+)
 COUNTED = Struct("count" / Int8ub, "parts" / Parts({"four": FOUR, "sealed": SEALED}, this.count))
 LINK = Struct("next" / Int8ub, "x" / Bytes(this.next % 3))
-CHAIN = Struct("first" / Int8ub, "parts" / Parts(LINK, size=this.first, following=this.next), "end" / Int8ub)
+CHAIN = Struct(
+    "first" / Int8ub, "parts" / Parts(LINK, size=this.first, following=this.next), "end" / Int8ub
+)
 FILLING = Struct("n" / Int8ub, "x" / Array(this.n, Int8ub))
 WITHIN = Struct("size" / Int8ub, "parts" / Parts(FILLING, within=this.size), "end" / Int8ub)
 OUTER = Struct("x" / Bytes(this._.wide))
-AROUND = Struct("wide" / Int8ub, "count" / Int8ub, "parts" / Parts(OUTER, this.count), "rest" / Bytes(this.parts.size % 4))
+AROUND = Struct(
+    "wide" / Int8ub,
+    "count" / Int8ub,
+    "parts" / Parts(OUTER, this.count),
+    "rest" / Bytes(this.parts.size % 4),
+)
 #: structs, with frames of theirs and what is none.
 FRAMES = {
-    "count": (COUNTED, ["00", "01 04 00 09", "02 05 01 04 04 00 01"], ["01 09 00 09", "01 05 01 05"]),
+    "count": (
+        COUNTED,
+        ["00", "01 04 00 09", "02 05 01 04 04 00 01"],
+        ["01 09 00 09", "01 05 01 05"],
+    ),
     "chain": (CHAIN, ["00 07", "01 00 07", "02 01 aa 00 07"], ["03 02 aa bb 03 07", "01 01 00 00"]),
-    "within": (WITHIN, ["00 09", "01 00 09", "05 00 01 07 01 08 09"], ["02 03 01 09", "02 02 01 01 09"]),
-    "around": (AROUND, ["02 01 aa bb cc dd", "01 04 01 02 03 04", "03 01 aa bb cc 01 02 03"], ["00 01", "02 01 aa bb"]),
+    "within": (
+        WITHIN,
+        ["00 09", "01 00 09", "05 00 01 07 01 08 09"],
+        ["02 03 01 09", "02 02 01 01 09"],
+    ),
+    "around": (
+        AROUND,
+        ["02 01 aa bb cc dd", "01 04 01 02 03 04", "03 01 aa bb cc 01 02 03"],
+        ["00 01", "02 01 aa bb"],
+    ),
 }
 
 
@@ -107,8 +182,17 @@ def test_frames_are_what_construct_takes_for_frames(name: str) -> None:
     struct, good, bad = FRAMES[name]
     whole = list(map(bytes.fromhex, good))
     assert against_construct.agree(struct, [*whole, *map(bytes.fromhex, bad)]) == len(whole)
-    damaged = [data[:spot] + bytes([byte]) + data[spot + 1 :] for data in whole for spot in range(len(data)) for byte in (0, 1, 4, 5, 0xFF)]
-    against_construct.agree(struct, [*damaged, *(data[:-1] for data in whole), *(data + b"\0" for data in whole)], kept=False)
+    damaged = [
+        data[:spot] + bytes([byte]) + data[spot + 1 :]
+        for data in whole
+        for spot in range(len(data))
+        for byte in (0, 1, 4, 5, 0xFF)
+    ]
+    against_construct.agree(
+        struct,
+        [*damaged, *(data[:-1] for data in whole), *(data + b"\0" for data in whole)],
+        kept=False,
+    )
 
 
 def test_invalid_parts_are_refused_when_they_are_declared() -> None:
@@ -125,7 +209,12 @@ def test_invalid_parts_are_refused_when_they_are_declared() -> None:
 
 
 def test_a_wrong_part_is_reported_with_its_place() -> None:
-    data = CHANNELS.build("data", wide=0, azimuth=100, channels=[dict(ring=3, distances=[1, 2]), dict(ring=4, distances=[])])
+    data = CHANNELS.build(
+        "data",
+        wide=0,
+        azimuth=100,
+        channels=[dict(ring=3, distances=[1, 2]), dict(ring=4, distances=[])],
+    )
     with pytest.raises(WireError) as fault:
         CHANNELS.parse(data[:-1] + b"\x05")
     assert (fault.value.path, fault.value.offset) == ("channels[1].check", 14)
@@ -141,14 +230,22 @@ def test_a_wrong_part_is_reported_with_its_place() -> None:
 def test_a_part_of_no_kind_is_counted_alike_by_both_engines() -> None:
     sensor, data = against_construct.sensor(COUNTED), bytes.fromhex("01 09 00 09")
     assert_backends_agree(sensor, [data, bytes.fromhex("01 04 00 09")])
-    assert (sensor.decode([data]).stats.bad_constant, sensor.decode([data]).stats.bad_length) == (1, 0)
+    assert (sensor.decode([data]).stats.bad_constant, sensor.decode([data]).stats.bad_length) == (
+        1,
+        0,
+    )
 
 
 def test_garbage_between_long_chains_is_walked_in_linear_time() -> None:
     """A chain that claims a thousand parts at every byte costs the frames behind it nothing."""
     link = Struct("next" / Int8ub, "x" / Bytes(3))
     struct = Checksummed(
-        Struct("head" / Const(b"\x04"), "first" / Int8ub, "parts" / Parts(link, size=this.first, following=this.next), "sum" / Int16ub),
+        Struct(
+            "head" / Const(b"\x04"),
+            "first" / Int8ub,
+            "parts" / Parts(link, size=this.first, following=this.next),
+            "sum" / Int16ub,
+        ),
         field="sum",
         algorithm=Sum(16, order="big"),
     )
@@ -182,12 +279,18 @@ def numbered() -> Sensor:
         "short": Struct("type" / Const(b"\x01"), "value" / Int8ub),
         "long": Struct("type" / Const(b"\x02"), "length" / Int8ub, "content" / Bytes(this.length)),
     }
-    struct = Struct("header" / Const(b"\xaa\x55"), "count" / Int32ub, "parts" / Parts(kinds, count=this.count))
+    struct = Struct(
+        "header" / Const(b"\xaa\x55"), "count" / Int32ub, "parts" / Parts(kinds, count=this.count)
+    )
     frames = {"data": Frame(struct, max_length=LONGEST)}
-    return dataclasses.replace(TAGS, id="shape-numbered", frames=frames, points=None, scan=None, simulation=Simulation())
+    return dataclasses.replace(
+        TAGS, id="shape-numbered", frames=frames, points=None, scan=None, simulation=Simulation()
+    )
 
 
-def test_numbers_of_parts_above_the_longest_frame_are_one_layout(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_numbers_of_parts_above_the_longest_frame_are_one_layout(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     sensor = numbered()
     walks = 0
     explore = HeaderTree._explore
@@ -200,7 +303,10 @@ def test_numbers_of_parts_above_the_longest_frame_are_one_layout(monkeypatch: py
     monkeypatch.setattr(HeaderTree, "_explore", counting)
     source = random.Random(1)
     parts = [b"\x01\x07", b"\x02\x01\x09", b"\x02\xff", b"\x03", b""]
-    data = b"".join(b"\xaa\x55" + source.randbytes(4) + b"".join(source.choices(parts, k=5)) for _ in range(FALSE_HEADERS))
+    data = b"".join(
+        b"\xaa\x55" + source.randbytes(4) + b"".join(source.choices(parts, k=5))
+        for _ in range(FALSE_HEADERS)
+    )
     decoder = sensor.decoder()
     assert not decoder.feed(data)
     assert not decoder.finish()
@@ -212,5 +318,8 @@ def test_each_number_of_parts_is_told_as_construct_tells_it(count: int) -> None:
     sensor = numbered()
     for part in (b"\x01\x07", b"\x02\x00", b"\x03"):
         data = b"\xaa\x55" + count.to_bytes(4, "big") + part * 40
-        found = {backend: (Books(sensor, backend=backend).feed(data).finish()) for backend in ("numpy", "construct")}
+        found = {
+            backend: (Books(sensor, backend=backend).feed(data).finish())
+            for backend in ("numpy", "construct")
+        }
         assert found["numpy"] == found["construct"]

@@ -25,16 +25,31 @@ class Own(Checksum):
 
 
 def crc8(source: random.Random) -> Crc:
-    return Crc(8, source.randrange(1, 256), source.randrange(256), source.random() < 0.5, source.random() < 0.5, source.randrange(256))
+    return Crc(
+        8,
+        source.randrange(1, 256),
+        source.randrange(256),
+        source.random() < 0.5,
+        source.random() < 0.5,
+        source.randrange(256),
+    )
 
 
 KINDS: dict[str, Callable[[random.Random], Checksum]] = {
     "crc8": crc8,
-    "crc16": lambda source: Crc(16, 0x1021, source.randrange(1 << 16), xorout=source.randrange(1 << 16)),
-    "crc32": lambda source: Crc(32, 0x04C11DB7, source.randrange(1 << 32), True, True, source.randrange(1 << 32)),
-    "other crc": lambda source: Crc(source.randrange(1, 65), 1, refin=source.random() < 0.5, refout=source.random() < 0.5),
+    "crc16": lambda source: Crc(
+        16, 0x1021, source.randrange(1 << 16), xorout=source.randrange(1 << 16)
+    ),
+    "crc32": lambda source: Crc(
+        32, 0x04C11DB7, source.randrange(1 << 32), True, True, source.randrange(1 << 32)
+    ),
+    "other crc": lambda source: Crc(
+        source.randrange(1, 65), 1, refin=source.random() < 0.5, refout=source.random() < 0.5
+    ),
     "sum": lambda source: Sum(source.randrange(1, 65)),
-    "word xor": lambda source: WordXor(source.randrange(12), tuple(source.choice((1, 2)) for _ in range(source.randrange(1, 5)))),
+    "word xor": lambda source: WordXor(
+        source.randrange(12), tuple(source.choice((1, 2)) for _ in range(source.randrange(1, 5)))
+    ),
     "others": lambda source: source.choice((Xor(), Fold15(), Own())),
 }
 

@@ -1,4 +1,6 @@
-"""Lengths that follow from what they measure: filled in, held, and the same for both engines; what construct prefixes, pads and aligns."""
+"""Lengths that follow from what they measure: filled in, held, and the same for both engines; what
+construct prefixes, pads and aligns.
+"""
 
 from __future__ import annotations
 
@@ -40,14 +42,38 @@ TWO = [dict(d=1, q=2), dict(d=3, q=4)]
 POINTS = "000102000304"
 BODY = Struct("n" / Int8ub, "points" / Array(this.n, POINT))
 
-#: by name: members behind a constant; values of a frame; its bytes from there on; what else is read of it.
+#: by name: members behind a constant; values of a frame; its bytes from there on; what else is read
+#: of it.
 MEASURED: dict[str, tuple[list[Any], dict[str, Any], str, dict[str, Any]]] = {
-    "a part": (["length" / SizeOf(Int16ub, "v", 1), "v" / BODY], dict(v=dict(points=TWO)), f"0008 02{POINTS}", dict(length=8)),
-    "itself": (["length" / SizeOf(Int16ub, plus=-4), "v" / Array(this.length // 3, POINT)], dict(v=TWO), f"0006 {POINTS}", dict(length=6)),
-    "beside it": (["h" / Struct("length" / SizeOf(Int16ub, "_.v")), "v" / BODY], dict(v=dict(points=TWO)), f"0007 02{POINTS}", {}),
-    "within it": (["length" / SizeOf(Int8ub, "v.points"), "v" / BODY], dict(v=dict(points=TWO)), f"06 02{POINTS}", dict(length=6)),
+    "a part": (
+        ["length" / SizeOf(Int16ub, "v", 1), "v" / BODY],
+        dict(v=dict(points=TWO)),
+        f"0008 02{POINTS}",
+        dict(length=8),
+    ),
+    "itself": (
+        ["length" / SizeOf(Int16ub, plus=-4), "v" / Array(this.length // 3, POINT)],
+        dict(v=TWO),
+        f"0006 {POINTS}",
+        dict(length=6),
+    ),
+    "beside it": (
+        ["h" / Struct("length" / SizeOf(Int16ub, "_.v")), "v" / BODY],
+        dict(v=dict(points=TWO)),
+        f"0007 02{POINTS}",
+        {},
+    ),
+    "within it": (
+        ["length" / SizeOf(Int8ub, "v.points"), "v" / BODY],
+        dict(v=dict(points=TWO)),
+        f"06 02{POINTS}",
+        dict(length=6),
+    ),
     "in bits": (
-        ["h" / BitStruct("k" / BitsInteger(4), "length" / SizeOf(BitsInteger(12), "_.v")), "v" / BODY],
+        [
+            "h" / BitStruct("k" / BitsInteger(4), "length" / SizeOf(BitsInteger(12), "_.v")),
+            "v" / BODY,
+        ],
         dict(h=dict(k=3), v=dict(points=TWO)),
         f"3007 02{POINTS}",
         {},
@@ -59,13 +85,24 @@ MEASURED: dict[str, tuple[list[Any], dict[str, Any], str, dict[str, Any]]] = {
         {},
     ),
     "under a seal": (
-        ["v" / Checksummed(Struct("length" / SizeOf(Int8ub), "p" / POINT, "sum" / Int8ub), field="sum", algorithm=Sum(8))],
+        [
+            "v"
+            / Checksummed(
+                Struct("length" / SizeOf(Int8ub), "p" / POINT, "sum" / Int8ub),
+                field="sum",
+                algorithm=Sum(8),
+            )
+        ],
         dict(v=dict(p=TWO[0])),
         "05 000102 08",
         {},
     ),
     "of alternatives": (
-        ["k" / Int8ub, "length" / SizeOf(Int8ub, "v"), "v" / Switch(this.k, {1: BODY}, Struct("z" / Int8ub))],
+        [
+            "k" / Int8ub,
+            "length" / SizeOf(Int8ub, "v"),
+            "v" / Switch(this.k, {1: BODY}, Struct("z" / Int8ub)),
+        ],
         dict(k=1, v=dict(points=TWO)),
         f"01 07 02{POINTS}",
         dict(length=7),
@@ -79,22 +116,51 @@ MEASURED: dict[str, tuple[list[Any], dict[str, Any], str, dict[str, Any]]] = {
     "of parts": (
         [
             "length" / SizeOf(Int16ub, "v"),
-            "v" / Parts(Struct("size" / SizeOf(Int8ub), "points" / PrefixedArray(Int8ub, POINT)), within=this.length),
+            "v"
+            / Parts(
+                Struct("size" / SizeOf(Int8ub), "points" / PrefixedArray(Int8ub, POINT)),
+                within=this.length,
+            ),
         ],
         dict(v=[dict(points=TWO), dict(points=[])]),
         f"000a 0802{POINTS} 0200",
         dict(length=10),
     ),
-    "PrefixedArray": (["v" / PrefixedArray(Int8ub, POINT)], dict(v=TWO), f"02 {POINTS}", dict(v_count=2)),
-    "Prefixed bytes": (["v" / Prefixed(Int16ub, GreedyBytes, includelength=True)], dict(v=b"ab"), "0004 6162", dict(v_size=4)),
-    "Prefixed struct": (["v" / Prefixed(Int8ub, BODY)], dict(v=dict(points=TWO)), f"07 02{POINTS}", dict(v_size=7)),
+    "PrefixedArray": (
+        ["v" / PrefixedArray(Int8ub, POINT)],
+        dict(v=TWO),
+        f"02 {POINTS}",
+        dict(v_count=2),
+    ),
+    "Prefixed bytes": (
+        ["v" / Prefixed(Int16ub, GreedyBytes, includelength=True)],
+        dict(v=b"ab"),
+        "0004 6162",
+        dict(v_size=4),
+    ),
+    "Prefixed struct": (
+        ["v" / Prefixed(Int8ub, BODY)],
+        dict(v=dict(points=TWO)),
+        f"07 02{POINTS}",
+        dict(v_size=7),
+    ),
     "Prefixed rest": (
-        ["v" / Prefixed(Int8ub, Struct("n" / Int8ub, "points" / Array(this.n, POINT), "rest" / GreedyBytes))],
+        [
+            "v"
+            / Prefixed(
+                Int8ub, Struct("n" / Int8ub, "points" / Array(this.n, POINT), "rest" / GreedyBytes)
+            )
+        ],
         dict(v=dict(points=TWO, rest=b"ab")),
         f"09 02{POINTS}6162",
         dict(v_size=9),
     ),
-    "Prefixed range": (["v" / Prefixed(Int8ub, GreedyRange(POINT))], dict(v=TWO), f"06 {POINTS}", dict(v_size=6)),
+    "Prefixed range": (
+        ["v" / Prefixed(Int8ub, GreedyRange(POINT))],
+        dict(v=TWO),
+        f"06 {POINTS}",
+        dict(v_size=6),
+    ),
     "Prefixed under a condition": (
         ["k" / Int8ub, "v" / If(this.k == 1, Prefixed(Int8ub, BODY))],
         dict(k=1, v=dict(points=TWO)),
@@ -119,7 +185,12 @@ MEASURED: dict[str, tuple[list[Any], dict[str, Any], str, dict[str, Any]]] = {
         f"07 02 {POINTS}",
         dict(v_size=7, v_count=2),
     ),
-    "FixedSized": (["v" / FixedSized(9, BODY)], dict(v=dict(points=TWO)), f"02{POINTS} 0000", dict(v_padding=b"\0\0")),
+    "FixedSized": (
+        ["v" / FixedSized(9, BODY)],
+        dict(v=dict(points=TWO)),
+        f"02{POINTS} 0000",
+        dict(v_padding=b"\0\0"),
+    ),
     "FixedSized by a field": (
         ["k" / Int8ub, "v" / FixedSized(this.k, Struct("p" / POINT, "rest" / GreedyBytes))],
         dict(k=4, v=dict(p=TWO[0], rest=b"a")),
@@ -134,8 +205,18 @@ MEASURED: dict[str, tuple[list[Any], dict[str, Any], str, dict[str, Any]]] = {
     ),
 }
 INTERPRETED: dict[str, tuple[list[Any], dict[str, Any], str, dict[str, Any]]] = {
-    "of a text": (["length" / SizeOf(Int16ub, "v"), "v" / CString("ascii")], dict(v="abc"), "0004 61626300", dict(length=4)),
-    "of no fixed width": (["v" / Prefixed(VarInt, GreedyBytes)], dict(v=bytes(130)), "8201" + "00" * 130, dict(v_size=130)),
+    "of a text": (
+        ["length" / SizeOf(Int16ub, "v"), "v" / CString("ascii")],
+        dict(v="abc"),
+        "0004 61626300",
+        dict(length=4),
+    ),
+    "of no fixed width": (
+        ["v" / Prefixed(VarInt, GreedyBytes)],
+        dict(v=bytes(130)),
+        "8201" + "00" * 130,
+        dict(v_size=130),
+    ),
     "in elements that differ": (
         ["v" / Array(2, Struct("x" / Prefixed(Int8ub, GreedyBytes)))],
         dict(v=[dict(x=b"a"), dict(x=b"")]),
@@ -192,8 +273,15 @@ def test_a_wrong_length_is_told_with_what_it_should_be() -> None:
     ours = declared("a part")
     with pytest.raises(WireError) as fault:
         ours.parse(bytes.fromhex(f"f15a 0009 02{POINTS}"))
-    assert (fault.value.path, fault.value.offset, fault.value.expected, fault.value.got) == ("length", 2, 8, 9)
-    assert "length       wrong: 9, expected 8" in str(ls.explain(bytes.fromhex(f"f15a 0009 02{POINTS}"), ours))
+    assert (fault.value.path, fault.value.offset, fault.value.expected, fault.value.got) == (
+        "length",
+        2,
+        8,
+        9,
+    )
+    assert "length       wrong: 9, expected 8" in str(
+        ls.explain(bytes.fromhex(f"f15a 0009 02{POINTS}"), ours)
+    )
     assert ours.parse(bytes.fromhex(f"f15a 0009 02{POINTS}"), verify=False).length == 9
     assert ours.build("data", length=77, v=dict(points=TWO))[2:4] == b"\0\x08"
 
@@ -208,12 +296,20 @@ def test_padding_is_kept_and_may_be_given() -> None:
 
 
 def test_a_part_that_is_longer_than_its_length_can_say_is_no_frame() -> None:
-    ours = sensor(Struct("length" / SizeOf(Int8ub, "v"), "n" / Int16ub, "v" / Array(this.n, Int8ub)), max_length=1000)
+    ours = sensor(
+        Struct("length" / SizeOf(Int8ub, "v"), "n" / Int16ub, "v" / Array(this.n, Int8ub)),
+        max_length=1000,
+    )
     with pytest.raises(UsageError, match="length"):
         ours.build("data", v=[0] * 300)
     with pytest.raises(WireError) as fault:
         ours.parse(bytes([44, 1, 44]) + bytes(300))
-    assert (fault.value.path, fault.value.offset, fault.value.expected, fault.value.got) == ("length", 0, 300, 44)
+    assert (fault.value.path, fault.value.offset, fault.value.expected, fault.value.got) == (
+        "length",
+        0,
+        300,
+        44,
+    )
     assert len(ours.decode([bytes([44, 1, 44]) + bytes(300)])) == 0
 
 

@@ -1,4 +1,6 @@
-"""Wire forms on single frames: what is read, what is written, how it was spelled, and what cannot be either."""
+"""Wire forms on single frames: what is read, what is written, how it was spelled, and what cannot
+be either.
+"""
 
 from __future__ import annotations
 
@@ -12,7 +14,9 @@ from lidarspec import Sensor, SpecError, UsageError, WireError, explain, export
 from lidarspec.spec import Echoes, Escaped, Frame, Lines, Scip, SixBits, Tokens
 from tests.shapes import SHAPES
 
-TOKENS, LINES, JOINED, ESCAPED = (SHAPES[f"shape-{name}"] for name in ("tokens", "lines", "joined", "escaped"))
+TOKENS, LINES, JOINED, ESCAPED = (
+    SHAPES[f"shape-{name}"] for name in ("tokens", "lines", "joined", "escaped")
+)
 
 
 def sensor(struct: Struct, form: object, longest: int = 200) -> Sensor:
@@ -24,7 +28,9 @@ def sensor(struct: Struct, form: object, longest: int = 200) -> Sensor:
 NUMBERS = sensor(Struct("a" / Int16ub, "b" / Int16sb, "c" / Int32ub), Tokens(start=b"\x02"))
 
 
-@pytest.mark.parametrize("text", [b"10F FFFE 2710", b"010f fffe 00002710", b"+271 -2 +10000", b"10F -2 0000000000002710"])
+@pytest.mark.parametrize(
+    "text", [b"10F FFFE 2710", b"010f fffe 00002710", b"+271 -2 +10000", b"10F -2 0000000000002710"]
+)
 def test_a_number_is_read_and_built_as_it_was_spelled(text: bytes) -> None:
     data = b"\x02" + text + b"\x03"
     values = NUMBERS.parse(data)
@@ -33,17 +39,37 @@ def test_a_number_is_read_and_built_as_it_was_spelled(text: bytes) -> None:
     assert NUMBERS.build("data", {**values, "a": 272}) == b"\x02110 FFFE 2710\x03"
 
 
-@pytest.mark.parametrize("text", [b"10000 1 1", b"1 +32768 1", b"-1 1 1", b"+F 1 1", b"1 1", b"1  1", b"1 1 1 1", b"G 1 1", b"1 1 1 "])
+@pytest.mark.parametrize(
+    "text",
+    [
+        b"10000 1 1",
+        b"1 +32768 1",
+        b"-1 1 1",
+        b"+F 1 1",
+        b"1 1",
+        b"1  1",
+        b"1 1 1 1",
+        b"G 1 1",
+        b"1 1 1 ",
+    ],
+)
 def test_what_is_no_number_of_its_slot_makes_no_frame(text: bytes) -> None:
     data = b"\x02" + text + b"\x03"
     with pytest.raises(WireError):
         NUMBERS.parse(data)
     counters = NUMBERS.decode(data + b"\x021 1 1\x03").stats
-    assert (counters.frames, counters.bytes_skipped, counters.bad_length) == ({"data": 1}, len(data), 1)
+    assert (counters.frames, counters.bytes_skipped, counters.bad_length) == (
+        {"data": 1},
+        len(data),
+        1,
+    )
 
 
 def test_decimal_tokens_have_signs_and_a_width() -> None:
-    decimal = sensor(Struct("a" / Int16ub, "b" / Int16sb), Tokens(start=b"$", sep=b",", end=b"\n", base=10, width=4))
+    decimal = sensor(
+        Struct("a" / Int16ub, "b" / Int16sb),
+        Tokens(start=b"$", sep=b",", end=b"\n", base=10, width=4),
+    )
     assert decimal.build("data", a=65_535, b=-32_768) == b"$65535,-32768\n"
     assert decimal.build("data", a=7, b=-1) == b"$0007,-0001\n"
     assert decimal.parse(b"$7,-1\n") == decimal.parse(b"$0007,-0001\n")
@@ -78,13 +104,21 @@ def test_a_step_has_as_many_echoes_as_are_sent() -> None:
     data = joined(4, b"1Dh055Dh05&1Dh07" + b"00000" + b"00001&00000&00002")
     values = JOINED.parse(data)
     echoes = [[(echo.range, echo.strength) for echo in step.echoes] for step in values.steps]
-    assert echoes == [[(5432, 5), (0, 0), (0, 0)], [(21816, 5), (5432, 7), (0, 0)], [(0, 0)] * 3, [(0, 1), (0, 0), (0, 2)]]
+    assert echoes == [
+        [(5432, 5), (0, 0), (0, 0)],
+        [(21816, 5), (5432, 7), (0, 0)],
+        [(0, 0)] * 3,
+        [(0, 1), (0, 0), (0, 2)],
+    ]
     assert JOINED.build("data", tens=0, ones=4, time=0, sector=0, steps=values.steps) == data
     spelled = joined(1, b"1Dh05&00000")  # an echo of nothing, which would not be sent
     assert JOINED.build("data", JOINED.parse(spelled)) == spelled
     shown = str(explain(data, JOINED)).splitlines()
     assert next(line for line in shown if "strength 7" in line).startswith("0015  31 44 68 30 37")
-    assert [line[:10].strip() for line in shown if "strength 2" in line or "(end)" in line] == ["002d  30 3", "0034  0a"]
+    assert [line[:10].strip() for line in shown if "strength 2" in line or "(end)" in line] == [
+        "002d  30 3",
+        "0034  0a",
+    ]
 
 
 @pytest.mark.parametrize(
@@ -99,7 +133,16 @@ def test_a_step_has_as_many_echoes_as_are_sent() -> None:
         (1, b"1Dh05&1Dh", 16),
         (1, b"1Dh051Dh05", 15),
     ],
-    ids=["behind all", "before all", "twice", "within", "too many", "too few steps", "cut", "too many steps"],
+    ids=[
+        "behind all",
+        "before all",
+        "twice",
+        "within",
+        "too many",
+        "too few steps",
+        "cut",
+        "too many steps",
+    ],
 )
 def test_marks_that_join_no_echoes_make_no_frame(steps: int, characters: bytes, place: int) -> None:
     data = joined(steps, characters)
@@ -121,8 +164,13 @@ def test_escapes_are_written_where_they_have_to_be_and_read_wherever_they_are() 
 
 
 def test_a_text_behind_another_of_any_content_tells_what_is_a_candidate() -> None:
-    """What only begins with the same mark is not looked at any further, and so not counted as a frame of a wrong length."""
-    made = sensor(Struct("kind" / Bytes(3), "none" / Bytes(0), "name" / Const(b"scan"), "value" / Int8ub), Tokens(start=b"\x02"))
+    """What only begins with the same mark is not looked at any further, and so not counted as a
+    frame of a wrong length.
+    """
+    made = sensor(
+        Struct("kind" / Bytes(3), "none" / Bytes(0), "name" / Const(b"scan"), "value" / Int8ub),
+        Tokens(start=b"\x02"),
+    )
     frames = b"".join(b"\x02%s scan 7\x03" % kind for kind in (b"abc", b"a c", b"   "))
     decoder = made.decoder()
     stream = b"\x02 \x02\x02abc rest 1 2\x03" + frames + b"\x02abc sca"
@@ -137,7 +185,11 @@ def test_a_text_behind_another_of_any_content_tells_what_is_a_candidate() -> Non
 def test_a_fault_has_its_place_on_the_wire() -> None:
     with pytest.raises(WireError) as fault:
         NUMBERS.parse(b"\x0210F XY 1\x03")
-    assert (fault.value.path, fault.value.offset, fault.value.expected) == ("b", 5, "a number of 2 bytes")
+    assert (fault.value.path, fault.value.offset, fault.value.expected) == (
+        "b",
+        5,
+        "a number of 2 bytes",
+    )
     with pytest.raises(WireError) as fault:
         ESCAPED.parse(ESCAPED.example("data")[:-3] + b"\x00\x00\x7e")
     assert fault.value.path == "fcs"

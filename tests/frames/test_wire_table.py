@@ -1,4 +1,6 @@
-"""Wire tables say where the fields are: their offsets and formulas against the compiled layout of example frames."""
+"""Wire tables say where the fields are: their offsets and formulas against the compiled layout of
+example frames.
+"""
 
 from __future__ import annotations
 
@@ -32,7 +34,9 @@ def test_offsets_are_those_of_the_layout(name: str) -> None:
             assert_offsets_are_those_of_the_layout(sensor, frame, engine)
 
 
-def assert_offsets_are_those_of_the_layout(sensor: ls.Sensor, frame: str, engine: CompiledCodec) -> None:
+def assert_offsets_are_those_of_the_layout(
+    sensor: ls.Sensor, frame: str, engine: CompiledCodec
+) -> None:
     data = sensor.example(frame, seed=2)
     layout = engine.tree.layout(data)
     assert isinstance(layout, Layout)
@@ -43,7 +47,13 @@ def assert_offsets_are_those_of_the_layout(sensor: ls.Sensor, frame: str, engine
     checked = 0
     for row in wire_table(sensor.frames[frame]):
         leaf = layout.leaves.get(re.sub(r"\[\w\]", "", row.field))
-        if leaf is None or row.type == "array" or "size(" in row.offset or "?" in row.offset or 0 in leaf.shape:
+        if (
+            leaf is None
+            or row.type == "array"
+            or "size(" in row.offset
+            or "?" in row.offset
+            or 0 in leaf.shape
+        ):
             continue
         names = {**values, **dict.fromkeys(INDICES, 0)}
         origin = evaluated(row.offset, names)
@@ -61,14 +71,23 @@ def test_every_field_has_a_row(name: str) -> None:
         engine = codec(frame)
         if not isinstance(engine, CompiledCodec):
             continue
-        rows = {re.sub(r"\[\w\]", "", row.field) for row in wire_table(frame) if row.type not in NO_FIELDS}
+        rows = {
+            re.sub(r"\[\w\]", "", row.field)
+            for row in wire_table(frame)
+            if row.type not in NO_FIELDS
+        }
         assert rows - {"(constant)"} == set(engine.schema.all_fields)
 
 
 def test_rows_tell_type_unit_and_meaning() -> None:
     rows = {row.field: row for row in wire_table(ls.sensor("robosense-m1").frames["data"])}
     assert rows["blocks[i].channels[j].azimuth"] == WireRow(
-        "38 + 47*i + 9*j", "2", "uint16 be", "blocks[i].channels[j].azimuth", "0.01 deg - 327.68", ""
+        "38 + 47*i + 9*j",
+        "2",
+        "uint16 be",
+        "blocks[i].channels[j].azimuth",
+        "0.01 deg - 327.68",
+        "",
     )
     assert rows["magic"].meaning == "always 55 aa 5a a5"
     assert rows["seconds"].type == "uint48 be"
@@ -79,14 +98,20 @@ def test_rows_tell_type_unit_and_meaning() -> None:
 
 def test_a_part_begins_where_the_one_before_it_ends() -> None:
     rows = {row.field: row for row in wire_table(SHAPES["shape-segments"].frames["data"])}
-    chain = "a chain: first_size bytes, then as many as next_size of the part before says; 0 ends it"
+    chain = (
+        "a chain: first_size bytes, then as many as next_size of the part before says; 0 ends it"
+    )
     assert rows["segments"] == WireRow("9", "size(segments)", "parts", "segments", "", chain)
     assert rows["segments[i].time"].offset == "4 + at(segments[i])"
     assert rows["crc"].offset == "9 + size(segments)"
 
 
 def test_what_some_headers_leave_out_is_marked() -> None:
-    rows = [row for row in wire_table(SHAPES["shape-options"].frames["data"]) if row.field.startswith(("extension", "extra"))]
+    rows = [
+        row
+        for row in wire_table(SHAPES["shape-options"].frames["data"])
+        if row.field.startswith(("extension", "extra"))
+    ]
     assert [(row.field, row.meaning) for row in rows] == [
         ("extension.serial", "if options.extended == 1"),
         ("extension.trim", "if options.extended == 1"),
@@ -94,7 +119,10 @@ def test_what_some_headers_leave_out_is_marked() -> None:
         ("extra.rpm", "if options.kind == 2"),
         ("extra.volts", "if options.kind == 2"),
     ]
-    assert frame_size(SHAPES["shape-options"].frames["data"]) == "9 + size(extension) + size(extra) + 2*(rows * columns)"
+    assert (
+        frame_size(SHAPES["shape-options"].frames["data"])
+        == "9 + size(extension) + size(extra) + 2*(rows * columns)"
+    )
 
 
 def test_a_length_that_follows_from_another_says_from_which() -> None:
@@ -107,7 +135,11 @@ def test_a_length_that_follows_from_another_says_from_which() -> None:
 
 def test_text_has_no_size_of_its_own() -> None:
     rows = {row.field: row for row in wire_table(SHAPES["shape-text"].frames["data"])}
-    assert (rows["angle"].offset, rows["angle"].size, rows["angle"].type) == ("2", "varies", "text up to ','")
+    assert (rows["angle"].offset, rows["angle"].size, rows["angle"].type) == (
+        "2",
+        "varies",
+        "text up to ','",
+    )
     assert rows["strength"].offset == "2 + size(angle) + size(distance)"
 
 
@@ -130,12 +162,23 @@ def test_an_empty_struct_has_no_rows() -> None:
 
 
 def test_wide_integers_are_bytes_and_conditions_have_names() -> None:
-    struct = Struct("kind" / Enum(Int8ul, plain=1), "more" / If(this.kind == "plain", Int8ul), "wide" / BytesInteger(10))
+    struct = Struct(
+        "kind" / Enum(Int8ul, plain=1),
+        "more" / If(this.kind == "plain", Int8ul),
+        "wide" / BytesInteger(10),
+    )
     rows = {row.field: row for row in wire_table(Frame(struct, max_length=12))}
     assert rows["more"].meaning == "if kind == 'plain'"
-    assert (rows["wide"].offset, rows["wide"].size, rows["wide"].type) == ("1 + size(more)", "10", "uint80 be")
+    assert (rows["wide"].offset, rows["wide"].size, rows["wide"].type) == (
+        "1 + size(more)",
+        "10",
+        "uint80 be",
+    )
 
 
 def test_lengths_that_python_alone_calculates_are_said_as_written() -> None:
-    struct = Struct("a" / Int8ul, "inner" / Struct("x" / Bytes(this._.a / 2), "y" / Bytes(lambda c: 1 if c.x else 2)))
+    struct = Struct(
+        "a" / Int8ul,
+        "inner" / Struct("x" / Bytes(this._.a / 2), "y" / Bytes(lambda c: 1 if c.x else 2)),
+    )
     assert [row.size for row in wire_table(Frame(struct, max_length=600))] == ["1", "a / 2", "?"]

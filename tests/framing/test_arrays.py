@@ -1,4 +1,6 @@
-"""Frames in arrays and in one buffer: found where they stand, with the result of one datagram after another."""
+"""Frames in arrays and in one buffer: found where they stand, with the result of one datagram after
+another.
+"""
 
 from __future__ import annotations
 
@@ -34,11 +36,17 @@ EXAMPLES = 10
 
 @functools.cache
 def damaged(name: str) -> NDArray[np.uint8]:
-    """Return frames of one length, (n, size), with a byte changed in every fifth, at places all over the frame."""
+    """Return frames of one length, (n, size), with a byte changed in every fifth, at places all
+    over the frame.
+    """
     sensor = load_sensor(name)
     frames = [sensor.example(sensor.data_frame, seed=seed) for seed in range(EXAMPLES)]
     size = max(map(len, frames), key=[len(frame) for frame in frames].count)
-    rows = np.frombuffer(b"".join(frame for frame in frames if len(frame) == size), np.uint8).reshape(-1, size).copy()
+    rows = (
+        np.frombuffer(b"".join(frame for frame in frames if len(frame) == size), np.uint8)
+        .reshape(-1, size)
+        .copy()
+    )
     for row in range(0, len(rows), 5):
         rows[row, row * size // len(rows)] ^= 0x41
     return rows
@@ -49,19 +57,28 @@ def facts(spans: Frames) -> list[tuple[str, int, bytes, int]]:
 
 
 @each_shape
-@pytest.mark.parametrize("distance", ["uneven", *(pytest.param(name, marks=pytest.mark.slow) for name in ("none", "even"))])
+@pytest.mark.parametrize(
+    "distance",
+    ["uneven", *(pytest.param(name, marks=pytest.mark.slow) for name in ("none", "even"))],
+)
 def test_datagrams_in_one_buffer_are_those_one_after_another(name: str, distance: str) -> None:
     sensor = load_sensor(name)
     rows = damaged(name)
     count, size = rows.shape
     one_by_one, together = sensor.decoder(stream=False), sensor.decoder(stream=False)
-    wanted = [(f.frame, f.offset, f.data, f.gap) for row in rows for f in one_by_one.feed(row.tobytes())]
-    spare = {"none": 0, "even": 58, "uneven": np.random.default_rng(1).integers(0, 30, count)}[distance]
+    wanted = [
+        (f.frame, f.offset, f.data, f.gap) for row in rows for f in one_by_one.feed(row.tobytes())
+    ]
+    spare = {"none": 0, "even": 58, "uneven": np.random.default_rng(1).integers(0, 30, count)}[
+        distance
+    ]
     starts = np.cumsum(np.full(count, size) + spare) - size
     buffer = np.random.default_rng(2).integers(0, 256, int(starts[-1]) + size, np.uint8)
     for start, row in zip(starts, rows, strict=True):
         buffer[start : start + size] = row
-    found = together.placed(buffer, starts.astype(np.intp), np.full(count, size, np.intp), np.full(count, -1, np.int64))
+    found = together.placed(
+        buffer, starts.astype(np.intp), np.full(count, size, np.intp), np.full(count, -1, np.int64)
+    )
     assert facts(found) == wanted
     assert together.stats == one_by_one.stats
 
@@ -82,14 +99,20 @@ def test_arrays_of_sound_frames_alone_and_with_damaged_ones_in_turn(name: str) -
     sensor = load_sensor(name)
     mixed = damaged(name)
     judge = sensor.decoder(stream=False)
-    sound = np.array([row for row in mixed if judge.feed(row.tobytes())]).reshape(-1, mixed.shape[1])
+    sound = np.array([row for row in mixed if judge.feed(row.tobytes())]).reshape(
+        -1, mixed.shape[1]
+    )
     arrays = [sound, mixed, sound, sound, mixed[:1], sound[:1], mixed[-1:], sound[::-1], mixed[:0]]
     together, one_by_one = sensor.decoder(stream=False), sensor.decoder(stream=False)
     found = [together.datagrams(array) for array in arrays]
     listed = [one_by_one.datagrams([row.tobytes()]) for array in arrays for row in array]
-    assert [fact for spans in found for fact in facts(spans)] == [fact for spans in listed for fact in facts(spans)]
+    assert [fact for spans in found for fact in facts(spans)] == [
+        fact for spans in listed for fact in facts(spans)
+    ]
     assert together.stats == one_by_one.stats
-    assert not len(sound) or (found[5].layout is not None) == is_compiled(sensor.frames[sensor.data_frame])
+    assert not len(sound) or (found[5].layout is not None) == is_compiled(
+        sensor.frames[sensor.data_frame]
+    )
     streams = [PacketStream(sensor, sensor.data_frame, Counters()) for _ in range(3)]
     whole, wanted = streams[0].add(found, whole=True), streams[1].add(listed, whole=True)
     parts = joined([streams[2].add([spans], whole=True) for spans in found])
@@ -123,7 +146,10 @@ def test_clocks_run_on_over_wraps_and_steps_back(wraps_at: float) -> None:
     pieces = [parts.push(true[a:b] % turn, nobody[a:b]) for a, b in pairwise(cuts)]
     np.testing.assert_array_equal(np.concatenate(pieces), found)
     silent = Unwrapper(wraps_at)
-    pieces = [silent.push(true[a:b] % turn, repeated(0, b - a)) for a, b in pairwise([*range(0, 5000, 3), 5000])]
+    pieces = [
+        silent.push(true[a:b] % turn, repeated(0, b - a))
+        for a, b in pairwise([*range(0, 5000, 3), 5000])
+    ]
     np.testing.assert_array_equal(np.concatenate(pieces), found)
 
 
@@ -140,8 +166,14 @@ def test_a_clock_that_is_a_function_is_read_as_the_function_says(spread: int) ->
     table = codec(sensor.frames["data"]).table([row.tobytes() for row in rows])
     for some in (np.arange(400), np.arange(1), np.arange(150, 250)):
         batch = Batch(table.take(some), np.zeros(len(some), np.bool_))
-        seconds = [np.broadcast_to(np.asarray(term).reshape(-1), len(some)) for term in sensor.clock.source(Fields(batch))]
-        assert clock_ns(sensor, batch).tolist() == sum(np.rint(term * 1e9).astype(np.int64) for term in seconds).tolist()
+        seconds = [
+            np.broadcast_to(np.asarray(term).reshape(-1), len(some))
+            for term in sensor.clock.source(Fields(batch))
+        ]
+        assert (
+            clock_ns(sensor, batch).tolist()
+            == sum(np.rint(term * 1e9).astype(np.int64) for term in seconds).tolist()
+        )
 
 
 @pytest.mark.parametrize(
@@ -159,8 +191,15 @@ def test_a_clock_that_is_a_function_is_read_as_the_function_says(spread: int) ->
         lambda f: (f.angle > 7) | (f.mode == 1),
     ],
 )
-def test_plausible_frames_of_an_array_are_those_that_the_function_says(plausible: Callable[[Any], Any]) -> None:
-    frame = Frame(Struct("sync" / Const(b"\xa5"), "mode" / Int8ul, "angle" / Int16ub), data=True, max_length=4, plausible=plausible)
+def test_plausible_frames_of_an_array_are_those_that_the_function_says(
+    plausible: Callable[[Any], Any],
+) -> None:
+    frame = Frame(
+        Struct("sync" / Const(b"\xa5"), "mode" / Int8ul, "angle" / Int16ub),
+        data=True,
+        max_length=4,
+        plausible=plausible,
+    )
     sensor = dataclasses.replace(SHAPES["shape-bits"], frames={"data": frame})
     rows = np.random.default_rng(5).integers(0, 256, (70_000, 4), np.uint8)
     rows[:, 0] = 0xA5

@@ -1,4 +1,6 @@
-"""Framing: inputs that have broken other parsers, and single mechanisms; the rule as a whole is held in tests/engine."""
+"""Framing: inputs that have broken other parsers, and single mechanisms; the rule as a whole is
+held in tests/engine.
+"""
 
 from __future__ import annotations
 
@@ -38,20 +40,45 @@ def conversation(sensor: Sensor, *, seed: int = 0, length: int = LENGTH) -> byte
 @pytest.mark.parametrize("sensor", SHAPES.values(), ids=SHAPES)
 def test_datagrams_of_any_size_raise_on_nothing(sensor: Sensor) -> None:
     frame = sensor.example(sensor.data_frame, seed=3)
-    data = [b"", frame[:1], frame[:-1], frame, frame + b"\x00", bytes(65507), b"\xff" * 65507, frame, b"\x00" * len(frame)]
+    data = [
+        b"",
+        frame[:1],
+        frame[:-1],
+        frame,
+        frame + b"\x00",
+        bytes(65507),
+        b"\xff" * 65507,
+        frame,
+        b"\x00" * len(frame),
+    ]
     assert_backends_agree(sensor, data)
     decoder = sensor.decoder(stream=False)
     found = [item for datagram in data for item in decoder.feed(datagram)] + decoder.finish()
     stats = decoder.stats
-    assert stats.bytes_in == sum(map(len, data)) == sum(len(item.data) for item in found) + stats.bytes_skipped
-    if sensor.frames[sensor.data_frame].after is None and sensor.frames[sensor.data_frame].confirm == 1:
+    assert (
+        stats.bytes_in
+        == sum(map(len, data))
+        == sum(len(item.data) for item in found) + stats.bytes_skipped
+    )
+    if (
+        sensor.frames[sensor.data_frame].after is None
+        and sensor.frames[sensor.data_frame].confirm == 1
+    ):
         assert [item.data for item in found].count(frame) == 2
 
 
-@pytest.mark.parametrize("sensor", [sensor for sensor in SHAPES.values() if sensor.datagrams], ids=lambda sensor: sensor.id)
+@pytest.mark.parametrize(
+    "sensor",
+    [sensor for sensor in SHAPES.values() if sensor.datagrams],
+    ids=lambda sensor: sensor.id,
+)
 def test_each_datagram_is_judged_by_its_own_bytes_alone(sensor: Sensor) -> None:
     streams = hostile.streams(Subject(sensor), length=1000)
-    datagrams = [*streams["heads of frames"], *streams["random headers"], *streams["damaged frames"]]
+    datagrams = [
+        *streams["heads of frames"],
+        *streams["random headers"],
+        *streams["damaged frames"],
+    ]
     together, each = sensor.decoder(stream=False), sensor.decoder(stream=False)
     found = together.datagrams(datagrams)
     alone = [each.datagrams([datagram]) for datagram in datagrams]
@@ -66,12 +93,20 @@ def test_a_new_header_is_gone_through_once() -> None:
         asked.append(1)
         return int(context.n)
 
-    counts = Struct("sync" / Const(b"\x5a\xa5"), "n" / Int8ub, "a" / Array(first, Byte), *(f"n{i}" / Int8ub for i in range(4)))
+    counts = Struct(
+        "sync" / Const(b"\x5a\xa5"),
+        "n" / Int8ub,
+        "a" / Array(first, Byte),
+        *(f"n{i}" / Int8ub for i in range(4)),
+    )
     frame = counts + Struct(*(f"a{i}" / Array(getattr(this, f"n{i}"), Byte) for i in range(4)))
     engine = codec(Frame(frame, max_length=2000))
     assert isinstance(engine, CompiledCodec)
     asked.clear()
-    assert engine.tree.layout(bytes.fromhex("5aa50100 01020304".replace(" ", "")) + bytes(20)) is not None
+    assert (
+        engine.tree.layout(bytes.fromhex("5aa50100 01020304".replace(" ", "")) + bytes(20))
+        is not None
+    )
     assert len(asked) == 1
 
 
@@ -85,14 +120,19 @@ def test_idle_between_chunks_is_the_rule_on_each_part(sensor: Sensor) -> None:
     books, expected, base = Books(sensor), [], 0
     for part in parts:
         books.feed(part).finish()
-        expected += [(name, base + offset, frame) for name, offset, frame in Oracle(sensor, part).frames()]
+        expected += [
+            (name, base + offset, frame) for name, offset, frame in Oracle(sensor, part).frames()
+        ]
         base += len(part)
     assert books.found == expected
 
 
 @pytest.mark.slow
 def test_decoders_in_threads_do_not_know_of_each_other() -> None:
-    work = [(sensor, damaged(conversation(sensor, length=600), 5e-3, 1)[:1200]) for sensor in STREAMS.values()]
+    work = [
+        (sensor, damaged(conversation(sensor, length=600), 5e-3, 1)[:1200])
+        for sensor in STREAMS.values()
+    ]
     alone = [decoded(*item) for item in work]
     with ThreadPoolExecutor(8) as pool:
         assert list(pool.map(lambda item: decoded(*item), work)) == alone
@@ -101,11 +141,30 @@ def test_decoders_in_threads_do_not_know_of_each_other() -> None:
 def test_a_frame_inside_a_frame_belongs_to_it() -> None:
     sensor = SHAPES["shape-options"]
     inner = sensor.build(
-        "data", options=dict(extended=0, coarse=0, kind=0), rows=0, columns=0, angle=0, distances=[], extension=None, extra=None
+        "data",
+        options=dict(extended=0, coarse=0, kind=0),
+        rows=0,
+        columns=0,
+        angle=0,
+        distances=[],
+        extension=None,
+        extra=None,
     )
-    words = [int.from_bytes(inner[spot : spot + 2].ljust(2, b"\0"), "little") for spot in range(0, len(inner), 2)]
+    words = [
+        int.from_bytes(inner[spot : spot + 2].ljust(2, b"\0"), "little")
+        for spot in range(0, len(inner), 2)
+    ]
     options = dict(extended=0, coarse=0, kind=0)
-    outer = sensor.build("data", options=options, rows=1, columns=len(words), angle=100, distances=words, extension=None, extra=None)
+    outer = sensor.build(
+        "data",
+        options=options,
+        rows=1,
+        columns=len(words),
+        angle=100,
+        distances=words,
+        extension=None,
+        extra=None,
+    )
     assert inner[:8] in outer
     assert [data for _, _, data in decoded(sensor, outer + inner)] == [outer, inner]
     broken = outer[:-1] + bytes([outer[-1] ^ 1])
@@ -114,7 +173,12 @@ def test_a_frame_inside_a_frame_belongs_to_it() -> None:
 
 def test_a_false_header_whose_length_swallows_good_frames_gives_them_back() -> None:
     sensor = SHAPES["shape-count"]
-    frames = [sensor.build("data", count=2, first=0, last=100, samples=[dict(distance=0x1234, quality=1)] * 2) for _ in range(5)]
+    frames = [
+        sensor.build(
+            "data", count=2, first=0, last=100, samples=[dict(distance=0x1234, quality=1)] * 2
+        )
+        for _ in range(5)
+    ]
     data = b"\xaa\x55\x28" + b"".join(frames)
     books = Books(sensor).feed(data)
     assert books.found == []
@@ -153,14 +217,27 @@ def test_a_datagram_with_a_wrong_constant_is_not_one_of_wrong_length() -> None:
     sensor = ls.sensor("velodyne-vlp16")
     (good,) = ls.simulate(sensor, 1)
     first, inner = b"\xff\xef" + good[2:], good[:100] + b"\xff\xef" + good[102:]
-    for data, wrong in (([first], "bad_constant"), ([inner], "bad_constant"), ([good[:-1]], "bad_length"), ([b"\xff"], "bad_length")):
+    for data, wrong in (
+        ([first], "bad_constant"),
+        ([inner], "bad_constant"),
+        ([good[:-1]], "bad_length"),
+        ([b"\xff"], "bad_length"),
+    ):
         for backend in ("numpy", "construct"):
             decoder = sensor.decoder(stream=False, backend=backend)
             assert decoder.feed(data[0]) == []
-            counted = {name: number for name, number in decoder.stats.to_dict().items() if name.startswith("bad_") and number}
+            counted = {
+                name: number
+                for name, number in decoder.stats.to_dict().items()
+                if name.startswith("bad_") and number
+            }
             assert counted == {wrong: 1}, (backend, data[0][:4])
     for name in ("velodyne-vlp16", "slamtec-rplidar-a1"):
-        noisy = ls.sensor(name).configure(**({"answer": "node"} if name.endswith("a1") else {})).decoder(stream=True)
+        noisy = (
+            ls.sensor(name)
+            .configure(**({"answer": "node"} if name.endswith("a1") else {}))
+            .decoder(stream=True)
+        )
         noisy.feed(b"\xff\xee" * 2000 + random.Random(1).randbytes(20_000))
         assert noisy.stats.bad_constant == 0
 
@@ -178,9 +255,22 @@ def test_what_a_descriptor_announces_is_what_is_looked_for() -> None:
     sensor = SHAPES["shape-modes"]
     plain, express = sensor.example("plain", seed=1), sensor.example("express", seed=1)
     begin_plain, begin_express = sensor.example("begin_plain"), sensor.example("begin_express")
-    data = plain + begin_plain + plain + plain + express + begin_express + express + plain + begin_plain + plain
+    data = (
+        plain
+        + begin_plain
+        + plain
+        + plain
+        + express
+        + begin_express
+        + express
+        + plain
+        + begin_plain
+        + plain
+    )
     assert decoded(sensor, data) == Oracle(sensor, data).frames()
-    assert [found.frame for found in sensor.split(begin_plain + plain + begin_express + express)] == [
+    assert [
+        found.frame for found in sensor.split(begin_plain + plain + begin_express + express)
+    ] == [
         "begin_plain",
         "plain",
         "begin_express",
@@ -197,21 +287,31 @@ def test_runs_of_weak_frames_count_whole_or_not_at_all() -> None:
     frames = [sensor.example("data", seed=seed) for seed in range(6)]
     for number in range(7):
         data = b"\x00" * 7 + b"".join(frames[:number]) + b"\x00" * 7
-        assert [data for _, _, data in decoded(sensor, data)] == (frames[:number] if number >= 3 else [])
+        assert [data for _, _, data in decoded(sensor, data)] == (
+            frames[:number] if number >= 3 else []
+        )
         assert decoded(sensor, data) == Oracle(sensor, data).frames()
 
 
 def test_a_frame_that_comes_first_in_the_order_ends_a_run() -> None:
     sensor = SHAPES["shape-weak"]
-    node, info = sensor.example("data", seed=1), sensor.build("info", revision=0x12, temperature=0x34)
+    node, info = (
+        sensor.example("data", seed=1),
+        sensor.build("info", revision=0x12, temperature=0x34),
+    )
     assert sensor.parse(info, frame="data")
     for before in range(5):
         data = node * before + info + node * 2 + info + node * 3
         assert decoded(sensor, data) == Oracle(sensor, data).frames()
-        assert [name for name, _, _ in decoded(sensor, data)] == ["data"] * (before if before >= 3 else 0) + ["info", "info"] + ["data"] * 3
+        assert [name for name, _, _ in decoded(sensor, data)] == ["data"] * (
+            before if before >= 3 else 0
+        ) + ["info", "info"] + ["data"] * 3
 
 
-@pytest.mark.parametrize("name", ["shape-count", "shape-options", "shape-state", "shape-modes", "shape-text", "shape-commands"])
+@pytest.mark.parametrize(
+    "name",
+    ["shape-count", "shape-options", "shape-state", "shape-modes", "shape-text", "shape-commands"],
+)
 def test_a_frame_is_out_with_its_last_byte(name: str) -> None:
     data = Subject(SHAPES[name]).stream()
     decoder = SHAPES[name].decoder()
@@ -229,10 +329,15 @@ def test_a_line_says_what_things_are() -> None:
     assert repr(frame) == f"Frame({frame.max_length} bytes: {', '.join(sensor.parse(data))})"
     assert repr(sensor.frames["data"]).startswith("Frame(data, up to ")
     assert repr(ls.sensor("cspc-m1c1-mini").frames["command"]).startswith("Frame(out, 4 bytes: ")
-    assert repr(decoder) == f"Decoder(cspc-coin-d4, stream, auto: 1 info frames, bytes_in {len(data)})"
+    assert (
+        repr(decoder) == f"Decoder(cspc-coin-d4, stream, auto: 1 info frames, bytes_in {len(data)})"
+    )
     assert repr(decoder.stats) == f"Counters(1 info frames, bytes_in {len(data)})"
     assert repr(found) == f"Found(info at byte 0, {len(data)} bytes: {data[:8].hex(' ')} ...)"
-    assert repr(ls.explain(data, sensor)) == f"Explanation(cspc-coin-d4 info, {len(data)} bytes: valid)"
+    assert (
+        repr(ls.explain(data, sensor))
+        == f"Explanation(cspc-coin-d4 info, {len(data)} bytes: valid)"
+    )
 
 
 def test_completion_offers_public_names_alone() -> None:
@@ -242,9 +347,14 @@ def test_completion_offers_public_names_alone() -> None:
 
 def test_a_frame_that_begins_with_a_free_byte_may_be_cut_anywhere() -> None:
     """The sync bytes come second: where only the free byte has arrived, a frame may begin."""
-    struct = Struct("free" / Int8ub, "magic" / Const(b"\x55\xaa"), "value" / Int16ub, "sum" / Int8ub)
+    struct = Struct(
+        "free" / Int8ub, "magic" / Const(b"\x55\xaa"), "value" / Int16ub, "sum" / Int8ub
+    )
     made = against_construct.sensor(Checksummed(struct, field="sum", algorithm=Sum(8)))
-    frames = [made.build("data", free=37 * number % 256, value=999 * number % 65_536) for number in range(12)]
+    frames = [
+        made.build("data", free=37 * number % 256, value=999 * number % 65_536)
+        for number in range(12)
+    ]
     data = b"\x01\x02".join(frames)
     whole = [(found.offset, found.data) for found in made.split(data)]
     assert [frame for _, frame in whole] == frames

@@ -1,4 +1,6 @@
-"""Candidates of many lengths are judged together: with the same frames and counters as layout by layout, and with little work."""
+"""Candidates of many lengths are judged together: with the same frames and counters as layout by
+layout, and with little work.
+"""
 
 from __future__ import annotations
 
@@ -27,7 +29,8 @@ MAX_SAMPLES = 40
 SAMPLES = "samples" / Array(this.count, Struct("distance" / Int16ul, "quality" / Int8ul))
 #: Such a number of layouts is never met.
 NEVER = 1 << 30
-#: False headers of a stream, and the calls of functions for each of them. Layout by layout there are about 75.
+#: False headers of a stream, and the calls of functions for each of them. Layout by layout there
+#: are about 75.
 HEADERS = 1200
 MAX_CALLS = 20
 
@@ -40,18 +43,29 @@ def plausible(f: Fields) -> Any:
 def with_frame(struct: Any, samples: int = MAX_SAMPLES) -> Sensor:
     """Return a sensor with one type of frames, of so many samples at most."""
     frame = Frame(struct, max_length=10 + 3 * samples, plausible=plausible)
-    return dataclasses.replace(COUNT, id="shape-made", frames={"data": frame}, points=None, simulation=Simulation(), scan=None)
+    return dataclasses.replace(
+        COUNT,
+        id="shape-made",
+        frames={"data": frame},
+        points=None,
+        simulation=Simulation(),
+        scan=None,
+    )
 
 
 def summed_behind(algorithm: Checksum, absent: tuple[int, ...] = ()) -> Sensor:
     """Return a sensor with the checksum at the end of its frames."""
-    struct = Struct("header" / Const(b"\xaa\x55"), "count" / Int8ul, "first" / Int16ul, SAMPLES, "sum" / Int16ul)
+    struct = Struct(
+        "header" / Const(b"\xaa\x55"), "count" / Int8ul, "first" / Int16ul, SAMPLES, "sum" / Int16ul
+    )
     return with_frame(Checksummed(struct, field="sum", algorithm=algorithm, absent=absent))
 
 
 def summed_before(samples: int = MAX_SAMPLES) -> Sensor:
     """Return a sensor with the checksum before its samples."""
-    struct = Struct("header" / Const(b"\xaa\x55"), "count" / Int8ul, "first" / Int16ul, "sum" / Int16ul, SAMPLES)
+    struct = Struct(
+        "header" / Const(b"\xaa\x55"), "count" / Int8ul, "first" / Int16ul, "sum" / Int16ul, SAMPLES
+    )
     return with_frame(Checksummed(struct, field="sum", algorithm=WordXor(5, (1, 2))), samples)
 
 
@@ -90,7 +104,9 @@ def books(sensor: Sensor, data: bytes, piece: int) -> tuple[list[Any], str]:
 
 
 @pytest.mark.parametrize("name", SENSORS)
-def test_the_frames_and_counters_are_those_of_each_layout_by_itself(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_frames_and_counters_are_those_of_each_layout_by_itself(
+    name: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
     sensor = SENSORS[name]
     judged = 0
     judge = Together.judge
@@ -129,7 +145,9 @@ def test_what_computes_checksums_is_asked_for_all_lengths() -> None:
     assert "bad_checksum" not in found[0][1]
 
 
-def test_a_checksum_that_zeros_change_is_computed_length_by_length(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_checksum_that_zeros_change_is_computed_length_by_length(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     monkeypatch.setattr(Together, "judge", None)
     sensor = summed_behind(Crc(16, 0x1021))
     data = false_headers(sensor, 3000)
@@ -138,12 +156,16 @@ def test_a_checksum_that_zeros_change_is_computed_length_by_length(monkeypatch: 
 
 def test_two_engines_of_one_frame_type_share_its_layouts() -> None:
     frame = summed_behind(Sum(16)).frames["data"]
-    headers = [b"\xaa\x55" + bytes([count]) + bytes(3 * MAX_SAMPLES + 4) for count in range(MAX_SAMPLES)]
+    headers = [
+        b"\xaa\x55" + bytes([count]) + bytes(3 * MAX_SAMPLES + 4) for count in range(MAX_SAMPLES)
+    ]
     data = np.frombuffer(b"".join(headers), np.uint8)
     offsets = np.arange(len(headers)) * len(headers[0])
     first = frame_engine.CompiledCodec(frame)
     second = frame_engine.CompiledCodec(frame)
-    some = first.survey(data, offsets[1:]).status  # not the layout without samples, which has fewer tests
+    some = first.survey(
+        data, offsets[1:]
+    ).status  # not the layout without samples, which has fewer tests
     every = second.survey(data, offsets).status
     assert every[1:].tolist() == some.tolist()
 

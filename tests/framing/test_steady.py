@@ -1,4 +1,6 @@
-"""Frames that follow one another are found without a search: with the same frames and counters as the search has."""
+"""Frames that follow one another are found without a search: with the same frames and counters as
+the search has.
+"""
 
 from __future__ import annotations
 
@@ -19,11 +21,24 @@ from tests.shapes import SHAPES
 
 TWINS = SHAPES["shape-twins"]
 #: the short type first: it begins where each of the long ones does.
-SHORT_FIRST = dataclasses.replace(TWINS, id="shape-short-first", frames=dict(reversed(TWINS.frames.items())))
-STREAMS = {name: sensor for name, sensor in SHAPES.items() if not sensor.datagrams} | {SHORT_FIRST.id: SHORT_FIRST}
+SHORT_FIRST = dataclasses.replace(
+    TWINS, id="shape-short-first", frames=dict(reversed(TWINS.frames.items()))
+)
+STREAMS = {name: sensor for name, sensor in SHAPES.items() if not sensor.datagrams} | {
+    SHORT_FIRST.id: SHORT_FIRST
+}
 
 #: Streams that are tried in the quick tier: of each way to find frames.
-QUICK_STREAMS = ("shape-count", "shape-bits", "shape-weak", "shape-twins", SHORT_FIRST.id, "shape-modes", "shape-options", "shape-text")
+QUICK_STREAMS = (
+    "shape-count",
+    "shape-bits",
+    "shape-weak",
+    "shape-twins",
+    SHORT_FIRST.id,
+    "shape-modes",
+    "shape-options",
+    "shape-text",
+)
 
 
 def as_it_comes(data: bytes, size: int, seed: int) -> list[bytes]:
@@ -41,7 +56,13 @@ def is_steady(frames: Frames) -> bool:
     return isinstance(frames.places, range)
 
 
-@pytest.mark.parametrize("name", [pytest.param(name, marks=() if name in QUICK_STREAMS else pytest.mark.slow) for name in STREAMS])
+@pytest.mark.parametrize(
+    "name",
+    [
+        pytest.param(name, marks=() if name in QUICK_STREAMS else pytest.mark.slow)
+        for name in STREAMS
+    ],
+)
 @pytest.mark.parametrize("rate", [0.0, pytest.param(1e-3, marks=pytest.mark.soak), 5e-3])
 def test_pieces_of_a_few_frames_give_what_the_whole_gives(name: str, rate: float) -> None:
     sensor = STREAMS[name]
@@ -49,7 +70,9 @@ def test_pieces_of_a_few_frames_give_what_the_whole_gives(name: str, rate: float
     for seed in range(1 if rate == 0 else 2):
         other = Subject(sensor).stream(seed=seed, rounds=1)
         train = sensor.example(sensor.data_frame, seed=seed) * 12 + other
-        train += b"".join(sensor.example(sensor.data_frame, seed=number) for number in range(20)) + other
+        train += (
+            b"".join(sensor.example(sensor.data_frame, seed=number) for number in range(20)) + other
+        )
         data = damaged(train, rate, seed)
         whole = Books(sensor).feed(data)
         expected = whole.finish()
@@ -78,7 +101,11 @@ def test_long_pieces_are_taken_up_to_the_first_damage(faults: int) -> None:
         data[spot : spot + source.randrange(2)] = source.randbytes(source.randint(0, 30))
     whole, parts = TWINS.decoder(), TWINS.decoder()
     found = [*whole.frames(bytes(data)), *whole.rest()]
-    pieces = [spans for start in range(0, len(data), 5000) for spans in parts.frames(bytes(data[start : start + 5000]))]
+    pieces = [
+        spans
+        for start in range(0, len(data), 5000)
+        for spans in parts.frames(bytes(data[start : start + 5000]))
+    ]
     pieces += parts.rest()
     for name in ("offsets", "gaps", "kinds"):
         assert (
@@ -102,8 +129,15 @@ def test_a_type_that_comes_first_is_looked_for_at_each_frame() -> None:
 def test_a_type_that_comes_first_is_looked_for_where_only_some_frames_begin_like_it() -> None:
     marked = Struct("magic" / Const(b"\x5a\xa5\x07"), "check" / Bytes(1))
     info = Checksummed(marked, field="check", algorithm=Xor())
-    sensor = dataclasses.replace(TWINS, id="shape-some", frames={"info": Frame(info, max_length=4), "data": TWINS.frames["data"]})
-    frames = [TWINS.build("data", angle=angle, distances=[1, 2, 3, 4, 5, 6]) for angle in (7, 8, 263, 9, 7, 10) * 4]
+    sensor = dataclasses.replace(
+        TWINS,
+        id="shape-some",
+        frames={"info": Frame(info, max_length=4), "data": TWINS.frames["data"]},
+    )
+    frames = [
+        TWINS.build("data", angle=angle, distances=[1, 2, 3, 4, 5, 6])
+        for angle in (7, 8, 263, 9, 7, 10) * 4
+    ]
     decoder = sensor.decoder()
     for start in range(0, len(frames), 3):
         decoder.frames(b"".join(frames[start : start + 3]))
@@ -121,7 +155,10 @@ def test_what_cannot_become_a_frame_is_not_waited_for() -> None:
 
 def test_a_shorter_frame_behind_the_others_is_not_waited_for() -> None:
     count = SHAPES["shape-count"]
-    long, short = (count.build("data", first=0, last=9, samples=[dict(distance=1, quality=2)] * number) for number in (9, 2))
+    long, short = (
+        count.build("data", first=0, last=9, samples=[dict(distance=1, quality=2)] * number)
+        for number in (9, 2)
+    )
     decoder = count.decoder()
     decoder.frames(long * 3)
     assert sum(map(len, decoder.frames(long * 3 + short))) == 4
@@ -137,4 +174,6 @@ def test_few_rows_have_the_registers_that_many_have(width: int, refin: bool) -> 
         many = source.integers(0, 256, (FEW // length + 1, length + 2), dtype=np.uint8)
         spans = ((0, 1), (2, length + 1)) if length > 1 else ((1, 2),)
         together = registers(many, spans, start, width, poly, refin)
-        assert registers(many[:5], spans, start, width, poly, refin).tolist() == together[:5].tolist()
+        assert (
+            registers(many[:5], spans, start, width, poly, refin).tolist() == together[:5].tolist()
+        )

@@ -1,4 +1,6 @@
-"""`make fuzz INPUTS=10000000 SEED=1`: hostile input for everything that reads; the same command goes on where it was stopped."""
+"""`make fuzz INPUTS=10000000 SEED=1`: hostile input for everything that reads; the same command
+goes on where it was stopped.
+"""
 
 from __future__ import annotations
 
@@ -21,20 +23,59 @@ from tests.fuzz import slug
 ROOT = Path(__file__).parents[2]
 #: seconds without a word after which a job is stopped: nothing that it may do takes as long.
 SILENCE = 300.0
-#: groups whose inputs are of kilobytes: atheris keeps each that it made until the end, which for a million of these is all the memory.
+#: groups whose inputs are of kilobytes: atheris keeps each that it made until the end, which for a
+#: million of these is all the memory.
 SEEDED = {"capture", "file", "log", "recording"}
 
 
 def arguments() -> argparse.Namespace:
     """The command line."""
     parser = argparse.ArgumentParser(prog="make fuzz", description=__doc__)
-    parser.add_argument("--inputs", metavar="N", type=int, default=1_000_000, help="in all, spread over the targets; default: a million")
-    parser.add_argument("--seed", metavar="N", type=int, default=0, help="of everything that is drawn; another one makes other inputs")
-    parser.add_argument("--only", metavar="NAME", action="append", help="targets whose names begin so, such as frame or 'stream ldrobot'")
-    parser.add_argument("--jobs", metavar="N", type=int, default=os.cpu_count(), help="processes at a time; default: one for each core")
-    parser.add_argument("--engine", choices=["atheris", "seeded"], help="what chooses inputs; default: atheris where it is installed")
-    parser.add_argument("--folder", metavar="DIR", type=Path, default=ROOT / ".fuzz", help="for corpus and findings; default: .fuzz")
-    parser.add_argument("--again", metavar="FILE", type=Path, help="read the input of a finding once more, and let it fail in the open")
+    parser.add_argument(
+        "--inputs",
+        metavar="N",
+        type=int,
+        default=1_000_000,
+        help="in all, spread over the targets; default: a million",
+    )
+    parser.add_argument(
+        "--seed",
+        metavar="N",
+        type=int,
+        default=0,
+        help="of everything that is drawn; another one makes other inputs",
+    )
+    parser.add_argument(
+        "--only",
+        metavar="NAME",
+        action="append",
+        help="targets whose names begin so, such as frame or 'stream ldrobot'",
+    )
+    parser.add_argument(
+        "--jobs",
+        metavar="N",
+        type=int,
+        default=os.cpu_count(),
+        help="processes at a time; default: one for each core",
+    )
+    parser.add_argument(
+        "--engine",
+        choices=["atheris", "seeded"],
+        help="what chooses inputs; default: atheris where it is installed",
+    )
+    parser.add_argument(
+        "--folder",
+        metavar="DIR",
+        type=Path,
+        default=ROOT / ".fuzz",
+        help="for corpus and findings; default: .fuzz",
+    )
+    parser.add_argument(
+        "--again",
+        metavar="FILE",
+        type=Path,
+        help="read the input of a finding once more, and let it fail in the open",
+    )
     parser.add_argument("--job", metavar="TARGET", help=argparse.SUPPRESS)
     given = parser.parse_args()
     given.engine = given.engine or ("atheris" if importlib.util.find_spec("atheris") else "seeded")
@@ -52,11 +93,17 @@ def main() -> int:
     with tempfile.TemporaryDirectory() as scratch:
         chosen = listed(Path(scratch), given.only)
     names = list(chosen)
-    done = {path.stem: json.loads(path.read_text()) for path in (given.folder / f"done-{given.seed}").glob("*.json")}
+    done = {
+        path.stem: json.loads(path.read_text())
+        for path in (given.folder / f"done-{given.seed}").glob("*.json")
+    }
     shares = spread(chosen, given.inputs)
     waiting = [name for name in names if done.get(slug(name), {}).get("asked") != shares[name]]
     before = len(names) - len(waiting)
-    print(f"{len(names)} targets, {sum(shares.values())} inputs, {given.engine}, seed {given.seed}; {before} targets done before")
+    print(
+        f"{len(names)} targets, {sum(shares.values())} inputs, {given.engine}, seed {given.seed};"
+        f" {before} targets done before"
+    )
     run(given, waiting, shares)
     return told(given, names)
 
@@ -67,20 +114,32 @@ def listed(folder: Path, only: list[str] | None) -> dict[str, float]:
     from tests.fuzz.targets import targets
 
     known = targets(folder, every_sensor().values())
-    found = {name: target.cost for name, target in known.items() if not only or name.startswith(tuple(only))}
+    found = {
+        name: target.cost
+        for name, target in known.items()
+        if not only or name.startswith(tuple(only))
+    }
     if not found:
         sys.exit(f"no target begins so; there are {', '.join(known)}")
     return found
 
 
 def spread(costs: dict[str, float], number: int) -> dict[str, int]:
-    """How many inputs each target gets: the shares of the groups, and within one the fewer the more they cost."""
+    """How many inputs each target gets: the shares of the groups, and within one the fewer the more
+    they cost.
+    """
     from tests.fuzz.targets import SHARES
 
     of = {name: name.partition(" ")[0] for name in costs}
     whole = sum(SHARES[group] for group in set(of.values()))
-    parts = {group: sum(1 / cost for name, cost in costs.items() if of[name] == group) for group in of.values()}
-    return {name: max(1, round(number * SHARES[of[name]] / whole / cost / parts[of[name]])) for name, cost in costs.items()}
+    parts = {
+        group: sum(1 / cost for name, cost in costs.items() if of[name] == group)
+        for group in of.values()
+    }
+    return {
+        name: max(1, round(number * SHARES[of[name]] / whole / cost / parts[of[name]]))
+        for name, cost in costs.items()
+    }
 
 
 def run(given: argparse.Namespace, waiting: list[str], shares: dict[str, int]) -> None:
@@ -104,7 +163,10 @@ def run(given: argparse.Namespace, waiting: list[str], shares: dict[str, int]) -
                     ended(given, name, shares[name], process)
                     del running[name]
     except KeyboardInterrupt:
-        print("interrupted: the same command goes on with the targets that are not done", file=sys.stderr)
+        print(
+            "interrupted: the same command goes on with the targets that are not done",
+            file=sys.stderr,
+        )
     finally:
         for process, _ in running.values():
             process.kill()
@@ -115,18 +177,41 @@ def start(given: argparse.Namespace, name: str, number: int) -> subprocess.Popen
     (given.folder / "jobs").mkdir(parents=True, exist_ok=True)
     report = given.folder / "jobs" / f"{slug(name)}.json"
     report.unlink(missing_ok=True)
-    words = ["--job", name, "--inputs", str(number), "--seed", str(given.seed), "--engine", given.engine, "--folder", str(given.folder)]
+    words = [
+        "--job",
+        name,
+        "--inputs",
+        str(number),
+        "--seed",
+        str(given.seed),
+        "--engine",
+        given.engine,
+        "--folder",
+        str(given.folder),
+    ]
     with report.with_suffix(".log").open("wb") as log:
-        return subprocess.Popen([sys.executable, "-m", "tests.fuzz", *words], cwd=ROOT, stdin=subprocess.DEVNULL, stdout=log, stderr=log)
+        return subprocess.Popen(
+            [sys.executable, "-m", "tests.fuzz", *words],
+            cwd=ROOT,
+            stdin=subprocess.DEVNULL,
+            stdout=log,
+            stderr=log,
+        )
 
 
-def ended(given: argparse.Namespace, name: str, asked: int, process: subprocess.Popen[bytes]) -> None:
+def ended(
+    given: argparse.Namespace, name: str, asked: int, process: subprocess.Popen[bytes]
+) -> None:
     """Keep what a job did; the input at which its process died is a finding of its own."""
     from tests.fuzz.campaign import keep
     from tests.fuzz.trial import Finding
 
     report = given.folder / "jobs" / f"{slug(name)}.json"
-    did = json.loads(report.read_text()) if report.is_file() else {"inputs": 0, "lines": 0, "seconds": 0.0, "findings": []}
+    did = (
+        json.loads(report.read_text())
+        if report.is_file()
+        else {"inputs": 0, "lines": 0, "seconds": 0.0, "findings": []}
+    )
     current = given.folder / "current" / slug(name)
     if current.is_file():
         held = current.read_bytes()
@@ -136,7 +221,8 @@ def ended(given: argparse.Namespace, name: str, asked: int, process: subprocess.
             Finding(
                 name,
                 data,
-                f"the process ended with {process.returncode}; -9: it was stopped after {SILENCE:g} s without a word",
+                f"the process ended with {process.returncode}; -9: it was stopped after {SILENCE:g}"
+                " s without a word",
                 "the process",
             ),
         )
@@ -148,42 +234,73 @@ def ended(given: argparse.Namespace, name: str, asked: int, process: subprocess.
     place = given.folder / f"done-{given.seed}"
     place.mkdir(exist_ok=True)
     (place / f"{slug(name)}.json").write_text(
-        json.dumps({**did, "found": len(did["findings"]), "asked": asked if did["inputs"] >= asked else 0, "target": name})
+        json.dumps(
+            {
+                **did,
+                "found": len(did["findings"]),
+                "asked": asked if did["inputs"] >= asked else 0,
+                "target": name,
+            }
+        )
     )
-    print(f"{name}: {did['inputs']} inputs, {did['inputs'] / max(did['seconds'], 1e-9):.0f} a second", flush=True)
+    print(
+        f"{name}: {did['inputs']} inputs, {did['inputs'] / max(did['seconds'], 1e-9):.0f} a second",
+        flush=True,
+    )
 
 
 def told(given: argparse.Namespace, names: list[str]) -> int:
-    """Print what all jobs of this seed did, by group, and how each finding is had again; 1 where there is one."""
-    every = [json.loads(path.read_text()) for path in sorted((given.folder / f"done-{given.seed}").glob("*.json"))]
+    """Print what all jobs of this seed did, by group, and how each finding is had again; 1 where
+    there is one.
+    """
+    every = [
+        json.loads(path.read_text())
+        for path in sorted((given.folder / f"done-{given.seed}").glob("*.json"))
+    ]
     groups: dict[str, list[dict[str, Any]]] = {}
     for did in (did for did in every if did["target"] in names):
         groups.setdefault(did["target"].partition(" ")[0], []).append(did)
     print(f"\n{'target':14}{'inputs':>12}{'seconds':>9}{'a second':>10}{'findings':>10}")
     for group, mine in {**groups, "all": [did for jobs in groups.values() for did in jobs]}.items():
-        inputs, seconds, found = (sum(did[key] for did in mine) for key in ("inputs", "seconds", "found"))
+        inputs, seconds, found = (
+            sum(did[key] for did in mine) for key in ("inputs", "seconds", "found")
+        )
         print(f"{group:14}{inputs:12}{seconds:9.0f}{inputs / max(seconds, 1e-9):10.0f}{found:10}")
-    places = [(did["target"], place) for jobs in groups.values() for did in jobs for place in did["findings"]]
+    places = [
+        (did["target"], place)
+        for jobs in groups.values()
+        for did in jobs
+        for place in did["findings"]
+    ]
     for target, place in places:
         print(f"{target}: {place}")
     kept = {slug(target) for target, _ in places}
     for path in sorted((given.folder / "findings").glob("*/*.txt")):
         if path.parent.name in kept:
-            print(f"make fuzz ARGS='--again {os.path.relpath(path.with_suffix(''))}'   # {path.read_text().strip()[:150]}")
+            print(
+                f"make fuzz ARGS='--again {os.path.relpath(path.with_suffix(''))}'   #"
+                f" {path.read_text().strip()[:150]}"
+            )
     return int(bool(places))
 
 
 def child(given: argparse.Namespace) -> int:
-    """Run one job, or one input again, in this process: alone, in a folder of its own, and with nobody's settings."""
+    """Run one job, or one input again, in this process: alone, in a folder of its own, and with
+    nobody's settings.
+    """
     os.environ.update(OPENBLAS_NUM_THREADS="1", COLUMNS="80")
-    is_guided = given.engine == "atheris" and given.job and given.job.partition(" ")[0] not in SEEDED
+    is_guided = (
+        given.engine == "atheris" and given.job and given.job.partition(" ")[0] not in SEEDED
+    )
     atheris = importlib.import_module("atheris") if is_guided else None
     sys.stdout.flush()
     with (
         tempfile.TemporaryDirectory() as scratch,
         atheris.instrument_imports(include=["lidarspec"]) if atheris else contextlib.nullcontext(),
     ):
-        os.environ.update(XDG_CONFIG_HOME=f"{scratch}/settings", LIDARSPEC_CACHE=str(given.folder / "kernels"))
+        os.environ.update(
+            XDG_CONFIG_HOME=f"{scratch}/settings", LIDARSPEC_CACHE=str(given.folder / "kernels")
+        )
         from tests.every_sensor import every_sensor
         from tests.fuzz.campaign import Job, guided, seeded
         from tests.fuzz.targets import targets
@@ -198,7 +315,9 @@ def child(given: argparse.Namespace) -> int:
             name = next(name for name in known if slug(name) == given.again.parent.name)
             known[name].run(given.again.read_bytes())
             return 0
-        (guided if atheris else seeded)(Job(known[given.job], given.folder, given.seed), given.inputs)
+        (guided if atheris else seeded)(
+            Job(known[given.job], given.folder, given.seed), given.inputs
+        )
     return 0
 
 

@@ -1,4 +1,6 @@
-"""Inputs for one target, made of its examples and of what reached new lines: by atheris where it is installed, else by seed."""
+"""Inputs for one target, made of its examples and of what reached new lines: by atheris where it is
+installed, else by seed.
+"""
 
 from __future__ import annotations
 
@@ -54,7 +56,9 @@ class Job:
 
     @property
     def current(self) -> Path:
-        """The file of the input that is being read: what remains of a process that does not live to report it."""
+        """The file of the input that is being read: what remains of a process that does not live to
+        report it.
+        """
         return self.folder / "current" / slug(self.target.name)
 
     def read(self, data: bytes) -> None:
@@ -73,7 +77,12 @@ class Job:
     def tell(self) -> None:
         """Write how far it is."""
         self.seconds = time.monotonic() - self._began
-        told = {"inputs": self.inputs, "lines": self.lines, "seconds": self.seconds, "findings": sorted(self.findings)}
+        told = {
+            "inputs": self.inputs,
+            "lines": self.lines,
+            "seconds": self.seconds,
+            "findings": sorted(self.findings),
+        }
         path = self.folder / "jobs" / f"{slug(self.target.name)}.json"
         path.with_suffix(".new").write_text(json.dumps(told), encoding="utf-8")
         os.replace(path.with_suffix(".new"), path)
@@ -83,7 +92,10 @@ class Job:
         """The inputs to begin with, each read once within no limits; then the limits hold."""
         for path in (self.corpus, self.current.parent, self.folder / "jobs"):
             path.mkdir(parents=True, exist_ok=True)
-        beginning = [*self.target.examples(), *(path.read_bytes() for path in sorted(self.corpus.iterdir()))]
+        beginning = [
+            *self.target.examples(),
+            *(path.read_bytes() for path in sorted(self.corpus.iterdir())),
+        ]
         for data in beginning:
             with contextlib.suppress(Exception):  # told when it is read within the limits
                 self.target.run(data)
@@ -104,7 +116,9 @@ def keep(folder: Path, found: Finding) -> Path:
 
 
 def seeded(job: Job, number: int) -> None:
-    """Read so many inputs: mutations of the examples, and of those of a sample that reached new lines."""
+    """Read so many inputs: mutations of the examples, and of those of a sample that reached new
+    lines.
+    """
     source = random.Random(f"{job.seed} {job.target.name}")
     lines: set[Any] = set()
     with job.running() as pool:
@@ -156,7 +170,9 @@ def guided(job: Job, number: int) -> None:
 
     def mutation(data: bytes, longest: int, seed: int) -> bytes:
         source = random.Random(seed)
-        return job.target.mutation(data or source.choice(beginning), source.choice(beginning), source)[:longest]
+        return job.target.mutation(
+            data or source.choice(beginning), source.choice(beginning), source
+        )[:longest]
 
     def one(data: bytes) -> None:
         job.read(data)

@@ -1,4 +1,6 @@
-"""What is read: frames and streams of every sensor and shape, captures, recordings, settings, scenes, vectors, calibration, words."""
+"""What is read: frames and streams of every sensor and shape, captures, recordings, settings,
+scenes, vectors, calibration, words.
+"""
 
 from __future__ import annotations
 
@@ -27,7 +29,16 @@ from lidarspec.captures.pcap import CaptureReader, StreamReader
 from lidarspec.device.settings import FILE as SETTINGS, devices
 from lidarspec.frames.layout import Layout
 from lidarspec.framing.frame_engine import codec
-from lidarspec.recording.format import DATAGRAM, EVENT, HEADER, MAGIC, RECEIVED, Header, Recording, packed
+from lidarspec.recording.format import (
+    DATAGRAM,
+    EVENT,
+    HEADER,
+    MAGIC,
+    RECEIVED,
+    Header,
+    Recording,
+    packed,
+)
 from lidarspec.simulation.scenes import read_scene
 from lidarspec.stores import digest, stamp
 from lidarspec.testing import subject as material
@@ -88,12 +99,18 @@ class Target:
         return self.name.partition(" ")[0]
 
     def mutation(self, data: bytes, other: bytes, source: random.Random) -> bytes:
-        """A neighbour of an input, with a piece of another one in it at times; half of them have their checksums mended."""
+        """A neighbour of an input, with a piece of another one in it at times; half of them have
+        their checksums mended.
+        """
         if self.is_text and source.random() < 0.5 and (values := list(VALUE.finditer(data))):
             start, end = source.choice(values).span()
             return data[:start] + source.choice(self.words()) + data[end:]
         start = source.randrange(len(other) + 1)
-        words = self.words() if source.random() < 0.8 else [other[start : start + source.choice((4, 64, LONGEST))]]
+        words = (
+            self.words()
+            if source.random() < 0.8
+            else [other[start : start + source.choice((4, 64, LONGEST))]]
+        )
         found = material.mutated(data, source, words, self.spots(data))[:LONGEST]
         return self.mended(found) if source.random() < 0.5 else found
 
@@ -126,18 +143,47 @@ def targets(folder: Path, sensors: Collection[Sensor]) -> dict[str, Target]:
     """
     found = [_frame(sensor, name) for sensor, name in distinct_frames(sensors)]
     found += [_stream(sensor) for sensor in distinct_sensors(sensors)]
-    found += [_capture(), _file(folder), _recording(folder), _settings(folder), _scene(folder), _vectors(folder)]
+    found += [
+        _capture(),
+        _file(folder),
+        _recording(folder),
+        _settings(folder),
+        _scene(folder),
+        _vectors(folder),
+    ]
     found += [_manifest(folder), *(_log(folder, kind) for kind in ("mcap", "bag", "db3"))]
-    found += [_calibration(sensor, option, folder) for sensor in sensors if sensor.id not in SHAPES for option in sensor.configure.files]
+    found += [
+        _calibration(sensor, option, folder)
+        for sensor in sensors
+        if sensor.id not in SHAPES
+        for option in sensor.configure.files
+    ]
     text = [word.encode() for word in HOSTILE]
-    printed = [b"54 2c", b"0: {0x54, 0x2C}; // one", b"0000  54 2c  T,\n0002", b"[12:00:01.5] 54 /* */"]
+    printed = [
+        b"54 2c",
+        b"0: {0x54, 0x2C}; // one",
+        b"0000  54 2c  T,\n0002",
+        b"[12:00:01.5] 54 /* */",
+    ]
     printed += [b"(1.5) can0 044#1122", b"time,value\n1,0x54"]
-    found.append(Target("hex", lambda data: unhexed(data.decode("latin-1")), lambda: printed, (ValueError,), lambda: text))
+    found.append(
+        Target(
+            "hex",
+            lambda data: unhexed(data.decode("latin-1")),
+            lambda: printed,
+            (ValueError,),
+            lambda: text,
+        )
+    )
     found.append(
         Target(
             "source",
             _named,
-            lambda: [b"udp://:2368?src=192.0.2.1", b"serial:///dev/ttyUSB0?baud=9600&dtr=on", *(word for word in text if b":" in word)],
+            lambda: [
+                b"udp://:2368?src=192.0.2.1",
+                b"serial:///dev/ttyUSB0?baud=9600&dtr=on",
+                *(word for word in text if b":" in word),
+            ],
             (ls.UsageError,),
             lambda: text,
         )
@@ -152,7 +198,10 @@ def _frame(sensor: Sensor, name: str) -> Target:
 
     def run(data: bytes) -> None:
         parse = functools.partial(sensor.parse, data)
-        for call in (lambda: parse(frame=name), lambda: parse(frame=name, verify=False, units=bool(len(data) & 1))):
+        for call in (
+            lambda: parse(frame=name),
+            lambda: parse(frame=name, verify=False, units=bool(len(data) & 1)),
+        ):
             _but(ls.WireError, call)
         if zlib.crc32(data) % (64 + len(data)) == 0:
             _but(ls.WireError, parse)
@@ -180,11 +229,20 @@ def _frame(sensor: Sensor, name: str) -> Target:
     def made() -> list[bytes]:
         return [subject.example(name, seed=seed) for seed in range(6)]
 
-    return Target(f"frame {sensor.id} {name}", run, made, spots=spots, mended=mended, cost=100 + sensor.frames[name].max_length)
+    return Target(
+        f"frame {sensor.id} {name}",
+        run,
+        made,
+        spots=spots,
+        mended=mended,
+        cost=100 + sensor.frames[name].max_length,
+    )
 
 
 def _stream(sensor: Sensor) -> Target:
-    """A stream in pieces of any size, or datagrams, through the decoder and on to scans: nothing of it raises."""
+    """A stream in pieces of any size, or datagrams, through the decoder and on to scans: nothing of
+    it raises.
+    """
     subject = Subject(sensor)
 
     def run(data: bytes) -> None:
@@ -196,12 +254,22 @@ def _stream(sensor: Sensor) -> Target:
             if source.random() < 0.02:
                 decoder.idle()
         decoder.finish()
-        for scan in sensor.scans(chunks if sensor.datagrams else data) if sensor.points is not None else ():
+        for scan in (
+            sensor.scans(chunks if sensor.datagrams else data) if sensor.points is not None else ()
+        ):
             scan.points.to_structured()
 
     def examples() -> list[bytes]:
-        talks = [[data for _, data in subject.conversation(seed=seed, rounds=2)][:12] for seed in range(3)]
-        return [b"".join(struct.pack("<H", len(data)) + data if sensor.datagrams else data for data in talk) for talk in talks]
+        talks = [
+            [data for _, data in subject.conversation(seed=seed, rounds=2)][:12]
+            for seed in range(3)
+        ]
+        return [
+            b"".join(
+                struct.pack("<H", len(data)) + data if sensor.datagrams else data for data in talk
+            )
+            for talk in talks
+        ]
 
     @functools.cache
     def words() -> list[bytes]:
@@ -231,7 +299,10 @@ def _capture() -> Target:
     def run(data: bytes) -> None:
         for reader in (CaptureReader, StreamReader):
             _but(ls.SourceError, lambda reader=reader: list(reader(io.BytesIO(data))))
-        _but(ls.SourceError, lambda: [batch.data(0) for batch in CaptureBatches(io.BytesIO(data)).batches()])
+        _but(
+            ls.SourceError,
+            lambda: [batch.data(0) for batch in CaptureBatches(io.BytesIO(data)).batches()],
+        )
 
     blocks = [
         made.section(),
@@ -240,8 +311,17 @@ def _capture() -> Target:
         made.packet(made.frame(b"x")),
         made.record(b""),
     ]
-    packets = [made.ipv4(made.udp(b"payload")), made.ipv6(made.udp(b"payload")), made.ethernet(made.ipv4(made.udp(b"x")), ethertype=0x8100)]
-    return Target("capture", run, _captures, words=lambda: [*EDGES, *blocks, *packets, *(struct.pack("<I", link) for link in LINKS)])
+    packets = [
+        made.ipv4(made.udp(b"payload")),
+        made.ipv6(made.udp(b"payload")),
+        made.ethernet(made.ipv4(made.udp(b"x")), ethertype=0x8100),
+    ]
+    return Target(
+        "capture",
+        run,
+        _captures,
+        words=lambda: [*EDGES, *blocks, *packets, *(struct.pack("<I", link) for link in LINKS)],
+    )
 
 
 def _captures() -> list[bytes]:
@@ -253,14 +333,31 @@ def _captures() -> list[bytes]:
     ]
     found = [made.pcap(*packets, link=link) for link in LINKS]
     for order in ("<", ">"):
-        kinds = [made.packet(packet, order, kind=kind) for packet in packets for kind in (made.ENHANCED, made.SIMPLE, made.OBSOLETE)]
-        found.append(made.section(order) + made.interface(order, options=made.option(9, b"\x06", order)) + b"".join(kinds))
-    parts = [made.ipv4(part, place=place) for part, place in ((made.udp(bytes(32), length=40)[:24], 0x2000), (bytes(16), 3))]
-    return [*found, made.pcap(*map(made.ethernet, parts)), b"".join([made.pcap(), *[made.record(made.frame(b"same"))] * 20])]
+        kinds = [
+            made.packet(packet, order, kind=kind)
+            for packet in packets
+            for kind in (made.ENHANCED, made.SIMPLE, made.OBSOLETE)
+        ]
+        found.append(
+            made.section(order)
+            + made.interface(order, options=made.option(9, b"\x06", order))
+            + b"".join(kinds)
+        )
+    parts = [
+        made.ipv4(part, place=place)
+        for part, place in ((made.udp(bytes(32), length=40)[:24], 0x2000), (bytes(16), 3))
+    ]
+    return [
+        *found,
+        made.pcap(*map(made.ethernet, parts)),
+        b"".join([made.pcap(), *[made.record(made.frame(b"same"))] * 20]),
+    ]
 
 
 def _file(folder: Path) -> Target:
-    """Files of every kind as a source: packets and scans of a sensor, found by what is in them where nobody says it."""
+    """Files of every kind as a source: packets and scans of a sensor, found by what is in them
+    where nobody says it.
+    """
 
     def run(data: bytes) -> None:
         path = folder / ("some.hex" if zlib.crc32(data) & 3 == 0 else "some.bin")
@@ -276,7 +373,10 @@ def _file(folder: Path) -> Target:
         frames = [ls.sensor(STL).example("data", seed=seed) for seed in range(3)]
         with tempfile.TemporaryDirectory() as place:
             topics = {"/p": ("nebula_msgs/msg/NebulaPackets", velodyne)}
-            logs = [test_bags.recorded(Path(place), kind, topics).read_bytes() for kind in ("bag", "mcap")]
+            logs = [
+                test_bags.recorded(Path(place), kind, topics).read_bytes()
+                for kind in ("bag", "mcap")
+            ]
         return [
             *logs,
             made.pcap(*map(made.frame, velodyne)),
@@ -288,7 +388,13 @@ def _file(folder: Path) -> Target:
             lzma.compress(recorded(VLP, velodyne)),
         ]
 
-    return Target("file", run, examples, (ls.LidarSpecError,), lambda: [*EDGES, *(word.encode() for word in HOSTILE)])
+    return Target(
+        "file",
+        run,
+        examples,
+        (ls.LidarSpecError,),
+        lambda: [*EDGES, *(word.encode() for word in HOSTILE)],
+    )
 
 
 def _log(folder: Path, kind: str) -> Target:
@@ -304,14 +410,18 @@ def _log(folder: Path, kind: str) -> Target:
     def examples() -> list[bytes]:
         frames = [ls.sensor(VLP).example("data", seed=seed) for seed in range(3)]
         with tempfile.TemporaryDirectory() as place:
-            log = test_bags.recorded(Path(place), kind, {"/p": ("nebula_msgs/msg/NebulaPackets", frames)})
+            log = test_bags.recorded(
+                Path(place), kind, {"/p": ("nebula_msgs/msg/NebulaPackets", frames)}
+            )
             return [log.read_bytes()]
 
     return Target(f"log {kind}", run, examples, (ls.LidarSpecError,))
 
 
 def _manifest(folder: Path) -> Target:
-    """The manifest of a folder of results that another run has left, for the file that it is of and with the result beside it."""
+    """The manifest of a folder of results that another run has left, for the file that it is of and
+    with the result beside it.
+    """
     results = folder / "results"
     source = folder / "drive.bin"
     piece = Piece(str(source), STL, {}, str(results / "drive.ply"), True, 10**9)
@@ -333,16 +443,33 @@ def _manifest(folder: Path) -> Target:
         failed = replace(piece, number=1).failed(ls.SourceError("gone"))
         return [b"".join(json.dumps(record).encode() + b"\n" for record in (done, failed))]
 
-    return Target("manifest", run, examples, (ls.SourceError,), lambda: [b"[" * 5000, b"null", *TOML], is_text=True)
+    return Target(
+        "manifest",
+        run,
+        examples,
+        (ls.SourceError,),
+        lambda: [b"[" * 5000, b"null", *TOML],
+        is_text=True,
+    )
 
 
 def recorded(sensor: str, frames: Iterable[bytes]) -> bytes:
     """A recording of these frames."""
     datagrams = ls.sensor(sensor).datagrams
     sender = {"sender": ("192.0.2.1", 2368), "receiver": ("192.0.2.2", 2368)} if datagrams else {}
-    records = [packed(RECEIVED, frame, 10**18 + index, flags=DATAGRAM * datagrams, **sender) for index, frame in enumerate(frames)]
+    records = [
+        packed(RECEIVED, frame, 10**18 + index, flags=DATAGRAM * datagrams, **sender)
+        for index, frame in enumerate(frames)
+    ]
     event = packed(EVENT, json.dumps({"event": "disconnected"}).encode(), 10**18)
-    return b"".join([MAGIC, packed(HEADER, Header(sensor, source="x", datagrams=datagrams).to_json(), 10**18), *records, event])
+    return b"".join(
+        [
+            MAGIC,
+            packed(HEADER, Header(sensor, source="x", datagrams=datagrams).to_json(), 10**18),
+            *records,
+            event,
+        ]
+    )
 
 
 def _recording(folder: Path) -> Target:
@@ -357,19 +484,50 @@ def _recording(folder: Path) -> Target:
                     str(record)
 
     def mended(data: bytes) -> bytes:
-        """With the checksum of each record set right, where its lengths lead to the end of the data."""
+        """With the checksum of each record set right, where its lengths lead to the end of the
+        data.
+        """
         found, place = bytearray(data), len(MAGIC)
         while place + 21 <= len(found):
-            end = place + 17 + found[place + 6] + int.from_bytes(found[place + 7 : place + 9], "little")
+            end = (
+                place
+                + 17
+                + found[place + 6]
+                + int.from_bytes(found[place + 7 : place + 9], "little")
+            )
             found[end : end + 4] = zlib.crc32(found[place:end]).to_bytes(4, "little")
             place = end + 4
         return bytes(found)
 
     def examples() -> list[bytes]:
-        return [recorded(name, [ls.sensor(name).example("data", seed=seed) for seed in range(2)]) for name in (STL, VLP)]
+        return [
+            recorded(name, [ls.sensor(name).example("data", seed=seed) for seed in range(2)])
+            for name in (STL, VLP)
+        ]
 
-    values = [value.encode() for value in ('"a"', "[]", "{}", "null", "1e999", "true", "-1", "[" * 2000, '{"event": []}', '{"a":' * 300)]
-    return Target("recording", run, examples, (ls.SourceError, ls.WireError), lambda: [*EDGES, *values], mended=mended)
+    values = [
+        value.encode()
+        for value in (
+            '"a"',
+            "[]",
+            "{}",
+            "null",
+            "1e999",
+            "true",
+            "-1",
+            "[" * 2000,
+            '{"event": []}',
+            '{"a":' * 300,
+        )
+    ]
+    return Target(
+        "recording",
+        run,
+        examples,
+        (ls.SourceError, ls.WireError),
+        lambda: [*EDGES, *values],
+        mended=mended,
+    )
 
 
 def _settings(folder: Path) -> Target:
@@ -391,14 +549,35 @@ source = "./rear.lsr"
 sensor = "{VLP}"
 options = {{calibration = "./angles.csv"}}
 """
-    return Target("settings", run, lambda: [text.encode()], (ls.UsageError, ls.SourceError), lambda: TOML, is_text=True)
+    return Target(
+        "settings",
+        run,
+        lambda: [text.encode()],
+        (ls.UsageError, ls.SourceError),
+        lambda: TOML,
+        is_text=True,
+    )
 
 
 #: pieces of TOML and JSON that make trouble.
 TOML = [
     word.encode()
     for word in (
-        *("inf", "nan", "-1", "0x7f", "1e400", '""', "[]", "{}", "true", "'''", "1979-05-27T07:32:00Z", "99999999999999999999", "\\u0000"),
+        *(
+            "inf",
+            "nan",
+            "-1",
+            "0x7f",
+            "1e400",
+            '""',
+            "[]",
+            "{}",
+            "true",
+            "'''",
+            "1979-05-27T07:32:00Z",
+            "99999999999999999999",
+            "\\u0000",
+        ),
         *(
             '"\\u001b[2J"',
             "[[box]]",
@@ -436,11 +615,21 @@ def _scene(folder: Path) -> Target:
 
     text = b"[room]\nlow=[-3.0,-2.2,-1.2]\nhigh=[4.6,3.1,1.6]\n[[box]]\nlow=[2.0,0.8,-1.2]\nhigh=[2.7,1.6,0.9]\n"
     mover = b"[[mover]]\nsize=[0.4,0.5,1.7]\npath=[[1.4,-1.5],[0.8,1.9]]\nspeed=0.8\nfloor=-1.2\n"
-    return Target("scene", run, lambda: [text + mover], (ls.UsageError, ls.SourceError), lambda: TOML, is_text=True)
+    return Target(
+        "scene",
+        run,
+        lambda: [text + mover],
+        (ls.UsageError, ls.SourceError),
+        lambda: TOML,
+        is_text=True,
+    )
 
 
 def _vectors(folder: Path) -> Target:
-    path, sensor = folder / "vectors.json", SHAPES["shape-datagrams"]  # without a checksum, which would be searched for
+    path, sensor = (
+        folder / "vectors.json",
+        SHAPES["shape-datagrams"],
+    )  # without a checksum, which would be searched for
     subject = Subject(sensor, vectors=path)
 
     def run(data: bytes) -> None:
@@ -448,9 +637,17 @@ def _vectors(folder: Path) -> Target:
         vectors_hold(subject)
 
     frame = sensor.example("data", seed=1)
-    vector = {"source": "manual 3.2", "frame": "data", "hex": frame.hex(" "), "values": {"number": sensor.parse(frame).number}}
+    vector = {
+        "source": "manual 3.2",
+        "frame": "data",
+        "hex": frame.hex(" "),
+        "values": {"number": sensor.parse(frame).number},
+    }
     cloud = sensor.decode([frame]).points()
-    points = {str(index): {name: float(getattr(cloud, name)[index]) for name in ("range", "x", "y")} for index in (0, 3)}
+    points = {
+        str(index): {name: float(getattr(cloud, name)[index]) for name in ("range", "x", "y")}
+        for index in (0, 3)
+    }
     units = {"blocks[0].azimuth": sensor.parse(frame, units=True).blocks[0].azimuth}
     more = {"units": units, "points": points, "sensor": [sensor.id], "note": "x"}
     words = [
@@ -461,8 +658,24 @@ def _vectors(folder: Path) -> Target:
         b'"points":{"-1":{"x":1}}',
         b'"values":{"points[0]":1}',
     ]
-    words += [b'"frame":[]', b'"sensor":1', b'"hex":1', b'"units":[]', b'"reply":"54"', b"NaN", b"null", b"1e999"]
-    return Target("vectors", run, lambda: [json.dumps([vector, {**vector, **more}]).encode()], (Violation,), lambda: words, is_text=True)
+    words += [
+        b'"frame":[]',
+        b'"sensor":1',
+        b'"hex":1',
+        b'"units":[]',
+        b'"reply":"54"',
+        b"NaN",
+        b"null",
+        b"1e999",
+    ]
+    return Target(
+        "vectors",
+        run,
+        lambda: [json.dumps([vector, {**vector, **more}]).encode()],
+        (Violation,),
+        lambda: words,
+        is_text=True,
+    )
 
 
 def _calibration(sensor: Sensor, option: str, folder: Path) -> Target:
@@ -482,13 +695,35 @@ def _calibration(sensor: Sensor, option: str, folder: Path) -> Target:
             return [at128.TABLE.told()]
         if sensor.id.startswith("velodyne-hdl64e"):
             return [write_velodyne_xml(folder / "db.xml").read_bytes()]
-        heading = "Channel,Elevation,Azimuth" if option == "calibration" else "Channel,fire time(us)"
-        rows = [f"{channel},{20.5 - channel / 2}{f',{channel % 5 * 15 - 30}' * heading.count('Azimuth')}" for channel in range(1, 129)]
+        heading = (
+            "Channel,Elevation,Azimuth" if option == "calibration" else "Channel,fire time(us)"
+        )
+        rows = [
+            f"{channel},{20.5 - channel / 2}{f',{channel % 5 * 15 - 30}' * heading.count('Azimuth')}"
+            for channel in range(1, 129)
+        ]
         return ["\n".join([heading, *rows[:number]]).encode() for number in (16, 32, 40, 64, 128)]
 
     words = [
         word.encode()
-        for word in ("nan", "inf", "-inf", "1e999", ",", "\n", '"', "\x00", "1_0", "\u0661", "EEFF", "414", "0", "-0", ",,,,", "9" * 5000)
+        for word in (
+            "nan",
+            "inf",
+            "-inf",
+            "1e999",
+            ",",
+            "\n",
+            '"',
+            "\x00",
+            "1_0",
+            "\u0661",
+            "EEFF",
+            "414",
+            "0",
+            "-0",
+            ",,,,",
+            "9" * 5000,
+        )
     ]
     return Target(
         f"calibration {sensor.id} {option}",
@@ -502,13 +737,29 @@ def _calibration(sensor: Sensor, option: str, folder: Path) -> Target:
 
 def _metadata(rows: int) -> bytes:
     """What a unit of so many rows would say of itself, as its web server has it."""
-    numbers, still = [float(row) for row in range(rows)], [float(spot % 5 == 0) for spot in range(16)]
-    layout = {"columns_per_frame": 1024, "columns_per_packet": 16, "pixels_per_column": rows, "udp_profile_lidar": "RNG19_RFL8_SIG16_NIR16"}
-    beams = {"beam_altitude_angles": numbers, "beam_azimuth_angles": numbers, "beam_to_lidar_transform": still}
+    numbers, still = (
+        [float(row) for row in range(rows)],
+        [float(spot % 5 == 0) for spot in range(16)],
+    )
+    layout = {
+        "columns_per_frame": 1024,
+        "columns_per_packet": 16,
+        "pixels_per_column": rows,
+        "udp_profile_lidar": "RNG19_RFL8_SIG16_NIR16",
+    }
+    beams = {
+        "beam_altitude_angles": numbers,
+        "beam_azimuth_angles": numbers,
+        "beam_to_lidar_transform": still,
+    }
     return json.dumps(
         {
             "sensor_info": {},
-            "lidar_data_format": {**layout, "column_window": [0, 1023], "pixel_shift_by_row": [0] * rows},
+            "lidar_data_format": {
+                **layout,
+                "column_window": [0, 1023],
+                "pixel_shift_by_row": [0] * rows,
+            },
             "beam_intrinsics": beams,
             "lidar_intrinsics": {"lidar_to_sensor_transform": still},
             "imu_intrinsics": {"imu_to_sensor_transform": still},

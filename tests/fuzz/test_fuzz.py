@@ -1,4 +1,6 @@
-"""Every target reads its examples and neighbours of theirs, and what does harm is found; `make fuzz` does it by the million."""
+"""Every target reads its examples and neighbours of theirs, and what does harm is found; `make
+fuzz` does it by the million.
+"""
 
 from __future__ import annotations
 
@@ -37,18 +39,25 @@ def few(folder: Path) -> dict[str, Target]:
 
 
 @pytest.fixture
-def known(folder: Path, few: dict[str, Target], monkeypatch: pytest.MonkeyPatch) -> dict[str, Target]:
+def known(
+    folder: Path, few: dict[str, Target], monkeypatch: pytest.MonkeyPatch
+) -> dict[str, Target]:
     monkeypatch.chdir(folder)
     return few
 
 
 def read_neighbours(target: Target, number: int) -> None:
-    """Read the examples of a target and mutations of them; an exception that is not documented fails."""
+    """Read the examples of a target and mutations of them; an exception that is not documented
+    fails.
+    """
     source = random.Random(f"{target.name} few")
     examples = target.examples()
     valid = 0
     inputs = [*examples[: 1 if target.group == "stream" else None]]
-    inputs += [target.mutation(source.choice(examples), source.choice(examples), source) for _ in range(number)]
+    inputs += [
+        target.mutation(source.choice(examples), source.choice(examples), source)
+        for _ in range(number)
+    ]
     for data in inputs:
         with warnings.catch_warnings(action="ignore"):
             try:
@@ -69,7 +78,9 @@ def test_neighbours_of_valid_input_do_no_harm(known: dict[str, Target], group: s
 
 
 @pytest.mark.slow
-def test_neighbours_of_valid_input_of_sensors_do_no_harm(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_neighbours_of_valid_input_of_sensors_do_no_harm(
+    folder: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.chdir(folder)
     for target in targets(folder, [ls.sensor(name) for name in REPRESENTATIVES]).values():
         read_neighbours(target, LEAST)
@@ -88,8 +99,12 @@ def greedy(data: bytes) -> None:
     bytearray(3 * trial.MEMORY)
 
 
-@pytest.mark.parametrize(("run", "what"), [(raising, "ValueError"), (endless, "TooLong"), (greedy, "MemoryError")])
-def test_harm_is_found_and_kept_for_another_look(run: object, what: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+@pytest.mark.parametrize(
+    ("run", "what"), [(raising, "ValueError"), (endless, "TooLong"), (greedy, "MemoryError")]
+)
+def test_harm_is_found_and_kept_for_another_look(
+    run: object, what: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.setattr(trial, "BUSY", 0.05)
     target = Target("invented one", run, lambda: [b"abc"])  # type: ignore[arg-type]
     with trial.limits():
@@ -102,7 +117,9 @@ def test_harm_is_found_and_kept_for_another_look(run: object, what: str, tmp_pat
     assert found.place in path.with_suffix(".txt").read_text()
 
 
-def test_an_input_that_reaches_new_lines_is_mutated_further(known: dict[str, Target], tmp_path: Path) -> None:
+def test_an_input_that_reaches_new_lines_is_mutated_further(
+    known: dict[str, Target], tmp_path: Path
+) -> None:
     job = Job(known["frame shape-count data"], tmp_path / "kept", seed=1)
     seeded(job, 100)
     assert job.inputs == 100
@@ -113,7 +130,11 @@ def test_an_input_that_reaches_new_lines_is_mutated_further(known: dict[str, Tar
 
 @pytest.mark.slow
 def test_a_run_spreads_its_inputs_reports_them_and_goes_on_where_it_stopped(tmp_path: Path) -> None:
-    assert spread({"frame a": 100.0, "frame b": 300.0, "hex": 1.0}, 1000) == {"frame a": 685, "frame b": 228, "hex": 86}
+    assert spread({"frame a": 100.0, "frame b": 300.0, "hex": 1.0}, 1000) == {
+        "frame a": 685,
+        "frame b": 228,
+        "hex": 86,
+    }
     words = [
         sys.executable,
         "-m",
@@ -129,7 +150,10 @@ def test_a_run_spreads_its_inputs_reports_them_and_goes_on_where_it_stopped(tmp_
         "--folder",
         str(tmp_path),
     ]
-    first, second = (subprocess.run(words, cwd=ROOT, capture_output=True, text=True, check=False) for _ in range(2))
+    first, second = (
+        subprocess.run(words, cwd=ROOT, capture_output=True, text=True, check=False)
+        for _ in range(2)
+    )
     assert first.returncode == second.returncode == 0, first.stdout + first.stderr
     assert "0 targets done before" in first.stdout
     assert "2 targets done before" in second.stdout

@@ -1,4 +1,6 @@
-"""One input, read within its limits: what comes of it is nothing, a documented exception, or a finding."""
+"""One input, read within its limits: what comes of it is nothing, a documented exception, or a
+finding.
+"""
 
 from __future__ import annotations
 
@@ -15,7 +17,8 @@ from typing import NoReturn
 import lidarspec
 from tests.fuzz.targets import Target
 
-#: processor seconds that an input may take; what only waits is given the longer time, since other jobs may have the processor.
+#: processor seconds that an input may take; what only waits is given the longer time, since other
+#: jobs may have the processor.
 BUSY, WAITING = 1.0, 30.0
 #: bytes that an input may add to the process.
 MEMORY = 500_000_000
@@ -34,7 +37,8 @@ class Finding:
         target: the name of what read it.
         data: it.
         what: the exception.
-        place: the innermost line of lidarspec or of a plugin that it came out of: the same for the same fault.
+        place: the innermost line of lidarspec or of a plugin that it came out of: the same for the
+            same fault.
     """
 
     target: str
@@ -45,7 +49,9 @@ class Finding:
 
 @contextlib.contextmanager
 def limits() -> Iterator[None]:
-    """A process in which no input takes more memory than it may, and in which `judged` can count its time."""
+    """A process in which no input takes more memory than it may, and in which `judged` can count
+    its time.
+    """
     before = resource.getrlimit(resource.RLIMIT_AS)
     bound_memory()
     handlers = {kind: signal.signal(kind, _late) for kind in (signal.SIGPROF, signal.SIGALRM)}
@@ -58,7 +64,9 @@ def limits() -> Iterator[None]:
 
 
 def bound_memory() -> None:
-    """From now on the process may take so much more memory; asked for now and then, since what chooses inputs keeps some of them."""
+    """From now on the process may take so much more memory; asked for now and then, since what
+    chooses inputs keeps some of them.
+    """
     pages = int(Path("/proc/self/statm").read_text().split()[0])
     hard = resource.getrlimit(resource.RLIMIT_AS)[1]
     resource.setrlimit(resource.RLIMIT_AS, (pages * resource.getpagesize() + MEMORY, hard))

@@ -1,6 +1,8 @@
-"""Command lines out of bytes: each byte chooses the next word, of a verb's own options and values, or of those that make trouble.
+"""Command lines out of bytes: each byte chooses the next word, of a verb's own options and values,
+or of those that make trouble.
 
-Nothing that is chosen opens a line or goes on for ever: sources are files, and what is simulated goes into one for some milliseconds.
+Nothing that is chosen opens a line or goes on for ever: sources are files, and what is simulated
+goes into one for some milliseconds.
 """
 
 from __future__ import annotations
@@ -54,7 +56,18 @@ HOSTILE = (
         ":",
         "::",
     ),
-    *("54 2c", "54:2c", "0x54, 0x2C}", "5", "zz", "#", "//", "\\x54\\x", "0000: 54", "\u00b2\u00b2"),
+    *(
+        "54 2c",
+        "54:2c",
+        "0x54, 0x2C}",
+        "5",
+        "zz",
+        "#",
+        "//",
+        "\\x54\\x",
+        "0000: 54",
+        "\u00b2\u00b2",
+    ),
     *(
         "udp://",
         "udp://[",
@@ -98,14 +111,28 @@ ENDING = (
     "sim",
 )
 #: what a file is called that is written.
-TARGETS = ("out.csv", "out.npz", "out.svg", "out.lsr", "out.pcap", "out.bin", "out.xyz", "out", "none/out.csv")
+TARGETS = (
+    "out.csv",
+    "out.npz",
+    "out.svg",
+    "out.lsr",
+    "out.pcap",
+    "out.bin",
+    "out.xyz",
+    "out",
+    "none/out.csv",
+)
 #: files that are there, by their content.
 SOURCES = ("stl.bin", "stl.hex", "vlp.pcap", "stl.lsr", "empty.bin", "noise.bin")
 
 
 def spoken() -> list[bytes]:
     """Bytes to begin with: every verb, with a few choices after it."""
-    return [bytes([verb, *range(start, start + 12)]) for verb in range(len(ENDING)) for start in (0, 40, 90)]
+    return [
+        bytes([verb, *range(start, start + 12)])
+        for verb in range(len(ENDING))
+        for start in (0, 40, 90)
+    ]
 
 
 def words(data: bytes) -> list[str]:
@@ -116,14 +143,25 @@ def words(data: bytes) -> list[str]:
     command = main.get_command(click.Context(main), verb)
     assert command is not None
     arguments = [parameter for parameter in command.params if isinstance(parameter, click.Argument)]
-    options = [option for option in command.params if isinstance(option, click.Option) and option.name not in ("loop", "help")]
+    options = [
+        option
+        for option in command.params
+        if isinstance(option, click.Option) and option.name not in ("loop", "help")
+    ]
     found, rest = [verb], iter(data[1:14])
     for argument in arguments:
-        found += [_value(argument.name or "", next(rest, 0), next(rest, 0)) for _ in range(1 if argument.nargs == 1 else next(rest, 0) % 3)]
+        found += [
+            _value(argument.name or "", next(rest, 0), next(rest, 0))
+            for _ in range(1 if argument.nargs == 1 else next(rest, 0) % 3)
+        ]
     for byte in rest:
         option = options[byte % len(options)] if options else None
         if option is not None:
-            found += [option.opts[-1]] if option.is_flag else [option.opts[-1], _value(option.name or "", next(rest, 0), next(rest, 0))]
+            found += (
+                [option.opts[-1]]
+                if option.is_flag
+                else [option.opts[-1], _value(option.name or "", next(rest, 0), next(rest, 0))]
+            )
     if verb == "sim":  # into a file, and not much of it
         found += ["--to", TARGETS[3 + data[-1] % 3], "-t", "10ms", "--rate", "max"]
     if verb == "record":  # what is live has no end
@@ -161,7 +199,16 @@ def _known(name: str) -> tuple[str, ...]:
             "x[=1",
             "points[99]=1",
         ),
-        "options": ("frame=vendor", "answer=data", "answer=x", "zero=1e9", "calibration=stl.bin", "=", "frame", "calibration=none.csv"),
+        "options": (
+            "frame=vendor",
+            "answer=data",
+            "answer=x",
+            "zero=1e9",
+            "calibration=stl.bin",
+            "=",
+            "frame",
+            "calibration=none.csv",
+        ),
         "output": TARGETS,
         "target": TARGETS,
         "to": TARGETS[3:6],
@@ -173,7 +220,8 @@ def _known(name: str) -> tuple[str, ...]:
 
 
 def commanded(folder: Path, data: bytes) -> None:
-    """Run a command line; it ends with one of the documented codes, and nothing that it prints calls itself a bug.
+    """Run a command line; it ends with one of the documented codes, and nothing that it prints
+    calls itself a bug.
 
     Args:
         folder: the working directory, in which the files that it names are made.

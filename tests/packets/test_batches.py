@@ -1,4 +1,6 @@
-"""Packets and scans of lossy, late, doubled and noisy input: right by an oracle, and the same however it was cut into batches."""
+"""Packets and scans of lossy, late, doubled and noisy input: right by an oracle, and the same
+however it was cut into batches.
+"""
 
 from __future__ import annotations
 
@@ -24,13 +26,17 @@ def facts(scan: Scan) -> tuple[int, bool, int]:
     return len(scan), scan.complete, scan.stamp_ns
 
 
-def run(sensor: ls.Sensor, datagrams: list[bytes], cuts: Sequence[int]) -> tuple[list[Packets], list[Scan], Counters]:
+def run(
+    sensor: ls.Sensor, datagrams: list[bytes], cuts: Sequence[int]
+) -> tuple[list[Packets], list[Scan], Counters]:
     decoder = sensor.decoder(stream=False)
     stream, scans = PacketStream(sensor, sensor.data_frame, decoder.stats), ScanStream(sensor)
     batches: list[Packets] = []
     found: list[Scan] = []
     for start, end in itertools.pairwise(cuts):
-        batches.append(stream.add([decoder.datagrams(datagrams[start:end], list(range(start, end)))]))
+        batches.append(
+            stream.add([decoder.datagrams(datagrams[start:end], list(range(start, end)))])
+        )
         found += scans.add(batches[-1])
     return batches, found + scans.finish(), decoder.stats
 
@@ -45,18 +51,31 @@ def disturbed(datagrams: list[bytes], draw: random.Random, loss: float) -> list[
     for _ in range(len(left) // 20 if loss else 0):
         spot = draw.randrange(len(left))
         left.insert(min(len(left), spot + draw.randint(0, 7)), left.pop(spot))
-        left.insert(draw.randrange(len(left)), draw.choice([b"noise", left[draw.randrange(len(left))]]))
+        left.insert(
+            draw.randrange(len(left)), draw.choice([b"noise", left[draw.randrange(len(left))]])
+        )
     return left
 
 
 @pytest.mark.parametrize("loss", [0, pytest.param(0.01, marks=pytest.mark.slow), 0.2])
-@pytest.mark.parametrize("name", ["shape-headed", "shape-paced", "velodyne-vlp16", pytest.param("robosense-m1", marks=pytest.mark.slow)])
+@pytest.mark.parametrize(
+    "name",
+    [
+        "shape-headed",
+        "shape-paced",
+        "velodyne-vlp16",
+        pytest.param("robosense-m1", marks=pytest.mark.slow),
+    ],
+)
 def test_batches_do_not_matter(name: str, loss: float) -> None:
     sensor = load_sensor(name)
     draw = random.Random(f"{name} {loss}")
     datagrams = disturbed(simulate(sensor, 150), draw, loss)
     whole, scans, stats = run(sensor, datagrams, [0, len(datagrams)])
-    splits = [sorted({0, len(datagrams), *(draw.randrange(len(datagrams)) for _ in range(many))}) for many in (3, 20)]
+    splits = [
+        sorted({0, len(datagrams), *(draw.randrange(len(datagrams)) for _ in range(many))})
+        for many in (3, 20)
+    ]
     for cuts in [*splits, range(len(datagrams) + 1)]:
         batches, other, counted = run(sensor, datagrams, cuts)
         assert counted == stats
@@ -65,12 +84,16 @@ def test_batches_do_not_matter(name: str, loss: float) -> None:
         for scan, same in zip(other, scans, strict=True):
             assert np.array_equal(scan.rate_hz, same.rate_hz, equal_nan=True)
             for each in same.points.columns:
-                assert np.array_equal(getattr(scan.points, each), getattr(same.points, each), equal_nan=True), each
+                assert np.array_equal(
+                    getattr(scan.points, each), getattr(same.points, each), equal_nan=True
+                ), each
 
 
 @pytest.mark.parametrize("seed", range(6))
 def test_sequences_against_the_true_numbers(seed: int) -> None:
-    """Numbers 1 to 200 over many turns, with losses and late packets: the index runs like the true count."""
+    """Numbers 1 to 200 over many turns, with losses and late packets: the index runs like the true
+    count.
+    """
     draw = random.Random(seed)
     sensor = SHAPES["shape-datagrams"]
     template = sensor.example("data")
@@ -101,7 +124,10 @@ def test_late_and_doubled_packets_make_the_same_scans() -> None:
     _, same, stats = run(sensor, late, [0, 700, len(late)])
     assert (stats.lost, stats.late > 20, stats.duplicates > 20) == (0, True, True)
     for scan, other in zip(scans, same, strict=True):
-        assert all(np.array_equal(getattr(scan.points, each), getattr(other.points, each), equal_nan=True) for each in scan.points.columns)
+        assert all(
+            np.array_equal(getattr(scan.points, each), getattr(other.points, each), equal_nan=True)
+            for each in scan.points.columns
+        )
 
 
 def test_a_period_that_depends_on_the_frame_is_looked_up_again_when_it_changes() -> None:
@@ -114,17 +140,30 @@ def test_a_period_that_depends_on_the_frame_is_looked_up_again_when_it_changes()
     datagrams = [*single[:630], *dual, *dual[:40], *single[:100]]
     batches, _, stats = run(sensor, datagrams, [0, 300, 640, 1500, len(datagrams)])
     assert (stats.lost, stats.late, stats.duplicates) == (0, 0, 0)
-    assert int(column(batches, "breaks").sum()) == 2, "where the period changes the counter starts again"
+    assert int(column(batches, "breaks").sum()) == 2, (
+        "where the period changes the counter starts again"
+    )
 
 
 @pytest.mark.parametrize("backend", ["numpy", "construct"])
 @pytest.mark.parametrize("counts", [(1, 0), (0, 1, 1), (0, 0), (3, 0, 1)])
-def test_packets_without_samples_give_no_points_whatever_packets_are_beside_them(counts: tuple[int, ...], backend: str) -> None:
+def test_packets_without_samples_give_no_points_whatever_packets_are_beside_them(
+    counts: tuple[int, ...], backend: str
+) -> None:
     shape = SHAPES["shape-count"]
-    sensor = dataclasses.replace(shape, frames={"data": dataclasses.replace(shape.frames["data"], plausible=None)})
-    samples = [[dict(distance=1000 + index, quality=index)] * count for index, count in enumerate(counts)]
-    packets = sensor.decode(b"".join(sensor.build("data", first=0, last=100, samples=each) for each in samples), backend=backend)
+    sensor = dataclasses.replace(
+        shape, frames={"data": dataclasses.replace(shape.frames["data"], plausible=None)}
+    )
+    samples = [
+        [dict(distance=1000 + index, quality=index)] * count for index, count in enumerate(counts)
+    ]
+    packets = sensor.decode(
+        b"".join(sensor.build("data", first=0, last=100, samples=each) for each in samples),
+        backend=backend,
+    )
     cloud = packets.points()
     assert (len(packets), len(cloud)) == (len(counts), sum(counts))
     assert cloud.intensity is not None
-    assert cloud.intensity.tolist() == [index for index, count in enumerate(counts) for _ in range(count)]
+    assert cloud.intensity.tolist() == [
+        index for index, count in enumerate(counts) for _ in range(count)
+    ]

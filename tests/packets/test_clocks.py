@@ -30,16 +30,29 @@ def test_whole_turns_that_nobody_saw_are_counted_by_the_host() -> None:
 
 
 def test_a_pause_of_more_than_half_a_turn_goes_forward_where_the_host_says_so() -> None:
-    for pause, arrived in ((18, 18), (22, 21.5), (14, 14), (0.01, 18)):  # the last was held back on its way
+    for pause, arrived in (
+        (18, 18),
+        (22, 21.5),
+        (14, 14),
+        (0.01, 18),
+    ):  # the last was held back on its way
         clock = Unwrapper(30.0)
-        found = [clock.push(times(reading % 30), NOW + times(at)) for reading, at in ((11, 1), (11 + pause, 1 + arrived))]
+        found = [
+            clock.push(times(reading % 30), NOW + times(at))
+            for reading, at in ((11, 1), (11 + pause, 1 + arrived))
+        ]
         assert (np.concatenate(found)[1] - found[0][0]) / SECOND == pause
 
 
 @pytest.mark.parametrize("arrivals", [[0, 0], [0, NOW], [NOW, 0]])
 def test_an_arrival_that_nobody_knows_counts_no_turns(arrivals: list[int]) -> None:
     clock = Unwrapper(30.0)
-    found = np.concatenate([clock.push(times(at), np.array([host], np.int64)) for at, host in zip((10, 11), arrivals, strict=True)])
+    found = np.concatenate(
+        [
+            clock.push(times(at), np.array([host], np.int64))
+            for at, host in zip((10, 11), arrivals, strict=True)
+        ]
+    )
     assert np.diff(found).tolist() == [SECOND]
 
 
@@ -49,7 +62,12 @@ def test_readings_run_on_over_a_hundred_turns_also_when_late() -> None:
     true[500], true[501] = true[501], true[500]
     clock = Unwrapper(30.0)
     assert true[-1] // (30 * SECOND) > 60
-    found = np.concatenate([clock.push(part % (30 * SECOND), np.zeros(len(part), np.int64)) for part in np.array_split(true, 37)])
+    found = np.concatenate(
+        [
+            clock.push(part % (30 * SECOND), np.zeros(len(part), np.int64))
+            for part in np.array_split(true, 37)
+        ]
+    )
     assert (found - found[0] == true - true[0]).all()
 
 
@@ -75,11 +93,22 @@ def wide(numbers: Iterable[int]) -> list[bytes]:
 @pytest.mark.parametrize("first", [0, 1])
 @pytest.mark.parametrize("backend", BACKENDS)
 def test_a_counter_of_64_bits_counts_losses_and_starts_again(first: int, backend: str) -> None:
-    counted = dataclasses.replace(sensor(Struct("n" / Int64ul, "d" / Int8ub)), sequence=Sequence("n", first=first))
+    counted = dataclasses.replace(
+        sensor(Struct("n" / Int64ul, "d" / Int8ub)), sequence=Sequence("n", first=first)
+    )
     turn = [2**63 - 1, 2**63, 2**64 - 2, 2**64 - 1, first, first + 1]
-    for numbers, lost in (([1, 2, 3, 7, 8], 3), (turn[:2], 0), (turn[2:], 0), ([2**64 - 3, first + 1], 3)):
+    for numbers, lost in (
+        ([1, 2, 3, 7, 8], 3),
+        (turn[:2], 0),
+        (turn[2:], 0),
+        ([2**64 - 3, first + 1], 3),
+    ):
         stats = counted.decode(wide(numbers), backend=backend).stats
-        assert (stats.lost, stats.late, stats.duplicates, stats.plugin_errors) == (lost, 0, 0, 0), numbers
-    packets = counted.decode(wide([10**18, 5, 6, 2**63, 2**63 + 1]), backend=backend)  # it was switched off and on
+        assert (stats.lost, stats.late, stats.duplicates, stats.plugin_errors) == (lost, 0, 0, 0), (
+            numbers
+        )
+    packets = counted.decode(
+        wide([10**18, 5, 6, 2**63, 2**63 + 1]), backend=backend
+    )  # it was switched off and on
     assert (packets.stats.lost, packets.stats.plugin_errors) == (0, 0)
     assert np.diff(packets.index)[[1, 3]].tolist() == [1, 1]

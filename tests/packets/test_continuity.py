@@ -35,7 +35,9 @@ def in_pieces(sensor: Sensor, frames: Sequence[bytes], size: int) -> tuple[np.nd
     decoder = sensor.decoder()
     stream = PacketStream(sensor, "data", decoder.stats)
     parts = [frames[start : start + size] for start in range(0, len(frames), size)]
-    return np.concatenate([stream.add([decoder.datagrams(part, [None] * len(part))]).index for part in parts]), decoder.stats
+    return np.concatenate(
+        [stream.add([decoder.datagrams(part, [None] * len(part))]).index for part in parts]
+    ), decoder.stats
 
 
 def test_sensors_without_a_counter_are_known() -> None:
@@ -53,7 +55,9 @@ def test_a_gap_of_the_clock_is_a_loss_where_nothing_is_counted(name: str, lost: 
     packets = decoded(sensor, frames[:250] + frames[250 + lost :])
     assert counted(packets) == (lost, 0, 0)
     assert np.flatnonzero(packets.breaks).tolist() == [250]
-    assert packets.index.tolist() == [int(packets.index[0]) + place for place in range(600) if not 250 <= place < 250 + lost]
+    assert packets.index.tolist() == [
+        int(packets.index[0]) + place for place in range(600) if not 250 <= place < 250 + lost
+    ]
     assert counted(decoded(sensor, frames)) == (0, 0, 0)
 
 
@@ -84,7 +88,11 @@ def doubled(frames: list[bytes]) -> list[bytes]:
 
 
 def doubled_late(frames: list[bytes]) -> list[bytes]:
-    return [other for place, frame in enumerate(frames) for other in ([frame, frames[place - 5]] if place % 50 == 30 else [frame])]
+    return [
+        other
+        for place, frame in enumerate(frames)
+        for other in ([frame, frames[place - 5]] if place % 50 == 30 else [frame])
+    ]
 
 
 @pytest.mark.parametrize("name", UNCOUNTED)
@@ -101,9 +109,15 @@ def test_order_and_identity_are_those_of_the_clock_where_nothing_is_counted(
     assert (lost, duplicates) == (0, len(changed) - len(frames))
     assert (late > 0) == (disturbed is swapped)
     for scan, same in itertools.zip_longest(sensor.scans(changed), sensor.scans(frames)):
-        assert (len(scan), scan.complete, scan.stamp_ns) == (len(same), same.complete, same.stamp_ns)
+        assert (len(scan), scan.complete, scan.stamp_ns) == (
+            len(same),
+            same.complete,
+            same.stamp_ns,
+        )
         for column in scan.points.columns:
-            np.testing.assert_array_equal(getattr(scan.points, column), getattr(same.points, column))
+            np.testing.assert_array_equal(
+                getattr(scan.points, column), getattr(same.points, column)
+            )
 
 
 def test_packets_of_one_time_that_differ_are_not_doubles() -> None:
@@ -124,7 +138,11 @@ def test_what_the_counter_wraps_over_is_counted_by_the_clock(lost: int) -> None:
 def helios(number: int, counter: int | None = None) -> bytes:
     sensor = ls.sensor("robosense-helios16p")
     (frame,) = simulate(sensor, 1, start=number)
-    return frame if counter is None else sensor.build("data", {**sensor.parse(frame), "bottom_packet_count": counter})
+    return (
+        frame
+        if counter is None
+        else sensor.build("data", {**sensor.parse(frame), "bottom_packet_count": counter})
+    )
 
 
 @pytest.mark.parametrize("counter", [294_968_297, 0, 103, 95, 99, 2**32 - 1])
@@ -139,7 +157,9 @@ def test_a_counter_that_jumps_without_the_clock_is_damage_and_no_loss(counter: i
 
 def test_a_counter_that_starts_again_while_the_clock_goes_on_is_followed() -> None:
     sensor = ls.sensor("robosense-helios16p")
-    frames = simulate(sensor, 200) + [helios(number, number - 200) for number in range(200, 230) if number not in (210, 211)]
+    frames = simulate(sensor, 200) + [
+        helios(number, number - 200) for number in range(200, 230) if number not in (210, 211)
+    ]
     assert counted(sensor.decode(frames)) == (2, 0, 0)
 
 
@@ -181,7 +201,9 @@ def test_a_clock_that_does_not_advance_evenly_says_nothing() -> None:
     assert counted(sensor.decode(frames)) == (0, 0, 0)
 
 
-@pytest.mark.parametrize("name", ["shape-paced", "shape-columns", "shape-headed", "velodyne-vlp16", "robosense-m1"])
+@pytest.mark.parametrize(
+    "name", ["shape-paced", "shape-columns", "shape-headed", "velodyne-vlp16", "robosense-m1"]
+)
 @pytest.mark.parametrize("seed", [0, 2])
 def test_pieces_do_not_matter(name: str, seed: int) -> None:
     sensor = load_sensor(name)
@@ -204,4 +226,6 @@ def test_a_recording_that_is_played_in_a_loop_goes_on(name: str) -> None:
     packets = sensor.decode(simulate(sensor, 630) * 4)
     assert counted(packets) == (0, 0, 0)
     assert packets.breaks.sum() == (0 if name == "robosense-m1" else 3)
-    assert sum(len(scan) for scan in sensor.scans(simulate(sensor, 630) * 4)) == len(packets.points())
+    assert sum(len(scan) for scan in sensor.scans(simulate(sensor, 630) * 4)) == len(
+        packets.points()
+    )

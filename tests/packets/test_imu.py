@@ -1,4 +1,6 @@
-"""What an IMU feels: decoded in bulk and as it comes, in SI and the axes of the points, in time, and in the scans that it belongs to."""
+"""What an IMU feels: decoded in bulk and as it comes, in SI and the axes of the points, in time,
+and in the scans that it belongs to.
+"""
 
 from __future__ import annotations
 
@@ -35,7 +37,9 @@ def sent(shake: float = 0.0, sensor: ls.Sensor = SENSOR) -> list[bytes]:
 
 def sample(time: int, *values: float) -> bytes:
     names = [f"{what}_{axis}" for what in ("gyro", "force") for axis in "xyz"]
-    return SENSOR.build("imu", status=0, felt_at=time, units=True, **dict(zip(names, values, strict=True)))
+    return SENSOR.build(
+        "imu", status=0, felt_at=time, units=True, **dict(zip(names, values, strict=True))
+    )
 
 
 def test_values_are_in_si_and_the_axes_of_the_points() -> None:
@@ -43,12 +47,22 @@ def test_values_are_in_si_and_the_axes_of_the_points() -> None:
     assert (found.time_ns.tolist(), len(found)) == ([70], 1)
     np.testing.assert_allclose(found.angular_velocity, [[1, 2, 3]])
     np.testing.assert_allclose(found.linear_acceleration, [[9.80665, -19.6133, 0]])
-    one = dict(zip([f"{what}_{axis}" for what in ("gyro", "force") for axis in "xyz"], [100, 200, -300, 2048, 1024, -2048], strict=True))
-    data = SENSOR.build("data", number=0, time=1000, block=0, distances=[500] * 8, samples=[one] * SAMPLES)
+    one = dict(
+        zip(
+            [f"{what}_{axis}" for what in ("gyro", "force") for axis in "xyz"],
+            [100, 200, -300, 2048, 1024, -2048],
+            strict=True,
+        )
+    )
+    data = SENSOR.build(
+        "data", number=0, time=1000, block=0, distances=[500] * 8, samples=[one] * SAMPLES
+    )
     beside = SENSOR.decode([data]).imu()
     assert beside.time_ns.tolist() == [1000, 1000 + 1_666_667, 1000 + 3_333_333]
     np.testing.assert_allclose(beside.angular_velocity, np.deg2rad([[1, -2, 3]] * SAMPLES))
-    np.testing.assert_allclose(beside.linear_acceleration, np.array([[1, -0.5, 1]] * SAMPLES) * 9.80665)
+    np.testing.assert_allclose(
+        beside.linear_acceleration, np.array([[1, -0.5, 1]] * SAMPLES) * 9.80665
+    )
     assert list(beside.columns)[:2] == ["time_ns", "angular_velocity_x"]
 
 
@@ -56,7 +70,10 @@ def test_values_are_in_si_and_the_axes_of_the_points() -> None:
 def test_both_engines_and_single_packets_read_alike(frame: str) -> None:
     data = [SENSOR.example(frame, seed=seed) for seed in range(30)]
     bulk = SENSOR.decode(data, frame).imu()
-    ways = [SENSOR.decode(data, frame, backend="construct").imu(), joined([SENSOR.decode([each], frame).imu() for each in data])]
+    ways = [
+        SENSOR.decode(data, frame, backend="construct").imu(),
+        joined([SENSOR.decode([each], frame).imu() for each in data]),
+    ]
     for other in ways:
         for name in ("time_ns", "angular_velocity", "linear_acceleration"):
             np.testing.assert_array_equal(getattr(bulk, name), getattr(other, name))
@@ -71,7 +88,10 @@ def test_a_simulated_sensor_is_at_rest_and_shakes_when_asked() -> None:
         assert (found.angular_velocity == 0).all()
         shaken = SENSOR.decode(sent(0.1), frame).imu()
         assert (np.abs(shaken.linear_acceleration.mean(axis=0) - AT_REST) < 0.05).all()
-        assert ((shaken.linear_acceleration.std(axis=0) > 0.05) & (shaken.angular_velocity.std(axis=0) > 0.05)).all()
+        assert (
+            (shaken.linear_acceleration.std(axis=0) > 0.05)
+            & (shaken.angular_velocity.std(axis=0) > 0.05)
+        ).all()
 
 
 def assert_in_their_scans(scans: list[ls.Scan], number: int) -> None:
@@ -91,7 +111,9 @@ def test_scans_have_what_was_felt_during_them(tmp_path: Path) -> None:
     data = sent()
     number = len(SENSOR.decode(data, "imu").imu()) + len(SENSOR.decode(data).imu())
     assert_in_their_scans(list(SENSOR.scans(data)), number)
-    with ls.open(f"sim:{written(tmp_path)}?rate=max", written(tmp_path), record=str(tmp_path / "a.lsr")) as device:
+    with ls.open(
+        f"sim:{written(tmp_path)}?rate=max", written(tmp_path), record=str(tmp_path / "a.lsr")
+    ) as device:
         live = next(iter(device.scans()))
         assert live.imu is not None
         assert (np.abs(live.imu.linear_acceleration - AT_REST) < 1e-5).all()
@@ -115,7 +137,12 @@ def test_scans_have_what_was_felt_during_them(tmp_path: Path) -> None:
 def written(folder: Path) -> str:
     """A sensor's module."""
     path = folder / "inertia.py"
-    hook = ["from lidarspec.spec import hookimpl", "from tests.shapes.inertia import SENSOR", "@hookimpl", "def lidarspec_sensors():"]
+    hook = [
+        "from lidarspec.spec import hookimpl",
+        "from tests.shapes.inertia import SENSOR",
+        "@hookimpl",
+        "def lidarspec_sensors():",
+    ]
     path.write_text("\n".join([*hook, "    return [SENSOR]", ""]), encoding="ascii")
     return str(path)
 
@@ -124,8 +151,14 @@ def test_a_mount_and_the_axes_of_the_vendor_turn_it() -> None:
     found = SENSOR.decode([sample(0, 1, 2, 3, 4, 5, 6)], "imu").imu()
     turned = found.turned(Mount(yaw_deg=90.0).rotation)
     np.testing.assert_allclose(turned.linear_acceleration, [[-5, 4, 6]], atol=1e-6)
-    vendor = dataclasses.replace(SENSOR, vendor_axes=("right", "forward", "up")).configure(frame="vendor")
-    np.testing.assert_allclose(vendor.decode([sample(0, 1, 2, 3, 4, 5, 6)], "imu").imu().angular_velocity, [[-2, 1, 3]], rtol=1e-6)
+    vendor = dataclasses.replace(SENSOR, vendor_axes=("right", "forward", "up")).configure(
+        frame="vendor"
+    )
+    np.testing.assert_allclose(
+        vendor.decode([sample(0, 1, 2, 3, 4, 5, 6)], "imu").imu().angular_velocity,
+        [[-2, 1, 3]],
+        rtol=1e-6,
+    )
 
 
 def test_an_imu_by_another_clock_than_the_points_is_in_no_scan() -> None:
@@ -133,7 +166,10 @@ def test_an_imu_by_another_clock_than_the_points_is_in_no_scan() -> None:
     hosts = dataclasses.replace(SENSOR, frames=frames)
     assert all(scan.imu is None for scan in hosts.scans(sent(sensor=hosts)))
     assert (hosts.decode([sample(70, *[0] * 6)], "imu").imu().time_ns == 0).all()
-    assert all(scan.imu is None for scan in SHAPES["shape-extras"].scans(ls.simulate(SHAPES["shape-extras"], 30)))
+    assert all(
+        scan.imu is None
+        for scan in SHAPES["shape-extras"].scans(ls.simulate(SHAPES["shape-extras"], 30))
+    )
 
 
 def test_samples_that_no_scan_asks_for_are_let_go() -> None:
@@ -153,13 +189,18 @@ def test_mistakes_are_named() -> None:
     extras = SHAPES["shape-extras"]
     with pytest.raises(SpecError, match="no frame"):
         extras.decode([extras.example("data")]).imu()
-    only = dataclasses.replace(SENSOR, frames={**SENSOR.frames, "data": dataclasses.replace(SENSOR.frames["data"], imu=None)})
+    only = dataclasses.replace(
+        SENSOR,
+        frames={**SENSOR.frames, "data": dataclasses.replace(SENSOR.frames["data"], imu=None)},
+    )
     with pytest.raises(SpecError, match="imu"):
         only.decode([only.example("data")]).imu()
 
     def wrong(f: Fields) -> Any:
         return Cartesian(0, 0, 0)
 
-    failing = dataclasses.replace(SENSOR, frames={**SENSOR.frames, "imu": Frame(SENSOR.frames["imu"].struct, imu=wrong)})
+    failing = dataclasses.replace(
+        SENSOR, frames={**SENSOR.frames, "imu": Frame(SENSOR.frames["imu"].struct, imu=wrong)}
+    )
     with pytest.raises(SpecError, match="Imu"):
         failing.decode([failing.example("imu")], "imu").imu()

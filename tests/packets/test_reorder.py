@@ -18,7 +18,8 @@ from lidarspec.scans.scans import ScanStream
 from tests.representatives import load_sensor
 from tests.shapes.paced import FAST_S
 
-#: datagrams ordered by a counter, a counter and a clock, a clock with a declared pace, and a clock with a learned one.
+#: datagrams ordered by a counter, a counter and a clock, a clock with a declared pace, and a clock
+#: with a learned one.
 SHAPES = ["shape-headed", "shape-extras", "shape-paced", "shape-columns"]
 #: float32 columns of one packet may differ in the last bit between batches of different sizes.
 LAST_BIT = 2e-6
@@ -36,10 +37,20 @@ def assert_same_scans(scans: Sequence[Scan], expected: Sequence[Scan]) -> None:
     """Compare the facts and all columns of scans."""
     assert len(scans) == len(expected)
     for scan, same in zip(scans, expected, strict=True):
-        assert (len(scan), scan.complete, scan.whole, scan.stamp_ns) == (len(same), same.complete, same.whole, same.stamp_ns)
+        assert (len(scan), scan.complete, scan.whole, scan.stamp_ns) == (
+            len(same),
+            same.complete,
+            same.whole,
+            same.stamp_ns,
+        )
         assert scan.rate_hz == pytest.approx(same.rate_hz, nan_ok=True)
         for column in scan.points.columns:
-            np.testing.assert_allclose(scan.points.columns[column], same.points.columns[column], rtol=LAST_BIT, atol=LAST_BIT)
+            np.testing.assert_allclose(
+                scan.points.columns[column],
+                same.points.columns[column],
+                rtol=LAST_BIT,
+                atol=LAST_BIT,
+            )
 
 
 def assert_order_does_not_matter(sensor: Sensor, frames: Sequence[bytes], first: int) -> None:
@@ -64,7 +75,9 @@ def test_doubled_and_displaced_packets_make_the_same_scans(name: str, first: int
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("name", sorted(name for name, sensor in ls.sensors().items() if sensor.datagrams))
+@pytest.mark.parametrize(
+    "name", sorted(name for name, sensor in ls.sensors().items() if sensor.datagrams)
+)
 def test_every_sensor_that_sends_datagrams_keeps_the_promise(name: str) -> None:
     sensor = ls.sensor(name)
     assert_order_does_not_matter(sensor, simulate(sensor, 800), 0)
@@ -90,7 +103,9 @@ def test_a_late_packet_between_unevenly_timed_ones_is_no_loss() -> None:
     """Each packet is up to 40 % of its pace late by the clock."""
     draw = random.Random(1)
     delays = [draw.uniform(0, 0.4) * FAST_S for _ in range(97)]
-    sensor = with_sweep("shape-paced", lambda i, values: {**values, "micros": values["micros"] + delays[i % 97]})
+    sensor = with_sweep(
+        "shape-paced", lambda i, values: {**values, "micros": values["micros"] + delays[i % 97]}
+    )
     assert_order_does_not_matter(sensor, simulate(sensor, 120), 0)
 
 
@@ -115,7 +130,9 @@ def test_the_sizes_of_batches_do_not_matter(name: str) -> None:
 def test_packets_in_order_are_held_at_the_start_alone(name: str) -> None:
     sensor = load_sensor(name)
     reorder = Reorder(enabled=True)
-    released = [sum(map(len, reorder.push(packets))) for packets in pieces(sensor, simulate(sensor, 60), 1)]
+    released = [
+        sum(map(len, reorder.push(packets))) for packets in pieces(sensor, simulate(sensor, 60), 1)
+    ]
     held = WINDOW if sensor.sequence is not None else START_WINDOW
     assert released == [0] * held + [held + 1] + [1] * (59 - held)
 

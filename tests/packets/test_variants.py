@@ -1,4 +1,6 @@
-"""One sensor in several forms: data frames told apart by length, counters and units that the header gives, angles by default."""
+"""One sensor in several forms: data frames told apart by length, counters and units that the header
+gives, angles by default.
+"""
 
 from __future__ import annotations
 
@@ -19,14 +21,21 @@ PLAIN, COUNTED = (lengths.SENSOR.configure(answer=name) for name in ("plain", "c
 
 
 def counted(*numbers: int) -> list[bytes]:
-    return [COUNTED.build("counted", azimuth=100 * number % 36_000, distances=[1000] * 3, counter=number) for number in numbers]
+    return [
+        COUNTED.build(
+            "counted", azimuth=100 * number % 36_000, distances=[1000] * 3, counter=number
+        )
+        for number in numbers
+    ]
 
 
 def block(number: int | None) -> bytes:
     """A frame of one block, with this counter or without."""
     channels = [{"distance": 500, "strength": 9}] * 3
     blocks = [{"azimuth": 0, "channels": channels}]
-    return headed.SENSOR.build("data", unit=4, counted=int(number is not None), blocks=blocks, counter=number)
+    return headed.SENSOR.build(
+        "data", unit=4, counted=int(number is not None), blocks=blocks, counter=number
+    )
 
 
 @pytest.mark.parametrize("form", [PLAIN, COUNTED])
@@ -35,7 +44,11 @@ def test_the_form_that_arrives_is_decoded(form: Sensor) -> None:
     assert packets.frame == form.data_frame
     assert len(packets) == 30
     assert packets.points().valid.all()
-    assert [scan.complete for scan in lengths.SENSOR.scans(simulate(form, 30))] == [False, True, False]
+    assert [scan.complete for scan in lengths.SENSOR.scans(simulate(form, 30))] == [
+        False,
+        True,
+        False,
+    ]
 
 
 def test_the_first_form_decides_and_a_configured_one_or_a_named_one_has_precedence() -> None:
@@ -91,9 +104,17 @@ def test_packets_whose_header_leaves_the_counter_out_follow_each_other(
 ) -> None:
     for backend in ("auto", "construct"):
         packets = headed.SENSOR.decode([block(number) for number in numbers], backend=backend)
-        assert (packets.stats.lost, packets.stats.duplicates, packets.stats.plugin_errors) == (lost, duplicates, 0)
-        assert (np.diff(packets.index) > 0).all() if index is None else packets.index.tolist() == index
-        assert sum(len(scan) for scan in headed.SENSOR.scans([block(number) for number in numbers])) == 3 * (len(numbers) - duplicates)
+        assert (packets.stats.lost, packets.stats.duplicates, packets.stats.plugin_errors) == (
+            lost,
+            duplicates,
+            0,
+        )
+        assert (
+            (np.diff(packets.index) > 0).all() if index is None else packets.index.tolist() == index
+        )
+        assert sum(
+            len(scan) for scan in headed.SENSOR.scans([block(number) for number in numbers])
+        ) == 3 * (len(numbers) - duplicates)
 
 
 def test_distances_are_in_the_unit_of_the_header_also_when_simulated() -> None:
@@ -101,7 +122,9 @@ def test_distances_are_in_the_unit_of_the_header_also_when_simulated() -> None:
     fine, rough = (sensor.decode(simulate(sensor, 12)) for sensor in (headed.SENSOR, coarse))
     assert set(fine["unit"]) == {4}
     assert set(rough["unit"]) == {8}
-    assert abs(fine["blocks.channels.distance"] / rough["blocks.channels.distance"] - 2).max() < 0.02
+    assert (
+        abs(fine["blocks.channels.distance"] / rough["blocks.channels.distance"] - 2).max() < 0.02
+    )
     assert abs(fine.points().range - rough.points().range).max() <= 0.0061
     assert fine.points().range.min() > 1
 
@@ -115,25 +138,46 @@ def test_a_cloud_is_nominal_until_the_sensor_has_its_own_calibration() -> None:
     own = headed.SENSOR.configure(calibration=headed.EXAMPLE)
     assert bool(headed.SENSOR.decode([block(1)]).points().nominal)
     assert not own.decode([block(1)]).points().nominal
-    assert own.decode([block(1)]).points().elevation.tolist() == pytest.approx(np.deg2rad([-7.5, -2.5, 2.5]))
+    assert own.decode([block(1)]).points().elevation.tolist() == pytest.approx(
+        np.deg2rad([-7.5, -2.5, 2.5])
+    )
     assert [bool(scan.points.nominal) for scan in headed.SENSOR.scans([block(1)])] == [True]
 
 
 def test_an_array_without_elements_is_the_same_on_both_paths() -> None:
     empty = headed.SENSOR.build("data", unit=4, counted=0, rows=0, blocks=[], counter=None)
-    compiled, interpreted = (headed.SENSOR.decode([empty, block(1)], backend=backend) for backend in ("auto", "construct"))
-    assert compiled["blocks.channels.distance"].tolist() == interpreted["blocks.channels.distance"].tolist()
+    compiled, interpreted = (
+        headed.SENSOR.decode([empty, block(1)], backend=backend)
+        for backend in ("auto", "construct")
+    )
+    assert (
+        compiled["blocks.channels.distance"].tolist()
+        == interpreted["blocks.channels.distance"].tolist()
+    )
     assert interpreted.count("blocks").tolist() == [0, 1]
     assert compiled.count("blocks").tolist() == [0, 1]
-    assert compiled.count("blocks.channels").tolist() == interpreted.count("blocks.channels").tolist() == [0, 3]
+    assert (
+        compiled.count("blocks.channels").tolist()
+        == interpreted.count("blocks.channels").tolist()
+        == [0, 3]
+    )
 
 
 def test_an_array_in_one_without_elements_may_have_a_length_of_its_own() -> None:
     row = Struct("cells" / Array(this._.width, Int8ul))
-    struct = Struct("magic" / Const(b"RW"), "height" / Int8ul, "width" / Int8ul, "rows" / Array(this.height, row))
+    struct = Struct(
+        "magic" / Const(b"RW"),
+        "height" / Int8ul,
+        "width" / Int8ul,
+        "rows" / Array(this.height, row),
+    )
     frame_type = Frame(struct, data=True, max_length=40)
     sensor = replace(
-        headed.SENSOR, frames={"data": frame_type}, points=lambda f: Polar(f.rows.cells, 0), sequence=None, simulation=Simulation()
+        headed.SENSOR,
+        frames={"data": frame_type},
+        points=lambda f: Polar(f.rows.cells, 0),
+        sequence=None,
+        simulation=Simulation(),
     )
     data = [bytes.fromhex("5257 00 05"), bytes.fromhex("5257 02 03 010203 040506")]
     for backend in ("auto", "construct"):

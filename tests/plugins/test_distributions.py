@@ -1,4 +1,6 @@
-"""Distributions installed by pip: a foreign one is found and works, broken ones are named and disturb no other."""
+"""Distributions installed by pip: a foreign one is found and works, broken ones are named and
+disturb no other.
+"""
 
 from __future__ import annotations
 
@@ -83,9 +85,26 @@ def site(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A folder with the stranger's and the broken distributions, installed by pip as a user would."""
     folder = tmp_path_factory.mktemp("plugins")
     sources = [shutil.copytree(HERE / name, folder / name) for name in ("stranger", "broken")]
-    (folder / "broken" / "lidarspec_broken" / "syntax.py").write_text("def broken(:\n", encoding="utf-8")
-    command = [sys.executable, "-m", "pip", "install", "--quiet", "--disable-pip-version-check", "--no-index", "--no-deps"]
-    command += ["--no-build-isolation", "--no-compile", "--target", str(folder / "site"), *map(str, sources)]
+    (folder / "broken" / "lidarspec_broken" / "syntax.py").write_text(
+        "def broken(:\n", encoding="utf-8"
+    )
+    command = [
+        sys.executable,
+        "-m",
+        "pip",
+        "install",
+        "--quiet",
+        "--disable-pip-version-check",
+        "--no-index",
+        "--no-deps",
+    ]
+    command += [
+        "--no-build-isolation",
+        "--no-compile",
+        "--target",
+        str(folder / "site"),
+        *map(str, sources),
+    ]
     subprocess.run(command, check=True, capture_output=True, timeout=120)
     own = folder / "site" / "lidarspec" / "lidarspec.toml"
     own.parent.mkdir()
@@ -105,8 +124,20 @@ def seen(site: Path) -> dict[str, Any]:
 def python(site: Path, *arguments: str) -> subprocess.CompletedProcess[str]:
     paths = [str(site), os.environ.get("PYTHONPATH", "")]
     own = dict.fromkeys(("XDG_CONFIG_HOME", "APPDATA"), str(site))
-    environment = {**os.environ, **own, "PYTHONPATH": os.pathsep.join(path for path in paths if path)}
-    return subprocess.run([sys.executable, *arguments], check=False, env=environment, cwd=site, capture_output=True, text=True, timeout=120)
+    environment = {
+        **os.environ,
+        **own,
+        "PYTHONPATH": os.pathsep.join(path for path in paths if path),
+    }
+    return subprocess.run(
+        [sys.executable, *arguments],
+        check=False,
+        env=environment,
+        cwd=site,
+        capture_output=True,
+        text=True,
+        timeout=120,
+    )
 
 
 def test_a_strangers_sensor_is_found_and_works(seen: dict[str, Any]) -> None:
@@ -115,7 +146,11 @@ def test_a_strangers_sensor_is_found_and_works(seen: dict[str, Any]) -> None:
 
 
 def test_every_broken_plugin_is_named_with_its_error(seen: dict[str, Any]) -> None:
-    errors = {entry: (distribution, version, error, kept) for distribution, version, entry, _, error, kept in seen["plugins"] if error}
+    errors = {
+        entry: (distribution, version, error, kept)
+        for distribution, version, entry, _, error, kept in seen["plugins"]
+        if error
+    }
     assert errors.keys() == REPORTS.keys()
     for entry, (distribution, version, error, kept) in errors.items():
         assert (distribution, version) == ("lidarspec-broken", "0.0.7")
@@ -125,17 +160,25 @@ def test_every_broken_plugin_is_named_with_its_error(seen: dict[str, Any]) -> No
 
 
 def test_nothing_of_a_broken_plugin_stays(seen: dict[str, Any]) -> None:
-    assert set(seen["sensors"]) - set(seen["good"]) == {*FAILING, "broken-nan", "broken-fresh"}  # which stands beside a duplicate
+    assert set(seen["sensors"]) - set(seen["good"]) == {
+        *FAILING,
+        "broken-nan",
+        "broken-fresh",
+    }  # which stands beside a duplicate
 
 
 @pytest.mark.parametrize("name", FAILING)
-def test_a_plugin_that_fails_at_work_is_counted_and_says_so(seen: dict[str, Any], name: str) -> None:
+def test_a_plugin_that_fails_at_work_is_counted_and_says_so(
+    seen: dict[str, Any], name: str
+) -> None:
     said, parsed = seen["report"][name]
     assert said[0][:4] == said[1][:4]
     for frames, errors, _, _, text in said:
         assert FAILING[name] in text
         assert frames == 3 or errors >= 3
-    assert parsed == "" or (parsed.startswith("SpecError") and name in parsed and FAILING[name] in parsed)
+    assert parsed == "" or (
+        parsed.startswith("SpecError") and name in parsed and FAILING[name] in parsed
+    )
 
 
 def test_points_that_are_not_numbers_are_not_valid(seen: dict[str, Any]) -> None:
@@ -172,24 +215,40 @@ RULES = {
 
 
 def test_a_broken_distribution_is_checked_to_its_end(site: Path) -> None:
-    done = python(site, "-m", "lidarspec", "check", "lidarspec-broken", "--max-examples", "3", "--json")
+    done = python(
+        site, "-m", "lidarspec", "check", "lidarspec-broken", "--max-examples", "3", "--json"
+    )
     assert (done.returncode, done.stderr) == (1, "")
     loading, *sensors = json.loads(done.stdout)
     named = {finding["path"]: finding["code"] for finding in loading["findings"]}
     assert RULES.items() <= named.items()
     assert named.get("on") == "LS102"
-    assert {"broken-checksum", "broken-plausible", "broken-points"} <= {report["name"] for report in sensors if report["findings"]}
-    assert {finding["path"] for finding in loading["findings"] if finding["code"] == "LS001" and not finding["line"]} == {
-        "absent-module = lidarspec_broken.absent"
+    assert {"broken-checksum", "broken-plausible", "broken-points"} <= {
+        report["name"] for report in sensors if report["findings"]
     }
+    assert {
+        finding["path"]
+        for finding in loading["findings"]
+        if finding["code"] == "LS001" and not finding["line"]
+    } == {"absent-module = lidarspec_broken.absent"}
 
 
 @pytest.mark.parametrize("name", ["acme-x1", "acme-lidars", "lidarspec-broken"])
-def test_of_two_with_one_id_both_are_named_and_the_one_that_is_meant_is_checked(site: Path, name: str) -> None:
+def test_of_two_with_one_id_both_are_named_and_the_one_that_is_meant_is_checked(
+    site: Path, name: str
+) -> None:
     done = python(site, "-m", "lidarspec", "check", name, "--max-examples", "3", "--json")
     reports = {report["name"]: report for report in json.loads(done.stdout)}
-    (taken,) = [finding for report in reports.values() for finding in report["findings"] if finding["code"] == "LS005"]
-    assert taken["what"] == "lidarspec-broken has acme-x1: another sensor has this id already: that of acme-lidars:acme_lidars"
+    (taken,) = [
+        finding
+        for report in reports.values()
+        for finding in report["findings"]
+        if finding["code"] == "LS005"
+    ]
+    assert (
+        taken["what"]
+        == "lidarspec-broken has acme-x1: another sensor has this id already: that of acme-lidars:acme_lidars"
+    )
     assert taken["path"] == "duplicate = lidarspec_broken.duplicate"
     source = reports["acme-x1"]["picture"].get("source")
     assert (source == "Acme X1 manual, which nobody wrote") == (name != "lidarspec-broken")

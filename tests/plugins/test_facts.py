@@ -1,4 +1,6 @@
-"""Declarations that have to agree among the sensors of all plugins: related models, device information, scan rates."""
+"""Declarations that have to agree among the sensors of all plugins: related models, device
+information, scan rates.
+"""
 
 from __future__ import annotations
 
@@ -80,7 +82,11 @@ def test_sensors_with_the_same_incoming_frames_are_related(module: str) -> None:
     sensors = _sensors()
     for sensor in sensors_in(module):
         incoming = dict(sensor.incoming)
-        same = {other.id for other in sensors.values() if other.id != sensor.id and dict(other.incoming) == incoming}
+        same = {
+            other.id
+            for other in sensors.values()
+            if other.id != sensor.id and dict(other.incoming) == incoming
+        }
         named = {name for name in sensor.relatives if name in sensors}
         assert same <= named, sensor.id
         for name in named - same:

@@ -13,7 +13,7 @@ import lidarspec
 from lidarspec import Sensor, SpecError
 from lidarspec.plugins import Registry
 from lidarspec.scans.scans import scans_of
-from lidarspec.spec import Checksummed, Frame, OnWrap, Polar, Serial, Sum, Xor, hookimpl
+from lidarspec.spec import Checksummed, Fields, Frame, OnWrap, Polar, Serial, Sum, Xor, hookimpl
 from tests.plugins.test_plugins import STRANGER
 from tests.shapes import SHAPES
 
@@ -29,7 +29,10 @@ class Plugin:
 @pytest.fixture
 def registry() -> Registry:
     found = Registry()
-    found.add(Plugin(lidarspec_sensors=lambda: [SHAPES["shape-count"], SHAPES["shape-nested"]]), name="shapes")
+    found.add(
+        Plugin(lidarspec_sensors=lambda: [SHAPES["shape-count"], SHAPES["shape-nested"]]),
+        name="shapes",
+    )
     return found
 
 
@@ -40,7 +43,12 @@ def test_an_alias_names_the_same_sensor(registry: Registry) -> None:
 
 def test_a_checksum_hook_replaces_the_algorithm_and_nothing_else(registry: Registry) -> None:
     plain = registry.sensor("shape-count").example("data", seed=1)
-    registry.add(Plugin(lidarspec_checksum=lambda sensor, frame: Xor() if sensor.id == "shape-count" else None), name="site")
+    registry.add(
+        Plugin(
+            lidarspec_checksum=lambda sensor, frame: Xor() if sensor.id == "shape-count" else None
+        ),
+        name="site",
+    )
     hooked = registry.sensor("shape-count")
     built = hooked.build("data", hooked.parse(plain, verify=False))
     assert built[:-2] == plain[:-2]
@@ -53,7 +61,9 @@ def test_a_checksum_hook_replaces_the_algorithm_and_nothing_else(registry: Regis
 
 
 def test_a_checksum_hook_supplies_what_a_sensor_leaves_out(registry: Registry) -> None:
-    struct = Checksummed(Struct("header" / Const(b"\x99\x01"), "angle" / Int8ul, "sum" / Int8ul), field="sum")
+    struct = Checksummed(
+        Struct("header" / Const(b"\x99\x01"), "angle" / Int8ul, "sum" / Int8ul), field="sum"
+    )
     open_ = Sensor(
         "open-sum",
         vendor="Open",
@@ -69,7 +79,12 @@ def test_a_checksum_hook_supplies_what_a_sensor_leaves_out(registry: Registry) -
     registry.add(Plugin(lidarspec_sensors=lambda: [open_]), name="open")
     with pytest.raises(SpecError, match="lidarspec_checksum"):
         registry.sensor("open-sum").build("data", angle=5)
-    registry.add(Plugin(lidarspec_checksum=lambda sensor, frame: Sum(8) if sensor.id == "open-sum" else None), name="sums")
+    registry.add(
+        Plugin(
+            lidarspec_checksum=lambda sensor, frame: Sum(8) if sensor.id == "open-sum" else None
+        ),
+        name="sums",
+    )
     sensor = registry.sensor("open-sum")
     assert sensor.build("data", angle=5) == b"\x99\x01\x05\x9f"
     assert len(sensor.decode(sensor.build("data", angle=5) * 3)) == 3
@@ -79,14 +94,21 @@ def test_a_points_hook_stands_in_for_the_sensors_own(registry: Registry) -> None
     plain = registry.sensor("shape-count")
     data = plain.example("data", seed=1)
     own = plain.decode(data).points()
-    answer = lambda sensor, fields: Polar(range=fields.samples.distance * 2, azimuth=0.5) if sensor.id == "shape-count" else None  # noqa: E731
+
+    def answer(sensor: Sensor, fields: Fields) -> Polar | None:
+        if sensor.id != "shape-count":
+            return None
+        return Polar(range=fields.samples.distance * 2, azimuth=0.5)
+
     registry.add(Plugin(lidarspec_points=answer), name="site")
     found = registry.sensor("shape-count").decode(data).points()
     np.testing.assert_allclose(found.range[own.valid], 2 * own.range[own.valid], rtol=1e-6)
     assert set(found.azimuth.tolist()) == {0.5}
     nested = registry.sensor("shape-nested")
     frame = nested.example("data")
-    np.testing.assert_array_equal(nested.decode(frame).points().x, SHAPES["shape-nested"].decode(frame).points().x)
+    np.testing.assert_array_equal(
+        nested.decode(frame).points().x, SHAPES["shape-nested"].decode(frame).points().x
+    )
 
 
 def test_a_hook_that_fails_is_a_spec_error_of_its_sensor(registry: Registry) -> None:
@@ -105,7 +127,11 @@ def test_a_hook_that_fails_is_a_spec_error_of_its_sensor(registry: Registry) -> 
     assert "the site's file is gone" in packets.stats.tracebacks[0]
 
 
-@pytest.mark.parametrize("answer", [lambda sensor, frame: 1 / 0, lambda sensor, frame: "crc"], ids=["raises", "no checksum"])
+@pytest.mark.parametrize(
+    "answer",
+    [lambda sensor, frame: 1 / 0, lambda sensor, frame: "crc"],
+    ids=["raises", "no checksum"],
+)
 def test_a_checksum_hook_that_fails_disturbs_no_sensor(registry: Registry, answer: Any) -> None:
     before = registry.sensor("shape-count").example("data", seed=1)
     registry.add(Plugin(lidarspec_checksum=answer), name="site")

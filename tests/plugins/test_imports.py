@@ -1,4 +1,6 @@
-"""Finding a sensor imports what a sensor is and its own plugin, and nothing that can be done with it."""
+"""Finding a sensor imports what a sensor is and its own plugin, and nothing that can be done with
+it.
+"""
 
 from __future__ import annotations
 
@@ -28,7 +30,15 @@ ALLOWED = {
         "spec.checksums",
     ),
     *("spec.syntax", "spec.syntax.classes", "spec.syntax.meaning", "spec.syntax.refusals"),
-    *("spec.description", "spec.fields", "spec.links", "spec.results", "spec.sensor", "spec.timing", "spec.tree"),
+    *(
+        "spec.description",
+        "spec.fields",
+        "spec.links",
+        "spec.results",
+        "spec.sensor",
+        "spec.timing",
+        "spec.tree",
+    ),
     *(
         "spec.vocabulary",
         "spec.wire_forms",
@@ -41,7 +51,8 @@ ALLOWED = {
         "frames.schema",
     ),
 }
-#: of the standard library, what takes long to import; NumPy and construct may bring it along, lidarspec does not.
+#: of the standard library, what takes long to import; NumPy and construct may bring it along,
+#: lidarspec does not.
 SLOW = {"difflib", "email", "importlib.metadata", "pathlib", "random", "socket", "zipfile"}
 
 LOADED = """
@@ -56,14 +67,22 @@ print(json.dumps(sorted(set(sys.modules) - before)))
 
 def loaded(code: str) -> set[str]:
     """The modules that a new process imports for this, beyond NumPy, construct and pluggy."""
-    done = subprocess.run([sys.executable, "-c", LOADED.format(code)], check=True, capture_output=True, text=True, timeout=60)
+    done = subprocess.run(
+        [sys.executable, "-c", LOADED.format(code)],
+        check=True,
+        capture_output=True,
+        text=True,
+        timeout=60,
+    )
     return set(json.loads(done.stdout))
 
 
 def test_finding_a_sensor_imports_neither_the_engine_nor_other_plugins() -> None:
     found = loaded("ls.sensor('ldrobot-stl27l')")
     assert {name for name in found if name.startswith("lidarspec_")} == {"lidarspec_ldrobot"}
-    assert {name.removeprefix("lidarspec.") for name in found if name.startswith("lidarspec.")} <= ALLOWED
+    assert {
+        name.removeprefix("lidarspec.") for name in found if name.startswith("lidarspec.")
+    } <= ALLOWED
     assert not found & SLOW
 
 
@@ -72,14 +91,26 @@ def test_a_method_brings_the_engine() -> None:
 
 
 def test_importing_the_package_imports_no_library() -> None:
-    code = "import sys, lidarspec; print(sorted({'numpy', 'construct', 'pluggy'} & set(sys.modules)))"
-    assert subprocess.run([sys.executable, "-c", code], check=True, capture_output=True, text=True, timeout=60).stdout == "[]\n"
+    code = (
+        "import sys, lidarspec; print(sorted({'numpy', 'construct', 'pluggy'} & set(sys.modules)))"
+    )
+    assert (
+        subprocess.run(
+            [sys.executable, "-c", code], check=True, capture_output=True, text=True, timeout=60
+        ).stdout
+        == "[]\n"
+    )
 
 
 @pytest.mark.parametrize("options", [{}, {"frame": "vendor"}])
 def test_a_sensor_is_unpickled_where_nothing_was_imported_yet(options: dict[str, str]) -> None:
     sensor = ls.sensor("ldrobot-stl27l")
     packed = pickle.dumps(sensor.configure(**options) if options else sensor)
-    code = f"import pickle; sensor = pickle.loads({packed!r}); print(sensor); sensor.parse(sensor.example('data'))"
-    done = subprocess.run([sys.executable, "-c", code], check=True, capture_output=True, text=True, timeout=60)
+    code = (
+        f"import pickle; sensor = pickle.loads({packed!r}); print(sensor);"
+        " sensor.parse(sensor.example('data'))"
+    )
+    done = subprocess.run(
+        [sys.executable, "-c", code], check=True, capture_output=True, text=True, timeout=60
+    )
     assert "ldrobot-stl27l" in done.stdout

@@ -1,4 +1,6 @@
-"""Entry points as importlib.metadata finds them, and the plugins that are loaded only for their own ids."""
+"""Entry points as importlib.metadata finds them, and the plugins that are loaded only for their own
+ids.
+"""
 
 from __future__ import annotations
 
@@ -30,23 +32,38 @@ from tests.shapes import SHAPES
 
 def by_metadata(group: str) -> list[tuple[str, str, str, str]]:
     """The reference."""
-    found = [(e.name, e.value, e.dist.name, e.dist.version) for e in importlib.metadata.entry_points(group=group) if e.dist]
+    found = [
+        (e.name, e.value, e.dist.name, e.dist.version)
+        for e in importlib.metadata.entry_points(group=group)
+        if e.dist
+    ]
     return sorted(found, key=lambda entry: entry[:2])
 
 
-def distribution(place: Path, name: str, version: str, entries: str, kind: str = "dist-info") -> None:
+def distribution(
+    place: Path, name: str, version: str, entries: str, kind: str = "dist-info"
+) -> None:
     """A distribution as an installer leaves it behind."""
     folder = place / f"{name}-{version}.{kind}"
     folder.mkdir(parents=True)
     (folder / "entry_points.txt").write_text(entries, encoding="utf-8")
     header = f"Metadata-Version: 2.1\nName: {name}\nVersion: {version}\n\nName: a line of its description\n"
-    (folder / ("METADATA" if kind == "dist-info" else "PKG-INFO")).write_text(header, encoding="utf-8")
+    (folder / ("METADATA" if kind == "dist-info" else "PKG-INFO")).write_text(
+        header, encoding="utf-8"
+    )
 
 
 @pytest.mark.parametrize("zipped", [False, True])
-def test_odd_installations_are_read_as_importlib_metadata_reads_them(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, zipped: bool) -> None:
+def test_odd_installations_are_read_as_importlib_metadata_reads_them(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, zipped: bool
+) -> None:
     first, second, other = tmp_path / "first", tmp_path / "second", tmp_path / "other.zip"
-    distribution(first, "Some.Lidars", "2.0", "[else]\nx = no\n[odd.group]\n# y = no\n b = some.lidars:inner.part [extra]\n\na- = some\n")
+    distribution(
+        first,
+        "Some.Lidars",
+        "2.0",
+        "[else]\nx = no\n[odd.group]\n# y = no\n b = some.lidars:inner.part [extra]\n\na- = some\n",
+    )
     distribution(second, "some_lidars", "1.0", "[odd.group]\nold = hidden\n")
     distribution(second, "eggs", "3", "[odd.group]\nc = eggs\n", "egg-info")
     (second / "bare-1.dist-info").mkdir()
@@ -61,7 +78,9 @@ def test_odd_installations_are_read_as_importlib_metadata_reads_them(tmp_path: P
     assert found[0][2:] == ("Some.Lidars", "2.0")
 
 
-def test_an_import_hook_that_finds_distributions_is_asked(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+def test_an_import_hook_that_finds_distributions_is_asked(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
     distribution(tmp_path, "hooked", "1", "[odd.group]\nh = hooked\n")
 
     class Bare(importlib.metadata.PathDistribution):
@@ -73,14 +92,22 @@ def test_an_import_hook_that_finds_distributions_is_asked(monkeypatch: pytest.Mo
         def find_spec(self, *_: Any) -> None:
             return None
 
-        def find_distributions(self, context: Any = None) -> Iterable[importlib.metadata.Distribution]:
-            return [Bare(tmp_path), importlib.metadata.PathDistribution(tmp_path / "hooked-1.dist-info")]
+        def find_distributions(
+            self, context: Any = None
+        ) -> Iterable[importlib.metadata.Distribution]:
+            return [
+                Bare(tmp_path),
+                importlib.metadata.PathDistribution(tmp_path / "hooked-1.dist-info"),
+            ]
 
     monkeypatch.setattr(sys, "meta_path", [*sys.meta_path, Finder()])
     assert [entry.name for entry in entry_points("odd.group")] == ["h"]
 
 
-@pytest.mark.parametrize("value", ["json", "json:decoder.JSONDecoder", " json : decoder.JSONDecoder ", "json:dumps [extra]"])
+@pytest.mark.parametrize(
+    "value",
+    ["json", "json:decoder.JSONDecoder", " json : decoder.JSONDecoder ", "json:dumps [extra]"],
+)
 def test_an_entry_point_loads_as_its_reference_does(value: str) -> None:
     reference = importlib.metadata.EntryPoint("x", value.strip(), "g").load()
     assert EntryPoint("x", value, "d", "1").load() is reference
@@ -104,8 +131,14 @@ def plugins(monkeypatch: pytest.MonkeyPatch) -> dict[str, SimpleNamespace]:
     found: dict[str, SimpleNamespace] = {}
 
     def made(name: str, *ids: str, aliases: tuple[str, ...] = (), **hooks: Any) -> SimpleNamespace:
-        sensors = [replace(SHAPES["shape-count"], id=one, aliases=aliases, model=name) for one in ids]
-        module = Module(asked=0, given=[], **{hook: hookimpl(specname=None)(function) for hook, function in hooks.items()})
+        sensors = [
+            replace(SHAPES["shape-count"], id=one, aliases=aliases, model=name) for one in ids
+        ]
+        module = Module(
+            asked=0,
+            given=[],
+            **{hook: hookimpl(specname=None)(function) for hook, function in hooks.items()},
+        )
         module.by_name = {sensor.id.replace("-", "_"): sensor for sensor in sensors}
         module.by_name |= {alias.replace("-", "_"): sensors[0] for alias in aliases}
 
@@ -129,14 +162,18 @@ def plugins(monkeypatch: pytest.MonkeyPatch) -> dict[str, SimpleNamespace]:
 
 
 def registry(*entries: str, offered: str = "") -> Registry:
-    """A registry of modules given as "name = value", and of sensors given by their ids, in the order in which they would be found.
+    """A registry of modules given as "name = value", and of sensors given by their ids, in the
+    order in which they would be found.
 
     Args:
         offered: "id = module" for each sensor, separated by blanks around a comma.
     """
 
     def found(texts: Iterable[str]) -> list[EntryPoint]:
-        return [EntryPoint(name, value, "dist", "1") for name, _, value in sorted(text.partition(" = ") for text in texts)]
+        return [
+            EntryPoint(name, value, "dist", "1")
+            for name, _, value in sorted(text.partition(" = ") for text in texts)
+        ]
 
     named = (text.partition(" = ") for text in offered.split(", ") if text)
     sensors = [f"{name} = {module}:{name.replace('-', '_')}" for name, _, module in named]
@@ -162,16 +199,22 @@ def test_a_sensor_is_loaded_when_it_is_asked_for(plugins: dict[str, SimpleNamesp
     ]
 
 
-def test_an_alias_without_an_entry_of_its_own_is_known_once_all_are_loaded(plugins: dict[str, SimpleNamespace]) -> None:
+def test_an_alias_without_an_entry_of_its_own_is_known_once_all_are_loaded(
+    plugins: dict[str, SimpleNamespace],
+) -> None:
     assert registry(offered="acme-x1 = acme, beta-x1 = beta").sensor("b-one").id == "beta-x1"
 
 
-def test_an_unknown_id_is_told_with_the_ids_of_all_plugins(plugins: dict[str, SimpleNamespace]) -> None:
+def test_an_unknown_id_is_told_with_the_ids_of_all_plugins(
+    plugins: dict[str, SimpleNamespace],
+) -> None:
     with pytest.raises(UnknownSensor, match="did you mean 'beta-x1'"):
         registry(offered=OFFERED).sensor("bta-x1")
 
 
-def test_sensor_of_a_broken_distribution_is_named_with_its_error(plugins: dict[str, SimpleNamespace]) -> None:
+def test_sensor_of_a_broken_distribution_is_named_with_its_error(
+    plugins: dict[str, SimpleNamespace],
+) -> None:
     expected = (
         "unknown sensor 'acme-x7': it comes with dist, which failed to load: "
         "ModuleNotFoundError: No module named 'a_module_that_nobody_has'"
@@ -183,13 +226,20 @@ def test_sensor_of_a_broken_distribution_is_named_with_its_error(plugins: dict[s
         assert raised.value.__notes__ == ["next: lidarspec plugins"]
 
 
-def test_unknown_sensor_names_plugins_of_unknown_content_that_failed(plugins: dict[str, SimpleNamespace]) -> None:
-    with pytest.raises(UnknownSensor, match=r"^unknown sensor 'gamma-x1'.*; dist failed to load: ModuleNotFoundError: .* 'a_module_that"):
+def test_unknown_sensor_names_plugins_of_unknown_content_that_failed(
+    plugins: dict[str, SimpleNamespace],
+) -> None:
+    with pytest.raises(
+        UnknownSensor,
+        match=r"^unknown sensor 'gamma-x1'.*; dist failed to load: ModuleNotFoundError: .* 'a_module_that",
+    ):
         registry("gamma = a_module_that_nobody_has", offered=OFFERED).sensor("gamma-x1")
 
 
 @pytest.mark.parametrize("asked", [["acme-x1"], ["acme-x3"], ["other-x1"], ["acme-x2"], []])
-def test_of_two_with_one_id_the_first_wins_whichever_is_asked_for(plugins: dict[str, SimpleNamespace], asked: list[str]) -> None:
+def test_of_two_with_one_id_the_first_wins_whichever_is_asked_for(
+    plugins: dict[str, SimpleNamespace], asked: list[str]
+) -> None:
     found = registry(offered="acme-x1 = acme, acme-x2 = acme, acme-x2 = again, acme-x3 = again")
     for name in asked:
         with contextlib.suppress(UnknownSensor):
@@ -205,7 +255,10 @@ def test_of_two_with_one_id_the_first_wins_whichever_is_asked_for(plugins: dict[
 @pytest.mark.parametrize(
     ("offered", "error"),
     [
-        ("liar-x2 = liar", "liar-x1: its entry point is called 'liar-x2', which is none of its names"),
+        (
+            "liar-x2 = liar",
+            "liar-x1: its entry point is called 'liar-x2', which is none of its names",
+        ),
         ("odd-x1 = odd", "lidarspec_sensors returns sensors, not int"),
         ("gone-x1 = a_module_that_nobody_has", "ModuleNotFoundError"),
         ("acme-x7 = acme", "AttributeError"),
@@ -223,10 +276,15 @@ def test_an_entry_that_names_no_such_sensor_is_named_and_leaves_nothing(
     assert broken.traceback
 
 
-def test_a_sensor_cannot_take_an_id_from_a_module_that_is_always_loaded(plugins: dict[str, SimpleNamespace]) -> None:
+def test_a_sensor_cannot_take_an_id_from_a_module_that_is_always_loaded(
+    plugins: dict[str, SimpleNamespace],
+) -> None:
     found = registry("zz = again", offered="acme-x2 = acme")
     assert found.sensor("acme-x2").model == "again"
-    assert [plugin.error for plugin in found.plugins] == ["", "acme-x2: another sensor has this id already: that of dist:again"]
+    assert [plugin.error for plugin in found.plugins] == [
+        "",
+        "acme-x2: another sensor has this id already: that of dist:again",
+    ]
 
 
 def test_threads_that_ask_at_once_get_the_same_sensor(plugins: dict[str, SimpleNamespace]) -> None:
@@ -238,7 +296,9 @@ def test_threads_that_ask_at_once_get_the_same_sensor(plugins: dict[str, SimpleN
         assert not any(plugin.error for plugin in found.plugins)
 
 
-def test_a_hook_that_is_always_loaded_reaches_the_sensors_that_are_offered(plugins: dict[str, SimpleNamespace]) -> None:
+def test_a_hook_that_is_always_loaded_reaches_the_sensors_that_are_offered(
+    plugins: dict[str, SimpleNamespace],
+) -> None:
     found = registry("meddler = meddler", offered="acme-x1 = acme")
     assert isinstance(found.sensor("acme-x1").points, HookedPoints)
     found.sensor("acme-x1")
@@ -248,14 +308,20 @@ def test_a_hook_that_is_always_loaded_reaches_the_sensors_that_are_offered(plugi
 
 
 def claimed(*claims: str, owners: dict[str, str] | None = None) -> Registry:
-    """A registry of sensors that distributions offer, each given as "distribution: name = module, ..."; an alias as "name = module:id"."""
+    """A registry of sensors that distributions offer, each given as "distribution: name = module,
+    ..."; an alias as "name = module:id".
+    """
     offered = []
     for claim in claims:
         distribution, _, entries = claim.partition(": ")
         for entry in entries.split(", "):
             name, _, value = entry.partition(" = ")
             module, _, attribute = value.partition(":")
-            offered.append(EntryPoint(name, f"{module}:{(attribute or name).replace('-', '_')}", distribution, "1"))
+            offered.append(
+                EntryPoint(
+                    name, f"{module}:{(attribute or name).replace('-', '_')}", distribution, "1"
+                )
+            )
     return Registry([], offered, lambda: owners or {})
 
 
@@ -270,22 +336,41 @@ def test_the_owner_of_an_id_has_it_and_the_other_keeps_the_rest(
     found = claimed(f"{stranger}: acme-x2 = again, acme-x3 = again", OWNED)
     for name in asked:
         found.sensor(name)
-    assert {name: sensor.model for name, sensor in found.sensors().items()} == {"acme-x1": "acme", "acme-x2": "acme", "acme-x3": "again"}
+    assert {name: sensor.model for name, sensor in found.sensors().items()} == {
+        "acme-x1": "acme",
+        "acme-x2": "acme",
+        "acme-x3": "again",
+    }
     assert found.sensor("ACME X2").model == "acme"
     assert [(plugin.distribution, plugin.sensors, plugin.error) for plugin in found.plugins] == [
-        (stranger, ("acme-x3",), "acme-x2: another sensor has this id already: that of lidarspec-acme:acme"),
+        (
+            stranger,
+            ("acme-x3",),
+            "acme-x2: another sensor has this id already: that of lidarspec-acme:acme",
+        ),
         ("lidarspec-acme", ("acme-x1", "acme-x2"), ""),
     ]
 
 
 def test_whom_the_user_names_comes_before_the_vendor(plugins: dict[str, SimpleNamespace]) -> None:
-    found = claimed("my-fork: acme-x2 = again, acme-x3 = again", OWNED, owners={"acme-x2": "My_Fork"})
-    assert {name: sensor.model for name, sensor in found.sensors().items()} == {"acme-x1": "acme", "acme-x2": "again", "acme-x3": "again"}
-    assert [plugin.error for plugin in found.plugins] == ["", "acme-x2: another sensor has this id already: that of my-fork:again"]
+    found = claimed(
+        "my-fork: acme-x2 = again, acme-x3 = again", OWNED, owners={"acme-x2": "My_Fork"}
+    )
+    assert {name: sensor.model for name, sensor in found.sensors().items()} == {
+        "acme-x1": "acme",
+        "acme-x2": "again",
+        "acme-x3": "again",
+    }
+    assert [plugin.error for plugin in found.plugins] == [
+        "",
+        "acme-x2: another sensor has this id already: that of my-fork:again",
+    ]
 
 
 @pytest.mark.parametrize("text", ["[owners", "owners = 3", "[owners]\nacme-x1 = 3"])
-def test_owners_that_cannot_be_read_are_warned_of(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, text: str) -> None:
+def test_owners_that_cannot_be_read_are_warned_of(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, text: str
+) -> None:
     for name in ("XDG_CONFIG_HOME", "APPDATA"):
         monkeypatch.setenv(name, str(tmp_path))
     (file := own_settings()).parent.mkdir()
@@ -294,23 +379,38 @@ def test_owners_that_cannot_be_read_are_warned_of(tmp_path: Path, monkeypatch: p
         assert named_owners() == {}
 
 
-def test_an_alias_goes_to_the_sensor_of_its_owner_also_where_no_entry_point_says_so(plugins: dict[str, SimpleNamespace]) -> None:
-    plugins["liar"].by_name["liar_x1"] = replace(plugins["liar"].by_name["liar_x1"], aliases=("b-one", "acme-x1"))
+def test_an_alias_goes_to_the_sensor_of_its_owner_also_where_no_entry_point_says_so(
+    plugins: dict[str, SimpleNamespace],
+) -> None:
+    plugins["liar"].by_name["liar_x1"] = replace(
+        plugins["liar"].by_name["liar_x1"], aliases=("b-one", "acme-x1")
+    )
     strangers = "a-stranger: liar-x1 = liar"
     found = claimed(strangers, "lidarspec-beta: beta-x1 = beta, b-one = beta:beta-x1", OWNED)
     for _ in range(2):  # before the stranger's is loaded, and after
         assert (found.sensor("b-one").id, found.sensor("acme-x1").model) == ("beta-x1", "acme")
         assert found.sensor("liar-x1").id == "liar-x1"
     assert sorted(found.sensors()) == ["acme-x1", "acme-x2", "beta-x1", "liar-x1"]
-    plugins["again"].by_name["b_one"] = replace(plugins["again"].by_name["acme_x3"], aliases=("b-one",))
-    found = claimed("a-stranger: b-one = again, acme-x3 = again", "lidarspec-beta: beta-x1 = beta, b-one = beta:beta-x1")
+    plugins["again"].by_name["b_one"] = replace(
+        plugins["again"].by_name["acme_x3"], aliases=("b-one",)
+    )
+    found = claimed(
+        "a-stranger: b-one = again, acme-x3 = again",
+        "lidarspec-beta: beta-x1 = beta, b-one = beta:beta-x1",
+    )
     assert found.sensor("b-one").id == "beta-x1"
     assert sorted(found.sensors()) == ["acme-x3", "beta-x1"]
 
 
-def test_an_id_that_nobody_owns_is_an_error_when_it_is_used_and_no_other_is(plugins: dict[str, SimpleNamespace]) -> None:
-    found = claimed("one-lidars: acme-x2 = again, acme-x3 = again", "two-lidars: acme-x1 = acme, acme-x2 = acme")
-    with pytest.raises(UsageError, match=r'one-lidars and two-lidars each have .*\[owners\] acme-x2 = "one-lidars"'):
+def test_an_id_that_nobody_owns_is_an_error_when_it_is_used_and_no_other_is(
+    plugins: dict[str, SimpleNamespace],
+) -> None:
+    found = claimed(
+        "one-lidars: acme-x2 = again, acme-x3 = again", "two-lidars: acme-x1 = acme, acme-x2 = acme"
+    )
+    with pytest.raises(
+        UsageError, match=r'one-lidars and two-lidars each have .*\[owners\] acme-x2 = "one-lidars"'
+    ):
         found.sensor("acme-x2")
     assert sorted(found.sensors()) == ["acme-x1", "acme-x3"]
     assert [(plugin.sensors, plugin.error) for plugin in found.plugins] == [
@@ -321,8 +421,12 @@ def test_an_id_that_nobody_owns_is_an_error_when_it_is_used_and_no_other_is(plug
     assert "acme-x3" in found
 
 
-def test_an_owner_that_does_not_load_is_not_replaced_by_a_stranger(plugins: dict[str, SimpleNamespace]) -> None:
-    found = claimed("a-stranger: acme-x2 = again", "lidarspec-acme: acme-x2 = a_module_that_nobody_has")
+def test_an_owner_that_does_not_load_is_not_replaced_by_a_stranger(
+    plugins: dict[str, SimpleNamespace],
+) -> None:
+    found = claimed(
+        "a-stranger: acme-x2 = again", "lidarspec-acme: acme-x2 = a_module_that_nobody_has"
+    )
     with pytest.raises(UnknownSensor):
         found.sensor("acme-x2")
 
@@ -333,20 +437,34 @@ def test_entry_points_that_are_not_text_are_named_and_keep_nothing_else_away(
 ) -> None:
     distribution(tmp_path, "good", "1", "[odd.group]\na = json\n")
     distribution(tmp_path, "bad", "2", "")
-    (tmp_path / "bad-2.dist-info" / "entry_points.txt").write_bytes(b"[odd.group]\nb = json\n[console_scripts]\nm\xfcller = bad:main\n")
+    (tmp_path / "bad-2.dist-info" / "entry_points.txt").write_bytes(
+        b"[odd.group]\nb = json\n[console_scripts]\nm\xfcller = bad:main\n"
+    )
     distribution(tmp_path, "worse", "3", "[odd.group]\nc = json\n")
-    (tmp_path / "worse-3.dist-info" / "METADATA").write_bytes(b"Name: worse\nVersion: 3\nAuthor: M\xfcller\n")
+    (tmp_path / "worse-3.dist-info" / "METADATA").write_bytes(
+        b"Name: worse\nVersion: 3\nAuthor: M\xfcller\n"
+    )
     if zipped:
         with zipfile.ZipFile(tmp_path / "other.zip", "w") as archive:
             archive.writestr("packed-4.dist-info/METADATA", "Name: packed\nVersion: 4\n")
-    monkeypatch.setattr(sys, "path", [str(tmp_path), *([str(tmp_path / "other.zip")] * zipped), *sys.path])
+    monkeypatch.setattr(
+        sys, "path", [str(tmp_path), *([str(tmp_path / "other.zip")] * zipped), *sys.path]
+    )
     assert {entry.distribution for entry in entry_points("odd.group")} >= {"good"}
-    (named,) = [plugin for plugin in Registry(entry_points("lidarspec")).plugins if "bad" in plugin.distribution]
+    (named,) = [
+        plugin
+        for plugin in Registry(entry_points("lidarspec")).plugins
+        if "bad" in plugin.distribution
+    ]
     assert "its entry_points.txt is not UTF-8" in named.error
 
 
-def test_a_plugin_that_takes_long_is_named_while_it_does(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    (tmp_path / "slow_lidars.py").write_text("import its_end\nits_end.come.wait(60)\n", encoding="utf-8")
+def test_a_plugin_that_takes_long_is_named_while_it_does(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (tmp_path / "slow_lidars.py").write_text(
+        "import its_end\nits_end.come.wait(60)\n", encoding="utf-8"
+    )
     end = threading.Event()
     monkeypatch.setitem(sys.modules, "its_end", SimpleNamespace(come=end))  # type: ignore[arg-type]
     monkeypatch.syspath_prepend(tmp_path)
@@ -364,7 +482,9 @@ def test_a_plugin_that_takes_long_is_named_while_it_does(tmp_path: Path, monkeyp
     assert told == ["slow-lidars: slow_lidars has been loading for 0.01 s; next: lidarspec plugins"]
 
 
-def test_a_plugin_that_hangs_is_left_out_and_the_others_work(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_plugin_that_hangs_is_left_out_and_the_others_work(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     code = "import its_end\n\nits_end.come.wait(60)\nits_end.gone.set()\n"
     (tmp_path / "hanging_lidars.py").write_text(code, encoding="utf-8")
     end, gone = threading.Event(), threading.Event()
@@ -373,8 +493,13 @@ def test_a_plugin_that_hangs_is_left_out_and_the_others_work(tmp_path: Path, mon
     monkeypatch.setattr("lidarspec.plugins.PATIENCE", 0.01)
     monkeypatch.setattr("lidarspec.plugins.LIMIT", 0.02)
     monkeypatch.setattr("lidarspec.plugins._hanging", {})
-    hanging = [EntryPoint("a", "hanging_lidars", "hanging-lidars", "1"), EntryPoint("acme-x1", "hanging_lidars:X1", "hanging-lidars", "1")]
-    good = next(entry for entry in entry_points("lidarspec.sensors") if entry.name == "cspc-m1c1-mini")
+    hanging = [
+        EntryPoint("a", "hanging_lidars", "hanging-lidars", "1"),
+        EntryPoint("acme-x1", "hanging_lidars:X1", "hanging-lidars", "1"),
+    ]
+    good = next(
+        entry for entry in entry_points("lidarspec.sensors") if entry.name == "cspc-m1c1-mini"
+    )
     good.load()  # so that it does not take long
     with pytest.warns(UserWarning, match="what it adds is left out"):
         found = Registry(hanging[:1], [hanging[1], good])
@@ -392,8 +517,13 @@ def test_a_verb_runs_beside_a_plugin_that_hangs(tmp_path: Path) -> None:
     (tmp_path / "hanging_lidars.py").write_text("import time\ntime.sleep(600)\n", encoding="utf-8")
     environment = os.environ | {"PYTHONPATH": str(tmp_path)}
     command = [sys.executable, "-m", "lidarspec", "parse", "545a", "-s", "ldrobot-stl27l"]
-    done = subprocess.run(command, env=environment, capture_output=True, text=True, check=False, timeout=300)
-    assert f"hanging: it hangs: not loaded after 10 s at {tmp_path / 'hanging_lidars.py'}, line 2" in done.stderr
+    done = subprocess.run(
+        command, env=environment, capture_output=True, text=True, check=False, timeout=300
+    )
+    assert (
+        f"hanging: it hangs: not loaded after 10 s at {tmp_path / 'hanging_lidars.py'}, line 2"
+        in done.stderr
+    )
     assert done.returncode == 4
 
 
@@ -416,9 +546,14 @@ HANGING = {"hangs": ("import time\ntime.sleep(600)", "it hangs: not loaded after
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(("plugins", "limit_s"), [(ODD, 600), (HANGING, 0.5)], ids=["odd", "hanging"])
+@pytest.mark.parametrize(
+    ("plugins", "limit_s"), [(ODD, 600), (HANGING, 0.5)], ids=["odd", "hanging"]
+)
 def test_each_plugin_is_tried_in_a_process_of_its_own_if_anything_is_wrong(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, plugins: dict[str, tuple[str, str, str]], limit_s: float
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    plugins: dict[str, tuple[str, str, str]],
+    limit_s: float,
 ) -> None:
     for name, (code, _, _) in plugins.items():
         (tmp_path / f"odd_{name}.py").write_text(code, encoding="utf-8")
@@ -426,23 +561,43 @@ def test_each_plugin_is_tried_in_a_process_of_its_own_if_anything_is_wrong(
     monkeypatch.syspath_prepend(tmp_path)
     monkeypatch.setattr("lidarspec.plugins.LIMIT", limit_s)
     entries = entry_points("lidarspec")
-    monkeypatch.setattr("lidarspec.plugins.entry_points", lambda group: entries if group == "lidarspec" else [])
-    monkeypatch.setattr(threading.Thread, "start", lambda thread: None if thread.name == "mine" else START(thread))  # not here too
-    found = {plugin.distribution.removeprefix("odd_"): (plugin.error, plugin.remark) for plugin in tried()}
+    monkeypatch.setattr(
+        "lidarspec.plugins.entry_points", lambda group: entries if group == "lidarspec" else []
+    )
+    monkeypatch.setattr(
+        threading.Thread, "start", lambda thread: None if thread.name == "mine" else START(thread)
+    )  # not here too
+    found = {
+        plugin.distribution.removeprefix("odd_"): (plugin.error, plugin.remark)
+        for plugin in tried()
+    }
     assert found == {name: (error, remark) for name, (_, error, remark) in plugins.items()}
 
 
 @pytest.mark.slow
-def test_plugins_with_which_nothing_is_wrong_are_tried_in_one_process(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_plugins_with_which_nothing_is_wrong_are_tried_in_one_process(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     for name in ("one", "other"):
         (tmp_path / f"sound_{name}.py").write_text("", encoding="utf-8")
         distribution(tmp_path, f"sound_{name}", "1", f"[lidarspec]\n{name} = sound_{name}\n")
     monkeypatch.syspath_prepend(tmp_path)
-    entries = [entry for entry in entry_points("lidarspec") if entry.distribution.startswith("sound")]
-    monkeypatch.setattr("lidarspec.plugins.entry_points", lambda group: entries if group == "lidarspec" else [])
+    entries = [
+        entry for entry in entry_points("lidarspec") if entry.distribution.startswith("sound")
+    ]
+    monkeypatch.setattr(
+        "lidarspec.plugins.entry_points", lambda group: entries if group == "lidarspec" else []
+    )
     run, started = subprocess.run, []
-    monkeypatch.setattr(subprocess, "run", lambda command, **more: [started.append(command), run(command, **more)][1])
-    assert {plugin.distribution: (plugin.error, plugin.remark) for plugin in tried()} == {"sound_one": ("", ""), "sound_other": ("", "")}
+    monkeypatch.setattr(
+        subprocess,
+        "run",
+        lambda command, **more: [started.append(command), run(command, **more)][1],
+    )
+    assert {plugin.distribution: (plugin.error, plugin.remark) for plugin in tried()} == {
+        "sound_one": ("", ""),
+        "sound_other": ("", ""),
+    }
     assert len(started) == 1
 
 

@@ -1,7 +1,8 @@
-"""The table of known sensors: it equals a fresh generation, lists what is installed, and names what is not.
+"""The table of known sensors: it equals a fresh generation, lists what is installed, and names what
+is not.
 
-The environment of these tests holds the core and one plugin: a virtual environment with links to the installed packages that the core
-requires, and no other.
+The environment of these tests holds the core and one plugin: a virtual environment with links to
+the installed packages that the core requires, and no other.
 """
 
 from __future__ import annotations
@@ -27,7 +28,17 @@ from tests.made_captures import ethernet, ipv4, pcap
 from tools.make_known_sensors import TABLE, table
 
 INSTALLED = "lidarspec-ldrobot"
-PACKAGES = ("lidarspec", "lidarspec_ldrobot", "click", "construct", "numpy", "numpy.libs", "pluggy", "serial", "rich")
+PACKAGES = (
+    "lidarspec",
+    "lidarspec_ldrobot",
+    "click",
+    "construct",
+    "numpy",
+    "numpy.libs",
+    "pluggy",
+    "serial",
+    "rich",
+)
 REQUIRED_BY_RICH = ("pygments", "markdown_it", "mdurl")
 VELODYNE_PORT = 2368
 LIVOX_PORT = 56301
@@ -47,13 +58,21 @@ def one_plugin(tmp_path_factory: pytest.TempPathFactory) -> Path:
         if folder is not None:
             (site / name).symlink_to(folder, target_is_directory=True)
     for name in ("lidarspec", INSTALLED):
-        metadata = Path(str(distribution(name).locate_file(f"{name.replace('-', '_')}-{ls.__version__}.dist-info")))
+        metadata = Path(
+            str(
+                distribution(name).locate_file(
+                    f"{name.replace('-', '_')}-{ls.__version__}.dist-info"
+                )
+            )
+        )
         (site / metadata.name).symlink_to(metadata, target_is_directory=True)
     return python
 
 
 def package_folder(name: str) -> Path | None:
-    """Return the folder of an installed package; None if there is none, as with `numpy.libs` on some systems."""
+    """Return the folder of an installed package; None if there is none, as with `numpy.libs` on
+    some systems.
+    """
     if "." in name:
         folder = package_folder(name.partition(".")[0])
         assert folder is not None
@@ -65,14 +84,22 @@ def package_folder(name: str) -> Path | None:
 def capture_to(port: int, datagrams: list[bytes]) -> bytes:
     """Return a pcap file of datagrams to a port."""
     headers = (struct.pack(">HHHH", SENDER_PORT, port, 8 + len(data), 0) for data in datagrams)
-    return pcap(*(ethernet(ipv4(header + data)) for header, data in zip(headers, datagrams, strict=True)))
+    return pcap(
+        *(ethernet(ipv4(header + data)) for header, data in zip(headers, datagrams, strict=True))
+    )
 
 
 def run(python: Path, *words: object, code: int = 0) -> subprocess.CompletedProcess[str]:
     """Run the command line in an environment."""
-    variables = {name: value for name, value in os.environ.items() if not name.startswith(("PYTHON", "LIDARSPEC"))}
+    variables = {
+        name: value
+        for name, value in os.environ.items()
+        if not name.startswith(("PYTHON", "LIDARSPEC"))
+    }
     command = [python, "-m", "lidarspec", *map(str, words)]
-    done = subprocess.run(command, capture_output=True, text=True, cwd=python.parent, env=variables, check=False)
+    done = subprocess.run(
+        command, capture_output=True, text=True, cwd=python.parent, env=variables, check=False
+    )
     assert done.returncode == code, done.stdout + done.stderr
     return done
 
@@ -89,15 +116,24 @@ def test_rows_survive_their_json_form() -> None:
 def test_every_installed_sensor_is_listed_as_it_is() -> None:
     listed = {row.id: row._replace(signatures=()) for row in registry().list_sensors()}
     homes = {name: plugin for plugin in registry().plugins for name in plugin.sensors}
-    assert listed == {name: summarize(sensor, homes[name].distribution, homes[name].version) for name, sensor in ls.sensors().items()}
+    assert listed == {
+        name: summarize(sensor, homes[name].distribution, homes[name].version)
+        for name, sensor in ls.sensors().items()
+    }
 
 
 @pytest.mark.parametrize(
     ("version", "names", "loaded"),
-    [("0.1.0", {"ldrobot-ld20", "ld20"}, False), ("0.1.1", {"ldrobot-ld20", "ld20"}, True), ("0.1.0", {"ldrobot-ld20"}, True)],
+    [
+        ("0.1.0", {"ldrobot-ld20", "ld20"}, False),
+        ("0.1.1", {"ldrobot-ld20", "ld20"}, True),
+        ("0.1.0", {"ldrobot-ld20"}, True),
+    ],
     ids=["as in the table", "another version", "an alias less"],
 )
-def test_only_a_sensor_that_the_table_describes_is_listed_without_its_plugin(version: str, names: set[str], loaded: bool) -> None:
+def test_only_a_sensor_that_the_table_describes_is_listed_without_its_plugin(
+    version: str, names: set[str], loaded: bool
+) -> None:
     entries = [EntryPoint(name, "no_such_module:LD20", INSTALLED, version) for name in names]
     registry = Registry(offered=entries)
     listed = [row.id for row in registry.list_sensors()]
@@ -113,19 +149,29 @@ def test_a_sensor_that_is_not_installed_is_named_with_its_distribution(name: str
     assert caught.value.__notes__ == [f"next: {install_command('lidarspec-velodyne')}"]
 
 
-def test_the_install_command_names_a_folder_of_the_checkout_else_the_repository(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+def test_the_install_command_names_a_folder_of_the_checkout_else_the_repository(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
     assert Path(install_command("lidarspec-ouster").split()[-1]).is_dir()
-    monkeypatch.setattr("lidarspec.known_sensors.__file__", str(tmp_path / "lidarspec" / "known_sensors.py"))
+    monkeypatch.setattr(
+        "lidarspec.known_sensors.__file__", str(tmp_path / "lidarspec" / "known_sensors.py")
+    )
     assert install_command("lidarspec-ouster").endswith("#subdirectory=plugins/lidarspec-ouster'")
 
 
 @pytest.mark.slow
-def test_with_one_plugin_verbs_name_the_distribution_to_install(one_plugin: Path, tmp_path: Path) -> None:
+def test_with_one_plugin_verbs_name_the_distribution_to_install(
+    one_plugin: Path, tmp_path: Path
+) -> None:
     vlp16 = ls.sensor("velodyne-vlp16")
     datagrams = [bytes(frame) for frame in ls.simulate(vlp16, 20)]
     capture = tmp_path / "drive.pcap"
     capture.write_bytes(capture_to(VELODYNE_PORT, datagrams))
-    for words in (("view", "sim:velodyne-vlp16", "--once"), ("show", "vlp16"), ("stats", capture, "-s", "velodyne-vlp16")):
+    for words in (
+        ("view", "sim:velodyne-vlp16", "--once"),
+        ("show", "vlp16"),
+        ("stats", capture, "-s", "velodyne-vlp16"),
+    ):
         assert "pip install 'lidarspec-velodyne @" in run(one_plugin, *words, code=2).stderr
     assert "lidarspec-velodyne" in run(one_plugin, "detect", capture, code=4).stderr
     assert "lidarspec-velodyne" in run(one_plugin, "read", capture, code=4).stderr
@@ -134,7 +180,9 @@ def test_with_one_plugin_verbs_name_the_distribution_to_install(one_plugin: Path
 @pytest.mark.slow
 def test_with_one_plugin_a_serial_stream_is_recognized(one_plugin: Path, tmp_path: Path) -> None:
     stream = tmp_path / "line.bin"
-    stream.write_bytes(b"".join(bytes(frame) for frame in ls.simulate(ls.sensor("cspc-m1c1-mini"), 100)))
+    stream.write_bytes(
+        b"".join(bytes(frame) for frame in ls.simulate(ls.sensor("cspc-m1c1-mini"), 100))
+    )
     assert "lidarspec-cspc" in run(one_plugin, "detect", stream, code=4).stderr
 
 
@@ -153,6 +201,9 @@ def test_with_one_plugin_only_its_sensors_are_listed(one_plugin: Path) -> None:
 
 
 def test_listing_loads_no_plugin_that_the_table_describes(one_plugin: Path) -> None:
-    code = "import sys; from lidarspec.plugins import registry; registry().list_sensors(); print('lidarspec_ldrobot' in sys.modules)"
+    code = (
+        "import sys; from lidarspec.plugins import registry; registry().list_sensors();"
+        " print('lidarspec_ldrobot' in sys.modules)"
+    )
     done = subprocess.run([one_plugin, "-c", code], capture_output=True, text=True, check=True)
     assert done.stdout.strip() == "False"

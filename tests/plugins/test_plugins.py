@@ -22,8 +22,12 @@ HERE = Path(__file__).resolve().parents[1] / "shapes"
 STRANGER = HERE / "stranger" / "acme_lidars.py"
 
 
-def test_sensor_of_a_foreign_distribution_is_found_and_decodes(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    lidarspec.sensor("ldrobot-stl27l")  # the registry of this process is made before the stranger is on the path
+def test_sensor_of_a_foreign_distribution_is_found_and_decodes(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    lidarspec.sensor(
+        "ldrobot-stl27l"
+    )  # the registry of this process is made before the stranger is on the path
     shutil.copy(STRANGER, tmp_path)
     distribution(tmp_path, "acme_lidars", "3.2.1", "[lidarspec]\nacme = acme_lidars\n")
     monkeypatch.syspath_prepend(tmp_path)
@@ -57,7 +61,9 @@ def test_the_stranger_uses_state_look_ahead_and_its_calibration_file(tmp_path: P
     file = tmp_path / "elevations.txt"
     file.write_text("-10 0 10 20", encoding="utf-8")
     np.testing.assert_allclose(
-        np.rad2deg(sensor.configure(calibration=file).decode(data).points().elevation[:4]), [-10, 0, 10, 20], atol=1e-5
+        np.rad2deg(sensor.configure(calibration=file).decode(data).points().elevation[:4]),
+        [-10, 0, 10, 20],
+        atol=1e-5,
     )
     with pytest.raises(UsageError, match="not a file of elevations"):
         sensor.configure(calibration=tmp_path / "none.txt")
@@ -72,7 +78,9 @@ def test_a_file_of_another_kind_is_no_sensor(tmp_path: Path) -> None:
 
 def test_a_file_with_several_sensors_asks_which(tmp_path: Path) -> None:
     file = tmp_path / "two.py"
-    text = STRANGER.read_text(encoding="utf-8").replace("return [X1]", "return [X1, dataclasses.replace(X1, id='acme-x2', aliases=())]")
+    text = STRANGER.read_text(encoding="utf-8").replace(
+        "return [X1]", "return [X1, dataclasses.replace(X1, id='acme-x2', aliases=())]"
+    )
     file.write_text(text, encoding="utf-8")
     assert lidarspec.sensor(f"{file}:acme-x2").id == "acme-x2"
     with pytest.raises(UsageError, match=r"two.py:acme-x1, .*two.py:acme-x2"):
@@ -90,14 +98,18 @@ def test_a_file_that_is_no_sensor_is_a_clear_error(tmp_path: Path) -> None:
         "def broken(:": "SyntaxError",
         "raise SystemExit(3)": "SystemExit",
         "": "no function lidarspec_sensors",
-        "from lidarspec.spec import hookimpl\n@hookimpl\ndef lidarspec_sensors():\n    return [1 / 0]": "ZeroDivisionError",
+        "from lidarspec.spec import hookimpl\n@hookimpl\ndef lidarspec_sensors():\n    return [1 / 0]": (
+            "ZeroDivisionError"
+        ),
     }.items():
         file.write_text(text, encoding="utf-8")
         with pytest.raises(SpecError, match=message):
             lidarspec.sensor(str(file))
 
 
-def test_a_relative_file_needs_no_more_than_its_name(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_relative_file_needs_no_more_than_its_name(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     shutil.copy(STRANGER, tmp_path / "x.py")
     monkeypatch.chdir(tmp_path)
     assert lidarspec.sensor("./x.py").id == lidarspec.sensor("x.py").id == "acme-x1"
@@ -114,7 +126,9 @@ def test_a_relative_file_needs_no_more_than_its_name(tmp_path: Path, monkeypatch
         ("VLP", "'velodyne-vlp16', 'velodyne-vlp32c' or 'velodyne-puck-hi-res'"),
     ],
 )
-def test_an_unknown_sensor_suggests_those_with_this_part_or_the_closest(name: str, meant: str) -> None:
+def test_an_unknown_sensor_suggests_those_with_this_part_or_the_closest(
+    name: str, meant: str
+) -> None:
     with pytest.raises(UnknownSensor, match=rf"did you mean {meant}\?$"):
         lidarspec.sensor(name)
 
@@ -122,8 +136,18 @@ def test_an_unknown_sensor_suggests_those_with_this_part_or_the_closest(name: st
 @pytest.mark.parametrize(
     ("name", "meant"),
     [
-        *(("ld19", "ldrobot-ld06"), ("LD06", "ldrobot-ld06"), ("STL-27L", "ldrobot-stl27l"), ("rplidar", "slamtec-rplidar-a1")),
-        *(("Puck", "velodyne-vlp16"), ("vlp_16", "velodyne-vlp16"), ("PandarXT-32", "hesai-xt32"), ("helios16p", "robosense-helios16p")),
+        *(
+            ("ld19", "ldrobot-ld06"),
+            ("LD06", "ldrobot-ld06"),
+            ("STL-27L", "ldrobot-stl27l"),
+            ("rplidar", "slamtec-rplidar-a1"),
+        ),
+        *(
+            ("Puck", "velodyne-vlp16"),
+            ("vlp_16", "velodyne-vlp16"),
+            ("PandarXT-32", "hesai-xt32"),
+            ("helios16p", "robosense-helios16p"),
+        ),
     ],
 )
 def test_a_sensor_is_known_by_the_names_that_people_use(name: str, meant: str) -> None:
@@ -132,12 +156,24 @@ def test_a_sensor_is_known_by_the_names_that_people_use(name: str, meant: str) -
 
 def test_each_name_of_a_sensor_loads_it_alone() -> None:
     offered = {entry.name for entry in entry_points(SENSORS)}
-    assert {name for sensor in lidarspec.sensors().values() for name in (sensor.id, *sensor.aliases)} <= offered
+    assert {
+        name for sensor in lidarspec.sensors().values() for name in (sensor.id, *sensor.aliases)
+    } <= offered
 
 
 def test_a_file_may_have_dataclasses_with_annotations_that_are_texts(tmp_path: Path) -> None:
     text = STRANGER.read_text(encoding="utf-8")
-    own = "\n".join(["", "from dataclasses import dataclass", "", "@dataclass", "class Laser:", "    angle: float = 0.0", ""])
+    own = "\n".join(
+        [
+            "",
+            "from dataclasses import dataclass",
+            "",
+            "@dataclass",
+            "class Laser:",
+            "    angle: float = 0.0",
+            "",
+        ]
+    )
     file, broken = tmp_path / "mine.py", tmp_path / "broken.py"
     file.write_text(text + own, encoding="utf-8")
     assert "from __future__ import annotations" in text

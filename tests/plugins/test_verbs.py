@@ -1,4 +1,6 @@
-"""Verbs of plugins stand in the help without being loaded, and do what their command says; one that cannot be loaded disturbs no other."""
+"""Verbs of plugins stand in the help without being loaded, and do what their command says; one that
+cannot be loaded disturbs no other.
+"""
 
 from __future__ import annotations
 
@@ -34,19 +36,31 @@ def site(tmp_path: Path) -> Path:
     """A folder with a distribution of some verbs."""
     about = tmp_path / "acme_survey-1.2.dist-info"
     about.mkdir()
-    (about / "METADATA").write_text("Metadata-Version: 2.1\nName: acme-survey\nVersion: 1.2\n", encoding="utf-8")
-    verbs = {"survey": "acme_survey", "read": "acme_survey", "absent": "acme_absent", "other": "acme_survey", "plain": "acme_plain"}
+    (about / "METADATA").write_text(
+        "Metadata-Version: 2.1\nName: acme-survey\nVersion: 1.2\n", encoding="utf-8"
+    )
+    verbs = {
+        "survey": "acme_survey",
+        "read": "acme_survey",
+        "absent": "acme_absent",
+        "other": "acme_survey",
+        "plain": "acme_plain",
+    }
     lines = "".join(f"{verb} = {module}\n" for verb, module in verbs.items())
     (about / "entry_points.txt").write_text(f"[lidarspec.verbs]\n{lines}", encoding="utf-8")
     (tmp_path / "acme_survey.py").write_text(MODULE, encoding="utf-8")
-    (tmp_path / "acme_plain.py").write_text("def lidarspec_verbs():\n    return []\n", encoding="utf-8")
+    (tmp_path / "acme_plain.py").write_text(
+        "def lidarspec_verbs():\n    return []\n", encoding="utf-8"
+    )
     return tmp_path
 
 
 def ran(site: Path, *words: str) -> subprocess.CompletedProcess[str]:
     environment = os.environ | {"PYTHONPATH": os.pathsep.join([str(site), *filter(None, sys.path)])}
     command = [sys.executable, "-P", "-m", "lidarspec", *words]
-    return subprocess.run(command, env=environment, capture_output=True, text=True, timeout=60, check=False)
+    return subprocess.run(
+        command, env=environment, capture_output=True, text=True, timeout=60, check=False
+    )
 
 
 @pytest.mark.slow
@@ -59,7 +73,9 @@ def test_a_verb_is_listed_without_being_loaded_and_runs(site: Path) -> None:
     assert "Says a word." in ran(site, "help", "survey").stdout
     assert "next: lidarspec survey --help" in ran(site, "survey").stderr
     assert "did you mean 'survey'?" in ran(site, "surveys").stderr
-    assert "The points that a sensor sends" in ran(site, "read", "--help").stdout  # ours comes first
+    assert (
+        "The points that a sensor sends" in ran(site, "read", "--help").stdout
+    )  # ours comes first
 
 
 @pytest.mark.slow
@@ -71,7 +87,9 @@ def test_a_verb_is_listed_without_being_loaded_and_runs(site: Path) -> None:
         ("plain", "lidarspec_verbs lacks @hookimpl"),
     ],
 )
-def test_a_verb_that_cannot_be_loaded_is_named_with_its_distribution(site: Path, verb: str, reason: str) -> None:
+def test_a_verb_that_cannot_be_loaded_is_named_with_its_distribution(
+    site: Path, verb: str, reason: str
+) -> None:
     done = ran(site, verb)
     assert done.returncode == 1
     assert "acme-survey" in done.stderr
@@ -82,6 +100,8 @@ def test_a_verb_that_cannot_be_loaded_is_named_with_its_distribution(site: Path,
 @pytest.mark.slow
 def test_plugins_with_verbs_are_among_the_plugins(site: Path) -> None:
     found = json.loads(ran(site, "plugins", "--json").stdout)
-    errors = {one["entry_point"]: one["error"] for one in found if one["distribution"] == "acme-survey"}
+    errors = {
+        one["entry_point"]: one["error"] for one in found if one["distribution"] == "acme-survey"
+    }
     assert errors["other = acme_survey"] == ""
     assert "No module named 'acme_absent'" in errors["absent = acme_absent"]

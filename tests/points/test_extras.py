@@ -1,4 +1,6 @@
-"""Further columns of points: the same on every way, in their types and units, carried wherever clouds go, free for who reads none."""
+"""Further columns of points: the same on every way, in their types and units, carried wherever
+clouds go, free for who reads none.
+"""
 
 from __future__ import annotations
 
@@ -7,7 +9,17 @@ import pickle
 
 import numpy as np
 import pytest
-from construct import Array, BitsInteger, BitStruct, ByteSwapped, Const, Int16sl, Int16ul, Int32ub, Struct
+from construct import (
+    Array,
+    BitsInteger,
+    BitStruct,
+    ByteSwapped,
+    Const,
+    Int16sl,
+    Int16ul,
+    Int32ub,
+    Struct,
+)
 
 import lidarspec
 from lidarspec import PointCloud, Sensor, SpecError, simulate
@@ -34,7 +46,9 @@ KINDS = {
 
 def packets(number: int = 40, backend: str = "numpy") -> Packets:
     """Packets with anything in them."""
-    return SENSOR.decode([SENSOR.example("data", seed=seed) for seed in range(number)], backend=backend)
+    return SENSOR.decode(
+        [SENSOR.example("data", seed=seed) for seed in range(number)], backend=backend
+    )
 
 
 @EVERY_BACKEND
@@ -44,13 +58,21 @@ def test_columns_have_the_values_types_and_units_of_the_plain_evaluation(backend
     assert isinstance(found, LazyCloud) == (backend != "construct")
     assert list(found.extra) == list(plain.extra) == list(KINDS)
     for cloud in (found, plain):
-        assert {name: (cloud.extra[name].dtype.str[1:], cloud.units[name]) for name in cloud.extra} == KINDS
+        assert {
+            name: (cloud.extra[name].dtype.str[1:], cloud.units[name]) for name in cloud.extra
+        } == KINDS
     assert_same_points(found, plain)
     channels = "blocks.channels."
-    np.testing.assert_array_equal(found.extra["velocity"], read[f"{channels}velocity"].reshape(-1).astype(np.float32))
-    np.testing.assert_array_equal(found.extra["signal"], np.repeat(read["blocks.signal"].reshape(-1), 3))  # more than float32 holds
+    np.testing.assert_array_equal(
+        found.extra["velocity"], read[f"{channels}velocity"].reshape(-1).astype(np.float32)
+    )
+    np.testing.assert_array_equal(
+        found.extra["signal"], np.repeat(read["blocks.signal"].reshape(-1), 3)
+    )  # more than float32 holds
     assert found.extra["signal"].max() > 2**24
-    np.testing.assert_array_equal(np.isnan(found.extra["confidence"]), read[f"{channels}mark.noise"].reshape(-1) == 7)
+    np.testing.assert_array_equal(
+        np.isnan(found.extra["confidence"]), read[f"{channels}mark.noise"].reshape(-1) == 7
+    )
 
 
 def test_a_scan_has_columns_of_its_own_packets_made_and_no_others() -> None:
@@ -60,7 +82,9 @@ def test_a_scan_has_columns_of_its_own_packets_made_and_no_others() -> None:
     assert len(scans) == 3
     for name in ("signal", "flags"):
         columns = [scan.points.extra[name] for scan in scans]
-        assert all(column.base is not None and column.base.nbytes == column.nbytes for column in columns)
+        assert all(
+            column.base is not None and column.base.nbytes == column.nbytes for column in columns
+        )
         np.testing.assert_array_equal(np.concatenate(columns), whole.extra[name])
 
 
@@ -108,7 +132,10 @@ def test_structured_arrays_have_them_behind_the_layout_of_pcl() -> None:
     cloud = packets().points()
     made = cloud.to_structured()
     assert made.dtype.itemsize == 64
-    assert {name: made.dtype.fields[name][1] for name in ("x", "ring", "time", "velocity", "near_ir", "signal")} == dict(  # type: ignore[index]
+    assert {
+        name: made.dtype.fields[name][1]
+        for name in ("x", "ring", "time", "velocity", "near_ir", "signal")
+    } == dict(  # type: ignore[index]
         x=0, ring=20, time=24, velocity=32, near_ir=36, signal=40
     )
     for name, column in cloud.extra.items():
@@ -135,9 +162,15 @@ def test_types_and_units_can_be_declared_and_low_values_are_spread() -> None:
         }
         return Polar(f.blocks.channels.distance, f.blocks.azimuth, extra=extra)
 
-    read = dataclasses.replace(SENSOR, points=points).decode([SENSOR.example("data", seed=seed) for seed in range(9)])
+    read = dataclasses.replace(SENSOR, points=points).decode(
+        [SENSOR.example("data", seed=seed) for seed in range(9)]
+    )
     found, plain = read.points(), evaluate(read).cloud
-    assert [(column.dtype.str[1:], found.units[name]) for name, column in found.extra.items()] == [("f8", ""), ("u1", ""), ("f4", "")]
+    assert [(column.dtype.str[1:], found.units[name]) for name, column in found.extra.items()] == [
+        ("f8", ""),
+        ("u1", ""),
+        ("f4", ""),
+    ]
     np.testing.assert_array_equal(found.extra["noise"], np.repeat(read["number"] % 7, 12))
     assert_same_points(found, plain)
     assert_well_formed(found)
@@ -154,20 +187,37 @@ def test_points_in_parts_have_them_too() -> None:
     assert (cloud.extra["step"] == np.float32(1.5)).all()
 
 
-#: 12 bytes an element, three words of four: bits, whole bytes and numbers in them, and one that stands across two.
+#: 12 bytes an element, three words of four: bits, whole bytes and numbers in them, and one that
+#: stands across two.
 PIXEL = ByteSwapped(
     BitStruct(
-        *("window" / BitsInteger(8), "across" / BitsInteger(16), "near_ir" / BitsInteger(16), "signal" / BitsInteger(16)),
-        *("unused" / BitsInteger(8), "reflectivity" / BitsInteger(8), "rest" / BitsInteger(5), "flags" / BitsInteger(3)),
+        *(
+            "window" / BitsInteger(8),
+            "across" / BitsInteger(16),
+            "near_ir" / BitsInteger(16),
+            "signal" / BitsInteger(16),
+        ),
+        *(
+            "unused" / BitsInteger(8),
+            "reflectivity" / BitsInteger(8),
+            "rest" / BitsInteger(5),
+            "flags" / BitsInteger(3),
+        ),
         "distance" / Scaled(BitsInteger(16), 0.002, "m"),
     )
 )
 
 
 def words() -> Sensor:
-    """A sensor whose pixels share words, in directions that are looked up; two fields beside them stand in none."""
+    """A sensor whose pixels share words, in directions that are looked up; two fields beside them
+    stand in none.
+    """
     columns = Array(4, Struct("number" / Int16ul, "pixels" / Array(8, PIXEL)))
-    struct = Struct("head" / Const(b"\xa5\x5a"), "columns" / columns, "ends" / Array(8, Struct("whole" / Int32ub, "sign" / Int16sl)))
+    struct = Struct(
+        "head" / Const(b"\xa5\x5a"),
+        "columns" / columns,
+        "ends" / Array(8, Struct("whole" / Int32ub, "sign" / Int16sl)),
+    )
     table, level = np.linspace(-3, 3, 640).reshape(80, 8), np.linspace(-0.4, 0.4, 8)
     names = ("signal", "near_ir", "across", "window", "flags", "rest")
 
@@ -175,17 +225,37 @@ def words() -> Sensor:
         pixels, number = f.columns.pixels, f.columns.number % 80
         place = (take(table, number), along("pixels", level), 0.1)
         extra = {name: getattr(pixels, name) for name in names}
-        return Polar(pixels.distance, take(table, number), along("pixels", level), origin=place, intensity=pixels.reflectivity, extra=extra)
+        return Polar(
+            pixels.distance,
+            take(table, number),
+            along("pixels", level),
+            origin=place,
+            intensity=pixels.reflectivity,
+            extra=extra,
+        )
 
     return dataclasses.replace(
-        SENSOR, frames={"data": Frame(struct, data=True)}, points=points, clock=None, sequence=None, simulation=Simulation()
+        SENSOR,
+        frames={"data": Frame(struct, data=True)},
+        points=points,
+        clock=None,
+        sequence=None,
+        simulation=Simulation(),
     )
 
 
 @BACKENDS
-@pytest.mark.parametrize("sensor", [words(), SENSOR, SHAPES["shape-segments"], SHAPES["shape-bits"]], ids=lambda sensor: sensor.id)
-def test_columns_that_are_read_together_are_those_that_are_read_one_by_one(sensor: Sensor, backend: str) -> None:
-    read = sensor.decode([sensor.example(sensor.data_frame, seed=seed) for seed in range(9)], backend=backend).with_points
+@pytest.mark.parametrize(
+    "sensor",
+    [words(), SENSOR, SHAPES["shape-segments"], SHAPES["shape-bits"]],
+    ids=lambda sensor: sensor.id,
+)
+def test_columns_that_are_read_together_are_those_that_are_read_one_by_one(
+    sensor: Sensor, backend: str
+) -> None:
+    read = sensor.decode(
+        [sensor.example(sensor.data_frame, seed=seed) for seed in range(9)], backend=backend
+    ).with_points
     plain = evaluate(read).cloud
     names = [*plain.columns, "valid"]
     for which in (..., slice(5, len(plain) - 5)):

@@ -1,4 +1,6 @@
-"""Coordinates and floating-point fields, whatever is in them: plans and kernels give what the plain evaluation gives."""
+"""Coordinates and floating-point fields, whatever is in them: plans and kernels give what the plain
+evaluation gives.
+"""
 
 from __future__ import annotations
 
@@ -32,7 +34,10 @@ def bits(column: NDArray[Any]) -> NDArray[Any]:
 def frames_of(sensor: Sensor, points: list[Any]) -> list[bytes]:
     """Whole frames of these points, dicts of raw values."""
     rows = [points[start : start + POINTS] for start in range(0, len(points) - POINTS + 1, POINTS)]
-    return [sensor.build("data", number=index, time=index, count=POINTS, points=row) for index, row in enumerate(rows)]
+    return [
+        sensor.build("data", number=index, time=index, count=POINTS, points=row)
+        for index, row in enumerate(rows)
+    ]
 
 
 def values_of(name: str) -> list[Any]:
@@ -61,7 +66,10 @@ def moved(f: Any) -> Cartesian:
 def test_coordinates_are_the_same_bit_by_bit(name: str, points: Any, backend: str) -> None:
     sensor = dataclasses.replace(SHAPES[name], points=points or SHAPES[name].points)
     edges = itertools.product(values_of(name), repeat=3)
-    given = [dict(x=x, y=y, z=z, reflectivity=spot % 256, tag=spot % 251) for spot, (x, y, z) in enumerate(edges)]
+    given = [
+        dict(x=x, y=y, z=z, reflectivity=spot % 256, tag=spot % 251)
+        for spot, (x, y, z) in enumerate(edges)
+    ]
     packets = sensor.decode(frames_of(sensor, given), backend=backend)
     found, plain = evaluated(packets).cloud, evaluate(packets).cloud
     assert isinstance(found, LazyCloud)
@@ -77,7 +85,9 @@ def test_a_point_is_where_its_coordinates_say(backend: str) -> None:
     sensor = SHAPES["shape-millimetres"]
     given = [(3000, 4000, -12000, 0), (0, 0, 0, 0), (0, -2000, 0, 200), (-1500, 0, 0, 199)]
     points = [dict(x=x, y=y, z=z, reflectivity=9, tag=tag) for x, y, z, tag in given]
-    cloud = sensor.decode([sensor.build("data", number=1, time=0, count=4, points=points)], backend=backend).points()
+    cloud = sensor.decode(
+        [sensor.build("data", number=1, time=0, count=4, points=points)], backend=backend
+    ).points()
     assert cloud.range.tolist()[::3] == [13.0, 1.5]
     assert np.isinf(cloud.range[1])
     assert np.isnan(cloud.range[2])
@@ -89,7 +99,9 @@ def test_a_point_is_where_its_coordinates_say(backend: str) -> None:
 
 @BACKENDS
 @pytest.mark.parametrize("columns", [(1, 0, 0), (0, 1, -2), (0, 0, 1)])
-def test_coordinates_may_lie_in_a_plane_and_be_turned(columns: tuple[int, int, int], backend: str) -> None:
+def test_coordinates_may_lie_in_a_plane_and_be_turned(
+    columns: tuple[int, int, int], backend: str
+) -> None:
     """With the vendor's axes, too: x right, y ahead."""
     shape = SHAPES["shape-centimetres"]
 
@@ -98,8 +110,12 @@ def test_coordinates_may_lie_in_a_plane_and_be_turned(columns: tuple[int, int, i
         return Cartesian(x, y, z, ring=np.arange(POINTS))
 
     for frame in ("rep103", "vendor"):
-        sensor = dataclasses.replace(shape, points=points, vendor_axes=("right", "forward", "up")).configure(frame=frame)
-        packets = sensor.decode([shape.example("data", seed=seed) for seed in range(3)], backend=backend)
+        sensor = dataclasses.replace(
+            shape, points=points, vendor_axes=("right", "forward", "up")
+        ).configure(frame=frame)
+        packets = sensor.decode(
+            [shape.example("data", seed=seed) for seed in range(3)], backend=backend
+        )
         found = evaluated(packets).cloud
         assert isinstance(found, LazyCloud)
         assert_same_points(found, evaluate(packets).cloud)
@@ -109,28 +125,41 @@ def test_coordinates_may_lie_in_a_plane_and_be_turned(columns: tuple[int, int, i
 def scaled(backend: str, **values: Any) -> tuple[PointCloud, PointCloud]:
     """Points of two frames with a float scale, one of them with these values; and the plain ones."""
     sensor = SHAPES["shape-scales"]
-    usual: dict[str, Any] = dict(scale=2.0, start=90.0, tilt=0.1, distances=[0, 1, 2, 1000, 4660, 65535], strengths=[1.5] * 6)
-    packets = sensor.decode(sensor.build("data", **usual) + sensor.build("data", **{**usual, **values}), backend=backend)
+    usual: dict[str, Any] = dict(
+        scale=2.0, start=90.0, tilt=0.1, distances=[0, 1, 2, 1000, 4660, 65535], strengths=[1.5] * 6
+    )
+    packets = sensor.decode(
+        sensor.build("data", **usual) + sensor.build("data", **{**usual, **values}), backend=backend
+    )
     assert len(packets) == 2
     return evaluated(packets).cloud, evaluate(packets).cloud
 
 
 @BACKENDS
 def test_floating_point_fields_are_planned(backend: str) -> None:
-    for values in ({}, dict(scale=0.3, start=0.0, tilt=-0.7), dict(strengths=[*ODD[:6]]), dict(strengths=[*ODD[6:]])):
+    for values in (
+        {},
+        dict(scale=0.3, start=0.0, tilt=-0.7),
+        dict(strengths=[*ODD[:6]]),
+        dict(strengths=[*ODD[6:]]),
+    ):
         found, plain = scaled(backend, **values)
         assert isinstance(found, LazyCloud)
         assert_same_points(found, plain)
     assert found.range[3] == 2.0
     turned = np.deg2rad(94.5)
     np.testing.assert_allclose(
-        found.xyz[3], [2 * np.cos(turned) * np.cos(0.1), 2 * np.sin(turned) * np.cos(0.1), 2 * np.sin(0.1)], atol=1e-6
+        found.xyz[3],
+        [2 * np.cos(turned) * np.cos(0.1), 2 * np.sin(turned) * np.cos(0.1), 2 * np.sin(0.1)],
+        atol=1e-6,
     )
 
 
 @BACKENDS
 @pytest.mark.parametrize("number", [np.nan, np.inf, -np.inf, 1e-45, 3e38, -1.0])
-def test_a_batch_whose_floats_a_plan_could_lose_is_evaluated_plainly(number: float, backend: str) -> None:
+def test_a_batch_whose_floats_a_plan_could_lose_is_evaluated_plainly(
+    number: float, backend: str
+) -> None:
     found, plain = scaled(backend, scale=number)
     assert not isinstance(found, LazyCloud)
     assert_same_points(found, plain)
@@ -148,8 +177,18 @@ def test_floats_at_random(backend: str) -> None:
         frames = []
         for _ in range(50):
             ranges = random.choice(ODD, 3) if odd else random.normal(0, 10, 3).clip(0, None)
-            samples = [dict(range=float(r), elevation=int(random.integers(-9000, 9000)), spare=0) for r in ranges]
-            values = dict(reserved=bytes(3), stamp=1, serial=0, offset=0, azimuth=float(random.normal(0, 90)), samples=samples)
+            samples = [
+                dict(range=float(r), elevation=int(random.integers(-9000, 9000)), spare=0)
+                for r in ranges
+            ]
+            values = dict(
+                reserved=bytes(3),
+                stamp=1,
+                serial=0,
+                offset=0,
+                azimuth=float(random.normal(0, 90)),
+                samples=samples,
+            )
             frames.append(shape.build("data", **values))
         packets = shape.decode(b"".join(frames), backend=backend)
         found = evaluated(packets).cloud
@@ -163,4 +202,6 @@ def test_scans_of_coordinates_are_those_of_all_points() -> None:
     whole, scans = sensor.decode(frames).points(), list(sensor.scans(frames))
     assert len(scans) > 4
     for name in ("x", "range", "azimuth", "elevation"):
-        np.testing.assert_array_equal(np.concatenate([scan.points.columns[name] for scan in scans]), whole.columns[name])
+        np.testing.assert_array_equal(
+            np.concatenate([scan.points.columns[name] for scan in scans]), whole.columns[name]
+        )

@@ -1,4 +1,6 @@
-"""What lies in the folder of compiled code is run only where nobody but its user can have put it there, and is never in the way."""
+"""What lies in the folder of compiled code is run only where nobody but its user can have put it
+there, and is never in the way.
+"""
 
 from __future__ import annotations
 
@@ -19,10 +21,17 @@ from lidarspec.points.numba_kernels.kernels import _module_name, compiled_before
 from lidarspec.points.numba_kernels.source import HEAD
 from tests.points.backends import COMPILED
 
-pytestmark = [COMPILED, pytest.mark.skipif(sys.platform == "win32", reason="folders of a user are the user's alone there")]
+pytestmark = [
+    COMPILED,
+    pytest.mark.skipif(
+        sys.platform == "win32", reason="folders of a user are the user's alone there"
+    ),
+]
 
 SOURCE = HEAD + "@compiled(KEPT, (INTEGER,))\ndef kernel(number):\n    return number + 1\n"
-ROOT = pytest.mark.skipif(not hasattr(os, "geteuid") or os.geteuid() != 0, reason="only root can give files away")
+ROOT = pytest.mark.skipif(
+    not hasattr(os, "geteuid") or os.geteuid() != 0, reason="only root can give files away"
+)
 
 
 @pytest.fixture
@@ -94,7 +103,9 @@ DAMAGE: dict[str, Callable[[Path], object]] = {
 #: the damage that would run code of others is tried in the quick tier.
 QUICK = ("not the user's bytes", "kernel")
 CASES = [
-    pytest.param(what, name, marks=() if (what, name) == QUICK else pytest.mark.slow, id=f"{name} {what}")
+    pytest.param(
+        what, name, marks=() if (what, name) == QUICK else pytest.mark.slow, id=f"{name} {what}"
+    )
     for what in DAMAGE
     for name in ("kernel", "key")
 ]
@@ -119,7 +130,9 @@ def test_a_file_of_another_user_is_not_read(folder: Path) -> None:
 def test_a_folder_that_is_open_to_others_is_not_used_and_that_is_said_once(folder: Path) -> None:
     _is_read()
     folder.chmod(0o777)
-    with pytest.warns(UserWarning, match="kernels is open to others: chmod 700 makes it yours") as said:
+    with pytest.warns(
+        UserWarning, match="kernels is open to others: chmod 700 makes it yours"
+    ) as said:
         assert [_is_read(), _is_read()] == [False, False]
     assert len(said) == 1
     _forget()
@@ -145,7 +158,12 @@ print(function_of({source!r})(41))
 
 @pytest.mark.slow
 def test_a_full_disk_means_compiling_again_and_leaves_nothing_behind(folder: Path) -> None:
-    command = [sys.executable, "-B", "-c", FULL.format(source=SOURCE)]  # or Python itself keeps half a module
+    command = [
+        sys.executable,
+        "-B",
+        "-c",
+        FULL.format(source=SOURCE),
+    ]  # or Python itself keeps half a module
     done = subprocess.run(command, capture_output=True, text=True, check=False)
     assert done.stdout == "42\n", done.stderr
     assert "compiled code is not kept between runs: [Errno 27] File too large" in done.stderr

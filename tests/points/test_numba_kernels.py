@@ -1,4 +1,6 @@
-"""The fused back end gives the points of the plain evaluation: same masks, coordinates within six units in the last place."""
+"""The fused back end gives the points of the plain evaluation: same masks, coordinates within six
+units in the last place.
+"""
 
 from __future__ import annotations
 
@@ -61,7 +63,8 @@ POINT_SHAPES = (
     "shape-joined",
     "shape-floats",
 )
-#: The representatives without the one whose points are declared for parts alone, which have no kernel.
+#: The representatives without the one whose points are declared for parts alone, which have no
+#: kernel.
 COMPILED_REPRESENTATIVES = [name for name in REPRESENTATIVES if name != "sick-multiscan136"]
 
 
@@ -72,7 +75,9 @@ def tier_of(shape: str) -> tuple[pytest.MarkDecorator, ...]:
     return (pytest.mark.slow,) if shape in POINT_SHAPES else (pytest.mark.soak,)
 
 
-SHAPED = [pytest.param(name, marks=tier_of(name)) for name, sensor in SHAPES.items() if sensor.frames]
+SHAPED = [
+    pytest.param(name, marks=tier_of(name)) for name, sensor in SHAPES.items() if sensor.frames
+]
 ULPS = 6
 WIDE = [
     Crc(64, 0x42F0E1EBA9EA3693, init=(1 << 64) - 1, refin=True, refout=True, xorout=(1 << 64) - 1),
@@ -105,7 +110,10 @@ def test_kernels_give_what_the_plain_evaluation_gives(name: str) -> None:
         packets = packets_of(name, number)
         if len(packets):
             assert_same_points(evaluated(packets).cloud, evaluate(packets).cloud, ulps=ULPS)
-            one, other = evaluated(packets, final=False, epoch=5), evaluate(packets, final=False, epoch=5)
+            one, other = (
+                evaluated(packets, final=False, epoch=5),
+                evaluate(packets, final=False, epoch=5),
+            )
             assert_same_points(one.cloud, other.cloud, ulps=ULPS)
 
 
@@ -141,8 +149,12 @@ def simulated(sensor: Sensor, answer: str, backend: str, number: int = 2 * MANY)
 @pytest.mark.parametrize("module", sensor_modules())
 def test_every_installed_sensor_has_a_kernel(module: str) -> None:
     for sensor, answer in answers_in(module):
-        made = plan(simulated(sensor, answer, "numpy", number=max(sensor.frames[answer].confirm, 2)))
-        assert "def kernel(" in written(made, tuple(made.expressions), made.varying).source, sensor.id
+        made = plan(
+            simulated(sensor, answer, "numpy", number=max(sensor.frames[answer].confirm, 2))
+        )
+        assert "def kernel(" in written(made, tuple(made.expressions), made.varying).source, (
+            sensor.id
+        )
 
 
 @pytest.mark.slow
@@ -169,7 +181,9 @@ def assert_kernel_gives_the_plain_points(sensor: Sensor, answer: str) -> None:
 
 def plan(packets: Packets) -> Plan:
     assert isinstance(packets.table, Rows)
-    found = plan_for(packets.sensor.points_of(packets.frame), packets.batch(), packets.table.groups[0])
+    found = plan_for(
+        packets.sensor.points_of(packets.frame), packets.batch(), packets.table.groups[0]
+    )
     assert isinstance(found, Plan), str(found)
     return found
 
@@ -177,7 +191,9 @@ def plan(packets: Packets) -> Plan:
 @pytest.mark.slow
 def test_any_number_of_threads_gives_the_same(monkeypatch: pytest.MonkeyPatch) -> None:
     sensor = lidarspec.sensor("velodyne-vlp16")
-    rows = np.tile(np.frombuffer(b"".join(frames_of("velodyne-vlp16")), np.uint8).reshape(MANY, -1), (40, 1))
+    rows = np.tile(
+        np.frombuffer(b"".join(frames_of("velodyne-vlp16")), np.uint8).reshape(MANY, -1), (40, 1)
+    )
     alone = sensor.decode(rows, backend="jit").points()
     for number in ("2", "3"):
         monkeypatch.setenv("LIDARSPEC_THREADS", number)
@@ -191,13 +207,21 @@ def test_any_number_of_threads_gives_the_same(monkeypatch: pytest.MonkeyPatch) -
 
 @pytest.mark.slow
 @pytest.mark.parametrize("compiled", [False, True])
-def test_it_is_chosen_by_itself_once_enough_points_were_made(compiled: bool, monkeypatch: pytest.MonkeyPatch) -> None:
-    sensor = dataclasses.replace(lidarspec.sensor("ldrobot-stl27l"), points=functools.partial(points_of_another_kind))
+def test_it_is_chosen_by_itself_once_enough_points_were_made(
+    compiled: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    sensor = dataclasses.replace(
+        lidarspec.sensor("ldrobot-stl27l"), points=functools.partial(points_of_another_kind)
+    )
     packets = sensor.decode(b"".join(frames_of("ldrobot-stl27l")))
     enough = 3 * 12 * len(packets)
     monkeypatch.setattr("lidarspec.points.numba_kernels.kernels.WARM", enough if compiled else 0)
-    monkeypatch.setattr("lidarspec.points.numba_kernels.kernels.COLD", 10 * enough if compiled else enough)
-    monkeypatch.setattr("lidarspec.points.numba_kernels.kernels.compiled_before", lambda source: compiled)
+    monkeypatch.setattr(
+        "lidarspec.points.numba_kernels.kernels.COLD", 10 * enough if compiled else enough
+    )
+    monkeypatch.setattr(
+        "lidarspec.points.numba_kernels.kernels.compiled_before", lambda source: compiled
+    )
     used = []
     for _ in range(4):
         cloud = packets.points()
@@ -207,11 +231,21 @@ def test_it_is_chosen_by_itself_once_enough_points_were_made(compiled: bool, mon
 
 
 def points_of_another_kind(f: Fields) -> Polar:
-    return Polar(range=f.points.distance, azimuth=np.deg2rad(f.start_angle + 2 * np.arange(12)), intensity=f.points.intensity)
+    return Polar(
+        range=f.points.distance,
+        azimuth=np.deg2rad(f.start_angle + 2 * np.arange(12)),
+        intensity=f.points.intensity,
+    )
 
 
 def run(code: str, **environment: str) -> subprocess.CompletedProcess[str]:
-    return subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, env={**os.environ, **environment}, check=False)
+    return subprocess.run(
+        [sys.executable, "-c", code],
+        capture_output=True,
+        text=True,
+        env={**os.environ, **environment},
+        check=False,
+    )
 
 
 DECODING = """
@@ -231,8 +265,13 @@ def test_the_environment_names_the_default_and_nothing_else_imports_numba() -> N
 
 
 @pytest.mark.slow
-def test_kernels_are_kept_between_runs_and_done_without_where_they_cannot_be(tmp_path: Path) -> None:
-    code = DECODING + "print(any(m.kernel.stats.cache_hits for name, m in sys.modules.items() if name.startswith('lidarspec_kernel_')))"
+def test_kernels_are_kept_between_runs_and_done_without_where_they_cannot_be(
+    tmp_path: Path,
+) -> None:
+    code = (
+        DECODING + "print(any(m.kernel.stats.cache_hits for name, m in sys.modules.items() if"
+        " name.startswith('lidarspec_kernel_')))"
+    )
     for is_read in ("False", "True"):
         done = run(code, LIDARSPEC_BACKEND="jit", LIDARSPEC_CACHE=str(tmp_path / "kept"))
         assert done.stdout.split() == ["True", "36", is_read], done.stderr
@@ -254,10 +293,20 @@ def test_without_numba_asking_for_it_is_an_error_and_nothing_else_is() -> None:
 
 @pytest.mark.slow
 @pytest.mark.parametrize(
-    "algorithm", [Crc(8, 0x4D), Crc(16, 0x1021, init=0xFFFF), Crc(13, 0x1CF5, refin=True, refout=True), Xor(), WordXor(8, (1, 2)), *WIDE]
+    "algorithm",
+    [
+        Crc(8, 0x4D),
+        Crc(16, 0x1021, init=0xFFFF),
+        Crc(13, 0x1CF5, refin=True, refout=True),
+        Xor(),
+        WordXor(8, (1, 2)),
+        *WIDE,
+    ],
 )
 @pytest.mark.parametrize("spans", [((0, 46),), ((0, 8), (10, 45))])
-def test_compiled_checksums_are_those_of_the_algorithm(algorithm: Checksum, spans: tuple[tuple[int, int], ...]) -> None:
+def test_compiled_checksums_are_those_of_the_algorithm(
+    algorithm: Checksum, spans: tuple[tuple[int, int], ...]
+) -> None:
     rows = np.random.default_rng(1).integers(0, 256, (kernelsums.EARNED, 50), dtype=np.uint8)
     seal = Seal((), spans, algorithm, ())
     found = kernelsums.checksums(seal, rows)
@@ -278,7 +327,9 @@ def test_crcs_over_long_rows_are_those_of_the_algorithm(algorithm: Crc) -> None:
 
 
 @pytest.mark.slow
-def test_checksums_are_compiled_for_the_decoder_that_asks_and_no_other(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_checksums_are_compiled_for_the_decoder_that_asks_and_no_other(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     asked: list[int] = []
     monkeypatch.setattr(kernelsums, "checksums", lambda seal, rows: asked.append(len(rows)))
     for name in ("ldrobot-stl27l", "shape-count"):

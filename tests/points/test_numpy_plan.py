@@ -1,4 +1,6 @@
-"""The plan gives the points of the plain evaluation: same masks, coordinates within four units in the last place."""
+"""The plan gives the points of the plain evaluation: same masks, coordinates within four units in
+the last place.
+"""
 
 from __future__ import annotations
 
@@ -44,8 +46,13 @@ def plan(packets: Packets) -> Any:
 
 def packets_of(sensor: Sensor, number: int) -> Packets:
     random = np.random.default_rng(number)
-    frames = [sensor.example(sensor.data_frame, seed=int(seed)) for seed in random.integers(0, 1000, number)]
-    return sensor.decode(frames if is_datagram(sensor.links.get("data")) else b"".join(frames)).with_points
+    frames = [
+        sensor.example(sensor.data_frame, seed=int(seed))
+        for seed in random.integers(0, 1000, number)
+    ]
+    return sensor.decode(
+        frames if is_datagram(sensor.links.get("data")) else b"".join(frames)
+    ).with_points
 
 
 @pytest.mark.parametrize("number", [1, 4, pytest.param(12, marks=pytest.mark.slow)])
@@ -79,7 +86,10 @@ def assert_planned_points_are_the_plain_ones(packets: Packets) -> None:
     """Fail unless plan and plain evaluation agree on points, counts and values carried over."""
     if len(packets):
         assert_same_points(evaluated(packets).cloud, evaluate(packets).cloud)
-        one, other = evaluated(packets, final=False, epoch=5), evaluate(packets, final=False, epoch=5)
+        one, other = (
+            evaluated(packets, final=False, epoch=5),
+            evaluate(packets, final=False, epoch=5),
+        )
         assert one.ready == other.ready
         assert_same_points(one.cloud, other.cloud)
         np.testing.assert_array_equal(one.counts, other.counts)
@@ -92,7 +102,10 @@ def assert_planned_points_are_the_plain_ones(packets: Packets) -> None:
 LARGE = ("shape-joined", "shape-channels", "shape-segments")
 
 
-@pytest.mark.parametrize("name", [pytest.param(name, marks=pytest.mark.slow) if name in LARGE else name for name in SHAPED])
+@pytest.mark.parametrize(
+    "name",
+    [pytest.param(name, marks=pytest.mark.slow) if name in LARGE else name for name in SHAPED],
+)
 def test_every_column_of_damaged_and_mixed_streams(name: str) -> None:
     sensor = SHAPES[name]
     packets = sensor.decode(Subject(sensor).stream()).with_points
@@ -119,7 +132,10 @@ def indexing(f: Fields) -> Polar:
     return Polar(range=np.asarray(f.points.distance) * 1.0, azimuth=0)
 
 
-@pytest.mark.parametrize(("points", "reason"), [(branching, ".array"), (reducing, "np.add.reduce"), (indexing, "made an array")])
+@pytest.mark.parametrize(
+    ("points", "reason"),
+    [(branching, ".array"), (reducing, "np.add.reduce"), (indexing, "made an array")],
+)
 def test_what_cannot_be_traced_says_so_and_runs_all_the_same(points: Any, reason: str) -> None:
     sensor = dataclasses.replace(lidarspec.sensor("ldrobot-stl27l"), points=points)
     packets = sensor.decode(b"".join(sensor.example("data", seed=seed) for seed in range(4)))
@@ -144,8 +160,14 @@ def test_a_factor_that_is_zero_or_negative_leaves_no_point_behind() -> None:
     "text",
     [
         'Struct("text" / Bytes(3), "n" / Int64ub, "x" / Array(3, Struct("v" / Int8sb)))',
-        'Struct("x" / Array(2, Struct("h" / Int8ub, "y" / Array(3, Struct("text" / Bytes(2), "v" / Int16ul)))))',
-        'Struct("x" / Array(2, Struct("y" / Array(3, Struct("z" / Array(2, Int8ub), "v" / Int16ul)))), "end" / Int8ub)',
+        (
+            'Struct("x" / Array(2, Struct("h" / Int8ub, "y" / Array(3, Struct("text" / Bytes(2),'
+            ' "v" / Int16ul)))))'
+        ),
+        (
+            'Struct("x" / Array(2, Struct("y" / Array(3, Struct("z" / Array(2, Int8ub), "v" /'
+            ' Int16ul)))), "end" / Int8ub)'
+        ),
     ],
 )
 def test_arrays_of_one_form_are_told_apart_and_elements_may_begin_with_anything(text: str) -> None:
@@ -167,12 +189,17 @@ def test_columns_are_made_once_and_slices_share_them() -> None:
 
 def test_threads_that_decode_with_one_sensor_do_not_meet() -> None:
     sensor = lidarspec.sensor("robosense-m1")
-    some = np.stack([np.frombuffer(sensor.example("data", seed=seed), np.uint8) for seed in range(40)])
+    some = np.stack(
+        [np.frombuffer(sensor.example("data", seed=seed), np.uint8) for seed in range(40)]
+    )
     inputs = [np.tile(some[:20], (50, 1)), np.tile(some[20:], (50, 1))]
     wanted = [sensor.decode(rows).points().x for rows in inputs]
 
     def same(index: int) -> bool:
-        return all(np.array_equal(sensor.decode(inputs[index]).points().x, wanted[index], equal_nan=True) for _ in range(4))
+        return all(
+            np.array_equal(sensor.decode(inputs[index]).points().x, wanted[index], equal_nan=True)
+            for _ in range(4)
+        )
 
     with ThreadPoolExecutor(2) as pool:
         assert all(pool.map(same, [0, 1]))
@@ -180,7 +207,9 @@ def test_threads_that_decode_with_one_sensor_do_not_meet() -> None:
 
 @BACKENDS
 def test_sensors_that_share_a_points_function_keep_their_own_scales(backend: str) -> None:
-    """Tables are kept for a points function, and one of these sensors measures in other units than the first."""
+    """Tables are kept for a points function, and one of these sensors measures in other units than
+    the first.
+    """
     for unit in (0.001, 0.002):
         sample = Struct("distance" / Scaled(Int16ul, unit, "m"), "quality" / Int8ul)
         made = sound.sensor(sound.frame(sound.sealed(samples=Array(this.count, sample))))
@@ -200,18 +229,34 @@ def test_beams_that_start_beside_the_sensor_are_exact_near_and_far(backend: str)
     )
 
     def points(f: Fields) -> Polar:
-        azimuth, elevation, *start = (take(table, f.number) for table in (azimuths, elevations, *starts))
+        azimuth, elevation, *start = (
+            take(table, f.number) for table in (azimuths, elevations, *starts)
+        )
         return Polar(f.ranges, azimuth, elevation, origin=tuple(start))
 
     struct = Struct("number" / Int16ul, "ranges" / Array(32, Scaled(Int16ul, 0.004, "m")))
-    numbers, ranges = np.arange(200) % 10, random.integers(0, 3000, (200, 32))  # of ten rows, the table has nine
+    numbers, ranges = (
+        np.arange(200) % 10,
+        random.integers(0, 3000, (200, 32)),
+    )  # of ten rows, the table has nine
     ranges[20:60] = random.integers(0, 64_000, (40, 32))
     ranges[random.random(ranges.shape) < 0.2] = 0
-    frames = np.ascontiguousarray(np.concatenate([numbers[:, None], ranges], axis=1).astype("<u2")).view(np.uint8)
-    xyz = dataclasses.replace(sensor(struct), points=points).decode(frames, backend=backend).points().xyz.reshape(200, 32, 3)
+    frames = np.ascontiguousarray(
+        np.concatenate([numbers[:, None], ranges], axis=1).astype("<u2")
+    ).view(np.uint8)
+    xyz = (
+        dataclasses.replace(sensor(struct), points=points)
+        .decode(frames, backend=backend)
+        .points()
+        .xyz.reshape(200, 32, 3)
+    )
     assert (np.isnan(xyz).all(axis=2) == ((ranges == 0) | (numbers == 9)[:, None])).all()
     seen, measured = numbers < 9, np.where(ranges, ranges * 0.004, np.nan)
-    azimuth, elevation, start = (table[..., numbers[seen], :] for table in (azimuths, elevations, starts))
+    azimuth, elevation, start = (
+        table[..., numbers[seen], :] for table in (azimuths, elevations, starts)
+    )
     level = np.cos(elevation)
     directions = np.stack([level * np.cos(azimuth), level * np.sin(azimuth), np.sin(elevation)])
-    np.testing.assert_allclose(xyz[seen], np.moveaxis(directions * measured[seen] + start, 0, -1), rtol=0, atol=1e-5)
+    np.testing.assert_allclose(
+        xyz[seen], np.moveaxis(directions * measured[seen] + start, 0, -1), rtol=0, atol=1e-5
+    )

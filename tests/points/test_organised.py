@@ -22,10 +22,19 @@ SENSOR = SHAPES["shape-columns"]
 
 def frame(first: int, **of_all: Any) -> bytes:
     pixel = [dict(range=100 + pixel, signal=2) for pixel in range(PIXELS)]
-    columns = [dict(timestamp=1000 * number, measurement=number, status=1, pixels=pixel) for number in range(first, first + COLUMNS)]
+    columns = [
+        dict(timestamp=1000 * number, measurement=number, status=1, pixels=pixel)
+        for number in range(first, first + COLUMNS)
+    ]
     return SENSOR.build(
         "data",
-        **{"frame": 1, "shifts": [10 * pixel for pixel in range(PIXELS)], "gains": list(range(COLUMNS)), "columns": columns, **of_all},
+        **{
+            "frame": 1,
+            "shifts": [10 * pixel for pixel in range(PIXELS)],
+            "gains": list(range(COLUMNS)),
+            "columns": columns,
+            **of_all,
+        },
     )
 
 
@@ -48,7 +57,10 @@ def test_what_is_along_which_array(backend: str) -> None:
 def two_returns(f: Fields) -> Polar:
     pixels = f.columns.pixels
     return Polar(
-        range=stack(pixels.range, pixels.range + 1), azimuth=0, return_index=stack(0, pixels.signal * 0 + 1), column=f.columns.measurement
+        range=stack(pixels.range, pixels.range + 1),
+        azimuth=0,
+        return_index=stack(0, pixels.signal * 0 + 1),
+        column=f.columns.measurement,
     )
 
 
@@ -66,7 +78,9 @@ def test_the_shape_is_columns_and_rows_for_two_returns_too(backend: str) -> None
 
 
 def test_rows_of_tables_are_looked_at_where_they_are_or_gathered() -> None:
-    in_order = [frame(first) for first in (*range(16, TURN, COLUMNS), 0, 16)]  # round the end of the table, too
+    in_order = [
+        frame(first) for first in (*range(16, TURN, COLUMNS), 0, 16)
+    ]  # round the end of the table, too
     beyond, mixed = [frame(TURN - 1)], [frame(0), frame(32)]
     for frames in (in_order, beyond, mixed, in_order * 40 + beyond):
         read = SENSOR.decode(frames, backend="numpy")
@@ -107,7 +121,11 @@ def test_what_cannot_be_a_picture_is_refused() -> None:
 def test_a_lost_packet_is_a_gap_of_its_scan() -> None:
     frames = simulate(SENSOR, 12)
     scans = list(SENSOR.scans(frames[:6] + frames[7:]))
-    assert [scan.points.shape for scan in scans] == [(TURN, PIXELS), (TURN - COLUMNS, PIXELS), (TURN, PIXELS)]
+    assert [scan.points.shape for scan in scans] == [
+        (TURN, PIXELS),
+        (TURN - COLUMNS, PIXELS),
+        (TURN, PIXELS),
+    ]
     valid = scans[1].points.organised(TURN).valid.reshape(TURN, PIXELS)
     assert not valid[2 * COLUMNS : 3 * COLUMNS].any()
     assert valid[: 2 * COLUMNS].any(axis=1).all()

@@ -1,4 +1,6 @@
-"""Clouds and scans as other libraries take them: NumPy, pyarrow, pandas, Polars, DuckDB and whoever reads DLPack."""
+"""Clouds and scans as other libraries take them: NumPy, pyarrow, pandas, Polars, DuckDB and whoever
+reads DLPack.
+"""
 
 from __future__ import annotations
 
@@ -26,7 +28,9 @@ def test_a_cloud_is_an_array_of_points_for_numpy(scan: Scan) -> None:
     assert np.asarray(cloud).dtype == np.float32
     assert np.array(cloud, np.float64).dtype == np.float64
     np.testing.assert_array_equal(np.asarray(cloud[3]), cloud.xyz[3])
-    np.testing.assert_allclose(np.linalg.norm(cloud[cloud.valid], axis=1), cloud.range[cloud.valid], rtol=1e-5)
+    np.testing.assert_allclose(
+        np.linalg.norm(cloud[cloud.valid], axis=1), cloud.range[cloud.valid], rtol=1e-5
+    )
     with pytest.raises(ValueError, match="is a copy"):
         np.asarray(cloud, copy=False)
 
@@ -56,7 +60,9 @@ def test_arrow_takes_columns_without_a_copy_and_knows_their_units(scan: Scan) ->
     assert table.column_names == list(cloud.columns)
     for name, column in cloud.columns.items():
         np.testing.assert_array_equal(table[name], column)
-        assert column.dtype.kind == "b" or np.shares_memory(cloud.to_arrow()[name].to_numpy(), column), name
+        assert column.dtype.kind == "b" or np.shares_memory(
+            cloud.to_arrow()[name].to_numpy(), column
+        ), name
     told = {key.decode(): value.decode() for key, value in table.schema.metadata.items()}
     assert json.loads(told.pop("units"))["velocity"] == "m/s"
     assert told == scan.facts | {"stamp_ns": str(scan.stamp_ns)}
@@ -78,7 +84,11 @@ def test_duckdb_asks_a_cloud_and_a_scan(scan: Scan) -> None:
 
 @pytest.mark.slow
 def test_data_frames_share_the_columns(scan: Scan) -> None:
-    pandas, polars, cloud = pytest.importorskip("pandas"), pytest.importorskip("polars"), scan.points
+    pandas, polars, cloud = (
+        pytest.importorskip("pandas"),
+        pytest.importorskip("polars"),
+        scan.points,
+    )
     frame, polar = cloud.to_pandas(), cloud.to_polars()
     assert isinstance(frame, pandas.DataFrame)
     assert isinstance(polar, polars.DataFrame)
@@ -91,8 +101,12 @@ def test_data_frames_share_the_columns(scan: Scan) -> None:
     assert polars.DataFrame(scan).columns == polar.columns
 
 
-@pytest.mark.parametrize(("library", "extra"), [("pyarrow", "arrow"), ("pandas", "pandas"), ("polars", "polars")])
-def test_a_library_that_is_missing_is_named(scan: Scan, library: str, extra: str, monkeypatch: pytest.MonkeyPatch) -> None:
+@pytest.mark.parametrize(
+    ("library", "extra"), [("pyarrow", "arrow"), ("pandas", "pandas"), ("polars", "polars")]
+)
+def test_a_library_that_is_missing_is_named(
+    scan: Scan, library: str, extra: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.setitem(sys.modules, library, None)
     with pytest.raises(LibraryError) as caught:
         getattr(scan.points, f"to_{extra}")()

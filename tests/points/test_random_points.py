@@ -1,4 +1,6 @@
-"""Random `points` functions: the plan and the kernels give what the plain evaluation gives, in batches of odd sizes."""
+"""Random `points` functions: the plan and the kernels give what the plain evaluation gives, in
+batches of odd sizes.
+"""
 
 from __future__ import annotations
 
@@ -23,7 +25,9 @@ Expression = Callable[[Fields], Any]
 
 @dataclasses.dataclass(frozen=True)
 class Parts:
-    """What the functions for one sensor are made of: values of a packet or block, those of each point, and points in a row."""
+    """What the functions for one sensor are made of: values of a packet or block, those of each
+    point, and points in a row.
+    """
 
     sensor_id: str
     low: tuple[Expression, ...]
@@ -34,13 +38,22 @@ class Parts:
 PARTS = {
     "serial": Parts(
         "ldrobot-stl27l",
-        (lambda f: f.start_angle, lambda f: f.end_angle, lambda f: wrap(f.end_angle - f.start_angle, 360), lambda f: f.speed),
+        (
+            lambda f: f.start_angle,
+            lambda f: f.end_angle,
+            lambda f: wrap(f.end_angle - f.start_angle, 360),
+            lambda f: f.speed,
+        ),
         (lambda f: f.points.distance, lambda f: f.points.intensity),
         12,
     ),
     "blocks": Parts(
         "velodyne-vlp16",
-        (lambda f: f.blocks.azimuth, lambda f: following(f.blocks.azimuth) - f.blocks.azimuth, lambda f: previous(f.blocks.azimuth)),
+        (
+            lambda f: f.blocks.azimuth,
+            lambda f: following(f.blocks.azimuth) - f.blocks.azimuth,
+            lambda f: previous(f.blocks.azimuth),
+        ),
         (lambda f: f.blocks.channels.distance, lambda f: f.blocks.channels.intensity),
         32,
     ),
@@ -55,7 +68,9 @@ class Maker:
 
     def _row(self) -> Any:
         values = [self._source.uniform(-2, 2) for _ in range(self._parts.row)]
-        return np.array(values) if self._source.random() < 0.8 else np.full(self._parts.row, values[0])
+        return (
+            np.array(values) if self._source.random() < 0.8 else np.full(self._parts.row, values[0])
+        )
 
     def term(self) -> Expression:
         """One part of an angle in degrees."""
@@ -81,7 +96,10 @@ class Maker:
 
     def angle(self) -> Expression:
         """A sum of terms, in radians."""
-        terms, outer = [self.term() for _ in range(self._source.randint(1, 4))], self._source.randrange(4)
+        terms, outer = (
+            [self.term() for _ in range(self._source.randint(1, 4))],
+            self._source.randrange(4),
+        )
 
         def value(f: Fields) -> Any:
             total = sum((term(f) for term in terms[1:]), terms[0](f))
@@ -95,12 +113,25 @@ class Maker:
         distance, level = self._parts.full[0], self._source.randrange(4)
         azimuth, row, tilt = self.angle(), self._row(), self.angle()
         origin = (0.0, 0.0, 0.1) if self._source.random() < 0.3 else (0.0, 0.0, 0.0)
-        elevation: list[Expression] = [lambda f: 0.0, lambda f: row * 0.1, lambda f: np.deg2rad(self._parts.low[0](f)), tilt]
+        elevation: list[Expression] = [
+            lambda f: 0.0,
+            lambda f: row * 0.1,
+            lambda f: np.deg2rad(self._parts.low[0](f)),
+            tilt,
+        ]
         limit = self._source.choice([None, 1.0, 20.0])
 
         def points(f: Fields) -> Polar:
-            far = distance(f) if limit is None else np.where(distance(f) > limit, distance(f), np.nan)
-            return Polar(range=far, azimuth=azimuth(f), elevation=elevation[level](f), intensity=self._parts.full[1](f), origin=origin)
+            far = (
+                distance(f) if limit is None else np.where(distance(f) > limit, distance(f), np.nan)
+            )
+            return Polar(
+                range=far,
+                azimuth=azimuth(f),
+                elevation=elevation[level](f),
+                intensity=self._parts.full[1](f),
+                origin=origin,
+            )
 
         return points
 
@@ -110,13 +141,17 @@ def packets_of(name: str, seed: int, backend: str) -> Packets:
     parts, source = PARTS[name], random.Random(seed)
     known = lidarspec.sensor(parts.sensor_id)
     sensor = dataclasses.replace(known, points=Maker(parts, seed).points())
-    frames = simulate(known, source.randint(1, 30)) + [known.example("data", seed=n) for n in range(source.randrange(9))]
+    frames = simulate(known, source.randint(1, 30)) + [
+        known.example("data", seed=n) for n in range(source.randrange(9))
+    ]
     source.shuffle(frames)
     return sensor.decode(frames if sensor.datagrams else b"".join(frames), backend=backend)
 
 
 @pytest.mark.parametrize("name", list(PARTS))
-@pytest.mark.parametrize("seed", [*range(10), *(pytest.param(seed, marks=pytest.mark.slow) for seed in range(10, 60))])
+@pytest.mark.parametrize(
+    "seed", [*range(10), *(pytest.param(seed, marks=pytest.mark.slow) for seed in range(10, 60))]
+)
 def test_a_plan_of_a_random_function_gives_the_plain_points(name: str, seed: int) -> None:
     packets = packets_of(name, seed, "numpy")
     found = plan_for(packets.sensor.points_of("data"), packets.batch(), packets.table.groups[0])  # type: ignore[attr-defined]
@@ -126,7 +161,9 @@ def test_a_plan_of_a_random_function_gives_the_plain_points(name: str, seed: int
 
 @pytest.mark.parametrize("name", list(PARTS))
 @pytest.mark.slow
-@pytest.mark.parametrize("seed", [*range(2), *(pytest.param(seed, marks=pytest.mark.soak) for seed in range(2, 60))])
+@pytest.mark.parametrize(
+    "seed", [*range(2), *(pytest.param(seed, marks=pytest.mark.soak) for seed in range(2, 60))]
+)
 def test_kernels_of_a_random_function_give_the_plain_points(name: str, seed: int) -> None:
     pytest.importorskip("numba")
     packets = packets_of(name, seed, "jit")

@@ -1,4 +1,6 @@
-"""Angles that lie close together: as exact as those computed one by one, and the same whatever other packets are in the batch."""
+"""Angles that lie close together: as exact as those computed one by one, and the same whatever
+other packets are in the batch.
+"""
 
 from __future__ import annotations
 
@@ -27,7 +29,9 @@ def stl27l() -> Sensor:
 
 def with_azimuth(sensor: Sensor, azimuth: Callable[[Fields], Any]) -> Sensor:
     """Return the sensor with another direction of its points."""
-    return dataclasses.replace(sensor, points=lambda f: Polar(range=f.points.distance, azimuth=azimuth(f)))
+    return dataclasses.replace(
+        sensor, points=lambda f: Polar(range=f.points.distance, azimuth=azimuth(f))
+    )
 
 
 def turning(f: Fields) -> Any:
@@ -48,19 +52,30 @@ def alike(f: Fields) -> Any:
 
 @pytest.mark.parametrize("azimuth", [turning, fixed, both, alike])
 @pytest.mark.parametrize("narrow", [True, False])
-def test_points_are_those_of_the_plain_evaluation(stl27l: Sensor, azimuth: Any, narrow: bool) -> None:
+def test_points_are_those_of_the_plain_evaluation(
+    stl27l: Sensor, azimuth: Any, narrow: bool
+) -> None:
     sensor = with_azimuth(stl27l, azimuth)
-    frames = simulate(stl27l, 700) if narrow else [stl27l.example("data", seed=seed) for seed in range(40)]
+    frames = (
+        simulate(stl27l, 700)
+        if narrow
+        else [stl27l.example("data", seed=seed) for seed in range(40)]
+    )
     packets = sensor.decode(b"".join(frames))
     assert_same_points(evaluated(packets).cloud, evaluate(packets).cloud)
 
 
 @pytest.mark.parametrize("azimuth", [turning, fixed])
-def test_cosines_and_sines_are_nearly_as_exact_as_float32_can_be(stl27l: Sensor, azimuth: Any) -> None:
+def test_cosines_and_sines_are_nearly_as_exact_as_float32_can_be(
+    stl27l: Sensor, azimuth: Any
+) -> None:
     sensor = with_azimuth(stl27l, azimuth)
     packets = sensor.decode(b"".join(simulate(stl27l, 1800)))
     cloud, angle = packets.points(), np.asarray(azimuth(Fields(packets.batch()))).reshape(-1)
-    error = np.hypot(cloud.x - cloud.range * np.cos(angle), cloud.y - cloud.range * np.sin(angle)) / cloud.range
+    error = (
+        np.hypot(cloud.x - cloud.range * np.cos(angle), cloud.y - cloud.range * np.sin(angle))
+        / cloud.range
+    )
     assert np.nanmax(error[cloud.valid]) < 1.7e-7
 
 
@@ -72,7 +87,9 @@ def test_a_packet_has_the_same_points_in_any_company(stl27l: Sensor) -> None:
     for index, frame in enumerate(mixed):
         alone = stl27l.decode(frame).points()
         for name in "xy":
-            np.testing.assert_array_equal(getattr(together, name)[12 * index : 12 * index + 12], getattr(alone, name))
+            np.testing.assert_array_equal(
+                getattr(together, name)[12 * index : 12 * index + 12], getattr(alone, name)
+            )
 
 
 @pytest.mark.parametrize("full", [360.0, 2 * np.pi, 6400.0, 0.1])
@@ -80,8 +97,12 @@ def test_remainders_are_those_of_numpy(full: float) -> None:
     edges = np.arange(-5, 6) * full
     near = [np.nextafter(edges, -np.inf), edges, np.nextafter(edges, np.inf)]
     odd = [-0.0, 1e-300, -1e-300, 1e300, np.inf, -np.inf, np.nan]
-    values = np.concatenate([*near, odd, np.random.default_rng(1).uniform(-3 * full, 4 * full, 9000)])
+    values = np.concatenate(
+        [*near, odd, np.random.default_rng(1).uniform(-3 * full, 4 * full, 9000)]
+    )
     with np.errstate(invalid="ignore"):
         wanted, found = np.remainder(values, full), remainder(values, np.asarray(full))
-    np.testing.assert_array_equal(np.signbit(wanted) & ~np.isnan(wanted), np.signbit(found) & ~np.isnan(found))
+    np.testing.assert_array_equal(
+        np.signbit(wanted) & ~np.isnan(wanted), np.signbit(found) & ~np.isnan(found)
+    )
     np.testing.assert_array_equal(wanted, found)

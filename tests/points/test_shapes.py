@@ -1,4 +1,6 @@
-"""Points of the invented sensors, worked out by hand: each mechanism gives what its frame says, on both paths."""
+"""Points of the invented sensors, worked out by hand: each mechanism gives what its frame says, on
+both paths.
+"""
 
 from __future__ import annotations
 
@@ -12,7 +14,19 @@ from construct import Array, Const, ConstructError, Int8ub, Int16ub, Int16ul, Re
 
 from lidarspec import PointCloud, Sensor, SpecError, UsageError, simulate
 from lidarspec.errors import OutOfRange, PluginError
-from lidarspec.spec import Checksummed, Frame, Polar, Scaled, Simulation, Sum, Xor, along, spread, steps, wrap
+from lidarspec.spec import (
+    Checksummed,
+    Frame,
+    Polar,
+    Scaled,
+    Simulation,
+    Sum,
+    Xor,
+    along,
+    spread,
+    steps,
+    wrap,
+)
 from lidarspec.testing.agreement import assert_same_points
 from tests.engine import against_construct
 from tests.shapes import SHAPES, calibration
@@ -25,7 +39,9 @@ def degrees(cloud: PointCloud) -> list[float]:
 
 
 def cloud_of(sensor: Sensor, *frames: bytes, backend: str) -> PointCloud:
-    return sensor.decode(list(frames) if sensor.datagrams else b"".join(frames), backend=backend).points()
+    return sensor.decode(
+        list(frames) if sensor.datagrams else b"".join(frames), backend=backend
+    ).points()
 
 
 @both
@@ -33,9 +49,13 @@ def test_counts_spread_the_angles_and_wrap(backend: str) -> None:
     sensor = SHAPES["shape-count"]
 
     def frame(first: int, last: int, *distances: int) -> bytes:
-        return sensor.build("data", first=first, last=last, samples=[dict(distance=d, quality=9) for d in distances])
+        return sensor.build(
+            "data", first=first, last=last, samples=[dict(distance=d, quality=9) for d in distances]
+        )
 
-    cloud = cloud_of(sensor, frame(35000, 2000, 1000, 2000, 0, 4660), frame(9000, 12000, 500), backend=backend)
+    cloud = cloud_of(
+        sensor, frame(35000, 2000, 1000, 2000, 0, 4660), frame(9000, 12000, 500), backend=backend
+    )
     assert degrees(cloud) == [10.0, 0.0, -10.0, -20.0, -90.0]
     assert cloud.range.tolist() == pytest.approx([1.0, 2.0, np.inf, 4.66, 0.5])
     assert cloud.valid.tolist() == [True, True, False, True, True]
@@ -52,13 +72,18 @@ def test_the_index_of_a_sample_is_as_long_as_the_arrays_of_the_batch(backend: st
     short = timed.build("data", first=0, last=100, samples=[dict(distance=1000, quality=9)] * 2)
     long = timed.build("data", first=0, last=100, samples=[dict(distance=1000, quality=9)] * 3)
     assert cloud_of(timed, short, backend=backend).time.tolist() == pytest.approx([0, 0.01])
-    assert cloud_of(timed, short, long, short, backend=backend).time.tolist() == pytest.approx([0, 0.01, 0, 0.01, 0.02, 0, 0.01])
+    assert cloud_of(timed, short, long, short, backend=backend).time.tolist() == pytest.approx(
+        [0, 0.01, 0, 0.01, 0.02, 0, 0.01]
+    )
     assert steps(3).tolist() == [0, 1, 2]
 
 
 def test_a_spread_that_folds_everything_onto_one_value_says_so() -> None:
     shape = SHAPES["shape-count"]
-    folded = replace(shape, points=lambda f: replace(shape.points(f), time=spread(0, f.count - 1, f.count, full=1.0)))
+    folded = replace(
+        shape,
+        points=lambda f: replace(shape.points(f), time=spread(0, f.count - 1, f.count, full=1.0)),
+    )
     packets = folded.decode(b"".join(shape.example("data", seed=seed) for seed in range(3)))
     with pytest.raises(PluginError, match=r"whole turns of 1 from its start.*steps\(count\)"):
         packets.points()
@@ -67,9 +92,15 @@ def test_a_spread_that_folds_everything_onto_one_value_says_so() -> None:
 def test_a_sweep_of_one_beam_starts_and_ends_at_its_start() -> None:
     with np.errstate(all="raise"):
         for count in (1, np.array([[1.0]])):
-            np.testing.assert_array_equal(spread(np.array([[350.0]]), np.array([[10.0]]), count, full=360.0), [[350.0]])
-        np.testing.assert_array_equal(spread(np.array([[350.0]]), np.array([[10.0]]), 3, full=360.0), [[350, 360, 370]])
-        np.testing.assert_array_equal(spread(np.array([[5.0]]), np.array([[5.0]]), 2, full=360.0), [[5, 5]])
+            np.testing.assert_array_equal(
+                spread(np.array([[350.0]]), np.array([[10.0]]), count, full=360.0), [[350.0]]
+            )
+        np.testing.assert_array_equal(
+            spread(np.array([[350.0]]), np.array([[10.0]]), 3, full=360.0), [[350, 360, 370]]
+        )
+        np.testing.assert_array_equal(
+            spread(np.array([[5.0]]), np.array([[5.0]]), 2, full=360.0), [[5, 5]]
+        )
     assert wrap(np.array([360.0, -1e-20, 725.0]), 360.0).tolist() == [0, 0, 5]
 
 
@@ -87,9 +118,20 @@ def test_a_length_that_follows_from_another_is_filled_in_wherever_a_frame_is_mad
 
 
 def test_a_length_may_follow_from_a_constant() -> None:
-    struct = Struct("magic" / Const(b"SZ"), "length" / Rebuild(Int16ub, this.size + 5), "size" / Const(1, Int16ub), "speed" / Int16ub)
+    struct = Struct(
+        "magic" / Const(b"SZ"),
+        "length" / Rebuild(Int16ub, this.size + 5),
+        "size" / Const(1, Int16ub),
+        "speed" / Int16ub,
+    )
     shape = SHAPES["shape-sized"]
-    sensor = replace(shape, frames={**shape.frames, "speed": Frame(struct, max_length=8, plausible=lambda f: f.length == 6)})
+    sensor = replace(
+        shape,
+        frames={
+            **shape.frames,
+            "speed": Frame(struct, max_length=8, plausible=lambda f: f.length == 6),
+        },
+    )
     assert sensor.build("speed", speed=7) == b"SZ\0\6\0\1\0\7"
     assert sensor.parse(sensor.example("speed"), "speed").length == 6
 
@@ -97,10 +139,19 @@ def test_a_length_may_follow_from_a_constant() -> None:
 def test_plausible_frames_are_found_around_the_lengths_of_the_sweep() -> None:
     """Nothing says here that one length follows from the other, and chance would never make both."""
     shape = SHAPES["shape-sized"]
-    children = [child if child.name != "length" else "length" / Int16ub for child in shape.frames["data"].struct.subcon.subcons]
-    plain = dataclasses.replace(shape.frames["data"], struct=Checksummed(Struct(*children), "sum", Sum(16)))
+    children = [
+        child if child.name != "length" else "length" / Int16ub
+        for child in shape.frames["data"].struct.subcon.subcons
+    ]
+    plain = dataclasses.replace(
+        shape.frames["data"], struct=Checksummed(Struct(*children), "sum", Sum(16))
+    )
     sensor = replace(
-        shape, frames={"data": plain}, simulation=Simulation(lambda i: dict(length=7 + 3 * (i % 9), size=2 + 3 * (i % 9), angle=7.0))
+        shape,
+        frames={"data": plain},
+        simulation=Simulation(
+            lambda i: dict(length=7 + 3 * (i % 9), size=2 + 3 * (i % 9), angle=7.0)
+        ),
     )
     assert len({len(sensor.example("data", seed=seed)) for seed in range(8)}) > 2
 
@@ -109,11 +160,19 @@ def test_plausible_frames_are_found_around_the_lengths_of_the_sweep() -> None:
 def test_bit_fields_in_both_orders(backend: str) -> None:
     sensor = SHAPES["shape-bits"]
     sample = dict(distance=0x1234, mode=1, intensity=0xAB)
-    values: dict[str, Any] = dict(first=0x012345, drift=-2, little=[sample] * 6, big=[sample] * 6, mirrored=dict(flags=1, tilt=-3))
+    values: dict[str, Any] = dict(
+        first=0x012345,
+        drift=-2,
+        little=[sample] * 6,
+        big=[sample] * 6,
+        mirrored=dict(flags=1, tilt=-3),
+    )
     data = sensor.build("data", **values)
     assert data[2:5] == bytes.fromhex("45 23 01")
     assert data[5:8] == bytes.fromhex("ff ff fe")
-    assert data[8:11] == bytes.fromhex("ab d1 48")  # 0x1234 << 10 | 1 << 8 | 0xab = 0x48d1ab, low byte first
+    assert data[8:11] == bytes.fromhex(
+        "ab d1 48"
+    )  # 0x1234 << 10 | 1 << 8 | 0xab = 0x48d1ab, low byte first
     assert data[26:29] == bytes.fromhex("48 d1 ab")
     assert data[44] == int(f"{1 << 5 | 0b11101:08b}"[::-1], 2)
     packets = sensor.decode(data, backend=backend)
@@ -126,10 +185,14 @@ def test_bit_fields_in_both_orders(backend: str) -> None:
 
 
 def test_checksums_stand_where_they_are_declared() -> None:
-    middle = SHAPES["shape-middle"].build("data", angle=0x1234, samples=[dict(quality=1, distance=0x0203)] * 4)
+    middle = SHAPES["shape-middle"].build(
+        "data", angle=0x1234, samples=[dict(quality=1, distance=0x0203)] * 4
+    )
     words = middle[:4] + middle[6:]
     low, high = words[0] ^ words[2], words[1] ^ words[3]
-    for quality, distance_low, distance_high in zip(words[4::3], words[5::3], words[6::3], strict=True):
+    for quality, distance_low, distance_high in zip(
+        words[4::3], words[5::3], words[6::3], strict=True
+    ):
         low, high = low ^ quality ^ distance_low, high ^ distance_high
     assert middle[4:6] == bytes([low, high])
     nibbles = SHAPES["shape-nibbles"].build("data", angle=64, distances=[1, 2, 3, 4, 0x1234])
@@ -142,7 +205,9 @@ def test_checksums_stand_where_they_are_declared() -> None:
     assert frame[14:18] == other[14:18]
 
 
-@pytest.mark.parametrize("name", ["shape-middle", "shape-nibbles", "shape-nested", "shape-twice", "shape-sized"])
+@pytest.mark.parametrize(
+    "name", ["shape-middle", "shape-nibbles", "shape-nested", "shape-twice", "shape-sized"]
+)
 def test_a_sealed_struct_parses_and_builds_without_a_sensor(name: str) -> None:
     """As an author tries it first."""
     sensor = SHAPES[name]
@@ -161,11 +226,20 @@ def test_what_follows_reaches_over_packets_but_not_over_losses(backend: str) -> 
     def frame(angle: int, lift: int, distance: int) -> bytes:
         return sensor.build("data", angle=angle, lift=lift, distances=[distance] * 8)
 
-    frames = [frame(35600, 0, 1000), frame(400, 20, 2000), frame(1200, 0, 3000), frame(9000, 0, 1000), frame(9400, 0, 1000)]
+    frames = [
+        frame(35600, 0, 1000),
+        frame(400, 20, 2000),
+        frame(1200, 0, 3000),
+        frame(9000, 0, 1000),
+        frame(9400, 0, 1000),
+    ]
     cloud = cloud_of(sensor, *frames[:3], b"lost", *frames[3:], backend=backend)
     angles = degrees(cloud)
     assert angles[:9] == [-4, -3, -2, -1, 0, 1, 2, 3, 4]
-    assert angles[16:18] == [12, 13]  # nothing follows before the loss: the step of the packet before
+    assert angles[16:18] == [
+        12,
+        13,
+    ]  # nothing follows before the loss: the step of the packet before
     assert angles[24:28] == [90, 90.5, 91, 91.5]
     lifts = np.rad2deg(cloud.elevation[::8])
     np.testing.assert_allclose(lifts, [0, 2, 2, 2, 2], atol=1e-5)
@@ -180,14 +254,21 @@ def test_what_follows_reaches_over_packets_but_not_over_losses(backend: str) -> 
 def test_state_of_another_packet_stands_on_the_axes_of_the_points(backend: str) -> None:
     sensor = SHAPES["shape-state"]
     block = dict(azimuth=1000, channels=[dict(distance=500)] * 4)
-    data = sensor.build("data", twist=[0, 100, 0, 200], lag=[0, 10, 20], blocks=[block, block, dict(block, azimuth=2000)])
+    data = sensor.build(
+        "data",
+        twist=[0, 100, 0, 200],
+        lag=[0, 10, 20],
+        blocks=[block, block, dict(block, azimuth=2000)],
+    )
     nominal = cloud_of(sensor, data, backend=backend)
     assert bool(nominal.nominal)
     assert degrees(nominal) == [10, 11, 10, 12, 10, 11, 10, 12, 20, 21, 20, 22]
     np.testing.assert_allclose(np.rad2deg(nominal.elevation), [-3, -1, 1, 3] * 3, atol=1e-5)
     np.testing.assert_allclose(nominal.time, np.repeat([0, 1e-5, 2e-5], 4), atol=1e-12)
     info = sensor.build("info", zero=500, vertical=[-100, 0, 100, 200])
-    known = cloud_of(sensor, data, info, data, backend=backend)  # reading a whole input applies the first info from the start
+    known = cloud_of(
+        sensor, data, info, data, backend=backend
+    )  # reading a whole input applies the first info from the start
     assert not known.nominal
     assert degrees(known)[:4] == degrees(known)[12:16] == [5, 6, 5, 7]
     np.testing.assert_allclose(np.rad2deg(known.elevation[:4]), [-1, 0, 1, 2], atol=1e-5)
@@ -199,7 +280,9 @@ def test_a_calibration_file_decides_the_frames() -> None:
         bare.parse(b"\xca\x1b")
     with pytest.raises(UsageError, match="configure"):
         bare.decoder()
-    data = sensor.build("data", azimuth=9000, channels=[dict(row=row, distance=1000) for row in (0, 1, 4, 5, 255)])
+    data = sensor.build(
+        "data", azimuth=9000, channels=[dict(row=row, distance=1000) for row in (0, 1, 4, 5, 255)]
+    )
     cloud = sensor.decode(data).points()
     np.testing.assert_allclose(np.rad2deg(cloud.elevation[:3]), [-7.5, -2.5, 12.5], atol=1e-5)
     assert cloud.valid.tolist() == [True, True, True, False, False]
@@ -210,10 +293,20 @@ def test_a_calibration_file_decides_the_frames() -> None:
 def test_options_of_the_header_change_what_follows(backend: str) -> None:
     sensor = SHAPES["shape-options"]
 
-    def frame(extended: int, coarse: int, kind: int, extension: Any, extra: Any, rows: int, columns: int) -> bytes:
+    def frame(
+        extended: int, coarse: int, kind: int, extension: Any, extra: Any, rows: int, columns: int
+    ) -> bytes:
         options = dict(extended=extended, coarse=coarse, kind=kind)
         distances = [1000] * (rows * columns)
-        values = dict(options=options, rows=rows, columns=columns, extension=extension, extra=extra, angle=500, distances=distances)
+        values = dict(
+            options=options,
+            rows=rows,
+            columns=columns,
+            extension=extension,
+            extra=extra,
+            angle=500,
+            distances=distances,
+        )
         return sensor.build("data", **values)
 
     frames = [
@@ -235,14 +328,24 @@ def test_options_of_the_header_change_what_follows(backend: str) -> None:
 def test_a_clock_that_wraps_runs_on(backend: str) -> None:
     sensor = SHAPES["shape-clock"]
     instants = [58.5, 59.25, 59.9999, 0.0, 29.5, 58.0, 1.0]
-    frames = [sensor.build("data", seconds=int(t), ticks=round(t % 1 * 10_000), distances=[1, 2, 3, 4]) for t in instants]
+    frames = [
+        sensor.build("data", seconds=int(t), ticks=round(t % 1 * 10_000), distances=[1, 2, 3, 4])
+        for t in instants
+    ]
     packets = sensor.decode(b"".join(frames), backend=backend)
     expected = [58.5, 59.25, 59.9999, 60.0, 89.5, 118.0, 121.0]
     assert packets.time_ns.tolist() == [round(t * 1e4) * 100_000 for t in expected]
-    turns = [sensor.build("data", seconds=i * 10 % 60, ticks=0, distances=[1, 2, 3, 4]) for i in range(300)]
-    assert sensor.decode(b"".join(turns), backend=backend).time_ns.tolist() == [i * 10 * 10**9 for i in range(300)]
+    turns = [
+        sensor.build("data", seconds=i * 10 % 60, ticks=0, distances=[1, 2, 3, 4])
+        for i in range(300)
+    ]
+    assert sensor.decode(b"".join(turns), backend=backend).time_ns.tolist() == [
+        i * 10 * 10**9 for i in range(300)
+    ]
     late = [turns[spot] for spot in (0, 1, 3, 2, 4)]
-    assert sensor.decode(b"".join(late), backend=backend).time_ns.tolist() == [i * 10 * 10**9 for i in (0, 1, 3, 2, 4)]
+    assert sensor.decode(b"".join(late), backend=backend).time_ns.tolist() == [
+        i * 10 * 10**9 for i in (0, 1, 3, 2, 4)
+    ]
     scans = list(sensor.scans(b"".join(frames[:4]), backend=backend))
     assert [len(scan) for scan in scans] == [4, 4, 4, 4]
 
@@ -250,10 +353,13 @@ def test_a_clock_that_wraps_runs_on(backend: str) -> None:
 @both
 def test_two_echoes_stand_side_by_side_even_at_one_distance(backend: str) -> None:
     sensor = SHAPES["shape-echoes"]
-    beams = [dict(near=250, far=500, weak=1, strong=2), dict(near=250, far=250, weak=3, strong=4)] + [
-        dict(near=0, far=0, weak=0, strong=0)
-    ] * 3
-    cloud = cloud_of(sensor, sensor.build("data", turn=1, angle=10_000, beams=beams), backend=backend)
+    beams = [
+        dict(near=250, far=500, weak=1, strong=2),
+        dict(near=250, far=250, weak=3, strong=4),
+    ] + [dict(near=0, far=0, weak=0, strong=0)] * 3
+    cloud = cloud_of(
+        sensor, sensor.build("data", turn=1, angle=10_000, beams=beams), backend=backend
+    )
     assert cloud.range[:4].tolist() == [1, 2, 1, 1]
     assert cloud.return_index.tolist() == [0, 1] * 5  # type: ignore[union-attr]
     assert cloud.intensity[:4].tolist() == [1, 2, 3, 4]  # type: ignore[union-attr]
@@ -289,7 +395,12 @@ def test_numbers_keep_every_bit(backend: str) -> None:
     sensor = SHAPES["shape-numbers"]
     sample = dict(range=1.5, elevation=-9000, spare=255)
     values: dict[str, Any] = dict(
-        reserved=b"\x01\x02\x03", stamp=12_345_678_901, serial=-(2**63), offset=-1, azimuth=0.25, samples=[sample] * 3
+        reserved=b"\x01\x02\x03",
+        stamp=12_345_678_901,
+        serial=-(2**63),
+        offset=-1,
+        azimuth=0.25,
+        samples=[sample] * 3,
     )
     data = sensor.build("data", **values)
     assert data[-2:] not in (b"\0\0", b"\xff\xff")
@@ -337,7 +448,9 @@ def test_a_sequence_counts_what_is_lost_doubled_and_late(backend: str) -> None:
     assert (stats.lost, stats.duplicates, stats.late) == (3, 1, 1)
     assert stats.frames == {"data": 6}
     ordered = list(sensor.scans([frame(n) for n in range(1, 9)], backend=backend))
-    shuffled = list(sensor.scans([frame(n) for n in (1, 2, 4, 3, 3, 5, 7, 6, 8, 8)], backend=backend))
+    shuffled = list(
+        sensor.scans([frame(n) for n in (1, 2, 4, 3, 3, 5, 7, 6, 8, 8)], backend=backend)
+    )
     for one, other in zip(ordered, shuffled, strict=True):
         np.testing.assert_array_equal(one.points.xyz, other.points.xyz)
 
@@ -360,7 +473,9 @@ BESIDE = Struct("first" / Int8ub, "near" / Array(3, Int8ub), "other" / Array(4, 
         lambda f: Polar(range=np.asarray(f.near), azimuth=ANGLES[:, None]),
     ],
 )
-def test_numbers_go_along_the_one_array_that_is_as_long_or_that_is_named(points: Any, backend: str) -> None:
+def test_numbers_go_along_the_one_array_that_is_as_long_or_that_is_named(
+    points: Any, backend: str
+) -> None:
     sensor = replace(against_construct.sensor(BESIDE), points=points)
     cloud = sensor.decode([bytes(range(16))] * 2, backend=backend).points()
     assert cloud.range.tolist() == [1, 2, 3] * 2
@@ -375,22 +490,35 @@ def test_numbers_go_along_the_one_array_that_is_as_long_or_that_is_named(points:
             lambda f: Polar(range=f.near, azimuth=f.first * ANGLES),
             r"3 values goes with near as well as with other\[\]: .*along\('other\[\]', ",
         ),
-        (lambda f: Polar(range=f.near, azimuth=np.zeros(7)), r"7 values goes with no array of the frame: near 3, other 4, other\[\] 3"),
+        (
+            lambda f: Polar(range=f.near, azimuth=np.zeros(7)),
+            r"7 values goes with no array of the frame: near 3, other 4, other\[\] 3",
+        ),
         (
             lambda f: Polar(range=f.near, azimuth=along("other[]", ANGLES)),
             r"along 'other\[\]', where no field of theirs is \(.*other\[\] 3",
         ),
-        (lambda f: Polar(range=f.near, azimuth=along("other", np.zeros(4))), r"axis 'near' meets axis 'other'"),
+        (
+            lambda f: Polar(range=f.near, azimuth=along("other", np.zeros(4))),
+            r"axis 'near' meets axis 'other'",
+        ),
         (
             lambda f: Polar(range=f.near, azimuth=along("further", ANGLES)),
             r"no array 'further' in the frame; there are near, other, other\[\]",
         ),
-        (lambda f: Polar(range=np.asarray(f.near)[:, :, 0], azimuth=0), r"along 'other(\[\])?', where no field of theirs is"),
+        (
+            lambda f: Polar(range=np.asarray(f.near)[:, :, 0], azimuth=0),
+            r"along 'other(\[\])?', where no field of theirs is",
+        ),
         (lambda f: Polar(range=f.first, azimuth=f.first.index), r"an index of arrays only"),
     ],
 )
-def test_numbers_that_go_along_several_arrays_or_none_are_refused_by_their_names(points: Any, said: str, backend: str) -> None:
-    packets = replace(against_construct.sensor(BESIDE), points=points).decode([bytes(range(16))] * 2, backend=backend)
+def test_numbers_that_go_along_several_arrays_or_none_are_refused_by_their_names(
+    points: Any, said: str, backend: str
+) -> None:
+    packets = replace(against_construct.sensor(BESIDE), points=points).decode(
+        [bytes(range(16))] * 2, backend=backend
+    )
     with pytest.raises(SpecError, match=said):
         packets.points()
 
@@ -398,17 +526,30 @@ def test_numbers_that_go_along_several_arrays_or_none_are_refused_by_their_names
 @both
 def test_lengths_that_do_not_fit_are_named_with_their_axes(backend: str) -> None:
     sensor = against_construct.sensor(BESIDE)
-    terms = replace(sensor, points=lambda f: Polar(range=f.other * np.ones((3, 1)), azimuth=0)).decode([bytes(16)], backend=backend)
-    with pytest.raises(SpecError, match=r"lengths that do not go together: 1: other 4 x other\[\] 3, 2: other 3"):
+    terms = replace(
+        sensor, points=lambda f: Polar(range=f.other * np.ones((3, 1)), azimuth=0)
+    ).decode([bytes(16)], backend=backend)
+    with pytest.raises(
+        SpecError, match=r"lengths that do not go together: 1: other 4 x other\[\] 3, 2: other 3"
+    ):
         terms.points()
-    parts = replace(sensor, points=lambda f: Polar(range=f.other, azimuth=along("other", np.zeros(2)))).decode([bytes(16)], backend=backend)
-    with pytest.raises(SpecError, match=r"lengths that do not go together: range: other 4 x other\[\] 3, azimuth: other 2"):
+    parts = replace(
+        sensor, points=lambda f: Polar(range=f.other, azimuth=along("other", np.zeros(2)))
+    ).decode([bytes(16)], backend=backend)
+    with pytest.raises(
+        SpecError,
+        match=r"lengths that do not go together: range: other 4 x other\[\] 3, azimuth: other 2",
+    ):
         parts.points()
 
 
 def test_what_a_sensor_in_a_scene_measures_is_refused_for_the_same_axes() -> None:
     sensor = replace(
-        against_construct.sensor(Struct("near" / Array(3, Scaled(Int8ub, 0.1, "m")), "other" / Array(4, Array(3, Int8ub)))),
+        against_construct.sensor(
+            Struct(
+                "near" / Array(3, Scaled(Int8ub, 0.1, "m")), "other" / Array(4, Array(3, Int8ub))
+            )
+        ),
         points=lambda f: Polar(range=f.near * along("other[]", np.ones(3)), azimuth=0),
         simulation=Simulation(lambda i: {}, rate=10),
     )
@@ -416,14 +557,25 @@ def test_what_a_sensor_in_a_scene_measures_is_refused_for_the_same_axes() -> Non
         simulate(sensor, 2)
 
 
-@pytest.mark.parametrize("sizes", [[(7, 0)], [(0, 3)], [(7, 0), (3, 2)], [(0, 3), (3, 2)], [(7, 0), (0, 3)]])
+@pytest.mark.parametrize(
+    "sizes", [[(7, 0)], [(0, 3)], [(7, 0), (3, 2)], [(0, 3), (3, 2)], [(7, 0), (0, 3)]]
+)
 def test_arrays_in_empty_ones_have_no_length(sizes: list[tuple[int, int]]) -> None:
     sensor, each = SHAPES["shape-segments"], dict(turn=0, time=0, start=0)
     segments = [
-        dict(each, channels=channels, beams=beams, elevations=[1] * channels, data=[[dict(distance=1, strength=1)] * channels] * beams)
+        dict(
+            each,
+            channels=channels,
+            beams=beams,
+            elevations=[1] * channels,
+            data=[[dict(distance=1, strength=1)] * channels] * beams,
+        )
         for channels, beams in sizes
     ]
     frame = sensor.build("data", counter=1, step=1.5, segments=segments, units=True)
-    plain, parsed = cloud_of(sensor, frame, backend="numpy"), cloud_of(sensor, frame, backend="construct")
+    plain, parsed = (
+        cloud_of(sensor, frame, backend="numpy"),
+        cloud_of(sensor, frame, backend="construct"),
+    )
     assert len(plain) == sum(channels * beams for channels, beams in sizes)
     assert_same_points(plain, parsed)

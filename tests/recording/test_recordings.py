@@ -56,7 +56,9 @@ def path(tmp_path: Path) -> Path:
     return tmp_path / "it.lsr"
 
 
-def record(path: Path, chunks: list[Chunk], *, sensor: str | None = None, datagrams: bool | None = None) -> Path:
+def record(
+    path: Path, chunks: list[Chunk], *, sensor: str | None = None, datagrams: bool | None = None
+) -> Path:
     with Recorder(path, sensor, datagrams=datagrams) as recorder:
         for chunk in chunks:
             recorder.write(chunk)
@@ -69,7 +71,10 @@ def read(path: Path, *, salvage: bool = False) -> list[Record]:
 
 
 def as_records(chunks: list[Chunk], *, datagram: bool = True) -> list[Record]:
-    return [Record("in", chunk.data, chunk.at, chunk.sender, chunk.receiver, datagram, chunk.gap) for chunk in chunks]
+    return [
+        Record("in", chunk.data, chunk.at, chunk.sender, chunk.receiver, datagram, chunk.gap)
+        for chunk in chunks
+    ]
 
 
 def test_what_was_written_comes_back(path: Path) -> None:
@@ -81,8 +86,16 @@ def test_what_was_written_comes_back(path: Path) -> None:
     found = read(path)
     assert found[:4] == as_records(CHUNKS)
     assert found[4] == Record("out", b"stop", 7, datagram=True)
-    assert (found[5].direction, found[5].at, json.loads(found[5].data)) == ("event", 9, {"event": "disconnect", "reason": "gone"})
-    assert (recorder.records, recorder.bytes, recorder.dropped) == (5, sum(len(chunk.data) for chunk in CHUNKS) + 4, 0)
+    assert (found[5].direction, found[5].at, json.loads(found[5].data)) == (
+        "event",
+        9,
+        {"event": "disconnect", "reason": "gone"},
+    )
+    assert (recorder.records, recorder.bytes, recorder.dropped) == (
+        5,
+        sum(len(chunk.data) for chunk in CHUNKS) + 4,
+        0,
+    )
 
 
 def test_the_header_tells_where_it_came_from(path: Path) -> None:
@@ -92,8 +105,16 @@ def test_the_header_tells_where_it_came_from(path: Path) -> None:
         pass
     with Recording(path) as recording:
         header = recording.header
-    assert (header.sensor, header.options, header.source, header.baud) == (STREAM, {"frame": "vendor"}, "serial:///dev/ttyUSB0", 921600)
-    assert header.versions == {"lidarspec": ls.__version__, "lidarspec-ldrobot": header.versions["lidarspec-ldrobot"]}
+    assert (header.sensor, header.options, header.source, header.baud) == (
+        STREAM,
+        {"frame": "vendor"},
+        "serial:///dev/ttyUSB0",
+        921600,
+    )
+    assert header.versions == {
+        "lidarspec": ls.__version__,
+        "lidarspec-ldrobot": header.versions["lidarspec-ldrobot"],
+    }
     assert before <= header.wall_ns <= time.time_ns()
     assert not header.datagrams
     assert header.known_sensor(path.parent).options == {"frame": "vendor"}
@@ -167,9 +188,19 @@ def test_hostile_files_cost_neither_memory_nor_exceptions(path: Path, *, salvage
     source = random.Random(3)
     header = MAGIC + packed(HEADER, b"{}")
     claims = _HEAD.pack(b"\xb5LS\x1e", 1, 0, 255, 65535, 0)
-    sealed = _HEAD.pack(b"\xb5LS\x1e", 1, 0, 4, 0, 0) + b"\x09\x00\x00\x00"  # an address that is longer than its place
+    sealed = (
+        _HEAD.pack(b"\xb5LS\x1e", 1, 0, 4, 0, 0) + b"\x09\x00\x00\x00"
+    )  # an address that is longer than its place
     sealed += zlib.crc32(sealed).to_bytes(4, "little")
-    for tail in (claims, claims * 300, sealed * 3, MAGIC, source.randbytes(100_000), b"\xb5" * 1000, b"\xb5LS\x1e" * 1000):
+    for tail in (
+        claims,
+        claims * 300,
+        sealed * 3,
+        MAGIC,
+        source.randbytes(100_000),
+        b"\xb5" * 1000,
+        b"\xb5LS\x1e" * 1000,
+    ):
         path.write_bytes(header + tail)
         tracemalloc.start()
         with Recording(path, salvage=salvage) as recording:
@@ -182,7 +213,16 @@ def test_hostile_files_cost_neither_memory_nor_exceptions(path: Path, *, salvage
 
 @pytest.mark.parametrize(
     "text",
-    [b"", b"[" * 60_000, b"[]", b'{"sensor": 1}', b'{"baud": true}', b'{"options": []}', b'{"datagrams": 1}', b"\xff"],
+    [
+        b"",
+        b"[" * 60_000,
+        b"[]",
+        b'{"sensor": 1}',
+        b'{"baud": true}',
+        b'{"options": []}',
+        b'{"datagrams": 1}',
+        b"\xff",
+    ],
     ids=["empty", "deep", "list", "sensor", "baud", "options", "datagrams", "bytes"],
 )
 def test_hostile_headers_are_told_as_such(text: bytes) -> None:
@@ -192,7 +232,12 @@ def test_hostile_headers_are_told_as_such(text: bytes) -> None:
 
 @pytest.mark.parametrize(
     "text",
-    ['{"sensor": "./evil.py"}', '{"sensor": "a.py:x"}', '{"sensor": "' + STREAM + '", "options": {"calibration": "/etc/passwd"}}', "{}"],
+    [
+        '{"sensor": "./evil.py"}',
+        '{"sensor": "a.py:x"}',
+        '{"sensor": "' + STREAM + '", "options": {"calibration": "/etc/passwd"}}',
+        "{}",
+    ],
 )
 def test_a_header_opens_no_file(text: str) -> None:
     with pytest.raises(UsageError):
@@ -246,7 +291,10 @@ def test_records_reach_the_file_by_themselves_and_at_once_when_asked(path: Path)
 
 def test_several_threads_may_write(path: Path) -> None:
     with Recorder(path) as recorder:
-        threads = [threading.Thread(target=lambda: [recorder.write(Chunk(b"x" * 99)) for _ in range(500)]) for _ in range(8)]
+        threads = [
+            threading.Thread(target=lambda: [recorder.write(Chunk(b"x" * 99)) for _ in range(500)])
+            for _ in range(8)
+        ]
         for thread in threads:
             thread.start()
         for thread in threads:
@@ -270,7 +318,9 @@ for number in range(10**9):
 
 def killed(path: Path, after: float) -> int:
     """The last number that a recorder acknowledged before it was killed."""
-    with subprocess.Popen([sys.executable, "-c", WRITER, str(path)], stdout=subprocess.PIPE) as child:
+    with subprocess.Popen(
+        [sys.executable, "-c", WRITER, str(path)], stdout=subprocess.PIPE
+    ) as child:
         assert child.stdout is not None
         child.stdout.readline()
         time.sleep(after)
@@ -280,7 +330,9 @@ def killed(path: Path, after: float) -> int:
 
 
 @pytest.mark.skipif(sys.platform == "win32", reason="there is no SIGKILL")
-@pytest.mark.parametrize("times", [1, pytest.param(5, marks=pytest.mark.slow), pytest.param(100, marks=pytest.mark.soak)])
+@pytest.mark.parametrize(
+    "times", [1, pytest.param(5, marks=pytest.mark.slow), pytest.param(100, marks=pytest.mark.soak)]
+)
 def test_kill_9_loses_no_acknowledged_record(tmp_path: Path, times: int) -> None:
     source = random.Random(times)
     for attempt in range(times):
@@ -331,9 +383,15 @@ def test_a_file_that_may_not_grow_is_whole_to_its_last_record(path: Path) -> Non
     assert path.stat().st_size > 100_777 - 1100
 
 
-@pytest.mark.skipif(not hasattr(os, "geteuid") or os.geteuid() != 0, reason="only root may mount a small disk")
+@pytest.mark.skipif(
+    not hasattr(os, "geteuid") or os.geteuid() != 0, reason="only root may mount a small disk"
+)
 def test_a_full_disk_is_told_once_and_the_file_is_whole(tmp_path: Path) -> None:
-    made = subprocess.run(["mount", "-t", "tmpfs", "-o", "size=100k", "tmpfs", tmp_path], capture_output=True, check=False)
+    made = subprocess.run(
+        ["mount", "-t", "tmpfs", "-o", "size=100k", "tmpfs", tmp_path],
+        capture_output=True,
+        check=False,
+    )
     if made.returncode:
         pytest.skip(f"no disk can be mounted here: {made.stderr.decode().strip()}")
     try:
@@ -349,7 +407,9 @@ def test_a_recording_that_cannot_even_begin_says_so() -> None:
 
 
 @pytest.mark.skipif(not hasattr(os, "mkfifo"), reason="needs a named pipe")
-def test_a_disk_that_does_not_keep_up_holds_up_nobody(path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_disk_that_does_not_keep_up_holds_up_nobody(
+    path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.setattr(appending, "BACKLOG", 300_000)
     os.mkfifo(path)
     taken = bytearray()
@@ -360,7 +420,9 @@ def test_a_disk_that_does_not_keep_up_holds_up_nobody(path: Path, monkeypatch: p
         assert recorder.dropped > 0
         assert recorder.records + recorder.dropped == 1000
         os.set_blocking(slow.fileno(), True)
-        reader = threading.Thread(target=lambda: [taken.extend(block) for block in iter(lambda: slow.read(65536), b"")])
+        reader = threading.Thread(
+            target=lambda: [taken.extend(block) for block in iter(lambda: slow.read(65536), b"")]
+        )
         reader.start()
         recorder.sync()
         recorder.write(Chunk(b"again", 1000))
@@ -382,7 +444,11 @@ def frames(number: int) -> list[bytes]:
 
 def test_a_recording_is_read_like_any_file(path: Path) -> None:
     one, two, three = frames(3)
-    record(path, [Chunk(one + two[:20], 1_000), Chunk(two[20:], 2_000), Chunk(three, 3_000)], sensor=STREAM)
+    record(
+        path,
+        [Chunk(one + two[:20], 1_000), Chunk(two[20:], 2_000), Chunk(three, 3_000)],
+        sensor=STREAM,
+    )
     with ls.open(path) as device:
         assert device.sensor.id == STREAM
         found = [found for spans in device.spans() for one in spans for found in one.found()]
@@ -423,7 +489,10 @@ def test_recorded_datagrams_decode_as_the_capture_does(path: Path) -> None:
         before, after = list(one.packets()), list(other.packets())
     assert sum(len(packets) for packets in before) == len(chunks)
     for column in ("raw", "time_ns"):
-        expected, found = (np.concatenate([getattr(packets, column) for packets in batches]) for batches in (before, after))
+        expected, found = (
+            np.concatenate([getattr(packets, column) for packets in batches])
+            for batches in (before, after)
+        )
         assert found.tobytes() == expected.tobytes()
 
 
@@ -433,11 +502,16 @@ def test_damage_is_told_when_a_recording_is_read(path: Path) -> None:
         file.write(b"\xb5LS")
     with ls.open(path) as device:
         assert sum(len(packets) for packets in device.packets()) == 3
-        assert device.warnings == [f"{path} is cut off in its last record: 3 bytes were not read, everything before them was"]
+        assert device.warnings == [
+            f"{path} is cut off in its last record: 3 bytes were not read, everything before"
+            " them was"
+        ]
 
 
 HESAI = "hesai-xt16"
-ANGLES = "Channel,Elevation,Azimuth\n" + "".join(f"{channel},{16 - channel},0\n" for channel in range(1, 17))
+ANGLES = "Channel,Elevation,Azimuth\n" + "".join(
+    f"{channel},{16 - channel},0\n" for channel in range(1, 17)
+)
 
 
 @pytest.mark.parametrize(
@@ -467,8 +541,12 @@ def test_a_recording_opens_no_descriptor_and_no_file_elsewhere(
         recorder.write(Chunk(b"x", 1))
     data = (folder / "a.lsr").read_bytes()
     header = Header(sensor=HESAI, options={"calibration": value}, datagrams=True).to_json()
-    (folder / "a.lsr").write_bytes(MAGIC + packed(0, header) + data[len(MAGIC) + size_at(data, len(MAGIC)) :])
-    with pytest.raises(UsageError, match=rf"a\.lsr: it was recorded with an option .*-s {HESAI} -O .*{told}"):
+    (folder / "a.lsr").write_bytes(
+        MAGIC + packed(0, header) + data[len(MAGIC) + size_at(data, len(MAGIC)) :]
+    )
+    with pytest.raises(
+        UsageError, match=rf"a\.lsr: it was recorded with an option .*-s {HESAI} -O .*{told}"
+    ):
         ls.open(folder / "a.lsr")
 
 
@@ -482,7 +560,16 @@ def test_a_file_beside_the_recording_is_taken(path: Path, monkeypatch: pytest.Mo
         assert device.sensor.options["calibration"] == path.parent / "angles.csv"
 
 
-NO_EVENTS = [b'{"event": ["disconnect"]}', b"[" * 60_000, b'{"event": {}}', b"[1]", b"3", b'"disconnect"', b"\xff", b"{}"]
+NO_EVENTS = [
+    b'{"event": ["disconnect"]}',
+    b"[" * 60_000,
+    b'{"event": {}}',
+    b"[1]",
+    b"3",
+    b'"disconnect"',
+    b"\xff",
+    b"{}",
+]
 
 
 def test_an_event_that_is_none_is_a_fault_of_its_recording(path: Path) -> None:
@@ -491,7 +578,9 @@ def test_an_event_that_is_none_is_a_fault_of_its_recording(path: Path) -> None:
         file.write(b"".join(packed(3, event) for event in NO_EVENTS))
     with contextlib.closing(transport(path)) as opened:
         assert len(list(opened.chunks())) == 2
-    assert opened.warnings == [f"{path}: {len(NO_EVENTS)} events were passed over, which have no name"]
+    assert opened.warnings == [
+        f"{path}: {len(NO_EVENTS)} events were passed over, which have no name"
+    ]
 
 
 KILLED = """
@@ -506,7 +595,10 @@ os.kill(os.getpid(), 9)
 @pytest.mark.skipif(sys.platform == "win32", reason="there is no SIGKILL")
 def test_what_a_killed_recorder_left_is_removed_by_the_next(path: Path) -> None:
     record(path, CHUNKS[:1])
-    assert subprocess.run([sys.executable, "-c", KILLED, str(path)], check=False).returncode == -signal.SIGKILL
+    assert (
+        subprocess.run([sys.executable, "-c", KILLED, str(path)], check=False).returncode
+        == -signal.SIGKILL
+    )
     (left,) = (other for other in path.parent.iterdir() if other != path)
     assert read(path) == as_records(CHUNKS[:1], datagram=False)
     os.utime(left, (0, 0))

@@ -22,7 +22,14 @@ from lidarspec.recording.recorders import Recorder, recorder
 from lidarspec.spec import Chunk, Disconnected
 from lidarspec.transports import outlets
 from lidarspec.transports.open_url import transport
-from lidarspec.transports.outlets import FileOutlet, Outlet, PtyOutlet, TcpOutlet, UdpOutlet, replay_outlet
+from lidarspec.transports.outlets import (
+    FileOutlet,
+    Outlet,
+    PtyOutlet,
+    TcpOutlet,
+    UdpOutlet,
+    replay_outlet,
+)
 from lidarspec.transports.serving import Deadlines, replayed
 from tests.lines import TIMEOUT_S, until, working
 
@@ -64,7 +71,9 @@ def datagrams(tmp_path: Path) -> Path:
 
 
 @contextlib.contextmanager
-def playing(path: Path, target: Outlet, *, speed: float | None, began: list[float] | None = None) -> Iterator[list[BaseException]]:
+def playing(
+    path: Path, target: Outlet, *, speed: float | None, began: list[float] | None = None
+) -> Iterator[list[BaseException]]:
     """A replay in a thread of its own; what went wrong there, and by `began` when it began."""
     failed: list[BaseException] = []
 
@@ -121,7 +130,9 @@ def until_the_end(read: Callable[[], bytes]) -> Iterator[bytes]:
 
 @pytest.mark.parametrize("speed", SPEEDS)
 @pytest.mark.parametrize("kind", [pytest.param("pty", marks=posix), "tcp"])
-def test_a_stream_comes_out_as_it_went_in_at_every_speed(stream: Path, kind: str, speed: float | None) -> None:
+def test_a_stream_comes_out_as_it_went_in_at_every_speed(
+    stream: Path, kind: str, speed: float | None
+) -> None:
     target = PtyOutlet() if kind == "pty" else TcpOutlet("127.0.0.1", 0, sole=True)
     with playing(stream, target, speed=speed) as failed:
         received = (from_pty if kind == "pty" else from_tcp)(target.place)
@@ -132,7 +143,9 @@ def test_a_stream_comes_out_as_it_went_in_at_every_speed(stream: Path, kind: str
 
 
 @pytest.mark.parametrize("speed", SPEEDS)
-def test_datagrams_come_out_as_they_went_in_at_every_speed(datagrams: Path, speed: float | None) -> None:
+def test_datagrams_come_out_as_they_went_in_at_every_speed(
+    datagrams: Path, speed: float | None
+) -> None:
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as receiver:
         receiver.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 1 << 20)
         receiver.bind(("127.0.0.1", 0))
@@ -148,12 +161,19 @@ def test_datagrams_come_out_as_they_went_in_at_every_speed(datagrams: Path, spee
 
 
 @pytest.mark.parametrize("suffix", [".lsr", ".pcap", ".pcapng"])
-def test_into_a_file_datagrams_keep_their_times_and_addresses(datagrams: Path, tmp_path: Path, suffix: str) -> None:
+def test_into_a_file_datagrams_keep_their_times_and_addresses(
+    datagrams: Path, tmp_path: Path, suffix: str
+) -> None:
     copy = tmp_path / f"copy{suffix}"
-    with playing(datagrams, FileOutlet(recorder(copy, DATAGRAMS, datagrams=True)), speed=None) as failed:
+    with playing(
+        datagrams, FileOutlet(recorder(copy, DATAGRAMS, datagrams=True)), speed=None
+    ) as failed:
         pass
     assert not failed
-    with contextlib.closing(transport(datagrams)) as before, contextlib.closing(transport(copy)) as after:
+    with (
+        contextlib.closing(transport(datagrams)) as before,
+        contextlib.closing(transport(copy)) as after,
+    ):
         assert list(after.chunks()) == list(before.chunks())
     with ls.open(datagrams) as one, ls.open(copy, DATAGRAMS) as other:
         expected, found = ([p.points().xyz for p in device.packets()] for device in (one, other))
@@ -162,13 +182,18 @@ def test_into_a_file_datagrams_keep_their_times_and_addresses(datagrams: Path, t
 
 def test_datagrams_go_to_the_ports_of_then(datagrams: Path) -> None:
     with contextlib.ExitStack() as stack:
-        receivers = [stack.enter_context(socket.socket(socket.AF_INET, socket.SOCK_DGRAM)) for _ in range(2)]
+        receivers = [
+            stack.enter_context(socket.socket(socket.AF_INET, socket.SOCK_DGRAM)) for _ in range(2)
+        ]
         for receiver in receivers:
             receiver.bind(("127.0.0.1", 0))
             receiver.settimeout(TIMEOUT_S)
         target = stack.enter_context(contextlib.closing(UdpOutlet()))
         for number, receiver in enumerate(receivers):
-            target.send([Chunk(bytes([number]), receiver=("10.0.0.1", receiver.getsockname()[1]))], patient=True)
+            target.send(
+                [Chunk(bytes([number]), receiver=("10.0.0.1", receiver.getsockname()[1]))],
+                patient=True,
+            )
             assert receiver.recv(9) == bytes([number])
         with pytest.raises(UsageError, match="which port"):
             target.send([Chunk(b"nowhere")], patient=True)
@@ -224,7 +249,10 @@ def test_oversleeping_does_not_add_up(speed: float) -> None:
     clock = Clock()
     listener = Listener(clock)
     chunks = [Chunk(b"x", 10**18 + number * MS) for number in range(10_000)]
-    late = [late for _, late in replayed(chunks, listener, speed=speed, now=clock.now, sleep=clock.sleep)]
+    late = [
+        late
+        for _, late in replayed(chunks, listener, speed=speed, now=clock.now, sleep=clock.sleep)
+    ]
     due = [round(number * MS / speed) for number in range(10_000)]
     errors = [at - listener.times[0] - when for at, when in zip(listener.times, due, strict=True)]
     assert 0 <= min(errors) <= max(errors) <= 3 * MS
@@ -234,7 +262,20 @@ def test_oversleeping_does_not_add_up(speed: float) -> None:
 def test_as_fast_as_possible_never_waits() -> None:
     clock = Clock()
     listener = Listener(clock)
-    assert len(list(replayed([Chunk(b"", SECOND * n) for n in range(9)], listener, speed=None, now=clock.now, sleep=clock.sleep))) == 9
+    assert (
+        len(
+            list(
+                replayed(
+                    [Chunk(b"", SECOND * n) for n in range(9)],
+                    listener,
+                    speed=None,
+                    now=clock.now,
+                    sleep=clock.sleep,
+                )
+            )
+        )
+        == 9
+    )
     assert set(listener.times) == {5 * SECOND}
 
 
@@ -256,7 +297,10 @@ def test_a_reader_that_leaves_is_noticed(stream: Path) -> None:
         os.close(descriptor)
     assert [type(error) for error in failed] == [Disconnected]
     server = TcpOutlet("127.0.0.1", 0, sole=True)
-    with playing(stream, server, speed=1.0) as failed, socket.create_connection(("127.0.0.1", int(server.place.split(":")[2]))) as reader:
+    with (
+        playing(stream, server, speed=1.0) as failed,
+        socket.create_connection(("127.0.0.1", int(server.place.split(":")[2]))) as reader,
+    ):
         reader.recv(1)
     assert [type(error) for error in failed] == [Disconnected]
 
@@ -303,13 +347,18 @@ def test_the_last_bytes_reach_a_slow_reader(stream: Path) -> None:
         ("tcp://127.0.0.1", False, "name the port"),
     ],
 )
-def test_places_that_cannot_take_it_say_why(place: str, *, holds_datagrams: bool, reason: str) -> None:
+def test_places_that_cannot_take_it_say_why(
+    place: str, *, holds_datagrams: bool, reason: str
+) -> None:
     with pytest.raises(UsageError, match=reason):
         replay_outlet(place, datagrams=holds_datagrams)
 
 
 def test_an_address_in_use_is_told() -> None:
-    with socket.create_server(("127.0.0.1", 0)) as taken, pytest.raises(SourceError, match="in use"):
+    with (
+        socket.create_server(("127.0.0.1", 0)) as taken,
+        pytest.raises(SourceError, match="in use"),
+    ):
         TcpOutlet("127.0.0.1", taken.getsockname()[1])
 
 

@@ -22,13 +22,17 @@ def recording(tmp_path_factory: pytest.TempPathFactory) -> Path:
     with Recorder(path, datagrams=True) as target:
         for number in range(NUMBER):
             target.keep_up()
-            target.write(Chunk(MARK + number.to_bytes(4, "big") + bytes(292), START + number * STEP))
+            target.write(
+                Chunk(MARK + number.to_bytes(4, "big") + bytes(292), START + number * STEP)
+            )
             target.write(Chunk(b"asked", START + number * STEP), "out")
     return path
 
 
 @pytest.mark.parametrize("number", [2000, 3900, NUMBER, 10 * NUMBER])
-def test_what_follows_a_time_is_all_there_and_what_lies_before_is_not_read(recording: Path, number: int) -> None:
+def test_what_follows_a_time_is_all_there_and_what_lies_before_is_not_read(
+    recording: Path, number: int
+) -> None:
     with Recording(recording) as file:
         first = next(iter(file))
         assert file.seek(START + number * STEP)
@@ -64,12 +68,17 @@ def test_a_damaged_place_in_the_middle_is_no_hindrance(recording: Path, tmp_path
     assert times[-1] == START + (NUMBER - 1) * STEP
 
 
-def test_a_time_that_was_passed_or_that_nobody_knows_moves_nothing(recording: Path, tmp_path: Path) -> None:
+def test_a_time_that_was_passed_or_that_nobody_knows_moves_nothing(
+    recording: Path, tmp_path: Path
+) -> None:
     with Recording(recording) as file:
         assert not file.seek(START - STEP)
         assert sum(record.direction == "in" for record in file) == NUMBER
     timeless = tmp_path / "timeless.lsr"
-    timeless.write_bytes(recording.read_bytes()[: recording.read_bytes().index(MARK, 12)] + packed(RECEIVED, bytes(300)) * 2000)
+    timeless.write_bytes(
+        recording.read_bytes()[: recording.read_bytes().index(MARK, 12)]
+        + packed(RECEIVED, bytes(300)) * 2000
+    )
     with Recording(timeless) as file:
         assert not file.seek(START + STEP)
         assert sum(record.direction == "in" for record in file) == 2000

@@ -37,14 +37,21 @@ def is_visible(degrees: Any, sector: Sector) -> Any:
     return (degrees >= start) | (degrees < stop)
 
 
-def blocks_of(sector: Sector | None, *, whole_packets: bool, turns: int = TURNS) -> list[np.ndarray]:
+def blocks_of(
+    sector: Sector | None, *, whole_packets: bool, turns: int = TURNS
+) -> list[np.ndarray]:
     """Return the numbers of the blocks in each packet of a sensor that sends a sector alone.
 
     Args:
-        whole_packets: packets have the blocks that they would have without a mask; else those of the sector, one after another.
+        whole_packets: packets have the blocks that they would have without a mask; else those of
+            the sector, one after another.
     """
     blocks = np.arange(turns * BLOCKS_PER_TURN // BLOCKS * BLOCKS)
-    visible = np.ones(len(blocks), bool) if sector is None else is_visible(blocks * STEP_DEG % 360, sector)
+    visible = (
+        np.ones(len(blocks), bool)
+        if sector is None
+        else is_visible(blocks * STEP_DEG % 360, sector)
+    )
     if whole_packets:
         packets = blocks.reshape(-1, BLOCKS)
         return list(packets[visible.reshape(-1, BLOCKS).any(axis=1)])
@@ -52,8 +59,12 @@ def blocks_of(sector: Sector | None, *, whole_packets: bool, turns: int = TURNS)
     return list(sent[: len(sent) // BLOCKS * BLOCKS].reshape(-1, BLOCKS))
 
 
-def rotating(packets: Sequence[np.ndarray], *, counted: bool = False, clockwise: bool = False) -> Sensor:
-    """Return a sensor that sends such packets, ordered by a clock or by a counter of the packets sent."""
+def rotating(
+    packets: Sequence[np.ndarray], *, counted: bool = False, clockwise: bool = False
+) -> Sensor:
+    """Return a sensor that sends such packets, ordered by a clock or by a counter of the packets
+    sent.
+    """
 
     def sweep(i: int) -> dict[str, Any]:
         blocks = packets[min(i, len(packets) - 1)] + max(i - len(packets) + 1, 0)
@@ -89,7 +100,9 @@ def assert_one_scan_a_turn(scans: Sequence[Scan], sector: Sector) -> None:
         degrees = degrees_of(scan)
         width = (sector[1] - sector[0]) % 360
         assert abs(degrees[-1] - degrees[0]) == pytest.approx(width, abs=(BLOCKS + 1) * STEP_DEG)
-        assert (degrees[0] - sector[0] + 180) % 360 - 180 == pytest.approx(0, abs=(BLOCKS + 1) * STEP_DEG)
+        assert (degrees[0] - sector[0] + 180) % 360 - 180 == pytest.approx(
+            0, abs=(BLOCKS + 1) * STEP_DEG
+        )
 
 
 @pytest.mark.parametrize("whole_packets", [True, False], ids=["whole", "packed"])
@@ -146,7 +159,9 @@ def test_a_loss_is_no_masked_sector(lost: range) -> None:
     assert stats.lost == len(lost)
     assert not stats.masked
     scans = list(sensor.scans(frames))
-    assert [len(scan) for scan in scans if scan.complete] == [BLOCKS_PER_TURN * 3] * sum(scan.complete for scan in scans)
+    assert [len(scan) for scan in scans if scan.complete] == [BLOCKS_PER_TURN * 3] * sum(
+        scan.complete for scan in scans
+    )
     assert TURNS - 3 <= sum(scan.complete for scan in scans) < TURNS - 1
 
 
@@ -167,7 +182,10 @@ def test_a_rotor_that_stops_behind_a_masked_sector_ends_its_scans() -> None:
     scan_stream = ScanStream(sensor)
     values = sensor.parse(simulate(sensor, 70)[-1])
     frames = simulate(sensor, 70)
-    frames += [sensor.build("data", {**values, "time": values["time"] + number * 10_000}) for number in range(1, 200)]
+    frames += [
+        sensor.build("data", {**values, "time": values["time"] + number * 10_000})
+        for number in range(1, 200)
+    ]
     scans = scan_stream.add(packet_stream.add([decoder.datagrams(frames, [None] * len(frames))]))
     assert scans
 
@@ -201,14 +219,24 @@ def test_a_cut_that_cannot_be_is_refused() -> None:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("name", ["velodyne-vlp16", "hesai-xt32", "robosense-rs16", "robosense-helios16p", "ouster-os1"])
+@pytest.mark.parametrize(
+    "name", ["velodyne-vlp16", "hesai-xt32", "robosense-rs16", "robosense-helios16p", "ouster-os1"]
+)
 @pytest.mark.parametrize("sector", [(270, 90), (0, 180), (90, 100)], ids=str)
 def test_sensors_with_a_masked_sector(name: str, sector: Sector) -> None:
     sensor = ls.sensor(name)
     frames = simulate(sensor, 1600 if name == "hesai-xt32" else 500)
     packets = sensor.decode(frames)
-    degrees = packets["columns.measurement_id"] * 360 / 1024 if isinstance(sensor.scan, OnChange) else packets[sensor.scan.name]
-    visible = [frame for frame, is_kept in zip(frames, is_visible(degrees, sector).any(axis=1), strict=True) if is_kept]
+    degrees = (
+        packets["columns.measurement_id"] * 360 / 1024
+        if isinstance(sensor.scan, OnChange)
+        else packets[sensor.scan.name]
+    )
+    visible = [
+        frame
+        for frame, is_kept in zip(frames, is_visible(degrees, sector).any(axis=1), strict=True)
+        if is_kept
+    ]
     scans = list(sensor.scans(visible))
     assert sensor.decode(visible).stats.lost == 0
     assert all(scan.complete for scan in scans[1:-1])

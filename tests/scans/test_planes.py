@@ -1,4 +1,6 @@
-"""Planar scans of one sensor are on one grid, which fits what it sees, and one line of times fits all beams."""
+"""Planar scans of one sensor are on one grid, which fits what it sees, and one line of times fits
+all beams.
+"""
 
 from __future__ import annotations
 
@@ -35,7 +37,9 @@ def beams_of(one: LaserScan, scan: Scan) -> np.ndarray:
 
 def test_a_sensor_that_looks_one_way_has_one_beam() -> None:
     for planes in (Planes(), Planes(beams=360), Planes(field=(-1.0, 1.0))):
-        for scan, one in zip(scans := simulated("benewake-tfmini"), planar(planes, scans), strict=True):
+        for scan, one in zip(
+            scans := simulated("benewake-tfmini"), planar(planes, scans), strict=True
+        ):
             assert one.ranges.tolist() == [scan.points.range[scan.points.valid].min()]
             assert one.angle_min == one.angle_max == 0
 
@@ -50,12 +54,19 @@ def test_each_beam_is_as_late_as_its_points(name: str) -> None:
     scans = simulated(name)
     found = planar(Planes(), scans)
     assert len(found) > 2
-    assert len({(one.angle_min, one.angle_max, one.angle_increment, len(one.ranges)) for one in found}) == 1
+    assert (
+        len({(one.angle_min, one.angle_max, one.angle_increment, len(one.ranges)) for one in found})
+        == 1
+    )
     for one, scan in zip(found, scans, strict=True):
-        assert one.angle_max == pytest.approx(one.angle_min + (len(one.ranges) - 1) * one.angle_increment)
+        assert one.angle_max == pytest.approx(
+            one.angle_min + (len(one.ranges) - 1) * one.angle_increment
+        )
         late = (one.stamp_ns - scan.stamp_ns) * 1e-9 + beams_of(one, scan) * one.time_increment
         off = np.abs(late - scan.points.time)
-        turned = np.abs(off - one.scan_time) < 3 * abs(one.time_increment)  # where two scans meet some points are beyond the end
+        turned = np.abs(off - one.scan_time) < 3 * abs(
+            one.time_increment
+        )  # where two scans meet some points are beyond the end
         assert (off[~turned] <= 3 * abs(one.time_increment) + 2e-3).all()
         assert turned.sum() <= 0.04 * len(scan)
 
@@ -65,14 +76,23 @@ def test_a_sensor_that_sees_less_than_a_turn_has_beams_where_it_sees() -> None:
     (one,) = planar(Planes(), [scan])
     assert (math.degrees(one.angle_min), math.degrees(one.angle_max)) == pytest.approx((-135, 135))
     assert len(one.ranges) == len(scan) == 1081
-    np.testing.assert_array_equal(one.ranges, np.where(scan.points.valid, scan.points.range, np.inf))
+    np.testing.assert_array_equal(
+        one.ranges, np.where(scan.points.valid, scan.points.range, np.inf)
+    )
     (fewer,) = planar(Planes(541), [scan])
-    assert (fewer.angle_min, fewer.angle_max, len(fewer.ranges)) == (one.angle_min, one.angle_max, 541)
+    assert (fewer.angle_min, fewer.angle_max, len(fewer.ranges)) == (
+        one.angle_min,
+        one.angle_max,
+        541,
+    )
 
 
 def test_a_field_that_is_asked_for_has_its_share_of_the_beams() -> None:
     scans = simulated("ldrobot-stl27l")
-    (whole, *_), (half, *_) = planar(Planes(), scans), planar(Planes(field=(-math.pi / 2, math.pi / 2)), scans)
+    (whole, *_), (half, *_) = (
+        planar(Planes(), scans),
+        planar(Planes(field=(-math.pi / 2, math.pi / 2)), scans),
+    )
     assert len(half.ranges) == len(whole.ranges) // 2 + 1
     assert half.angle_increment == pytest.approx(whole.angle_increment)
     assert (half.angle_min, half.angle_max) == (-math.pi / 2, math.pi / 2)
@@ -83,7 +103,10 @@ def test_a_field_that_is_asked_for_has_its_share_of_the_beams() -> None:
 def test_a_sensor_upside_down_is_planar_and_mirrored() -> None:
     scans = simulated("ldrobot-stl27l")
     over = [replace(scan, points=Mount(inverted=True).applied(scan.points)) for scan in scans]
-    (one, *_), (other, *_) = planar(Planes(360, (-math.pi / 2, math.pi / 2)), scans), planar(Planes(360, (-math.pi / 2, math.pi / 2)), over)
+    (one, *_), (other, *_) = (
+        planar(Planes(360, (-math.pi / 2, math.pi / 2)), scans),
+        planar(Planes(360, (-math.pi / 2, math.pi / 2)), over),
+    )
     assert np.sign(other.time_increment) == -np.sign(one.time_increment)
     assert np.mean(np.isclose(one.ranges, other.ranges[::-1], atol=0.05)) > 0.95
 

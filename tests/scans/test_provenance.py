@@ -27,11 +27,18 @@ POINTS = 24
 POINTS_OF_LARGE = 12
 #: Sensors with long frames.
 LARGE = ("robosense-airy", "velodyne-vlp16")
-NAMES = ("parts", "waiting parts", "ldrobot-stl27l", *(pytest.param(name, marks=pytest.mark.slow) for name in LARGE))
+NAMES = (
+    "parts",
+    "waiting parts",
+    "ldrobot-stl27l",
+    *(pytest.param(name, marks=pytest.mark.slow) for name in LARGE),
+)
 
 
 def waiting_points(f: Fields) -> Polar:
-    """Those of the segments, each of which waits for the segment behind it, in whatever frame that is."""
+    """Those of the segments, each of which waits for the segment behind it, in whatever frame that
+    is.
+    """
     cloud = segments.points(f)
     return replace(cloud, range=cloud.range + 0 * following(f.start))
 
@@ -50,7 +57,11 @@ def frames_of(sensor: Sensor) -> list[bytes]:
 def scans_of(sensor: Sensor, frames: list[bytes], together: int) -> tuple[list[Scan], list[int]]:
     """The scans of frames that come so many at a time, and where each frame begins in the input."""
     decoder = sensor.decoder()
-    packets, stream, scans = PacketStream(sensor, sensor.data_frame, decoder.stats), ScanStream(sensor), list[Scan]()
+    packets, stream, scans = (
+        PacketStream(sensor, sensor.data_frame, decoder.stats),
+        ScanStream(sensor),
+        list[Scan](),
+    )
     offsets = list[int]()
     for start in range(0, len(frames), together):
         found = []

@@ -1,4 +1,6 @@
-"""The columns of scans: those of all points in a row, cut, whether they are made for one scan or shared by several."""
+"""The columns of scans: those of all points in a row, cut, whether they are made for one scan or
+shared by several.
+"""
 
 from __future__ import annotations
 
@@ -34,7 +36,10 @@ from tests.shapes import SHAPES
 
 SHAPED = [name for name, sensor in SHAPES.items() if sensor.frames]
 #: Sensors whose kernels are compiled: a stream, datagrams, Cartesian points.
-COMPILED_CASES = [pytest.param(name, "jit", marks=COMPILED) for name in ("ldrobot-stl27l", "velodyne-vlp16", "livox-mid360")]
+COMPILED_CASES = [
+    pytest.param(name, "jit", marks=COMPILED)
+    for name in ("ldrobot-stl27l", "velodyne-vlp16", "livox-mid360")
+]
 
 
 @functools.cache
@@ -51,14 +56,21 @@ def batches(packets: Packets, *sizes: int) -> list[Packets]:
     return [packets.take(slice(start, stop)) for start, stop in itertools.pairwise(edges)]
 
 
-def assert_cut_from(scans: list[Scan], whole: PointCloud, names: tuple[str, ...] = (*COLUMNS, "valid")) -> None:
+def assert_cut_from(
+    scans: list[Scan], whole: PointCloud, names: tuple[str, ...] = (*COLUMNS, "valid")
+) -> None:
     start = 0
     for scan in scans:
         stop = start + len(scan)
         for name in names:
             found, wanted = getattr(scan.points, name), getattr(whole, name)
             if name == "time":
-                assert abs(found + (scan.stamp_ns - whole.stamp_ns) * 1e-9 - wanted[start:stop]).max(initial=0) < 2e-9
+                assert (
+                    abs(found + (scan.stamp_ns - whole.stamp_ns) * 1e-9 - wanted[start:stop]).max(
+                        initial=0
+                    )
+                    < 2e-9
+                )
             elif wanted is None:
                 assert found is None
             else:
@@ -70,8 +82,12 @@ def assert_cut_from(scans: list[Scan], whole: PointCloud, names: tuple[str, ...]
 
 @BACKENDS
 @pytest.mark.parametrize("least", [0, 1 << 14, 1 << 30])
-@pytest.mark.parametrize("name", ["velodyne-vlp16", "robosense-m1", pytest.param("hesai-xt32", marks=pytest.mark.slow)])
-def test_scans_are_the_points_of_the_whole_cut(name: str, least: int, backend: str, monkeypatch: pytest.MonkeyPatch) -> None:
+@pytest.mark.parametrize(
+    "name", ["velodyne-vlp16", "robosense-m1", pytest.param("hesai-xt32", marks=pytest.mark.slow)]
+)
+def test_scans_are_the_points_of_the_whole_cut(
+    name: str, least: int, backend: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.setattr(lazy_columns, "LEAST", least)
     monkeypatch.setattr(lazy_columns, "SHARED", 5000)
     packets = packets_of(name, 700, backend)
@@ -80,7 +96,9 @@ def test_scans_are_the_points_of_the_whole_cut(name: str, least: int, backend: s
     assert_cut_from(scans, packets.points())
 
 
-@pytest.mark.parametrize("order", [("time", "z", "valid"), ("azimuth", "x"), ("ring", "range", "y", "azimuth")])
+@pytest.mark.parametrize(
+    "order", [("time", "z", "valid"), ("azimuth", "x"), ("ring", "range", "y", "azimuth")]
+)
 def test_columns_do_not_depend_on_the_order_in_which_they_are_read(order: tuple[str, ...]) -> None:
     packets = packets_of("velodyne-vlp16", 200, "numpy")
     assert_cut_from(list(scans_of(packets.sensor, batches(packets, 90))), packets.points(), order)
@@ -111,7 +129,9 @@ def test_small_scans_share_what_is_computed() -> None:
     assert_cut_from(scans, packets.points())
 
 
-@pytest.mark.parametrize("seed", [0, *(pytest.param(seed, marks=pytest.mark.slow) for seed in (1, 2))])
+@pytest.mark.parametrize(
+    "seed", [0, *(pytest.param(seed, marks=pytest.mark.slow) for seed in (1, 2))]
+)
 def test_small_scans_may_be_read_in_any_order(seed: int) -> None:
     sensor = small_scans()
     packets = sensor.decode(simulate(ls.sensor("velodyne-vlp16"), 400))
@@ -162,7 +182,11 @@ def test_a_scan_is_forgotten_once_it_was_given(opened: bool, tmp_path: Path) -> 
     with path.open("wb") as file:
         file.write(capture_head(ETHERNET))
         for frame in frames:
-            file.write(datagram_record(Datagram(frame, 10**18, ("192.168.1.200", 2368), ("192.168.1.102", 2368))))
+            file.write(
+                datagram_record(
+                    Datagram(frame, 10**18, ("192.168.1.200", 2368), ("192.168.1.102", 2368))
+                )
+            )
     given = list[weakref.ref[Scan]]()
     with ls.open(path, sensor) as device:
         for scan in device.scans() if opened else scans_of(sensor, [sensor.decode(frames)]):
@@ -173,7 +197,9 @@ def test_a_scan_is_forgotten_once_it_was_given(opened: bool, tmp_path: Path) -> 
 
 
 def test_a_sensor_that_turns_back_and_forth_is_cut_alike_in_any_batches() -> None:
-    sensor = dataclasses.replace(ls.sensor("velodyne-vlp16"), clock=None)  # by which packets that go back in time are late
+    sensor = dataclasses.replace(
+        ls.sensor("velodyne-vlp16"), clock=None
+    )  # by which packets that go back in time are late
     assert isinstance(sensor.scan, OnWrap)
     frames = simulate(ls.sensor("velodyne-vlp16"), 300)
     packets = sensor.decode([*frames, *frames[::-1], *frames])
@@ -189,8 +215,12 @@ def test_packets_that_stay_where_they_were_read_give_the_same_points(name: str) 
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(("name", "backend"), [*((name, "numpy") for name in REPRESENTATIVES), *COMPILED_CASES])
-def test_packets_of_a_sensor_that_stay_where_they_were_read_give_the_same_points(name: str, backend: str) -> None:
+@pytest.mark.parametrize(
+    ("name", "backend"), [*((name, "numpy") for name in REPRESENTATIVES), *COMPILED_CASES]
+)
+def test_packets_of_a_sensor_that_stay_where_they_were_read_give_the_same_points(
+    name: str, backend: str
+) -> None:
     assert_place_of_packets_does_not_matter(ls.sensor(name), backend)
 
 
@@ -204,7 +234,10 @@ def assert_place_of_packets_does_not_matter(sensor: Sensor, backend: str) -> Non
     starts, sizes = np.arange(len(rows)) * (size + 1), np.full(len(rows), size)
     unknown = np.full(len(rows), -1)
     found = []
-    for buffer, places in ((rows.reshape(-1), np.arange(len(rows)) * size), (apart.reshape(-1), starts)):
+    for buffer, places in (
+        (rows.reshape(-1), np.arange(len(rows)) * size),
+        (apart.reshape(-1), starts),
+    ):
         decoder = Decoder(sensor, stream=False, backend=backend)
         stream = PacketStream(sensor, sensor.data_frame, decoder.stats, backend=backend)
         found.append(stream.add([decoder.placed(buffer, places, sizes, unknown)]))
@@ -213,7 +246,9 @@ def assert_place_of_packets_does_not_matter(sensor: Sensor, backend: str) -> Non
     if isinstance(separate.table, Rows) and len(separate):
         link = sensor.links["data"]
         recoded = sensor.frames[sensor.data_frame].wire is not None
-        copied = recoded or (isinstance(link, Udp) and link.assembled is not None)  # what is joined or recoded stands elsewhere
+        copied = recoded or (
+            isinstance(link, Udp) and link.assembled is not None
+        )  # what is joined or recoded stands elsewhere
         if len(separate.table.groups[0].where) == len(rows) > 1 and not copied:
             assert separate.table.groups[0].rows.strides[0] == size + (size > 1)
         assert_cut_from([Scan(separate.points(), 0.0, True, sensor)], together.points())
@@ -224,13 +259,17 @@ def test_a_number_of_sectors_that_is_none_is_refused_by_name(number: Any) -> Non
     sensor = ls.sensor("ldrobot-stl27l")
     scan = next(sensor.scans(sensor.example("data")))
     for bins in (scan.to_bins, scan.to_laserscan):
-        with pytest.raises(UsageError, match=f"{bins.__name__} takes how many sectors the turn has"):
+        with pytest.raises(
+            UsageError, match=f"{bins.__name__} takes how many sectors the turn has"
+        ):
             bins(number)
     assert scan.to_bins(np.int32(4)).shape == (4,)
 
 
 @pytest.mark.parametrize("backend", ["numpy", pytest.param("construct", marks=pytest.mark.soak)])
-def test_a_scan_with_gaps_is_not_complete_and_one_whose_packets_are_mostly_lost_not_whole(backend: str) -> None:
+def test_a_scan_with_gaps_is_not_complete_and_one_whose_packets_are_mostly_lost_not_whole(
+    backend: str,
+) -> None:
     sensor = ls.sensor("cspc-m1c1-mini")
     frames = simulate(sensor, 1500)
     noise = random.Random(5)
@@ -241,7 +280,10 @@ def test_a_scan_with_gaps_is_not_complete_and_one_whose_packets_are_mostly_lost_
         stream, decoder = ScanStream(sensor), sensor.decoder(stream=True, backend=backend)
         packets = PacketStream(sensor, "data", decoder.stats, backend=backend)
         step = len(data) // pieces + 1
-        cut = [stream.add(packets.add(decoder.frames(data[at : at + step]))) for at in range(0, len(data), step)]
+        cut = [
+            stream.add(packets.add(decoder.frames(data[at : at + step])))
+            for at in range(0, len(data), step)
+        ]
         return [scan for scans in cut for scan in scans]
 
     gaps = scans_with(0.2, 1)[1:]
@@ -264,7 +306,9 @@ def test_a_scan_whose_datagrams_are_mostly_lost_is_not_complete() -> None:
 
 def test_scans_of_a_wrong_sensor_and_of_a_plugin_that_raises_are_warned_of() -> None:
     other = b"".join(simulate(ls.sensor("cspc-m1c1-mini"), 40))
-    with pytest.warns(UserWarning, match=r"ldrobot-stl27l: no data frame in the data .*is it of another sensor\?"):
+    with pytest.warns(
+        UserWarning, match=r"ldrobot-stl27l: no data frame in the data .*is it of another sensor\?"
+    ):
         assert not list(ls.sensor("ldrobot-stl27l").scans(other))
     with pytest.warns(UserWarning, match=r"distnace.*, at 12 packets"):
         list(sound.sensor(points=points_fail.points).scans(b"".join(simulate(sound.sensor(), 12))))
@@ -272,15 +316,36 @@ def test_scans_of_a_wrong_sensor_and_of_a_plugin_that_raises_are_warned_of() -> 
 
 @pytest.mark.parametrize("backend", ["construct", "numpy"])
 @pytest.mark.parametrize("size", [1, 2, 3, 100])
-def test_the_shape_of_a_scan_is_that_of_its_packets_whatever_they_came_with(backend: str, size: int) -> None:
+def test_the_shape_of_a_scan_is_that_of_its_packets_whatever_they_came_with(
+    backend: str, size: int
+) -> None:
     sensor = SHAPES["shape-segments"]
 
     def segment(turn: int, channels: int, beams: int) -> dict[str, Any]:
         data = [[dict(distance=1, strength=1)] * channels] * beams
-        return dict(turn=turn, channels=channels, beams=beams, time=turn, start=0, elevations=[1] * channels, data=data)
+        return dict(
+            turn=turn,
+            channels=channels,
+            beams=beams,
+            time=turn,
+            start=0,
+            elevations=[1] * channels,
+            data=data,
+        )
 
     turns = [[(3, 4), (3, 2), (3, 0), (3, 4)], [(2, 5), (0, 5), (2, 5)], [(3, 4), (2, 4)], [(2, 1)]]
     segments = [segment(turn, *each) for turn, sizes in enumerate(turns) for each in sizes]
-    frames = [sensor.build("data", counter=i, step=15, segments=segments[2 * i : 2 * i + 2]) for i in range(len(segments) // 2)]
-    read = [sensor.decode(frames[start : start + size], backend=backend) for start in range(0, len(frames), size)]
-    assert [scan.points.shape for scan in scans_of(sensor, read)] == [(10, 3), (10, 2), None, (1, 2)]
+    frames = [
+        sensor.build("data", counter=i, step=15, segments=segments[2 * i : 2 * i + 2])
+        for i in range(len(segments) // 2)
+    ]
+    read = [
+        sensor.decode(frames[start : start + size], backend=backend)
+        for start in range(0, len(frames), size)
+    ]
+    assert [scan.points.shape for scan in scans_of(sensor, read)] == [
+        (10, 3),
+        (10, 2),
+        None,
+        (1, 2),
+    ]

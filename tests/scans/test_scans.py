@@ -20,9 +20,16 @@ from lidarspec.simulation.scenes import Room
 from lidarspec.simulation.simulator import opening, simulation
 from tests.shapes import SHAPES
 
-#: a rotor that is blocked, or the start of a scan that does not come: seconds of the longest scan, twice the slowest turn.
-BLOCKED = {"ldrobot-ld06": 0.4, "velodyne-vlp16": 0.4, "slamtec-rplidar-a1": 2.0, "cspc-m1c1-mini": 1.0}
-#: one sensor for each way to cut scans: where an angle wraps, in a stream and in datagrams, and where a counter starts again.
+#: a rotor that is blocked, or the start of a scan that does not come: seconds of the longest scan,
+#: twice the slowest turn.
+BLOCKED = {
+    "ldrobot-ld06": 0.4,
+    "velodyne-vlp16": 0.4,
+    "slamtec-rplidar-a1": 2.0,
+    "cspc-m1c1-mini": 1.0,
+}
+#: one sensor for each way to cut scans: where an angle wraps, in a stream and in datagrams, and
+#: where a counter starts again.
 CUT_BY = ("ldrobot-ld06", "velodyne-vlp16", "robosense-m1")
 #: sensors whose scans are cut in one of these ways.
 RELATED = ("velodyne-hdl32e", "hesai-pandar40p", "robosense-helios16p")
@@ -37,14 +44,23 @@ class Reading:
         self.sensor = ls.sensor(name)
         decoder = self.sensor.decoder()
         self.decoder, self.stats = decoder, decoder.stats
-        self._packets, self._scans = PacketStream(self.sensor, self.sensor.data_frame, decoder.stats), ScanStream(self.sensor)
+        self._packets, self._scans = (
+            PacketStream(self.sensor, self.sensor.data_frame, decoder.stats),
+            ScanStream(self.sensor),
+        )
         if decoder.stream:
             decoder.frames(opening(self.sensor))
 
     def scans(self, frames: list[bytes]) -> list[Scan]:
         """The scans that some more frames complete."""
         decoder = self.decoder
-        return self.scans_of(*(decoder.frames(b"".join(frames)) if decoder.stream else [decoder.datagrams(frames, [1] * len(frames))]))
+        return self.scans_of(
+            *(
+                decoder.frames(b"".join(frames))
+                if decoder.stream
+                else [decoder.datagrams(frames, [1] * len(frames))]
+            )
+        )
 
     def scans_of(self, *found: Frames) -> list[Scan]:
         """The scans that frames of the decoder complete."""
@@ -55,7 +71,10 @@ class Reading:
 QUICK = "ldrobot-ld06"
 
 
-@pytest.mark.parametrize("name", [name if name == QUICK else pytest.param(name, marks=pytest.mark.slow) for name in BLOCKED])
+@pytest.mark.parametrize(
+    "name",
+    [name if name == QUICK else pytest.param(name, marks=pytest.mark.slow) for name in BLOCKED],
+)
 def test_a_scan_ends_though_the_rotor_is_blocked(name: str) -> None:
     reading = Reading(name)
     blocked = simulation(reading.sensor, reading.sensor.data_frame, blocked=True)
@@ -78,12 +97,22 @@ def test_ten_minutes_of_a_blocked_rotor_keep_no_more_than_one_scan() -> None:
     reading, number = Reading("velodyne-vlp16"), 4096
     frames = simulation(reading.sensor, "data", blocked=True).block(0, number, Room()).frames
     rows = np.frombuffer(b"".join(frames), np.uint8).reshape(number, -1)
-    starts, sizes, kept = np.arange(number) * rows.shape[1], np.full(number, rows.shape[1]), list[int]()
+    starts, sizes, kept = (
+        np.arange(number) * rows.shape[1],
+        np.full(number, rows.shape[1]),
+        list[int](),
+    )
     tracemalloc.start()
     for first in range(0, 600 * 10**9 // PACKET_NS, number):
         stamped = rows.copy()
-        stamped[:, 1200:1204] = ((np.arange(first, first + number) * PACKET_NS // 1000).astype("<u4")).view(np.uint8).reshape(-1, 4)
-        found = reading.decoder.placed(stamped.reshape(-1), starts, sizes, np.ones(number, np.int64))
+        stamped[:, 1200:1204] = (
+            ((np.arange(first, first + number) * PACKET_NS // 1000).astype("<u4"))
+            .view(np.uint8)
+            .reshape(-1, 4)
+        )
+        found = reading.decoder.placed(
+            stamped.reshape(-1), starts, sizes, np.ones(number, np.int64)
+        )
         assert len(reading.scans_of(found)) in (13, 14)
         kept.append(tracemalloc.get_traced_memory()[0])
     tracemalloc.stop()
@@ -111,7 +140,10 @@ def test_scans_go_on_after_a_pause_and_no_rotor_is_blamed_for_it() -> None:
 def test_scans_of_data_without_an_end_are_warned_of() -> None:
     sensor = ls.sensor("ldrobot-ld06")
     frames = simulation(sensor, "data", blocked=True).block(0, 1000, Room()).frames
-    with pytest.warns(UserWarning, match=r"ldrobot-ld06: the angle does not pass 0 \(azimuth\): is the rotor blocked\?"):
+    with pytest.warns(
+        UserWarning,
+        match=r"ldrobot-ld06: the angle does not pass 0 \(azimuth\): is the rotor blocked\?",
+    ):
         assert len(list(sensor.scans(b"".join(frames)))) == 7
 
 
@@ -127,7 +159,9 @@ def scans_without(name: str, lost: Collection[int], number: int = 4000) -> list[
     return list(sensor.scans(frames if sensor.datagrams else b"".join([opening(sensor), *frames])))
 
 
-@pytest.mark.parametrize("name", [*CUT_BY, *(pytest.param(name, marks=pytest.mark.slow) for name in RELATED)])
+@pytest.mark.parametrize(
+    "name", [*CUT_BY, *(pytest.param(name, marks=pytest.mark.slow) for name in RELATED)]
+)
 def test_a_scan_is_complete_where_nothing_is_missing_and_only_there(name: str) -> None:
     sound = scans_without(name, ())
     assert [scan.complete for scan in sound] == [False, *[True] * (len(sound) - 2), False]
@@ -135,20 +169,45 @@ def test_a_scan_is_complete_where_nothing_is_missing_and_only_there(name: str) -
     middle = round((sizes[1] + sizes[2]) / 2 / per_packet)
     turn = round(len(sound[2]) / per_packet)
     for lost in (1, turn // 3, turn // 2 - 5):
-        scans = scans_without(name, range(middle, middle + lost) if lost < turn // 3 + 1 else range(middle - lost // 2, middle + lost // 2))
+        scans = scans_without(
+            name,
+            (
+                range(middle, middle + lost)
+                if lost < turn // 3 + 1
+                else range(middle - lost // 2, middle + lost // 2)
+            ),
+        )
         assert len(scans) == len(sound)
-        assert [scan.complete for scan in scans] == [False, True, False, *[True] * (len(sound) - 4), False], lost
+        assert [scan.complete for scan in scans] == [
+            False,
+            True,
+            False,
+            *[True] * (len(sound) - 4),
+            False,
+        ], lost
         assert scans[2].whole
         assert np.isfinite(scans[2].rate_hz)
 
 
 @pytest.mark.parametrize("name", CUT_BY)
-@pytest.mark.parametrize("turns", [0.6, 1.0, 2.0, *(pytest.param(turns, marks=pytest.mark.slow) for turns in (0.9, 1.1, 1.7, 3.4))])
+@pytest.mark.parametrize(
+    "turns",
+    [
+        0.6,
+        1.0,
+        2.0,
+        *(pytest.param(turns, marks=pytest.mark.slow) for turns in (0.9, 1.1, 1.7, 3.4)),
+    ],
+)
 @pytest.mark.parametrize("after", [0.0, 0.9, pytest.param(0.3, marks=pytest.mark.slow)])
-def test_no_two_turns_are_one_scan_whatever_is_missing(name: str, turns: float, after: float) -> None:
+def test_no_two_turns_are_one_scan_whatever_is_missing(
+    name: str, turns: float, after: float
+) -> None:
     sound = scans_without(name, ())
     turn = round(len(sound[2]) * 4000 / sum(map(len, sound)))
-    first = round((len(sound[0]) + len(sound[1])) * 4000 / sum(map(len, sound))) + round(after * turn)
+    first = round((len(sound[0]) + len(sound[1])) * 4000 / sum(map(len, sound))) + round(
+        after * turn
+    )
     scans = scans_without(name, range(first, first + round(turns * turn)))
     for scan in scans:
         assert len(scan) <= len(sound[2]) * 1.02
@@ -157,15 +216,25 @@ def test_no_two_turns_are_one_scan_whatever_is_missing(name: str, turns: float, 
     assert sum(scan.complete for scan in scans) >= len(sound) - 2 - turns - 3
 
 
-def test_a_frame_whose_first_packet_is_there_is_complete_though_the_end_of_the_one_before_is_missing() -> None:
+def test_a_frame_whose_first_packet_is_there_is_complete_though_the_end_of_the_one_before_is_missing() -> (
+    None
+):
     scans = scans_without("robosense-m1", range(1250, 1260))
-    assert [(len(scan) // 125, scan.complete) for scan in scans] == [(630, False), (620, False), *[(630, True)] * 4, (220, False)]
+    assert [(len(scan) // 125, scan.complete) for scan in scans] == [
+        (630, False),
+        (620, False),
+        *[(630, True)] * 4,
+        (220, False),
+    ]
 
 
 def scans_of_pieces(name: str, frames: list[bytes], size: int) -> list[Scan]:
     """The scans of the frames of a shape, whose packets come in batches of a size."""
     sensor = SHAPES[name]
-    packets, stream = sensor.decode(frames if sensor.datagrams else b"".join(frames)), ScanStream(sensor)
+    packets, stream = (
+        sensor.decode(frames if sensor.datagrams else b"".join(frames)),
+        ScanStream(sensor),
+    )
     pieces = [packets.take(slice(start, start + size)) for start in range(0, len(packets), size)]
     return [scan for piece in pieces for scan in stream.add(piece)] + stream.finish()
 
@@ -176,38 +245,80 @@ def segments() -> list[bytes]:
 
 
 @pytest.mark.parametrize("size", [7, 100, pytest.param(1, marks=pytest.mark.slow)])
-@pytest.mark.parametrize(("lost", "whole", "complete"), [(0, True, True), (3, True, False), (10, True, False), (11, False, False)])
+@pytest.mark.parametrize(
+    ("lost", "whole", "complete"),
+    [(0, True, True), (3, True, False), (10, True, False), (11, False, False)],
+)
 def test_a_frame_of_parts_counts_once(lost: int, whole: bool, complete: bool, size: int) -> None:
-    """A turn is 20 frames, with 30 parts: it is whole where at least as many frames are there as are missing."""
+    """A turn is 20 frames, with 30 parts: it is whole where at least as many frames are there as
+    are missing.
+    """
     frames = [frame for place, frame in enumerate(segments()) if not 24 <= place < 24 + lost]
     assert SHAPES["shape-segments"].decode(frames).stats.lost == lost
     scans = scans_of_pieces("shape-segments", frames, size)
     ends = (False, False)
-    assert [(scan.whole, scan.complete) for scan in scans] == [ends, (whole, complete), (True, True), (True, True), ends]
+    assert [(scan.whole, scan.complete) for scan in scans] == [
+        ends,
+        (whole, complete),
+        (True, True),
+        (True, True),
+        ends,
+    ]
 
 
 def test_a_frame_that_two_scans_share_counts_in_both() -> None:
-    sensor, segment = SHAPES["shape-segments"], dict(channels=1, beams=1, start=0, elevations=[4], data=[[dict(distance=1, strength=2)]])
-    turns = [[{**segment, "turn": turn, "time": turn * 1000} for turn in (number, number + 1)] for number in range(6)]
-    frames = [sensor.build("data", counter=number, step=15, segments=parts) for number, parts in enumerate(turns) if number != 3]
+    sensor, segment = (
+        SHAPES["shape-segments"],
+        dict(channels=1, beams=1, start=0, elevations=[4], data=[[dict(distance=1, strength=2)]]),
+    )
+    turns = [
+        [{**segment, "turn": turn, "time": turn * 1000} for turn in (number, number + 1)]
+        for number in range(6)
+    ]
+    frames = [
+        sensor.build("data", counter=number, step=15, segments=parts)
+        for number, parts in enumerate(turns)
+        if number != 3
+    ]
     scans = scans_of_pieces("shape-segments", frames, 100)
-    assert [(scan.whole, scan.complete) for scan in scans[1:4]] == [(True, True), (True, True), (True, False)]
+    assert [(scan.whole, scan.complete) for scan in scans[1:4]] == [
+        (True, True),
+        (True, True),
+        (True, False),
+    ]
 
 
 @pytest.mark.parametrize("size", [1, 100])
 def test_a_frame_without_parts_that_have_points_leaves_no_gap(size: int) -> None:
     sensor = SHAPES["shape-tags"]
     empty = sensor.build("data", number=0, tags=[dict(type=2, temperature=30)], padding=bytes(5))
-    frames = [frame for pair in zip(simulate(sensor, 16), [empty] * 16, strict=True) for frame in pair]
-    assert [scan.complete for scan in scans_of_pieces("shape-tags", frames, size)] == [False, True, True, False]
+    frames = [
+        frame for pair in zip(simulate(sensor, 16), [empty] * 16, strict=True) for frame in pair
+    ]
+    assert [scan.complete for scan in scans_of_pieces("shape-tags", frames, size)] == [
+        False,
+        True,
+        True,
+        False,
+    ]
     cut_off = [*frames[:11], frames[10][:9], *frames[11:]]
-    assert [scan.complete for scan in scans_of_pieces("shape-tags", cut_off, size)] == [False, False, True, False]
+    assert [scan.complete for scan in scans_of_pieces("shape-tags", cut_off, size)] == [
+        False,
+        False,
+        True,
+        False,
+    ]
 
 
-@pytest.mark.parametrize("kind", ["node", *(pytest.param(kind, marks=pytest.mark.slow) for kind in ("express", "hq"))])
+@pytest.mark.parametrize(
+    "kind", ["node", *(pytest.param(kind, marks=pytest.mark.slow) for kind in ("express", "hq"))]
+)
 def test_false_and_missing_nodes_make_a_scan_incomplete(kind: str) -> None:
     sensor = ls.sensor("slamtec-rplidar-a1").configure(answer=kind)
-    sound, draw = opening(sensor) + b"".join(simulate(sensor, 3000 if kind == "node" else 300)), random.Random(5)
+    sound, draw = (
+        opening(sensor) + b"".join(simulate(sensor, 3000 if kind == "node" else 300)),
+        random.Random(5),
+    )
     whole = {len(scan) for scan in sensor.scans(sound) if scan.complete}
     for _ in range(8):
         data, place = bytearray(sound), draw.randrange(len(sound) // 3, len(sound) // 2)
@@ -238,31 +349,48 @@ def test_pieces_do_not_matter_where_packets_are_missing(name: str) -> None:
     for size in (len(frames), 400, 37):
         reading = Reading(name)
         found.append(
-            [(len(scan), scan.whole, scan.complete) for at in range(0, len(frames), size) for scan in reading.scans(frames[at : at + size])]
+            [
+                (len(scan), scan.whole, scan.complete)
+                for at in range(0, len(frames), size)
+                for scan in reading.scans(frames[at : at + size])
+            ]
         )
     assert found[0] == found[1] == found[2]
 
 
 @pytest.mark.parametrize("size", [1, 7, 200])
 def test_scans_end_where_an_angle_jumps_and_not_where_it_passes_0(size: int) -> None:
-    """Each face of the shape's mirror is a scan of 20 rows, whichever packets they stand in; the second sweeps across 0."""
+    """Each face of the shape's mirror is a scan of 20 rows, whichever packets they stand in; the
+    second sweeps across 0.
+    """
     sensor = SHAPES["shape-mirror"]
     scans = scans_of_pieces("shape-mirror", simulate(sensor, 200), size)
     assert [len(scan) for scan in scans] == [40] * 30
     assert {scan.complete for scan in scans[1:-1]} == {True}
-    assert np.ptp(np.rad2deg(scans[1].points.azimuth.astype(np.float64))) == pytest.approx(2 * 28.5 + 0.4, abs=1e-3)
+    assert np.ptp(np.rad2deg(scans[1].points.azimuth.astype(np.float64))) == pytest.approx(
+        2 * 28.5 + 0.4, abs=1e-3
+    )
 
 
-@pytest.mark.parametrize(("name", "falls"), [("ldrobot-stl27l", True), ("velodyne-vlp16", True), ("hokuyo-utm30lx", False)])
-def test_a_laserscan_has_the_beams_that_are_asked_for_and_the_way_that_the_azimuth_goes(name: str, falls: bool) -> None:
+@pytest.mark.parametrize(
+    ("name", "falls"),
+    [("ldrobot-stl27l", True), ("velodyne-vlp16", True), ("hokuyo-utm30lx", False)],
+)
+def test_a_laserscan_has_the_beams_that_are_asked_for_and_the_way_that_the_azimuth_goes(
+    name: str, falls: bool
+) -> None:
     sensor = ls.sensor(name)
     for scan in list(sensor.scans(simulate(sensor, 400)))[:4]:
         for beams in (450, 7):
             planar = scan.to_laserscan(beams=beams)
             assert len(planar.ranges) == len(planar.intensities) == beams
-            assert planar.angle_max == pytest.approx(planar.angle_min + (beams - 1) * planar.angle_increment)
+            assert planar.angle_max == pytest.approx(
+                planar.angle_min + (beams - 1) * planar.angle_increment
+            )
             assert (planar.time_increment < 0) == falls
-            assert abs(planar.time_increment) * beams == pytest.approx(planar.scan_time, rel=1e-3)  # its clock counts in ms
+            assert abs(planar.time_increment) * beams == pytest.approx(
+                planar.scan_time, rel=1e-3
+            )  # its clock counts in ms
         assert len(scan.to_laserscan().ranges) == (sensor.beams or len(scan))
 
 
@@ -279,6 +407,8 @@ def test_a_scan_says_when_the_packet_of_its_first_point_arrived() -> None:
     assert scans[0].host_ns == arrivals[0]
     for before, after in itertools.pairwise(scans):
         assert after.host_ns in arrivals
-        assert abs((after.host_ns - before.host_ns) - (after.stamp_ns - before.stamp_ns)) <= PACKET_NS
+        assert (
+            abs((after.host_ns - before.host_ns) - (after.stamp_ns - before.stamp_ns)) <= PACKET_NS
+        )
         assert after.to_laserscan().host_ns == after.host_ns
     assert {scan.host_ns for scan in reading.sensor.scans(frames)} == {0}

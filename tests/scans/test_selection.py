@@ -1,4 +1,6 @@
-"""Which scans of a source are given, and what of each: the same as of all scans, by time, by number and by place."""
+"""Which scans of a source are given, and what of each: the same as of all scans, by time, by number
+and by place.
+"""
 
 from __future__ import annotations
 
@@ -28,7 +30,9 @@ END = r"(9\.9|10)"
 
 @pytest.fixture(scope="module")
 def recordings(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
-    """The same seconds as a recording and a capture, in which times are found, and as a packed capture, which is read through."""
+    """The same seconds as a recording and a capture, in which times are found, and as a packed
+    capture, which is read through.
+    """
     folder = tmp_path_factory.mktemp("selection")
     ran("sim", ID, "--to", folder / "drive.lsr", "-t", f"{SECONDS}s")
     ran("replay", folder / "drive.lsr", "--to", folder / "drive.pcap", "-s", ID)
@@ -54,15 +58,21 @@ def assert_same(some: list[Scan], others: list[Scan]) -> None:
     for one, other in zip(some, others, strict=True):
         assert list(one.points.columns) == list(other.points.columns)
         for name, column in one.points.columns.items():
-            np.testing.assert_allclose(column, other.points.columns[name], rtol=0, atol=1e-12 if name == "time" else 0)
+            np.testing.assert_allclose(
+                column, other.points.columns[name], rtol=0, atol=1e-12 if name == "time" else 0
+            )
 
 
 @pytest.mark.slow
-def test_the_same_is_selected_wherever_scans_come_from(recordings: dict[str, Path], every: list[Scan]) -> None:
+def test_the_same_is_selected_wherever_scans_come_from(
+    recordings: dict[str, Path], every: list[Scan]
+) -> None:
     select = Selection(scans=(3, 20), every=4, columns=("x", "y"))
     wanted = list(scans(recordings["pcap"], select))
     assert [scan.stamp_ns for scan in wanted] == [scan.stamp_ns for scan in every[3:20:4]]
-    frames = [frame for packets in ls.open(recordings["pcap"], ID).packets() for frame in packets.raw]
+    frames = [
+        frame for packets in ls.open(recordings["pcap"], ID).packets() for frame in packets.raw
+    ]
     of_bytes = ls.sensor(ID).scans(b"".join(bytes(frame) for frame in frames), select=select)
     assert [len(scan) for scan in of_bytes] == [len(scan) for scan in wanted]
 
@@ -79,14 +89,25 @@ def test_the_same_is_selected_wherever_scans_come_from(recordings: dict[str, Pat
 
 
 @pytest.mark.parametrize("suffix", ["lsr", "pcap"])
-@pytest.mark.parametrize(("times", "seconds"), [((6.0, 7.5), (6, 7.5)), ((8.5, None), (8.5, 99)), ((None, 0.5), (0, 0.5))])
-def test_a_slice_is_the_scans_of_that_time(recordings: dict[str, Path], every: list[Scan], suffix: str, times: Any, seconds: Any) -> None:
+@pytest.mark.parametrize(
+    ("times", "seconds"),
+    [((6.0, 7.5), (6, 7.5)), ((8.5, None), (8.5, 99)), ((None, 0.5), (0, 0.5))],
+)
+def test_a_slice_is_the_scans_of_that_time(
+    recordings: dict[str, Path], every: list[Scan], suffix: str, times: Any, seconds: Any
+) -> None:
     first = every[0].stamp_ns
-    wanted = [scan for scan in every if seconds[0] * 1e9 <= scan.stamp_ns - first < seconds[1] * 1e9]
+    wanted = [
+        scan for scan in every if seconds[0] * 1e9 <= scan.stamp_ns - first < seconds[1] * 1e9
+    ]
     assert 4 < len(wanted) < 22
     assert_same(list(scans(recordings[suffix], Selection(times=times))), wanted)
     dates = tuple(
-        None if moment is None else datetime.fromtimestamp(0, UTC) + timedelta(microseconds=first // 1000) + timedelta(seconds=moment)
+        None
+        if moment is None
+        else datetime.fromtimestamp(0, UTC)
+        + timedelta(microseconds=first // 1000)
+        + timedelta(seconds=moment)
         for moment in times
     )
     with ls.open(recordings[suffix], ID) as device:
@@ -96,7 +117,9 @@ def test_a_slice_is_the_scans_of_that_time(recordings: dict[str, Path], every: l
 
 @pytest.mark.slow
 @pytest.mark.parametrize(("suffix", "share"), [("lsr", 0.4), ("pcap", 0.8)])
-def test_a_slice_of_a_long_file_is_read_without_what_lies_before_it(tmp_path: Path, suffix: str, share: float) -> None:
+def test_a_slice_of_a_long_file_is_read_without_what_lies_before_it(
+    tmp_path: Path, suffix: str, share: float
+) -> None:
     path = tmp_path / f"drive.{suffix}"
     ran("sim", ID, "--to", path, "-t", "40s")
     with ls.open(path, ID) as device:
@@ -107,7 +130,9 @@ def test_a_slice_of_a_long_file_is_read_without_what_lies_before_it(tmp_path: Pa
     assert bytes_read < share * bytes_sent
 
 
-def test_each_so_manieth_scan_of_some_by_number(recordings: dict[str, Path], every: list[Scan]) -> None:
+def test_each_so_manieth_scan_of_some_by_number(
+    recordings: dict[str, Path], every: list[Scan]
+) -> None:
     for selection, wanted in (
         (Selection(scans=(5, 10)), slice(5, 10)),
         (Selection(scans=(5, 25), every=7), slice(5, 25, 7)),
@@ -122,24 +147,33 @@ def test_by_the_time_of_arrival(recordings: dict[str, Path]) -> None:
     every = list(scans(recordings["lsr"], Selection(scans=(0, 30))))
     hosts = [scan.host_ns for scan in every]
     found = list(scans(recordings["lsr"], Selection(times=(1.0, 2.0), time="host")))
-    assert [scan.stamp_ns for scan in found] == [host for host in hosts if 10**9 <= host - hosts[0] < 2 * 10**9]
+    assert [scan.stamp_ns for scan in found] == [
+        host for host in hosts if 10**9 <= host - hosts[0] < 2 * 10**9
+    ]
     assert all(scan.points.stamp_ns == scan.stamp_ns == scan.host_ns for scan in found)
     assert all(scan.points.time[0] == 0 for scan in found)
 
 
 def test_returns_from_elsewhere_are_none(recordings: dict[str, Path]) -> None:
     every = list(scans(recordings["pcap"], Selection(scans=(3, 6))))
-    for scan, near in zip(every, scans(recordings["pcap"], Selection(scans=(3, 6), ranges=(1.5, 3.0))), strict=True):
+    for scan, near in zip(
+        every, scans(recordings["pcap"], Selection(scans=(3, 6), ranges=(1.5, 3.0))), strict=True
+    ):
         ranges, valid = scan.points.range, scan.points.valid
         inside = valid & (ranges >= 1.5) & (ranges <= 3.0)
         assert 0 < inside.sum() < valid.sum()
         cloud = near.points
         np.testing.assert_array_equal(cloud.valid, inside)
         np.testing.assert_array_equal(
-            cloud.range, np.where(valid & (ranges < 1.5), -np.inf, np.where(valid & (ranges > 3.0), np.inf, ranges))
+            cloud.range,
+            np.where(
+                valid & (ranges < 1.5), -np.inf, np.where(valid & (ranges > 3.0), np.inf, ranges)
+            ),
         )
         for axis in "xyz":
-            np.testing.assert_array_equal(getattr(cloud, axis), np.where(inside, getattr(scan.points, axis), np.nan))
+            np.testing.assert_array_equal(
+                getattr(cloud, axis), np.where(inside, getattr(scan.points, axis), np.nan)
+            )
         np.testing.assert_array_equal(cloud.intensity, scan.points.intensity)
         planar = near.to_laserscan(100)
         assert np.isin(planar.ranges[np.isfinite(planar.ranges)], ranges[inside]).all()
@@ -181,11 +215,23 @@ def test_bytes_without_times_have_no_slice(tmp_path: Path) -> None:
     source = tmp_path / "timeless.bin"
     source.write_bytes(b"".join(simulate(ls.sensor("cspc-coin-d4"), 500)))
     for selection in (Selection(time="host"), Selection(times=(1.0, None))):
-        with ls.open(source, "cspc-coin-d4") as device, pytest.raises(UsageError, match="does not say when its bytes arrived"):
+        with (
+            ls.open(source, "cspc-coin-d4") as device,
+            pytest.raises(UsageError, match="does not say when its bytes arrived"),
+        ):
             list(device.scans(select=selection))
 
 
-@pytest.mark.parametrize("wrong", [{"scans": (-3, None)}, {"scans": (5, 5)}, {"every": 0}, {"times": (5.0, 1.0)}, {"ranges": (3.0, 1.0)}])
+@pytest.mark.parametrize(
+    "wrong",
+    [
+        {"scans": (-3, None)},
+        {"scans": (5, 5)},
+        {"every": 0},
+        {"times": (5.0, 1.0)},
+        {"ranges": (3.0, 1.0)},
+    ],
+)
 def test_a_selection_of_nothing_is_refused(wrong: dict[str, Any]) -> None:
     with pytest.raises(UsageError):
         Selection(**wrong)

@@ -1,4 +1,6 @@
-"""Small invented sensors, one mechanism each, so that the engine is general before it is large; every test runs over all of them."""
+"""Small invented sensors, one mechanism each, so that the engine is general before it is large;
+every test runs over all of them.
+"""
 
 from __future__ import annotations
 
@@ -94,4 +96,6 @@ _MODULES = (
     paced,
 )
 
-SHAPES: dict[str, Sensor] = {sensor.id: sensor for sensor in (*(module.SENSOR for module in _MODULES), *coordinates.SENSORS)}
+SHAPES: dict[str, Sensor] = {
+    sensor.id: sensor for sensor in (*(module.SENSOR for module in _MODULES), *coordinates.SENSORS)
+}

@@ -1,4 +1,6 @@
-"""A frame that needs the next: the beams spread up to the next packet's angle; its neighbours and the last good reading count too."""
+"""A frame that needs the next: the beams spread up to the next packet's angle; its neighbours and
+the last good reading count too.
+"""
 
 from __future__ import annotations
 
@@ -6,7 +8,20 @@ import numpy as np
 from construct import Array, Const, Int8ul, Int16ul, Struct
 
 from lidarspec import Sensor
-from lidarspec.spec import Checksummed, Crc, Fields, Frame, OnWrap, Polar, Scaled, Serial, following, last, previous, wrap
+from lidarspec.spec import (
+    Checksummed,
+    Crc,
+    Fields,
+    Frame,
+    OnWrap,
+    Polar,
+    Scaled,
+    Serial,
+    following,
+    last,
+    previous,
+    wrap,
+)
 
 SAMPLES = 8
 

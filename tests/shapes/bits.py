@@ -1,9 +1,22 @@
-"""Bit fields in both orders: 24-bit samples from the low and from the high end, mirrored bits, and plain 24-bit integers."""
+"""Bit fields in both orders: 24-bit samples from the low and from the high end, mirrored bits, and
+plain 24-bit integers.
+"""
 
 from __future__ import annotations
 
 import numpy as np
-from construct import Array, BitsInteger, BitsSwapped, BitStruct, ByteSwapped, Const, Int16ub, Int24sb, Int24ul, Struct
+from construct import (
+    Array,
+    BitsInteger,
+    BitsSwapped,
+    BitStruct,
+    ByteSwapped,
+    Const,
+    Int16ub,
+    Int24sb,
+    Int24ul,
+    Struct,
+)
 
 from lidarspec import Sensor
 from lidarspec.spec import Checksummed, Crc, Fields, Frame, OnWrap, Polar, Scaled, Serial, stack
@@ -13,7 +26,11 @@ SAMPLES = 6
 
 def sample() -> BitStruct:
     """Fourteen bits of distance, two of mode, eight of intensity, from the high end down."""
-    return BitStruct("distance" / Scaled(BitsInteger(14), 0.001, "m"), "mode" / BitsInteger(2), "intensity" / BitsInteger(8))
+    return BitStruct(
+        "distance" / Scaled(BitsInteger(14), 0.001, "m"),
+        "mode" / BitsInteger(2),
+        "intensity" / BitsInteger(8),
+    )
 
 
 DATA = Checksummed(
@@ -23,7 +40,12 @@ DATA = Checksummed(
         "drift" / Scaled(Int24sb, 0.001, "deg"),
         "little" / Array(SAMPLES, ByteSwapped(sample())),
         "big" / Array(SAMPLES, sample()),
-        "mirrored" / BitsSwapped(BitStruct("flags" / BitsInteger(3), "tilt" / Scaled(BitsInteger(5, signed=True), 1, "deg"))),
+        "mirrored"
+        / BitsSwapped(
+            BitStruct(
+                "flags" / BitsInteger(3), "tilt" / Scaled(BitsInteger(5, signed=True), 1, "deg")
+            )
+        ),
         "crc" / Int16ub,
     ),
     field="crc",

@@ -1,4 +1,6 @@
-"""Calibration from a file: the number of channels and their elevations; before it is given there are no frames."""
+"""Calibration from a file: the number of channels and their elevations; before it is given there
+are no frames.
+"""
 
 from __future__ import annotations
 
@@ -21,7 +23,8 @@ def data(channels: int) -> Checksummed:
         Struct(
             "header" / Const(b"\xca\x1b"),
             "azimuth" / Scaled(Int16ul, 0.01, "deg"),
-            "channels" / Array(channels, Struct("row" / Int8ul, "distance" / Scaled(Int16ul, 0.001, "m"))),
+            "channels"
+            / Array(channels, Struct("row" / Int8ul, "distance" / Scaled(Int16ul, 0.001, "m"))),
             "crc" / Int8ul,
         ),
         field="crc",
@@ -34,14 +37,26 @@ def configure(sensor: Sensor, *, calibration: str | Path) -> Sensor:
     try:
         elevations = json.loads(Path(calibration).read_text(encoding="utf-8"))["elevations"]
     except (OSError, ValueError, KeyError, TypeError) as error:
-        raise UsageError(f"{calibration}: not a calibration file of this sensor: {error}") from error
+        raise UsageError(
+            f"{calibration}: not a calibration file of this sensor: {error}"
+        ) from error
     table = np.deg2rad(elevations)
 
     def points(f: Fields) -> Polar:
         """A row that the file does not know gives no direction."""
-        return Polar(range=f.channels.distance, azimuth=np.deg2rad(f.azimuth), elevation=take(table, f.channels.row), ring=f.channels.row)
+        return Polar(
+            range=f.channels.distance,
+            azimuth=np.deg2rad(f.azimuth),
+            elevation=take(table, f.channels.row),
+            ring=f.channels.row,
+        )
 
-    frame = Frame(data(len(table)), data=True, max_length=5 + 3 * len(table), acknowledged={"LS206": "no line is noisy enough for a shape"})
+    frame = Frame(
+        data(len(table)),
+        data=True,
+        max_length=5 + 3 * len(table),
+        acknowledged={"LS206": "no line is noisy enough for a shape"},
+    )
     return dataclasses.replace(sensor, frames={"data": frame}, points=points)
 
 

@@ -1,4 +1,6 @@
-"""Channels of different lengths, each with a checksum of its own, that fill their frame; its header says how wide they are."""
+"""Channels of different lengths, each with a checksum of its own, that fill their frame; its header
+says how wide they are.
+"""
 
 from __future__ import annotations
 
@@ -8,13 +10,26 @@ import numpy as np
 from construct import Array, Const, IfThenElse, Int8ub, Int16ub, Struct, this
 
 from lidarspec import Sensor
-from lidarspec.spec import Checksummed, Fields, Frame, OnWrap, Parts, Polar, Scaled, Serial, Simulation, Xor, steps
+from lidarspec.spec import (
+    Checksummed,
+    Fields,
+    Frame,
+    OnWrap,
+    Parts,
+    Polar,
+    Scaled,
+    Serial,
+    Simulation,
+    Xor,
+    steps,
+)
 
 CHANNEL = Checksummed(
     Struct(
         "ring" / Int8ub,
         "count" / Int8ub,
-        "distances" / Array(this.count, Scaled(IfThenElse(this._.wide == 1, Int16ub, Int8ub), 0.05, "m")),
+        "distances"
+        / Array(this.count, Scaled(IfThenElse(this._.wide == 1, Int16ub, Int8ub), 0.05, "m")),
         "check" / Int8ub,
     ),
     field="check",
@@ -34,19 +49,32 @@ def plausible(f: Fields) -> Any:
 
 
 def points(f: Fields) -> Polar:
-    return Polar(range=f.distances, azimuth=np.deg2rad(f.frame.azimuth + steps(f.count)), elevation=np.deg2rad(f.ring), ring=f.ring)
+    return Polar(
+        range=f.distances,
+        azimuth=np.deg2rad(f.frame.azimuth + steps(f.count)),
+        elevation=np.deg2rad(f.ring),
+        ring=f.ring,
+    )
 
 
 def sweep(i: int) -> dict[str, Any]:
     """Twelve packets a turn, with channels of two lengths."""
-    return dict(wide=1, azimuth=i * 30.0 % 360, channels=[dict(ring=ring, count=20 - 5 * (ring % 2)) for ring in range(3)])
+    return dict(
+        wide=1,
+        azimuth=i * 30.0 % 360,
+        channels=[dict(ring=ring, count=20 - 5 * (ring % 2)) for ring in range(3)],
+    )
 
 
 SENSOR = Sensor(
     "shape-channels",
     vendor="Shapes",
     model="Channels",
-    frames={"data": Frame(DATA, data=True, max_length=300, plausible=plausible, points={"channels": points})},
+    frames={
+        "data": Frame(
+            DATA, data=True, max_length=300, plausible=plausible, points={"channels": points}
+        )
+    },
     points=None,
     scan=OnWrap("azimuth"),
     links={"data": Serial(230_400)},

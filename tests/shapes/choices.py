@@ -1,4 +1,6 @@
-"""What a frame may say: numbers of which some are allowed, names for all of a field's values, checks, and alternatives that are errors."""
+"""What a frame may say: numbers of which some are allowed, names for all of a field's values,
+checks, and alternatives that are errors.
+"""
 
 from __future__ import annotations
 
@@ -22,7 +24,17 @@ from construct import (
 )
 
 from lidarspec import Sensor
-from lidarspec.spec import Checksummed, Fields, Frame, OnWrap, Polar, Scaled, Serial, Simulation, Sum
+from lidarspec.spec import (
+    Checksummed,
+    Fields,
+    Frame,
+    OnWrap,
+    Polar,
+    Scaled,
+    Serial,
+    Simulation,
+    Sum,
+)
 
 SAMPLE = Struct(
     "distance" / Scaled(Int16ub, 0.001, "m"),
@@ -35,7 +47,12 @@ DATA = Checksummed(
         "version" / OneOf(Int32ub, [0x01000002, 0x01000003]),
         "mode" / Mapping(Int8ub, {"slow": 1, "fast": 4}),
         "least" / NoneOf(Int8ub, [0, *range(32, 256)]),
-        "setting" / Switch(this.mode, {"slow": Struct("rate" / Int8ub), "fast": Struct("rate" / Int16ub)}, default=Error),
+        "setting"
+        / Switch(
+            this.mode,
+            {"slow": Struct("rate" / Int8ub), "fast": Struct("rate" / Int16ub)},
+            default=Error,
+        ),
         "angle" / Scaled(Int16ub, 0.01, "deg"),
         "turned" / Check(this.angle < 36_000),
         "samples" / Array(2, SAMPLE),
@@ -47,11 +64,17 @@ DATA = Checksummed(
 
 
 def points(f: Fields) -> Polar:
-    return Polar(range=f.samples.distance, azimuth=np.deg2rad(f.angle + np.arange(2)), intensity=f.samples.flags.quality)
+    return Polar(
+        range=f.samples.distance,
+        azimuth=np.deg2rad(f.angle + np.arange(2)),
+        intensity=f.samples.flags.quality,
+    )
 
 
 def sweep(i: int) -> dict[str, float]:
-    """Eighteen packets a turn; what only some values may be is left out, and the first of them stands there."""
+    """Eighteen packets a turn; what only some values may be is left out, and the first of them
+    stands there.
+    """
     return {"angle": i * 20.0 % 360, "samples.flags.quality": 40}
 
 

@@ -24,14 +24,20 @@ DATA = Checksummed(
 
 
 def points(f: Fields) -> Polar:
-    return Polar(range=f.distances * 0.001, azimuth=np.arange(SAMPLES) * 0.1, time=np.arange(SAMPLES) * 0.001)
+    return Polar(
+        range=f.distances * 0.001, azimuth=np.arange(SAMPLES) * 0.1, time=np.arange(SAMPLES) * 0.001
+    )
 
 
 SENSOR = Sensor(
     "shape-clock",
     vendor="Shapes",
     model="Clock",
-    frames={"data": Frame(DATA, data=True, max_length=15, plausible=lambda f: (f.seconds < 60) & (f.ticks < 1))},
+    frames={
+        "data": Frame(
+            DATA, data=True, max_length=15, plausible=lambda f: (f.seconds < 60) & (f.ticks < 1)
+        )
+    },
     points=points,
     scan=Every(0.1),
     links={"data": Serial(115_200)},

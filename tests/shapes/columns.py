@@ -1,4 +1,6 @@
-"""Columns of pixels, each with a header of its own, from tables by the columns' numbers; what all columns share stands beside them."""
+"""Columns of pixels, each with a header of its own, from tables by the columns' numbers; what all
+columns share stands beside them.
+"""
 
 from __future__ import annotations
 
@@ -8,7 +10,18 @@ import numpy as np
 from construct import Array, Const, Int8ub, Int16sl, Int16ul, Int32ul, Struct
 
 from lidarspec import Sensor
-from lidarspec.spec import Clock, Fields, Frame, OnChange, Polar, Scaled, Simulation, Udp, along, take
+from lidarspec.spec import (
+    Clock,
+    Fields,
+    Frame,
+    OnChange,
+    Polar,
+    Scaled,
+    Simulation,
+    Udp,
+    along,
+    take,
+)
 
 COLUMNS, PIXELS, TURN = 16, 32, 64
 

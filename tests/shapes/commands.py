@@ -6,7 +6,18 @@ import numpy as np
 from construct import Array, Const, Int8ul, Int16ul, Struct
 
 from lidarspec import Sensor
-from lidarspec.spec import Checksummed, Command, Fields, Frame, OnWrap, Polar, Scaled, Serial, Sum, Xor
+from lidarspec.spec import (
+    Checksummed,
+    Command,
+    Fields,
+    Frame,
+    OnWrap,
+    Polar,
+    Scaled,
+    Serial,
+    Sum,
+    Xor,
+)
 
 SAMPLES = 3
 
@@ -14,14 +25,19 @@ ORDER = Checksummed(
     Struct(
         "header" / Const(b"\x16"),
         "code" / Int8ul,
-        "motor" / Struct("speed" / Scaled(Int16ul, 0.01, "Hz"), "trim" / Scaled(Int8ul, 0.5, "deg", offset=-64)),
+        "motor"
+        / Struct(
+            "speed" / Scaled(Int16ul, 0.01, "Hz"), "trim" / Scaled(Int8ul, 0.5, "deg", offset=-64)
+        ),
         "check" / Int8ul,
     ),
     field="check",
     algorithm=Xor(),
 )
 ACK = Checksummed(
-    Struct("header" / Const(b"\x17\x71"), "code" / Int8ul, "result" / Int8ul, "check" / Int8ul), field="check", algorithm=Xor()
+    Struct("header" / Const(b"\x17\x71"), "code" / Int8ul, "result" / Int8ul, "check" / Int8ul),
+    field="check",
+    algorithm=Xor(),
 )
 DATA = Checksummed(
     Struct(
@@ -45,15 +61,25 @@ SENSOR = Sensor(
     model="Commands",
     frames={
         "data": Frame(DATA, data=True, max_length=11, plausible=lambda f: f.angle < 360),
-        "ack": Frame(ACK, max_length=5, acknowledged={"LS206": "no line is noisy enough for a shape"}),
+        "ack": Frame(
+            ACK, max_length=5, acknowledged={"LS206": "no line is noisy enough for a shape"}
+        ),
         "order": Frame(ORDER, direction="out", max_length=6),
     },
     points=points,
     scan=OnWrap("azimuth"),
     links={"data": Serial(115_200, dtr=True)},
     commands={
-        "start": Command("order", values={"code": 1, "motor.speed": 0, "motor.trim": 0}, reply="ack", matches={"code": 1}, starts=True),
-        "stop": Command("order", values={"code": 2, "motor.speed": 0, "motor.trim": 0}, settle=0.1, stops=True),
+        "start": Command(
+            "order",
+            values={"code": 1, "motor.speed": 0, "motor.trim": 0},
+            reply="ack",
+            matches={"code": 1},
+            starts=True,
+        ),
+        "stop": Command(
+            "order", values={"code": 2, "motor.speed": 0, "motor.trim": 0}, settle=0.1, stops=True
+        ),
         "speed": Command(
             "order",
             values={"code": 3},

@@ -1,4 +1,6 @@
-"""Commands with texts, addresses, bytes and elements of arrays, a running number that replies repeat, and a table that is learned."""
+"""Commands with texts, addresses, bytes and elements of arrays, a running number that replies
+repeat, and a table that is learned.
+"""
 
 from __future__ import annotations
 
@@ -10,7 +12,22 @@ import numpy as np
 from construct import Array, Bytes, Const, Int8ul, Int16ub, Int16ul, Struct, this
 
 from lidarspec import Sensor, UsageError
-from lidarspec.spec import Address, Checksummed, Command, Count, Crc, Fields, Frame, Learned, OnWrap, Polar, Scaled, Simulation, Text, Udp
+from lidarspec.spec import (
+    Address,
+    Checksummed,
+    Command,
+    Count,
+    Crc,
+    Fields,
+    Frame,
+    Learned,
+    OnWrap,
+    Polar,
+    Scaled,
+    Simulation,
+    Text,
+    Udp,
+)
 
 SAMPLES = 4
 CRC = Crc(16, 0x1021, init=0xFFFF, order="big")
@@ -29,7 +46,12 @@ ORDER = Checksummed(
     algorithm=CRC,
 )
 ACK = Checksummed(
-    Struct("header" / Const(b"\x2a\xc1"), "head" / Struct("number" / Int16ub, "code" / Int8ul), "result" / Int8ul, "crc" / Int16ub),
+    Struct(
+        "header" / Const(b"\x2a\xc1"),
+        "head" / Struct("number" / Int16ub, "code" / Int8ul),
+        "result" / Int8ul,
+        "crc" / Int16ub,
+    ),
     field="crc",
     algorithm=CRC,
 )
@@ -57,7 +79,9 @@ DATA = Checksummed(
 ECHOES = ("head.number", "head.code")
 
 
-def points(f: Fields, angles: tuple[float, ...] = (0.0, 1.0, 2.0, 3.0), *, nominal: bool = True) -> Polar:
+def points(
+    f: Fields, angles: tuple[float, ...] = (0.0, 1.0, 2.0, 3.0), *, nominal: bool = True
+) -> Polar:
     return Polar(range=f.distances, azimuth=np.deg2rad(f.angle + np.array(angles)), nominal=nominal)
 
 
@@ -78,7 +102,14 @@ def sweep(i: int) -> dict[str, float]:
 
 def order(code: int) -> dict[str, object]:
     """The values of an order of its own code, in which nothing else is said."""
-    return {"head.number": Count(16, 7), "head.code": code, "host": [0] * 4, "ports": [7020, 0], "name": bytes(8), "key": bytes(2)}
+    return {
+        "head.number": Count(16, 7),
+        "head.code": code,
+        "host": [0] * 4,
+        "ports": [7020, 0],
+        "name": bytes(8),
+        "key": bytes(2),
+    }
 
 
 SENSOR = Sensor(
@@ -96,9 +127,17 @@ SENSOR = Sensor(
     links={"data": Udp(7020), "control": Udp(7021)},
     commands={
         "get_table": Command(
-            "order", order(5), reply="table", echoes=ECHOES, link="control", learns=lambda reply: {"table": reply.angles}, timeout=5.0
+            "order",
+            order(5),
+            reply="table",
+            echoes=ECHOES,
+            link="control",
+            learns=lambda reply: {"table": reply.angles},
+            timeout=5.0,
         ),
-        "hello": Command("order", {**order(1), "host": Address()}, reply="ack", echoes=ECHOES, link="control"),
+        "hello": Command(
+            "order", {**order(1), "host": Address()}, reply="ack", echoes=ECHOES, link="control"
+        ),
         "send_to": Command(
             "order",
             order(2),
@@ -107,10 +146,26 @@ SENSOR = Sensor(
             echoes=ECHOES,
             link="control",
         ),
-        "call": Command("order", order(3), args={"name": ("name", Text(8))}, reply="ack", echoes=ECHOES, link="control"),
-        "unlock": Command("order", order(4), args={"key": ("key", bytes)}, reply="ack", echoes=ECHOES, link="control"),
+        "call": Command(
+            "order",
+            order(3),
+            args={"name": ("name", Text(8))},
+            reply="ack",
+            echoes=ECHOES,
+            link="control",
+        ),
+        "unlock": Command(
+            "order",
+            order(4),
+            args={"key": ("key", bytes)},
+            reply="ack",
+            echoes=ECHOES,
+            link="control",
+        ),
     },
-    simulation=Simulation(sweep, rate=900, answers={"get_table": [("table", {"angles": b"0.5 1 1.5 2"})]}),
+    simulation=Simulation(
+        sweep, rate=900, answers={"get_table": [("table", {"angles": b"0.5 1 1.5 2"})]}
+    ),
     configure=configure,
     range_limits=(0.05, 30.0),
     status="manual",

@@ -1,4 +1,6 @@
-"""Points by coordinates: whole millimetres behind a count, whole centimetres, and floats, where a point may be no number at all."""
+"""Points by coordinates: whole millimetres behind a count, whole centimetres, and floats, where a
+point may be no number at all.
+"""
 
 from __future__ import annotations
 
@@ -8,7 +10,19 @@ import numpy as np
 from construct import Array, Const, Float32b, Int8ul, Int16sl, Int16ul, Int32sl, Struct, this
 
 from lidarspec import Sensor
-from lidarspec.spec import Cartesian, Checksummed, Clock, Crc, Every, Fields, Frame, Scaled, Sequence, Simulation, Udp
+from lidarspec.spec import (
+    Cartesian,
+    Checksummed,
+    Clock,
+    Crc,
+    Every,
+    Fields,
+    Frame,
+    Scaled,
+    Sequence,
+    Simulation,
+    Udp,
+)
 
 POINTS, RATE = 12, 100
 
@@ -38,7 +52,10 @@ def _sensor(name: str, coordinate: Any, count: Any, longest: int) -> Sensor:
         links={"data": Udp(56_300)},
         clock=Clock("time", wraps_at=655.36),
         sequence=Sequence("number"),
-        simulation=Simulation(lambda i: dict(number=i % 65_536, time=i / RATE % 655.36, count=POINTS), directions=directions),
+        simulation=Simulation(
+            lambda i: dict(number=i % 65_536, time=i / RATE % 655.36, count=POINTS),
+            directions=directions,
+        ),
         range_limits=(0.1, 100.0),
         status="manual",
         source="invented for the tests: points by coordinates",
@@ -47,7 +64,13 @@ def _sensor(name: str, coordinate: Any, count: Any, longest: int) -> Sensor:
 
 def points(f: Fields) -> Cartesian:
     """A point with a tag of 200 or more is noise."""
-    return Cartesian(f.points.x, f.points.y, f.points.z, intensity=f.points.reflectivity, invalid=f.points.tag >= 200)
+    return Cartesian(
+        f.points.x,
+        f.points.y,
+        f.points.z,
+        intensity=f.points.reflectivity,
+        invalid=f.points.tag >= 200,
+    )
 
 
 def directions(i: int) -> tuple[Any, Any]:

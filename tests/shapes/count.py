@@ -1,4 +1,6 @@
-"""A variable count: the header says how many samples follow; the angles between the first and the last are even steps."""
+"""A variable count: the header says how many samples follow; the angles between the first and the
+last are even steps.
+"""
 
 from __future__ import annotations
 
@@ -8,7 +10,18 @@ import numpy as np
 from construct import Array, Const, Int8ul, Int16ul, Struct, this
 
 from lidarspec import Sensor
-from lidarspec.spec import Checksummed, Fields, Frame, OnWrap, Polar, Scaled, Serial, Simulation, Sum, spread
+from lidarspec.spec import (
+    Checksummed,
+    Fields,
+    Frame,
+    OnWrap,
+    Polar,
+    Scaled,
+    Serial,
+    Simulation,
+    Sum,
+    spread,
+)
 
 LONGEST = 40
 
@@ -18,7 +31,8 @@ DATA = Checksummed(
         "count" / Int8ul,
         "first" / Scaled(Int16ul, 0.01, "deg"),
         "last" / Scaled(Int16ul, 0.01, "deg"),
-        "samples" / Array(this.count, Struct("distance" / Scaled(Int16ul, 0.001, "m"), "quality" / Int8ul)),
+        "samples"
+        / Array(this.count, Struct("distance" / Scaled(Int16ul, 0.001, "m"), "quality" / Int8ul)),
         "sum" / Int16ul,
     ),
     field="sum",
@@ -32,7 +46,9 @@ def plausible(f: Fields) -> Any:
 
 def points(f: Fields) -> Polar:
     clockwise = spread(f.first, f.last, f.count, full=360.0)
-    return Polar(range=f.samples.distance, azimuth=-np.deg2rad(clockwise), intensity=f.samples.quality)
+    return Polar(
+        range=f.samples.distance, azimuth=-np.deg2rad(clockwise), intensity=f.samples.quality
+    )
 
 
 def sweep(i: int) -> dict[str, float]:

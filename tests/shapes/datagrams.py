@@ -19,7 +19,10 @@ DATA = Struct(
         BLOCKS,
         Struct(
             "azimuth" / Scaled(Int16ub, 0.01, "deg"),
-            "channels" / Array(CHANNELS, Struct("distance" / Scaled(Int16ub, 0.005, "m"), "intensity" / Int8ub)),
+            "channels"
+            / Array(
+                CHANNELS, Struct("distance" / Scaled(Int16ub, 0.005, "m"), "intensity" / Int8ub)
+            ),
         ),
     ),
 )
@@ -42,7 +45,9 @@ SENSOR = Sensor(
     vendor="Shapes",
     model="Datagrams",
     frames={
-        "data": Frame(DATA, data=True, max_length=52, plausible=lambda f: (f.number >= 1) & (f.number <= 200)),
+        "data": Frame(
+            DATA, data=True, max_length=52, plausible=lambda f: (f.number >= 1) & (f.number <= 200)
+        ),
         "info": Frame(INFO, max_length=7),
     },
     points=points,

@@ -18,7 +18,12 @@ DATA = Checksummed(
         "beams"
         / Array(
             BEAMS,
-            Struct("near" / Scaled(Int16ul, 0.004, "m"), "far" / Scaled(Int16ul, 0.004, "m"), "weak" / Int8ul, "strong" / Int8ul),
+            Struct(
+                "near" / Scaled(Int16ul, 0.004, "m"),
+                "far" / Scaled(Int16ul, 0.004, "m"),
+                "weak" / Int8ul,
+                "strong" / Int8ul,
+            ),
         ),
         "check" / Int8ul,
     ),
@@ -40,7 +45,14 @@ SENSOR = Sensor(
     "shape-echoes",
     vendor="Shapes",
     model="Echoes",
-    frames={"data": Frame(DATA, data=True, max_length=36, acknowledged={"LS206": "no line is noisy enough for a shape"})},
+    frames={
+        "data": Frame(
+            DATA,
+            data=True,
+            max_length=36,
+            acknowledged={"LS206": "no line is noisy enough for a shape"},
+        )
+    },
     points=points,
     scan=OnChange("turn"),
     links={"data": Serial(115_200)},

@@ -1,4 +1,6 @@
-"""Escaped bytes between flags, with a checksum over what they stand for, and segments of their own lengths in it."""
+"""Escaped bytes between flags, with a checksum over what they stand for, and segments of their own
+lengths in it.
+"""
 
 from __future__ import annotations
 
@@ -8,7 +10,21 @@ import numpy as np
 from construct import Array, Int8ub, Int16ub, Int16ul, Struct, this
 
 from lidarspec import Sensor
-from lidarspec.spec import Checksummed, Crc, Escaped, Fields, Frame, OnWrap, Parts, Polar, Scaled, Sequence, Serial, Simulation, steps
+from lidarspec.spec import (
+    Checksummed,
+    Crc,
+    Escaped,
+    Fields,
+    Frame,
+    OnWrap,
+    Parts,
+    Polar,
+    Scaled,
+    Sequence,
+    Serial,
+    Simulation,
+    steps,
+)
 
 SEGMENT = Struct(
     "count" / Int8ub,
@@ -35,7 +51,9 @@ def points(f: Fields) -> Polar:
 
 def sweep(i: int) -> dict[str, Any]:
     """Two segments in each frame, fifteen of these a turn, of two lengths."""
-    segments = [dict(count=BEAMS - number % 2, start=number * 24.0 % 360) for number in (2 * i, 2 * i + 1)]
+    segments = [
+        dict(count=BEAMS - number % 2, start=number * 24.0 % 360) for number in (2 * i, 2 * i + 1)
+    ]
     return dict(number=i % 256, segments=segments)
 
 
@@ -43,7 +61,16 @@ SENSOR = Sensor(
     "shape-escaped",
     vendor="Shapes",
     model="Escaped",
-    frames={"data": Frame(DATA, data=True, max_length=1200, points={"segments": points}, simulation=Simulation(sweep), wire=Escaped())},
+    frames={
+        "data": Frame(
+            DATA,
+            data=True,
+            max_length=1200,
+            points={"segments": points},
+            simulation=Simulation(sweep),
+            wire=Escaped(),
+        )
+    },
     points=None,
     scan=OnWrap("segments.start"),
     links={"data": Serial(115_200)},

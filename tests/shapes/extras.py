@@ -1,12 +1,37 @@
-"""Points with further attributes: one in a unit, with a sign; one further out, as the wire has it; bits; and one calculated."""
+"""Points with further attributes: one in a unit, with a sign; one further out, as the wire has it;
+bits; and one calculated.
+"""
 
 from __future__ import annotations
 
 import numpy as np
-from construct import Array, BitsInteger, BitStruct, Const, Int8ul, Int16sb, Int16ub, Int32ub, Struct
+from construct import (
+    Array,
+    BitsInteger,
+    BitStruct,
+    Const,
+    Int8ul,
+    Int16sb,
+    Int16ub,
+    Int32ub,
+    Struct,
+)
 
 from lidarspec import Sensor
-from lidarspec.spec import Checksummed, Clock, Every, Extra, Fields, Frame, Polar, Scaled, Sequence, Simulation, Udp, Xor
+from lidarspec.spec import (
+    Checksummed,
+    Clock,
+    Every,
+    Extra,
+    Fields,
+    Frame,
+    Polar,
+    Scaled,
+    Sequence,
+    Simulation,
+    Udp,
+    Xor,
+)
 
 BLOCKS, CHANNELS = 4, 3
 
@@ -41,7 +66,9 @@ DATA = Checksummed(
 
 
 def points(f: Fields) -> Polar:
-    """The signal is that of a block; the confidence falls with the noise, and there is none from noise 7 on."""
+    """The signal is that of a block; the confidence falls with the noise, and there is none from
+    noise 7 on.
+    """
     channels = f.blocks.channels
     return Polar(
         channels.distance,
@@ -52,7 +79,9 @@ def points(f: Fields) -> Polar:
             "near_ir": channels.near_ir,
             "signal": Extra(f.blocks.signal, unit="photons"),
             "tag": channels.mark.tag,
-            "confidence": Extra(np.where(channels.mark.noise < 7, 1 - channels.mark.noise / 7, np.nan), unit="1"),
+            "confidence": Extra(
+                np.where(channels.mark.noise < 7, 1 - channels.mark.noise / 7, np.nan), unit="1"
+            ),
             "strong": channels.near_ir > 1000 + 8 * channels.mark.tag,
         },
     )

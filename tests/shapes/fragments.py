@@ -1,4 +1,6 @@
-"""Messages in several datagrams, each with the number of its message, its own and how many there are; a short one comes whole."""
+"""Messages in several datagrams, each with the number of its message, its own and how many there
+are; a short one comes whole.
+"""
 
 from __future__ import annotations
 
@@ -6,7 +8,19 @@ import numpy as np
 from construct import Array, Const, Int8ub, Int16ub, Struct, this
 
 from lidarspec import Sensor
-from lidarspec.spec import Assembled, Fields, Frame, OnWrap, Polar, Scaled, Sequence, Simulation, SizeOf, Udp, spread
+from lidarspec.spec import (
+    Assembled,
+    Fields,
+    Frame,
+    OnWrap,
+    Polar,
+    Scaled,
+    Sequence,
+    Simulation,
+    SizeOf,
+    Udp,
+    spread,
+)
 
 LONGEST = 60
 
@@ -19,7 +33,9 @@ DATA = Struct(
     "samples" / Array(this.count, Scaled(Int16ub, 0.001, "m")),
 )
 
-FRAGMENT = Struct("magic" / Const(b"\x7a\xa7\x01"), "message" / Int16ub, "index" / Int8ub, "count" / Int8ub)
+FRAGMENT = Struct(
+    "magic" / Const(b"\x7a\xa7\x01"), "message" / Int16ub, "index" / Int8ub, "count" / Int8ub
+)
 
 
 def points(f: Fields) -> Polar:
@@ -36,10 +52,21 @@ SENSOR = Sensor(
     "shape-fragments",
     vendor="Shapes",
     model="Fragments",
-    frames={"data": Frame(DATA, data=True, max_length=9 + 2 * LONGEST, plausible=lambda f: (f.angle < 360) & (f.count > 1))},
+    frames={
+        "data": Frame(
+            DATA,
+            data=True,
+            max_length=9 + 2 * LONGEST,
+            plausible=lambda f: (f.angle < 360) & (f.count > 1),
+        )
+    },
     points=points,
     scan=OnWrap("azimuth"),
-    links={"data": Udp(7780, assembled=Assembled(FRAGMENT, key="message", index="index", count="count"))},
+    links={
+        "data": Udp(
+            7780, assembled=Assembled(FRAGMENT, key="message", index="index", count="count")
+        )
+    },
     sequence=Sequence("counter"),
     simulation=Simulation(sweep),
     range_limits=(0.05, 30.0),

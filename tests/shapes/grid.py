@@ -27,7 +27,10 @@ def points(f: Fields) -> Cartesian:
     """A picture of depths: columns to the right, rows down."""
     right, down = np.arange(COLUMNS) - 1.5, np.arange(ROWS)[:, None] - 1.0
     return Cartesian(
-        x=f.depth, y=-f.depth * right * 0.1, z=-f.depth * down * 0.1 + f.skew.on("depth", "depth[]"), ring=np.arange(ROWS)[:, None]
+        x=f.depth,
+        y=-f.depth * right * 0.1,
+        z=-f.depth * down * 0.1 + f.skew.on("depth", "depth[]"),
+        ring=np.arange(ROWS)[:, None],
     )
 
 

@@ -1,4 +1,6 @@
-"""A header that says how many blocks follow, in which unit, and whether a counter does; angles by default until a file is given."""
+"""A header that says how many blocks follow, in which unit, and whether a counter does; angles by
+default until a file is given.
+"""
 
 from __future__ import annotations
 
@@ -25,7 +27,10 @@ DATA = Struct(
     "blocks"
     / Array(
         this.rows,
-        Struct("azimuth" / Scaled(Int16ul, 0.01, "deg"), "channels" / Array(CHANNELS, Struct("distance" / Int16ul, "strength" / Int8ul))),
+        Struct(
+            "azimuth" / Scaled(Int16ul, 0.01, "deg"),
+            "channels" / Array(CHANNELS, Struct("distance" / Int16ul, "strength" / Int8ul)),
+        ),
     ),
     "counter" / If(this.counted == 1, Int16ul),
 )
@@ -53,14 +58,27 @@ def configure(sensor: Sensor, *, calibration: str | Path) -> Sensor:
 
 def sweep(i: int) -> dict[str, Any]:
     """Twelve packets of two blocks a turn."""
-    return {"unit": 4, "rows": 2, "counted": 1, "counter": i % 65_536, "blocks.azimuth": [i * 30 % 360, (i * 30 + 15) % 360]}
+    return {
+        "unit": 4,
+        "rows": 2,
+        "counted": 1,
+        "counter": i % 65_536,
+        "blocks.azimuth": [i * 30 % 360, (i * 30 + 15) % 360],
+    }
 
 
 SENSOR = Sensor(
     "shape-headed",
     vendor="Shapes",
     model="Headed",
-    frames={"data": Frame(DATA, data=True, max_length=7 + 8 * 11, plausible=lambda f: (f.unit >= 1) & (f.blocks.azimuth < 360))},
+    frames={
+        "data": Frame(
+            DATA,
+            data=True,
+            max_length=7 + 8 * 11,
+            plausible=lambda f: (f.unit >= 1) & (f.blocks.azimuth < 360),
+        )
+    },
     points=points_with([-1.0, 0.0, 1.0], nominal=True),
     scan=OnWrap("blocks.azimuth"),
     links={"data": Udp(7004)},

@@ -1,4 +1,6 @@
-"""An IMU in frames of its own, with a clock of its own, and beside the points: three samples a packet, in other units and other axes."""
+"""An IMU in frames of its own, with a clock of its own, and beside the points: three samples a
+packet, in other units and other axes.
+"""
 
 from __future__ import annotations
 
@@ -8,7 +10,20 @@ import numpy as np
 from construct import Array, Const, Float32l, Int8ul, Int16sl, Int16ul, Int64ul, Struct
 
 from lidarspec import Sensor
-from lidarspec.spec import Checksummed, Clock, Fields, Frame, Imu, OnRewind, Polar, Scaled, Sequence, Simulation, Udp, Xor
+from lidarspec.spec import (
+    Checksummed,
+    Clock,
+    Fields,
+    Frame,
+    Imu,
+    OnRewind,
+    Polar,
+    Scaled,
+    Sequence,
+    Simulation,
+    Udp,
+    Xor,
+)
 
 POINTS, SAMPLES, TURN, PERIOD = 8, 3, 20, 0.005
 RATE = 100  # IMU frames a second
@@ -45,7 +60,11 @@ IMU = Checksummed(
 
 
 def points(f: Fields) -> Polar:
-    return Polar(f.distances, np.deg2rad(f.block + np.arange(POINTS) * 2.25), time=np.arange(POINTS) * (PERIOD / POINTS))
+    return Polar(
+        f.distances,
+        np.deg2rad(f.block + np.arange(POINTS) * 2.25),
+        time=np.arange(POINTS) * (PERIOD / POINTS),
+    )
 
 
 def beside(f: Fields) -> Imu:
@@ -72,7 +91,12 @@ SENSOR = Sensor(
     model="Inertia",
     frames={
         "data": Frame(DATA, data=True, imu=beside),
-        "imu": Frame(IMU, imu=alone, clock=Clock("felt_at"), simulation=Simulation(lambda i: {"felt_at": i * 10_000_000}, rate=RATE)),
+        "imu": Frame(
+            IMU,
+            imu=alone,
+            clock=Clock("felt_at"),
+            simulation=Simulation(lambda i: {"felt_at": i * 10_000_000}, rate=RATE),
+        ),
     },
     points=points,
     scan=OnRewind("block"),

@@ -1,4 +1,6 @@
-"""Lines of steps with one to three echoes each, joined by a mark: a distance and a strength of six bits to a character."""
+"""Lines of steps with one to three echoes each, joined by a mark: a distance and a strength of six
+bits to a character.
+"""
 
 from __future__ import annotations
 
@@ -8,7 +10,20 @@ import numpy as np
 from construct import Array, Const, Int8ub, Int16ub, Int24ub, Struct, this
 
 from lidarspec import Sensor
-from lidarspec.spec import Clock, Echoes, Fields, Frame, Lines, OnWrap, Polar, Scaled, Scip, Simulation, SixBits, Tcp
+from lidarspec.spec import (
+    Clock,
+    Echoes,
+    Fields,
+    Frame,
+    Lines,
+    OnWrap,
+    Polar,
+    Scaled,
+    Scip,
+    Simulation,
+    SixBits,
+    Tcp,
+)
 
 ECHOES, BEAMS = 3, 30
 

@@ -1,4 +1,6 @@
-"""Two data frames that differ in length alone: with and without a counter; whichever arrives is read."""
+"""Two data frames that differ in length alone: with and without a counter; whichever arrives is
+read.
+"""
 
 from __future__ import annotations
 

@@ -1,4 +1,6 @@
-"""Lines of text with a check character each, in which numbers are characters of six bits; decimal digits say how many there are."""
+"""Lines of text with a check character each, in which numbers are characters of six bits; decimal
+digits say how many there are.
+"""
 
 from __future__ import annotations
 
@@ -8,7 +10,20 @@ import numpy as np
 from construct import Array, Const, Int8ub, Int24ub, Int32ub, Struct, this
 
 from lidarspec import Sensor
-from lidarspec.spec import Clock, Fields, Frame, Lines, OnWrap, Polar, Scaled, Scip, Simulation, SixBits, Tcp, steps
+from lidarspec.spec import (
+    Clock,
+    Fields,
+    Frame,
+    Lines,
+    OnWrap,
+    Polar,
+    Scaled,
+    Scip,
+    Simulation,
+    SixBits,
+    Tcp,
+    steps,
+)
 
 BEAMS = 40
 
@@ -42,7 +57,11 @@ SENSOR = Sensor(
     model="Lines",
     frames={
         "data": Frame(
-            DATA, data=True, max_length=400, plausible=plausible, wire=Lines(64, head=(4, 2, 4), bare=1, check=Scip()) | SixBits()
+            DATA,
+            data=True,
+            max_length=400,
+            plausible=plausible,
+            wire=Lines(64, head=(4, 2, 4), bare=1, check=Scip()) | SixBits(),
         )
     },
     points=points,

@@ -15,7 +15,8 @@ DATA = Checksummed(
         "header" / Const(b"\x12\x34"),
         "angle" / Scaled(Int16ub, 0.01, "deg"),
         "check" / Int16ul,
-        "samples" / Array(SAMPLES, Struct("quality" / Int8ul, "distance" / Scaled(Int16ub, 0.0005, "m"))),
+        "samples"
+        / Array(SAMPLES, Struct("quality" / Int8ul, "distance" / Scaled(Int16ub, 0.0005, "m"))),
     ),
     field="check",
     algorithm=WordXor(head=4, groups=(1, 2)),
@@ -24,7 +25,12 @@ DATA = Checksummed(
 
 def points(f: Fields) -> Polar:
     angle = f.angle + np.arange(SAMPLES) * 0.5
-    return Polar(range=f.samples.distance, azimuth=np.deg2rad(angle), intensity=f.samples.quality, invalid=f.samples.quality == 0)
+    return Polar(
+        range=f.samples.distance,
+        azimuth=np.deg2rad(angle),
+        intensity=f.samples.quality,
+        invalid=f.samples.quality == 0,
+    )
 
 
 SENSOR = Sensor(

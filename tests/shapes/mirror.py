@@ -1,4 +1,6 @@
-"""A mirror of two faces, each with a sector of its own, one of them across 0: a scan ends where the angle jumps from one to the other."""
+"""A mirror of two faces, each with a sector of its own, one of them across 0: a scan ends where the
+angle jumps from one to the other.
+"""
 
 from __future__ import annotations
 
@@ -15,7 +17,14 @@ FACES = (150.0, 345.0)  # where they begin; a sector has 28.5 degrees, and the s
 FRAME = Struct(
     "magic" / Const(b"MR"),
     "counter" / Int8ul,
-    "rows" / Array(ROWS, Struct("angle" / Scaled(Int16ul, 0.01, "deg"), "distances" / Array(2, Scaled(Int16ul, 0.01, "m")))),
+    "rows"
+    / Array(
+        ROWS,
+        Struct(
+            "angle" / Scaled(Int16ul, 0.01, "deg"),
+            "distances" / Array(2, Scaled(Int16ul, 0.01, "m")),
+        ),
+    ),
 )
 
 

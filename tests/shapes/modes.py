@@ -1,4 +1,6 @@
-"""Frame types that a descriptor switches: the same bytes are one answer or the other, after what was announced last."""
+"""Frame types that a descriptor switches: the same bytes are one answer or the other, after what
+was announced last.
+"""
 
 from __future__ import annotations
 
@@ -6,12 +8,27 @@ import numpy as np
 from construct import Array, BitsInteger, BitStruct, Const, Int8ul, Int16ul, Struct
 
 from lidarspec import Sensor
-from lidarspec.spec import Checksummed, Fields, Frame, OnWrap, Polar, Scaled, Serial, Simulation, Sum
+from lidarspec.spec import (
+    Checksummed,
+    Fields,
+    Frame,
+    OnWrap,
+    Polar,
+    Scaled,
+    Serial,
+    Simulation,
+    Sum,
+)
 
 SAMPLES = 4
 
 PLAIN = Checksummed(
-    Struct("sync" / Const(b"\xa5"), "angle" / Scaled(Int16ul, 0.01, "deg"), "distance" / Scaled(Int16ul, 0.001, "m"), "sum" / Int8ul),
+    Struct(
+        "sync" / Const(b"\xa5"),
+        "angle" / Scaled(Int16ul, 0.01, "deg"),
+        "distance" / Scaled(Int16ul, 0.001, "m"),
+        "sum" / Int8ul,
+    ),
     field="sum",
     algorithm=Sum(8),
 )

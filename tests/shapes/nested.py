@@ -1,4 +1,6 @@
-"""A nested checksum: the header is sealed on its own, and the frame around it once more, over named fields only."""
+"""A nested checksum: the header is sealed on its own, and the frame around it once more, over named
+fields only.
+"""
 
 from __future__ import annotations
 
@@ -11,7 +13,9 @@ from lidarspec.spec import Checksummed, Crc, Fields, Frame, OnWrap, Polar, Scale
 SAMPLES = 3
 
 HEADER = Checksummed(
-    Struct("magic" / Const(0xC0DE, Int16ub), "angle" / Scaled(Int16ub, 0.01, "deg"), "sum" / Int8ub),
+    Struct(
+        "magic" / Const(0xC0DE, Int16ub), "angle" / Scaled(Int16ub, 0.01, "deg"), "sum" / Int8ub
+    ),
     field="sum",
     algorithm=Sum(8),
 )
@@ -25,7 +29,9 @@ DATA = Checksummed(
     ),
     field="crc",
     over=("header", "distances"),
-    algorithm=Crc(32, 0x04C11DB7, init=0xFFFFFFFF, refin=True, refout=True, xorout=0xFFFFFFFF, order="big"),
+    algorithm=Crc(
+        32, 0x04C11DB7, init=0xFFFFFFFF, refin=True, refout=True, xorout=0xFFFFFFFF, order="big"
+    ),
 )
 
 
@@ -37,7 +43,14 @@ SENSOR = Sensor(
     "shape-nested",
     vendor="Shapes",
     model="Nested",
-    frames={"data": Frame(DATA, data=True, max_length=20, acknowledged={"LS205 serial": "`over` is what the shape is about"})},
+    frames={
+        "data": Frame(
+            DATA,
+            data=True,
+            max_length=20,
+            acknowledged={"LS205 serial": "`over` is what the shape is about"},
+        )
+    },
     points=points,
     scan=OnWrap("header.angle"),
     links={"data": Serial(230_400)},

@@ -1,9 +1,24 @@
-"""Floats and 64-bit integers, reserved bytes that have to survive, and checksum values that mean "not filled"."""
+"""Floats and 64-bit integers, reserved bytes that have to survive, and checksum values that mean
+"not filled".
+"""
 
 from __future__ import annotations
 
 import numpy as np
-from construct import Array, Bytes, Const, Float32b, Float64l, Int8ul, Int16sl, Int16ul, Int32sb, Int64sb, Int64ul, Struct
+from construct import (
+    Array,
+    Bytes,
+    Const,
+    Float32b,
+    Float64l,
+    Int8ul,
+    Int16sl,
+    Int16ul,
+    Int32sb,
+    Int64sb,
+    Int64ul,
+    Struct,
+)
 
 from lidarspec import Sensor
 from lidarspec.spec import Checksummed, Clock, Crc, Fields, Frame, OnWrap, Polar, Scaled, Serial
@@ -19,7 +34,14 @@ DATA = Checksummed(
         "offset" / Int32sb,
         "azimuth" / Scaled(Float64l, 1, "rad"),
         "samples"
-        / Array(SAMPLES, Struct("range" / Scaled(Float32b, 1, "m"), "elevation" / Scaled(Int16sl, 0.01, "deg"), "spare" / Int8ul)),
+        / Array(
+            SAMPLES,
+            Struct(
+                "range" / Scaled(Float32b, 1, "m"),
+                "elevation" / Scaled(Int16sl, 0.01, "deg"),
+                "spare" / Int8ul,
+            ),
+        ),
         "crc" / Int16ul,
     ),
     field="crc",
@@ -30,7 +52,9 @@ DATA = Checksummed(
 
 def points(f: Fields) -> Polar:
     """A range that is not a number stays one; a direction of that kind makes the point invalid."""
-    return Polar(range=f.samples.range, azimuth=f.azimuth, elevation=np.deg2rad(f.samples.elevation))
+    return Polar(
+        range=f.samples.range, azimuth=f.azimuth, elevation=np.deg2rad(f.samples.elevation)
+    )
 
 
 SENSOR = Sensor(

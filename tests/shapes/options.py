@@ -1,9 +1,24 @@
-"""Counts and options in the header: optional parts, alternatives, a count out of two fields, and the unit of the distances."""
+"""Counts and options in the header: optional parts, alternatives, a count out of two fields, and
+the unit of the distances.
+"""
 
 from __future__ import annotations
 
 import numpy as np
-from construct import Array, BitsInteger, BitStruct, Const, If, Int8ub, Int16ub, Int16ul, Int32ub, Struct, Switch, this
+from construct import (
+    Array,
+    BitsInteger,
+    BitStruct,
+    Const,
+    If,
+    Int8ub,
+    Int16ub,
+    Int16ul,
+    Int32ub,
+    Struct,
+    Switch,
+    this,
+)
 
 from lidarspec import Sensor
 from lidarspec.spec import Checksummed, Crc, Fields, Frame, OnRewind, Polar, Scaled, Serial
@@ -13,13 +28,25 @@ LONGEST = 48
 DATA = Checksummed(
     Struct(
         "magic" / Const(b"\x0f\xf0"),
-        "options" / BitStruct("extended" / BitsInteger(1), "coarse" / BitsInteger(1), "kind" / BitsInteger(6)),
+        "options"
+        / BitStruct(
+            "extended" / BitsInteger(1), "coarse" / BitsInteger(1), "kind" / BitsInteger(6)
+        ),
         "rows" / Int8ub,
         "columns" / Int8ub,
-        "extension" / If(this.options.extended == 1, Struct("serial" / Int32ub, "trim" / Scaled(Int8ub, 0.1, "deg"))),
-        "extra" / Switch(this.options.kind, {1: Struct("rpm" / Int16ub), 2: Struct("rpm" / Int16ub, "volts" / Int8ub)}),
+        "extension"
+        / If(
+            this.options.extended == 1,
+            Struct("serial" / Int32ub, "trim" / Scaled(Int8ub, 0.1, "deg")),
+        ),
+        "extra"
+        / Switch(
+            this.options.kind,
+            {1: Struct("rpm" / Int16ub), 2: Struct("rpm" / Int16ub, "volts" / Int8ub)},
+        ),
         "angle" / Scaled(Int16ub, 0.01, "deg"),
-        "distances" / Array(this.rows * this.columns, Scaled(Int16ul, 1, "") * "in steps that the options say"),
+        "distances"
+        / Array(this.rows * this.columns, Scaled(Int16ul, 1, "") * "in steps that the options say"),
         "crc" / Int16ub,
     ),
     field="crc",
@@ -38,7 +65,14 @@ SENSOR = Sensor(
     "shape-options",
     vendor="Shapes",
     model="Options",
-    frames={"data": Frame(DATA, data=True, max_length=17 + 2 * LONGEST, plausible=lambda f: (f.options.kind <= 2) & (f.angle < 360))},
+    frames={
+        "data": Frame(
+            DATA,
+            data=True,
+            max_length=17 + 2 * LONGEST,
+            plausible=lambda f: (f.options.kind <= 2) & (f.angle < 360),
+        )
+    },
     points=points,
     scan=OnRewind("angle"),
     links={"data": Serial(921_600)},

@@ -13,7 +13,11 @@ MOST = 15
 DATA = Checksummed(
     Struct(
         "sync" / Const(b"\x3c\xc3"),
-        "header" / BitStruct("version" / BitsInteger(4), "size" / BitsInteger(4) * "of the body: an angle and two bytes a distance"),
+        "header"
+        / BitStruct(
+            "version" / BitsInteger(4),
+            "size" / BitsInteger(4) * "of the body: an angle and two bytes a distance",
+        ),
         "body"
         / Struct(
             "angle" / Scaled(Int8ul, 1, "deg"),
@@ -27,7 +31,10 @@ DATA = Checksummed(
 
 
 def points(f: Fields) -> Polar:
-    return Polar(range=f.body.distances, azimuth=np.deg2rad(f.body.angle + np.arange(f.body.distances.shape[1])))
+    return Polar(
+        range=f.body.distances,
+        azimuth=np.deg2rad(f.body.angle + np.arange(f.body.distances.shape[1])),
+    )
 
 
 SENSOR = Sensor(

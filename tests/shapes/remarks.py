@@ -8,7 +8,17 @@ import numpy as np
 from construct import Array, Bytes, Const, Int8ul, Int16ul, Struct
 
 from lidarspec import Sensor
-from lidarspec.spec import Checksummed, Fields, Frame, OnWrap, Polar, Scaled, Serial, Simulation, Xor
+from lidarspec.spec import (
+    Checksummed,
+    Fields,
+    Frame,
+    OnWrap,
+    Polar,
+    Scaled,
+    Serial,
+    Simulation,
+    Xor,
+)
 
 SAMPLES, LETTERS = 4, 24
 
@@ -43,8 +53,15 @@ SENSOR = Sensor(
     vendor="Shapes",
     model="Remarks",
     frames={
-        "data": Frame(DATA, data=True, max_length=13, acknowledged={"LS206": "no line is noisy enough for a shape"}),
-        "remark": Frame(REMARK, max_length=27, plausible=plausible_remark, simulation=Simulation(sweep_remark)),
+        "data": Frame(
+            DATA,
+            data=True,
+            max_length=13,
+            acknowledged={"LS206": "no line is noisy enough for a shape"},
+        ),
+        "remark": Frame(
+            REMARK, max_length=27, plausible=plausible_remark, simulation=Simulation(sweep_remark)
+        ),
     },
     points=points,
     scan=OnWrap("angle"),

@@ -1,4 +1,6 @@
-"""Distances that a floating-point header scales, turns and lifts: whole steps of the wire, and a far point beside them as a float."""
+"""Distances that a floating-point header scales, turns and lifts: whole steps of the wire, and a
+far point beside them as a float.
+"""
 
 from __future__ import annotations
 
@@ -6,7 +8,17 @@ import numpy as np
 from construct import Array, Const, Float32b, Float64b, Int16ub, Struct
 
 from lidarspec import Sensor
-from lidarspec.spec import Checksummed, Crc, Fields, Frame, OnWrap, Polar, Scaled, Serial, Simulation
+from lidarspec.spec import (
+    Checksummed,
+    Crc,
+    Fields,
+    Frame,
+    OnWrap,
+    Polar,
+    Scaled,
+    Serial,
+    Simulation,
+)
 
 SAMPLES, STEP = 6, 1.5
 

@@ -1,4 +1,6 @@
-"""A chain of segments, each of which says how long the next one is, with channels of their own number, under one checksum."""
+"""A chain of segments, each of which says how long the next one is, with channels of their own
+number, under one checksum.
+"""
 
 from __future__ import annotations
 
@@ -8,7 +10,22 @@ import numpy as np
 from construct import Array, Const, Int8ul, Int16ul, Int32ul, Struct, this
 
 from lidarspec import Sensor
-from lidarspec.spec import Checksummed, Clock, Crc, Extra, Fields, Frame, OnChange, Parts, Polar, Scaled, Sequence, Simulation, Udp, steps
+from lidarspec.spec import (
+    Checksummed,
+    Clock,
+    Crc,
+    Extra,
+    Fields,
+    Frame,
+    OnChange,
+    Parts,
+    Polar,
+    Scaled,
+    Sequence,
+    Simulation,
+    Udp,
+    steps,
+)
 
 SEGMENT = Struct(
     "turn" / Int16ul,
@@ -18,7 +35,11 @@ SEGMENT = Struct(
     "start" / Scaled(Int16ul, 0.01, "deg"),
     "elevations" / Array(this.channels, Scaled(Int8ul, 0.5, "deg")),
     "next_size" / Int16ul * "bytes of the next segment, 0 behind the last",
-    "data" / Array(this.beams, Array(this.channels, Struct("distance" / Scaled(Int16ul, 0.001, "m"), "strength" / Int8ul))),
+    "data"
+    / Array(
+        this.beams,
+        Array(this.channels, Struct("distance" / Scaled(Int16ul, 0.001, "m"), "strength" / Int8ul)),
+    ),
 )
 DATA = Checksummed(
     Struct(
@@ -44,7 +65,11 @@ def points(f: Fields) -> Polar:
         elevation=np.deg2rad(f.elevations.on("data[]")),
         intensity=f.data.strength,
         ring=steps(f.channels),
-        extra={"signal": f.data.strength, "step": Extra(f.frame.step, unit="deg"), "share": f.data.strength / 255},
+        extra={
+            "signal": f.data.strength,
+            "step": Extra(f.frame.step, unit="deg"),
+            "share": f.data.strength / 255,
+        },
     )
 
 
@@ -52,20 +77,39 @@ def segment(i: int) -> dict[str, Any]:
     """Thirty segments a turn, of two lengths."""
     number = CHANNELS - i % 2
     elevations = np.arange(number) * 2.0
-    return dict(turn=i // 30, channels=number, beams=BEAMS, time=i * 500.0, start=i * 12.0 % 360, elevations=elevations)
+    return dict(
+        turn=i // 30,
+        channels=number,
+        beams=BEAMS,
+        time=i * 500.0,
+        start=i * 12.0 % 360,
+        elevations=elevations,
+    )
 
 
 def sweep(i: int) -> dict[str, Any]:
     """Two segments in each telegram, then one."""
     first = i // 2 * 3 + i % 2 * 2
-    return dict(counter=i % 65_536, step=1.5, segments=[segment(number) for number in range(first, first + 2 - i % 2)])
+    return dict(
+        counter=i % 65_536,
+        step=1.5,
+        segments=[segment(number) for number in range(first, first + 2 - i % 2)],
+    )
 
 
 SENSOR = Sensor(
     "shape-segments",
     vendor="Shapes",
     model="Segments",
-    frames={"data": Frame(DATA, data=True, max_length=1200, points={"segments": points}, simulation=Simulation(sweep))},
+    frames={
+        "data": Frame(
+            DATA,
+            data=True,
+            max_length=1200,
+            points={"segments": points},
+            simulation=Simulation(sweep),
+        )
+    },
     points=None,
     scan=OnChange("segments.turn"),
     links={"data": Udp(7005)},

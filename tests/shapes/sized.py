@@ -1,4 +1,6 @@
-"""Two lengths that say the same: that of the frame follows from that of its samples, and is filled in wherever a frame is made."""
+"""Two lengths that say the same: that of the frame follows from that of its samples, and is filled
+in wherever a frame is made.
+"""
 
 from __future__ import annotations
 
@@ -8,7 +10,18 @@ import numpy as np
 from construct import Array, Const, Int8ub, Int16ub, Rebuild, Struct, this
 
 from lidarspec import Sensor
-from lidarspec.spec import Checksummed, Fields, Frame, OnWrap, Polar, Scaled, Serial, Simulation, Sum, spread
+from lidarspec.spec import (
+    Checksummed,
+    Fields,
+    Frame,
+    OnWrap,
+    Polar,
+    Scaled,
+    Serial,
+    Simulation,
+    Sum,
+    spread,
+)
 
 LONGEST = 30
 
@@ -18,7 +31,11 @@ DATA = Checksummed(
         "length" / Rebuild(Int16ub, this.size + 5) * "all bytes before the sum",
         "size" / Int16ub * "bytes of the angle and the samples",
         "angle" / Scaled(Int16ub, 0.01, "deg"),
-        "samples" / Array((this.size - 2) // 3, Struct("quality" / Int8ub, "distance" / Scaled(Int16ub, 0.001, "m"))),
+        "samples"
+        / Array(
+            (this.size - 2) // 3,
+            Struct("quality" / Int8ub, "distance" / Scaled(Int16ub, 0.001, "m")),
+        ),
         "sum" / Int16ub,
     ),
     field="sum",
@@ -32,7 +49,10 @@ def plausible(f: Fields) -> Any:
 
 def points(f: Fields) -> Polar:
     count = (f.size - 2) / 3
-    return Polar(range=f.samples.distance, azimuth=np.deg2rad(spread(f.angle, f.angle + 20 - 20 / count, count, full=360.0)))
+    return Polar(
+        range=f.samples.distance,
+        azimuth=np.deg2rad(spread(f.angle, f.angle + 20 - 20 / count, count, full=360.0)),
+    )
 
 
 def sweep(i: int) -> dict[str, float]:

@@ -1,4 +1,6 @@
-"""State from another packet: elevations come with the info frame, or else by default; siblings are put on the points' axes."""
+"""State from another packet: elevations come with the info frame, or else by default; siblings are
+put on the points' axes.
+"""
 
 from __future__ import annotations
 
@@ -19,7 +21,8 @@ DATA = Checksummed(
         / Array(
             BLOCKS,
             Struct(
-                "azimuth" / Scaled(Int16ul, 0.01, "deg"), "channels" / Array(CHANNELS, Struct("distance" / Scaled(Int16ul, 0.002, "m")))
+                "azimuth" / Scaled(Int16ul, 0.01, "deg"),
+                "channels" / Array(CHANNELS, Struct("distance" / Scaled(Int16ul, 0.002, "m"))),
             ),
         ),
         "sum" / Int8ul,
@@ -55,7 +58,12 @@ SENSOR = Sensor(
     vendor="Shapes",
     model="State",
     frames={
-        "data": Frame(DATA, data=True, max_length=40, acknowledged={"LS206": "no line is noisy enough for a shape"}),
+        "data": Frame(
+            DATA,
+            data=True,
+            max_length=40,
+            acknowledged={"LS206": "no line is noisy enough for a shape"},
+        ),
         "info": Frame(INFO, max_length=13, plausible=lambda f: f.zero < 360),
     },
     points=points,

@@ -1,4 +1,6 @@
-"""A terminator: one reading to a line of text, "$L" angle "," distance "," strength line-feed; construct alone can read it."""
+"""A terminator: one reading to a line of text, "$L" angle "," distance "," strength line-feed;
+construct alone can read it.
+"""
 
 from __future__ import annotations
 

@@ -1,15 +1,41 @@
-"""Text in tokens: a constant behind any three characters, hexadecimal numbers of all kinds, arrays with counts of their own, and a name
-with a separator in it."""
+"""Text in tokens: a constant behind any three characters, hexadecimal numbers of all kinds, arrays
+with counts of their own, and a name with a separator in it."""
 
 from __future__ import annotations
 
 from typing import Any
 
 import numpy as np
-from construct import Array, Bytes, Const, Enum, Float32b, If, Int8ub, Int16sb, Int16ub, Int32sb, Int32ub, Struct, this
+from construct import (
+    Array,
+    Bytes,
+    Const,
+    Enum,
+    Float32b,
+    If,
+    Int8ub,
+    Int16sb,
+    Int16ub,
+    Int32sb,
+    Int32ub,
+    Struct,
+    this,
+)
 
 from lidarspec import Sensor
-from lidarspec.spec import Clock, Fields, Frame, OnWrap, Polar, Scaled, Sequence, Simulation, Tcp, Tokens, steps
+from lidarspec.spec import (
+    Clock,
+    Fields,
+    Frame,
+    OnWrap,
+    Polar,
+    Scaled,
+    Sequence,
+    Simulation,
+    Tcp,
+    Tokens,
+    steps,
+)
 
 BEAMS = 30
 KIND = np.frombuffer(b"sSN", np.uint8)
@@ -42,14 +68,30 @@ def points(f: Fields) -> Polar:
 
 def sweep(i: int) -> dict[str, Any]:
     """Twelve telegrams a turn."""
-    return dict(kind=KIND, counter=i % 65_536, time=i * 5000 % 2**32, scale=1.0, start=(i * BEAMS) % 360 - 180.0, step=1.0, count=BEAMS)
+    return dict(
+        kind=KIND,
+        counter=i % 65_536,
+        time=i * 5000 % 2**32,
+        scale=1.0,
+        start=(i * BEAMS) % 360 - 180.0,
+        step=1.0,
+        count=BEAMS,
+    )
 
 
 SENSOR = Sensor(
     "shape-tokens",
     vendor="Shapes",
     model="Tokens",
-    frames={"data": Frame(SCAN, data=True, max_length=3000, plausible=plausible, wire=Tokens(start=b"\x02", sep=b" ", end=b"\x03"))},
+    frames={
+        "data": Frame(
+            SCAN,
+            data=True,
+            max_length=3000,
+            plausible=plausible,
+            wire=Tokens(start=b"\x02", sep=b" ", end=b"\x03"),
+        )
+    },
     points=points,
     scan=OnWrap("azimuth"),
     links={"data": Tcp(2112)},

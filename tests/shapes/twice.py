@@ -1,9 +1,22 @@
-"""Two checksums around one struct, each with a field of its own: one over a whole bit block and the angle, one over all others."""
+"""Two checksums around one struct, each with a field of its own: one over a whole bit block and the
+angle, one over all others.
+"""
 
 from __future__ import annotations
 
 import numpy as np
-from construct import Array, BitsInteger, BitStruct, Const, If, Int8ub, Int16ub, Int16ul, Struct, this
+from construct import (
+    Array,
+    BitsInteger,
+    BitStruct,
+    Const,
+    If,
+    Int8ub,
+    Int16ub,
+    Int16ul,
+    Struct,
+    this,
+)
 
 from lidarspec import Sensor
 from lidarspec.spec import Checksummed, Crc, Fields, Frame, OnWrap, Polar, Scaled, Serial, Xor
@@ -15,11 +28,14 @@ FIELDS = Struct(
     "status" / BitStruct("marked" / BitsInteger(1), "speed" / BitsInteger(7)),
     "angle" / Scaled(Int16ub, 0.01, "deg"),
     "check" / Int8ub,
-    "mark" / If(this.status.marked == 1, BitStruct("kind" / BitsInteger(4), "level" / BitsInteger(4))),
+    "mark"
+    / If(this.status.marked == 1, BitStruct("kind" / BitsInteger(4), "level" / BitsInteger(4))),
     "distances" / Array(SAMPLES, Scaled(Int16ul, 0.001, "m")),
     "crc" / Int16ul,
 )
-DATA = Checksummed(Checksummed(FIELDS, "check", Xor(), over=("status", "angle")), "crc", Crc(16, 0x1021))
+DATA = Checksummed(
+    Checksummed(FIELDS, "check", Xor(), over=("status", "angle")), "crc", Crc(16, 0x1021)
+)
 
 
 def points(f: Fields) -> Polar:

@@ -1,4 +1,6 @@
-"""Two types with one magic: only length and checksum tell them apart, and their order decides where both fit."""
+"""Two types with one magic: only length and checksum tell them apart, and their order decides where
+both fit.
+"""
 
 from __future__ import annotations
 
@@ -23,7 +25,10 @@ DATA = Checksummed(
 )
 INFO = Checksummed(
     Struct(
-        "magic" / Const(MAGIC), "temperature" / Scaled(Int8ul, 1, "degC", offset=-40), "voltage" / Scaled(Int8ul, 1, "V"), "check" / Int8ul
+        "magic" / Const(MAGIC),
+        "temperature" / Scaled(Int8ul, 1, "degC", offset=-40),
+        "voltage" / Scaled(Int8ul, 1, "V"),
+        "check" / Int8ul,
     ),
     field="check",
     algorithm=Xor(),
@@ -38,7 +43,10 @@ SENSOR = Sensor(
     "shape-twins",
     vendor="Shapes",
     model="Twins",
-    frames={"data": Frame(DATA, data=True, max_length=18), "info": Frame(INFO, max_length=5, plausible=lambda f: f.voltage < 200)},
+    frames={
+        "data": Frame(DATA, data=True, max_length=18),
+        "info": Frame(INFO, max_length=5, plausible=lambda f: f.voltage < 200),
+    },
     points=points,
     scan=OnWrap("angle"),
     links={"data": Serial(115_200)},

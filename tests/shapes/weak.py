@@ -1,6 +1,8 @@
-"""A weak frame: five bytes, held together by a start bit, its inverse and a check bit; three in a row make it believable.
+"""A weak frame: five bytes, held together by a start bit, its inverse and a check bit; three in a
+row make it believable.
 
-Its info frame has a checksum, comes first in the order, and would pass for a weak one: it ends a run.
+Its info frame has a checksum, comes first in the order, and would pass for a weak one: it ends a
+run.
 """
 
 from __future__ import annotations
@@ -14,12 +16,21 @@ from lidarspec import Sensor
 from lidarspec.spec import Checksummed, Fields, Frame, OnFlag, Polar, Scaled, Serial, Sum
 
 DATA = Struct(
-    "head" / BitStruct("quality" / BitsInteger(6), "inverse" / BitsInteger(1), "start" / BitsInteger(1)),
-    "beam" / ByteSwapped(BitStruct("angle" / Scaled(BitsInteger(15), 1 / 64, "deg"), "check" / BitsInteger(1))),
+    "head"
+    / BitStruct("quality" / BitsInteger(6), "inverse" / BitsInteger(1), "start" / BitsInteger(1)),
+    "beam"
+    / ByteSwapped(
+        BitStruct("angle" / Scaled(BitsInteger(15), 1 / 64, "deg"), "check" / BitsInteger(1))
+    ),
     "distance" / Scaled(Int16ul, 0.00025, "m"),
 )
 INFO = Checksummed(
-    Struct("header" / Const(b"\x3e\x01"), "revision" / Int8ul, "temperature" / Scaled(Int8ul, 1, "degC"), "sum" / Int8ul),
+    Struct(
+        "header" / Const(b"\x3e\x01"),
+        "revision" / Int8ul,
+        "temperature" / Scaled(Int8ul, 1, "degC"),
+        "sum" / Int8ul,
+    ),
     field="sum",
     algorithm=Sum(8),
 )
@@ -38,9 +49,16 @@ SENSOR = Sensor(
     vendor="Shapes",
     model="Weak",
     frames={
-        "info": Frame(INFO, max_length=5, acknowledged={"LS206": "no line is noisy enough for a shape"}),
+        "info": Frame(
+            INFO, max_length=5, acknowledged={"LS206": "no line is noisy enough for a shape"}
+        ),
         "data": Frame(
-            DATA, data=True, max_length=5, plausible=plausible, confirm=3, acknowledged={"LS212": "one bit, held by `plausible`"}
+            DATA,
+            data=True,
+            max_length=5,
+            plausible=plausible,
+            confirm=3,
+            acknowledged={"LS212": "one bit, held by `plausible`"},
         ),
     },
     points=points,

@@ -1,4 +1,6 @@
-"""Sensors that answer in several data frames: each simulated by its own sweep; packets that need the next; counts further out."""
+"""Sensors that answer in several data frames: each simulated by its own sweep; packets that need
+the next; counts further out.
+"""
 
 from __future__ import annotations
 
@@ -19,8 +21,13 @@ MODES, AHEAD, OUTER = SHAPES["shape-modes"], SHAPES["shape-ahead"], SHAPES["shap
 def test_every_answer_is_simulated_by_its_own_sweep(answer: str) -> None:
     sensor = MODES.configure(answer=answer)
     frames = simulate(sensor, 40)
-    assert [found.frame for found in MODES.split(opening(sensor) + b"".join(frames))] == [f"begin_{answer}", *[answer] * 40]
-    assert np.rint(sensor.decode(b"".join(frames))["angle"]).tolist() == [i * (2 if answer == "plain" else 4) for i in range(40)]
+    assert [found.frame for found in MODES.split(opening(sensor) + b"".join(frames))] == [
+        f"begin_{answer}",
+        *[answer] * 40,
+    ]
+    assert np.rint(sensor.decode(b"".join(frames))["angle"]).tolist() == [
+        i * (2 if answer == "plain" else 4) for i in range(40)
+    ]
 
 
 def test_a_sensor_that_needs_no_opening_has_none() -> None:
@@ -32,7 +39,9 @@ def test_simulated_packets_that_need_the_next_do_not_depend_on_batches() -> None
         step = wrap(following(f.angle) - f.angle, 360) / 8
         return Polar(range=f.distances, azimuth=np.deg2rad(f.angle + step * np.arange(8)))
 
-    sensor = dataclasses.replace(AHEAD, points=points, simulation=Simulation(lambda i: {"angle": i * 8 % 360}))
+    sensor = dataclasses.replace(
+        AHEAD, points=points, simulation=Simulation(lambda i: {"angle": i * 8 % 360})
+    )
     assert simulate(sensor, 20) == simulate(sensor, 7) + simulate(sensor, 13, start=7)
 
 
@@ -44,4 +53,6 @@ def test_a_count_further_out_is_filled_in() -> None:
 
 def test_a_count_further_out_that_is_wrong_is_the_callers_fault() -> None:
     with pytest.raises(ls.UsageError, match="distances"):
-        OUTER.build("data", header={"version": 2, "size": 9}, body={"angle": 9, "distances": [1, 2, 3]})
+        OUTER.build(
+            "data", header={"version": 2, "size": 9}, body={"angle": 9, "distances": [1, 2, 3]}
+        )

@@ -1,4 +1,6 @@
-"""A simulated sensor as a device, sans-IO: commands and their documented answers, start-up, pace, faults."""
+"""A simulated sensor as a device, sans-IO: commands and their documented answers, start-up, pace,
+faults.
+"""
 
 from __future__ import annotations
 
@@ -75,7 +77,12 @@ def test_the_m1c1_mini_starts_as_its_manual_says() -> None:
 def test_a_captured_start_of_a_coin_d4_comes_out_byte_for_byte_up_to_its_points() -> None:
     device = on(ls.sensor("cspc-coin-d4"), seed=4)
     started = asked(device, "start", 0) + passing(device, 0, SECOND + 5 * MS)
-    captured = bytes.fromhex("a55a500701000000000000a9 fafa a55a1400e30201") + b"COIN-D4" + bytes(12) + bytes.fromhex("01 a55a0000800181")
+    captured = (
+        bytes.fromhex("a55a500701000000000000a9 fafa a55a1400e30201")
+        + b"COIN-D4"
+        + bytes(12)
+        + bytes.fromhex("01 a55a0000800181")
+    )
     shown = started[:12] + started[26:]
     assert shown.startswith(captured)
 
@@ -107,13 +114,24 @@ def test_an_rplidar_says_what_it_is_and_scans_in_the_mode_that_is_asked_for() ->
     info = a1().parse(asked(device, "get_info", 0))
     assert (info.model, info.firmware_major, info.firmware_minor, info.hardware) == (0x18, 1, 29, 7)
     assert a1().parse(asked(device, "get_mode_count", 0)).value.mode_count == 4
-    assert a1().parse(asked(device, "get_us_per_sample", 0, mode=3)).value.us_per_sample == 127 * 256
-    assert bytes(a1().parse(asked(device, "get_mode_name", 0, mode=3)).value.data) == b"Sensitivity\0"
+    assert (
+        a1().parse(asked(device, "get_us_per_sample", 0, mode=3)).value.us_per_sample == 127 * 256
+    )
+    assert (
+        bytes(a1().parse(asked(device, "get_mode_name", 0, mode=3)).value.data) == b"Sensitivity\0"
+    )
     assert asked(device, "get_mode_name", 0, mode=9) == b""
-    types = [a1().parse(asked(device, "get_answer_type", 0, mode=mode)).value.answer_type for mode in range(4)]
+    types = [
+        a1().parse(asked(device, "get_answer_type", 0, mode=mode)).value.answer_type
+        for mode in range(4)
+    ]
     kinds = {}
     for mode, kind in enumerate(types):
-        started = asked(device, "express_scan", mode * SECOND, mode=mode) if mode else asked(device, "scan", 0)
+        started = (
+            asked(device, "express_scan", mode * SECOND, mode=mode)
+            if mode
+            else asked(device, "scan", 0)
+        )
         started += passing(device, mode * SECOND, mode * SECOND + SECOND // 2)
         assert a1().parse(started[:7])["type"] == kind
         found = a1().decode(started).stats
@@ -126,7 +144,9 @@ def test_an_rplidar_says_what_it_is_and_scans_in_the_mode_that_is_asked_for() ->
         2: ["ultra", "ultra_descriptor"],
         3: ["ultra", "ultra_descriptor"],
     }
-    assert b"\xa5\x5a\x14" not in asked(device, "get_info", 5 * SECOND)  # answered only while it does not scan
+    assert b"\xa5\x5a\x14" not in asked(
+        device, "get_info", 5 * SECOND
+    )  # answered only while it does not scan
     assert device.heard[-1] == "get_info"
     assert asked(device, "stop", 5 * SECOND).count(b"\xa5\x5a") == 0
     assert a1().parse(asked(device, "get_info", 5 * SECOND)).hardware == 7
@@ -146,7 +166,10 @@ def test_other_frames_come_at_their_own_rate_with_the_defaults_of_the_spec() -> 
     assert (device.sent["difop"], packets.stats.frames["difop"]) == (4, 4)
     assert out[0] == next(data for data in out if data[:2] == b"\xa5\xff")
     assert not packets.points().nominal
-    assert np.array_equal(helios.decode([data for data in out if data[:2] != b"\xa5\xff"]).points().xyz, packets.points().xyz)
+    assert np.array_equal(
+        helios.decode([data for data in out if data[:2] != b"\xa5\xff"]).points().xyz,
+        packets.points().xyz,
+    )
 
 
 @pytest.mark.parametrize(
@@ -171,9 +194,12 @@ def test_the_pace_does_not_depend_on_how_often_it_is_asked(name: str, rate: floa
         numbers.append(device.sent[sensor.data_frame if name != "slamtec-rplidar-s2" else "node"])
     shorter = min(map(len, streams))
     assert streams[0][:shorter] == streams[1][:shorter]
-    interval = {"ldrobot-stl27l": 12 / 21_600, "cspc-m1c1-mini": 1 / (17 * 5.5), "velodyne-vlp16": 1 / 753.5, "slamtec-rplidar-s2": 508e-6}[
-        name
-    ]
+    interval = {
+        "ldrobot-stl27l": 12 / 21_600,
+        "cspc-m1c1-mini": 1 / (17 * 5.5),
+        "velodyne-vlp16": 1 / 753.5,
+        "slamtec-rplidar-s2": 508e-6,
+    }[name]
     settling = 1.0 if name == "cspc-m1c1-mini" else 0.0
     assert numbers[0] == pytest.approx((2 * rate - settling) / interval, rel=0.03)
 
@@ -231,7 +257,8 @@ def test_the_same_seed_does_the_same_harm(name: str) -> None:
     sensor = ls.sensor(name)
     faults = Faults(errors=0.001, loss=0.02, reorder=4 if sensor.datagrams else 0)
     first, second, other = (
-        passing(on(sensor, faults=faults, seed=seed), 0, SECOND, step) for seed, step in ((1, MS), (1, 7 * MS), (2, MS))
+        passing(on(sensor, faults=faults, seed=seed), 0, SECOND, step)
+        for seed, step in ((1, MS), (1, 7 * MS), (2, MS))
     )
     shorter = min(len(first), len(second))
     assert first[:shorter] == second[:shorter]
@@ -251,7 +278,10 @@ def test_damaged_bytes_are_as_many_as_asked_for_and_the_sound_frames_come_throug
 def test_lost_packets_are_missing_and_reordered_ones_are_late() -> None:
     m1 = ls.sensor("robosense-m1")
     clean, harmed = on(m1), on(m1, faults=Faults(loss=0.01, reorder=5))
-    sound, out = ([data for now in range(0, SECOND // 2, 2 * MS) for _, data in device.outgoing(now)] for device in (clean, harmed))
+    sound, out = (
+        [data for now in range(0, SECOND // 2, 2 * MS) for _, data in device.outgoing(now)]
+        for device in (clean, harmed)
+    )
     line, places = harmed.lines["data"], {data: place for place, data in enumerate(sound)}
     assert 0.005 < line.lost / line.sent < 0.02
     order = [places[data] for data in out]
@@ -273,7 +303,10 @@ def test_damage_in_datagrams_keeps_their_length() -> None:
 def test_every_byte_of_a_line_can_be_damaged() -> None:
     out = Line(Faults(errors=1.0), stream=True).carry([("", bytes(300))])
     assert 150 < len(out[0][1]) < 450
-    assert all(a or b for a, b in pairwise(Line(Faults(errors=1.0), stream=False).carry([("", bytes(300))])[0][1]))
+    assert all(
+        a or b
+        for a, b in pairwise(Line(Faults(errors=1.0), stream=False).carry([("", bytes(300))])[0][1])
+    )
 
 
 def test_the_plug_is_pulled_and_put_in_again() -> None:
@@ -316,19 +349,51 @@ def test_faults_that_cannot_be_are_refused(options: dict[str, str], error: type[
 
 
 def test_faults_by_text() -> None:
-    asked_for = {"errors": "0.01", "loss": "0.02", "reorder": "4", "unplug": "30s", "absent": "500ms"}
+    asked_for = {
+        "errors": "0.01",
+        "loss": "0.02",
+        "reorder": "4",
+        "unplug": "30s",
+        "absent": "500ms",
+    }
     assert faults_of(asked_for) == Faults(0.01, 0.02, 4, 30.0, 0.5)
-    assert (duration("2min"), duration("1.5h"), duration("7"), duration("20us")) == (120, 5400, 7, pytest.approx(20e-6))
+    assert (duration("2min"), duration("1.5h"), duration("7"), duration("20us")) == (
+        120,
+        5400,
+        7,
+        pytest.approx(20e-6),
+    )
     with pytest.raises(UsageError, match="keep their order"):
         on(stl(), faults=Faults(reorder=2))
 
 
-@pytest.mark.parametrize("told", [{"echoes": ("key", "mode", "rates")}, {"matches": {"key": b"abc", "mode": "fast", "rates": [20, 30]}}])
+@pytest.mark.parametrize(
+    "told",
+    [
+        {"echoes": ("key", "mode", "rates")},
+        {"matches": {"key": b"abc", "mode": "fast", "rates": [20, 30]}},
+    ],
+)
 def test_a_reply_is_told_by_bytes_names_and_arrays(told: dict[str, Any]) -> None:
-    fields = {"key": Bytes(3), "mode": Enum(Int8ul, slow=1, fast=7), "rates": Array(2, Scaled(Int8ul, 0.1, "Hz"))}
-    order, ack = (Struct("header" / Const(head), *(name / con for name, con in fields.items())) for head in (b"\x16\x61", b"\x17\x71"))
+    fields = {
+        "key": Bytes(3),
+        "mode": Enum(Int8ul, slow=1, fast=7),
+        "rates": Array(2, Scaled(Int8ul, 0.1, "Hz")),
+    }
+    order, ack = (
+        Struct("header" / Const(head), *(name / con for name, con in fields.items()))
+        for head in (b"\x16\x61", b"\x17\x71")
+    )
     sensor = sound.sensor(
         frames={"data": sound.frame(), "ack": Frame(ack), "order": Frame(order, direction="out")},
-        commands={"start": Command("order", {"key": b"abc", "mode": "fast", "rates": [20, 30]}, reply="ack", starts=True, **told)},
+        commands={
+            "start": Command(
+                "order",
+                {"key": b"abc", "mode": "fast", "rates": [20, 30]},
+                reply="ack",
+                starts=True,
+                **told,
+            )
+        },
     )
     the_simulated_sensor_answers(Subject(sensor), "start")

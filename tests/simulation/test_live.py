@@ -1,4 +1,6 @@
-"""Simulated sensors on real lines: as a source of this process, on pseudo terminals, UDP, TCP and in files."""
+"""Simulated sensors on real lines: as a source of this process, on pseudo terminals, UDP, TCP and
+in files.
+"""
 
 from __future__ import annotations
 
@@ -57,7 +59,9 @@ def scans(device: ls.Device, number: int) -> list[ls.Scan]:
     raise AssertionError("the device ended")
 
 
-@pytest.mark.parametrize("name", ["ldrobot-stl27l", "cspc-m1c1-mini", "slamtec-rplidar-a1", "velodyne-vlp16"])
+@pytest.mark.parametrize(
+    "name", ["ldrobot-stl27l", "cspc-m1c1-mini", "slamtec-rplidar-a1", "velodyne-vlp16"]
+)
 def test_a_simulated_sensor_is_a_source_that_needs_no_other_word(name: str) -> None:
     with ls.open(f"sim:{name}?rate=max") as device:
         assert device.sensor.id == name
@@ -75,7 +79,9 @@ def test_a_sensor_that_is_not_started_keeps_silent() -> None:
 
 
 def test_an_rplidar_is_opened_in_the_scan_mode_that_it_is_configured_for() -> None:
-    with ls.open("sim:slamtec-rplidar-a1?rate=max", ls.sensor("slamtec-rplidar-a1").configure(mode=3)) as device:
+    with ls.open(
+        "sim:slamtec-rplidar-a1?rate=max", ls.sensor("slamtec-rplidar-a1").configure(mode=3)
+    ) as device:
         assert scans(device, 2)
         assert set(device.stats.frames) == {"ultra", "ultra_descriptor"}
 
@@ -147,7 +153,11 @@ def test_on_a_serial_port_nothing_is_lost_and_every_command_is_answered(name: st
             found = scans(device, 2)
             assert device.stats.bad_checksum == 0
             assert device.stats.bytes_skipped == device.stats.bytes_filler
-        wanted = [command for command in (*sensor.on_open, *sensor.on_close) if sensor.commands[command].frame]
+        wanted = [
+            command
+            for command in (*sensor.on_open, *sensor.on_close)
+            if sensor.commands[command].frame
+        ]
         until(lambda: port.device.heard == wanted)
     for scan in found:
         assert scan.points.valid.mean() > 0.98
@@ -205,7 +215,10 @@ def test_datagrams_go_to_the_declared_ports_by_their_kind_unless_one_is_named() 
     sensor = dataclasses.replace(vlp(), links={"data": Udp(*ports)})
     with virtual_port(sensor, to="udp://") as port:
         assert port.path == f"udp://127.0.0.1?port={ports[0]},{ports[1]}"
-        assert [{len(receiver.recv(2000)) for _ in range(20)} for receiver in receivers] == [{1206}, {512}]
+        assert [{len(receiver.recv(2000)) for _ in range(20)} for receiver in receivers] == [
+            {1206},
+            {512},
+        ]
     with virtual_port(sensor, to=f"udp://127.0.0.1:{ports[1]}"):
         assert {len(receivers[1].recv(2000)) for _ in range(60)} == {1206, 512}
     for receiver in receivers:
@@ -214,7 +227,10 @@ def test_datagrams_go_to_the_declared_ports_by_their_kind_unless_one_is_named() 
 
 def test_over_udp_all_packets_arrive() -> None:
     number = free_port()
-    with ls.open(f"udp://127.0.0.1:{number}", "robosense-m1") as device, virtual_port("robosense-m1", to=f"udp://127.0.0.1:{number}"):
+    with (
+        ls.open(f"udp://127.0.0.1:{number}", "robosense-m1") as device,
+        virtual_port("robosense-m1", to=f"udp://127.0.0.1:{number}"),
+    ):
         scans(device, 3)
         assert device.stats.lost == 0
 
@@ -248,7 +264,9 @@ def test_over_tcp_several_listen_and_a_slow_one_holds_nobody_up() -> None:
         ("robosense-m1", "pcap", 0.1),
     ],
 )
-def test_a_file_holds_what_the_sensor_would_have_sent(name: str, suffix: str, seconds: float, tmp_path: Path) -> None:
+def test_a_file_holds_what_the_sensor_would_have_sent(
+    name: str, suffix: str, seconds: float, tmp_path: Path
+) -> None:
     path, device = tmp_path / f"made.{suffix}", SimulatedDevice(ls.sensor(name), scene=Room())
     written = write_file(device, path, seconds)
     assert written > 3000
@@ -274,14 +292,33 @@ def test_a_start_command_that_no_program_sends_does_not_silence_a_sensor(tmp_pat
 def test_a_file_with_nothing_in_it_is_an_error_with_the_reason(tmp_path: Path) -> None:
     start = Command("order", {"code": 1}, starts=True)
     stop = Command("order", {"code": 2}, stops=True)
-    slow = sound.sensor(on_open=("start",), simulation=Simulation(sound.sweep, answers={"start": (0.5,)}))
+    slow = sound.sensor(
+        on_open=("start",), simulation=Simulation(sound.sweep, answers={"start": (0.5,)})
+    )
     stopped = sound.sensor(commands={"stop": stop}, on_open=("stop",))
-    mistaken = sound.sensor(commands={"wake": Command("order", {"code": 1}), "start": start}, on_open=("start",))
+    mistaken = sound.sensor(
+        commands={"wake": Command("order", {"code": 1}), "start": start}, on_open=("start",)
+    )
     for device, seconds, error, said in (
-        (SimulatedDevice(slow), 0.1, UsageError, "sends nothing in the first 0.1 s; its next frame is due after 0.5 s"),
-        (SimulatedDevice(stl(), faults=Faults(loss=1.0)), 0.1, UsageError, "data frames were sent, and all of them were lost"),
+        (
+            SimulatedDevice(slow),
+            0.1,
+            UsageError,
+            "sends nothing in the first 0.1 s; its next frame is due after 0.5 s",
+        ),
+        (
+            SimulatedDevice(stl(), faults=Faults(loss=1.0)),
+            0.1,
+            UsageError,
+            "data frames were sent, and all of them were lost",
+        ),
         (SimulatedDevice(stopped), 0.1, SpecError, "nothing starts its data after stop"),
-        (SimulatedDevice(mistaken), 0.1, SpecError, "'start' was sent to it, and it recognized wake"),
+        (
+            SimulatedDevice(mistaken),
+            0.1,
+            SpecError,
+            "'start' was sent to it, and it recognized wake",
+        ),
     ):
         with pytest.raises(error, match=said):
             write_file(device, tmp_path / "empty.bin", seconds)
@@ -339,7 +376,9 @@ def above_1023() -> Iterator[None]:
 
 @posix
 @pytest.mark.usefixtures("above_1023")
-@pytest.mark.parametrize(("name", "to"), [(A1, "pty"), (A1, "tcp://127.0.0.1:0"), ("velodyne-vlp16", "udp")])
+@pytest.mark.parametrize(
+    ("name", "to"), [(A1, "pty"), (A1, "tcp://127.0.0.1:0"), ("velodyne-vlp16", "udp")]
+)
 def test_descriptors_may_have_any_number(name: str, to: str) -> None:
     place = f"udp://127.0.0.1:{free_port()}" if to == "udp" else to
     with virtual_port(name, to=place) as port, ls.open(port.path, name) as device:
@@ -402,7 +441,13 @@ PAGE = (Path(__file__).parents[2] / "docs" / "how-to" / "simulate.md").read_text
 @pytest.mark.slow
 @pytest.mark.parametrize("block", re.findall(r"```python\n(.*?)```", PAGE, flags=re.DOTALL))
 def test_the_programs_on_the_page_run_as_they_stand(block: str) -> None:
-    done = subprocess.run([sys.executable, "-c", block], capture_output=True, text=True, check=False, timeout=10 * TIMEOUT_S)
+    done = subprocess.run(
+        [sys.executable, "-c", block],
+        capture_output=True,
+        text=True,
+        check=False,
+        timeout=10 * TIMEOUT_S,
+    )
     assert done.returncode == 0, done.stderr
 
 

@@ -25,7 +25,8 @@ from tests.shapes import coordinates, count, sized
 
 #: metres by which a point may be off its surface: half a step of the range, and float32.
 EXACT = 2e-6
-#: half of the widest step of each kind of data frame, metres, where it is not in the unit of a field.
+#: half of the widest step of each kind of data frame, metres, where it is not in the unit of a
+#: field.
 STEPS = {"ultra": 0.004, "ultra_dense": 0.0015}
 #: metres of one step where the header says the unit.
 BY_HEADER = 0.004
@@ -38,17 +39,27 @@ SHAPE = count.SENSOR
 
 
 def placed(cloud: ls.PointCloud, packets: int) -> NDArray[np.float64]:
-    """The coordinates of the valid points; those of the last packet are left out, where directions ask for what follows."""
+    """The coordinates of the valid points; those of the last packet are left out, where directions
+    ask for what follows.
+    """
     xyz = np.stack([cloud.x, cloud.y, cloud.z], axis=1)[: len(cloud) - 2 * len(cloud) // packets]
     return xyz[cloud.valid[: len(xyz)]].astype(np.float64)
 
 
 def half_step(sensor: Sensor, frame: str) -> float:
-    """Half a step of the coarsest range field; of coordinates, which are rounded one by one, as far as that can be from a corner."""
+    """Half a step of the coarsest range field; of coordinates, which are rounded one by one, as far
+    as that can be from a corner.
+    """
     if frame in STEPS:
         return STEPS[frame]
-    fields = ls.sensor(sensor.id).decode(b"" if not sensor.datagrams else [], frame).table.schema.fields.values()
-    metres = [info.scale for info in fields if info.unit == "m" and info.axes] or [info.scale for info in fields if info.unit == "m"]
+    fields = (
+        ls.sensor(sensor.id)
+        .decode(b"" if not sensor.datagrams else [], frame)
+        .table.schema.fields.values()
+    )
+    metres = [info.scale for info in fields if info.unit == "m" and info.axes] or [
+        info.scale for info in fields if info.unit == "m"
+    ]
     corner = np.sqrt(3) if sensor.simulation_of(frame).directions else 1
     return float(max(metres, default=BY_HEADER) / 2 * corner)
 
@@ -67,12 +78,20 @@ def streamed(sensor: Sensor, seconds: float, room: Room) -> tuple[list[bytes], S
     return out, device
 
 
-def _seen(sensor: Sensor, frame: str, cloud: ls.PointCloud, room: Room, numbers: range) -> NDArray[np.bool_]:
-    """Which beams meet something that is neither too near nor too far for the sensor, by the width of a hand."""
+def _seen(
+    sensor: Sensor, frame: str, cloud: ls.PointCloud, room: Room, numbers: range
+) -> NDArray[np.bool_]:
+    """Which beams meet something that is neither too near nor too far for the sensor, by the width
+    of a hand.
+    """
     low, high = sensor.range_limits or (0.0, np.inf)
     azimuth, elevation = cloud.azimuth.astype(float), cloud.elevation.astype(float)
-    if (directions := sensor.simulation_of(frame).directions) is not None:  # without a return there are no coordinates to have one
-        pairs = [np.stack(np.broadcast_arrays(*directions(number))).reshape(2, -1) for number in numbers]
+    if (
+        directions := sensor.simulation_of(frame).directions
+    ) is not None:  # without a return there are no coordinates to have one
+        pairs = [
+            np.stack(np.broadcast_arrays(*directions(number))).reshape(2, -1) for number in numbers
+        ]
         declared = np.concatenate(pairs, axis=1)
         azimuth, elevation = np.repeat(declared, len(cloud) // declared.shape[1], axis=1)
     ranges = room.measure(azimuth, elevation)
@@ -115,11 +134,16 @@ def test_every_kind_of_data_frame_of_a_sensor_gives_the_scene_back(name: str) ->
 @pytest.mark.parametrize("name", REPRESENTATIVES)
 def test_the_bytes_of_a_device_decode_to_the_scene_without_a_byte_too_many(name: str) -> None:
     sensor, room = ls.sensor(name), Room()
-    out, device = streamed(sensor, 0.12 if sensor.datagrams else 1.3, room)  # a turn is sent by then
+    out, device = streamed(
+        sensor, 0.12 if sensor.datagrams else 1.3, room
+    )  # a turn is sent by then
     packets = sensor.decode(out if sensor.datagrams else b"".join(out))
     cloud = packets.points()
     assert packets.stats.frames == dict(device.sent)
-    assert packets.stats.bytes_skipped - packets.stats.bytes_filler in (0, 2)  # two stray bytes that a COIN-D4 was seen to send
+    assert packets.stats.bytes_skipped - packets.stats.bytes_filler in (
+        0,
+        2,
+    )  # two stray bytes that a COIN-D4 was seen to send
     assert (packets.stats.lost, packets.stats.plugin_errors) == (0, 0)
     assert off(room, placed(cloud, len(packets))).max() < half_step(sensor, packets.frame) + EXACT
     assert set(np.round(np.sign(np.diff(packets.time_ns))).tolist()) <= {0.0, 1.0}
@@ -140,7 +164,17 @@ def test_beams_begin_where_they_are_said_to() -> None:
     room, origin = Room(), (0.5, -0.25, 0.125)
     azimuth = np.linspace(-np.pi, np.pi, 400, endpoint=False)
     ranges = room.measure(azimuth, np.full(400, 0.1), origin)
-    hits = np.stack([np.cos(0.1) * np.cos(azimuth), np.cos(0.1) * np.sin(azimuth), np.full(400, np.sin(0.1))], axis=1) * ranges[:, None]
+    hits = (
+        np.stack(
+            [
+                np.cos(0.1) * np.cos(azimuth),
+                np.cos(0.1) * np.sin(azimuth),
+                np.full(400, np.sin(0.1)),
+            ],
+            axis=1,
+        )
+        * ranges[:, None]
+    )
     assert off(room, hits + origin).max() < 1e-9
 
 
@@ -156,10 +190,16 @@ def test_somebody_walks() -> None:
 
 
 def test_what_a_device_sees_moves_with_its_own_time() -> None:
-    sensor, scene = ls.sensor("ldrobot-stl27l"), Room(boxes=(), movers=(Mover((0.3, 0.3, 2), ((1.5, -1), (1.5, 1)), speed=1.0, floor=-1),))
+    sensor, scene = (
+        ls.sensor("ldrobot-stl27l"),
+        Room(boxes=(), movers=(Mover((0.3, 0.3, 2), ((1.5, -1), (1.5, 1)), speed=1.0, floor=-1),)),
+    )
     out, _ = streamed(sensor, 2.05, scene)
     whole = [scan.points for scan in sensor.scans(b"".join(out)) if scan.complete]
-    seen = [np.median(points.y[(points.range < 2) & (np.abs(points.y) < 1.3) & (points.x > 1)]) for points in whole]
+    seen = [
+        np.median(points.y[(points.range < 2) & (np.abs(points.y) < 1.3) & (points.x > 1)])
+        for points in whole
+    ]
     assert len(seen) >= 18
     assert np.allclose(np.diff(seen), 0.1, atol=0.03)
 
@@ -184,7 +224,9 @@ def test_the_pace_is_that_of_the_clock_of_the_points_of_the_declaration_or_of_th
         "slamtec-rplidar-a1": 508e-6,  # declared
     }
     for name, seconds in wanted.items():
-        assert simulation(ls.sensor(name), ls.sensor(name).data_frame).interval == pytest.approx(seconds * 1e9, rel=0.01)
+        assert simulation(ls.sensor(name), ls.sensor(name).data_frame).interval == pytest.approx(
+            seconds * 1e9, rel=0.01
+        )
     bare = replace(SHAPE, links={"data": Serial(9600)})
     assert simulation(bare, "data").interval == pytest.approx((9 + 3 * 40) * 10 / 9600 * 1e9)
 
@@ -193,7 +235,13 @@ def test_a_sensor_without_time_on_datagrams_has_to_declare_its_rate() -> None:
     bare = replace(SHAPE, links={"data": Udp(2000)})
     with pytest.raises(SpecError, match="declare its `rate`"):
         SimulatedDevice(bare)
-    paced = replace(bare, frames={**bare.frames, "data": replace(bare.frames["data"], simulation=Simulation(rate=50.0))})
+    paced = replace(
+        bare,
+        frames={
+            **bare.frames,
+            "data": replace(bare.frames["data"], simulation=Simulation(rate=50.0)),
+        },
+    )
     device = SimulatedDevice(paced)
     device.start(0)
     assert sum(len(device.outgoing(now)) for now in range(0, SECOND + 1, SECOND // 100)) == 51
@@ -207,12 +255,16 @@ def test_what_cannot_be_simulated_says_why() -> None:
         simulate(replace(sensor, points=lambda f: Polar(f.samples.distance * 0 + 1, 0)), 1)
     with pytest.raises(SpecError, match="no field makes the range"):
         simulate(replace(sensor, points=lambda f: Polar(1, np.deg2rad(f.first))), 1)
-    with pytest.raises(SpecError, match=r"along Simulation\(directions=\.\.\.\), and none are declared"):
+    with pytest.raises(
+        SpecError, match=r"along Simulation\(directions=\.\.\.\), and none are declared"
+    ):
         simulate(replace(sensor, points=lambda f: Cartesian(f.samples.distance, 0, 0)), 1)
     with pytest.raises(SpecError, match="sweep has to give 'size', which the length"):
         simulate(replace(sized.SENSOR, simulation=Simulation(lambda i: {"angle": 0})), 1)
     with pytest.raises(SpecError, match="with size = 500 there is no frame of at most 99 bytes"):
-        simulate(replace(sized.SENSOR, simulation=Simulation(lambda i: {"angle": 0, "size": 500})), 1)
+        simulate(
+            replace(sized.SENSOR, simulation=Simulation(lambda i: {"angle": 0, "size": 500})), 1
+        )
 
 
 @pytest.mark.parametrize(("stretch", "shift"), [(1, 0.1), (1, -0.02), (1.01, 0.05), (0.98, 0)])
@@ -221,7 +273,11 @@ def test_corrected_ranges_go_back_through_the_correction(stretch: float, shift: 
 
     def corrected(f: Any) -> Polar:
         polar = count.points(f)
-        return Polar(np.where(polar.range > 0, polar.range * stretch + shift, 0), polar.azimuth, intensity=polar.intensity)
+        return Polar(
+            np.where(polar.range > 0, polar.range * stretch + shift, 0),
+            polar.azimuth,
+            intensity=polar.intensity,
+        )
 
     room = Room()
     frames = simulate(replace(SHAPE, points=corrected), 9, scene=room)
@@ -233,7 +289,9 @@ def test_corrected_ranges_go_back_through_the_correction(stretch: float, shift: 
 
 
 @pytest.mark.parametrize("sensor", coordinates.SENSORS, ids=lambda sensor: sensor.id)
-def test_coordinates_give_the_scene_back_along_the_directions_that_are_declared(sensor: Sensor) -> None:
+def test_coordinates_give_the_scene_back_along_the_directions_that_are_declared(
+    sensor: Sensor,
+) -> None:
     room = furnished(3)
     room = Room(room.walls, room.boxes)
     out, device = streamed(sensor, 1.3, room)
@@ -258,8 +316,12 @@ def turned_sensor(directions: Any) -> Sensor:
     """As many beams as the header says."""
     point = Struct(*(axis / Int16sl for axis in "xyz"))
     beam = Struct("first" / point, "second" / point, "light" / Int8ub)
-    sensor = against_construct.sensor(Struct("n" / Int8ub, "step" / Scaled(Int8ub, 0.001, "m"), "beams" / Array(this.n, beam)))
-    simulated = Simulation(lambda i: dict(n=2 + i % 5, step=0.001 * (1 + i % 3)), directions=directions, rate=100)
+    sensor = against_construct.sensor(
+        Struct("n" / Int8ub, "step" / Scaled(Int8ub, 0.001, "m"), "beams" / Array(this.n, beam))
+    )
+    simulated = Simulation(
+        lambda i: dict(n=2 + i % 5, step=0.001 * (1 + i % 3)), directions=directions, rate=100
+    )
     return replace(sensor, points=turned, simulation=simulated)
 
 
@@ -277,10 +339,18 @@ def test_coordinates_are_solved_for_whatever_points_makes_of_the_fields() -> Non
 
 
 def test_directions_that_do_not_fit_and_fields_that_are_not_there_are_named() -> None:
-    with pytest.raises(PluginError, match=r"azimuth and elevation \(9,\) do not broadcast to the points of frame 0, "):
+    with pytest.raises(
+        PluginError,
+        match=r"azimuth and elevation \(9,\) do not broadcast to the points of frame 0, ",
+    ):
         simulate(turned_sensor(lambda i: (np.zeros(9), 0)), 1)
-    with pytest.raises(SpecError, match="no field of a point makes its coordinates: the sensor has to give `encode`"):
-        simulate(replace(turned_sensor(None), points=lambda f: Cartesian(f.beams.light * 0 + 1, 2, 3)), 1)
+    with pytest.raises(
+        SpecError,
+        match="no field of a point makes its coordinates: the sensor has to give `encode`",
+    ):
+        simulate(
+            replace(turned_sensor(None), points=lambda f: Cartesian(f.beams.light * 0 + 1, 2, 3)), 1
+        )
 
 
 def test_a_beam_that_meets_nothing_in_reach_has_no_coordinates() -> None:
@@ -308,7 +378,9 @@ def test_a_frame_may_encode_its_ranges_itself() -> None:
     sensor = SHAPE
     frame: Frame = replace(sensor.frames["data"], simulation=Simulation(encode=encode))
     thirds = replace(sensor, frames={**sensor.frames, "data": frame})
-    plain, third = (s.decode(b"".join(simulate(s, 20)))["samples.distance"] for s in (sensor, thirds))
+    plain, third = (
+        s.decode(b"".join(simulate(s, 20)))["samples.distance"] for s in (sensor, thirds)
+    )
     assert np.abs(third * 3 - plain).max() < 0.003
     assert plain.max() > 1
 
@@ -330,7 +402,9 @@ def test_a_scene_can_be_a_small_file(tmp_path: Path) -> None:
     path = tmp_path / "hall.toml"
     path.write_text(GOOD)
     walker = Mover((0.4, 0.5, 1.7), ((1.4, -1.5), (0.8, 1.9)))
-    assert read_scene(path) == Room(Room().walls, (Box((2.0, 0.8, -1.2), (2.7, 1.6, 0.9)),), (walker,))
+    assert read_scene(path) == Room(
+        Room().walls, (Box((2.0, 0.8, -1.2), (2.7, 1.6, 0.9)),), (walker,)
+    )
     assert scene_of({}) == Room(None, ())
 
 
@@ -339,20 +413,34 @@ def test_a_scene_can_be_a_small_file(tmp_path: Path) -> None:
     [
         ("[room]", "[rom]", "unknown key 'rom'; did you mean 'room'"),
         ("[[box]]", "[box]", r"box: tables in double brackets, \[\[box\]\]"),
-        ("high = [2.7, 1.6, 0.9]", "hihg = [2.7, 1.6, 0.9]", r"box\[0\]: unknown key 'hihg'; did you mean 'high'"),
+        (
+            "high = [2.7, 1.6, 0.9]",
+            "hihg = [2.7, 1.6, 0.9]",
+            r"box\[0\]: unknown key 'hihg'; did you mean 'high'",
+        ),
         ("high = [2.7, 1.6, 0.9]", "high = [2.7, 1.6]", r"box\[0\].high: 3 numbers"),
         ("high = [2.7, 1.6, 0.9]", "high = [2.7, 1.6, -2]", r"box\[0\]: every number of high"),
         ("high = [4.6, 3.1, 1.6]", "high = [-1, 3.1, 1.6]", "room: the sensor, at"),
         ("size = [0.4, 0.5, 1.7]", "size = [0.4, 'a', 1.7]", r"mover\[0\].size: a number, not 'a'"),
         ("size = [0.4, 0.5, 1.7]", "size = [0.4, 0, 1.7]", r"mover\[0\].size: numbers above 0"),
-        ("path = [[1.4, -1.5], [0.8, 1.9]]", "path = [[1.4, -1.5]]", r"mover\[0\].path: two places"),
-        ("path = [[1.4, -1.5], [0.8, 1.9]]", "path = [[1, 1], [1, 1]]", r"mover\[0\].path: it leads nowhere"),
+        (
+            "path = [[1.4, -1.5], [0.8, 1.9]]",
+            "path = [[1.4, -1.5]]",
+            r"mover\[0\].path: two places",
+        ),
+        (
+            "path = [[1.4, -1.5], [0.8, 1.9]]",
+            "path = [[1, 1], [1, 1]]",
+            r"mover\[0\].path: it leads nowhere",
+        ),
         ("path = [[1.4, -1.5], [0.8, 1.9]]", "path = [[1, 1], [2]]", r"path\[1\]: 2 numbers"),
         ("[room]", "[room", "line 2"),
         ("low = [-3, -2.2, -1.2]", "low = [-3, -2.2, nan]", "room.low: a number, not nan"),
     ],
 )
-def test_a_mistake_in_a_scene_is_named_by_its_key(tmp_path: Path, old: str, new: str, said: str) -> None:
+def test_a_mistake_in_a_scene_is_named_by_its_key(
+    tmp_path: Path, old: str, new: str, said: str
+) -> None:
     path = tmp_path / "hall.toml"
     assert old in GOOD
     path.write_text(GOOD.replace(old, new, 1))
@@ -360,7 +448,16 @@ def test_a_mistake_in_a_scene_is_named_by_its_key(tmp_path: Path, old: str, new:
         read_scene(path)
 
 
-@pytest.mark.parametrize("text", [b"x = " + b"[" * 10_000, b"a." * 30_000 + b"b = 1", b"x = " + b"9" * 5000, b"\xff", b"#" * (1 << 19)])
+@pytest.mark.parametrize(
+    "text",
+    [
+        b"x = " + b"[" * 10_000,
+        b"a." * 30_000 + b"b = 1",
+        b"x = " + b"9" * 5000,
+        b"\xff",
+        b"#" * (1 << 19),
+    ],
+)
 def test_what_is_no_scene_is_a_fault_of_its_file(text: bytes, tmp_path: Path) -> None:
     (path := tmp_path / "strange.toml").write_bytes(text)
     with pytest.raises(UsageError, match=r"strange\.toml: not TOML: "):
@@ -376,10 +473,14 @@ def test_a_scene_that_cannot_be_read_is_the_systems_fault(tmp_path: Path) -> Non
 
 
 def test_an_intensity_that_sweep_gives_stays() -> None:
-    frame = Struct("points" / Array(3, Struct("distance" / Scaled(Int8ub, 0.05, "m"), "intensity" / Int8ub)))
+    frame = Struct(
+        "points" / Array(3, Struct("distance" / Scaled(Int8ub, 0.05, "m"), "intensity" / Int8ub))
+    )
     made = replace(
         against_construct.sensor(frame),
-        points=lambda f: Polar(range=f.points.distance, azimuth=np.arange(3), intensity=f.points.intensity),
+        points=lambda f: Polar(
+            range=f.points.distance, azimuth=np.arange(3), intensity=f.points.intensity
+        ),
         simulation=Simulation(lambda i: {"points.intensity": [7, 8, 9]}, rate=10),
     )
     assert made.decode(simulate(made, 2)).points().intensity.tolist() == [7, 8, 9] * 2

@@ -1,4 +1,6 @@
-"""`make soak`: every promise held and measured, and the table of the figures, written into docs/explanation/reliability.md."""
+"""`make soak`: every promise held and measured, and the table of the figures, written into
+docs/explanation/reliability.md.
+"""
 
 from __future__ import annotations
 
@@ -27,10 +29,23 @@ def arguments() -> argparse.Namespace:
     """The command line."""
     parser = argparse.ArgumentParser(prog="make soak", description=__doc__)
     parser.add_argument(
-        "--only", metavar="NAME", action="append", help="these promises alone, such as P3; the table is printed and not written"
+        "--only",
+        metavar="NAME",
+        action="append",
+        help="these promises alone, such as P3; the table is printed and not written",
     )
-    parser.add_argument("--share", metavar="SHARE", type=float, default=1.0, help="of the full effort, up to 1; the table says it")
-    parser.add_argument("--no-tests", action="store_true", help="measure alone, and run no tests; the table says what was not run")
+    parser.add_argument(
+        "--share",
+        metavar="SHARE",
+        type=float,
+        default=1.0,
+        help="of the full effort, up to 1; the table says it",
+    )
+    parser.add_argument(
+        "--no-tests",
+        action="store_true",
+        help="measure alone, and run no tests; the table says what was not run",
+    )
     return parser.parse_args()
 
 
@@ -59,30 +74,75 @@ def held(promise: Promise, share: float, *, tests: bool = True) -> Figure:
             parts.append(promise.measured(share))
         except Exception as error:
             traceback.print_exc()
-            parts.append(Figure(f"could not be measured: {type(error).__name__}: {error}"[:200], False))
-    return Figure("; ".join(part.words for part in parts if part.words) or "not run", all(part.kept for part in parts))
+            parts.append(
+                Figure(f"could not be measured: {type(error).__name__}: {error}"[:200], False)
+            )
+    return Figure(
+        "; ".join(part.words for part in parts if part.words) or "not run",
+        all(part.kept for part in parts),
+    )
 
 
 def ran(promise: Promise, *, long: bool) -> Figure:
     """What the tests of a promise say: their number, and what they show where all of them pass."""
     with tempfile.TemporaryDirectory() as folder:
         report = Path(folder, "report.xml")
-        words = [sys.executable, "-m", "pytest", "-p", "no:cacheprovider", "-n", "2", f"--junitxml={report}", *promise.tests]
-        subprocess.run([*words, *(["-m", "soak or not soak"] if long else [])], cwd=ROOT, stdout=subprocess.DEVNULL, check=False)
+        words = [
+            sys.executable,
+            "-m",
+            "pytest",
+            "-p",
+            "no:cacheprovider",
+            "-n",
+            "2",
+            f"--junitxml={report}",
+            *promise.tests,
+        ]
+        subprocess.run(
+            [*words, *(["-m", "soak or not soak"] if long else [])],
+            cwd=ROOT,
+            stdout=subprocess.DEVNULL,
+            check=False,
+        )
         cases = list(xml.parse(report).getroot().iter("testcase")) if report.is_file() else []
-    failed = [str(case.get("name")) for case in cases if case.find("failure") is not None or case.find("error") is not None]
+    failed = [
+        str(case.get("name"))
+        for case in cases
+        if case.find("failure") is not None or case.find("error") is not None
+    ]
     passed = len(cases) - len(failed) - sum(case.find("skipped") is not None for case in cases)
     if failed or not passed:
         return Figure(f"{len(failed)} of {len(cases)} tests fail: {', '.join(failed[:3])}", False)
-    return Figure("; ".join(part for part in (promise.told if long else "", f"{passed} tests") if part), True)
+    return Figure(
+        "; ".join(part for part in (promise.told if long else "", f"{passed} tests") if part), True
+    )
 
 
 def table(figures: dict[Promise, Figure], seconds: float, effort: str = "") -> str:
-    """The table, with the day, the version, the kind of machine, and the effort where it was not the full one."""
-    day, machine = datetime.date.today().isoformat(), f"{os.cpu_count()} cores, {platform.machine()}, {platform.system()}"
-    what = f"{day}, lidarspec {lidarspec.__version__}, Python {platform.python_version()}, {machine}; {seconds / 60:.0f} minutes{effort}."
-    rows = [[promise.name, promise.words, figure.words.replace("|", "/"), verdict(figure)] for promise, figure in figures.items()]
-    return "\n".join([what, "", "| | promise | today | kept |", "|---|---|---|---|", *(f"| {' | '.join(row)} |" for row in rows)])
+    """The table, with the day, the version, the kind of machine, and the effort where it was not
+    the full one.
+    """
+    day, machine = (
+        datetime.date.today().isoformat(),
+        f"{os.cpu_count()} cores, {platform.machine()}, {platform.system()}",
+    )
+    what = (
+        f"{day}, lidarspec {lidarspec.__version__}, Python {platform.python_version()}, {machine};"
+        f" {seconds / 60:.0f} minutes{effort}."
+    )
+    rows = [
+        [promise.name, promise.words, figure.words.replace("|", "/"), verdict(figure)]
+        for promise, figure in figures.items()
+    ]
+    return "\n".join(
+        [
+            what,
+            "",
+            "| | promise | today | kept |",
+            "|---|---|---|---|",
+            *(f"| {' | '.join(row)} |" for row in rows),
+        ]
+    )
 
 
 def verdict(figure: Figure) -> str:
@@ -93,7 +153,9 @@ def verdict(figure: Figure) -> str:
 def written(text: str) -> None:
     """Put the table into the page, between its marks."""
     page = PAGE.read_text(encoding="utf-8")
-    found = re.sub(f"{BEGIN}.*{END}", lambda _: f"{BEGIN}\n\n{text}\n\n{END}", page, flags=re.DOTALL)
+    found = re.sub(
+        f"{BEGIN}.*{END}", lambda _: f"{BEGIN}\n\n{text}\n\n{END}", page, flags=re.DOTALL
+    )
     PAGE.write_text(found, encoding="utf-8")
     print(f"written into {PAGE.relative_to(ROOT)}")
 

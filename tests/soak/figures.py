@@ -1,4 +1,6 @@
-"""What is measured of a promise, as functions that return it in words and whether it is as good as promised."""
+"""What is measured of a promise, as functions that return it in words and whether it is as good as
+promised.
+"""
 
 from __future__ import annotations
 
@@ -75,7 +77,11 @@ def splits(share: float) -> Figure:
                 books.feed(part)
             tried += 1
             differing += books.finish() != whole or books.decoder.stats != stats
-    return Figure(f"{tried:,} splits of the streams of {len(streams())} sensors and shapes: {differing} differ", not differing)
+    return Figure(
+        f"{tried:,} splits of the streams of {len(streams())} sensors and shapes: {differing}"
+        " differ",
+        not differing,
+    )
 
 
 def recovered(share: float) -> Figure:
@@ -86,8 +92,16 @@ def recovered(share: float) -> Figure:
         for rate, burst in itertools.product(RATES, BURSTS) if share == 1 else [(1e-3, 1)]:
             noisy = damaged(data, rate, seed, burst=burst)
             found, wanted = set(decoded(sensor, noisy)), set(Oracle(sensor, noisy).frames())
-            frames, missed, extra = frames + len(wanted), missed + len(wanted - found), extra + len(found - wanted)
-    return Figure(f"{frames:,} frames in damaged streams, by brute force: {missed} missed, {extra} found besides", not missed + extra)
+            frames, missed, extra = (
+                frames + len(wanted),
+                missed + len(wanted - found),
+                extra + len(found - wanted),
+            )
+    return Figure(
+        f"{frames:,} frames in damaged streams, by brute force: {missed} missed, {extra} found"
+        " besides",
+        not missed + extra,
+    )
 
 
 def documented(share: float) -> Figure:
@@ -95,17 +109,36 @@ def documented(share: float) -> Figure:
     number = int(400_000 * share) + 300
     only = [] if share >= 0.1 else ["--only", "hex", "--only", "recording"]
     with tempfile.TemporaryDirectory() as folder:
-        words = [sys.executable, "-m", "tests.fuzz", "--engine", "seeded", "--inputs", str(number), "--folder", folder, *only]
+        words = [
+            sys.executable,
+            "-m",
+            "tests.fuzz",
+            "--engine",
+            "seeded",
+            "--inputs",
+            str(number),
+            "--folder",
+            folder,
+            *only,
+        ]
         done = subprocess.run(words, cwd=ROOT, capture_output=True, text=True, check=False)
-    found = next((line.split() for line in done.stdout.splitlines() if line.startswith("all ")), ["all", "0", "0", "0", "1"])
+    found = next(
+        (line.split() for line in done.stdout.splitlines() if line.startswith("all ")),
+        ["all", "0", "0", "0", "1"],
+    )
     names = sorted(
         {
             place.partition(":")[0]
-            for place in re.findall(r"^(?!make)\w[^:\n]*: \S+:\d+$", done.stdout.rpartition("\nall ")[2], re.MULTILINE)
+            for place in re.findall(
+                r"^(?!make)\w[^:\n]*: \S+:\d+$", done.stdout.rpartition("\nall ")[2], re.MULTILINE
+            )
         }
     )
     where = f" ({', '.join(names)})" if names else ""
-    return Figure(f"{int(found[1]):,} hostile inputs of `make fuzz`: {found[-1]} findings{where}", done.returncode == 0)
+    return Figure(
+        f"{int(found[1]):,} hostile inputs of `make fuzz`: {found[-1]} findings{where}",
+        done.returncode == 0,
+    )
 
 
 def bounded(share: float) -> Figure:
@@ -116,7 +149,10 @@ def bounded(share: float) -> Figure:
         fed(sensor, data, chunk=1 << 16)  # what is made once, and for all decoders
         held[name] = peak(lambda sensor=sensor: fed(sensor, data, size, 1 << 16))
     most = max(held, key=lambda name: held[name])
-    return Figure(f"{size} MB of garbage: at most {held[most] / 1e3:,.0f} kB held ({most})", held[most] < 1 << 20)
+    return Figure(
+        f"{size} MB of garbage: at most {held[most] / 1e3:,.0f} kB held ({most})",
+        held[most] < 1 << 20,
+    )
 
 
 def linear(share: float) -> Figure:
@@ -124,10 +160,16 @@ def linear(share: float) -> Figure:
     length, ratios = int(400_000 * share) + 20_000, {}
     for name, sensor in few(installed(streams()), share):
         for what, data in (("garbage", garbage(length)), ("worst stream", worst(sensor, length))):
-            half, whole = (min(seconds(sensor, data[:size]) for _ in range(5)) for size in (length // 2, length))
+            half, whole = (
+                min(seconds(sensor, data[:size]) for _ in range(5))
+                for size in (length // 2, length)
+            )
             ratios[f"{name}, {what}"] = whole / max(half, 1e-3)
     most = max(ratios, key=lambda name: ratios[name])
-    return Figure(f"twice the bytes take at most {ratios[most]:.2f} times as long ({most})", ratios[most] <= 2.5)
+    return Figure(
+        f"twice the bytes take at most {ratios[most]:.2f} times as long ({most})",
+        ratios[most] <= 2.5,
+    )
 
 
 def delay(share: float) -> Figure:
@@ -135,12 +177,19 @@ def delay(share: float) -> Figure:
     worst_share = 0.0
     for _, sensor in few(streams(), share):
         data = Subject(sensor).stream(rounds=3)[: int(20_000 * share) + 3000]
-        bound = max(frame.max_length * frame.confirm for frame in sensor.frames.values() if frame.direction == "in")
+        bound = max(
+            frame.max_length * frame.confirm
+            for frame in sensor.frames.values()
+            if frame.direction == "in"
+        )
         decoder = sensor.decoder()
         for spot in range(len(data)):
             for found in decoder.feed(data[spot : spot + 1]):
                 worst_share = max(worst_share, (spot + 1 - found.offset - len(found.data)) / bound)
-    return Figure(f"a frame is out {worst_share:.2f} longest frames after its last byte, or earlier", worst_share < 1)
+    return Figure(
+        f"a frame is out {worst_share:.2f} longest frames after its last byte, or earlier",
+        worst_share < 1,
+    )
 
 
 def round_trips(share: float) -> Figure:
@@ -151,10 +200,15 @@ def round_trips(share: float) -> Figure:
         until_then = time.monotonic() + 3 * share + 0.01
         for seed in range(10_000):
             data = sensor.example(kind, seed=seed)
-            tried, lost = tried + 1, lost + (sensor.build(kind, sensor.parse(data, frame=kind)) != data)
+            tried, lost = (
+                tried + 1,
+                lost + (sensor.build(kind, sensor.parse(data, frame=kind)) != data),
+            )
             if time.monotonic() > until_then:
                 break
-    return Figure(f"{tried:,} frames of {len(frames)} types: {lost} come back as other bytes", not lost)
+    return Figure(
+        f"{tried:,} frames of {len(frames)} types: {lost} come back as other bytes", not lost
+    )
 
 
 def in_any_order(share: float) -> Figure:
@@ -171,14 +225,25 @@ def in_any_order(share: float) -> Figure:
         )
         if not is_same:
             differing.append(name)
-    words = f"{len(few(sensors, share))} sensors, 1,000 packets each, 10 % of them doubled, every one displaced by up to 3 places: "
-    return Figure(words + (f"other scans of {', '.join(differing)}" if differing else "the scans are the same"), not differing)
+    words = (
+        f"{len(few(sensors, share))} sensors, 1,000 packets each, 10 % of them doubled, every one"
+        " displaced by up to 3 places: "
+    )
+    return Figure(
+        words
+        + (f"other scans of {', '.join(differing)}" if differing else "the scans are the same"),
+        not differing,
+    )
 
 
 def whole(sensor: Sensor, frames: Sequence[bytes]) -> list[Scan]:
     """The complete scans of some frames."""
     with warnings.catch_warnings(action="ignore"):
-        return [scan for scan in sensor.scans(frames if sensor.datagrams else b"".join(frames)) if scan.complete]
+        return [
+            scan
+            for scan in sensor.scans(frames if sensor.datagrams else b"".join(frames))
+            if scan.complete
+        ]
 
 
 def blocked(share: float) -> Figure:
@@ -186,7 +251,10 @@ def blocked(share: float) -> Figure:
     told, kept = [], True
     cases: list[tuple[str, Callable[[Any], object]]] = [
         ("ldrobot-ld06", lambda frame: frame.update({"start_angle": 9000, "end_angle": 9000})),
-        ("velodyne-vlp16", lambda frame: [block.update({"azimuth": 9000}) for block in frame.blocks]),
+        (
+            "velodyne-vlp16",
+            lambda frame: [block.update({"azimuth": 9000}) for block in frame.blocks],
+        ),
     ]
     for name, stop in cases:
         sensor, frames = ls.sensor(name), []
@@ -197,7 +265,10 @@ def blocked(share: float) -> Figure:
         with warnings.catch_warnings(action="ignore"):
             scans = list(sensor.scans(frames if sensor.datagrams else b"".join(frames)))
         packets = len(frames) / max(len(scans), 1)
-        told.append(f"{name}: {len(scans)} scans of {len(frames)} packets, {sum(scan.complete for scan in scans)} said to be complete")
+        told.append(
+            f"{name}: {len(scans)} scans of {len(frames)} packets,"
+            f" {sum(scan.complete for scan in scans)} said to be complete"
+        )
         kept &= len(scans) > 1 and packets < 500 and not any(scan.complete for scan in scans)
     return Figure("rotor blocked, " + "; ".join(told), kept)
 
@@ -211,7 +282,9 @@ OTHER_LINE_RATE = 1e6
 
 
 def slowest(share: float) -> Figure:
-    """P20: the worst of many hostile streams, against the line's rate; and the memory kept for each byte of frames in turn."""
+    """P20: the worst of many hostile streams, against the line's rate; and the memory kept for each
+    byte of frames in turn.
+    """
     rates = {}
     held = {}
     fastest = line_rates()
@@ -263,13 +336,17 @@ def _frames_key(sensor: Sensor) -> Hashable:
 
 
 def strangers(share: float) -> Figure:
-    """P21: valid frames and calibration frames of another address among those of the sensor, while it is recorded."""
+    """P21: valid frames and calibration frames of another address among those of the sensor, while
+    it is recorded.
+    """
     sensor, number = ls.sensor("robosense-helios16p"), int(300 * share) + 50
     frames, port = simulate(sensor, number), free_port()
     others = [frames[0], sensor.example("difop", seed=9)]
     with contextlib.ExitStack() as stack:
         path = Path(stack.enter_context(tempfile.TemporaryDirectory()), "all.lsr")
-        own, other = (stack.enter_context(socket.socket(socket.AF_INET, socket.SOCK_DGRAM)) for _ in range(2))
+        own, other = (
+            stack.enter_context(socket.socket(socket.AF_INET, socket.SOCK_DGRAM)) for _ in range(2)
+        )
         own.bind(("127.0.0.1", 0))
         other.bind(("127.0.0.2", 0))
         device = stack.enter_context(ls.open(f"udp://127.0.0.1:{port}", sensor, record=path))
@@ -288,19 +365,24 @@ def strangers(share: float) -> Figure:
             return Figure(f"the session ended: {error}"[:160], False)
         foreign = device.stats.foreign
     return Figure(
-        f"{number - 1} frames of a stranger among {number}: {points} read, {foreign} counted as foreign",
+        f"{number - 1} frames of a stranger among {number}: {points} read, {foreign} counted as"
+        " foreign",
         (points, foreign) == (number, number - 1),
     )
 
 
 def nothing_runs(share: float) -> Figure:
-    """P22: a settings file in a parent folder that names Python, and recordings whose header names a descriptor or a file."""
+    """P22: a settings file in a parent folder that names Python, and recordings whose header names
+    a descriptor or a file.
+    """
     with tempfile.TemporaryDirectory() as place:
         folder, home = Path(place, "project", "below"), Path(place, "home")
         folder.mkdir(parents=True)
         home.mkdir()
         (folder.parent / "evil.py").write_text(f"open({str(Path(place, 'ran'))!r}, 'w').close()\n")
-        (folder.parent / "lidarspec.toml").write_text('[device.front]\nsource = "x.bin"\nsensor = "./evil.py"\n')
+        (folder.parent / "lidarspec.toml").write_text(
+            '[device.front]\nsource = "x.bin"\nsensor = "./evil.py"\n'
+        )
         frame = ls.sensor("hesai-xt16").example("data")
         for index, value in enumerate((0, "angles.csv", "/etc/passwd", "../x")):
             header = Header("hesai-xt16", {"calibration": value}, datagrams=True).to_json()
@@ -310,10 +392,25 @@ def nothing_runs(share: float) -> Figure:
         for source in ("front", "0.lsr", "1.lsr", "2.lsr", "3.lsr"):
             words = [sys.executable, "-c", TRIED, source]
             environment = {**os.environ, "XDG_CONFIG_HOME": str(home), "PYTHONPATH": str(ROOT)}
-            done = subprocess.run(words, input="of the terminal", cwd=folder, env=environment, capture_output=True, text=True, check=False)
-            opened += json.loads(done.stdout.splitlines()[-1])["left"] != "of the terminal" if done.stdout else 1
+            done = subprocess.run(
+                words,
+                input="of the terminal",
+                cwd=folder,
+                env=environment,
+                capture_output=True,
+                text=True,
+                check=False,
+            )
+            opened += (
+                json.loads(done.stdout.splitlines()[-1])["left"] != "of the terminal"
+                if done.stdout
+                else 1
+            )
         ran = Path(place, "ran").exists()
-    words = f"5 files of others: {'Python ran' if ran else 'no Python ran'}, {opened} read a descriptor or failed"
+    words = (
+        f"5 files of others: {'Python ran' if ran else 'no Python ran'}, {opened} read a descriptor"
+        " or failed"
+    )
     return Figure(words, not ran and not opened)
 
 
@@ -336,8 +433,15 @@ def complete(share: float) -> Figure:
         sensor = ls.sensor(name)
         frames = simulate(sensor, 3000)
         left = frames[:1400] + frames[1400 + number :]
-        lost, before, after = sensor.decode(left).stats.lost, len(whole(sensor, frames)), len(whole(sensor, left))
-        told.append(f"{name} without {number} packets: lost {lost}, {before - after} scans fewer are complete")
+        lost, before, after = (
+            sensor.decode(left).stats.lost,
+            len(whole(sensor, frames)),
+            len(whole(sensor, left)),
+        )
+        told.append(
+            f"{name} without {number} packets: lost {lost}, {before - after} scans fewer are"
+            " complete"
+        )
         kept &= abs(lost - number) <= 1 and after < before
     return Figure("; ".join(told), kept)
 
@@ -349,20 +453,44 @@ def not_in_silence(share: float) -> Figure:
     cases = {
         "cut.pcap": (made.pcap(*map(made.frame, velodyne))[:-40], "velodyne-vlp16", 0),
         "damaged.pcap": (
-            made.section() + made.interface() + b"".join([*blocks[:2], blocks[2][:-4] + bytes(4), *blocks[2:]]),
+            made.section()
+            + made.interface()
+            + b"".join([*blocks[:2], blocks[2][:-4] + bytes(4), *blocks[2:]]),
             "velodyne-vlp16",
             1,
         ),
-        "guessed.pcap": (made.pcap(*map(made.frame, simulate(ls.sensor("hesai-xt32"), 300))), "hesai-xt32", 0),
+        "guessed.pcap": (
+            made.pcap(*map(made.frame, simulate(ls.sensor("hesai-xt32"), 300))),
+            "hesai-xt32",
+            0,
+        ),
     }
     silent = []
     with tempfile.TemporaryDirectory() as folder:
         for name, (data, sensor, code) in cases.items():
             Path(folder, name).write_bytes(data)
-            words = [sys.executable, "-m", "lidarspec", "convert", name, "out.csv", "-s", sensor, "--force"]
+            words = [
+                sys.executable,
+                "-m",
+                "lidarspec",
+                "convert",
+                name,
+                "out.csv",
+                "-s",
+                sensor,
+                "--force",
+            ]
             done = subprocess.run(words, cwd=folder, capture_output=True, text=True, check=False)
-            silent += [] if done.returncode == code and done.stderr else [f"{name} (exit code {done.returncode})"]
-    return Figure(f"{len(cases)} files, cut off, damaged, and with guessed angles: {', '.join(silent) or 'each said'}", not silent)
+            silent += (
+                []
+                if done.returncode == code and done.stderr
+                else [f"{name} (exit code {done.returncode})"]
+            )
+    return Figure(
+        f"{len(cases)} files, cut off, damaged, and with guessed angles:"
+        f" {', '.join(silent) or 'each said'}",
+        not silent,
+    )
 
 
 def few(sensors: dict[str, Sensor], share: float) -> list[tuple[str, Sensor]]:

@@ -1,4 +1,6 @@
-"""The promises: what is said, the tests that hold it, the long ones among them too, and what is measured besides."""
+"""The promises: what is said, the tests that hold it, the long ones among them too, and what is
+measured besides.
+"""
 
 from __future__ import annotations
 
@@ -28,7 +30,11 @@ class Promise:
     measured: Callable[[float], Figure] | None = None
 
 
-RULE, LIMITS, PROMISES = "tests/engine/test_framing_rule.py", "tests/engine/test_limits.py", "tests/engine/test_promises.py"
+RULE, LIMITS, PROMISES = (
+    "tests/engine/test_framing_rule.py",
+    "tests/engine/test_limits.py",
+    "tests/engine/test_promises.py",
+)
 RECORDINGS, DEVICE = "tests/recording/test_recordings.py", "tests/device/test_device.py"
 HOSTILE = "tests/captures/test_pcap_hostile.py"
 CONTINUITY = "tests/packets/test_continuity.py"
@@ -38,8 +44,16 @@ SCANS = "tests/scans/test_scans.py"
 EVERY = (
     Promise("P1", "any split of a stream gives the same result", (RULE,), "", figures.splits),
     Promise("P2", "every recoverable frame is recovered", (RULE,), "", figures.recovered),
-    Promise("P3", "only documented exceptions", ("tests/engine/test_hostile_input.py", "tests/fuzz"), "", figures.documented),
-    Promise("P4", "memory is bounded: under 1 MiB for 50 MB of garbage", (LIMITS,), "", figures.bounded),
+    Promise(
+        "P3",
+        "only documented exceptions",
+        ("tests/engine/test_hostile_input.py", "tests/fuzz"),
+        "",
+        figures.documented,
+    ),
+    Promise(
+        "P4", "memory is bounded: under 1 MiB for 50 MB of garbage", (LIMITS,), "", figures.bounded
+    ),
     Promise(
         "P5",
         "time grows with the input and no faster: at most 2.5 times for twice",
@@ -47,21 +61,36 @@ EVERY = (
         "",
         figures.linear,
     ),
-    Promise("P6", "a frame is out before one longest frame more has come", (LIMITS,), "", figures.delay),
-    Promise("P7", "exact round trip", ("tests/testing/test_conformance.py",), "", figures.round_trips),
+    Promise(
+        "P6", "a frame is out before one longest frame more has come", (LIMITS,), "", figures.delay
+    ),
+    Promise(
+        "P7", "exact round trip", ("tests/testing/test_conformance.py",), "", figures.round_trips
+    ),
     Promise(
         "P8",
         "a recording survives kill -9 at any byte",
         (f"{RECORDINGS}",),
         "killed 100 times: no acknowledged record lost; cut at every byte",
     ),
-    Promise("P9", "replay is bit-exact", (f"{PROMISES}::TestReplay", "tests/recording/test_replay.py"), "the same SHA-256 at every speed"),
-    Promise("P10", "survives unplug and replug", (f"{DEVICE}",), "unplugged 100 times: no frame spliced, no descriptor or thread left"),
+    Promise(
+        "P9",
+        "replay is bit-exact",
+        (f"{PROMISES}::TestReplay", "tests/recording/test_replay.py"),
+        "the same SHA-256 at every speed",
+    ),
+    Promise(
+        "P10",
+        "survives unplug and replug",
+        (f"{DEVICE}",),
+        "unplugged 100 times: no frame spliced, no descriptor or thread left",
+    ),
     Promise(
         "P11",
         "UDP at full rate without loss",
         ("tests/device/test_rates.py",),
-        "378,000 datagrams in 60 s, in bursts beside a thread that computes and stalls of 250 ms: 0 lost",
+        "378,000 datagrams in 60 s, in bursts beside a thread that computes and stalls of 250 ms: 0"
+        " lost",
     ),
     Promise(
         "P12",
@@ -70,13 +99,17 @@ EVERY = (
         "1,000,000 chunks, both policies: produced = consumed + dropped",
     ),
     Promise(
-        "P13", "a broken plugin is isolated", ("tests/plugins/test_plugins.py",), "each kind of broken plugin is named, the others work"
+        "P13",
+        "a broken plugin is isolated",
+        ("tests/plugins/test_plugins.py",),
+        "each kind of broken plugin is named, the others work",
     ),
     Promise(
         "P14",
         "hostile captures take no memory, and move on or stop",
         (HOSTILE, "tests/captures/test_memory.py"),
-        "20,000 mutations of each format: no exception but SourceError; a capture of 1 GB below 200 MB",
+        "20,000 mutations of each format: no exception but SourceError; a capture of 1 GB below"
+        " 200 MB",
     ),
     Promise(
         "P15",
@@ -90,20 +123,60 @@ EVERY = (
         (f"{PROMISES}::TestClocks", "tests/packets/test_clocks.py"),
         "100 turns of 30 s, an hour, and 16 bits, late packets among them: exact",
     ),
-    Promise("P17", "late, doubled and reordered packets give the same scan", (CONTINUITY, REORDER, SCANS), "", figures.in_any_order),
-    Promise("P18", "decoders are independent", ("tests/framing/test_framing.py",), "in turn, and in 8 threads: as alone"),
+    Promise(
+        "P17",
+        "late, doubled and reordered packets give the same scan",
+        (CONTINUITY, REORDER, SCANS),
+        "",
+        figures.in_any_order,
+    ),
+    Promise(
+        "P18",
+        "decoders are independent",
+        ("tests/framing/test_framing.py",),
+        "in turn, and in 8 threads: as alone",
+    ),
     Promise("P19", "a scan always ends", (SCANS,), "", figures.blocked),
-    Promise("P20", "no stream is slower than its line: 10 times its rate, under 64 bytes kept for each", (RULE,), "", figures.slowest),
-    Promise("P21", "strangers do not disturb", (DEVICE, "tests/device/test_source_recording.py"), "", figures.strangers),
+    Promise(
+        "P20",
+        "no stream is slower than its line: 10 times its rate, under 64 bytes kept for each",
+        (RULE,),
+        "",
+        figures.slowest,
+    ),
+    Promise(
+        "P21",
+        "strangers do not disturb",
+        (DEVICE, "tests/device/test_source_recording.py"),
+        "",
+        figures.strangers,
+    ),
     Promise(
         "P22",
         "other people's files run nothing",
-        ("tests/device/test_settings.py", RECORDINGS, "tests/points/test_kernel_cache.py", "tests/plugins/test_installed.py"),
+        (
+            "tests/device/test_settings.py",
+            RECORDINGS,
+            "tests/points/test_kernel_cache.py",
+            "tests/plugins/test_installed.py",
+        ),
         "",
         figures.nothing_runs,
     ),
-    Promise("P23", "complete means complete, lost is what was lost", (CONTINUITY, SCANS), "", figures.complete),
-    Promise("P24", "nothing is lost in silence", ("tests/cli/test_captures.py", "tests/cli/test_terminal.py"), "", figures.not_in_silence),
+    Promise(
+        "P23",
+        "complete means complete, lost is what was lost",
+        (CONTINUITY, SCANS),
+        "",
+        figures.complete,
+    ),
+    Promise(
+        "P24",
+        "nothing is lost in silence",
+        ("tests/cli/test_captures.py", "tests/cli/test_terminal.py"),
+        "",
+        figures.not_in_silence,
+    ),
     Promise(
         "",
         "the other long tests: exports, engines and points agree on what is drawn at random",

@@ -1,4 +1,6 @@
-"""The soak measures what it says, finds what is not kept, and writes its table; a few of the quick figures, in little."""
+"""The soak measures what it says, finds what is not kept, and writes its table; a few of the quick
+figures, in little.
+"""
 
 from __future__ import annotations
 
@@ -32,18 +34,30 @@ def test_what_is_promised_is_measured(name: str) -> None:
 
 @pytest.mark.slow
 def test_a_promise_that_is_not_kept_says_so(tmp_path: Path) -> None:
-    (tmp_path / "test_promised.py").write_text("def test_kept(): pass\ndef test_broken(): assert False\n")
-    figure = soak.held(Promise("P0", "", (str(tmp_path / "test_promised.py"),), "all is well"), 0.01)
+    (tmp_path / "test_promised.py").write_text(
+        "def test_kept(): pass\ndef test_broken(): assert False\n"
+    )
+    figure = soak.held(
+        Promise("P0", "", (str(tmp_path / "test_promised.py"),), "all is well"), 0.01
+    )
     assert figure == Figure("1 of 2 tests fail: test_broken", False)
 
     def failing(share: float) -> Figure:
         raise OSError("no line")
 
-    assert soak.held(Promise("P0", "", (), "", failing), 0.01) == Figure("could not be measured: OSError: no line", False)
+    assert soak.held(Promise("P0", "", (), "", failing), 0.01) == Figure(
+        "could not be measured: OSError: no line", False
+    )
 
 
-def test_the_table_is_written_between_its_marks(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    assert soak.PAGE.read_text(encoding="utf-8").count(soak.BEGIN) == soak.PAGE.read_text(encoding="utf-8").count(soak.END) == 1
+def test_the_table_is_written_between_its_marks(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    assert (
+        soak.PAGE.read_text(encoding="utf-8").count(soak.BEGIN)
+        == soak.PAGE.read_text(encoding="utf-8").count(soak.END)
+        == 1
+    )
     page = tmp_path / "page.md"
     page.write_text(f"before\n{soak.BEGIN}\nold\n{soak.END}\nbehind\n")
     monkeypatch.setattr(soak, "PAGE", page)
@@ -53,8 +67,9 @@ def test_the_table_is_written_between_its_marks(tmp_path: Path, monkeypatch: pyt
         soak.written(soak.table({promise: figure}, 60.0))
     text = page.read_text()
     assert f"| P1 | {promise.words} | 0 differ | yes |" in text
-    assert "| P1 | any split of a stream gives the same result | 3 / 4 differ | **no** |" in soak.table(
-        {promise: Figure("3 | 4 differ", False)}, 60.0
+    assert (
+        "| P1 | any split of a stream gives the same result | 3 / 4 differ | **no** |"
+        in soak.table({promise: Figure("3 | 4 differ", False)}, 60.0)
     )
     assert text.startswith("before\n")
     assert text.endswith("behind\n")

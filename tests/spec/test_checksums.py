@@ -1,4 +1,6 @@
-"""Checksums against catalogue check values, an oracle that works bit by bit, another library, and frames from manuals and captures."""
+"""Checksums against catalogue check values, an oracle that works bit by bit, another library, and
+frames from manuals and captures.
+"""
 
 from __future__ import annotations
 
@@ -38,8 +40,14 @@ CHECK_VALUES = [
     (Crc(16, 0x1021, init=0xFFFF), 0x29B1),  # CCITT-FALSE
     (Crc(32, 0x04C11DB7, init=0xFFFFFFFF), 0x0376E6E7),  # MPEG-2, Hesai
     (CRC32, 0xCBF43926),
-    (Crc(32, 0xF4ACFB13, init=0xFFFFFFFF, refin=True, refout=True, xorout=0xFFFFFFFF), 0x1697D06A),  # AUTOSAR P4
-    (Crc(64, 0x42F0E1EBA9EA3693, init=2**64 - 1, refin=True, refout=True, xorout=2**64 - 1), 0x995DC9BBDF1939FA),  # XZ
+    (
+        Crc(32, 0xF4ACFB13, init=0xFFFFFFFF, refin=True, refout=True, xorout=0xFFFFFFFF),
+        0x1697D06A,
+    ),  # AUTOSAR P4
+    (
+        Crc(64, 0x42F0E1EBA9EA3693, init=2**64 - 1, refin=True, refout=True, xorout=2**64 - 1),
+        0x995DC9BBDF1939FA,
+    ),  # XZ
     (Crc(24, 0x864CFB, init=0xB704CE), 0x21CF02),  # OpenPGP
     (Crc(12, 0x80F, refout=True), 0xDAF),  # UMTS
     (Crc(5, 0x05, init=0x1F, refin=True, refout=True, xorout=0x1F), 0x19),  # USB
@@ -52,11 +60,18 @@ ALGORITHMS: list[Checksum] = [
     Crc(40, 0x0004820009, init=0x123456789A, refin=True),
     Xor(),
     *(Sum(width) for width in (1, 7, 8, 16, 20, 64)),
-    *(WordXor(head, groups) for head, groups in [(0, (2,)), (0, (1,)), (8, (1, 2)), (3, (2, 1)), (5, (1, 2, 2, 1))]),
+    *(
+        WordXor(head, groups)
+        for head, groups in [(0, (2,)), (0, (1,)), (8, (1, 2)), (3, (2, 1)), (5, (1, 2, 2, 1))]
+    ),
     Fold15(),
-    *(ZeroPadded(inner, to) for inner, to in [(CRC32, 4), (Crc(16, 0x1021, order="big"), 3), (Fold15(), 8)]),
+    *(
+        ZeroPadded(inner, to)
+        for inner, to in [(CRC32, 4), (Crc(16, 0x1021, order="big"), 3), (Fold15(), 8)]
+    ),
 ]
-#: Algorithms tried at length in the quick tier: of each kind, and CRCs of few bits, of whole bytes, reflected and not.
+#: Algorithms tried at length in the quick tier: of each kind, and CRCs of few bits, of whole bytes,
+#: reflected and not.
 QUICK_ALGORITHMS = [
     CRC8_LDROBOT,
     CRC16_MODBUS,
@@ -78,7 +93,9 @@ name_of = methodcaller("describe")
 
 def slow_unless(values: Iterable[Any], quick: Collection[Any]) -> list[Any]:
     """Return parameters of which those that are not in `quick` are left to the slow tier."""
-    return [pytest.param(value, marks=() if value in quick else pytest.mark.slow) for value in values]
+    return [
+        pytest.param(value, marks=() if value in quick else pytest.mark.slow) for value in values
+    ]
 
 
 def bitwise_crc(crc: Crc, data: bytes) -> int:
@@ -107,7 +124,9 @@ def singly(algorithm: Checksum, rows: NDArray[np.uint8]) -> list[int]:
 
 @pytest.mark.parametrize(("crc", "check"), CHECK_VALUES, ids=str)
 def test_catalogue_check_values(crc: Crc, check: int) -> None:
-    assert crc(b"123456789") == bitwise_crc(crc, b"123456789") == check  # the oracle is held to them too
+    assert (
+        crc(b"123456789") == bitwise_crc(crc, b"123456789") == check
+    )  # the oracle is held to them too
     rows = np.tile(np.frombuffer(b"123456789", np.uint8), (1000, 1))
     assert batch(crc, rows).tolist() == [check] * 1000
 
@@ -120,21 +139,37 @@ def test_crc32_is_that_of_zlib(length: int) -> None:
 
 @pytest.mark.parametrize("length", [128, 129, 781])
 @pytest.mark.parametrize("refout", [False, True])
-def test_rows_of_the_polynomial_of_zlib_agree_with_the_bitwise_oracle(length: int, refout: bool) -> None:
+def test_rows_of_the_polynomial_of_zlib_agree_with_the_bitwise_oracle(
+    length: int, refout: bool
+) -> None:
     crc = Crc(32, 0x04C11DB7, 0x12345678, True, refout, 0x9ABCDEF0)
     wide = random_rows(200, length + 9)
     for rows in (wide[:, 4:-5], np.asfortranarray(wide[:, 4:-5])):
-        assert batch(crc, rows)[::13].tolist() == [bitwise_crc(crc, row.tobytes()) for row in rows[::13]]
+        assert batch(crc, rows)[::13].tolist() == [
+            bitwise_crc(crc, row.tobytes()) for row in rows[::13]
+        ]
 
 
 @pytest.mark.parametrize("width", slow_unless(range(1, 65), QUICK_WIDTHS))
 def test_every_width_agrees_with_the_bitwise_oracle(width: int) -> None:
     rng, top = random.Random(width), 2**width - 1
     for refin, refout in product((False, True), repeat=2):
-        crc = Crc(width, rng.randint(1, top), rng.randint(0, top), refin, refout, rng.randint(0, top))
-        for data in (rng.randbytes(length) for length in (0, 1, 2, 3, 7, 8, 9, rng.randint(10, 100), 2500)):
+        crc = Crc(
+            width, rng.randint(1, top), rng.randint(0, top), refin, refout, rng.randint(0, top)
+        )
+        for data in (
+            rng.randbytes(length) for length in (0, 1, 2, 3, 7, 8, 9, rng.randint(10, 100), 2500)
+        ):
             assert crc(data) == bitwise_crc(crc, data), (crc, len(data))
-        shapes = [(2100, 1), (450, 5), (270, 8), (30, 77), (5, rng.randint(500, 700)), (1024, 17), (1030, rng.randint(20, 90))]
+        shapes = [
+            (2100, 1),
+            (450, 5),
+            (270, 8),
+            (30, 77),
+            (5, rng.randint(500, 700)),
+            (1024, 17),
+            (1030, rng.randint(20, 90)),
+        ]
         for count, length in shapes:
             rows = random_rows(count, length, seed=width)
             values = batch(crc, rows)
@@ -143,11 +178,20 @@ def test_every_width_agrees_with_the_bitwise_oracle(width: int) -> None:
 
 
 def test_agrees_with_crccheck() -> None:
-    others = [other for other in pytest.importorskip("crccheck.crc").ALLCRCCLASSES if other._width <= 64]
+    others = [
+        other for other in pytest.importorskip("crccheck.crc").ALLCRCCLASSES if other._width <= 64
+    ]
     assert len(others) > 100
     rng = random.Random(1)
     for other in others:
-        crc = Crc(other._width, other._poly, other._initvalue, other._reflect_input, other._reflect_output, other._xor_output)
+        crc = Crc(
+            other._width,
+            other._poly,
+            other._initvalue,
+            other._reflect_input,
+            other._reflect_output,
+            other._xor_output,
+        )
         assert crc(b"123456789") == other._check_result, other
         for length in (*range(20), 300):
             data = rng.randbytes(length)
@@ -162,37 +206,74 @@ class TestBatch:
 
     def test_every_short_length(self, algorithm: Checksum) -> None:
         for length in range(71):
-            for count in (0, 3, 2048 // max(1, length) + 2):  # the last is past the point where CRCs leave the loop over bytes
+            for count in (
+                0,
+                3,
+                2048 // max(1, length) + 2,
+            ):  # the last is past the point where CRCs leave the loop over bytes
                 values = batch(algorithm, random_rows(count, length))
                 assert values.dtype == np.uint64
-                assert values.tolist() == singly(algorithm, random_rows(count, length)), (count, length)
+                assert values.tolist() == singly(algorithm, random_rows(count, length)), (
+                    count,
+                    length,
+                )
 
-    @pytest.mark.parametrize(("count", "length"), [(3, 1039), (40, 128), (9, 1210), (2, 24_832), (300, 1217), (11_000, 48)])
-    def test_long_rows_and_several_blocks(self, algorithm: Checksum, count: int, length: int) -> None:
+    @pytest.mark.parametrize(
+        ("count", "length"),
+        [(3, 1039), (40, 128), (9, 1210), (2, 24_832), (300, 1217), (11_000, 48)],
+    )
+    def test_long_rows_and_several_blocks(
+        self, algorithm: Checksum, count: int, length: int
+    ) -> None:
         rows = random_rows(count, length)
         values = batch(algorithm, rows)
         for row in {*range(0, count, 211), count - 1}:
-            data = rows[row].tobytes()  # of this length, a single CRC is a batch of one: the oracle has to judge
-            assert values[row] == (bitwise_crc(algorithm, data) if isinstance(algorithm, Crc) and length > 2000 else algorithm(data))
+            data = rows[
+                row
+            ].tobytes()  # of this length, a single CRC is a batch of one: the oracle has to judge
+            assert values[row] == (
+                bitwise_crc(algorithm, data)
+                if isinstance(algorithm, Crc) and length > 2000
+                else algorithm(data)
+            )
 
     def test_bytes_anywhere_in_the_rows(self, algorithm: Checksum) -> None:
-        for spans in [((0, 8), (10, 85)), ((3, 5),), ((1, 2), (4, 9), (9, 30)), ((5, 5), (7, 7)), ((80, 88), (0, 3)), ((2, 3), (85, 88))]:
+        for spans in [
+            ((0, 8), (10, 85)),
+            ((3, 5),),
+            ((1, 2), (4, 9), (9, 30)),
+            ((5, 5), (7, 7)),
+            ((80, 88), (0, 3)),
+            ((2, 3), (85, 88)),
+        ]:
             for count in (3, 300 if spans[0] == (0, 8) else 60):
                 rows = random_rows(count, 88)
                 joined = np.concatenate([rows[:, start:stop] for start, stop in spans], axis=1)
-                assert over(algorithm, rows, spans).tolist() == singly(algorithm, joined), (spans, count)
+                assert over(algorithm, rows, spans).tolist() == singly(algorithm, joined), (
+                    spans,
+                    count,
+                )
         short = random_rows(400, 5)
-        assert over(algorithm, short, ((0, 1), (3, 5))).tolist() == singly(algorithm, short[:, [0, 3, 4]])
+        assert over(algorithm, short, ((0, 1), (3, 5))).tolist() == singly(
+            algorithm, short[:, [0, 3, 4]]
+        )
 
     def test_any_strides(self, algorithm: Checksum) -> None:
         for length in (13, 46):
             buffer = random_rows(400, 3 * length)
-            for rows in (buffer[::2, 5 : 5 + length], buffer[::-1, ::3], buffer[:, length::-1], np.asfortranarray(buffer[:, :length])):
+            for rows in (
+                buffer[::2, 5 : 5 + length],
+                buffer[::-1, ::3],
+                buffer[:, length::-1],
+                np.asfortranarray(buffer[:, :length]),
+            ):
                 assert not rows.flags.c_contiguous
                 assert batch(algorithm, rows).tolist() == singly(algorithm, rows)
 
 
-@pytest.mark.parametrize("algorithm", [CRC8_LDROBOT, CRC32, Xor(), Sum(), Sum(64), M1C1, Fold15()], ids=name_of)
+@pytest.mark.parametrize(
+    "algorithm", [CRC8_LDROBOT, CRC32, Xor(), Sum(), Sum(64), M1C1, Fold15()], ids=name_of
+)
 def test_temporary_memory_is_bounded(algorithm: Checksum) -> None:
     rows = random_rows(200_000, 47)
     batch(algorithm, rows[:100])  # tables are not temporary
@@ -200,7 +281,9 @@ def test_temporary_memory_is_bounded(algorithm: Checksum) -> None:
     batch(algorithm, rows)
     peak = tracemalloc.get_traced_memory()[1]
     tracemalloc.stop()
-    assert peak < 4 * 8 * len(rows) + 3_000_000  # a few columns as long as the answer, and one block
+    assert (
+        peak < 4 * 8 * len(rows) + 3_000_000
+    )  # a few columns as long as the answer, and one block
 
 
 def test_sums_and_xors_by_hand() -> None:
@@ -209,7 +292,9 @@ def test_sums_and_xors_by_hand() -> None:
     assert Sum()(data) == 0xCC
     assert Sum(16)(data) == Sum(16, "big")(data) == 0x01CC
     assert Sum(16)(b"\xff" * 258) == 258 * 255 - 65536
-    assert WordXor(groups=(1, 2))(data) == 0x0012 ^ 0xFF34 ^ 0x0080 ^ 0x0007  # the last word is cut short
+    assert (
+        WordXor(groups=(1, 2))(data) == 0x0012 ^ 0xFF34 ^ 0x0080 ^ 0x0007
+    )  # the last word is cut short
     assert WordXor(head=3, groups=(2, 1))(data) == 0x3412 ^ 0x00FF ^ 0x0780  # so is the head's
     assert WordXor()(data) == WordXor(head=8, groups=(1,))(data) == 0x3412 ^ 0x80FF ^ 0x0007
 
@@ -243,8 +328,19 @@ VECTOR_FRAMES = [
     (Sum(16), 4, "cspc_info_corrected cspc_scan_start"),
     (M1C1, 8, "cspc_start_packet_synth yd_tmini_16pt"),
     (WordXor(), 8, "yd_40pt_wrap_capture yd_tg15_capture"),
-    (CRC8_LDROBOT, -1, "ld_manual_example ld_stl27l_10hz_synth ld14p_start ld06_capture_1 ld20_capture"),
-    (Fold15(), -2, "camsense_x1_capture camsense_x1_wrap_capture neato_synth lds08rr_capture_1 lds08rr_capture_2"),
+    (
+        CRC8_LDROBOT,
+        -1,
+        "ld_manual_example ld_stl27l_10hz_synth ld14p_start ld06_capture_1 ld20_capture",
+    ),
+    (
+        Fold15(),
+        -2,
+        (
+            "camsense_x1_capture camsense_x1_wrap_capture neato_synth lds08rr_capture_1"
+            " lds08rr_capture_2"
+        ),
+    ),
     (Sum(16, order="big"), -2, "delta_2a_data_capture"),
     (Sum(), -1, "lslidar_n10_synth tfmini_frame_synth tfmini_set_rate_1000"),
     (CRC16_MODBUS, -2, "wt53r_read wt53r_answer"),
@@ -272,20 +368,36 @@ def test_frames_of_the_vectors() -> None:
         (Sum(16), 4, vector_bytes(VECTORS, "cspc_info_as_printed")),
         (CRC8_LDROBOT, -1, vector_bytes(VECTORS, "ld_manual_table_variant")),
     )
-    assert [stored_and_computed(*misprint) for misprint in misprints] == [(0x0402, 0x0403), (0x50, 0xD0)]
+    assert [stored_and_computed(*misprint) for misprint in misprints] == [
+        (0x0402, 0x0403),
+        (0x50, 0xD0),
+    ]
 
 
 def test_coin_d4_packets_of_a_capture() -> None:
-    packets = np.frombuffer(vector_bytes(VECTORS, "coin_d4_startup_capture")[62:], np.uint8).reshape(2, 85)
-    stored, covered = packets[:, 8] + 256 * packets[:, 9].astype(int), np.delete(packets, [8, 9], axis=1)
+    packets = np.frombuffer(
+        vector_bytes(VECTORS, "coin_d4_startup_capture")[62:], np.uint8
+    ).reshape(2, 85)
+    stored, covered = (
+        packets[:, 8] + 256 * packets[:, 9].astype(int),
+        np.delete(packets, [8, 9], axis=1),
+    )
     assert batch(M1C1, covered).tolist() == stored.tolist() != WordXor().batch(covered).tolist()
 
 
 def test_algorithms_are_equal_and_hashed_by_their_parameters() -> None:
     assert len(set(ALGORITHMS)) == len(ALGORITHMS)
-    assert {Crc(8, 0x4D), Crc(width=8, poly=0x4D, init=0), Xor(), Xor(), Sum(), Sum(8)} == {CRC8_LDROBOT, Xor(), Sum(8)}
+    assert {Crc(8, 0x4D), Crc(width=8, poly=0x4D, init=0), Xor(), Xor(), Sum(), Sum(8)} == {
+        CRC8_LDROBOT,
+        Xor(),
+        Sum(8),
+    }
     assert Sum(16) != Sum(16, "big")
-    assert [(each.width, each.order) for each in (Xor(), M1C1, Fold15())] == [(8, "little"), (16, "little"), (15, "little")]
+    assert [(each.width, each.order) for each in (Xor(), M1C1, Fold15())] == [
+        (8, "little"),
+        (16, "little"),
+        (15, "little"),
+    ]
     with pytest.raises(AttributeError):
         CRC8_LDROBOT.poly = 0x07  # type: ignore[misc]
 
@@ -293,7 +405,9 @@ def test_algorithms_are_equal_and_hashed_by_their_parameters() -> None:
 @pytest.mark.parametrize("algorithm", ALGORITHMS, ids=name_of)
 def test_takes_every_kind_of_bytes_and_pickles(algorithm: Checksum) -> None:
     for data in (random_rows(1, length).tobytes() for length in (46, 47, 3000)):
-        assert algorithm(bytearray(data)) == algorithm(memoryview(data[::-1])[::-1]) == algorithm(data)
+        assert (
+            algorithm(bytearray(data)) == algorithm(memoryview(data[::-1])[::-1]) == algorithm(data)
+        )
         copy = pickle.loads(pickle.dumps(algorithm))
         assert (copy, hash(copy), copy(data)) == (algorithm, hash(algorithm), algorithm(data))
 
@@ -308,9 +422,17 @@ def test_padding_with_zeros_to_whole_words() -> None:
 def test_describe() -> None:
     assert CRC8_LDROBOT.describe() == "CRC-8 poly 0x4d"
     assert CRC16_MODBUS.describe() == "CRC-16 poly 0x8005 init 0xffff reflected"
-    assert Crc(12, 0x80F, refout=True, xorout=1).describe() == "CRC-12 poly 0x80f xorout 0x001 refout"
-    assert (Xor().describe(), Sum(16).describe(), Fold15().describe()) == ("XOR-8", "16-bit sum", "15-bit folded sum")
-    assert ZeroPadded(Xor(), 4).describe() == "XOR-8 of the bytes padded with zeros to a multiple of 4"
+    assert (
+        Crc(12, 0x80F, refout=True, xorout=1).describe() == "CRC-12 poly 0x80f xorout 0x001 refout"
+    )
+    assert (Xor().describe(), Sum(16).describe(), Fold15().describe()) == (
+        "XOR-8",
+        "16-bit sum",
+        "15-bit folded sum",
+    )
+    assert (
+        ZeroPadded(Xor(), 4).describe() == "XOR-8 of the bytes padded with zeros to a multiple of 4"
+    )
     assert M1C1.describe() == "XOR-16 of 1+2-byte words after a head of 8 bytes"
 
 
@@ -332,7 +454,9 @@ def test_describe() -> None:
 )
 def test_wrong_parameters_are_refused(right: Any, name: str, wrong_values: list[object]) -> None:
     for value in wrong_values:
-        with pytest.raises(ValueError, match=rf"{type(right).__name__}: {name} .*{re.escape(repr(value))}"):
+        with pytest.raises(
+            ValueError, match=rf"{type(right).__name__}: {name} .*{re.escape(repr(value))}"
+        ):
             dataclasses.replace(right, **{name: value})
 
 
@@ -351,12 +475,16 @@ def test_an_algorithm_of_a_plugin_gets_its_batch_for_free() -> None:
 
 
 @pytest.mark.parametrize(("init", "xorout"), [(0xFFFFFFFF, 0xFFFFFFFF), (0x12345678, 0x9ABCDEF0)])
-def test_long_rows_of_zlibs_polynomial_have_its_values_wherever_they_stand(init: int, xorout: int) -> None:
+def test_long_rows_of_zlibs_polynomial_have_its_values_wherever_they_stand(
+    init: int, xorout: int
+) -> None:
     crc = Crc(32, 0x04C11DB7, init, True, True, xorout)
     rows = np.random.default_rng(5).integers(0, 256, (9, 3001), dtype=np.uint8)
     parts = [row[2:1400].tobytes() + row[1404:].tobytes() for row in rows]
     begin, end = int(f"{init:032b}"[::-1], 2) ^ 2**32 - 1, 2**32 - 1 ^ xorout
-    assert over(crc, rows, ((2, 1400), (1404, 3001))).tolist() == [zlib.crc32(part, begin) ^ end for part in parts]
+    assert over(crc, rows, ((2, 1400), (1404, 3001))).tolist() == [
+        zlib.crc32(part, begin) ^ end for part in parts
+    ]
 
 
 @dataclasses.dataclass(frozen=True)
@@ -377,9 +505,17 @@ class Attentive(Checksum):
 def test_a_checksum_that_may_be_not_filled_is_computed_only_where_it_is() -> None:
     attentive = Attentive()
     sensor = against_construct.sensor(
-        Checksummed(Struct("header" / Const(b"\x55\x66"), "value" / Int8ub, "sum" / Int8ub), field="sum", algorithm=attentive, absent=[0])
+        Checksummed(
+            Struct("header" / Const(b"\x55\x66"), "value" / Int8ub, "sum" / Int8ub),
+            field="sum",
+            algorithm=attentive,
+            absent=[0],
+        )
     )
-    frames = [bytes([0x55, 0x66, value, total]) for value, total in ((1, 0), (2, 0xBD), (3, 0), (4, 0xFF), (5, 0))]
+    frames = [
+        bytes([0x55, 0x66, value, total])
+        for value, total in ((1, 0), (2, 0xBD), (3, 0), (4, 0xFF), (5, 0))
+    ]
     packets = sensor.decode(b"".join(frames))
     assert (packets["value"].tolist(), packets.stats.bad_checksum) == ([1, 2, 3, 5], 1)
     assert {data[2] for data in attentive.asked} == {2, 4}
@@ -388,14 +524,28 @@ def test_a_checksum_that_may_be_not_filled_is_computed_only_where_it_is() -> Non
     assert not attentive.asked
 
 
-def test_two_checksums_around_one_struct_are_made_in_the_order_in_which_they_need_each_other() -> None:
-    fields = Struct("header" / Const(b"\x55\x66"), "value" / Int8ub, "check" / Int8ub, "rest" / Int8ub, "sum" / Int8ub)
-    inside_first = Checksummed(Checksummed(fields, "check", Xor(), over=("header", "value")), "sum", Sum(8))
-    outside_first = Checksummed(Checksummed(fields, "sum", Sum(8)), "check", Xor(), over=("header", "value"))
+def test_two_checksums_around_one_struct_are_made_in_the_order_in_which_they_need_each_other() -> (
+    None
+):
+    fields = Struct(
+        "header" / Const(b"\x55\x66"),
+        "value" / Int8ub,
+        "check" / Int8ub,
+        "rest" / Int8ub,
+        "sum" / Int8ub,
+    )
+    inside_first = Checksummed(
+        Checksummed(fields, "check", Xor(), over=("header", "value")), "sum", Sum(8)
+    )
+    outside_first = Checksummed(
+        Checksummed(fields, "sum", Sum(8)), "check", Xor(), over=("header", "value")
+    )
     for struct in (inside_first, outside_first):
         sensor = against_construct.sensor(struct)
         frame = sensor.build("data", value=7, rest=9)
-        assert frame == bytes([0x55, 0x66, 7, 0x55 ^ 0x66 ^ 7, 9, sum([0x55, 0x66, 7, 0x55 ^ 0x66 ^ 7, 9]) & 0xFF])
+        assert frame == bytes(
+            [0x55, 0x66, 7, 0x55 ^ 0x66 ^ 7, 9, sum([0x55, 0x66, 7, 0x55 ^ 0x66 ^ 7, 9]) & 0xFF]
+        )
         assert sensor.parse(sensor.example("data"))
         damaged = [frame[:3] + b"\0" + frame[4:], frame[:-1] + b"\0"]
         assert [sensor.decode(data).stats.bad_checksum for data in (frame, *damaged)] == [0, 1, 1]
@@ -405,6 +555,8 @@ def test_two_checksums_around_one_struct_are_made_in_the_order_in_which_they_nee
 
 def test_a_checksum_over_a_whole_bit_block_covers_its_bytes() -> None:
     block = BitStruct("high" / BitsInteger(4), "low" / BitsInteger(4))
-    sensor = against_construct.sensor(Checksummed(Struct("k" / Int8ub, "bits" / block, "sum" / Int8ub), "sum", Xor(), over="bits"))
+    sensor = against_construct.sensor(
+        Checksummed(Struct("k" / Int8ub, "bits" / block, "sum" / Int8ub), "sum", Xor(), over="bits")
+    )
     assert sensor.build("data", k=1, bits={"high": 5, "low": 6}) == b"\x01\x56\x56"
     assert sensor.parse(b"\x01\x56\x56").sum == 0x56

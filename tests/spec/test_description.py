@@ -22,12 +22,30 @@ BYTE = Struct("value" / Int8ub)
 @pytest.mark.parametrize(
     ("describe", "message"),
     [
-        (lambda: Clock("time", wraps_at=2**64 / 1e6), "clock.wraps_at: 1.845e+13 s is longer than 292 years; leave wraps_at out"),
-        (lambda: Clock("time", wraps_at=0), "clock.wraps_at: expected a positive number of seconds, got 0"),
-        (lambda: Frame(BYTE, simulation=None), "simulation: expected a Simulation(...), got None; leave it out"),  # type: ignore[arg-type]
-        (lambda: Frame(BYTE, sweep=None), "Frame has no argument 'sweep'; write Frame(simulation=Simulation(sweep=...))"),
-        (lambda: ls.Sensor("a-b", sweep=None), "Sensor has no argument 'sweep'; write Sensor(simulation=Simulation(sweep=...))"),
-        (lambda: ls.Sensor("a-b", range_limit=(0, 1)), "Sensor has no argument 'range_limit'; did you mean 'range_limits'?"),
+        (
+            lambda: Clock("time", wraps_at=2**64 / 1e6),
+            "clock.wraps_at: 1.845e+13 s is longer than 292 years; leave wraps_at out",
+        ),
+        (
+            lambda: Clock("time", wraps_at=0),
+            "clock.wraps_at: expected a positive number of seconds, got 0",
+        ),
+        (
+            lambda: Frame(BYTE, simulation=None),
+            "simulation: expected a Simulation(...), got None; leave it out",
+        ),  # type: ignore[arg-type]
+        (
+            lambda: Frame(BYTE, sweep=None),
+            "Frame has no argument 'sweep'; write Frame(simulation=Simulation(sweep=...))",
+        ),
+        (
+            lambda: ls.Sensor("a-b", sweep=None),
+            "Sensor has no argument 'sweep'; write Sensor(simulation=Simulation(sweep=...))",
+        ),
+        (
+            lambda: ls.Sensor("a-b", range_limit=(0, 1)),
+            "Sensor has no argument 'range_limit'; did you mean 'range_limits'?",
+        ),
     ],
 )
 def test_invalid_argument_raises_typed_error(describe: Callable[[], Any], message: str) -> None:
@@ -36,7 +54,9 @@ def test_invalid_argument_raises_typed_error(describe: Callable[[], Any], messag
 
 
 def test_unknown_frame_is_also_a_key_error() -> None:
-    with pytest.raises(UnknownFrame, match=r"^shape-count: unknown frame 'dta'; did you mean 'data'\?$") as raised:
+    with pytest.raises(
+        UnknownFrame, match=r"^shape-count: unknown frame 'dta'; did you mean 'data'\?$"
+    ) as raised:
         SENSOR.frames["dta"]
     assert isinstance(raised.value, KeyError)
     assert SENSOR.frames.get("dta") is None
@@ -47,7 +67,9 @@ def test_column_compared_with_bytes_says_that_it_is_numbers() -> None:
     def plausible(f: Fields) -> Any:
         return f.text != b""
 
-    frame = Frame(Struct("header" / Const(b"\xa5\x5a"), "text" / Bytes(4)), data=True, plausible=plausible)
+    frame = Frame(
+        Struct("header" / Const(b"\xa5\x5a"), "text" / Bytes(4)), data=True, plausible=plausible
+    )
     sensor = ls.Sensor(
         "a-b",
         vendor="A",

@@ -39,11 +39,23 @@ def configure(
         ({"turned": True}, "turned .*True"),
         ({"mode": 1.5}, "mode .*1.5"),
         ({"upside": 1}, "upside .*1"),
-        ({"file": None, "turned": 1, "mode": np.int64(3), "upside": True, "kind": 3, "plain": [1]}, ""),
+        (
+            {
+                "file": None,
+                "turned": 1,
+                "mode": np.int64(3),
+                "upside": True,
+                "kind": 3,
+                "plain": [1],
+            },
+            "",
+        ),
         ({"file": Path("a"), "turned": np.float32(1), "mode": None}, ""),
     ],
 )
-def test_an_option_is_of_the_type_that_its_parameter_declares(options: dict[str, Any], named: str) -> None:
+def test_an_option_is_of_the_type_that_its_parameter_declares(
+    options: dict[str, Any], named: str
+) -> None:
     sensor = dataclasses.replace(SHAPES["shape-count"], configure=configure)
     if not named:
         assert sensor.configure(**options).options == options
@@ -52,7 +64,9 @@ def test_an_option_is_of_the_type_that_its_parameter_declares(options: dict[str,
         sensor.configure(**options)
 
 
-def test_on_the_command_line_a_digit_can_be_the_name_of_a_file(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_on_the_command_line_a_digit_can_be_the_name_of_a_file(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.chdir(tmp_path)
     Path("1").write_text("nothing of the kind", encoding="utf-8")
     Path("x.bin").touch()

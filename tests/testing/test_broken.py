@@ -142,20 +142,31 @@ LINES = {
 def found(name: str) -> list[Finding]:
     """What `check` says of one of the modules."""
     file = HERE / f"{name}.py"
-    return [finding for report in reports(target(file), str(file), examples=4) for finding in report.findings]
+    return [
+        finding
+        for report in reports(target(file), str(file), examples=4)
+        for finding in report.findings
+    ]
 
 
-@pytest.mark.parametrize("name", [pytest.param(name, marks=() if name in QUICK else pytest.mark.slow) for name in EVERY])
+@pytest.mark.parametrize(
+    "name", [pytest.param(name, marks=() if name in QUICK else pytest.mark.slow) for name in EVERY]
+)
 def test_the_mistake_is_named_and_no_other(name: str) -> None:
     findings = found(name)
     assert {finding.code for finding in findings} == EVERY[name], "\n".join(map(str, findings))
     if name in LINES:
         spots = [finding for finding in findings if finding.file]
         assert spots
-        assert any(LINES[name] in Path(spot.file).read_text(encoding="utf-8").splitlines()[spot.line - 1] for spot in spots)
+        assert any(
+            LINES[name] in Path(spot.file).read_text(encoding="utf-8").splitlines()[spot.line - 1]
+            for spot in spots
+        )
 
 
-@pytest.mark.parametrize("name", ["sound", pytest.param("by_vectors/sound", marks=pytest.mark.slow)])
+@pytest.mark.parametrize(
+    "name", ["sound", pytest.param("by_vectors/sound", marks=pytest.mark.slow)]
+)
 def test_without_a_mistake_nothing_is_found(name: str) -> None:
     assert found(name) == []
 

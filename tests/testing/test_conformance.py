@@ -14,7 +14,8 @@ from tests.shapes import SHAPES
 INTERPRETED = {"shape-text data"}
 INTERPRETED_OF_HOKUYO = ("version", "parameters", "state")
 
-#: Shapes that are held to all properties in the quick tier: one for each way to find, to check and to cut frames.
+#: Shapes that are held to all properties in the quick tier: one for each way to find, to check and
+#: to cut frames.
 QUICK = {
     "shape-ahead",
     "shape-bits",
@@ -54,5 +55,8 @@ def test_frames_of_shapes_compile_except_those_named_here() -> None:
 def test_frames_of_installed_sensors_compile_except_those_named_here() -> None:
     sensors = dict(ls.sensors())
     assert _interpreted(sensors) == {
-        f"{sensor_id} {name}" for sensor_id in sensors if sensor_id.startswith("hokuyo-") for name in INTERPRETED_OF_HOKUYO
+        f"{sensor_id} {name}"
+        for sensor_id in sensors
+        if sensor_id.startswith("hokuyo-")
+        for name in INTERPRETED_OF_HOKUYO
     }

@@ -1,4 +1,6 @@
-"""The test kit's own promises: strategies, shrinking, acknowledgements, vectors, and the fixtures in a pytest run of an author's."""
+"""The test kit's own promises: strategies, shrinking, acknowledgements, vectors, and the fixtures
+in a pytest run of an author's.
+"""
 
 from __future__ import annotations
 
@@ -37,14 +39,31 @@ from hypothesis import strategies as st
 from lidarspec import Sensor
 from lidarspec.framing.examples import random_frame
 from lidarspec.framing.frame_engine import CompiledCodec, InterpretedCodec
-from lidarspec.spec import Checksummed, Command, Crc, Fields, Frame, Http, HttpReply, HttpRequest, Polar, Scaled, Simulation, Sum, take
+from lidarspec.spec import (
+    Checksummed,
+    Command,
+    Crc,
+    Fields,
+    Frame,
+    Http,
+    HttpReply,
+    HttpRequest,
+    Polar,
+    Scaled,
+    Simulation,
+    Sum,
+    take,
+)
 from lidarspec.testing import frames
 from lidarspec.testing.agreement import parse_decode_and_any_cutting_agree
 from lidarspec.testing.check import Target, reports
 from lidarspec.testing.commands import the_simulated_sensor_answers
 from lidarspec.testing.declared import declared
 from lidarspec.testing.findings import Violation, left_over
-from lidarspec.testing.frames import values_in_units_build_the_same_bytes, values_survive_building_and_parsing
+from lidarspec.testing.frames import (
+    values_in_units_build_the_same_bytes,
+    values_survive_building_and_parsing,
+)
 from lidarspec.testing.geometry import the_points_turn_as_the_axes_do
 from lidarspec.testing.hostile import MAX_CALLS_PER_BYTE, calls_per_byte, streams
 from lidarspec.testing.properties import PROPERTIES, Property
@@ -98,17 +117,25 @@ STRANGER = Path(__file__).resolve().parents[1] / "shapes" / "stranger" / "acme_l
 
 def run(folder: Path, *words: str, **variables: str) -> subprocess.CompletedProcess[str]:
     command, env = [sys.executable, *words], {**os.environ, **variables}
-    return subprocess.run(command, cwd=folder, capture_output=True, text=True, check=False, timeout=300, env=env)
+    return subprocess.run(
+        command, cwd=folder, capture_output=True, text=True, check=False, timeout=300, env=env
+    )
 
 
 def codes(sensor: Sensor) -> set[str]:
-    return {finding.code for report in reports(Target([sensor]), sensor.id, examples=6) for finding in report.findings}
+    return {
+        finding.code
+        for report in reports(Target([sensor]), sensor.id, examples=6)
+        for finding in report.findings
+    }
 
 
 @pytest.mark.slow
 def test_an_authors_tests_run_with_the_kits_fixtures(tmp_path: Path) -> None:
     (tmp_path / "test_mine.py").write_text(AUTHOR.format(sensor=str(STRANGER)), encoding="utf-8")
-    done = run(tmp_path, "-m", "pytest", "-q", "-rs", "-p", "no:cacheprovider", "--strict-markers", ".")
+    done = run(
+        tmp_path, "-m", "pytest", "-q", "-rs", "-p", "no:cacheprovider", "--strict-markers", "."
+    )
     assert "which sensor? mark the test with" in done.stdout
     assert "5 passed, 1 error" in done.stdout, done.stdout
     assert "failed" not in done.stdout, done.stdout
@@ -122,8 +149,19 @@ def test_the_plugin_loads_nothing_of_the_engine(tmp_path: Path) -> None:
         "    assert not heavy & sys.modules.keys()\n",
         encoding="utf-8",
     )
-    words = ["-m", "pytest", "-q", "-p", "no:cacheprovider", "-p", "lidarspec", "."]  # by its name as an entry point
-    done = run(tmp_path, *words, PYTEST_DISABLE_PLUGIN_AUTOLOAD="1")  # other libraries' plugins load what they like
+    words = [
+        "-m",
+        "pytest",
+        "-q",
+        "-p",
+        "no:cacheprovider",
+        "-p",
+        "lidarspec",
+        ".",
+    ]  # by its name as an entry point
+    done = run(
+        tmp_path, *words, PYTEST_DISABLE_PLUGIN_AUTOLOAD="1"
+    )  # other libraries' plugins load what they like
     assert done.returncode == 0, done.stdout
 
 
@@ -135,21 +173,33 @@ def test_cost_of_a_stream_is_counted_in_function_calls() -> None:
         assert (calls_per_byte(sensor, stream) > MAX_CALLS_PER_BYTE) == is_dear
 
 
-#: bytes of a frame that is too long to try everything with it, and of its copies with flipped bits that are tried.
+#: bytes of a frame that is too long to try everything with it, and of its copies with flipped bits
+#: that are tried.
 LONG = 100_000
 FLIPPED_BYTES = 1 << 22
 LONG_FRAME = Checksummed(
-    Struct("header" / Const(b"\xaa\x55\xc3"), "count" / Int8ul, "picture" / Bytes(LONG - 6), "sum" / Int16ul),
+    Struct(
+        "header" / Const(b"\xaa\x55\xc3"),
+        "count" / Int8ul,
+        "picture" / Bytes(LONG - 6),
+        "sum" / Int16ul,
+    ),
     field="sum",
     algorithm=Sum(16),
 )
 
 
 @pytest.mark.parametrize(
-    "check", [one for one in PROPERTIES if one.function.__module__.endswith("testing.frames")], ids=lambda one: one.name
+    "check",
+    [one for one in PROPERTIES if one.function.__module__.endswith("testing.frames")],
+    ids=lambda one: one.name,
 )
-def test_work_with_a_long_frame_is_limited_in_bytes(check: Property, monkeypatch: pytest.MonkeyPatch) -> None:
-    sensor = sound.sensor(frames={**sound.sensor().frames, "picture": Frame(LONG_FRAME, max_length=LONG)})
+def test_work_with_a_long_frame_is_limited_in_bytes(
+    check: Property, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    sensor = sound.sensor(
+        frames={**sound.sensor().frames, "picture": Frame(LONG_FRAME, max_length=LONG)}
+    )
     parsed = surveyed = 0
     parse, survey = Sensor.parse, CompiledCodec.survey
 
@@ -171,7 +221,9 @@ def test_work_with_a_long_frame_is_limited_in_bytes(check: Property, monkeypatch
     check.function(Subject(sensor), "picture")
 
 
-def test_a_long_frame_that_construct_alone_reads_is_not_begun_anew_for_each_byte(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_long_frame_that_construct_alone_reads_is_not_begun_anew_for_each_byte(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     class Unknown(Adapter):
         def _decode(self, obj: int, context: Any, path: str) -> int:
             return obj
@@ -179,8 +231,12 @@ def test_a_long_frame_that_construct_alone_reads_is_not_begun_anew_for_each_byte
         def _encode(self, obj: int, context: Any, path: str) -> int:
             return obj
 
-    struct = Struct("header" / Const(b"\x91\x37\xc9"), "kind" / Unknown(Int8ul), "picture" / Bytes(LONG - 4))
-    sensor = sound.sensor(frames={**sound.sensor().frames, "picture": Frame(struct, max_length=LONG)})
+    struct = Struct(
+        "header" / Const(b"\x91\x37\xc9"), "kind" / Unknown(Int8ul), "picture" / Bytes(LONG - 4)
+    )
+    sensor = sound.sensor(
+        frames={**sound.sensor().frames, "picture": Frame(struct, max_length=LONG)}
+    )
     read = 0
     judge = InterpretedCodec._judge
 
@@ -207,11 +263,21 @@ def test_a_long_length_that_a_count_in_the_header_can_reach_is_no_finding() -> N
         return (f.count >= 1) & (f.first < 360) & (f.last < 360) & (f.time < sound.WRAP)
 
     struct = sound.sealed(count=Int16ul)
-    assert left(sound.sensor(Frame(struct, data=True, max_length=16 + 3 * 65_535, plausible=plausible))) == set()
+    assert (
+        left(
+            sound.sensor(Frame(struct, data=True, max_length=16 + 3 * 65_535, plausible=plausible))
+        )
+        == set()
+    )
     page = Frame(HttpReply, max_length=65_536)
     ask = Frame(HttpRequest, direction="out", max_length=4096)
     assert (
-        left(sound.sensor(frames={**sound.sensor().frames, "page": page, "ask": ask}, links={**sound.sensor().links, "web": Http(80)}))
+        left(
+            sound.sensor(
+                frames={**sound.sensor().frames, "page": page, "ask": ask},
+                links={**sound.sensor().links, "web": Http(80)},
+            )
+        )
         == set()
     )
 
@@ -232,8 +298,13 @@ def test_a_long_length_that_a_count_in_the_header_can_reach_is_no_finding() -> N
 def test_what_contradicts_itself_is_named(plugin: Any, code: str) -> None:
     def found(sensor: Sensor) -> set[str]:
         subject = Subject(sensor)
-        consistent = [one for one in PROPERTIES if one.function.__module__.endswith("testing.consistency")]
-        findings = [*declared(subject), *(finding for one in consistent for finding in one.findings(subject))]
+        consistent = [
+            one for one in PROPERTIES if one.function.__module__.endswith("testing.consistency")
+        ]
+        findings = [
+            *declared(subject),
+            *(finding for one in consistent for finding in one.findings(subject)),
+        ]
         return {finding.code for finding in findings}
 
     (sensor,) = plugin.lidarspec_sensors()
@@ -245,13 +316,21 @@ def rare(f: object) -> object:
     return f.key == 0xBEEF  # type: ignore[attr-defined]
 
 
-INFO = Checksummed(Struct("header" / Const(b"\x18\x81\x55"), "key" / Int16ul, "check" / Int8ul), field="check", algorithm=Sum(8))
+INFO = Checksummed(
+    Struct("header" / Const(b"\x18\x81\x55"), "key" / Int16ul, "check" / Int8ul),
+    field="check",
+    algorithm=Sum(8),
+)
 
 
-@pytest.mark.parametrize("how", [st.just(0xBEEF), lambda source: 0xBEEF], ids=["strategy", "function"])
+@pytest.mark.parametrize(
+    "how", [st.just(0xBEEF), lambda source: 0xBEEF], ids=["strategy", "function"]
+)
 def test_what_cannot_be_derived_is_asked_for_by_name(how: object) -> None:
     plain = sound.sensor()
-    sensor = replace(plain, frames={**plain.frames, "info": Frame(INFO, max_length=6, plausible=rare)})
+    sensor = replace(
+        plain, frames={**plain.frames, "info": Frame(INFO, max_length=6, plausible=rare)}
+    )
     assert codes(sensor) == {"LS301"}
     subject = Subject(sensor, 6, strategies={"info.key": how})
     assert {sensor.parse(subject.example("info", seed=seed)).key for seed in range(5)} == {0xBEEF}
@@ -291,14 +370,23 @@ def test_what_is_meant_is_acknowledged_with_a_reason() -> None:
     far = sound.sensor(range_limits=(0.05, 100.0))
     assert left(far) == {"LS210"}
     assert left(replace(far, acknowledged={"LS210": "the next model reaches so far"})) == set()
-    assert left(replace(far, acknowledged={"LS210 data.samples.distance": "the next model reaches so far"})) == set()
+    assert (
+        left(
+            replace(
+                far, acknowledged={"LS210 data.samples.distance": "the next model reaches so far"}
+            )
+        )
+        == set()
+    )
     assert left(replace(far, acknowledged={"LS210": " "})) == {"LS209", "LS210"}
     assert left(replace(far, acknowledged={"LS210 data.tilt": "no"})) == {"LS209", "LS210"}
 
 
 @pytest.mark.slow
 def test_what_is_acknowledged_keeps_nothing_from_being_tried() -> None:
-    coded = sound.sealed(samples=Array(this.count, Struct("distance" / Int16ul, "quality" / Int8ul)))
+    coded = sound.sealed(
+        samples=Array(this.count, Struct("distance" / Int16ul, "quality" / Int8ul))
+    )
     bare = sound.sensor(sound.frame(coded), acknowledged={"LS201": "a code"})
     (report,) = reports(Target([bare]), "bare", examples=1)
     assert "LS201" not in {finding.code for finding in report.findings}
@@ -310,7 +398,9 @@ def test_what_only_looks_up_a_table_needs_no_unit() -> None:
         return Polar(f.samples.distance, take(np.linspace(0, 1, 256), f.number))
 
     assert left(sound.sensor(points=points)) == set()
-    assert left(sound.sensor(points=lambda f: Polar(f.samples.distance, f.number / 256))) == {"LS201"}
+    assert left(sound.sensor(points=lambda f: Polar(f.samples.distance, f.number / 256))) == {
+        "LS201"
+    }
 
 
 BY_VECTORS = Path(sound.__file__).parent / "by_vectors" / "vectors.json"
@@ -322,52 +412,96 @@ def told(sensor: Sensor, vectors: list[dict[str, Any]] | None, *family: str) -> 
         file = Path(folder) / "vectors.json"
         file.write_text(json.dumps(vectors), encoding="utf-8")
         subject = Subject(sensor, vectors=None if vectors is None else file, family=family)
-        about = [one for one in PROPERTIES if one.function.__module__ == vectors_hold.__module__ and not one.lacks(subject)]
-        return [f"{finding.code} {finding.path}: {finding.what}" for one in about for finding in one.findings(subject)]
+        about = [
+            one
+            for one in PROPERTIES
+            if one.function.__module__ == vectors_hold.__module__ and not one.lacks(subject)
+        ]
+        return [
+            f"{finding.code} {finding.path}: {finding.what}"
+            for one in about
+            for finding in one.findings(subject)
+        ]
 
 
 def test_a_status_is_proven_by_vectors_of_its_own() -> None:
-    proven, known = sound.sensor(status="capture"), json.loads(BY_VECTORS.read_text(encoding="utf-8"))
-    assert told(proven, None) == ["LS710 : status is 'capture', and there is no file of golden vectors"]
+    proven, known = (
+        sound.sensor(status="capture"),
+        json.loads(BY_VECTORS.read_text(encoding="utf-8")),
+    )
+    assert told(proven, None) == [
+        "LS710 : status is 'capture', and there is no file of golden vectors"
+    ]
     assert told(proven, [{**entry, "sensor": "broken-two"} for entry in known]) == [
         "LS710 : status is 'capture', and vectors.json has none of broken-one"
     ]
-    assert told(proven, [{**entry, "sensor": ["broken-one", "broken-two"]} for entry in known], "broken-one", "broken-two") == []
+    assert (
+        told(
+            proven,
+            [{**entry, "sensor": ["broken-one", "broken-two"]} for entry in known],
+            "broken-one",
+            "broken-two",
+        )
+        == []
+    )
     assert told(sound.sensor(), None) == []
 
 
 def test_vectors_of_several_sensors_say_whose_they_are() -> None:
     known = json.loads(BY_VECTORS.read_text(encoding="utf-8"))
     asked = told(sound.sensor(), known, "broken-one", "broken-two")
-    assert 'it names no sensor, and the file is shared by broken-one, broken-two: "sensor": "broken-one"' in asked[0]
-    asked = told(sound.sensor(), [{**entry, "sensor": "borken-one"} for entry in known], "broken-one")
+    assert (
+        'it names no sensor, and the file is shared by broken-one, broken-two: "sensor": "broken-one"'
+        in asked[0]
+    )
+    asked = told(
+        sound.sensor(), [{**entry, "sensor": "borken-one"} for entry in known], "broken-one"
+    )
     assert "there is no sensor 'borken-one' here, but broken-one" in asked[0]
 
 
 def test_a_field_of_the_data_that_no_vector_pins_down_is_named() -> None:
     first, second = json.loads(BY_VECTORS.read_text(encoding="utf-8"))
-    del first["values"]["last"], first["values"]["samples[1].distance"], second["values"]["samples[1].distance"]
+    del (
+        first["values"]["last"],
+        first["values"]["samples[1].distance"],
+        second["values"]["samples[1].distance"],
+    )
     first["values"]["samples[2].distance"] = 0
-    assert told(sound.sensor(), [first, second]) == ["LS711 data: no vector gives a value of last; 0 alone is given of samples.distance"]
+    assert told(sound.sensor(), [first, second]) == [
+        "LS711 data: no vector gives a value of last; 0 alone is given of samples.distance"
+    ]
     ack = {"frame": "ack", "hex": sound.sensor().example("ack").hex(), "source": "made up"}
     assert told(sound.sensor(), [ack])[0] == "LS711 data: no vector is a 'data' frame"
 
 
 def test_vectors_place_points_in_two_quadrants_within_reach() -> None:
     first, second = json.loads(BY_VECTORS.read_text(encoding="utf-8"))
-    assert told(sound.sensor(range_limits=(0.05, 4.0)), [first, second]) == ["LS713 data: 4.66 m, and range_limits end at 4 m"]
+    assert told(sound.sensor(range_limits=(0.05, 4.0)), [first, second]) == [
+        "LS713 data: 4.66 m, and range_limits end at 4 m"
+    ]
     del second["points"]
-    assert told(sound.sensor(), [first, second]) == ["LS712 data.points: they say x and y of points in 1 quadrant"]
+    assert told(sound.sensor(), [first, second]) == [
+        "LS712 data.points: they say x and y of points in 1 quadrant"
+    ]
 
 
-@pytest.mark.parametrize(("axes", "sense"), [(("right", "forward", "up"), "clockwise"), (("forward", "left", "up"), "counter-clockwise")])
-def test_the_sense_of_the_points_is_measured_and_held_against_the_axes(axes: tuple[str, str, str], sense: str) -> None:
+@pytest.mark.parametrize(
+    ("axes", "sense"),
+    [(("right", "forward", "up"), "clockwise"), (("forward", "left", "up"), "counter-clockwise")],
+)
+def test_the_sense_of_the_points_is_measured_and_held_against_the_axes(
+    axes: tuple[str, str, str], sense: str
+) -> None:
     sign = 1 if sense == "counter-clockwise" else -1
 
     def turning(sign: int, f: Fields) -> Polar:
         return Polar(f.samples.distance, sign * sound.points(f).azimuth)
 
-    right, wrong = (Subject(sound.sensor(points=partial(turning, way), vendor_axes=axes)) for way in (sign, -sign))
+    right, wrong = (
+        Subject(sound.sensor(points=partial(turning, way), vendor_axes=axes))
+        for way in (sign, -sign)
+    )
     the_points_turn_as_the_axes_do(right, "data")
     assert right.picture["data: sense"] == f"{sense} as first grows, seen from above"
     with pytest.raises(Violation, match=f"angles run {sense}") as found:
@@ -378,25 +512,40 @@ def test_the_sense_of_the_points_is_measured_and_held_against_the_axes(axes: tup
 def test_a_checksum_in_the_other_byte_order_is_told_with_the_right_one() -> None:
     swapped = sound.frame(Checksummed(sound.struct(sum=Int16ub), field="sum", algorithm=Sum(16)))
     known = json.loads(BY_VECTORS.read_text(encoding="utf-8"))
-    assert "Sum(16) over all other bytes, in a field that is little-endian," in told(sound.sensor(swapped), known)[0]
+    assert (
+        "Sum(16) over all other bytes, in a field that is little-endian,"
+        in told(sound.sensor(swapped), known)[0]
+    )
 
 
 def test_the_checksum_that_is_offered_is_as_wide_as_its_field() -> None:
     def data(algorithm: Any) -> Sensor:
         struct = sound.struct(spare=Int16ul, sum=Int16ub)
-        return sound.sensor(sound.frame(Checksummed(struct, field="sum", algorithm=algorithm), max_length=sound.SIZE + 2))
+        return sound.sensor(
+            sound.frame(
+                Checksummed(struct, field="sum", algorithm=algorithm), max_length=sound.SIZE + 2
+            )
+        )
 
     right = data(Sum(16))
     parsed = [right.parse(right.example("data", seed=seed)) for seed in range(6)]
-    frames = [right.build("data", {**one, "spare": 0}) for one in parsed]  # the sum is right in four bytes as well
+    frames = [
+        right.build("data", {**one, "spare": 0}) for one in parsed
+    ]  # the sum is right in four bytes as well
     vectors = [{"frame": "data", "hex": frame.hex(), "source": "made up"} for frame in frames]
-    (said,) = {text.partition("; ")[2] for text in told(data(Crc(16, 0x1021)), vectors) if text.startswith("LS703 vectors[0]")}
+    (said,) = {
+        text.partition("; ")[2]
+        for text in told(data(Crc(16, 0x1021)), vectors)
+        if text.startswith("LS703 vectors[0]")
+    }
     assert said == "Sum(16) over all other bytes, in a field that is big-endian, fits"
 
 
 @pytest.mark.parametrize("samples", [3, 200], ids=["short", "long"])
 def test_a_checksum_of_another_name_is_found_in_the_vectors(samples: int) -> None:
-    struct = Struct("header" / Const(b"\xaa\x55\xc3"), "samples" / Array(samples, Int16ul), "end" / Int16ul)
+    struct = Struct(
+        "header" / Const(b"\xaa\x55\xc3"), "samples" / Array(samples, Int16ul), "end" / Int16ul
+    )
     plain = Frame(struct, data=True, max_length=5 + 2 * samples)
     sealed = replace(plain, struct=Checksummed(struct, field="end", algorithm=Crc(16, 0x8005)))
     examples = [sound.sensor(sealed).example("data", seed=seed) for seed in range(3)]
@@ -416,7 +565,12 @@ def test_a_vector_that_cannot_be_read_hides_no_other() -> None:
         {**known[1], "source": ""},
     ]
     said = [text.partition(":")[0] for text in told(sound.sensor(), vectors)]
-    assert said[:4] == ["LS702 vectors[0]", "LS706 vectors[1] data.number", "LS702 vectors[2]", "LS701 vectors[3]"]
+    assert said[:4] == [
+        "LS702 vectors[0]",
+        "LS706 vectors[1] data.number",
+        "LS702 vectors[2]",
+        "LS701 vectors[3]",
+    ]
 
 
 def test_a_reply_that_nothing_makes_up_asks_for_answers() -> None:
@@ -428,15 +582,28 @@ def test_a_reply_that_nothing_makes_up_asks_for_answers() -> None:
         frames = {**plain.frames, "page": frame}
         sensor = sound.sensor(frames=frames, commands={"ask": command}, configure=configure)
         (answering,) = [one for one in PROPERTIES if one.function is the_simulated_sensor_answers]
-        return [f"{found.code} {found.path}: {found.what}" for found in answering.findings(Subject(sensor))]
+        return [
+            f"{found.code} {found.path}: {found.what}"
+            for found in answering.findings(Subject(sensor))
+        ]
 
-    page = Frame(Struct("mark" / Const(b"RPLY"), "size" / Int8ul, "text" / Bytes(this.size)), max_length=64)
-    ended = Frame(Struct("mark" / Const(b"RPLY"), "text" / NullTerminated(GreedyBytes)), max_length=64)
-    learning = Command("order", {"code": 9}, reply="page", learns=lambda reply: {"serial": int(reply.text)})
+    page = Frame(
+        Struct("mark" / Const(b"RPLY"), "size" / Int8ul, "text" / Bytes(this.size)), max_length=64
+    )
+    ended = Frame(
+        Struct("mark" / Const(b"RPLY"), "text" / NullTerminated(GreedyBytes)), max_length=64
+    )
+    learning = Command(
+        "order", {"code": 9}, reply="page", learns=lambda reply: {"serial": int(reply.text)}
+    )
     (empty,) = finding(learning, page)
-    assert empty.startswith("LS604 commands.ask: its reply, which is made up without answers= of the Simulation, cannot be learned from")
+    assert empty.startswith(
+        "LS604 commands.ask: its reply, which is made up without answers= of the Simulation, cannot be learned from"
+    )
     (unmade,) = finding(Command("order", {"code": 9}, reply="page"), ended)
-    assert unmade.startswith("LS604 commands.ask: its reply cannot be made up without answers= of the Simulation: cannot be simulated")
+    assert unmade.startswith(
+        "LS604 commands.ask: its reply cannot be made up without answers= of the Simulation: cannot be simulated"
+    )
 
 
 def test_vectors_that_prove_nothing_are_findings(tmp_path: Path) -> None:
@@ -468,8 +635,15 @@ def test_vectors_that_prove_nothing_are_findings(tmp_path: Path) -> None:
         ({"args": {"speed": 3}}, "unknown"),
     ],
 )
-def test_vectors_hold_commands_and_their_replies(changes: dict[str, Any], said: str, tmp_path: Path) -> None:
-    vector = {"command": "start", "hex": "16 61 01 76", "reply": "17 71 44 01 23", "source": "by hand"}
+def test_vectors_hold_commands_and_their_replies(
+    changes: dict[str, Any], said: str, tmp_path: Path
+) -> None:
+    vector = {
+        "command": "start",
+        "hex": "16 61 01 76",
+        "reply": "17 71 44 01 23",
+        "source": "by hand",
+    }
     (file := tmp_path / "vectors.json").write_text(json.dumps([vector | changes]), encoding="utf-8")
     if not said:
         vectors_hold(Subject(sound.sensor(), vectors=file))
@@ -508,7 +682,9 @@ def test_scaled_floats_are_read_and_built_in_their_unit() -> None:
         ('[{"args": 1}]', "args is an object of numbers and texts"),
     ],
 )
-def test_vectors_of_any_shape_are_a_fault_of_their_file(text: str | bytes, said: str, tmp_path: Path) -> None:
+def test_vectors_of_any_shape_are_a_fault_of_their_file(
+    text: str | bytes, said: str, tmp_path: Path
+) -> None:
     file = tmp_path / "strange.txt"
     file.write_bytes(text if isinstance(text, bytes) else text.encode())
     (holding,) = [one for one in PROPERTIES if one.function is vectors_hold]
@@ -522,12 +698,18 @@ def is_certain(f: Fields) -> Any:
 
 
 def certain_sweep(i: int) -> dict[str, Any]:
-    return {**count.sweep(i), "samples.quality": np.full(count.LONGEST, 7), "samples.distance": np.full(count.LONGEST, 1.0)}
+    return {
+        **count.sweep(i),
+        "samples.quality": np.full(count.LONGEST, 7),
+        "samples.distance": np.full(count.LONGEST, 1.0),
+    }
 
 
 @pytest.mark.parametrize("number", [1, count.LONGEST])
 def test_a_frame_around_a_sweep_has_as_many_elements_as_are_drawn(number: int) -> None:
     data = replace(count.SENSOR.frames["data"], plausible=is_certain)
     sensor = replace(count.SENSOR, frames={"data": data}, simulation=Simulation(certain_sweep))
-    frame = sensor.parse(random_frame(sensor, "data", random.Random(1), {"count": lambda _: number}))
+    frame = sensor.parse(
+        random_frame(sensor, "data", random.Random(1), {"count": lambda _: number})
+    )
     assert [sample.quality for sample in frame.samples] == [7] * number

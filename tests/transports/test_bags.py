@@ -31,11 +31,19 @@ STEP = 1_327_104
 LIST = "std_msgs/Header header\n{1}[] packets\n" + "=" * 80 + "\nMSG: {0}/{1}\n"
 STAMPED = LIST + "builtin_interfaces/Time stamp\n"
 LAYOUTS = {
-    "velodyne_msgs/msg/VelodyneScan": f"{STAMPED}uint8[1206] data".format("velodyne_msgs", "VelodynePacket"),
-    "pandar_msgs/msg/PandarScan": f"{STAMPED}uint8[1500] data\nuint32 size".format("pandar_msgs", "PandarPacket"),
+    "velodyne_msgs/msg/VelodyneScan": f"{STAMPED}uint8[1206] data".format(
+        "velodyne_msgs", "VelodynePacket"
+    ),
+    "pandar_msgs/msg/PandarScan": f"{STAMPED}uint8[1500] data\nuint32 size".format(
+        "pandar_msgs", "PandarPacket"
+    ),
     "nebula_msgs/msg/NebulaPackets": f"{STAMPED}uint8[] data".format("nebula_msgs", "NebulaPacket"),
-    "hesai_ros_driver/msg/UdpFrame": f"{LIST}uint8[] data\nuint32 size".format("hesai_ros_driver", "UdpPacket"),
-    "rslidar_msgs/msg/rslidarScan": f"{STAMPED}uint8[1248] data".format("rslidar_msgs", "rslidarPacket"),
+    "hesai_ros_driver/msg/UdpFrame": f"{LIST}uint8[] data\nuint32 size".format(
+        "hesai_ros_driver", "UdpPacket"
+    ),
+    "rslidar_msgs/msg/rslidarScan": f"{STAMPED}uint8[1248] data".format(
+        "rslidar_msgs", "rslidarPacket"
+    ),
     "rslidar_msg/msg/RslidarPacket": "std_msgs/Header header\nuint8 is_difop\nuint8 is_frame_begin\nuint8[] data",
     "ouster_sensor_msgs/msg/PacketMsg": "uint8[] buf",
 }
@@ -47,24 +55,46 @@ def packets(number: int, name: str = "velodyne-vlp16", start: int = 0) -> list[b
 
 
 def recorded(path: Path, kind: str, topics: dict[str, tuple[str, Sequence[bytes]]]) -> Path:
-    """A log in which each topic has a type and packets, a list of ten or one a message, as rosbags writes it."""
+    """A log in which each topic has a type and packets, a list of ten or one a message, as rosbags
+    writes it.
+    """
     is_1 = kind == "bag"
-    store = typesys.get_typestore(typesys.Stores.ROS1_NOETIC if is_1 else typesys.Stores.ROS2_HUMBLE)
-    plugin = rosbag2.StoragePlugin.MCAP if kind in ("folder", "mcap") else rosbag2.StoragePlugin.SQLITE3
-    log = rosbag1.Writer(path / "log.bag") if is_1 else rosbag2.Writer(path / "log", version=8, storage_plugin=plugin)
+    store = typesys.get_typestore(
+        typesys.Stores.ROS1_NOETIC if is_1 else typesys.Stores.ROS2_HUMBLE
+    )
+    plugin = (
+        rosbag2.StoragePlugin.MCAP if kind in ("folder", "mcap") else rosbag2.StoragePlugin.SQLITE3
+    )
+    log = (
+        rosbag1.Writer(path / "log.bag")
+        if is_1
+        else rosbag2.Writer(path / "log", version=8, storage_plugin=plugin)
+    )
     with log:
         for topic, (msgtype, data) in topics.items():
             if msgtype not in store.types:
                 store.register(typesys.get_types_from_msg(LAYOUTS[msgtype], msgtype))
             link = log.add_connection(topic, msgtype, typestore=store)
             for at, message in messages(store, msgtype, data):
-                log.write(link, at, store.serialize_ros1(message, msgtype) if is_1 else store.serialize_cdr(message, msgtype))
+                log.write(
+                    link,
+                    at,
+                    store.serialize_ros1(message, msgtype)
+                    if is_1
+                    else store.serialize_cdr(message, msgtype),
+                )
     if kind == "untold":
         with sqlite3.connect(path / "log" / "log.db3") as database:
             database.execute("drop table message_definitions")
             database.execute("update schema set schema_version = 3")
         database.close()
-    names = {"bag": "log.bag", "folder": "log", "mcap": "log/log.mcap", "db3": "log/log.db3", "untold": "log/log.db3"}
+    names = {
+        "bag": "log.bag",
+        "folder": "log",
+        "mcap": "log/log.mcap",
+        "db3": "log/log.db3",
+        "untold": "log/log.db3",
+    }
     return path / names[kind]
 
 
@@ -79,17 +109,33 @@ def messages(store: Any, msgtype: str, data: Sequence[bytes]) -> Iterator[tuple[
             yield stamps[0], made(store, msgtype, *next(items))
             continue
         (*_, (element, _)) = dict(store.fielddefs[msgtype][1])["packets"]
-        yield stamps[-1], kind(header=header(store, stamps[-1]), packets=[made(store, element[1], *item) for item in items])
+        yield (
+            stamps[-1],
+            kind(
+                header=header(store, stamps[-1]),
+                packets=[made(store, element[1], *item) for item in items],
+            ),
+        )
 
 
 def made(store: Any, name: str, data: bytes, at: int) -> Any:
-    values: dict[str, Any] = {"stamp": time(store, at), "header": header(store, at), "size": len(data), "is_difop": 0, "is_frame_begin": 0}
-    fixed = {"velodyne_msgs/msg/VelodynePacket": 1206, "rslidar_msgs/msg/rslidarPacket": 1248, "pandar_msgs/msg/PandarPacket": 1500}.get(
-        name, len(data)
-    )
+    values: dict[str, Any] = {
+        "stamp": time(store, at),
+        "header": header(store, at),
+        "size": len(data),
+        "is_difop": 0,
+        "is_frame_begin": 0,
+    }
+    fixed = {
+        "velodyne_msgs/msg/VelodynePacket": 1206,
+        "rslidar_msgs/msg/rslidarPacket": 1248,
+        "pandar_msgs/msg/PandarPacket": 1500,
+    }.get(name, len(data))
     values["data"] = values["buf"] = np.frombuffer(data.ljust(fixed, b"\0"), np.uint8)
     kind = store.types[name]
-    return kind(**{field: values[field] for field in kind.__dataclass_fields__ if field != "__msgtype__"})
+    return kind(
+        **{field: values[field] for field in kind.__dataclass_fields__ if field != "__msgtype__"}
+    )
 
 
 def time(store: Any, at: int) -> Any:
@@ -98,7 +144,11 @@ def time(store: Any, at: int) -> Any:
 
 def header(store: Any, at: int) -> Any:
     kind = store.types["std_msgs/msg/Header"]
-    return kind(**({"seq": 1} if "seq" in kind.__dataclass_fields__ else {}), stamp=time(store, at), frame_id="x")
+    return kind(
+        **({"seq": 1} if "seq" in kind.__dataclass_fields__ else {}),
+        stamp=time(store, at),
+        frame_id="x",
+    )
 
 
 def read(source: Path | str) -> list[Chunk]:
@@ -109,7 +159,9 @@ def read(source: Path | str) -> list[Chunk]:
 
 #: every layout in one kind of log and every kind of log with one layout; the other pairs are slow.
 PAIRS = [
-    pytest.param(kind, msgtype, marks=() if kind == "mcap" or "Velodyne" in msgtype else pytest.mark.slow)
+    pytest.param(
+        kind, msgtype, marks=() if kind == "mcap" or "Velodyne" in msgtype else pytest.mark.slow
+    )
     for kind in KINDS
     for msgtype in LAYOUTS
 ]
@@ -117,7 +169,9 @@ PAIRS = [
 
 @pytest.mark.parametrize(("kind", "msgtype"), PAIRS)
 def test_packets_come_back_as_they_were_recorded(tmp_path: Path, kind: str, msgtype: str) -> None:
-    sent = packets(25, "robosense-rs16" if msgtype == "rslidar_msgs/msg/rslidarScan" else "velodyne-vlp16")
+    sent = packets(
+        25, "robosense-rs16" if msgtype == "rslidar_msgs/msg/rslidarScan" else "velodyne-vlp16"
+    )
     chunks = read(recorded(tmp_path, kind, {"/lidar/packets": (msgtype, sent)}))
     assert [chunk.data for chunk in chunks] == sent
     assert {chunk.sender for chunk in chunks} == {None}
@@ -144,7 +198,9 @@ def test_a_log_is_converted_as_a_capture_is(tmp_path: Path, kind: str) -> None:
 def test_packets_of_several_sensors_are_chosen_by_namespace_or_topic(tmp_path: Path) -> None:
     sent, other = packets(20), packets(20, start=1000)
     scan = "velodyne_msgs/msg/VelodyneScan"
-    path = recorded(tmp_path, "mcap", {"/front/packets": (scan, sent), "/rear/packets": (scan, other)})
+    path = recorded(
+        tmp_path, "mcap", {"/front/packets": (scan, sent), "/rear/packets": (scan, other)}
+    )
     assert {chunk.sender for chunk in read(path)} == {("/front", 0), ("/rear", 0)}
     said = ran("convert", path, tmp_path / "out.csv", "-s", "velodyne-vlp16", code=2).stderr
     assert "/front and /rear both send frames of velodyne-vlp16" in said
@@ -161,7 +217,11 @@ def test_packets_of_several_sensors_are_chosen_by_namespace_or_topic(tmp_path: P
 def test_topics_of_one_namespace_are_one_sensor(tmp_path: Path) -> None:
     sent = packets(20)
     kind = "ouster_sensor_msgs/msg/PacketMsg"
-    path = recorded(tmp_path, "db3", {"/ouster/lidar_packets": (kind, sent), "/ouster/imu_packets": (kind, [b"imu"] * 20)})
+    path = recorded(
+        tmp_path,
+        "db3",
+        {"/ouster/lidar_packets": (kind, sent), "/ouster/imu_packets": (kind, [b"imu"] * 20)},
+    )
     chunks = read(path)
     assert {chunk.sender for chunk in chunks} == {None}
     assert [chunk.data for chunk in chunks if chunk.data != b"imu"] == sent
@@ -171,13 +231,17 @@ def test_topics_of_one_namespace_are_one_sensor(tmp_path: Path) -> None:
 def test_a_log_of_points_says_that_it_has_no_packets(tmp_path: Path) -> None:
     sensor = ls.sensor("velodyne-vlp16")
     write(tmp_path / "a.bag", sensor.scans(packets(20)))
-    said = ran("convert", tmp_path / "a.bag", tmp_path / "out.csv", "-s", "velodyne-vlp16", code=4).stderr
+    said = ran(
+        "convert", tmp_path / "a.bag", tmp_path / "out.csv", "-s", "velodyne-vlp16", code=4
+    ).stderr
     assert "a.bag is a ROS 1 bag without packets: /points has sensor_msgs/msg/PointCloud2" in said
 
 
 @pytest.mark.parametrize("kind", KINDS)
 @pytest.mark.parametrize("inputs", [10, pytest.param(100, marks=pytest.mark.slow)])
-def test_a_damaged_log_is_a_source_error_and_no_other(tmp_path: Path, kind: str, inputs: int) -> None:
+def test_a_damaged_log_is_a_source_error_and_no_other(
+    tmp_path: Path, kind: str, inputs: int
+) -> None:
     path = recorded(tmp_path, kind, {"/p": ("nebula_msgs/msg/NebulaPackets", packets(50))})
     target = next(iter(path.glob("*.mcap"))) if path.is_dir() else path
     whole, random = target.read_bytes(), np.random.default_rng(1)
@@ -195,7 +259,10 @@ def test_damage_in_a_log_of_our_own_packets_is_a_source_error(tmp_path: Path, su
     """Opening such a log reads its first message, which says whether it holds datagrams."""
     source = tmp_path / "it.pcap"
     ends = ("192.168.1.201", 2368), ("192.168.1.77", 2368)
-    records = [datagram_record(Datagram(data, START + STEP * number, *ends)) for number, data in enumerate(packets(20))]
+    records = [
+        datagram_record(Datagram(data, START + STEP * number, *ends))
+        for number, data in enumerate(packets(20))
+    ]
     source.write_bytes(capture_head(ETHERNET) + b"".join(records))
     log = tmp_path / f"out.{suffix}"
     ran("convert", "--packets", source, log, "-s", "velodyne-vlp16")
@@ -218,14 +285,21 @@ def test_packets_are_the_same_through_every_container(tmp_path: Path) -> None:
     sent = packets(40)
     source = tmp_path / "it.pcap"
     ends = ("192.168.1.201", 2368), ("192.168.1.77", 2368)
-    records = [datagram_record(Datagram(data, START + STEP * number, *ends)) for number, data in enumerate(sent)]
+    records = [
+        datagram_record(Datagram(data, START + STEP * number, *ends))
+        for number, data in enumerate(sent)
+    ]
     source.write_bytes(capture_head(ETHERNET) + b"".join(records))
     for suffix in ("mcap", "bag", "rosbag2", "db3", "lsr", "pcap"):
         target = tmp_path / f"out.{suffix}"
         words = ("record",) if suffix in ("lsr", "pcap") else ("convert", "--packets")
         ran(*words, source, *(["-o"] if len(words) == 1 else []), target, "-s", "velodyne-vlp16")
-        assert [(chunk.data, chunk.at) for chunk in read(target)] == [(data, START + STEP * number) for number, data in enumerate(sent)]
-        source = target if suffix in ("mcap", "lsr") else source  # packets of a log are taken over from log to log
+        assert [(chunk.data, chunk.at) for chunk in read(target)] == [
+            (data, START + STEP * number) for number, data in enumerate(sent)
+        ]
+        source = (
+            target if suffix in ("mcap", "lsr") else source
+        )  # packets of a log are taken over from log to log
     ran("convert", tmp_path / "out.mcap", tmp_path / "mcap.csv", "-s", "velodyne-vlp16")
     ran("convert", tmp_path / "it.pcap", tmp_path / "pcap.csv", "-s", "velodyne-vlp16")
     assert (tmp_path / "mcap.csv").read_bytes() == (tmp_path / "pcap.csv").read_bytes()
@@ -233,10 +307,26 @@ def test_packets_are_the_same_through_every_container(tmp_path: Path) -> None:
 
 def test_packets_have_no_place_elsewhere(tmp_path: Path) -> None:
     (tmp_path / "it.bin").write_bytes(ls.sensor("ldrobot-stl27l").example("data"))
-    said = ran("convert", tmp_path / "it.bin", tmp_path / "out.mcap", "--packets", "-s", "ldrobot-stl27l", code=2).stderr
+    said = ran(
+        "convert",
+        tmp_path / "it.bin",
+        tmp_path / "out.mcap",
+        "--packets",
+        "-s",
+        "ldrobot-stl27l",
+        code=2,
+    ).stderr
     assert "it.bin is a stream of bytes: packets are those of datagrams" in said
-    assert "can be read only once: record it first" in ran("convert", "-", "o.mcap", "--packets", "-s", "velodyne-vlp16", code=2).stderr
+    assert (
+        "can be read only once: record it first"
+        in ran("convert", "-", "o.mcap", "--packets", "-s", "velodyne-vlp16", code=2).stderr
+    )
     path = recorded(tmp_path, "mcap", {"/p": ("nebula_msgs/msg/NebulaPackets", packets(20))})
-    said = ran("convert", path, tmp_path / "out.csv", "--packets", "-s", "velodyne-vlp16", code=2).stderr
-    assert "out.csv: .csv has no place for --packets; those that have are .mcap, .bag, .rosbag2, .db3" in said
+    said = ran(
+        "convert", path, tmp_path / "out.csv", "--packets", "-s", "velodyne-vlp16", code=2
+    ).stderr
+    assert (
+        "out.csv: .csv has no place for --packets; those that have are .mcap, .bag, .rosbag2, .db3"
+        in said
+    )
     assert not list(tmp_path.glob("out.*"))

@@ -1,4 +1,6 @@
-"""Hexadecimal text, in the ways that people print it; what could mean something else is refused by name."""
+"""Hexadecimal text, in the ways that people print it; what could mean something else is refused by
+name.
+"""
 
 from __future__ import annotations
 
@@ -41,12 +43,18 @@ def test_bytes_are_read_as_people_print_them(text: str, tmp_path: Path) -> None:
         assert b"".join(chunk.data for chunk in opened.chunks()) == b"\x8b\x13\x5a"
 
 
-@pytest.mark.parametrize("form", ["8b135a", "8B 13 5a ", "0x8B,0x13,0x5A,", "8b:13:5a:", r"\x8b\x13\x5a", "  8b 135a\t"])
-def test_a_line_without_end_is_read_in_pieces(form: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+@pytest.mark.parametrize(
+    "form", ["8b135a", "8B 13 5a ", "0x8B,0x13,0x5A,", "8b:13:5a:", r"\x8b\x13\x5a", "  8b 135a\t"]
+)
+def test_a_line_without_end_is_read_in_pieces(
+    form: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     block = 1 << 13
     monkeypatch.setattr(hexadecimal, "BLOCK", block)
     line = form * (3 * block // len(form))
-    (tmp_path / "a.hex").write_text(f"0000: {line}# {line}\n{line}\n{line[: block // len(form) * len(form)]}", encoding="ascii")
+    (tmp_path / "a.hex").write_text(
+        f"0000: {line}# {line}\n{line}\n{line[: block // len(form) * len(form)]}", encoding="ascii"
+    )
     with contextlib.closing(transport(tmp_path / "a.hex")) as opened:
         found = [chunk.data for chunk in opened.chunks()]
     assert b"".join(found) == unhexed(line) * 2 + unhexed(form) * (block // len(form))
@@ -56,7 +64,12 @@ def test_a_line_without_end_is_read_in_pieces(form: str, tmp_path: Path, monkeyp
 def test_a_single_digit_is_a_byte_where_it_says_so_alone() -> None:
     assert unhexed("0xa, 0x5") == b"\x0a\x05"
     assert unhexed("") == b""
-    for text, reason in (("a 5", "'a' makes no whole bytes"), ("0x", "makes no whole bytes"), ("a5 z1", "'z' is no digit"), ("a5|", "'|'")):
+    for text, reason in (
+        ("a 5", "'a' makes no whole bytes"),
+        ("0x", "makes no whole bytes"),
+        ("a5 z1", "'z' is no digit"),
+        ("a5|", "'|'"),
+    ):
         with pytest.raises(ValueError, match=reason.replace("|", r"\|")):
             unhexed(text)
 
@@ -75,16 +88,29 @@ EVERY = bytes(range(256)) + b" ab |ef  12 34  #//abc/*"
 
 @pytest.mark.parametrize(
     "command",
-    ["xxd", "xxd -g1", "xxd -u -g4 -c32", "xxd -p", "xxd -i", "hexdump -C", "od -An -tx1", "od -tx1"],
+    [
+        "xxd",
+        "xxd -g1",
+        "xxd -u -g4 -c32",
+        "xxd -p",
+        "xxd -i",
+        "hexdump -C",
+        "od -An -tx1",
+        "od -tx1",
+    ],
 )
 def test_dumps_are_read_as_their_tools_print_them(command: str, tmp_path: Path) -> None:
     (tmp_path / "it.bin").write_bytes(EVERY)
     program, *options = command.split()
     if shutil.which(program) is None:
         pytest.skip(f"there is no {program} here")
-    done = subprocess.run([program, *options, "it.bin"], cwd=tmp_path, capture_output=True, text=True, check=True)
+    done = subprocess.run(
+        [program, *options, "it.bin"], cwd=tmp_path, capture_output=True, text=True, check=True
+    )
     assert unhexed(done.stdout) == EVERY
-    assert unhexed(done.stdout * 2) == EVERY * 2 or command == "xxd -p"  # a dump begins again where its offset does
+    assert (
+        unhexed(done.stdout * 2) == EVERY * 2 or command == "xxd -p"
+    )  # a dump begins again where its offset does
 
 
 def test_frames_are_read_as_analysers_and_terminals_print_them() -> None:
@@ -93,9 +119,7 @@ def test_frames_are_read_as_analysers_and_terminals_print_them() -> None:
         "0010   64 2c                                             d,\n"
     )
     older = "0000  54 2c 10 0e 54 2c 41 20  2e 2e 2e 2e 61 62 20 63   T,..T,A ....ab c\n0010  64 2c   d,"
-    tcpdump = (
-        "\t0x0000:  542c 100e 542c 4120 2e2e 2e2e 6162 2063  T,..T,A.....ab.c\n\t0x0010:  642c                                     d,\n"
-    )
+    tcpdump = "\t0x0000:  542c 100e 542c 4120 2e2e 2e2e 6162 2063  T,..T,A.....ab.c\n\t0x0010:  642c                                     d,\n"
     for text in (wireshark, older, tcpdump):
         assert unhexed(text) == b"T,\x10\x0eT,A ....ab cd,", text
 
@@ -133,9 +157,14 @@ LOGIC = 'name,type,start_time,duration,data\n"Async Serial","data",0.0000125,8.6
 @pytest.mark.parametrize("table", [SALEAE, LOGIC])
 def test_tables_of_logic_analysers_are_read_with_their_times(table: str, tmp_path: Path) -> None:
     for name in ("it.csv", "it.hex", "it.hex.gz"):
-        (tmp_path / name).write_bytes(gzip.compress(table.encode()) if name.endswith("gz") else table.encode())
+        (tmp_path / name).write_bytes(
+            gzip.compress(table.encode()) if name.endswith("gz") else table.encode()
+        )
         with contextlib.closing(transport(tmp_path / name)) as opened:
-            assert [(chunk.data, chunk.at) for chunk in opened.chunks() if chunk.data] == [(b"\x54", 12500), (b"\x2c", 1_500_000_000)]
+            assert [(chunk.data, chunk.at) for chunk in opened.chunks() if chunk.data] == [
+                (b"\x54", 12500),
+                (b"\x2c", 1_500_000_000),
+            ]
     (tmp_path / "raw.log").write_bytes(b"\x54\x2c\xff")
     with contextlib.closing(transport(tmp_path / "raw.log")) as opened:
         assert [chunk.data for chunk in opened.chunks()] == [b"\x54\x2c\xff"]
@@ -185,13 +214,30 @@ def test_what_can_be_read_in_two_ways_is_refused_by_what_it_may_be(text: str) ->
 
 def test_the_command_line_takes_text_in_every_place(tmp_path: Path) -> None:
     frame = ls.sensor("ldrobot-stl27l").example("data")
-    dump = "\n".join(f"{start:08x}  {frame[start : start + 16].hex(' ')}" for start in range(0, len(frame), 16))
-    log = "".join(f"(1700000000.{number:06d}) can0 003#{frame[number : number + 8].hex()}\n" for number in range(0, len(frame), 8))
+    dump = "\n".join(
+        f"{start:08x}  {frame[start : start + 16].hex(' ')}" for start in range(0, len(frame), 16)
+    )
+    log = "".join(
+        f"(1700000000.{number:06d}) can0 003#{frame[number : number + 8].hex()}\n"
+        for number in range(0, len(frame), 8)
+    )
     (tmp_path / "it.log").write_text(log * 3, encoding="ascii")
     plain = ran("parse", frame.hex(), "-s", "ldrobot-stl27l").stdout
     assert ran("parse", "-", "-s", "ldrobot-stl27l", given=dump.encode()).stdout == plain
     assert ran("parse", "-", "-s", "ldrobot-stl27l", given=log.encode()).stdout == plain
-    assert ran("parse", *(f"0x{byte:02X}," for byte in frame), "-s", "ldrobot-stl27l").stdout == plain
+    assert (
+        ran("parse", *(f"0x{byte:02X}," for byte in frame), "-s", "ldrobot-stl27l").stdout == plain
+    )
     assert "ldrobot-" in ran("detect", tmp_path / "it.log").output
-    said = ran("parse", "-", "-s", "ldrobot-stl27l", given=(log + log.replace("003#", "004#")).encode(), code=4).stderr
-    assert "standard input, line 7: not hexadecimal: CAN frames of can0 003 and of can0 004; grep takes those of one" in said
+    said = ran(
+        "parse",
+        "-",
+        "-s",
+        "ldrobot-stl27l",
+        given=(log + log.replace("003#", "004#")).encode(),
+        code=4,
+    ).stderr
+    assert (
+        "standard input, line 7: not hexadecimal: CAN frames of can0 003 and of can0 004; grep takes those of one"
+        in said
+    )

@@ -41,7 +41,12 @@ def registry() -> Iterator[None]:
 def test_a_transport_of_a_plugin_has_what_it_does_not_say() -> None:
     opened = transport("once:")
     assert [chunk.data for chunk in opened.chunks()] == [b"once"]
-    assert (opened.datagrams, opened.baud, list(opened.warnings), opened.foreign) == (False, None, [], 0)
+    assert (opened.datagrams, opened.baud, list(opened.warnings), opened.foreign) == (
+        False,
+        None,
+        [],
+        0,
+    )
     with pytest.raises(ls.UsageError, match="is a file"):
         live("once:")
 

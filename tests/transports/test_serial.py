@@ -25,7 +25,9 @@ def opened(source: str, sensor: ls.Sensor | None = None) -> SerialTransport:
     return made
 
 
-@pytest.mark.parametrize("form", ["serial://{}?baud=115200", "{}?baud=115200", "serial://{}?baud=150000&dtr=0&rts=1"])
+@pytest.mark.parametrize(
+    "form", ["serial://{}?baud=115200", "{}?baud=115200", "serial://{}?baud=150000&dtr=0&rts=1"]
+)
 def test_a_port_is_read_and_written(tmp_path: Path, form: str) -> None:
     with port(tmp_path) as line:
         name = str(line.name) if "serial" in form else os.path.realpath(line.name)
@@ -45,7 +47,10 @@ def test_a_port_is_read_and_written(tmp_path: Path, form: str) -> None:
 def test_the_sensor_says_the_baud_rate_and_the_source_overrides_it(tmp_path: Path) -> None:
     sensor = SHAPES["shape-commands"]
     with port(tmp_path) as line:
-        for source, baud in ((f"serial://{line.name}", 115_200), (f"serial://{line.name}?baud=460800", 460_800)):
+        for source, baud in (
+            (f"serial://{line.name}", 115_200),
+            (f"serial://{line.name}?baud=460800", 460_800),
+        ):
             one = opened(source, sensor)
             assert one.baud == baud
             one.close()
@@ -72,7 +77,9 @@ def test_control_lines_are_taken_where_the_port_has_none(tmp_path: Path) -> None
         ("serial://?baud=9600", UsageError, "names no port", ""),
     ],
 )
-def test_what_cannot_be_opened_says_why(source: str, error: type[Exception], text: str, following: str) -> None:
+def test_what_cannot_be_opened_says_why(
+    source: str, error: type[Exception], text: str, following: str
+) -> None:
     with pytest.raises(error, match=text) as caught:
         transport(source)
     assert not following or caught.value.__notes__ == [f"next: {following}"]

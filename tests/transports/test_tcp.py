@@ -55,9 +55,13 @@ def test_a_stream_is_read_written_and_connected_again(server: socket.socket) -> 
         ("tcp://127.0.0.1:1?port=3", UsageError, "unknown option 'port'"),
     ],
 )
-def test_what_cannot_be_connected_says_why(server: socket.socket, source: str, error: type[Exception], text: str) -> None:
+def test_what_cannot_be_connected_says_why(
+    server: socket.socket, source: str, error: type[Exception], text: str
+) -> None:
     port = server.getsockname()[1]
     server.close()
     with pytest.raises(error, match=text) as caught:
         transport(source.format(free=port))
-    assert error is UsageError or caught.value.__notes__[0].startswith("next: lidarspec doctor tcp://")
+    assert error is UsageError or caught.value.__notes__[0].startswith(
+        "next: lidarspec doctor tcp://"
+    )

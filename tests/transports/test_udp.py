@@ -95,10 +95,17 @@ def test_a_sender_is_asked_for_by_any_name_of_its_address(name: str) -> None:
 
 @pytest.mark.parametrize(
     "source",
-    ["udp://:{port}?src=localhots.invalid", "udp://:{port}?src=192.168.1", "udp://10.0.0.256:{port}", "udp://:{port}?src=%00"],
+    [
+        "udp://:{port}?src=localhots.invalid",
+        "udp://:{port}?src=192.168.1",
+        "udp://10.0.0.256:{port}",
+        "udp://:{port}?src=%00",
+    ],
 )
 def test_a_host_that_nobody_knows_is_refused(source: str) -> None:
-    with pytest.raises(UsageError, match=r"there is no host '(localhots.invalid|192.168.1|10.0.0.256|\\x00)'"):
+    with pytest.raises(
+        UsageError, match=r"there is no host '(localhots.invalid|192.168.1|10.0.0.256|\\x00)'"
+    ):
         opened(source.format(port=free_port()))
 
 
@@ -141,7 +148,9 @@ def test_without_recvmmsg_datagrams_come_one_by_one() -> None:
         assert list(one.datagrams(7, 0)) == []
         for data in (b"a", b"", bytes(65_507)):
             sender.sendto(data, receiver.getsockname())
-        assert list(one.datagrams(7, 0)) == [(data, sender.getsockname(), 7) for data in (b"a", b"", bytes(65_507))]
+        assert list(one.datagrams(7, 0)) == [
+            (data, sender.getsockname(), 7) for data in (b"a", b"", bytes(65_507))
+        ]
 
 
 @LINUX
@@ -154,7 +163,9 @@ def test_many_datagrams_in_one_call() -> None:
             (sender if index % 3 else other).sendto(data, ("127.0.0.1", number))
         found = read(one, 700)
         assert [chunk.data for chunk in found] == sent
-        assert [chunk.sender for chunk in found] == [(sender if index % 3 else other).getsockname() for index in range(700)]
+        assert [chunk.sender for chunk in found] == [
+            (sender if index % 3 else other).getsockname() for index in range(700)
+        ]
     assert [chunk.at for chunk in found] == sorted(chunk.at or 0 for chunk in found)
     one.close()
 
@@ -247,8 +258,18 @@ def test_the_buffer_is_read_back() -> None:
 @pytest.mark.parametrize(
     ("source", "error", "text", "following"),
     [
-        ("udp://:{busy}", SourceError, "UDP port {busy} is in use by another program", "lidarspec doctor udp://:{busy}"),
-        ("udp://192.0.2.1:{free}", SourceError, "192.0.2.1 is no address of this computer", "lidarspec doctor udp://:{free}"),
+        (
+            "udp://:{busy}",
+            SourceError,
+            "UDP port {busy} is in use by another program",
+            "lidarspec doctor udp://:{busy}",
+        ),
+        (
+            "udp://192.0.2.1:{free}",
+            SourceError,
+            "192.0.2.1 is no address of this computer",
+            "lidarspec doctor udp://:{free}",
+        ),
         ("udp://", UsageError, "which port", ""),
         ("udp://:2368?group=10.0.0.1", UsageError, "no multicast group", ""),
         ("udp://?port=1,x", UsageError, "port is one number", ""),
@@ -256,7 +277,9 @@ def test_the_buffer_is_read_back() -> None:
         ("udp://:2368?source=10.0.0.1", UsageError, "unknown option 'source'", ""),
     ],
 )
-def test_what_cannot_be_opened_says_why(source: str, error: type[Exception], text: str, following: str) -> None:
+def test_what_cannot_be_opened_says_why(
+    source: str, error: type[Exception], text: str, following: str
+) -> None:
     with udp() as busy:
         names = {"busy": busy.getsockname()[1], "free": free_port()}
         with pytest.raises(error, match=text.format(**names)) as caught:

@@ -15,5 +15,10 @@ from tests.view.browser import FLAGS, installed
 def browser() -> Iterator[Any]:
     """A browser of playwright's, closed at the end."""
     api = pytest.importorskip("playwright.sync_api", reason="playwright is not installed")
-    with api.sync_playwright() as running, contextlib.closing(running.chromium.launch(executable_path=installed(), args=FLAGS)) as started:
+    with (
+        api.sync_playwright() as running,
+        contextlib.closing(
+            running.chromium.launch(executable_path=installed(), args=FLAGS)
+        ) as started,
+    ):
         yield started

@@ -16,7 +16,9 @@ def parsed(message: bytes) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
     columns = {}
     for column in header["columns"]:
         assert place % 8 == 0
-        columns[column["name"]] = np.frombuffer(message, "<" + column["type"], header["points"], place)
+        columns[column["name"]] = np.frombuffer(
+            message, "<" + column["type"], header["points"], place
+        )
         place += columns[column["name"]].nbytes + -columns[column["name"]].nbytes % 8
     assert place == len(message)
     return header, columns

@@ -1,4 +1,6 @@
-"""A broadcast that is served, and pages that are open on it: real sockets, and what a page says and hears."""
+"""A broadcast that is served, and pages that are open on it: real sockets, and what a page says and
+hears.
+"""
 
 from __future__ import annotations
 
@@ -37,32 +39,50 @@ client = Library("websockets.sync.client")
 DEADLINE = 30.0
 FLAT, SOLID = "ldrobot-stl27l", "robosense-m1"
 #: a page that stands for the built one.
-PAGE_TEXT = '<!doctype html><title>page</title><link rel="icon" href="data:,"><script src="page.js"></script>'
+PAGE_TEXT = (
+    '<!doctype html><title>page</title><link rel="icon" href="data:,"><script'
+    ' src="page.js"></script>'
+)
 
 
 class Station:
-    """A source that is read in a thread and served, as `lidarspec view --web` does; a context manager.
+    """A source that is read in a thread and served, as `lidarspec view --web` does; a context
+    manager.
 
     Attributes:
         said: what was told of pages.
         failure: what reading it ended with.
     """
 
-    def __init__(self, source: object, folder: Path, sensor: Any = None, *, select: Selection = EVERYTHING, **options: Any) -> None:
+    def __init__(
+        self,
+        source: object,
+        folder: Path,
+        sensor: Any = None,
+        *,
+        select: Selection = EVERYTHING,
+        **options: Any,
+    ) -> None:
         from lidarspec.view.broadcast import Broadcast
         from lidarspec.view.server import Site
 
         self.source, self.said = str(source), list[str]()
         self.switch = Switch(self.source, folder) if is_live(self.source) else None
-        device = open_device(self.source, sensor, record=self.switch.attached if self.switch else None, period=LOOK)
+        device = open_device(
+            self.source, sensor, record=self.switch.attached if self.switch else None, period=LOOK
+        )
         if self.switch is not None:
             self.switch.sensor_id = device.sensor.id
         reopened = partial(open_device, self.source, device.sensor)
-        self.broadcast = Broadcast(self.source, device, reopened=reopened, select=select, switch=self.switch)
+        self.broadcast = Broadcast(
+            self.source, device, reopened=reopened, select=select, switch=self.switch
+        )
         (folder / "page").mkdir(exist_ok=True)
         (folder / "page" / "index.html").write_text(PAGE_TEXT)
         (folder / "page" / "page.js").write_text("1")
-        self.site = Site(self.broadcast, say=self.said.append, **{"page": folder / "page", **options})
+        self.site = Site(
+            self.broadcast, say=self.said.append, **{"page": folder / "page", **options}
+        )
         self.failure: LidarSpecError | None = None
         self._thread = threading.Thread(target=self._read, name="reading")
 
@@ -92,7 +112,10 @@ class Station:
         """What opens a WebSocket by hand."""
         host = f"127.0.0.1:{self.port}"
         given = {"Host": host, "Origin": f"http://{host}", "Connection": "Upgrade", **UPGRADE}
-        lines = [f"GET /socket?token={self.token} HTTP/1.1", *(f"{name.replace('_', '-')}: {value}" for name, value in given.items())]
+        lines = [
+            f"GET /socket?token={self.token} HTTP/1.1",
+            *(f"{name.replace('_', '-')}: {value}" for name, value in given.items()),
+        ]
         return "\r\n".join([*lines, "", ""]).encode()
 
     def page(self, **options: Any) -> Page:
@@ -115,8 +138,16 @@ class Page:
 
     def __init__(self, link: str, **options: Any) -> None:
         address, _, query = link.partition("?")
-        given = {"origin": address.rstrip("/"), "max_size": None, "compression": None, "open_timeout": DEADLINE, **options}
-        self._opened = client.connect(f"ws{address.removeprefix('http')}socket{'?' * bool(query)}{query}", **given)
+        given = {
+            "origin": address.rstrip("/"),
+            "max_size": None,
+            "compression": None,
+            "open_timeout": DEADLINE,
+            **options,
+        }
+        self._opened = client.connect(
+            f"ws{address.removeprefix('http')}socket{'?' * bool(query)}{query}", **given
+        )
         self._kept = deque[Any]()
 
     def say(self, word: str, **facts: Any) -> None:
@@ -131,7 +162,11 @@ class Page:
         end = time.monotonic() + within
         while (left := end - time.monotonic()) > 0:
             message = self.socket.recv(left)
-            message = parsed(message) if isinstance(message, bytes) else json.loads(message, parse_constant=_no_constant)
+            message = (
+                parsed(message)
+                if isinstance(message, bytes)
+                else json.loads(message, parse_constant=_no_constant)
+            )
             if is_it(message):
                 return message
             self._kept.append(message)
@@ -139,11 +174,17 @@ class Page:
 
     def until(self, word: str, holds: Callable[[Any], bool] = lambda message: True) -> Any:
         """The next message of a word of which something holds."""
-        return self.heard(lambda message: isinstance(message, dict) and message["is"] == word and holds(message))
+        return self.heard(
+            lambda message: isinstance(message, dict) and message["is"] == word and holds(message)
+        )
 
     def state(self, holds: Callable[[Any], bool] = lambda state: True) -> Any:
         """The next state from now on of which something holds."""
-        self._kept = deque(message for message in self._kept if not (isinstance(message, dict) and message["is"] == "state"))
+        self._kept = deque(
+            message
+            for message in self._kept
+            if not (isinstance(message, dict) and message["is"] == "state")
+        )
         return self.until("state", holds)
 
     def scan(self, most: int = 1 << 20) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
@@ -152,7 +193,9 @@ class Page:
         return self.heard(lambda message: isinstance(message, tuple))  # type: ignore[no-any-return]
 
     def scan_at(self, position: float) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
-        """The first scan from now on that is near a place; one that was on its way may come before it."""
+        """The first scan from now on that is near a place; one that was on its way may come before
+        it.
+        """
         while True:
             header, columns = self.scan()
             if abs(header["position"] - position) < 0.21:
@@ -161,7 +204,11 @@ class Page:
     def asked(self, word: str, **facts: Any) -> Any:
         """What comes back on a question: whatever is neither a scan nor a state."""
         self.say(word, **facts)
-        return self.heard(lambda message: isinstance(message, dict) and message["is"] not in ("state", "hello", "ended"))
+        return self.heard(
+            lambda message: (
+                isinstance(message, dict) and message["is"] not in ("state", "hello", "ended")
+            )
+        )
 
     def __enter__(self) -> Page:
         self.socket = self._opened.__enter__()
@@ -175,7 +222,9 @@ def _no_constant(name: str) -> None:
     raise ValueError(f"{name} is not JSON")
 
 
-def recorded(folder: Path, sensor: str = FLAT, seconds: float = 5.0, suffix: str = ".lsr", **faults: Any) -> Path:
+def recorded(
+    folder: Path, sensor: str = FLAT, seconds: float = 5.0, suffix: str = ".lsr", **faults: Any
+) -> Path:
     """A file of what a simulated sensor sends."""
     path = folder / f"sent{suffix}"
     write_file(SimulatedDevice(ls.sensor(sensor), **faults), path, seconds)
@@ -186,10 +235,20 @@ def answered(port: int, path: str, **headers: str) -> tuple[int, dict[str, str],
     """Status, headers and body of what comes back on a raw request.
 
     Args:
-        headers: in the place of the usual ones and beside them, with "_" for "-"; a WebSocket is asked for where one of them is `upgrade`.
+        headers: in the place of the usual ones and beside them, with "_" for "-"; a WebSocket is
+            asked for where one of them is `upgrade`.
     """
-    given = {"Host": f"127.0.0.1:{port}", "Connection": "Upgrade" if "upgrade" in headers else "close", **headers}
-    lines = [f"GET {path} HTTP/1.1", *(f"{name.replace('_', '-')}: {value}" for name, value in given.items()), "", ""]
+    given = {
+        "Host": f"127.0.0.1:{port}",
+        "Connection": "Upgrade" if "upgrade" in headers else "close",
+        **headers,
+    }
+    lines = [
+        f"GET {path} HTTP/1.1",
+        *(f"{name.replace('_', '-')}: {value}" for name, value in given.items()),
+        "",
+        "",
+    ]
     with socket.create_connection(("127.0.0.1", port), DEADLINE) as raw:
         raw.settimeout(DEADLINE)
         raw.sendall("\r\n".join(lines).encode("latin-1"))
@@ -198,14 +257,21 @@ def answered(port: int, path: str, **headers: str) -> tuple[int, dict[str, str],
             data += more
         head, _, body = data.partition(b"\r\n\r\n")
         lines = head.decode("latin-1").split("\r\n")
-        told = {name.lower(): value.strip() for name, _, value in (line.partition(":") for line in lines[1:])}
+        told = {
+            name.lower(): value.strip()
+            for name, _, value in (line.partition(":") for line in lines[1:])
+        }
         while len(body) < int(told.get("content-length", 0)) and (more := raw.recv(1 << 16)):
             body += more
     return int(lines[0].split()[1]), told, body
 
 
 #: the headers that ask for a WebSocket, with which a browser says whose page asks.
-UPGRADE = {"upgrade": "websocket", "Sec_WebSocket_Key": "dGhlIHNhbXBsZSBub25jZQ==", "Sec_WebSocket_Version": "13"}
+UPGRADE = {
+    "upgrade": "websocket",
+    "Sec_WebSocket_Key": "dGhlIHNhbXBsZSBub25jZQ==",
+    "Sec_WebSocket_Version": "13",
+}
 
 
 def masked(message: dict[str, Any]) -> bytes:

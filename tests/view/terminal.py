@@ -22,22 +22,49 @@ _PIECES = re.compile(r"\x1b\[(\d+);(\d+)H|\x1b\[\??([0-9;]*)([A-Za-z])|([\r\n])|
 
 
 class Terminal:
-    """A program, by default ``lidarspec``, with these words in a window of so many columns and lines; a context manager.
+    """A program, by default ``lidarspec``, with these words in a window of so many columns and
+    lines; a context manager.
 
     Attributes:
         modes: private modes that are set: 1049 (alternate screen), 25 (cursor) and so on.
     """
 
     def __init__(
-        self, *words: object, program: Sequence[str] = (), columns: int = 80, lines: int = 24, cwd: Path | None = None, **environment: str
+        self,
+        *words: object,
+        program: Sequence[str] = (),
+        columns: int = 80,
+        lines: int = 24,
+        cwd: Path | None = None,
+        **environment: str,
     ) -> None:
         self._master, slave = os.openpty()
         self.resize(columns, lines, notify=False)
         self.before = termios.tcgetattr(slave)
         self._slave = slave
-        names = {**os.environ, "TERM": "xterm-256color", "NO_COLOR": "", "COLORTERM": "", **environment}
-        command = [sys.executable, "-c", _MAIN, *(program or [sys.executable, "-m", "lidarspec"]), *map(str, words)]
-        self.process = subprocess.Popen(command, stdin=slave, stdout=slave, stderr=slave, cwd=cwd, env=names, start_new_session=True)
+        names = {
+            **os.environ,
+            "TERM": "xterm-256color",
+            "NO_COLOR": "",
+            "COLORTERM": "",
+            **environment,
+        }
+        command = [
+            sys.executable,
+            "-c",
+            _MAIN,
+            *(program or [sys.executable, "-m", "lidarspec"]),
+            *map(str, words),
+        ]
+        self.process = subprocess.Popen(
+            command,
+            stdin=slave,
+            stdout=slave,
+            stderr=slave,
+            cwd=cwd,
+            env=names,
+            start_new_session=True,
+        )
         self.raw, self.modes = "", {"25", "7"}
         self._rest = b""
 
@@ -77,16 +104,24 @@ class Terminal:
         return self.process.returncode
 
     def loaded(self) -> None:
-        """Wait until the program has imported what it works with and sleeps now and then; where that cannot be seen, time has to do."""
+        """Wait until the program has imported what it works with and sleeps now and then; where
+        that cannot be seen, time has to do.
+        """
         end, asleep = time.monotonic() + DEADLINE, 0
         while asleep < 5 and self.process.poll() is None and time.monotonic() < end:
             try:
                 maps = Path(f"/proc/{self.process.pid}/maps").read_text(encoding="utf-8")
-                state = Path(f"/proc/{self.process.pid}/stat").read_text(encoding="utf-8").rpartition(") ")[2]
+                state = (
+                    Path(f"/proc/{self.process.pid}/stat")
+                    .read_text(encoding="utf-8")
+                    .rpartition(") ")[2]
+                )
             except OSError:
                 maps = state = ""
                 end = min(end, time.monotonic() + 3)
-            asleep += "_multiarray_umath" in maps and state.startswith("S")  # one that is being loaded runs, or waits for the disk
+            asleep += "_multiarray_umath" in maps and state.startswith(
+                "S"
+            )  # one that is being loaded runs, or waits for the disk
             self._read(0.02)
 
     def is_as_before(self) -> bool:
@@ -95,17 +130,26 @@ class Terminal:
         return self.modes == {"25", "7"} and termios.tcgetattr(self._slave) == self.before
 
     def is_clean(self) -> bool:
-        """Whether the terminal is as it was: main screen, cursor, wrapping, colours, and lines that are echoed."""
+        """Whether the terminal is as it was: main screen, cursor, wrapping, colours, and lines that
+        are echoed.
+        """
         self.text()
         now = termios.tcgetattr(self._slave)
         return (
-            self.modes == {"25", "7"} and now == self.before and self.raw.rpartition("\x1b[?1049l")[0].endswith("\x1b[0m\x1b[?7h\x1b[?25h")
+            self.modes == {"25", "7"}
+            and now == self.before
+            and self.raw.rpartition("\x1b[?1049l")[0].endswith("\x1b[0m\x1b[?7h\x1b[?25h")
         )
 
     def __enter__(self) -> Terminal:
         return self
 
-    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None) -> None:
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
+    ) -> None:
         self.process.kill()
         self.process.wait()
         os.close(self._master)
@@ -118,7 +162,9 @@ class Terminal:
         data = self._rest + os.read(self._master, 1 << 16)
         whole = len(data)
         begun = data.rfind(b"\x1b")
-        if begun >= 0 and not data[begun:].rstrip(b"0123456789;?[\x1b")[:1]:  # a sequence that goes on in the next piece
+        if (
+            begun >= 0 and not data[begun:].rstrip(b"0123456789;?[\x1b")[:1]
+        ):  # a sequence that goes on in the next piece
             whole = begun
         while whole and data[whole - 1] >= 0x80 and not _decodes(data[:whole]):
             whole -= 1
@@ -135,7 +181,9 @@ class Terminal:
             self._place = int(at_row) - 1, int(at_column) - 1
         elif letter in ("h", "l"):
             (self.modes.add if letter == "h" else self.modes.discard)(numbers)
-            if numbers == "1049":  # the other screen; the text of the main one is not kept here, its cursor is
+            if (
+                numbers == "1049"
+            ):  # the other screen; the text of the main one is not kept here, its cursor is
                 self.grid = [[" "] * len(line) for line in self.grid]
                 self._place, self._kept = self._kept, self._place
         elif letter == "A":
@@ -161,8 +209,8 @@ def _decodes(data: bytes) -> bool:
     return True
 
 
-#: makes the pty the terminal of the session, then runs a program in it; a test run in the background of a shell has interrupts
-#: switched off, and its children would inherit that.
+#: makes the pty the terminal of the session, then runs a program in it; a test run in the
+#: background of a shell has interrupts switched off, and its children would inherit that.
 _MAIN = """
 import fcntl, os, signal, sys, termios
 signal.signal(signal.SIGINT, signal.SIG_DFL)

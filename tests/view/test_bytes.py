@@ -13,11 +13,20 @@ import lidarspec as ls
 from lidarspec.simulation.faults import Faults
 from tests.view.pages import FLAT, SOLID, Page, Station, recorded
 
-#: a byte stream, datagrams, points that wait for the next packet, parts of a frame, text on the wire, messages of several datagrams.
-SENSORS = (FLAT, SOLID, "slamtec-rplidar-a1", "sick-multiscan136", "hokuyo-ust10lx", "robosense-airy")
+#: a byte stream, datagrams, points that wait for the next packet, parts of a frame, text on the
+#: wire, messages of several datagrams.
+SENSORS = (
+    FLAT,
+    SOLID,
+    "slamtec-rplidar-a1",
+    "sick-multiscan136",
+    "hokuyo-ust10lx",
+    "robosense-airy",
+)
 #: Others of these kinds.
 MORE_SENSORS = ("livox-mid360", "velodyne-vlp16")
-#: How fast sensors of many points are simulated: simulating some of them at full speed takes a whole processor.
+#: How fast sensors of many points are simulated: simulating some of them at full speed takes a
+#: whole processor.
 SLOWLY = "rate=0.3"
 #: points of a scan that are asked for.
 ASKED = 8
@@ -25,7 +34,9 @@ ASKED = 8
 ASKED_OF_LONG_FRAMES = 3
 
 
-def agree(page: Page, header: dict[str, Any], columns: dict[str, np.ndarray], spot: int, scan: ls.Scan) -> None:
+def agree(
+    page: Page, header: dict[str, Any], columns: dict[str, np.ndarray], spot: int, scan: ls.Scan
+) -> None:
     """The frame of a point is explained as `explain` does it, and one of its points is this one."""
     index = int(columns["index"][spot])
     frame = page.asked("frame", point={"scan": header["scan"], "index": index})
@@ -71,9 +82,15 @@ def test_a_point_leads_to_its_frame_and_its_field(tmp_path: Path, sensor: str) -
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(("sensor", "suffix", "to"), [(FLAT, ".lsr", 15), (FLAT, ".bin", 3), (SOLID, ".pcap", 3)])
-def test_a_point_of_a_file_leads_to_its_frame(tmp_path: Path, sensor: str, suffix: str, to: int) -> None:
-    """Also where what lies before it was passed over without being read, so that the same bytes stand elsewhere in the input."""
+@pytest.mark.parametrize(
+    ("sensor", "suffix", "to"), [(FLAT, ".lsr", 15), (FLAT, ".bin", 3), (SOLID, ".pcap", 3)]
+)
+def test_a_point_of_a_file_leads_to_its_frame(
+    tmp_path: Path, sensor: str, suffix: str, to: int
+) -> None:
+    """Also where what lies before it was passed over without being read, so that the same bytes
+    stand elsewhere in the input.
+    """
     path = recorded(tmp_path, sensor, to + 2, suffix)
     with Station(path, tmp_path, sensor) as station, station.page() as page:
         page.scan()
@@ -90,7 +107,10 @@ def test_a_point_of_a_file_leads_to_its_frame(tmp_path: Path, sensor: str, suffi
 
 @pytest.mark.slow
 def test_lost_and_reordered_packets_do_not_mislead(tmp_path: Path) -> None:
-    with Station(f"sim:{SOLID}?loss=0.05&reorder=3&{SLOWLY}", tmp_path) as station, station.page() as page:
+    with (
+        Station(f"sim:{SOLID}?loss=0.05&reorder=3&{SLOWLY}", tmp_path) as station,
+        station.page() as page,
+    ):
         page.state(lambda state: state["figures"] and state["figures"]["lost"])
         header, columns = page.scan()
         shown = station.broadcast.numbered(header["scan"])
@@ -100,7 +120,9 @@ def test_lost_and_reordered_packets_do_not_mislead(tmp_path: Path) -> None:
 
 
 @pytest.mark.slow
-def test_a_point_leads_to_its_frame_where_the_newest_bytes_are_gone(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_point_leads_to_its_frame_where_the_newest_bytes_are_gone(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.setattr("lidarspec.view.backlog.BYTES", 1)
     with Station(f"sim:{SOLID}?{SLOWLY}", tmp_path) as station, station.page() as page:
         header, columns = page.scan()
@@ -143,7 +165,9 @@ def test_the_newest_frame_is_sent_while_it_is_watched(tmp_path: Path) -> None:
         page.state()
         page.state()
         with pytest.raises(TimeoutError):
-            page.heard(lambda message: isinstance(message, dict) and message["is"] == "frame", within=1.5)
+            page.heard(
+                lambda message: isinstance(message, dict) and message["is"] == "frame", within=1.5
+            )
 
 
 @pytest.mark.slow
@@ -155,13 +179,18 @@ def test_paused_bytes_stand_still(tmp_path: Path) -> None:
         page.say("watch", frames=True)
         last = page.until("frame")
         with pytest.raises(TimeoutError):
-            page.heard(lambda message: isinstance(message, dict) and message["is"] == "frame", within=1.5)
+            page.heard(
+                lambda message: isinstance(message, dict) and message["is"] == "frame", within=1.5
+            )
         assert page.asked("frame", number=last["number"] - 1)["is"] == "frame"
         assert page.asked("frame", number=last["number"] + 1)["is"] == "gone"
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(("source", "what"), [(f"sim:{FLAT}?errors=0.0002", "flipped"), (f"sim:{SOLID}?errors=0.0001&{SLOWLY}", "bit")])
+@pytest.mark.parametrize(
+    ("source", "what"),
+    [(f"sim:{FLAT}?errors=0.0002", "flipped"), (f"sim:{SOLID}?errors=0.0001&{SLOWLY}", "bit")],
+)
 def test_damaged_frames_are_listed_and_explained(tmp_path: Path, source: str, what: str) -> None:
     with Station(source, tmp_path) as station, station.page() as page:
         listed: list[dict[str, Any]] = []
@@ -175,12 +204,22 @@ def test_damaged_frames_are_listed_and_explained(tmp_path: Path, source: str, wh
         frames = [page.asked("frame", damaged=number) for number in numbers[-8:]]
         assert {frame["is"] for frame in frames} == {"frame"}
         for frame, piece in zip(frames, listed[-8:], strict=True):
-            assert (frame["why"], frame["number"], len(frame["hex"]) // 2) == ("damaged", piece["number"], piece["size"])
+            assert (frame["why"], frame["number"], len(frame["hex"]) // 2) == (
+                "damaged",
+                piece["number"],
+                piece["size"],
+            )
             rows = frame["explanation"]["rows"]
-            assert "".join(row["hex"].replace(" ", "") for row in rows) == frame["hex"]  # every byte once, in order
-            assert [row["offset"] for row in rows] == np.cumsum([0, *(len(bytes.fromhex(row["hex"])) for row in rows[:-1])]).tolist()
+            assert (
+                "".join(row["hex"].replace(" ", "") for row in rows) == frame["hex"]
+            )  # every byte once, in order
+            assert [row["offset"] for row in rows] == np.cumsum(
+                [0, *(len(bytes.fromhex(row["hex"])) for row in rows[:-1])]
+            ).tolist()
         if what == "flipped":
-            assert any("flipped bit" in note for frame in frames for note in frame["explanation"]["notes"])
+            assert any(
+                "flipped bit" in note for frame in frames for note in frame["explanation"]["notes"]
+            )
 
 
 def test_what_is_damaged_in_a_file_is_what_explain_finds(tmp_path: Path) -> None:

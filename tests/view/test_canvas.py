@@ -1,4 +1,6 @@
-"""Cells: braille dots, labels, ASCII, and the bytes that bring a terminal from one picture to the next."""
+"""Cells: braille dots, labels, ASCII, and the bytes that bring a terminal from one picture to the
+next.
+"""
 
 from __future__ import annotations
 
@@ -8,7 +10,18 @@ import numpy as np
 import pytest
 
 from lidarspec.points.look import STEPS
-from lidarspec.view.canvas import ALARM, BLANK, FAINT, FIRST_STEP, INKS, PLAIN, Canvas, Cells, sgr, style
+from lidarspec.view.canvas import (
+    ALARM,
+    BLANK,
+    FAINT,
+    FIRST_STEP,
+    INKS,
+    PLAIN,
+    Canvas,
+    Cells,
+    sgr,
+    style,
+)
 from lidarspec.view.screen import changes
 from tests.view.test_polar import DOTS
 
@@ -69,7 +82,9 @@ def test_ascii_keeps_the_density_of_dots() -> None:
 
 
 def shown(before: list[str], text: str) -> list[str]:
-    """What a terminal shows after some output: cursor addressing and characters, as ECMA-48 has them."""
+    """What a terminal shows after some output: cursor addressing and characters, as ECMA-48 has
+    them.
+    """
     grid = [list(line) for line in before]
     row = column = 0
     for address, _, character in re.findall(r"\x1b\[(\d+;\d+)H|(\x1b\[[0-9;]*m)|(.)", text):
@@ -87,7 +102,12 @@ def test_changes_bring_a_terminal_from_picture_to_picture() -> None:
     for _ in range(50):
         after = Cells(before.codes.copy(), before.inks.copy())
         for _ in range(source.integers(0, 30)):
-            after.write(int(source.integers(8)), int(source.integers(30)), chr(source.integers(33, 126)), int(source.integers(3)))
+            after.write(
+                int(source.integers(8)),
+                int(source.integers(30)),
+                chr(source.integers(33, 126)),
+                int(source.integers(3)),
+            )
         text = changes(before, after, "256")
         assert shown(before.lines(), text) == after.lines()
         before = after

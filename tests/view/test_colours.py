@@ -1,4 +1,6 @@
-"""One scale of colours for terminal, SVG, plot, Rerun, page and notebook; in order and readable for everybody."""
+"""One scale of colours for terminal, SVG, plot, Rerun, page and notebook; in order and readable for
+everybody.
+"""
 
 from __future__ import annotations
 
@@ -47,7 +49,9 @@ def test_terminal_and_svg_have_the_scale() -> None:
     assert [ink.rgb for ink in INKS[FIRST_STEP:]] == make_ramp("dark", STEPS)
     points = cloud(*((x, 0, 0) for x in np.linspace(0.1, 5, 100)))
     picture = svg(points, look(points), "title")
-    for step, (dark, light) in enumerate(zip(make_ramp("dark", STEPS), make_ramp("light", STEPS), strict=True)):
+    for step, (dark, light) in enumerate(
+        zip(make_ramp("dark", STEPS), make_ramp("light", STEPS), strict=True)
+    ):
         assert f".dots{step}{{stroke:{to_hex(dark)}}}" in picture
         assert f'class="ramp{step}"' in picture
         assert f'fill="{to_hex(light)}"' in picture

@@ -76,7 +76,9 @@ def test_pages_do_not_make_way(station: Station) -> None:
 
 
 @pytest.mark.parametrize("sent", [b"", b"G", b"GET / HTTP/1.1\r\nHost: 127.0.0.1\r\nX-A: "])
-def test_a_connection_without_the_token_ends(station: Station, monkeypatch: pytest.MonkeyPatch, sent: bytes) -> None:
+def test_a_connection_without_the_token_ends(
+    station: Station, monkeypatch: pytest.MonkeyPatch, sent: bytes
+) -> None:
     """Whether it sends nothing, or a header without an end, byte by byte."""
     with station.page() as page, connect(station) as slow:
         page.scan()
@@ -97,9 +99,15 @@ def test_errors_of_the_event_loop_are_one_line_each() -> None:
     try:
         loop.set_exception_handler(ErrorReporter(told.append))
         for _ in range(3):
-            context = {"message": "socket.accept() failed", "exception": OSError(24, "Too many open files")}
+            context = {
+                "message": "socket.accept() failed",
+                "exception": OSError(24, "Too many open files"),
+            }
             loop.call_exception_handler(context)
         loop.call_exception_handler({"message": "a task was destroyed"})
     finally:
         loop.close()
-    assert told == ["server: socket.accept() failed: [Errno 24] Too many open files", "server: a task was destroyed"]
+    assert told == [
+        "server: socket.accept() failed: [Errno 24] Too many open files",
+        "server: a task was destroyed",
+    ]

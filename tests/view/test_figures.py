@@ -1,4 +1,6 @@
-"""Figures for reports show what was measured: to scale, with units, bounded in memory, as PNG, PDF and SVG."""
+"""Figures for reports show what was measured: to scale, with units, bounded in memory, as PNG, PDF
+and SVG.
+"""
 
 from __future__ import annotations
 
@@ -43,7 +45,11 @@ def test_a_flat_scan_is_seen_from_above_forward_up_and_left_left() -> None:
     assert axes.get_aspect() == 1  # metres alike
     left, right = axes.get_xlim()
     assert left == -right == look(one.points).reach
-    assert (axes.get_xlabel(), axes.get_ylabel(), bar.get_ylabel()) == ("y [m], left", "x [m], forward", "range [m]")
+    assert (axes.get_xlabel(), axes.get_ylabel(), bar.get_ylabel()) == (
+        "y [m], left",
+        "x [m], forward",
+        "range [m]",
+    )
 
 
 def test_a_scan_with_heights_is_seen_from_its_side_too() -> None:
@@ -52,7 +58,12 @@ def test_a_scan_with_heights_is_seen_from_its_side_too() -> None:
     cloud = one.points[one.points.valid]
     np.testing.assert_array_equal(offsets(side), np.stack([cloud.x, cloud.z], axis=1))
     np.testing.assert_array_equal(above.collections[0].get_array(), cloud.intensity)
-    assert (side.get_xlabel(), side.get_ylabel(), side.get_aspect(), bar.get_ylabel()) == ("x [m], forward", "z [m], up", 1, "intensity")
+    assert (side.get_xlabel(), side.get_ylabel(), side.get_aspect(), bar.get_ylabel()) == (
+        "x [m], forward",
+        "z [m], up",
+        1,
+        "intensity",
+    )
 
 
 def test_a_fitted_scan_fills_the_panel() -> None:
@@ -69,8 +80,16 @@ def test_every_intensity_is_counted() -> None:
     (axes,) = figures.of_intensities(iter(scans), "title").axes
     counts = [patch.get_height() for patch in axes.patches]
     assert sum(counts) == sum(int(one.points.valid.sum()) for one in scans)
-    strengths = np.concatenate([one.points.intensity[one.points.valid] for one in scans if one.points.intensity is not None])
-    edges = [patch.get_x() for patch in axes.patches] + [axes.patches[-1].get_x() + axes.patches[-1].get_width()]
+    strengths = np.concatenate(
+        [
+            one.points.intensity[one.points.valid]
+            for one in scans
+            if one.points.intensity is not None
+        ]
+    )
+    edges = [patch.get_x() for patch in axes.patches] + [
+        axes.patches[-1].get_x() + axes.patches[-1].get_width()
+    ]
     np.testing.assert_array_equal(counts, np.histogram(strengths, edges)[0])
     with pytest.raises(UsageError, match="no intensities"):
         figures.of_intensities([scan(0, intensity=False)], "title")
@@ -79,12 +98,16 @@ def test_every_intensity_is_counted() -> None:
 def at_range(number: int, metres: float) -> Scan:
     one = scan(number, points=500)
     ranges = np.full(500, metres, np.float32)
-    points = dataclasses.replace(one.points, range=ranges, valid=np.ones(500, np.bool_), stamp_ns=10**18 + number * 10**8)
+    points = dataclasses.replace(
+        one.points, range=ranges, valid=np.ones(500, np.bool_), stamp_ns=10**18 + number * 10**8
+    )
     return dataclasses.replace(one, points=points, whole=True)
 
 
 def test_ranges_stand_at_their_time() -> None:
-    axes, _ = figures.of_ranges([at_range(number, 2.0 + number) for number in range(10)], "title").axes
+    axes, _ = figures.of_ranges(
+        [at_range(number, 2.0 + number) for number in range(10)], "title"
+    ).axes
     mesh = axes.collections[0]
     counts = np.ma.filled(mesh.get_array(), 0).reshape(200, 10)
     edges = mesh.get_coordinates()
@@ -120,12 +143,19 @@ def test_rates_are_those_of_stats(lossy: Path) -> None:
         reading = feed.meter.summary(device.stats)
     assert rates.totals[0].sum() == reading.packets
     packets, scans, lost, wrong = figures.of_rates(rates, "title").axes
-    assert [axes.get_ylabel() for axes in (packets, scans, lost, wrong)] == ["packets [1/s]", "scans [1/s]", "lost [%]", "wrong [%]"]
+    assert [axes.get_ylabel() for axes in (packets, scans, lost, wrong)] == [
+        "packets [1/s]",
+        "scans [1/s]",
+        "lost [%]",
+        "wrong [%]",
+    ]
     values, edges, _ = packets.patches[0].get_data()
     assert np.median(values) == pytest.approx(reading.packet_rate_hz, rel=0.1)
     assert np.diff(edges) == pytest.approx(0.1)
     shares, _, _ = lost.patches[0].get_data()
-    assert np.average(shares, weights=values) == pytest.approx(100 * (reading.loss_rate or 0), rel=0.2)
+    assert np.average(shares, weights=values) == pytest.approx(
+        100 * (reading.loss_rate or 0), rel=0.2
+    )
     assert 5 < 100 * (reading.loss_rate or 0) < 15
     assert not wrong.patches[0].get_data().values.any()
 
@@ -133,7 +163,20 @@ def test_rates_are_those_of_stats(lossy: Path) -> None:
 def test_packets_without_times_are_refused(tmp_path: Path) -> None:
     sensor = ls.sensor("camsense-x1")
     (tmp_path / "a.bin").write_bytes(b"".join(simulate(sensor, 100)))
-    assert "bear no times" in ran("plot", tmp_path / "a.bin", "-s", sensor.id, "--kind", "rates", "-o", tmp_path / "a.png", code=2).stderr
+    assert (
+        "bear no times"
+        in ran(
+            "plot",
+            tmp_path / "a.bin",
+            "-s",
+            sensor.id,
+            "--kind",
+            "rates",
+            "-o",
+            tmp_path / "a.png",
+            code=2,
+        ).stderr
+    )
     assert [path.name for path in tmp_path.iterdir()] == ["a.bin"]
 
 
@@ -155,10 +198,15 @@ def test_figures_are_vectors_too_and_the_same_bytes_again(lossy: Path, tmp_path:
     printed = [ran("plot", lossy, "--kind", "rates", "-o", "-").stdout for _ in range(2)]
     assert printed[0] == printed[1]
     assert printed[0].startswith("<?xml")
-    assert "pictures are written as .png, .pdf, .svg" in ran("plot", lossy, "-o", tmp_path / "a.jpg", code=2).stderr
+    assert (
+        "pictures are written as .png, .pdf, .svg"
+        in ran("plot", lossy, "-o", tmp_path / "a.jpg", code=2).stderr
+    )
 
 
 def test_a_live_source_is_drawn_for_a_while(tmp_path: Path) -> None:
     for kind in ("ranges", "rates"):
-        ran("plot", "sim:ldrobot-stl27l", "--kind", kind, "-t", "1s", "-o", tmp_path / f"{kind}.png")
+        ran(
+            "plot", "sim:ldrobot-stl27l", "--kind", kind, "-t", "1s", "-o", tmp_path / f"{kind}.png"
+        )
         assert (tmp_path / f"{kind}.png").stat().st_size > 10_000

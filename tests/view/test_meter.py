@@ -27,7 +27,10 @@ class Bench:
         self.frames = simulate(sensor, frames)
         self.decoder: Decoder = sensor.decoder()
         self.meter = Meter(self.decoder.stats, sequenced=False)
-        self._packets, self._scans = PacketStream(sensor, "data", self.decoder.stats), ScanStream(sensor)
+        self._packets, self._scans = (
+            PacketStream(sensor, "data", self.decoder.stats),
+            ScanStream(sensor),
+        )
 
     def feed(self, data: bytes, at: int | None) -> Packets:
         packets = self._packets.add(self.decoder.frames(data, at))
@@ -86,9 +89,14 @@ def test_errors_and_skipped_bytes_are_shares() -> None:
 def test_lost_packets_are_a_share_where_the_sensor_numbers_them() -> None:
     sensor = ls.sensor("robosense-m1")
     decoder = sensor.decoder()
-    meter, stream = Meter(decoder.stats, sequenced=True), PacketStream(sensor, "data", decoder.stats)
+    meter, stream = (
+        Meter(decoder.stats, sequenced=True),
+        PacketStream(sensor, "data", decoder.stats),
+    )
     frames = [frame for number, frame in enumerate(simulate(sensor, 200)) if number % 10 != 5]
-    meter.packets(stream.add([decoder.datagrams(frames, [START + n * 1000 for n in range(len(frames))])]))
+    meter.packets(
+        stream.add([decoder.datagrams(frames, [START + n * 1000 for n in range(len(frames))])])
+    )
     assert meter.summary(decoder.stats).loss_rate == pytest.approx(0.1)
 
 
@@ -105,7 +113,9 @@ def test_before_anything_has_come_nothing_is_known() -> None:
     bench = Bench()
     found = bench.meter.reading(bench.decoder.stats)
     assert (found.packets, found.scans, found.error_rate) == (0, 0, 0.0)
-    assert {found.speed_hz, found.packet_rate_hz, found.jitter_s, found.points, found.seconds} == {None}
+    assert {found.speed_hz, found.packet_rate_hz, found.jitter_s, found.points, found.seconds} == {
+        None
+    }
     assert all(value is None or math.isfinite(value) for value in found.to_dict().values())
 
 

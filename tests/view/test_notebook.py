@@ -1,4 +1,6 @@
-"""What a notebook shows: pictures where the points are, tables of what was sent, bounded, escaped, on light and dark pages."""
+"""What a notebook shows: pictures where the points are, tables of what was sent, bounded, escaped,
+on light and dark pages.
+"""
 
 from __future__ import annotations
 
@@ -25,7 +27,9 @@ def dots(svg: str, view: int = 0) -> list[tuple[float, float]]:
     scale = float(group.get("transform", "").removeprefix("scale(").removesuffix(")"))
     found = []
     for path in group:
-        steps = np.array([list(map(int, step)) for step in re.findall(r"m(-?\d+) (-?\d+)h0", path.get("d", ""))])
+        steps = np.array(
+            [list(map(int, step)) for step in re.findall(r"m(-?\d+) (-?\d+)h0", path.get("d", ""))]
+        )
         found += (np.cumsum(steps, axis=0) * scale).tolist()
     return [(across, down) for across, down in found]
 
@@ -34,7 +38,9 @@ def test_a_cloud_is_drawn_where_its_points_are() -> None:
     svg = cloud((4, 0, 0), (0, 2, 0))._repr_svg_()
     assert svg is not None
     middle = 260
-    metre = middle / (2 * 1.08)  # two metres from the middle of the points to their ends, and a margin
+    metre = middle / (
+        2 * 1.08
+    )  # two metres from the middle of the points to their ends, and a margin
     expected = [(middle - metre, middle + 2 * metre), (middle + metre, middle - 2 * metre)]
     np.testing.assert_allclose(sorted(dots(svg)), expected, atol=0.5)
     assert "2 returns as 2 dots" in svg
@@ -45,7 +51,9 @@ def test_a_cloud_with_heights_is_drawn_from_the_side_as_well() -> None:
     svg = cloud((4, 0, 1), (2, 0, -1))._repr_svg_()
     assert svg is not None
     (first, high), (second, low) = sorted(dots(svg, 1), reverse=True)
-    metres = 2 * 260 / 1.08  # the two metres between the points, with a margin, are the width of the picture
+    metres = (
+        2 * 260 / 1.08
+    )  # the two metres between the points, with a margin, are the width of the picture
     assert first - second == pytest.approx(metres, abs=0.6)
     assert low - high == pytest.approx(metres, abs=0.6)
 
@@ -63,7 +71,9 @@ def test_a_large_cloud_makes_a_small_picture_that_says_so() -> None:
     assert len(svg) < 300_000
     told = re.search(r"200,000 returns as ([\d,]+) and ([\d,]+) dots", svg)
     assert told is not None
-    assert [len(dots(svg, view)) for view in (0, 1)] == [int(number.replace(",", "")) for number in told.groups()]
+    assert [len(dots(svg, view)) for view in (0, 1)] == [
+        int(number.replace(",", "")) for number in told.groups()
+    ]
 
 
 def packets(sensor: ls.Sensor, number: int) -> ls.Packets:
@@ -83,10 +93,17 @@ def test_packets_are_a_table_with_units_and_times() -> None:
     some = packets(ls.sensor("ldrobot-stl27l"), 12)
     heads, *rows = cells(str(some._repr_html_()))
     assert heads[:4] == ["offset", "time [s]", "speed [deg/s]", "start_angle [deg]"]
-    assert [row[0] for row in rows] == [*map(str, range(0, 5 * 47, 47)), "⋮", *map(str, range(7 * 47, 12 * 47, 47))]
+    assert [row[0] for row in rows] == [
+        *map(str, range(0, 5 * 47, 47)),
+        "⋮",
+        *map(str, range(7 * 47, 12 * 47, 47)),
+    ]
     assert [float(row[3]) for row in rows[:5]] == pytest.approx(some["start_angle"][:5].tolist())
     distances = some["points.distance"][0]
-    assert rows[0][heads.index("points.distance [m]")] == f"12 x {distances.min():.10g} to {distances.max():.10g}"
+    assert (
+        rows[0][heads.index("points.distance [m]")]
+        == f"12 x {distances.min():.10g} to {distances.max():.10g}"
+    )
     assert len(cells(str(some.take([])._repr_html_()))) == 1
 
 
@@ -95,7 +112,12 @@ LONG = ("ouster-os1", "sick-tim571", "ti-iwr6843", "velodyne-vls128")
 
 
 @pytest.mark.parametrize(
-    "sensor_id", ["robosense-m1", "slamtec-rplidar-a1", *(pytest.param(name, marks=pytest.mark.slow) for name in LONG)]
+    "sensor_id",
+    [
+        "robosense-m1",
+        "slamtec-rplidar-a1",
+        *(pytest.param(name, marks=pytest.mark.slow) for name in LONG),
+    ],
 )
 def test_tables_and_diagrams_are_bounded(sensor_id: str) -> None:
     sensor = ls.sensor(sensor_id)
@@ -105,7 +127,11 @@ def test_tables_and_diagrams_are_bounded(sensor_id: str) -> None:
     table = explained._repr_html_()
     assert len(table) < 150_000
     shown = bytes.fromhex(
-        " ".join(re.sub(r"[^0-9a-f ]", "", row[1].replace("\n", " ")) for row in cells(table)[1:] if row[1]).replace(" ", "")
+        " ".join(
+            re.sub(r"[^0-9a-f ]", "", row[1].replace("\n", " "))
+            for row in cells(table)[1:]
+            if row[1]
+        ).replace(" ", "")
     )
     assert frame.startswith(shown)
     assert (shown == frame) == ("further rows" not in table)
@@ -131,7 +157,9 @@ def test_words_of_the_wire_and_of_a_spec_are_text() -> None:
     for text in (sensor._repr_html_(), marked._repr_svg_(), packets(sensor, 2)._repr_html_()):
         assert "<script" not in str(text)
     assert "&lt;script&gt;" in str(sensor._repr_html_())
-    named = dataclasses.replace(ls.explain(sensor.example("data"), sensor), sensor=SCRIPT, notes=(SCRIPT,))
+    named = dataclasses.replace(
+        ls.explain(sensor.example("data"), sensor), sensor=SCRIPT, notes=(SCRIPT,)
+    )
     assert str(named._repr_html_()).count("&lt;script&gt;") == 2
     assert "<script" not in str(named._repr_html_())
 
@@ -145,9 +173,10 @@ def test_a_frame_that_no_export_draws_says_why() -> None:
 @pytest.mark.slow
 def test_nothing_that_draws_is_imported_before_a_notebook_asks() -> None:
     script = (
-        "import sys, lidarspec as ls; s = ls.sensor('ldrobot-stl27l'); scans = list(s.scans(s.example('data')))\n"
-        "assert not any(name.startswith(('lidarspec.view', 'lidarspec.exports')) for name in sys.modules)\n"
-        "assert scans[0]._repr_svg_().startswith('<svg') and 'lidarspec.view.svg' in sys.modules"
+        "import sys, lidarspec as ls; s = ls.sensor('ldrobot-stl27l'); scans ="
+        " list(s.scans(s.example('data')))\nassert not any(name.startswith(('lidarspec.view',"
+        " 'lidarspec.exports')) for name in sys.modules)\nassert"
+        " scans[0]._repr_svg_().startswith('<svg') and 'lidarspec.view.svg' in sys.modules"
     )
     subprocess.run([sys.executable, "-c", script], check=True)
 
@@ -156,7 +185,10 @@ def test_nothing_that_draws_is_imported_before_a_notebook_asks() -> None:
 def test_pictures_and_tables_are_readable_on_light_and_dark_pages(browser: Any) -> None:
     scan = next(ls.sensor("ldrobot-stl27l").scans(ls.sensor("ldrobot-stl27l").example("data")))
     explained = ls.explain(ls.sensor("ldrobot-stl27l").example("data"), ls.sensor("ldrobot-stl27l"))
-    for scheme, colours in (("light", "background:#fff;color:#111"), ("dark", "background:#111;color:#ddd")):
+    for scheme, colours in (
+        ("light", "background:#fff;color:#111"),
+        ("dark", "background:#111;color:#ddd"),
+    ):
         page = browser.new_page(color_scheme=scheme)
         page.set_content(f"<body style='{colours}'>{scan._repr_svg_()}{explained._repr_html_()}")
         seen = page.evaluate(
@@ -168,9 +200,9 @@ def test_pictures_and_tables_are_readable_on_light_and_dark_pages(browser: Any) 
         ground, head, dot = (luminance(seen[name]) for name in ("ground", "head", "dots"))
         assert contrast(ground, head) > 7
         assert contrast(ground, dot) > 2.5
-        assert page.evaluate("getComputedStyle(document.querySelector('td code')).color") == page.evaluate(
-            "getComputedStyle(document.body).color"
-        )
+        assert page.evaluate(
+            "getComputedStyle(document.querySelector('td code')).color"
+        ) == page.evaluate("getComputedStyle(document.body).color")
 
 
 def luminance(colour: str) -> float:

@@ -67,7 +67,11 @@ def test_what_the_sensor_does_not_take_is_refused(tmp_path: Path) -> None:
         for command, words in WRONG_ARGUMENTS:
             for word in ("compose", "send"):
                 refused = page.asked(word, command=command, arguments=words)
-                assert (refused["is"], refused["of"], refused["command"]) == ("refused", word, command)
+                assert (refused["is"], refused["of"], refused["command"]) == (
+                    "refused",
+                    word,
+                    command,
+                )
                 assert command in refused["text"]
 
 
@@ -95,21 +99,29 @@ def test_a_command_without_an_answer_is_sent(tmp_path: Path) -> None:
 @pytest.mark.slow
 def test_a_real_device_takes_commands_only_with_control(tmp_path: Path) -> None:
     sensor = ls.sensor(ANSWERING)
-    with Served(SimulatedDevice(sensor), simulated_outlet(sensor, "tcp://127.0.0.1:0"), patient=True) as served:
+    with Served(
+        SimulatedDevice(sensor), simulated_outlet(sensor, "tcp://127.0.0.1:0"), patient=True
+    ) as served:
         with Station(served.path, tmp_path, ANSWERING) as station, station.page() as page:
             hello = page.until("hello")
             assert not hello["control"]
             assert "--control" in hello["why_no_control"]
             assert "--control" in page.asked("send", command="get_version", arguments={})["text"]
             assert page.asked("compose", command="get_version", arguments={})["is"] == "composed"
-        with Station(served.path, tmp_path, ANSWERING, control=True) as station, station.page() as page:
+        with (
+            Station(served.path, tmp_path, ANSWERING, control=True) as station,
+            station.page() as page,
+        ):
             assert page.until("hello")["control"]
             assert page.asked("send", command="get_version", arguments={})["is"] == "replied"
 
 
 @pytest.mark.parametrize("sensor", [FLAT, pytest.param(STREAM, marks=pytest.mark.slow)])
 def test_a_file_takes_no_commands(tmp_path: Path, sensor: str) -> None:
-    with Station(recorded(tmp_path, sensor), tmp_path, control=True) as station, station.page() as page:
+    with (
+        Station(recorded(tmp_path, sensor), tmp_path, control=True) as station,
+        station.page() as page,
+    ):
         hello = page.until("hello")
         assert not hello["control"]
         assert hello["why_no_control"]
@@ -129,4 +141,6 @@ def test_every_command_of_every_sensor_has_a_form(module: str) -> None:
         for name in sensor.commands:
             described = form(sensor, name)
             assert described["name"] == name, sensor.id
-            assert all(argument.keys() == KEYS_OF_AN_ARGUMENT for argument in described["arguments"]), sensor.id
+            assert all(
+                argument.keys() == KEYS_OF_AN_ARGUMENT for argument in described["arguments"]
+            ), sensor.id

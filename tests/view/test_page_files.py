@@ -1,4 +1,6 @@
-"""What the page does with what it shows: it is recorded and saved by a click, and a sensor that is unplugged and comes back is said."""
+"""What the page does with what it shows: it is recorded and saved by a click, and a sensor that is
+unplugged and comes back is said.
+"""
 
 from __future__ import annotations
 
@@ -34,7 +36,9 @@ def test_what_comes_is_recorded_until_the_next_click(browser: Any, tmp_path: Pat
         visit = Visit(browser, link)
         assert visit.text("#recording") == "Record"
         visit.page.click("#record")
-        visit.until(lambda: "0.1 MB" in visit.text("#recording"), "it is not shown how much is recorded")
+        visit.until(
+            lambda: "0.1 MB" in visit.text("#recording"), "it is not shown how much is recorded"
+        )
         name = visit.text("#recording").partition(" · ")[0]
         visit.page.click("#record")
         visit.until(lambda: visit.text("#recording") == "Record", "the recording does not end")
@@ -49,17 +53,27 @@ def test_what_comes_is_recorded_until_the_next_click(browser: Any, tmp_path: Pat
         assert device.stats.bad_checksum == 0
 
 
-def test_a_double_click_starts_one_recording_that_all_pages_show(browser: Any, tmp_path: Path) -> None:
+def test_a_double_click_starts_one_recording_that_all_pages_show(
+    browser: Any, tmp_path: Path
+) -> None:
     with served("sim:ldrobot-stl27l?rate=0.5", folder=tmp_path) as link:
         visit, other = Visit(browser, link), Visit(browser, link)
         visit.page.dblclick("#record")
         for page in (visit, other):
-            page.until(lambda page=page: " · " in page.text("#recording"), "it is not shown that it records")
-        assert visit.text("#recording").partition(" ")[0] == other.text("#recording").partition(" ")[0]
+            page.until(
+                lambda page=page: " · " in page.text("#recording"),
+                "it is not shown that it records",
+            )
+        assert (
+            visit.text("#recording").partition(" ")[0] == other.text("#recording").partition(" ")[0]
+        )
         visit.page.wait_for_timeout(600)  # from then on it is another press
         other.page.click("#record")
         for page in (visit, other):
-            page.until(lambda page=page: page.text("#recording") == "Record", "it is not shown that it ended")
+            page.until(
+                lambda page=page: page.text("#recording") == "Record",
+                "it is not shown that it ended",
+            )
             page.context.close()
             assert not page.errors
     assert len(list(tmp_path.glob("*.lsr"))) == 1
@@ -75,7 +89,9 @@ def test_the_scan_that_is_shown_is_saved(browser: Any) -> None:
         rows = list(csv.DictReader(io.StringIO(table.decode())))
         shown = visit.scan
         own = np.array([[float(row[axis]) for axis in "xyz"] for row in rows])
-        np.testing.assert_allclose(np.stack([shown[axis] for axis in "xyz"], axis=1), own[shown["index"]], atol=1e-3)
+        np.testing.assert_allclose(
+            np.stack([shown[axis] for axis in "xyz"], axis=1), own[shown["index"]], atol=1e-3
+        )
         name, cloud = saved(visit, "pcd")
         assert name.endswith(".pcd")
         assert f"POINTS {len(rows)}\n".encode() in cloud
@@ -88,7 +104,9 @@ def test_the_scan_that_is_shown_is_saved(browser: Any) -> None:
 
 
 def check_picture(visit: Visit, data: bytes) -> None:
-    """Hold a saved picture against the one on the screen: as large, and with the walls of the room in colour."""
+    """Hold a saved picture against the one on the screen: as large, and with the walls of the room
+    in colour.
+    """
     image = pytest.importorskip("PIL.Image", reason="Pillow is not installed")
     assert data.startswith(SIGNATURE)
     pixels = np.asarray(image.open(io.BytesIO(data)).convert("RGB"), int)
@@ -108,12 +126,23 @@ def test_a_sensor_that_is_unplugged_is_said_and_comes_back(browser: Any) -> None
         visit = Visit(browser, link)
         assert visit.until(lambda: visit.text("#status"), "no state is shown") == "streaming"
         port.unplug()
-        visit.until(lambda: visit.text("#status") == "disconnected", "it is not said that the sensor is gone")
-        visit.until(lambda: "the device is gone; waiting for it to come back" in visit.text("#warnings"), "it is not said what comes next")
+        visit.until(
+            lambda: visit.text("#status") == "disconnected",
+            "it is not said that the sensor is gone",
+        )
+        visit.until(
+            lambda: "the device is gone; waiting for it to come back" in visit.text("#warnings"),
+            "it is not said what comes next",
+        )
         before = visit.value("lidarspec.picture.scan.scan")
         port.plug()
-        visit.until(lambda: visit.text("#status") == "streaming", "it is not said that the sensor is back")
-        visit.until(lambda: visit.value("lidarspec.picture.scan.scan") > before + 3, "the picture does not go on")
+        visit.until(
+            lambda: visit.text("#status") == "streaming", "it is not said that the sensor is back"
+        )
+        visit.until(
+            lambda: visit.value("lidarspec.picture.scan.scan") > before + 3,
+            "the picture does not go on",
+        )
         visit.until(lambda: visit.text("#warnings") == "", "it is still said that it is gone")
         visit.context.close()
         assert not visit.errors

@@ -1,4 +1,6 @@
-"""Pages that ask without end, and scans that are saved but not read: other pages are served as before."""
+"""Pages that ask without end, and scans that are saved but not read: other pages are served as
+before.
+"""
 
 from __future__ import annotations
 
@@ -81,8 +83,12 @@ def test_messages_above_the_rate_wait() -> None:
     assert [limit.delay_s(200.0) for _ in range(4)] == pytest.approx([0, 0, 0, 0.1])
 
 
-def test_a_page_that_asks_without_end_waits_for_itself(station: Station, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Its messages are not all done before another page has its scans, and pausing again does nothing."""
+def test_a_page_that_asks_without_end_waits_for_itself(
+    station: Station, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Its messages are not all done before another page has its scans, and pausing again does
+    nothing.
+    """
     counts = Counter[str]()
     delay_s, frozen = RateLimit.delay_s, Backlog.frozen
 
@@ -118,7 +124,9 @@ def test_questions_of_a_page_are_answered_in_their_order(station: Station) -> No
     assert [answer["number"] for answer in answers] == list(range(count))
 
 
-def test_scans_that_are_written_keep_nothing_from_pages(station: Station, folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_scans_that_are_written_keep_nothing_from_pages(
+    station: Station, folder: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """A disk that stands still, and more requests than are saved at a time."""
     may_write = threading.Event()
     write = saving.write_file
@@ -138,7 +146,10 @@ def test_scans_that_are_written_keep_nothing_from_pages(station: Station, folder
                 assert other.scan()[1]["x"].size
                 assert other.asked("frame", number=0)["is"] == "frame"
             status, _, body = station.answered(f"/save/{number}.csv")
-            assert (status, body) == (503, b"2 scans are being saved already: try again in a moment")
+            assert (status, body) == (
+                503,
+                b"2 scans are being saved already: try again in a moment",
+            )
         finally:
             may_write.set()
         end = time.monotonic() + DEADLINE
@@ -147,7 +158,9 @@ def test_scans_that_are_written_keep_nothing_from_pages(station: Station, folder
             time.sleep(0.05)
 
 
-def test_a_scan_that_is_not_read_is_given_up(tmp_path: Path, folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_scan_that_is_not_read_is_given_up(
+    tmp_path: Path, folder: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     dropped = threading.Semaphore(0)
     drop = Connections.drop
 
@@ -158,7 +171,11 @@ def test_a_scan_that_is_not_read_is_given_up(tmp_path: Path, folder: Path, monke
     monkeypatch.setattr(Connections, "drop", counted_drop)
     monkeypatch.setattr(saving, "write_file", lambda path, shown: path.write_bytes(bytes(LARGE)))
     monkeypatch.setattr(saving, "SEND_TIMEOUT_S", 0.1)
-    with Station(f"sim:{FLAT}", tmp_path) as station, station.page() as page, contextlib.ExitStack() as stack:
+    with (
+        Station(f"sim:{FLAT}", tmp_path) as station,
+        station.page() as page,
+        contextlib.ExitStack() as stack,
+    ):
         number = kept_scan(page)
         unread = [stack.enter_context(start_save(station, number)) for _ in range(SAVES)]
         for _ in unread:
@@ -174,7 +191,9 @@ def test_a_scan_that_is_not_read_is_given_up(tmp_path: Path, folder: Path, monke
         assert len(station.answered(f"/save/{number}.csv")[2]) == LARGE
 
 
-def test_saved_scans_leave_nothing_behind(tmp_path: Path, folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_saved_scans_leave_nothing_behind(
+    tmp_path: Path, folder: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """Neither if the server ends while they are sent, nor that of a server that was killed."""
     stale = folder / f"{PREFIX}stale"
     stale.mkdir()
@@ -189,7 +208,9 @@ def test_saved_scans_leave_nothing_behind(tmp_path: Path, folder: Path, monkeypa
         assert not list(folder.iterdir())
 
 
-def test_a_folder_that_cannot_be_made_is_reported(station: Station, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_folder_that_cannot_be_made_is_reported(
+    station: Station, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.setattr("tempfile.tempdir", "/nowhere")
     with station.page() as page:
         number = kept_scan(page)

@@ -1,4 +1,6 @@
-"""Who may reach the page: raw requests with hosts and origins of others, without the token, and what devices say of themselves."""
+"""Who may reach the page: raw requests with hosts and origins of others, without the token, and
+what devices say of themselves.
+"""
 
 from __future__ import annotations
 
@@ -20,7 +22,15 @@ from lidarspec.view.server import PAGE
 from tests.view.pages import FLAT, UPGRADE, Station, answered, recorded
 
 EVIL = "http://evil.example"
-FOREIGN_ORIGINS = (EVIL, "null", "http://127.0.0.1", "https://127.0.0.1:{port}", "http://127.0.0.1:1", "http://localhost:{port}", None)
+FOREIGN_ORIGINS = (
+    EVIL,
+    "null",
+    "http://127.0.0.1",
+    "https://127.0.0.1:{port}",
+    "http://127.0.0.1:1",
+    "http://localhost:{port}",
+    None,
+)
 FOREIGN_HOSTS = (
     "evil.example:{port}",
     "evil.example",
@@ -82,29 +92,54 @@ def test_other_pages_get_no_scan(tmp_path: Path) -> None:
 @pytest.mark.parametrize("path", ["/", "/nothing.js", "/save/0.pcd"])
 def test_browsers_are_told_to_keep_to_the_page_itself(shared: Station, path: str) -> None:
     _, headers, _ = shared.answered(path)
-    policy = dict(part.strip().partition(" ")[::2] for part in headers["content-security-policy"].split(";"))
-    assert (policy["default-src"], policy["script-src"], policy["style-src"]) == ("'none'", "'self'", "'self'")
-    assert (policy["frame-ancestors"], policy["base-uri"], policy["form-action"]) == ("'none'", "'none'", "'none'")
+    policy = dict(
+        part.strip().partition(" ")[::2] for part in headers["content-security-policy"].split(";")
+    )
+    assert (policy["default-src"], policy["script-src"], policy["style-src"]) == (
+        "'none'",
+        "'self'",
+        "'self'",
+    )
+    assert (policy["frame-ancestors"], policy["base-uri"], policy["form-action"]) == (
+        "'none'",
+        "'none'",
+        "'none'",
+    )
     assert not any(word in headers["content-security-policy"] for word in ("unsafe", "http:", "*"))
-    assert (headers["x-content-type-options"], headers["referrer-policy"]) == ("nosniff", "no-referrer")
+    assert (headers["x-content-type-options"], headers["referrer-policy"]) == (
+        "nosniff",
+        "no-referrer",
+    )
     assert headers["cache-control"] == "no-store"
     assert "server" not in headers
 
 
-@pytest.mark.parametrize("path", ["/../server.py", "/%2e%2e/%2e%2e/etc/passwd", "//etc/passwd", "/..%5c..%5cserver.py"])
+@pytest.mark.parametrize(
+    "path", ["/../server.py", "/%2e%2e/%2e%2e/etc/passwd", "//etc/passwd", "/..%5c..%5cserver.py"]
+)
 def test_only_the_files_of_the_page_are_served(shared: Station, path: str) -> None:
     status, _, body = shared.answered(path)
     assert status in (400, 404)
     assert b"secret" not in body
 
 
-@pytest.mark.parametrize("path", ["/", "/index.html", "/page.js", "/nothing.js", "/save/0.csv", "/socket", "/?"])
+@pytest.mark.parametrize(
+    "path", ["/", "/index.html", "/page.js", "/nothing.js", "/save/0.csv", "/socket", "/?"]
+)
 def test_nothing_is_served_without_the_token(shared: Station, path: str) -> None:
     """Other users of this computer can connect, and know no token."""
     token = shared.token
     assert len(token) >= 32
     more = {**UPGRADE, "Origin": f"http://127.0.0.1:{shared.port}"} if path == "/socket" else {}
-    wrong = ("", "?token=", f"?token={token[:-1]}", f"?token={token}x", f"?tokem={token}", "?token=%C3%A9", f"#{token}")
+    wrong = (
+        "",
+        "?token=",
+        f"?token={token[:-1]}",
+        f"?token={token}x",
+        f"?tokem={token}",
+        "?token=%C3%A9",
+        f"#{token}",
+    )
     for query in wrong:
         status, headers, body = answered(shared.port, f"{path}{query}", **more)
         assert status == 403, query
@@ -125,7 +160,10 @@ def test_a_refused_page_says_where_the_link_is(shared: Station) -> None:
 def test_the_page_loads_its_files_with_the_token(shared: Station) -> None:
     status, headers, body = shared.answered("/")
     assert (status, headers["cache-control"]) == (200, "no-store")
-    assert f'<link rel="icon" href="data:,"><script src="page.js?token={shared.token}">'.encode() in body
+    assert (
+        f'<link rel="icon" href="data:,"><script src="page.js?token={shared.token}">'.encode()
+        in body
+    )
     assert shared.answered("/index.html")[2] == body
     assert shared.answered("/page.js")[2] == b"1"
     assert "set-cookie" not in headers
@@ -134,7 +172,11 @@ def test_the_page_loads_its_files_with_the_token(shared: Station) -> None:
 def test_the_built_page_names_no_file_that_would_lack_the_token() -> None:
     """Scripts and styles are in the head of the page, and load nothing themselves."""
     text = add_token((PAGE / "index.html").read_text(encoding="utf-8"), "TOKEN")
-    assert re.findall(r'(?:href|src)="([^"]*)"', text) == ["data:,", "page.css?token=TOKEN", "page.js?token=TOKEN"]
+    assert re.findall(r'(?:href|src)="([^"]*)"', text) == [
+        "data:,",
+        "page.css?token=TOKEN",
+        "page.js?token=TOKEN",
+    ]
     assert "url(" not in (PAGE / "page.css").read_text(encoding="utf-8")
 
 
@@ -144,7 +186,9 @@ def test_each_server_has_a_token_of_its_own(tmp_path: Path, shared: Station) -> 
         assert answered(station.port, f"/?token={shared.token}")[0] == 403
 
 
-def test_a_browser_is_started_with_a_file_and_not_with_the_token(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_browser_is_started_with_a_file_and_not_with_the_token(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """Other users see the command lines of all programs."""
     monkeypatch.setattr("tempfile.tempdir", str(tmp_path))
     with Station(f"sim:{FLAT}", tmp_path) as station:
@@ -153,7 +197,10 @@ def test_a_browser_is_started_with_a_file_and_not_with_the_token(tmp_path: Path,
         path = Path(urllib.request.url2pathname(urllib.parse.urlsplit(url).path))
         assert f'content="0; url={station.link}"' in path.read_text()
         if os.name == "posix":
-            assert (path.stat().st_mode & 0o777, path.parent.stat().st_mode & 0o777) == (0o600, 0o700)
+            assert (path.stat().st_mode & 0o777, path.parent.stat().st_mode & 0o777) == (
+                0o600,
+                0o700,
+            )
     assert not path.parent.exists()
 
 
@@ -180,7 +227,9 @@ def test_markup_that_a_device_sends_stays_text(tmp_path: Path) -> None:
     markup, sensor = "<script>alert(1)<!--", ls.sensor("hokuyo-ust10lx")
     told = sensor.parse(sensor.example("parameters"), "parameters")
     told["model"]["text"] = markup.encode()
-    path = recorded(tmp_path, sensor.id, seconds=1.0, suffix=".bin").rename(tmp_path / "<img src=x>.bin")
+    path = recorded(tmp_path, sensor.id, seconds=1.0, suffix=".bin").rename(
+        tmp_path / "<img src=x>.bin"
+    )
     path.write_bytes(sensor.build("parameters", told) + path.read_bytes())
     with Station(path, tmp_path, sensor) as station, station.page() as page:
         assert page.until("hello")["source"].endswith("<img src=x>.bin")

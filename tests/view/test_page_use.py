@@ -20,7 +20,8 @@ pytestmark = pytest.mark.slow
 PHONE = (390, 844)
 MIN_TARGET_PX = 44
 AXE = Path(ls.__file__).parent / "view" / "page" / "node_modules" / "axe-core" / "axe.min.js"
-#: elements that reach beyond the window and cannot be scrolled into it: the strip of figures scrolls by itself.
+#: elements that reach beyond the window and cannot be scrolled into it: the strip of figures
+#: scrolls by itself.
 TOO_WIDE = """[...document.querySelectorAll("body *")].filter((element) => {
   const { left, right, width } = element.getBoundingClientRect();
   return width > 1 && (left < -1 || right > innerWidth + 1) && !element.closest("#side, .scroll");
@@ -73,7 +74,11 @@ def check_fits(visit: Visit) -> None:
 def move_fingers(visit: Visit, *steps: list[tuple[float, float]]) -> None:
     """Put fingers on the screen, move them from places to places, and lift them."""
     session = visit.context.new_cdp_session(visit.page)
-    for kind, places in (("touchStart", steps[0]), *(("touchMove", step) for step in steps[1:]), ("touchEnd", [])):
+    for kind, places in (
+        ("touchStart", steps[0]),
+        *(("touchMove", step) for step in steps[1:]),
+        ("touchEnd", []),
+    ):
         points = [{"x": x, "y": y, "id": finger} for finger, (x, y) in enumerate(places)]
         session.send("Input.dispatchTouchEvent", {"type": kind, "touchPoints": points})
     session.detach()
@@ -86,14 +91,20 @@ def home(visit: Visit) -> list[float]:
 
 def metre(visit: Visit) -> float:
     """Return the pixels of a metre."""
-    return float(visit.value("lidarspec.picture.place(0, 0, 0)[1] - lidarspec.picture.place(1, 0, 0)[1]"))
+    return float(
+        visit.value("lidarspec.picture.place(0, 0, 0)[1] - lidarspec.picture.place(1, 0, 0)[1]")
+    )
 
 
 def test_a_phone_shows_the_picture_first_and_nothing_is_cut_off(phone: Visit) -> None:
     box = phone.page.locator("#picture").bounding_box()
     assert box["width"] == PHONE[0]
     assert box["height"] == pytest.approx(0.55 * PHONE[1], abs=1)
-    assert box["y"] < phone.page.locator("#tools").bounding_box()["y"] < phone.page.locator("#side").bounding_box()["y"]
+    assert (
+        box["y"]
+        < phone.page.locator("#tools").bounding_box()["y"]
+        < phone.page.locator("#side").bounding_box()["y"]
+    )
     check_fits(phone)
     phone.page.click("#save summary")
     check_fits(phone)
@@ -103,7 +114,12 @@ def test_a_phone_shows_the_picture_first_and_nothing_is_cut_off(phone: Visit) ->
 @pytest.mark.parametrize("tab", ["bytes", "damaged", "commands"])
 def test_a_tab_covers_the_whole_of_a_phone(phone: Visit, tab: str) -> None:
     phone.page.tap(f"#tab-{tab}")
-    assert phone.page.locator("#drawer").bounding_box() == {"x": 0, "y": 0, "width": PHONE[0], "height": PHONE[1]}
+    assert phone.page.locator("#drawer").bounding_box() == {
+        "x": 0,
+        "y": 0,
+        "width": PHONE[0],
+        "height": PHONE[1],
+    }
     if tab == "bytes":
         phone.until(lambda: phone.page.locator(".branch[data-path]").count(), "no frame is shown")
     check_fits(phone)
@@ -124,7 +140,10 @@ def test_fingers_drag_pinch_and_tap(phone: Visit) -> None:
     phone.pause()
     across, down = phone.scan["place"][len(phone.scan["x"]) // 3]
     phone.page.touchscreen.tap(box["x"] + across + 12, box["y"] + down)
-    phone.until(lambda: phone.told.get("frame", {}).get("why") == "point", "a tap beside a point does not open its frame")
+    phone.until(
+        lambda: phone.told.get("frame", {}).get("why") == "point",
+        "a tap beside a point does not open its frame",
+    )
     phone.page.tap("#fold")
     phone.play()
 
@@ -151,7 +170,13 @@ def test_tabs_are_tabs_and_the_keyboard_reaches_everything(desk: Visit) -> None:
     selected = desk.page.locator("[role=tab][aria-selected=true]")
     desk.page.click("#tab-bytes")
     assert desk.page.locator("#bytes").is_visible(), "a click on the open tab does not close it"
-    for key, tab in (("ArrowRight", "damaged"), ("End", "commands"), ("ArrowRight", "bytes"), ("ArrowLeft", "commands"), ("Home", "bytes")):
+    for key, tab in (
+        ("ArrowRight", "damaged"),
+        ("End", "commands"),
+        ("ArrowRight", "bytes"),
+        ("ArrowLeft", "commands"),
+        ("Home", "bytes"),
+    ):
         desk.page.keyboard.press(key)
         assert selected.get_attribute("data-value") == tab
         assert desk.page.locator(f"#{tab}[role=tabpanel]").is_visible()
@@ -160,7 +185,10 @@ def test_tabs_are_tabs_and_the_keyboard_reaches_everything(desk: Visit) -> None:
     desk.page.locator("#bytes .tree").focus()
     desk.page.keyboard.press("Home")
     desk.page.keyboard.press("ArrowDown")
-    assert desk.page.locator("[role=treeitem][aria-selected=true]").get_attribute("data-path") == "speed"
+    assert (
+        desk.page.locator("[role=treeitem][aria-selected=true]").get_attribute("data-path")
+        == "speed"
+    )
     assert desk.page.locator(".dump i.kept").count() == 4, "two bytes, in hexadecimal and as text"
     desk.page.locator("#bytes .live").click()
     desk.page.locator("#picture").focus()
@@ -170,7 +198,10 @@ def test_tabs_are_tabs_and_the_keyboard_reaches_everything(desk: Visit) -> None:
     desk.page.set_viewport_size({"width": 1440, "height": 600})
     desk.page.locator("#side").focus()
     desk.page.keyboard.press("End")
-    desk.until(lambda: desk.value("document.getElementById('side').scrollTop") > 0, "the figures are not scrolled")
+    desk.until(
+        lambda: desk.value("document.getElementById('side').scrollTop") > 0,
+        "the figures are not scrolled",
+    )
     desk.page.set_viewport_size({"width": 1440, "height": 900})
     desk.page.click("#fold")
     assert not desk.page.locator("#bytes").is_visible()
@@ -202,21 +233,32 @@ def test_a_damaged_packet_is_counted_once(browser: Any, tmp_path: Path) -> None:
     """Its checksum is wrong, and the sensor's clock misses it as well."""
     sensor = ls.sensor("ldrobot-stl27l")
     frames = list(ls.simulate(sensor, packets=6000))
-    damaged = [frame if number % 2 else frame[:20] + bytes([frame[20] ^ 1]) + frame[21:] for number, frame in enumerate(frames)]
+    damaged = [
+        frame if number % 2 else frame[:20] + bytes([frame[20] ^ 1]) + frame[21:]
+        for number, frame in enumerate(frames)
+    ]
     path = tmp_path / "damaged.bin"
     path.write_bytes(b"".join(damaged))
     with served(str(path), "-s", sensor.id) as link:
         visit = Visit(browser, link)
-        visit.until(lambda: visit.text(".split").startswith(("damaged 49", "damaged 5")), "the share of damaged packets is not shown")
+        visit.until(
+            lambda: visit.text(".split").startswith(("damaged 49", "damaged 5")),
+            "the share of damaged packets is not shown",
+        )
         titles = visit.page.locator(".chart:visible h2").all_inner_texts()
-        assert sum("missing" in title or "lost" in title or "damaged" in title for title in titles) == 1
+        assert (
+            sum("missing" in title or "lost" in title or "damaged" in title for title in titles)
+            == 1
+        )
         total = float(next(title for title in titles if "missing" in title).split()[-2])
         assert 45 < total < 55
         visit.context.close()
         assert not visit.errors
 
 
-def test_a_sensor_that_is_unplugged_is_said_and_its_picture_dimmed(browser: Any, tmp_path: Path) -> None:
+def test_a_sensor_that_is_unplugged_is_said_and_its_picture_dimmed(
+    browser: Any, tmp_path: Path
+) -> None:
     """The line can be dismissed, and does not repeat the path of the port."""
     sensor = ls.sensor("ldrobot-stl27l")
     frames = list(ls.simulate(sensor, packets=1800))
@@ -243,7 +285,10 @@ def test_a_sensor_that_is_unplugged_is_said_and_its_picture_dimmed(browser: Any,
             assert not visit.page.locator("#age").is_visible()
             unplugged.set()
             visit.until(lambda: visit.page.locator("#age").is_visible(), "its age is not shown")
-            assert visit.value("getComputedStyle(document.getElementById('picture')).opacity") == "0.35"
+            assert (
+                visit.value("getComputedStyle(document.getElementById('picture')).opacity")
+                == "0.35"
+            )
             notice = visit.page.locator("#notice")
             visit.until(notice.is_visible, "nothing is said of it")
             assert len(visit.text("#reason")) < 60
@@ -264,23 +309,37 @@ def test_a_question_to_a_running_sensor_stops_it_and_starts_it_again(browser: An
     with served("sim:slamtec-rplidar-a1") as link:
         visit = Visit(browser, link)
         visit.page.click("#tab-commands")
-        assert visit.page.locator("#commands h2").all_inner_texts() == ["Ask", "Set", "Start and stop"]
+        assert visit.page.locator("#commands h2").all_inner_texts() == [
+            "Ask",
+            "Set",
+            "Start and stop",
+        ]
         assert visit.page.locator(".list [aria-pressed=true]").count() == 0
-        assert not visit.page.locator("#commands .primary").count(), "nothing can be sent before it is chosen"
+        assert not visit.page.locator("#commands .primary").count(), (
+            "nothing can be sent before it is chosen"
+        )
         visit.page.click(".list [data-value=get_info]")
         send = visit.page.locator("#commands .primary")
-        visit.until(lambda: send.inner_text() == "Stop, ask, start again" and send.is_enabled(), "it does not offer to stop")
+        visit.until(
+            lambda: send.inner_text() == "Stop, ask, start again" and send.is_enabled(),
+            "it does not offer to stop",
+        )
         send.click()
         visit.until(lambda: "answered" in visit.text("#commands .reply"), "there is no reply")
         visit.until(lambda: len(visit.asked_for("send")) == 3, "it is not started again")
         assert visit.asked_for("send")[1]["command"] == "get_info"
         before = visit.value("lidarspec.picture.scan.scan")
-        visit.until(lambda: visit.value("lidarspec.picture.scan.scan") > before + 3, "no scan comes any more")
+        visit.until(
+            lambda: visit.value("lidarspec.picture.scan.scan") > before + 3,
+            "no scan comes any more",
+        )
         visit.context.close()
         assert not visit.errors
 
 
-def test_a_saved_scan_is_named_after_its_time_in_the_file_at_each_replay(browser: Any, tmp_path: Path) -> None:
+def test_a_saved_scan_is_named_after_its_time_in_the_file_at_each_replay(
+    browser: Any, tmp_path: Path
+) -> None:
     sensor = ls.sensor("ldrobot-stl27l")
     path = tmp_path / "short.bin"
     path.write_bytes(b"".join(ls.simulate(sensor, packets=1800)))  # a second
@@ -288,7 +347,10 @@ def test_a_saved_scan_is_named_after_its_time_in_the_file_at_each_replay(browser
         visit = Visit(browser, link)
         newest = -1
         for _ in range(2):
-            visit.until(lambda newest=newest: visit.value("lidarspec.picture.scan.scan") > newest, "it does not begin anew")
+            visit.until(
+                lambda newest=newest: visit.value("lidarspec.picture.scan.scan") > newest,
+                "it does not begin anew",
+            )
             visit.until(lambda: visit.text("#play") == "▶ Play", "it does not end")
             visit.page.click("#save summary")
             with visit.page.expect_download() as download:

@@ -11,11 +11,30 @@ import pytest
 
 from lidarspec import PointCloud
 from lidarspec.errors import UnknownName
-from lidarspec.points.look import STEPS, Look, bounds, fit, look, ramps, ring_step, rounded_up, shade
+from lidarspec.points.look import (
+    STEPS,
+    Look,
+    bounds,
+    fit,
+    look,
+    ramps,
+    ring_step,
+    rounded_up,
+    shade,
+)
 from lidarspec.view.canvas import BLANK, FIRST_STEP
 from lidarspec.view.polar import picture
 
-DOTS = {0x01: (0, 0), 0x02: (1, 0), 0x04: (2, 0), 0x40: (3, 0), 0x08: (0, 1), 0x10: (1, 1), 0x20: (2, 1), 0x80: (3, 1)}
+DOTS = {
+    0x01: (0, 0),
+    0x02: (1, 0),
+    0x04: (2, 0),
+    0x40: (3, 0),
+    0x08: (0, 1),
+    0x10: (1, 1),
+    0x20: (2, 1),
+    0x80: (3, 1),
+}
 FLAT = Look("range", 5, 5)
 TALL = Look("range", 5, 5, flat=False)
 
@@ -42,7 +61,11 @@ def dots(lines: Iterable[str]) -> set[tuple[int, int]]:
         for column, character in enumerate(line):
             bits = ord(character) - BLANK
             if 0 < bits < 256:
-                found |= {(4 * row + down, 2 * column + across) for bit, (down, across) in DOTS.items() if bits & bit}
+                found |= {
+                    (4 * row + down, 2 * column + across)
+                    for bit, (down, across) in DOTS.items()
+                    if bits & bit
+                }
     return found
 
 
@@ -53,16 +76,28 @@ def of_points(points: PointCloud) -> set[tuple[int, int]]:
 
 @pytest.mark.parametrize(
     ("point", "row", "column"),
-    [((4.1, 0, 0), -1, 0), ((0, 4.1, 0), 0, -1), ((-4.1, 0, 0), 1, 0), ((0, -4.1, 0), 0, 1), ((3, 3, 0), -1, -1)],
+    [
+        ((4.1, 0, 0), -1, 0),
+        ((0, 4.1, 0), 0, -1),
+        ((-4.1, 0, 0), 1, 0),
+        ((0, -4.1, 0), 0, 1),
+        ((3, 3, 0), -1, -1),
+    ],
 )
-def test_forward_is_up_and_left_is_left(point: tuple[float, float, float], row: int, column: int) -> None:
+def test_forward_is_up_and_left_is_left(
+    point: tuple[float, float, float], row: int, column: int
+) -> None:
     ((down, across),) = of_points(cloud(point))
     assert np.sign([round((down - 61) / 9), round((across - 61) / 9)]).tolist() == [row, column]
 
 
 def test_a_circle_is_round() -> None:
     turn = np.linspace(0, 2 * np.pi, 2000)
-    found = np.array(sorted(of_points(cloud(*zip(4.5 * np.cos(turn), 4.5 * np.sin(turn), 0 * turn, strict=True)))))
+    found = np.array(
+        sorted(
+            of_points(cloud(*zip(4.5 * np.cos(turn), 4.5 * np.sin(turn), 0 * turn, strict=True)))
+        )
+    )
     height, width = np.ptp(found, axis=0)
     assert abs(int(height) - int(width)) <= 1
     assert height == pytest.approx(2 * 4.5 / 5 * 59.5, abs=2)
@@ -98,7 +133,13 @@ def test_a_label_hides_no_point() -> None:
 
 def test_the_middle_can_be_elsewhere() -> None:
     points = cloud((9, 3, 0))
-    assert len(dots(drawn(points, Look("range", 5, 5, middle=(8.5, 3.0)))) - dots(drawn(points[:0], Look("range", 5, 5, (8.5, 3.0))))) == 1
+    assert (
+        len(
+            dots(drawn(points, Look("range", 5, 5, middle=(8.5, 3.0))))
+            - dots(drawn(points[:0], Look("range", 5, 5, (8.5, 3.0))))
+        )
+        == 1
+    )
 
 
 def test_the_reach_takes_in_most_points_and_is_round() -> None:
@@ -106,12 +147,16 @@ def test_the_reach_takes_in_most_points_and_is_round() -> None:
     assert look(cloud(*near)).reach == 2.0
     assert look(cloud(*near, (90, 0, 0))).reach == 2.0
     assert look(cloud()).reach == 1.0
-    assert [rounded_up(value) for value in (0.011, 1.0, 1.01, 5.3, 99, 101)] == pytest.approx([0.012, 1.0, 1.2, 6.0, 100.0, 120.0])
+    assert [rounded_up(value) for value in (0.011, 1.0, 1.01, 5.3, 99, 101)] == pytest.approx(
+        [0.012, 1.0, 1.2, 6.0, 100.0, 120.0]
+    )
 
 
 @pytest.mark.parametrize("outliers", [0, 10])
 @pytest.mark.parametrize("middle", [(0.0, 0.0), (60.0, -8.0)])
-def test_a_fitted_picture_is_filled_by_98_percent_of_the_points(middle: tuple[float, float], outliers: int) -> None:
+def test_a_fitted_picture_is_filled_by_98_percent_of_the_points(
+    middle: tuple[float, float], outliers: int
+) -> None:
     turn = np.linspace(0, 2 * np.pi, 600)
     x, y = middle[0] + 4 * np.cos(turn), middle[1] + 2.5 * np.sin(turn)
     points = cloud(*zip(x, y, 0 * x, strict=True), *[(500.0, 300.0, 20.0)] * outliers)
@@ -135,7 +180,9 @@ def test_a_fitted_picture_shows_the_sensor_if_that_costs_little() -> None:
 def test_colours_go_from_near_to_far_and_from_weak_to_strong() -> None:
     points = cloud((0.1, 0.1, 0), (3.4, 3.4, 0), intensity=(200, 1))
     for ramp, last in (("range", [0, STEPS - 1]), ("intensity", [STEPS - 1, 0])):
-        inks = picture(points, width=60, height=30, look=Look(ramp, 5, 4.8 if ramp == "range" else 200)).inks
+        inks = picture(
+            points, width=60, height=30, look=Look(ramp, 5, 4.8 if ramp == "range" else 200)
+        ).inks
         steps = inks[inks >= FIRST_STEP] - FIRST_STEP
         assert steps.tolist()[::-1] == last  # the near one is further down
 
@@ -173,9 +220,18 @@ def most(values: Iterable[int]) -> int:
 
 def test_colours_show_a_further_column_from_its_lowest_value_on() -> None:
     plain = cloud((1, 0, 0), (2, 0, 0), (3, 0, 0))
-    points = dataclasses.replace(plain, extra={"velocity": np.array([-3.0, np.nan, 5.0], np.float32)}, units={"velocity": "m/s"})
+    points = dataclasses.replace(
+        plain,
+        extra={"velocity": np.array([-3.0, np.nan, 5.0], np.float32)},
+        units={"velocity": "m/s"},
+    )
     found = look(points, ramp="velocity")
-    assert (found.ramp, found.low, found.full, found.ends) == ("velocity", -3.0, 5.0, ("-3", "5 m/s"))
+    assert (found.ramp, found.low, found.full, found.ends) == (
+        "velocity",
+        -3.0,
+        5.0,
+        ("-3", "5 m/s"),
+    )
     assert shade(points, found).tolist() == [0.0, 0.0, 1.0]
     assert ramps(points) == ["range", "velocity"]
     with pytest.raises(UnknownName, match="did you mean 'velocity'"):

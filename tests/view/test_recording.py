@@ -40,8 +40,9 @@ def press_at_once(switch: Switch) -> None:
             done.result()
 
 
-def open_recordings() -> list[str]:
-    return [one.name for one in threading.enumerate() if one.name.startswith("recorder of ")]
+def open_recordings(folder: Path) -> list[str]:
+    start = f"recorder of {folder}"
+    return [one.name for one in threading.enumerate() if one.name.startswith(start)]
 
 
 def test_presses_at_once_leave_no_recording_open(tmp_path: Path) -> None:
@@ -49,7 +50,7 @@ def test_presses_at_once_leave_no_recording_open(tmp_path: Path) -> None:
     switch = open_switch(tmp_path)
     press_at_once(switch)
     assert switch.recording is None
-    assert not open_recordings()
+    assert not open_recordings(tmp_path)
     kept = {Path(path).name for path, _ in switch.written}
     assert {path.name for path in tmp_path.iterdir()} == kept
 
@@ -98,4 +99,4 @@ def test_every_second_press_ends_the_recording(tmp_path: Path) -> None:
             page.say("record")
         page.scan()
         page.state(lambda state: state["recording"] is None)
-        assert not open_recordings()
+        assert not open_recordings(tmp_path)

@@ -17,18 +17,31 @@ from lidarspec.scans.selection import Selection
 from tests.view.pages import DEADLINE, FLAT, SOLID, Station, masked, recorded
 
 
-@pytest.mark.parametrize(("sensor", "planar"), [(FLAT, True), pytest.param(SOLID, False, marks=pytest.mark.slow)])
+@pytest.mark.parametrize(
+    ("sensor", "planar"), [(FLAT, True), pytest.param(SOLID, False, marks=pytest.mark.slow)]
+)
 def test_a_page_is_told_what_it_shows(tmp_path: Path, sensor: str, planar: bool) -> None:
     with Station(f"sim:{sensor}", tmp_path) as station, station.page() as page:
         hello = page.until("hello")
-        assert (hello["sensor"], hello["source"], hello["live"], hello["planar"]) == (sensor, f"sim:{sensor}", True, planar)
+        assert (hello["sensor"], hello["source"], hello["live"], hello["planar"]) == (
+            sensor,
+            f"sim:{sensor}",
+            True,
+            planar,
+        )
         assert (hello["duration"], hello["records"]) == (None, True)
         assert {"pcd", "csv", "svg"} <= set(hello["saves"])
         state = page.state(lambda state: state["figures"])
         assert 0 < state["position"] < 10  # since the first scan
-        assert (state["state"], state["paused"], state["damaged"]) == ("streaming", False, {"total": 0, "newest": []})
+        assert (state["state"], state["paused"], state["damaged"]) == (
+            "streaming",
+            False,
+            {"total": 0, "newest": []},
+        )
         assert state["figures"]["speed_hz"] == pytest.approx(10, rel=0.2)
-        assert {"lost", "disconnects", "latency_s", "jitter_s", "loss_rate", "at"} <= state["figures"].keys()
+        assert {"lost", "disconnects", "latency_s", "jitter_s", "loss_rate", "at"} <= state[
+            "figures"
+        ].keys()
 
 
 @pytest.mark.slow
@@ -98,12 +111,20 @@ def test_a_page_that_goes_and_one_that_comes_are_told_of(tmp_path: Path) -> None
             page.until("hello")
         with station.page() as page:
             page.until("hello")
-            assert station.said == ["page 1 opened by 127.0.0.1; 1 open", "page 1 closed; 0 open", "page 2 opened by 127.0.0.1; 1 open"]
+            assert station.said == [
+                "page 1 opened by 127.0.0.1; 1 open",
+                "page 1 closed; 0 open",
+                "page 2 opened by 127.0.0.1; 1 open",
+            ]
 
 
 @pytest.mark.slow
 def test_a_live_source_that_a_page_pauses_goes_on_for_the_others(tmp_path: Path) -> None:
-    with Station(f"sim:{FLAT}", tmp_path) as station, station.page() as paused, station.page() as other:
+    with (
+        Station(f"sim:{FLAT}", tmp_path) as station,
+        station.page() as paused,
+        station.page() as other,
+    ):
         header, columns = paused.scan()
         paused.say("pause")
         stands = paused.state(lambda state: state["paused"])
@@ -115,10 +136,14 @@ def test_a_live_source_that_a_page_pauses_goes_on_for_the_others(tmp_path: Path)
             pass
         with pytest.raises(TimeoutError):
             paused.heard(lambda message: isinstance(message, tuple), within=0.5)
-        frame = paused.asked("frame", point={"scan": header["scan"], "index": int(columns["index"][3])})
+        frame = paused.asked(
+            "frame", point={"scan": header["scan"], "index": int(columns["index"][3])}
+        )
         assert frame["is"] == "frame"
         paused.say("play")
-        assert paused.heard(lambda message: isinstance(message, tuple))[0]["scan"] >= first["scan"] + 5
+        assert (
+            paused.heard(lambda message: isinstance(message, tuple))[0]["scan"] >= first["scan"] + 5
+        )
 
 
 @pytest.mark.slow
@@ -180,7 +205,9 @@ def test_a_file_is_played_at_its_speed_and_at_another(tmp_path: Path) -> None:
 @pytest.mark.slow
 @pytest.mark.parametrize(("sensor", "suffix"), [(FLAT, ".bin"), (FLAT, ".lsr"), (SOLID, ".pcap")])
 def test_a_file_is_read_as_it_is_played(tmp_path: Path, sensor: str, suffix: str) -> None:
-    """Figures, bytes and damaged frames are those of the scans that are shown, and not of the rest of the file."""
+    """Figures, bytes and damaged frames are those of the scans that are shown, and not of the rest
+    of the file.
+    """
     path = recorded(tmp_path, sensor, 8, suffix)
     with Station(path, tmp_path, sensor) as station, station.page() as page:
         header, _ = page.scan()
@@ -215,14 +242,20 @@ def test_behind_the_end_of_a_file_is_its_end(tmp_path: Path) -> None:
 @pytest.mark.slow
 def test_what_is_selected_of_a_file_is_not_moved_through(tmp_path: Path) -> None:
     path = recorded(tmp_path)
-    with Station(path, tmp_path, select=Selection(times=(1.0, 2.0))) as station, station.page() as page:
+    with (
+        Station(path, tmp_path, select=Selection(times=(1.0, 2.0))) as station,
+        station.page() as page,
+    ):
         assert page.until("hello")["duration"] is None
         assert "moved" in page.asked("seek", to=1)["text"]
         page.until("ended")
 
 
 def test_a_failing_source_is_told_of(tmp_path: Path) -> None:
-    with Station(recorded(tmp_path), tmp_path, select=Selection(times=(100.0, 200.0))) as station, station.page() as page:
+    with (
+        Station(recorded(tmp_path), tmp_path, select=Selection(times=(100.0, 200.0))) as station,
+        station.page() as page,
+    ):
         assert "nothing of that is asked for" in page.until("ended")["text"]
     assert isinstance(station.failure, UsageError)
 
@@ -255,7 +288,11 @@ def test_nonsense_is_refused_with_a_word_and_ends_nothing(tmp_path: Path) -> Non
 
 
 def test_a_message_that_is_too_long_ends_its_page_alone(tmp_path: Path) -> None:
-    with Station(f"sim:{FLAT}", tmp_path) as station, station.page() as page, station.page() as other:
+    with (
+        Station(f"sim:{FLAT}", tmp_path) as station,
+        station.page() as page,
+        station.page() as other,
+    ):
         page.socket.send(" " * (1 << 17))
         with pytest.raises(Exception, match=r"1009|too big"):
             page.heard(lambda message: False)
@@ -270,12 +307,23 @@ def test_a_scan_is_saved_as_it_is_shown(tmp_path: Path) -> None:
         for suffix in page.until("hello")["saves"]:
             status, headers, body = station.answered(f"/save/{header['scan']}.{suffix}")
             assert (status, len(body) > 1000) == (200, True), suffix
-            assert re.search(rf'filename="{FLAT}-\d+\.\d{{3}}s\.{suffix}"', headers["content-disposition"])
+            assert re.search(
+                rf'filename="{FLAT}-\d+\.\d{{3}}s\.{suffix}"', headers["content-disposition"]
+            )
             assert headers["cache-control"] == "no-store"
             if suffix == "csv":
-                x = np.array([float(line.split(b",")[0]) for line in body.splitlines()[1:]], np.float32)
+                x = np.array(
+                    [float(line.split(b",")[0]) for line in body.splitlines()[1:]], np.float32
+                )
                 assert np.allclose(x, columns["x"])
-        for name in ("9999.pcd", f"{header['scan']}.exe", f"{header['scan']}.", "x.pcd", "..%2f..%2fetc%2fpasswd", "-1.pcd"):
+        for name in (
+            "9999.pcd",
+            f"{header['scan']}.exe",
+            f"{header['scan']}.",
+            "x.pcd",
+            "..%2f..%2fetc%2fpasswd",
+            "-1.pcd",
+        ):
             assert station.answered(f"/save/{name}")[0] == 404, name
 
 
@@ -284,7 +332,9 @@ def test_a_recording_is_switched_on_and_off(tmp_path: Path) -> None:
         page.scan()
         assert page.state()["recording"] is None
         page.say("record")
-        recording = page.state(lambda state: state["recording"] and state["recording"]["bytes"] > 10_000)["recording"]
+        recording = page.state(
+            lambda state: state["recording"] and state["recording"]["bytes"] > 10_000
+        )["recording"]
         page.say("record")
         page.state(lambda state: state["recording"] is None)
     with ls.open(tmp_path / recording["name"]) as again:
@@ -299,7 +349,9 @@ def test_a_file_is_not_recorded(tmp_path: Path) -> None:
 
 
 @pytest.mark.slow
-def test_a_page_that_takes_nothing_is_dropped_and_a_recording_loses_nothing(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_page_that_takes_nothing_is_dropped_and_a_recording_loses_nothing(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """It asks for scan after scan and reads none of them, until its window is full."""
     monkeypatch.setattr("lidarspec.view.server.STALLED", 2.0)
     with (

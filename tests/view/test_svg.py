@@ -1,4 +1,6 @@
-"""A cloud as SVG: points fill the picture, and labels are written once, whole, apart from each other."""
+"""A cloud as SVG: points fill the picture, and labels are written once, whole, apart from each
+other.
+"""
 
 from __future__ import annotations
 
@@ -22,13 +24,22 @@ def walls(forward: float, left: float) -> list[tuple[float, float, float]]:
     turn = np.linspace(0, 2 * np.pi, 400)
     larger = np.maximum(abs(np.cos(turn)), abs(np.sin(turn)))
     height = np.tile(np.linspace(-1, 1, 16), 25)
-    return list(zip(forward + 4 * np.cos(turn) / larger, left + 2.5 * np.sin(turn) / larger, height, strict=True))
+    return list(
+        zip(
+            forward + 4 * np.cos(turn) / larger,
+            left + 2.5 * np.sin(turn) / larger,
+            height,
+            strict=True,
+        )
+    )
 
 
 @pytest.mark.parametrize("middle", [(0, 0), (4.2, 1), (90, -30)])
 def test_labels_are_whole_and_apart(middle: tuple[float, float]) -> None:
     points = cloud(*walls(*middle))
-    for view in ET.fromstring(svg(points, fit(points, look(points)), "title")).iter(f"{NAMESPACE}svg"):
+    for view in ET.fromstring(svg(points, fit(points, look(points)), "title")).iter(
+        f"{NAMESPACE}svg"
+    ):
         if view.get("x") is None:  # the whole picture
             continue
         _, top, width, height = (float(part) for part in view.attrib["viewBox"].split())
@@ -46,7 +57,9 @@ def test_labels_are_whole_and_apart(middle: tuple[float, float]) -> None:
             assert top <= box[1], box
             assert box[3] <= top + height + 1, box
             for other in boxes[number + 1 :]:
-                is_apart = box[2] < other[0] or other[2] < box[0] or box[3] < other[1] or other[3] < box[1]
+                is_apart = (
+                    box[2] < other[0] or other[2] < box[0] or box[3] < other[1] or other[3] < box[1]
+                )
                 assert is_apart, (box, other)
 
 
@@ -56,6 +69,8 @@ def test_points_fill_the_picture_whatever_a_few_far_ones_do() -> None:
     (scale,) = re.findall(r"scale\(([\d.]+)\)", picture)
     found = []
     for path in re.findall(r' d="([^"]*h0)"', picture):
-        moves = [(int(across), int(down)) for across, down in re.findall(r"m(-?\d+) (-?\d+)h0", path)]
+        moves = [
+            (int(across), int(down)) for across, down in re.findall(r"m(-?\d+) (-?\d+)h0", path)
+        ]
         found.append(np.cumsum(moves, axis=0) * float(scale))
     assert np.ptp(np.concatenate(found), axis=0).max() > 0.88 * SIDE

@@ -1,4 +1,6 @@
-"""The widget in a cell: real messages of ipywidgets, the bundle in a real browser, one scan under way, closed with its cell."""
+"""The widget in a cell: real messages of ipywidgets, the bundle in a real browser, one scan under
+way, closed with its cell.
+"""
 
 from __future__ import annotations
 
@@ -17,7 +19,8 @@ from tests.cli.running import ran
 from tests.libraries import needs
 
 pytestmark = [pytest.mark.slow, needs("anywidget")]
-#: what a notebook's front end is to a widget of anywidget's: a model that sends and hears, and an element to render into.
+#: what a notebook's front end is to a widget of anywidget's: a model that sends and hears, and an
+#: element to render into.
 CELL = """async (esm) => {
     const heard = new Set();
     window.fromKernel = (content, buffers) => {
@@ -32,7 +35,9 @@ CELL = """async (esm) => {
 
 
 class Comm:
-    """The connection of a widget to its cell: what is sent there waits in a queue, in whichever thread it was sent."""
+    """The connection of a widget to its cell: what is sent there waits in a queue, in whichever
+    thread it was sent.
+    """
 
     comm_id = "one"
 
@@ -55,13 +60,17 @@ class Cell:
         self.asked: list[str] = []
         self.scans, self.most = 0, 0
         viewer._widget.comm = self.comm
-        page.set_content("<body style='background:#111;color:#ddd'><div id=cell style='width:600px'></div>")
+        page.set_content(
+            "<body style='background:#111;color:#ddd'><div id=cell style='width:600px'></div>"
+        )
         page.expose_function("toKernel", self._to_kernel)
         page.evaluate(CELL, widget.DRAWING.read_text(encoding="utf-8"))
 
     def _to_kernel(self, content: dict[str, Any]) -> None:
         self.asked.append(content["do"])
-        self.comm.heard({"content": {"data": {"method": "custom", "content": content}}, "buffers": []})
+        self.comm.heard(
+            {"content": {"data": {"method": "custom", "content": content}}, "buffers": []}
+        )
 
     def until(self, reached: Callable[[], bool], seconds: float = 20.0) -> None:
         """Carry messages to and fro until something is so."""
@@ -96,7 +105,9 @@ def test_a_cell_shows_one_scan_after_another_and_closes_its_source(page: Any) ->
     assert cell.most <= 1  # under way
     assert "RoboSense RS-LiDAR-M1" in cell.text
     assert "78,750 points" in cell.text
-    assert [option.inner_text() for option in page.query_selector_all("select[title=colour] option")] == [
+    assert [
+        option.inner_text() for option in page.query_selector_all("select[title=colour] option")
+    ] == [
         "range",
         "intensity",
         "ring",
@@ -139,7 +150,11 @@ def test_a_file_is_played_stands_still_and_ends(page: Any, tmp_path: Path) -> No
 def test_what_is_wrong_with_a_source_stands_in_the_cell_in_one_line(page: Any) -> None:
     cell = Cell(page, widget.Viewer("/dev/ttyUSB99"))
     cell.until(lambda: "no such port" in cell.text)
-    assert cell.text.strip() == cell.viewer.failure == "/dev/ttyUSB99: no such port; next: lidarspec ports"
+    assert (
+        cell.text.strip()
+        == cell.viewer.failure
+        == "/dev/ttyUSB99: no such port; next: lidarspec ports"
+    )
 
 
 def colours(page: Any) -> int:

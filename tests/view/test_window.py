@@ -1,4 +1,6 @@
-"""`view` in a real terminal: it draws, takes keys, follows the window, and leaves the terminal as it was, whatever ends it."""
+"""`view` in a real terminal: it draws, takes keys, follows the window, and leaves the terminal as
+it was, whatever ends it.
+"""
 
 from __future__ import annotations
 
@@ -34,7 +36,10 @@ def capture(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def test_a_sensor_is_drawn_and_q_leaves_the_terminal_clean(tmp_path: Path) -> None:
     with Terminal(*LIVE, cwd=tmp_path) as terminal:
         shown = terminal.wait_for("10.0 Hz")
-        assert all(text in shown for text in ("● live", "0° forward", "2 m", "points", "2160", "q quit", "▲"))
+        assert all(
+            text in shown
+            for text in ("● live", "0° forward", "2 m", "points", "2160", "q quit", "▲")
+        )
         assert sum(0x2800 < ord(character) < 0x2900 for character in shown) > 150
         assert {"1049"} <= terminal.modes
         assert "25" not in terminal.modes
@@ -120,7 +125,9 @@ def test_the_picture_follows_the_window(tmp_path: Path) -> None:
     ("end", "code"),
     [("\x03", 130), (signal.SIGTERM, 143), (signal.SIGHUP, 129)],
 )
-def test_whatever_ends_it_leaves_the_terminal_clean(tmp_path: Path, end: str | signal.Signals, code: int) -> None:
+def test_whatever_ends_it_leaves_the_terminal_clean(
+    tmp_path: Path, end: str | signal.Signals, code: int
+) -> None:
     with Terminal(*LIVE, cwd=tmp_path) as terminal:
         terminal.wait_for("live")
         terminal.type(end) if isinstance(end, str) else terminal.process.send_signal(end)
@@ -136,7 +143,9 @@ def test_a_failure_is_told_on_a_clean_terminal(tmp_path: Path) -> None:
     with Terminal("view", "raw.bin", "-s", "./failing.py", cwd=tmp_path) as terminal:
         assert terminal.ended() == 1
         assert terminal.is_clean()
-        assert "a bug in lidarspec: MemoryError: by hand" in terminal.raw.rpartition("\x1b[?1049l")[2]
+        assert (
+            "a bug in lidarspec: MemoryError: by hand" in terminal.raw.rpartition("\x1b[?1049l")[2]
+        )
 
 
 #: a sensor whose clock gives out in the middle of the stream with what no plugin is forgiven.
@@ -161,7 +170,9 @@ def lidarspec_sensors():
 @pytest.mark.slow
 @pytest.mark.skipif(shutil.which("bash") is None, reason="needs a shell with job control")
 def test_it_can_be_suspended(tmp_path: Path) -> None:
-    with Terminal(program=["bash", "--norc", "--noediting", "-i"], cwd=tmp_path, PS1="shell> ") as terminal:
+    with Terminal(
+        program=["bash", "--norc", "--noediting", "-i"], cwd=tmp_path, PS1="shell> "
+    ) as terminal:
         terminal.wait_for("shell>")
         terminal.type(f"{sys.executable} -m lidarspec {' '.join(LIVE)}\n")
         terminal.wait_for("● live")

@@ -1,4 +1,6 @@
-"""Pages that are open in a real browser, as people open them: the verb serves a source, and what page and server say is heard."""
+"""Pages that are open in a real browser, as people open them: the verb serves a source, and what
+page and server say is heard.
+"""
 
 from __future__ import annotations
 
@@ -25,7 +27,8 @@ SHOWN = """(() => {
   const places = [...x].flatMap((_, row) => picture.place(x[row], y[row], z[row]));
   return [Object.fromEntries([...columns].map(([name, column]) => [name, [...column]])), places];
 })()"""
-#: the size of the picture, and the numbers of the pixels in it that are neither black, grey nor white.
+#: the size of the picture, and the numbers of the pixels in it that are neither black, grey nor
+#: white.
 COLOURED = """(async () => {
   const image = await createImageBitmap(await lidarspec.picture.image()), { width, height } = image;
   const context = new OffscreenCanvas(width, height).getContext("2d");
@@ -51,7 +54,9 @@ for library in ("starlette", "uvicorn", "websockets"):
 def served(*words: str, address: str = "127.0.0.1", folder: Path | None = None) -> Iterator[str]:
     """The link to the page of a source; `folder`: where it is served from."""
     command = [sys.executable, "-m", "lidarspec", "view", *words, "--web", "--address", address]
-    process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, cwd=folder)
+    process = subprocess.Popen(
+        command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, cwd=folder
+    )
     try:
         assert process.stdout is not None
         line = process.stdout.readline()
@@ -88,10 +93,14 @@ class Visit:
         self.errors: list[str] = []
         width, height = size
         viewport = {"width": width, "height": height}
-        self.context = browser.new_context(viewport=viewport, color_scheme=theme, has_touch=touch, is_mobile=touch)
+        self.context = browser.new_context(
+            viewport=viewport, color_scheme=theme, has_touch=touch, is_mobile=touch
+        )
         self.page = self.context.new_page()
         self.page.on("pageerror", lambda error: self.errors.append(str(error)))
-        self.page.on("console", lambda message: message.type == "error" and self.errors.append(message.text))
+        self.page.on(
+            "console", lambda message: message.type == "error" and self.errors.append(message.text)
+        )
         self.page.on("websocket", self._listen)
         self.page.goto(link)
         self.until(lambda: self.value("lidarspec.figures.latency > 0"), "nothing is drawn")
@@ -135,13 +144,20 @@ class Visit:
 
     @property
     def scan(self) -> dict[str, np.ndarray]:
-        """The columns of the points that are shown, and where each of them is in the picture, in pixels."""
+        """The columns of the points that are shown, and where each of them is in the picture, in
+        pixels.
+        """
         columns, places = self.value(SHOWN)
-        return {**{name: np.array(column) for name, column in columns.items()}, "place": np.array(places).reshape(-1, 2)}
+        return {
+            **{name: np.array(column) for name, column in columns.items()},
+            "place": np.array(places).reshape(-1, 2),
+        }
 
     @property
     def coloured(self) -> tuple[np.ndarray, np.ndarray]:
-        """Which pixels of the picture have a colour, and which are nothing but points and what lies under them, (height, width) each."""
+        """Which pixels of the picture have a colour, and which are nothing but points and what lies
+        under them, (height, width) each.
+        """
         width, height, pixels = self.value(COLOURED)
         coloured, looked = np.zeros(height * width, bool), np.ones((height, width), bool)
         coloured[pixels] = True
@@ -160,7 +176,9 @@ class Visit:
 
 @contextlib.contextmanager
 def streaming(visit: Visit) -> Iterator[None]:
-    """Let an open page play during one test only, because drawing scans in software takes much processor time."""
+    """Let an open page play during one test only, because drawing scans in software takes much
+    processor time.
+    """
     if visit.text("#status") == "paused":
         visit.play()
     yield

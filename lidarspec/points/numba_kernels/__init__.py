@@ -1,7 +1,8 @@
 """Points and checksums by compiled code: an optional back end, which needs Numba.
 
-In: a `points.plan.Plan`. Out: what fills its columns, by `compile`; and what computes the checksums of a decoder, by `compiled_sums`.
-Nobody needs to know more of this package, and nothing breaks without it but ``backend="jit"``. Numba is imported with the first kernel
+In: a `points.plan.Plan`. Out: what fills its columns, by `compile`; and what computes the checksums
+of a decoder, by `compiled_sums`. Nobody needs to know more of this package, and nothing breaks
+without it but ``backend="jit"``. Numba is imported with the first kernel
 that runs, not with this package. Modules in reading order:
 
 * `arithmetic`: what kernels are written with; the only module that imports Numba as it is imported.
@@ -25,7 +26,8 @@ def compile(plan: Plan, names: tuple[str, ...], frames: int | None = None) -> Ma
     """What makes these columns of the plan's points, compiled; kept with the plan.
 
     Args:
-        frames: how many are to be made, where a kernel is wanted only if it pays; else it is wanted in any case.
+        frames: how many are to be made, where a kernel is wanted only if it pays; else it is wanted
+            in any case.
 
     Returns:
         None where a kernel does not pay, or Numba is missing.

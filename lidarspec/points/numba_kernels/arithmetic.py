@@ -1,4 +1,5 @@
-"""What generated kernels are written with: memory by index without checks, sines and cosines of float32, NumPy's odd cases.
+"""What generated kernels are written with: memory by index without checks, sines and cosines of
+float32, NumPy's odd cases.
 
 The only module that imports Numba as it is imported; nothing imports it but a kernel.
 """
@@ -25,7 +26,11 @@ WORDS = types.Array(types.uint16, 1, "C", readonly=True)
 MADE_SINGLES = types.Array(types.float32, 1, "C")
 MADE_PLACES = types.Array(types.int64, 1, "C")
 #: columns of whole numbers, by the name of their type.
-MADE = {f"{sign}int{bits}": types.Array(getattr(types, f"{sign}int{bits}"), 1, "C") for sign in ("", "u") for bits in (8, 16, 32)}
+MADE = {
+    f"{sign}int{bits}": types.Array(getattr(types, f"{sign}int{bits}"), 1, "C")
+    for sign in ("", "u")
+    for bits in (8, 16, 32)
+}
 INTEGER = types.int64
 
 #: added to a float64 and taken off again, it leaves a whole number, whose lowest bit is the sum's.
@@ -42,7 +47,9 @@ def compiled(kept, signature, **options):
 
     def make(function):
         dispatcher = njit(nogil=True, **options)(function)
-        dispatcher._cache = kept  # Numba's own unpickles what lies in its folder, whoever put it there
+        dispatcher._cache = (
+            kept  # Numba's own unpickles what lies in its folder, whoever put it there
+        )
         dispatcher.compile(signature)
         dispatcher.disable_compile()
         return dispatcher
@@ -56,7 +63,9 @@ def byte_at(context, array, index):
 
     def make(target, builder, signature, args):
         held = target.make_array(signature.args[0])(target, builder, args[0])
-        return builder.zext(builder.load(cgutils.gep_inbounds(builder, held.data, args[1])), ir.IntType(64))
+        return builder.zext(
+            builder.load(cgutils.gep_inbounds(builder, held.data, args[1])), ir.IntType(64)
+        )
 
     return types.int64(array, types.int64), make
 
@@ -69,7 +78,11 @@ def word_at(context, array, index):
         held = target.make_array(signature.args[0])(target, builder, args[0])
         place = cgutils.gep_inbounds(builder, held.data, args[1])
         word = builder.load(builder.bitcast(place, ir.IntType(64).as_pointer()), align=1)
-        return builder.call(builder.module.declare_intrinsic("llvm.bswap", [ir.IntType(64)]), [word]) if _IS_BIG else word
+        return (
+            builder.call(builder.module.declare_intrinsic("llvm.bswap", [ir.IntType(64)]), [word])
+            if _IS_BIG
+            else word
+        )
 
     return types.int64(array, types.int64), make
 
@@ -82,14 +95,20 @@ def four_at(context, array, index):
         held = target.make_array(signature.args[0])(target, builder, args[0])
         place = cgutils.gep_inbounds(builder, held.data, args[1])
         word = builder.load(builder.bitcast(place, ir.IntType(32).as_pointer()), align=1)
-        return builder.call(builder.module.declare_intrinsic("llvm.bswap", [ir.IntType(32)]), [word]) if _IS_BIG else word
+        return (
+            builder.call(builder.module.declare_intrinsic("llvm.bswap", [ir.IntType(32)]), [word])
+            if _IS_BIG
+            else word
+        )
 
     return types.uint32(array, types.int64), make
 
 
 @intrinsic
 def apart(context):
-    """Say of the arrays that the kernel is called with that none is a part of another, so that several points are computed at a time."""
+    """Say of the arrays that the kernel is called with that none is a part of another, so that
+    several points are computed at a time.
+    """
 
     def make(target, builder, signature, args):
         for argument in builder.function.args[2:]:
@@ -111,7 +130,9 @@ def fused(context, factor, other, added):
 
 
 def _float_at(bits, kind):
-    """What loads a float of so many bits from an index of bytes on, as a float64; one is kept for each order of the bytes."""
+    """What loads a float of so many bits from an index of bytes on, as a float64; one is kept for
+    each order of the bytes.
+    """
 
     def maker(is_swapped):
         @intrinsic
@@ -121,7 +142,9 @@ def _float_at(bits, kind):
                 place = cgutils.gep_inbounds(builder, held.data, args[1])
                 word = builder.load(builder.bitcast(place, ir.IntType(bits).as_pointer()), align=1)
                 if is_swapped:
-                    word = builder.call(builder.module.declare_intrinsic("llvm.bswap", [ir.IntType(bits)]), [word])
+                    word = builder.call(
+                        builder.module.declare_intrinsic("llvm.bswap", [ir.IntType(bits)]), [word]
+                    )
                 number = builder.bitcast(word, kind)
                 return number if bits == 64 else builder.fpext(number, ir.DoubleType())
 

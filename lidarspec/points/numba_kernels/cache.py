@@ -1,8 +1,10 @@
-"""Compiled kernels kept on disk between runs, in a folder that is its user's alone: what is read from there is run.
+"""Compiled kernels kept on disk between runs, in a folder that is its user's alone: what is read
+from there is run.
 
-A kernel is one file: a keyed digest (HMAC), and behind it what Numba made of the kernel, a pickle, which is opened only where the digest
-is right. The key is a file that its user alone can read, and names come out of it too. So nothing that somebody else, a full disk or a
-crash left in the folder is ever run; whatever is wrong there means compiling again.
+A kernel is one file: a keyed digest (HMAC), and behind it what Numba made of the kernel, a pickle,
+which is opened only where the digest is right. The key is a file that its user alone can read, and
+names come out of it too. So nothing that somebody else, a full disk or a crash left in the folder
+is ever run; whatever is wrong there means compiling again.
 """
 
 from __future__ import annotations
@@ -48,7 +50,9 @@ class Kept:
         self._name = name
 
     def load_overload(self, signature: object, target: Any) -> Any:
-        """What Numba made of the kernel in an earlier run; None where that is not at hand, or not beyond doubt."""
+        """What Numba made of the kernel in an earlier run; None where that is not at hand, or not
+        beyond doubt.
+        """
         from numba.core.compiler import CompileResult
 
         with contextlib.suppress(Exception):  # Numba compiles what it cannot use

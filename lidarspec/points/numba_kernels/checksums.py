@@ -1,11 +1,13 @@
-"""Checksums of many frames by compiled code, where each byte adds its share by XOR: a table of 256 for each place.
+"""Checksums of many frames by compiled code, where each byte adds its share by XOR: a table of 256
+for each place.
 
-A CRC is such a sum, and so is every XOR of bytes or words: the checksum of a frame is that of zeros, XORed with what each
-byte, alone among zeros, changes about it. The tables are made by the algorithm itself; where a share is the byte as it
-stands, words of eight bytes are XORed instead.
+A CRC is such a sum, and so is every XOR of bytes or words: the checksum of a frame is that of
+zeros, XORed with what each byte, alone among zeros, changes about it. The tables are made by the
+algorithm itself; where a share is the byte as it stands, words of eight bytes are XORed instead.
 
-A CRC over more bytes, or of more than 16 bits, runs along the row eight bytes at a time by eight tables of 256 ("slicing by eight"),
-four rows side by side, since each step waits for the one before.
+A CRC over more bytes, or of more than 16 bits, runs along the row eight bytes at a time by eight
+tables of 256 ("slicing by eight"), four rows side by side, since each step waits for the one
+before.
 """
 
 from __future__ import annotations
@@ -69,12 +71,17 @@ _SIDE = "abcd"
 
 def _sliced(name: str) -> str:
     """A register after eight more bytes, by what it and they are together."""
-    return " ^ ".join(f"at(table, {256 * byte} + ({name} >> {8 * byte} & 255))" for byte in range(8))
+    return " ^ ".join(
+        f"at(table, {256 * byte} + ({name} >> {8 * byte} & 255))" for byte in range(8)
+    )
 
 
 def _single(name: str) -> str:
     """A register after one more byte."""
-    return f"at(table, 1792 + (({name} ^ byte_at(rows, at_{name} + place)) & 255)) ^ ({name} >> 8 & {(1 << 56) - 1})"
+    return (
+        f"at(table, 1792 + (({name} ^ byte_at(rows, at_{name} + place)) & 255)) ^ ({name} >> 8 &"
+        f" {(1 << 56) - 1})"
+    )
 
 
 _ALONG = (
@@ -104,7 +111,9 @@ def _along(algorithm: Crc, spans: tuple[tuple[int, int], ...], rows: Bytes2D) ->
     table, _, _ = places(8, 0, algorithm.width, algorithm.poly, algorithm.refin)
     found, edges = np.empty(len(rows), np.int64), np.array(spans, np.int64).reshape(-1)
     start = int(np.uint64(algorithm.start).astype(np.int64))
-    function_of(_ALONG)(rows.reshape(-1), rows.shape[1], edges, table.astype(np.uint64).view(np.int64), start, found)
+    function_of(_ALONG)(
+        rows.reshape(-1), rows.shape[1], edges, table.astype(np.uint64).view(np.int64), start, found
+    )
     return finished(algorithm, found.view(np.uint64).astype(table.dtype))
 
 
@@ -113,16 +122,23 @@ class _Shares:
 
     Attributes:
         words: where eight bytes are loaded at a time.
-        tables: of each of these bytes, its share by its value; 0 for those that are not covered, or were before.
-        is_plain: whether all shares are the bytes as they stand, in the low byte of the checksum or the high one.
-        lows, highs: where shares are the bytes themselves, which of them go into the low byte of the checksum, and the high one.
+        tables: of each of these bytes, its share by its value; 0 for those that are not covered, or
+            were before.
+        is_plain: whether all shares are the bytes as they stand, in the low byte of the checksum or
+            the high one.
+        lows, highs: where shares are the bytes themselves, which of them go into the low byte of
+            the checksum, and the high one.
     """
 
     def __init__(self, seal: Seal) -> None:
         self.seen = 0
         self._seal = seal
         self._places = np.concatenate([np.arange(*span, dtype=np.int64) for span in seal.spans])
-        self.is_suited = isinstance(seal.algorithm, Crc | Xor | WordXor) and seal.algorithm.width <= 16 and len(self._places) <= LONGEST
+        self.is_suited = (
+            isinstance(seal.algorithm, Crc | Xor | WordXor)
+            and seal.algorithm.width <= 16
+            and len(self._places) <= LONGEST
+        )
         self.start, self.tables = 0, np.empty(0, np.uint16)
 
     def make(self, size: int) -> None:
@@ -138,17 +154,25 @@ class _Shares:
                 words.append(min(place, size - 8))
         none = np.zeros(256, np.uint16)
         self.words, self.start = np.array(words, np.int64), int(values[0])
-        self.tables = np.concatenate([shares.pop(word + byte, none) for word in words for byte in range(8)])
+        self.tables = np.concatenate(
+            [shares.pop(word + byte, none) for word in words for byte in range(8)]
+        )
         low, high = (self.tables.reshape(-1, 256)[:, 1] == one for one in (1, 256))
         bytes_ = np.arange(256, dtype=np.uint16)
-        self.is_plain = np.array_equal(self.tables.reshape(-1, 256), np.outer(low, bytes_) + np.outer(high, bytes_ << 8))
-        self.lows, self.highs = (np.packbits(np.repeat(part, 8)).view("<i8").astype(np.int64) for part in (low, high))
+        self.is_plain = np.array_equal(
+            self.tables.reshape(-1, 256), np.outer(low, bytes_) + np.outer(high, bytes_ << 8)
+        )
+        self.lows, self.highs = (
+            np.packbits(np.repeat(part, 8)).view("<i8").astype(np.int64) for part in (low, high)
+        )
 
     def values(self, rows: Bytes2D) -> NDArray[np.uint64]:
         """The checksums of frames, (n,)."""
         found, flat = np.empty(len(rows), np.int64), rows.reshape(-1)
         if self.is_plain:
-            function_of(_XORED)(flat, rows.shape[1], self.words, self.lows, self.highs, self.start, found)
+            function_of(_XORED)(
+                flat, rows.shape[1], self.words, self.lows, self.highs, self.start, found
+            )
         else:
             function_of(_SHARES)(flat, rows.shape[1], self.words, self.tables, self.start, found)
         return found.view(np.uint64)
@@ -163,14 +187,22 @@ def checksums(seal: Seal, rows: Bytes2D) -> NDArray[np.uint64] | None:
     if known is None and not seal.spans:
         return None  # over no bytes there is nothing to compute
     algorithm, length = seal.algorithm, sum(stop - start for start, stop in seal.spans)
-    if isinstance(algorithm, Crc) and (algorithm.width > 16 or (algorithm.width > 8 and length > LONGEST)):
+    if isinstance(algorithm, Crc) and (
+        algorithm.width > 16 or (algorithm.width > 8 and length > LONGEST)
+    ):
         if not rows.flags.c_contiguous or rows.size < WORTH:
             return None
         return _along(algorithm, seal.spans, rows)
     if known is None:
         known = _KNOWN[seal] = _Shares(seal)
     known.seen += len(rows)
-    if not known.is_suited or len(rows) < FEW or known.seen < EARNED or rows.shape[1] < 8 or not rows.flags.c_contiguous:
+    if (
+        not known.is_suited
+        or len(rows) < FEW
+        or known.seen < EARNED
+        or rows.shape[1] < 8
+        or not rows.flags.c_contiguous
+    ):
         return None
     if not len(known.tables):
         known.make(rows.shape[1])

@@ -1,6 +1,8 @@
-"""Kernels at work: compiled by Numba, or as an earlier run kept them; called by one thread or several; and when that pays.
+"""Kernels at work: compiled by Numba, or as an earlier run kept them; called by one thread or
+several; and when that pays.
 
-Nothing here imports Numba before a kernel is wanted. The name of a kernel is a hash of all that its code depends on.
+Nothing here imports Numba before a kernel is wanted. The name of a kernel is a hash of all that its
+code depends on.
 """
 
 from __future__ import annotations
@@ -34,7 +36,8 @@ THREADS = "LIDARSPEC_THREADS"
 #: points below which a second thread costs more than it saves.
 SHARE = 1 << 16
 
-#: points of a job that earn loading Numba with a kernel compiled before, and with one to be compiled; about a second's worth each.
+#: points of a job that earn loading Numba with a kernel compiled before, and with one to be
+#: compiled; about a second's worth each.
 WARM, COLD = 1 << 26, 1 << 28
 #: a count that nothing brings up to them.
 NEVER = -(1 << 62)
@@ -73,7 +76,10 @@ class Kernel(Maker):
         self._function = self._function or function_of(self._text.source)
 
     def columns(self, number: int) -> dict[str, NDArray[Any]]:
-        return {name: np.empty(number * self._width, dtype) for name, dtype in self._text.columns.items()}
+        return {
+            name: np.empty(number * self._width, dtype)
+            for name, dtype in self._text.columns.items()
+        }
 
     def run(self, rows: Bytes2D, values: Values, columns: Mapping[str, NDArray[Any]]) -> None:
         self.compile()
@@ -81,9 +87,16 @@ class Kernel(Maker):
         given: list[Any] = []
         for node in self._text.wanted.nodes:
             given += _flat(values(node), node.shape)
-        rest = (self._numbers, *self._text.wanted.arrays, *given, *(columns[name] for name in self._text.columns))
+        rest = (
+            self._numbers,
+            *self._text.wanted.arrays,
+            *given,
+            *(columns[name] for name in self._text.columns),
+        )
         data = span(rows)
-        self._shared(count, lambda first, number: self._function(data, stride, first, number, *rest))
+        self._shared(
+            count, lambda first, number: self._function(data, stride, first, number, *rest)
+        )
 
     def _shared(self, count: int, run: Callable[[int, int], Any]) -> None:
         """Call for all frames, by parts where there are threads and enough for them."""
@@ -93,30 +106,45 @@ class Kernel(Maker):
                 run(0, count)
             return
         edges = [count * index // number for index in range(number + 1)]
-        parts = [_pool(number - 1).submit(run, first, last - first) for first, last in pairwise(edges[1:])]
+        parts = [
+            _pool(number - 1).submit(run, first, last - first)
+            for first, last in pairwise(edges[1:])
+        ]
         run(0, edges[1])
         for part in parts:
             part.result()
 
 
 def _flat(array: NDArray[Any], shape: tuple[int, ...]) -> tuple[NDArray[np.float64], int]:
-    """A result for every packet, or one for all, (n or 1, *shape), as one run of numbers; and how many each packet has of its own."""
+    """A result for every packet, or one for all, (n or 1, *shape), as one run of numbers; and how
+    many each packet has of its own.
+    """
     full = (len(array), *shape)
     array = array if array.shape == full else np.broadcast_to(array, full)
-    return np.ascontiguousarray(array, np.float64).reshape(-1), math.prod(shape) if len(array) > 1 else 0
+    return np.ascontiguousarray(array, np.float64).reshape(-1), math.prod(shape) if len(
+        array
+    ) > 1 else 0
 
 
 def kernel_of(plan: Plan, names: tuple[str, ...]) -> Kernel:
-    """The kernel for these columns; one for the layout alone, or one that serves all where there have been several."""
+    """The kernel for these columns; one for the layout alone, or one that serves all where there
+    have been several.
+    """
     kernel = plan.kernels.get(names)
     if not isinstance(kernel, Kernel):
-        is_own = not plan.varying or _OWN.setdefault(plan.function, plan.layout.size) == plan.layout.size
-        kernel = plan.kernels[names] = Kernel(written(plan, names, set() if is_own else plan.varying), plan.width)
+        is_own = (
+            not plan.varying or _OWN.setdefault(plan.function, plan.layout.size) == plan.layout.size
+        )
+        kernel = plan.kernels[names] = Kernel(
+            written(plan, names, set() if is_own else plan.varying), plan.width
+        )
     return kernel
 
 
 def pays(plan: Plan, names: tuple[str, ...], frames: int) -> bool:
-    """Whether so many points of a `points` function were asked for, these frames included, that its kernel pays; it is compiled then."""
+    """Whether so many points of a `points` function were asked for, these frames included, that its
+    kernel pays; it is compiled then.
+    """
     made = _MADE.setdefault(plan.function, {})
     made[names] = made.get(names, 0) + frames * plan.width
     if made[names] < WARM:
@@ -170,7 +198,9 @@ def require() -> None:
 
 @functools.cache
 def _module_name(source: str) -> str:
-    """A name by all that the compiled code depends on, but for the processor, which Numba looks after."""
+    """A name by all that the compiled code depends on, but for the processor, which Numba looks
+    after.
+    """
     from importlib.metadata import version
 
     vocabulary = Path(__file__).with_name("arithmetic.py").read_bytes()
@@ -187,7 +217,9 @@ def compiled_before(source: str) -> bool:
 
 @functools.lru_cache(maxsize=256)
 def function_of(source: str) -> Any:
-    """The compiled function of a kernel's text; where it cannot be kept on disk, compiled for this run only."""
+    """The compiled function of a kernel's text; where it cannot be kept on disk, compiled for this
+    run only.
+    """
     name = _module_name(source)
     module = types.ModuleType(name)
     module.__dict__["KEPT"] = Kept(name)

@@ -1,10 +1,13 @@
-"""The source of a kernel: the columns of a plan as one loop over packets, blocks and points, which reads the frames' bytes.
+"""The source of a kernel: the columns of a plan as one loop over packets, blocks and points, which
+reads the frames' bytes.
 
-Each value is computed in the loop in which it varies: what a packet has once outside the loop over its blocks, and so on
-(`writer.Writer`). `Expressions` writes a traced expression so, in float64 or float32; what has no text of its own is computed by NumPy
-before, and given to the kernel. Where sines and cosines of each point's own angle are left, the points of a few packets go through scratch
-arrays into a second, flat loop, which computes several at a time (`Later`, `Assembly`). Lengths and places stand in the text as numbers
-where all frames have the same, else they are arguments, so that one kernel serves all lengths.
+Each value is computed in the loop in which it varies: what a packet has once outside the loop over
+its blocks, and so on (`writer.Writer`). `Expressions` writes a traced expression so, in float64 or
+float32; what has no text of its own is computed by NumPy before, and given to the kernel. Where
+sines and cosines of each point's own angle are left, the points of a few packets go through scratch
+arrays into a second, flat loop, which computes several at a time (`Later`, `Assembly`). Lengths and
+places stand in the text as numbers where all frames have the same, else they are arguments, so that
+one kernel serves all lengths.
 """
 
 from __future__ import annotations
@@ -16,7 +19,15 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from lidarspec.expressions.graph import FACTORS, Node, is_full, is_nan_where, last_axis, only_field, traverse
+from lidarspec.expressions.graph import (
+    FACTORS,
+    Node,
+    is_full,
+    is_nan_where,
+    last_axis,
+    only_field,
+    traverse,
+)
 from lidarspec.points.conventions import returned_range
 from lidarspec.points.numba_kernels.writer import TEMPLATES, Value, Wanted, Writer, is_cheap, line
 from lidarspec.points.plan import Plan
@@ -31,7 +42,9 @@ SMALL = 0.125
 
 @dataclass(frozen=True, eq=False)
 class Later:
-    """A product or sum (`sign`) of float32 values, one of which is the sine or cosine of an angle that the flat loop takes."""
+    """A product or sum (`sign`) of float32 values, one of which is the sine or cosine of an angle
+    that the flat loop takes.
+    """
 
     sign: str
     parts: tuple[Any, ...]
@@ -62,7 +75,11 @@ class Expressions(Writer):
             if source is not None and is_full(source, self.width) and not is_cheap(node):
                 found = self.looked_up(node, source, np.float64, 1.0)
                 if found is not None:
-                    return self.let(found.level, f"{found.text} != 0") if node.sample.array.dtype.kind == "b" else found
+                    return (
+                        self.let(found.level, f"{found.text} != 0")
+                        if node.sample.array.dtype.kind == "b"
+                        else found
+                    )
             return self._call(node)
         if node.kind == "rows" and not self.shared(node.args[0]):
             return self._row(node, "float64")
@@ -74,28 +91,48 @@ class Expressions(Writer):
         row = self.double(index)
         start = self.once(
             ("row", index, table.shape),
-            lambda: self.let(row.level, f"row_at({row.text}, {self.number(len(table))}) * {self.number(table.shape[1])}"),
+            lambda: self.let(
+                row.level,
+                f"row_at({row.text}, {self.number(len(table))}) * {self.number(table.shape[1])}",
+            ),
         )
-        place = self.place(tuple(length if own == 1 else 1 for own, length in zip(index.shape, node.shape, strict=True)))
-        name = self.array(self.once(("cast", id(table), kind), lambda: (table.astype(kind, copy=False), table))[0])
+        place = self.place(
+            tuple(
+                length if own == 1 else 1
+                for own, length in zip(index.shape, node.shape, strict=True)
+            )
+        )
+        name = self.array(
+            self.once(("cast", id(table), kind), lambda: (table.astype(kind, copy=False), table))[0]
+        )
         return self.let(1 + last_axis(node.shape), f"at({name}, {start.text} + {place})")
 
     def shared(self, node: Node) -> bool:
-        """Whether an expression is made of other frames' fields only: then NumPy computes it, mostly once for all packets."""
+        """Whether an expression is made of other frames' fields only: then NumPy computes it,
+        mostly once for all packets.
+        """
         return self.once(("shared", node), lambda: self._shared(node))  # type: ignore[no-any-return]
 
     def _shared(self, node: Node) -> bool:
         if node.kind in ("state", "on"):
             return node.kind == "state" or self.shared(node.args[0])
-        return node.kind == "call" and all(self.shared(arg) for arg in node.args if isinstance(arg, Node))
+        return node.kind == "call" and all(
+            self.shared(arg) for arg in node.args if isinstance(arg, Node)
+        )
 
     def _call(self, node: Node) -> Value:
         depth = max(len(arg.shape) for arg in node.args if isinstance(arg, Node))
-        if any(np.ndim(arg) > depth + 1 or (np.ndim(arg) == depth + 1 and len(arg) != 1) for arg in node.args if not isinstance(arg, Node)):
+        if any(
+            np.ndim(arg) > depth + 1 or (np.ndim(arg) == depth + 1 and len(arg) != 1)
+            for arg in node.args
+            if not isinstance(arg, Node)
+        ):
             return self.given(node)
         if node.function is side_by_side and len(node.shape) == depth + 1:
             parts = [self.double(arg, depth) for arg in node.args]
-            chain = "".join(f"{part.text} if i{depth} == {at} else " for at, part in enumerate(parts[:-1]))
+            chain = "".join(
+                f"{part.text} if i{depth} == {at} else " for at, part in enumerate(parts[:-1])
+            )
             return self.let(2 + depth, f"{chain}{parts[-1].text}") if len(parts) > 1 else parts[0]
         if len(node.shape) != depth:
             return self.given(node)
@@ -108,13 +145,26 @@ class Expressions(Writer):
         if template is None:
             return self.given(node)
         args = [self.double(arg, depth) for arg in node.args]
-        return self.let(max(arg.level for arg in args), template.format(*(arg.text for arg in args)))
+        return self.let(
+            max(arg.level for arg in args), template.format(*(arg.text for arg in args))
+        )
 
     def _template(self, node: Node) -> str | None:
-        kinds = [arg.sample.array.dtype.kind if isinstance(arg, Node) else np.asarray(arg).dtype.kind for arg in node.args]
+        kinds = [
+            arg.sample.array.dtype.kind if isinstance(arg, Node) else np.asarray(arg).dtype.kind
+            for arg in node.args
+        ]
         if all(kind == "b" for kind in kinds):
-            logical: dict[Any, str] = {np.bitwise_and: "({} & {})", np.bitwise_or: "({} | {})", np.invert: "(not {})"}
-            logical |= {np.logical_and: "({} & {})", np.logical_or: "({} | {})", np.logical_not: "(not {})"}
+            logical: dict[Any, str] = {
+                np.bitwise_and: "({} & {})",
+                np.bitwise_or: "({} | {})",
+                np.invert: "(not {})",
+            }
+            logical |= {
+                np.logical_and: "({} & {})",
+                np.logical_or: "({} | {})",
+                np.logical_not: "(not {})",
+            }
             return logical.get(node.function)
         found = TEMPLATES.get(node.function)
         return found if found is not None and found.count("{}") == len(node.args) else None
@@ -130,7 +180,12 @@ class Expressions(Writer):
             return self.given(node)
         info = leaf.info
         return self.let(
-            raw.level, f"{raw.text} * {float(info.scale)!r} + {float(info.offset)!r}" if info.scaled else f"np.float64({raw.text})"
+            raw.level,
+            (
+                f"{raw.text} * {float(info.scale)!r} + {float(info.offset)!r}"
+                if info.scaled
+                else f"np.float64({raw.text})"
+            ),
         )
 
     def single(self, value: Any, *, exact: bool = False, root: bool = False) -> Any:
@@ -142,7 +197,9 @@ class Expressions(Writer):
         """
         if not isinstance(value, Node):
             return self.constant(value, len(self.shape), "float32")
-        return self.once(("single", value, exact), lambda: self._single(value, exact=exact, root=root))
+        return self.once(
+            ("single", value, exact), lambda: self._single(value, exact=exact, root=root)
+        )
 
     def _single(self, node: Node, *, exact: bool, root: bool) -> Any:
         found = self._of_field(node, exact=exact)
@@ -164,36 +221,67 @@ class Expressions(Writer):
         if node.kind == "rows" and not self.shared(node.args[0]) and not exact:
             return self._row(node, "float32")
         made = self.double(node)
-        return self.let(made.level, f"np.float32({made.text if not exact else f'number({made.text})'})")
+        return self.let(
+            made.level, f"np.float32({made.text if not exact else f'number({made.text})'})"
+        )
 
     def _along(self, beam: Beam) -> Value | None:
-        """A place on a beam, rounded once: what was sent times a direction in two halves, and its start; None where NumPy reads these."""
+        """A place on a beam, rounded once: what was sent times a direction in two halves, and its
+        start; None where NumPy reads these.
+        """
         sent, table = self._marked(beam.distance, raw=True), beam.direction.args[1]
         if sent is None or self.shared(beam.direction.args[0]) or self.shared(beam.start.args[0]):
             return None
-        high, low, _ = self.once(("halves", id(table), beam.step), lambda: (*_halves(table * beam.step), table))
+        high, low, _ = self.once(
+            ("halves", id(table), beam.step), lambda: (*_halves(table * beam.step), table)
+        )
         first, second = (self._row(beam.direction, "float32", half) for half in (high, low))
         return self.let(
-            self.inner, f"fused({sent.text}, {first.text}, fused({sent.text}, {second.text}, {self._row(beam.start, 'float32').text}))"
+            self.inner,
+            f"fused({sent.text}, {first.text}, fused({sent.text}, {second.text},"
+            f" {self._row(beam.start, 'float32').text}))",
         )
 
     def _marked(self, node: Node, *, raw: bool = False) -> Value | None:
-        """A distance in float32, nan where nothing came back or a condition says so; None for what is none, or has to be float64 first."""
+        """A distance in float32, nan where nothing came back or a condition says so; None for what
+        is none, or has to be float64 first.
+        """
         if not is_full(node, self.width):
             return None
         if node.kind == "field":
             leaf = self.layout.leaves.get(node.path)
-            is_short = leaf is not None and leaf.info.kind == "int" and leaf.info.bits < 32 and not leaf.info.offset
+            is_short = (
+                leaf is not None
+                and leaf.info.kind == "int"
+                and leaf.info.bits < 32
+                and not leaf.info.offset
+            )
             sent = self.raw(leaf) if leaf is not None and is_short else None
-            scale = f" * np.float32({float(leaf.info.scale)!r})" if leaf is not None and leaf.info.scaled and not raw else ""
-            return None if sent is None else self.let(self.inner, f"np.float32(np.int32({sent.text})){scale}")
+            scale = (
+                f" * np.float32({float(leaf.info.scale)!r})"
+                if leaf is not None and leaf.info.scaled and not raw
+                else ""
+            )
+            return (
+                None
+                if sent is None
+                else self.let(self.inner, f"np.float32(np.int32({sent.text})){scale}")
+            )
         if node.kind != "call" or not isinstance(node.args[-1], Node):
             return None
         if node.function is not returned_range and not is_nan_where(node):
             return None
-        made = self.once(("marked", node.args[-1], raw), lambda: self._marked(node.args[-1], raw=raw))
+        made = self.once(
+            ("marked", node.args[-1], raw), lambda: self._marked(node.args[-1], raw=raw)
+        )
         if made is None or node.function is returned_range:
-            return None if made is None else self.let(self.inner, f"{made.text} if np.float32(0) < {made.text} else np.float32(nan)")
+            return (
+                None
+                if made is None
+                else self.let(
+                    self.inner, f"{made.text} if np.float32(0) < {made.text} else np.float32(nan)"
+                )
+            )
         flag = self.double(node.args[0], len(node.shape))
         return self.let(self.inner, f"np.float32(nan) if {flag.text} else {made.text}")
 
@@ -206,7 +294,11 @@ class Expressions(Writer):
     def _of_field(self, node: Node, *, exact: bool) -> Value | None:
         """An expression of one field that each point has: by a straight line or a table."""
         source = only_field(node)
-        leaf = self.layout.leaves.get(source.path) if source is not None and is_full(source, self.width) else None
+        leaf = (
+            self.layout.leaves.get(source.path)
+            if source is not None and is_full(source, self.width)
+            else None
+        )
         if leaf is None or source is None or window(leaf) is None:
             return None
         values = every_value(node, leaf)
@@ -247,7 +339,10 @@ class Expressions(Writer):
             return self.angle(args[0], factor * FACTORS[function], depth)
         if function in (np.add, np.subtract):
             first, second = (self.angle(arg, factor, depth) for arg in args)
-            return self.let(max(first.level, second.level), f"{first.text} {'+' if function is np.add else '-'} {second.text}")
+            return self.let(
+                max(first.level, second.level),
+                f"{first.text} {'+' if function is np.add else '-'} {second.text}",
+            )
         if function is np.multiply and any(not isinstance(arg, Node) for arg in args):
             known, other = args if not isinstance(args[0], Node) else args[::-1]
             if np.size(known) == 1:
@@ -255,7 +350,9 @@ class Expressions(Writer):
             row, made = self.constant(np.asarray(known) * factor, depth), self.double(other)
             return self.let(max(row.level, made.level), f"{made.text} * {row.text}")
         if function is np.where and len(args) == 3:
-            return self._where(self.double(args[0], depth), *(self.angle(arg, factor, depth) for arg in args[1:]))
+            return self._where(
+                self.double(args[0], depth), *(self.angle(arg, factor, depth) for arg in args[1:])
+            )
         return self._scaled(node, factor)
 
     def _scaled(self, node: Node, factor: float) -> Value:
@@ -358,7 +455,10 @@ class Assembly:
 
     def turns(self) -> list[str]:
         """The cosines and sines that the flat loop begins with."""
-        return [f"cos{index}, sin{index} = cos_sin({self._stored(made, 'float64')})" for index, made in enumerate(self.writer.angles)]
+        return [
+            f"cos{index}, sin{index} = cos_sin({self._stored(made, 'float64')})"
+            for index, made in enumerate(self.writer.angles)
+        ]
 
 
 def written(plan: Plan, names: tuple[str, ...], varying: Set[str]) -> Text:
@@ -372,10 +472,16 @@ def written(plan: Plan, names: tuple[str, ...], varying: Set[str]) -> Text:
     assembly = Assembly(writer)
     writer.both = _both(expressions.values())
     made = {name: _made(writer, plan, name, value) for name, value in expressions.items()}
-    columns = {name: plan.extra[name].dtype if name in plan.sent else np.dtype(np.float32) for name in made}
-    directed = [] if plan.exact else [*plan.directed, *(plan.parts[name] for name in ("ox", "oy", "oz"))]
+    columns = {
+        name: plan.extra[name].dtype if name in plan.sent else np.dtype(np.float32) for name in made
+    }
+    directed = (
+        [] if plan.exact else [*plan.directed, *(plan.parts[name] for name in ("ox", "oy", "oz"))]
+    )
     places = {}
-    if not all(is_number(value, plan.layout.leaves) for value in directed):  # where one coordinate is nan, all are
+    if not all(
+        is_number(value, plan.layout.leaves) for value in directed
+    ):  # where one coordinate is nan, all are
         places = {name: value for name, value in made.items() if name in "xyz"}
     if places:
         assembly.together(places)
@@ -389,7 +495,10 @@ def written(plan: Plan, names: tuple[str, ...], varying: Set[str]) -> Text:
 def _both(expressions: Iterable[Any]) -> set[Node]:
     """The angles of which the cosine and the sine are wanted."""
     nodes = list(traverse(*expressions))
-    cosines, sines = ({node.args[0] for node in nodes if node.function is function} for function in (np.cos, np.sin))
+    cosines, sines = (
+        {node.args[0] for node in nodes if node.function is function}
+        for function in (np.cos, np.sin)
+    )
     return {node for node in cosines & sines if isinstance(node, Node)}
 
 
@@ -400,30 +509,54 @@ def _made(writer: Expressions, plan: Plan, name: str, value: Any) -> Any:
         return writer.let(made.level, f"np.{plan.extra[name].dtype}({made.text})")
     if name == "azimuth" or (exact and name != "intensity"):
         made = writer.double(value, len(writer.shape))
-        return writer.let(made.level, f"{'narrowed' if name == 'azimuth' else 'np.float32'}({made.text})")
+        return writer.let(
+            made.level, f"{'narrowed' if name == 'azimuth' else 'np.float32'}({made.text})"
+        )
     return writer.single(value, exact=name == "intensity", root=True)
 
 
-def _function(writer: Writer, assembly: Assembly, turns: list[str], columns: Mapping[str, np.dtype[Any]]) -> str:
+def _function(
+    writer: Writer, assembly: Assembly, turns: list[str], columns: Mapping[str, np.dtype[Any]]
+) -> str:
     """The signature and the loops."""
     width = writer.number(writer.width)
     held = writer.number(max(CHUNK // writer.width, 1)) if turns else "count"
     loops = _loops(writer, width)
     wanted = writer.wanted
-    parameters = [("rows", "BYTES"), ("stride", "INTEGER"), ("first", "INTEGER"), ("count", "INTEGER"), ("numbers", "PLACES")]
-    parameters += [(f"c{index}", _TYPES[array.dtype.name]) for index, array in enumerate(wanted.arrays)]
+    parameters = [
+        ("rows", "BYTES"),
+        ("stride", "INTEGER"),
+        ("first", "INTEGER"),
+        ("count", "INTEGER"),
+        ("numbers", "PLACES"),
+    ]
+    parameters += [
+        (f"c{index}", _TYPES[array.dtype.name]) for index, array in enumerate(wanted.arrays)
+    ]
     for index in range(len(wanted.nodes)):
         parameters += [(f"g{index}", "DOUBLES"), (f"s{index}", "INTEGER")]
-    parameters += [(f"out_{name}", "MADE_SINGLES" if dtype.kind == "f" else f"MADE['{dtype}']") for name, dtype in columns.items()]
-    arguments, types = ", ".join(name for name, _ in parameters), ", ".join(kind for _, kind in parameters)
-    body = ["apart()"] + [f"n{index} = at(numbers, {index})" for index in range(len(wanted.numbers))]
+    parameters += [
+        (f"out_{name}", "MADE_SINGLES" if dtype.kind == "f" else f"MADE['{dtype}']")
+        for name, dtype in columns.items()
+    ]
+    arguments, types = (
+        ", ".join(name for name, _ in parameters),
+        ", ".join(kind for _, kind in parameters),
+    )
+    body = ["apart()"] + [
+        f"n{index} = at(numbers, {index})" for index in range(len(wanted.numbers))
+    ]
     body += [f"step = {held}", f"held = step * {width}", *assembly.scratch, *writer.lines[0]]
     body += [
         "for begin in range(first, first + count, step):",
         "    end = min(begin + step, first + count)",
         "    start = begin * " + width,
     ]
-    body += ["    for p in range(begin, end):", "        base = p * stride", *(f"        {text}" for text in loops)]
+    body += [
+        "    for p in range(begin, end):",
+        "        base = p * stride",
+        *(f"        {text}" for text in loops),
+    ]
     if turns:
         body += [f"    for k in range((end - begin) * {width}):", "        o = start + k"]
         body += [f"        {text}" for text in (*turns, *assembly.flat)]

@@ -1,9 +1,11 @@
-"""What the source of a kernel is written with: fields, tables, constants and places as text, each in the loop in which it varies.
+"""What the source of a kernel is written with: fields, tables, constants and places as text, each
+in the loop in which it varies.
 
-A `Value` is text and the loop at which it varies. `Writer` keeps the lines of each loop, the arguments that the kernel is to be called
-with, and what it has written before, so that nothing is computed twice. A field is an expression of its bytes (`integer`); a function of
-one field is looked up in a table by them, or computed, where the table is a straight line (`Line`). `TEMPLATES` are NumPy's functions of
-numbers.
+A `Value` is text and the loop at which it varies. `Writer` keeps the lines of each loop, the
+arguments that the kernel is to be called with, and what it has written before, so that nothing is
+computed twice. A field is an expression of its bytes (`integer`); a function of one field is looked
+up in a table by them, or computed, where the table is a straight line (`Line`). `TEMPLATES` are
+NumPy's functions of numbers.
 """
 
 from __future__ import annotations
@@ -23,17 +25,42 @@ from lidarspec.points.conventions import returned_range
 from lidarspec.points.windows import CHEAP, every_value, raw_values, window, word_of
 from lidarspec.spec.bits import whole_bytes
 
-_SIGNS = {np.add: "+", np.subtract: "-", np.multiply: "*", np.true_divide: "/", np.equal: "==", np.not_equal: "!="}
+_SIGNS = {
+    np.add: "+",
+    np.subtract: "-",
+    np.multiply: "*",
+    np.true_divide: "/",
+    np.equal: "==",
+    np.not_equal: "!=",
+}
 _SIGNS |= {np.less: "<", np.less_equal: "<=", np.greater: ">", np.greater_equal: ">="}
 
 #: how a kernel writes NumPy's functions of numbers; what is not here is computed by NumPy itself.
 TEMPLATES: dict[Any, str] = {
     **{function: f"({{}} {sign} {{}})" for function, sign in _SIGNS.items()},
-    **{function: f"({{}} * {FACTORS[function]!r})" for function in (np.deg2rad, np.radians, np.rad2deg, np.degrees)},
-    **{function: f"np.{function.__name__}({{}})" for function in (np.floor, np.ceil, np.trunc, np.rint, np.sqrt, np.exp2)},
-    **{function: f"math.{function.__name__}({{}})" for function in (np.sin, np.cos, np.tan, np.exp, np.isfinite, np.isnan)},
-    **{np.arctan: "math.atan({})", np.arctan2: "math.atan2({}, {})", np.hypot: "math.hypot({}, {})"},
-    **{np.mod: "modulo({}, {})", np.nan_to_num: "number({})", np.minimum: "smaller({}, {})", np.maximum: "larger({}, {})"},
+    **{
+        function: f"({{}} * {FACTORS[function]!r})"
+        for function in (np.deg2rad, np.radians, np.rad2deg, np.degrees)
+    },
+    **{
+        function: f"np.{function.__name__}({{}})"
+        for function in (np.floor, np.ceil, np.trunc, np.rint, np.sqrt, np.exp2)
+    },
+    **{
+        function: f"math.{function.__name__}({{}})"
+        for function in (np.sin, np.cos, np.tan, np.exp, np.isfinite, np.isnan)
+    },
+    **{
+        np.arctan: "math.atan({})",
+        np.arctan2: "math.atan2({}, {})",
+        np.hypot: "math.hypot({}, {})",
+    },
+    **{
+        np.mod: "modulo({}, {})",
+        np.nan_to_num: "number({})",
+        np.minimum: "smaller({}, {})",
+        np.maximum: "larger({}, {})",
+    },
     returned_range: "returned({})",
     **{np.negative: "(-{})", np.positive: "{}", np.absolute: "abs({})"},
 }
@@ -45,15 +72,25 @@ FEW = 8
 def is_cheap(node: Node) -> bool:
     """Whether an expression of one field is a few simple operations."""
     nodes = list(islice(traverse(node), FEW + 1))
-    return len(nodes) <= FEW and all(this.kind != "call" or this.function in CHEAP for this in nodes)
+    return len(nodes) <= FEW and all(
+        this.kind != "call" or this.function in CHEAP for this in nodes
+    )
 
 
 def integer(leaf: Leaf, byte: Any) -> str | None:
-    """The raw value of a field as an expression of its bytes, `byte(offset)` each; None where it has no simple one."""
+    """The raw value of a field as an expression of its bytes, `byte(offset)` each; None where it
+    has no simple one.
+    """
     if len(leaf.shape) > len(leaf.strides) or (leaf.wire is not None and leaf.wire.kind == "f"):
         return None
-    order: Literal["little", "big"] = "big" if leaf.wire is not None and leaf.wire.byteorder == ">" else "little"
-    element = leaf.elements[0] if leaf.wire is None else whole_bytes(leaf.wire.itemsize, order, signed=leaf.wire.kind == "i")
+    order: Literal["little", "big"] = (
+        "big" if leaf.wire is not None and leaf.wire.byteorder == ">" else "little"
+    )
+    element = (
+        leaf.elements[0]
+        if leaf.wire is None
+        else whole_bytes(leaf.wire.itemsize, order, signed=leaf.wire.kind == "i")
+    )
     if element.width > 48:
         return None
     parts = []
@@ -68,7 +105,8 @@ def integer(leaf: Leaf, byte: Any) -> str | None:
 
 @dataclass(frozen=True)
 class Line:
-    """A table that is a straight line of the raw value from `low` to `high`, and `other` for all values besides.
+    """A table that is a straight line of the raw value from `low` to `high`, and `other` for all
+    values besides.
 
     Attributes:
         exact: whether the arithmetic has to be that of float64.
@@ -91,12 +129,23 @@ class Line:
             found = f"(np.float32(np.int32({raw})) * np.float32({self.slope!r})" + (
                 f" + np.float32({self.start!r}))" if self.start else ")"
             )
-        tests = [f"{raw} {sign} {limit}" for sign, limit in ((">=", self.low), ("<=", self.high)) if limit is not None]
-        return f"({found} if {' and '.join(tests)} else np.float32({'nan' if np.isnan(self.other) else 'inf'}))" if tests else found
+        tests = [
+            f"{raw} {sign} {limit}"
+            for sign, limit in ((">=", self.low), ("<=", self.high))
+            if limit is not None
+        ]
+        return (
+            f"({found} if {' and '.join(tests)} else"
+            f" np.float32({'nan' if np.isnan(self.other) else 'inf'}))"
+            if tests
+            else found
+        )
 
 
 def line(leaf: Leaf, values: NDArray[Any], *, exact: bool) -> Line | None:
-    """The line that a table by a field's window is, in float32: equal where `exact`, else within a unit in the last place."""
+    """The line that a table by a field's window is, in float32: equal where `exact`, else within a
+    unit in the last place.
+    """
     seen = window(leaf)
     assert seen is not None
     raw = raw_values(leaf, seen).astype(np.int64)
@@ -112,7 +161,10 @@ def line(leaf: Leaf, values: NDArray[Any], *, exact: bool) -> Line | None:
     first, last = float(values[raw == low][0]), float(values[raw == high][0])
     slope = (last - first) / (high - low)
     start = first - slope * low
-    slope, start = float(f"{slope:.12g}"), 0.0 if abs(start) < 1e-9 * abs(slope) else float(f"{start:.12g}")
+    slope, start = (
+        float(f"{slope:.12g}"),
+        0.0 if abs(start) < 1e-9 * abs(slope) else float(f"{start:.12g}"),
+    )
     wanted, some = values[good].astype(np.float32), raw[good]
     limits = (low if (raw < low).any() else None, high if (raw > high).any() else None)
     other = float(others[0]) if len(others) else 0.0
@@ -122,14 +174,18 @@ def line(leaf: Leaf, values: NDArray[Any], *, exact: bool) -> Line | None:
         if (apart <= (0 if exact else np.spacing(np.abs(wanted)))).all():
             return Line(slope, start, *limits, other, exact=False)
         long = (some * slope + start).astype(np.float32)
-        if (np.abs(long.astype(np.float64) - wanted) <= (0 if exact else np.spacing(np.abs(wanted)))).all():
+        if (
+            np.abs(long.astype(np.float64) - wanted) <= (0 if exact else np.spacing(np.abs(wanted)))
+        ).all():
             return Line(slope, start, *limits, other, exact=True)
     return None
 
 
 @dataclass(frozen=True)
 class Value:
-    """An expression in a kernel, and the loop at which it varies: 0 never, 1 with the packet, 2 with its first array, and so on."""
+    """An expression in a kernel, and the loop at which it varies: 0 never, 1 with the packet, 2
+    with its first array, and so on.
+    """
 
     text: str
     level: int
@@ -137,7 +193,9 @@ class Value:
 
 @dataclass
 class Wanted:
-    """What a kernel is called with besides the bytes: arrays and numbers that are known, results of nodes that are not."""
+    """What a kernel is called with besides the bytes: arrays and numbers that are known, results of
+    nodes that are not.
+    """
 
     arrays: list[NDArray[Any]] = field(default_factory=list)
     numbers: list[int] = field(default_factory=list)
@@ -153,7 +211,13 @@ class Writer:
         tables: those known already, by what they are of; added to.
     """
 
-    def __init__(self, layout: Layout, shape: tuple[int, ...], tables: dict[Any, NDArray[Any]], varying: Set[str]) -> None:
+    def __init__(
+        self,
+        layout: Layout,
+        shape: tuple[int, ...],
+        tables: dict[Any, NDArray[Any]],
+        varying: Set[str],
+    ) -> None:
         self.layout, self.shape, self.width, self.varying = layout, shape, math.prod(shape), varying
         self.inner = 1 + last_axis(shape)
         self.wanted = Wanted()
@@ -185,7 +249,9 @@ class Writer:
 
     def place(self, shape: tuple[int, ...]) -> str:
         """The index of an element of an array of this shape in the loops."""
-        return self.strided(shape, tuple(self.number(math.prod(shape[axis + 1 :])) for axis in range(len(shape))))
+        return self.strided(
+            shape, tuple(self.number(math.prod(shape[axis + 1 :])) for axis in range(len(shape)))
+        )
 
     def strided(self, shape: tuple[int, ...], strides: tuple[str, ...]) -> str:
         """The index of an element in the loops, of an array with these steps along each axis."""
@@ -209,11 +275,19 @@ class Writer:
         """A number, or an element of an array that all packets share."""
         array = np.asarray(value)
         if array.size == 1:
-            number = array.reshape(()).astype(np.float64 if array.dtype.kind != "b" else np.bool_).item()
+            number = (
+                array.reshape(()).astype(np.float64 if array.dtype.kind != "b" else np.bool_).item()
+            )
             return Value(f"np.float32({number!r})" if kind == "float32" else repr(number), 0)
         shape = (1,) * (depth - array.ndim) + array.shape[max(array.ndim - depth, 0) :]
-        name = self.array(self.once(("cast", id(value), kind), lambda: (array.astype(kind), value))[0])
-        return self.once(("element", name, shape), lambda: self.let(1 + last_axis(shape), f"at({name}, {self.place(shape)})"))  # type: ignore[no-any-return]
+        name = self.array(
+            self.once(("cast", id(value), kind), lambda: (array.astype(kind), value))[0]
+        )
+        element: Value = self.once(
+            ("element", name, shape),
+            lambda: self.let(1 + last_axis(shape), f"at({name}, {self.place(shape)})"),
+        )
+        return element
 
     def given(self, node: Node) -> Value:
         """What NumPy has computed before."""
@@ -221,7 +295,10 @@ class Writer:
             self.wanted.nodes.append(node)
         name = self.wanted.nodes.index(node)
         found = self.once(
-            ("given", node), lambda: self.let(1 + last_axis(node.shape), f"at(g{name}, p * s{name} + {self.place(node.shape)})")
+            ("given", node),
+            lambda: self.let(
+                1 + last_axis(node.shape), f"at(g{name}, p * s{name} + {self.place(node.shape)})"
+            ),
         )
         if node.sample.array.dtype.kind != "b":
             return found  # type: ignore[no-any-return]
@@ -239,7 +316,11 @@ class Writer:
             place, shift, mask = word
             four = self._read(leaf, place, "four_at").text
             kind = "int32" if mask >> 31 == 0 else "int64"
-            return self.let(1 + last_axis(leaf.shape), f"np.{kind}({four}{f' >> np.uint32({shift})' if shift else ''} & np.uint32({mask}))")
+            return self.let(
+                1 + last_axis(leaf.shape),
+                f"np.{kind}({four}{f' >> np.uint32({shift})' if shift else ''} &"
+                f" np.uint32({mask}))",
+            )
         text = integer(leaf, lambda offset: self.byte(leaf, offset).text)
         return None if text is None else self.let(1 + last_axis(leaf.shape), text)
 
@@ -254,25 +335,44 @@ class Writer:
         return self._read(leaf, offset, "byte_at")
 
     def _read(self, leaf: Leaf, offset: int, reader: str) -> Value:
-        """What a function of `arithmetic` reads of the element of an array, or of the frame, from an offset on."""
-        shape, level = leaf.shape[: len(leaf.strides)], 1 + last_axis(leaf.shape[: len(leaf.strides)])
-        steps = self.once(("element", shape, leaf.strides), lambda: self.let(level, f"base + {self.strided(shape, self._strides(leaf))}"))
+        """What a function of `arithmetic` reads of the element of an array, or of the frame, from
+        an offset on.
+        """
+        shape, level = (
+            leaf.shape[: len(leaf.strides)],
+            1 + last_axis(leaf.shape[: len(leaf.strides)]),
+        )
+        steps = self.once(
+            ("element", shape, leaf.strides),
+            lambda: self.let(level, f"base + {self.strided(shape, self._strides(leaf))}"),
+        )
         place = str(offset) if self._stays(leaf) else self.number(offset)
         return self.once(  # type: ignore[no-any-return]
-            (reader, shape, leaf.strides, offset), lambda: self.let(level, f"{reader}(rows, {steps.text} + {place})")
+            (reader, shape, leaf.strides, offset),
+            lambda: self.let(level, f"{reader}(rows, {steps.text} + {place})"),
         )
 
     def _strides(self, leaf: Leaf) -> tuple[str, ...]:
-        """The steps of a field's arrays; that of the innermost arrays of all, on which most depends, is the same in all frames."""
+        """The steps of a field's arrays; that of the innermost arrays of all, on which most
+        depends, is the same in all frames.
+        """
         strides = [self.number(stride) for stride in leaf.strides]
-        if leaf.strides and len(leaf.info.axes) == max(len(other.info.axes) for other in self.layout.leaves.values()):
+        if leaf.strides and len(leaf.info.axes) == max(
+            len(other.info.axes) for other in self.layout.leaves.values()
+        ):
             strides[-1] = str(leaf.strides[-1])
         return tuple(strides)
 
     def _stays(self, leaf: Leaf) -> bool:
-        """Whether a field has the same place in all frames: it stands before what varies, or in the first element of it."""
+        """Whether a field has the same place in all frames: it stands before what varies, or in the
+        first element of it.
+        """
         leaves = self.layout.leaves.values()
-        found = [(other.offset, other.strides) for other in leaves if any(axis in self.varying for axis in other.info.axes)]
+        found = [
+            (other.offset, other.strides)
+            for other in leaves
+            if any(axis in self.varying for axis in other.info.axes)
+        ]
         first, strides = min(found, default=(self.layout.size, ()))
         inside = bool(strides) and leaf.strides == strides and leaf.offset - first < strides[-1]
         return leaf.offset <= first or inside
@@ -289,23 +389,42 @@ class Writer:
     def _table(self, node: Node, leaf: Leaf, kind: Any, factor: float) -> NDArray[Any]:
         seen = window(leaf)
         assert seen is not None
-        name = ("kernel", np.dtype(kind).name, factor, seen.offset - leaf.offset, seen.size, leaf.size, leaf.info, key(node))
+        name = (
+            "kernel",
+            np.dtype(kind).name,
+            factor,
+            seen.offset - leaf.offset,
+            seen.size,
+            leaf.size,
+            leaf.info,
+            key(node),
+        )
         if name not in self._tables:
-            self._tables[name] = np.ascontiguousarray(np.asarray(every_value(node, leaf)) * factor, kind)
+            self._tables[name] = np.ascontiguousarray(
+                np.asarray(every_value(node, leaf)) * factor, kind
+            )
         return self._tables[name]
 
     def _code(self, leaf: Leaf) -> str:
         seen = window(leaf)
         assert seen is not None
         first = self.byte(leaf, seen.offset).text
-        return first if seen.size == 1 else f"({first} | {self.byte(leaf, seen.offset + 1).text} << 8)"
+        return (
+            first if seen.size == 1 else f"({first} | {self.byte(leaf, seen.offset + 1).text} << 8)"
+        )
 
     def beside(self, node: Node, leaf: Leaf) -> Value:
-        """A cosine or sine from a table that has both side by side, so that they are fetched together."""
+        """A cosine or sine from a table that has both side by side, so that they are fetched
+        together.
+        """
         name = ("kernel", "both", leaf.info, leaf.size, key(node.args[0]))
         if name not in self._tables:
             angles = np.asarray(every_value(node.args[0], leaf))
-            self._tables[name] = np.stack([np.cos(angles), np.sin(angles)], axis=1).astype(np.float32)
+            self._tables[name] = np.stack([np.cos(angles), np.sin(angles)], axis=1).astype(
+                np.float32
+            )
         table = self.array(self._tables[name])
         index = self.once(("spot", name), lambda: self.let(self.inner, f"{self._code(leaf)} << 1"))
-        return self.let(self.inner, f"at({table}, {index.text}{' + 1' if node.function is np.sin else ''})")
+        return self.let(
+            self.inner, f"at({table}, {index.text}{' + 1' if node.function is np.sin else ''})"
+        )

@@ -1,6 +1,8 @@
-"""Points by NumPy alone: a back end that compiles the columns of a plan to calls on arrays that stay in the cache.
+"""Points by NumPy alone: a back end that compiles the columns of a plan to calls on arrays that
+stay in the cache.
 
-In: a `points.plan.Plan`. Out: what fills its columns, by `compile`; nobody needs to know more of this package. Modules in reading order:
+In: a `points.plan.Plan`. Out: what fills its columns, by `compile`; nobody needs to know more of
+this package. Modules in reading order:
 
 * `blocks`: frames compacted, so that each field is one long array.
 * `registers`: the memory that is computed in, used again and again.
@@ -30,7 +32,11 @@ def compile(plan: Plan, names: tuple[str, ...]) -> Maker:
 def _compiled(plan: Plan, names: tuple[str, ...], tables: dict[Any, NDArray[Any]]) -> Compiler:
     compiler = Compiler(plan, tables)
     if plan.sent.keys() & set(names):
-        read = {node.path: None for node in traverse(*(plan.expressions[name] for name in names)) if node.kind == "field"}
+        read = {
+            node.path: None
+            for node in traverse(*(plan.expressions[name] for name in names))
+            if node.kind == "field"
+        }
         compiler.share(plan.layout.leaves[path] for path in read if path in plan.layout.leaves)
     for name in names:
         if name in plan.sent:
@@ -43,11 +49,17 @@ def _compiled(plan: Plan, names: tuple[str, ...], tables: dict[Any, NDArray[Any]
 
 def describe(plan: Plan) -> list[str]:
     """A plan in lines: the shape, what is computed for each packet, and the calls for each chunk."""
-    names = tuple(name for name in ("x", "y", "z", "intensity") if name in plan.expressions and not (name == "z" and plan.level))
+    names = tuple(
+        name
+        for name in ("x", "y", "z", "intensity")
+        if name in plan.expressions and not (name == "z" and plan.level)
+    )
     tables: dict[Any, NDArray[Any]] = {}
     compiler = _compiled(plan, names, tables)
     program = compiler.program
-    axes = " x ".join(f"{axis} {length}" for axis, length in zip(plan.axes, plan.shape, strict=True))
+    axes = " x ".join(
+        f"{axis} {length}" for axis, length in zip(plan.axes, plan.shape, strict=True)
+    )
     lines = [f"{plan.width} points a packet{': ' if axes else ''}{axes}"]
     plainly = [node for node in plan.tape.nodes if node in compiler.low or node in plan.eager]
     lines.append(f"for each packet or block, plainly: {len(plainly)} values")

@@ -1,8 +1,10 @@
-"""Frames compacted before anything is computed: the innermost arrays of a chunk of packets, without what stands between them.
+"""Frames compacted before anything is computed: the innermost arrays of a chunk of packets, without
+what stands between them.
 
-Each field is then one long array with one distance from element to element, which NumPy reads several times as fast as a view with a
-distance for each level. Where elements follow each other at one distance from frame to frame as they stand, nothing is copied; nor where
-so many of them do that their arrays are read as quickly where they are.
+Each field is then one long array with one distance from element to element, which NumPy reads
+several times as fast as a view with a distance for each level. Where elements follow each other at
+one distance from frame to frame as they stand, nothing is copied; nor where so many of them do that
+their arrays are read as quickly where they are.
 """
 
 from __future__ import annotations
@@ -21,14 +23,16 @@ LONG = 64
 
 
 class Blocks:
-    """The innermost arrays of frames, without what stands between them, a chunk of packets at a time.
+    """The innermost arrays of frames, without what stands between them, a chunk of packets at a
+    time.
 
     Args:
         leaves: the fields wanted; all of the same arrays.
         size: of a frame in bytes.
 
     Attributes:
-        is_flat: whether nothing stands between them, if the frames stand back to back, as they then have to.
+        is_flat: whether nothing stands between them, if the frames stand back to back, as they then
+            have to.
         room: bytes that they take for each packet when they are compacted.
     """
 
@@ -40,8 +44,14 @@ class Blocks:
         self.is_flat = self._regular(size, strides)
         self.is_long = count >= LONG and not self.is_flat
         self._length = count * self.stride
-        last = sum((number - 1) * step for number, step in zip(self.shape, strides[:-1], strict=False))  # from the first block on
-        self._base = 0 if self.is_flat else min(*(leaf.offset for leaf in leaves), size - last - self._length)
+        last = sum(
+            (number - 1) * step for number, step in zip(self.shape, strides[:-1], strict=False)
+        )  # from the first block on
+        self._base = (
+            0
+            if self.is_flat
+            else min(*(leaf.offset for leaf in leaves), size - last - self._length)
+        )
         self._strides, self._size = strides[:-1], size
         self.room = 0 if self.is_flat or self.is_long else math.prod(self.shape[:-1]) * self._length
 
@@ -53,10 +63,19 @@ class Blocks:
     def loading(self, rows: Bytes2D, room: NDArray[np.uint8]) -> Loading:
         """Their fields, compacted in this room."""
         if self.is_flat or self.is_long:
-            return Loading(rows, None, 0, self._size, self.stride, (self.shape, (*self._strides, self.stride)) if self.is_long else None)
+            return Loading(
+                rows,
+                None,
+                0,
+                self._size,
+                self.stride,
+                (self.shape, (*self._strides, self.stride)) if self.is_long else None,
+            )
         block = np.dtype(f"V{self._length}")
         source = elements(rows, block, self._base, self.shape[:-1], self._strides)
-        return Loading(source, room.view(block).reshape(-1, *self.shape[:-1]), self._base, 0, self.stride)
+        return Loading(
+            source, room.view(block).reshape(-1, *self.shape[:-1]), self._base, 0, self.stride
+        )
 
     def holds(self, seen: Window) -> bool:
         """Whether a window lies in the elements that are kept."""
@@ -68,11 +87,13 @@ class Loading:
 
     Args:
         source: the frames, or their blocks.
-        compact: what the blocks of a chunk are copied to; None where the frames are looked at themselves.
+        compact: what the blocks of a chunk are copied to; None where the frames are looked at
+            themselves.
         base: where a block begins in its frame.
         size: bytes from packet to packet in the source, where that is looked at.
         stride: bytes from element to element.
-        arrays: lengths and distances of arrays that are looked at themselves; None where all elements have one distance.
+        arrays: lengths and distances of arrays that are looked at themselves; None where all
+            elements have one distance.
     """
 
     def __init__(
@@ -84,17 +105,37 @@ class Loading:
         stride: int,
         arrays: tuple[tuple[int, ...], tuple[int, ...]] | None = None,
     ) -> None:
-        self._source, self._compact, self._base, self._size, self._stride = source, compact, base, size, stride
+        self._source, self._compact, self._base, self._size, self._stride = (
+            source,
+            compact,
+            base,
+            size,
+            stride,
+        )
         self._arrays = arrays
         self._start = -1
 
     def column(self, seen: Window, start: int, stop: int, width: int) -> NDArray[Any]:
-        """A window of each of `width` elements of the packets from `start` to `stop`; along their arrays where these are long."""
+        """A window of each of `width` elements of the packets from `start` to `stop`; along their
+        arrays where these are long.
+        """
         if self._arrays is not None:
             return elements(self._source[start:stop], seen.dtype, seen.offset, *self._arrays)
         if self._compact is None:
-            return np.ndarray(((stop - start) * width,), seen.dtype, self._source.data, start * self._size + seen.offset, (self._stride,))
+            return np.ndarray(
+                ((stop - start) * width,),
+                seen.dtype,
+                self._source.data,
+                start * self._size + seen.offset,
+                (self._stride,),
+            )
         if self._start != start:
             np.copyto(self._compact[: stop - start], self._source[start:stop])
             self._start = start
-        return np.ndarray(((stop - start) * width,), seen.dtype, self._compact.data, seen.offset - self._base, (self._stride,))
+        return np.ndarray(
+            ((stop - start) * width,),
+            seen.dtype,
+            self._compact.data,
+            seen.offset - self._base,
+            (self._stride,),
+        )

@@ -1,8 +1,10 @@
 """From a plan's expressions to the steps of a program.
 
-What depends on one field of two bytes or less is a table by its raw value, or its bits as they stand (`points.windows`). Sums, and the
-sines and cosines of angles that are near each other, are matrix products where they can be (`products`); only what is left is computed in
-full, angles reduced to half a turn before they become float32. Everything else is ordinary NumPy, and what is not full is known before.
+What depends on one field of two bytes or less is a table by its raw value, or its bits as they
+stand (`points.windows`). Sums, and the sines and cosines of angles that are near each other, are
+matrix products where they can be (`products`); only what is left is computed in full, angles
+reduced to half a turn before they become float32. Everything else is ordinary NumPy, and what is
+not full is known before.
 """
 
 from __future__ import annotations
@@ -15,7 +17,16 @@ from typing import Any, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-from lidarspec.expressions.graph import Node, Term, chosen, is_full, is_nan_where, key, last_axis, only_field
+from lidarspec.expressions.graph import (
+    Node,
+    Term,
+    chosen,
+    is_full,
+    is_nan_where,
+    key,
+    last_axis,
+    only_field,
+)
 from lidarspec.frames.arrays import deep
 from lidarspec.frames.layout import Leaf
 from lidarspec.points.conventions import returned_range
@@ -24,13 +35,23 @@ from lidarspec.points.numpy_plan.blocks import Blocks
 from lidarspec.points.numpy_plan.program import Program, Read, Run
 from lidarspec.points.numpy_plan.registers import TYPES
 from lidarspec.points.plan import Plan
-from lidarspec.points.windows import CHEAP, Window, beam_of, every_value, run_of, shift_of, window, word_of
+from lidarspec.points.windows import (
+    CHEAP,
+    Window,
+    beam_of,
+    every_value,
+    run_of,
+    shift_of,
+    window,
+    word_of,
+)
 from lidarspec.spec.tree import FieldInfo
 from lidarspec.spec.vocabulary import row_numbers
 
 _Made = TypeVar("_Made")
 
-#: how often a table is repeated at most, so that rows that follow one another round its end follow one another in it.
+#: how often a table is repeated at most, so that rows that follow one another round its end follow
+#: one another in it.
 TURNS = 8
 
 #: metres up to which a few roundings of float32 leave coordinates within 0.01 mm.
@@ -50,7 +71,12 @@ class Compiler:
 
     def __init__(self, plan: Plan, tables: dict[Any, NDArray[Any]]) -> None:
         self.program, self.low = Program(plan.width, plan.safe), list[Node]()
-        self._layout, self._shape, self._width, self._tables = plan.layout, plan.shape, plan.width, tables
+        self._layout, self._shape, self._width, self._tables = (
+            plan.layout,
+            plan.shape,
+            plan.width,
+            tables,
+        )
         self._known: dict[Any, Any] = {}
         self._exact, self._shared = False, set[int]()
 
@@ -59,10 +85,13 @@ class Compiler:
 
         Args:
             kind: "single" or "double".
-            exact: computed in float64, each operation as it is written; else products may be float32, and sums in another order.
+            exact: computed in float64, each operation as it is written; else products may be
+                float32, and sums in another order.
         """
         self._exact = exact
-        self.program.outputs[name] = self._single(value) if kind == "single" else self._double(value)
+        self.program.outputs[name] = (
+            self._single(value) if kind == "single" else self._double(value)
+        )
 
     def want_sent(self, name: str, leaf: Leaf) -> None:
         """Make a column of whole numbers of a field, as they were sent."""
@@ -75,13 +104,17 @@ class Compiler:
             register = self.program.step(
                 f"{leaf.info.path} as it was sent",
                 kind,
-                lambda run, out: np.copyto(out.reshape(-1, *leaf.shape), leaf.load(run.rows[run.start : run.stop])),
+                lambda run, out: np.copyto(
+                    out.reshape(-1, *leaf.shape), leaf.load(run.rows[run.start : run.stop])
+                ),
             )
         self.program.outputs[name] = register
 
     def share(self, leaves: Iterable[Leaf]) -> None:
         """Load words once that several of these fields stand in, each to be cut out of its word."""
-        words = Counter(word[0] for leaf in leaves if (word := word_of(leaf, self._layout)) is not None)
+        words = Counter(
+            word[0] for leaf in leaves if (word := word_of(leaf, self._layout)) is not None
+        )
         self._shared = {word for word, count in words.items() if count > 1}
 
     def _is_shared(self, leaf: Leaf) -> bool:
@@ -101,7 +134,11 @@ class Compiler:
         return self._once(("single", self._exact, value), lambda: self._full_single(value))
 
     def _full_single(self, node: Node) -> int:
-        register = self._gathered(node, "single") if node.kind == "rows" else self._of_field(node, "single")
+        register = (
+            self._gathered(node, "single")
+            if node.kind == "rows"
+            else self._of_field(node, "single")
+        )
         if register is None:
             register = self._marked(node, "single")
         if register is None and not self._exact:
@@ -109,7 +146,12 @@ class Compiler:
         if register is not None:
             return register
         read = Read(self._double(node))
-        return self.program.step("as float32", "single", lambda run, out: np.copyto(out, read(run), casting="same_kind"), read)
+        return self.program.step(
+            "as float32",
+            "single",
+            lambda run, out: np.copyto(out, read(run), casting="same_kind"),
+            read,
+        )
 
     def _product(self, node: Node) -> int | None:
         """A product or a direction in float32; None where it is none."""
@@ -122,23 +164,38 @@ class Compiler:
         return self._along_beams(node) if node.kind == "call" and node.function is np.add else None
 
     def _along_beams(self, node: Node) -> int | None:
-        """Measured distances along rows of a table, from rows on where beams start; None for other sums.
+        """Measured distances along rows of a table, from rows on where beams start; None for other
+        sums.
 
-        Points up to `FINE` metres away are float32 throughout. Rows that reach farther are computed again in float64.
+        Points up to `FINE` metres away are float32 throughout. Rows that reach farther are computed
+        again in float64.
         """
         beam = beam_of(node, self._layout.leaves)
-        parts = [self._gathered(rows, "single") for rows in (beam.direction, beam.start)] if beam is not None else [None]
+        parts = (
+            [self._gathered(rows, "single") for rows in (beam.direction, beam.start)]
+            if beam is not None
+            else [None]
+        )
         if beam is None or None in parts:
             return None
         distance, direction, start, step = beam
-        measured, toward, begin = Read(self._single(distance)), *(Read(part) for part in parts if part is not None)
+        measured, toward, begin = (
+            Read(self._single(distance)),
+            *(Read(part) for part in parts if part is not None),
+        )
         inner, place = direction.args[1].shape[1], ("far", distance)
 
         def far(run: Run) -> tuple[int, NDArray[np.intp], NDArray[np.float64]]:
-            """Where the chunk begins, which of its rows reach too far, and their distances as they were sent."""
+            """Where the chunk begins, which of its rows reach too far, and their distances as they
+            were sent.
+            """
             if run.prepared.get(place, (-1,))[0] != run.start:
                 rows = measured(run).reshape(-1, inner)
-                which = np.flatnonzero(np.fmax.reduce(rows, axis=1) > FINE) if np.fmax.reduce(rows, axis=None) > FINE else _NOWHERE
+                which = (
+                    np.flatnonzero(np.fmax.reduce(rows, axis=1) > FINE)
+                    if np.fmax.reduce(rows, axis=None) > FINE
+                    else _NOWHERE
+                )
                 distances = np.multiply(rows[which], 1 / step, dtype=np.float64)
                 np.multiply(np.rint(distances, out=distances), step, out=distances)
                 run.prepared[place] = run.start, which, distances
@@ -148,7 +205,9 @@ class Compiler:
         def row(rows: Node, run: Run, which: NDArray[np.intp]) -> NDArray[np.float64]:
             index, table = rows.args
             numbers = run.prepared["rows", index, len(table) - 1][0]
-            chosen: NDArray[np.float64] = table.take(numbers[_rows(run, numbers[None])][which], axis=0)
+            chosen: NDArray[np.float64] = table.take(
+                numbers[_rows(run, numbers[None])][which], axis=0
+            )
             return chosen
 
         def run(execution: Run, out: NDArray[Any]) -> None:
@@ -161,7 +220,9 @@ class Compiler:
                 exact += row(start, execution, which)
                 out.reshape(-1, inner)[which] = exact
 
-        return self.program.step("along beams, float64 where they are long", "single", run, measured, toward, begin)
+        return self.program.step(
+            "along beams, float64 where they are long", "single", run, measured, toward, begin
+        )
 
     def _double(self, value: Any) -> int:
         """An expression in float64, or a condition."""
@@ -180,22 +241,36 @@ class Compiler:
         return register if register is not None else self._spread(node, kind)
 
     def _marked(self, node: Node, kind: str) -> int | None:
-        """A value, or nan where a condition says so or nothing came back, without a branch; None where it is none."""
+        """A value, or nan where a condition says so or nothing came back, without a branch; None
+        where it is none.
+        """
         if node.kind != "call" or not is_full(value := node.args[-1], self._width):
             return None
         if node.function is returned_range:
             return self._returned(value, kind, None)
         condition = node.args[0]
-        if not is_nan_where(node) or not isinstance(condition, Node) or condition.sample.array.dtype.kind != "b":
+        if (
+            not is_nan_where(node)
+            or not isinstance(condition, Node)
+            or condition.sample.array.dtype.kind != "b"
+        ):
             return None
         if value.function is returned_range and not is_full(condition, self._width):
             return self._returned(value.args[0], kind, condition)
-        mark, read, is_each = self._mark(condition, kind), self._read(value, kind), is_full(condition, self._width)
+        mark, read, is_each = (
+            self._mark(condition, kind),
+            self._read(value, kind),
+            is_full(condition, self._width),
+        )
 
         def run(execution: Run, out: NDArray[Any]) -> None:
             target = out.reshape(-1, *self._shape)
             marks = mark(execution)
-            np.multiply(read(execution).reshape(target.shape), marks.reshape(target.shape) if is_each else marks, out=target)
+            np.multiply(
+                read(execution).reshape(target.shape),
+                marks.reshape(target.shape) if is_each else marks,
+                out=target,
+            )
 
         return self.program.step("marked", kind, run, mark, read)
 
@@ -212,15 +287,25 @@ class Compiler:
             np.absolute(out, out=out)  # a nan without a sign, as np.nan is
 
         flags = Read(self._double(condition))
-        return Read(self._once(("mark", kind, condition), lambda: self.program.step("1, or nan", kind, marked, flags)))
+        return Read(
+            self._once(
+                ("mark", kind, condition),
+                lambda: self.program.step("1, or nan", kind, marked, flags),
+            )
+        )
 
     def _returned(self, value: Node, kind: str, lost: Node | None) -> int:
-        """Ranges, nan where nothing came back, or where packets or blocks are `lost`: what divided by itself is 1, or no number."""
+        """Ranges, nan where nothing came back, or where packets or blocks are `lost`: what divided
+        by itself is 1, or no number.
+        """
         read, shape, depth = self._read(value, kind), self._shape, len(self._shape)
         self.low += [] if lost is None else [lost]
         leaf = self._layout.leaves.get(value.path)
         is_positive = (
-            leaf is not None and leaf.info.dtype is not None and leaf.info.dtype.kind == "u" and min(leaf.info.scale, leaf.info.offset) >= 0
+            leaf is not None
+            and leaf.info.dtype is not None
+            and leaf.info.dtype.kind == "u"
+            and min(leaf.info.scale, leaf.info.offset) >= 0
         )
 
         def run(execution: Run, out: NDArray[Any]) -> None:
@@ -238,9 +323,15 @@ class Compiler:
         return Read(self._single(value) if kind == "single" else self._double(value))
 
     def _of_field(self, node: Node, kind: str, factor: float = 1.0) -> int | None:
-        """An expression of one field, times a number: loaded as it is, or looked up by its window; None where it is neither."""
+        """An expression of one field, times a number: loaded as it is, or looked up by its window;
+        None where it is neither.
+        """
         source = only_field(node)
-        leaf = self._layout.leaves.get(source.path) if source is not None and is_full(source, self._width) else None
+        leaf = (
+            self._layout.leaves.get(source.path)
+            if source is not None and is_full(source, self._width)
+            else None
+        )
         seen = window(leaf) if leaf is not None else None
         if (
             leaf is not None
@@ -252,7 +343,12 @@ class Compiler:
             return self._whole(leaf, leaf.wire, kind)
         if leaf is not None and node is source and factor == 1 and seen is None:
             return self._cut_out(leaf, kind)
-        if leaf is None or source is None or seen is None or (self._exact and seen.size > 1 and node.function in _QUICK):
+        if (
+            leaf is None
+            or source is None
+            or seen is None
+            or (self._exact and seen.size > 1 and node.function in _QUICK)
+        ):
             return None
         shift = self._shift(leaf, seen)
         if node is source and factor == 1 and not leaf.info.scaled:
@@ -269,9 +365,14 @@ class Compiler:
             whole = Read(index)
             index = self._once(("index", seen, shift), lambda: self._cut(leaf, seen, *shift, whole))
         table = self._table(node, leaf, seen, kind, factor)
-        text = f"{node.path or source.path}: table of {len(table)} by {(len(table) - 1).bit_length()} bits"
+        text = (
+            f"{node.path or source.path}: table of {len(table)} by {(len(table) - 1).bit_length()}"
+            " bits"
+        )
         read = Read(index)
-        return self.program.step(text, kind, lambda run, out: table.take(read(run), out=out, mode="wrap"), read)
+        return self.program.step(
+            text, kind, lambda run, out: table.take(read(run), out=out, mode="wrap"), read
+        )
 
     def _whole(self, leaf: Leaf, wire: np.dtype[Any], kind: str) -> int | None:
         """A field of whole bytes, loaded; None where it has to be float64 first."""
@@ -284,7 +385,9 @@ class Compiler:
         return not leaf.info.scaled or not (self._exact or leaf.info.offset)
 
     def _cut_out(self, leaf: Leaf, kind: str) -> int | None:
-        """A field of bits that stand in a row in four bytes, cut out of these; None where they do not, or it has to be float64 first."""
+        """A field of bits that stand in a row in four bytes, cut out of these; None where they do
+        not, or it has to be float64 first.
+        """
         if kind == "single" and not self._is_short(leaf):
             return None
         word = word_of(leaf, self._layout)
@@ -294,29 +397,53 @@ class Compiler:
         if run is None:
             return None
         order, first, count, lowest = run
-        last = self._layout.size - sum((length - 1) * stride for length, stride in zip(leaf.shape, leaf.strides, strict=True)) - 4
+        last = (
+            self._layout.size
+            - sum(
+                (length - 1) * stride
+                for length, stride in zip(leaf.shape, leaf.strides, strict=True)
+            )
+            - 4
+        )
         blocks = self._blocks(leaf, Window(first, count))
         for start in (first, first + count - 4):
             if 0 <= start <= last and blocks.holds(Window(start, 4)):
                 shift = lowest + 8 * (first - start if order == "<" else start + 4 - first - count)
                 mask = (1 << leaf.info.bits) - 1
-                return self._shifted(leaf, Window(start, 4), shift, mask, kind, np.dtype(f"{order}u4"))
+                return self._shifted(
+                    leaf, Window(start, 4), shift, mask, kind, np.dtype(f"{order}u4")
+                )
         return None
 
     def _shift(self, leaf: Leaf, seen: Window) -> tuple[int, int] | None:
-        """How a field that shares its window with others is cut out of it: shift and mask, or None where that takes a table."""
+        """How a field that shares its window with others is cut out of it: shift and mask, or None
+        where that takes a table.
+        """
         if leaf.wire is not None:
             return None
         return self._once(("shift", leaf.info.path, seen), lambda: shift_of(leaf, seen))
 
-    def _table(self, node: Node, leaf: Leaf, seen: Window, kind: str, factor: float) -> NDArray[Any]:
+    def _table(
+        self, node: Node, leaf: Leaf, seen: Window, kind: str, factor: float
+    ) -> NDArray[Any]:
         shift = self._shift(leaf, seen)
-        name = (kind, seen.offset - leaf.offset, seen.size, leaf.size, shift, factor, leaf.info, key(node))
+        name = (
+            kind,
+            seen.offset - leaf.offset,
+            seen.size,
+            leaf.size,
+            shift,
+            factor,
+            leaf.info,
+            key(node),
+        )
         if name not in self._tables:
             values = np.asarray(every_value(node, leaf))
             if shift is not None and seen.size > 1:
                 values = values[np.arange(shift[1] + 1) << shift[0]]
-            self._tables[name] = np.ascontiguousarray(values if factor == 1 else values * factor, TYPES[kind])
+            self._tables[name] = np.ascontiguousarray(
+                values if factor == 1 else values * factor, TYPES[kind]
+            )
         return self._tables[name]
 
     def _load(self, leaf: Leaf, seen: Window, dtype: np.dtype[Any], kind: str) -> int:
@@ -326,19 +453,43 @@ class Compiler:
 
         def run(execution: Run, out: NDArray[Any]) -> None:
             column = execution.prepared[blocks].column(seen, execution.start, execution.stop, width)
-            np.copyto(out.reshape(column.shape), column if column.dtype == dtype else column.view(dtype), casting="unsafe")
+            np.copyto(
+                out.reshape(column.shape),
+                column if column.dtype == dtype else column.view(dtype),
+                casting="unsafe",
+            )
             if is_scaled:
                 _scale(out, info)
 
         return self.program.step(f"{leaf.info.path}: {dtype} at byte {seen.offset}", kind, run)
 
-    def _shifted(self, leaf: Leaf, seen: Window, shift: int, mask: int, kind: str, dtype: np.dtype[Any] | None = None) -> int:
-        """Some bits of a window of every element, in its unit; `dtype`: of the window's word, where that is not little-endian."""
+    def _shifted(
+        self,
+        leaf: Leaf,
+        seen: Window,
+        shift: int,
+        mask: int,
+        kind: str,
+        dtype: np.dtype[Any] | None = None,
+    ) -> int:
+        """Some bits of a window of every element, in its unit; `dtype`: of the window's word, where
+        that is not little-endian.
+        """
         words, dtype = f"u{seen.size}", dtype or seen.dtype
         word = Read(self._once((dtype, seen), lambda: self._load(leaf, seen, dtype, words)))
-        is_whole = kind in TYPES and TYPES[kind].kind in "iu" and mask == (1 << 8 * TYPES[kind].itemsize) - 1  # which leaves off the rest
-        read = Read(self._cut(leaf, seen, shift, (1 << 8 * seen.size) - 1 >> shift if is_whole else mask, word))
-        quick = np.dtype(f"i{seen.size}" if mask >> 8 * seen.size - 1 == 0 else words)  # signed ones become floats several at a time
+        is_whole = (
+            kind in TYPES
+            and TYPES[kind].kind in "iu"
+            and mask == (1 << 8 * TYPES[kind].itemsize) - 1
+        )  # which leaves off the rest
+        read = Read(
+            self._cut(
+                leaf, seen, shift, (1 << 8 * seen.size) - 1 >> shift if is_whole else mask, word
+            )
+        )
+        quick = np.dtype(
+            f"i{seen.size}" if mask >> 8 * seen.size - 1 == 0 else words
+        )  # signed ones become floats several at a time
 
         def run(execution: Run, out: NDArray[Any]) -> None:
             np.copyto(out, read(execution).view(quick), casting="unsafe")
@@ -366,7 +517,11 @@ class Compiler:
         for blocks in self.program.blocks:
             if blocks.shape == leaf.shape and blocks.holds(seen):
                 return blocks
-        beside = [other for other in self._layout.leaves.values() if (other.info.axes, other.shape) == (leaf.info.axes, leaf.shape)]
+        beside = [
+            other
+            for other in self._layout.leaves.values()
+            if (other.info.axes, other.shape) == (leaf.info.axes, leaf.shape)
+        ]
         self.program.blocks.append(Blocks(beside or [leaf], self._layout.size))
         return self.program.blocks[-1]
 
@@ -385,19 +540,26 @@ class Compiler:
                 target[...] = function(*(read(execution) for read in reads))
 
         is_direct = isinstance(function, np.ufunc)
-        return self.program.step(f"{getattr(function, '__name__', 'function')} as it stands", kind, run, *used)
+        return self.program.step(
+            f"{getattr(function, '__name__', 'function')} as it stands", kind, run, *used
+        )
 
     def _argument(self, value: Any, depth: int) -> Callable[[Run], Any]:
         if not isinstance(value, Node):
             return _always(value)
         if is_full(value, self._width):
-            read, shape = Read(self._double(value)), (*value.shape, *(1,) * (depth - len(value.shape)))
+            read, shape = (
+                Read(self._double(value)),
+                (*value.shape, *(1,) * (depth - len(value.shape))),
+            )
             return lambda run: read(run).reshape(-1, *shape)
         self.low.append(value)
         return lambda run: deep(run.part(run.values(value)), depth)
 
     def _factor(self, value: Any) -> Callable[[Run], Any]:
-        """A factor of a float32 product: a register, a number, or a row repeated for the whole chunk."""
+        """A factor of a float32 product: a register, a number, or a row repeated for the whole
+        chunk.
+        """
         if is_full(value, self._width):
             return Read(self._single(value))
         if not isinstance(value, Node) and np.size(value) == 1:
@@ -407,10 +569,14 @@ class Compiler:
     def _spread(self, value: Any, kind: str) -> int:
         """What is not full, for every point."""
         if not isinstance(value, Node):
-            return self.program.tiled(np.broadcast_to(np.asarray(value, TYPES[kind]), self._shape).reshape(-1), kind)
+            return self.program.tiled(
+                np.broadcast_to(np.asarray(value, TYPES[kind]), self._shape).reshape(-1), kind
+            )
         self.low.append(value)
         if value.width == math.prod(self._shape[: last_axis(value.shape)]):
-            return self.program.repeated("computed plainly before", kind, lambda run: run.values(value))
+            return self.program.repeated(
+                "computed plainly before", kind, lambda run: run.values(value)
+            )
         shape, depth = self._shape, len(self._shape)
 
         def run(execution: Run, out: NDArray[Any]) -> None:
@@ -429,7 +595,10 @@ class Compiler:
         times = 1 + -(-self.program.most * index.width // number) if number else 1
         times = times if times <= TURNS else 1
         rows = self._once(
-            ("rows", id(table), kind), lambda: np.concatenate([np.tile(table[:-1], (times, 1)), table[-1:]]).astype(TYPES[kind])
+            ("rows", id(table), kind),
+            lambda: np.concatenate([np.tile(table[:-1], (times, 1)), table[-1:]]).astype(
+                TYPES[kind]
+            ),
         )
         register, place = len(self.program.kinds), ("rows", index, number)
 
@@ -440,32 +609,48 @@ class Compiler:
             each = _rows(execution, every[None])
             numbers, first = every[each], int(every[each.start])
             last = first + len(numbers)
-            if first < number and last < len(rows) and not breaks[each.start : each.stop - 1].any():  # they are looked at where they are
+            if (
+                first < number and last < len(rows) and not breaks[each.start : each.stop - 1].any()
+            ):  # they are looked at where they are
                 execution.views[register] = rows[first:last].reshape(-1)
             else:
-                rows[(times - 1) * number :].take(numbers, axis=0, out=out.reshape(-1, inner), mode="clip")
+                rows[(times - 1) * number :].take(
+                    numbers, axis=0, out=out.reshape(-1, inner), mode="clip"
+                )
 
         return self.program.step(f"rows of a table of {number} x {inner}", kind, run)
 
     def _direction(self, node: Node) -> int:
-        """A cosine or sine; where all points of a packet or block have the same or nearly so, it is computed once for them."""
+        """A cosine or sine; where all points of a packet or block have the same or nearly so, it is
+        computed once for them.
+        """
         value, function = node.args[0], node.function
         angles = self._angles(value)
         if angles is not None and angles.all_alike:
             name = f"{function.__name__} of each block"
-            return self.program.repeated(name, "single", lambda run: function(_shared_by(angles, run)))
+            return self.program.repeated(
+                name, "single", lambda run: function(_shared_by(angles, run))
+            )
         rotation = self._rotation(value)
         if rotation is not None:
-            return self._turned(function, rotation, self._once(("wide", value), lambda: self._wide(rotation)))
+            return self._turned(
+                function, rotation, self._once(("wide", value), lambda: self._wide(rotation))
+            )
         angle = self._once(("angle", value), lambda: self._angle(value))
         return self.program.call(function.__name__, "single", function, Read(angle))
 
     def _rotation(self, value: Node) -> products.Rotation | None:
         angles = self._angles(value)
-        return None if angles is None else self._once(("rotation", value), lambda: products.Rotation.of(angles))
+        return (
+            None
+            if angles is None
+            else self._once(("rotation", value), lambda: products.Rotation.of(angles))
+        )
 
     def _wide(self, rotation: products.Rotation) -> int:
-        """The angles of those packets or blocks whose points are too far apart for one rotation, within half a turn."""
+        """The angles of those packets or blocks whose points are too far apart for one rotation,
+        within half a turn.
+        """
 
         def run(execution: Run, out: NDArray[Any]) -> None:
             if rotation not in execution.prepared:
@@ -478,7 +663,9 @@ class Compiler:
         return self.program.step("angles of what is wide", "single", run)
 
     def _turned(self, function: Any, rotation: products.Rotation, wide: int) -> int:
-        """Cosines or sines of angles that are turned a little from the one in their middle: a matrix product of series."""
+        """Cosines or sines of angles that are turned a little from the one in their middle: a
+        matrix product of series.
+        """
         read, which = Read(wide), 0 if function is np.cos else 1
 
         def run(execution: Run, out: NDArray[Any]) -> None:
@@ -489,7 +676,9 @@ class Compiler:
             if turns.some_wide:
                 rows[turns.wide] = function(read(execution).reshape(-1, rotation.inner)[turns.wide])
 
-        return self.program.step(f"{function.__name__} by {len(rotation.rows[0])} products", "single", run, read)
+        return self.program.step(
+            f"{function.__name__} by {len(rotation.rows[0])} products", "single", run, read
+        )
 
     def _angle(self, value: Node) -> int:
         """An angle in float32, reduced to half a turn either way before it loses precision."""
@@ -510,8 +699,14 @@ class Compiler:
         return self.program.step("reduce to half a turn", "single", run, read, Read(turns))
 
     def _near(self, value: Node, angles: products.Angles) -> int:
-        """Angles that lie around one of their packet or block, reduced so: most of them need no reduction of their own."""
-        read = Read(self._added(angles.around.rows, angles.left, angles, products.split(value, self._width)[1]))
+        """Angles that lie around one of their packet or block, reduced so: most of them need no
+        reduction of their own.
+        """
+        read = Read(
+            self._added(
+                angles.around.rows, angles.left, angles, products.split(value, self._width)[1]
+            )
+        )
 
         def run(execution: Run, out: NDArray[Any]) -> None:
             radians, (numbers, far) = read(execution), execution.prepared[angles]
@@ -524,8 +719,12 @@ class Compiler:
         return self.program.step("reduce what is far from half a turn", "single", run, read)
 
     def _angles(self, value: Node) -> products.Angles | None:
-        """Angles that lie around one of their packet or block; None where they do not, or nobody knows."""
-        angles = self._once(("angles", value), lambda: products.angles_of(value, self._shape, self._layout.leaves))
+        """Angles that lie around one of their packet or block; None where they do not, or nobody
+        knows.
+        """
+        angles = self._once(
+            ("angles", value), lambda: products.angles_of(value, self._shape, self._layout.leaves)
+        )
         self.low += [] if angles is None else angles.nodes
         return angles
 
@@ -535,9 +734,20 @@ class Compiler:
         if product is None:
             return None
         self.low += product.nodes
-        return self._added(product.rows, lambda run: (product.left(run),), product, products.split(node, self._width)[1])
+        return self._added(
+            product.rows,
+            lambda run: (product.left(run),),
+            product,
+            products.split(node, self._width)[1],
+        )
 
-    def _added(self, rows: NDArray[Any], left: Callable[[Run], tuple[Any, ...]], place: Any, full: list[Term]) -> int:
+    def _added(
+        self,
+        rows: NDArray[Any],
+        left: Callable[[Run], tuple[Any, ...]],
+        place: Any,
+        full: list[Term],
+    ) -> int:
         """A matrix product of numbers and rows; what is full is added to it.
 
         Args:
@@ -550,7 +760,9 @@ class Compiler:
             if place not in execution.prepared:
                 execution.prepared[place] = left(execution)
             numbers = execution.prepared[place][0]
-            products.multiplied(numbers[:, _rows(execution, numbers)].T, rows, out.reshape(-1, inner))
+            products.multiplied(
+                numbers[:, _rows(execution, numbers)].T, rows, out.reshape(-1, inner)
+            )
 
         register = self.program.step(f"sum of {len(rows)} products", "double", run)
         for part in full:
@@ -562,9 +774,18 @@ class Compiler:
         assert part.full is not None
         factor, options = float(part.row), chosen(part.full, self._width)
         if options is None:
-            return self.program.call("add", "double", np.add, Read(sum_), Read(self._scaled(part.full, factor)))
+            return self.program.call(
+                "add", "double", np.add, Read(sum_), Read(self._scaled(part.full, factor))
+            )
         condition, *values = options
-        first, second = (Read(self._scaled(value, factor)) if isinstance(value, Node) else _always(value * factor) for value in values)
+        first, second = (
+            (
+                Read(self._scaled(value, factor))
+                if isinstance(value, Node)
+                else _always(value * factor)
+            )
+            for value in values
+        )
         self.low.append(condition)
         shape, depth, before = self._shape, len(self._shape), Read(sum_)
 
@@ -574,20 +795,30 @@ class Compiler:
                 np.add(before(execution), (first if flags.any() else second)(execution), out=out)
                 return
             either = (np.asarray(read(execution)) for read in (first, second))
-            added = np.where(deep(flags, depth), *(array.reshape(-1, *shape) if array.ndim else array for array in either))
+            added = np.where(
+                deep(flags, depth),
+                *(array.reshape(-1, *shape) if array.ndim else array for array in either),
+            )
             np.add(before(execution), added.reshape(-1), out=out)
 
         return self.program.step("add one of two", "double", run, before, first, second)
 
     def _scaled(self, node: Node, factor: float) -> int:
-        """What is full times a number, in float64; the number is part of the table where there is one."""
+        """What is full times a number, in float64; the number is part of the table where there is
+        one.
+        """
         register = self._of_field(node, "double", factor)
         if register is not None:
             return register
         read = Read(self._double(node))
         if factor == 1:
             return read.register
-        return self.program.step(f"times {factor:.6g}", "double", lambda run, out: np.multiply(read(run), factor, out=out), read)
+        return self.program.step(
+            f"times {factor:.6g}",
+            "double",
+            lambda run, out: np.multiply(read(run), factor, out=out),
+            read,
+        )
 
 
 _NONE, _NOWHERE = np.zeros(0, np.bool_), np.zeros(0, np.intp)
@@ -611,11 +842,14 @@ def _rows(run: Run, numbers: NDArray[Any]) -> slice:
 
 
 def _numbers(run: Run, index: Node, rows: int) -> tuple[NDArray[np.intp], NDArray[np.bool_]]:
-    """The rows of a table of so many, for all packets or blocks, (k,); and after which of them another than the next one comes.
+    """The rows of a table of so many, for all packets or blocks, (k,); and after which of them
+    another than the next one comes.
 
     After the last one comes the first; the row of nan behind them is nobody's next.
     """
-    numbers = np.broadcast_to(row_numbers(run.values(index), rows + 1), (len(run.rows), *index.shape)).reshape(-1)
+    numbers = np.broadcast_to(
+        row_numbers(run.values(index), rows + 1), (len(run.rows), *index.shape)
+    ).reshape(-1)
     step = numbers[1:] - numbers[:-1]
     return numbers, (step != 1) & (step != 1 - rows) | (numbers[1:] == rows)
 

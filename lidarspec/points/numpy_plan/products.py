@@ -1,13 +1,16 @@
 """Sums and angles of packets and blocks as matrix products.
 
-What packets or blocks have once, times rows that all of them share, summed, is one matrix product (`Product`). Angles that are such a sum
-lie around one of their packet or block: that one alone is reduced to half a turn before they become float32 (`Angles`).
+What packets or blocks have once, times rows that all of them share, summed, is one matrix product
+(`Product`). Angles that are such a sum lie around one of their packet or block: that one alone is
+reduced to half a turn before they become float32 (`Angles`).
 
-Cosines and sines of angles that lie close together are those of the one in the middle of their packet or block, turned by a series:
-cos(m + d) is a polynomial of d whose coefficients are cosines and sines of m. So the points of a packet or block cost one row of a matrix
-product in float32, and no trigonometry (`Rotation`, `Turns`).
+Cosines and sines of angles that lie close together are those of the one in the middle of their
+packet or block, turned by a series: cos(m + d) is a polynomial of d whose coefficients are cosines
+and sines of m. So the points of a packet or block cost one row of a matrix product in float32, and
+no trigonometry (`Rotation`, `Turns`).
 
-Which sums and angles are so is decided here from their terms; `numpy_plan.compiler` makes steps of them.
+Which sums and angles are so is decided here from their terms; `numpy_plan.compiler` makes steps of
+them.
 """
 
 from __future__ import annotations
@@ -34,7 +37,8 @@ TURN = 2 * np.pi
 NEAR = 4.0
 #: points that blocks with rows of their own have at least: each block takes a matrix product.
 WORTHWHILE = 16
-#: multiplications up to which OpenBLAS stays in one thread (`SMP_THRESHOLD_MIN` times `GEMM_MULTITHREAD_THRESHOLD`).
+#: multiplications up to which OpenBLAS stays in one thread (`SMP_THRESHOLD_MIN` times
+#: `GEMM_MULTITHREAD_THRESHOLD`).
 _ALONE = 1 << 18
 
 
@@ -44,7 +48,8 @@ class Product:
 
     Attributes:
         lows: the numbers, None for 1.
-        rows: (k, inner), of each the row that it is multiplied by; (k, groups, inner) where these differ by the block of a packet.
+        rows: (k, inner), of each the row that it is multiplied by; (k, groups, inner) where these
+            differ by the block of a packet.
         outer: the axes after the packets' that the numbers have.
     """
 
@@ -54,13 +59,19 @@ class Product:
 
     @classmethod
     def of(cls, parts: Sequence[Term], shape: tuple[int, ...]) -> Product | None:
-        """The product of the parts of a sum that are low, for points of this shape; None where there are none, or it would be in crumbs."""
+        """The product of the parts of a sum that are low, for points of this shape; None where
+        there are none, or it would be in crumbs.
+        """
         if not parts:
             return None
         level, crossing = split_level(parts, len(shape))
         if crossing and math.prod(shape[level:]) < WORTHWHILE:
             return None
-        whole, inner = (shape, math.prod(shape[level:])) if crossing else (shape[level:], math.prod(shape[level:]))
+        whole, inner = (
+            (shape, math.prod(shape[level:]))
+            if crossing
+            else (shape[level:], math.prod(shape[level:]))
+        )
         rows = np.stack([np.broadcast_to(part.row, whole).reshape(-1, inner) for part in parts])
         return cls([part.low for part in parts], rows if crossing else rows[:, 0], shape[:level])
 
@@ -108,14 +119,27 @@ class Angles:
 
     @classmethod
     def of(cls, product: Product, more: tuple[float, float]) -> Angles | None:
-        """The angles that a product makes; None where nothing is the same for all points of a packet or block."""
+        """The angles that a product makes; None where nothing is the same for all points of a
+        packet or block.
+        """
         level = [bool((row == row.flat[0]).all()) for row in product.rows]
-        start = [(low, float(row.flat[0])) for low, row, is_level in zip(product.lows, product.rows, level, strict=True) if is_level]
-        if not any(low is not None for low, _ in start) or not np.isfinite((*product.rows.flat, *more)).all():
+        start = [
+            (low, float(row.flat[0]))
+            for low, row, is_level in zip(product.lows, product.rows, level, strict=True)
+            if is_level
+        ]
+        if (
+            not any(low is not None for low, _ in start)
+            or not np.isfinite((*product.rows.flat, *more)).all()
+        ):
             return None
         others = [index for index, is_level in enumerate(level) if not is_level]
         rows = np.concatenate([np.ones((1, *product.rows.shape[1:])), product.rows[others]])
-        return cls(start, Product([None, *(product.lows[index] for index in others)], rows, product.outer), more)
+        return cls(
+            start,
+            Product([None, *(product.lows[index] for index in others)], rows, product.outer),
+            more,
+        )
 
     @property
     def nodes(self) -> list[Node]:
@@ -128,7 +152,9 @@ class Angles:
         return len(self.around.rows) == 1 and self.more == (0.0, 0.0)
 
     def left(self, run: Run) -> tuple[Floats, NDArray[np.bool_]]:
-        """The numbers, (k, rows), the first of each within half a turn; and where angles may be that have to be reduced all the same."""
+        """The numbers, (k, rows), the first of each within half a turn; and where angles may be
+        that have to be reduced all the same.
+        """
         found, rows = self.around.left(run), self.around.rows.reshape(len(self.around.rows), -1)
         start = found[0].reshape(len(run.rows), *self.around.outer)
         start[...] = 0
@@ -154,14 +180,19 @@ def reduced(angles: Floats) -> Floats:
 
 
 def multiplied(left: NDArray[Any], right: NDArray[Any], out: NDArray[Any]) -> None:
-    """A matrix product in pieces that a BLAS does in one thread; with two, a chunk would wait for the one that is busy elsewhere.
+    """A matrix product in pieces that a BLAS does in one thread; with two, a chunk would wait for
+    the one that is busy elsewhere.
 
-    Rows come out the same in any company: for that a lone one needs another, as it would be summed in another order. Where the right side
-    differs by group, rows belong to the groups by turns.
+    Rows come out the same in any company: for that a lone one needs another, as it would be summed
+    in another order. Where the right side differs by group, rows belong to the groups by turns.
     """
     if right.ndim == 3:
         for group in range(right.shape[1]):
-            multiplied(np.ascontiguousarray(left[group :: right.shape[1]]), right[:, group], out[group :: right.shape[1]])
+            multiplied(
+                np.ascontiguousarray(left[group :: right.shape[1]]),
+                right[:, group],
+                out[group :: right.shape[1]],
+            )
         return
     step = max(_ALONE // right.size, 2)
     for start in range(0, len(left), step):
@@ -186,7 +217,8 @@ class Rotation:
 
     Attributes:
         angles: what is turned.
-        moving: whether packets or blocks have a number of their own for how far; else it is the same in all.
+        moving: whether packets or blocks have a number of their own for how far; else it is the
+            same in all.
     """
 
     angles: Angles
@@ -194,9 +226,13 @@ class Rotation:
 
     @classmethod
     def of(cls, angles: Angles) -> Rotation | None:
-        """The rotation that makes these angles; None where several rows besides their middle have numbers of packets or blocks."""
+        """The rotation that makes these angles; None where several rows besides their middle have
+        numbers of packets or blocks.
+        """
         numbered = [low for low in angles.around.lows if low is not None]
-        return None if len(numbered) > 1 or angles.more != (0.0, 0.0) else cls(angles, bool(numbered))
+        return (
+            None if len(numbered) > 1 or angles.more != (0.0, 0.0) else cls(angles, bool(numbered))
+        )
 
     @property
     def inner(self) -> int:
@@ -205,15 +241,22 @@ class Rotation:
 
     @cached_property
     def row(self) -> Floats:
-        """By what the number of a packet or block is multiplied; where none has one, how far each point is turned."""
+        """By what the number of a packet or block is multiplied; where none has one, how far each
+        point is turned.
+        """
         around = self.angles.around
-        return next((row for row, low in zip(around.rows, around.lows, strict=True) if low is not None), self.aside)
+        return next(
+            (row for row, low in zip(around.rows, around.lows, strict=True) if low is not None),
+            self.aside,
+        )
 
     @cached_property
     def aside(self) -> Floats:
         """By how much each point is turned in all packets or blocks alike."""
         around = self.angles.around
-        fixed = [row for row, low in zip(around.rows[1:], around.lows[1:], strict=True) if low is None]
+        fixed = [
+            row for row, low in zip(around.rows[1:], around.lows[1:], strict=True) if low is None
+        ]
         return np.sum(fixed, axis=0) if fixed else np.zeros(around.rows.shape[1:])
 
     @cached_property
@@ -235,7 +278,9 @@ class Rotation:
         if not self.moving:
             return _single([np.cos(row), -np.sin(row)]), _single([np.cos(row), np.sin(row)])
         series = [(row / half) ** term / math.factorial(term) for term in range(TERMS)]
-        cos, sin = ([sign * part for sign, part in zip(signs, series, strict=True)] for signs in _SIGNS)
+        cos, sin = (
+            [sign * part for sign, part in zip(signs, series, strict=True)] for signs in _SIGNS
+        )
         if not self.joint:
             return _single(cos), _single(sin)
         across, along = np.sin(self.aside), np.cos(self.aside)
@@ -249,9 +294,21 @@ class Rotation:
         """The left sides of the products, for a batch."""
         around, (middle, half) = self.angles.around, self.span
         numbered = [low for low in around.lows if low is not None]
-        terms = [*self.angles.start, *((low, middle) for low in numbered)] if numbered else [*self.angles.start, (None, middle)]
-        values = [(around.values(run, low), factor / TURN) for low, factor in terms if low is not None]
-        return Turns(self, len(run.rows), values, sum(factor for low, factor in terms if low is None) / TURN, half)
+        terms = (
+            [*self.angles.start, *((low, middle) for low in numbered)]
+            if numbered
+            else [*self.angles.start, (None, middle)]
+        )
+        values = [
+            (around.values(run, low), factor / TURN) for low, factor in terms if low is not None
+        ]
+        return Turns(
+            self,
+            len(run.rows),
+            values,
+            sum(factor for low, factor in terms if low is None) / TURN,
+            half,
+        )
 
 
 class Turns:
@@ -260,7 +317,8 @@ class Turns:
     Args:
         rotation: whose.
         number: of packets.
-        terms: what makes the angle in the middle: numbers, (n or 1, *outer), and their factors in turns; the last are those that move.
+        terms: what makes the angle in the middle: numbers, (n or 1, *outer), and their factors in
+            turns; the last are those that move.
         fixed: turns that are added to it.
         half: the factor of those that makes the distance of the farthest points from the middle.
 
@@ -270,15 +328,34 @@ class Turns:
         some_wide, all_wide: whether there are such, and no others.
     """
 
-    def __init__(self, rotation: Rotation, number: int, terms: list[tuple[Floats, float]], fixed: float, half: float) -> None:
-        self._rotation, self._number, self._terms, self._fixed, self._half = rotation, number, terms, fixed, half
-        self._outer, self._groups = math.prod(rotation.angles.around.outer), rotation.angles.around.groups
+    def __init__(
+        self,
+        rotation: Rotation,
+        number: int,
+        terms: list[tuple[Floats, float]],
+        fixed: float,
+        half: float,
+    ) -> None:
+        self._rotation, self._number, self._terms, self._fixed, self._half = (
+            rotation,
+            number,
+            terms,
+            fixed,
+            half,
+        )
+        self._outer, self._groups = (
+            math.prod(rotation.angles.around.outer),
+            rotation.angles.around.groups,
+        )
         self._first = self._last = 0
 
     def move(self, start: int, stop: int) -> None:
         """Go to the packets from `start` to `stop`."""
         if not self._first <= start < stop <= self._last:
-            self._first, self._last = start, min(max(stop, start + _WINDOW // self._outer), self._number)
+            self._first, self._last = (
+                start,
+                min(max(stop, start + _WINDOW // self._outer), self._number),
+            )
             self._expand()
         series = self._of_chunk(self._series, start, stop)
         if self._rotation.joint:
@@ -288,25 +365,36 @@ class Turns:
             self.left = series[:, 0], series[:, 1]
         self.some_wide = self.all_wide = False
         if self._any_wide:
-            wide, middle, moved = (self._of_chunk(array, start, stop).T.reshape(-1) for array in (self._wide, self._middle, self._moved))
+            wide, middle, moved = (
+                self._of_chunk(array, start, stop).T.reshape(-1)
+                for array in (self._wide, self._middle, self._moved)
+            )
             self.some_wide, self.all_wide = bool(wide.any()), bool(wide.all())
-            self.wide: slice | NDArray[np.intp] = slice(None) if self.all_wide else np.flatnonzero(wide)
+            self.wide: slice | NDArray[np.intp] = (
+                slice(None) if self.all_wide else np.flatnonzero(wide)
+            )
             self._chunk = np.flatnonzero(wide) % self._groups, middle[self.wide], moved[self.wide]
 
     def multiply(self, which: int, out: Singles) -> None:
         """The products, of cosines for 0 and of sines for 1, (rows of the chunk, inner)."""
         right = self._rotation.rows[which]
         for group, left in enumerate(np.moveaxis(self.left[which], 1, 0)):
-            multiplied(left.T, right if right.ndim == 2 else right[:, group], out[group :: self._groups])
+            multiplied(
+                left.T, right if right.ndim == 2 else right[:, group], out[group :: self._groups]
+            )
 
     def _of_chunk(self, array: NDArray[Any], start: int, stop: int) -> NDArray[Any]:
-        """What an array, (..., rows of the window, group by group), holds for the packets of a chunk: (..., groups, rows)."""
+        """What an array, (..., rows of the window, group by group), holds for the packets of a
+        chunk: (..., groups, rows).
+        """
         each = self._outer // self._groups
         whole = array.reshape(*array.shape[:-1], self._groups, -1)
         return whole[..., (start - self._first) * each : (stop - self._first) * each]
 
     def _expand(self) -> None:
-        """The coefficients of the packets that come next: of each, its cosine and sine times powers of how far its points go."""
+        """The coefficients of the packets that come next: of each, its cosine and sine times powers
+        of how far its points go.
+        """
         chosen = [self._rows(values) for values, _ in self._terms]
         middle = chosen[0] * self._terms[0][1]
         for values, (_, factor) in zip(chosen[1:], self._terms[1:], strict=True):
@@ -317,7 +405,9 @@ class Turns:
         single = middle.astype(np.float32)
         rest = (middle - single).astype(np.float32)
         cos, sin = np.cos(single), np.sin(single)
-        series = self._series = np.empty((TERMS if self._rotation.moving else 2, 2, len(middle)), np.float32)
+        series = self._series = np.empty(
+            (TERMS if self._rotation.moving else 2, 2, len(middle)), np.float32
+        )
         np.subtract(cos, rest * sin, out=series[0, 0])
         np.add(sin, rest * cos, out=series[0, 1])
         self._any_wide = False
@@ -337,7 +427,11 @@ class Turns:
         """Numbers of the packets that come next, one for each of their rows."""
         number = self._last - self._first
         rows = np.broadcast_to(
-            values.reshape(-1, self._outer) if len(values) == 1 else values[self._first : self._last].reshape(number, -1),
+            (
+                values.reshape(-1, self._outer)
+                if len(values) == 1
+                else values[self._first : self._last].reshape(number, -1)
+            ),
             (number, self._outer),
         )
         return rows.reshape(-1) if self._groups == 1 else rows.T.reshape(-1)
@@ -345,7 +439,10 @@ class Turns:
     def angles(self) -> Floats:
         """The angles of the rows that are wide, (rows, inner) radians."""
         groups, middle, moved = self._chunk
-        row, aside = (row if row.ndim == 1 else row[groups] for row in (self._rotation.row, self._rotation.aside))
+        row, aside = (
+            row if row.ndim == 1 else row[groups]
+            for row in (self._rotation.row, self._rotation.aside)
+        )
         return reduced(middle[:, None] + moved[:, None] * (row - self._rotation.span[0]) + aside)
 
 
@@ -356,11 +453,15 @@ def _single(rows: Sequence[Floats]) -> Singles:
 def split(node: Node, width: int) -> tuple[list[Term], list[Term]]:
     """The parts of a sum that are low, and those that each of the `width` points of a packet has."""
     parts = terms(node, width)
-    return [part for part in parts if part.full is None], [part for part in parts if part.full is not None]
+    return [part for part in parts if part.full is None], [
+        part for part in parts if part.full is not None
+    ]
 
 
 def product_of(node: Node, shape: tuple[int, ...]) -> Product | None:
-    """What is low in a sum as one product; None where it is none, or what is full is multiplied by a row."""
+    """What is low in a sum as one product; None where it is none, or what is full is multiplied by
+    a row.
+    """
     low, full = split(node, math.prod(shape))
     return None if any(part.row.ndim for part in full) else Product.of(low, shape)
 
@@ -371,14 +472,18 @@ def angles_of(node: Node, shape: tuple[int, ...], leaves: Mapping[str, Leaf]) ->
     if product is None:
         return None
     reaches = [_reach(part, math.prod(shape), leaves) for part in split(node, math.prod(shape))[1]]
-    return Angles.of(product, (float(sum(low for low, _ in reaches)), float(sum(high for _, high in reaches))))
+    return Angles.of(
+        product, (float(sum(low for low, _ in reaches)), float(sum(high for _, high in reaches)))
+    )
 
 
 def _reach(part: Term, width: int, leaves: Mapping[str, Leaf]) -> tuple[float, float]:
     """The least and the most of what is full in a sum; infinite where it is not known."""
     assert part.full is not None
     options = chosen(part.full, width)
-    values = np.concatenate([_every(value, leaves) for value in ((part.full,) if options is None else options[1:])])
+    values = np.concatenate(
+        [_every(value, leaves) for value in ((part.full,) if options is None else options[1:])]
+    )
     reach = np.outer(values, part.row.reshape(-1))
     return float(reach.min()), float(reach.max())
 

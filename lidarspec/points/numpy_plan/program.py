@@ -1,8 +1,11 @@
-"""A program: NumPy calls on registers, chunk by chunk of packets, that make some flat columns out of frames of one layout.
+"""A program: NumPy calls on registers, chunk by chunk of packets, that make some flat columns out
+of frames of one layout.
 
-The machine knows nothing of fields or expressions: `numpy_plan.compiler` appends the steps. A step makes one register out of others, of
-the frames' blocks, or of values of packets that are known. Registers are float32 ("single"), float64 ("double"), indices, flags or words
-of the wire. Those of columns are the columns' own memory; the others come from scratch memory that is used again for every chunk.
+The machine knows nothing of fields or expressions: `numpy_plan.compiler` appends the steps. A step
+makes one register out of others, of the frames' blocks, or of values of packets that are known.
+Registers are float32 ("single"), float64 ("double"), indices, flags or words of the wire. Those of
+columns are the columns' own memory; the others come from scratch memory that is used again for
+every chunk.
 """
 
 from __future__ import annotations
@@ -66,7 +69,8 @@ class Program(Maker):
 
     Args:
         width: points of a packet.
-        safe: whether a nan marks all coordinates of a point alike, for some values of the packets; else they are made to.
+        safe: whether a nan marks all coordinates of a point alike, for some values of the packets;
+            else they are made to.
 
     Attributes:
         chunk: packets of a chunk.
@@ -92,23 +96,39 @@ class Program(Maker):
         self.kinds.append(kind)
         return len(self.kinds) - 1
 
-    def step(self, text: str, kind: str, run: Callable[[Run, NDArray[Any]], Any], *reads: Callable[[Run], Any]) -> int:
+    def step(
+        self,
+        text: str,
+        kind: str,
+        run: Callable[[Run, NDArray[Any]], Any],
+        *reads: Callable[[Run], Any],
+    ) -> int:
         """A new register, made by a call that reads or uses others."""
         output = self.register(kind)
-        self.steps.append(Step(text, run, output, tuple(read.register for read in reads if isinstance(read, Read))))
+        self.steps.append(
+            Step(
+                text, run, output, tuple(read.register for read in reads if isinstance(read, Read))
+            )
+        )
         return output
 
     def call(self, text: str, kind: str, function: Any, *reads: Callable[[Run], Any]) -> int:
         """A new register, made by a function of others that takes `out`."""
-        return self.step(text, kind, lambda run, out: function(*(read(run) for read in reads), out=out), *reads)
+        return self.step(
+            text, kind, lambda run, out: function(*(read(run) for read in reads), out=out), *reads
+        )
 
     def repeated(self, text: str, kind: str, make: Callable[[Run], NDArray[Any]]) -> int:
-        """A new register with numbers of packets or blocks, made for the batch at its first chunk, for each point of theirs."""
+        """A new register with numbers of packets or blocks, made for the batch at its first chunk,
+        for each point of theirs.
+        """
         place = object()
 
         def run(execution: Run, out: NDArray[Any]) -> None:
             if place not in execution.prepared:
-                execution.prepared[place] = np.asarray(make(execution), TYPES[kind]).reshape(len(execution.rows), -1)
+                execution.prepared[place] = np.asarray(make(execution), TYPES[kind]).reshape(
+                    len(execution.rows), -1
+                )
             numbers = execution.prepared[place][execution.start : execution.stop].reshape(-1, 1)
             out.reshape(len(numbers), -1)[...] = numbers
 
@@ -121,7 +141,10 @@ class Program(Maker):
         return register
 
     def columns(self, number: int) -> dict[str, NDArray[Any]]:
-        return {name: np.empty(number * self.width, TYPES[self.kinds[register]]) for name, register in self.outputs.items()}
+        return {
+            name: np.empty(number * self.width, TYPES[self.kinds[register]])
+            for name, register in self.outputs.items()
+        }
 
     def run(self, rows: Bytes2D, values: Values, columns: Mapping[str, NDArray[Any]]) -> None:
         number = len(rows)
@@ -133,8 +156,14 @@ class Program(Maker):
         room = min(self.most, 1 << step.bit_length())  # the same for scans that are nearly as long
         memory, execution = borrowed(), Run(rows, values)
         made = memory.arrays(self._slots, room, self._wanted)
-        execution.prepared = {blocks: blocks.loading(rows, space) for blocks, space in zip(self.blocks, made, strict=False)}
-        registers = [made[slot + len(self.blocks)] if slot >= 0 else self._tiles.get(at, _NOTHING) for at, slot in enumerate(self._slots)]
+        execution.prepared = {
+            blocks: blocks.loading(rows, space)
+            for blocks, space in zip(self.blocks, made, strict=False)
+        }
+        registers = [
+            made[slot + len(self.blocks)] if slot >= 0 else self._tiles.get(at, _NOTHING)
+            for at, slot in enumerate(self._slots)
+        ]
         with np.errstate(all="ignore"):
             for start in range(0, number, step):
                 self._chunk(execution, registers, columns, start, min(start + step, number))
@@ -148,15 +177,36 @@ class Program(Maker):
     @cached_property
     def _slots(self) -> list[int]:
         """Which registers share memory; asked for when no column is added any more."""
-        return slots_of([(step.output, *step.reads) for step in self.steps], self.kinds, {*self.outputs.values(), *self._tiles})
+        return slots_of(
+            [(step.output, *step.reads) for step in self.steps],
+            self.kinds,
+            {*self.outputs.values(), *self._tiles},
+        )
 
     @cached_property
     def _wanted(self) -> list[tuple[int, np.dtype[Any]]]:
-        """The arrays that a chunk needs, of so many elements a packet: for the blocks, then for the slots."""
-        kinds = dict(sorted((slot, kind) for slot, kind in zip(self._slots, self.kinds, strict=True) if slot >= 0))
-        return [(blocks.room, np.dtype(np.uint8)) for blocks in self.blocks] + [(self.width, TYPES[kind]) for kind in kinds.values()]
+        """The arrays that a chunk needs, of so many elements a packet: for the blocks, then for the
+        slots.
+        """
+        kinds = dict(
+            sorted(
+                (slot, kind)
+                for slot, kind in zip(self._slots, self.kinds, strict=True)
+                if slot >= 0
+            )
+        )
+        return [(blocks.room, np.dtype(np.uint8)) for blocks in self.blocks] + [
+            (self.width, TYPES[kind]) for kind in kinds.values()
+        ]
 
-    def _chunk(self, run: Run, registers: list[NDArray[Any]], columns: Mapping[str, NDArray[Any]], start: int, stop: int) -> None:
+    def _chunk(
+        self,
+        run: Run,
+        registers: list[NDArray[Any]],
+        columns: Mapping[str, NDArray[Any]],
+        start: int,
+        stop: int,
+    ) -> None:
         count = (stop - start) * self.width
         run.start, run.stop = start, stop
         run.views = [array[:count] for array in registers]

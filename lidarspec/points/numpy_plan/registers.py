@@ -1,7 +1,9 @@
-"""The memory that programs compute in: registers, so few and so often used again that a chunk of packets stays in the cache.
+"""The memory that programs compute in: registers, so few and so often used again that a chunk of
+packets stays in the cache.
 
-A register is an array of one kind for a chunk. Registers that are never needed at the same time share a slot (`slots_of`). Their memory
-comes from a `Scratch`, which is borrowed for one execution and given back, so that each thread has another and each batch the same.
+A register is an array of one kind for a chunk. Registers that are never needed at the same time
+share a slot (`slots_of`). Their memory comes from a `Scratch`, which is borrowed for one execution
+and given back, so that each thread has another and each batch the same.
 """
 
 from __future__ import annotations
@@ -15,7 +17,8 @@ from numpy.typing import NDArray
 #: pieces of memory kept for use again, and bytes of each at most.
 MOST_KEPT, LARGEST = 2, 1 << 23
 
-#: bytes; where arrays begin, and what is left between them, so that they do not all fall on the same places of a cache.
+#: bytes; where arrays begin, and what is left between them, so that they do not all fall on the
+#: same places of a cache.
 ALIGNED, APART = 64, 320
 
 
@@ -26,7 +29,9 @@ class Scratch:
         self._memory, self._wanted = _aligned(0), 0
         self._arranged: tuple[object, int, list[NDArray[Any]]] | None = None
 
-    def arrays(self, owner: object, number: int, kinds: Sequence[tuple[int, np.dtype[Any]]]) -> list[NDArray[Any]]:
+    def arrays(
+        self, owner: object, number: int, kinds: Sequence[tuple[int, np.dtype[Any]]]
+    ) -> list[NDArray[Any]]:
         """Arrays that hold anything.
 
         Args:
@@ -35,13 +40,21 @@ class Scratch:
         """
         if self._arranged is None or self._arranged[0] is not owner or self._arranged[1] != number:
             self._wanted = 0
-            self._arranged = owner, number, [self._taken(number * count, dtype) for count, dtype in kinds]
+            self._arranged = (
+                owner,
+                number,
+                [self._taken(number * count, dtype) for count, dtype in kinds],
+            )
         return self._arranged[2]
 
     def _taken(self, count: int, dtype: np.dtype[Any]) -> NDArray[Any]:
         start, size = self._wanted, count * dtype.itemsize
         self._wanted = start + size + -size % ALIGNED + APART
-        memory = self._memory[start : start + size] if start + size <= len(self._memory) else np.empty(size, np.uint8)
+        memory = (
+            self._memory[start : start + size]
+            if start + size <= len(self._memory)
+            else np.empty(size, np.uint8)
+        )
         return memory.view(dtype)
 
     def grow(self) -> None:
@@ -85,8 +98,11 @@ _CODES = {
 TYPES: dict[str, np.dtype[Any]] = {kind: np.dtype(code) for kind, code in _CODES.items()}
 
 
-def slots_of(uses: Sequence[Collection[int]], kinds: Sequence[str], own: Collection[int]) -> list[int]:
-    """A slot for each register, so that registers of one kind that are never needed at the same time have the same one.
+def slots_of(
+    uses: Sequence[Collection[int]], kinds: Sequence[str], own: Collection[int]
+) -> list[int]:
+    """A slot for each register, so that registers of one kind that are never needed at the same
+    time have the same one.
 
     Args:
         uses: the registers that each step makes, reads or needs besides, in the order of the steps.
@@ -94,7 +110,8 @@ def slots_of(uses: Sequence[Collection[int]], kinds: Sequence[str], own: Collect
         own: registers that have memory of their own.
 
     Returns:
-        The number of each register's slot; -1 for those that have memory of their own, or are not used.
+        The number of each register's slot; -1 for those that have memory of their own, or are not
+        used.
     """
     last = {register: place for place, used in enumerate(uses) for register in used}
     slots, free, count = [-1] * len(kinds), dict[str, list[int]](), 0

@@ -1,9 +1,12 @@
-"""The layer over construct, and the only package that knows its classes: an author's struct made fit for the engine, and read off.
+"""The layer over construct, and the only package that knows its classes: an author's struct made
+fit for the engine, and read off.
 
-In: an author's struct. Out: `prepare`, a copy of it for the engine; `check_struct`, what speaks against it; `frame_tree`, the nodes that
+In: an author's struct. Out: `prepare`, a copy of it for the engine; `check_struct`, what speaks
+against it; `frame_tree`, the nodes that
 it means. Modules in reading order:
 
-* `classes`: the few classes that stand in the places of construct's, and what one can ask of a construct.
+* `classes`: the few classes that stand in the places of construct's, and what one can ask of a
+  construct.
 * `refusals`: what no frame can be described by, with the reason.
 * `meaning`: a struct read off as nodes.
 """
@@ -40,5 +43,10 @@ from lidarspec.spec.syntax.classes import (
     unwrap as unwrap,
     verifying as verifying,
 )
-from lidarspec.spec.syntax.meaning import bytes_of as bytes_of, frame_tree as frame_tree, seen as seen, unnamed as unnamed
+from lidarspec.spec.syntax.meaning import (
+    bytes_of as bytes_of,
+    frame_tree as frame_tree,
+    seen as seen,
+    unnamed as unnamed,
+)
 from lidarspec.spec.syntax.refusals import check_struct as check_struct

@@ -1,7 +1,9 @@
-"""What stands in the places of construct's classes, and what one can ask of a construct, whatever it is.
+"""What stands in the places of construct's classes, and what one can ask of a construct, whatever
+it is.
 
-`prepare` copies an author's struct with a few classes replaced, and nothing else changed: structs note where their members stand,
-arrays put the index into error paths, constants can be read unchecked, and a NaN keeps its payload.
+`prepare` copies an author's struct with a few classes replaced, and nothing else changed: structs
+note where their members stand, arrays put the index into error paths, constants can be read
+unchecked, and a NaN keeps its payload.
 """
 
 from __future__ import annotations
@@ -18,7 +20,18 @@ from collections.abc import Callable, Iterable, Iterator, Mapping
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import construct
-from construct import Array, BitsInteger, Bytes, BytesInteger, Const, Construct, Container, FormatField, Struct, Subconstruct
+from construct import (
+    Array,
+    BitsInteger,
+    Bytes,
+    BytesInteger,
+    Const,
+    Construct,
+    Container,
+    FormatField,
+    Struct,
+    Subconstruct,
+)
 from construct.expr import ExprMixin
 
 from lidarspec.errors import SpecError
@@ -50,7 +63,8 @@ class Mismatch(construct.ConstructError):  # type: ignore[misc]
 
 
 class Seen(NamedTuple):
-    """A part that was parsed: construct's path, first byte and the one after its last, the value, and the construct if it is a seal.
+    """A part that was parsed: construct's path, first byte and the one after its last, the value,
+    and the construct if it is a seal.
 
     Within a bit block `start` and `end` count what the block was unpacked to.
     """
@@ -63,7 +77,9 @@ class Seen(NamedTuple):
 
 
 def note(context: Any, path: str, start: int, end: int, value: Any, seal: Any = None) -> None:
-    """Add a `Seen` to the list that a parse was given as ``_trail``, so that a parse that fails has still said how far it came."""
+    """Add a `Seen` to the list that a parse was given as ``_trail``, so that a parse that fails has
+    still said how far it came.
+    """
     trail = context._params.get("_trail")
     if trail is not None:
         trail.append(Seen(path, start, end, value, seal))
@@ -84,7 +100,9 @@ class WireNaN(float):
 
 
 class MarkedStruct(Struct):  # type: ignore[misc]
-    """A Struct whose parsed container holds, under ``_marks``, the (start, end) of each member in the stream."""
+    """A Struct whose parsed container holds, under ``_marks``, the (start, end) of each member in
+    the stream.
+    """
 
     def _parse(self, stream: Any, context: Any, path: str) -> Any:
         obj = Container()
@@ -130,9 +148,17 @@ class MarkedStruct(Struct):  # type: ignore[misc]
     def _inner(self, stream: Any, context: Any, *, is_parsing: bool) -> Container:
         """The context of the members' expressions.
 
-        `_marks` holds (start, end) by name, `_sizings` (sizing, path, offset, value) of each field that states a length.
+        `_marks` holds (start, end) by name, `_sizings` (sizing, path, offset, value) of each field
+        that states a length.
         """
-        inner = Container(_=context, _params=context._params, _root=None, _parsing=is_parsing, _building=not is_parsing, _sizing=False)
+        inner = Container(
+            _=context,
+            _params=context._params,
+            _root=None,
+            _parsing=is_parsing,
+            _building=not is_parsing,
+            _sizing=False,
+        )
         inner._subcons, inner._io, inner._index = self._subcons, stream, context.get("_index", None)
         inner._root = context.get("_root", None) or inner
         inner._marks = {}
@@ -141,9 +167,11 @@ class MarkedStruct(Struct):  # type: ignore[misc]
 
 
 class IndexedArray(Array):  # type: ignore[misc]
-    """An Array that says in an error's path which element it was, and has no more elements than its frame can have bytes (or bits).
+    """An Array that says in an error's path which element it was, and has no more elements than its
+    frame can have bytes (or bits).
 
-    Nor has a frame more elements without a byte, all its arrays together: nested ones would multiply.
+    Nor has a frame more elements without a byte, all its arrays together: nested ones would
+    multiply.
     """
 
     limit: int
@@ -162,7 +190,9 @@ class IndexedArray(Array):  # type: ignore[misc]
             if trail is not None:
                 trail.append(Seen(place, start, stream.tell(), element))
             if stream.tell() == start and not self.in_bits:
-                context._params["_empty"] = bounded(context._params.get("_empty", 0) + 1, self.limit, "count", path)
+                context._params["_empty"] = bounded(
+                    context._params.get("_empty", 0) + 1, self.limit, "count", path
+                )
         return found
 
     def _build(self, obj: Any, stream: Any, context: Any, path: str) -> Any:
@@ -184,7 +214,9 @@ def _built(con: Subconstruct, elements: Iterable[Any], stream: Any, context: Any
 
 
 class FullRange(construct.GreedyRange):  # type: ignore[misc]
-    """A GreedyRange that takes up all bytes of the part that bounds it: construct's own drops an element that fails, and what follows."""
+    """A GreedyRange that takes up all bytes of the part that bounds it: construct's own drops an
+    element that fails, and what follows.
+    """
 
     def _parse(self, stream: Any, context: Any, path: str) -> Any:
         found = construct.ListContainer()
@@ -263,32 +295,54 @@ class _Compared:
 
 
 def _allowed(con: construct.Validator) -> tuple[int, ...] | None:
-    """The raw values that a validator lets pass: those that it compares with, or of 16 bits all that pass; None where neither is known."""
+    """The raw values that a validator lets pass: those that it compares with, or of 16 bits all
+    that pass; None where neither is known.
+    """
     field, subcon = unwrap(con), con.subcon
     while isinstance(subcon, Subconstruct) and not isinstance(subcon, construct.Enum):
         subcon = subcon.subcon
-    if not isinstance(field, FormatField | BytesInteger | BitsInteger) or getattr(field, "fmtstr", "B")[-1] in "efd?":
+    if (
+        not isinstance(field, FormatField | BytesInteger | BitsInteger)
+        or getattr(field, "fmtstr", "B")[-1] in "efd?"
+    ):
         return None
-    width, signed = bit_width(field), field.fmtstr[-1].islower() if isinstance(field, FormatField) else field.signed
+    width, signed = (
+        bit_width(field),
+        field.fmtstr[-1].islower() if isinstance(field, FormatField) else field.signed,
+    )
     low, high = (-(1 << (width - 1)), (1 << (width - 1)) - 1) if signed else (0, (1 << width) - 1)
-    with contextlib.suppress(Exception):  # the author's function may raise anything at what is no number
+    with contextlib.suppress(
+        Exception
+    ):  # the author's function may raise anything at what is no number
         passes = con._validate(compared := _Compared(), None, "")
         if compared.values and not passes and all(type(value) is int for value in compared.values):
-            return tuple(value for value in sorted({*compared.values}) if low <= value <= high and con._validate(value, None, ""))
+            return tuple(
+                value
+                for value in sorted({*compared.values})
+                if low <= value <= high and con._validate(value, None, "")
+            )
     with contextlib.suppress(Exception):  # or at numbers that it does not expect
         if width <= 16:
-            seen = (lambda raw: subcon._decode(raw, None, None)) if isinstance(subcon, construct.Enum) else int
+            seen = (
+                (lambda raw: subcon._decode(raw, None, None))
+                if isinstance(subcon, construct.Enum)
+                else int
+            )
             return tuple(raw for raw in range(low, high + 1) if con._validate(seen(raw), None, ""))
     return None
 
 
 class CountedBytes(Bytes):  # type: ignore[misc]
-    """Bytes, of which a wrong length is told from an end of the stream, and what are none from an expression that fails."""
+    """Bytes, of which a wrong length is told from an end of the stream, and what are none from an
+    expression that fails.
+    """
 
     limit: int
 
     def _parse(self, stream: Any, context: Any, path: str) -> Any:
-        length = bounded(operator.index(construct.evaluate(self.length, context)), self.limit, "length", path)
+        length = bounded(
+            operator.index(construct.evaluate(self.length, context)), self.limit, "length", path
+        )
         return construct.stream_read(stream, length, path)
 
     def _build(self, obj: Any, stream: Any, context: Any, path: str) -> Any:
@@ -335,7 +389,8 @@ class Sealing(Subconstruct):  # type: ignore[misc]
     Attributes:
         fields: names of the fields that hold it, low bits first.
         algorithm: of the checksum, None where a hook has to supply it.
-        over: names of the fields that it covers, in a row; None: all bytes that hold no bit of `fields`.
+        over: names of the fields that it covers, in a row; None: all bytes that hold no bit of
+            `fields`.
         absent: values that mean "not filled".
     """
 
@@ -349,13 +404,15 @@ class Sizing(Subconstruct):  # type: ignore[misc]
     """A number that says how many bytes a part has: made of it, and held to it.
 
     Attributes:
-        of: the names that lead to the part from the struct that it stands in, which is itself what no names lead to; "_" leads one
-            struct out.
+        of: the names that lead to the part from the struct that it stands in, which is itself what
+            no names lead to; "_" leads one struct out.
         plus: what is added.
         since: a member before the part, from which on is measured; "" for the part alone.
     """
 
-    def __init__(self, subcon: Construct, of: tuple[str, ...], plus: int = 0, since: str = "") -> None:
+    def __init__(
+        self, subcon: Construct, of: tuple[str, ...], plus: int = 0, since: str = ""
+    ) -> None:
         super().__init__(subcon)
         self.of, self.plus, self.since, self.flagbuildnone = of, plus, since, True
 
@@ -369,10 +426,16 @@ class Sizing(Subconstruct):  # type: ignore[misc]
         *parents, name = self.of[self.out :] or ("",)
         try:
             marks = (member(obj, ".".join(parents)) if parents else obj)["_marks"]
-            start, end = marks[name] if name else (min(marks.values())[0], max(end for _, end in marks.values()))
+            start, end = (
+                marks[name]
+                if name
+                else (min(marks.values())[0], max(end for _, end in marks.values()))
+            )
             start = marks[self.since][0] if self.since else start
         except (KeyError, TypeError):
-            raise SpecError(f"SizeOf measures {'.'.join(self.of)!r}, and there is no such part") from None
+            raise SpecError(
+                f"SizeOf measures {'.'.join(self.of)!r}, and there is no such part"
+            ) from None
         return int(end - start + self.plus)
 
     def _parse(self, stream: Any, context: Any, path: str) -> Any:
@@ -402,18 +465,25 @@ class Counting(Subconstruct):  # type: ignore[misc]
 
     def _build(self, obj: Any, stream: Any, context: Any, path: str) -> Any:
         array = context.get(self.of)
-        return self.subcon._build(len(array) if isinstance(array, list | tuple | bytes) else obj, stream, context, path)
+        return self.subcon._build(
+            len(array) if isinstance(array, list | tuple | bytes) else obj, stream, context, path
+        )
 
 
 class Bounded(Subconstruct):  # type: ignore[misc]
-    """A part that ends after `length` bytes of a frame that comes, and is as long as its values are in one that is made."""
+    """A part that ends after `length` bytes of a frame that comes, and is as long as its values are
+    in one that is made.
+    """
 
     def __init__(self, length: Any, subcon: Construct) -> None:
         super().__init__(subcon)
         self.length = length
 
     def _parse(self, stream: Any, context: Any, path: str) -> Any:
-        start, length = stream.tell(), bounded(construct.evaluate(self.length, context), sys.maxsize, "length", path)
+        start, length = (
+            stream.tell(),
+            bounded(construct.evaluate(self.length, context), sys.maxsize, "length", path),
+        )
         stream.seek(0)
         within = io.BytesIO(construct.stream_read(stream, start + length, path))
         within.seek(start)
@@ -423,14 +493,23 @@ class Bounded(Subconstruct):  # type: ignore[misc]
 
 
 class Filler(CountedBytes):
-    """The bytes behind members (from one to another, `of`), up to a length (`to`) or to a multiple of one (`modulus`).
+    """The bytes behind members (from one to another, `of`), up to a length (`to`) or to a multiple
+    of one (`modulus`).
 
     They are those of a pattern unless given.
     """
 
-    def __init__(self, of: tuple[str, str], to: Any = None, modulus: Any = None, pattern: bytes = b"\0") -> None:
+    def __init__(
+        self, of: tuple[str, str], to: Any = None, modulus: Any = None, pattern: bytes = b"\0"
+    ) -> None:
         super().__init__(self._missing)
-        self.of, self.to, self.modulus, self.pattern, self.flagbuildnone = of, to, modulus, pattern, True
+        self.of, self.to, self.modulus, self.pattern, self.flagbuildnone = (
+            of,
+            to,
+            modulus,
+            pattern,
+            True,
+        )
 
     def _missing(self, context: Any) -> int:
         start, end = context._marks[self.of[0]][0], context._marks[self.of[1]][1]
@@ -443,7 +522,9 @@ class Filler(CountedBytes):
 
 
 class Pieces(construct.ListContainer):  # type: ignore[misc]
-    """Parts that were parsed or built: kind, first byte and the one after the last of each as `spans`; `size`: the bytes of all."""
+    """Parts that were parsed or built: kind, first byte and the one after the last of each as
+    `spans`; `size`: the bytes of all.
+    """
 
     def __init__(self) -> None:
         super().__init__()
@@ -481,14 +562,22 @@ LEVELS = ("constants", "lengths", "checksums", "values")
 
 
 def verifying(context: Any, what: str = "constants") -> bool:
-    """Whether constants, lengths, checksums or values are checked in this parse; who checks one of them checks those before it."""
+    """Whether constants, lengths, checksums or values are checked in this parse; who checks one of
+    them checks those before it.
+    """
     wanted = context._params.get("_verify", True)
     return LEVELS.index(what) <= LEVELS.index(wanted) if isinstance(wanted, str) else bool(wanted)
 
 
 #: construct's classes -> those that stand in for them.
 _OWN: dict[type, type] = {
-    **{Struct: MarkedStruct, Array: IndexedArray, Const: CheckedConst, construct.Enum: NamedEnum, construct.GreedyRange: FullRange},
+    **{
+        Struct: MarkedStruct,
+        Array: IndexedArray,
+        Const: CheckedConst,
+        construct.Enum: NamedEnum,
+        construct.GreedyRange: FullRange,
+    },
 }
 
 #: attributes of constructs that hold others; "cases" does by key.
@@ -504,12 +593,20 @@ def prepare(con: Construct, limit: int = sys.maxsize, *, in_bits: bool = False) 
     """
     if isinstance(con, FormatField):
         return ExactFloat(con.fmtstr[0], con.fmtstr[-1]) if con.fmtstr[-1] in "efd" else con
-    if isinstance(con, construct.Hex | construct.HexDump):  # how a value is printed; it is the value below it
+    if isinstance(
+        con, construct.Hex | construct.HexDump
+    ):  # how a value is printed; it is the value below it
         return prepare(con.subcon, limit, in_bits=in_bits)
     if isinstance(con, construct.Check):
         return HeldCheck(con.func)
-    if isinstance(con, construct.Mapping) and {*map(type, con.encmapping), *map(type, con.decmapping)} == {str, int}:
-        return Limited(NamedEnum(prepare(con.subcon, limit, in_bits=in_bits), **con.encmapping), tuple(sorted(con.decmapping)))
+    if isinstance(con, construct.Mapping) and {
+        *map(type, con.encmapping),
+        *map(type, con.decmapping),
+    } == {str, int}:
+        return Limited(
+            NamedEnum(prepare(con.subcon, limit, in_bits=in_bits), **con.encmapping),
+            tuple(sorted(con.decmapping)),
+        )
     if isinstance(con, construct.ExprValidator) and (allowed := _allowed(con)) is not None:
         return Limited(prepare(con.subcon, limit, in_bits=in_bits), allowed)
     if isinstance(con, Filler):
@@ -520,20 +617,34 @@ def prepare(con: Construct, limit: int = sys.maxsize, *, in_bits: bool = False) 
         counted.limit = limit
         return counted
     if isinstance(con, Struct):
-        members = con.subcons if in_bits else [member for child in con.subcons for member in _spelled_out(child)]
+        members = (
+            con.subcons
+            if in_bits
+            else [member for child in con.subcons for member in _spelled_out(child)]
+        )
         return MarkedStruct(*(prepare(child, limit, in_bits=in_bits) for child in members))
     if isinstance(con, construct.Renamed):
         inner = con.subcon
-        while isinstance(inner, construct.Renamed):  # ("name" / con) * "docs" wraps twice, and the path would name it twice
+        while isinstance(
+            inner, construct.Renamed
+        ):  # ("name" / con) * "docs" wraps twice, and the path would name it twice
             inner = inner.subcon
-        return construct.Renamed(prepare(inner, limit, in_bits=in_bits), newname=con.name, newdocs=con.docs)
+        return construct.Renamed(
+            prepare(inner, limit, in_bits=in_bits), newname=con.name, newdocs=con.docs
+        )
     if not isinstance(con, Subconstruct | construct.IfThenElse | construct.Switch | Partition):
         return con
     same = copy.copy(con)
     same.__class__ = next((own for kind, own in _OWN.items() if isinstance(con, kind)), type(con))
     is_block = isinstance(con, construct.Transformed | construct.Restreamed)
     for name in vars(con).keys() & _INNER:
-        setattr(same, name, prepare(getattr(con, name), 8 * limit if is_block else limit, in_bits=in_bits or is_block))
+        setattr(
+            same,
+            name,
+            prepare(
+                getattr(con, name), 8 * limit if is_block else limit, in_bits=in_bits or is_block
+            ),
+        )
     if isinstance(con, construct.Switch | Partition):
         same.cases = {key: prepare(case, limit, in_bits=in_bits) for key, case in con.cases.items()}
     if isinstance(same, IndexedArray):
@@ -544,7 +655,9 @@ def prepare(con: Construct, limit: int = sys.maxsize, *, in_bits: bool = False) 
 
 
 def _spelled_out(con: Construct) -> list[Construct]:
-    """A member of a struct; of those that construct prefixes, pads or aligns, what it does not show: the length or count, the padding."""
+    """A member of a struct; of those that construct prefixes, pads or aligns, what it does not
+    show: the length or count, the padding.
+    """
     name, inner, docs = con.name, con, con.docs
     while isinstance(inner, construct.Renamed):
         inner = inner.subcon
@@ -554,24 +667,64 @@ def _spelled_out(con: Construct) -> list[Construct]:
 
     if name and isinstance(inner, construct.IfThenElse) and inner.elsesubcon is construct.Pass:
         members = _spelled_out(construct.Renamed(inner.thensubcon, newname=name, newdocs=docs))
-        optional = (construct.Renamed(construct.If(inner.condfunc, one.subcon), newname=one.name, newdocs=one.docs) for one in members)
+        optional = (
+            construct.Renamed(
+                construct.If(inner.condfunc, one.subcon), newname=one.name, newdocs=one.docs
+            )
+            for one in members
+        )
         return [con] if len(members) == 1 else list(optional)
     if name and isinstance(inner, construct.Prefixed):
-        plus, length = inner.lengthfield.sizeof() if inner.includelength else 0, construct.this[f"{name}_size"]
-        content = Bounded(length - plus if plus else length, inner.subcon) if is_greedy(inner.subcon) else inner.subcon
+        plus, length = (
+            inner.lengthfield.sizeof() if inner.includelength else 0,
+            construct.this[f"{name}_size"],
+        )
+        content = (
+            Bounded(length - plus if plus else length, inner.subcon)
+            if is_greedy(inner.subcon)
+            else inner.subcon
+        )
         members = _spelled_out(construct.Renamed(content, newname=name, newdocs=docs))
-        return [named("_size", Sizing(inner.lengthfield, (members[-1].name,), plus, members[0].name), "bytes of"), *members]
-    if name and isinstance(inner, construct.FocusedSeq) and [part.name for part in inner.subcons] == ["count", "items"]:  # PrefixedArray
+        return [
+            named(
+                "_size",
+                Sizing(inner.lengthfield, (members[-1].name,), plus, members[0].name),
+                "bytes of",
+            ),
+            *members,
+        ]
+    if (
+        name
+        and isinstance(inner, construct.FocusedSeq)
+        and [part.name for part in inner.subcons] == ["count", "items"]
+    ):  # PrefixedArray
         count, items = (part.subcon for part in inner.subcons)
         array = Array(construct.this[f"{name}_count"], items.subcon)
-        return [named("_count", Counting(count.subcon, name), "number of"), construct.Renamed(array, newname=name, newdocs=docs)]
-    if name and (isinstance(inner, construct.Aligned) or (isinstance(inner, construct.FixedSized) and not is_greedy(inner.subcon))):
+        return [
+            named("_count", Counting(count.subcon, name), "number of"),
+            construct.Renamed(array, newname=name, newdocs=docs),
+        ]
+    if name and (
+        isinstance(inner, construct.Aligned)
+        or (isinstance(inner, construct.FixedSized) and not is_greedy(inner.subcon))
+    ):
         members = _spelled_out(construct.Renamed(inner.subcon, newname=name, newdocs=docs))
         span = (members[0].name, members[-1].name)
         if isinstance(inner, construct.Aligned):
-            return [*members, named("_padding", Filler(span, modulus=inner.modulus, pattern=inner.pattern), "padding of")]
+            return [
+                *members,
+                named(
+                    "_padding",
+                    Filler(span, modulus=inner.modulus, pattern=inner.pattern),
+                    "padding of",
+                ),
+            ]
         is_full = isinstance(inner.length, int) and inner.length == fixed_size(inner.subcon)
-        return members if is_full else [*members, named("_padding", Filler(span, to=inner.length), "padding of")]
+        return (
+            members
+            if is_full
+            else [*members, named("_padding", Filler(span, to=inner.length), "padding of")]
+        )
     return [con]
 
 
@@ -583,13 +736,26 @@ def is_greedy(con: Construct, kinds: tuple[type, ...] = (*GREEDY, construct.Null
     """Whether a part takes all bytes that it is given, by ending in one of some kinds that do."""
     if isinstance(con, kinds):
         return True
-    if isinstance(con, Array | construct.NullTerminated | construct.NullStripped | construct.FixedSized | construct.Prefixed | Bounded):
+    if isinstance(
+        con,
+        Array
+        | construct.NullTerminated
+        | construct.NullStripped
+        | construct.FixedSized
+        | construct.Prefixed
+        | Bounded,
+    ):
         return False
-    return any(is_greedy(child, kinds) for child in (children(con)[-1:] if isinstance(con, Struct) else children(con)))
+    return any(
+        is_greedy(child, kinds)
+        for child in (children(con)[-1:] if isinstance(con, Struct) else children(con))
+    )
 
 
 def unwrap(con: Construct, *, bits: bool = True) -> Construct:
-    """The construct below names, units and checksums, and below bit transformations unless `bits` is False."""
+    """The construct below names, units and checksums, and below bit transformations unless `bits`
+    is False.
+    """
     while isinstance(con, Subconstruct) and not isinstance(con, Array | Const):
         if isinstance(con, construct.Transformed | construct.Restreamed) and not bits:
             return con
@@ -642,20 +808,30 @@ def member(obj: Any, dotted: str, default: object = _MISSING) -> Any:
 def clean(parsed: Any) -> Any:
     """The parsed object without construct's and our own private entries."""
     if isinstance(parsed, dict):
-        return Container({name: clean(value) for name, value in parsed.items() if not name.startswith("_")})
+        return Container(
+            {name: clean(value) for name, value in parsed.items() if not name.startswith("_")}
+        )
     if isinstance(parsed, list):
         return construct.ListContainer(clean(value) for value in parsed)
     return parsed
 
 
 def field_path(path: str | None) -> str:
-    """construct's "(parsing) -> points[1] -> intensity" as "points[1].intensity"; a text on a part without name makes a "None"."""
+    """construct's "(parsing) -> points[1] -> intensity" as "points[1].intensity"; a text on a part
+    without name makes a "None".
+    """
     names = re.sub(r" -> None(?=$| ->|\[)", "", path or "").split(" -> ")[1:]
     return ".".join(names)
 
 
 def _shown(value: object) -> str:
-    return value.hex(" ") if isinstance(value, bytes) else f"0x{value:x}" if isinstance(value, int) else repr(value)
+    return (
+        value.hex(" ")
+        if isinstance(value, bytes)
+        else f"0x{value:x}"
+        if isinstance(value, int)
+        else repr(value)
+    )
 
 
 def children(con: Construct) -> list[Construct]:
@@ -679,7 +855,9 @@ def seals(con: Construct) -> Iterator[Sealing]:
         yield from seals(child)
 
 
-def leaves(parsed: Any, keys: tuple[str | int, ...] = ()) -> Iterator[tuple[tuple[str | int, ...], Any]]:
+def leaves(
+    parsed: Any, keys: tuple[str | int, ...] = ()
+) -> Iterator[tuple[tuple[str | int, ...], Any]]:
     """The values of a parsed object with where they stand in it, private entries left out."""
     if isinstance(parsed, dict):
         for name, value in parsed.items():
@@ -697,15 +875,19 @@ def is_expression(value: object) -> bool:
     return isinstance(value, ExprMixin | Construct)
 
 
-#: the highest of the low numbers that are drawn half of the time: as a count or a choice, a number of any size hardly ever fits.
+#: the highest of the low numbers that are drawn half of the time: as a count or a choice, a number
+#: of any size hardly ever fits.
 MANY = (1, 6, 40)
 
 #: how often a part is drawn that does not fit.
 DRAWS = 100
 
 
-def random_value(con: Construct, source: random.Random, drawn: Drawn, scope: Any = None, path: str = "") -> Any:
-    """A random value that a construct can build; for parts that have no places and so cannot be filled with random bytes.
+def random_value(
+    con: Construct, source: random.Random, drawn: Drawn, scope: Any = None, path: str = ""
+) -> Any:
+    """A random value that a construct can build; for parts that have no places and so cannot be
+    filled with random bytes.
 
     Args:
         drawn: field path -> what draws its value in place of chance.
@@ -714,19 +896,28 @@ def random_value(con: Construct, source: random.Random, drawn: Drawn, scope: Any
     if path in drawn:
         return drawn[path](source)
     if isinstance(con, Const):
-        return con.parse(con.build(con.value), _verify=False)  # a name of an Enum with its number, as other expressions see it
+        return con.parse(
+            con.build(con.value), _verify=False
+        )  # a name of an Enum with its number, as other expressions see it
     if isinstance(con, construct.Rebuild):
-        with contextlib.suppress(Exception):  # it may ask for what comes after it, and is evaluated again when the frame is built
+        with contextlib.suppress(
+            Exception
+        ):  # it may ask for what comes after it, and is evaluated again when the frame is built
             return con.func(scope)
     if isinstance(con, Struct):
         values = Container(_=scope)
         values._root = values if scope is None else scope._root
         for child in con.subcons:
             if child.name is not None:
-                values[child.name] = random_value(child, source, drawn, values, f"{path}.{child.name}" if path else child.name)
+                values[child.name] = random_value(
+                    child, source, drawn, values, f"{path}.{child.name}" if path else child.name
+                )
         return values
     if isinstance(con, construct.GreedyRange):
-        return [random_value(con.subcon, source, drawn, scope, path) for _ in range(source.randint(0, 4))]
+        return [
+            random_value(con.subcon, source, drawn, scope, path)
+            for _ in range(source.randint(0, 4))
+        ]
     if isinstance(con, Partition):
         return _random_parts(con, source, drawn, scope, path)
     if isinstance(con, Array):
@@ -734,33 +925,69 @@ def random_value(con: Construct, source: random.Random, drawn: Drawn, scope: Any
         bounded(count * _elements(con.subcon, scope), con.limit, "count", path)
         return [random_value(con.subcon, source, drawn, scope, path) for _ in range(count)]
     if isinstance(con, construct.IfThenElse):
-        return random_value(con.thensubcon if construct.evaluate(con.condfunc, scope) else con.elsesubcon, source, drawn, scope, path)
+        return random_value(
+            con.thensubcon if construct.evaluate(con.condfunc, scope) else con.elsesubcon,
+            source,
+            drawn,
+            scope,
+            path,
+        )
     if isinstance(con, construct.Switch):
-        return random_value(con.cases.get(construct.evaluate(con.keyfunc, scope), con.default), source, drawn, scope, path)
+        return random_value(
+            con.cases.get(construct.evaluate(con.keyfunc, scope), con.default),
+            source,
+            drawn,
+            scope,
+            path,
+        )
     if isinstance(con, Limited):
         raw = source.choice(con.allowed)
-        return con.subcon._decode(raw, None, None) if isinstance(con.subcon, construct.Enum) else raw
+        return (
+            con.subcon._decode(raw, None, None) if isinstance(con.subcon, construct.Enum) else raw
+        )
     if isinstance(con, construct.Enum):
-        named = list(con.ksymapping) if not isinstance(unwrap(con), Const) and source.random() < 0.5 else []
-        return con._decode(source.choice(named) if named else random_value(con.subcon, source, drawn, scope, path), None, None)
+        named = (
+            list(con.ksymapping)
+            if not isinstance(unwrap(con), Const) and source.random() < 0.5
+            else []
+        )
+        return con._decode(
+            source.choice(named) if named else random_value(con.subcon, source, drawn, scope, path),
+            None,
+            None,
+        )
     if isinstance(con, construct.NullTerminated) or not isinstance(con, Subconstruct):
         return _random_leaf(con, source, scope)
     if isinstance(con, construct.Adapter):
-        return clean(con.parse(con.subcon.build(random_value(con.subcon, source, drawn, scope, path))))
+        return clean(
+            con.parse(con.subcon.build(random_value(con.subcon, source, drawn, scope, path)))
+        )
     return random_value(con.subcon, source, drawn, scope, path)
 
 
 def _elements(con: Construct, scope: Any) -> int:
-    """How many an element of an array has itself, where it is an array too; as far as that is known before there is one."""
-    with contextlib.suppress(Exception):  # whatever an expression raises that asks for what is not there yet
-        return int(construct.evaluate(con.count, scope)) * _elements(con.subcon, scope) if isinstance(con, Array) else 1
+    """How many an element of an array has itself, where it is an array too; as far as that is known
+    before there is one.
+    """
+    with contextlib.suppress(
+        Exception
+    ):  # whatever an expression raises that asks for what is not there yet
+        return (
+            int(construct.evaluate(con.count, scope)) * _elements(con.subcon, scope)
+            if isinstance(con, Array)
+            else 1
+        )
     return 1
 
 
-def _random_parts(con: Partition, source: random.Random, drawn: Drawn, scope: Any, path: str) -> Pieces:
+def _random_parts(
+    con: Partition, source: random.Random, drawn: Drawn, scope: Any, path: str
+) -> Pieces:
     """Some parts, with how long each is, which what stands behind them may ask for."""
     found = Pieces()
-    around = Container({**scope, "_params": Container(), "_parsing": False, "_building": True, "_sizing": False})
+    around = Container(
+        {**scope, "_params": Container(), "_parsing": False, "_building": True, "_sizing": False}
+    )
     for _ in range(source.randint(0, 4)):
         name, stream = source.choice(list(con.cases)), io.BytesIO()
         found.append(_random_part(con.cases[name], source, drawn, scope, path))
@@ -770,7 +997,9 @@ def _random_parts(con: Partition, source: random.Random, drawn: Drawn, scope: An
 
 
 def _random_part(con: Construct, source: random.Random, drawn: Drawn, scope: Any, path: str) -> Any:
-    """One part; drawn again by itself where it is too long, since frames of many counts would else have no part at all."""
+    """One part; drawn again by itself where it is too long, since frames of many counts would else
+    have no part at all.
+    """
     for _ in range(DRAWS):
         with contextlib.suppress(Fault):
             return random_value(con, source, drawn, scope, path)
@@ -779,7 +1008,8 @@ def _random_part(con: Construct, source: random.Random, drawn: Drawn, scope: Any
 
 def _random_leaf(con: Construct, source: random.Random, scope: Any) -> Any:
     if con is construct.Pass or isinstance(con, construct.Check | Filler):
-        return None  # whether a Check holds, and how much there is to fill, is seen when the frame is built
+        # whether a Check holds, and how much there is to fill, is seen when the frame is built
+        return None
     if isinstance(con, construct.NullTerminated):
         return str(source.randrange(10 ** source.randint(1, 4))).encode()
     if isinstance(con, construct.Computed):
@@ -787,9 +1017,15 @@ def _random_leaf(con: Construct, source: random.Random, scope: Any) -> Any:
     if con is construct.GreedyBytes:
         return source.randbytes(source.randint(0, 4))
     if isinstance(con, Bytes):
-        return source.randbytes(bounded(construct.evaluate(con.length, scope), con.limit, "length", ""))
-    if isinstance(con, FormatField | BytesInteger | BitsInteger) and source.random() < 0.5:  # it may be a count
-        return con.parse(con.build(source.randint(0, min(source.choice(MANY), (1 << (bit_width(con) - 1)) - 1))))
+        return source.randbytes(
+            bounded(construct.evaluate(con.length, scope), con.limit, "length", "")
+        )
+    if (
+        isinstance(con, FormatField | BytesInteger | BitsInteger) and source.random() < 0.5
+    ):  # it may be a count
+        return con.parse(
+            con.build(source.randint(0, min(source.choice(MANY), (1 << (bit_width(con) - 1)) - 1)))
+        )
     if con in (construct.VarInt, construct.ZigZag):
         return source.randint(0, source.choice(MANY))
     if isinstance(con, BitsInteger):

@@ -1,8 +1,8 @@
 """A struct read off as nodes (`lidarspec.spec.tree`), once for each frame.
 
-Expressions are called with symbols in place of fields and what they do with them is written down, and the bits of a bit block are found
-out by parsing it with construct, so that no rule about bit order stands anywhere else. What no node stands for stays a part of
-construct's, with the reason.
+Expressions are called with symbols in place of fields and what they do with them is written down,
+and the bits of a bit block are found out by parsing it with construct, so that no rule about bit
+order stands anywhere else. What no node stands for stays a part of construct's, with the reason.
 """
 
 from __future__ import annotations
@@ -17,7 +17,17 @@ from typing import Any, Literal
 
 import construct
 import numpy as np
-from construct import Array, BitsInteger, Bytes, BytesInteger, Const, Construct, FormatField, Struct, Subconstruct
+from construct import (
+    Array,
+    BitsInteger,
+    Bytes,
+    BytesInteger,
+    Const,
+    Construct,
+    FormatField,
+    Struct,
+    Subconstruct,
+)
 from construct.expr import BinExpr, ExprMixin, UniExpr
 
 from lidarspec.errors import SpecError
@@ -48,7 +58,9 @@ def frame_tree(con: Construct) -> tree.Node:
 
 
 def _twice(made: Callable[[_Builder], tree.Node]) -> tuple[tree.Node, _Builder]:
-    """What a builder makes, and the builder; where values follow from later fields, one that knows these."""
+    """What a builder makes, and the builder; where values follow from later fields, one that knows
+    these.
+    """
     builder = _Builder()
     root = made(builder)
     if builder.rebuilding:
@@ -58,7 +70,9 @@ def _twice(made: Callable[[_Builder], tree.Node]) -> tuple[tree.Node, _Builder]:
 
 
 def _traced(expression: Any, scope: tree.Scope) -> Any:
-    """What an expression comes to; construct's own are walked, since its ``~`` asks for the truth of a value."""
+    """What an expression comes to; construct's own are walked, since its ``~`` asks for the truth
+    of a value.
+    """
     if isinstance(expression, BinExpr):
         return expression.op(_traced(expression.lhs, scope), _traced(expression.rhs, scope))
     if isinstance(expression, UniExpr):
@@ -70,15 +84,23 @@ def _traced(expression: Any, scope: tree.Scope) -> Any:
 
 
 def _spelled(expression: Any, path: str) -> str:
-    """An expression of the part at `path` as its author wrote it, with fields by their whole paths; "?" for a function."""
+    """An expression of the part at `path` as its author wrote it, with fields by their whole paths;
+    "?" for a function.
+    """
     text = repr(expression)
     if " at 0x" in text:
         return "?"
-    return re.sub(r"\bthis(?:\.\w+)+", functools.partial(_whole_path, path), re.sub(r"\['(\w+)'\]", r".\1", text))
+    return re.sub(
+        r"\bthis(?:\.\w+)+",
+        functools.partial(_whole_path, path),
+        re.sub(r"\['(\w+)'\]", r".\1", text),
+    )
 
 
 def _whole_path(path: str, way: re.Match[str]) -> str:
-    """``this.count`` or ``this._.count`` in the part at `path` as the path from the top of the frame."""
+    """``this.count`` or ``this._.count`` in the part at `path` as the path from the top of the
+    frame.
+    """
     names = path.split(".")[:-1]
     for name in way[0].split(".")[1:]:
         names = [] if name == "_root" else names[:-1] if name == "_" else [*names, name]
@@ -106,7 +128,9 @@ class _Fields:
 
 
 def seen(info: tree.FieldInfo, raw: int) -> Any:
-    """A raw value as the expressions of a struct see it: where construct's Enum has a name for it, that name."""
+    """A raw value as the expressions of a struct see it: where construct's Enum has a name for it,
+    that name.
+    """
     return construct.EnumIntegerString.new(raw, info.labels[raw]) if raw in info.labels else raw
 
 
@@ -117,7 +141,9 @@ def unnamed(raw: int) -> Any:
 
 @dataclass(frozen=True)
 class _Place:
-    """Where in the tree a construct stands: what is said of it, what its expressions see, and whether it is a part of a bit block."""
+    """Where in the tree a construct stands: what is said of it, what its expressions see, and
+    whether it is a part of a bit block.
+    """
 
     info: tree.FieldInfo
     scope: tree.Scope | None
@@ -135,7 +161,8 @@ class _Builder:
     """Makes the nodes of a struct.
 
     Args:
-        before: that has made them once, where values follow from what stands behind them: it knows this.
+        before: that has made them once, where values follow from what stands behind them: it knows
+            this.
 
     Attributes:
         scopes: what was known at the end of each struct.
@@ -150,7 +177,8 @@ class _Builder:
         self.sizes: list[tree.Formula | None] = []
         self.rebuilding = False
         self._asked: list[tree.Ref] = []
-        #: of each struct that is being made, those that measure a part of it: which they are, and what they measure.
+        #: of each struct that is being made, those that measure a part of it: which they are, and
+        #: what they measure.
         self._measured: dict[tree.Scope, list[tuple[int, Sizing]]] = {}
 
     def node(self, con: Construct, place: _Place) -> tree.Node:
@@ -169,17 +197,23 @@ class _Builder:
         if isinstance(inner, Array):
             axis = axis_path(info)
             count = self._formula(inner.count, place)
-            return tree.Repeat(name, axis, count, self.node(inner.subcon, place.inside(axes=(*info.axes, axis))))
+            return tree.Repeat(
+                name, axis, count, self.node(inner.subcon, place.inside(axes=(*info.axes, axis)))
+            )
         if isinstance(inner, Partition):
             return self._parts(inner, place)
         if isinstance(inner, construct.IfThenElse):
             condition = self._formula(inner.condfunc, place)
-            branches = (self.node(branch, place.inside(optional=True)) for branch in (inner.thensubcon, inner.elsesubcon))
+            branches = (
+                self.node(branch, place.inside(optional=True))
+                for branch in (inner.thensubcon, inner.elsesubcon)
+            )
             return tree.When(name, condition, *branches)
         if isinstance(inner, construct.Switch):
             return self._select(inner, place)
         if isinstance(inner, Bounded) or (
-            isinstance(inner, construct.FixedSized) and is_greedy(inner.subcon, (type(construct.GreedyBytes),))
+            isinstance(inner, construct.FixedSized)
+            and is_greedy(inner.subcon, (type(construct.GreedyBytes),))
         ):
             room = self._formula(inner.length, place)
             return self.node(inner.subcon, replace(place, room=room))
@@ -192,14 +226,18 @@ class _Builder:
         return tree.Empty(name) if inner is construct.Pass else self._leaf(inner, place)
 
     def _peeled(self, con: Construct, place: _Place) -> tuple[Construct, _Place]:
-        """What is below the wrappers that only describe (name, unit, labels, constant), and what they say."""
+        """What is below the wrappers that only describe (name, unit, labels, constant), and what
+        they say.
+        """
         while True:
             if isinstance(con, construct.Renamed):
                 place = place.inside(docs=con.docs or place.info.docs)
             elif isinstance(con, Describing):
                 place = replace(place, info=con.described(place.info))
             elif isinstance(con, construct.Enum):
-                place = place.inside(labels={int(value): str(name) for value, name in con.ksymapping.items()})
+                place = place.inside(
+                    labels={int(value): str(name) for value, name in con.ksymapping.items()}
+                )
             elif isinstance(con, Const):
                 place = place.inside(const=_constant(con))
             elif isinstance(con, Limited):
@@ -216,16 +254,28 @@ class _Builder:
                 return con, place
             con = con.subcon
 
-    def _formula(self, expression: Any, place: _Place, known: tree.Scope | None = None, *, is_key: bool = False) -> tree.Formula:
+    def _formula(
+        self,
+        expression: Any,
+        place: _Place,
+        known: tree.Scope | None = None,
+        *,
+        is_key: bool = False,
+    ) -> tree.Formula:
         """A count, length, condition or key as data, as far as it can be written down."""
         if isinstance(expression, int):
             return int(expression)
-        scope = next((scope for scope in (known, place.scope) if scope is not None), tree.Scope(None, "", self._asked))
+        scope = next(
+            (scope for scope in (known, place.scope) if scope is not None),
+            tree.Scope(None, "", self._asked),
+        )
         scope.asked.clear()
         blind = False
         try:
             value = _traced(expression, scope)
-            if not isinstance(expression, ExprMixin) and any(ref.info.optional for ref in scope.asked):
+            if not isinstance(expression, ExprMixin) and any(
+                ref.info.optional for ref in scope.asked
+            ):
                 reason = "a Python function of a field that may be left out"
             elif isinstance(value, bool | int):
                 return int(value)
@@ -241,7 +291,15 @@ class _Builder:
             reason = f"a Python function of other fields ({type(error).__name__}: {error})"
         return self._code(expression, place, reason, tuple(scope.asked), blind=blind)
 
-    def _code(self, expression: Any, place: _Place, reason: str, asked: tuple[tree.Ref, ...], *, blind: bool = False) -> tree.Code:
+    def _code(
+        self,
+        expression: Any,
+        place: _Place,
+        reason: str,
+        asked: tuple[tree.Ref, ...],
+        *,
+        blind: bool = False,
+    ) -> tree.Code:
         paths, scope = list[str](), place.scope
         while scope is not None:
             paths.append(scope.path)
@@ -251,22 +309,36 @@ class _Builder:
         def function(read: tree.Read) -> Any:
             return expression(_Fields(read, ways)) if callable(expression) else expression
 
-        return tree.Code(function, tuple(dict.fromkeys(asked)), f"{path}: {reason}", _spelled(expression, path), blind)
+        return tree.Code(
+            function,
+            tuple(dict.fromkeys(asked)),
+            f"{path}: {reason}",
+            _spelled(expression, path),
+            blind,
+        )
 
     def _select(self, con: construct.Switch, place: _Place) -> tree.Select:
         key = self._formula(con.keyfunc, place, is_key=True)
         labels = key.info.labels if isinstance(key, tree.Ref) else {}
         raw = {name: value for value, name in labels.items()}
         # construct looks a value that has a name up by that name alone
-        values = {case: raw.get(str(case), case) if isinstance(case, str) else case for case in con.cases if case not in labels}
+        values = {
+            case: raw.get(str(case), case) if isinstance(case, str) else case
+            for case in con.cases
+            if case not in labels
+        }
         odd = [case for case, value in values.items() if not isinstance(value, int)]
         if odd and not isinstance(key, tree.Code):
-            named = isinstance(key, tree.Ref) and isinstance(odd[0], str)
-            reason = f"{key.path} has no value named {odd[0]!r}" if named else f"a case for {odd[0]!r}, which is no integer"  # type: ignore[union-attr]
+            if isinstance(key, tree.Ref) and isinstance(odd[0], str):
+                reason = f"{key.path} has no value named {odd[0]!r}"
+            else:
+                reason = f"a case for {odd[0]!r}, which is no integer"
             key = self._code(con.keyfunc, place, reason, tuple(tree.refs(key)))
         if isinstance(key, tree.Code):
             values = {case: case for case in con.cases}
-        cases = tuple((value, self._branch(con.cases[case], place)) for case, value in values.items())
+        cases = tuple(
+            (value, self._branch(con.cases[case], place)) for case, value in values.items()
+        )
         return tree.Select(place.name, key, cases, self._branch(con.default, place))
 
     def _branch(self, con: Construct, place: _Place) -> tree.Node:
@@ -281,22 +353,40 @@ class _Builder:
         self._measured[scope] = []
         for child in con.subcons:
             path = ".".join(part for part in (info.path, child.name) if part)
-            said = tree.FieldInfo(path, info.axes, docs=info.docs if place.in_bits else "", optional=info.optional)
+            said = tree.FieldInfo(
+                path, info.axes, docs=info.docs if place.in_bits else "", optional=info.optional
+            )
             inside = _Place(said, scope, child.name or "", place.in_bits)
             part = unwrap(child)
-            if isinstance(filler := unwrap(part.thensubcon) if isinstance(part, construct.IfThenElse) else part, Filler):
-                inside = replace(inside, room=self._padding(filler, inside, _from(members, filler.of[0])))
+            if isinstance(
+                filler := (
+                    unwrap(part.thensubcon) if isinstance(part, construct.IfThenElse) else part
+                ),
+                Filler,
+            ):
+                inside = replace(
+                    inside, room=self._padding(filler, inside, _from(members, filler.of[0]))
+                )
             elif place.room is not None and child is con.subcons[-1]:
-                inside = replace(inside, room=tree.joined("-", place.room, tree.total(map(tree.size, members))))
+                inside = replace(
+                    inside, room=tree.joined("-", place.room, tree.total(map(tree.size, members)))
+                )
             members.append(self.node(child, inside))
         self.scopes[info.path] = scope
         made = tree.Struct(place.name, info.path, tuple(members), info.docs)
         for index, sizing in self._measured.pop(scope):
             part = _below(made, sizing.of[sizing.out :])
-            self.sizes[index] = tree.total((_from(members, sizing.since, part.name) if sizing.since else tree.size(part), sizing.plus))
+            self.sizes[index] = tree.total(
+                (
+                    _from(members, sizing.since, part.name) if sizing.since else tree.size(part),
+                    sizing.plus,
+                )
+            )
         return made
 
-    def _padding(self, con: Filler, place: _Place, size: tree.Formula | None) -> tree.Formula | None:
+    def _padding(
+        self, con: Filler, place: _Place, size: tree.Formula | None
+    ) -> tree.Formula | None:
         """The bytes behind a part of this size."""
         number = self._formula(con.modulus if con.to is None else con.to, place)
         if con.to is not None:
@@ -310,72 +400,137 @@ class _Builder:
             scope = None if scope is None else scope.parent
         if scope not in self._measured:
             raise SpecError(
-                f"SizeOf measures {'.'.join(con.of)!r}, which is beyond the frame, or the part, that it stands in", path=place.info.path
+                f"SizeOf measures {'.'.join(con.of)!r}, which is beyond the frame, or the part,"
+                " that it stands in",
+                path=place.info.path,
             )
         index = len(self.sizes)
         self._measured[scope].append((index, con))
         self.sizes.append(None)
         size = self._sizes[index] if self._sizes else None
-        return None if isinstance(size, tree.Ref) and size.path == place.info.path else size  # what it says itself holds
+        return (
+            None if isinstance(size, tree.Ref) and size.path == place.info.path else size
+        )  # what it says itself holds
 
     def _filling(self, con: construct.GreedyRange, place: _Place) -> tree.Node:
         """As many elements as fill a part, where all are of one size."""
         axis = axis_path(place.info)
-        element = self.node(con.subcon, replace(place.inside(axes=(*place.info.axes, axis)), room=None))
+        element = self.node(
+            con.subcon, replace(place.inside(axes=(*place.info.axes, axis)), room=None)
+        )
         size = tree.size(element)
         if not isinstance(size, int) or not size:
-            reason = "elements of sizes of their own, which fill a length: say Parts(element, within=...) for them"
+            reason = (
+                "elements of sizes of their own, which fill a length: say Parts(element,"
+                " within=...) for them"
+            )
             return tree.Opaque(place.name, place.info, "GreedyRange", reason, (element,))
         return tree.Repeat(place.name, axis, tree.calculated("//", place.room, size), element)  # type: ignore[arg-type]
 
     def _parts(self, con: Partition, place: _Place) -> tree.Parts:
         info, scope, axis = place.info, place.scope, axis_path(place.info)
         assert scope is not None  # since parts are a member of a struct
-        elements = [self.node(case, place.inside(axes=(*info.axes, axis))) for case in con.cases.values()]
+        elements = [
+            self.node(case, place.inside(axes=(*info.axes, axis))) for case in con.cases.values()
+        ]
         kinds, outer = list[tree.Kind](), dict[tree.Ref, None]()
         for (name, case), element in zip(con.cases.items(), elements, strict=True):
             root, following = self._alone(case, con.following, place)
             kinds.append(tree.Kind(name, element, root, following))
-            asked = [ref for node in tree.nodes(root) for formula in tree.formulas(node) for ref in tree.refs(formula)]
+            asked = [
+                ref
+                for node in tree.nodes(root)
+                for formula in tree.formulas(node)
+                for ref in tree.refs(formula)
+            ]
             asked += [] if following is None else tree.refs(following)
-            outer |= dict.fromkeys(tree.Ref(ref.path[2:], ref.info) for ref in asked if ref.path.startswith("_."))
-        count, size, within = (None if rule is None else self._formula(rule, place) for rule in (con.count, con.size, con.within))
-        total = tree.FieldInfo(f"{info.path}.size", info.axes, np.dtype(np.int64), "int", bits=64, docs="bytes of all parts")
+            outer |= dict.fromkeys(
+                tree.Ref(ref.path[2:], ref.info) for ref in asked if ref.path.startswith("_.")
+            )
+        count, size, within = (
+            None if rule is None else self._formula(rule, place)
+            for rule in (con.count, con.size, con.within)
+        )
+        total = tree.FieldInfo(
+            f"{info.path}.size",
+            info.axes,
+            np.dtype(np.int64),
+            "int",
+            bits=64,
+            docs="bytes of all parts",
+        )
         known = scope.names[place.name] = tree.Scope(scope, info.path, self._asked)
         known.add("size", tree.Ref(total.path, total))
         return tree.Parts(place.name, axis, tuple(kinds), count, size, within, tuple(outer), total)
 
-    def _alone(self, case: Construct, following: Any, place: _Place) -> tuple[tree.Node, tree.Formula | None]:
+    def _alone(
+        self, case: Construct, following: Any, place: _Place
+    ) -> tuple[tree.Node, tree.Formula | None]:
         """A part as a frame in itself, and the size of the one behind it."""
 
         def around(builder: _Builder) -> _Place:
             return _Place(tree.FieldInfo(""), tree.Outside(place.scope, builder._asked))  # type: ignore[arg-type]
 
         root, builder = _twice(lambda builder: builder.node(case, around(builder)))
-        rule = None if following is None else builder._formula(following, replace(around(builder), scope=builder.scopes[""]))
+        rule = (
+            None
+            if following is None
+            else builder._formula(following, replace(around(builder), scope=builder.scopes[""]))
+        )
         return root, rule
 
     def _check(self, con: construct.Check, place: _Place) -> tree.Node:
-        """A condition on fields that stand side by side, as far as 64-bit integers hold what it comes to."""
+        """A condition on fields that stand side by side, as far as 64-bit integers hold what it
+        comes to.
+        """
         condition, info = self._formula(con.func, place), place.info
         if isinstance(condition, int):
             return tree.Empty(place.name) if condition else tree.Never(place.name)
         try:
-            asked = [ref for ref in tree.refs(condition) if ref.path.startswith("_.") or ref.info.axes != info.axes[: len(ref.info.axes)]]
-            if not asked and tree.width(condition) <= tree.MOST_BITS and all(map(_is_whole, tree.parts(condition))):
+            asked = [
+                ref
+                for ref in tree.refs(condition)
+                if ref.path.startswith("_.") or ref.info.axes != info.axes[: len(ref.info.axes)]
+            ]
+            if (
+                not asked
+                and tree.width(condition) <= tree.MOST_BITS
+                and all(map(_is_whole, tree.parts(condition)))
+            ):
                 return tree.Check(place.name, info.path, info.axes, condition)
-            reason = f"{info.path}: it asks for {asked[0].path}, another array or frame" if asked else f"{info.path}: it may exceed 64 bits"
+            reason = (
+                f"{info.path}: it asks for {asked[0].path}, another array or frame"
+                if asked
+                else f"{info.path}: it may exceed 64 bits"
+            )
         except ValueError as code:
             reason = str(code)
-        return tree.Opaque(place.name, info, "Check", f"{reason.partition(': ')[2]}: plausible=lambda f: ... is judged in bulk")
+        return tree.Opaque(
+            place.name,
+            info,
+            "Check",
+            f"{reason.partition(': ')[2]}: plausible=lambda f: ... is judged in bulk",
+        )
 
     def _sealed(self, con: Sealing, place: _Place) -> tree.Node:
         body = self.node(con.subcon, place)
         if not isinstance(body, tree.Struct | tree.Sealed):
-            return tree.Opaque(place.name, place.info, type(con).__name__, "a checksum around something that is no struct", (body,))
+            return tree.Opaque(
+                place.name,
+                place.info,
+                type(con).__name__,
+                "a checksum around something that is no struct",
+                (body,),
+            )
         prefix = f"{place.info.path}." if place.info.path else ""
         over = (prefix + con.over[0], prefix + con.over[-1]) if con.over is not None else None
-        return tree.Sealed(body, tuple(prefix + name for name in con.fields), over, con.algorithm, tuple(sorted(con.absent)))
+        return tree.Sealed(
+            body,
+            tuple(prefix + name for name in con.fields),
+            over,
+            con.algorithm,
+            tuple(sorted(con.absent)),
+        )
 
     def _leaf(self, con: Construct, place: _Place) -> tree.Node:
         name, info = place.name, _typed(con, place.info)
@@ -383,17 +538,26 @@ class _Builder:
             place.scope.add(name, tree.Ref(info.path, info))
         if isinstance(con, FormatField) and con.fmtstr[-1] != "?":
             big = con.fmtstr[0] in ">!" or (con.fmtstr[0] == "=" and sys.byteorder == "big")
-            node: tree.Node = tree.Number(info, con.length, _KINDS[info.dtype.kind], "big" if big else "little")  # type: ignore[union-attr]
+            node: tree.Node = _number(info, con.length, is_big=big)
         elif isinstance(con, BytesInteger) and not _is_odd(con):
-            node = tree.Number(info, con.length, _KINDS[info.dtype.kind], "little" if con.swapped else "big")  # type: ignore[union-attr]
+            node = _number(info, con.length, is_big=not con.swapped)
         elif place.room is not None and (isinstance(con, Filler) or con is construct.GreedyBytes):
             node = tree.Blob(name, info, place.room, info.const)
         elif isinstance(con, Bytes) and not isinstance(con, Filler):
             node = tree.Blob(name, info, self._formula(con.length, place), info.const)
         else:
             kind = type(con).__name__
-            size = self._formula(con.length, place) if isinstance(con, construct.FixedSized) else None
-            node = tree.Opaque(name, info, kind, _INSTEAD.get(kind, f"{kind} has no fixed place"), size=size, form=_form(con))
+            size = (
+                self._formula(con.length, place) if isinstance(con, construct.FixedSized) else None
+            )
+            node = tree.Opaque(
+                name,
+                info,
+                kind,
+                _INSTEAD.get(kind, f"{kind} has no fixed place"),
+                size=size,
+                form=_form(con),
+            )
         if not name and info.const is not None and not isinstance(node, tree.Opaque):
             return tree.Blob("", info, con.length, con.build(info.const))
         return node
@@ -407,19 +571,34 @@ class _Builder:
         except (construct.ConstructError, LookupError):
             fields = None
         if fields is None:
-            reason = "a bit block whose values are not plain bits of it: declare the bits as they come, and undo it in `points`"
-            return tree.Opaque(place.name, place.info, type(con).__name__, reason, (inside,), in_bits=True)
-        infos = {node.info.path: node.info for node in tree.nodes(inside) if isinstance(node, tree.Number | tree.Blob | tree.Opaque)}
+            reason = (
+                "a bit block whose values are not plain bits of it: declare the bits as they come,"
+                " and undo it in `points`"
+            )
+            return tree.Opaque(
+                place.name, place.info, type(con).__name__, reason, (inside,), in_bits=True
+            )
+        infos = {
+            node.info.path: node.info
+            for node in tree.nodes(inside)
+            if isinstance(node, tree.Number | tree.Blob | tree.Opaque)
+        }
         parts = []
         for bits in fields:
             names = tuple(key for key in bits.keys if isinstance(key, str))
             info = infos[".".join(part for part in (place.info.path, *names) if part)]
-            parts.append(tree.Part(info, bits, names, tuple(key for key in bits.keys if isinstance(key, int))))
+            parts.append(
+                tree.Part(
+                    info, bits, names, tuple(key for key in bits.keys if isinstance(key, int))
+                )
+            )
         return tree.Block(place.name, place.info, size, tuple(parts))
 
 
 def _is_whole(formula: tree.Formula) -> bool:
-    """Whether an operation gives an integer whatever its fields are: it neither divides by one nor shifts by one."""
+    """Whether an operation gives an integer whatever its fields are: it neither divides by one nor
+    shifts by one.
+    """
     return not (isinstance(formula, tree.Op) and formula.symbol in ("//", "%", "<<", ">>")) or (
         isinstance(formula.args[1], int) and formula.args[1] > 0
     )
@@ -428,7 +607,9 @@ def _is_whole(formula: tree.Formula) -> bool:
 def _from(members: Sequence[tree.Node], first: str, last: str = "") -> tree.Formula | None:
     """The bytes of some members of a struct, from one name to another, or to the end."""
     names = [member.name for member in members]
-    return tree.total(map(tree.size, members[names.index(first) : names.index(last) + 1 if last else None]))
+    return tree.total(
+        map(tree.size, members[names.index(first) : names.index(last) + 1 if last else None])
+    )
 
 
 def _below(node: tree.Node, names: Iterable[str]) -> tree.Node:
@@ -439,14 +620,24 @@ def _below(node: tree.Node, names: Iterable[str]) -> tree.Node:
     """
     for name in names:
         body = node.struct if isinstance(node, tree.Sealed) else node
-        found = [member for member in body.members if member.name == name] if isinstance(body, tree.Struct) else []
+        found = (
+            [member for member in body.members if member.name == name]
+            if isinstance(body, tree.Struct)
+            else []
+        )
         if not found:
-            raise SpecError(f"SizeOf measures {'.'.join(names)!r}, and there is no part {name!r}", path=getattr(body, "path", ""))
+            raise SpecError(
+                f"SizeOf measures {'.'.join(names)!r}, and there is no part {name!r}",
+                path=getattr(body, "path", ""),
+            )
         node = found[0]
     return node
 
 
-_TURNED = "{} makes other bytes of those on the wire: declare them as they come and undo it in `points` (f.x ^ 0x55), or say a WireForm"
+_TURNED = (
+    "{} makes other bytes of those on the wire: declare them as they come and undo it in `points`"
+    " (f.x ^ 0x55), or say a WireForm"
+)
 
 #: of what construct alone can read, what to write in its place.
 _INSTEAD = {
@@ -455,22 +646,44 @@ _INSTEAD = {
         name: f"{name} has no numbers of its own: say the Array or Struct below it"
         for name in ("Slicing", "Indexing", "NamedTuple", "LazyArray")
     },
-    "StringEncoded": "a text has no numbers and no fixed place: say Bytes(n), and decode it where it is shown",
+    "StringEncoded": (
+        "a text has no numbers and no fixed place: say Bytes(n), and decode it where it is shown"
+    ),
     "Mapping": "Mapping to what is no name: say Enum, or Scaled(field, step, unit) for numbers",
-    "ExprAdapter": "ExprAdapter is Python code: say Scaled(field, step, unit, offset), or calculate it in `points`",
-    "ExprValidator": "a test of values that are not listed: say OneOf with those that there are, or plausible=lambda f: ...",
-    "Computed": "Computed is no field of the wire: calculate it in `points`, and repeat it where a count needs it",
-    "Peek": "Peek reads bytes twice: declare them as a field, and let If or Switch behind it choose",
+    "ExprAdapter": (
+        "ExprAdapter is Python code: say Scaled(field, step, unit, offset), or calculate it in"
+        " `points`"
+    ),
+    "ExprValidator": (
+        "a test of values that are not listed: say OneOf with those that there are, or"
+        " plausible=lambda f: ..."
+    ),
+    "Computed": (
+        "Computed is no field of the wire: calculate it in `points`, and repeat it where a count"
+        " needs it"
+    ),
+    "Peek": (
+        "Peek reads bytes twice: declare them as a field, and let If or Switch behind it choose"
+    ),
     "Tell": "Tell is no field of the wire: SizeOf says and holds the length of a part",
     "Index": "Index is no field of the wire: in `points` the index of an element is f.x.index",
-    "LazyBound": "LazyBound has no fixed place: say the part itself, or Parts for one after another",
+    "LazyBound": (
+        "LazyBound has no fixed place: say the part itself, or Parts for one after another"
+    ),
     "VarInt": "VarInt has no fixed place: a WireForm makes numbers of as many bytes as they need",
     "ZigZag": "ZigZag has no fixed place: a WireForm makes numbers of as many bytes as they need",
-    "FocusedSeq": "PrefixedArray is compiled as a named member of a Struct alone: Struct('points' / PrefixedArray(...))",
-    "Prefixed": "Prefixed is compiled as a named member of a Struct alone: Struct('part' / Prefixed(...))",
+    "FocusedSeq": (
+        "PrefixedArray is compiled as a named member of a Struct alone: Struct('points' /"
+        " PrefixedArray(...))"
+    ),
+    "Prefixed": (
+        "Prefixed is compiled as a named member of a Struct alone: Struct('part' / Prefixed(...))"
+    ),
     "Sequence": "the parts of a Sequence have no names: say Struct('a' / ..., 'b' / ...)",
     "LazyStruct": "LazyStruct has no fixed place: say Struct, which is read in bulk",
-    "RepeatUntil": "RepeatUntil has no fixed place: say Array with a count, or Parts with one of its rules",
+    "RepeatUntil": (
+        "RepeatUntil has no fixed place: say Array with a count, or Parts with one of its rules"
+    ),
 }
 
 #: what takes all bytes as they are.
@@ -478,6 +691,12 @@ _BYTES = (type(construct.GreedyBytes),)
 
 #: of numbers, by those of their types.
 _KINDS: dict[str, Literal["uint", "int", "float"]] = {"u": "uint", "i": "int", "f": "float"}
+
+
+def _number(info: tree.FieldInfo, size: int, *, is_big: bool) -> tree.Number:
+    """Return the node of a number of whole bytes."""
+    assert info.dtype is not None
+    return tree.Number(info, size, _KINDS[info.dtype.kind], "big" if is_big else "little")
 
 
 def axis_path(info: tree.FieldInfo) -> str:
@@ -498,8 +717,14 @@ def _typed(con: Construct, info: tree.FieldInfo) -> tree.FieldInfo:
     """What is known of a field, with the type of its values."""
     if isinstance(con, FormatField):
         code = con.fmtstr[-1]
-        kind, letter = ("float", "f") if code in "efd" else ("int", "u" if code.isupper() or code == "?" else "i")
-        return replace(info, dtype=np.dtype(f"{letter}{con.length}"), kind=kind, bits=8 * con.length)
+        kind, letter = (
+            ("float", "f")
+            if code in "efd"
+            else ("int", "u" if code.isupper() or code == "?" else "i")
+        )
+        return replace(
+            info, dtype=np.dtype(f"{letter}{con.length}"), kind=kind, bits=8 * con.length
+        )
     if isinstance(con, BytesInteger | BitsInteger) and isinstance(con.length, int):
         bits = con.length * (8 if isinstance(con, BytesInteger) else 1)
         dtype = integer_type(bits, signed=bool(con.signed)) if bits <= 64 else None
@@ -508,7 +733,9 @@ def _typed(con: Construct, info: tree.FieldInfo) -> tree.FieldInfo:
         return replace(info, dtype=np.dtype("u1"), kind="int", bits=1)
     if isinstance(con, Bytes):
         bits = 8 * con.length if isinstance(con.length, int) else 0
-        return replace(info, dtype=np.dtype("u1"), kind="bytes", bits=bits, axes=(*info.axes, axis_path(info)))
+        return replace(
+            info, dtype=np.dtype("u1"), kind="bytes", bits=bits, axes=(*info.axes, axis_path(info))
+        )
     if _is_text(con):
         return replace(info, dtype=np.dtype("u1"), kind="bytes", axes=(*info.axes, axis_path(info)))
     return info
@@ -516,7 +743,13 @@ def _typed(con: Construct, info: tree.FieldInfo) -> tree.FieldInfo:
 
 def _is_text(con: Construct) -> bool:
     """Whether it gives the bytes up to a terminator, or as many as are said in front of them."""
-    while isinstance(con, construct.NullTerminated | construct.NullStripped | construct.FixedSized | construct.Prefixed):
+    while isinstance(
+        con,
+        construct.NullTerminated
+        | construct.NullStripped
+        | construct.FixedSized
+        | construct.Prefixed,
+    ):
         con = con.subcon
     return con is construct.GreedyBytes
 
@@ -532,12 +765,17 @@ def _form(con: Construct) -> str:
 
 
 def _constant(con: Const) -> Any:
-    """The raw value of a constant, also where it is given by the name that construct's Enum has for it."""
+    """The raw value of a constant, also where it is given by the name that construct's Enum has for
+    it.
+    """
     below = con.subcon
     while isinstance(con.value, str) and isinstance(below, Subconstruct):
         if isinstance(below, construct.Enum):
             if con.value not in below.encmapping:
-                raise SpecError(f"the constant {str(con.value)!r} is none of {', '.join(map(str, below.encmapping))}")
+                raise SpecError(
+                    f"the constant {str(con.value)!r} is none of"
+                    f" {', '.join(map(str, below.encmapping))}"
+                )
             return int(below.encmapping[con.value])
         below = below.subcon
     return con.value
@@ -550,16 +788,26 @@ def _is_odd(con: BytesInteger) -> bool:
 
 @functools.lru_cache(maxsize=4096)
 def _probed(con: Construct, size: int) -> list[BitField] | None:
-    """The bit fields of a block; None where construct decides on its bits, or values are no plain integers."""
-    return probe(lambda block: dict(leaves(con.parse(block, _verify=False))), size) if _is_even(con) else None  # every pattern is tried
+    """The bit fields of a block; None where construct decides on its bits, or values are no plain
+    integers.
+    """
+    return (
+        probe(lambda block: dict(leaves(con.parse(block, _verify=False))), size)
+        if _is_even(con)
+        else None
+    )  # every pattern is tried
 
 
 def _is_even(con: Construct) -> bool:
-    """Whether every block is read in the same way: what a value decides on shows with few blocks only, and probing could miss it."""
+    """Whether every block is read in the same way: what a value decides on shows with few blocks
+    only, and probing could miss it.
+    """
     if isinstance(con, Struct):
         return all(map(_is_even, con.subcons))
     if isinstance(con, Subconstruct):
-        return (isinstance(con, construct.Enum) or not isinstance(con, construct.Adapter)) and _is_even(con.subcon)
+        return (
+            isinstance(con, construct.Enum) or not isinstance(con, construct.Adapter)
+        ) and _is_even(con.subcon)
     return isinstance(con, BitsInteger | Bytes | BytesInteger | FormatField | type(construct.Flag))
 
 

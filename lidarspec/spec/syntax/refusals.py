@@ -1,4 +1,6 @@
-"""What no frame can be described by: names that clash, constructs that lose bits, run code or never end; with path and reason."""
+"""What no frame can be described by: names that clash, constructs that lose bits, run code or never
+end; with path and reason.
+"""
 
 from __future__ import annotations
 
@@ -9,7 +11,16 @@ from construct import Array, Const, Construct, Container, Struct
 
 from lidarspec.errors import SpecError
 from lidarspec.spec import tree
-from lidarspec.spec.syntax.classes import GREEDY, Bounded, Describing, HeldCheck, Partition, children, fixed_size, unwrap
+from lidarspec.spec.syntax.classes import (
+    GREEDY,
+    Bounded,
+    Describing,
+    HeldCheck,
+    Partition,
+    children,
+    fixed_size,
+    unwrap,
+)
 
 #: names that `points` and the engine need for themselves.
 RESERVED = frozenset({"state", "on"})
@@ -18,18 +29,42 @@ SHADOWED = frozenset(name for name in dir(Container) if not name.startswith("_")
 #: the rule under which `lidarspec check` explains it, and the reason.
 _REFUSED: dict[type, tuple[str, str]] = {
     type(construct.Pickled): ("LS110", "Pickled runs code from the wire"),
-    construct.FlagsEnum: ("LS108", "FlagsEnum loses undeclared bits: declare each bit as a field of a BitStruct"),
+    construct.FlagsEnum: (
+        "LS108",
+        "FlagsEnum loses undeclared bits: declare each bit as a field of a BitStruct",
+    ),
     construct.RawCopy: ("LS109", "RawCopy ignores edits on rebuild: use Checksummed"),
-    construct.Checksum: ("LS109", "construct's Checksum needs RawCopy, which ignores edits on rebuild: use Checksummed"),
-    construct.Union: ("LS109", "Union reads bytes in several ways, and edits of all but one are ignored on rebuild: declare one of them"),
-    construct.Padded: ("LS106", "padding loses its bytes on a round trip: declare it as a field, such as 'reserved' / Bytes(n)"),
+    construct.Checksum: (
+        "LS109",
+        "construct's Checksum needs RawCopy, which ignores edits on rebuild: use Checksummed",
+    ),
+    construct.Union: (
+        "LS109",
+        (
+            "Union reads bytes in several ways, and edits of all but one are ignored on rebuild:"
+            " declare one of them"
+        ),
+    ),
+    construct.Padded: (
+        "LS106",
+        (
+            "padding loses its bytes on a round trip: declare it as a field, such as 'reserved' /"
+            " Bytes(n)"
+        ),
+    ),
     construct.Aligned: (
         "LS106",
-        "Aligned loses its padding on a round trip, unless it is a named member of a Struct: Struct('part' / Aligned(4, ...))",
+        (
+            "Aligned loses its padding on a round trip, unless it is a named member of a Struct:"
+            " Struct('part' / Aligned(4, ...))"
+        ),
     ),
     construct.Pointer: ("LS112", "Pointer reads outside the frame"),
     construct.Seek: ("LS112", "Seek reads outside the frame"),
-    construct.Select: ("LS113", "Select and Optional hide errors in the bytes: use If or Switch on a header field"),
+    construct.Select: (
+        "LS113",
+        "Select and Optional hide errors in the bytes: use If or Switch on a header field",
+    ),
 }
 
 #: what gives a greedy part its end, and what has none of its own.
@@ -38,10 +73,18 @@ _BOUNDED = (construct.NullTerminated, construct.FixedSized, construct.Prefixed, 
 
 #: of what stands in a struct without a name, what to write in its place.
 _INSTEAD: dict[type, str] = {
-    HeldCheck: "a Check has no name to be told by: 'valid' / Check(...), or plausible=lambda f: ..., which is judged in bulk",
-    type(construct.Terminated): "Terminated asks for the end of a stream, which a frame does not have: the last field ends it",
+    HeldCheck: (
+        "a Check has no name to be told by: 'valid' / Check(...), or plausible=lambda f: ..., which"
+        " is judged in bulk"
+    ),
+    type(construct.Terminated): (
+        "Terminated asks for the end of a stream, which a frame does not have: the last field"
+        " ends it"
+    ),
     construct.Probe: "Probe prints while it parses: lidarspec explain shows every byte of a frame",
-    construct.StopIf: "StopIf leaves out what follows in a struct: 'rest' / If(this.more, Struct(...))",
+    construct.StopIf: (
+        "StopIf leaves out what follows in a struct: 'rest' / If(this.more, Struct(...))"
+    ),
     construct.Seek: "Seek reads outside the frame: name the bytes between, 'reserved' / Bytes(n)",
 }
 
@@ -50,7 +93,8 @@ def check_struct(con: Construct) -> None:
     """Raise `SpecError` with path and reason if a frame cannot be described by this construct.
 
     Raises:
-        SpecError: for a shadowed, reserved, duplicate or missing name, or a construct that loses bits or never ends.
+        SpecError: for a shadowed, reserved, duplicate or missing name, or a construct that loses
+            bits or never ends.
     """
     _check_ends(con, "", bounded=False)
     for path, part, in_bits in _walk(con, "", in_bits=False):
@@ -58,36 +102,69 @@ def check_struct(con: Construct) -> None:
             if isinstance(part, kind):
                 raise SpecError(reason, path=path, rule=rule)
         if isinstance(part, type(construct.Flag)) and not in_bits:
-            raise SpecError("Flag keeps one bit of its byte only: use a BitStruct, or Int8ul", path=path, rule="LS107")
+            raise SpecError(
+                "Flag keeps one bit of its byte only: use a BitStruct, or Int8ul",
+                path=path,
+                rule="LS107",
+            )
         if isinstance(part, Struct):
             _check_names(part, path, in_bits=in_bits)
-        if isinstance(part, Partition) and any(child.name == "frame" for case in part.cases.values() for child in unwrap(case).subcons):
-            raise SpecError("no field of a part may be called 'frame', which is the frame around it", path=f"{path}.frame", rule="LS102")
+        if isinstance(part, Partition) and any(
+            child.name == "frame" for case in part.cases.values() for child in unwrap(case).subcons
+        ):
+            raise SpecError(
+                "no field of a part may be called 'frame', which is the frame around it",
+                path=f"{path}.frame",
+                rule="LS102",
+            )
     _check_measures(con, "", (1, 0, ""), {})
 
 
 def _check_ends(con: Construct, path: str, *, bounded: bool) -> None:
-    """Refuse what has no end on a stream: greedy parts, unless they are the last in one that has an end; and what such a one would drop."""
+    """Refuse what has no end on a stream: greedy parts, unless they are the last in one that has an
+    end; and what such a one would drop.
+    """
     path = f"{path}.{con.name}".strip(".") if isinstance(con, construct.Renamed) else path
     if isinstance(con, GREEDY) and not bounded:
-        name, what = (type(con), "length") if con is construct.GreedyBytes else (construct.GreedyRange, "count")
-        reason = f"{name.__name__} has no end of its own on a stream: give a {what}, or a terminator, or bound it by Prefixed or FixedSized"
+        name, what = (
+            (type(con), "length")
+            if con is construct.GreedyBytes
+            else (construct.GreedyRange, "count")
+        )
+        reason = (
+            f"{name.__name__} has no end of its own on a stream: give a {what}, or a terminator, or"
+            " bound it by Prefixed or FixedSized"
+        )
         raise SpecError(reason, path=path, rule="LS111")
     below = children(con)
     for child in below:
         passes = bounded and child is below[-1] if isinstance(con, Struct) else bounded
-        _check_ends(child, path, bounded=isinstance(con, _BOUNDED) or (passes and not isinstance(con, Array | construct.GreedyRange)))
+        _check_ends(
+            child,
+            path,
+            bounded=isinstance(con, _BOUNDED)
+            or (passes and not isinstance(con, Array | construct.GreedyRange)),
+        )
     is_sized = isinstance(con, construct.FixedSized)
     fits = is_sized and isinstance(con.length, int) and fixed_size(con.subcon) == con.length
     if isinstance(con, _BOUNDED) and not fits and not _fills(con.subcon, padded=is_sized):
         name = "Prefixed" if isinstance(con, Bounded) else type(con).__name__
-        named = "" if isinstance(con, Bounded | construct.NullTerminated) else ", unless it is a named member of a Struct"
-        reason = f"{name} loses what its content leaves of it{named}: let the content end with a field for it, 'rest' / GreedyBytes"
+        named = (
+            ""
+            if isinstance(con, Bounded | construct.NullTerminated)
+            else ", unless it is a named member of a Struct"
+        )
+        reason = (
+            f"{name} loses what its content leaves of it{named}: let the content end with a field"
+            " for it, 'rest' / GreedyBytes"
+        )
         raise SpecError(reason, path=path, rule="LS106")
 
 
 def _fills(con: Construct, *, padded: bool) -> bool:
-    """Whether a part takes up all bytes that it is given, and builds them again; `padded`: with zeros behind it where it is shorter."""
+    """Whether a part takes up all bytes that it is given, and builds them again; `padded`: with
+    zeros behind it where it is shorter.
+    """
     if isinstance(con, construct.NullStripped):
         return padded and con.pad == b"\0" and con.subcon is construct.GreedyBytes
     if isinstance(con, (Array, *_BOUNDED)) or not children(con):
@@ -105,31 +182,54 @@ def _check_names(struct: Struct, path: str, *, in_bits: bool) -> None:
         if name is None:
             if in_bits or not isinstance(unwrap(child), Const):
                 kind = type(unwrap(child))
-                reason = _INSTEAD.get(kind, f"an unnamed {kind.__name__} would lose its value: give it a name")
+                reason = _INSTEAD.get(
+                    kind, f"an unnamed {kind.__name__} would lose its value: give it a name"
+                )
                 raise SpecError(reason, path=path, rule="LS105")
             continue
         if name in seen:
-            raise SpecError("two fields of this name: the last one would win silently", path=place, rule="LS104")
+            raise SpecError(
+                "two fields of this name: the last one would win silently", path=place, rule="LS104"
+            )
         if name in RESERVED:
             raise SpecError("no field may be called 'state' or 'on'", path=place, rule="LS102")
         if name in SHADOWED:
-            raise SpecError(f"the name {name!r} is shadowed by a method of construct's Container", path=place, rule="LS101")
+            raise SpecError(
+                f"the name {name!r} is shadowed by a method of construct's Container",
+                path=place,
+                rule="LS101",
+            )
         if name.startswith("_") or not name.isidentifier():
-            raise SpecError("a field name must be a Python identifier without a leading underscore", path=place, rule="LS103")
+            raise SpecError(
+                "a field name must be a Python identifier without a leading underscore",
+                path=place,
+                rule="LS103",
+            )
         seen.add(name)
 
 
-def _check_measures(con: Construct, path: str, measure: tuple[float, float, str], found: dict[str, tuple[float, float, str]]) -> None:
-    """Refuse a field that branches measure in different steps or units: it is one column, and has one of each."""
+def _check_measures(
+    con: Construct,
+    path: str,
+    measure: tuple[float, float, str],
+    found: dict[str, tuple[float, float, str]],
+) -> None:
+    """Refuse a field that branches measure in different steps or units: it is one column, and has
+    one of each.
+    """
     if isinstance(con, construct.Renamed):
         path = f"{path}.{con.name}" if path else str(con.name)
         measure = (1, 0, "")
     if isinstance(con, Describing):
         said = con.described(tree.FieldInfo(""))
         measure = (said.scale, said.offset, said.unit)
-    is_number = isinstance(con, construct.FormatField | construct.BytesInteger | construct.BitsInteger)
+    is_number = isinstance(
+        con, construct.FormatField | construct.BytesInteger | construct.BitsInteger
+    )
     if is_number and found.setdefault(path, measure) != measure:
-        raise SpecError("its branches have different scales or units: give each a name of its own", path=path)
+        raise SpecError(
+            "its branches have different scales or units: give each a name of its own", path=path
+        )
     for child in children(con):
         if not isinstance(con, Struct) or child.name is not None:
             _check_measures(child, path, measure, found)

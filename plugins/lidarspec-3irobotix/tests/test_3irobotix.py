@@ -16,16 +16,29 @@ DELTA_2A, DELTA_2G = ls.sensor("3irobotix-delta2a"), ls.sensor("3irobotix-delta2
 
 
 def test_the_packets_of_a_delta_2a() -> None:
-    data, expected = vector_bytes(FILE, "delta_2a_data_capture"), vectors(FILE)["delta_2a_data_capture"]["expected"]
+    data, expected = (
+        vector_bytes(FILE, "delta_2a_data_capture"),
+        vectors(FILE)["delta_2a_data_capture"]["expected"],
+    )
     packets = decoded(DELTA_2A, data)
     parsed, cloud = DELTA_2A.parse(data), packets.points()
     assert DELTA_2A.build("data", parsed) == data
-    assert (parsed.length, parsed.size, parsed.sum) == (expected["length"], expected["data_len"], expected["cs"])
+    assert (parsed.length, parsed.size, parsed.sum) == (
+        expected["length"],
+        expected["data_len"],
+        expected["cs"],
+    )
     assert packets["speed"].tolist() == [expected["speed_hz"]]
     assert packets["zero_offset"].tolist() == [expected["zero_offset_deg"]]
-    assert [[sample.quality, sample.distance] for sample in parsed.samples[:3]] == expected["first3"]
+    assert [[sample.quality, sample.distance] for sample in parsed.samples[:3]] == expected[
+        "first3"
+    ]
     assert np.round(cloud.range[-1] * 1000, 2) == expected["last_mm"]
-    np.testing.assert_allclose(clockwise(cloud), expected["start_deg"] + np.arange(expected["n"]) * 22.5 / expected["n"], atol=1e-4)
+    np.testing.assert_allclose(
+        clockwise(cloud),
+        expected["start_deg"] + np.arange(expected["n"]) * 22.5 / expected["n"],
+        atol=1e-4,
+    )
     speed = DELTA_2A.parse(vector_bytes(FILE, "delta_2a_rpm_only"))
     assert (speed.version, speed.speed) == (0, 201)  # 10.05 Hz
 
@@ -42,4 +55,6 @@ def test_a_2g_is_told_by_where_its_packets_start_and_the_others_not_at_all() -> 
     assert verdict(Heard("", tuple(simulate(DELTA_2G, 60)))).sensor is DELTA_2G
     found = verdict(Heard("", tuple(simulate(DELTA_2A, 60))))
     assert found.sensor is None
-    assert {score.sensor.id for score in found.alike} == {f"3irobotix-{name}" for name in ("delta2a", "delta2b", "delta2d", "lds08rr")}
+    assert {score.sensor.id for score in found.alike} == {
+        f"3irobotix-{name}" for name in ("delta2a", "delta2b", "delta2d", "lds08rr")
+    }

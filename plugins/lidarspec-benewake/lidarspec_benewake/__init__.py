@@ -1,11 +1,14 @@
-"""Benewake TFmini-S, TFmini Plus and TF-Luna: rangefinders with one beam over a UART, which send by themselves.
+"""Benewake TFmini-S, TFmini Plus and TF-Luna: rangefinders with one beam over a UART, which send by
+themselves.
 
-Source: TFmini-S manual A01, sections 5 and 7, table 12; TFmini Plus manual A04, the same sections, and its data sheet A00; TF-Luna manual
-A05, section 5, appendices I and II. The first TFmini sends the same frames with other numbers in place of the temperature, and has other
-commands. Frames do not say whether their distances are centimetres, as they come, or millimetres: ``configure(unit="mm")`` reads what
-`set_unit_mm` asks for. The formats of text and those with a time are not here. A TF-Luna's manual has commands with a sum of 00, which it
-does not look at; the others do. The answers that
-the TFmini-S manual prints to a reset, factory settings and a save have the sums of their commands; here they are those of their own bytes.
+Source: TFmini-S manual A01, sections 5 and 7, table 12; TFmini Plus manual A04, the same sections,
+and its data sheet A00; TF-Luna manual A05, section 5, appendices I and II. The first TFmini sends
+the same frames with other numbers in place of the temperature, and has other commands. Frames do
+not say whether their distances are centimetres, as they come, or millimetres:
+``configure(unit="mm")`` reads what `set_unit_mm` asks for. The formats of text and those with a
+time are not here. A TF-Luna's manual has commands with a sum of 00, which it does not look at; the
+others do. The answers that the TFmini-S manual prints to a reset, factory settings and a save have
+the sums of their commands; here they are those of their own bytes.
 """
 
 from __future__ import annotations
@@ -18,9 +21,25 @@ from typing import Any
 from construct import Const, Int8ul, Int16ul, Int32ul, Struct
 
 from lidarspec import UsageError
-from lidarspec.spec import Checksummed, Command, Every, Fields, Frame, Polar, Scaled, Sensor, Serial, Simulation, Sum, hookimpl
+from lidarspec.spec import (
+    Checksummed,
+    Command,
+    Every,
+    Fields,
+    Frame,
+    Polar,
+    Scaled,
+    Sensor,
+    Serial,
+    Simulation,
+    Sum,
+    hookimpl,
+)
 
-WEAK, BLINDED = 100, 0xFFFF  # signals below and at which the distance is not to be relied on (TFmini-S 5.3, TF-Luna 5.4)
+WEAK, BLINDED = (
+    100,
+    0xFFFF,
+)  # signals below and at which the distance is not to be relied on (TFmini-S 5.3, TF-Luna 5.4)
 UNITS = {"cm": 0.01, "mm": 0.001}
 VERSION, RESET, RATE, TRIGGER, FORMAT, BAUD, OUTPUT, FACTORY, SAVE = 1, 2, 3, 4, 5, 6, 7, 0x10, 0x11
 HEAD = "header" / Const(b"\x5a") * "then the length of the frame"
@@ -62,8 +81,12 @@ def framed(size: int, *fields: Any, out: bool = False) -> Frame:
 
 
 def known(f: Fields) -> Any:
-    """What is answered with one byte: a reset, the format, the output, factory settings, and that settings are saved."""
-    return (f.id == RESET) | (f.id == FORMAT) | (f.id == OUTPUT) | (f.id == FACTORY) | (f.id == SAVE)
+    """What is answered with one byte: a reset, the format, the output, factory settings, and that
+    settings are saved.
+    """
+    return (
+        (f.id == RESET) | (f.id == FORMAT) | (f.id == OUTPUT) | (f.id == FACTORY) | (f.id == SAVE)
+    )
 
 
 def of(number: int) -> Any:
@@ -77,7 +100,9 @@ FRAMES = {
     "version": framed(7, of(VERSION), "revision" / Int8ul, "minor" / Int8ul, "major" / Int8ul),
     "rate": framed(6, of(RATE), RATE_FIELD),
     "baud": framed(8, of(BAUD), BAUD_FIELD),
-    "setting": framed(5, "id" / Int8ul, "value" / Int8ul * "what is set; of an action, 0: it succeeded"),
+    "setting": framed(
+        5, "id" / Int8ul, "value" / Int8ul * "what is set; of an action, 0: it succeeded"
+    ),
     "request": framed(4, "id" / Int8ul, out=True),
     "set_rate": framed(6, of(RATE), RATE_FIELD, out=True),
     "set_baud": framed(8, of(BAUD), BAUD_FIELD, out=True),
@@ -92,20 +117,37 @@ def action(number: int) -> Command:
 
 def setting(number: int, value: int, **more: Any) -> Command:
     """What is set to a value, and answered with the same."""
-    return Command("set", {"id": number, "value": value}, reply="setting", echoes=("id", "value"), retries=1, **more)
+    return Command(
+        "set",
+        {"id": number, "value": value},
+        reply="setting",
+        echoes=("id", "value"),
+        retries=1,
+        **more,
+    )
 
 
 def commands(fastest: int) -> dict[str, Command]:
-    """The commands of a model that sends so many frames a second at most; what is set is lost with the power unless it is saved."""
+    """The commands of a model that sends so many frames a second at most; what is set is lost with
+    the power unless it is saved.
+    """
     return {
         "get_version": Command("request", {"id": VERSION}, reply="version", retries=1),
         "output_on": setting(OUTPUT, 1, starts=True),
         "output_off": setting(OUTPUT, 0, stops=True),
-        "set_rate": Command("set_rate", args={"rate": ("rate", 0, fastest)}, reply="rate", echoes=("rate",), retries=1),
+        "set_rate": Command(
+            "set_rate",
+            args={"rate": ("rate", 0, fastest)},
+            reply="rate",
+            echoes=("rate",),
+            retries=1,
+        ),
         "trigger": Command("request", {"id": TRIGGER}, reply="data"),
         "set_unit_cm": setting(FORMAT, 1),
         "set_unit_mm": setting(FORMAT, 6),
-        "set_baud": Command("set_baud", args={"baud": ("baud", 9600, 921_600)}, reply="baud", echoes=("baud",)),
+        "set_baud": Command(
+            "set_baud", args={"baud": ("baud", 9600, 921_600)}, reply="baud", echoes=("baud",)
+        ),
         "save": action(SAVE),
         "factory_settings": action(FACTORY),
         "reset": action(RESET),
@@ -141,8 +183,20 @@ MODELS: dict[str, tuple[str, tuple[float, float], int, tuple[str, ...], str]] = 
         ("tfmini", "tfmini-s", "benewake-tfmini-s"),
         "TFmini-S manual A01, 5.3 and table 12",
     ),
-    "benewake-tfmini-plus": ("TFmini Plus", (0.1, 12.0), 1000, ("tfmini-plus",), "TFmini Plus manual A04, 5.3 and 7; data sheet A00"),
-    "benewake-tfluna": ("TF-Luna", (0.2, 8.0), 250, ("tf-luna", "benewake-tf-luna"), "TF-Luna manual A05, 5 and appendix II"),
+    "benewake-tfmini-plus": (
+        "TFmini Plus",
+        (0.1, 12.0),
+        1000,
+        ("tfmini-plus",),
+        "TFmini Plus manual A04, 5.3 and 7; data sheet A00",
+    ),
+    "benewake-tfluna": (
+        "TF-Luna",
+        (0.2, 8.0),
+        250,
+        ("tf-luna", "benewake-tf-luna"),
+        "TF-Luna manual A05, 5 and appendix II",
+    ),
 }
 
 
@@ -158,11 +212,17 @@ def rangefinder(name: str) -> Sensor:
         scan=Every(0.1),
         links={"data": Serial(115_200)},
         commands=commands(fastest),
-        simulation=Simulation(lambda i: {"strength": 1000, "temperature": 21.0}, rate=100, answers=answers()),
+        simulation=Simulation(
+            lambda i: {"strength": 1000, "temperature": 21.0}, rate=100, answers=answers()
+        ),
         configure=configure,
         on_open=("output_on",),
         range_limits=limits,
-        relatives={other: "nothing in its frames: the label on the housing" for other in MODELS if other != name},
+        relatives={
+            other: "nothing in its frames: the label on the housing"
+            for other in MODELS
+            if other != name
+        },
         info={"temperature": "data.temperature"},
         aliases=aliases,
         status="vectors",

@@ -1,4 +1,6 @@
-"""Benewake TFmini and TF-Luna: the manuals' frames and commands, what is unreliable, and millimetres."""
+"""Benewake TFmini and TF-Luna: the manuals' frames and commands, what is unreliable, and
+millimetres.
+"""
 
 from __future__ import annotations
 
@@ -25,11 +27,17 @@ def frame(distance: int, strength: int = 1000) -> bytes:
 
 
 def test_every_vector_of_the_family_is_used() -> None:
-    assert {name for name in vectors(FILE) if name.startswith("tfmini_")} == {"tfmini_frame_synth", *COMMANDS}
+    assert {name for name in vectors(FILE) if name.startswith("tfmini_")} == {
+        "tfmini_frame_synth",
+        *COMMANDS,
+    }
 
 
 def test_the_published_frame() -> None:
-    data, expected = vector_bytes(FILE, "tfmini_frame_synth"), vectors(FILE)["tfmini_frame_synth"]["expected"]
+    data, expected = (
+        vector_bytes(FILE, "tfmini_frame_synth"),
+        vectors(FILE)["tfmini_frame_synth"]["expected"],
+    )
     packets = decoded(TFMINI, data)
     assert packets["distance"].tolist() == [expected["dist_cm"] / 100]
     assert packets["strength"].tolist() == [expected["strength"]]
@@ -44,21 +52,28 @@ def test_a_command_is_the_manuals(name: str) -> None:
 
 
 def test_what_is_unreliable_is_no_point() -> None:
-    cloud = decoded(TFMINI, frame(300) + frame(300, 99) + frame(300, 0xFFFF) + frame(0xFFFF) + frame(0)).points()
+    cloud = decoded(
+        TFMINI, frame(300) + frame(300, 99) + frame(300, 0xFFFF) + frame(0xFFFF) + frame(0)
+    ).points()
     assert cloud.valid.tolist() == [True, False, False, False, False]
     assert np.isnan(cloud.range[1:4]).all()
     assert decoded(TFMINI, frame(4000)).stats.frames == {}
 
 
 def test_millimetres_are_read_where_they_were_asked_for() -> None:
-    assert TFMINI.configure(unit="mm").decode(frame(300)).points().range.tolist() == [pytest.approx(0.3)]
+    assert TFMINI.configure(unit="mm").decode(frame(300)).points().range.tolist() == [
+        pytest.approx(0.3)
+    ]
     assert TFMINI.configure(unit="cm").decode(frame(300)).points().range.tolist() == [3.0]
     with pytest.raises(ls.UsageError, match="'cm' or 'mm'"):
         TFMINI.configure(unit="m")
 
 
 def test_a_simulated_one_answers() -> None:
-    with virtual_port("benewake-tfluna") as made, ls.open(made.path, sensor="benewake-tfluna") as device:
+    with (
+        virtual_port("benewake-tfluna") as made,
+        ls.open(made.path, sensor="benewake-tfluna") as device,
+    ):
         assert device.send("get_version")["major"] == 3
         assert device.send("set_rate", rate=250)["rate"] == 250
         assert (device.send("save")["value"], device.send("factory_settings")["id"]) == (0, 0x10)

@@ -1,8 +1,11 @@
-"""Camsense X1 and the LDS08RR that sends its packets: 360 degree lidars of vacuum cleaners, which turn and send by themselves.
+"""Camsense X1 and the LDS08RR that sends its packets: 360 degree lidars of vacuum cleaners, which
+turn and send by themselves.
 
-There is no public manual. Source: packets of both (thijses/camsense-X1, "a few data packets"; kaiaai/LDS, issue 17), of which every
-checksum is right, and the drivers kaiaai/LDS (LDS_CAMSENSE_X1, LDS_LDS08RR_CAMSENSE) and lds2d. Known errors of drivers: what they call an
-unknown CRC-16 is a folded sum over all bytes before it. There are two LDS08RR: the other one sends 3iRobotix' packets, which begin with AA.
+There is no public manual. Source: packets of both (thijses/camsense-X1, "a few data packets";
+kaiaai/LDS, issue 17), of which every checksum is right, and the drivers kaiaai/LDS
+(LDS_CAMSENSE_X1, LDS_LDS08RR_CAMSENSE) and lds2d. Known errors of drivers: what they call an
+unknown CRC-16 is a folded sum over all bytes before it. There are two LDS08RR: the other one sends
+3iRobotix' packets, which begin with AA.
 """
 
 from __future__ import annotations
@@ -13,10 +16,35 @@ from functools import partial
 from typing import Any
 
 import numpy as np
-from construct import Array, BitsInteger, BitStruct, Bytes, ByteSwapped, Const, Construct, Int8ul, Int16ul, Struct
+from construct import (
+    Array,
+    BitsInteger,
+    BitStruct,
+    Bytes,
+    ByteSwapped,
+    Const,
+    Construct,
+    Int8ul,
+    Int16ul,
+    Struct,
+)
 
 from lidarspec import UsageError
-from lidarspec.spec import Checksummed, Fields, Fold15, Frame, OnWrap, Polar, Scaled, Sensor, Serial, Simulation, hookimpl, spread, wrap
+from lidarspec.spec import (
+    Checksummed,
+    Fields,
+    Fold15,
+    Frame,
+    OnWrap,
+    Polar,
+    Scaled,
+    Sensor,
+    Serial,
+    Simulation,
+    hookimpl,
+    spread,
+    wrap,
+)
 
 HOUSING = 21.0  # degrees from the data's zero to the housing's, for the X1 (the vendor's SDK)
 DISTANCE = ByteSwapped(
@@ -44,7 +72,11 @@ def data(form: int, count: int, *rest: Construct) -> Frame:
         "checksum" / Int16ul,
     )
     sealed = Checksummed(struct, field="checksum", algorithm=Fold15())
-    weak = {"LS310": "the sum loses the highest bits of the first words of a long packet"} if count > 8 else {}
+    weak = (
+        {"LS310": "the sum loses the highest bits of the first words of a long packet"}
+        if count > 8
+        else {}
+    )
     return Frame(sealed, data=True, plausible=plausible, acknowledged=weak)
 
 
@@ -54,7 +86,9 @@ def plausible(f: Fields) -> Any:
 
 
 def points(f: Fields, count: int, zero: float = 0.0) -> Polar:
-    """Even steps from the start angle to the end angle, clockwise; the direction is that of the drivers, which draw rooms with it."""
+    """Even steps from the start angle to the end angle, clockwise; the direction is that of the
+    drivers, which draw rooms with it.
+    """
     swept = spread(f.start_angle, f.end_angle, count, full=360.0)  # degrees, (n, count)
     return Polar(
         range=np.where(f.samples.range.invalid, 0, f.samples.range.distance),
@@ -65,20 +99,27 @@ def points(f: Fields, count: int, zero: float = 0.0) -> Polar:
 
 
 def configure(sensor: Sensor, *, zero: str = "data") -> Sensor:
-    """The X1 with angles counted from the zero of the data, as on the wire, or from the housing's, as the vendor's SDK does.
+    """The X1 with angles counted from the zero of the data, as on the wire, or from the housing's,
+    as the vendor's SDK does.
 
     Raises:
         UsageError: for another zero than "data" and "housing".
     """
     if zero not in ("data", "housing"):
         raise UsageError(f"{sensor.id}: zero is 'data' or 'housing', not {zero!r}")
-    return dataclasses.replace(sensor, points=partial(points, count=8, zero=HOUSING * (zero == "housing")))
+    return dataclasses.replace(
+        sensor, points=partial(points, count=8, zero=HOUSING * (zero == "housing"))
+    )
 
 
 def sweep(i: int, count: int, steps: int, speed: float) -> dict[str, float]:
     """Packet i of turns with so many points, at so many turns a minute."""
     first = i * count % steps
-    return {"speed": speed, "start_angle": first * 360 / steps, "end_angle": (first + count - 1) * 360 / steps}
+    return {
+        "speed": speed,
+        "start_angle": first * 360 / steps,
+        "end_angle": (first + count - 1) * 360 / steps,
+    }
 
 
 X1 = Sensor(
@@ -89,12 +130,17 @@ X1 = Sensor(
     points=partial(points, count=8),
     scan=OnWrap("azimuth"),
     links={"data": Serial(115_200)},
-    simulation=Simulation(partial(sweep, count=8, steps=400, speed=312)),  # 2080 samples and 5.2 turns a second
+    simulation=Simulation(
+        partial(sweep, count=8, steps=400, speed=312)
+    ),  # 2080 samples and 5.2 turns a second
     configure=configure,
     range_limits=(0.08, 8.0),
     turn=(4.5, 6.0),
     status="vectors",
-    source="three captured packets; kaiaai/LDS, LDS_CAMSENSE_X1; the housing's zero from the vendor's SDK. Limits of range are assumed",
+    source=(
+        "three captured packets; kaiaai/LDS, LDS_CAMSENSE_X1; the housing's zero from the vendor's"
+        " SDK. Limits of range are assumed"
+    ),
 )
 
 LDS08RR = dataclasses.replace(
@@ -107,7 +153,10 @@ LDS08RR = dataclasses.replace(
     configure=None,  # where the zero of its housing is, no public source says
     aliases=("lds08rr-camsense",),
     status="capture",
-    source="two captured packets; kaiaai/LDS, LDS_LDS08RR_CAMSENSE. Limits of range and speed are assumed",
+    source=(
+        "two captured packets; kaiaai/LDS, LDS_LDS08RR_CAMSENSE. Limits of range and speed are"
+        " assumed"
+    ),
 )
 
 

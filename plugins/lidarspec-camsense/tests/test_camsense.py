@@ -24,17 +24,25 @@ PACKETS = {
 
 
 def test_every_vector_of_the_family_is_used() -> None:
-    assert {name for name in vectors(FILE) if name.startswith(("camsense_", "lds08rr_"))} == PACKETS.keys()
+    assert {
+        name for name in vectors(FILE) if name.startswith(("camsense_", "lds08rr_"))
+    } == PACKETS.keys()
 
 
 @pytest.mark.parametrize("name", PACKETS)
 def test_a_packet_is_what_it_is_published_as(name: str) -> None:
-    sensor, data, expected = PACKETS[name], vector_bytes(FILE, name), vectors(FILE)[name]["expected"]
+    sensor, data, expected = (
+        PACKETS[name],
+        vector_bytes(FILE, name),
+        vectors(FILE)[name]["expected"],
+    )
     packets, cloud = decoded(sensor, data), decoded(sensor, data).points()
     assert sensor.build("data", sensor.parse(data)) == data
     assert packets["start_angle"].tolist() == [expected["start_deg"]]
     assert packets["end_angle"].tolist() == [expected.get("end_deg", packets["end_angle"][0])]
-    assert packets["speed"][0] / 60 == pytest.approx(expected.get("hz", packets["speed"][0] / 60), abs=1e-6)
+    assert packets["speed"][0] / 60 == pytest.approx(
+        expected.get("hz", packets["speed"][0] / 60), abs=1e-6
+    )
     millimetres = np.where(cloud.valid, np.round(cloud.range * 1000), 0).tolist()
     assert millimetres == expected.get("dist_mm", millimetres)
     assert cloud.intensity is not None
@@ -56,12 +64,16 @@ def test_packets_of_an_lds08rr_are_told_from_those_of_an_x1() -> None:
 
 def test_a_packet_that_crosses_360_degrees_goes_on_forward() -> None:
     angles = clockwise(decoded(X1, vector_bytes(FILE, "camsense_x1_wrap_capture")).points())
-    np.testing.assert_allclose(angles, (354.03125 + np.arange(8) * (360.5625 - 354.03125) / 7) % 360, atol=1e-4)
+    np.testing.assert_allclose(
+        angles, (354.03125 + np.arange(8) * (360.5625 - 354.03125) / 7) % 360, atol=1e-4
+    )
 
 
 def test_angles_from_the_zero_of_the_housing() -> None:
     data = vector_bytes(FILE, "camsense_x1_capture")
-    turned = clockwise(decoded(X1.configure(zero="housing"), data).points()) - clockwise(decoded(X1, data).points())
+    turned = clockwise(decoded(X1.configure(zero="housing"), data).points()) - clockwise(
+        decoded(X1, data).points()
+    )
     np.testing.assert_allclose(turned, 21, atol=1e-4)
     with pytest.raises(ls.UsageError, match="'data' or 'housing'"):
         X1.configure(zero="motor")

@@ -1,9 +1,11 @@
 """Cepton Vista: lidars that look ahead, over UDP, with points by their coordinates.
 
-Source: the opening of Cepton's Sensor Communication Specifications (developer.cepton.com/doc/data_format), and a public reader of the
-packets in Rust. Neither says whether STDV stands in this order on the wire, or as a number with the low byte first: both are taken. That
-the time of a point counts from the one before it is assumed, since 144 points take longer than its byte can say; so are the reach, and the
-pattern of a simulated one. Information and fault packets are not public, and are skipped. No packet of a sensor was seen.
+Source: the opening of Cepton's Sensor Communication Specifications
+(developer.cepton.com/doc/data_format), and a public reader of the packets in Rust. Neither says
+whether STDV stands in this order on the wire, or as a number with the low byte first: both are
+taken. That the time of a point counts from the one before it is assumed, since 144 points take
+longer than its byte can say; so are the reach, and the pattern of a simulated one. Information and
+fault packets are not public, and are skipped. No packet of a sensor was seen.
 """
 
 from __future__ import annotations
@@ -12,9 +14,34 @@ from collections.abc import Iterable
 from typing import Any
 
 import numpy as np
-from construct import Array, BitsInteger, BitStruct, Const, Int8ul, Int16sl, Int16ul, Int32ul, Int64ul, Struct, this
+from construct import (
+    Array,
+    BitsInteger,
+    BitStruct,
+    Const,
+    Int8ul,
+    Int16sl,
+    Int16ul,
+    Int32ul,
+    Int64ul,
+    Struct,
+    this,
+)
 
-from lidarspec.spec import Cartesian, Clock, Fields, Frame, OnChange, Scaled, Sensor, Sequence, Simulation, Udp, hookimpl, running
+from lidarspec.spec import (
+    Cartesian,
+    Clock,
+    Fields,
+    Frame,
+    OnChange,
+    Scaled,
+    Sensor,
+    Sequence,
+    Simulation,
+    Udp,
+    hookimpl,
+    running,
+)
 
 MOST = 144  # points of a packet
 HEADER, POINT = 24, 10  # bytes
@@ -60,7 +87,11 @@ DATA = Struct(
 
 def plausible(f: Fields) -> Any:
     """A known signature, and no more points than a packet takes."""
-    return ((f.signature == SIGNATURES[0]) | (f.signature == SIGNATURES[1])) & (f.count >= 1) & (f.count <= MOST)
+    return (
+        ((f.signature == SIGNATURES[0]) | (f.signature == SIGNATURES[1]))
+        & (f.count >= 1)
+        & (f.count <= MOST)
+    )
 
 
 def points(f: Fields) -> Cartesian:
@@ -110,7 +141,9 @@ VISTA = Sensor(
     vendor_axes=("right", "forward", "up"),
     aliases=("vista", "cepton-vista-p60", "cepton-vista-p90", "cepton-vista-x120"),
     status="manual",
-    source="Sensor Communication Specifications (opening), and a public reader; the reach is assumed",
+    source=(
+        "Sensor Communication Specifications (opening), and a public reader; the reach is assumed"
+    ),
 )
 
 

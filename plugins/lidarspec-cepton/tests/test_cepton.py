@@ -1,4 +1,6 @@
-"""Cepton Vista: the point that a public reader is tested with, pictures told apart by parity, and both orders of the signature."""
+"""Cepton Vista: the point that a public reader is tested with, pictures told apart by parity, and
+both orders of the signature.
+"""
 
 from __future__ import annotations
 
@@ -15,7 +17,15 @@ FILE, NAME = "vectors_udp3d.json", "cepton_point_unit"
 def test_the_point_of_the_public_reader() -> None:
     data, expected = vector_bytes(FILE, NAME), vectors(FILE)[NAME]["expected"]
     for signature in (b"STDV", b"VDTS"):
-        packet = signature + bytes([1, 24, 0, 0]) + bytes(8) + bytes([1, 10, 2, 0]) + bytes(4) + data + data
+        packet = (
+            signature
+            + bytes([1, 24, 0, 0])
+            + bytes(8)
+            + bytes([1, 10, 2, 0])
+            + bytes(4)
+            + data
+            + data
+        )
         assert VISTA.build("data", VISTA.parse(packet)) == packet
         cloud = decoded(VISTA, [packet]).points()
         right, ahead, up = expected["xyz"]

@@ -1,4 +1,6 @@
-"""CSPC M1C1_Mini and COIN-D4: vectors, the manual's examples, a captured start-up, points worked out by hand."""
+"""CSPC M1C1_Mini and COIN-D4: vectors, the manual's examples, a captured start-up, points worked
+out by hand.
+"""
 
 from __future__ import annotations
 
@@ -16,7 +18,11 @@ from lidarspec.testing.agreement import assert_same_points
 from tests.evidence import assert_points, clockwise, decoded, vector_bytes, vectors
 
 FILE = "vectors_serial2d.json"
-SENSOR, COIN, COIN_D6 = ls.sensor("cspc-m1c1-mini"), ls.sensor("cspc-coin-d4"), ls.sensor("cspc-coin-d6")
+SENSOR, COIN, COIN_D6 = (
+    ls.sensor("cspc-m1c1-mini"),
+    ls.sensor("cspc-coin-d4"),
+    ls.sensor("cspc-coin-d6"),
+)
 V11 = ls.sensor("cspc-m1c1-mini-v11")
 
 WHOLE = {
@@ -39,13 +45,16 @@ OLDER = {"cspc_v11_ack_start", "cspc_v11_ack_stop", "cspc_v11_si2"}  # of V11
 
 # A start packet at 0.5 degrees: 500 mm, intensity 200, scans at 5.5 Hz.
 START = bytes.fromhex("aa556f0141004100375321d307")
-# The device information of the manual with the sum put right (0403): angles to be corrected, zero at 12 degrees.
+# The device information of the manual with the sum put right (0403): angles to be corrected, zero
+# at 12 degrees.
 INFO = bytes.fromhex("a55a14000304014d3143315f4d696e690000000c00000100000004")
 
 # Four samples at 30, 120, 210 and 300 degrees, 1, 2, 4 and 8 m, intensity 100, low exposure:
-#   FSA 0f01: >> 1 = 1920, / 64 = 30.   LSA 9601: >> 1 = 19200, / 64 = 300.   Step (300 - 30) / 3 = 90.
+#   FSA 0f01: >> 1 = 1920, / 64 = 30.   LSA 9601: >> 1 = 19200, / 64 = 300.   Step (300 - 30) / 3 =
+# 90.
 #   Samples 92 S1 S2: exposure 92 & 3 = 2; intensity (S1 & 3) * 64 + (92 >> 2) = 64 + 36 = 100;
-#   distance S2 * 64 + (S1 >> 2): 15 * 64 + 40 = 1000, 31 * 64 + 16 = 2000, 62 * 64 + 32 = 4000, 125 * 64 + 0 = 8000.
+#   distance S2 * 64 + (S1 >> 2): 15 * 64 + 40 = 1000, 31 * 64 + 16 = 2000, 62 * 64 + 32 = 4000, 125
+# * 64 + 0 = 8000.
 #   CS: 55aa ^ 0400 ^ 0f01 ^ 9601 = c8aa; the four 0092 cancel; ^ 0fa1 ^ 1f41 ^ 3e81 ^ 7d01 = 9bca.
 QUADRANTS = bytes.fromhex("aa55 0004 010f 0196 ca9b 92a10f 92411f 92813e 92017d")
 
@@ -54,11 +63,21 @@ def packet(angles: tuple[float, float], distances: list[int], **more: Any) -> by
     """A point packet with raw angles in degrees and distances in millimetres."""
     samples = [{"distance": distance, "intensity": 100, "exposure": 1} for distance in distances]
     raw = [{"angle": round(angle * 64)} for angle in angles]
-    return SENSOR.build("data", fsa=raw[0], lsa=raw[1], samples=samples, **{"mt": {"frequency": 0, "start": 0}, **more})
+    return SENSOR.build(
+        "data",
+        fsa=raw[0],
+        lsa=raw[1],
+        samples=samples,
+        **{"mt": {"frequency": 0, "start": 0}, **more},
+    )
 
 
 def test_every_vector_of_the_family_is_used() -> None:
-    known = {name for name, vector in vectors(FILE).items() if name.startswith(("cspc_", "coin_")) or "CSPC" in vector["sensor"]}
+    known = {
+        name
+        for name, vector in vectors(FILE).items()
+        if name.startswith(("cspc_", "coin_")) or "CSPC" in vector["sensor"]
+    }
     assert known == WHOLE.keys() | STREAMS | WRONG | EXCERPTS | OLDER
 
 
@@ -68,7 +87,12 @@ def test_a_whole_frame_is_parsed_and_built_to_the_same_bytes(name: str) -> None:
     parsed = SENSOR.parse(data)
     assert SENSOR.build(frame, parsed) == data
     assert SENSOR.parse(data, frame) == parsed
-    for mine, printed in {"mode": "mode", "length": "length", "revision": "sw_rev", "correction": "needs_angle_correction"}.items():
+    for mine, printed in {
+        "mode": "mode",
+        "length": "length",
+        "revision": "sw_rev",
+        "correction": "needs_angle_correction",
+    }.items():
         expected = vectors(FILE)[name]["expected"]
         assert mine not in parsed or parsed[mine] == expected.get(printed, parsed[mine])
     if frame != "command":
@@ -82,7 +106,13 @@ def test_the_fields_of_the_answers_and_of_the_device_information() -> None:
     assert (ack.mode, ack.firmware, ack.reserved, ack.checksum) == (0x50, 3, bytes(6), 0xAB)
     info = SENSOR.parse(INFO)
     assert info.model == b"M1C1_Mini\0\0\0"
-    assert (info.sum, info.zero_angle, info.direction, info.correction, info.revision) == (0x0403, 12, 0, 1, 4)
+    assert (info.sum, info.zero_angle, info.direction, info.correction, info.revision) == (
+        0x0403,
+        12,
+        0,
+        1,
+        4,
+    )
     assert SENSOR.decode(INFO, "info")["zero_angle"].tolist() == [12]
 
 
@@ -91,7 +121,13 @@ def test_the_printed_sum_of_the_device_information_is_wrong() -> None:
     with pytest.raises(ls.WireError) as caught:
         SENSOR.parse(data)
     fault = caught.value
-    assert (fault.frame, fault.path, fault.offset, fault.expected, fault.got) == ("info", "sum", 4, "0x0403", "0x0402")
+    assert (fault.frame, fault.path, fault.offset, fault.expected, fault.got) == (
+        "info",
+        "sum",
+        4,
+        "0x0403",
+        "0x0402",
+    )
     assert SENSOR.parse(data, verify=False).model == b"M1C1_Mini\0\0\0"
     assert decoded(SENSOR, data).stats.bad_checksum == 1
 
@@ -111,20 +147,40 @@ def test_an_answer_of_the_older_generation_is_no_point_packet(name: str) -> None
 
 
 def test_the_samples_of_the_older_generation_have_two_bytes() -> None:
-    """The answer, what it is, and a packet with the manual's sample: 30, 120, 210 and 300 degrees, 1, 2, 7.161 and 8 m."""
+    """The answer, what it is, and a packet with the manual's sample: 30, 120, 210 and 300 degrees,
+    1, 2, 7.161 and 8 m.
+    """
     si = vector_bytes(FILE, "cspc_v11_si2")
     data = bytes.fromhex("aa55 0004 010f 0196 aeca a00f 401f") + si + bytes.fromhex("007d")
-    packets = decoded(V11, vector_bytes(FILE, "cspc_v11_ack_start") + b"\xfe\xff" + INFO + bytes.fromhex("a55a0000800181") + data)
+    packets = decoded(
+        V11,
+        vector_bytes(FILE, "cspc_v11_ack_start")
+        + b"\xfe\xff"
+        + INFO
+        + bytes.fromhex("a55a0000800181")
+        + data,
+    )
     assert packets.stats.frames == {"ack": 1, "info": 1, "scan_start": 1, "data": 1}
-    assert packets["samples.distance"][0].tolist() == pytest.approx([1, 2, vectors(FILE)["cspc_v11_si2"]["expected"]["mm"] / 1000, 8])
+    assert packets["samples.distance"][0].tolist() == pytest.approx(
+        [1, 2, vectors(FILE)["cspc_v11_si2"]["expected"]["mm"] / 1000, 8]
+    )
     # corrected as by the newer manual, at 7161 mm by 11.852045 degrees: 198.147955
-    assert_points(packets.points(), [(0, (0.94520, -0.32648, 0)), (2, (-6.80478, 2.23045, 0)), (3, (2.48973, 7.60271, 0))])
+    assert_points(
+        packets.points(),
+        [(0, (0.94520, -0.32648, 0)), (2, (-6.80478, 2.23045, 0)), (3, (2.48973, 7.60271, 0))],
+    )
     assert packets.points().intensity is None
-    assert np.rad2deg(-V11.configure(zero="housing").decode(data).points().azimuth[0]) == pytest.approx(19.055532 + 12, abs=1e-4)
+    assert np.rad2deg(
+        -V11.configure(zero="housing").decode(data).points().azimuth[0]
+    ) == pytest.approx(19.055532 + 12, abs=1e-4)
 
 
-def test_an_older_one_is_told_from_a_ydlidar_by_its_name_or_by_start_packets_that_tell_a_speed() -> None:
-    """Its packets are those of a YDLIDAR with two bytes a sample; started, it says its name, and a YDLIDAR tells how fast it turns."""
+def test_an_older_one_is_told_from_a_ydlidar_by_its_name_or_by_start_packets_that_tell_a_speed() -> (
+    None
+):
+    """Its packets are those of a YDLIDAR with two bytes a sample; started, it says its name, and a
+    YDLIDAR tells how fast it turns.
+    """
     own, other = (b"".join(simulate(ls.sensor(name), 60)) for name in (V11.id, "ydlidar-x4"))
     assert verdict(Heard("", (INFO + own,))).sensor is V11
     assert V11.id not in {alike.sensor.id for alike in verdict(Heard("", (other,))).alike}
@@ -138,7 +194,9 @@ def test_an_older_one_is_told_from_a_ydlidar_by_its_name_or_by_start_packets_tha
         packet((0.0, 0.0), []),
         packet((360.0, 10.0), [1000, 1000]),
         packet((10.0, 360.0), [1000, 1000]),
-        packet((10.0, 20.0), [1000, 1000], mt={"frequency": 55, "start": 1}),  # a start packet has one sample
+        packet(
+            (10.0, 20.0), [1000, 1000], mt={"frequency": 55, "start": 1}
+        ),  # a start packet has one sample
         bytes(200),
         b"\xff" * 200,
     ],
@@ -164,7 +222,9 @@ def test_the_first_fields_of_the_angle_example() -> None:
     assert packets["fsa.angle"].tolist() == [expected["fsa_deg"]]
     assert packets["lsa.angle"].tolist() == [expected["lsa_deg"]]
     angles = clockwise(packets.points())
-    np.testing.assert_allclose(angles[[0, 24]], [expected["angle_fsa"], expected["angle_lsa"]], atol=2e-5)
+    np.testing.assert_allclose(
+        angles[[0, 24]], [expected["angle_fsa"], expected["angle_lsa"]], atol=2e-5
+    )
     np.testing.assert_allclose(angles[[0, 24]], [37.4933, 59.3065], atol=0.003)  # as printed
     assert not np.isclose(angles[24], 59.3065, atol=1e-3)  # the printed one is 0.002 off
 
@@ -172,11 +232,19 @@ def test_the_first_fields_of_the_angle_example() -> None:
 def test_points_by_hand_with_the_correction() -> None:
     cloud = decoded(SENSOR, INFO + QUADRANTS).points()
     # Clockwise angle = raw - atan(19.16 (d - 90.15) / (90.15 d)), azimuth its negative:
-    #   1000: 30 - 10.944468 = 19.055532;    x = cos = 0.94520,      y = -sin = -0.32648   front right
-    #   2000: 120 - 11.472618 = 108.527382;  x = 2 cos = -0.63552,   y = -1.89634          back right
+    #   1000: 30 - 10.944468 = 19.055532;    x = cos = 0.94520,      y = -sin = -0.32648   front
+    # right
+    #   2000: 120 - 11.472618 = 108.527382;  x = 2 cos = -0.63552,   y = -1.89634          back
+    # right
     #   4000: 210 - 11.735960 = 198.264040;  x = 4 cos = -3.79849,   y = +1.25359          back left
-    #   8000: 300 - 11.867443 = 288.132557;  x = 8 cos = 2.48973,    y = +7.60271          front left
-    expected = [(0.94520, -0.32648, 0), (-0.63552, -1.89634, 0), (-3.79849, 1.25359, 0), (2.48973, 7.60271, 0)]
+    #   8000: 300 - 11.867443 = 288.132557;  x = 8 cos = 2.48973,    y = +7.60271          front
+    # left
+    expected = [
+        (0.94520, -0.32648, 0),
+        (-0.63552, -1.89634, 0),
+        (-3.79849, 1.25359, 0),
+        (2.48973, 7.60271, 0),
+    ]
     assert_points(cloud, enumerate(expected))
     assert cloud.intensity is not None
     assert cloud.intensity.tolist() == [100] * 4
@@ -201,7 +269,10 @@ def test_points_by_hand_without_the_correction() -> None:
 
 def test_the_device_information_decides_about_the_correction() -> None:
     off = SENSOR.build("info", {**SENSOR.parse(INFO), "correction": 0, "sum": None})
-    corrected, raw = decoded(SENSOR, INFO + QUADRANTS).points(), decoded(SENSOR, off + QUADRANTS).points()
+    corrected, raw = (
+        decoded(SENSOR, INFO + QUADRANTS).points(),
+        decoded(SENSOR, off + QUADRANTS).points(),
+    )
     np.testing.assert_allclose(clockwise(raw), [30, 120, 210, 300], atol=1e-4)
     both = decoded(SENSOR, INFO + QUADRANTS + off + QUADRANTS).points()
     np.testing.assert_array_equal(both.azimuth, np.concatenate([corrected.azimuth, raw.azimuth]))
@@ -211,16 +282,29 @@ def test_the_device_information_decides_about_the_correction() -> None:
 def test_nominal_until_the_device_information_is_known() -> None:
     assert SENSOR.decode(QUADRANTS).points().nominal
     assert not SENSOR.decode(INFO + QUADRANTS).points().nominal
-    assert not SENSOR.decode(QUADRANTS + INFO).points().nominal  # of a whole input the first one applies from the start
-    assert_same_points(decoded(SENSOR, INFO + QUADRANTS).points()[:2], decoded(SENSOR, QUADRANTS + INFO).points()[:2])
-    np.testing.assert_array_equal(SENSOR.decode(QUADRANTS).points().xyz, SENSOR.decode(INFO + QUADRANTS).points().xyz)
+    assert (
+        not SENSOR.decode(QUADRANTS + INFO).points().nominal
+    )  # of a whole input the first one applies from the start
+    assert_same_points(
+        decoded(SENSOR, INFO + QUADRANTS).points()[:2],
+        decoded(SENSOR, QUADRANTS + INFO).points()[:2],
+    )
+    np.testing.assert_array_equal(
+        SENSOR.decode(QUADRANTS).points().xyz, SENSOR.decode(INFO + QUADRANTS).points().xyz
+    )
 
 
 def test_the_correction_where_the_formula_is_delicate() -> None:
-    # 90.15 mm would be corrected by nothing, less by a negative angle; 0 is not corrected at all, nor divided by.
+    # 90.15 mm would be corrected by nothing, less by a negative angle; 0 is not corrected at all,
+    # nor divided by.
     cloud = decoded(SENSOR, packet((100.0, 100.0), [0, 90, 1, 16383])).points()
-    expected = [0.0, *(math.degrees(math.atan(19.16 * (d - 90.15) / (90.15 * d))) for d in (90, 1, 16383))]
-    np.testing.assert_allclose(clockwise(cloud), [100 - correction for correction in expected], atol=1e-4)
+    expected = [
+        0.0,
+        *(math.degrees(math.atan(19.16 * (d - 90.15) / (90.15 * d))) for d in (90, 1, 16383)),
+    ]
+    np.testing.assert_allclose(
+        clockwise(cloud), [100 - correction for correction in expected], atol=1e-4
+    )
     assert expected[1] < 0
     assert expected[2] < -86
     assert cloud.valid.tolist() == [False, True, True, True]
@@ -232,15 +316,23 @@ def test_one_sample_has_the_first_angle() -> None:
     packets = decoded(SENSOR, vector_bytes(FILE, "cspc_start_packet_synth"))
     expected = vectors(FILE)["cspc_start_packet_synth"]["expected"]
     cloud = packets.points()
-    np.testing.assert_allclose(clockwise(cloud), [expected["first_angle_deg"]], atol=2e-5)  # 0.5 - 9.883 goes below 0
+    np.testing.assert_allclose(
+        clockwise(cloud), [expected["first_angle_deg"]], atol=2e-5
+    )  # 0.5 - 9.883 goes below 0
     assert packets["mt.frequency"].tolist() == [pytest.approx(expected["scan_freq_hz"])]
-    assert (round(float(cloud.range[0]) * 1000), packets.raw["samples"]["intensity"][0, 0]) == (500, 200)
-    apart = decoded(SENSOR, packet((40.0, 80.0), [0])).points()  # LSA of a single sample does not count
+    assert (round(float(cloud.range[0]) * 1000), packets.raw["samples"]["intensity"][0, 0]) == (
+        500,
+        200,
+    )
+    apart = decoded(
+        SENSOR, packet((40.0, 80.0), [0])
+    ).points()  # LSA of a single sample does not count
     np.testing.assert_allclose(clockwise(apart), [40])
 
 
 def test_packets_that_cross_360_degrees_go_on_forward() -> None:
-    # FSA b181: >> 1 = 22720, / 64 = 355.   LSA 0281: >> 1 = 320, / 64 = 5.   Step (5 + 360 - 355) / 4 = 2.5.
+    # FSA b181: >> 1 = 22720, / 64 = 355.   LSA 0281: >> 1 = 320, / 64 = 5.   Step (5 + 360 - 355) /
+    # 4 = 2.5.
     data = bytes.fromhex("aa550005 81b1 8102 59cd 920100 92a10f 92411f 920100 92813e")
     cloud = decoded(COIN, data).points()
     np.testing.assert_allclose(clockwise(cloud), [355, 357.5, 0, 2.5, 5], atol=1e-5)
@@ -251,13 +343,27 @@ def test_packets_that_cross_360_degrees_go_on_forward() -> None:
 
 def test_angles_from_the_mark_on_the_housing() -> None:
     housing = SENSOR.configure(zero="housing")
-    turned = (clockwise(housing.decode(INFO + QUADRANTS).points()) - clockwise(SENSOR.decode(INFO + QUADRANTS).points())) % 360
+    turned = (
+        clockwise(housing.decode(INFO + QUADRANTS).points())
+        - clockwise(SENSOR.decode(INFO + QUADRANTS).points())
+    ) % 360
     np.testing.assert_allclose(turned, 12, atol=1e-4)
-    other = SENSOR.build("info", {**SENSOR.parse(INFO), "zero_angle": 20, "correction": 0, "sum": None})
-    np.testing.assert_allclose(clockwise(decoded(housing, other + QUADRANTS).points()), [50, 140, 230, 320], atol=1e-4)
-    np.testing.assert_allclose(clockwise(COIN.configure(zero="housing").decode(QUADRANTS).points())[0], 30, atol=1e-4)
-    assert_same_points(pickle.loads(pickle.dumps(housing)).decode(QUADRANTS).points(), housing.decode(QUADRANTS).points())
-    assert_same_points(SENSOR.configure(zero="data").decode(QUADRANTS).points(), SENSOR.decode(QUADRANTS).points())
+    other = SENSOR.build(
+        "info", {**SENSOR.parse(INFO), "zero_angle": 20, "correction": 0, "sum": None}
+    )
+    np.testing.assert_allclose(
+        clockwise(decoded(housing, other + QUADRANTS).points()), [50, 140, 230, 320], atol=1e-4
+    )
+    np.testing.assert_allclose(
+        clockwise(COIN.configure(zero="housing").decode(QUADRANTS).points())[0], 30, atol=1e-4
+    )
+    assert_same_points(
+        pickle.loads(pickle.dumps(housing)).decode(QUADRANTS).points(),
+        housing.decode(QUADRANTS).points(),
+    )
+    assert_same_points(
+        SENSOR.configure(zero="data").decode(QUADRANTS).points(), SENSOR.decode(QUADRANTS).points()
+    )
     with pytest.raises(ls.UsageError, match="'data' or 'housing'"):
         SENSOR.configure(zero="motor")
 

@@ -19,4 +19,17 @@ from lidarspec_hesai.xt import XT16, XT32, XT32M
 @hookimpl
 def lidarspec_sensors() -> Iterable[Sensor]:
     """The Hesai sensors."""
-    return [PANDAR40P, PANDAR64, XT32, XT16, XT32M, QT64, QT128, PANDAR128, OT128, JT128, JT16, AT128]
+    return [
+        PANDAR40P,
+        PANDAR64,
+        XT32,
+        XT16,
+        XT32M,
+        QT64,
+        QT128,
+        PANDAR128,
+        OT128,
+        JT128,
+        JT16,
+        AT128,
+    ]

@@ -1,14 +1,18 @@
-"""Hesai AT128: protocol 4.3, a header, 2 blocks of 128 channels with a finer azimuth, 1086 bytes, 1118 with a signature.
+"""Hesai AT128: protocol 4.3, a header, 2 blocks of 128 channels with a finer azimuth, 1086 bytes,
+1118 with a signature.
 
-A mirror with three faces sweeps the beams over 120 degrees to the front; a scan is what one face sees. The azimuth of a block is the
-mirror's, which turns the beam by twice as much: from the start of the face, plus that of the channel, plus what the unit's file says for
-the channel in steps of two degrees of the mirror. Between faces nothing is sent, and the azimuth jumps by some 60 degrees.
+A mirror with three faces sweeps the beams over 120 degrees to the front; a scan is what one face
+sees. The azimuth of a block is the mirror's, which turns the beam by twice as much: from the start
+of the face, plus that of the channel, plus what the unit's file says for the channel in steps of
+two degrees of the mirror. Between faces nothing is sent, and the azimuth jumps by some 60 degrees.
 
-The CRCs are those of a QT128, as far as is known; no packet of this model was seen, so they are not held.
+The CRCs are those of a QT128, as far as is known; no packet of this model was seen, so they are not
+held.
 
-Source: HesaiLidar_SDK_2.0 (udp_protocol_v4_3.h, udp4_3_parser.cc: packet, correction file 1.5, jump of 10 degrees, axes as in its code;
-correction files of an AT128E2X); tier4/nebula (times, 1 to 180 m, three scans in each turn of 200 rpm). The SDK takes the steps of the
-corrections by halves, nebula evenly, as here.
+Source: HesaiLidar_SDK_2.0 (udp_protocol_v4_3.h, udp4_3_parser.cc: packet, correction file 1.5, jump
+of 10 degrees, axes as in its code; correction files of an AT128E2X); tier4/nebula (times, 1 to 180
+m, three scans in each turn of 200 rpm). The SDK takes the steps of the corrections by halves,
+nebula evenly, as here.
 """
 
 from __future__ import annotations
@@ -20,20 +24,49 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from construct import Array, Bytes, Const, ConstructError, Int8ul, Int16ul, Int32sl, Int32ul, OneOf, Struct, this
+from construct import (
+    Array,
+    Bytes,
+    Const,
+    ConstructError,
+    Int8ul,
+    Int16ul,
+    Int32sl,
+    Int32ul,
+    OneOf,
+    Struct,
+    this,
+)
 
 from lidarspec import UsageError
 from lidarspec.spec import Fields, Frame, Learned, OnJump, Polar, Scaled, take
 from lidarspec_hesai.calibration import Calibration, Table, content
 from lidarspec_hesai.family import spinning
 from lidarspec_hesai.parts import FACTORY, RETURN_MODES, UTC, returns_of, turning
-from lidarspec_hesai.sealed import BLOCKS, LASERS, UNSEEN, distance, in_body, longest, packet, plausible
+from lidarspec_hesai.sealed import (
+    BLOCKS,
+    LASERS,
+    UNSEEN,
+    distance,
+    in_body,
+    longest,
+    packet,
+    plausible,
+)
 
 STEPS = 256 * 100  # of the finer azimuth in a degree
 EVERY = 2  # degrees of the mirror between corrections
-LAST, SHOT = -9.249e-6, 41.666e-6  # seconds from the packet's time to the end of the last shot, and from shot to shot
+LAST, SHOT = (
+    -9.249e-6,
+    41.666e-6,
+)  # seconds from the packet's time to the end of the last shot, and from shot to shot
 JUMP = 10.0  # degrees of the mirror
-SHOTS, AHEAD = 1200, 15.0  # of a simulated scan, which begins so many degrees of the mirror after the face: 0.1 degrees from shot to shot
+SHOTS, AHEAD = (
+    1200,
+    15.0,
+    # of a simulated scan, which begins so many degrees of the mirror after the face: 0.1 degrees from
+    # shot to shot
+)
 
 # fmt: off
 FIRING_US = (
@@ -70,7 +103,8 @@ class Mirror(Calibration):
 
     Attributes:
         faces: (faces,) azimuths at which they begin, degrees of the mirror.
-        azimuth_adjust, elevation_adjust: (181, channels) degrees to be added, in steps of 2 degrees of the mirror; None: nothing.
+        azimuth_adjust, elevation_adjust: (181, channels) degrees to be added, in steps of 2 degrees
+            of the mirror; None: nothing.
     """
 
     faces: Table = dataclasses.field(default_factory=lambda: np.array([23.075, 143.44, 263.133]))
@@ -87,9 +121,14 @@ class Mirror(Calibration):
         try:
             file = FILE.parse(data)
         except ConstructError as error:
-            raise UsageError(f"{path!s}: not a correction file of an AT128, version 1.5 (.dat): {str(error).splitlines()[-1]}") from None
+            raise UsageError(
+                f"{path!s}: not a correction file of an AT128, version 1.5 (.dat):"
+                f" {str(error).splitlines()[-1]}"
+            ) from None
         if not file.faces or hashlib.sha256(data[:-32]).digest() != data[-32:]:
-            raise UsageError(f"{path!s}: the correction file is damaged: its SHA-256 is not that of its bytes")
+            raise UsageError(
+                f"{path!s}: the correction file is damaged: its SHA-256 is not that of its bytes"
+            )
         unit = file.resolution / STEPS
         return dataclasses.replace(
             self,
@@ -120,7 +159,9 @@ class Mirror(Calibration):
         return data + hashlib.sha256(data).digest()
 
     def adjusted(self, table: Table | None, azimuth: Any) -> Any:
-        """What is added at azimuths of the mirror: degrees, for every channel; evenly between the steps."""
+        """What is added at azimuths of the mirror: degrees, for every channel; evenly between the
+        steps.
+        """
         if table is None:
             return 0.0
         step = np.floor(azimuth / EVERY)
@@ -135,7 +176,11 @@ def _steps(data: bytes, resolution: int) -> Table:
 
 
 VERSION = ("major" / Const(4, Int8ul), "minor" / OneOf(Int8ul, [1, 3]))
-CHANNEL = Struct("distance" / Int16ul * "steps of dis_unit; 0: no return", "reflectivity" / Int8ul, "confidence" / Int8ul)
+CHANNEL = Struct(
+    "distance" / Int16ul * "steps of dis_unit; 0: no return",
+    "reflectivity" / Int8ul,
+    "confidence" / Int8ul,
+)
 TAIL = (
     "tail_reserved" / Bytes(6),
     "shutdown" / Int8ul * "bit 0: too hot, about to shut down",
@@ -149,7 +194,9 @@ TAIL = (
 
 
 def points(f: Fields, channels: Mirror) -> Polar:
-    """Shots up to the packet's time (tier4/nebula); azimuths from the face behind, clockwise from the left."""
+    """Shots up to the packet's time (tier4/nebula); azimuths from the face behind, clockwise from
+    the left.
+    """
     blocks, block, returns = f.body.blocks, np.arange(BLOCKS)[:, None], returns_of(f.return_mode)
     mirror = blocks.azimuth + blocks.fine_azimuth / STEPS
     turned = np.mod(mirror - channels.faces[0], 360)
@@ -159,7 +206,9 @@ def points(f: Fields, channels: Mirror) -> Polar:
     return Polar(
         range=distance(f),
         azimuth=np.deg2rad(90 - azimuth),
-        elevation=np.deg2rad(channels.elevation + channels.adjusted(channels.elevation_adjust, mirror)),
+        elevation=np.deg2rad(
+            channels.elevation + channels.adjusted(channels.elevation_adjust, mirror)
+        ),
         intensity=blocks.channels.reflectivity,
         time=LAST - SHOT * ((BLOCKS - block + returns - 1) // returns) + channels.firing,
         ring=np.arange(LASERS),
@@ -169,11 +218,20 @@ def points(f: Fields, channels: Mirror) -> Polar:
 
 
 def sweep(i: int) -> dict[str, Any]:
-    """Packet i at 10 scans a second with single return; the mirror turns on while no packet is sent, which the time leaves out."""
+    """Packet i at 10 scans a second with single return; the mirror turns on while no packet is
+    sent, which the time leaves out.
+    """
     shot = i * BLOCKS + np.arange(BLOCKS)
     azimuth = TABLE.faces[shot // SHOTS % len(TABLE.faces)] + AHEAD + shot % SHOTS * (60 / SHOTS)
-    values = {**turning(i, BLOCKS, SHOTS), "blocks.azimuth": np.floor(azimuth * 100) / 100, "motor_speed": 200}
-    return {**in_body(values, confidence=1), "body.blocks.fine_azimuth": np.floor(azimuth * 100 % 1 * 256)}
+    values = {
+        **turning(i, BLOCKS, SHOTS),
+        "blocks.azimuth": np.floor(azimuth * 100) / 100,
+        "motor_speed": 200,
+    }
+    return {
+        **in_body(values, confidence=1),
+        "body.blocks.fine_azimuth": np.floor(azimuth * 100 % 1 * 256),
+    }
 
 
 TABLE = Mirror(
@@ -204,5 +262,8 @@ AT128 = spinning(
     aliases=("at128", "at128e2x", "pandarat128"),
     status="manual",
     acknowledged={"LS711": UNSEEN},
-    source=f"HesaiLidar_SDK_2.0 (udp_protocol_v4_3.h, AT128E2X correction files), tier4/nebula (times, range); {UNSEEN}",
+    source=(
+        "HesaiLidar_SDK_2.0 (udp_protocol_v4_3.h, AT128E2X correction files), tier4/nebula (times,"
+        f" range); {UNSEEN}"
+    ),
 )

@@ -26,7 +26,8 @@ Table = NDArray[np.float64]
 LARGEST, QUOTED = 1_000_000, 60
 #: what stands above the headings of some files, and below the table.
 MARK, HASH = "EEFF", re.compile(r"[0-9a-fA-F]{8,}")
-#: how many times as far as the model's own values those of a unit may spread, or how little: radians do 57 times less than degrees.
+#: how many times as far as the model's own values those of a unit may spread, or how little:
+#: radians do 57 times less than degrees.
 UNLIKE = 10
 
 
@@ -51,7 +52,9 @@ class Column:
 CHANNEL = Column("channel", ("channel", "laserid", "laser"), 0, 1 << 16, ("numbers",))
 ELEVATION = Column("elevation", ("elevation",), -90, 90, ("degrees", "degree", "deg", "°"))
 AZIMUTH = Column("azimuth", ("azimuth",), -360, 360, ELEVATION.units)
-FIRING = Column("fire time", ("firetime", "firingtime"), -10_000, 10_000, ("microseconds", "us", "µs", "μs"))
+FIRING = Column(
+    "fire time", ("firetime", "firingtime"), -10_000, 10_000, ("microseconds", "us", "µs", "μs")
+)
 
 
 @dataclass(frozen=True, eq=False)
@@ -84,12 +87,21 @@ class Calibration:
     def told(self) -> bytes:
         """The angles as a unit says them: a file of corrections."""
         rows = zip(self.elevation, self.azimuth, strict=True)
-        return "".join(["Laser id,Elevation,Azimuth\n", *(f"{i},{e:.6f},{a:.6f}\n" for i, (e, a) in enumerate(rows, start=1))]).encode()
+        return "".join(
+            [
+                "Laser id,Elevation,Azimuth\n",
+                *(f"{i},{e:.6f},{a:.6f}\n" for i, (e, a) in enumerate(rows, start=1)),
+            ]
+        ).encode()
 
 
-def nominal(elevation: Iterable[float], azimuth: Iterable[float], firing_us: Iterable[float]) -> Calibration:
+def nominal(
+    elevation: Iterable[float], azimuth: Iterable[float], firing_us: Iterable[float]
+) -> Calibration:
     """The table of a model; firing times in microseconds."""
-    return Calibration(np.array(list(elevation)), np.array(list(azimuth)), np.array(list(firing_us)) * 1e-6)
+    return Calibration(
+        np.array(list(elevation)), np.array(list(azimuth)), np.array(list(firing_us)) * 1e-6
+    )
 
 
 def configure(
@@ -101,54 +113,77 @@ def configure(
     calibration: str | Path | Learned | None = None,
     firing_times: str | Path | None = None,
 ) -> Sensor:
-    """The sensor with a unit's own tables in place of the model's; a file named in an earlier `configure` stays.
+    """The sensor with a unit's own tables in place of the model's; a file named in an earlier
+    `configure` stays.
 
     A unit whose angles stand in a file is not asked for them.
 
     Args:
         points: the model's function of `Fields` and the channels' `Calibration`.
         table: the model's channels.
-        calibration: CSV with the headings Channel (or Laser id), Elevation and Azimuth, in degrees, in any order, or the binary file of a
-            model that has one; or what the unit said.
+        calibration: CSV with the headings Channel (or Laser id), Elevation and Azimuth, in degrees,
+            in any order, or the binary file of a model that has one; or what the unit said.
         firing_times: CSV with the headings Channel and Fire time, in microseconds.
 
     Raises:
         UsageError: for a file that cannot be read, or is none of this model; with line and column.
     """
-    angles, times = calibration or sensor.options.get("calibration"), firing_times or sensor.options.get("firing_times")
+    angles, times = (
+        calibration or sensor.options.get("calibration"),
+        firing_times or sensor.options.get("firing_times"),
+    )
     if angles:
         table = table.measured(angles)
     if times:
-        table = dataclasses.replace(table, firing=columns(times, {FIRING: table.firing * 1e6})[0] * 1e-6)
+        table = dataclasses.replace(
+            table, firing=columns(times, {FIRING: table.firing * 1e6})[0] * 1e-6
+        )
     asked = () if angles and not isinstance(angles, Learned) else sensor.on_open
     return dataclasses.replace(sensor, points=partial(points, channels=table), on_open=asked)
 
 
 def columns(path: str | Path | Learned, wanted: Mapping[Column, Table]) -> list[Table]:
-    """Columns of a correction file by their headings, each (channels,), in the order of the channels.
+    """Columns of a correction file by their headings, each (channels,), in the order of the
+    channels.
 
-    The mark EEFF above the headings and the hash below the table are passed over, as the vendor's reader does.
+    The mark EEFF above the headings and the hash below the table are passed over, as the vendor's
+    reader does.
 
     Args:
         wanted: the model's own values of each column, which those of a unit are of a kind with.
 
     Raises:
-        UsageError: with line and column, where the file cannot be read, or does not hold these columns for every channel of the model once.
+        UsageError: with line and column, where the file cannot be read, or does not hold these
+            columns for every channel of the model once.
     """
     (line, headings), *rows = _rows(path)
     places = [_place(path, line, headings, column) for column in (CHANNEL, *wanted)]
     channels = len(next(iter(wanted.values())))
     listed: dict[int, tuple[int, list[float]]] = {}
     for line, cells in rows:
-        channel, *values = (_value(path, line, cells, place, column) for place, column in zip(places, (CHANNEL, *wanted), strict=True))
+        channel, *values = (
+            _value(path, line, cells, place, column)
+            for place, column in zip(places, (CHANNEL, *wanted), strict=True)
+        )
         if channel != int(channel) or not 1 <= channel <= channels:
-            raise _fault(path, line, places[0], f"channel {channel:g}, and this model has channels 1 to {channels}")
+            raise _fault(
+                path,
+                line,
+                places[0],
+                f"channel {channel:g}, and this model has channels 1 to {channels}",
+            )
         if channel in listed:
-            raise _fault(path, line, places[0], f"channel {channel:g} stands in line {listed[int(channel)][0]} already")
+            raise _fault(
+                path,
+                line,
+                places[0],
+                f"channel {channel:g} stands in line {listed[int(channel)][0]} already",
+            )
         listed[int(channel)] = line, values
     if missing := [channel for channel in range(1, channels + 1) if channel not in listed]:
         raise UsageError(
-            f"{path!s}: lists {len(listed)} channels, and this model has channels 1 to {channels}; {missing[0]} is the first missing"
+            f"{path!s}: lists {len(listed)} channels, and this model has channels 1 to {channels};"
+            f" {missing[0]} is the first missing"
         )
     tables = list(np.array([listed[channel][1] for channel in sorted(listed)]).T)
     for (column, own), table, place in zip(wanted.items(), tables, places[1:], strict=True):
@@ -160,7 +195,11 @@ def _rows(path: str | Path | Learned) -> list[tuple[int, list[str]]]:
     """The headings and the table, each row with its line."""
     try:
         reader = csv.reader(io.StringIO(content(path).decode("utf-8-sig", "replace"), newline=""))
-        rows = [(reader.line_num, [cell.strip() for cell in cells]) for cells in reader if any(map(str.strip, cells))]
+        rows = [
+            (reader.line_num, [cell.strip() for cell in cells])
+            for cells in reader
+            if any(map(str.strip, cells))
+        ]
     except csv.Error as error:
         raise UsageError(f"{path!s}: not a correction file: {error}") from error
     rows = rows[1:] if rows and rows[0][1][0] == MARK else rows
@@ -183,7 +222,9 @@ def content(path: str | Path | Learned) -> bytes:
     except OSError as error:
         raise UsageError(f"{path!s}: not a correction file: {error}") from error
     if len(data) > LARGEST:
-        raise UsageError(f"{path!s}: not a correction file: it has more than {LARGEST // 1_000_000} MB")
+        raise UsageError(
+            f"{path!s}: not a correction file: it has more than {LARGEST // 1_000_000} MB"
+        )
     return data
 
 
@@ -195,27 +236,46 @@ def _place(path: str | Path | Learned, line: int, headings: list[str], column: C
             if unit.strip(" )") not in ("", *column.units):
                 raise _fault(path, line, place, f"{heading!r} is not in {column.units[0]}")
             return place
-    raise UsageError(f"{path!s}: line {line}: no column is headed {column.name!r}; the headings are {', '.join(headings)[:QUOTED]!r}")
+    raise UsageError(
+        f"{path!s}: line {line}: no column is headed {column.name!r}; the headings are"
+        f" {', '.join(headings)[:QUOTED]!r}"
+    )
 
 
-def _value(path: str | Path | Learned, line: int, cells: list[str], place: int, column: Column) -> float:
+def _value(
+    path: str | Path | Learned, line: int, cells: list[str], place: int, column: Column
+) -> float:
     text = cells[place] if place < len(cells) else ""
     try:
         value = float(text)
     except ValueError:
         raise _fault(path, line, place, f"{column.name} is {text[:QUOTED]!r}, no number") from None
     if not column.low <= value <= column.high:  # nor nan
-        raise _fault(path, line, place, f"{column.name} {value:g} is not within {column.low:g} .. {column.high:g} {column.units[0]}")
+        raise _fault(
+            path,
+            line,
+            place,
+            f"{column.name} {value:g} is not within {column.low:g} .. {column.high:g}"
+            f" {column.units[0]}",
+        )
     return value
 
 
-def _compare(path: str | Path | Learned, line: int, place: int, column: Column, table: Table, own: Table) -> None:
-    """Nothing, where the values spread like the model's own, to a factor of ten, or those spread too little to tell by."""
+def _compare(
+    path: str | Path | Learned, line: int, place: int, column: Column, table: Table, own: Table
+) -> None:
+    """Nothing, where the values spread like the model's own, to a factor of ten, or those spread
+    too little to tell by.
+    """
     spread, usual = float(np.ptp(table)), float(np.ptp(own))
     if usual > 1 and not usual / UNLIKE < spread < usual * UNLIKE:
         told = f"spread over {spread:g}" if spread else f"are all {table[0]:g}"
         raise _fault(
-            path, line, place, f"the {column.name}s {told}, those of this model over {usual:g} {column.units[0]}: is it another unit?"
+            path,
+            line,
+            place,
+            f"the {column.name}s {told}, those of this model over {usual:g} {column.units[0]}: is"
+            " it another unit?",
         )
 
 

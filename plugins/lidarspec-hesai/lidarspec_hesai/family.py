@@ -47,7 +47,9 @@ def spinning(
         on_open=("get_calibration",),
         clock=Clock(clock),
         sequence=Sequence("sequence"),
-        simulation=Simulation(sweep, answers={"get_calibration": (("answer", {"payload": table.told()}),)}),
+        simulation=Simulation(
+            sweep, answers={"get_calibration": (("answer", {"payload": table.told()}),)}
+        ),
         configure=partial(configure, points, table),
         **(defaults | facts),
     )

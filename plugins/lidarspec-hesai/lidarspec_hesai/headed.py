@@ -2,7 +2,8 @@
 
     EE FF  major minor  reserved(2) | lasers blocks first_return dis_unit return_num flags
 
-Source: HesaiLidar_SDK_2.0 (udp_protocol_header.h, udp_protocol_v3_1.h, udp_protocol_v6_1.h); the length rule holds for captures of both.
+Source: HesaiLidar_SDK_2.0 (udp_protocol_header.h, udp_protocol_v3_1.h, udp_protocol_v6_1.h); the
+length rule holds for captures of both.
 """
 
 from __future__ import annotations
@@ -10,7 +11,20 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import Any
 
-from construct import Array, BitsInteger, BitStruct, Bytes, Const, Construct, If, Int8ul, Int16ul, Int32ul, Struct, this
+from construct import (
+    Array,
+    BitsInteger,
+    BitStruct,
+    Bytes,
+    Const,
+    Construct,
+    If,
+    Int8ul,
+    Int16ul,
+    Int32ul,
+    Struct,
+    this,
+)
 
 from lidarspec.spec import Fields, Scaled
 
@@ -32,7 +46,11 @@ def packet(major: int, minor: int, lasers: int, tail: Sequence[Construct]) -> St
         "return_count" / Int8ul * "returns of a shot; of some models the most that there can be",
         "flags" / BitStruct("reserved" / BitsInteger(7), "sequence" / BitsInteger(1)),
     ]
-    channel = Struct("distance" / Int16ul * "steps of dis_unit; 0: no return", "reflectivity" / Int8ul, "reserved" / Int8ul)
+    channel = Struct(
+        "distance" / Int16ul * "steps of dis_unit; 0: no return",
+        "reflectivity" / Int8ul,
+        "reserved" / Int8ul,
+    )
     block = Struct("azimuth" / Scaled(Int16ul, 0.01, "deg"), "channels" / Array(lasers, channel))
     sequence = "sequence" / If(this.flags.sequence == 1, Int32ul)
     return Struct(*header, "blocks" / Array(this.block_count, block), *tail, sequence)
@@ -45,7 +63,13 @@ def longest(lasers: int, blocks: int) -> int:
 
 def plausible(f: Fields) -> Any:
     """A block, one to three returns, a unit, and azimuths below 360 degrees."""
-    return (f.block_count >= 1) & (f.dis_unit >= 1) & (f.return_count >= 1) & (f.return_count <= 3) & (f.blocks.azimuth < 360)
+    return (
+        (f.block_count >= 1)
+        & (f.dis_unit >= 1)
+        & (f.return_count >= 1)
+        & (f.return_count <= 3)
+        & (f.blocks.azimuth < 360)
+    )
 
 
 def distance(f: Fields) -> Any:
@@ -60,4 +84,10 @@ def block_numbers(f: Fields) -> Any:
 
 def header(blocks: int) -> dict[str, Any]:
     """The header of a simulated packet with single return."""
-    return {"block_count": blocks, "first_return": 1, "dis_unit": USUAL_UNIT, "return_count": 1, "flags.sequence": 1}
+    return {
+        "block_count": blocks,
+        "first_return": 1,
+        "dis_unit": USUAL_UNIT,
+        "return_count": 1,
+        "flags.sequence": 1,
+    }

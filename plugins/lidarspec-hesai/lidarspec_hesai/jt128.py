@@ -1,9 +1,12 @@
-"""Hesai JT128: the packet of a Pandar128E3X with a status from 137 on, blocks as many as its header says.
+"""Hesai JT128: the packet of a Pandar128E3X with a status from 137 on, blocks as many as its header
+says.
 
-What it has of its own: a speed in steps of 0.1 rpm, and a time that is 1.888 ms after the last shot. How many blocks there are in a packet,
-how far it measures and how fast it turns stands in no source at hand: it is read as its packets say, and simulated with 2 blocks at 10 Hz.
+What it has of its own: a speed in steps of 0.1 rpm, and a time that is 1.888 ms after the last
+shot. How many blocks there are in a packet, how far it measures and how fast it turns stands in no
+source at hand: it is read as its packets say, and simulated with 2 blocks at 10 Hz.
 
-Source: HesaiLidar_SDK_2.0 (udp_protocol_v1_4.h, udp1_4_parser.cc; angle and firing-time files of the model).
+Source: HesaiLidar_SDK_2.0 (udp_protocol_v1_4.h, udp1_4_parser.cc; angle and firing-time files of
+the model).
 """
 
 from __future__ import annotations
@@ -18,11 +21,23 @@ from lidarspec_hesai.family import spinning
 from lidarspec_hesai.headed import block_numbers
 from lidarspec_hesai.pandar128 import CHANNEL, FIRST_JT128, VERSION, relatives, tail
 from lidarspec_hesai.parts import beams, returns_of, turning
-from lidarspec_hesai.sealed import BLOCKS, LASERS, UNSEEN, distance, in_body, longest, packet, plausible
+from lidarspec_hesai.sealed import (
+    BLOCKS,
+    LASERS,
+    UNSEEN,
+    distance,
+    in_body,
+    longest,
+    packet,
+    plausible,
+)
 
 MOST = 8  # blocks of the longest packet that would go into one datagram
 PER_TURN = 900  # blocks in a turn at 10 Hz: 0.4 degrees, by the time of a block
-LAST_SHOT, SHOT = -1.888e-3, 111e-6  # seconds from the packet's time to the last shot, and from shot to shot
+LAST_SHOT, SHOT = (
+    -1.888e-3,
+    111e-6,
+)  # seconds from the packet's time to the last shot, and from shot to shot
 
 # fmt: off
 ELEVATION = (
@@ -62,12 +77,18 @@ def points(f: Fields, channels: Calibration) -> Polar:
     """Shots up to 1.888 ms before the packet's time (HesaiLidar_SDK_2.0)."""
     block, returns = block_numbers(f), returns_of(f.return_mode)
     fired = LAST_SHOT - SHOT * ((f.block_count - 1 - block) // returns)
-    return beams(f.body.blocks, channels, distance=distance(f), block=block, returns=returns, fired=fired)
+    return beams(
+        f.body.blocks, channels, distance=distance(f), block=block, returns=returns, fired=fired
+    )
 
 
 def sweep(i: int) -> dict[str, Any]:
     """Packet i at 10 Hz with single return."""
-    return {**in_body(turning(i, BLOCKS, PER_TURN), imu=1), "status_version": FIRST_JT128, "block_count": BLOCKS}
+    return {
+        **in_body(turning(i, BLOCKS, PER_TURN), imu=1),
+        "status_version": FIRST_JT128,
+        "block_count": BLOCKS,
+    }
 
 
 JT128 = spinning(

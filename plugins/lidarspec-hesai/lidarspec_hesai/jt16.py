@@ -1,16 +1,20 @@
-"""Hesai JT16: 16 channels over a serial line, 80 bytes for each azimuth, and 34 for each sample of the IMU.
+"""Hesai JT16: 16 channels over a serial line, 80 bytes for each azimuth, and 34 for each sample of
+the IMU.
 
-    EE FF 01 08  time_version  00 | date, microseconds | azimuth, 16 x (distance, reflectivity), dirt, state, sequence | CRC
-    EE FF 01 08  time_version  01 | date, microseconds | acceleration, rate, sequence | CRC
+    EE FF 01 08  time_version  00 | date, microseconds | azimuth, 16 x (distance, reflectivity),
+    dirt, state, sequence | CRC EE FF 01 08  time_version  01 | date, microseconds | acceleration,
+    rate, sequence | CRC
 
-No packet of this model was seen. How many azimuths there are in a turn, and how fast it turns, stands in no source at hand: 600 by 5 Hz are
-simulated, as fine as the grid of the vendor's code, and as many as the line carries. The axes of the IMU are not documented, so its samples
-are fields alone.
+No packet of this model was seen. How many azimuths there are in a turn, and how fast it turns,
+stands in no source at hand: 600 by 5 Hz are simulated, as fine as the grid of the vendor's code,
+and as many as the line carries. The axes of the IMU are not documented, so its samples are fields
+alone.
 
-Left out: commands, which go over a second line (RS232, 9600 baud) and bear random numbers; with them a unit would say its angles.
+Left out: commands, which go over a second line (RS232, 9600 baud) and bear random numbers; with
+them a unit would say its angles.
 
-Source: HesaiLidar_SDK_2.0 (udp_protocol_v1_8.h, udp1_8_parser.cc: fields, steps of 4 mm, angles, CRC; serial_source.cc: lengths;
-parameter_introduction.md: 3,125,000 baud; JT16 correction file).
+Source: HesaiLidar_SDK_2.0 (udp_protocol_v1_8.h, udp1_8_parser.cc: fields, steps of 4 mm, angles,
+CRC; serial_source.cc: lengths; parameter_introduction.md: 3,125,000 baud; JT16 correction file).
 """
 
 from __future__ import annotations
@@ -21,7 +25,20 @@ from typing import Any
 import numpy as np
 from construct import Array, Const, Int8ul, Int16sl, Int16ul, Int32ul, Struct
 
-from lidarspec.spec import Checksummed, Clock, Fields, Frame, OnWrap, Polar, Scaled, Sensor, Sequence, Serial, Simulation, ZeroPadded
+from lidarspec.spec import (
+    Checksummed,
+    Clock,
+    Fields,
+    Frame,
+    OnWrap,
+    Polar,
+    Scaled,
+    Sensor,
+    Sequence,
+    Serial,
+    Simulation,
+    ZeroPadded,
+)
 from lidarspec_hesai.calibration import Calibration, configure, nominal
 from lidarspec_hesai.parts import UTC, clock, turning
 from lidarspec_hesai.sealed import CRC
@@ -55,10 +72,20 @@ DATA = Checksummed(
     packet(
         0,
         "azimuth" / Scaled(Int16ul, 0.01, "deg"),
-        "channels" / Array(CHANNELS, Struct("distance" / Scaled(Int16ul, 0.004, "m") * "0: no return", "reflectivity" / Int8ul)),
-        "dirt" / Int32ul * "on the window, two bits for each channel, those of the first in the lowest",
+        "channels"
+        / Array(
+            CHANNELS,
+            Struct(
+                "distance" / Scaled(Int16ul, 0.004, "m") * "0: no return", "reflectivity" / Int8ul
+            ),
+        ),
+        "dirt"
+        / Int32ul
+        * "on the window, two bits for each channel, those of the first in the lowest",
         "unit_state" / Int8ul,
-        "reserved_id" / Int8ul * "what the next field is: 12 to 15 the version of the software, 16 to 19 of the hardware",
+        "reserved_id"
+        / Int8ul
+        * "what the next field is: 12 to 15 the version of the software, 16 to 19 of the hardware",
         "reserved_info" / Int16ul,
         "sequence" / Int16ul,
     ),
@@ -68,7 +95,9 @@ DATA = Checksummed(
 IMU = Checksummed(
     packet(
         1,
-        "acceleration" / Array(3, Scaled(Int16sl, 1 / 8192, "g")) * "x, y, z of the unit's IMU, whose axes are not documented",
+        "acceleration"
+        / Array(3, Scaled(Int16sl, 1 / 8192, "g"))
+        * "x, y, z of the unit's IMU, whose axes are not documented",
         "rate" / Array(3, Scaled(Int16sl, 1 / 32.8, "deg/s")),
         "sequence" / Int16ul,
     ),
@@ -92,7 +121,11 @@ def points(f: Fields, channels: Calibration) -> Polar:
 def sweep(i: int) -> dict[str, Any]:
     """Packet i."""
     values = turning(i, 1, PER_TURN, RATE_HZ)
-    kept = {name: value for name, value in values.items() if name == "timestamp" or name.startswith("utc.")}
+    kept = {
+        name: value
+        for name, value in values.items()
+        if name == "timestamp" or name.startswith("utc.")
+    }
     return {**kept, "azimuth": float(values["blocks.azimuth"][0]), "sequence": i % (1 << 16)}
 
 
@@ -102,7 +135,10 @@ JT16 = Sensor(
     "hesai-jt16",
     vendor="Hesai",
     model="JT16",
-    frames={"data": Frame(DATA, data=True, plausible=lambda f: f.azimuth < 360), "imu": Frame(IMU, simulation=Simulation(rate=100))},
+    frames={
+        "data": Frame(DATA, data=True, plausible=lambda f: f.azimuth < 360),
+        "imu": Frame(IMU, simulation=Simulation(rate=100)),
+    },
     points=partial(points, channels=TABLE),
     scan=OnWrap("azimuth"),
     links={"data": Serial(3_125_000)},
@@ -114,5 +150,8 @@ JT16 = Sensor(
     vendor_axes=("right", "forward", "up"),
     aliases=("jt16",),
     status="manual",
-    source="HesaiLidar_SDK_2.0 (udp_protocol_v1_8.h, udp1_8_parser.cc, JT16 correction file); no packet of this model was seen",
+    source=(
+        "HesaiLidar_SDK_2.0 (udp_protocol_v1_8.h, udp1_8_parser.cc, JT16 correction file); no"
+        " packet of this model was seen"
+    ),
 )

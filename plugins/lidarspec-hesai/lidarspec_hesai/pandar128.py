@@ -1,16 +1,20 @@
-"""Hesai Pandar128E3X and OT128: protocol 1.4, 2 blocks of 128 channels, 861 bytes, 893 with a signature.
+"""Hesai Pandar128E3X and OT128: protocol 1.4, 2 blocks of 128 channels, 861 bytes, 893 with a
+signature.
 
     EE FF 01 04  status 00 | 80 02 first_return unit return_count flags
     2 x [azimuth, 128 x (distance, reflectivity [, confidence] [, weight] [, environment])], CRC
     [safety], tail [, sequence] [, IMU], CRC [, signature]
 
-What the status says tells the models apart. The CRCs are those of a QT128, as far as is known; no packet of these models was seen, so they
-are not held. Which channels fire, and when, depends on the operational state and on the azimuth state of the block: sixteen groups of eight
-channels share their times. Nearer than 2.85 m, 32 channels of a Pandar128E3X fire 0.8 to 16.7 us later than said here.
+What the status says tells the models apart. The CRCs are those of a QT128, as far as is known; no
+packet of these models was seen, so they are not held. Which channels fire, and when, depends on the
+operational state and on the azimuth state of the block: sixteen groups of eight channels share
+their times. Nearer than 2.85 m, 32 channels of a Pandar128E3X fire 0.8 to 16.7 us later than said
+here.
 
-Source: HesaiLidar_SDK_2.0 (udp_protocol_v1_4.h, udp1_4_parser.cc: which model it is, block and firing times; angle and firing-time files of
-sample units); Pandar128E3X user manual (lengths; the firing times hold for "standard" and "energy saving" states alike). For an OT128
-tier4/nebula has other times.
+Source: HesaiLidar_SDK_2.0 (udp_protocol_v1_4.h, udp1_4_parser.cc: which model it is, block and
+firing times; angle and firing-time files of sample units); Pandar128E3X user manual (lengths; the
+firing times hold for "standard" and "energy saving" states alike). For an OT128 tier4/nebula has
+other times.
 """
 
 from __future__ import annotations
@@ -26,7 +30,16 @@ from lidarspec.spec import Fields, Frame, Polar, Relative, Scaled, take
 from lidarspec_hesai.calibration import Calibration, nominal
 from lidarspec_hesai.family import spinning
 from lidarspec_hesai.parts import FACTORY, RETURN_MODES, UTC, beams, returns_of, turning
-from lidarspec_hesai.sealed import BLOCKS, LASERS, UNSEEN, distance, in_body, longest, packet, plausible
+from lidarspec_hesai.sealed import (
+    BLOCKS,
+    LASERS,
+    UNSEEN,
+    distance,
+    in_body,
+    longest,
+    packet,
+    plausible,
+)
 
 PER_TURN = 1800  # blocks in a turn at 10 Hz and single return, of the standard state: 0.2 degrees
 SHOT = 27.778e-6  # seconds from shot to shot, twice that in other operational states than 0
@@ -167,17 +180,28 @@ def points(f: Fields, channels: Calibration, last: float, times: Any) -> Polar:
         last: seconds from the packet's time to the last shot.
         times: seconds of each channel, a row for each state.
     """
-    block, returns, slow = np.arange(BLOCKS)[:, None], returns_of(f.return_mode), np.where(f.operational_state == 0, 1, 2)
+    block, returns, slow = (
+        np.arange(BLOCKS)[:, None],
+        returns_of(f.return_mode),
+        np.where(f.operational_state == 0, 1, 2),
+    )
     state = np.mod(np.floor(f.azimuth_state / 4.0 ** (7 - block)), 4)
     within = take(times, np.where(f.operational_state == 0, state, 4 + np.mod(state, 2)))
     fired = last - SHOT * slow * ((BLOCKS - 1 - block) // returns) + within
-    return beams(f.body.blocks, channels, distance=distance(f), block=block, returns=returns, fired=fired)
+    return beams(
+        f.body.blocks, channels, distance=distance(f), block=block, returns=returns, fired=fired
+    )
 
 
 def sweep(i: int, status: int) -> dict[str, Any]:
     """Packet i at 10 Hz with single return."""
     values = in_body(turning(i, BLOCKS, PER_TURN), imu=1, safety=1)
-    return {**values, "status_version": status, "operational_state": STANDARD, "azimuth_state": 0x1000}
+    return {
+        **values,
+        "status_version": status,
+        "operational_state": STANDARD,
+        "azimuth_state": 0x1000,
+    }
 
 
 def by_channel(groups: str, times_us: Mapping[str, Sequence[float]]) -> Any:
@@ -213,7 +237,10 @@ PANDAR128 = spinning(
     relatives=relatives("hesai-pandar128"),
     status="manual",
     acknowledged={"LS711": UNSEEN},
-    source=f"HesaiLidar_SDK_2.0 (udp_protocol_v1_4.h, Pandar128E3X correction files), Pandar128E3X user manual; {UNSEEN}",
+    source=(
+        "HesaiLidar_SDK_2.0 (udp_protocol_v1_4.h, Pandar128E3X correction files), Pandar128E3X"
+        f" user manual; {UNSEEN}"
+    ),
 )
 
 OT128 = spinning(

@@ -1,11 +1,13 @@
-"""Hesai Pandar40P: 40 channels, a packet without header, of 1262 bytes, or 1266 with the UDP sequence.
+"""Hesai Pandar40P: 40 channels, a packet without header, of 1262 bytes, or 1266 with the UDP
+sequence.
 
     10 x [FF EE, azimuth, 40 x (distance, reflectivity)], tail(22) [, sequence]
 
-Nothing in the packet says whether the sequence is there, only its length does: so there are two frame types, and `decode`
-reads by the one that arrives first.
+Nothing in the packet says whether the sequence is there, only its length does: so there are two
+frame types, and `decode` reads by the one that arrives first.
 
-Source: HesaiLidar_SDK_2.0 (udp_protocol_p40.h; angle and firing-time files of a sample unit); tier4/nebula.
+Source: HesaiLidar_SDK_2.0 (udp_protocol_p40.h; angle and firing-time files of a sample unit);
+tier4/nebula.
 """
 
 from __future__ import annotations
@@ -22,7 +24,10 @@ from lidarspec_hesai.parts import TAIL_40P, beams, returns_of, turning
 
 BLOCKS, CHANNELS = 10, 40
 PER_TURN = 1800  # blocks in a turn at 10 Hz and single return: 0.2 degrees
-LAST_SHOT, SHOT = -28.58e-6, 55.56e-6  # seconds from the packet's time to the last shot, and from shot to shot
+LAST_SHOT, SHOT = (
+    -28.58e-6,
+    55.56e-6,
+)  # seconds from the packet's time to the last shot, and from shot to shot
 
 # fmt: off
 ELEVATION = (
@@ -49,7 +54,14 @@ PLAIN = Struct(
         Struct(
             "sync" / Const(b"\xff\xee"),
             "azimuth" / Scaled(Int16ul, 0.01, "deg") * "clockwise seen from above",
-            "channels" / Array(CHANNELS, Struct("distance" / Scaled(Int16ul, 0.004, "m") * "0: no return", "reflectivity" / Int8ul)),
+            "channels"
+            / Array(
+                CHANNELS,
+                Struct(
+                    "distance" / Scaled(Int16ul, 0.004, "m") * "0: no return",
+                    "reflectivity" / Int8ul,
+                ),
+            ),
         ),
     ),
     *TAIL_40P,
@@ -63,10 +75,19 @@ def plausible(f: Fields) -> Any:
 
 
 def points(f: Fields, channels: Calibration) -> Polar:
-    """Shots before the packet's time (HesaiLidar_SDK_2.0); with dual return, pairs of blocks are one shot."""
+    """Shots before the packet's time (HesaiLidar_SDK_2.0); with dual return, pairs of blocks are
+    one shot.
+    """
     block, returns = np.arange(BLOCKS)[:, None], returns_of(f.return_mode)
     fired = LAST_SHOT - SHOT * ((BLOCKS - 1 - block) // returns)
-    return beams(f.blocks, channels, distance=f.blocks.channels.distance, block=block, returns=returns, fired=fired)
+    return beams(
+        f.blocks,
+        channels,
+        distance=f.blocks.channels.distance,
+        block=block,
+        returns=returns,
+        fired=fired,
+    )
 
 
 def sweep(i: int) -> dict[str, Any]:
@@ -78,7 +99,10 @@ TABLE = nominal(ELEVATION, AZIMUTH, FIRING_US)
 
 PANDAR40P = spinning(
     "hesai-pandar40p",
-    {"data": Frame(PLAIN, data=True, plausible=plausible), "data_sequence": Frame(COUNTED, data=True, plausible=plausible)},
+    {
+        "data": Frame(PLAIN, data=True, plausible=plausible),
+        "data_sequence": Frame(COUNTED, data=True, plausible=plausible),
+    },
     points,
     TABLE,
     sweep,
@@ -86,5 +110,8 @@ PANDAR40P = spinning(
     range_limits=(0.3, 200.0),
     aliases=("pandar40p",),
     status="capture",
-    source="HesaiLidar_SDK_2.0 (udp_protocol_p40.h, Pandar40P correction files); captures of tier4/nebula and velocity.report",
+    source=(
+        "HesaiLidar_SDK_2.0 (udp_protocol_p40.h, Pandar40P correction files); captures of"
+        " tier4/nebula and velocity.report"
+    ),
 )

@@ -1,11 +1,12 @@
-"""Hesai Pandar64: 64 channels, a header of eight bytes, six blocks, 1194 bytes, or 1198 with the UDP sequence.
+"""Hesai Pandar64: 64 channels, a header of eight bytes, six blocks, 1194 bytes, or 1198 with the
+UDP sequence.
 
     EE FF 40 06 00 unit 00 00, 6 x [azimuth, 64 x (distance, reflectivity)], tail(22) [, sequence]
 
 As with the Pandar40P, whose tail it has, its length alone says whether the sequence is there.
 
-Source: HesaiLidar_SDK_2.0 (udp_protocol_p64.h; angle and firing-time files of a sample unit); one captured packet of tier4/nebula,
-in which the year counts from 1900.
+Source: HesaiLidar_SDK_2.0 (udp_protocol_p64.h; angle and firing-time files of a sample unit); one
+captured packet of tier4/nebula, in which the year counts from 1900.
 """
 
 from __future__ import annotations
@@ -56,7 +57,14 @@ PLAIN = Struct(
     "header_reserved" / Bytes(1),
     "dis_unit" / Scaled(Int8ul, 1, "mm") * "one step of a distance",
     "header_end" / Const(bytes(2)),
-    "blocks" / Array(BLOCKS, Struct("azimuth" / Scaled(Int16ul, 0.01, "deg") * "clockwise", "channels" / Array(CHANNELS, CHANNEL))),
+    "blocks"
+    / Array(
+        BLOCKS,
+        Struct(
+            "azimuth" / Scaled(Int16ul, 0.01, "deg") * "clockwise",
+            "channels" / Array(CHANNELS, CHANNEL),
+        ),
+    ),
     *TAIL_40P,
 )
 COUNTED = Struct(*PLAIN.subcons, "sequence" / Int32ul)
@@ -64,14 +72,20 @@ COUNTED = Struct(*PLAIN.subcons, "sequence" / Int32ul)
 
 def plausible(f: Fields) -> Any:
     """A unit, azimuths below 360 degrees and a known factory byte."""
-    return (f.dis_unit >= 1) & (f.blocks.azimuth < 360) & ((f.factory == 0x42) | (f.factory == 0x43))
+    return (
+        (f.dis_unit >= 1) & (f.blocks.azimuth < 360) & ((f.factory == 0x42) | (f.factory == 0x43))
+    )
 
 
 def points(f: Fields, channels: Calibration) -> Polar:
-    """Shots before the packet's time (HesaiLidar_SDK_2.0); with dual return, pairs of blocks are one shot."""
+    """Shots before the packet's time (HesaiLidar_SDK_2.0); with dual return, pairs of blocks are
+    one shot.
+    """
     block, returns = np.arange(BLOCKS)[:, None], returns_of(f.return_mode)
     fired = LAST_SHOT - SHOT * ((BLOCKS - 1 - block) // returns)
-    return beams(f.blocks, channels, distance=distance(f), block=block, returns=returns, fired=fired)
+    return beams(
+        f.blocks, channels, distance=distance(f), block=block, returns=returns, fired=fired
+    )
 
 
 def sweep(i: int) -> dict[str, Any]:
@@ -83,7 +97,10 @@ TABLE = nominal(ELEVATION, AZIMUTH, FIRING_US)
 
 PANDAR64 = spinning(
     "hesai-pandar64",
-    {"data": Frame(PLAIN, data=True, plausible=plausible), "data_sequence": Frame(COUNTED, data=True, plausible=plausible)},
+    {
+        "data": Frame(PLAIN, data=True, plausible=plausible),
+        "data_sequence": Frame(COUNTED, data=True, plausible=plausible),
+    },
     points,
     TABLE,
     sweep,
@@ -91,5 +108,8 @@ PANDAR64 = spinning(
     range_limits=(0.3, 200.0),
     aliases=("pandar64",),
     status="vectors",
-    source="HesaiLidar_SDK_2.0 (udp_protocol_p64.h, Pandar64 correction files); one captured packet of tier4/nebula",
+    source=(
+        "HesaiLidar_SDK_2.0 (udp_protocol_p64.h, Pandar64 correction files); one captured packet of"
+        " tier4/nebula"
+    ),
 )

@@ -1,6 +1,8 @@
-"""What all packets of the family have in common: the date, the return modes, and how a shot becomes points.
+"""What all packets of the family have in common: the date, the return modes, and how a shot becomes
+points.
 
-Source: HesaiLidar_SDK_2.0 (year rule, return modes, timing) and tier4/nebula (geometry, which reproduces its published clouds).
+Source: HesaiLidar_SDK_2.0 (year rule, return modes, timing) and tier4/nebula (geometry, which
+reproduces its published clouds).
 """
 
 from __future__ import annotations
@@ -14,16 +16,28 @@ from construct import Bytes, Int8ul, Int16ul, Int32ul, Struct
 from lidarspec.spec import Fields, Polar, Scaled
 from lidarspec_hesai.calibration import Calibration
 
-RETURN_MODES = "33 first, 34 second, 37 strongest, 38 last, 39 last and strongest, 3b first and last, 3c first and strongest, 3d three"
+RETURN_MODES = (
+    "33 first, 34 second, 37 strongest, 38 last, 39 last and strongest, 3b first and last, 3c first"
+    " and strongest, 3d three"
+)
 FACTORY = "42 or 43"
 EPOCH = datetime.datetime(2024, 1, 1)  # of simulated packets
-TURN = (5.0, 20.0)  # turns a second, slowest and fastest: 300 to 1200 rpm (tier4/nebula, rotation_speed of all models)
+TURN = (
+    5.0,
+    20.0,
+    # turns a second, slowest and fastest: 300 to 1200 rpm (tier4/nebula, rotation_speed of all models)
+)
 
 #: why no data frames are among the golden vectors.
-UNPUBLISHED = {"LS711": "the captures are others', and too large: the project's tests read them where they are"}
+UNPUBLISHED = {
+    "LS711": "the captures are others', and too large: the project's tests read them where they are"
+}
 
 UTC = Struct(
-    "year" / Int8ul * "from 70 on since 1900, below since 2000; 0: the last five bytes are Unix seconds, big-endian",
+    "year"
+    / Int8ul
+    * "from 70 on since 1900, below since 2000; 0: the last five bytes are Unix seconds,"
+    " big-endian",
     "month" / Int8ul,
     "day" / Int8ul,
     "hour" / Int8ul,
@@ -61,14 +75,18 @@ def clock(f: Fields) -> tuple[Any, Any]:
 
 
 def _days(year: Any, month: Any, day: Any) -> Any:
-    """Days from 1970-01-01 in the Gregorian calendar; years begin in March, so that the leap day is the last."""
+    """Days from 1970-01-01 in the Gregorian calendar; years begin in March, so that the leap day is
+    the last.
+    """
     years = np.where(month <= 2, year - 1, year)
     months = np.where(month <= 2, month + 9, month - 3)
     leap_days = np.floor(years / 4) - np.floor(years / 100) + np.floor(years / 400)
     return 365 * years + leap_days + np.floor((153 * months + 2) / 5) + day - 719_469
 
 
-def beams(blocks: Fields, channels: Calibration, *, distance: Any, block: Any, returns: Any, fired: Any) -> Polar:
+def beams(
+    blocks: Fields, channels: Calibration, *, distance: Any, block: Any, returns: Any, fired: Any
+) -> Polar:
     """The points of a packet.
 
     Args:
@@ -94,8 +112,13 @@ def beams(blocks: Fields, channels: Calibration, *, distance: Any, block: Any, r
 def turning(i: int, blocks: int, per_turn: int, rate_hz: float = 10.0) -> dict[str, Any]:
     """Azimuths, speed and time of packet i of a sensor that fires `per_turn` blocks in each turn."""
     shots = i * blocks + np.arange(blocks)
-    now = EPOCH + datetime.timedelta(microseconds=round(1e6 * (i + 1) * blocks / (per_turn * rate_hz)))
-    date = {"year": now.year - 2000, **{name: getattr(now, name) for name in ("month", "day", "hour", "minute", "second")}}
+    now = EPOCH + datetime.timedelta(
+        microseconds=round(1e6 * (i + 1) * blocks / (per_turn * rate_hz))
+    )
+    date = {
+        "year": now.year - 2000,
+        **{name: getattr(now, name) for name in ("month", "day", "hour", "minute", "second")},
+    }
     return {
         "blocks.azimuth": np.round(shots % per_turn * 360 / per_turn, 2),
         "motor_speed": rate_hz * 60,

@@ -2,9 +2,11 @@
 
     47 74  code  result | length(4) | payload
 
-A unit is asked for its angles when it is opened. Units that speak TLS alone, or PTC 2.0 (57 75), do not answer.
+A unit is asked for its angles when it is opened. Units that speak TLS alone, or PTC 2.0 (57 75), do
+not answer.
 
-Source: HesaiLidar_SDK_2.0 (ptc_client.h, ptc_1_0_parser.h: frame and codes); tier4/nebula (hesai_common.hpp: numbers of the return modes).
+Source: HesaiLidar_SDK_2.0 (ptc_client.h, ptc_1_0_parser.h: frame and codes); tier4/nebula
+(hesai_common.hpp: numbers of the return modes).
 """
 
 from __future__ import annotations
@@ -19,11 +21,18 @@ from lidarspec.spec import Address, Command, Fields, Frame, Scaled, SizeOf, Tcp
 CONTROL = Tcp(9347)
 LARGEST = 1 << 16  # bytes of a payload; the longest known, the angles of an AT128, has 47,176
 
-RESULTS = "0 done, 1 bad parameter, 2 connection, 3 data, 4 memory, 5 not supported, 6 FPGA, 7 other"
+RESULTS = (
+    "0 done, 1 bad parameter, 2 connection, 3 data, 4 memory, 5 not supported, 6 FPGA, 7 other"
+)
 SETTINGS = {
     0x17: Struct("rate" / Scaled(Int16ub, 1, "rpm")),
     0x1C: Struct("standby" / Int8ub * "1: the motor stands still"),
-    0x1E: Struct("mode" / Int8ub * "0 last, 1 strongest, 2 both, 3 first, 4 first and last, 5 first and strongest, where a model has it"),
+    0x1E: Struct(
+        "mode"
+        / Int8ub
+        * "0 last, 1 strongest, 2 both, 3 first, 4 first and last, 5 first and strongest, where a"
+        " model has it"
+    ),
     0x20: Struct("host" / Bytes(4), "port" / Int16ub * "of the data", "gps_port" / Int16ub),
 }
 
@@ -50,19 +59,32 @@ FRAMES = {
         max_length=8 + LARGEST,
         plausible=plausible,
     ),
-    "request": Frame(message(Switch(this.code, SETTINGS, default=Bytes(0))), direction="out", max_length=16),
+    "request": Frame(
+        message(Switch(this.code, SETTINGS, default=Bytes(0))), direction="out", max_length=16
+    ),
 }
 
 
 def _command(code: int, **more: Any) -> Command:
     fixed = {"code": code, "result": 0, **({} if code in SETTINGS else {"payload": b""})}
-    return Command("request", fixed, reply="answer", matches={"result": 0}, echoes=("code",), timeout=3.0, link="control", **more)
+    return Command(
+        "request",
+        fixed,
+        reply="answer",
+        matches={"result": 0},
+        echoes=("code",),
+        timeout=3.0,
+        link="control",
+        **more,
+    )
 
 
 def commands(rates: tuple[int, int]) -> Mapping[str, Command]:
     """What can be asked of a unit that turns at these rates, rpm, slowest and fastest."""
     return {
-        "get_calibration": _command(0x05, learns=lambda reply: {"calibration": bytes(reply.payload)}),
+        "get_calibration": _command(
+            0x05, learns=lambda reply: {"calibration": bytes(reply.payload)}
+        ),
         "get_firing_times": _command(0xA9),
         "get_inventory": _command(0x07),
         "get_status": _command(0x09),

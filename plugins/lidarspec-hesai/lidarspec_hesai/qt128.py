@@ -1,8 +1,9 @@
-"""Hesai QT128C2X: protocol 3.2, a header, 2 blocks of 128 channels, CRCs over blocks, functional safety and tail, 1127 bytes.
+"""Hesai QT128C2X: protocol 3.2, a header, 2 blocks of 128 channels, CRCs over blocks, functional
+safety and tail, 1127 bytes.
 
-Source: HesaiLidar_SDK_2.0 (udp_protocol_v3_2.h; angle and firing-time files of a sample unit); the CRCs hold for a capture of tier4/nebula,
-as the fact that the second block follows the first by 111.11 us (nebula has it the other way round). By turns two loops fire 92 of
-the channels each.
+Source: HesaiLidar_SDK_2.0 (udp_protocol_v3_2.h; angle and firing-time files of a sample unit); the
+CRCs hold for a capture of tier4/nebula, as the fact that the second block follows the first by
+111.11 us (nebula has it the other way round). By turns two loops fire 92 of the channels each.
 """
 
 from __future__ import annotations
@@ -16,10 +17,22 @@ from lidarspec.spec import Fields, Frame, Polar, Scaled
 from lidarspec_hesai.calibration import Calibration, nominal
 from lidarspec_hesai.family import spinning
 from lidarspec_hesai.parts import FACTORY, RETURN_MODES, UTC, beams, returns_of, turning
-from lidarspec_hesai.sealed import ACKNOWLEDGED, BLOCKS, LASERS, distance, in_body, longest, packet, plausible
+from lidarspec_hesai.sealed import (
+    ACKNOWLEDGED,
+    BLOCKS,
+    LASERS,
+    distance,
+    in_body,
+    longest,
+    packet,
+    plausible,
+)
 
 PER_TURN = 900  # blocks in a turn at 10 Hz and single return: 0.4 degrees
-FIRST_SHOT, SHOT = 9e-6, 111.11e-6  # seconds from the packet's time to the first shot, and from shot to shot
+FIRST_SHOT, SHOT = (
+    9e-6,
+    111.11e-6,
+)  # seconds from the packet's time to the first shot, and from shot to shot
 
 # fmt: off
 ELEVATION = (
@@ -74,7 +87,11 @@ LOOP_2_US = (
 # fmt: on
 
 VERSION = ("major" / Const(3, Int8ul), "minor" / Const(2, Int8ul))
-CHANNEL = Struct("distance" / Int16ul * "steps of dis_unit; 0: no return", "reflectivity" / Int8ul, "confidence" / Int8ul)
+CHANNEL = Struct(
+    "distance" / Int16ul * "steps of dis_unit; 0: no return",
+    "reflectivity" / Int8ul,
+    "confidence" / Int8ul,
+)
 TAIL = (
     "tail_reserved" / Bytes(5),
     "mode_flag" / Int8ul * "bit 0: the loop of the packet, with dual return",
@@ -88,11 +105,15 @@ TAIL = (
 
 
 def points(f: Fields, channels: Calibration) -> Polar:
-    """Shots after the packet's time (HesaiLidar_SDK_2.0); channels by the loop, which changes with each shot."""
+    """Shots after the packet's time (HesaiLidar_SDK_2.0); channels by the loop, which changes with
+    each shot.
+    """
     block, returns = np.arange(BLOCKS)[:, None], returns_of(f.return_mode)
     loop = np.where(returns > 1, np.mod(f.mode_flag, 2), block % 2)
     fired = FIRST_SHOT + SHOT * (block // returns) + np.where(loop == 0, 0, 1) * LATER
-    return beams(f.body.blocks, channels, distance=distance(f), block=block, returns=returns, fired=fired)
+    return beams(
+        f.body.blocks, channels, distance=distance(f), block=block, returns=returns, fired=fired
+    )
 
 
 def sweep(i: int) -> dict[str, Any]:
@@ -101,7 +122,9 @@ def sweep(i: int) -> dict[str, Any]:
 
 
 TABLE = nominal(ELEVATION, AZIMUTH, LOOP_1_US)
-LATER = (np.array(LOOP_2_US) - np.array(LOOP_1_US)) * 1e-6  # seconds by which channels fire later in the second loop
+LATER = (
+    np.array(LOOP_2_US) - np.array(LOOP_1_US)
+) * 1e-6  # seconds by which channels fire later in the second loop
 
 QT128 = spinning(
     "hesai-qt128",
@@ -122,5 +145,8 @@ QT128 = spinning(
     range_limits=(0.05, 50.0),
     aliases=("qt128", "qt128c2x"),
     status="vectors",
-    source="HesaiLidar_SDK_2.0 (udp_protocol_v3_2.h, QT128C2X correction files); one captured packet of tier4/nebula",
+    source=(
+        "HesaiLidar_SDK_2.0 (udp_protocol_v3_2.h, QT128C2X correction files); one captured packet"
+        " of tier4/nebula"
+    ),
 )

@@ -1,4 +1,5 @@
-"""Hesai PandarQT64: protocol 3.1, a header, up to 4 blocks of 64 channels, 1072 bytes with the UDP sequence.
+"""Hesai PandarQT64: protocol 3.1, a header, up to 4 blocks of 64 channels, 1072 bytes with the UDP
+sequence.
 
 Source: HesaiLidar_SDK_2.0 (udp_protocol_v3_1.h; angle and firing-time files of the model).
 """
@@ -17,7 +18,10 @@ from lidarspec_hesai.parts import FACTORY, RETURN_MODES, UTC, beams, returns_of,
 
 BLOCKS, CHANNELS = 4, 64
 PER_TURN = 600  # blocks in a turn at 10 Hz and single return: 0.6 degrees
-FIRST_SHOT, SHOTS = 25.71e-6, (0.0, 166.67e-6, 333.33e-6, 500.0e-6)  # seconds from the packet's time
+FIRST_SHOT, SHOTS = (
+    25.71e-6,
+    (0.0, 166.67e-6, 333.33e-6, 500.0e-6),
+)  # seconds from the packet's time
 
 # fmt: off
 ELEVATION = (
@@ -55,7 +59,9 @@ def points(f: Fields, channels: Calibration) -> Polar:
     """Four shots, or two with dual return, after the packet's time (HesaiLidar_SDK_2.0)."""
     block, returns = block_numbers(f), returns_of(f.return_mode)
     fired = FIRST_SHOT + take(SHOTS, block // returns)
-    return beams(f.blocks, channels, distance=distance(f), block=block, returns=returns, fired=fired)
+    return beams(
+        f.blocks, channels, distance=distance(f), block=block, returns=returns, fired=fired
+    )
 
 
 def sweep(i: int) -> dict[str, Any]:
@@ -67,7 +73,14 @@ TABLE = nominal(ELEVATION, AZIMUTH, FIRING_US)
 
 QT64 = spinning(
     "hesai-qt64",
-    {"data": Frame(packet(3, 1, CHANNELS, TAIL), data=True, max_length=longest(CHANNELS, BLOCKS), plausible=plausible)},
+    {
+        "data": Frame(
+            packet(3, 1, CHANNELS, TAIL),
+            data=True,
+            max_length=longest(CHANNELS, BLOCKS),
+            plausible=plausible,
+        )
+    },
     points,
     TABLE,
     sweep,
@@ -75,5 +88,8 @@ QT64 = spinning(
     range_limits=(0.1, 60.0),
     aliases=("qt64", "pandarqt64"),
     status="capture",
-    source="HesaiLidar_SDK_2.0 (udp_protocol_v3_1.h, PandarQT correction files); capture of tier4/nebula",
+    source=(
+        "HesaiLidar_SDK_2.0 (udp_protocol_v3_1.h, PandarQT correction files); capture of"
+        " tier4/nebula"
+    ),
 )

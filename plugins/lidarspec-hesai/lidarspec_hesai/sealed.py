@@ -1,10 +1,12 @@
-"""Packets with CRCs of their own over blocks, functional safety and tail (QT128, Pandar128, OT128, JT128, AT128).
+"""Packets with CRCs of their own over blocks, functional safety and tail (QT128, Pandar128, OT128,
+JT128, AT128).
 
     EE FF  major minor  status reserved | lasers blocks first_return dis_unit return_num flags
-    2 x [azimuth, channels], CRC [, functional safety] , tail [, sequence], [, IMU], CRC [, signature]
+    2 x [azimuth, channels], CRC [, functional safety] , tail [, sequence], [, IMU], CRC [,
+    signature]
 
-Source: HesaiLidar_SDK_2.0 (udp_protocol_v3_2.h, udp_protocol_v1_4.h); what the CRCs cover was found in a capture of a QT128, and is assumed
-of the others, where they are not held.
+Source: HesaiLidar_SDK_2.0 (udp_protocol_v3_2.h, udp_protocol_v1_4.h); what the CRCs cover was found
+in a capture of a QT128, and is assumed of the others, where they are not held.
 """
 
 from __future__ import annotations
@@ -12,7 +14,21 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import Any
 
-from construct import Array, BitsInteger, BitStruct, Bytes, Const, Construct, If, Int8ul, Int16sl, Int16ul, Int32ul, Struct, this
+from construct import (
+    Array,
+    BitsInteger,
+    BitStruct,
+    Bytes,
+    Const,
+    Construct,
+    If,
+    Int8ul,
+    Int16sl,
+    Int16ul,
+    Int32ul,
+    Struct,
+    this,
+)
 
 from lidarspec.spec import Checksummed, Crc, Fields, Scaled
 from lidarspec_hesai.headed import USUAL_UNIT
@@ -70,17 +86,24 @@ def packet(
         block: what stands between the azimuth of a block and its channels.
         blocks: how many there are.
         imu, safety: whether there can be one.
-        held: whether CRCs are held; where nobody has seen what they cover, they are fields like others.
+        held: whether CRCs are held; where nobody has seen what they cover, they are fields like
+            others.
     """
     finer = [] if block is None else ["fine_azimuth" / block]
     body = Struct(
-        "blocks" / Array(this._.block_count, Struct("azimuth" / Scaled(Int16ul, 0.01, "deg"), *finer, "channels" / channels)),
+        "blocks"
+        / Array(
+            this._.block_count,
+            Struct("azimuth" / Scaled(Int16ul, 0.01, "deg"), *finer, "channels" / channels),
+        ),
         "crc" / Int32ul,
     )
     frame = Struct(
         "sync" / Const(b"\xee\xff"),
         *version,
-        "status_version" / Int8ul * "of what the tail says of the unit; tells models of one version",
+        "status_version"
+        / Int8ul
+        * "of what the tail says of the unit; tells models of one version",
         "header_reserved" / Bytes(1),
         "lasers" / Const(LASERS, Int8ul),
         "block_count" / blocks,
@@ -89,7 +112,17 @@ def packet(
         "return_count" / Int8ul * "returns of a shot; of some models the most that there can be",
         "flags" / FLAGS,
         "body" / (Checksummed(body, "crc", CRC) if held else body),
-        *(["safety" / If(this.flags.safety == 1, Checksummed(SAFETY, "crc", CRC, over=SAFE) if held else SAFETY)] if safety else []),
+        *(
+            [
+                "safety"
+                / If(
+                    this.flags.safety == 1,
+                    Checksummed(SAFETY, "crc", CRC, over=SAFE) if held else SAFETY,
+                )
+            ]
+            if safety
+            else []
+        ),
         *tail,
         "sequence" / If(this.flags.sequence == 1, Int32ul),
         *(["imu" / If(this.flags.imu == 1, IMU)] if imu else []),
@@ -108,13 +141,20 @@ def longest(blocks: int, block: int) -> int:
 
 def plausible(f: Fields) -> Any:
     """Blocks, one to three returns, a unit, and azimuths below 360 degrees."""
-    counted = (f.block_count >= 1) & (f.dis_unit >= 1) & (f.return_count >= 1) & (f.return_count <= 3)
+    counted = (
+        (f.block_count >= 1) & (f.dis_unit >= 1) & (f.return_count >= 1) & (f.return_count <= 3)
+    )
     return counted & (f.body.blocks.azimuth < 360)
 
 
 #: findings of the kit that hold for these packets.
 UNSEEN = "no packet of this model was seen: what its CRCs cover is not known, and they are not held"
-ACKNOWLEDGED = {"LS205": "as found on a captured stream: header, version of the safety part and signature are under no CRC"}
+ACKNOWLEDGED = {
+    "LS205": (
+        "as found on a captured stream: header, version of the safety part and signature are under"
+        " no CRC"
+    )
+}
 
 
 def distance(f: Fields) -> Any:
@@ -123,11 +163,22 @@ def distance(f: Fields) -> Any:
 
 
 def in_body(values: dict[str, Any], **more: int) -> dict[str, Any]:
-    """The values of a simulated packet with single return and a sequence: of its header, and these, its azimuths in the body.
+    """The values of a simulated packet with single return and a sequence: of its header, and these,
+    its azimuths in the body.
 
     Args:
         more: flags, and fields of the header.
     """
-    flags = {"flags.sequence": 1, **{f"flags.{name}": value for name, value in more.items() if name in ("confidence", "imu", "safety")}}
+    flags = {
+        "flags.sequence": 1,
+        **{
+            f"flags.{name}": value
+            for name, value in more.items()
+            if name in ("confidence", "imu", "safety")
+        },
+    }
     header = {"first_return": 1, "dis_unit": USUAL_UNIT, "return_count": 1, **flags}
-    return {**header, **{name.replace("blocks.", "body.blocks."): value for name, value in values.items()}}
+    return {
+        **header,
+        **{name.replace("blocks.", "body.blocks."): value for name, value in values.items()},
+    }

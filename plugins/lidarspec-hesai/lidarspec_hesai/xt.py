@@ -1,6 +1,8 @@
-"""Hesai PandarXT-32, PandarXT-16 and XT32M2X: protocol 6.1, a header, up to 8 blocks, 1080 and 568 bytes; 6 blocks, 820, of the last.
+"""Hesai PandarXT-32, PandarXT-16 and XT32M2X: protocol 6.1, a header, up to 8 blocks, 1080 and 568
+bytes; 6 blocks, 820, of the last.
 
-Source: HesaiLidar_SDK_2.0 (udp_protocol_v6_1.h; correction files of the models, which give whole degrees and no offsets).
+Source: HesaiLidar_SDK_2.0 (udp_protocol_v6_1.h; correction files of the models, which give whole
+degrees and no offsets).
 """
 
 from __future__ import annotations
@@ -32,10 +34,14 @@ TAIL = (
 
 
 def points(f: Fields, channels: Calibration) -> Polar:
-    """Shots up to the packet's time (HesaiLidar_SDK_2.0); the header says how many returns there can be, not how many there are."""
+    """Shots up to the packet's time (HesaiLidar_SDK_2.0); the header says how many returns there
+    can be, not how many there are.
+    """
     block, returns = block_numbers(f), returns_of(f.return_mode)
     fired = -SHOT * ((f.block_count - 1 - block) // returns)
-    return beams(f.blocks, channels, distance=distance(f), block=block, returns=returns, fired=fired)
+    return beams(
+        f.blocks, channels, distance=distance(f), block=block, returns=returns, fired=fired
+    )
 
 
 def sweep(i: int, blocks: int = BLOCKS) -> dict[str, Any]:
@@ -61,8 +67,16 @@ TABLE_32 = nominal(15.0 - np.arange(32), np.zeros(32), 6.0 + 1.512 * np.arange(3
 TABLE_16 = nominal(15.0 - 2.0 * np.arange(16), np.zeros(16), 6.0 + 3.024 * np.arange(16))
 TABLE_XT32M = nominal(ELEVATION_XT32M, AZIMUTH_XT32M, 6.0 + 2.888 * (np.arange(32) % 16))
 
-FRAMES_32 = {"data": Frame(packet(6, 1, 32, TAIL), data=True, max_length=longest(32, BLOCKS), plausible=plausible)}
-FRAMES_16 = {"data": Frame(packet(6, 1, 16, TAIL), data=True, max_length=longest(16, BLOCKS), plausible=plausible)}
+FRAMES_32 = {
+    "data": Frame(
+        packet(6, 1, 32, TAIL), data=True, max_length=longest(32, BLOCKS), plausible=plausible
+    )
+}
+FRAMES_16 = {
+    "data": Frame(
+        packet(6, 1, 16, TAIL), data=True, max_length=longest(16, BLOCKS), plausible=plausible
+    )
+}
 
 XT32 = spinning(
     "hesai-xt32",
@@ -73,9 +87,16 @@ XT32 = spinning(
     model="PandarXT-32",
     range_limits=(0.05, 120.0),
     aliases=("xt32", "pandarxt-32"),
-    relatives={"hesai-xt32m": Relative("6 blocks in a packet, an XT32 sends 8", lambda f: f.block_count == 6)},
+    relatives={
+        "hesai-xt32m": Relative(
+            "6 blocks in a packet, an XT32 sends 8", lambda f: f.block_count == 6
+        )
+    },
     status="capture",
-    source="HesaiLidar_SDK_2.0 (udp_protocol_v6_1.h, PandarXT correction files); capture of tier4/nebula",
+    source=(
+        "HesaiLidar_SDK_2.0 (udp_protocol_v6_1.h, PandarXT correction files); capture of"
+        " tier4/nebula"
+    ),
 )
 
 XT16 = spinning(
@@ -88,7 +109,10 @@ XT16 = spinning(
     range_limits=(0.05, 120.0),
     aliases=("xt16", "pandarxt-16"),
     status="vectors",
-    source="HesaiLidar_SDK_2.0 (udp_protocol_v6_1.h, PandarXT-16 correction files); one captured packet of tier4/nebula",
+    source=(
+        "HesaiLidar_SDK_2.0 (udp_protocol_v6_1.h, PandarXT-16 correction files); one captured"
+        " packet of tier4/nebula"
+    ),
 )
 
 XT32M = spinning(
@@ -100,7 +124,14 @@ XT32M = spinning(
     model="XT32M2X",
     range_limits=(0.5, 300.0),
     aliases=("xt32m", "xt32m2x"),
-    relatives={"hesai-xt32": Relative("8 blocks in a packet, an XT32M sends 6", lambda f: f.block_count == 8)},
+    relatives={
+        "hesai-xt32": Relative(
+            "8 blocks in a packet, an XT32M sends 6", lambda f: f.block_count == 8
+        )
+    },
     status="vectors",
-    source="HesaiLidar_SDK_2.0 (udp_protocol_v6_1.h, PandarXT-32M2X correction files); one captured packet of tier4/nebula",
+    source=(
+        "HesaiLidar_SDK_2.0 (udp_protocol_v6_1.h, PandarXT-32M2X correction files); one captured"
+        " packet of tier4/nebula"
+    ),
 )

@@ -1,8 +1,10 @@
-"""Hesai captures: every published point is one of ours and every one of ours is published; the 20 Hz Pandar40P with its sequence.
+"""Hesai captures: every published point is one of ours and every one of ours is published; the 20
+Hz Pandar40P with its sequence.
 
-The published clouds are one turn each, in the vendor's axes, cut where a point's own azimuth passes 0 (not its block's), with
-dual return's second echo left out where it is at the place of the first, and nothing nearer than the nearest of them. So our
-points of all packets are put into turns by their own azimuths, and counted by place.
+The published clouds are one turn each, in the vendor's axes, cut where a point's own azimuth passes
+0 (not its block's), with dual return's second echo left out where it is at the place of the first,
+and nothing nearer than the nearest of them. So our points of all packets are put into turns by
+their own azimuths, and counted by place.
 """
 
 from __future__ import annotations
@@ -47,7 +49,9 @@ def published(name: str) -> Points:
 
 
 def nearest(points: Points, queries: Points) -> NDArray[np.float64]:
-    """The distance from each query to the nearest point; inf beyond REACH. Points are sorted into cells of that size."""
+    """The distance from each query to the nearest point; inf beyond REACH. Points are sorted into
+    cells of that size.
+    """
 
     def codes(cells: NDArray[np.int64]) -> NDArray[np.int64]:
         return np.asarray((cells[:, 0] << 42) + (cells[:, 1] << 21) + cells[:, 2])
@@ -75,7 +79,9 @@ def turns(cloud: PointCloud) -> NDArray[np.intp]:
 
 def places(cloud: PointCloud, which: NDArray[np.bool_]) -> Points:
     """The places of some of the points, each once, in the vendor's axes."""
-    return np.unique(np.stack([-cloud.y, cloud.x, cloud.z], axis=1)[which & cloud.valid], axis=0).astype(np.float64)
+    return np.unique(
+        np.stack([-cloud.y, cloud.x, cloud.z], axis=1)[which & cloud.valid], axis=0
+    ).astype(np.float64)
 
 
 @pytest.mark.parametrize("name", PUBLISHED)
@@ -89,8 +95,14 @@ def test_the_points_of_a_turn_are_those_that_were_published(name: str) -> None:
     assert len(ours) == len(theirs)
     assert nearest(ours, theirs).max() < 1e-5
     assert nearest(theirs, ours).max() < 1e-5
-    vendor = calibrated(name, frame="vendor").decode(datagrams(capture(f"hesai/{name}/packets.derived.pcap"))).points()
-    np.testing.assert_array_equal(vendor.xyz[vendor.valid], np.stack([-cloud.y, cloud.x, cloud.z], axis=1)[cloud.valid])
+    vendor = (
+        calibrated(name, frame="vendor")
+        .decode(datagrams(capture(f"hesai/{name}/packets.derived.pcap")))
+        .points()
+    )
+    np.testing.assert_array_equal(
+        vendor.xyz[vendor.valid], np.stack([-cloud.y, cloud.x, cloud.z], axis=1)[cloud.valid]
+    )
 
 
 @pytest.mark.parametrize("name", PUBLISHED)
@@ -111,7 +123,11 @@ def test_a_capture_is_five_pieces_and_nothing_is_lost(name: str) -> None:
 
 @pytest.mark.parametrize("name", [*PUBLISHED, "40p_20hz"])
 def test_compiled_and_interpreted_agree_on_captured_packets(name: str) -> None:
-    path = capture("hesai/40p_20hz/lidar_20Hz.pcapng" if name == "40p_20hz" else f"hesai/{name}/packets.derived.pcap")
+    path = capture(
+        "hesai/40p_20hz/lidar_20Hz.pcapng"
+        if name == "40p_20hz"
+        else f"hesai/{name}/packets.derived.pcap"
+    )
     assert len(decoded(FAST if name == "40p_20hz" else calibrated(name), datagrams(path)[:8])) == 8
 
 
@@ -120,7 +136,9 @@ def test_the_sequence_of_the_20_hz_pandar40p_is_unbroken() -> None:
     assert (len(packets), packets.frame) == (200, "data_sequence")
     assert (packets.stats.lost, packets.stats.bytes_skipped) == (0, 0)
     assert set(np.diff(packets["sequence"])) == {1}
-    assert abs(np.diff(packets.time_ns) - 555_600).max() < 2000  # ten shots, by a clock of whole microseconds
+    assert (
+        abs(np.diff(packets.time_ns) - 555_600).max() < 2000
+    )  # ten shots, by a clock of whole microseconds
     with ls.open(capture("hesai/40p_20hz/lidar_20Hz.pcapng")) as device:
         assert device.sensor.id == FAST.id
         assert [len(scan) for scan in device.scans() if scan.complete] == [36_000]
@@ -130,14 +148,21 @@ def test_the_sequence_of_the_20_hz_pandar40p_is_unbroken() -> None:
 def test_exactly_the_removed_packets_are_lost(removed: set[int]) -> None:
     data = datagrams(capture("hesai/40p_20hz/lidar_20Hz.pcapng"))
     packets = FAST.decode([datagram for index, datagram in enumerate(data) if index not in removed])
-    assert (packets.stats.lost, packets.stats.duplicates, packets.stats.late) == (len(removed), 0, 0)
-    assert packets.index.tolist() == [int(packets.index[0]) + index for index in range(200) if index not in removed]
+    assert (packets.stats.lost, packets.stats.duplicates, packets.stats.late) == (
+        len(removed),
+        0,
+        0,
+    )
+    assert packets.index.tolist() == [
+        int(packets.index[0]) + index for index in range(200) if index not in removed
+    ]
 
 
 def test_the_angles_and_firing_times_of_the_20_hz_unit() -> None:
     folder = capture("hesai/40p_20hz")
     own = FAST.configure(
-        calibration=folder / "Pandar40P_Angle Correction File.csv", firing_times=folder / "Pandar40P_Firetime Correction File.csv"
+        calibration=folder / "Pandar40P_Angle Correction File.csv",
+        firing_times=folder / "Pandar40P_Firetime Correction File.csv",
     )
     cloud = own.decode(datagrams(folder / "lidar_20Hz.pcapng")).points()
     assert not cloud.nominal

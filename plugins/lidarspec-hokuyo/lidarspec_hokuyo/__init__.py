@@ -1,14 +1,16 @@
 """Hokuyo scanners that speak SCIP 2.0: URG-04LX, UST-10LX, UST-20LX, UTM-30LX and UTM-30LX-EW.
 
-An answer is a whole turn. It says which steps it has, but not of how many a turn is, nor of which model it is. What MD asks for goes on
-with distances, ME with intensities as well, MS with distances of two characters, ND and NE with all echoes; GD, GE, GS, HD and HE ask for
-one scan, and need `laser_on` before. Scans of any steps are read; which ones are asked for says
-``configure(content=, first=, last=, cluster=)``.
+An answer is a whole turn. It says which steps it has, but not of how many a turn is, nor of which
+model it is. What MD asks for goes on with distances, ME with intensities as well, MS with distances
+of two characters, ND and NE with all echoes; GD, GE, GS, HD and HE ask for one scan, and need
+`laser_on` before. Scans of any steps are read; which ones are asked for says ``configure(content=,
+first=, last=, cluster=)``.
 
-Source: SCIP 2.0, C-42-03320B (table 2: steps; 8: commands, and the answer of a URG-04LX to PP); UST-10LX/20LX, C-42-04076 (port); what a
-UST-10LX and a UTM-30LX-EW answer to PP, as users print it, for their ranges and speed. Assumed: that a UST-20LX and a UTM-30LX answer as a
-UTM-30LX-EW does, but for the shortest range of the UST-20LX; and that a URG-04LX alone takes SS, CR and HS, and no ME and GE. Only
-of a UTM-30LX-EW is it said that it sends several echoes.
+Source: SCIP 2.0, C-42-03320B (table 2: steps; 8: commands, and the answer of a URG-04LX to PP);
+UST-10LX/20LX, C-42-04076 (port); what a UST-10LX and a UTM-30LX-EW answer to PP, as users print it,
+for their ranges and speed. Assumed: that a UST-20LX and a UTM-30LX answer as a UTM-30LX-EW does,
+but for the shortest range of the UST-20LX; and that a URG-04LX alone takes SS, CR and HS, and no ME
+and GE. Only of a UTM-30LX-EW is it said that it sends several echoes.
 """
 
 from __future__ import annotations
@@ -19,7 +21,18 @@ from functools import cache, partial
 from typing import Any
 
 from lidarspec import UsageError
-from lidarspec.spec import Clock, Frame, Link, OnChange, Relative, Sensor, Serial, Simulation, Tcp, hookimpl
+from lidarspec.spec import (
+    Clock,
+    Frame,
+    Link,
+    OnChange,
+    Relative,
+    Sensor,
+    Serial,
+    Simulation,
+    Tcp,
+    hookimpl,
+)
 from lidarspec_hokuyo.commands import TOLD_BY, commands, messages, telling
 from lidarspec_hokuyo.scans import KINDS, WRAP, Asked, Geometry, number, scan, sweep
 
@@ -51,27 +64,41 @@ def relative(own: Geometry, other: Geometry) -> str | Relative:
 def frames(kind: str, geometry: Geometry) -> dict[str, Frame]:
     """All frames of a scanner, first the scans of a kind."""
     kinds = sorted(geometry.kinds, key=lambda other: other != kind)
-    scans = {f"{prefix}{one}": scan(command, geometry) for one in kinds for prefix, command in zip(("", "one_"), KINDS[one], strict=True)}
+    scans = {
+        f"{prefix}{one}": scan(command, geometry)
+        for one in kinds
+        for prefix, command in zip(("", "one_"), KINDS[one], strict=True)
+    }
     return scans | messages(kind, is_urg=geometry is URG)
 
 
-def configure(sensor: Sensor, *, content: str = "distances", first: int = -1, last: int = -1, cluster: int = 1) -> Sensor:
-    """The scanner that is asked for these scans: "distances", "intensities" as well, or "short" distances; of a
-    UTM-30LX-EW also "echoes", up to three of each step, and "echo_intensities".
+def configure(
+    sensor: Sensor, *, content: str = "distances", first: int = -1, last: int = -1, cluster: int = 1
+) -> Sensor:
+    """The scanner that is asked for these scans: "distances", "intensities" as well, or "short"
+    distances; of a UTM-30LX-EW also "echoes", up to three of each step, and "echo_intensities".
 
     Args:
-        first, last: the steps that are asked for; -1 for the first and the last ones that it measures.
+        first, last: the steps that are asked for; -1 for the first and the last ones that it
+            measures.
         cluster: steps that come as one distance, 1 to 99.
 
     Raises:
         UsageError: for what the scanner does not take.
     """
     geometry = MODELS[sensor.id][1]
-    asked = Asked(geometry.first if first < 0 else first, geometry.last if last < 0 else last, cluster)
+    asked = Asked(
+        geometry.first if first < 0 else first, geometry.last if last < 0 else last, cluster
+    )
     if content not in geometry.kinds:
-        raise UsageError(f"{sensor.id}: content is one of {', '.join(geometry.kinds)}, not {content!r}")
+        raise UsageError(
+            f"{sensor.id}: content is one of {', '.join(geometry.kinds)}, not {content!r}"
+        )
     if not (asked.first <= asked.last <= geometry.end and 1 <= cluster <= 99):
-        raise UsageError(f"{sensor.id}: steps go from 0 up to {geometry.end}, and 1 to 99 make a cluster; not {asked.text.decode()}")
+        raise UsageError(
+            f"{sensor.id}: steps go from 0 up to {geometry.end}, and 1 to 99 make a cluster; not"
+            f" {asked.text.decode()}"
+        )
     return dataclasses.replace(sensor, **conversation(sensor.id, content, asked))
 
 
@@ -80,14 +107,25 @@ def conversation(name: str, kind: str, asked: Asked) -> dict[str, Any]:
     model, geometry, limits, _, _ = MODELS[name]
     in_mm = {"shortest": f"{limits[0] * 1000:g}", "longest": f"{limits[1] * 1000:g}"}
     looks = {line: str(getattr(geometry, line)) for line in ("division", "first", "last", "ahead")}
-    told = {"model": model, "product": model, "protocol": "SCIP 2.0", "speed": f"{geometry.rate * 60:g}", **in_mm, **looks}
-    answers: dict[str, Any] = {command: (telling(frame, told),) for command, frame in TOLD_BY.items()}
+    told = {
+        "model": model,
+        "product": model,
+        "protocol": "SCIP 2.0",
+        "speed": f"{geometry.rate * 60:g}",
+        **in_mm,
+        **looks,
+    }
+    answers: dict[str, Any] = {
+        command: (telling(frame, told),) for command, frame in TOLD_BY.items()
+    }
     shown = partial(sweep, geometry=geometry, asked=asked)
     return {
         "range_limits": (limits[0], min(limits[1], FARTHEST_SHORT)) if kind == "short" else limits,
         "frames": frames(kind, geometry),
         "commands": commands(kind, asked.text, is_urg=geometry is URG),
-        "simulation": Simulation(shown, answers={**answers, "get_scan": ((f"one_{kind}", shown(0)),)}),
+        "simulation": Simulation(
+            shown, answers={**answers, "get_scan": ((f"one_{kind}", shown(0)),)}
+        ),
     }
 
 
@@ -106,13 +144,27 @@ def scanner(name: str) -> Sensor:
         on_open=("stop", "start"),
         on_close=("stop",),
         configure=configure,
-        relatives={other: relative(geometry, row[1]) for other, row in MODELS.items() if other != name},
-        info={"serial": "version.serial.text", "firmware": "version.firmware.text", "model": "parameters.model.text"},
-        aliases=tuple(alias for alias in (name.removeprefix("hokuyo-"), model.lower(), f"hokuyo-{model.lower()}")),
+        relatives={
+            other: relative(geometry, row[1]) for other, row in MODELS.items() if other != name
+        },
+        info={
+            "serial": "version.serial.text",
+            "firmware": "version.firmware.text",
+            "model": "parameters.model.text",
+        },
+        aliases=tuple(
+            alias
+            for alias in (name.removeprefix("hokuyo-"), model.lower(), f"hokuyo-{model.lower()}")
+        ),
         status=status,
-        source="SCIP 2.0, C-42-03320B"
-        if geometry is URG
-        else f"SCIP 2.0, C-42-03320B; {'UTM-30LX-EW, C-42-03886' if geometry is UTM else 'UST-10LX/20LX, C-42-04076'}",
+        source=(
+            "SCIP 2.0, C-42-03320B"
+            if geometry is URG
+            else (
+                "SCIP 2.0, C-42-03320B;"
+                f" {'UTM-30LX-EW, C-42-03886' if geometry is UTM else 'UST-10LX/20LX, C-42-04076'}"
+            )
+        ),
     )
 
 

@@ -1,7 +1,9 @@
-"""What can be asked of a scanner, and what it answers: an echo, a status and, where it tells something, lines with a name and a value each.
+"""What can be asked of a scanner, and what it answers: an echo, a status and, where it tells
+something, lines with a name and a value each.
 
-Source: SCIP 2.0, C-42-03320B, section 8: BM, QT, RS, TM, SS, CR, HS, VV, PP, II; the lines of VV, PP and II have their check character over
-what stands before the semicolon. Commands end with a line feed. No text is sent behind a command, though a scanner would repeat it.
+Source: SCIP 2.0, C-42-03320B, section 8: BM, QT, RS, TM, SS, CR, HS, VV, PP, II; the lines of VV,
+PP and II have their check character over what stands before the semicolon. Commands end with a line
+feed. No text is sent behind a command, though a scanner would repeat it.
 """
 
 from __future__ import annotations
@@ -17,9 +19,19 @@ from lidarspec.spec import Checksum, Checksummed, Command, Frame, Lines, Scaled,
 from lidarspec_hokuyo.scans import KINDS
 
 STATUS = "status" / Bytes(2) * "00 done; of BM 02: the laser is on already; else what is wrong"
-#: what a scanner tells of itself: reply -> command, its lines by name, the first four letters of each.
+#: what a scanner tells of itself: reply -> command, its lines by name, the first four letters of
+#: each.
 TOLD: dict[str, tuple[bytes, dict[str, str]]] = {
-    "version": (b"VV", {"vendor": "VEND", "product": "PROD", "firmware": "FIRM", "protocol": "PROT", "serial": "SERI"}),
+    "version": (
+        b"VV",
+        {
+            "vendor": "VEND",
+            "product": "PROD",
+            "firmware": "FIRM",
+            "protocol": "PROT",
+            "serial": "SERI",
+        },
+    ),
     "parameters": (
         b"PP",
         {
@@ -65,30 +77,49 @@ class LineCheck(Checksum):
 
 
 def line(name: str, begin: str) -> Construct:
-    """A line of a value behind a name: its text ends with a semicolon, behind which the check character stands."""
+    """A line of a value behind a name: its text ends with a semicolon, behind which the check
+    character stands.
+    """
     text = "text" / NullTerminated(GreedyBytes, term=b";")
-    struct = Struct("name" / Const(f"{begin}:".encode()), text, "check" / Int8ub, "end" / Const(b"\n"))
+    struct = Struct(
+        "name" / Const(f"{begin}:".encode()), text, "check" / Int8ub, "end" / Const(b"\n")
+    )
     return name / Checksummed(struct, field="check", algorithm=LineCheck(), over=("name", "text"))
 
 
 def told(command: bytes, lines: Mapping[str, str]) -> Frame:
     """An answer in such lines."""
-    struct = Struct("head" / Const(command + b"\n00P\n"), *(line(*one) for one in lines.items()), "end" / Const(b"\n"))
-    return Frame(struct, max_length=1000, acknowledged={"LS116": "it comes once, when it is asked for"})
+    struct = Struct(
+        "head" / Const(command + b"\n00P\n"),
+        *(line(*one) for one in lines.items()),
+        "end" / Const(b"\n"),
+    )
+    return Frame(
+        struct, max_length=1000, acknowledged={"LS116": "it comes once, when it is asked for"}
+    )
 
 
 def telling(name: str, values: Mapping[str, str]) -> bytes:
     """Such an answer, of a simulated scanner; what is not given is empty."""
     command, lines = TOLD[name]
     texts = [f"{begin}:{values.get(line, '')};".encode() for line, begin in lines.items()]
-    return command + b"\n00P\n" + b"".join(text + bytes([LineCheck()(text)]) + b"\n" for text in texts) + b"\n"
+    return (
+        command
+        + b"\n00P\n"
+        + b"".join(text + bytes([LineCheck()(text)]) + b"\n" for text in texts)
+        + b"\n"
+    )
 
 
 def answer(command: bytes, *more: Construct, size: int = 0, told: tuple[int, ...] = ()) -> Frame:
-    """The echo of a command with an argument of so many characters, and a status; what else is told stands in a line of its own."""
+    """The echo of a command with an argument of so many characters, and a status; what else is told
+    stands in a line of its own.
+    """
     value = ("value" / Bytes(size),) if size else ()
     wire = Lines(64, head=(len(command) + size, 2, *told), bare=1, check=Scip()) | SixBits()
-    return Frame(Struct("command" / Const(command), *value, STATUS, *more), max_length=40, wire=wire)
+    return Frame(
+        Struct("command" / Const(command), *value, STATUS, *more), max_length=40, wire=wire
+    )
 
 
 def order(command: bytes, size: int) -> Frame:
@@ -117,7 +148,10 @@ OF_URG: dict[str, tuple[bytes, int, dict[str, Any]]] = {
 
 def orders(kind: str, *, is_urg: bool) -> dict[str, tuple[bytes, int, dict[str, Any]]]:
     """All that a scanner takes whose scans are of this kind."""
-    scans = {"start": (KINDS[kind][0].encode(), 13, {"starts": True}), "get_scan": (KINDS[kind][1].encode(), 10, {})}
+    scans = {
+        "start": (KINDS[kind][0].encode(), 13, {"starts": True}),
+        "get_scan": (KINDS[kind][1].encode(), 10, {}),
+    }
     return scans | ORDERS | (OF_URG if is_urg else {})
 
 
@@ -128,13 +162,17 @@ def messages(kind: str, *, is_urg: bool) -> dict[str, Frame]:
     for name, (command, size, _) in rows.items():
         found[f"{name}_order"] = order(command, size)
         if name not in TOLD_BY:
-            clock = ("time" / Scaled(Int32ub, 0.001, "s") * "24 bits",) if name == "get_time" else ()
+            clock = (
+                ("time" / Scaled(Int32ub, 0.001, "s") * "24 bits",) if name == "get_time" else ()
+            )
             found[f"{name}_answer"] = answer(command, *clock, size=size, told=(4,) if clock else ())
     return found | {name: told(*row) for name, row in TOLD.items()}
 
 
 def commands(kind: str, steps: bytes, *, is_urg: bool) -> dict[str, Command]:
-    """The commands of a scanner that is asked for these steps: the first, the last and how many come as one distance."""
+    """The commands of a scanner that is asked for these steps: the first, the last and how many
+    come as one distance.
+    """
     given = {"start": {"value": steps + b"000"}, "get_scan": {"value": steps}}
     found = dict[str, Command]()
     for name, (_, size, more) in orders(kind, is_urg=is_urg).items():
@@ -144,7 +182,11 @@ def commands(kind: str, steps: bytes, *, is_urg: bool) -> dict[str, Command]:
             own["matches"] = {"status": b"00"}
         if size:
             own["echoes"] = ("value",)
-            own |= {"values": given[name]} if name in given else {"args": {"value": ("value", Text(size))}}
+            own |= (
+                {"values": given[name]}
+                if name in given
+                else {"args": {"value": ("value", Text(size))}}
+            )
         if name == "get_scan":
             own |= {"reply": f"one_{kind}", "matches": {}, "echoes": ()}
         found[name] = Command(f"{name}_order", **own)

@@ -1,9 +1,12 @@
-"""The scans that a scanner sends: distances of two or three characters, or distances with intensities; of one echo, or of up to three.
+"""The scans that a scanner sends: distances of two or three characters, or distances with
+intensities; of one echo, or of up to three.
 
-Source: SCIP 2.0, C-42-03320B: characters (6), steps (5), MD and MS with the time and the errors (8.1), GD and GS (8.2). ME and GE send a
-distance and an intensity of three characters each (UTM-30LX-EW, C-42-03886). ND, NE, HD and HE send the same for each echo of a step, with
-"&" between them (C-42-03886). A cluster of steps comes as one distance, its shortest; that a last cluster of fewer steps comes too, that a
-cluster is seen in its middle, and that a step has three echoes at most (Hokuyo's urg_library makes room for three), is assumed.
+Source: SCIP 2.0, C-42-03320B: characters (6), steps (5), MD and MS with the time and the errors
+(8.1), GD and GS (8.2). ME and GE send a distance and an intensity of three characters each
+(UTM-30LX-EW, C-42-03886). ND, NE, HD and HE send the same for each echo of a step, with "&" between
+them (C-42-03886). A cluster of steps comes as one distance, its shortest; that a last cluster of
+fewer steps comes too, that a cluster is seen in its middle, and that a step has three echoes at
+most (Hokuyo's urg_library makes room for three), is assumed.
 """
 
 from __future__ import annotations
@@ -18,7 +21,10 @@ from construct import Array, Const, Int8ub, Int16ub, Int24ub, Int32ub, OneOf, St
 from lidarspec.spec import Echoes, Fields, Frame, Lines, Polar, Scaled, Scip, SixBits
 
 WIDTH = 64  # characters of a line of data
-LONGEST = {1: 7000, 3: 23_000}  # characters by echoes: 1081 distances with intensities take 6727, with three echoes each 22,327
+LONGEST = {
+    1: 7000,
+    3: 23_000,
+}  # characters by echoes: 1081 distances with intensities take 6727, with three echoes each 22,327
 ECHOES = 3  # of a step, at most
 WRAP = 2**24 * 1e-3  # seconds after which the clock starts again
 LEAST = 0.02  # metres: what is below is the number of an error (tables 3 and 4)
@@ -44,7 +50,8 @@ class Geometry:
 
     Attributes:
         division: steps of a whole turn.
-        first, last, ahead: the first and the last step that it measures, and the one straight ahead.
+        first, last, ahead: the first and the last step that it measures, and the one straight
+            ahead.
         end: the highest step that can be asked for.
         rate: turns a second.
         kinds: of scans that it sends.
@@ -74,11 +81,15 @@ class Asked:
 
 
 def decimal(name: str, places: int, most: int = 9999) -> Any:
-    """A number of so many decimal digits, the first of them no larger than that of the largest number."""
+    """A number of so many decimal digits, the first of them no larger than that of the largest
+    number.
+    """
     first = most // 10 ** (places - 1) if places == 4 else 9
     largest = (first, *[9] * (places - 1))
     digits = zip(DIGITS[places], largest, strict=True)
-    return name / Struct(*(place / Scaled(OneOf(Int8ub, range(high + 1)), 1, "") for place, high in digits))
+    return name / Struct(
+        *(place / Scaled(OneOf(Int8ub, range(high + 1)), 1, "") for place, high in digits)
+    )
 
 
 def number(digits: Any) -> Any:
@@ -93,7 +104,10 @@ def two(digits: Any) -> Any:
 
 def digits(name: str, value: int, places: int) -> dict[str, int]:
     """The digits of a number, by their paths."""
-    return {f"{name}.{place}": int(digit) for place, digit in zip(DIGITS[places], f"{value:0{places}}", strict=True)}
+    return {
+        f"{name}.{place}": int(digit)
+        for place, digit in zip(DIGITS[places], f"{value:0{places}}", strict=True)
+    }
 
 
 def width(f: Any) -> Any:
@@ -112,8 +126,13 @@ def plausible(f: Fields, end: int) -> Any:
 
 
 def points(f: Fields, geometry: Geometry, echoes: int) -> Polar:
-    """Points from the first step on, counter-clockwise; a distance below the shortest is the number of an error, or no echo."""
-    step, seen = number(f.first) + f.points.index * width(f) + (width(f) - 1) / 2, f.points if echoes == 1 else f.points.echoes
+    """Points from the first step on, counter-clockwise; a distance below the shortest is the number
+    of an error, or no echo.
+    """
+    step, seen = (
+        number(f.first) + f.points.index * width(f) + (width(f) - 1) / 2,
+        f.points if echoes == 1 else f.points.echoes,
+    )
     return Polar(
         range=seen.distance,
         azimuth=(step - geometry.ahead) * (2 * np.pi / geometry.division),
@@ -129,7 +148,14 @@ def scan(command: str, geometry: Geometry) -> Frame:
     """The answer to a command for scans."""
     goes_on, echoes = command[0] in "MN", ECHOES if command[0] in "NH" else 1
     fields = FIELDS[command[1]]
-    rest = ("skip" / Int8ub * "turns left out between scans", decimal("left", 2) * "scans to come; 0: on and on") if goes_on else ()
+    rest = (
+        (
+            "skip" / Int8ub * "turns left out between scans",
+            decimal("left", 2) * "scans to come; 0: on and on",
+        )
+        if goes_on
+        else ()
+    )
     struct = Struct(
         "command" / Const(command.encode()),
         decimal("first", 4, geometry.end) * "step",
@@ -138,7 +164,8 @@ def scan(command: str, geometry: Geometry) -> Frame:
         *rest,
         "status" / Const(b"99" if goes_on else b"00"),
         "time" / Scaled(Int32ub, 0.001, "s") * "when the turn was at step 0; 24 bits",
-        "points" / Array(count(this), fields if echoes == 1 else Struct("echoes" / Array(echoes, fields))),
+        "points"
+        / Array(count(this), fields if echoes == 1 else Struct("echoes" / Array(echoes, fields))),
     )
     return Frame(
         struct,
@@ -154,5 +181,9 @@ def scan(command: str, geometry: Geometry) -> Frame:
 
 def sweep(i: int, geometry: Geometry, asked: Asked) -> dict[str, Any]:
     """Scan i of those that were asked for."""
-    steps = digits("first", asked.first, 4) | digits("last", asked.last, 4) | digits("cluster", asked.cluster, 2)
+    steps = (
+        digits("first", asked.first, 4)
+        | digits("last", asked.last, 4)
+        | digits("cluster", asked.cluster, 2)
+    )
     return {**steps, "skip": 0, **digits("left", 0, 2), "time": i / geometry.rate % WRAP}

@@ -1,4 +1,6 @@
-"""Hokuyo scanners: the examples of the manual, scans of some steps and clusters, what tells models, and the simulated twin."""
+"""Hokuyo scanners: the examples of the manual, scans of some steps and clusters, what tells models,
+and the simulated twin.
+"""
 
 from __future__ import annotations
 
@@ -11,7 +13,11 @@ from lidarspec.detect.identification import verdict
 from lidarspec.simulation.device import SimulatedDevice
 from tests.evidence import decoded, vector_bytes
 
-URG, UST, UTM = ls.sensor("hokuyo-urg04lx"), ls.sensor("hokuyo-ust10lx"), ls.sensor("hokuyo-utm30lxew")
+URG, UST, UTM = (
+    ls.sensor("hokuyo-urg04lx"),
+    ls.sensor("hokuyo-ust10lx"),
+    ls.sensor("hokuyo-utm30lxew"),
+)
 LINES = ("pp_dmin", "pp_dmax", "pp_ares", "pp_amin", "pp_amax", "pp_afrt", "pp_scan")
 LOOK_ALIKE = {"hokuyo-ust10lx", "hokuyo-ust20lx", "hokuyo-utm30lx", "hokuyo-utm30lxew"}
 
@@ -22,8 +28,13 @@ def hokuyo(name: str) -> bytes:
 
 def test_the_examples_of_the_manual_are_read() -> None:
     lines = b"".join(hokuyo(line) + b"\n" for line in LINES)
-    parameters = URG.parse(b"PP\n" + hokuyo("status_00") + b"\nMODL:URG-04LX;9\n" + lines + b"\n", frame="parameters")
-    assert [int(parameters[name].text) for name in ("shortest", "longest", "division", "first", "last", "ahead", "speed")] == [
+    parameters = URG.parse(
+        b"PP\n" + hokuyo("status_00") + b"\nMODL:URG-04LX;9\n" + lines + b"\n", frame="parameters"
+    )
+    assert [
+        int(parameters[name].text)
+        for name in ("shortest", "longest", "division", "first", "last", "ahead", "speed")
+    ] == [
         20,
         5600,
         1024,
@@ -32,12 +43,23 @@ def test_the_examples_of_the_manual_are_read() -> None:
         384,
         600,
     ]
-    scan = b"MD0384038401000\n" + hokuyo("status_99") + b"\n" + hokuyo("4char") + b"?\n" + hokuyo("3char") + b"M\n\n"
+    scan = (
+        b"MD0384038401000\n"
+        + hokuyo("status_99")
+        + b"\n"
+        + hokuyo("4char")
+        + b"?\n"
+        + hokuyo("3char")
+        + b"M\n\n"
+    )
     values = URG.parse(scan, frame="distances")
     assert (values.time, values.points[0].distance) == (16_000_000, 5432)
     refused = URG.parse(b"MD0384038401000\n" + hokuyo("status_0E") + b"\n\n")
     assert refused.status == b"0E"
-    short = URG.parse(b"GS0384038401\n00P\n" + hokuyo("4char") + b"?\n" + hokuyo("2char") + b"5\n\n", frame="one_short")
+    short = URG.parse(
+        b"GS0384038401\n00P\n" + hokuyo("4char") + b"?\n" + hokuyo("2char") + b"5\n\n",
+        frame="one_short",
+    )
     assert short.points[0].distance == 1234
 
 
@@ -55,7 +77,9 @@ def test_scans_of_some_steps_and_clusters_stand_where_they_were_asked_for() -> N
     assert asked.command("start") == b"MS0128064004000\n"
     cloud = asked.decode(b"".join(ls.simulate(asked, 2))).points()
     assert len(cloud) == 2 * 129
-    np.testing.assert_allclose(cloud.azimuth[:2], np.deg2rad(np.array([129.5, 133.5]) - 384) * 360 / 1024, atol=1e-6)
+    np.testing.assert_allclose(
+        cloud.azimuth[:2], np.deg2rad(np.array([129.5, 133.5]) - 384) * 360 / 1024, atol=1e-6
+    )
     with pytest.raises(ls.UsageError, match="steps go from 0 up to 768"):
         URG.configure(last=1080)
     with pytest.raises(ls.UsageError, match="content is one of distances, short"):
@@ -66,13 +90,25 @@ def test_a_step_with_several_echoes_has_a_point_for_each() -> None:
     asked = UTM.configure(content="echoes", first=539, last=541)
     assert asked.command("start") == b"ND0539054101000\n"
     assert asked.command("get_scan") == b"HD0539054101\n"
-    scan = b"ND0539054101000\n" + hokuyo("status_99") + b"\n" + hokuyo("4char") + b"?\n1Dh1Dh&0Vh&0CB1Dh6\n\n"
+    scan = (
+        b"ND0539054101000\n"
+        + hokuyo("status_99")
+        + b"\n"
+        + hokuyo("4char")
+        + b"?\n1Dh1Dh&0Vh&0CB1Dh6\n\n"
+    )
     for sensor in (asked, UTM):
         cloud = decoded(sensor, scan).points()
         assert cloud.return_index.tolist() == [0, 1, 2] * 3
-        np.testing.assert_allclose(cloud.range[cloud.valid], [5.432, 5.432, 2.488, 1.234, 5.432], rtol=1e-6)
-        np.testing.assert_allclose(cloud.azimuth, np.deg2rad(np.repeat([-0.25, 0, 0.25], 3)), atol=1e-6)
-    with pytest.raises(ls.UsageError, match="content is one of distances, intensities, short, not 'echoes'"):
+        np.testing.assert_allclose(
+            cloud.range[cloud.valid], [5.432, 5.432, 2.488, 1.234, 5.432], rtol=1e-6
+        )
+        np.testing.assert_allclose(
+            cloud.azimuth, np.deg2rad(np.repeat([-0.25, 0, 0.25], 3)), atol=1e-6
+        )
+    with pytest.raises(
+        ls.UsageError, match="content is one of distances, intensities, short, not 'echoes'"
+    ):
         UST.configure(content="echoes")
 
 
@@ -87,7 +123,9 @@ def test_a_cluster_of_00_is_one_step_and_the_numbers_of_errors_are_no_points() -
 def test_models_are_told_by_their_steps_and_by_what_they_answer() -> None:
     scans = b"".join(ls.simulate(UST, 3))
     assert not URG.decode(scans).stats.frames
-    assert {one.sensor.id for one in verdict(Heard("", (scans,))).alike} | {"hokuyo-ust10lx"} == LOOK_ALIKE
+    assert {one.sensor.id for one in verdict(Heard("", (scans,))).alike} | {
+        "hokuyo-ust10lx"
+    } == LOOK_ALIKE
     device = SimulatedDevice(UTM)
     device.start(0)
     device.receive(UTM.command("get_parameters"), 0)
@@ -96,4 +134,6 @@ def test_models_are_told_by_their_steps_and_by_what_they_answer() -> None:
     device.receive(UTM.command("start"), 10**6)
     data = b"".join(data for _, data in device.outgoing(10**8))
     assert data.startswith(b"MD0000108001000\n00P\n\nMD0000108001000\n99b\n")
-    assert {one.sensor.id for one in verdict(Heard("", (told + data,))).alike} == {"hokuyo-utm30lxew"}
+    assert {one.sensor.id for one in verdict(Heard("", (told + data,))).alike} == {
+        "hokuyo-utm30lxew"
+    }

@@ -1,15 +1,19 @@
-"""LDROBOT STL-27L and relatives: 360 degree time-of-flight and triangulating lidars over a UART, which send by themselves.
+"""LDROBOT STL-27L and relatives: 360 degree time-of-flight and triangulating lidars over a UART,
+which send by themselves.
 
-Source: STL-27L development manual, section 3; rates, bauds and the frames beside the data from the vendor's SDKs (ldlidar_sdk,
-ldlidar_stl_ros2). LD06, LD19 and STL-19P are one sensor on the line: same frame, baud and rate. An LD14 triangulates, and its angles
-are turned into those seen from the axis as the SDK does (sl_transform.cpp). There is an older LD14P of 2300 points a second.
+Source: STL-27L development manual, section 3; rates, bauds and the frames beside the data from the
+vendor's SDKs (ldlidar_sdk, ldlidar_stl_ros2). LD06, LD19 and STL-19P are one sensor on the line:
+same frame, baud and rate. An LD14 triangulates, and its angles are turned into those seen from the
+axis as the SDK does (sl_transform.cpp). There is an older LD14P of 2300 points a second.
 
-What an LD14P answers to commands is nowhere said: they are sent without waiting. Bauds of LD20, STL-06P and STL-26 are assumed to be
-the LD19's; no frame of the last two was seen. An STL-50 is left out: nothing about its protocol is public.
+What an LD14P answers to commands is nowhere said: they are sent without waiting. Bauds of LD20,
+STL-06P and STL-26 are assumed to be the LD19's; no frame of the last two was seen. An STL-50 is
+left out: nothing about its protocol is public.
 
 Known errors of the manual: the CRC table lacks entries 175 to 186 (it
-is generated here); the decode table of the example prints point 2 as 200 mm (0x00dc is 220) and point 12 as B0 00 EA
-(the dump, whose CRC is right, has C0 00 E5); no rule for frames that cross 360 degrees.
+is generated here); the decode table of the example prints point 2 as 200 mm (0x00dc is 220) and
+point 12 as B0 00 EA (the dump, whose CRC is right, has C0 00 E5); no rule for frames that cross 360
+degrees.
 """
 
 from __future__ import annotations
@@ -41,8 +45,16 @@ from lidarspec.spec import (
 )
 
 POINTS = 12
-#: points per second: STL-27L manual, section 1; LD06 data sheet (450 points a turn at 10 Hz); SDKs; LD20: from a captured frame.
-RATES = {"STL-27L": 21_600, "LD06": 4_500, "STL-06P": 5_000, "LD14": 2_300, "LD14P": 4_000, "LD20": 4_000}
+#: points per second: STL-27L manual, section 1; LD06 data sheet (450 points a turn at 10 Hz); SDKs;
+#: LD20: from a captured frame.
+RATES = {
+    "STL-27L": 21_600,
+    "LD06": 4_500,
+    "STL-06P": 5_000,
+    "LD14": 2_300,
+    "LD14P": 4_000,
+    "LD20": 4_000,
+}
 CRC8 = Crc(width=8, poly=0x4D)
 
 
@@ -93,7 +105,9 @@ def plausible(f: Fields) -> Any:
 
 
 def seen_aside(distance: Any) -> Any:
-    """Degrees by which what an LD14 sees lies before the angle of its laser, by the distance in metres (SDK, sl_transform.cpp)."""
+    """Degrees by which what an LD14 sees lies before the angle of its laser, by the distance in
+    metres (SDK, sl_transform.cpp).
+    """
     mm = distance * 1000
     return np.where(mm > 0, np.rad2deg(np.arctan((0.11923 * mm - 18.975571) / (mm + 5.9))), 0)
 
@@ -115,7 +129,12 @@ def sweep(i: int, rate: int, turns: int) -> dict[str, float]:
     """Frame i at so many turns and points per second."""
     step = 360.0 * turns / rate
     start = i * POINTS * step % 360
-    return dict(speed=360 * turns, start_angle=start, end_angle=(start + (POINTS - 1) * step) % 360, timestamp=i * POINTS / rate % 30)
+    return dict(
+        speed=360 * turns,
+        start_angle=start,
+        end_angle=(start + (POINTS - 1) * step) % 360,
+        timestamp=i * POINTS / rate % 30,
+    )
 
 
 def slug(name: str) -> str:
@@ -124,19 +143,31 @@ def slug(name: str) -> str:
 
 
 def keeps_pace(f: Fields, rate: int) -> Any:
-    """Whether the angles of a frame are as far apart as those of a lidar with so many points a second, more than with any other rate."""
-    found = (POINTS - 1) * np.maximum(f.speed, 1) / np.maximum(wrap(f.end_angle - f.start_angle, 360.0), 0.01)
+    """Whether the angles of a frame are as far apart as those of a lidar with so many points a
+    second, more than with any other rate.
+    """
+    found = (
+        (POINTS - 1)
+        * np.maximum(f.speed, 1)
+        / np.maximum(wrap(f.end_angle - f.start_angle, 360.0), 0.01)
+    )
     off = [np.abs(np.log(found / known)) for known in (rate, *RATES.values())]
     return np.min(off, axis=0) == off[0]
 
 
 def relatives(own: str) -> dict[str, str | Relative]:
-    """What tells the others apart: how far they turn from point to point at the speed that they tell."""
+    """What tells the others apart: how far they turn from point to point at the speed that they
+    tell.
+    """
     others = {slug(name): rate for name, rate in RATES.items() if name != own}
     return {
-        name: "nothing in the data: it has as many points a second"
-        if rate == RATES[own]
-        else Relative(f"{rate} points a second, by its speed and angles", partial(keeps_pace, rate=rate))
+        name: (
+            "nothing in the data: it has as many points a second"
+            if rate == RATES[own]
+            else Relative(
+                f"{rate} points a second, by its speed and angles", partial(keeps_pace, rate=rate)
+            )
+        )
         for name, rate in others.items()
     }
 
@@ -148,7 +179,14 @@ TOLD = {
 }
 
 
-def lidar(name: str, *, turns: int = 10, aside: bool = False, frames: Mapping[str, Frame] | None = None, **more: Any) -> Sensor:
+def lidar(
+    name: str,
+    *,
+    turns: int = 10,
+    aside: bool = False,
+    frames: Mapping[str, Frame] | None = None,
+    **more: Any,
+) -> Sensor:
     """One model, simulated at so many turns a second, with the frames that it has beside the data."""
     rate = RATES[name]
     return Sensor(
@@ -170,7 +208,10 @@ STL27L = lidar(
     "STL-27L",
     links={"data": Serial(921_600)},
     range_limits=(0.03, 25.0),
-    turn=(9.9, 10.1),  # by its own control (manual, section 1); no limits are given for control by PWM
+    turn=(
+        9.9,
+        10.1,
+    ),  # by its own control (manual, section 1); no limits are given for control by PWM
     aliases=("stl27l",),
     status="vectors",
     source="STL-27L development manual, sections 1 to 4",
@@ -183,7 +224,10 @@ LD06 = lidar(
     turn=(5.0, 13.0),  # inno-maker's page of the LD06; by PWM, as for the LD19
     aliases=("ld06", "ld19", "ldrobot-ld19", "stl19p", "ldrobot-stl19p", "d500"),
     status="capture",
-    source="LD06 and LD19 development manual v2.5 (the STL-27L's frame); three consecutive captured frames",
+    source=(
+        "LD06 and LD19 development manual v2.5 (the STL-27L's frame); three consecutive captured"
+        " frames"
+    ),
 )
 LD20 = lidar(
     "LD20",
@@ -212,7 +256,10 @@ LD14 = lidar(
     range_limits=(0.1, 8.0),
     aliases=("ld14",),
     status="vectors",
-    source="ldlidar_sdk (ldlidar_protocol.h, sl_transform.cpp, demo.cpp); the STL-27L manual's example; its range is assumed",
+    source=(
+        "ldlidar_sdk (ldlidar_protocol.h, sl_transform.cpp, demo.cpp); the STL-27L manual's"
+        " example; its range is assumed"
+    ),
 )
 LD14P = lidar(
     "LD14P",
@@ -226,12 +273,17 @@ LD14P = lidar(
         "set_speed": Command("command", {"command": 0xA2}, args={"speed": ("speed", 720, 2880)}),
         "get_firmware": Command("command", {"command": 0xA8, "speed": 0}),
     },
-    on_open=("start",),  # it turns by itself when it is plugged in, and not where it was stopped before
+    on_open=(
+        "start",
+    ),  # it turns by itself when it is plugged in, and not where it was stopped before
     range_limits=(0.1, 8.0),
     turn=(2.0, 8.0),
     aliases=("ld14p", "d200"),
     status="vectors",
-    source="ldlidar_sdk, as the LD14; commands as kaiaai/LDS sends them; Waveshare's page of the D200 kit (range, turns, baud)",
+    source=(
+        "ldlidar_sdk, as the LD14; commands as kaiaai/LDS sends them; Waveshare's page of the D200"
+        " kit (range, turns, baud)"
+    ),
 )
 
 

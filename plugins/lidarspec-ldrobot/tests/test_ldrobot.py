@@ -1,4 +1,6 @@
-"""LDROBOT STL-27L, LD06 and LD14P: the manual's example, real frames, the clock, points worked out by hand."""
+"""LDROBOT STL-27L, LD06 and LD14P: the manual's example, real frames, the clock, points worked out
+by hand.
+"""
 
 from __future__ import annotations
 
@@ -31,17 +33,32 @@ WHOLE = [
 ]
 STREAMS = {"ld06_stream_3_capture"}
 WRONG = {"ld_manual_table_variant"}
-OF_THE_LD14P = {"ld14p_start", "ld14p_stop", "ld14p_speed_6hz", "ld14p_get_motor_fw", "ld_manufacture_synth"}
+OF_THE_LD14P = {
+    "ld14p_start",
+    "ld14p_stop",
+    "ld14p_speed_6hz",
+    "ld14p_get_motor_fw",
+    "ld_manufacture_synth",
+}
 
-# 30 to 277.5 degrees in steps of 22.5; point k at 1 + k / 2 metres with intensity 10 + k; 3600 deg/s, 1 s.
-#   b8 0b: 0bb8 = 3000, 0.01 deg = 30.   66 6c: 6c66 = 27750.   d0 07 0c: 07d0 = 2000 mm, intensity 12.   CRC 1f.
-QUADRANTS = bytes.fromhex("542c 100e b80b e8030a dc050b d0070c c4090d b80b0e ac0d0f a00f10 941111 881312 7c1513 701714 641915 666c e803 1f")
+# 30 to 277.5 degrees in steps of 22.5; point k at 1 + k / 2 metres with intensity 10 + k; 3600
+# deg/s, 1 s.
+#   b8 0b: 0bb8 = 3000, 0.01 deg = 30.   66 6c: 6c66 = 27750.   d0 07 0c: 07d0 = 2000 mm, intensity
+# 12.   CRC 1f.
+QUADRANTS = bytes.fromhex(
+    "542c 100e b80b e8030a dc050b d0070c c4090d b80b0e ac0d0f a00f10 941111 881312 7c1513 701714"
+    " 641915 666c e803 1f"
+)
 
 
-def frame(start: float = 10.0, end: float = 12.0, seconds: float = 1.0, distance: float = 1.0, **more: Any) -> bytes:
+def frame(
+    start: float = 10.0, end: float = 12.0, seconds: float = 1.0, distance: float = 1.0, **more: Any
+) -> bytes:
     """A frame with all points at one distance."""
     values: dict[str, Any] = dict(speed=3600, start_angle=start, end_angle=end, timestamp=seconds)
-    return SENSOR.build("data", units=True, points=[dict(distance=distance, intensity=7)] * 12, **values, **more)
+    return SENSOR.build(
+        "data", units=True, points=[dict(distance=distance, intensity=7)] * 12, **values, **more
+    )
 
 
 def test_every_vector_of_the_family_is_used() -> None:
@@ -59,27 +76,43 @@ def test_a_whole_frame_is_parsed_and_built_to_the_same_bytes(name: str) -> None:
     for printed, path in known.items():
         assert packets[path][0] == pytest.approx(expected[printed], abs=1e-9)
     assert parsed.timestamp == expected["timestamp_ms"]
-    assert [point.distance for point in parsed.points] == expected.get("dist_mm", [point.distance for point in parsed.points])
+    assert [point.distance for point in parsed.points] == expected.get(
+        "dist_mm", [point.distance for point in parsed.points]
+    )
     angles = clockwise(packets.points())
     step = expected.get("step_deg", (expected["end_deg"] - expected["start_deg"]) / 11)
     np.testing.assert_allclose(angles, expected["start_deg"] + step * np.arange(12), atol=1e-4)
 
 
 def test_the_example_of_the_manual() -> None:
-    data, expected = vector_bytes(FILE, "ld_manual_example"), vectors(FILE)["ld_manual_example"]["expected"]
+    data, expected = (
+        vector_bytes(FILE, "ld_manual_example"),
+        vectors(FILE)["ld_manual_example"]["expected"],
+    )
     parsed = SENSOR.parse(data)
     assert [point.intensity for point in parsed.points] == expected["intensity"]
     assert parsed.points[1].distance == 220  # printed as 200
-    assert (parsed.points[11].distance, parsed.points[11].intensity) == (192, 229)  # printed as 176 and 234
+    assert (parsed.points[11].distance, parsed.points[11].intensity) == (
+        192,
+        229,
+    )  # printed as 176 and 234
     assert parsed.crc == expected["crc"]
 
 
 def test_the_decode_table_of_the_manual_is_wrong() -> None:
-    data, expected = vector_bytes(FILE, "ld_manual_table_variant"), vectors(FILE)["ld_manual_table_variant"]["expected"]
+    data, expected = (
+        vector_bytes(FILE, "ld_manual_table_variant"),
+        vectors(FILE)["ld_manual_table_variant"]["expected"],
+    )
     with pytest.raises(ls.WireError) as caught:
         SENSOR.parse(data)
     fault = caught.value
-    assert (fault.path, fault.offset, fault.expected, fault.got) == ("crc", 46, f"0x{expected['crc_calc']:02x}", f"0x{expected['crc']:02x}")
+    assert (fault.path, fault.offset, fault.expected, fault.got) == (
+        "crc",
+        46,
+        f"0x{expected['crc_calc']:02x}",
+        f"0x{expected['crc']:02x}",
+    )
     packets = decoded(SENSOR, data + QUADRANTS)
     assert (len(packets), packets.stats.bad_checksum, packets.stats.bytes_skipped) == (1, 1, 47)
 
@@ -99,12 +132,15 @@ def test_frames_of_the_ld14p_are_its_own(name: str) -> None:
     assert LD14P.build(frame, parsed) == data
     named = {"cmd": "command", "value": "speed", "sn_high": "serial_high", "sn_low": "serial_low"}
     known = {named.get(key, key): value for key, value in expected.items()}
-    assert {key: parsed[key] for key in parsed if key in known} == {key: value for key, value in known.items() if key in parsed}
+    assert {key: parsed[key] for key in parsed if key in known} == {
+        key: value for key, value in known.items() if key in parsed
+    }
 
 
 def test_an_ld14_looks_from_aside() -> None:
-    # 1 m at 30 degrees: atan((0.11923 * 1000 - 18.975571) / 1005.9) = 5.69167 degrees less: 24.30833.
-    # 3 m at 120 degrees: atan((357.69 - 18.975571) / 3005.9) = 6.42915 degrees less: 113.57085.
+    # 1 m at 30 degrees: atan((0.11923 * 1000 - 18.975571) / 1005.9) = 5.69167 degrees less:
+    # 24.30833. 3 m at 120 degrees: atan((357.69 - 18.975571) / 3005.9) = 6.42915 degrees less:
+    # 113.57085.
     cloud = decoded(LD14P, QUADRANTS).points()
     np.testing.assert_allclose(clockwise(cloud)[[0, 4]], [24.30833, 113.57085], atol=1e-4)
     assert_points(cloud, [(0, (0.91134, -0.41165, 0))])
@@ -112,18 +148,35 @@ def test_an_ld14_looks_from_aside() -> None:
 
 @pytest.mark.parametrize(
     ("name", "owner"),
-    [("ld06_capture_1", "LD06"), ("ld06_capture_fsharp", "LD06"), ("ld20_capture", "LD20"), ("ld_manual_example", "LD14")],
+    [
+        ("ld06_capture_1", "LD06"),
+        ("ld06_capture_fsharp", "LD06"),
+        ("ld20_capture", "LD20"),
+        ("ld_manual_example", "LD14"),
+    ],
 )
 def test_one_frame_shows_the_pace_of_its_lidar(name: str, owner: str) -> None:
     fields = Fields(SENSOR.decode(vector_bytes(FILE, name)).batch())
-    assert [rate for rate in sorted({*RATES.values()}) if np.all(np.asarray(keeps_pace(fields, rate)))] == [RATES[owner]]
+    assert [
+        rate for rate in sorted({*RATES.values()}) if np.all(np.asarray(keeps_pace(fields, rate)))
+    ] == [RATES[owner]]
 
 
 def test_the_crc_has_all_256_entries() -> None:
-    # The manual's table lacks entries 175 to 186; the register after one byte from 0 is the entry of that byte.
+    # The manual's table lacks entries 175 to 186; the register after one byte from 0 is the entry
+    # of that byte.
     crc = Crc(width=8, poly=0x4D)
-    assert bytes(crc(bytes([index])) for index in range(175, 187)).hex(" ") == "3f ca 87 50 1d b3 fe 29 64 38 75 a2"
-    assert [crc(bytes([index])) for index in (1, 2, 174, 187, 255)] == [0x4D, 0x9A, 0x72, 0xEF, 0xA8]
+    assert (
+        bytes(crc(bytes([index])) for index in range(175, 187)).hex(" ")
+        == "3f ca 87 50 1d b3 fe 29 64 38 75 a2"
+    )
+    assert [crc(bytes([index])) for index in (1, 2, 174, 187, 255)] == [
+        0x4D,
+        0x9A,
+        0x72,
+        0xEF,
+        0xA8,
+    ]
     assert crc(b"123456789") == 0xC3
 
 
@@ -134,20 +187,36 @@ def test_points_by_hand() -> None:
     #   point 4:  120 deg, 3 m:     x = -1.5,      y = -2.59808    back right
     #   point 8:  210 deg, 5 m:     x = -4.33013,  y = +2.5        back left
     #   point 11: 277.5 deg, 6.5 m: x = 0.84842,   y = +6.44439    front left
-    expected = [(0, (0.86603, -0.5, 0)), (4, (-1.5, -2.59808, 0)), (8, (-4.33013, 2.5, 0)), (11, (0.84842, 6.44439, 0))]
+    expected = [
+        (0, (0.86603, -0.5, 0)),
+        (4, (-1.5, -2.59808, 0)),
+        (8, (-4.33013, 2.5, 0)),
+        (11, (0.84842, 6.44439, 0)),
+    ]
     assert_points(cloud, expected)
     assert_points(decoded(LD06, QUADRANTS).points(), expected)
-    assert_points(SENSOR.configure(frame="vendor").decode(QUADRANTS).points(), [(0, (0.86603, 0.5, 0)), (8, (-4.33013, -2.5, 0))])
+    assert_points(
+        SENSOR.configure(frame="vendor").decode(QUADRANTS).points(),
+        [(0, (0.86603, 0.5, 0)), (8, (-4.33013, -2.5, 0))],
+    )
     assert cloud.intensity is not None
     assert cloud.intensity.tolist() == list(range(10, 22))
 
 
 def test_points_of_real_frames_by_hand() -> None:
-    # 86.76 deg, 01f2 = 498 mm: x = .498 cos = 0.02815, y = -0.49720.   114.35 deg, 0229 = 553 mm: x = -0.22801, y = -0.50380.
-    # 324.27 deg, 00e0 = 224 mm (the manual): x = 0.18184, y = +0.13081.
-    assert_points(decoded(LD06, vector_bytes(FILE, "ld06_capture_1")).points(), [(0, (0.02815, -0.49720, 0))])
-    assert_points(decoded(LD06, vector_bytes(FILE, "ld06_capture_3")).points(), [(11, (-0.22801, -0.50380, 0))])
-    assert_points(decoded(LD06, vector_bytes(FILE, "ld_manual_example")).points(), [(0, (0.18184, 0.13081, 0))])
+    # 86.76 deg, 01f2 = 498 mm: x = .498 cos = 0.02815, y = -0.49720.   114.35 deg, 0229 = 553 mm: x
+    # = -0.22801, y = -0.50380. 324.27 deg, 00e0 = 224 mm (the manual): x = 0.18184, y = +0.13081.
+    assert_points(
+        decoded(LD06, vector_bytes(FILE, "ld06_capture_1")).points(), [(0, (0.02815, -0.49720, 0))]
+    )
+    assert_points(
+        decoded(LD06, vector_bytes(FILE, "ld06_capture_3")).points(),
+        [(11, (-0.22801, -0.50380, 0))],
+    )
+    assert_points(
+        decoded(LD06, vector_bytes(FILE, "ld_manual_example")).points(),
+        [(0, (0.18184, 0.13081, 0))],
+    )
 
 
 def test_three_consecutive_frames() -> None:
@@ -157,7 +226,9 @@ def test_three_consecutive_frames() -> None:
     assert (packets.stats.frames, packets.stats.bytes_skipped) == ({"data": 3}, 0)
     assert np.diff(packets.time_ns).tolist() == [2_000_000, 3_000_000]
     angles = clockwise(packets.points())
-    np.testing.assert_allclose(np.diff(angles), 0.79, atol=0.03)  # the step goes on over the borders of frames
+    np.testing.assert_allclose(
+        np.diff(angles), 0.79, atol=0.03
+    )  # the step goes on over the borders of frames
 
 
 def test_six_real_frames() -> None:
@@ -165,8 +236,12 @@ def test_six_real_frames() -> None:
     assert len(expected) == 6
     packets = decoded(LD06, b"\x54".join(bytes.fromhex(item["hex"]) for item in expected))
     assert (len(packets), packets.stats.bytes_skipped) == (6, 5)
-    assert packets.raw["points"]["distance"].tolist() == [[point[0] for point in item["pts"]] for item in expected]
-    assert packets.raw["points"]["intensity"].tolist() == [[point[1] for point in item["pts"]] for item in expected]
+    assert packets.raw["points"]["distance"].tolist() == [
+        [point[0] for point in item["pts"]] for item in expected
+    ]
+    assert packets.raw["points"]["intensity"].tolist() == [
+        [point[1] for point in item["pts"]] for item in expected
+    ]
     assert packets["start_angle"].tolist() == pytest.approx([item["start"] for item in expected])
     assert packets.raw["timestamp"].tolist() == [item["ts"] for item in expected]
     assert packets.raw["speed"].tolist() == [item["speed_dps"] for item in expected]
@@ -181,7 +256,9 @@ def test_no_return_has_no_place_whatever_its_intensity() -> None:
     assert cloud.intensity[6] == 213
 
 
-@pytest.mark.parametrize(("start", "end"), [(359.5, 1.33), (359.99, 0.0), (10.0, 10.0), (0.0, 359.99)])
+@pytest.mark.parametrize(
+    ("start", "end"), [(359.5, 1.33), (359.99, 0.0), (10.0, 10.0), (0.0, 359.99)]
+)
 def test_frames_that_cross_360_degrees_go_on_forward(start: float, end: float) -> None:
     angles = clockwise(decoded(SENSOR, frame(start, end)).points())
     steps = (angles - start + 0.005) % 360 - 0.005
@@ -190,7 +267,15 @@ def test_frames_that_cross_360_degrees_go_on_forward(start: float, end: float) -
 
 @pytest.mark.parametrize(
     "data",
-    [frame(start=360.0), frame(end=360.0), frame(start=655.35), frame(seconds=30.001), bytes(200), b"\xff" * 200, b"\x54\x2c" * 100],
+    [
+        frame(start=360.0),
+        frame(end=360.0),
+        frame(start=655.35),
+        frame(seconds=30.001),
+        bytes(200),
+        b"\xff" * 200,
+        b"\x54\x2c" * 100,
+    ],
 )
 def test_implausible_bytes_are_no_frames(data: bytes) -> None:
     packets = decoded(SENSOR, data)
@@ -201,7 +286,9 @@ def test_implausible_bytes_are_no_frames(data: bytes) -> None:
 def test_the_clock_runs_on_over_100_wraps() -> None:
     # 9.7 s apart, so that every part of the 30 s is met: 320 frames pass 30 s 103 times.
     milliseconds = np.arange(320) * 9_700
-    packets = decoded(SENSOR, b"".join(frame(seconds=float(now % 30_000) / 1000) for now in milliseconds))
+    packets = decoded(
+        SENSOR, b"".join(frame(seconds=float(now % 30_000) / 1000) for now in milliseconds)
+    )
     assert milliseconds[-1] // 30_000 > 100
     assert (packets.time_ns - packets.time_ns[0]).tolist() == (milliseconds * 1_000_000).tolist()
 
@@ -209,7 +296,10 @@ def test_the_clock_runs_on_over_100_wraps() -> None:
 def test_the_clock_runs_on_between_batches() -> None:
     decoder = SENSOR.decoder()
     stream = PacketStream(SENSOR, "data", decoder.stats)
-    times = [stream.add(decoder.frames(frame(seconds=now % 30_000 / 1000))).time_ns for now in range(0, 400_000, 7_000)]
+    times = [
+        stream.add(decoder.frames(frame(seconds=now % 30_000 / 1000))).time_ns
+        for now in range(0, 400_000, 7_000)
+    ]
     assert np.concatenate(times).tolist() == [now * 10**6 for now in range(0, 400_000, 7_000)]
 
 
@@ -222,7 +312,10 @@ def test_points_of_a_frame_are_apart_by_the_rate_of_the_model(sensor: ls.Sensor,
 def test_turns_are_cut_where_the_angle_passes_zero(sensor: ls.Sensor, number: int) -> None:
     assert sensor.simulation.sweep is not None
     points = [dict(distance=2.0, intensity=9)] * 12
-    frames = [sensor.build("data", units=True, points=points, **sensor.simulation.sweep(i)) for i in range(5 * number // 24)]
+    frames = [
+        sensor.build("data", units=True, points=points, **sensor.simulation.sweep(i))
+        for i in range(5 * number // 24)
+    ]
     scans = list(sensor.scans(b"".join(frames)))
     assert scans[1].complete
     assert not scans[-1].complete
@@ -253,10 +346,17 @@ def test_decoding_follows_a_struct_with_renamed_and_reordered_fields() -> None:
     )
 
     def points(f: Fields) -> Polar:
-        return Polar(f.echoes.far, -np.deg2rad(spread(f.since, f.to, 12, full=360.0)), intensity=f.echoes.strength)
+        return Polar(
+            f.echoes.far,
+            -np.deg2rad(spread(f.since, f.to, 12, full=360.0)),
+            intensity=f.echoes.strength,
+        )
 
     other = dataclasses.replace(
-        SENSOR, frames={"data": Frame(struct, data=True, max_length=47)}, points=points, clock=Clock("clock", wraps_at=30.0)
+        SENSOR,
+        frames={"data": Frame(struct, data=True, max_length=47)},
+        points=points,
+        clock=Clock("clock", wraps_at=30.0),
     )
     echoes = [dict(far=1 + k / 2, strength=10 + k) for k in range(12)]
     data = other.build("data", units=True, clock=1.0, since=30, to=277.5, speed=3600, echoes=echoes)

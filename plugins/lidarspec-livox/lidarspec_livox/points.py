@@ -1,6 +1,8 @@
-"""What both generations have in common: what a point is, what an IMU feels, and where a simulated one looks.
+"""What both generations have in common: what a point is, what an IMU feels, and where a simulated
+one looks.
 
-Source: Livox-SDK 9306596 (livox_def.h) and Livox-SDK2 08f523c (livox_lidar_def.h), which have the same points.
+Source: Livox-SDK 9306596 (livox_def.h) and Livox-SDK2 08f523c (livox_lidar_def.h), which have the
+same points.
 """
 
 from __future__ import annotations
@@ -16,12 +18,19 @@ from lidarspec.spec import Cartesian, Fields, Imu, Polar, Scaled
 View = tuple[float, float, float, float]
 SOF = "sof" / Const(b"\xaa")
 GRAVITY = 9.80665  # m/s2
-REFLECTIVITY = "reflectivity" / Int8ul * "up to 150 as of a diffuse target, 0 to 100 %; above as of a retroreflector"
+REFLECTIVITY = (
+    "reflectivity"
+    / Int8ul
+    * "up to 150 as of a diffuse target, 0 to 100 %; above as of a retroreflector"
+)
 TAG = "tag" / Int8ul * "doubts about the point, and of the first generation its return; 0: none"
 MILLIMETRES = tuple(axis / Scaled(Int32sl, 0.001, "m") for axis in "xyz")
 CENTIMETRES = tuple(axis / Scaled(Int16sl, 0.01, "m") for axis in "xyz")
 DEPTH = ("depth" / Scaled(Int32ul, 0.001, "m"),)
-DIRECTION = ("zenith" / Scaled(Int16ul, 0.01, "deg") * "from the z axis", "azimuth" / Scaled(Int16ul, 0.01, "deg"))
+DIRECTION = (
+    "zenith" / Scaled(Int16ul, 0.01, "deg") * "from the z axis",
+    "azimuth" / Scaled(Int16ul, 0.01, "deg"),
+)
 INERTIAL = (
     *(f"gyro_{axis}" / Scaled(Float32l, 1, "rad/s") for axis in "xyz"),
     *(f"acc_{axis}" / Scaled(Float32l, GRAVITY, "m/s2") * "sent in g" for axis in "xyz"),
@@ -63,7 +72,8 @@ def imu(f: Fields) -> Imu:
 def looking(shots: Any, rate: float, view: View) -> tuple[Any, Any]:
     """Azimuth and elevation, degrees, of shots with these numbers, at so many a second.
 
-    The real pattern never repeats and is not published: here a wave goes up and down 610 times a second, and across 7.3 times.
+    The real pattern never repeats and is not published: here a wave goes up and down 610 times a
+    second, and across 7.3 times.
     """
     right, left, low, high = view
     across, up = np.sin(2 * np.pi * 7.3 * shots / rate), np.sin(2 * np.pi * 610 * shots / rate)

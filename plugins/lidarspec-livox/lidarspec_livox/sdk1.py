@@ -1,13 +1,17 @@
-"""Livox Mid-40, Mid-70, Horizon, Tele-15 and Avia: the first generation of the protocol, which Livox-SDK speaks.
+"""Livox Mid-40, Mid-70, Horizon, Tele-15 and Avia: the first generation of the protocol, which
+Livox-SDK speaks.
 
-A Lidar says once a second who it is (`broadcast`, to port 55000 of everybody). It is told where its data go (`handshake`), and goes on as
-long as it hears a `heartbeat` each second. Packets of points have no checksum and no counter, so that their length and header have to prove
-them; they do not say either how far apart their points are in time, which is the model's.
+A Lidar says once a second who it is (`broadcast`, to port 55000 of everybody). It is told where its
+data go (`handshake`), and goes on as long as it hears a `heartbeat` each second. Packets of points
+have no checksum and no counter, so that their length and header have to prove them; they do not say
+either how far apart their points are in time, which is the model's.
 
-Source: Livox-SDK communication protocol 1.3.0, Livox-SDK 9306596 (livox_def.h, device_discovery.h) and livox_ros_driver (lds.h: packet
-sizes, points a second; it prints 9 bytes for a point of type 3, which has 10). Ranges and fields of view are as remembered from the user
-manuals: assumed. Which model sends which type of data is not said: all are read of each. That the version of a packet
-is 5 is assumed, since vectors have it and drivers do not look at it. Hubs are not here, nor are the parameters of commands 0B to 0D.
+Source: Livox-SDK communication protocol 1.3.0, Livox-SDK 9306596 (livox_def.h, device_discovery.h)
+and livox_ros_driver (lds.h: packet sizes, points a second; it prints 9 bytes for a point of type 3,
+which has 10). Ranges and fields of view are as remembered from the user manuals: assumed. Which
+model sends which type of data is not said: all are read of each. That the version of a packet is 5
+is assumed, since vectors have it and drivers do not look at it. Hubs are not here, nor are the
+parameters of commands 0B to 0D.
 """
 
 from __future__ import annotations
@@ -59,12 +63,19 @@ GPS = 3  # the type of timestamps that are a date
 IMU_RATE = 200  # samples a second
 MODEL_TYPES = "1 Mid-40, 2 Tele-15, 3 Horizon LiDAR, 6 Mid-70, 7 Avia"
 STATES = "0 starts, 1 normal, 2 saves power, 3 stands by, 4 error"
-LONG = {"LS711": "packets of points have up to 1362 bytes: those that were worked out are in the project's tests"}
+LONG = {
+    "LS711": (
+        "packets of points have up to 1362 bytes: those that were worked out are in the project's"
+        " tests"
+    )
+}
 COMMAND_PORT, DATA_PORT, IMU_PORT = 55_501, 56_001, 56_002  # of this computer
 
 #: in pieces that keep 64 bits of nanoseconds exact, and hold a date as well.
 TIMESTAMP = Struct(
-    "low" / Int32ul * "of nanoseconds; of a date years since 2000, month, day and hour, a byte each",
+    "low"
+    / Int32ul
+    * "of nanoseconds; of a date years since 2000, month, day and hour, a byte each",
     "middle" / Int16ul,
     "high" / Int16ul * "with `middle`, of a date: microseconds within the hour",
 )
@@ -77,7 +88,10 @@ def packet(kind: int, *members: Any) -> Struct:
         "slot" / Int8ul,
         "lidar_id" / Int8ul,
         "reserved" / Int8ul,
-        "status_code" / Int32ul * "bits 0-1 temperature, 2-3 voltage, 4-5 motor, 6-7 dirt ... 30-31 system: 0 normal, 1 warning, 2 error",
+        "status_code"
+        / Int32ul
+        * "bits 0-1 temperature, 2-3 voltage, 4-5 motor, 6-7 dirt ... 30-31 system: 0 normal, 1"
+        " warning, 2 error",
         "timestamp_type" / Int8ul * "0 since power-up, 1 PTP, 3 GPS and PPS: a date, 4 PPS",
         "data_type" / Const(kind, Int8ul),
         "timestamp" / TIMESTAMP,
@@ -90,8 +104,13 @@ def clock(f: Fields) -> tuple[Any, ...]:
     low, middle, high = f.timestamp.low, f.timestamp.middle, f.timestamp.high
     dated = f.timestamp_type == GPS
     year, month, day, hour = (np.mod(np.floor(low / 256**place), 256) for place in range(4))
-    years, months = np.where(month <= 2, year - 1, year), np.mod(month + 9, 12)  # from March on, so that the leap day is the last
-    days = 11_016 + day + 365 * years + np.floor(years / 4) + np.floor((153 * months + 2) / 5)  # 2000-03-01 is day 11 017 of 1970
+    years, months = (
+        np.where(month <= 2, year - 1, year),
+        np.mod(month + 9, 12),
+    )  # from March on, so that the leap day is the last
+    days = (
+        11_016 + day + 365 * years + np.floor(years / 4) + np.floor((153 * months + 2) / 5)
+    )  # 2000-03-01 is day 11 017 of 1970
     return (
         np.where(dated, 86_400 * days + 3600 * hour, 281_474 * high),
         np.where(dated, (65_536 * high + middle) * 1e-6, low * 1e-9),
@@ -101,7 +120,9 @@ def clock(f: Fields) -> tuple[Any, ...]:
 
 
 def known(f: Fields) -> Any:
-    """A type of timestamp that there is, and a slot and a number as a hub counts them; a Lidar by itself has such numbers too."""
+    """A type of timestamp that there is, and a slot and a number as a hub counts them; a Lidar by
+    itself has such numbers too.
+    """
     return (f.timestamp_type <= 4) & (f.timestamp_type != 2) & (f.slot <= 15) & (f.lidar_id <= 15)
 
 
@@ -128,10 +149,21 @@ def data_frame(name: str, rate: float, **more: Any) -> Frame:
         return made(f, along("points", np.arange(shots) / rate), returns=returns, tagged=tagged)
 
     def plausible(f: Fields) -> Any:
-        return known(f) & (f.points[0].zenith <= 180) & (f.points[0].azimuth <= 360) if by_angles else known(f)
+        return (
+            known(f) & (f.points[0].zenith <= 180) & (f.points[0].azimuth <= 360)
+            if by_angles
+            else known(f)
+        )
 
     shot = Struct(*members)
-    return Frame(packet(kind, "points" / Array(shots, shot)), data=True, points=points, plausible=plausible, acknowledged=LONG, **more)
+    return Frame(
+        packet(kind, "points" / Array(shots, shot)),
+        data=True,
+        points=points,
+        plausible=plausible,
+        acknowledged=LONG,
+        **more,
+    )
 
 
 def simulation(name: str, rate: float, view: View, **more: Any) -> Simulation:
@@ -144,10 +176,15 @@ def simulation(name: str, rate: float, view: View, **more: Any) -> Simulation:
 
     def sweep(i: int) -> dict[str, Any]:
         azimuth, elevation = look(i)
-        angles = {"points.azimuth": np.ravel(azimuth) % 360, "points.zenith": 90 - np.ravel(elevation)}
+        angles = {
+            "points.azimuth": np.ravel(azimuth) % 360,
+            "points.zenith": 90 - np.ravel(elevation),
+        }
         return {**stamped(round(i * count * 1e9 / rate)), **angles}
 
-    return Simulation(sweep, directions=lambda i: tuple(np.deg2rad(angle) for angle in look(i)), **more)
+    return Simulation(
+        sweep, directions=lambda i: tuple(np.deg2rad(angle) for angle in look(i)), **more
+    )
 
 
 def stamped(ns: int) -> dict[str, Any]:
@@ -168,26 +205,49 @@ def message(packet_type: int, number: tuple[int, int] | None, *members: Any) -> 
         "crc16" / Int16ul,
     )
     names = ("cmd_set", "cmd_id")
-    numbers = (name / (Int8ul if number is None else Const(number[at], Int8ul)) for at, name in enumerate(names))
+    numbers = (
+        name / (Int8ul if number is None else Const(number[at], Int8ul))
+        for at, name in enumerate(names)
+    )
     sealed = "head" / Checksummed(head, field="crc16", algorithm=CRC16)
-    return Checksummed(Struct(sealed, *numbers, *members, "crc32" / Int32ul), field="crc32", algorithm=CRC32)
+    return Checksummed(
+        Struct(sealed, *numbers, *members, "crc32" / Int32ul), field="crc32", algorithm=CRC32
+    )
 
 
 RESULT = "result" / Int8ul * "0 done, 1 failed"
-NET = ("mode" / Int8ul * "0 DHCP, 1 static", *(name / Bytes(4) for name in ("ip", "mask", "gateway")))
+NET = (
+    "mode" / Int8ul * "0 DHCP, 1 static",
+    *(name / Bytes(4) for name in ("ip", "mask", "gateway")),
+)
 POSE = (
     *(name / Scaled(Float32l, 1, "deg") for name in ("roll", "pitch", "yaw")),
     *(axis / Scaled(Int32sl, 0.001, "m") for axis in "xyz"),
 )
 STATUS = "status_code" / Int32ul * "as in packets of points; while it starts, per cent"
 ASK, ANSWER, TELL = 0, 1, 2
-#: (set, number) of what is asked without more, of what is set to a number, and of what is answered with one.
+#: (set, number) of what is asked without more, of what is set to a number, and of what is answered
+#: with one.
 INFORMATION, DISCONNECT, ADDRESS, EXTRINSICS = (0, 2), (0, 6), (0, 9), (1, 2)
-SAMPLING, COORDINATES, MODE, RAIN, FAN, RETURNS, IMU = (0, 4), (0, 5), (1, 0), (1, 3), (1, 4), (1, 6), (1, 8)
+SAMPLING, COORDINATES, MODE, RAIN, FAN, RETURNS, IMU = (
+    (0, 4),
+    (0, 5),
+    (1, 0),
+    (1, 3),
+    (1, 4),
+    (1, 6),
+    (1, 8),
+)
 GET_FAN, GET_RETURNS, GET_IMU = (1, 5), (1, 7), (1, 9)
 
 
-DATE = ("year" / Int8ul * "since 2000", "month" / Int8ul, "day" / Int8ul, "hour" / Int8ul, "microseconds" / Int32ul * "within the hour")
+DATE = (
+    "year" / Int8ul * "since 2000",
+    "month" / Int8ul,
+    "day" / Int8ul,
+    "hour" / Int8ul,
+    "microseconds" / Int32ul * "within the hour",
+)
 
 
 def out(number: tuple[int, int] | None, *members: Any) -> Frame:
@@ -203,20 +263,39 @@ CONTROL: dict[str, Frame] = {
         simulation=Simulation(lambda i: stamped(i * 10**9 // IMU_RATE), rate=IMU_RATE),
     ),
     "broadcast": Frame(
-        message(TELL, (0, 0), "broadcast_code" / Bytes(16), "device_type" / Int8ul * MODEL_TYPES, "data_reserved" / Int16ul)
+        message(
+            TELL,
+            (0, 0),
+            "broadcast_code" / Bytes(16),
+            "device_type" / Int8ul * MODEL_TYPES,
+            "data_reserved" / Int16ul,
+        )
     ),
     "abnormal": Frame(message(TELL, (0, 7), STATUS)),
     "ack": Frame(message(ANSWER, None, RESULT)),
     "number": Frame(message(ANSWER, None, RESULT, "number" / Int8ul)),
     "firmware": Frame(message(ANSWER, INFORMATION, RESULT, "firmware" / Array(4, Int8ul))),
     "heartbeat_ack": Frame(
-        message(ANSWER, (0, 3), RESULT, "work_state" / Int8ul * STATES, "feature" / Int8ul * "bit 0: rain and fog", STATUS)
+        message(
+            ANSWER,
+            (0, 3),
+            RESULT,
+            "work_state" / Int8ul * STATES,
+            "feature" / Int8ul * "bit 0: rain and fog",
+            STATUS,
+        )
     ),
     "address": Frame(message(ANSWER, ADDRESS, RESULT, *NET)),
     "extrinsics": Frame(message(ANSWER, EXTRINSICS, RESULT, *POSE)),
     "ask": out(None),
     "set": out(None, "number" / Int8ul),
-    "handshake": out((0, 1), "host" / Bytes(4), "data_port" / Int16ul, "command_port" / Int16ul, "imu_port" / Int16ul),
+    "handshake": out(
+        (0, 1),
+        "host" / Bytes(4),
+        "data_port" / Int16ul,
+        "command_port" / Int16ul,
+        "imu_port" / Int16ul,
+    ),
     "set_address": out((0, 8), *NET),
     "reboot": out((0, 0x0A), "delay" / Scaled(Int16ul, 0.001, "s")),
     "set_extrinsics": out((1, 1), *POSE),
@@ -224,10 +303,19 @@ CONTROL: dict[str, Frame] = {
 }
 
 
-def command(frame: str, reply: str | None = "ack", number: tuple[int, int] | None = None, **more: Any) -> Command:
-    """A command with a running number, which the answer repeats, and its number where the frame is for several."""
+def command(
+    frame: str, reply: str | None = "ack", number: tuple[int, int] | None = None, **more: Any
+) -> Command:
+    """A command with a running number, which the answer repeats, and its number where the frame is
+    for several.
+    """
     values = {} if number is None else dict(zip(("cmd_set", "cmd_id"), number, strict=True))
-    own = {"values": {"head.seq": Count(16), **values, **more.pop("values", {})}, "echoes": ("head.seq",), "link": "control", "retries": 1}
+    own = {
+        "values": {"head.seq": Count(16), **values, **more.pop("values", {})},
+        "echoes": ("head.seq",),
+        "link": "control",
+        "retries": 1,
+    }
     return Command(frame, reply=reply, **{**own, **more})
 
 
@@ -245,7 +333,12 @@ DONE = {"result": 0}
 COMMANDS: dict[str, Command] = {
     "handshake": command(
         "handshake",
-        values={"host": Address(), "data_port": DATA_PORT, "command_port": COMMAND_PORT, "imu_port": IMU_PORT},
+        values={
+            "host": Address(),
+            "data_port": DATA_PORT,
+            "command_port": COMMAND_PORT,
+            "imu_port": IMU_PORT,
+        },
         matches=DONE,
     ),
     "heartbeat": command("ask", "heartbeat_ack", (0, 3), every=1.0, retries=0),
@@ -255,7 +348,12 @@ COMMANDS: dict[str, Command] = {
     "get_information": command("ask", "firmware", INFORMATION),
     "get_address": command("ask", "address", ADDRESS),
     "set_address": command(
-        "set_address", args={"mode": ("mode", 0, 1), **{name: (name, Address()) for name in ("ip", "mask", "gateway")}}, matches=DONE
+        "set_address",
+        args={
+            "mode": ("mode", 0, 1),
+            **{name: (name, Address()) for name in ("ip", "mask", "gateway")},
+        },
+        matches=DONE,
     ),
     "reboot": command("reboot", args={"delay": ("delay", 0, 65.535)}, retries=0),
     "set_coordinates": setter(COORDINATES, 0, 1),
@@ -270,7 +368,10 @@ COMMANDS: dict[str, Command] = {
     "get_extrinsics": command("ask", "extrinsics", EXTRINSICS),
     "set_extrinsics": command(
         "set_extrinsics",
-        args={**{name: (name, -360, 360) for name in ("roll", "pitch", "yaw")}, **{axis: (axis, -FARTHEST, FARTHEST) for axis in "xyz"}},
+        args={
+            **{name: (name, -360, 360) for name in ("roll", "pitch", "yaw")},
+            **{axis: (axis, -FARTHEST, FARTHEST) for axis in "xyz"},
+        },
         matches=DONE,
     ),
     "set_time": command(
@@ -289,22 +390,65 @@ COMMANDS: dict[str, Command] = {
 
 @cache
 def frames(rate: int, first: str) -> Mapping[str, Frame]:
-    """All frames of the models with so many shots a second, of which the first type of data is what they usually send."""
+    """All frames of the models with so many shots a second, of which the first type of data is what
+    they usually send.
+    """
     own = {first: data_frame(first, rate)}
     return (
-        own | {name: data_frame(name, rate, simulation=simulation(name, rate, WIDEST[rate])) for name in TYPES if name != first} | CONTROL
+        own
+        | {
+            name: data_frame(name, rate, simulation=simulation(name, rate, WIDEST[rate]))
+            for name in TYPES
+            if name != first
+        }
+        | CONTROL
     )
 
 
-ANSWERS = {"get_information": (("firmware", {**DONE, "firmware": [4, 11, 0, 6]}),)}  # of a simulated one
-#: shots a second -> what a simulated one of these sees with types of data that it does not usually send: a Mid-40's view, an Avia's.
+ANSWERS = {
+    "get_information": (("firmware", {**DONE, "firmware": [4, 11, 0, 6]}),)
+}  # of a simulated one
+#: shots a second -> what a simulated one of these sees with types of data that it does not usually
+#: send: a Mid-40's view, an Avia's.
 WIDEST: dict[int, View] = {100_000: (-19.2, 19.2, -19.2, 19.2), 240_000: (-35.2, 35.2, -38.6, 38.6)}
 #: id -> model, device type, shots a second, usual type of data, view, ranges, other ids.
 MODELS: dict[str, tuple[str, int, int, str, View, tuple[float, float], tuple[str, ...]]] = {
-    "livox-mid40": ("Mid-40", 1, 100_000, "cartesian", WIDEST[100_000], (1.0, 260.0), ("mid40", "mid-40", "livox-mid-40")),
-    "livox-mid70": ("Mid-70", 6, 100_000, "cartesian", (-35.2, 35.2, -35.2, 35.2), (0.05, 260.0), ("mid70", "mid-70", "livox-mid-70")),
-    "livox-horizon": ("Horizon LiDAR", 3, 240_000, "tagged", (-40.85, 40.85, -12.55, 12.55), (0.5, 260.0), ()),
-    "livox-tele15": ("Tele-15", 2, 240_000, "tagged", (-7.25, 7.25, -8.1, 8.1), (3.0, 500.0), ("tele15", "tele-15", "livox-tele-15")),
+    "livox-mid40": (
+        "Mid-40",
+        1,
+        100_000,
+        "cartesian",
+        WIDEST[100_000],
+        (1.0, 260.0),
+        ("mid40", "mid-40", "livox-mid-40"),
+    ),
+    "livox-mid70": (
+        "Mid-70",
+        6,
+        100_000,
+        "cartesian",
+        (-35.2, 35.2, -35.2, 35.2),
+        (0.05, 260.0),
+        ("mid70", "mid-70", "livox-mid-70"),
+    ),
+    "livox-horizon": (
+        "Horizon LiDAR",
+        3,
+        240_000,
+        "tagged",
+        (-40.85, 40.85, -12.55, 12.55),
+        (0.5, 260.0),
+        (),
+    ),
+    "livox-tele15": (
+        "Tele-15",
+        2,
+        240_000,
+        "tagged",
+        (-7.25, 7.25, -8.1, 8.1),
+        (3.0, 500.0),
+        ("tele15", "tele-15", "livox-tele-15"),
+    ),
     "livox-avia": ("Avia", 7, 240_000, "tagged", WIDEST[240_000], (1.0, 450.0), ("avia",)),
 }
 
@@ -312,7 +456,12 @@ MODELS: dict[str, tuple[str, int, int, str, View, tuple[float, float], tuple[str
 def lidar(name: str) -> Sensor:
     """One row of the table as a sensor."""
     model, device_type, rate, first, view, limits, aliases = MODELS[name]
-    who = {"head.seq": 0, "broadcast_code": b"0TFSIMULATED001", "device_type": device_type, "data_reserved": 0}
+    who = {
+        "head.seq": 0,
+        "broadcast_code": b"0TFSIMULATED001",
+        "device_type": device_type,
+        "data_reserved": 0,
+    }
     return Sensor(
         name,
         vendor="Livox",
@@ -320,20 +469,40 @@ def lidar(name: str) -> Sensor:
         frames=frames(rate, first),
         points=None,
         scan=Every(0.1),
-        links={"data": Udp(DATA_PORT, IMU_PORT, 55_000), "control": Udp(65_000, local=COMMAND_PORT)},
+        links={
+            "data": Udp(DATA_PORT, IMU_PORT, 55_000),
+            "control": Udp(65_000, local=COMMAND_PORT),
+        },
         commands=COMMANDS,
         clock=Clock(clock),
-        simulation=simulation(first, rate, view, answers={"handshake": (("ack", DONE), ("broadcast", who)), **ANSWERS}),
+        simulation=simulation(
+            first, rate, view, answers={"handshake": (("ack", DONE), ("broadcast", who)), **ANSWERS}
+        ),
         on_open=("handshake", "heartbeat", "get_information", "start"),
         on_close=("stop", "disconnect"),
         range_limits=limits,
         vendor_axes=("forward", "left", "up"),
-        relatives={other: "the device type in what it broadcasts" for other in MODELS if other != name and MODELS[other][2] == rate},
-        info={"serial": "broadcast.broadcast_code", "model": "broadcast.device_type", "firmware": "firmware.firmware"},
+        relatives={
+            other: "the device type in what it broadcasts"
+            for other in MODELS
+            if other != name and MODELS[other][2] == rate
+        },
+        info={
+            "serial": "broadcast.broadcast_code",
+            "model": "broadcast.device_type",
+            "firmware": "firmware.firmware",
+        },
         aliases=aliases,
         status="manual",
-        acknowledged={"LS507": "it sees nothing in a small room, which is nearer than its shortest range"} if limits[0] > 1 else {},
-        source="Livox-SDK communication protocol 1.3.0; Livox-SDK 9306596; livox_ros_driver (lds.h); user manuals",
+        acknowledged=(
+            {"LS507": "it sees nothing in a small room, which is nearer than its shortest range"}
+            if limits[0] > 1
+            else {}
+        ),
+        source=(
+            "Livox-SDK communication protocol 1.3.0; Livox-SDK 9306596; livox_ros_driver (lds.h);"
+            " user manuals"
+        ),
     )
 
 

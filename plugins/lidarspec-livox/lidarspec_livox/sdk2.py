@@ -1,14 +1,17 @@
 """Livox Mid-360 and HAP: the second generation of the protocol, which Livox-SDK2 speaks.
 
-Points, IMU and parameters come over UDP, each from and to a port of its own. A Lidar sends points to the host that it was told of
-(`set_point_host`) once it is sampling (`start`), and its parameters once a second by itself. Firmware of the Mid-360 is reported that
-leaves the CRC of point packets 0: these are taken as they are.
+Points, IMU and parameters come over UDP, each from and to a port of its own. A Lidar sends points
+to the host that it was told of (`set_point_host`) once it is sampling (`start`), and its parameters
+once a second by itself. Firmware of the Mid-360 is reported that leaves the CRC of point packets 0:
+these are taken as they are.
 
-Source: Livox Mid-360 protocol document 1.4.10 and Livox-SDK2 08f523c (livox_lidar_def.h), HAP protocol document 1.4.8 where they
-differ; HAP user manual, table 1.2.1, for its rate, ranges and view; those of a Mid-360 are assumed. livox_ros_driver2 divides
-`time_interval` by the number of points, the document by one less: the driver's rule is taken, which differs by 1 %. That a HAP takes the
-commands of a Mid-360 is assumed from the SDK, which sends it the same; where its state goes is not known, and not asked for. Commands for
-logs and firmware are not here. Keys whose values are not known are passed on as bytes.
+Source: Livox Mid-360 protocol document 1.4.10 and Livox-SDK2 08f523c (livox_lidar_def.h), HAP
+protocol document 1.4.8 where they differ; HAP user manual, table 1.2.1, for its rate, ranges and
+view; those of a Mid-360 are assumed. livox_ros_driver2 divides `time_interval` by the number of
+points, the document by one less: the driver's rule is taken, which differs by 1 %. That a HAP takes
+the commands of a Mid-360 is assumed from the SDK, which sends it the same; where its state goes is
+not known, and not asked for. Commands for logs and firmware are not here. Keys whose values are not
+known are passed on as bytes.
 """
 
 from __future__ import annotations
@@ -17,7 +20,21 @@ from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
-from construct import Array, Bytes, Const, Default, Float32l, Int8ul, Int16ul, Int32sl, Int32ul, Int64sl, Int64ul, Struct, this
+from construct import (
+    Array,
+    Bytes,
+    Const,
+    Default,
+    Float32l,
+    Int8ul,
+    Int16ul,
+    Int32sl,
+    Int32ul,
+    Int64sl,
+    Int64ul,
+    Struct,
+    this,
+)
 
 from lidarspec.spec import (
     Address,
@@ -106,11 +123,21 @@ def twice(f: Fields) -> Any:
 def points_frame(kind: int, points: Any, *members: Any, **more: Any) -> Frame:
     """Point packets of one type."""
     struct = packet(kind, "points" / Array(this.dot_num, Struct(*members)))
-    return Frame(struct, data=True, max_length=LONGEST, plausible=filled, points=points, acknowledged=UNSEALED, **more)
+    return Frame(
+        struct,
+        data=True,
+        max_length=LONGEST,
+        plausible=filled,
+        points=points,
+        acknowledged=UNSEALED,
+        **more,
+    )
 
 
 def message(cmd_id: int | None, *members: Any, ack: bool = True, lidar: bool = True) -> Any:
-    """A control frame: a header with a CRC-16, and data with a CRC-32, which is 0 where there are none."""
+    """A control frame: a header with a CRC-16, and data with a CRC-32, which is 0 where there are
+    none.
+    """
     head = Struct(
         SOF,
         "version" / Const(0, Int8ul),
@@ -125,20 +152,32 @@ def message(cmd_id: int | None, *members: Any, ack: bool = True, lidar: bool = T
     sealed = "head" / Checksummed(head, field="crc16", algorithm=CRC16)
     if not members:
         return Struct(sealed, "crc32" / Const(0, Int32ul))
-    return Checksummed(Struct(sealed, "crc32" / Int32ul, *members), field="crc32", algorithm=CRC32, over=[one.name for one in members])
+    return Checksummed(
+        Struct(sealed, "crc32" / Int32ul, *members),
+        field="crc32",
+        algorithm=CRC32,
+        over=[one.name for one in members],
+    )
 
 
 NUMBER = Int8ul
 HOST = Struct("ip" / Bytes(4), "host_port" / Int16ul, "lidar_port" / Int16ul)
 NET = Struct("ip" / Bytes(4), "mask" / Bytes(4), "gateway" / Bytes(4))
 ATTITUDE = Struct(
-    *(name / Scaled(Float32l, 1, "deg") for name in ("roll", "pitch", "yaw")), *(axis / Scaled(Int32sl, 0.001, "m") for axis in "xyz")
+    *(name / Scaled(Float32l, 1, "deg") for name in ("roll", "pitch", "yaw")),
+    *(axis / Scaled(Int32sl, 0.001, "m") for axis in "xyz"),
 )
-FOV = Struct(*(name / Int32sl for name in ("yaw_start", "yaw_stop", "pitch_start", "pitch_stop")), "reserved" / Default(Bytes(4), bytes(4)))
+FOV = Struct(
+    *(name / Int32sl for name in ("yaw_start", "yaw_stop", "pitch_start", "pitch_stop")),
+    "reserved" / Default(Bytes(4), bytes(4)),
+)
 #: name -> key and value of a parameter (Mid-360 protocol document; livox_lidar_def.h).
 PARAMETERS: dict[str, tuple[int, Any]] = {
     "point_type": (0x0000, NUMBER * "1 millimetres, 2 centimetres, 3 spherical"),
-    "scan_pattern": (0x0001, NUMBER * "0 does not repeat, 1 repeats, 2 repeats at a low frame rate"),
+    "scan_pattern": (
+        0x0001,
+        NUMBER * "0 does not repeat, 1 repeats, 2 repeats at a low frame rate",
+    ),
     "lidar_address": (0x0004, NET),
     "state_host": (0x0005, HOST),
     "point_host": (0x0006, HOST),
@@ -156,7 +195,10 @@ PARAMETERS: dict[str, tuple[int, Any]] = {
     "loader_version": (0x8003, Array(4, Int8ul)),
     "hardware_version": (0x8004, Array(4, Int8ul)),
     "mac": (0x8005, Bytes(6)),
-    "work_state": (0x8006, NUMBER * "1 sampling, 2 idle, 4 error, 5 self-check, 6 motor starts, 8 upgrade, 9 ready"),
+    "work_state": (
+        0x8006,
+        NUMBER * "1 sampling, 2 idle, 4 error, 5 self-check, 6 motor starts, 8 upgrade, 9 ready",
+    ),
     "core_temperature": (0x8007, Scaled(Int32sl, 0.01, "degC")),
     "power_ups": (0x8008, Int32ul),
     "local_time": (0x8009, Scaled(Int64ul, 1, "ns")),
@@ -172,7 +214,9 @@ PARAMETERS: dict[str, tuple[int, Any]] = {
 def parameter(name: str) -> Struct:
     """One parameter with its key and its length."""
     key, value = PARAMETERS[name]
-    return Struct("key" / Const(key, Int16ul), "length" / Const(value.sizeof(), Int16ul), name / value)
+    return Struct(
+        "key" / Const(key, Int16ul), "length" / Const(value.sizeof(), Int16ul), name / value
+    )
 
 
 LIST = (
@@ -186,17 +230,34 @@ LIST = (
     ),
 )
 RESERVED = "data_reserved" / Default(Int16ul, 0)
-RESULT = "result" / Int8ul * "0 done, 1 failed, 2 not now, 3 out of range, 20 unknown, 21 after a reboot, 22 read only, 23 length, 24 keys"
+RESULT = (
+    "result"
+    / Int8ul
+    * "0 done, 1 failed, 2 not now, 3 out of range, 20 unknown, 21 after a reboot, 22 read only, 23"
+    " length, 24 keys"
+)
 
 
 def setting(*values: Any) -> Frame:
     """A request to set one parameter."""
     value = Struct("key" / Int16ul, "size" / SizeOf(Int16ul, "value"), "value" / Struct(*values))
-    return Frame(message(0x0100, "key_count" / Const(1, Int16ul), RESERVED, "parameter" / value, ack=False, lidar=False), direction="out")
+    return Frame(
+        message(
+            0x0100,
+            "key_count" / Const(1, Int16ul),
+            RESERVED,
+            "parameter" / value,
+            ack=False,
+            lidar=False,
+        ),
+        direction="out",
+    )
 
 
 def simulation(rate: float, view: View, shots: Any = SHOTS, **more: Any) -> Simulation:
-    """What a simulated Lidar needs that shoots so many times a second; `shots` are those of a packet."""
+    """What a simulated Lidar needs that shoots so many times a second; `shots` are those of a
+    packet.
+    """
     points = len(shots)
 
     def look(i: int) -> tuple[Any, Any]:
@@ -215,26 +276,51 @@ def simulation(rate: float, view: View, shots: Any = SHOTS, **more: Any) -> Simu
             "points.zenith": 90 - elevation,
         }
 
-    return Simulation(sweep, directions=lambda i: tuple(np.deg2rad(angle) for angle in look(i)), **more)
+    return Simulation(
+        sweep, directions=lambda i: tuple(np.deg2rad(angle) for angle in look(i)), **more
+    )
 
 
 def inertia(i: int) -> dict[str, Any]:
     """IMU packet i."""
-    return {"time_interval": 0, "dot_num": 1, "udp_cnt": i % 65_536, "frame_cnt": 0, "timestamp": i * 10**9 // IMU_RATE}
+    return {
+        "time_interval": 0,
+        "dot_num": 1,
+        "udp_cnt": i % 65_536,
+        "frame_cnt": 0,
+        "timestamp": i * 10**9 // IMU_RATE,
+    }
 
 
 def state(i: int) -> dict[str, Any]:
     """What a simulated Lidar says of itself once a second."""
-    values = {"serial": b"SIMULATED", "app_version": [13, 18, 2, 40], "work_state": 1, "core_temperature": 41.5}
-    parameters = [{"key": PARAMETERS[name][0], "length": PARAMETERS[name][1].sizeof(), name: value} for name, value in values.items()]
+    values = {
+        "serial": b"SIMULATED",
+        "app_version": [13, 18, 2, 40],
+        "work_state": 1,
+        "core_temperature": 41.5,
+    }
+    parameters = [
+        {"key": PARAMETERS[name][0], "length": PARAMETERS[name][1].sizeof(), name: value}
+        for name, value in values.items()
+    ]
     return {"head.seq": i, "parameters": parameters}
 
 
 FRAMES: dict[str, Frame] = {
     "data": points_frame(1, lambda f: cartesian(f, after(f)), *MILLIMETRES, REFLECTIVITY, TAG),
-    "centimetres": points_frame(2, lambda f: cartesian(f, after(f)), *CENTIMETRES, REFLECTIVITY, TAG),
-    "spherical": points_frame(3, lambda f: spherical(f, after(f)), *DEPTH, *DIRECTION, REFLECTIVITY, TAG),
-    "dual": points_frame(0x11, twice, echoes(2, *MILLIMETRES), simulation=simulation(226_000, (-60, 60, -12.5, 12.5), SHOTS[:48, None])),
+    "centimetres": points_frame(
+        2, lambda f: cartesian(f, after(f)), *CENTIMETRES, REFLECTIVITY, TAG
+    ),
+    "spherical": points_frame(
+        3, lambda f: spherical(f, after(f)), *DEPTH, *DIRECTION, REFLECTIVITY, TAG
+    ),
+    "dual": points_frame(
+        0x11,
+        twice,
+        echoes(2, *MILLIMETRES),
+        simulation=simulation(226_000, (-60, 60, -12.5, 12.5), SHOTS[:48, None]),
+    ),
     "imu": Frame(
         packet(0, *INERTIAL),
         imu=imu,
@@ -259,7 +345,11 @@ FRAMES: dict[str, Frame] = {
         )
     ),
     "set_ack": Frame(message(0x0100, RESULT, "wrong_key" / Int16ul)),
-    "parameters": Frame(message(0x0101, RESULT, "count" / Int16ul, *LIST), max_length=LONGEST, acknowledged=ANY_NUMBER),
+    "parameters": Frame(
+        message(0x0101, RESULT, "count" / Int16ul, *LIST),
+        max_length=LONGEST,
+        acknowledged=ANY_NUMBER,
+    ),
     "ack": Frame(
         message(None, RESULT),
         plausible=lambda f: (f.head.cmd_id >= REBOOT) & (f.head.cmd_id <= SET_GPS_TIME),
@@ -267,7 +357,14 @@ FRAMES: dict[str, Frame] = {
     ),
     "discover": Frame(message(0x0000, ack=False, lidar=False), direction="out"),
     "get": Frame(
-        message(0x0101, "count" / Int16ul, RESERVED, "wanted" / Array(this.count, Int16ul), ack=False, lidar=False),
+        message(
+            0x0101,
+            "count" / Int16ul,
+            RESERVED,
+            "wanted" / Array(this.count, Int16ul),
+            ack=False,
+            lidar=False,
+        ),
         direction="out",
         max_length=LONGEST,
     ),
@@ -276,23 +373,51 @@ FRAMES: dict[str, Frame] = {
     "set_net": setting(*NET.subcons),
     "set_attitude": setting(*ATTITUDE.subcons),
     "set_fov": setting(*FOV.subcons),
-    "reboot": Frame(message(REBOOT, "delay" / Scaled(Int16ul, 0.001, "s"), ack=False, lidar=False), direction="out"),
-    "factory_settings": Frame(message(FACTORY_SETTINGS, "data" / Default(Bytes(16), bytes(16)), ack=False, lidar=False), direction="out"),
+    "reboot": Frame(
+        message(REBOOT, "delay" / Scaled(Int16ul, 0.001, "s"), ack=False, lidar=False),
+        direction="out",
+    ),
+    "factory_settings": Frame(
+        message(FACTORY_SETTINGS, "data" / Default(Bytes(16), bytes(16)), ack=False, lidar=False),
+        direction="out",
+    ),
     "set_gps_time": Frame(
-        message(SET_GPS_TIME, "type" / Const(2, Int8ul), "time" / Scaled(Int64ul, 1, "ns"), ack=False, lidar=False), direction="out"
+        message(
+            SET_GPS_TIME,
+            "type" / Const(2, Int8ul),
+            "time" / Scaled(Int64ul, 1, "ns"),
+            ack=False,
+            lidar=False,
+        ),
+        direction="out",
     ),
 }
 
 
 def asking(frame: str, reply: str, values: Mapping[str, Any] | None = None, **more: Any) -> Command:
     """A request with a running number, which the answer repeats."""
-    own = {"values": {"head.seq": Count(16), **(values or {})}, "reply": reply, "echoes": ("head.seq",), "link": "control", "retries": 1}
+    own = {
+        "values": {"head.seq": Count(16), **(values or {})},
+        "reply": reply,
+        "echoes": ("head.seq",),
+        "link": "control",
+        "retries": 1,
+    }
     return Command(frame, **{**own, **more})
 
 
-def setter(frame: str, name: str, values: Mapping[str, Any] | None = None, args: Mapping[str, Any] | None = None, **more: Any) -> Command:
+def setter(
+    frame: str,
+    name: str,
+    values: Mapping[str, Any] | None = None,
+    args: Mapping[str, Any] | None = None,
+    **more: Any,
+) -> Command:
     """A command that sets one parameter; values and arguments by their names in it."""
-    given = {"parameter.key": PARAMETERS[name][0], **{f"parameter.value.{path}": value for path, value in (values or {}).items()}}
+    given = {
+        "parameter.key": PARAMETERS[name][0],
+        **{f"parameter.value.{path}": value for path, value in (values or {}).items()},
+    }
     taken = {path: (f"parameter.value.{path}", *limits) for path, limits in (args or {}).items()}
     return asking(frame, "set_ack", given, args=taken, matches={"result": 0}, **more)
 
@@ -312,7 +437,9 @@ def work(mode: int, **more: Any) -> Command:
     return setter("set_number", "work_mode", {"number": mode}, **more)
 
 
-FAR = 1000.0  # metres that it can be mounted away from where its points are counted from, and degrees that angles go
+# metres that it can be mounted away from where its points are counted from, and degrees that angles
+# go
+FAR = 1000.0
 COMMANDS: dict[str, Command] = {
     "start": work(1, starts=True),
     "stop": work(2, stops=True),
@@ -321,32 +448,51 @@ COMMANDS: dict[str, Command] = {
     "set_detect_mode": one_of("detect_mode", 0, 1),
     "set_imu": one_of("imu_enabled", 0, 1),
     "enable_fov": one_of("fov_enabled", 0, 3),
-    "set_address": setter("set_net", "lidar_address", args={name: (Address(),) for name in ("ip", "mask", "gateway")}),
+    "set_address": setter(
+        "set_net", "lidar_address", args={name: (Address(),) for name in ("ip", "mask", "gateway")}
+    ),
     "set_attitude": setter(
         "set_attitude",
         "attitude",
-        args={**dict.fromkeys(("roll", "pitch", "yaw"), (-360, 360)), **dict.fromkeys("xyz", (-FAR, FAR))},
+        args={
+            **dict.fromkeys(("roll", "pitch", "yaw"), (-360, 360)),
+            **dict.fromkeys("xyz", (-FAR, FAR)),
+        },
     ),
     **{
         f"set_{name}": setter(
             "set_fov",
             name,
-            args={**dict.fromkeys(("yaw_start", "yaw_stop"), (0, 360)), **dict.fromkeys(("pitch_start", "pitch_stop"), (-90, 90))},
+            args={
+                **dict.fromkeys(("yaw_start", "yaw_stop"), (0, 360)),
+                **dict.fromkeys(("pitch_start", "pitch_stop"), (-90, 90)),
+            },
         )
         for name in ("fov_0", "fov_1")
     },
-    "get": asking("get", "parameters", {"count": 1, "wanted": [0]}, args={"key": ("wanted[0]", 0, 0xFFFF)}),
-    "get_state": asking("get", "parameters", {"count": 5, "wanted": [0x8000, 0x8002, 0x8006, 0x8007, 0x800C]}),
-    "reboot": asking("reboot", "ack", args={"delay": ("delay", 0.1, 2.0)}, matches={"result": 0}, retries=0),
+    "get": asking(
+        "get", "parameters", {"count": 1, "wanted": [0]}, args={"key": ("wanted[0]", 0, 0xFFFF)}
+    ),
+    "get_state": asking(
+        "get", "parameters", {"count": 5, "wanted": [0x8000, 0x8002, 0x8006, 0x8007, 0x800C]}
+    ),
+    "reboot": asking(
+        "reboot", "ack", args={"delay": ("delay", 0.1, 2.0)}, matches={"result": 0}, retries=0
+    ),
     "factory_settings": asking("factory_settings", "ack", matches={"result": 0}, retries=0),
-    "set_gps_time": asking("set_gps_time", "ack", args={"time": ("time", 0, 2**63)}, matches={"result": 0}),
+    "set_gps_time": asking(
+        "set_gps_time", "ack", args={"time": ("time", 0, 2**63)}, matches={"result": 0}
+    ),
 }
 
 
 #: what is sent to the host -> the port of the Lidar, and that of the host.
 Ports = dict[str, tuple[int, int]]
-#: id -> model, device type, port of the Lidar for commands and of the host, ports of the rest, points a second, view, ranges, other ids.
-MODELS: dict[str, tuple[str, int, int, int, Ports, int, View, tuple[float, float], tuple[str, ...]]] = {
+#: id -> model, device type, port of the Lidar for commands and of the host, ports of the rest,
+#: points a second, view, ranges, other ids.
+MODELS: dict[
+    str, tuple[str, int, int, int, Ports, int, View, tuple[float, float], tuple[str, ...]]
+] = {
     "livox-mid360": (
         "Mid-360",
         9,
@@ -381,7 +527,13 @@ def lidar(name: str) -> Sensor:
     """One row of the table as a sensor."""
     model, device_type, control, local, ports, rate, view, limits, aliases = MODELS[name]
     discovery = "control" if control == DISCOVERY else "discovery"
-    found = {"result": 0, "device_type": device_type, "serial": b"SIMULATED", "address": bytes([127, 0, 0, 1]), "command_port": control}
+    found = {
+        "result": 0,
+        "device_type": device_type,
+        "serial": b"SIMULATED",
+        "address": bytes([127, 0, 0, 1]),
+        "command_port": control,
+    }
     return Sensor(
         name,
         vendor="Livox",
@@ -397,11 +549,16 @@ def lidar(name: str) -> Sensor:
         commands={
             "discover": asking("discover", "discovery", link=discovery),
             **COMMANDS,
-            **{f"set_{what}_host": host(f"{what}_host", port, source) for what, (source, port) in ports.items()},
+            **{
+                f"set_{what}_host": host(f"{what}_host", port, source)
+                for what, (source, port) in ports.items()
+            },
         },
         clock=Clock("timestamp"),
         sequence=Sequence("udp_cnt"),
-        simulation=simulation(rate, view, answers={"discover": (("discovery", found),), "get_state": told}),
+        simulation=simulation(
+            rate, view, answers={"discover": (("discovery", found),), "get_state": told}
+        ),
         on_open=("discover", "get_state", *(f"set_{what}_host" for what in ports), "start"),
         on_close=("stop",),
         range_limits=limits,
@@ -415,7 +572,10 @@ def lidar(name: str) -> Sensor:
         },
         aliases=aliases,
         status="manual",
-        source="Livox Mid-360 protocol document 1.4.10; HAP protocol document 1.4.8; Livox-SDK2 08f523c; user manuals",
+        source=(
+            "Livox Mid-360 protocol document 1.4.10; HAP protocol document 1.4.8; Livox-SDK2"
+            " 08f523c; user manuals"
+        ),
     )
 
 
@@ -425,7 +585,9 @@ def hurried(f: Fields) -> Any:
 
 
 RELATIVES: dict[str, str | Relative] = {
-    "livox-mid360": Relative("5 us from a point to the next", lambda f: f.time_interval >= 3.3e-6 * f.dot_num),
+    "livox-mid360": Relative(
+        "5 us from a point to the next", lambda f: f.time_interval >= 3.3e-6 * f.dot_num
+    ),
     "livox-hap": Relative("2.2 us from a point to the next", hurried),
     "livox-mid360s": "the device type in its answer to a discovery, 35",
 }

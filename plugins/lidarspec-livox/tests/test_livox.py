@@ -1,4 +1,6 @@
-"""Livox: the published frames and commands of both generations, points of each type, dates, and what opening a simulated one takes."""
+"""Livox: the published frames and commands of both generations, points of each type, dates, and
+what opening a simulated one takes.
+"""
 
 from __future__ import annotations
 
@@ -24,9 +26,18 @@ COMMANDS: dict[str, tuple[str, str, dict[str, Any]]] = {
     "livox1_heartbeat": ("livox-mid40", "heartbeat", {"head.seq": 0}),
     "livox1_start_seq8": ("livox-mid40", "start", {"head.seq": 8}),
     "livox2_set_work_mode_sampling": ("livox-mid360", "start", {"head.seq": 1}),
-    "livox2_set_point_host": ("livox-mid360", "set_point_host", {"head.seq": 3, "parameter.value.ip": "192.168.1.50"}),
+    "livox2_set_point_host": (
+        "livox-mid360",
+        "set_point_host",
+        {"head.seq": 3, "parameter.value.ip": "192.168.1.50"},
+    ),
 }
-OTHERS = {"livox1_handshake", "livox1_data_type1_gps", "livox2_data_cart32", "livox2_data_spherical"}
+OTHERS = {
+    "livox1_handshake",
+    "livox1_data_type1_gps",
+    "livox2_data_cart32",
+    "livox2_data_spherical",
+}
 
 
 def test_every_vector_of_the_family_is_used() -> None:
@@ -42,7 +53,12 @@ def test_a_command_is_the_published_one(name: str) -> None:
 def test_the_handshake_is_the_published_one() -> None:
     data = vector_bytes(FILE, "livox1_handshake")
     parsed = MID40.parse(data, "handshake")
-    assert (bytes(parsed.host), parsed.data_port, parsed.command_port, parsed.imu_port) == (bytes([192, 168, 1, 50]), 55501, 56001, 56001)
+    assert (bytes(parsed.host), parsed.data_port, parsed.command_port, parsed.imu_port) == (
+        bytes([192, 168, 1, 50]),
+        55501,
+        56001,
+        56001,
+    )
     assert MID40.build("handshake", parsed) == data
 
 
@@ -66,7 +82,9 @@ def test_published_points_of_the_first_generation_and_their_date() -> None:
     cloud = packets.points()
     assert packets.time_ns.tolist() == [expected["timestamp_ns"]]
     assert len(cloud) == expected["points_n"]
-    assert [*cloud.xyz[0].tolist(), cloud.intensity[0]] == pytest.approx(expected["first"], abs=1e-4)
+    assert [*cloud.xyz[0].tolist(), cloud.intensity[0]] == pytest.approx(
+        expected["first"], abs=1e-4
+    )
 
 
 def header(kind: int, time_type: int, stamp: bytes) -> bytes:
@@ -77,11 +95,21 @@ def header(kind: int, time_type: int, stamp: bytes) -> bytes:
 def test_times_of_the_first_generation_are_exact() -> None:
     points = bytes(100 * 13)
     for ns in (0, 1_700_000_000_123_456_789, 2**32 - 1, 2**61 + 1):
-        assert decoded(MID40, [header(0, 1, struct.pack("<Q", ns)) + points]).time_ns.tolist() == [ns]
-    for year, month, day in ((2000, 1, 1), (2000, 2, 29), (2023, 12, 31), (2024, 2, 29), (2024, 3, 1)):
+        assert decoded(MID40, [header(0, 1, struct.pack("<Q", ns)) + points]).time_ns.tolist() == [
+            ns
+        ]
+    for year, month, day in (
+        (2000, 1, 1),
+        (2000, 2, 29),
+        (2023, 12, 31),
+        (2024, 2, 29),
+        (2024, 3, 1),
+    ):
         stamp = struct.pack("<BBBBI", year - 2000, month, day, 23, 3_599_999_999)
         seconds = int(datetime(year, month, day, 23, tzinfo=UTC).timestamp())
-        assert decoded(MID40, [header(0, 3, stamp) + points]).time_ns.tolist() == [seconds * 10**9 + 3_599_999_999_000]
+        assert decoded(MID40, [header(0, 3, stamp) + points]).time_ns.tolist() == [
+            seconds * 10**9 + 3_599_999_999_000
+        ]
 
 
 def cartesian(x: int, y: int, z: int, *rest: int) -> bytes:
@@ -100,10 +128,30 @@ TYPES: dict[int, tuple[int, bytes, list[list[float]], int | None]] = {
     1: (100, struct.pack("<I", 2000) + ANGLES + bytes([9]), [[2 * SIDE, 2 * SIDE, 1]], None),
     2: (96, cartesian(1000, -2000, 500, 9, 3), [[1, -2, 0.5]], 3),
     3: (96, struct.pack("<I", 2000) + ANGLES + bytes([9, 3]), [[2 * SIDE, 2 * SIDE, 1]], 3),
-    4: (48, cartesian(1000, -2000, 500, 9, 3) + cartesian(2000, -4000, 1000, 8, 16), [[1, -2, 0.5], [2, -4, 1]], 3),
-    5: (48, ANGLES + depth(2000, 9, 3) + depth(4000, 8, 16), [[2 * SIDE, 2 * SIDE, 1], [4 * SIDE, 4 * SIDE, 2]], 3),
-    7: (30, b"".join(cartesian(at * 1000, 0, 0, 9, 3) for at in (1, 2, 3)), [[1, 0, 0], [2, 0, 0], [3, 0, 0]], 3),
-    8: (30, ANGLES + b"".join(depth(at * 2000, 9, 3) for at in (1, 2)) + bytes(6), [[2 * SIDE, 2 * SIDE, 1], [4 * SIDE, 4 * SIDE, 2]], 3),
+    4: (
+        48,
+        cartesian(1000, -2000, 500, 9, 3) + cartesian(2000, -4000, 1000, 8, 16),
+        [[1, -2, 0.5], [2, -4, 1]],
+        3,
+    ),
+    5: (
+        48,
+        ANGLES + depth(2000, 9, 3) + depth(4000, 8, 16),
+        [[2 * SIDE, 2 * SIDE, 1], [4 * SIDE, 4 * SIDE, 2]],
+        3,
+    ),
+    7: (
+        30,
+        b"".join(cartesian(at * 1000, 0, 0, 9, 3) for at in (1, 2, 3)),
+        [[1, 0, 0], [2, 0, 0], [3, 0, 0]],
+        3,
+    ),
+    8: (
+        30,
+        ANGLES + b"".join(depth(at * 2000, 9, 3) for at in (1, 2)) + bytes(6),
+        [[2 * SIDE, 2 * SIDE, 1], [4 * SIDE, 4 * SIDE, 2]],
+        3,
+    ),
 }
 
 
@@ -138,8 +186,12 @@ def test_a_counter_that_starts_again_with_each_frame_is_no_loss() -> None:
 def test_what_an_imu_feels_is_in_si(sensor: ls.Sensor) -> None:
     felt = sensor.decode([sensor.example("imu", seed=seed) for seed in range(3)], "imu")
     first = felt.raw[0]
-    assert felt.imu().linear_acceleration[0].tolist() == pytest.approx([first[f"acc_{axis}"] * 9.80665 for axis in "xyz"], nan_ok=True)
-    assert felt.imu().angular_velocity[0].tolist() == pytest.approx([first[f"gyro_{axis}"] for axis in "xyz"], nan_ok=True)
+    assert felt.imu().linear_acceleration[0].tolist() == pytest.approx(
+        [first[f"acc_{axis}"] * 9.80665 for axis in "xyz"], nan_ok=True
+    )
+    assert felt.imu().angular_velocity[0].tolist() == pytest.approx(
+        [first[f"gyro_{axis}"] for axis in "xyz"], nan_ok=True
+    )
 
 
 @pytest.mark.slow
@@ -155,8 +207,16 @@ def test_a_model_is_not_taken_for_a_relative(name: str) -> None:
 @pytest.mark.parametrize("name", FIRST)
 def test_what_it_broadcasts_names_the_model(name: str) -> None:
     sensor = ls.sensor(name)
-    who = {"mid40": 1, "tele15": 2, "horizon": 3, "mid70": 6, "avia": 7}[name.removeprefix("livox-")]
-    said = sensor.build("broadcast", head={"seq": 0}, broadcast_code=b"0TESTLIDAR00001\0", device_type=who, data_reserved=0)
+    who = {"mid40": 1, "tele15": 2, "horizon": 3, "mid70": 6, "avia": 7}[
+        name.removeprefix("livox-")
+    ]
+    said = sensor.build(
+        "broadcast",
+        head={"seq": 0},
+        broadcast_code=b"0TESTLIDAR00001\0",
+        device_type=who,
+        data_reserved=0,
+    )
     found = verdict(Heard("a wire", (said, *ls.simulate(sensor, 40)), datagrams=True))
     assert [one.sensor.id for one in found.alike] == [name]
 
@@ -164,7 +224,9 @@ def test_what_it_broadcasts_names_the_model(name: str) -> None:
 @pytest.mark.slow
 @pytest.mark.parametrize("name", [MID360.id, HAP.id, MID40.id])
 def test_a_simulated_one_is_opened_started_and_read(name: str) -> None:
-    with ls.open(f"sim:{name}?rate=0.2") as device:  # simulating all of its points takes a whole processor
+    with ls.open(
+        f"sim:{name}?rate=0.2"
+    ) as device:  # simulating all of its points takes a whole processor
         scan = device.latest(timeout=30)
         assert len(scan.points)
         told = {
@@ -176,7 +238,11 @@ def test_a_simulated_one_is_opened_started_and_read(name: str) -> None:
         if name == MID40.id:
             told = {"serial": "0TFSIMULATED001", "model": "Mid-40", "firmware": "4.11.0.6"}
         assert device.info == told
-        reply = device.send("set_detect_mode", timeout=30, number=1) if name != MID40.id else device.send("get_information", timeout=30)
+        reply = (
+            device.send("set_detect_mode", timeout=30, number=1)
+            if name != MID40.id
+            else device.send("get_information", timeout=30)
+        )
         assert reply.confirmed
         if name != MID40.id:
             assert device.send("get", timeout=30, key=0).confirmed

@@ -1,12 +1,16 @@
-"""LSLIDAR N10, N10P and the M10 family: 360 degree time-of-flight lidars over a UART, high byte first; the C16 is in `c16`.
+"""LSLIDAR N10, N10P and the M10 family: 360 degree time-of-flight lidars over a UART, high byte
+first; the C16 is in `c16`.
 
-Source: the vendor's ROS drivers (lslidar_driver.cc of the edition for the N10P; lslidar_x10_driver.cpp of Lslidar_ROS2_driver V5). The N10
-and N10P are sealed by a sum; packets of the M10 family have no checksum, only marks at both ends. What the older driver calls the speed is
-the time of 15 degrees in microseconds: 4167 at 10 turns a second, and 3460 to 3490 of an M10P at 12.
+Source: the vendor's ROS drivers (lslidar_driver.cc of the edition for the N10P;
+lslidar_x10_driver.cpp of Lslidar_ROS2_driver V5). The N10 and N10P are sealed by a sum; packets of
+the M10 family have no checksum, only marks at both ends. What the older driver calls the speed is
+the time of 15 degrees in microseconds: 4167 at 10 turns a second, and 3460 to 3490 of an M10P at
+12.
 
-Known contradictions: the older driver draws angles clockwise, as it is done here, the newer one counter-clockwise; both spread the
-samples of an M10 over 15 degrees by the number of those that are not FFFF, which comes to the same where all of them are there.
-What bytes 103 and 104 of an N10P are, nobody says.
+Known contradictions: the older driver draws angles clockwise, as it is done here, the newer one
+counter-clockwise; both spread the samples of an M10 over 15 degrees by the number of those that are
+not FFFF, which comes to the same where all of them are there. What bytes 103 and 104 of an N10P
+are, nobody says.
 """
 
 from __future__ import annotations
@@ -17,7 +21,19 @@ from functools import partial
 from typing import Any
 
 import numpy as np
-from construct import Array, BitsInteger, BitStruct, Bytes, Const, Construct, Default, Int8ub, Int16ub, Struct, this
+from construct import (
+    Array,
+    BitsInteger,
+    BitStruct,
+    Bytes,
+    Const,
+    Construct,
+    Default,
+    Int8ub,
+    Int16ub,
+    Struct,
+    this,
+)
 
 from lidarspec.spec import (
     Checksummed,
@@ -72,7 +88,9 @@ def summed(size: Construct, samples: Construct, *rest: Construct) -> Frame:
         "end_angle" / ANGLE,
         "sum" / Int8ub,
     )
-    return Frame(Checksummed(struct, field="sum", algorithm=Sum(8)), data=True, plausible=n_plausible)
+    return Frame(
+        Checksummed(struct, field="sum", algorithm=Sum(8)), data=True, plausible=n_plausible
+    )
 
 
 def n_plausible(f: Fields) -> Any:
@@ -104,7 +122,9 @@ def from_to(f: Fields) -> tuple[Any, Any]:
 def n10_points(f: Fields) -> Polar:
     """Even steps from the start angle to the end angle."""
     azimuth, time = from_to(f)
-    return Polar(range=seen(f.samples.distance), azimuth=azimuth, intensity=f.samples.intensity, time=time)
+    return Polar(
+        range=seen(f.samples.distance), azimuth=azimuth, intensity=f.samples.intensity, time=time
+    )
 
 
 def n10p_points(f: Fields) -> Polar:
@@ -120,11 +140,15 @@ def n10p_points(f: Fields) -> Polar:
 
 
 def m_points(f: Fields, count: Callable[[Fields], Any]) -> Polar:
-    """Even steps through 15 degrees from the start angle on; what reflects strongly has an intensity of 255, as the driver gives it."""
+    """Even steps through 15 degrees from the start angle on; what reflects strongly has an
+    intensity of 255, as the driver gives it.
+    """
     number = count(f)
     swept = spread(f.start_angle, f.start_angle + SPAN - SPAN / number, number, full=360.0)
     return Polar(
-        range=np.where((f.samples.distance >= 32.767) & (f.samples.bright == 1), 0, f.samples.distance),
+        range=np.where(
+            (f.samples.distance >= 32.767) & (f.samples.bright == 1), 0, f.samples.distance
+        ),
         azimuth=-np.deg2rad(wrap(swept, 360.0)),
         intensity=f.samples.bright * 255,
         time=(swept - f.start_angle) / SPAN * f.period,
@@ -135,11 +159,17 @@ def n_sweep(i: int, packets: int) -> dict[str, float]:
     """Packet i of turns at 10 Hz with so many packets."""
     step = 360 / packets / N_SAMPLES
     first = i % packets * N_SAMPLES * step
-    return {"start_angle": first, "end_angle": first + (N_SAMPLES - 1) * step, "period": 0.1 / PACKETS}
+    return {
+        "start_angle": first,
+        "end_angle": first + (N_SAMPLES - 1) * step,
+        "period": 0.1 / PACKETS,
+    }
 
 
 def m_sweep(i: int, hertz: float, count: int = 0, *, timed: bool = False) -> dict[str, float]:
-    """Packet i of turns of 24 packets, so many a second, with a count of samples and the time where it has them."""
+    """Packet i of turns of 24 packets, so many a second, with a count of samples and the time where
+    it has them.
+    """
     seconds, microseconds = divmod(round(i * 1e6 / (hertz * PACKETS)), 1_000_000)
     clock = {
         "second": seconds % 60,
@@ -151,16 +181,36 @@ def m_sweep(i: int, hertz: float, count: int = 0, *, timed: bool = False) -> dic
     }
     parts = {"millisecond": microseconds // 1000 / 1000, "microsecond": microseconds % 1000 / 1e6}
     sized = {"length": 20 + 2 * count} if count else {}
-    return {"start_angle": i % PACKETS * SPAN, "period": 1 / (hertz * PACKETS), **sized, **(clock | parts if timed else {})}
+    return {
+        "start_angle": i % PACKETS * SPAN,
+        "period": 1 / (hertz * PACKETS),
+        **sized,
+        **(clock | parts if timed else {}),
+    }
 
 
-N10_DATA = summed(Const(58, Int8ub), Array(N_SAMPLES, Struct("distance" / DISTANCE, "intensity" / Int8ub)))
+N10_DATA = summed(
+    Const(58, Int8ub), Array(N_SAMPLES, Struct("distance" / DISTANCE, "intensity" / Int8ub))
+)
 N10P_DATA = summed(
     Int8ub,
-    Array(N_SAMPLES, Struct("first" / DISTANCE, "first_intensity" / Int8ub, "second" / DISTANCE, "second_intensity" / Int8ub)),
+    Array(
+        N_SAMPLES,
+        Struct(
+            "first" / DISTANCE,
+            "first_intensity" / Int8ub,
+            "second" / DISTANCE,
+            "second_intensity" / Int8ub,
+        ),
+    ),
     "reserved" / Bytes(2),
 )
-M10_HEAD = ("header" / START, "start_angle" / ANGLE, "period" / PERIOD, "samples" / Array(M_SAMPLES, SAMPLE))
+M10_HEAD = (
+    "header" / START,
+    "start_angle" / ANGLE,
+    "period" / PERIOD,
+    "samples" / Array(M_SAMPLES, SAMPLE),
+)
 M10_DATA = Frame(Struct(*M10_HEAD, "end" / END), data=True, plausible=m_plausible)
 M10_GPS_DATA = Frame(Struct(*M10_HEAD, *TIME, "end" / END), data=True, plausible=m_plausible)
 M10P_DATA = Frame(
@@ -181,7 +231,11 @@ INFO = Frame(
     Struct(
         "header" / Const(b"\xa5\x5a\x55\x00"),
         "unknown" / Bytes(169),
-        "compensation" / BitStruct("negative" / BitsInteger(1), "angle" / Scaled(BitsInteger(15), 0.01, "deg") * "told, and not applied"),
+        "compensation"
+        / BitStruct(
+            "negative" / BitsInteger(1),
+            "angle" / Scaled(BitsInteger(15), 0.01, "deg") * "told, and not applied",
+        ),
         "reserved" / Bytes(11),
         "end" / END,
     )
@@ -220,7 +274,9 @@ M_COMMANDS = RUNNING | {
 
 @dataclass(frozen=True)
 class Model:
-    """One row of the table of models: its packet, points, sweep, baud, turns a second, clock and status."""
+    """One row of the table of models: its packet, points, sweep, baud, turns a second, clock and
+    status.
+    """
 
     name: str
     data: Frame
@@ -235,24 +291,47 @@ class Model:
 OF_42 = partial(m_points, count=lambda f: M_SAMPLES)
 OF_LENGTH = partial(m_points, count=lambda f: (f.length - 20) / 2)
 MODELS = {
-    "lslidar-n10": Model("N10", N10_DATA, n10_points, partial(n_sweep, packets=28), 230_400, (6, 12)),
-    "lslidar-n10p": Model("N10P", N10P_DATA, n10p_points, partial(n_sweep, packets=34), 460_800, (6, 12)),
+    "lslidar-n10": Model(
+        "N10", N10_DATA, n10_points, partial(n_sweep, packets=28), 230_400, (6, 12)
+    ),
+    "lslidar-n10p": Model(
+        "N10P", N10P_DATA, n10p_points, partial(n_sweep, packets=34), 460_800, (6, 12)
+    ),
     "lslidar-m10": Model("M10", M10_DATA, OF_42, partial(m_sweep, hertz=10), 460_800),
-    "lslidar-m10gps": Model("M10GPS", M10_GPS_DATA, OF_42, partial(m_sweep, hertz=10, timed=True), 460_800, clock=CLOCK),
-    "lslidar-m10p": Model("M10P", M10P_DATA, OF_LENGTH, partial(m_sweep, hertz=12, count=70, timed=True), 500_000, clock=CLOCK),
+    "lslidar-m10gps": Model(
+        "M10GPS", M10_GPS_DATA, OF_42, partial(m_sweep, hertz=10, timed=True), 460_800, clock=CLOCK
+    ),
+    "lslidar-m10p": Model(
+        "M10P",
+        M10P_DATA,
+        OF_LENGTH,
+        partial(m_sweep, hertz=12, count=70, timed=True),
+        500_000,
+        clock=CLOCK,
+    ),
 }
-ALIASES = {"lslidar-n10": ("n10",), "lslidar-n10p": ("n10p", "lslidar-n10plus"), "lslidar-m10": ("m10",)}
+ALIASES = {
+    "lslidar-n10": ("n10",),
+    "lslidar-n10p": ("n10p", "lslidar-n10plus"),
+    "lslidar-m10": ("m10",),
+}
 
 
 def lidar(name: str) -> Sensor:
-    """One row of the table as a sensor; they turn as soon as they have power, and are not stopped on closing: drivers rely on it."""
+    """One row of the table as a sensor; they turn as soon as they have power, and are not stopped
+    on closing: drivers rely on it.
+    """
     model = MODELS[name]
     family = name.startswith("lslidar-n")
     return Sensor(
         name,
         vendor="LSLIDAR",
         model=model.name,
-        frames={"data": model.data, "command": COMMAND} if family else {"info": INFO, "data": model.data, "command": COMMAND},
+        frames=(
+            {"data": model.data, "command": COMMAND}
+            if family
+            else {"info": INFO, "data": model.data, "command": COMMAND}
+        ),
         points=model.points,
         scan=OnWrap("azimuth"),
         links={"data": Serial(model.baud)},
@@ -264,7 +343,10 @@ def lidar(name: str) -> Sensor:
         turn=model.hertz,
         aliases=ALIASES.get(name, ()),
         status=model.status,
-        source="the vendor's ROS drivers, lslidar_driver and Lslidar_ROS2_driver V5. Limits of range are assumed",
+        source=(
+            "the vendor's ROS drivers, lslidar_driver and Lslidar_ROS2_driver V5. Limits of range"
+            " are assumed"
+        ),
     )
 
 

@@ -1,13 +1,16 @@
-"""LSLIDAR C16, the edition with packets of 1212 bytes: a rotating lidar of 16 lasers over UDP, low byte first.
+"""LSLIDAR C16, the edition with packets of 1212 bytes: a rotating lidar of 16 lasers over UDP, low
+byte first.
 
-Source: the vendor's ROS driver (Lslidar_ROS2_driver, branch C16_V4.0, lslidar_driver.cpp); where the fields of the device information
-stand, the user manual of the C32. The times of the lasers are 3.125 us apart, as for the edition before it, which comes to the steps of
-0.36 degrees of a captured packet at 20 turns a second. Firings end at the time of their packet, as the driver has it.
+Source: the vendor's ROS driver (Lslidar_ROS2_driver, branch C16_V4.0, lslidar_driver.cpp); where
+the fields of the device information stand, the user manual of the C32. The times of the lasers are
+3.125 us apart, as for the edition before it, which comes to the steps of 0.36 degrees of a captured
+packet at 20 turns a second. Firings end at the time of their packet, as the driver has it.
 
-The clock is read as with GPS: date and nanoseconds. With PTP the same bytes are seconds, with NTP the last part has microseconds; only the
-device information says which. A C16 of the edition before sends packets of 1206 bytes, which are a Velodyne's but for their angles: they
-are not read here. Configuration, which is the whole device information sent back, is left out, and so are angles that a unit measured
-itself.
+The clock is read as with GPS: date and nanoseconds. With PTP the same bytes are seconds, with NTP
+the last part has microseconds; only the device information says which. A C16 of the edition before
+sends packets of 1206 bytes, which are a Velodyne's but for their angles: they are not read here.
+Configuration, which is the whole device information sent back, is left out, and so are angles that
+a unit measured itself.
 """
 
 from __future__ import annotations
@@ -20,13 +23,31 @@ import numpy as np
 from construct import Array, Bytes, Const, Int8ub, Int8ul, Int16ub, Int16ul, Int32ul, Struct
 
 from lidarspec import UsageError
-from lidarspec.spec import Clock, Fields, Frame, OnWrap, Polar, Scaled, Sensor, Simulation, Udp, following, previous, wrap
+from lidarspec.spec import (
+    Clock,
+    Fields,
+    Frame,
+    OnWrap,
+    Polar,
+    Scaled,
+    Sensor,
+    Simulation,
+    Udp,
+    following,
+    previous,
+    wrap,
+)
 
 BLOCKS, GROUPS, LASERS = 12, 2, 16
 STRONGEST, DUAL = 0x37, 0x39
 LASER = 3.125e-6  # seconds from laser to laser
 BLOCK = GROUPS * LASERS * LASER
-CENTRE, ASIDE = 0.0361, 20.25  # metres from the axis to the optical centre, and degrees by which it lies to the left of the azimuth
+CENTRE, ASIDE = (
+    0.0361,
+    20.25,
+    # metres from the axis to the optical centre, and degrees by which it lies to the left of the
+    # azimuth
+)
 GAP = 2.0  # degrees; 20 turns a second are 0.72 from block to block
 UNITS = (0.4, 0.25)  # centimetres of a step of distance, by the unit
 ELEVATION = np.array([-16.0, 0, -14, 2, -12, 4, -10, 6, -8, 8, -6, 10, -4, 12, -2, 14])
@@ -50,7 +71,16 @@ DATA = Struct(
             "groups"
             / Array(
                 GROUPS,
-                Struct("channels" / Array(LASERS, Struct("distance" / Scaled(Int16ul, 0.004, "m") * "0: no return", "intensity" / Int8ul))),
+                Struct(
+                    "channels"
+                    / Array(
+                        LASERS,
+                        Struct(
+                            "distance" / Scaled(Int16ul, 0.004, "m") * "0: no return",
+                            "intensity" / Int8ul,
+                        ),
+                    )
+                ),
             )
             * "two firings; with dual return the next block has the other returns of the same",
         ),
@@ -78,13 +108,24 @@ DIFOP = Struct(
 def plausible(f: Fields) -> Any:
     """Azimuths of the circle, a known way of return, and a C16."""
     known = (f.return_mode == STRONGEST) | (f.return_mode == DUAL)
-    return (f.blocks.azimuth < 360) & known & ((f.model == 0x10) | (f.model == 0x12)) & (f.month <= 12) & (f.nanosecond < 1)
+    return (
+        (f.blocks.azimuth < 360)
+        & known
+        & ((f.model == 0x10) | (f.model == 0x12))
+        & (f.month <= 12)
+        & (f.nanosecond < 1)
+    )
 
 
 def points(f: Fields, unit: float = UNITS[0]) -> Polar:
-    """Clockwise from ahead, on the way from block to block; from an optical centre that turns with the lasers, beside the axis."""
+    """Clockwise from ahead, on the way from block to block; from an optical centre that turns with
+    the lasers, beside the axis.
+    """
     dual = f.return_mode == DUAL
-    block, slot = np.arange(BLOCKS)[:, None, None], np.arange(GROUPS)[:, None] * LASERS + np.arange(LASERS)
+    block, slot = (
+        np.arange(BLOCKS)[:, None, None],
+        np.arange(GROUPS)[:, None] * LASERS + np.arange(LASERS),
+    )
     rotor = np.deg2rad(f.blocks.azimuth + rotor_step(f, dual) * (slot / (GROUPS * LASERS)))
     firing = np.where(dual, block // 2 - (BLOCKS // 2 - 1), block - (BLOCKS - 1))
     channels, aside = f.blocks.groups.channels, np.deg2rad(ASIDE)
@@ -109,7 +150,8 @@ def rotor_step(f: Fields, dual: Any) -> Any:
 
 
 def configure(sensor: Sensor, /, *, distance_unit: float) -> Sensor:
-    """The sensor with steps of distance of so many centimetres, as the driver's parameter of that name: 0.4, or 0.25 for some units.
+    """The sensor with steps of distance of so many centimetres, as the driver's parameter of that
+    name: 0.4, or 0.25 for some units.
 
     Raises:
         UsageError: for another unit.
@@ -124,8 +166,19 @@ def sweep(i: int) -> dict[str, Any]:
     seconds = i * BLOCKS * BLOCK
     return {
         "blocks.azimuth": np.round((i * BLOCKS + np.arange(BLOCKS)) * BLOCK * 3600, 2) % 360,
-        **{"year": 26, "month": 1, "day": 1, "hour": seconds // 3600 % 24 * 3600, "minute": seconds // 60 % 60 * 60},
-        **{"second": seconds // 1 % 60, "nanosecond": seconds % 1, "return_mode": STRONGEST, "model": 0x10},
+        **{
+            "year": 26,
+            "month": 1,
+            "day": 1,
+            "hour": seconds // 3600 % 24 * 3600,
+            "minute": seconds // 60 % 60 * 60,
+        },
+        **{
+            "second": seconds // 1 % 60,
+            "nanosecond": seconds % 1,
+            "return_mode": STRONGEST,
+            "model": 0x10,
+        },
     }
 
 
@@ -135,7 +188,9 @@ C16 = Sensor(
     model="C16",
     frames={
         "data": Frame(DATA, data=True, plausible=plausible),
-        "difop": Frame(DIFOP, simulation=Simulation(lambda i: {"rpm": 600, "time_service": 0}, rate=1.0)),
+        "difop": Frame(
+            DIFOP, simulation=Simulation(lambda i: {"rpm": 600, "time_service": 0}, rate=1.0)
+        ),
     },
     points=points,
     scan=OnWrap("blocks.azimuth"),
@@ -149,5 +204,8 @@ C16 = Sensor(
     info={"model": "data.model"},
     aliases=("c16", "leishen-c16"),
     status="vectors",
-    source="Lslidar_ROS2_driver, C16_V4.0; C32 user manual (device information); one captured packet, whose maker is not stated",
+    source=(
+        "Lslidar_ROS2_driver, C16_V4.0; C32 user manual (device information); one captured packet,"
+        " whose maker is not stated"
+    ),
 )

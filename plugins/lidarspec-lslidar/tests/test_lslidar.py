@@ -1,4 +1,6 @@
-"""LSLIDAR N10, N10P, M10 and C16: the published packet, two returns, lengths that the packets say, and the clock."""
+"""LSLIDAR N10, N10P, M10 and C16: the published packet, two returns, lengths that the packets say,
+and the clock.
+"""
 
 from __future__ import annotations
 
@@ -21,7 +23,9 @@ def test_the_published_packet_of_an_n10() -> None:
     assert np.round(cloud.range * 1000).tolist() == expected["dist_mm"]
     assert cloud.intensity is not None
     assert cloud.intensity.tolist() == expected["intensity"]
-    np.testing.assert_allclose(clockwise(cloud), np.linspace(expected["start_deg"], expected["end_deg"], 16), atol=1e-4)
+    np.testing.assert_allclose(
+        clockwise(cloud), np.linspace(expected["start_deg"], expected["end_deg"], 16), atol=1e-4
+    )
 
 
 def test_the_returns_of_an_n10p_share_their_direction() -> None:
@@ -35,16 +39,31 @@ def test_packets_of_an_m10p_are_as_long_as_they_say_and_run_on_over_midnight() -
     sweep = M10P.simulation.sweep
     assert sweep is not None
     sample = {"bright": 0, "distance": 1.0}
-    packets = [M10P.build("data", units=True, samples=[sample] * count, **{**sweep(0), "length": 20 + 2 * count}) for count in (69, 70, 74)]
+    packets = [
+        M10P.build(
+            "data", units=True, samples=[sample] * count, **{**sweep(0), "length": 20 + 2 * count}
+        )
+        for count in (69, 70, 74)
+    ]
     assert len(decoded(M10P, b"".join(packets)).points()) == 69 + 70 + 74
-    late = M10P.build("data", M10P.parse(packets[0]), hour=23, minute=59, second=59, millisecond=0, microsecond=0)
+    late = M10P.build(
+        "data", M10P.parse(packets[0]), hour=23, minute=59, second=59, millisecond=0, microsecond=0
+    )
     assert np.diff(decoded(M10P, late + packets[1]).time_ns).tolist() == [1_000_000_000]
 
 
 def test_no_return_is_no_point_and_a_strong_reflection_is_one() -> None:
-    samples = [{"bright": 1, "distance": 0x7FFF}, {"bright": 1, "distance": 2000}, {"bright": 0, "distance": 0}]
-    time = dict.fromkeys(("year", "month", "day", "hour", "minute", "second", "millisecond", "microsecond"), 0)
-    cloud = decoded(M10P, M10P.build("data", length=26, start_angle=0, period=4167, samples=samples, **time)).points()
+    samples = [
+        {"bright": 1, "distance": 0x7FFF},
+        {"bright": 1, "distance": 2000},
+        {"bright": 0, "distance": 0},
+    ]
+    time = dict.fromkeys(
+        ("year", "month", "day", "hour", "minute", "second", "millisecond", "microsecond"), 0
+    )
+    cloud = decoded(
+        M10P, M10P.build("data", length=26, start_angle=0, period=4167, samples=samples, **time)
+    ).points()
     assert cloud.intensity is not None
     assert (cloud.valid.tolist(), cloud.intensity[1]) == ([False, True, False], 255)
 
@@ -58,8 +77,12 @@ def test_a_captured_packet_of_a_c16() -> None:
     packets = decoded(C16, [data])
     assert packets.raw["blocks"]["azimuth"][0].tolist() == expected["azimuths"]
     first = packets.raw["blocks"]["groups"]["channels"][0, 0].reshape(32)
-    assert [first["distance"][slot] for _, slot, _, _ in expected["first"]] == [distance for *_, distance, _ in expected["first"]]
-    assert [first["intensity"][slot] for _, slot, _, _ in expected["first"]] == [intensity for *_, intensity in expected["first"]]
+    assert [first["distance"][slot] for _, slot, _, _ in expected["first"]] == [
+        distance for *_, distance, _ in expected["first"]
+    ]
+    assert [first["intensity"][slot] for _, slot, _, _ in expected["first"]] == [
+        intensity for *_, intensity in expected["first"]
+    ]
     cloud = packets.points()
     assert cloud.valid.sum() == expected["n_nonzero"]
     assert packets.time_ns[0] == 90_724_466_616  # 00:01:30 and b8 7b 2e 2b nanoseconds
@@ -76,7 +99,12 @@ def test_a_c16_with_two_returns_and_with_steps_of_another_size() -> None:
     assert dual.return_index.reshape(12, 32)[:, 0].tolist() == [0, 1] * 6
     np.testing.assert_array_equal(dual.azimuth[:32], dual.azimuth[32:64])
     np.testing.assert_allclose([dual.time[0], dual.time[-1]], [-191 * 3.125e-6, 0], atol=1e-9)
-    single, fine = C16.decode([data]).points(), decoded(C16.configure(distance_unit=0.25), [data]).points()
-    np.testing.assert_allclose(fine.range[fine.valid], single.range[single.valid] * 0.625, rtol=1e-6)
+    single, fine = (
+        C16.decode([data]).points(),
+        decoded(C16.configure(distance_unit=0.25), [data]).points(),
+    )
+    np.testing.assert_allclose(
+        fine.range[fine.valid], single.range[single.valid] * 0.625, rtol=1e-6
+    )
     with pytest.raises(ls.UsageError, match=r"0\.4 or 0\.25"):
         C16.configure(distance_unit=1.0)

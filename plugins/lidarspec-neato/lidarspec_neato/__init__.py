@@ -1,12 +1,15 @@
-"""Neato XV-11 and its kin: lidars of vacuum cleaners and of the TurtleBot3, with a point to the degree.
+"""Neato XV-11 and its kin: lidars of vacuum cleaners and of the TurtleBot3, with a point to the
+degree.
 
-Source: the drivers xv_11_laser_driver, kaiaai/LDS (LDS_NEATO_XV11, LDS_LDS02RR, LDS_HLS_LFCD2) and hls_lfcd_lds_driver of ROBOTIS; there
-are no public manuals. The XV-11 and Xiaomi's LDS01RR count counter-clockwise, the LDS02RR clockwise; nothing in their packets says which
-it is. The host drives their motors by PWM, at 5 turns a second; without it they send nothing.
+Source: the drivers xv_11_laser_driver, kaiaai/LDS (LDS_NEATO_XV11, LDS_LDS02RR, LDS_HLS_LFCD2) and
+hls_lfcd_lds_driver of ROBOTIS; there are no public manuals. The XV-11 and Xiaomi's LDS01RR count
+counter-clockwise, the LDS02RR clockwise; nothing in their packets says which it is. The host drives
+their motors by PWM, at 5 turns a second; without it they send nothing.
 
-Known contradictions on the HLS-LFCD2: its speed is in tenths of a turn a minute (ROBOTIS, thijses/HLS_LFCD) or in whole ones (kaiaai);
-its last two bytes are both FF less the sum of the others (thijses), the folded sum of an XV-11 (kaiaai), and ROBOTIS passes over them, as
-it is done here: two packets in a row are asked for instead.
+Known contradictions on the HLS-LFCD2: its speed is in tenths of a turn a minute (ROBOTIS,
+thijses/HLS_LFCD) or in whole ones (kaiaai); its last two bytes are both FF less the sum of the
+others (thijses), the folded sum of an XV-11 (kaiaai), and ROBOTIS passes over them, as it is done
+here: two packets in a row are asked for instead.
 """
 
 from __future__ import annotations
@@ -17,16 +20,41 @@ from functools import partial
 from typing import Any
 
 import numpy as np
-from construct import Array, BitsInteger, BitStruct, Bytes, ByteSwapped, Const, Int8ul, Int16ul, Struct
+from construct import (
+    Array,
+    BitsInteger,
+    BitStruct,
+    Bytes,
+    ByteSwapped,
+    Const,
+    Int8ul,
+    Int16ul,
+    Struct,
+)
 
-from lidarspec.spec import Checksummed, Command, Fields, Fold15, Frame, OnWrap, Polar, Scaled, Sensor, Serial, Simulation, hookimpl
+from lidarspec.spec import (
+    Checksummed,
+    Command,
+    Fields,
+    Fold15,
+    Frame,
+    OnWrap,
+    Polar,
+    Scaled,
+    Sensor,
+    Serial,
+    Simulation,
+    hookimpl,
+)
 
 FIRST = 0xA0  # index of the first packet of a turn
 
 DATA = Checksummed(
     Struct(
         "header" / Const(b"\xfa"),
-        "start_angle" / Scaled(Int8ul, 4, "deg", -4 * FIRST) * "index A0 to F9: angle of the first sample",
+        "start_angle"
+        / Scaled(Int8ul, 4, "deg", -4 * FIRST)
+        * "index A0 to F9: angle of the first sample",
         "speed" / Scaled(Int16ul, 1 / 64, "rpm"),
         "samples"
         / Array(
@@ -50,9 +78,19 @@ DATA = Checksummed(
 )
 LFCD = Struct(
     "header" / Const(b"\xfa"),
-    "start_angle" / Scaled(Int8ul, 6, "deg", -6 * FIRST) * "index A0 to DB: angle of the first sample",
+    "start_angle"
+    / Scaled(Int8ul, 6, "deg", -6 * FIRST)
+    * "index A0 to DB: angle of the first sample",
     "speed" / Scaled(Int16ul, 0.1, "rpm"),
-    "samples" / Array(6, Struct("intensity" / Int16ul, "distance" / Scaled(Int16ul, 0.001, "m") * "0: no return", "reserved" / Bytes(2))),
+    "samples"
+    / Array(
+        6,
+        Struct(
+            "intensity" / Int16ul,
+            "distance" / Scaled(Int16ul, 0.001, "m") * "0: no return",
+            "reserved" / Bytes(2),
+        ),
+    ),
     "trailer" / Bytes(2) * "said to be FF less the sum of all other bytes, twice",
 )
 
@@ -73,7 +111,9 @@ def after_first(f: Fields, count: int) -> Any:
 
 
 def points(f: Fields, turns: int) -> Polar:
-    """A degree from sample to sample, counter-clockwise (1) or clockwise (-1); a weak one is a point all the same."""
+    """A degree from sample to sample, counter-clockwise (1) or clockwise (-1); a weak one is a
+    point all the same.
+    """
     return Polar(
         range=np.where(f.samples.range.invalid, 0, f.samples.range.distance),
         azimuth=np.deg2rad(turns * (f.start_angle + np.arange(4))),
@@ -85,7 +125,12 @@ def points(f: Fields, turns: int) -> Polar:
 def lfcd_points(f: Fields) -> Polar:
     """A degree from sample to sample, clockwise; the first one is at 359 degrees (ROBOTIS)."""
     azimuth = np.deg2rad(359 - f.start_angle - np.arange(6))
-    return Polar(range=f.samples.distance, azimuth=azimuth, intensity=f.samples.intensity, time=after_first(f, 6))
+    return Polar(
+        range=f.samples.distance,
+        azimuth=azimuth,
+        intensity=f.samples.intensity,
+        time=after_first(f, 6),
+    )
 
 
 def sweep(i: int, count: int) -> dict[str, float]:
@@ -137,7 +182,11 @@ HLS_LFCD2 = Sensor(
     model="HLS-LFCD2 (LDS-01)",
     frames={
         "data": Frame(
-            LFCD, data=True, plausible=lfcd_plausible, confirm=2, acknowledged={"LS212": "its sources contradict each other on the trailer"}
+            LFCD,
+            data=True,
+            plausible=lfcd_plausible,
+            confirm=2,
+            acknowledged={"LS212": "its sources contradict each other on the trailer"},
         ),
         "command": Frame(Struct("letter" / Int8ul * "ASCII: b begin, e end"), direction="out"),
     },
@@ -156,7 +205,10 @@ HLS_LFCD2 = Sensor(
     turn=(4.83, 5.17),  # 300 turns a minute, give or take 10 (ROBOTIS, LDS-01)
     aliases=("hls-lfcd2", "robotis-lds-01", "turtlebot3-lds-01"),
     status="vectors",
-    source="hls_lfcd_lds_driver and the LDS-01's page of ROBOTIS; thijses/HLS_LFCD. What its trailer is, is not proven",
+    source=(
+        "hls_lfcd_lds_driver and the LDS-01's page of ROBOTIS; thijses/HLS_LFCD. What its trailer"
+        " is, is not proven"
+    ),
 )
 
 

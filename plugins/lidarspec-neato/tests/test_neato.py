@@ -1,4 +1,6 @@
-"""Neato XV-11 and its kin: the published vector, both directions, and a trailer that nobody is sure of."""
+"""Neato XV-11 and its kin: the published vector, both directions, and a trailer that nobody is sure
+of.
+"""
 
 from __future__ import annotations
 
@@ -10,7 +12,11 @@ from lidarspec import simulate
 from tests.evidence import decoded, vector_bytes, vectors
 
 FILE = "vectors_serial2d.json"
-XV11, LDS02RR, LFCD = ls.sensor("neato-xv11"), ls.sensor("xiaomi-lds02rr"), ls.sensor("turtlebot3-lds-01")
+XV11, LDS02RR, LFCD = (
+    ls.sensor("neato-xv11"),
+    ls.sensor("xiaomi-lds02rr"),
+    ls.sensor("turtlebot3-lds-01"),
+)
 
 
 def test_the_published_packet() -> None:
@@ -27,8 +33,12 @@ def test_the_published_packet() -> None:
 
 def test_the_xv11_counts_counter_clockwise_and_the_lds02rr_clockwise() -> None:
     data = vector_bytes(FILE, "neato_synth")
-    np.testing.assert_allclose(np.rad2deg(decoded(XV11, data).points().azimuth), [0, 1, 2, 3], atol=1e-4)
-    np.testing.assert_allclose(np.rad2deg(decoded(LDS02RR, data).points().azimuth) % 360, [0, 359, 358, 357], atol=1e-4)
+    np.testing.assert_allclose(
+        np.rad2deg(decoded(XV11, data).points().azimuth), [0, 1, 2, 3], atol=1e-4
+    )
+    np.testing.assert_allclose(
+        np.rad2deg(decoded(LDS02RR, data).points().azimuth) % 360, [0, 359, 358, 357], atol=1e-4
+    )
 
 
 @pytest.mark.parametrize("sensor", [XV11, LDS02RR, LFCD], ids=lambda sensor: sensor.id)

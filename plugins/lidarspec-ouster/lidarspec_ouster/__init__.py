@@ -1,11 +1,14 @@
-"""Ouster OS0, OS1, OS2 and OSDome: columns of pixels over UDP, whose layout and directions come with the unit's metadata.
+"""Ouster OS0, OS1, OS2 and OSDome: columns of pixels over UDP, whose layout and directions come
+with the unit's metadata.
 
-The metadata are a file, `configure(metadata=path)`, or are fetched from the sensor's web server when it is opened. Without them a layout
-can be named (`rows`, `turn`, `profile`), and the angles are those of an ideal sensor, evenly over its field of view: `nominal`.
+The metadata are a file, `configure(metadata=path)`, or are fetched from the sensor's web server
+when it is opened. Without them a layout can be named (`rows`, `turn`, `profile`), and the angles
+are those of an ideal sensor, evenly over its field of view: `nominal`.
 
-Source: Software User Manual of firmware 2.x and 3.x (coordinates, HTTP API); ouster-sdk (parsing.cpp, xyzlut.cpp, sensor_http_imp.cpp).
-The fields of view, and the offsets of OS0, OS1 and OS2, are those of the data sheets and of one captured unit each; the limits of range
-are the data sheets', for bright targets.
+Source: Software User Manual of firmware 2.x and 3.x (coordinates, HTTP API); ouster-sdk
+(parsing.cpp, xyzlut.cpp, sensor_http_imp.cpp). The fields of view, and the offsets of OS0, OS1 and
+OS2, are those of the data sheets and of one captured unit each; the limits of range are the data
+sheets', for bright targets.
 """
 
 from __future__ import annotations
@@ -43,7 +46,8 @@ from lidarspec_ouster.metadata import STILL, Table, Unit, read
 from lidarspec_ouster.packets import COLUMNS, ENCODER, PROFILES, VALID, imu, lidar
 from lidarspec_ouster.recognition import recognise
 
-#: model -> product line, degrees of the lowest and the highest beam, mm where beams leave and of the lidar's height, limits of range in m.
+#: model -> product line, degrees of the lowest and the highest beam, mm where beams leave and of
+#: the lidar's height, limits of range in m.
 MODELS = {
     "OS0": ("OS-0", -45.0, 45.0, 27.67, 36.18, (0.3, 100.0)),
     "OS1": ("OS-1", -22.5, 22.5, 15.806, 36.18, (0.3, 200.0)),
@@ -62,12 +66,18 @@ def points(f: Fields, unit: Unit) -> Polar:
 
     def each(name: str) -> Any:
         column = getattr(columns.pixels, name)
-        return stack(column, getattr(columns.pixels, f"{name}2", column)) if "range2" in bits else column
+        return (
+            stack(column, getattr(columns.pixels, f"{name}2", column))
+            if "range2" in bits
+            else column
+        )
 
     number, legacy = columns.measurement_id, unit.profile == "LEGACY"
 
     def table(rows: Table) -> Any:
-        return along("pixels", rows[0]) if np.ptp(rows, axis=0).max() < 1e-12 else take(rows, number)
+        return (
+            along("pixels", rows[0]) if np.ptp(rows, axis=0).max() < 1e-12 else take(rows, number)
+        )
 
     directions, starts = unit.beams()
     return Polar(
@@ -93,24 +103,43 @@ def sweep(unit: Unit, i: int) -> dict[str, Any]:
     times = numbers * (1_000_000_000 // (unit.turn * int(unit.rate or 10)))
     shared = {"columns.timestamp": times, "columns.measurement_id": places}
     if unit.profile == "LEGACY":
-        shared |= {"columns.frame_id": numbers // unit.turn % 65536, "columns.encoder": places * (ENCODER // unit.turn)}
+        shared |= {
+            "columns.frame_id": numbers // unit.turn % 65536,
+            "columns.encoder": places * (ENCODER // unit.turn),
+        }
         return {**shared, "columns.status": np.full(unit.columns, VALID)}
-    return {**shared, "columns.status": np.ones(unit.columns), "frame_id": numbers[0] // unit.turn % 65536, "serial": int(unit.serial or 0)}
+    return {
+        **shared,
+        "columns.status": np.ones(unit.columns),
+        "frame_id": numbers[0] // unit.turn % 65536,
+        "serial": int(unit.serial or 0),
+    }
 
 
 def shaped(sensor: Sensor, unit: Unit) -> Sensor:
     """The sensor with the layout and the beams of a unit."""
     turned = tuple(map(tuple, unit.imu[:3, :3].tolist()))
-    frames = {"data": lidar(unit.profile, unit.rows, unit.columns, unit.turn), "imu": imu(unit.samples, turned), **HTTP}
+    frames = {
+        "data": lidar(unit.profile, unit.rows, unit.columns, unit.turn),
+        "imu": imu(unit.samples, turned),
+        **HTTP,
+    }
     legacy = unit.profile == "LEGACY"
     return dataclasses.replace(
         sensor,
         frames=frames,
         points=partial(points, unit=unit),
-        scan=OnChange("columns[0].frame_id" if legacy else "frame_id", angle="columns[0].measurement_id", full=unit.turn),
+        scan=OnChange(
+            "columns[0].frame_id" if legacy else "frame_id",
+            angle="columns[0].measurement_id",
+            full=unit.turn,
+        ),
         clock=Clock("columns[0].timestamp"),
         info={} if legacy else {"serial": "data.serial"},
-        simulation=Simulation(partial(sweep, unit), answers={"get_metadata": (("reply", {"status": 200, "body": unit.told()}),)}),
+        simulation=Simulation(
+            partial(sweep, unit),
+            answers={"get_metadata": (("reply", {"status": 200, "body": unit.told()}),)},
+        ),
     )
 
 
@@ -123,7 +152,21 @@ def nominal(model: str, rows: int, turn: int, profile: str) -> Unit:
     level, shifts = np.zeros(rows), np.zeros(rows, np.int64)
     elevation = np.linspace(high, low, rows)
     window = (0, turn - 1)
-    return Unit(profile, turn, COLUMNS, window, 10.0, elevation, level, shifts, beam, lifted, still, product=f"{line}-{rows}", nominal=True)
+    return Unit(
+        profile,
+        turn,
+        COLUMNS,
+        window,
+        10.0,
+        elevation,
+        level,
+        shifts,
+        beam,
+        lifted,
+        still,
+        product=f"{line}-{rows}",
+        nominal=True,
+    )
 
 
 def configure(
@@ -134,16 +177,19 @@ def configure(
     turn: int | None = None,
     profile: str | None = None,
 ) -> Sensor:
-    """The sensor with the layout and the beams of a unit; or with a layout alone, and nominal beams.
+    """The sensor with the layout and the beams of a unit; or with a layout alone, and nominal
+    beams.
 
     Args:
-        metadata: the JSON file of the unit, such as its web server gives at /api/v1/sensor/metadata.
+        metadata: the JSON file of the unit, such as its web server gives at
+            /api/v1/sensor/metadata.
         rows: pixels of a column, 16 to 128.
         turn: columns of a turn, 512 to 4096.
         profile: how pixels are packed, RNG19_RFL8_SIG16_NIR16 and others.
 
     Raises:
-        UsageError: for metadata that cannot be read, or are of another model; for a layout that there is not.
+        UsageError: for metadata that cannot be read, or are of another model; for a layout that
+            there is not.
     """
     given = {"rows": rows, "turn": turn, "profile": profile}
     given = {name: value for name, value in given.items() if value is not None}
@@ -152,16 +198,29 @@ def configure(
         if given:
             raise UsageError(f"{sensor.id}: the metadata say {' and '.join(given)}: leave that out")
         unit = read(metadata)
-        known = [name for name, (line, *_) in MODELS.items() if unit.product.upper().startswith(line)]
+        known = [
+            name for name, (line, *_) in MODELS.items() if unit.product.upper().startswith(line)
+        ]
         if known and known[0] != sensor.model:
-            raise UsageError(f"{sensor.id}: these are metadata of an {unit.product}: -s ouster-{known[0].lower()}")
+            raise UsageError(
+                f"{sensor.id}: these are metadata of an {unit.product}: -s"
+                f" ouster-{known[0].lower()}"
+            )
         return dataclasses.replace(shaped(sensor, unit), on_open=())
-    layout = {**LAYOUT, **{name: value for name, value in sensor.options.items() if name in LAYOUT}, **given}
+    layout = {
+        **LAYOUT,
+        **{name: value for name, value in sensor.options.items() if name in LAYOUT},
+        **given,
+    }
     for name, most in (("rows", 128), ("turn", 4096)):
         if not 16 <= layout[name] <= most or layout[name] % 16:
-            raise UsageError(f"{sensor.id}: {name} is a multiple of 16 up to {most}, not {layout[name]}")
+            raise UsageError(
+                f"{sensor.id}: {name} is a multiple of 16 up to {most}, not {layout[name]}"
+            )
     if layout["profile"] not in PROFILES:
-        raise UsageError(f"{sensor.id}: profile is one of {', '.join(PROFILES)}, not {layout['profile']!r}")
+        raise UsageError(
+            f"{sensor.id}: profile is one of {', '.join(PROFILES)}, not {layout['profile']!r}"
+        )
     return shaped(sensor, nominal(sensor.model, **layout))
 
 
@@ -182,7 +241,9 @@ def asked(method: str, path: str, body: str = "", **more: Any) -> Command:
 COMMANDS = {
     "get_metadata": asked("GET", "sensor/metadata", learns=lambda reply: {"metadata": reply.body}),
     "get_config": asked("GET", "sensor/config"),
-    "set_config": dataclasses.replace(asked("POST", "sensor/config"), args={"json": ("body", Text(4096))}),
+    "set_config": dataclasses.replace(
+        asked("POST", "sensor/config"), args={"json": ("body", Text(4096))}
+    ),
     "start": asked("POST", "sensor/config", '{"operating_mode": "NORMAL"}'),
     "standby": asked("POST", "sensor/config", '{"operating_mode": "STANDBY"}'),
     "send_here": asked("POST", "sensor/cmd/set_udp_dest_auto"),
@@ -215,12 +276,18 @@ def model(name: str, status: str) -> Sensor:
         aliases=(name.lower(),),
         relatives={f"ouster-{other.lower()}": TOLD_BY for other in MODELS if other != name},
         status=status,
-        source="Ouster Software User Manual 2.x and 3.x; ouster-sdk, parsing.cpp, xyzlut.cpp and its captures",
+        source=(
+            "Ouster Software User Manual 2.x and 3.x; ouster-sdk, parsing.cpp, xyzlut.cpp and its"
+            " captures"
+        ),
     )
     return shaped(bare, unit)
 
 
-OS0, OS1, OS2, OSDOME = (model(name, status) for name, status in zip(MODELS, ("capture", "capture", "capture", "manual"), strict=True))
+OS0, OS1, OS2, OSDOME = (
+    model(name, status)
+    for name, status in zip(MODELS, ("capture", "capture", "capture", "manual"), strict=True)
+)
 
 
 @hookimpl

@@ -1,7 +1,8 @@
-"""What a unit says of itself: the layout of its packets and where its beams point, from its metadata (JSON).
+"""What a unit says of itself: the layout of its packets and where its beams point, from its
+metadata (JSON).
 
-Source: ouster-sdk (metadata.cpp, xyzlut.cpp). Files of firmware up to 2.4 are flat, later ones, and the sensor's own web server, have
-sections; both are read.
+Source: ouster-sdk (metadata.cpp, xyzlut.cpp). Files of firmware up to 2.4 are flat, later ones, and
+the sensor's own web server, have sections; both are read.
 """
 
 from __future__ import annotations
@@ -25,9 +26,27 @@ Table = NDArray[np.float64]
 ROWS, TURN = 256, 4096
 STILL = tuple(np.eye(4).ravel())
 # Stands in where metadata lack it, as in ouster-sdk (metadata.cpp): half a turn, and 36.18 mm up.
-LIDAR_TO_SENSOR = (-1.0, 0.0, 0.0, 0.0, 0.0, -1.0, 0.0, 0.0, 0.0, 0.0, 1.0, 36.18, 0.0, 0.0, 0.0, 1.0)
-# Millimetres from the axis of rotation to where beams leave, by the beginning of the product line; others, the first
-# generation of the OS1 among them, have the last one (ouster-sdk, sensor_info.cpp).
+LIDAR_TO_SENSOR = (
+    -1.0,
+    0.0,
+    0.0,
+    0.0,
+    0.0,
+    -1.0,
+    0.0,
+    0.0,
+    0.0,
+    0.0,
+    1.0,
+    36.18,
+    0.0,
+    0.0,
+    0.0,
+    1.0,
+)
+# Millimetres from the axis of rotation to where beams leave, by the beginning of the product line;
+# others, the first generation of the OS1 among them, have the last one (ouster-sdk,
+# sensor_info.cpp).
 BEAM_ORIGINS_MM = {"OS-0-": 27.67, "OS-1-": 15.806, "OS-2-": 13.762}
 BEAM_ORIGIN_GENERATION_1_MM = 12.163
 
@@ -43,8 +62,10 @@ class Unit:
         window: the first and the last column that it sends.
         rate: turns a second; 0 where nobody says it.
         elevation, azimuth: (rows,) degrees, of each beam; azimuth counted clockwise.
-        shifts: (rows,) by how many columns each row lies behind, for a picture: `PointCloud.destaggered`.
-        beam, lidar, imu: (4, 4), millimetres: where the beams leave in the lidar, the lidar in the sensor, and the IMU in it.
+        shifts: (rows,) by how many columns each row lies behind, for a picture:
+            `PointCloud.destaggered`.
+        beam, lidar, imu: (4, 4), millimetres: where the beams leave in the lidar, the lidar in the
+            sensor, and the IMU in it.
         samples: of an IMU packet; 0 for those of LEGACY.
         product, serial: as the metadata have them, "" where they do not.
         nominal: whether values of the model stand in for those of the unit.
@@ -72,11 +93,16 @@ class Unit:
         return len(self.elevation)
 
     def beams(self) -> tuple[Table, Table]:
-        """Directions (turn, rows, 3), and where each beam would begin if it were straight from range 0 on, (turn, rows, 3) in metres."""
+        """Directions (turn, rows, 3), and where each beam would begin if it were straight from
+        range 0 on, (turn, rows, 3) in metres.
+        """
         encoder = 2 * np.pi * (1 - np.arange(self.turn) / self.turn)[:, None]
         azimuth, elevation = encoder - np.deg2rad(self.azimuth), np.deg2rad(self.elevation)
         level = np.cos(elevation)
-        directions = np.stack([np.cos(azimuth) * level, np.sin(azimuth) * level, np.sin(elevation) + 0 * azimuth], axis=-1)
+        directions = np.stack(
+            [np.cos(azimuth) * level, np.sin(azimuth) * level, np.sin(elevation) + 0 * azimuth],
+            axis=-1,
+        )
         out, up = self.beam[0, 3], self.beam[2, 3]
         lens = np.stack([out * np.cos(encoder), out * np.sin(encoder), up + 0 * encoder], axis=-1)
         starts = lens - directions * np.hypot(out, up)
@@ -123,17 +149,24 @@ def read(metadata: str | Path | Learned) -> Unit:
     except (ValueError, RecursionError) as error:
         raise UsageError(f"{name}: no metadata of an Ouster sensor: {error}") from error
     if not isinstance(data, dict):
-        raise UsageError(f"{name}: no metadata of an Ouster sensor: a {type(data).__name__}, not an object")
+        raise UsageError(
+            f"{name}: no metadata of an Ouster sensor: a {type(data).__name__}, not an object"
+        )
     return Facts(name, merge_sections(data)).unit()
 
 
 def merge_sections(data: dict[str, Any]) -> dict[str, Any]:
     """Return the keys of all sections in one mapping.
 
-    Firmware differs in the section that holds a key: `imu_measurements_per_packet` stands in `lidar_data_format` or in
-    `imu_data_format`. What the sensor reports of itself takes precedence over `config_params`, the user's settings.
+    Firmware differs in the section that holds a key: `imu_measurements_per_packet` stands in
+    `lidar_data_format` or in `imu_data_format`. What the sensor reports of itself takes precedence
+    over `config_params`, the user's settings.
     """
-    sections = [section for name, section in data.items() if isinstance(section, dict) and name != "config_params"]
+    sections = [
+        section
+        for name, section in data.items()
+        if isinstance(section, dict) and name != "config_params"
+    ]
     settings = data.get("config_params")
     keys = dict(settings) if isinstance(settings, dict) else {}
     for section in (data, *sections):
@@ -168,9 +201,14 @@ class Facts:
         columns = self._whole("columns_per_packet", COLUMNS, COLUMNS)
         width = self._whole("columns_per_frame", TURN, int(turn) if turn.isdecimal() else None)
         if self._whole("pixels_per_column", ROWS, rows) != rows:
-            raise self._fault("beam_altitude_angles", f"{rows} angles for {self.data['pixels_per_column']} pixels of a column")
+            raise self._fault(
+                "beam_altitude_angles",
+                f"{rows} angles for {self.data['pixels_per_column']} pixels of a column",
+            )
         if width % columns:
-            raise self._fault("columns_per_frame", f"{width} is no multiple of {columns} columns in a packet")
+            raise self._fault(
+                "columns_per_frame", f"{width} is no multiple of {columns} columns in a packet"
+            )
         first, last = map(int, self._numbers("column_window", 2, (0, width - 1)))
         product = str(self.data.get("prod_line", ""))
         is_nominal = "lidar_to_sensor_transform" not in self.data
@@ -178,7 +216,9 @@ class Facts:
         if beam is None:
             is_nominal = is_nominal or "lidar_origin_to_beam_origin_mm" not in self.data
             beam = np.eye(4)
-            beam[0, 3] = self._numbers("lidar_origin_to_beam_origin_mm", 1, (usual_beam_origin_mm(product),))[0]
+            beam[0, 3] = self._numbers(
+                "lidar_origin_to_beam_origin_mm", 1, (usual_beam_origin_mm(product),)
+            )[0]
         measured = self.data.get("udp_profile_imu", "LEGACY") == "ACCEL32_GYRO32_NMEA"
         return Unit(
             profile=self._profile(),
@@ -201,17 +241,26 @@ class Facts:
     def _profile(self) -> str:
         profile = str(self.data.get("udp_profile_lidar", "LEGACY"))
         if profile not in PROFILES:
-            raise self._fault("udp_profile_lidar", f"{profile[:60]} is none of {', '.join(PROFILES)}")
+            raise self._fault(
+                "udp_profile_lidar", f"{profile[:60]} is none of {', '.join(PROFILES)}"
+            )
         return profile
 
-    def _numbers(self, key: str, count: int | None, usual: tuple[float, ...] | None = None) -> Table:
+    def _numbers(
+        self, key: str, count: int | None, usual: tuple[float, ...] | None = None
+    ) -> Table:
         """So many finite numbers; `usual` where the key is missing."""
         given = self.data.get(key, usual)
         try:
             numbers = np.atleast_1d(np.array(given, np.float64))
         except (TypeError, ValueError):
             numbers = np.array([np.nan])
-        if given is None or numbers.ndim != 1 or not 1 <= len(numbers) <= ROWS or not np.isfinite(numbers).all():
+        if (
+            given is None
+            or numbers.ndim != 1
+            or not 1 <= len(numbers) <= ROWS
+            or not np.isfinite(numbers).all()
+        ):
             raise self._fault(key, "is missing" if given is None else "is no list of numbers")
         if count is not None and len(numbers) != count:
             raise self._fault(key, f"has {len(numbers)} numbers, not {count}")
@@ -224,7 +273,9 @@ class Facts:
         return number
 
     def _transform(self, key: str, usual: tuple[float, ...] | None) -> Any:
-        """(4, 4), of 16 numbers in a row or in four; None where the key is missing and `usual` is None."""
+        """(4, 4), of 16 numbers in a row or in four; None where the key is missing and `usual` is
+        None.
+        """
         if usual is None and key not in self.data:
             return None
         given = self.data.get(key, usual)

@@ -4,8 +4,9 @@
 
 How many pixels a column has, and how they are packed, no packet says: the metadata do.
 
-Source: ouster-sdk, parsing.cpp; the bits of LEGACY, RNG19 (single and dual) and RNG15 hold for captures, whose every field has the
-MD5 of the vendor's digests; those of FUSA for one captured packet. The other profiles, and the IMU packets with NMEA, are read off alone.
+Source: ouster-sdk, parsing.cpp; the bits of LEGACY, RNG19 (single and dual) and RNG15 hold for
+captures, whose every field has the MD5 of the vendor's digests; those of FUSA for one captured
+packet. The other profiles, and the IMU packets with NMEA, are read off alone.
 """
 
 from __future__ import annotations
@@ -45,9 +46,35 @@ SMALL_SECOND = {"range2": 15, "flags2": 1, "reflectivity2": 8, "window": 8}
 RGB = {"red": 16, "green": 16, "blue": 16}
 #: profile -> a pixel.
 PROFILES: dict[str, Bits] = {
-    "LEGACY": {"range": 20, "_20": 8, "flags": 4, "reflectivity": 8, "_40": 8, "signal": 16, "near_ir": 16, "_80": 16},
-    "RNG19_RFL8_SIG16_NIR16": {**WIDE, "_24": 8, "reflectivity": 8, "_40": 8, "signal": 16, "near_ir": 16, "_80": 8, "window": 8},
-    "RNG19_RFL8_SIG16_NIR16_DUAL": {**FIRST, **SECOND, "signal": 16, "signal2": 16, "near_ir": 16, "_112": 8, "window": 8},
+    "LEGACY": {
+        "range": 20,
+        "_20": 8,
+        "flags": 4,
+        "reflectivity": 8,
+        "_40": 8,
+        "signal": 16,
+        "near_ir": 16,
+        "_80": 16,
+    },
+    "RNG19_RFL8_SIG16_NIR16": {
+        **WIDE,
+        "_24": 8,
+        "reflectivity": 8,
+        "_40": 8,
+        "signal": 16,
+        "near_ir": 16,
+        "_80": 8,
+        "window": 8,
+    },
+    "RNG19_RFL8_SIG16_NIR16_DUAL": {
+        **FIRST,
+        **SECOND,
+        "signal": 16,
+        "signal2": 16,
+        "near_ir": 16,
+        "_112": 8,
+        "window": 8,
+    },
     "RNG15_RFL8_NIR8": SMALL,
     "RNG15_RFL8_NIR8_DUAL": {**SMALL, **SMALL_SECOND},
     "FUSA_RNG15_RFL8_NIR8_DUAL": {**SMALL, **SMALL_SECOND},
@@ -58,9 +85,24 @@ PROFILES: dict[str, Bits] = {
         **{"signal": 16, "near_ir": 16, "zone_mask": 16},
     },
     "RNG15_RFL8_WIN8": {"range": 15, "flags": 1, "reflectivity": 8, "window": 8},
-    "RNG19_RFL8_SIG16_ZONE16_DUAL": {**FIRST, **SECOND, "signal": 16, "signal2": 16, "zone_mask": 16, "_112": 8, "window": 8},
+    "RNG19_RFL8_SIG16_ZONE16_DUAL": {
+        **FIRST,
+        **SECOND,
+        "signal": 16,
+        "signal2": 16,
+        "zone_mask": 16,
+        "_112": 8,
+        "window": 8,
+    },
     "RNG19_RFL8_SIG16_NIR16_RGB16": {**FIRST, "signal": 16, "near_ir": 16, **RGB, "_112": 16},
-    "RNG19_RFL8_SIG16_NIR16_RGB16_DUAL": {**FIRST, **SECOND, "signal": 16, "signal2": 16, "near_ir": 16, **RGB},
+    "RNG19_RFL8_SIG16_NIR16_RGB16_DUAL": {
+        **FIRST,
+        **SECOND,
+        "signal": 16,
+        "signal2": 16,
+        "near_ir": 16,
+        **RGB,
+    },
 }
 
 COLUMNS = 16  # of a packet, unless the metadata say otherwise
@@ -68,7 +110,8 @@ VALID = 0xFFFFFFFF  # status of a valid column of LEGACY; of others bit 0 says i
 ENCODER = 90_112  # counts of a turn
 LIDAR, IMU = 1, 2  # packet types
 GRAVITY = 9.80665  # m/s2, one g of the IMU
-#: values of the footer's CRC that mean that none is filled in: of firmware 2.2, and of 2.3 up to 3.1.
+#: values of the footer's CRC that mean that none is filled in: of firmware 2.2, and of 2.3 up to
+#: 3.1.
 NOT_FILLED = (0, 0xDEADBEEF0000C0DE)
 ONES = (1 << 64) - 1
 CRC = Crc(64, 0x42F0E1EBA9EA3693, init=ONES, refin=True, refout=True, xorout=ONES)  # CRC-64/XZ
@@ -107,28 +150,46 @@ def size(profile: str, rows: int, columns: int = COLUMNS) -> int:
 
 def pixel(profile: str) -> Construct:
     """One pixel as one number, whose bits are the fields."""
-    fields = ((f"reserved{name}" if name[0] == "_" else name, bits) for name, bits in reversed(PROFILES[profile].items()))
+    fields = (
+        (f"reserved{name}" if name[0] == "_" else name, bits)
+        for name, bits in reversed(PROFILES[profile].items())
+    )
     return ByteSwapped(BitStruct(*(name / _field(name, bits) for name, bits in fields)))
 
 
 def _field(name: str, bits: int) -> Construct:
-    """A field of a pixel: ranges have steps of 8 mm where they have 15 bits, else of 1 mm; near-infrared of 8 bits lacks its low 4."""
+    """A field of a pixel: ranges have steps of 8 mm where they have 15 bits, else of 1 mm;
+    near-infrared of 8 bits lacks its low 4.
+    """
     if name.startswith("range"):
         return Scaled(BitsInteger(bits), 0.008 if bits == 15 else 0.001, "m")
-    return Scaled(BitsInteger(bits), 16, "") if (name, bits) == ("near_ir", 8) else BitsInteger(bits)
+    return (
+        Scaled(BitsInteger(bits), 16, "") if (name, bits) == ("near_ir", 8) else BitsInteger(bits)
+    )
 
 
 def packet(profile: str, rows: int, columns: int) -> Construct:
     """A lidar packet."""
     pixels = "pixels" / Array(rows, pixel(profile))
-    began = ("timestamp" / TIME, "measurement_id" / Scaled(Int16ul, 1, "") * "number of the column in its turn")
+    began = (
+        "timestamp" / TIME,
+        "measurement_id" / Scaled(Int16ul, 1, "") * "number of the column in its turn",
+    )
     if profile == "LEGACY":
         head = (*began, "frame_id" / Int16ul, "encoder" / Int32ul * "90112 counts a turn")
-        return Struct("columns" / Array(columns, Struct(*head, pixels, "status" / Int32ul * "0xffffffff: valid")))
+        return Struct(
+            "columns"
+            / Array(columns, Struct(*head, pixels, "status" / Int32ul * "0xffffffff: valid"))
+        )
     body = "columns" / Array(columns, Struct(*began, "status" / Int16ul * "bit 0: valid", pixels))
     if profile.startswith("FUSA"):
         return Struct("type" / Const(LIDAR, Int8ul), *FUSA_HEADER, *STATE, body, *FOOTER)
-    return Checksummed(Struct("type" / Const(LIDAR, Int16ul), *HEADER, *STATE, body, *FOOTER), "crc", CRC, absent=NOT_FILLED)
+    return Checksummed(
+        Struct("type" / Const(LIDAR, Int16ul), *HEADER, *STATE, body, *FOOTER),
+        "crc",
+        CRC,
+        absent=NOT_FILLED,
+    )
 
 
 @functools.cache
@@ -148,7 +209,12 @@ def legacy_plausible(f: Fields, turn: int) -> Any:
     """The same, and all of one turn, valid or not: nothing else tells these packets from noise."""
     columns = f.columns
     status = (columns.status == VALID) | (columns.status == 0)
-    return plausible_columns(f, turn) & status & (columns.encoder < ENCODER) & (columns.frame_id == columns[0].frame_id)
+    return (
+        plausible_columns(f, turn)
+        & status
+        & (columns.encoder < ENCODER)
+        & (columns.frame_id == columns[0].frame_id)
+    )
 
 
 AXES = ("x", "y", "z")
@@ -156,11 +222,14 @@ LEGACY_IMU = Struct(
     "timestamp" / TIME,
     "acceleration_timestamp" / TIME,
     "gyro_timestamp" / TIME,
-    *(f"acceleration_{axis}" / Scaled(Float32l, GRAVITY, "m/s2") * "sent in units of g" for axis in AXES),
+    *(
+        f"acceleration_{axis}" / Scaled(Float32l, GRAVITY, "m/s2") * "sent in units of g"
+        for axis in AXES
+    ),
     *(f"gyro_{axis}" / Scaled(Float32l, 1, "deg/s") for axis in AXES),
 )
-# One measurement of an ACCEL32_GYRO32_NMEA packet. Captured values are multiples of 9.80665/2048 and of
-# (pi/180)/16.4: the sensor sends m/s2 and rad/s, and ouster-sdk hands them out unchanged.
+# One measurement of an ACCEL32_GYRO32_NMEA packet. Captured values are multiples of 9.80665/2048
+# and of (pi/180)/16.4: the sensor sends m/s2 and rad/s, and ouster-sdk hands them out unchanged.
 SAMPLE = Struct(
     "timestamp" / TIME,
     "measurement_id" / Int16ul,
@@ -173,15 +242,33 @@ Rotation = tuple[tuple[float, float, float], ...]
 
 @functools.cache
 def imu(samples: int, turned: Rotation) -> Frame:
-    """The frame of the IMU: LEGACY where `samples` is 0, else with NMEA and so many samples; and how the IMU is turned in the sensor."""
+    """The frame of the IMU: LEGACY where `samples` is 0, else with NMEA and so many samples; and
+    how the IMU is turned in the sensor.
+    """
     felt = partial(feel, path="samples" if samples else "", turned=turned)
     if not samples:
-        at_rest = Simulation(lambda i: dict.fromkeys(("timestamp", "acceleration_timestamp", "gyro_timestamp"), i * 10_000_000), rate=100)
-        return Frame(LEGACY_IMU, imu=felt, clock=Clock("gyro_timestamp"), plausible=steady, simulation=at_rest)
+        at_rest = Simulation(
+            lambda i: dict.fromkeys(
+                ("timestamp", "acceleration_timestamp", "gyro_timestamp"), i * 10_000_000
+            ),
+            rate=100,
+        )
+        return Frame(
+            LEGACY_IMU,
+            imu=felt,
+            clock=Clock("gyro_timestamp"),
+            plausible=steady,
+            simulation=at_rest,
+        )
     body = ("nmea_timestamp" / TIME, "nmea" / Bytes(92), "samples" / Array(samples, SAMPLE))
     head = Struct("type" / Const(IMU, Int16ul), *HEADER, *STATE, *body, *FOOTER)
     sealed = Checksummed(head, "crc", CRC, absent=NOT_FILLED)
-    return Frame(sealed, imu=felt, clock=Clock("samples[0].timestamp"), simulation=Simulation(partial(sampled, samples), rate=100))
+    return Frame(
+        sealed,
+        imu=felt,
+        clock=Clock("samples[0].timestamp"),
+        simulation=Simulation(partial(sampled, samples), rate=100),
+    )
 
 
 def sampled(samples: int, i: int) -> dict[str, Any]:
@@ -193,7 +280,8 @@ def feel(f: Fields, path: str, turned: Rotation) -> Imu:
     """Return the IMU measurements in the axes of the sensor: rad/s, m/s2 and seconds.
 
     Args:
-        path: array of measurements in an ACCEL32_GYRO32_NMEA packet; "" for the single one of a LEGACY packet.
+        path: array of measurements in an ACCEL32_GYRO32_NMEA packet; "" for the single one of a
+            LEGACY packet.
         turned: rotation from the IMU to the sensor.
     """
     if path:
@@ -211,9 +299,14 @@ def feel(f: Fields, path: str, turned: Rotation) -> Imu:
 def rotated(turned: Rotation, vector: Any) -> tuple[Any, ...]:
     """A vector of columns, turned."""
     parts = list(vector)
-    return tuple(sum(weight * part for weight, part in zip(row, parts, strict=True) if weight) for row in turned)
+    return tuple(
+        sum(weight * part for weight, part in zip(row, parts, strict=True) if weight)
+        for row in turned
+    )
 
 
 def steady(f: Fields) -> Any:
     """Times within a second of one another."""
-    return (abs(f.acceleration_timestamp - f.timestamp) < 1e9) & (abs(f.gyro_timestamp - f.timestamp) < 1e9)
+    return (abs(f.acceleration_timestamp - f.timestamp) < 1e9) & (
+        abs(f.gyro_timestamp - f.timestamp) < 1e9
+    )

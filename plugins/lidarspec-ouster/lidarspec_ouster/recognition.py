@@ -1,9 +1,12 @@
-"""Which layout packets have, that do not say it: by their length, the bits that nobody uses, and neighbours that are alike.
+"""Which layout packets have, that do not say it: by their length, the bits that nobody uses, and
+neighbours that are alike.
 
-Several layouts have one length: 32 pixels of 16 bytes, 64 of 8 and 128 of 4. In one that is too fine, every other or every fourth range
-is some other number, so that their means are far apart. Of layouts that are as fine, the first of `PROFILES` is taken whose unused bits
-are 0 in most pixels: some cannot be told apart by anything in them. How many columns a turn has is told by the encoder of LEGACY; of
-others by the largest number seen, and by the time from column to column at ten turns a second, as they leave the factory.
+Several layouts have one length: 32 pixels of 16 bytes, 64 of 8 and 128 of 4. In one that is too
+fine, every other or every fourth range is some other number, so that their means are far apart. Of
+layouts that are as fine, the first of `PROFILES` is taken whose unused bits are 0 in most pixels:
+some cannot be told apart by anything in them. How many columns a turn has is told by the encoder of
+LEGACY; of others by the largest number seen, and by the time from column to column at ten turns a
+second, as they leave the factory.
 """
 
 from __future__ import annotations
@@ -25,7 +28,9 @@ Bytes2D = NDArray[np.uint8]
 
 
 def recognise(datagrams: Sequence[bytes]) -> dict[str, Any]:
-    """The options of `configure` under which most of the datagrams are lidar packets; {} where they are none."""
+    """The options of `configure` under which most of the datagrams are lidar packets; {} where they
+    are none.
+    """
     lengths = [len(data) for data in datagrams]
     layouts = {(profile, rows): size(profile, rows) for profile in PROFILES for rows in ROWS}
     known = [length for length in lengths if length in layouts.values()]
@@ -34,12 +39,23 @@ def recognise(datagrams: Sequence[bytes]) -> dict[str, Any]:
     usual = max(set(known), key=known.count)
     some = [data for data in datagrams if len(data) == usual][:LOOKED_AT]
     packets = np.frombuffer(b"".join(some), np.uint8).reshape(len(some), usual)
-    finest_first = sorted((layout for layout, length in layouts.items() if length == usual), key=lambda layout: -layout[1])
-    columns = {layout: body for layout in finest_first if (body := _columns(packets, layout[0])) is not None}
+    finest_first = sorted(
+        (layout for layout, length in layouts.items() if length == usual),
+        key=lambda layout: -layout[1],
+    )
+    columns = {
+        layout: body
+        for layout in finest_first
+        if (body := _columns(packets, layout[0])) is not None
+    }
     fitting = {layout: _likeness(body, *layout) for layout, body in columns.items()}
     if not fitting:
         return {}
-    likely = next(found for least in (0.5, 0, -1) if (found := [layout for layout in fitting if fitting[layout] >= least]))
+    likely = next(
+        found
+        for least in (0.5, 0, -1)
+        if (found := [layout for layout in fitting if fitting[layout] >= least])
+    )
     profile, rows = likely[0]
     return {"profile": profile, "rows": rows, "turn": _turn(columns[likely[0]], profile)}
 
@@ -48,10 +64,16 @@ def _turn(columns: Bytes2D, profile: str) -> int:
     """Columns of a turn, as far as they tell it."""
     number, time = _word(columns, 8, 2), _word(columns, 0, 8)
     if profile == "LEGACY" and number.any():
-        guess = float(np.median(ENCODER * number[number > 0] / np.maximum(_word(columns, 12, 4)[number > 0], 1)))
+        guess = float(
+            np.median(
+                ENCODER * number[number > 0] / np.maximum(_word(columns, 12, 4)[number > 0], 1)
+            )
+        )
     else:
         guess = TEN_TURNS / max(float(np.median(np.diff(time))), 1.0)
-    return min((turn for turn in TURNS if turn > number.max()), key=lambda turn: abs(np.log(turn / guess)))
+    return min(
+        (turn for turn in TURNS if turn > number.max()), key=lambda turn: abs(np.log(turn / guess))
+    )
 
 
 def _columns(packets: Bytes2D, profile: str) -> Bytes2D | None:
@@ -59,7 +81,9 @@ def _columns(packets: Bytes2D, profile: str) -> Bytes2D | None:
     framed = profile != "LEGACY"
     if framed and not (packets[:, 0] == 1).all():
         return None
-    if framed and (packets[:, 1] == 0).all() == profile.startswith("FUSA"):  # of the type, or of the number of the start
+    if framed and (packets[:, 1] == 0).all() == profile.startswith(
+        "FUSA"
+    ):  # of the type, or of the number of the start
         return None
     body = packets[:, 32:-32] if framed else packets
     columns = body.reshape(len(packets) * COLUMNS, -1)
@@ -67,12 +91,16 @@ def _columns(packets: Bytes2D, profile: str) -> Bytes2D | None:
     steady = (np.diff(numbers, axis=1) == 1).all() and numbers.max() < TURNS[-1]
     if not framed:
         status = _word(columns, columns.shape[1] - 4, 4)
-        steady = steady and bool(((status == VALID) | (status == 0)).all() and (_word(columns, 12, 4) < ENCODER).all())
+        steady = steady and bool(
+            ((status == VALID) | (status == 0)).all() and (_word(columns, 12, 4) < ENCODER).all()
+        )
     return columns if steady else None
 
 
 def _likeness(columns: Bytes2D, profile: str, rows: int) -> float:
-    """The mean range of every fourth row, the least by the largest of the four; -1 where unused bits are set in many pixels."""
+    """The mean range of every fourth row, the least by the largest of the four; -1 where unused
+    bits are set in many pixels.
+    """
     start, bits = (16 if profile == "LEGACY" else 12), PROFILES[profile]
     step, spot = sum(bits.values()) // 8, 0
     pixels = columns[:, start : start + rows * step].reshape(len(columns), rows, step)
@@ -91,5 +119,7 @@ def _bits(rows: NDArray[Any], spot: int, width: int) -> NDArray[np.int64]:
 
 def _word(rows: NDArray[Any], start: int, count: int) -> NDArray[np.int64]:
     """Little-endian numbers out of the last axis."""
-    found: NDArray[np.int64] = (rows[..., start : start + count].astype(np.int64) << (8 * np.arange(count))).sum(axis=-1)
+    found: NDArray[np.int64] = (
+        rows[..., start : start + count].astype(np.int64) << (8 * np.arange(count))
+    ).sum(axis=-1)
     return found

@@ -1,4 +1,6 @@
-"""Ouster: real packets of six layouts against the vendor's digests and points; metadata, recognition, a simulated web server."""
+"""Ouster: real packets of six layouts against the vendor's digests and points; metadata,
+recognition, a simulated web server.
+"""
 
 from __future__ import annotations
 
@@ -27,11 +29,21 @@ from tests.evidence import capture, decoded, vector_bytes, vectors
 OS0, OS1, OS2 = (ls.sensor(f"ouster-os{number}") for number in range(3))
 #: capture, the metadata beside it, and the layout that packets alone tell.
 CAPTURES = {
-    "OS-0-32-U1_v2.2.0_1024x10": ("OS-0-32-U1_v2.2.0_1024x10", ("RNG19_RFL8_SIG16_NIR16_DUAL", 32, 1024)),
+    "OS-0-32-U1_v2.2.0_1024x10": (
+        "OS-0-32-U1_v2.2.0_1024x10",
+        ("RNG19_RFL8_SIG16_NIR16_DUAL", 32, 1024),
+    ),
     "OS-2-32-U0_v2.0.0_1024x10": ("OS-2-32-U0_v2.0.0_1024x10", ("LEGACY", 32, 1024)),
     "OS-1-128_v2.3.0_1024x10_lb_n3": ("OS-1-128_v2.3.0_1024x10", ("RNG15_RFL8_NIR8", 128, 1024)),
 }
-VECTORS = ["legacy_os1_32", "dual_os0_32", "rng15_os0_128", "single_os2_128", "crc64_rng15", "fusa_os1_128"]
+VECTORS = [
+    "legacy_os1_32",
+    "dual_os0_32",
+    "rng15_os0_128",
+    "single_os2_128",
+    "crc64_rng15",
+    "fusa_os1_128",
+]
 FILE = "vectors_udp3d.json"
 TYPES = {"range": "u4", "signal": "u2", "near_ir": "u2", "reflectivity": "u1", "flags": "u1"}
 
@@ -45,7 +57,9 @@ def payloads(path: Path) -> list[bytes]:
 def unit(name: str) -> tuple[ls.Sensor, list[bytes]]:
     """The sensor of a capture with its metadata, and the datagrams."""
     metadata = capture(f"ouster/{CAPTURES[name][0]}.json")
-    return ls.sensor(f"ouster-os{name[3]}").configure(metadata=metadata), payloads(capture(f"ouster/{name}.pcap"))
+    return ls.sensor(f"ouster-os{name[3]}").configure(metadata=metadata), payloads(
+        capture(f"ouster/{name}.pcap")
+    )
 
 
 def digest(values: Any) -> str:
@@ -61,10 +75,14 @@ def pixels(packets: ls.Packets, name: str) -> Any:
 def test_every_field_has_the_digest_of_the_vendor(name: str) -> None:
     sensor, data = unit(name)
     packets = sensor.decode(data)
-    digests = json.loads(capture(f"ouster/{name}_digest.json").read_text(encoding="utf-8"))["packet_hash"]
+    digests = json.loads(capture(f"ouster/{name}_digest.json").read_text(encoding="utf-8"))[
+        "packet_hash"
+    ]
     columns = packets.raw["columns"]
     legacy = "encoder" in columns.dtype.names
-    absent = np.zeros(columns.shape)  # what the vendor's reader says of columns that have no number of their turn, and no encoder
+    absent = np.zeros(
+        columns.shape
+    )  # what the vendor's reader says of columns that have no number of their turn, and no encoder
     found = {
         "TIMESTAMP": digest(columns["timestamp"].astype("u8")),
         "MEASUREMENT_ID": digest(columns["measurement_id"].astype("u2")),
@@ -72,14 +90,18 @@ def test_every_field_has_the_digest_of_the_vendor(name: str) -> None:
         "FRAME_ID": digest((columns["frame_id"] if legacy else absent).astype("u2")),
         "ENCODER_COUNT": digest((columns["encoder"] if legacy else absent).astype("u4")),
     }
-    names = [key for key in digests if key not in found and not key.startswith("RAW")]  # RAW32 are the words that the fields are cut out of
+    names = [
+        key for key in digests if key not in found and not key.startswith("RAW")
+    ]  # RAW32 are the words that the fields are cut out of
     found |= {key: digest(pixels(packets, key.lower())) for key in names}
     assert found == {key: digests[key] for key in found}
     assert len(names) == (5 if legacy else 9)
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("backend", ("numpy", "jit") if importlib.util.find_spec("numba") else ("numpy",))
+@pytest.mark.parametrize(
+    "backend", ("numpy", "jit") if importlib.util.find_spec("numba") else ("numpy",)
+)
 @pytest.mark.parametrize("name", CAPTURES)
 def test_points_are_those_of_the_vendor(name: str, backend: str) -> None:
     sensor, data = unit(name)
@@ -87,7 +109,10 @@ def test_points_are_those_of_the_vendor(name: str, backend: str) -> None:
     with np.load(capture(f"ouster/{name}.frame0.npz")) as expected:
         ranges, xyz = expected["RANGE"].T, expected["xyz"].transpose(1, 0, 2)
     shape = (*ranges.shape, -1)
-    valid, points = scan.points.valid.reshape(shape)[..., 0], scan.points.xyz.reshape(*shape, 3)[:, :, 0]
+    valid, points = (
+        scan.points.valid.reshape(shape)[..., 0],
+        scan.points.xyz.reshape(*shape, 3)[:, :, 0],
+    )
     np.testing.assert_array_equal(valid, ranges > 0)
     np.testing.assert_allclose(points[valid], xyz[valid], rtol=0, atol=1e-5)
 
@@ -99,7 +124,11 @@ def test_a_capture_is_read_whole(name: str) -> None:
     packets = decoded(sensor, data[:4] + data[-4:])
     assert packets.stats.bytes_skipped == 0
     stats = sensor.decode(data).stats
-    assert (stats.frames["data"] + stats.frames.get("imu", 0), stats.bytes_skipped, stats.lost) == (len(data), 0, 0)
+    assert (stats.frames["data"] + stats.frames.get("imu", 0), stats.bytes_skipped, stats.lost) == (
+        len(data),
+        0,
+        0,
+    )
     assert sensor.build("data", sensor.parse(data[0], "data")) == data[0]
 
 
@@ -112,12 +141,15 @@ def test_published_packets(name: str) -> None:
     packets = decoded(sensor, [data])
     fields = packets.raw["columns"]["pixels"]
     shift = {"RANGE": 3, "RANGE2": 3, "NEAR_IR": 4} if "RNG15" in params["profile"] else {}
-    sums = {key: int(fields[key.lower()].astype(np.int64).sum()) << shift.get(key, 0) for key in expected["sum"]}
+    sums = {
+        key: int(fields[key.lower()].astype(np.int64).sum()) << shift.get(key, 0)
+        for key in expected["sum"]
+    }
     assert sums == expected["sum"]
     head = packets.raw if "init_id" in expected else packets.raw["columns"]
-    assert {key: np.ravel(head[key])[0] for key in ("frame_id", "init_id", "serial") if key in expected} == {
-        key: expected[key] for key in ("frame_id", "init_id", "serial") if key in expected
-    }
+    assert {
+        key: np.ravel(head[key])[0] for key in ("frame_id", "init_id", "serial") if key in expected
+    } == {key: expected[key] for key in ("frame_id", "init_id", "serial") if key in expected}
     cloud = packets.points()
     xyz = cloud.xyz.reshape(16, params["H"], -1, 3)[:, :, 0]
     for point in expected["first"]:
@@ -127,20 +159,38 @@ def test_published_packets(name: str) -> None:
 def metadata_of(params: dict[str, Any]) -> dict[str, Any]:
     """What a vector's parameters say, in the form of a file."""
     beam = [1, 0, 0, params["n"], 0, 1, 0, 0, 0, 0, 1, params["nz"], 0, 0, 0, 1]
-    layout = {"columns_per_frame": params["W"], "columns_per_packet": params["columns_per_packet"], "udp_profile_lidar": params["profile"]}
-    angles = {"beam_altitude_angles": params["alt"], "beam_azimuth_angles": params["az"], "beam_to_lidar_transform": beam}
-    return {"lidar_data_format": layout, "beam_intrinsics": angles, "lidar_intrinsics": {"lidar_to_sensor_transform": params["l2s"]}}
+    layout = {
+        "columns_per_frame": params["W"],
+        "columns_per_packet": params["columns_per_packet"],
+        "udp_profile_lidar": params["profile"],
+    }
+    angles = {
+        "beam_altitude_angles": params["alt"],
+        "beam_azimuth_angles": params["az"],
+        "beam_to_lidar_transform": beam,
+    }
+    return {
+        "lidar_data_format": layout,
+        "beam_intrinsics": angles,
+        "lidar_intrinsics": {"lidar_to_sensor_transform": params["l2s"]},
+    }
 
 
 def test_bits_of_every_profile_stand_where_the_table_has_them() -> None:
     vectors(FILE)
-    table = json.loads((capture("ouster").parents[1] / "protocols" / "tables_udp3d.json").read_text(encoding="utf-8"))["ouster"]["profiles"]
+    table = json.loads(
+        (capture("ouster").parents[1] / "protocols" / "tables_udp3d.json").read_text(
+            encoding="utf-8"
+        )
+    )["ouster"]["profiles"]
     assert set(table) == set(PROFILES)
     names = {"red": "R", "green": "G", "blue": "B"}
     for profile, bits in PROFILES.items():
         spots = np.cumsum([0, *bits.values()]).tolist()
         stand = {
-            names.get(name, name.upper()): [spot, width] for (name, width), spot in zip(bits.items(), spots, strict=False) if name[0] != "_"
+            names.get(name, name.upper()): [spot, width]
+            for (name, width), spot in zip(bits.items(), spots, strict=False)
+            if name[0] != "_"
         }
         listed = table[profile]["fields_bit_offset_bits_leftshift"]
         assert stand == {name: place[:2] for name, place in listed.items() if name != "RGB"}
@@ -161,8 +211,12 @@ def test_the_imu_by_the_published_packet() -> None:
     vector = vectors(FILE)["ouster_imu_legacy"]
     felt = OS0.decode([bytes.fromhex(vector["hex"])], "imu").imu()
     assert felt.time_ns.tolist() == [vector["expected"]["gyro_ts"]]
-    np.testing.assert_allclose(felt.linear_acceleration[0] / 9.80665, vector["expected"]["acc_g"], atol=1e-6)
-    np.testing.assert_allclose(np.rad2deg(felt.angular_velocity[0]), vector["expected"]["gyro_dps"], atol=1e-6)
+    np.testing.assert_allclose(
+        felt.linear_acceleration[0] / 9.80665, vector["expected"]["acc_g"], atol=1e-6
+    )
+    np.testing.assert_allclose(
+        np.rad2deg(felt.angular_velocity[0]), vector["expected"]["gyro_dps"], atol=1e-6
+    )
 
 
 def test_lost_and_invalid_columns_leave_gaps() -> None:
@@ -191,7 +245,11 @@ def test_packets_alone_tell_their_layout() -> None:
 @pytest.mark.parametrize("name", VECTORS)
 def test_one_packet_tells_its_layout(name: str) -> None:
     params = vectors(FILE)[f"ouster_{name}"]["params"]
-    assert recognise([vector_bytes(FILE, f"ouster_{name}")]) == {"profile": params["profile"], "rows": params["H"], "turn": params["W"]}
+    assert recognise([vector_bytes(FILE, f"ouster_{name}")]) == {
+        "profile": params["profile"],
+        "rows": params["H"],
+        "turn": params["W"],
+    }
 
 
 @pytest.mark.parametrize("data", [b"", bytes(8448), b"\x01" + bytes(8447), bytes(6464)])
@@ -236,15 +294,26 @@ def test_older_and_newer_metadata_say_the_same(tmp_path: Path) -> None:
 def test_keys_are_read_from_whichever_section_has_them(tmp_path: Path) -> None:
     unit = dataclasses.replace(nominal("OS1", 16, 512, "RNG15_RFL8_NIR8"), samples=8)
     data = json.loads(unit.told())
-    data["imu_data_format"] = {"imu_measurements_per_packet": data["lidar_data_format"].pop("imu_measurements_per_packet")}
+    data["imu_data_format"] = {
+        "imu_measurements_per_packet": data["lidar_data_format"].pop("imu_measurements_per_packet")
+    }
     (tmp_path / "unit.json").write_text(json.dumps(data))
     assert read(tmp_path / "unit.json").samples == 8
 
 
 @pytest.mark.parametrize(
-    ("product", "distance_mm"), [("OS-0-128", 27.67), ("OS-1-64", 15.806), ("OS-2-32-U0", 13.762), ("", 12.163), ("OS1", 12.163)]
+    ("product", "distance_mm"),
+    [
+        ("OS-0-128", 27.67),
+        ("OS-1-64", 15.806),
+        ("OS-2-32-U0", 13.762),
+        ("", 12.163),
+        ("OS1", 12.163),
+    ],
 )
-def test_missing_offsets_are_those_of_the_model_and_nominal(tmp_path: Path, product: str, distance_mm: float) -> None:
+def test_missing_offsets_are_those_of_the_model_and_nominal(
+    tmp_path: Path, product: str, distance_mm: float
+) -> None:
     """The values that ouster-sdk takes (sensor_info.cpp, metadata.cpp)."""
     data = json.loads(nominal("OS1", 16, 512, "LEGACY").told())
     data["sensor_info"]["prod_line"] = product
@@ -264,9 +333,17 @@ def test_imu_measurements_come_in_si_units() -> None:
     gravity = 2048 * 9.80665 / 2048
     rate = 164 * np.deg2rad(1) / 16.4
     measurement = {f"{name}_{axis}": 0.0 for name in ("acceleration", "gyro") for axis in "xyz"}
-    measurement |= {"timestamp": 0, "measurement_id": 0, "status": 0, "acceleration_z": gravity, "gyro_x": rate}
+    measurement |= {
+        "timestamp": 0,
+        "measurement_id": 0,
+        "status": 0,
+        "acceleration_z": gravity,
+        "gyro_x": rate,
+    }
     values = sensor.parse(sensor.example("imu"), "imu")
-    samples = sensor.decode([sensor.build("imu", {**values, "samples": [measurement] * 2})], "imu").imu()
+    samples = sensor.decode(
+        [sensor.build("imu", {**values, "samples": [measurement] * 2})], "imu"
+    ).imu()
     np.testing.assert_allclose(samples.linear_acceleration, [[0, 0, 9.80665]] * 2, atol=1e-5)
     np.testing.assert_allclose(samples.angular_velocity, [[np.deg2rad(10), 0, 0]] * 2, atol=1e-6)
 
@@ -285,14 +362,29 @@ def test_imu_measurements_come_in_si_units() -> None:
         ({"prod_line": "OS-0-32"}, "of an OS-0-32: -s ouster-os0"),
     ],
 )
-def test_metadata_that_cannot_be_are_refused_by_name(tmp_path: Path, change: dict[str, Any], message: str) -> None:
-    data = {key: value for section in json.loads(nominal("OS1", 16, 512, "LEGACY").told()).values() for key, value in section.items()}
+def test_metadata_that_cannot_be_are_refused_by_name(
+    tmp_path: Path, change: dict[str, Any], message: str
+) -> None:
+    data = {
+        key: value
+        for section in json.loads(nominal("OS1", 16, 512, "LEGACY").told()).values()
+        for key, value in section.items()
+    }
     (tmp_path / "unit.json").write_text(json.dumps({**data, **change}))
     with pytest.raises(ls.UsageError, match=message):
         OS1.configure(metadata=tmp_path / "unit.json")
 
 
-@pytest.mark.parametrize("options", [{"rows": 8}, {"rows": 1 << 20}, {"turn": 500}, {"profile": "RNG99"}, {"metadata": "x", "rows": 16}])
+@pytest.mark.parametrize(
+    "options",
+    [
+        {"rows": 8},
+        {"rows": 1 << 20},
+        {"turn": 500},
+        {"profile": "RNG99"},
+        {"metadata": "x", "rows": 16},
+    ],
+)
 def test_layouts_that_there_are_not_are_refused(options: dict[str, Any]) -> None:
     with pytest.raises(ls.UsageError):
         OS1.configure(**options)

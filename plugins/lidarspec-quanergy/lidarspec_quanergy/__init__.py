@@ -1,10 +1,13 @@
-"""Quanergy M8 and MQ8: rotating lidars of eight lasers over TCP, which send by themselves, high byte first.
+"""Quanergy M8 and MQ8: rotating lidars of eight lasers over TCP, which send by themselves, high
+byte first.
 
-Source: the vendor's quanergy_client (packet_header.h, m_series_data_packet.h, data_packet_parser_00.cpp, data_packet_parser_04.cpp,
-data_packet_parser_m_series.h). The client takes the time of a packet for that of its last firing. Assumed are what it does not say: that
-firings are evenly apart, at 420 000 points a second, the limits of range, and turns a second. Which way a unit turns its positions tell:
-they may fall as well as grow. The nanoseconds of packets before version 4 count tens of them, which is not corrected here. Packets of other
-kinds (1 and 6) and settings over HTTP are left out. No packet of a sensor was seen.
+Source: the vendor's quanergy_client (packet_header.h, m_series_data_packet.h,
+data_packet_parser_00.cpp, data_packet_parser_04.cpp, data_packet_parser_m_series.h). The client
+takes the time of a packet for that of its last firing. Assumed are what it does not say: that
+firings are evenly apart, at 420 000 points a second, the limits of range, and turns a second. Which
+way a unit turns its positions tell: they may fall as well as grow. The nanoseconds of packets
+before version 4 count tens of them, which is not corrected here. Packets of other kinds (1 and 6)
+and settings over HTTP are left out. No packet of a sensor was seen.
 """
 
 from __future__ import annotations
@@ -17,20 +20,40 @@ import numpy as np
 from construct import Array, Bytes, Const, Construct, Int8ub, Int16ub, Int32ub, Struct
 from numpy.typing import NDArray
 
-from lidarspec.spec import Clock, Fields, Frame, OnWrap, Polar, Scaled, Sensor, Simulation, Tcp, hookimpl, stack
+from lidarspec.spec import (
+    Clock,
+    Fields,
+    Frame,
+    OnWrap,
+    Polar,
+    Scaled,
+    Sensor,
+    Simulation,
+    Tcp,
+    hookimpl,
+    stack,
+)
 
 FIRINGS, LASERS = 50, 8
 TICKS = 10_400  # positions of a turn
 FINE = 5  # the first version of packets with steps of 10 um; before it they are of 10 mm
 PERIOD = LASERS / 420_000  # seconds from firing to firing
-TIME = (np.arange(FIRINGS) - (FIRINGS - 1)) * PERIOD  # of the firings of a packet, after the packet's own
+TIME = (
+    np.arange(FIRINGS) - (FIRINGS - 1)
+) * PERIOD  # of the firings of a packet, after the packet's own
 
 #: radians above the level, from the lowest laser to the highest.
-M8_ELEVATION = np.array([-0.318505, -0.2692, -0.218009, -0.165195, -0.111003, -0.0557982, 0.0, 0.0557982])
-MQ8_ELEVATION = np.array([-0.24435, -0.18326, -0.14137, -0.10297, -0.07854, -0.055327, -0.041364, -0.027402])
+M8_ELEVATION = np.array(
+    [-0.318505, -0.2692, -0.218009, -0.165195, -0.111003, -0.0557982, 0.0, 0.0557982]
+)
+MQ8_ELEVATION = np.array(
+    [-0.24435, -0.18326, -0.14137, -0.10297, -0.07854, -0.055327, -0.041364, -0.027402]
+)
 
 POSITION: Construct = Scaled(Int16ub, 360 / TICKS, "deg") * "counter-clockwise"
-DISTANCES: Construct = Array(LASERS, Scaled(Int32ub, 1e-5, "m") * "0: no return; before version 5 a step is 10 mm")
+DISTANCES: Construct = Array(
+    LASERS, Scaled(Int32ub, 1e-5, "m") * "0: no return; before version 5 a step is 10 mm"
+)
 INTENSITIES: Construct = Array(LASERS, Int8ub * "255: saturated")
 
 
@@ -73,7 +96,16 @@ ONE = Struct(
     "status" / Int16ub * "0 good, 1 software and firmware do not match, 2 watchdog",
     "return_id" / Int8ub * "which of the three returns",
     "reserved" / Bytes(1),
-    "firings" / Array(FIRINGS, Struct("position" / POSITION, "padding" / Bytes(2), "distance" / DISTANCES, "intensity" / INTENSITIES)),
+    "firings"
+    / Array(
+        FIRINGS,
+        Struct(
+            "position" / POSITION,
+            "padding" / Bytes(2),
+            "distance" / DISTANCES,
+            "intensity" / INTENSITIES,
+        ),
+    ),
 )
 
 
@@ -83,12 +115,17 @@ def plausible(f: Fields) -> Any:
 
 
 def three_points(f: Fields, elevation: NDArray[np.float64]) -> Polar:
-    """Three returns of each laser; where there are fewer, the third repeats the first or the second, which then are no points."""
+    """Three returns of each laser; where there are fewer, the third repeats the first or the
+    second, which then are no points.
+    """
     fields = f.firings
-    first, second, third = (each.on("firings", "firings.third") for each in (fields.first, fields.second, fields.third))
+    first, second, third = (
+        each.on("firings", "firings.third") for each in (fields.first, fields.second, fields.third)
+    )
     intensities = (fields.first_intensity, fields.second_intensity, fields.third_intensity)
     return Polar(
-        range=stack(np.where(first == third, 0, first), np.where(second == third, 0, second), third) * np.where(f.api < FINE, 1000, 1),
+        range=stack(np.where(first == third, 0, first), np.where(second == third, 0, second), third)
+        * np.where(f.api < FINE, 1000, 1),
         azimuth=np.deg2rad(fields.position),
         elevation=elevation[:, None],
         intensity=stack(*(each.on("firings", "firings.third") for each in intensities)),
@@ -115,7 +152,12 @@ def sweep(i: int, more: Mapping[str, Any]) -> dict[str, Any]:
     """Packet i of 10 turns a second."""
     seconds, nanoseconds = divmod(round(i * FIRINGS * PERIOD * 1e9), 1_000_000_000)
     position = (i * FIRINGS + np.arange(FIRINGS)) * PERIOD * 3600 % 360
-    return {"firings.position": position, "seconds": seconds, "nanoseconds": nanoseconds * 1e-9, **more}
+    return {
+        "firings.position": position,
+        "seconds": seconds,
+        "nanoseconds": nanoseconds * 1e-9,
+        **more,
+    }
 
 
 def lidar(model: str, elevation: NDArray[np.float64], other: str, **facts: Any) -> Sensor:
@@ -132,7 +174,11 @@ def lidar(model: str, elevation: NDArray[np.float64], other: str, **facts: Any) 
                 plausible=plausible,
                 points=partial(points, elevation=elevation),
                 simulation=Simulation(partial(sweep, more=more)),
-                acknowledged={"LS507": "of a wall each laser has one return, which the other two repeat"} if more else {},
+                acknowledged={
+                    "LS507": "of a wall each laser has one return, which the other two repeat"
+                }
+                if more
+                else {},
             )
             for name, (struct, points, more) in kinds.items()
         },
@@ -142,7 +188,9 @@ def lidar(model: str, elevation: NDArray[np.float64], other: str, **facts: Any) 
         clock=Clock(("seconds", "nanoseconds")),
         vendor_axes=("forward", "left", "up"),
         turn=(5.0, 20.0),
-        relatives={f"quanergy-{other}": "nothing in the packets: the label, or the sensor's web page"},
+        relatives={
+            f"quanergy-{other}": "nothing in the packets: the label, or the sensor's web page"
+        },
         aliases=(model.lower(),),
         status="manual",
         source="quanergy_client; rate, turns and range are assumed",

@@ -1,4 +1,6 @@
-"""Quanergy M8 and MQ8: the built packet of three returns, returns that repeat another, and distances of older packets."""
+"""Quanergy M8 and MQ8: the built packet of three returns, returns that repeat another, and
+distances of older packets.
+"""
 
 from __future__ import annotations
 

@@ -1,15 +1,19 @@
 """RoboSense Airy: rotating lidar of 96 lasers from the horizon to the zenith over UDP, with an IMU.
 
-Two blocks of 48 lasers share an azimuth, the first with the lower half of the lasers; with dual return two such pairs.
+Two blocks of 48 lasers share an azimuth, the first with the lower half of the lasers; with dual
+return two such pairs.
 
-Source: Airy user manual 1.3: Tables 8 to 13 and 32 (packets, angles, emission times), appendix C (registers of DIFOP); from the vendor's
-rs_driver (decoder_RSAIRY.hpp): the optical centre, where it differs by how the sensor stands when its lasers fire, the bits of a distance,
-dual return, the time in a packet of the IMU.
+Source: Airy user manual 1.3: Tables 8 to 13 and 32 (packets, angles, emission times), appendix C
+(registers of DIFOP); from the vendor's rs_driver (decoder_RSAIRY.hpp): the optical centre, where it
+differs by how the sensor stands when its lasers fire, the bits of a distance, dual return, the time
+in a packet of the IMU.
 
-Contradictions: the manual's formula has x with the sine of the azimuth and the sensor turns towards y; rs_driver has x with its cosine
-and y with its sine turned round, as in all models, which is what stands here. Whether the integers of the IMU are big-endian nobody says:
-assumed, as all else is. Assumed too: the order of the blocks of dual return, which rs_driver reads by their places alone. Models of 48
-and 192 lasers (bytes 1 and 3) send other packets, and are refused.
+Contradictions: the manual's formula has x with the sine of the azimuth and the sensor turns towards
+y; rs_driver has x with its cosine
+and y with its sine turned round, as in all models, which is what stands here. Whether the integers
+of the IMU are big-endian nobody says: assumed, as all else is. Assumed too: the order of the blocks
+of dual return, which rs_driver reads by their places alone. Models of 48 and 192 lasers (bytes 1
+and 3) send other packets, and are refused.
 """
 
 from __future__ import annotations
@@ -19,9 +23,34 @@ from functools import partial
 from typing import Any
 
 import numpy as np
-from construct import Array, BitsInteger, BitStruct, Bytes, Const, Float32b, Int8ub, Int16ub, Int32sb, Int32ub, Struct
+from construct import (
+    Array,
+    BitsInteger,
+    BitStruct,
+    Bytes,
+    Const,
+    Float32b,
+    Int8ub,
+    Int16ub,
+    Int32sb,
+    Int32ub,
+    Struct,
+)
 
-from lidarspec.spec import Fields, Frame, Imu, Polar, Scaled, Sensor, Sequence, Simulation, Udp, following, previous, take
+from lidarspec.spec import (
+    Fields,
+    Frame,
+    Imu,
+    Polar,
+    Scaled,
+    Sensor,
+    Sequence,
+    Simulation,
+    Udp,
+    following,
+    previous,
+    take,
+)
 from lidarspec_robosense.rotor import (
     BLOCK,
     COMMON,
@@ -48,13 +77,21 @@ GRAVITY = 9.80665
 
 
 def emission(*times: float) -> Any:
-    """(blocks, lasers) seconds at which groups of eight lasers fire, after the azimuth of a pair of blocks."""
+    """(blocks, lasers) seconds at which groups of eight lasers fire, after the azimuth of a pair of
+    blocks.
+    """
     return np.tile(np.repeat(times, 8).reshape(2, HALF), (BLOCKS // 2, 1)) * 1e-6
 
 
-UPRIGHT = emission(0, 5.712, 12.376, 19.04, 25.704, 33.32, 41.888, 50.456, 59.024, 70.448, 81.872, 93.296)  # Table 32
-SIDEWAYS = emission(0, 11.424, 22.848, 34.272, 45.696, 54.264, 62.832, 71.4, 79.016, 85.68, 92.344, 99.008)  # rs_driver
-AIRY_M = emission(0, 7.616, 16.184, 24.752, 33.32, 42.84, 52.36, 61.88, 71.4, 79.968, 88.536, 97.104)  # rs_driver
+UPRIGHT = emission(
+    0, 5.712, 12.376, 19.04, 25.704, 33.32, 41.888, 50.456, 59.024, 70.448, 81.872, 93.296
+)  # Table 32
+SIDEWAYS = emission(
+    0, 11.424, 22.848, 34.272, 45.696, 54.264, 62.832, 71.4, 79.016, 85.68, 92.344, 99.008
+)  # rs_driver
+AIRY_M = emission(
+    0, 7.616, 16.184, 24.752, 33.32, 42.84, 52.36, 61.88, 71.4, 79.968, 88.536, 97.104
+)  # rs_driver
 # fmt: off
 VERTICAL = np.array([  # Table 32
     -0.07, 0.88, 1.81, 2.76, 3.69, 4.62, 5.54, 6.48, 7.41, 8.34, 9.27, 10.21, 11.15, 12.09, 13.03, 13.98, 14.92, 15.87, 16.82, 17.77, 18.72,
@@ -64,9 +101,17 @@ VERTICAL = np.array([  # Table 32
     74.33, 75.29, 76.24, 77.19, 78.14, 79.07, 80.02, 80.96, 81.9, 82.84, 83.78, 84.7, 85.64, 86.57, 87.52, 88.46, 89.4,
 ])
 # fmt: on
-ROTOR = Rotor(delay=UPRIGHT, period=111.08e-6, lens=float(np.hypot(0.0075, 0.00664)), height=0.04532, vertical=VERTICAL)
+ROTOR = Rotor(
+    delay=UPRIGHT,
+    period=111.08e-6,
+    lens=float(np.hypot(0.0075, 0.00664)),
+    height=0.04532,
+    vertical=VERTICAL,
+)
 
-ECHO = BitStruct("feature" / BitsInteger(2), "distance" / Scaled(BitsInteger(14), 0.005, "m") * "0: no return")
+ECHO = BitStruct(
+    "feature" / BitsInteger(2), "distance" / Scaled(BitsInteger(14), 0.005, "m") * "0: no return"
+)
 DATA = Struct(
     "header" / Const(b"\x55\xaa\x05\x5a"),
     "reserved_4" / Bytes(4),
@@ -87,7 +132,9 @@ DATA = Struct(
         BLOCKS,
         Struct(
             "flag" / BLOCK,
-            "azimuth" / Scaled(Int16ub, 0.01, "deg") * "of the rotor, clockwise, at the first laser of a pair of blocks",
+            "azimuth"
+            / Scaled(Int16ub, 0.01, "deg")
+            * "of the rotor, clockwise, at the first laser of a pair of blocks",
             "channels" / Array(HALF, Struct("echo" / ECHO, "intensity" / Int8ub)),
         ),
     ),
@@ -154,7 +201,9 @@ def points(f: Fields) -> Polar:
     behind = azimuth - np.where(dual, previous(azimuth, 4), previous(azimuth, 2))
     vertical = np.where(low, signed(difop.vertical_low), signed(difop.vertical_high))
     horizontal = np.where(low, signed(difop.horizontal_low), signed(difop.horizontal_high))
-    delay = np.where(difop.install_mode == 1, SIDEWAYS, np.where(difop.install_mode == 2, AIRY_M, UPRIGHT))
+    delay = np.where(
+        difop.install_mode == 1, SIDEWAYS, np.where(difop.install_mode == 2, AIRY_M, UPRIGHT)
+    )
     polar = beams(
         f,
         f.blocks.channels,
@@ -191,20 +240,34 @@ def sweep_data(i: int) -> dict[str, Any]:
 def sweep_imu(i: int) -> dict[str, Any]:
     """Sample i of an IMU with the ranges as delivered."""
     codes = {"data_rate": 3, "acceleration_range": 1, "rotation_range": 1}
-    return {"seconds": i // IMU_RATE, "microseconds": i % IMU_RATE / IMU_RATE, "count": (i + 1) % (1 << 32), **codes}
+    return {
+        "seconds": i // IMU_RATE,
+        "microseconds": i % IMU_RATE / IMU_RATE,
+        "count": (i + 1) % (1 << 32),
+        **codes,
+    }
 
 
 LOW, HIGH = np.split(VERTICAL, 2)
 NONE = np.zeros(HALF)
-STATE = {**signs("vertical_low", LOW), **signs("vertical_high", HIGH), **signs("horizontal_low", NONE), **signs("horizontal_high", NONE)}
+STATE = {
+    **signs("vertical_low", LOW),
+    **signs("vertical_high", HIGH),
+    **signs("horizontal_low", NONE),
+    **signs("horizontal_high", NONE),
+}
 
 AIRY = Sensor(
     "robosense-airy",
     model="Airy",
     frames={
         "data": Frame(DATA, data=True, plausible=plausible),
-        "difop": Frame(DIFOP, simulation=Simulation(partial(sweep_difop, speed="measured_rpm"), rate=1)),
-        "imu": Frame(IMU, imu=imu, plausible=plausible_imu, simulation=Simulation(sweep_imu, rate=IMU_RATE)),
+        "difop": Frame(
+            DIFOP, simulation=Simulation(partial(sweep_difop, speed="measured_rpm"), rate=1)
+        ),
+        "imu": Frame(
+            IMU, imu=imu, plausible=plausible_imu, simulation=Simulation(sweep_imu, rate=IMU_RATE)
+        ),
     },
     points=points,
     sequence=Sequence("packet_count"),
@@ -213,6 +276,9 @@ AIRY = Sensor(
     range_limits=(0.1, 60.0),  # Table 1
     info={"serial": "difop.serial_number", "firmware": "difop.top_firmware"},
     aliases=("airy", "rs-airy"),
-    source="Airy user manual 1.3, chapter 4.4 and appendices C and D; rs_driver (decoder_RSAIRY.hpp); no packet was seen",
+    source=(
+        "Airy user manual 1.3, chapter 4.4 and appendices C and D; rs_driver (decoder_RSAIRY.hpp);"
+        " no packet was seen"
+    ),
     **{**COMMON, "links": {"data": Udp(6699, 7788, 6688)}, "turn": (TURNS, TURNS)},
 )

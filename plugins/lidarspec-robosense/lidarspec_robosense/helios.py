@@ -1,20 +1,25 @@
-"""RoboSense RS-Helios: rotating lidars of 16 and of 32 lasers over UDP; their own angles come with the device information (DIFOP).
+"""RoboSense RS-Helios: rotating lidars of 16 and of 32 lasers over UDP; their own angles come with
+the device information (DIFOP).
 
-Source: RS-Helios-16P user manual: 5.4.2 (return modes), 6.2 and Table 9 (MSOP), 6.3 and Table 11 (DIFOP), appendix B.3
-to B.13 (registers). From the vendor's rs_driver (decoder_RSHELIOS.hpp, decoder_RSHELIOS_16P.hpp): coordinates, optical centre,
-temperature, where the horizontal angles stand, the times of 32 lasers. From nebula's former decoder of the 16P: the times of its
-lasers, by which the azimuths of the point clouds that it published come out to their last digit.
+Source: RS-Helios-16P user manual: 5.4.2 (return modes), 6.2 and Table 9 (MSOP), 6.3 and Table 11
+(DIFOP), appendix B.3 to B.13 (registers). From the vendor's rs_driver (decoder_RSHELIOS.hpp,
+decoder_RSHELIOS_16P.hpp): coordinates, optical centre, temperature, where the horizontal angles
+stand, the times of 32 lasers. From nebula's former decoder of the 16P: the times of its lasers, by
+which the azimuths of the point clouds that it published come out to their last digit.
 
-Known errors and contradictions: the manual's worked distance, 320 steps of 0.25 cm, is printed as 8 m and is 0.8 m; its
-vertical angle 00 05 d6, printed as 14.95 degrees, is 14.94, and its horizontal one, 01 01 96, needs brackets (-4.06);
-appendix B.13 has nanoseconds in the second part of a time, Table 9 and the capture have microseconds; the manual of the
-Helios-1610 has the type at byte 31, rs_driver and the capture at 30. rs_driver gives the second firing of a 16P 27.68 us after the
-first one; the manual's azimuth in between (half the step) and about 100 us from block to block ask for 55.56 us. The times of 32
-lasers are rs_driver's, 1.73 us apart; nebula has the 16P's and other ones, up to 48 us.
+Known errors and contradictions: the manual's worked distance, 320 steps of 0.25 cm, is printed as 8
+m and is 0.8 m; its vertical angle 00 05 d6, printed as 14.95 degrees, is 14.94, and its horizontal
+one, 01 01 96, needs brackets (-4.06); appendix B.13 has nanoseconds in the second part of a time,
+Table 9 and the capture have microseconds; the manual of the Helios-1610 has the type at byte 31,
+rs_driver and the capture at 30. rs_driver gives the second firing of a 16P 27.68 us after the first
+one; the manual's azimuth in between (half the step) and about 100 us from block to block ask for
+55.56 us. The times of 32 lasers are rs_driver's, 1.73 us apart; nebula has the 16P's and other
+ones, up to 48 us.
 
-The published capture under the 16P's name says type 6, Helios-5515, and its DIFOP has 32 different angles, at single return: it is of
-a 5515. Read as 16P, as it was published, the second half of each block gets directions that its lasers did not have, and the times of
-a packet run twice as long as it took.
+The published capture under the 16P's name says type 6, Helios-5515, and its DIFOP has 32 different
+angles, at single return: it is of a 5515. Read as 16P, as it was published, the second half of each
+block gets directions that its lasers did not have, and the times of a packet run twice as long as
+it took.
 """
 
 from __future__ import annotations
@@ -52,7 +57,24 @@ DUAL, STRONGEST = 0, 4  # return modes (manual 5.4.2)
 PERIOD = 55.56e-6  # seconds from one firing of all lasers to the next (rs_driver, nebula)
 TYPE_5515, TYPE_1615 = 6, 7  # of the 16P too
 #: microseconds from the start of a firing to each laser of a 16P (nebula's decoder).
-TIMES_16P = (0, 3.15, 6.3, 9.45, 13.26, 17.08, 20.56, 23.71, 26.53, 27.77, 31.49, 32.73, 36.46, 38.94, 41.42, 43.91)
+TIMES_16P = (
+    0,
+    3.15,
+    6.3,
+    9.45,
+    13.26,
+    17.08,
+    20.56,
+    23.71,
+    26.53,
+    27.77,
+    31.49,
+    32.73,
+    36.46,
+    38.94,
+    41.42,
+    43.91,
+)
 #: degrees; those of a captured unit's DIFOP, in steps of a third of a degree.
 VERTICAL_5515 = (
     *(15, 13, 11, 9, 7, 5.5, 4, 2.67, 1.33, 0, -1.33, -2.67, -4, -5.33, -6.67, -8),
@@ -63,9 +85,15 @@ HELIOS_16P_ROTOR = Rotor(
     delay=np.array(TIMES_16P) * 1e-6,
     period=PERIOD,
     lens=0.03498,
-    vertical=15.0 - 2 * np.arange(16),  # assumed: the topmost laser first, 2 degrees apart over the model's 30 degrees
+    vertical=15.0
+    - 2
+    * np.arange(
+        16
+    ),  # assumed: the topmost laser first, 2 degrees apart over the model's 30 degrees
 )
-HELIOS_5515_ROTOR = Rotor(delay=np.arange(LASERS) * 1.73e-6, period=PERIOD, lens=0.03498, vertical=np.array(VERTICAL_5515))
+HELIOS_5515_ROTOR = Rotor(
+    delay=np.arange(LASERS) * 1.73e-6, period=PERIOD, lens=0.03498, vertical=np.array(VERTICAL_5515)
+)
 # assumed: the topmost laser first, 1 degree apart over the model's 31 degrees
 HELIOS_32_ROTOR = dataclasses.replace(HELIOS_5515_ROTOR, vertical=15.0 - np.arange(LASERS))
 
@@ -91,7 +119,8 @@ def packet(rows: Construct) -> Struct:
     )
 
 
-#: Table 11: what stands from byte 313 on; the 16P has angles of 16 lasers and reserved bytes where others have those of 17 to 32.
+#: Table 11: what stands from byte 313 on; the 16P has angles of 16 lasers and reserved bytes where
+#: others have those of 17 to 32.
 STATUS: tuple[Construct, ...] = (
     "operating_status" / Bytes(12) * "current, and voltages: in, 12 V, 5 V, 2.5 V, APD",
     "reserved_325" / Bytes(17),
@@ -107,9 +136,16 @@ DIFOP_START = (*DIFOP_HEAD, *DIFOP_VERSIONS, *DIFOP_UNIT, *DIFOP_TIME, *STATUS)
 DIFOP_END = ("reserved_660" / Bytes(586), DIFOP_TAIL)
 OTHERS = Bytes(48) * "of lasers 17 to 32 in other models"
 DIFOP_16 = Struct(
-    *DIFOP_START, "vertical" / angles(16), "reserved_516" / OTHERS, "horizontal" / angles(16), "reserved_612" / OTHERS, *DIFOP_END
+    *DIFOP_START,
+    "vertical" / angles(16),
+    "reserved_516" / OTHERS,
+    "horizontal" / angles(16),
+    "reserved_612" / OTHERS,
+    *DIFOP_END,
 )
-DIFOP_32 = Struct(*DIFOP_START, "vertical" / angles(LASERS), "horizontal" / angles(LASERS), *DIFOP_END)
+DIFOP_32 = Struct(
+    *DIFOP_START, "vertical" / angles(LASERS), "horizontal" / angles(LASERS), *DIFOP_END
+)
 
 
 def plausible(f: Fields) -> Any:
@@ -146,7 +182,9 @@ def in_pairs(f: Fields) -> Any:
 
 
 def two_returns(f: Fields) -> Any:
-    """Whether the halves of most blocks are the same: the two returns of 16 lasers, where most have one echo."""
+    """Whether the halves of most blocks are the same: the two returns of 16 lasers, where most have
+    one echo.
+    """
     distance = np.asarray(f.blocks.channels.distance)
     one, other = distance[..., :16], distance[..., 16:]
     return (one == other).sum(axis=(1, 2)) > ((one != other) | (one == 0)).sum(axis=(1, 2))
@@ -162,7 +200,9 @@ HELIOS_16P = Sensor(
     "robosense-helios16p",
     model="RS-Helios-16P",
     frames={
-        "data": Frame(packet(blocks(BLOCKS, 16, 0.0025, firings=2)), data=True, plausible=plausible),
+        "data": Frame(
+            packet(blocks(BLOCKS, 16, 0.0025, firings=2)), data=True, plausible=plausible
+        ),
         "difop": Frame(DIFOP_16, simulation=DIFOP_SIMULATION),
     },
     points=points_16p,
@@ -170,14 +210,24 @@ HELIOS_16P = Sensor(
     state=HELIOS_16P_ROTOR.state(return_mode=STRONGEST),
     simulation=Simulation(partial(sweep_data, shots=2, lidar_type=TYPE_1615)),
     range_limits=(0.1, 180.0),  # rs_driver's limits for this model
-    # firmware: the first of three boards in Table 11; the temperature has its sign in a field of its own
-    info={"serial": "difop.serial_number", "firmware": "difop.top_firmware", "model": "data.lidar_type"},
+    # firmware: the first of three boards in Table 11; the temperature has its sign in a field of
+    # its own
+    info={
+        "serial": "difop.serial_number",
+        "firmware": "difop.top_firmware",
+        "model": "data.lidar_type",
+    },
     relatives={
         "robosense-helios5515": MODEL_5515,
-        "robosense-helios32": Relative("pairs of blocks with one azimuth; or a packet each 0.67 ms", in_pairs),
+        "robosense-helios32": Relative(
+            "pairs of blocks with one azimuth; or a packet each 0.67 ms", in_pairs
+        ),
     },
     aliases=("helios16p", "rs-helios-16p"),
-    source="RS-Helios-16P user manual, 5.4, 6.2, 6.3 and appendix B; rs_driver; nebula's capture and point clouds",
+    source=(
+        "RS-Helios-16P user manual, 5.4, 6.2, 6.3 and appendix B; rs_driver; nebula's capture and"
+        " point clouds"
+    ),
     **{**COMMON, "turn": (TURNS, 20.0), "status": "capture"},  # 600 and 1200 rpm (manual B.1)
 )
 
@@ -191,11 +241,16 @@ HELIOS_32 = dataclasses.replace(
     simulation=Simulation(partial(sweep_data, shots=1, lidar_type=TYPE_1615)),
     relatives={
         "robosense-helios5515": MODEL_5515,
-        "robosense-helios16p": Relative("halves of blocks alike; or a packet each 1.33 ms", two_returns),
+        "robosense-helios16p": Relative(
+            "halves of blocks alike; or a packet each 1.33 ms", two_returns
+        ),
     },
     aliases=("helios32", "robosense-helios1615", "rs-helios-1615"),
     status="manual",
-    source="rs_driver (decoder_RSHELIOS.hpp); RS-Helios-16P user manual; no packet of this model was seen",
+    source=(
+        "rs_driver (decoder_RSHELIOS.hpp); RS-Helios-16P user manual; no packet of this model was"
+        " seen"
+    ),
 )
 
 HELIOS_5515 = dataclasses.replace(
@@ -208,5 +263,8 @@ HELIOS_5515 = dataclasses.replace(
     relatives={"robosense-helios16p": NOT_5515, "robosense-helios32": NOT_5515},
     aliases=("helios5515", "rs-helios-5515"),
     status="capture",
-    source="rs_driver (decoder_RSHELIOS.hpp); RS-Helios-16P user manual; nebula's capture, which is of this model",
+    source=(
+        "rs_driver (decoder_RSHELIOS.hpp); RS-Helios-16P user manual; nebula's capture, which is of"
+        " this model"
+    ),
 )

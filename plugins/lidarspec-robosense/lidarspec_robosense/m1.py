@@ -1,18 +1,22 @@
-"""RoboSense RS-LiDAR-M1 and M1 Plus: solid-state lidars of five channels over UDP; every point carries its own angles.
+"""RoboSense RS-LiDAR-M1 and M1 Plus: solid-state lidars of five channels over UDP; every point
+carries its own angles.
 
 Both send the same packets, and nothing in them tells the two apart.
 
-Source: RS-LiDAR-M1 user guide, 2.1.2 and Table 5 (the data blocks); RS-LiDAR-M1P user guide, pages 9 to 14 (header,
-tail, formulas, worked example), with which the vendor's rs_driver agrees.
+Source: RS-LiDAR-M1 user guide, 2.1.2 and Table 5 (the data blocks); RS-LiDAR-M1P user guide, pages
+9 to 14 (header, tail, formulas, worked example), with which the vendor's rs_driver agrees.
 
-Known errors and gaps of the guides: the time of a group of points is printed as "titime_offset", and is the packet's
-timestamp plus time_offset; the offset 32768 of the angles stands on the M1P's next page only; z of the worked example is
-printed as 2.17 and is 2.1647; the formula raw - 80 of mems_tmp gives -46 degC for the guide's own capture, so the raw
-byte is kept; 750 000 points per second do not agree with 630 packets in a frame (787 500).
+Known errors and gaps of the guides: the time of a group of points is printed as "titime_offset",
+and is the packet's timestamp plus time_offset; the offset 32768 of the angles stands on the M1P's
+next page only; z of the worked example is printed as 2.17 and is 2.1647; the formula raw - 80 of
+mems_tmp gives -46 degC for the guide's own capture, so the raw byte is kept; 750 000 points per
+second do not agree with 630 packets in a frame (787 500).
 
-DIFOP has three layouts from byte 28 on, and no number says which: that of rs_driver since December 2023 (`difop`), that of the driver
-before, with the field of view (`difop_fov`), and that of the M1P user guide (`difop_guide`). The one in which return mode, kind and state
-of the synchronisation and microseconds are what they can be is taken, in this order; where none is, what stands there is `difop_other`.
+DIFOP has three layouts from byte 28 on, and no number says which: that of rs_driver since December
+2023 (`difop`), that of the driver before, with the field of view (`difop_fov`), and that of the M1P
+user guide (`difop_guide`). The one in which return mode, kind and state of the synchronisation and
+microseconds are what they can be is taken, in this order; where none is, what stands there is
+`difop_other`.
 """
 
 from __future__ import annotations
@@ -21,13 +25,39 @@ import functools
 from typing import Any
 
 import numpy as np
-from construct import Array, Bytes, Check, Const, Construct, Int8ub, Int16ub, Int24ub, OneOf, Struct, this
+from construct import (
+    Array,
+    Bytes,
+    Check,
+    Const,
+    Construct,
+    Int8ub,
+    Int16ub,
+    Int24ub,
+    OneOf,
+    Struct,
+    this,
+)
 
-from lidarspec.spec import Clock, Fields, Frame, OnRewind, Polar, Scaled, Sensor, Sequence, Simulation, Udp
+from lidarspec.spec import (
+    Clock,
+    Fields,
+    Frame,
+    OnRewind,
+    Polar,
+    Scaled,
+    Sensor,
+    Sequence,
+    Simulation,
+    Udp,
+)
 from lidarspec_robosense.rotor import TIME
 
 BLOCKS, CHANNELS = 25, 5
-SINGLE, DUAL = 630, 1260  # packets of a frame (rs_driver; M1P user guide: the counter restarts with each frame)
+SINGLE, DUAL = (
+    630,
+    1260,
+)  # packets of a frame (rs_driver; M1P user guide: the counter restarts with each frame)
 FRAME_RATE = 10  # Hz (M1P user guide, page 6)
 FIRING = 10e-6 / 3  # seconds between blocks: 0, 3, 7, 10, 13, 17 us in the M1P guide's capture
 OFFSETS = np.round(np.arange(BLOCKS) * FIRING, 6)  # seconds, as the sensor rounds them
@@ -87,8 +117,16 @@ MODES: tuple[Construct, ...] = (
     *TIME,
     "in_range" / Check((this.microseconds < 1_000_000) & (this.seconds < 2**36)),
 )
-VIEW = tuple(f"{way}_{end}" / Scaled(Int16ub, 0.01, "deg") for way in ("horizontal", "vertical") for end in ("start", "end"))
-POWER = ("currents" / Array(2, Int24ub), "voltages" / Array(2, Int16ub), "reserved_power" / Bytes(50))
+VIEW = tuple(
+    f"{way}_{end}" / Scaled(Int16ub, 0.01, "deg")
+    for way in ("horizontal", "vertical")
+    for end in ("start", "end")
+)
+POWER = (
+    "currents" / Array(2, Int24ub),
+    "voltages" / Array(2, Int16ub),
+    "reserved_power" / Bytes(50),
+)
 CALIBRATION = "calibration" / Array(20, Struct("sign" / Int8ub, "value" / Int16ub))
 RECENT = ("serial_number" / Bytes(6), *MODES, *POWER, CALIBRATION)
 DIFOP = Struct(*DIFOP_HEAD, *FIRMWARE, *RECENT, "reserved_end" / Bytes(79))
@@ -132,10 +170,12 @@ def points(f: Fields) -> Polar:
 
 @functools.cache
 def looking(number: int) -> tuple[Any, Any]:
-    """Elevation and azimuth in degrees, (25, 5), in a packet of this number, counted from 0, of a frame with single return.
+    """Elevation and azimuth in degrees, (25, 5), in a packet of this number, counted from 0, of a
+    frame with single return.
 
     Lines from +12.5 to -12.5 degrees, to and fro over a fifth of 120 degrees.
-    Source: field of view, number of packets and where the channels look are the guide's; the lines are assumed.
+    Source: field of view, number of packets and where the channels look are the guide's; the lines
+    are assumed.
     """
     line, spot = np.divmod(number * BLOCKS + np.arange(BLOCKS), LINE)
     across = (spot + 0.5) / LINE - 0.5
@@ -166,7 +206,13 @@ def sweep(i: int) -> dict[str, Any]:
 def sweep_difop(i: int) -> dict[str, Any]:
     """The device information of a sensor with the factory's settings."""
     addresses = {"lidar_ip": bytes([192, 168, 1, 200]), "host_ip": bytes([192, 168, 1, 102])}
-    modes = {"return_mode": 4, "time_sync_mode": 0, "time_sync_status": 0, "seconds": i, "microseconds": 0}
+    modes = {
+        "return_mode": 4,
+        "time_sync_mode": 0,
+        "time_sync_status": 0,
+        "seconds": i,
+        "microseconds": 0,
+    }
     return {"frame_rate": FRAME_RATE, "msop_port": 6699, "difop_port": 7788, **addresses, **modes}
 
 
@@ -194,5 +240,7 @@ M1 = Sensor(
     info={"serial": "difop.serial_number", "firmware": "difop.pl_firmware"},
     aliases=("rs-m1", "rs-lidar-m1", "robosense-m1plus", "rs-m1p"),
     status="vectors",
-    source="RS-LiDAR-M1 user guide 2.1.2 (Table 5); RS-LiDAR-M1P user guide, pages 9 to 14; rs_driver",
+    source=(
+        "RS-LiDAR-M1 user guide 2.1.2 (Table 5); RS-LiDAR-M1P user guide, pages 9 to 14; rs_driver"
+    ),
 )

@@ -1,11 +1,13 @@
-"""What the rotating lidars have in common: clocks, temperatures, DIFOP in three layouts, and lasers beside the direction of a rotor.
+"""What the rotating lidars have in common: clocks, temperatures, DIFOP in three layouts, and lasers
+beside the direction of a rotor.
 
-DIFOP tells the speed as set, the return mode and the angles of each laser of the unit. Its first layout is that of RS-LiDAR-16, -32 and
-RS-Bpearl, the second that of Helios; the Ruby family has the head of the second and the tail of the first, for 128 lasers.
+DIFOP tells the speed as set, the return mode and the angles of each laser of the unit. Its first
+layout is that of RS-LiDAR-16, -32 and RS-Bpearl, the second that of Helios; the Ruby family has the
+head of the second and the tail of the first, for 128 lasers.
 
-Source: the vendor's rs_driver (decoder.hpp, decoder_mech.hpp, block_iterator.hpp: layouts, geometry, time, gaps); RS-Helios-16P user
-manual, Table 11 and appendix B (what its second layout holds). That a DIFOP packet comes once a second: Airy manual, Table 8; assumed of
-the others.
+Source: the vendor's rs_driver (decoder.hpp, decoder_mech.hpp, block_iterator.hpp: layouts,
+geometry, time, gaps); RS-Helios-16P user manual, Table 11 and appendix B (what its second layout
+holds). That a DIFOP packet comes once a second: Airy manual, Table 8; assumed of the others.
 
 Not expressed: with a field of view set, blocks after the gap are later than a packet's times say.
 """
@@ -36,9 +38,15 @@ from numpy.typing import NDArray
 
 from lidarspec.spec import Clock, Fields, OnWrap, Polar, Scaled, Udp, following, previous, wrap
 
-GAP = 1.0  # degrees; a longer step between blocks is the edge of the field of view that was set (rs_driver)
+# degrees; a longer step between blocks is the edge of the field of view that was set (rs_driver)
+GAP = 1.0
 TURNS = 10  # per second, the factory's setting
-CLOCKWISE = {"LS511": "the rotor turns clockwise, and the angle on the wire with it, in axes that are right-handed"}
+CLOCKWISE = {
+    "LS511": (
+        "the rotor turns clockwise, and the angle on the wire with it, in axes that are"
+        " right-handed"
+    )
+}
 
 BLOCK: Construct = Const(b"\xff\xee")  # what a block begins with
 #: of most models: the low byte first, its sign in a bit of its own.
@@ -62,14 +70,23 @@ TIME: tuple[Construct, ...] = (
 )
 
 
-def blocks(count: int, lasers: int, step: float, *, firings: int = 1, flag: Construct = BLOCK) -> Construct:
-    """So many blocks of one azimuth, of one firing or of two groups, with distances in steps of so many metres."""
+def blocks(
+    count: int, lasers: int, step: float, *, firings: int = 1, flag: Construct = BLOCK
+) -> Construct:
+    """So many blocks of one azimuth, of one firing or of two groups, with distances in steps of so
+    many metres.
+    """
     channel = Struct("distance" / Scaled(Int16ub, step, "m") * "0: no return", "intensity" / Int8ub)
     channels: Construct = "channels" / Array(lasers, channel)
     if firings > 1:
-        groups = Struct(channels) * "single return: two firings; dual return: the two returns of one firing"
+        groups = (
+            Struct(channels)
+            * "single return: two firings; dual return: the two returns of one firing"
+        )
         channels = "groups" / Array(firings, groups)
-    azimuth: Construct = Scaled(Int16ub, 0.01, "deg") * "of the rotor, clockwise, at the block's first laser"
+    azimuth: Construct = (
+        Scaled(Int16ub, 0.01, "deg") * "of the rotor, clockwise, at the block's first laser"
+    )
     return Array(count, Struct("flag" / flag, "azimuth" / azimuth, channels))
 
 
@@ -132,7 +149,9 @@ DIFOP_TAIL = "tail" / Const(b"\x0f\xf0")
 def difop_first(*end: Construct) -> Construct:
     """Device information of the first layout; what stands from byte 468 on."""
     time = ("software" / Int16ub, "time" / Bytes(10))
-    return Struct(*DIFOP_HEAD, "reserved_50" / Bytes(242), *DIFOP_UNIT, *time, *DIFOP_STATUS, *end, DIFOP_TAIL)
+    return Struct(
+        *DIFOP_HEAD, "reserved_50" / Bytes(242), *DIFOP_UNIT, *time, *DIFOP_STATUS, *end, DIFOP_TAIL
+    )
 
 
 @dataclass(frozen=True, eq=False)
@@ -140,7 +159,8 @@ class Rotor:
     """What tells the models apart.
 
     Attributes:
-        delay: (slots,) seconds from the block to the firing of each laser; (blocks, slots) where blocks hold different lasers.
+        delay: (slots,) seconds from the block to the firing of each laser; (blocks, slots) where
+            blocks hold different lasers.
         period: seconds from one firing of all lasers to the next.
         lens: metres from the axis to the optical centre, in the rotor's direction.
         height: metres of it above the origin.
@@ -172,7 +192,9 @@ def signs(name: str, values: NDArray[np.float64]) -> dict[str, Any]:
 
 
 def signed(entry: Any) -> Any:
-    """Degrees of each laser, on the lasers' axis; nan, so no point, where the sensor is not calibrated."""
+    """Degrees of each laser, on the lasers' axis; nan, so no point, where the sensor is not
+    calibrated.
+    """
     sign, value = entry.sign.on("channels"), entry.value.on("channels")
     return np.where(sign == 0, value, np.where(sign == 1, -value, np.nan))
 
@@ -183,7 +205,9 @@ def directions(f: Fields) -> tuple[Any, Any]:
 
 
 def pairs(f: Fields, dual: Any, model: Rotor, *, late: Any = 0) -> Polar:
-    """Points of blocks of all lasers; with dual return, pairs of blocks are one firing, the first of which began `late` blocks ago."""
+    """Points of blocks of all lasers; with dual return, pairs of blocks are one firing, the first
+    of which began `late` blocks ago.
+    """
     azimuth, block = f.blocks.azimuth, f.blocks.index
     ahead = np.where(dual, following(azimuth, 2), following(azimuth)) - azimuth
     behind = azimuth - np.where(dual, previous(azimuth, 2), previous(azimuth))
@@ -197,7 +221,11 @@ def halves(f: Fields, dual: Any, model: Rotor, lasers: tuple[Any, Any]) -> Polar
     azimuth, group = f.blocks.azimuth, np.arange(2)[:, None]
     duration = np.where(dual, 1, 2) * model.period
     elapsed = np.where(dual, 0, group) * model.period + model.delay
-    ahead, behind, echo = following(azimuth) - azimuth, azimuth - previous(azimuth), np.where(dual, group, 0)
+    ahead, behind, echo = (
+        following(azimuth) - azimuth,
+        azimuth - previous(azimuth),
+        np.where(dual, group, 0),
+    )
     channels, shot = f.blocks.groups.channels, f.blocks.index
     times = {"elapsed": elapsed, "duration": duration, "shot": shot}
     return beams(f, channels, model, lasers, ahead, behind, echo=echo, **times)
@@ -218,11 +246,13 @@ def beams(
     distance: Any = None,
     ring: Any = None,
 ) -> Polar:
-    """Lasers beside the rotor's direction, from an optical centre that turns with it (rs_driver, internDecodeMsopPkt).
+    """Lasers beside the rotor's direction, from an optical centre that turns with it (rs_driver,
+    internDecodeMsopPkt).
 
     Args:
         lasers: degrees above the horizon, and clockwise of the rotor's direction.
-        ahead, behind: degrees to the azimuth of the next shot and from that of the one before, not wrapped.
+        ahead, behind: degrees to the azimuth of the next shot and from that of the one before, not
+            wrapped.
         elapsed: seconds from the azimuth of a shot to each laser.
         duration: seconds from shot to shot.
         shot: which shot of the packet a block is of.
@@ -230,7 +260,10 @@ def beams(
         distance: metres, where `channels` have no field of that name.
         ring: numbers of the lasers, where not by their elevation.
     """
-    step, (vertical, horizontal) = rotor_step(ahead, behind, f.state.difop.rpm * 6 * duration), lasers
+    step, (vertical, horizontal) = (
+        rotor_step(ahead, behind, f.state.difop.rpm * 6 * duration),
+        lasers,
+    )
     rotor = np.deg2rad(f.blocks.azimuth + step * elapsed / duration)
     return Polar(
         range=channels.distance if distance is None else distance,
@@ -251,16 +284,27 @@ def rotor_step(ahead: Any, behind: Any, usual: Any) -> Any:
 
 
 def sweep(i: int, shots: int, period: float, **others: Any) -> dict[str, Any]:
-    """Packet i of so many shots a packet, in single return mode, with the time in seconds and microseconds."""
+    """Packet i of so many shots a packet, in single return mode, with the time in seconds and
+    microseconds.
+    """
     time = i * shots * period
     azimuth = np.round((i * shots + np.arange(shots)) * period * TURNS * 360, 2) % 360
     return {"seconds": int(time), "microseconds": time % 1, "blocks.azimuth": azimuth, **others}
 
 
 def sweep_difop(i: int, speed: str = "measured_speed", **others: Any) -> Mapping[str, Any]:
-    """The device information of a sensor with the factory's settings; the angles are the default ones."""
+    """The device information of a sensor with the factory's settings; the angles are the default
+    ones.
+    """
     addresses = {"lidar_ip": bytes([192, 168, 1, 200]), "host_ip": bytes([192, 168, 1, 102])}
-    return {speed: TURNS * 60, "msop_port": 6699, "difop_port": 7788, "fov_end": 360.0, **addresses, **others}
+    return {
+        speed: TURNS * 60,
+        "msop_port": 6699,
+        "difop_port": 7788,
+        "fov_end": 360.0,
+        **addresses,
+        **others,
+    }
 
 
 #: what the declarations of all of them have in common.

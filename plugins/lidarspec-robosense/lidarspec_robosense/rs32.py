@@ -1,11 +1,15 @@
-"""RoboSense RS-LiDAR-16, RS-LiDAR-32 and RS-Bpearl: rotating lidars of 16 and 32 lasers over UDP, with DIFOP of the first layout.
+"""RoboSense RS-LiDAR-16, RS-LiDAR-32 and RS-Bpearl: rotating lidars of 16 and 32 lasers over UDP,
+with DIFOP of the first layout.
 
-Source: the vendor's rs_driver (decoder_RS16.hpp, decoder_RS32.hpp, decoder_RSBP.hpp and their tests: layouts, firing times, optical centre,
-return modes, time); angles of an example unit of each, ros_rslidar. The date of a packet is taken for UTC: rs_driver takes it for the
-computer's own zone. A comment in the test of the RS-LiDAR-16 has its angles in steps of 0.001 degrees, its result in steps of 0.0001.
+Source: the vendor's rs_driver (decoder_RS16.hpp, decoder_RS32.hpp, decoder_RSBP.hpp and their
+tests: layouts, firing times, optical centre, return modes, time); angles of an example unit of
+each, ros_rslidar. The date of a packet is taken for UTC: rs_driver takes it for the computer's own
+zone. A comment in the test of the RS-LiDAR-16 has its angles in steps of 0.001 degrees, its result
+in steps of 0.0001.
 
-Assumed: that the type byte 30 is 2 from an RS-LiDAR-32 alone and 1 from an RS-LiDAR-16 alone, as rs_driver has it; and that the nominal
-angles of a Bpearl are those of version 4 too. What tells version 4, bytes 31 and 32, is rs_driver's.
+Assumed: that the type byte 30 is 2 from an RS-LiDAR-32 alone and 1 from an RS-LiDAR-16 alone, as
+rs_driver has it; and that the nominal angles of a Bpearl are those of version 4 too. What tells
+version 4, bytes 31 and 32, is rs_driver's.
 """
 
 from __future__ import annotations
@@ -53,9 +57,12 @@ RS32_HORIZONTAL = (
 )
 # fmt: on
 
-RS16_ROTOR = Rotor(delay=np.arange(16) * 2.8e-6, period=55.5e-6, lens=0.03825, vertical=np.array(RS16_VERTICAL))
+RS16_ROTOR = Rotor(
+    delay=np.arange(16) * 2.8e-6, period=55.5e-6, lens=0.03825, vertical=np.array(RS16_VERTICAL)
+)
 RS32_ROTOR = Rotor(
-    # 2.88 us apart in two rows, the second 1.44 us after the first; the last of each later (rs_driver)
+    # 2.88 us apart in two rows, the second 1.44 us after the first; the last of each later
+    # (rs_driver)
     delay=(SLOT % 16 * 2.88 + SLOT // 16 * 1.44 + np.where(SLOT % 16 == 15, 1.44, 0)) * 1e-6,
     period=55.52e-6,
     lens=0.03997,
@@ -63,7 +70,8 @@ RS32_ROTOR = Rotor(
     horizontal=np.array(RS32_HORIZONTAL),
 )
 BPEARL_ROTOR = Rotor(
-    # 2.56 us apart in two rows, the second 1.28 us after the first, each with a pause in its middle (rs_driver)
+    # 2.56 us apart in two rows, the second 1.28 us after the first, each with a pause in its middle
+    # (rs_driver)
     delay=(SLOT % 16 * 2.56 + SLOT // 16 * 1.28 + np.where(SLOT % 16 >= 8, 5.2, 0)) * 1e-6,
     period=55.52e-6,
     lens=0.01473,
@@ -111,12 +119,18 @@ def packet(time: tuple[Construct, ...], rows: Construct) -> Struct:
 
 def difop(step: float) -> Construct:
     """Device information with the angles of 32 lasers, in steps of so many degrees."""
-    return difop_first("vertical" / angles(LASERS, step), "horizontal" / angles(LASERS, step), "reserved_660" / Bytes(586))
+    return difop_first(
+        "vertical" / angles(LASERS, step),
+        "horizontal" / angles(LASERS, step),
+        "reserved_660" / Bytes(586),
+    )
 
 
 DIFOP_16 = difop_first(
     "reserved_468" / Bytes(697),
-    "pitch" / Array(16, Scaled(Int24ub, 0.0001, "deg")) * "size of the vertical angles, those of the first eight lasers below the horizon",
+    "pitch"
+    / Array(16, Scaled(Int24ub, 0.0001, "deg"))
+    * "size of the vertical angles, those of the first eight lasers below the horizon",
     "reserved_1213" / Bytes(33),
 )
 
@@ -129,12 +143,19 @@ def plausible(f: Fields, lidar_type: int) -> Any:
 def plausible_bpearl(f: Fields, v4: bool) -> Any:
     """Azimuths below 360 degrees, and the type of no other model with such packets."""
     newer = (f.series == V4[0]) & (f.version == V4[1])
-    return (f.blocks.azimuth < 360) & (newer if v4 else (f.lidar_type != RS16_TYPE) & (f.lidar_type != RS32_TYPE) & ~newer)
+    return (f.blocks.azimuth < 360) & (
+        newer if v4 else (f.lidar_type != RS16_TYPE) & (f.lidar_type != RS32_TYPE) & ~newer
+    )
 
 
 def clock(f: Fields) -> tuple[Any, Any, Any]:
-    """Whole seconds since 1970, milliseconds and microseconds; years begin in March, so that the leap day is the last."""
-    years, months = np.where(f.month <= 2, f.year + 1999, f.year + 2000), np.where(f.month <= 2, f.month + 9, f.month - 3)
+    """Whole seconds since 1970, milliseconds and microseconds; years begin in March, so that the
+    leap day is the last.
+    """
+    years, months = (
+        np.where(f.month <= 2, f.year + 1999, f.year + 2000),
+        np.where(f.month <= 2, f.month + 9, f.month - 3),
+    )
     leap_days = np.floor(years / 4) - np.floor(years / 100) + np.floor(years / 400)
     days = 365 * years + leap_days + np.floor((153 * months + 2) / 5) + f.day - 719_469
     return 86_400 * days + 3600 * f.hour + 60 * f.minute + f.second, f.milliseconds, f.microseconds
@@ -152,12 +173,26 @@ def points(f: Fields, model: Rotor) -> Polar:
 
 
 def sweep(i: int, shots: float, lidar_type: int) -> dict[str, Any]:
-    """Packet i of a sensor in single return mode, from the beginning of 2024 on; blocks take so many microseconds."""
+    """Packet i of a sensor in single return mode, from the beginning of 2024 on; blocks take so
+    many microseconds.
+    """
     values = turning(i, BLOCKS, shots * 1e-6, lidar_type=lidar_type)
     seconds, micros = divmod(round(i * BLOCKS * shots), 1_000_000)
-    date = {"year": 24, "month": 1, "day": 1, "hour": seconds // 3600 % 24, "minute": seconds // 60 % 60, "second": seconds % 60}
+    date = {
+        "year": 24,
+        "month": 1,
+        "day": 1,
+        "hour": seconds // 3600 % 24,
+        "minute": seconds // 60 % 60,
+        "second": seconds % 60,
+    }
     del values["seconds"]
-    return {**values, **date, "milliseconds": micros // 1000 * 1e-3, "microseconds": micros % 1000 * 1e-6}
+    return {
+        **values,
+        **date,
+        "milliseconds": micros // 1000 * 1e-3,
+        "microseconds": micros % 1000 * 1e-6,
+    }
 
 
 INFORMATION = Simulation(sweep_difop, rate=1)
@@ -166,14 +201,22 @@ RS32 = Sensor(
     "robosense-rs32",
     model="RS-LiDAR-32",
     frames={
-        "data": Frame(packet(DATE, blocks(BLOCKS, LASERS, 0.005)), data=True, plausible=partial(plausible, lidar_type=RS32_TYPE)),
+        "data": Frame(
+            packet(DATE, blocks(BLOCKS, LASERS, 0.005)),
+            data=True,
+            plausible=partial(plausible, lidar_type=RS32_TYPE),
+        ),
         "difop": Frame(difop(0.001), simulation=INFORMATION),
     },
     points=partial(points, model=RS32_ROTOR),
     state=RS32_ROTOR.state(return_mode=STRONGEST),
     simulation=Simulation(partial(sweep, shots=55.52, lidar_type=RS32_TYPE)),
     range_limits=(0.4, 230.0),  # rs_driver's limits for this model
-    info={"serial": "difop.serial_number", "firmware": "difop.top_firmware", "model": "data.lidar_type"},
+    info={
+        "serial": "difop.serial_number",
+        "firmware": "difop.top_firmware",
+        "model": "data.lidar_type",
+    },
     aliases=("rs32", "rs-lidar-32"),
     source="rs_driver (decoder_RS32.hpp); angles of an example unit in ros_rslidar",
     **{**COMMON, "clock": Clock(clock)},
@@ -184,11 +227,17 @@ RS16 = dataclasses.replace(
     id="robosense-rs16",
     model="RS-LiDAR-16",
     frames={
-        "data": Frame(packet(DATE, blocks(BLOCKS, 16, 0.005, firings=2)), data=True, plausible=partial(plausible, lidar_type=RS16_TYPE)),
+        "data": Frame(
+            packet(DATE, blocks(BLOCKS, 16, 0.005, firings=2)),
+            data=True,
+            plausible=partial(plausible, lidar_type=RS16_TYPE),
+        ),
         "difop": Frame(DIFOP_16, simulation=INFORMATION),
     },
     points=points_16,
-    state={"difop": {"rpm": TURNS * 60, "return_mode": STRONGEST, "pitch": np.abs(RS16_ROTOR.vertical)}},
+    state={
+        "difop": {"rpm": TURNS * 60, "return_mode": STRONGEST, "pitch": np.abs(RS16_ROTOR.vertical)}
+    },
     simulation=Simulation(partial(sweep, shots=111.0, lidar_type=RS16_TYPE)),
     aliases=("rs16", "rs-lidar-16"),
     source="rs_driver (decoder_RS16.hpp and its test); angles of an example unit in ros_rslidar",
@@ -199,7 +248,11 @@ BPEARL = dataclasses.replace(
     id="robosense-bpearl",
     model="RS-Bpearl",
     frames={
-        "data": Frame(packet(DATE, blocks(BLOCKS, LASERS, 0.005)), data=True, plausible=partial(plausible_bpearl, v4=False)),
+        "data": Frame(
+            packet(DATE, blocks(BLOCKS, LASERS, 0.005)),
+            data=True,
+            plausible=partial(plausible_bpearl, v4=False),
+        ),
         "difop": Frame(difop(0.01), simulation=INFORMATION),
     },
     points=partial(points, model=BPEARL_ROTOR),
@@ -216,12 +269,18 @@ BPEARL_V4 = dataclasses.replace(
     id="robosense-bpearl-v4",
     model="RS-Bpearl, version 4",
     frames={
-        "data": Frame(packet(TIME, blocks(BLOCKS, LASERS, 0.0025)), data=True, plausible=partial(plausible_bpearl, v4=True)),
+        "data": Frame(
+            packet(TIME, blocks(BLOCKS, LASERS, 0.0025)),
+            data=True,
+            plausible=partial(plausible_bpearl, v4=True),
+        ),
         "difop": BPEARL.frames["difop"],
     },
     points=partial(points, model=BPEARL_V4_ROTOR),
     clock=Clock(("seconds", "microseconds")),
     state=BPEARL_V4_ROTOR.state(return_mode=STRONGEST),
-    simulation=Simulation(lambda i: turning(i, BLOCKS, BPEARL_V4_ROTOR.period, series=V4[0], version=V4[1])),
+    simulation=Simulation(
+        lambda i: turning(i, BLOCKS, BPEARL_V4_ROTOR.period, series=V4[0], version=V4[1])
+    ),
     aliases=("bpearl-v4", "rs-bpearl-v4"),
 )

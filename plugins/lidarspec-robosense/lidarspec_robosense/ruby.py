@@ -1,18 +1,22 @@
-"""RoboSense RS-Ruby (RS-LiDAR-128, -80, -48) and RS-Ruby Plus (128, 80, 80V, 48): rotating lidars of 48 to 128 lasers over UDP.
+"""RoboSense RS-Ruby (RS-LiDAR-128, -80, -48) and RS-Ruby Plus (128, 80, 80V, 48): rotating lidars
+of 48 to 128 lasers over UDP.
 
-Both series send the same packets, of 3, 4 or 8 blocks of all lasers. Three blocks with dual return hold one shot and a half: A A B, then
-B C C.
+Both series send the same packets, of 3, 4 or 8 blocks of all lasers. Three blocks with dual return
+hold one shot and a half: A A B, then B C C.
 
-Source: RS-Ruby Plus user manual, Table 5-2 to 5-5 (header, return modes, blocks), RS-Ruby user manual, Table 4; the vendor's rs_driver
-(decoder_RS128.hpp, decoder_RS80.hpp, decoder_RS48.hpp and their RSP namesakes: firing times, optical centre, DIFOP).
+Source: RS-Ruby Plus user manual, Table 5-2 to 5-5 (header, return modes, blocks), RS-Ruby user
+manual, Table 4; the vendor's rs_driver (decoder_RS128.hpp, decoder_RS80.hpp, decoder_RS48.hpp and
+their RSP namesakes: firing times, optical centre, DIFOP).
 
-Contradictions: the manual has series and model at bytes 31 and 32, rs_driver at 30 and 31, so both are looked at; rs_driver takes the
-return mode from DIFOP, with codes that differ by model, the manuals have it in every packet, which is what stands here. The seconds of a
-time are followed by nanoseconds in early units. In dual return the manual has the last return first, then the strongest.
+Contradictions: the manual has series and model at bytes 31 and 32, rs_driver at 30 and 31, so both
+are looked at; rs_driver takes the return mode from DIFOP, with codes that differ by model, the
+manuals have it in every packet, which is what stands here. The seconds of a time are followed by
+nanoseconds in early units. In dual return the manual has the last return first, then the strongest.
 
-Assumed: nominal angles, even steps over the 40 degrees of the 128 and 80 lasers' data sheets, the lowest laser first, for no table was
-found: before the first DIFOP packet clouds say that they are nominal; and that no RS-Ruby has the number of the Ruby Plus, 5, as series.
-What the ranges of a model's own unit are, and where rs_driver has them alike for all, is rs_driver's.
+Assumed: nominal angles, even steps over the 40 degrees of the 128 and 80 lasers' data sheets, the
+lowest laser first, for no table was found: before the first DIFOP packet clouds say that they are
+nominal; and that no RS-Ruby has the number of the Ruby Plus, 5, as series. What the ranges of a
+model's own unit are, and where rs_driver has them alike for all, is rs_driver's.
 """
 
 from __future__ import annotations
@@ -59,13 +63,18 @@ def packet(lasers: int) -> Struct:
         "header" / Const(b"\x55\xaa\x05\x5a"),
         "protocol_version" / Int16ub,
         "reserved_6" / Bytes(1),
-        "wave_mode" / BitStruct("reserved" / BitsInteger(4), "returns" / BitsInteger(4) * "1 first, 2 second, 3 both"),
+        "wave_mode"
+        / BitStruct(
+            "reserved" / BitsInteger(4), "returns" / BitsInteger(4) * "1 first, 2 second, 3 both"
+        ),
         "temperature" / TEMPERATURE_BE,
         *TIME,
         "reserved_20" / Bytes(10),
         "type_30" / Int8ub * "series as rs_driver has it",
         "series" / Int8ub * "5 RS-Ruby Plus; as rs_driver has it, the model",
-        "model" / Int8ub * "1 RS-Ruby Plus, 2 RS-Ruby Plus 80, 3 RS-Ruby Plus 80V, 4 RS-Ruby Plus 48",
+        "model"
+        / Int8ub
+        * "1 RS-Ruby Plus, 2 RS-Ruby Plus 80, 3 RS-Ruby Plus 80V, 4 RS-Ruby Plus 48",
         "reserved_33" / Bytes(47),
         "blocks" / blocks(BLOCKS[lasers], lasers, 0.005, flag=flag),
         "reserved_end" / Bytes(AFTER[lasers]),
@@ -78,7 +87,9 @@ def difop(lasers: int) -> Struct:
     more = () if lasers == 128 else ("others_horizontal" / angles(128 - lasers),)
     start = (*DIFOP_HEAD, *DIFOP_VERSIONS, *DIFOP_UNIT, *DIFOP_TIME, *DIFOP_STATUS)
     ends = ("reserved_1236" / Bytes(10), DIFOP_TAIL)
-    return Struct(*start, "vertical" / angles(lasers), *others, "horizontal" / angles(lasers), *more, *ends)
+    return Struct(
+        *start, "vertical" / angles(lasers), *others, "horizontal" / angles(lasers), *more, *ends
+    )
 
 
 def plausible(f: Fields) -> Any:
@@ -92,7 +103,9 @@ def is_plus(f: Fields) -> Any:
 
 
 def points(f: Fields, model: Rotor, variant: NDArray[np.float64] | None = None) -> Polar:
-    """With dual return the first block may hold the second return of a shot; `variant`: the delays of an 80V."""
+    """With dual return the first block may hold the second return of a shot; `variant`: the delays
+    of an 80V.
+    """
     late = np.where(f.blocks[0].azimuth == f.blocks[1].azimuth, 0, 1)
     if variant is not None:
         named = np.where(f.series == PLUS, f.model, f.series) == MODEL_80V
@@ -106,13 +119,20 @@ def staged(times: Any, counts: Any) -> NDArray[np.float64]:
 
 
 def steps(*counts: int) -> NDArray[np.float64]:
-    """Seconds of lasers of which so many fire at each of 16 times, 3.236 us apart, in two rows (rs_driver)."""
+    """Seconds of lasers of which so many fire at each of 16 times, 3.236 us apart, in two rows
+    (rs_driver).
+    """
     return staged(np.tile(np.arange(16) * 3.236, 2), counts)
 
 
 def rotor(delay: NDArray[np.float64], period: float, lens: float) -> Rotor:
     """A model by its firing times, with nominal angles."""
-    return Rotor(delay=delay, period=period, lens=lens, vertical=np.round(np.linspace(-25, 15, len(delay)), 2))
+    return Rotor(
+        delay=delay,
+        period=period,
+        lens=lens,
+        vertical=np.round(np.linspace(-25, 15, len(delay)), 2),
+    )
 
 
 # fmt: off
@@ -137,11 +157,15 @@ FRAMES = {
 }
 
 
-def model(id: str, name: str, rotor: Rotor, aliases: tuple[str, ...], relative: str, variant: Any = None) -> Sensor:
+def model(
+    id: str, name: str, rotor: Rotor, aliases: tuple[str, ...], relative: str, variant: Any = None
+) -> Sensor:
     """A Ruby, or where its id says so a Ruby Plus; what the two series have in common."""
     lasers, plus = len(rotor.delay), "plus" in id
     own = {"series": PLUS, "model": MODELS[lasers]} if plus else {}
-    data = partial(sweep, shots=BLOCKS[lasers], period=rotor.period, **own, **{"wave_mode.returns": SINGLE})
+    data = partial(
+        sweep, shots=BLOCKS[lasers], period=rotor.period, **own, **{"wave_mode.returns": SINGLE}
+    )
     named = {"model": "data.model"} if plus else {}
     return Sensor(
         id,
@@ -152,7 +176,13 @@ def model(id: str, name: str, rotor: Rotor, aliases: tuple[str, ...], relative: 
         simulation=Simulation(data),
         range_limits=(0.4, 250.0),  # rs_driver's limits for these models
         info={"serial": "difop.serial_number", "firmware": "difop.top_firmware", **named},
-        relatives={relative: Relative("another series than 5", lambda f: ~is_plus(f)) if plus else Relative("series 5", is_plus)},
+        relatives={
+            relative: (
+                Relative("another series than 5", lambda f: ~is_plus(f))
+                if plus
+                else Relative("series 5", is_plus)
+            )
+        },
         aliases=aliases,
         source="RS-Ruby Plus and RS-Ruby user manuals; rs_driver; no packet of this model was seen",
         **COMMON,
@@ -167,7 +197,9 @@ PLUS_128_ROTOR = rotor(staged(TIMES_128, [4] * 15 + [5] + [4] * 15 + [2, 1]), 55
 PLUS_80_ROTOR = rotor(staged(TIMES, COUNTS_80), 55.56e-6, 0.02892)
 PLUS_48_ROTOR = rotor(staged(TIMES[:24], [2] * 24), 55.56e-6, 0.02892)
 
-RS128 = model("robosense-rs128", "RS-LiDAR-128", RS128_ROTOR, ("rs128", "rs-ruby"), "robosense-ruby-plus-128")
+RS128 = model(
+    "robosense-rs128", "RS-LiDAR-128", RS128_ROTOR, ("rs128", "rs-ruby"), "robosense-ruby-plus-128"
+)
 RS80 = model("robosense-rs80", "RS-LiDAR-80", RS80_ROTOR, ("rs80",), "robosense-ruby-plus-80")
 RS48 = model("robosense-rs48", "RS-LiDAR-48", RS48_ROTOR, ("rs48",), "robosense-ruby-plus-48")
 RUBY_PLUS_128 = model(
@@ -185,4 +217,10 @@ RUBY_PLUS_80 = model(
     "robosense-rs80",
     variant=staged(TIMES[:20], [4] * 20),
 )
-RUBY_PLUS_48 = model("robosense-ruby-plus-48", "RS-Ruby Plus 48", PLUS_48_ROTOR, ("ruby-plus-48", "rsp48"), "robosense-rs48")
+RUBY_PLUS_48 = model(
+    "robosense-ruby-plus-48",
+    "RS-Ruby Plus 48",
+    PLUS_48_ROTOR,
+    ("ruby-plus-48", "rsp48"),
+    "robosense-rs48",
+)

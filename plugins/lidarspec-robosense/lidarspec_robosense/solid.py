@@ -1,13 +1,15 @@
-"""RoboSense M2, MX and E1: solid-state lidars over UDP; every point carries its radius and a direction of length 1.
+"""RoboSense M2, MX and E1: solid-state lidars over UDP; every point carries its radius and a
+direction of length 1.
 
-Source: the vendor's rs_driver (decoder_RSM2.hpp, decoder_RSMX.hpp, decoder_RSE1.hpp: packets, their number in a frame,
-limits); E1 user manual, Tables 4 to 9 (packets, tail, DIFOP).
+Source: the vendor's rs_driver (decoder_RSM2.hpp, decoder_RSMX.hpp, decoder_RSE1.hpp: packets, their
+number in a frame, limits); E1 user manual, Tables 4 to 9 (packets, tail, DIFOP).
 
-Contradictions: the E1's manual counts packets from 0, and has dual return as modes 9 to 11, rs_driver as 0. Not checked: the CRCs at the
-end of packets, of which nobody says in public what they are over; that of the E1 is called AUTOSAR E2E profile 4. Assumed: that the other
-models count from 1, as the M1 does; frames with dual return of twice as many packets, but for the MX, whose points have two radii; and g
-and rad/s of the E1's IMU, since rs_driver hands its numbers on beside those of the Airy in these units, from bytes that the manual leaves
-reserved.
+Contradictions: the E1's manual counts packets from 0, and has dual return as modes 9 to 11,
+rs_driver as 0. Not checked: the CRCs at the end of packets, of which nobody says in public what
+they are over; that of the E1 is called AUTOSAR E2E profile 4. Assumed: that the other models count
+from 1, as the M1 does; frames with dual return of twice as many packets, but for the MX, whose
+points have two radii; and g and rad/s of the E1's IMU, since rs_driver hands its numbers on beside
+those of the Airy in these units, from bytes that the manual leaves reserved.
 """
 
 from __future__ import annotations
@@ -18,7 +20,18 @@ from functools import partial
 from typing import Any
 
 import numpy as np
-from construct import Array, Bytes, Const, Construct, Float32b, Int8ub, Int16sb, Int16ub, Int32ub, Struct
+from construct import (
+    Array,
+    Bytes,
+    Const,
+    Construct,
+    Float32b,
+    Int8ub,
+    Int16sb,
+    Int16ub,
+    Int32ub,
+    Struct,
+)
 
 from lidarspec.spec import Fields, Frame, Imu, Polar, Scaled, Sequence, Simulation, stack
 from lidarspec_robosense.m1 import FRAME_RATE, HEADER, M1
@@ -49,11 +62,22 @@ class Scanner:
     high: float
 
 
-def packet(model: Scanner, offset: Construct, parts: tuple[Construct, ...], channel: tuple[Construct, ...], *tail: Construct) -> Struct:
+def packet(
+    model: Scanner,
+    offset: Construct,
+    parts: tuple[Construct, ...],
+    channel: tuple[Construct, ...],
+    *tail: Construct,
+) -> Struct:
     """A packet whose blocks have an offset of time, these parts, and channels of these fields."""
     time = "time_offset" / Scaled(offset, 1e-6, "s") * "after the packet's time"
     return Struct(
-        *HEADER, "blocks" / Array(model.blocks, Struct(time, *parts, "channels" / Array(model.channels, Struct(*channel)))), *tail
+        *HEADER,
+        "blocks"
+        / Array(
+            model.blocks, Struct(time, *parts, "channels" / Array(model.channels, Struct(*channel)))
+        ),
+        *tail,
     )
 
 
@@ -82,7 +106,12 @@ E1_SCANNER = Scanner(96, 1, 288, 0, wide=120, high=90)
 
 M2_DATA = packet(M2_SCANNER, Int8ub, (RETURN,), ONE, "reserved_end" / Bytes(4), *SEALED)
 MX_DATA = packet(MX_SCANNER, Int8ub, (), TWO, "reserved_end" / Bytes(16), *SEALED)
-E1_TAIL = ("data_length" / Const(1200, Int16ub), "counter" / Int16ub, "data_id" / Const(0xE5C, Int32ub), "crc" / Int32ub)
+E1_TAIL = (
+    "data_length" / Const(1200, Int16ub),
+    "counter" / Int16ub,
+    "data_id" / Const(0xE5C, Int32ub),
+    "crc" / Int32ub,
+)
 E1_DATA = packet(E1_SCANNER, Int16ub, (), ONE, "reserved_end" / Bytes(4), *E1_TAIL)
 E1_DIFOP = Struct(
     "magic" / MAGIC,
@@ -102,7 +131,9 @@ E1_DIFOP = Struct(
     "difop_port" / Int16ub,
     "reserved_74" / Bytes(25),
     "frame_rate" / Scaled(Int8ub, 1, "Hz"),
-    "return_mode" / Int8ub * "0 farthest, 4 strongest, 7 nearest, 8 second strongest, 9 to 11 two of these",
+    "return_mode"
+    / Int8ub
+    * "0 farthest, 4 strongest, 7 nearest, 8 second strongest, 9 to 11 two of these",
     "time_sync_mode" / Int8ub * "0 internal, 2 E2E L2, 3 gPTP",
     "time_sync_status" / Int8ub * "0 failed, 1 success, 2 timeout",
     *TIME,
@@ -126,7 +157,9 @@ def packets(f: Fields, model: Scanner, dual: tuple[int, ...]) -> Any:
 
 
 def direction(f: Fields) -> dict[str, Any]:
-    """Azimuth, elevation, and what points of every model have besides; REP-103 axes, as on the wire."""
+    """Azimuth, elevation, and what points of every model have besides; REP-103 axes, as on the
+    wire.
+    """
     channels = f.blocks.channels
     across = np.hypot(channels.x, channels.y)
     return {
@@ -138,11 +171,17 @@ def direction(f: Fields) -> dict[str, Any]:
 
 
 def points(f: Fields, returns: bool = False) -> Polar:
-    """A point of each channel; the length of a direction, 1 but for its steps, is part of the range, as in rs_driver."""
+    """A point of each channel; the length of a direction, 1 but for its steps, is part of the
+    range, as in rs_driver.
+    """
     channels = f.blocks.channels
     length = np.sqrt(channels.x**2 + channels.y**2 + channels.z**2)
     echo = np.maximum(f.blocks.return_seq - 1, 0) if returns else None
-    own = {"intensity": channels.intensity, "return_index": echo, "extra": {"attribute": channels.attribute}}
+    own = {
+        "intensity": channels.intensity,
+        "return_index": echo,
+        "extra": {"attribute": channels.attribute},
+    }
     return Polar(range=channels.radius * length, **direction(f), **own)
 
 
@@ -161,13 +200,20 @@ def points_mx(f: Fields) -> Polar:
 
 def imu(f: Fields) -> Imu:
     """As rs_driver hands it on."""
-    return Imu((f.rotation_x, f.rotation_y, f.rotation_z), (f.acceleration_x, f.acceleration_y, f.acceleration_z))
+    return Imu(
+        (f.rotation_x, f.rotation_y, f.rotation_z),
+        (f.acceleration_x, f.acceleration_y, f.acceleration_z),
+    )
 
 
 def sweep(i: int, model: Scanner, mode: int = STRONGEST) -> dict[str, Any]:
-    """Packet i of frames of so many packets: lines to and fro, downwards; each channel an equal part of a line."""
+    """Packet i of frames of so many packets: lines to and fro, downwards; each channel an equal
+    part of a line.
+    """
     number, time = i % model.packets, i / (model.packets * FRAME_RATE)
-    spot = (number * model.blocks + np.arange(model.blocks))[:, None] / (model.packets * model.blocks)
+    spot = (number * model.blocks + np.arange(model.blocks))[:, None] / (
+        model.packets * model.blocks
+    )
     lines = 100
     line, along = np.divmod(spot * lines, 1)
     along = np.where(line % 2, 1 - along, along)
@@ -189,16 +235,35 @@ def sweep(i: int, model: Scanner, mode: int = STRONGEST) -> dict[str, Any]:
 def sweep_e1(i: int) -> dict[str, Any]:
     """The device information of a sensor at rest with the factory's settings."""
     ports = {"msop_port": 6699, "difop_port": 7788, "lidar_ip": bytes([192, 168, 1, 200])}
-    return {"frame_rate": FRAME_RATE, "return_mode": STRONGEST, "seconds": i, "microseconds": 0, **ports}
+    return {
+        "frame_rate": FRAME_RATE,
+        "return_mode": STRONGEST,
+        "seconds": i,
+        "microseconds": 0,
+        **ports,
+    }
 
 
-MX_DIFOP = Struct("magic" / MAGIC, "reserved_8" / Bytes(30), "serial_number" / Bytes(6), "reserved_44" / Bytes(212))
+MX_DIFOP = Struct(
+    "magic" / MAGIC,
+    "reserved_8" / Bytes(30),
+    "serial_number" / Bytes(6),
+    "reserved_44" / Bytes(212),
+)
 
 M2 = dataclasses.replace(
     M1,
     id="robosense-m2",
     model="M2",
-    frames={**M1.frames, "data": Frame(M2_DATA, data=True, plausible=partial(plausible, model=M2_SCANNER), acknowledged=UNCHECKED)},
+    frames={
+        **M1.frames,
+        "data": Frame(
+            M2_DATA,
+            data=True,
+            plausible=partial(plausible, model=M2_SCANNER),
+            acknowledged=UNCHECKED,
+        ),
+    },
     points=partial(points, returns=True),
     sequence=Sequence("pkt_psn", first=1, last=partial(packets, model=M2_SCANNER, dual=(DUAL,))),
     simulation=Simulation(partial(sweep, model=M2_SCANNER)),
@@ -214,12 +279,19 @@ MX = dataclasses.replace(
     id="robosense-mx",
     model="MX",
     frames={
-        "data": Frame(MX_DATA, data=True, plausible=partial(plausible, model=MX_SCANNER), acknowledged=UNCHECKED),
+        "data": Frame(
+            MX_DATA,
+            data=True,
+            plausible=partial(plausible, model=MX_SCANNER),
+            acknowledged=UNCHECKED,
+        ),
         "difop": Frame(MX_DIFOP, simulation=Simulation(lambda i: {}, rate=1)),
     },
     points=points_mx,
     sequence=Sequence("pkt_psn", first=1, last=partial(packets, model=MX_SCANNER, dual=())),
-    simulation=Simulation(partial(sweep, model=MX_SCANNER, mode=DUAL)),  # whose packets have a second radius that is used
+    simulation=Simulation(
+        partial(sweep, model=MX_SCANNER, mode=DUAL)
+    ),  # whose packets have a second radius that is used
     range_limits=(0.2, 200.0),
     info={"serial": "difop.serial_number"},
     aliases=("rs-mx",),
@@ -231,7 +303,12 @@ E1 = dataclasses.replace(
     id="robosense-e1",
     model="E1",
     frames={
-        "data": Frame(E1_DATA, data=True, plausible=partial(plausible, model=E1_SCANNER), acknowledged=UNCHECKED),
+        "data": Frame(
+            E1_DATA,
+            data=True,
+            plausible=partial(plausible, model=E1_SCANNER),
+            acknowledged=UNCHECKED,
+        ),
         "difop": Frame(E1_DIFOP, imu=imu, simulation=Simulation(sweep_e1, rate=1)),
     },
     points=points,
@@ -240,5 +317,8 @@ E1 = dataclasses.replace(
     range_limits=(0.1, 200.0),  # E1 user manual, Table 1; rs_driver's
     info={"serial": "difop.serial_number", "firmware": "difop.software"},
     aliases=("rs-e1",),
-    source="E1 user manual, Tables 4 to 9; rs_driver (decoder_RSE1.hpp); no packet of this model was seen",
+    source=(
+        "E1 user manual, Tables 4 to 9; rs_driver (decoder_RSE1.hpp); no packet of this model was"
+        " seen"
+    ),
 )

@@ -1,4 +1,6 @@
-"""RoboSense RS-Helios-16P: vectors, the manual's examples, points worked out by hand, calibration as state, a real capture."""
+"""RoboSense RS-Helios-16P: vectors, the manual's examples, points worked out by hand, calibration
+as state, a real capture.
+"""
 
 from __future__ import annotations
 
@@ -37,10 +39,28 @@ def patched(data: bytes, offset: int, new: bytes | str) -> bytes:
     return data[:offset] + new + data[offset + len(new) :]
 
 
-def msop(azimuths: Sequence[int], channels: Channels | None = None, *, count: int = 0, resolution: int = 1, time: float = 0.0) -> bytes:
-    """A packet by the offsets of the manual's Table 9: raw azimuths, {(block, slot): (raw distance, intensity)}."""
+def msop(
+    azimuths: Sequence[int],
+    channels: Channels | None = None,
+    *,
+    count: int = 0,
+    resolution: int = 1,
+    time: float = 0.0,
+) -> bytes:
+    """A packet by the offsets of the manual's Table 9: raw azimuths, {(block, slot): (raw distance,
+    intensity)}.
+    """
     seconds = divmod(int(time), 1 << 32)
-    header = struct.pack(">4sH6xIxB2xHIIB11x", b"\x55\xaa\x05\x5a", 1, count, resolution, *seconds, round(time % 1 * 1e6), 7)
+    header = struct.pack(
+        ">4sH6xIxB2xHIIB11x",
+        b"\x55\xaa\x05\x5a",
+        1,
+        count,
+        resolution,
+        *seconds,
+        round(time % 1 * 1e6),
+        7,
+    )
     body = bytearray()
     for block, azimuth in enumerate(azimuths):
         body += b"\xff\xee" + struct.pack(">H", azimuth)
@@ -78,7 +98,8 @@ def test_every_vector_of_the_model_is_used() -> None:
     known = {
         name
         for name, vector in vectors(FILE).items()
-        if name.startswith("rs_") and any(word in vector["sensor"] for word in ("Helios", "mechanical"))
+        if name.startswith("rs_")
+        and any(word in vector["sensor"] for word in ("Helios", "mechanical"))
     }
     assert known == TIMES | TEMPERATURES | ANGLES.keys() | OTHER_MODELS
 
@@ -103,24 +124,43 @@ def test_calibration_angles(name: str) -> None:
     info = patched(difop(), ANGLES[name], vector_bytes(FILE, name))
     cloud = decoded(SENSOR, [info, msop(steady(0, 40))]).points()
     plain = decoded(SENSOR, [difop(), msop(steady(0, 40))]).points()
-    turned = np.rad2deg(plain.azimuth - cloud.azimuth + cloud.elevation)  # one of the two is 0; clockwise counts positive
+    turned = np.rad2deg(
+        plain.azimuth - cloud.azimuth + cloud.elevation
+    )  # one of the two is 0; clockwise counts positive
     expected = np.array(vectors(FILE)[name]["expected"]["values"]) / 100
     np.testing.assert_allclose(turned[:4], expected, atol=1e-4)
     np.testing.assert_allclose(turned[16:20], expected, atol=1e-4)
 
 
 def test_points_by_hand() -> None:
-    """One in each quadrant; x = d cos V cos H + C cos R, y = -(d cos V sin H + C sin R), z = d sin V, H = R + calibration.
+    """One in each quadrant; x = d cos V cos H + C cos R, y = -(d cos V sin H + C sin R), z = d sin
+    V, H = R + calibration.
 
-    The first is the manual's: distance 0x0140 and azimuth 0x88db of Figure 14, angles of appendix B.9 and B.10.
+    The first is the manual's: distance 0x0140 and azimuth 0x88db of Figure 14, angles of appendix
+    B.9 and B.10.
     """
-    angles = {468: "0005d6", 564: "010196", 477: "00037a", 573: "000166", 513: "010321", 609: "000165", 504: "01018c", 600: "01018c"}
+    angles = {
+        468: "0005d6",
+        564: "010196",
+        477: "00037a",
+        573: "000166",
+        513: "010321",
+        609: "000165",
+        504: "01018c",
+        600: "01018c",
+    }
     info = difop(angles)
     data = [
         msop(steady(0x88DB, 40), {(0, 0): (0x0140, 1)}, count=0),  # R 350.35, H 346.29
-        msop(steady(10_000, 40), {(0, 19): (4000, 2)}, count=50),  # laser 4 of the second firing: R 100.2340, H 103.8140
-        msop(steady(20_010, 38), {(0, 31): (12_345, 3)}, count=100),  # laser 16 of the second firing: R 200.4402, H 204.0102
-        msop(steady(2000, 40), {(0, 12): (65_535, 255)}, count=150),  # laser 13: R 20.1312, H 16.1712
+        msop(
+            steady(10_000, 40), {(0, 19): (4000, 2)}, count=50
+        ),  # laser 4 of the second firing: R 100.2340, H 103.8140
+        msop(
+            steady(20_010, 38), {(0, 31): (12_345, 3)}, count=100
+        ),  # laser 16 of the second firing: R 200.4402, H 204.0102
+        msop(
+            steady(2000, 40), {(0, 12): (65_535, 255)}, count=150
+        ),  # laser 13: R 20.1312, H 16.1712
     ]
     cloud = decoded(SENSOR, [info, *data]).points()
     places = [at(12 * packet, slot) for packet, slot in enumerate((0, 19, 31, 12))]
@@ -151,32 +191,46 @@ def test_firing_times_of_single_return() -> None:
 
 
 def test_dual_return_has_one_firing_a_block() -> None:
-    """Laser 9 fires 26.53 us after the block's first, of 55.56 us until the next block: 0.2 * 26.53 / 55.56 degrees on."""
+    """Laser 9 fires 26.53 us after the block's first, of 55.56 us until the next block: 0.2 * 26.53
+    / 55.56 degrees on.
+    """
     channels = {(3, 8): (400, 5), (3, 24): (800, 6)}
     cloud = decoded(SENSOR, [difop(mode=0), msop(steady(9000, 20), channels)]).points()
     first, second = at(3, 8), at(3, 24)
     assert cloud.return_index is not None
     assert cloud.return_index[[first, second]].tolist() == [0, 1]
     assert cloud.time[[first, second]].tolist() == pytest.approx([3 * FIRING + 26.53e-6] * 2)
-    assert clockwise(cloud)[[first, second]].tolist() == pytest.approx([90.6 + 0.2 * 26.53 / 55.56] * 2, abs=1e-4)
+    assert clockwise(cloud)[[first, second]].tolist() == pytest.approx(
+        [90.6 + 0.2 * 26.53 / 55.56] * 2, abs=1e-4
+    )
     assert cloud.range[[first, second]].tolist() == pytest.approx([1.0, 2.0])
 
 
 def test_two_firings_share_the_step_to_the_following_block_also_over_a_packets_border() -> None:
-    cloud = decoded(SENSOR, [difop(), msop(steady(35_600, 40), count=7), msop(steady(80, 36), count=8)]).points()
+    cloud = decoded(
+        SENSOR, [difop(), msop(steady(35_600, 40), count=7), msop(steady(80, 36), count=8)]
+    ).points()
     turned = clockwise(cloud)
     assert turned[at(10, 16)] == pytest.approx(0.2, abs=1e-4)  # 0.00 to 0.40
-    assert turned[at(11, 16)] == pytest.approx(0.6, abs=1e-4)  # 0.40 to 0.80, which is in the next packet
+    assert turned[at(11, 16)] == pytest.approx(
+        0.6, abs=1e-4
+    )  # 0.40 to 0.80, which is in the next packet
     assert turned[at(12, 16)] == pytest.approx(0.98, abs=1e-4)  # 0.80 to 1.16
-    assert turned[at(23, 16)] == pytest.approx(0.8 + 11 * 0.36 + 0.18, abs=1e-4)  # nothing follows: the step before
+    assert turned[at(23, 16)] == pytest.approx(
+        0.8 + 11 * 0.36 + 0.18, abs=1e-4
+    )  # nothing follows: the step before
 
 
 def test_a_lost_packet_and_a_gap_in_the_field_of_view_keep_the_step_before() -> None:
     azimuths = [*steady(8000, 30)[:6], *steady(24_000, 30)[:6]]
-    cloud = decoded(SENSOR, [difop(), msop(azimuths, count=1), msop(steady(24_220, 10), count=3)]).points()
+    cloud = decoded(
+        SENSOR, [difop(), msop(azimuths, count=1), msop(steady(24_220, 10), count=3)]
+    ).points()
     turned = clockwise(cloud)
     assert turned[at(5, 16)] == pytest.approx(81.5 + 0.15, abs=1e-4)
-    assert turned[at(11, 16)] == pytest.approx(241.5 + 0.15, abs=1e-4)  # packet 2 is missing: 242.20 is not the next block
+    assert turned[at(11, 16)] == pytest.approx(
+        241.5 + 0.15, abs=1e-4
+    )  # packet 2 is missing: 242.20 is not the next block
     assert turned[at(12, 16)] == pytest.approx(242.2 + 0.05, abs=1e-4)
 
 
@@ -189,13 +243,18 @@ def test_without_any_neighbour_the_step_is_that_of_the_speed(rpm: int, step: flo
 
 def test_the_header_says_how_long_a_step_of_distance_is() -> None:
     channels = {(0, 0): (400, 1)}
-    fine, coarse = (decoded(SENSOR, [msop(steady(0, 40), channels, resolution=step)]).points() for step in (1, 0))
+    fine, coarse = (
+        decoded(SENSOR, [msop(steady(0, 40), channels, resolution=step)]).points()
+        for step in (1, 0)
+    )
     assert (fine.range[0], coarse.range[0]) == (1.0, 2.0)
 
 
 def test_lasers_without_calibration_have_no_points() -> None:
     channels = {(0, 0): (400, 1), (0, 1): (400, 1), (0, 2): (400, 1)}
-    cloud = decoded(SENSOR, [difop({468: "ffffff", 567: "ffffff"}), msop(steady(0, 40), channels)]).points()
+    cloud = decoded(
+        SENSOR, [difop({468: "ffffff", 567: "ffffff"}), msop(steady(0, 40), channels)]
+    ).points()
     assert cloud.valid[:3].tolist() == [False, False, True]
 
 
@@ -205,12 +264,22 @@ def test_packets_before_the_device_information_are_nominal() -> None:
     decoder = SENSOR.decoder()
     stream = PacketStream(SENSOR, "data", decoder.stats)
     parts = [data[:500], data[500:600], data[600:]]
-    before, across, after = (stream.add([spans for datagram in part for spans in decoder.frames(datagram)]).points() for part in parts)
+    before, across, after = (
+        stream.add([spans for datagram in part for spans in decoder.frames(datagram)]).points()
+        for part in parts
+    )
     nominal, known = 15 - 2 * np.arange(3), [14.94, 13.03, 10.92]
     assert [bool(cloud.nominal) for cloud in (before, across, after)] == [True, True, False]
     border = (DIFOP_AT - 500) * at(12, 0)
-    for cloud, first, expected in ((before, 0, nominal), (across, border - 32, nominal), (across, border, known), (after, 0, known)):
-        np.testing.assert_allclose(np.rad2deg(cloud.elevation[first : first + 3]), expected, atol=1e-4)
+    for cloud, first, expected in (
+        (before, 0, nominal),
+        (across, border - 32, nominal),
+        (across, border, known),
+        (after, 0, known),
+    ):
+        np.testing.assert_allclose(
+            np.rad2deg(cloud.elevation[first : first + 3]), expected, atol=1e-4
+        )
 
 
 def test_a_file_is_read_with_the_first_device_information_from_its_start() -> None:
@@ -220,7 +289,11 @@ def test_a_file_is_read_with_the_first_device_information_from_its_start() -> No
     assert not cloud.nominal
     assert packets.stats.frames == {"data": 750, "difop": 1}
     assert (packets.stats.bytes_skipped, packets.stats.lost, packets.stats.duplicates) == (0, 0, 0)
-    given = np.loadtxt(capture(f"{FOLDER}/RobosenseHelios16P.csv"), delimiter=",", converters=lambda text: float(text.strip()))
+    given = np.loadtxt(
+        capture(f"{FOLDER}/RobosenseHelios16P.csv"),
+        delimiter=",",
+        converters=lambda text: float(text.strip()),
+    )
     np.testing.assert_allclose(np.rad2deg(cloud.elevation[:16]), given[:, 0], atol=1e-4)
     with ls.open(capture(f"{FOLDER}/packets.derived.pcap"), SENSOR) as device:
         scans = list(device.scans())
@@ -236,7 +309,10 @@ def test_the_capture_is_the_same_on_both_paths_and_built_again() -> None:
     decoded(SENSOR, some)
     decoded(SENSOR, some, "difop")
     for datagram in some:
-        assert SENSOR.build("difop" if datagram[0] == 0xA5 else "data", SENSOR.parse(datagram)) == datagram
+        assert (
+            SENSOR.build("difop" if datagram[0] == 0xA5 else "data", SENSOR.parse(datagram))
+            == datagram
+        )
 
 
 def test_packets_taken_out_are_lost_and_late_ones_come_in_their_place() -> None:
@@ -252,7 +328,9 @@ def test_packets_taken_out_are_lost_and_late_ones_come_in_their_place() -> None:
 @pytest.mark.slow
 @pytest.mark.parametrize("number", range(4))
 def test_published_point_clouds(number: int) -> None:
-    """nebula's: its azimuths are cut off at 0.01 degrees, and the last block of each packet takes the step of the speed."""
+    """nebula's: its azimuths are cut off at 0.01 degrees, and the last block of each packet takes
+    the step of the speed.
+    """
     scan = list(SENSOR.scans(datagrams()))[number].points
     published = np.loadtxt(sorted(capture(FOLDER).glob("*.pcd"))[number], skiprows=11)
     distance, degrees = _nearest(scan, published)
@@ -264,12 +342,16 @@ def test_published_point_clouds(number: int) -> None:
 
 
 def _nearest(scan: ls.PointCloud, published: Any) -> tuple[Any, Any]:
-    """How far the nearest of our points of the same laser is from each published one, and its azimuth, clockwise."""
+    """How far the nearest of our points of the same laser is from each published one, and its
+    azimuth, clockwise.
+    """
     distance, degrees = np.empty(len(published)), np.empty(len(published))
     for laser in range(16):
         ours = scan[scan.valid & (scan.ring == laser)]
         theirs = np.flatnonzero(published[:, 5] == 15 - laser)
-        squares = ((published[theirs, None, :3] - ours.xyz[None].astype(np.float64)) ** 2).sum(axis=-1)
+        squares = ((published[theirs, None, :3] - ours.xyz[None].astype(np.float64)) ** 2).sum(
+            axis=-1
+        )
         best = squares.argmin(axis=1)
         distance[theirs] = np.sqrt(squares[np.arange(len(theirs)), best])
         degrees[theirs] = clockwise(ours)[best]
@@ -280,10 +362,15 @@ def _nearest(scan: ls.PointCloud, published: Any) -> tuple[Any, Any]:
 def test_a_packet_that_names_another_model_is_told_of(tmp_path: Path) -> None:
     """Lidar type 6 is a Helios-5515: what is read as a 16P all the same is told of."""
     path, frames = tmp_path / "other.bin", simulate(SENSOR, 100)
-    path.write_bytes(b"".join(SENSOR.build("data", {**SENSOR.parse(frame), "lidar_type": 6}) for frame in frames))
+    path.write_bytes(
+        b"".join(SENSOR.build("data", {**SENSOR.parse(frame), "lidar_type": 6}) for frame in frames)
+    )
     with ls.open(path, SENSOR) as device:
         assert list(device.scans())
-        told = "read as robosense-helios16p, and the frames are those of robosense-helios5515 (type 6, Helios-5515); next: lidarspec detect"
+        told = (
+            "read as robosense-helios16p, and the frames are those of robosense-helios5515 (type 6,"
+            " Helios-5515); next: lidarspec detect"
+        )
         assert [told in warning for warning in device.warnings] == [True, False]
     path.write_bytes(b"".join(frames))
     with ls.open(path, SENSOR) as device:

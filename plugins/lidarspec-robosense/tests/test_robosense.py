@@ -18,9 +18,16 @@ SENSOR = ls.sensor("robosense-m1")
 SIZE = 1210
 
 WHOLE = {"rsm1_msop_full_dual_1": "data", "rsm1_difop_rs_driver_fov": "difop_fov"}
-EXCERPTS = {"rsm1_msop_header_manual", "rsm1_msop_blocks0_4_manual", "rsm1_point_manual_example", "rsm1_radius_example"}
+EXCERPTS = {
+    "rsm1_msop_header_manual",
+    "rsm1_msop_blocks0_4_manual",
+    "rsm1_point_manual_example",
+    "rsm1_radius_example",
+}
 SPLITS = {"rsm1_split_unit_a", "rsm1_split_unit_b", "rsm1_split_loop"}
-OTHER_LAYOUTS = {"rs_time_utc_us"}  # a time with milliseconds and microseconds apart, of the mechanical models
+OTHER_LAYOUTS = {
+    "rs_time_utc_us"
+}  # a time with milliseconds and microseconds apart, of the mechanical models
 
 
 def beginning(data: bytes) -> bytes:
@@ -29,13 +36,19 @@ def beginning(data: bytes) -> bytes:
 
 
 def with_channel(data: bytes, block: int, channel: int, values: str) -> bytes:
-    """The packet with other bytes in one channel: 32 + 47 * block + 2 + 9 * channel, by the tables of the manual."""
+    """The packet with other bytes in one channel: 32 + 47 * block + 2 + 9 * channel, by the tables
+    of the manual.
+    """
     start, new = 32 + 47 * block + 2 + 9 * channel, bytes.fromhex(values)
     return data[:start] + new + data[start + len(new) :]
 
 
 def test_every_vector_of_the_model_is_used() -> None:
-    known = {name for name, vector in vectors(FILE).items() if name.startswith("rsm1_") or vector["sensor"].startswith("M1")}
+    known = {
+        name
+        for name, vector in vectors(FILE).items()
+        if name.startswith("rsm1_") or vector["sensor"].startswith("M1")
+    }
     assert known == WHOLE.keys() | EXCERPTS | SPLITS | OTHER_LAYOUTS
 
 
@@ -52,7 +65,15 @@ def test_a_whole_packet_is_parsed_and_built_to_the_same_bytes(name: str) -> None
 def test_the_header_of_the_manual() -> None:
     expected = vectors(FILE)["rsm1_msop_header_manual"]["expected"]
     parsed = SENSOR.parse(beginning(vector_bytes(FILE, "rsm1_msop_header_manual")))
-    for name in ("pkt_psn", "protocol_version", "wave_mode", "time_sync_mode", "seconds", "microseconds", "lidar_type"):
+    for name in (
+        "pkt_psn",
+        "protocol_version",
+        "wave_mode",
+        "time_sync_mode",
+        "seconds",
+        "microseconds",
+        "lidar_type",
+    ):
         assert parsed[name] == expected[name], name
     assert parsed.mems_tmp == expected["temp_raw"]
     packets = decoded(SENSOR, [SENSOR.build("data", parsed)])
@@ -65,15 +86,24 @@ def test_the_first_five_blocks_of_the_manuals_capture() -> None:
     expected = vectors(FILE)["rsm1_msop_blocks0_4_manual"]["expected"]
     packets = decoded(SENSOR, [data])
     cloud = packets.points()
-    names = {"radius_m": "radius", "elevation_deg": "elevation", "azimuth_deg": "azimuth", "intensity": "intensity"}
+    names = {
+        "radius_m": "radius",
+        "elevation_deg": "elevation",
+        "azimuth_deg": "azimuth",
+        "intensity": "intensity",
+    }
     for number, block in enumerate(expected["blocks"]):
         assert packets.raw["blocks"]["time_offset"][0, number] == block["time_offset_us"]
         for ring, point in enumerate(block.get("points", [])):
             for printed, path in names.items():
                 if printed in point:
-                    assert packets[f"blocks.channels.{path}"][0, number, ring] == pytest.approx(point[printed], abs=1e-9)
+                    assert packets[f"blocks.channels.{path}"][0, number, ring] == pytest.approx(
+                        point[printed], abs=1e-9
+                    )
             index = 5 * number + ring
-            assert not point or cloud.valid[index] == point.get("valid", point.get("radius_raw", 1) > 0 and point.get("radius_m", 1) > 0)
+            assert not point or cloud.valid[index] == point.get(
+                "valid", point.get("radius_raw", 1) > 0 and point.get("radius_m", 1) > 0
+            )
     assert int(cloud.valid.sum()) == expected["n_valid"]
     assert SENSOR.build("data", SENSOR.parse(data)) == data
 
@@ -85,13 +115,17 @@ def test_points_by_hand() -> None:
     cloud = decoded(SENSOR, [data]).points()
     # (raw - 32768) / 100 degrees, radius * 5 mm; x = r cosE cosA, y = r cosE sinA, z = r sinE.
     #   block 0, channel 1: 0a77 = 2679: 13.395 m; 83a2 = 33698: E 9.30; 94df = 38111: A 53.43
-    #     x = 13.395 * .986856 * .595805 = 7.87591, y = 13.395 * .986856 * .803131 = 10.61651, z = 13.395 * .161604 = 2.16468
+    #     x = 13.395 * .986856 * .595805 = 7.87591, y = 13.395 * .986856 * .803131 = 10.61651, z =
+    # 13.395 * .161604 = 2.16468
     #   block 0, channel 4: 071b = 1819: 9.095 m; 846c = 33900: E 11.32; 76e9 = 30441: A -23.27
-    #     x = 9.095 * .980546 * .918656 = 8.19261, y = -9.095 * .980546 * .395064 = -3.52321, z = 9.095 * .196289 = 1.78524
+    #     x = 9.095 * .980546 * .918656 = 8.19261, y = -9.095 * .980546 * .395064 = -3.52321, z =
+    # 9.095 * .196289 = 1.78524
     #   block 5, channel 2: 03e8 = 1000: 5 m; 7c18 = 31768: E -10; 8bb8 = 35768: A 30
-    #     x = 5 * .984808 * .866025 = 4.26434, y = 5 * .984808 * .5 = 2.46202, z = -5 * .173648 = -0.86824
+    #     x = 5 * .984808 * .866025 = 4.26434, y = 5 * .984808 * .5 = 2.46202, z = -5 * .173648 =
+    # -0.86824
     #   block 6, channel 4: 0fa0 = 4000: 20 m; 7f9c = 32668: E -1; 7448 = 29768: A -30
-    #     x = 20 * .999848 * .866025 = 17.31787, y = -20 * .999848 * .5 = -9.99848, z = -20 * .017452 = -0.34905
+    #     x = 20 * .999848 * .866025 = 17.31787, y = -20 * .999848 * .5 = -9.99848, z = -20 *
+    # .017452 = -0.34905
     expected = {0: (7.87591, 10.61651, 2.16468), 3: (8.19261, -3.52321, 1.78524)}
     expected |= {26: (4.26434, 2.46202, -0.86824), 33: (17.31787, -9.99848, -0.34905)}
     assert_points(cloud, expected.items(), atol=3e-5)
@@ -99,16 +133,22 @@ def test_points_by_hand() -> None:
     assert cloud.ring is not None
     assert cloud.intensity[[0, 26, 33]].tolist() == [0x2D, 0x11, 0x22]
     assert cloud.ring[[0, 3, 26, 33]].tolist() == [0, 3, 1, 3]
-    np.testing.assert_array_equal(SENSOR.configure(frame="vendor").decode([data]).points().xyz, cloud.xyz)
+    np.testing.assert_array_equal(
+        SENSOR.configure(frame="vendor").decode([data]).points().xyz, cloud.xyz
+    )
 
 
 @pytest.mark.parametrize("name", ["rsm1_point_manual_example", "rsm1_radius_example"])
 def test_a_point_of_the_manual(name: str) -> None:
     expected = vectors(FILE)[name]["expected"]
     header = vector_bytes(FILE, "rsm1_msop_header_manual")
-    packets = decoded(SENSOR, [with_channel(beginning(header), 0, 0, vector_bytes(FILE, name).hex())])
+    packets = decoded(
+        SENSOR, [with_channel(beginning(header), 0, 0, vector_bytes(FILE, name).hex())]
+    )
     for path in ("elevation", "azimuth"):
-        assert packets[f"blocks.channels.{path}"][0, 0, 0] == pytest.approx(expected[f"{path}_deg"], abs=1e-9)
+        assert packets[f"blocks.channels.{path}"][0, 0, 0] == pytest.approx(
+            expected[f"{path}_deg"], abs=1e-9
+        )
     cloud = packets.points()
     assert cloud.range[0] == pytest.approx(expected["radius_m"])
     assert_points(cloud, [(0, expected["xyz"])], atol=0.006)
@@ -116,7 +156,17 @@ def test_a_point_of_the_manual(name: str) -> None:
 
 
 def test_no_return_by_its_radius_not_by_its_angles() -> None:
-    packets = decoded(SENSOR, [with_channel(beginning(vector_bytes(FILE, "rsm1_msop_blocks0_4_manual")), 20, 0, "0064 0000 0000 07")])
+    packets = decoded(
+        SENSOR,
+        [
+            with_channel(
+                beginning(vector_bytes(FILE, "rsm1_msop_blocks0_4_manual")),
+                20,
+                0,
+                "0064 0000 0000 07",
+            )
+        ],
+    )
     cloud = packets.points()
     assert not cloud.valid[2]  # radius 0, angle words 0
     assert not cloud.valid[24]  # radius 0, real angles
@@ -128,7 +178,9 @@ def test_no_return_by_its_radius_not_by_its_angles() -> None:
 def test_points_have_the_times_of_their_blocks() -> None:
     cloud = decoded(SENSOR, [beginning(vector_bytes(FILE, "rsm1_msop_blocks0_4_manual"))]).points()
     assert cloud.stamp_ns == 77633816_804541_000
-    np.testing.assert_allclose(cloud.time[:25], np.repeat([0, 3e-6, 7e-6, 10e-6, 13e-6], 5), atol=1e-12)
+    np.testing.assert_allclose(
+        cloud.time[:25], np.repeat([0, 3e-6, 7e-6, 10e-6, 13e-6], 5), atol=1e-12
+    )
     assert cloud.shape == (25, 5)
 
 
@@ -143,7 +195,9 @@ def test_dual_return() -> None:
     assert cloud.return_index is not None
     assert len(cloud) == 250
     assert cloud.return_index.tolist() == [0] * 125 + [1] * 125
-    np.testing.assert_array_equal(cloud.xyz[:125], cloud.xyz[125:])  # two echoes at one distance are both kept
+    np.testing.assert_array_equal(
+        cloud.xyz[:125], cloud.xyz[125:]
+    )  # two echoes at one distance are both kept
     single = decoded(SENSOR, [beginning(vector_bytes(FILE, "rsm1_msop_header_manual"))]).points()
     assert single.return_index is not None
     assert single.return_index.tolist() == [0] * 125
@@ -159,7 +213,11 @@ def test_the_device_information() -> None:
     )
     assert ".".join(map(str, parsed.lidar_ip)) == expected["lidar_ip"]
     assert ".".join(map(str, parsed.host_ip)) == expected["host_ip"]
-    assert (parsed.return_mode, parsed.seconds, parsed.microseconds) == (4, expected["seconds"], expected["microseconds"])
+    assert (parsed.return_mode, parsed.seconds, parsed.microseconds) == (
+        4,
+        expected["seconds"],
+        expected["microseconds"],
+    )
     assert SENSOR.links["data"] == Udp(parsed.msop_port, parsed.difop_port)
 
 
@@ -167,7 +225,12 @@ def test_each_layout_of_the_device_information_is_told_from_the_others() -> None
     """By what can stand where the modes and the time are; what fits none of them keeps its bytes."""
     head = bytes.fromhex("a5ff005a11115555000a") + bytes(18)
     modes = bytes([5, 2, 1]) + (1_700_000_000).to_bytes(6, "big") + (999_999).to_bytes(4, "big")
-    for frame, start in (("difop", 44), ("difop_fov", 52), ("difop_guide", 54), ("difop_other", 60)):
+    for frame, start in (
+        ("difop", 44),
+        ("difop_fov", 52),
+        ("difop_guide", 54),
+        ("difop_other", 60),
+    ):
         data = bytearray(head + bytes([9]) * (256 - len(head)))
         data[start : start + len(modes)] = modes
         (found,) = SENSOR.split([bytes(data)])
@@ -185,11 +248,19 @@ def test_datagrams_of_another_size_are_none_of_ours(size: int) -> None:
 
 def test_errors_name_the_field() -> None:
     data = vector_bytes(FILE, "rsm1_msop_full_dual_1")
-    for wrong, path, offset in [(b"\x55\xaa\x5a\xa4" + data[4:], "magic", 0), (data[:706], "blocks[14].channels[1].azimuth", 705)]:
+    for wrong, path, offset in [
+        (b"\x55\xaa\x5a\xa4" + data[4:], "magic", 0),
+        (data[:706], "blocks[14].channels[1].azimuth", 705),
+    ]:
         with pytest.raises(ls.WireError) as caught:
             SENSOR.parse(wrong, "data")
         assert (caught.value.path, caught.value.offset) == (path, offset)
-    assert decoded(SENSOR, [SENSOR.build("data", {**SENSOR.parse(data), "pkt_psn": 0})]).stats.implausible == 1
+    assert (
+        decoded(
+            SENSOR, [SENSOR.build("data", {**SENSOR.parse(data), "pkt_psn": 0})]
+        ).stats.implausible
+        == 1
+    )
 
 
 def test_the_sweep_stays_in_the_field_of_view() -> None:
@@ -202,15 +273,29 @@ def test_the_sweep_stays_in_the_field_of_view() -> None:
             angles.append(values[f"blocks.channels.{name}"])
     azimuth, elevation = np.array(seen["azimuth"]), np.array(seen["elevation"])
     assert azimuth.shape == elevation.shape == (210, 25, 5)
-    assert (azimuth.min(), azimuth.max()) == (pytest.approx(-60, abs=0.2), pytest.approx(60, abs=0.2))
-    assert (elevation.min(), elevation.max()) == (pytest.approx(-12.5, abs=0.3), pytest.approx(12.5, abs=0.3))
-    np.testing.assert_allclose(np.ptp(azimuth, axis=(0, 1)), 24, atol=0.3)  # each channel a fifth of 120 degrees
+    assert (azimuth.min(), azimuth.max()) == (
+        pytest.approx(-60, abs=0.2),
+        pytest.approx(60, abs=0.2),
+    )
+    assert (elevation.min(), elevation.max()) == (
+        pytest.approx(-12.5, abs=0.3),
+        pytest.approx(12.5, abs=0.3),
+    )
+    np.testing.assert_allclose(
+        np.ptp(azimuth, axis=(0, 1)), 24, atol=0.3
+    )  # each channel a fifth of 120 degrees
     assert SENSOR.simulation.sweep(630)["pkt_psn"] == 1
-    assert SENSOR.simulation.sweep(6300 + 63)["seconds"] + SENSOR.simulation.sweep(6300 + 63)["microseconds"] == pytest.approx(1.01)
+    assert SENSOR.simulation.sweep(6300 + 63)["seconds"] + SENSOR.simulation.sweep(6300 + 63)[
+        "microseconds"
+    ] == pytest.approx(1.01)
 
 
 def test_decoding_follows_a_struct_with_renamed_and_reordered_fields() -> None:
-    shot = Struct("bearing" / Scaled(Int16ub, 0.01, "deg", offset=-327.68), "far" / Scaled(Int16ub, 0.005, "m"), "spare" / Bytes(2))
+    shot = Struct(
+        "bearing" / Scaled(Int16ub, 0.01, "deg", offset=-327.68),
+        "far" / Scaled(Int16ub, 0.005, "m"),
+        "spare" / Bytes(2),
+    )
     group = Struct("shots" / Array(5, shot), "delay" / Scaled(Int8ub, 1e-6, "s"))
     struct = Struct(
         "magic" / Const(b"\x55\xaa\x5a\xa5"),
@@ -231,11 +316,19 @@ def test_decoding_follows_a_struct_with_renamed_and_reordered_fields() -> None:
         scan=OnRewind("turn"),
         info={},
     )
-    groups = [{"delay": 0.00001 * g, "shots": [{"far": 1 + g, "bearing": 10 * k, "spare": b"xy"} for k in range(5)]} for g in range(3)]
+    groups = [
+        {
+            "delay": 0.00001 * g,
+            "shots": [{"far": 1 + g, "bearing": 10 * k, "spare": b"xy"} for k in range(5)],
+        }
+        for g in range(3)
+    ]
     data = other.build("data", units=True, groups=groups, micros=0.5, turn=7)
     assert other.build("data", other.parse(data)) == data
     cloud = decoded(other, [data]).points()
     np.testing.assert_allclose(cloud.range, np.repeat([1, 2, 3], 5))
-    np.testing.assert_allclose(np.rad2deg(cloud.azimuth), np.tile([0, 10, 20, 30, 40], 3), atol=1e-4)
+    np.testing.assert_allclose(
+        np.rad2deg(cloud.azimuth), np.tile([0, 10, 20, 30, 40], 3), atol=1e-4
+    )
     np.testing.assert_allclose(cloud.time, np.repeat([0, 1e-5, 2e-5], 5), atol=1e-12)
     assert cloud.stamp_ns == 500_000_000

@@ -17,23 +17,39 @@ from tests.evidence import decoded, vector_bytes, vectors
 
 FILE = "vectors_udp3d.json"
 SENSOR = ls.sensor("robosense-m1")
-TEMPLATE = SENSOR.build("data", SENSOR.parse(SENSOR.example("data", seed=1)), seconds=0, microseconds=0)
+TEMPLATE = SENSOR.build(
+    "data", SENSOR.parse(SENSOR.example("data", seed=1)), seconds=0, microseconds=0
+)
 
 
 def packet(number: int, frame: int = 0, *, last: int = 630) -> bytes:
     """Packet `number` of a frame of 0.1 s; the first channel's radius tells which one it is.
 
-    The places are those of the manual's tables: number at 4, mode at 8, microseconds at 16, first radius at 34.
+    The places are those of the manual's tables: number at 4, mode at 8, microseconds at 16, first
+    radius at 34.
     """
     microseconds = round((frame + (number - 1) / last) * 100_000)
-    mode, places = bytes([0 if last == 1260 else 4]), (number.to_bytes(2, "big"), microseconds.to_bytes(4, "big"))
-    data = TEMPLATE[:4] + places[0] + TEMPLATE[6:8] + mode + TEMPLATE[9:16] + places[1] + TEMPLATE[20:34]
+    mode, places = (
+        bytes([0 if last == 1260 else 4]),
+        (number.to_bytes(2, "big"), microseconds.to_bytes(4, "big")),
+    )
+    data = (
+        TEMPLATE[:4]
+        + places[0]
+        + TEMPLATE[6:8]
+        + mode
+        + TEMPLATE[9:16]
+        + places[1]
+        + TEMPLATE[20:34]
+    )
     return data + (1000 * frame + number).to_bytes(2, "big") + TEMPLATE[36:]
 
 
 def frames(count: int, *, last: int = 630) -> list[bytes]:
     """So many whole frames, packet by packet."""
-    return [packet(number, frame, last=last) for frame in range(count) for number in range(1, last + 1)]
+    return [
+        packet(number, frame, last=last) for frame in range(count) for number in range(1, last + 1)
+    ]
 
 
 def numbers(scan: ls.Scan) -> list[int]:
@@ -42,7 +58,9 @@ def numbers(scan: ls.Scan) -> list[int]:
 
 
 def same_scans(one: list[ls.Scan], other: list[ls.Scan]) -> None:
-    assert [(len(scan), scan.complete) for scan in one] == [(len(scan), scan.complete) for scan in other]
+    assert [(len(scan), scan.complete) for scan in one] == [
+        (len(scan), scan.complete) for scan in other
+    ]
     for scan, twin in zip(one, other, strict=True):
         assert_same_points(scan.points, twin.points)
 
@@ -59,7 +77,10 @@ def test_frames_are_cut_where_the_vendors_driver_cuts(name: str) -> None:
     frame = np.cumsum(expected["new_frame_before"]).tolist()
     arrived = [(turn, number) for turn, number in zip(frame, psn, strict=True)]
     scans = list(SENSOR.scans([packet(number, turn) for turn, number in arrived]))
-    wanted = [sorted({1000 * turn + number for turn, number in arrived if turn == one}) for one in sorted(set(frame))]
+    wanted = [
+        sorted({1000 * turn + number for turn, number in arrived if turn == one})
+        for one in sorted(set(frame))
+    ]
     assert [numbers(scan) for scan in scans] == wanted
 
 
@@ -69,7 +90,11 @@ def test_frames_of_single_and_dual_return(last: int) -> None:
     packets = decoded(SENSOR, frames(2, last=last)[last - 20 : last + 10])
     assert (packets.stats.lost, packets.stats.late, packets.stats.duplicates) == (0, 0, 0)
     scans = list(SENSOR.scans(frames(3, last=last)[last - 40 : -20]))
-    assert [(len(scan) // 125, scan.complete) for scan in scans] == [(40, False), (last, True), (last - 20, False)]
+    assert [(len(scan) // 125, scan.complete) for scan in scans] == [
+        (40, False),
+        (last, True),
+        (last - 20, False),
+    ]
     assert scans[1].rate_hz == pytest.approx(10, rel=1e-3)
     assert scans[1].points.shape == (25 * last, 5)
 
@@ -77,19 +102,30 @@ def test_frames_of_single_and_dual_return(last: int) -> None:
 def shuffled(data: list[bytes], seed: int) -> list[bytes]:
     """Some packets up to five places late."""
     source = random.Random(seed)
-    return [item for _, item in sorted((place + source.choice([0, 0, 0, 5.5]), item) for place, item in enumerate(data))]
+    return [
+        item
+        for _, item in sorted(
+            (place + source.choice([0, 0, 0, 5.5]), item) for place, item in enumerate(data)
+        )
+    ]
 
 
 def doubled(data: list[bytes], seed: int) -> list[bytes]:
     """Some packets twice, at once or a few places later."""
     source = random.Random(seed)
-    again = [(place + source.choice([0.5, 3.5]), item) for place, item in enumerate(data) if source.random() < 0.05]
+    again = [
+        (place + source.choice([0.5, 3.5]), item)
+        for place, item in enumerate(data)
+        if source.random() < 0.05
+    ]
     return [item for _, item in sorted([*enumerate(data), *again], key=lambda pair: pair[0])]
 
 
 @pytest.mark.parametrize("seed", range(3))
 @pytest.mark.parametrize("disturbed", [shuffled, doubled])
-def test_late_and_doubled_packets_give_the_same_scans(disturbed: Callable[[list[bytes], int], list[bytes]], seed: int) -> None:
+def test_late_and_doubled_packets_give_the_same_scans(
+    disturbed: Callable[[list[bytes], int], list[bytes]], seed: int
+) -> None:
     data = frames(3)
     changed = disturbed(data, seed)
     assert changed != data

@@ -1,11 +1,13 @@
-"""How late a scan is at a subscriber, and what the node takes of a processor, beside what it is made of.
+"""How late a scan is at a subscriber, and what the node takes of a processor, beside what it is
+made of.
 
     python plugins/lidarspec-ros2/benchmarks/latency.py [SENSOR] [SECONDS]
 
-Three runs with processes of their own, of as many seconds each. A sender, in real time, sends what a sensor would, and notes when the
-packet left that ends each scan; the node publishes, and a subscriber notes when its callback was called. `lidarspec stats` reads the same.
-Then a publisher alone publishes as large a message as often. Printed are the milliseconds from the last byte, and from publishing, to the
-callback, and the shares of a core.
+Three runs with processes of their own, of as many seconds each. A sender, in real time, sends what
+a sensor would, and notes when the packet left that ends each scan; the node publishes, and a
+subscriber notes when its callback was called. `lidarspec stats` reads the same. Then a publisher
+alone publishes as large a message as often. Printed are the milliseconds from the last byte, and
+from publishing, to the callback, and the shares of a core.
 """
 
 from __future__ import annotations
@@ -30,7 +32,8 @@ import lidarspec as ls
 from lidarspec.simulation.simulator import simulate
 
 os.environ |= {"ROS_AUTOMATIC_DISCOVERY_RANGE": "LOCALHOST"}
-#: seconds in which everything comes to run before anything is measured, and from which on packets are sent.
+#: seconds in which everything comes to run before anything is measured, and from which on packets
+#: are sent.
 WARMING, PORT = 5.0, 26699
 
 
@@ -72,7 +75,13 @@ def subscribe(kind: str, topic: str, seconds: float, notes: str) -> None:
 
     rclpy.init()
     node, came = rclpy.create_node("subscriber"), list[tuple[int, int]]()
-    node.create_subscription(getattr(msg, kind), topic, lambda data: came.append((time.time_ns(), len(data))), 10, raw=True)
+    node.create_subscription(
+        getattr(msg, kind),
+        topic,
+        lambda data: came.append((time.time_ns(), len(data))),
+        10,
+        raw=True,
+    )
     end = time.monotonic() + seconds
     while time.monotonic() < end:
         rclpy.spin_once(node, timeout_sec=0.1)
@@ -87,7 +96,11 @@ def publish(kind: str, size: int, rate: float, seconds: float, notes: str) -> No
 
     rclpy.init()
     node = rclpy.create_node("publisher")
-    publisher, left, data = node.create_publisher(getattr(msg, kind), "alone", 10), list[int](), bytes(size)
+    publisher, left, data = (
+        node.create_publisher(getattr(msg, kind), "alone", 10),
+        list[int](),
+        bytes(size),
+    )
     begin, number = time.monotonic(), 0
     while time.monotonic() < begin + seconds:
         number += 1
@@ -101,7 +114,9 @@ def publish(kind: str, size: int, rate: float, seconds: float, notes: str) -> No
 @contextlib.contextmanager
 def process(*words: object) -> Iterator[subprocess.Popen[bytes]]:
     """A program, which is ended at the end."""
-    begun = subprocess.Popen([sys.executable, *map(str, words)], stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
+    begun = subprocess.Popen(
+        [sys.executable, *map(str, words)], stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL
+    )
     try:
         yield begun
     finally:
@@ -127,7 +142,10 @@ def late(left: list[int], came: list[tuple[int, int]]) -> str:
     after = np.array([at for at, _ in came if at > times[0]])
     which = np.searchsorted(times, after, side="right") - 1
     found = (after - times[which]) * 1e-6
-    return f"median {np.median(found):6.2f} ms, 99 % {np.percentile(found, 99):6.2f} ms of {len(found)}"
+    return (
+        f"median {np.median(found):6.2f} ms, 99 % {np.percentile(found, 99):6.2f} ms of"
+        f" {len(found)}"
+    )
 
 
 def main(sensor: str = "ldrobot-stl27l", seconds: float = 20.0) -> None:
@@ -136,7 +154,11 @@ def main(sensor: str = "ldrobot-stl27l", seconds: float = 20.0) -> None:
     spec, lasting = ls.sensor(sensor), seconds + 2 * WARMING
     kind, topic = ("PointCloud2", "points") if spec.datagrams else ("LaserScan", "scan")
     with tempfile.TemporaryDirectory() as folder:
-        left, came, place = f"{folder}/left", f"{folder}/came", "" if spec.datagrams else f"{folder}/port"
+        left, came, place = (
+            f"{folder}/left",
+            f"{folder}/came",
+            "" if spec.datagrams else f"{folder}/port",
+        )
         source = f"udp://127.0.0.1:{PORT}" if spec.datagrams else place
         with (
             process(__file__, "send", sensor, lasting, place, left) as sender,
@@ -144,7 +166,9 @@ def main(sensor: str = "ldrobot-stl27l", seconds: float = 20.0) -> None:
         ):
             while place and not os.path.islink(place):
                 time.sleep(0.1)
-            with process("-m", "lidarspec", "ros2", source, "-s", sensor, "--ros-args", "-p", "qos:=reliable") as node:
+            with process(
+                "-m", "lidarspec", "ros2", source, "-s", sensor, "--ros-args", "-p", "qos:=reliable"
+            ) as node:
                 time.sleep(WARMING)
                 taken = share(node.pid, seconds)
                 sender.wait()
@@ -170,7 +194,10 @@ def main(sensor: str = "ldrobot-stl27l", seconds: float = 20.0) -> None:
             subscriber.wait()
         alone = late(json.loads(Path(left).read_text()), json.loads(Path(came).read_text()))
         print(f"  publishing alone:               {alone}; {publishing:.1%} of a core")
-        print(f"  lidarspec stats: {reading:.1%} of a core; the node takes {taken / (reading + publishing):.2f} times both")
+        print(
+            f"  lidarspec stats: {reading:.1%} of a core; the node takes"
+            f" {taken / (reading + publishing):.2f} times both"
+        )
 
 
 if __name__ == "__main__":

@@ -16,7 +16,11 @@ CONFIG = Path(__file__).resolve().parent.parent / "config" / "two_lidars.yaml"
 
 def generate_launch_description() -> LaunchDescription:
     """The file of parameters as an argument, and the nodes."""
-    config = DeclareLaunchArgument("config", default_value=str(CONFIG), description="The parameters of /front/lidar and /back/lidar.")
+    config = DeclareLaunchArgument(
+        "config",
+        default_value=str(CONFIG),
+        description="The parameters of /front/lidar and /back/lidar.",
+    )
     nodes = [
         Node(
             package="lidarspec_ros2",

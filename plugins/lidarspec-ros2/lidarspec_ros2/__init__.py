@@ -1,6 +1,8 @@
-"""A ROS 2 driver for every lidar that lidarspec knows: the verb `lidarspec ros2`, and the executable `lidarspec_node`.
+"""A ROS 2 driver for every lidar that lidarspec knows: the verb `lidarspec ros2`, and the
+executable `lidarspec_node`.
 
-A lifecycle node over a `Device`, as every verb has one. ROS is imported when the node starts, and not before. Modules in reading order:
+A lifecycle node over a `Device`, as every verb has one. ROS is imported when the node starts, and
+not before. Modules in reading order:
 
 * `command`: the verb and the executable; which ROS there is.
 * `parameters`: the one table of parameters, and the values of one configuration.

@@ -1,17 +1,23 @@
 """The time of a sensor's clock by the clock of the host, from when its packets arrived.
 
-The sensor says when it measured, by a clock that began anywhere, runs fast or slow by some millionths, and may start again. The host says
-when a packet arrived: by the right clock, but late, by milliseconds that differ from packet to packet, as the line and the operating system
-please. A packet is never early. So the differences, arrival less sensor's time, lie above a line, that of packets without delay, and
-many lie close to it: its height is the offset between the clocks, its slope the drift.
+The sensor says when it measured, by a clock that began anywhere, runs fast or slow by some
+millionths, and may start again. The host says when a packet arrived: by the right clock, but late,
+by milliseconds that differ from packet to packet, as the line and the operating system please. A
+packet is never early. So the differences, arrival less sensor's time, lie above a line, that of
+packets without delay, and many lie close to it: its height is the offset between the clocks, its
+slope the drift.
 
-Of the last half minute the least difference of each quarter of a second is kept, and the lower convex hull of these is taken. The line is
-under all of them and as near as can be, which is the edge of the hull at their middle. Two seconds to either side it may have turned round:
-then the points are not sure of a slope, and the one that was known before stands. What comes out follows the line smoothly. A clock that
-was set is one from which several packets in a row come too early, or, for a second, later than they differ among themselves.
+Of the last half minute the least difference of each quarter of a second is kept, and the lower
+convex hull of these is taken. The line is
+under all of them and as near as can be, which is the edge of the hull at their middle. Two seconds
+to either side it may have turned round: then the points are not sure of a slope, and the one that
+was known before stands. What comes out follows the line smoothly. A clock that was set is one from
+which several packets in a row come too early, or, for a second, later than they differ among
+themselves.
 
-Source: S. B. Moon, P. Skelly, D. Towsley, Estimation and removal of clock skew from network delay measurements, INFOCOM 1999 (the line);
-L. Zhang, Z. Liu, C. H. Xia, Clock synchronization algorithms for network measurements, INFOCOM 2002 (the hull).
+Source: S. B. Moon, P. Skelly, D. Towsley, Estimation and removal of clock skew from network delay
+measurements, INFOCOM 1999 (the line); L. Zhang, Z. Liu, C. H. Xia, Clock synchronization algorithms
+for network measurements, INFOCOM 2002 (the hull).
 """
 
 from __future__ import annotations
@@ -31,15 +37,20 @@ Times = NDArray[np.int64]
 
 #: ns of which the least difference is kept, and how many of them: half a minute.
 PART, PARTS = 250_000_000, 120
-#: parts that tell a slope, those to either side of the middle over which it may not turn round, and parts after which it is relied on.
+#: parts that tell a slope, those to either side of the middle over which it may not turn round, and
+#: parts after which it is relied on.
 SLOPED, SURE, SETTLED = 20, 8, 40
-#: the share by which a sensor's clock may be fast or slow: that of a microcontroller without a crystal.
+#: the share by which a sensor's clock may be fast or slow: that of a microcontroller without a
+#: crystal.
 FASTEST = 0.02
-#: ns in which what comes out follows the line, and the share of its own pace, 50,000 ppm, by which it does so at most.
+#: ns in which what comes out follows the line, and the share of its own pace, 50,000 ppm, by which
+#: it does so at most.
 FOLLOWS, SLEW = 1_000_000_000, 0.05
-#: ns by which a packet is off the line at most, below and above, where its clock was not set; and before the line holds.
+#: ns by which a packet is off the line at most, below and above, where its clock was not set; and
+#: before the line holds.
 EARLY, LATE, UNSETTLED = 5_000_000, 10_000_000, 1_000_000_000
-#: packets in a row that tell that the clock was set; where they are only late, how many, for how many ns.
+#: packets in a row that tell that the clock was set; where they are only late, how many, for how
+#: many ns.
 SURELY, PROBABLY, FOR = 3, 5, 1_000_000_000
 
 
@@ -66,8 +77,8 @@ class Stamps:
     """The stamps of one sensor's messages, in ROS's time.
 
     Args:
-        wall: the computer's clock, of a live sensor: arrival times go on evenly where it is set, and ROS's time does not. None where a
-            recording is played.
+        wall: the computer's clock, of a live sensor: arrival times go on evenly where it is set,
+            and ROS's time does not. None where a recording is played.
 
     Attributes:
         clock: the sensor's clock by the host's.
@@ -80,7 +91,8 @@ class Stamps:
         """Learn from packets how the sensor's clock goes, and look whether the computer's was set.
 
         Args:
-            device_ns, host_ns: as of `DeviceClock.observe`; a packet of whose arrival nobody knows has 0 and tells nothing.
+            device_ns, host_ns: as of `DeviceClock.observe`; a packet of whose arrival nobody knows
+                has 0 and tells nothing.
         """
         known = host_ns > 0
         self.clock.observe(device_ns[known], host_ns[known])
@@ -102,7 +114,9 @@ class Stamps:
         return self._wanted(time_ns, estimated, estimated, settings)
 
     def _wanted(self, own: int, estimated: int, arrival: int, settings: Settings) -> int:
-        """What the parameters want of the three: the sensor's time, what is made of it, and the arrival."""
+        """What the parameters want of the three: the sensor's time, what is made of it, and the
+        arrival.
+        """
         if settings["use_device_time"] and settings["device_time_is_ros_time"]:
             at = own
         else:
@@ -114,8 +128,8 @@ class Stamps:
 class DeviceClock:
     """Times of a sensor as those of the host.
 
-    A delay that never changes cannot be told from an offset: the time on the line, and what the sensor needs before it sends, stay in the
-    times that come out.
+    A delay that never changes cannot be told from an offset: the time on the line, and what the
+    sensor needs before it sends, stay in the times that come out.
 
     Attributes:
         jumps: how often the sensor's clock was set.
@@ -125,7 +139,11 @@ class DeviceClock:
     def __init__(self) -> None:
         self._stamp = -(1 << 62)
         self.jumps, self.jump = 0, ""
-        self._least, self._strays, self._since = deque[Sample](maxlen=PARTS), deque[Sample](maxlen=PROBABLY), 0
+        self._least, self._strays, self._since = (
+            deque[Sample](maxlen=PARTS),
+            deque[Sample](maxlen=PROBABLY),
+            0,
+        )
         self._line, self._known = Line(0, 0, 0.0), 0.0
         self._shown: Sample | None = None
 
@@ -143,7 +161,8 @@ class DeviceClock:
         """Learn from packets.
 
         Args:
-            device_ns, host_ns: when they were sent by the sensor's clock, and when they arrived, int64 ns, shape (n,) or a number each.
+            device_ns, host_ns: when they were sent by the sensor's clock, and when they arrived,
+                int64 ns, shape (n,) or a number each.
         """
         device = np.atleast_1d(np.asarray(device_ns, np.int64))
         delays = np.asarray(host_ns, np.int64) - device
@@ -153,7 +172,8 @@ class DeviceClock:
                 self._take(Sample(times.item(late.argmin()), late.item(late.argmin())))
 
     def stamp(self, device_ns: int, host_ns: int) -> int:
-        """The host's time of a time of the sensor, later than all that were given before; learns from it, too.
+        """The host's time of a time of the sensor, later than all that were given before; learns
+        from it, too.
 
         Args:
             device_ns: the time of the first point of the next scan.
@@ -161,7 +181,9 @@ class DeviceClock:
         """
         self.observe(device_ns, host_ns)
         went_back = self._shown is not None and device_ns <= self._shown.device
-        offset = host_ns - device_ns if went_back else min(self._slewed(device_ns), host_ns - device_ns)
+        offset = (
+            host_ns - device_ns if went_back else min(self._slewed(device_ns), host_ns - device_ns)
+        )
         self._shown = Sample(device_ns, offset)
         self._stamp = max(device_ns + offset, self._stamp + 1)
         return self._stamp
@@ -177,7 +199,10 @@ class DeviceClock:
 
     def _take(self, sample: Sample) -> None:
         """Learn from the least delayed of some packets."""
-        off, has_paused = self._off(sample), bool(self._least) and sum(sample) - sum(self._least[-1]) > PARTS * PART
+        off, has_paused = (
+            self._off(sample),
+            bool(self._least) and sum(sample) - sum(self._least[-1]) > PARTS * PART,
+        )
         if has_paused and abs(off) < UNSETTLED:  # over so long the drift is not known well enough
             self._begin()
         early, late = (EARLY, LATE) if len(self._least) >= SETTLED else (UNSETTLED, UNSETTLED)
@@ -202,20 +227,29 @@ class DeviceClock:
         return sample.delay - self._line.at(sample.device)
 
     def _was_set(self, lasting: int) -> bool:
-        """Whether the clock was set before the strays came, for so many ns, and they are not only late."""
+        """Whether the clock was set before the strays came, for so many ns, and they are not only
+        late.
+        """
         newest, strays = self._least[-1].device, list(self._strays)
         surely = [self._off(sample) < 0 or sample.device < newest for sample in strays[-SURELY:]]
         if len(surely) == SURELY and all(surely):
             return True
         delays = [sample.delay for sample in strays]
         spread = sum(delays) / len(delays) - min(delays)
-        return len(strays) == PROBABLY and lasting >= FOR and min(map(self._off, strays)) > 4 * spread
+        return (
+            len(strays) == PROBABLY and lasting >= FOR and min(map(self._off, strays)) > 4 * spread
+        )
 
     def _follow(self) -> None:
-        """Begin again with the newest strays, as the clock was set before they came; the drift stays."""
+        """Begin again with the newest strays, as the clock was set before they came; the drift
+        stays.
+        """
         strays = list(self._strays)[-SURELY:]
         self.jumps += 1
-        self.jump = f"the sensor's clock was set by {(self._line.delay - min(sample.delay for sample in strays)) / 1e9:+.3f} s"
+        self.jump = (
+            "the sensor's clock was set by"
+            f" {(self._line.delay - min(sample.delay for sample in strays)) / 1e9:+.3f} s"
+        )
         self._begin()
         for sample in strays:
             self._learn(sample)
@@ -225,7 +259,9 @@ class DeviceClock:
         slope = self._line.slope
         if self._least and sample.device // PART <= self._least[-1].device // PART:
             last = self._least[-1]
-            if sample.device < last.device or sample.delay - last.delay > slope * (sample.device - last.device):
+            if sample.device < last.device or sample.delay - last.delay > slope * (
+                sample.device - last.device
+            ):
                 return
             self._least.pop()
         self._least.append(sample)
@@ -237,7 +273,8 @@ class DeviceClock:
 
 
 def drawn(least: Sequence[Sample], known: float) -> Line:
-    """The line under some samples that is as near to them as can be, of a slope that they are sure of.
+    """The line under some samples that is as near to them as can be, of a slope that they are sure
+    of.
 
     Args:
         least: in order, one or more.
@@ -246,9 +283,15 @@ def drawn(least: Sequence[Sample], known: float) -> Line:
     hull, last = lower_hull(least), least[-1]
     slope, middle = known, (len(least) - 1) / 2
     if len(least) >= SLOPED:
-        slope = min(max(slope, slope_over(middle - SURE, least, hull)), slope_over(middle + SURE, least, hull))
+        slope = min(
+            max(slope, slope_over(middle - SURE, least, hull)),
+            slope_over(middle + SURE, least, hull),
+        )
         slope = min(max(slope, -FASTEST), FASTEST)
-    height = min(least[place].delay - last.delay - slope * (least[place].device - last.device) for place in hull)
+    height = min(
+        least[place].delay - last.delay - slope * (least[place].device - last.device)
+        for place in hull
+    )
     return Line(last.device, last.delay + round(height), slope)
 
 

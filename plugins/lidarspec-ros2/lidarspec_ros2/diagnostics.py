@@ -14,7 +14,9 @@ from lidarspec.view.feed import Reading
 LOST = ("disconnected", "silent")
 
 
-def status(name: str, device: Device, reading: Reading, said: Sequence[str], more: Mapping[str, str]) -> DiagnosticStatus:
+def status(
+    name: str, device: Device, reading: Reading, said: Sequence[str], more: Mapping[str, str]
+) -> DiagnosticStatus:
     """How a device is doing.
 
     Args:
@@ -25,8 +27,20 @@ def status(name: str, device: Device, reading: Reading, said: Sequence[str], mor
     """
     warnings = [*device.warnings, *said]
     figures = {f"{name} [{unit}]": text(reading) for name, unit, _, text in FIGURES}
-    values = {"state": device.state, **figures, **more, **device.info, **{f"warning {n + 1}": text for n, text in enumerate(warnings)}}
-    level = DiagnosticStatus.ERROR if device.state in LOST else DiagnosticStatus.WARN if warnings else DiagnosticStatus.OK
+    values = {
+        "state": device.state,
+        **figures,
+        **more,
+        **device.info,
+        **{f"warning {n + 1}": text for n, text in enumerate(warnings)},
+    }
+    level = (
+        DiagnosticStatus.ERROR
+        if device.state in LOST
+        else DiagnosticStatus.WARN
+        if warnings
+        else DiagnosticStatus.OK
+    )
     return DiagnosticStatus(
         level=level,
         name=f"{name}: {device.sensor.id}",

@@ -1,7 +1,9 @@
-"""The lifecycle node: a sensor opened on configuring, published while active, closed on cleaning up.
+"""The lifecycle node: a sensor opened on configuring, published while active, closed on cleaning
+up.
 
-One thread reads the device and publishes what comes. The executor's thread serves transitions, parameters and commands, and does what the
-reading thread asks for: to say once a second how the sensor is doing, and to be inactive while it is gone.
+One thread reads the device and publishes what comes. The executor's thread serves transitions,
+parameters and commands, and does what the reading thread asks for: to say once a second how the
+sensor is doing, and to be inactive while it is gone.
 """
 
 from __future__ import annotations
@@ -14,7 +16,12 @@ from functools import partial
 from typing import Any
 
 from diagnostic_msgs.msg import DiagnosticArray
-from rcl_interfaces.msg import FloatingPointRange, IntegerRange, ParameterDescriptor, SetParametersResult
+from rcl_interfaces.msg import (
+    FloatingPointRange,
+    IntegerRange,
+    ParameterDescriptor,
+    SetParametersResult,
+)
 from rclpy.exceptions import ParameterException
 from rclpy.lifecycle import LifecycleNode, LifecycleState, TransitionCallbackReturn
 from rclpy.parameter import Parameter as RosParameter
@@ -33,7 +40,8 @@ from lidarspec_ros2.topics import Topics
 
 #: seconds between two diagnostics.
 SECOND = 1.0
-#: seconds by which the end of a scan is looked for too early, and for which it is looked for; which what an IMU felt may wait.
+#: seconds by which the end of a scan is looked for too early, and for which it is looked for; which
+#: what an IMU felt may wait.
 EARLY, LATE, SOON = 0.003, 0.02, 0.01
 
 
@@ -45,7 +53,8 @@ class LidarNode(LifecycleNode):
         max_cloud_bytes: size of the largest cloud that arrives with best effort; None if unknown.
 
     Attributes:
-        failure: why the node could not be configured, or the sensor cannot be read any more; None where it can.
+        failure: why the node could not be configured, or the sensor cannot be read any more; None
+            where it can.
         ended: set when nothing more will come of it by itself.
         opening: whether it waits for a sensor to be found, and to answer.
 
@@ -54,7 +63,10 @@ class LidarNode(LifecycleNode):
     """
 
     def __init__(self, given: Mapping[str, Any], *, max_cloud_bytes: int | None = None) -> None:
-        super().__init__(NODE_NAME, parameter_overrides=[RosParameter(name, value=value) for name, value in given.items()])
+        super().__init__(
+            NODE_NAME,
+            parameter_overrides=[RosParameter(name, value=value) for name, value in given.items()],
+        )
         self._max_cloud_bytes = max_cloud_bytes
         self.failure: Exception | None = None
         self.ended, self.opening = threading.Event(), False
@@ -65,7 +77,10 @@ class LidarNode(LifecycleNode):
         self._services_of_sensor: list[Any] = []
         self._diagnostics = self.create_publisher(DiagnosticArray, "/diagnostics", 10)
         try:
-            values = {one.name: self.declare_parameter(one.name, one.default, _descriptor(one)).value for one in PARAMETERS}
+            values = {
+                one.name: self.declare_parameter(one.name, one.default, _descriptor(one)).value
+                for one in PARAMETERS
+            }
             self._settings = Settings(values)
         except (ParameterException, LidarSpecError) as error:
             self.destroy_node()
@@ -165,20 +180,26 @@ class LidarNode(LifecycleNode):
         self._warn_of_unknown_parameters()
         self._stopping.clear()
         self._was_lost = False
-        self._thread = threading.Thread(target=self._read, args=(device, self._topics), name="reading")
+        self._thread = threading.Thread(
+            target=self._read, args=(device, self._topics), name="reading"
+        )
         self._thread.start()
 
     def _read(self, device: Device, topics: Topics) -> None:
         """Publish what comes, until the node is stopped or the input ends."""
         speed = self._settings["replay_speed"]
-        feed = Feed(device, played=speed > 0, speed=speed, ahead=None)  # what is read tells of the sensor's clock before it is shown
+        feed = Feed(
+            device, played=speed > 0, speed=speed, ahead=None
+        )  # what is read tells of the sensor's clock before it is shown
         due, expected = time.monotonic(), 0.0
         try:
             while not self._stopping.is_set() and not feed.ended:
                 feed.pump(0.0 if device.is_live else time.monotonic() + LOOK)
                 self._publish(feed, topics)
                 expected = _expected(expected, feed)
-                device.gather(min(expected, time.monotonic() + SOON) if device.sensor.imu_frames else expected)
+                device.gather(
+                    min(expected, time.monotonic() + SOON) if device.sensor.imu_frames else expected
+                )
                 self._watch(device)
                 if (now := time.monotonic()) >= due:
                     due = now + SECOND
@@ -220,12 +241,22 @@ class LidarNode(LifecycleNode):
         """Say how the sensor is doing."""
         if device is not self._device:  # which is closed
             return
-        more = {"lifecycle": "active" if topics.active else "inactive", "latency [ms]": f"{topics.latency_s * 1e3:.1f}"}
+        more = {
+            "lifecycle": "active" if topics.active else "inactive",
+            "latency [ms]": f"{topics.latency_s * 1e3:.1f}",
+        }
         more |= {f"{topic} sent": str(number) for topic, number in topics.sent.items()}
         clock = topics.stamps.clock
-        more |= {"clock drift [ppm]": f"{clock.drift_ppm:+.1f}", "clock set": f"{clock.jumps} times"}
-        found = status(self.get_name(), device, reading, [*filter(None, (clock.jump, topics.fault))], more)
-        self._diagnostics.publish(DiagnosticArray(header=Header(stamp=self.get_clock().now().to_msg()), status=[found]))
+        more |= {
+            "clock drift [ppm]": f"{clock.drift_ppm:+.1f}",
+            "clock set": f"{clock.jumps} times",
+        }
+        found = status(
+            self.get_name(), device, reading, [*filter(None, (clock.jump, topics.fault))], more
+        )
+        self._diagnostics.publish(
+            DiagnosticArray(header=Header(stamp=self.get_clock().now().to_msg()), status=[found])
+        )
 
     def _soon(self, callback: Callable[[], Any]) -> None:
         """Have something done in the thread of the executor."""
@@ -252,8 +283,15 @@ class LidarNode(LifecycleNode):
         ours = {one.name: one.value for one in parameters if one.name in NAMED}
         try:
             for name, value in ours.items():
-                if self._device is not None and not NAMED[name].live and value != self._settings[name]:
-                    raise UsageError(f"{name} is read on configuring: clean the node up, set it, and configure it again")
+                if (
+                    self._device is not None
+                    and not NAMED[name].live
+                    and value != self._settings[name]
+                ):
+                    raise UsageError(
+                        f"{name} is read on configuring: clean the node up, set it, and configure"
+                        " it again"
+                    )
             self._settings = Settings({**self._settings.values, **ours})
         except UsageError as error:
             return SetParametersResult(successful=False, reason=str(error))
@@ -262,26 +300,48 @@ class LidarNode(LifecycleNode):
         return SetParametersResult(successful=True)
 
     def _warn_of_unknown_parameters(self) -> None:
-        """Say which parameters are given that no node of this sensor has, of which ROS itself says nothing."""
+        """Say which parameters are given that no node of this sensor has, of which ROS itself says
+        nothing.
+        """
         for name in self._parameter_overrides:  # which rclpy tells in no other way
             if not self.has_parameter(name) and not name.startswith("qos_overrides."):
                 close = did_you_mean(name, [one.name for one in PARAMETERS])
-                self.get_logger().warning(f"parameter {name!r} is left out, as there is none of that name{close}")
+                self.get_logger().warning(
+                    f"parameter {name!r} is left out, as there is none of that name{close}"
+                )
 
     def _serve_commands(self, device: Device) -> None:
-        """A service for each command of the sensor, beside the node's own, such as get_state, and a parameter for each of its arguments."""
+        """A service for each command of the sensor, beside the node's own, such as get_state, and a
+        parameter for each of its arguments.
+        """
         for name, command in device.sensor.commands.items():
             for argument in command.args:
                 if not self.has_parameter(f"{name}.{argument}"):
-                    text = f"An argument of the service {name}, in the unit of its field, or with a unit."
-                    self.declare_parameter(f"{name}.{argument}", None, ParameterDescriptor(description=text, dynamic_typing=True))
-            self._services_of_sensor.append(self.create_service(Trigger, f"~/send/{name}", partial(self._send, device, name)))
+                    text = (
+                        f"An argument of the service {name}, in the unit of its field, or with a"
+                        " unit."
+                    )
+                    self.declare_parameter(
+                        f"{name}.{argument}",
+                        None,
+                        ParameterDescriptor(description=text, dynamic_typing=True),
+                    )
+            self._services_of_sensor.append(
+                self.create_service(Trigger, f"~/send/{name}", partial(self._send, device, name))
+            )
 
-    def _send(self, device: Device, name: str, request: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
+    def _send(
+        self, device: Device, name: str, request: Trigger.Request, response: Trigger.Response
+    ) -> Trigger.Response:
         """Send a command, and answer with its reply, or why there is none."""
-        given = {argument: self.get_parameter(f"{name}.{argument}").value for argument in device.sensor.commands[name].args}
+        given = {
+            argument: self.get_parameter(f"{name}.{argument}").value
+            for argument in device.sensor.commands[name].args
+        }
         try:
-            words = [f"{argument}={value}" for argument, value in given.items() if value is not None]
+            words = [
+                f"{argument}={value}" for argument, value in given.items() if value is not None
+            ]
             reply = device.send(name, **arguments(device.sensor, name, words))
         except LidarSpecError as error:
             response.success, response.message = False, str(error)
@@ -291,7 +351,9 @@ class LidarNode(LifecycleNode):
 
 
 def _expected(before: float, feed: Feed) -> float:
-    """When the next scan may end, a time of `time.monotonic`, a little too early; one that is late is waited for less eagerly."""
+    """When the next scan may end, a time of `time.monotonic`, a little too early; one that is late
+    is waited for less eagerly.
+    """
     now = time.monotonic()
     for scan in feed.scans:
         if scan.whole and math.isfinite(scan.rate_hz):
@@ -304,7 +366,11 @@ def _descriptor(parameter: Parameter) -> ParameterDescriptor:
     if parameter.low is None or parameter.high is None:
         return described
     if isinstance(parameter.default, float):
-        described.floating_point_range = [FloatingPointRange(from_value=float(parameter.low), to_value=float(parameter.high))]
+        described.floating_point_range = [
+            FloatingPointRange(from_value=float(parameter.low), to_value=float(parameter.high))
+        ]
     else:
-        described.integer_range = [IntegerRange(from_value=int(parameter.low), to_value=int(parameter.high), step=1)]
+        described.integer_range = [
+            IntegerRange(from_value=int(parameter.low), to_value=int(parameter.high), step=1)
+        ]
     return described

@@ -1,6 +1,8 @@
-"""Packets over a topic: what arrives from a sensor is published, and what is published is a source, `ros2:/TOPIC`.
+"""Packets over a topic: what arrives from a sensor is published, and what is published is a source,
+`ros2:/TOPIC`.
 
-So a node decodes again what another one published, or `ros2 bag play` plays, with the times at which it arrived then.
+So a node decodes again what another one published, or `ros2 bag play` plays, with the times at
+which it arrived then.
 """
 
 from __future__ import annotations
@@ -61,11 +63,15 @@ class PacketTransport(LiveTransport):
         self.label, self.datagrams, self._chunks = label, datagrams, list[Chunk]()
         self._context = rclpy.Context()
         rclpy.init(context=self._context)
-        self._node = rclpy.create_node(f"lidarspec_source_{os.getpid()}_{next(_NUMBER)}", context=self._context)
+        self._node = rclpy.create_node(
+            f"lidarspec_source_{os.getpid()}_{next(_NUMBER)}", context=self._context
+        )
         self._executor = SingleThreadedExecutor(context=self._context)
         self._executor.add_node(self._node)
         qos = QoSProfile(depth=WAITING, reliability=ReliabilityPolicy.BEST_EFFORT)
-        self._node.create_subscription(UInt8MultiArray, topic, lambda message: self._chunks.append(raw_chunk(message)), qos)
+        self._node.create_subscription(
+            UInt8MultiArray, topic, lambda message: self._chunks.append(raw_chunk(message)), qos
+        )
 
     def read(self, timeout: float) -> list[Chunk]:
         """The packets that have come."""

@@ -80,7 +80,9 @@ class SharedMemory:
     warning: str = ""
 
 
-def choose_shared_memory(rmw: str, find_sensor: Callable[[], Sensor | None], *, is_serial: bool) -> SharedMemory:
+def choose_shared_memory(
+    rmw: str, find_sensor: Callable[[], Sensor | None], *, is_serial: bool
+) -> SharedMemory:
     """Return the shared memory for the clouds of a sensor.
 
     Args:
@@ -118,10 +120,10 @@ def _fit(cloud_bytes: int | None, free: int) -> SharedMemory:
             )
             return SharedMemory(segment_bytes, segment_bytes // MIN_CLOUDS, notice)
     warning = (
-        f"Fast DDS: default transports, which lose clouds of {size} with best effort, as {SHARED_MEMORY_DIR} has "
-        f"{format_megabytes(free)} free and {format_megabytes(FREE_SEGMENTS * segment_bytes)} are "
-        "needed; give a container more with docker run --shm-size=512m or --ipc=host, or publish "
-        "with qos:=reliable"
+        f"Fast DDS: default transports, which lose clouds of {size} with best effort, as"
+        f" {SHARED_MEMORY_DIR} has {format_megabytes(free)} free and"
+        f" {format_megabytes(FREE_SEGMENTS * segment_bytes)} are needed; give a container more with"
+        " docker run --shm-size=512m or --ipc=host, or publish with qos:=reliable"
     )
     return SharedMemory(warning=warning)
 

@@ -34,8 +34,9 @@ from lidarspec_ros2.clock import Stamps
 from lidarspec_ros2.parameters import Settings
 from lidarspec_ros2.shared_memory import format_megabytes
 
-#: of each kind of message its topic, its class, and how many are kept for those who are slow: of scans those of five seconds, as Fast DDS
-#: asks only every three for what was lost on the way, and a busy computer loses some of clouds of megabytes.
+#: of each kind of message its topic, its class, and how many are kept for those who are slow: of
+#: scans those of five seconds, as Fast DDS asks only every three for what was lost on the way, and
+#: a busy computer loses some of clouds of megabytes.
 KINDS = {
     CLOUD: ("points", PointCloud2, 50),
     SCAN: ("scan", LaserScan, 50),
@@ -52,7 +53,8 @@ class Topics:
     Args:
         node: whose they are.
         sensor: as it was opened.
-        played: whether it is a file that is played: then /clock says its time, where `use_sim_time` is set.
+        played: whether it is a file that is played: then /clock says its time, where `use_sim_time`
+            is set.
         max_cloud_bytes: size of the largest cloud that arrives with best effort; None if unknown.
 
     Attributes:
@@ -60,7 +62,8 @@ class Topics:
         sent: how many messages were published, by topic.
         active: whether what is published is let through.
         fault: why there is no planar scan that was asked for, "" where there is.
-        latency_s: seconds from the arrival of the packets that ended the last scan to its being published.
+        latency_s: seconds from the arrival of the packets that ended the last scan to its being
+            published.
 
     Raises:
         UsageError: for a transform that cannot be published here.
@@ -76,9 +79,17 @@ class Topics:
         max_cloud_bytes: int | None = None,
     ) -> None:
         self._max_cloud_bytes = max_cloud_bytes
-        self._node, self._sensor, self.stamps = node, sensor, Stamps(None if played else HostClock())
+        self._node, self._sensor, self.stamps = (
+            node,
+            sensor,
+            Stamps(None if played else HostClock()),
+        )
         self._messages = Messages("ROS2_HUMBLE")
-        self._reliability = ReliabilityPolicy.RELIABLE if settings["qos"] == "reliable" else ReliabilityPolicy.BEST_EFFORT
+        self._reliability = (
+            ReliabilityPolicy.RELIABLE
+            if settings["qos"] == "reliable"
+            else ReliabilityPolicy.BEST_EFFORT
+        )
         self._publishers: dict[str, Any] = {}
         self.sent, self._publishing = Counter[str](), threading.Lock()
         self._others = list[Any]()
@@ -93,11 +104,19 @@ class Topics:
             self._publisher(IMU)
         if settings["publish_tf"]:
             self._publish_transform(settings)
-        self._time = self._other(Clock, "/clock", 10) if played and node.get_parameter("use_sim_time").value else None
+        self._time = (
+            self._other(Clock, "/clock", 10)
+            if played and node.get_parameter("use_sim_time").value
+            else None
+        )
 
     def show(self, settings: Settings) -> None:
         """Publish by other parameters from now on."""
-        self._settings, self._planes, self._sieve = settings, settings.planes(), Sieve(settings.selection())
+        self._settings, self._planes, self._sieve = (
+            settings,
+            settings.planes(),
+            Sieve(settings.selection()),
+        )
 
     def learn(self, packets: Packets) -> None:
         """Learn the sensor's clock from packets."""
@@ -117,7 +136,11 @@ class Topics:
         except UsageError as error:  # a ring that the sensor lacks: it is set at run time
             planar, self.fault = None, str(error)
         if planar is not None and self._listened(SCAN):
-            self._send(self._messages.laserscan(wanted, settings.narrowed(planar), at + planar.stamp_ns - scan.stamp_ns))
+            self._send(
+                self._messages.laserscan(
+                    wanted, settings.narrowed(planar), at + planar.stamp_ns - scan.stamp_ns
+                )
+            )
         self.latency_s = (time.time_ns() - self._arrived) / 1e9
         if self._time is not None and self.active:
             self._time.publish(Clock(clock=Time(nanoseconds=at).to_msg()))
@@ -125,7 +148,9 @@ class Topics:
     def feel(self, felt: ImuSamples) -> None:
         """Publish what the IMU felt."""
         for index in range(len(felt)) if len(felt) and self._listened(IMU) else ():
-            at = self.stamps.at(int(felt.time_ns[index]), self._settings, by_clock=self._is_felt_by_clock)
+            at = self.stamps.at(
+                int(felt.time_ns[index]), self._settings, by_clock=self._is_felt_by_clock
+            )
             self._send(self._messages.imu(felt, index, at, self._settings["frame_id"]))
 
     def raw(self, chunk: Chunk) -> None:
@@ -158,7 +183,9 @@ class Topics:
         if kind not in self._publishers:
             topic, message, depth = KINDS[kind]
             qos = QoSProfile(depth=depth, reliability=self._reliability)
-            publisher = self._node.create_lifecycle_publisher(message, topic, qos, qos_overriding_options=_OVERRIDING)
+            publisher = self._node.create_lifecycle_publisher(
+                message, topic, qos, qos_overriding_options=_OVERRIDING
+            )
             with self._publishing:
                 self._publishers[kind] = publisher
                 if self.active:
@@ -175,11 +202,14 @@ class Topics:
             from tf2_msgs.msg import TFMessage
         except ImportError as error:
             raise UsageError(
-                f"publish_tf takes tf2_msgs, which this ROS has not ({error}); static_transform_publisher does it too"
+                f"publish_tf takes tf2_msgs, which this ROS has not ({error});"
+                " static_transform_publisher does it too"
             ) from None
         qos = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
         stamp = self._node.get_clock().now().to_msg()
-        self._other(TFMessage, "/tf_static", qos).publish(TFMessage(transforms=[transform(settings, stamp)]))
+        self._other(TFMessage, "/tf_static", qos).publish(
+            TFMessage(transforms=[transform(settings, stamp)])
+        )
 
     def _listened(self, kind: str) -> bool:
         return self.active and self._publisher(kind).get_subscription_count() > 0
@@ -188,7 +218,9 @@ class Topics:
         publisher, data = self._publisher(message.kind), bytes(message.data)
         if message.kind == CLOUD:
             self._warn_of_large_cloud(len(data))
-        with self._publishing:  # packets come from a thread of their own, transitions from another one
+        with (
+            self._publishing
+        ):  # packets come from a thread of their own, transitions from another one
             if self.active:
                 publisher.publish(data)
                 self.sent[KINDS[message.kind][0]] += 1
@@ -201,20 +233,29 @@ class Topics:
             return
         self._max_cloud_bytes = None
         self._node.get_logger().warning(
-            f"clouds of {format_megabytes(size)} may be lost, as shared memory was chosen for up to "
-            f"{format_megabytes(limit)}; name the sensor when the node starts, or set qos:=reliable"
+            f"clouds of {format_megabytes(size)} may be lost, as shared memory was chosen for up to"
+            f" {format_megabytes(limit)}; name the sensor when the node starts, or set"
+            " qos:=reliable"
         )
 
 
 def transform(settings: Settings, stamp: Any) -> TransformStamped:
     """The mount, from the frame of the carrier to that of the points."""
     mount = settings.mount() or Mount()
-    roll, pitch, yaw = (math.radians(angle) / 2 for angle in (mount.roll_deg + 180.0 * mount.inverted, mount.pitch_deg, mount.yaw_deg))
+    roll, pitch, yaw = (
+        math.radians(angle) / 2
+        for angle in (mount.roll_deg + 180.0 * mount.inverted, mount.pitch_deg, mount.yaw_deg)
+    )
     (sr, cr), (sp, cp), (sy, cy) = ((math.sin(half), math.cos(half)) for half in (roll, pitch, yaw))
     turned = Quaternion(
-        x=sr * cp * cy - cr * sp * sy, y=cr * sp * cy + sr * cp * sy, z=cr * cp * sy - sr * sp * cy, w=cr * cp * cy + sr * sp * sy
+        x=sr * cp * cy - cr * sp * sy,
+        y=cr * sp * cy + sr * cp * sy,
+        z=cr * cp * sy - sr * sp * cy,
+        w=cr * cp * cy + sr * sp * sy,
     )
     stamped = TransformStamped(child_frame_id=settings["frame_id"])
     stamped.header.stamp, stamped.header.frame_id = stamp, settings["parent_frame"]
-    stamped.transform = Transform(translation=Vector3(x=mount.x, y=mount.y, z=mount.z), rotation=turned)
+    stamped.transform = Transform(
+        translation=Vector3(x=mount.x, y=mount.y, z=mount.z), rotation=turned
+    )
     return stamped

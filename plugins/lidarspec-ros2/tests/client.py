@@ -41,7 +41,9 @@ class Client:
         take: Callable[[bytes], None] | None = None,
         qos: QoSProfile | None = None,
     ) -> list[bytes]:
-        """The messages of a topic, as bytes, as they come, or what takes them; with `qos` in place of `reliable`, if given."""
+        """The messages of a topic, as bytes, as they come, or what takes them; with `qos` in place
+        of `reliable`, if given.
+        """
         received = self.received[topic] = list[bytes]()
         if qos is None:
             reliability = ReliabilityPolicy.RELIABLE if reliable else ReliabilityPolicy.BEST_EFFORT
@@ -59,7 +61,10 @@ class Client:
     def reliable(self, topic: str) -> list[bool]:
         """Whether what is published on a topic is reliable, for each who does."""
         reliable = ReliabilityPolicy.RELIABLE
-        return [one.qos_profile.reliability == reliable for one in self._node.get_publishers_info_by_topic(topic)]
+        return [
+            one.qos_profile.reliability == reliable
+            for one in self._node.get_publishers_info_by_topic(topic)
+        ]
 
     def call(self, kind: Any, service: str, **fields: Any) -> Any:
         """The response of a service of the node."""
@@ -95,7 +100,9 @@ class Client:
 
     def described(self, *names: str) -> list[Any]:
         """The descriptors of parameters."""
-        return list(self.call(DescribeParameters, "describe_parameters", names=list(names)).descriptors)
+        return list(
+            self.call(DescribeParameters, "describe_parameters", names=list(names)).descriptors
+        )
 
     def trigger(self, name: str) -> Any:
         """The response of a command's service."""

@@ -57,7 +57,9 @@ class Run:
 
     @property
     def is_settled(self) -> NDArray[np.bool_]:
-        """Which scans came some time after the beginning, and after the clock was set or started again."""
+        """Which scans came some time after the beginning, and after the clock was set or started
+        again.
+        """
         return np.array(self.times % SET >= SETTLING)
 
 
@@ -84,7 +86,9 @@ def simulated(
     times = np.arange(0, END, 1 / (rate * each)) + random.uniform(0, 0.1)
     late = JITTERS[jitter](random, len(times))
     late += (random.uniform(size=len(times)) < stalls) * random.uniform(0, 0.1, len(times))
-    device = np.rint(times * (1 + drift_ppm * 1e-6) * 1e9).astype(np.int64) + (times >= SET) * round(step * 1e9)
+    device = np.rint(times * (1 + drift_ppm * 1e-6) * 1e9).astype(np.int64) + (
+        times >= SET
+    ) * round(step * 1e9)
     device -= (times >= AGAIN) * TURN * wraps
     host = BEGAN + np.rint(np.maximum.accumulate(times + late) * 1e9).astype(np.int64)
     clock, stamps, said = DeviceClock(), list[int](), dict[str, None]()
@@ -103,12 +107,18 @@ CASES = ((10, 1, 50), (10, 1, -1000), (5, 1, 50), (10, 40, 50))
 
 def main(runs: int) -> None:
     """Print the table: of each case the error that 99 of 100 stamps keep, and the worst."""
-    heads = [f"{rate} scans{f', {rate * each} packets' * (each > 1)} a second, {drift} ppm" for rate, each, drift in CASES]
+    heads = [
+        f"{rate} scans{f', {rate * each} packets' * (each > 1)} a second, {drift} ppm"
+        for rate, each, drift in CASES
+    ]
     print(f"| late by | {' | '.join(heads)} |\n|---|{'---:|' * len(CASES)}")
     for jitter in JITTERS:
         cells = []
         for rate, each, drift in CASES:
-            made = [simulated(seed, jitter, rate=rate, each=each, drift_ppm=drift) for seed in range(runs)]
+            made = [
+                simulated(seed, jitter, rate=rate, each=each, drift_ppm=drift)
+                for seed in range(runs)
+            ]
             errors = np.abs(np.concatenate([run.errors[run.is_settled] for run in made])) * 1e3
             cells.append(f"{np.quantile(errors, 0.99):.2f} ms, {errors.max():.2f} ms")
         print(f"| {jitter} | {' | '.join(cells)} |", flush=True)

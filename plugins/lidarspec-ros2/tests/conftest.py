@@ -1,4 +1,6 @@
-"""A node in a process of its own, and a client of it in that of the tests; they meet on the loopback, in a domain that nobody else has."""
+"""A node in a process of its own, and a client of it in that of the tests; they meet on the
+loopback, in a domain that nobody else has.
+"""
 
 from __future__ import annotations
 
@@ -12,7 +14,10 @@ from pathlib import Path
 
 import pytest
 
-os.environ |= {"ROS_AUTOMATIC_DISCOVERY_RANGE": "LOCALHOST", "ROS_DOMAIN_ID": str(random.randrange(50, 100))}
+os.environ |= {
+    "ROS_AUTOMATIC_DISCOVERY_RANGE": "LOCALHOST",
+    "ROS_DOMAIN_ID": str(random.randrange(50, 100)),
+}
 
 import rclpy
 from client import PATIENCE, Client
@@ -39,10 +44,19 @@ def run(tmp_path: Path) -> Iterator[Run]:
     """Starts a node, by the words of the verb, and of ROS; which is ended at the end."""
     begun: list[subprocess.Popen[str]] = []
 
-    def started(*words: str, ros: Sequence[str] = (), executable: str = "lidarspec") -> subprocess.Popen[str]:
+    def started(
+        *words: str, ros: Sequence[str] = (), executable: str = "lidarspec"
+    ) -> subprocess.Popen[str]:
         verb = ["ros2"] if executable == "lidarspec" else []
-        command = [str(Path(sys.executable).with_name(executable)), *verb, *words, *(["--ros-args", *ros] if ros else [])]
-        process = subprocess.Popen(command, cwd=tmp_path, text=True, stderr=subprocess.PIPE, stdout=subprocess.PIPE)
+        command = [
+            str(Path(sys.executable).with_name(executable)),
+            *verb,
+            *words,
+            *(["--ros-args", *ros] if ros else []),
+        ]
+        process = subprocess.Popen(
+            command, cwd=tmp_path, text=True, stderr=subprocess.PIPE, stdout=subprocess.PIPE
+        )
         begun.append(process)
         return process
 

@@ -20,15 +20,22 @@ LATE_ONLY = [name for name in JITTERS if "±" not in name]
 
 
 @pytest.mark.parametrize("jitter", LATE_ONLY)
-@pytest.mark.parametrize(("drift_ppm", "step"), [(50, 1.5), (-50, -1.5), (50, 3600), (-1000, -3600), (10_000, 0.02), (-10_000, 0.2)])
-def test_stamps_are_within_a_millisecond_and_a_clock_that_is_set_is_reported(jitter: str, drift_ppm: float, step: float) -> None:
+@pytest.mark.parametrize(
+    ("drift_ppm", "step"),
+    [(50, 1.5), (-50, -1.5), (50, 3600), (-1000, -3600), (10_000, 0.02), (-10_000, 0.2)],
+)
+def test_stamps_are_within_a_millisecond_and_a_clock_that_is_set_is_reported(
+    jitter: str, drift_ppm: float, step: float
+) -> None:
     for seed in range(3):
         run = simulated(seed, jitter, drift_ppm=drift_ppm, step=step)
         assert np.abs(run.errors[run.is_settled]).max() < 1e-3
         assert (np.diff(run.stamps) > 0).all()
         assert (run.stamps <= run.host).all()
         assert run.clock.jumps == 2  # set, and started again
-        assert [float(text.split()[-2]) for text in run.said] == pytest.approx([step, -4294.967], abs=0.02)
+        assert [float(text.split()[-2]) for text in run.said] == pytest.approx(
+            [step, -4294.967], abs=0.02
+        )
         assert run.clock.jump == ""  # and it is well again
         assert run.clock.drift_ppm == pytest.approx(drift_ppm, abs=100)
 
@@ -42,8 +49,13 @@ def test_packets_tell_more_than_scans_alone(jitter: str) -> None:
 
 
 def made(wall: HostClock | None = None, **wanted: Any) -> NDArray[np.int64]:
-    """The stamps of ten seconds of scans that arrived 3 ms after they were measured, less the times of these."""
-    stamps, values = Stamps(wall), Settings({parameter.name: parameter.default for parameter in PARAMETERS} | wanted)
+    """The stamps of ten seconds of scans that arrived 3 ms after they were measured, less the times
+    of these.
+    """
+    stamps, values = (
+        Stamps(wall),
+        Settings({parameter.name: parameter.default for parameter in PARAMETERS} | wanted),
+    )
     found = []
     for at in range(0, 10 * SECOND, SECOND // 10):
         arrived = at + BEGAN + 3_000_000
@@ -87,7 +99,9 @@ def test_a_machine_that_stands_still_sets_no_clock(stall: float) -> None:
     still = (times >= 20 * SECOND) & (times < (20 + stall) * SECOND)
     host[still] = int((20 + stall) * SECOND)
     clock = DeviceClock()
-    stamps = np.array([clock.stamp(int(device), int(at)) for device, at in zip(times, host, strict=True)])
+    stamps = np.array(
+        [clock.stamp(int(device), int(at)) for device, at in zip(times, host, strict=True)]
+    )
     assert clock.jumps == 0
     assert np.abs(stamps - times)[times > 10 * SECOND].max() < 1_000_000
 
@@ -97,13 +111,20 @@ def test_a_line_that_becomes_worse_sets_no_clock() -> None:
         random, clock = np.random.default_rng(seed), DeviceClock()
         times = np.arange(0, 60 * SECOND, SECOND // 10)
         late = random.exponential(np.where(times < 20 * SECOND, 1e6, 30e6)).astype(np.int64)
-        stamps = np.array([clock.stamp(*pair) for pair in zip(times.tolist(), (times + late).tolist(), strict=True)])
+        stamps = np.array(
+            [
+                clock.stamp(*pair)
+                for pair in zip(times.tolist(), (times + late).tolist(), strict=True)
+            ]
+        )
         assert clock.jumps == 0
         assert np.abs(stamps - times)[times > 10 * SECOND].max() < 5_000_000
 
 
 @pytest.mark.parametrize("step", [3600, 1.5, 0.5, -0.5, -1.5, -3600])
-def test_until_it_is_sure_that_the_clock_was_set_stamps_are_no_worse_than_arrivals(step: float) -> None:
+def test_until_it_is_sure_that_the_clock_was_set_stamps_are_no_worse_than_arrivals(
+    step: float,
+) -> None:
     run = simulated(0, "uniform, 0 to 5 ms", step=step, stalls=0)
     after = (run.times >= SET) & (run.times < SET + 2)
     assert np.abs(run.errors[after]).max() < 20e-3
@@ -122,19 +143,35 @@ def test_a_source_that_pauses_goes_on(pause: int) -> None:
 
 
 @given(
-    st.booleans(), st.sampled_from(LATE_ONLY), st.integers(0, 2**32), st.floats(-200, 200), st.floats(0.05, 100), st.sampled_from([-1, 1])
+    st.booleans(),
+    st.sampled_from(LATE_ONLY),
+    st.integers(0, 2**32),
+    st.floats(-200, 200),
+    st.floats(0.05, 100),
+    st.sampled_from([-1, 1]),
 )
 @settings(max_examples=10, deadline=None)
-def test_any_drift_and_any_step_come_out_right(wraps: bool, jitter: str, seed: int, drift: float, step: float, sign: int) -> None:
+def test_any_drift_and_any_step_come_out_right(
+    wraps: bool, jitter: str, seed: int, drift: float, step: float, sign: int
+) -> None:
     run = simulated(seed, jitter, drift_ppm=drift, step=sign * step, wraps=wraps)
     assert np.abs(run.errors[run.is_settled]).max() < 2e-3
     assert (np.diff(run.stamps) > 0).all()
     assert run.clock.jumps == 1 + wraps
 
 
-@given(st.lists(st.tuples(st.integers(-(2**60), 2**60), st.integers(0, 10 * SECOND)), min_size=1, max_size=60), st.integers(0, 2**60))
+@given(
+    st.lists(
+        st.tuples(st.integers(-(2**60), 2**60), st.integers(0, 10 * SECOND)),
+        min_size=1,
+        max_size=60,
+    ),
+    st.integers(0, 2**60),
+)
 @settings(max_examples=100, deadline=None)
-def test_whatever_a_damaged_clock_says_stamps_are_in_order_and_not_in_the_future(steps: list[tuple[int, int]], first: int) -> None:
+def test_whatever_a_damaged_clock_says_stamps_are_in_order_and_not_in_the_future(
+    steps: list[tuple[int, int]], first: int
+) -> None:
     clock, host, last = DeviceClock(), first, -(1 << 62)
     for device, passed in steps:
         host += passed
@@ -145,11 +182,16 @@ def test_whatever_a_damaged_clock_says_stamps_are_in_order_and_not_in_the_future
 
 @given(st.integers(0, 2**32), st.integers(-(2**60), 2**60), st.integers(0, 2**60))
 @settings(max_examples=10, deadline=None)
-def test_it_does_not_matter_when_either_clock_began(seed: int, device_began: int, host_began: int) -> None:
+def test_it_does_not_matter_when_either_clock_began(
+    seed: int, device_began: int, host_began: int
+) -> None:
     random, plain, shifted = np.random.default_rng(seed), DeviceClock(), DeviceClock()
     for at in range(0, 100 * SECOND, SECOND // 4):  # a part each, so that the parts are the same
         late = int(random.exponential(5e6))
-        assert shifted.stamp(at + device_began // SECOND * SECOND, at + late + host_began) == plain.stamp(at, at + late) + host_began
+        assert (
+            shifted.stamp(at + device_began // SECOND * SECOND, at + late + host_began)
+            == plain.stamp(at, at + late) + host_began
+        )
 
 
 def test_packets_may_be_observed_in_batches_of_any_size() -> None:

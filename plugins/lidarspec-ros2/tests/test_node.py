@@ -1,4 +1,6 @@
-"""The node as a client sees it: its lifecycle, parameters, services and diagnostics, a port that goes away, and what is left at the end."""
+"""The node as a client sees it: its lifecycle, parameters, services and diagnostics, a port that
+goes away, and what is left at the end.
+"""
 
 from __future__ import annotations
 
@@ -40,8 +42,13 @@ def values(status: Any) -> dict[str, str]:
 
 
 def test_nothing_of_ros_is_imported_before_the_node_starts() -> None:
-    code = "import lidarspec_ros2, lidarspec_ros2.command, lidarspec_ros2.parameters, sys; print('rclpy' in sys.modules)"
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True, timeout=PATIENCE)
+    code = (
+        "import lidarspec_ros2, lidarspec_ros2.command, lidarspec_ros2.parameters, sys;"
+        " print('rclpy' in sys.modules)"
+    )
+    done = subprocess.run(
+        [sys.executable, "-c", code], capture_output=True, text=True, check=True, timeout=PATIENCE
+    )
     assert done.stdout == "False\n"
 
 
@@ -49,7 +56,9 @@ def test_without_ros_one_line_says_both_ways_to_have_it(tmp_path: Path) -> None:
     (tmp_path / "rclpy.py").write_text("raise ImportError('no rclpy here')", encoding="utf-8")
     environment = os.environ | {"PYTHONPATH": str(tmp_path)}
     command = [sys.executable, "-m", "lidarspec", "ros2", *STL]
-    done = subprocess.run(command, env=environment, capture_output=True, text=True, check=False, timeout=PATIENCE)
+    done = subprocess.run(
+        command, env=environment, capture_output=True, text=True, check=False, timeout=PATIENCE
+    )
     first, *_ = done.stderr.splitlines()
     assert done.returncode == 2
     assert "no rclpy here" in first
@@ -59,7 +68,10 @@ def test_without_ros_one_line_says_both_ways_to_have_it(tmp_path: Path) -> None:
 
 def test_the_lifecycle_is_the_managers_where_it_is_asked_for(run: Any, client: Client) -> None:
     scans = client.listen("scan", LaserScan)
-    process = run(ros=given(source=STL[0], sensor=STL[2], autostart=False, qos="reliable"), executable="lidarspec_node")
+    process = run(
+        ros=given(source=STL[0], sensor=STL[2], autostart=False, qos="reliable"),
+        executable="lidarspec_node",
+    )
     assert client.state == "unconfigured"
     assert not client.change("activate")
     assert client.change("configure")
@@ -90,8 +102,13 @@ def test_a_command_may_be_called_as_a_service_of_every_node(run: Any, client: Cl
     assert (answered.success, client.state) == (True, "active")
 
 
-def test_it_cannot_be_configured_with_what_cannot_be_opened_and_then_can(run: Any, client: Client, tmp_path: Path) -> None:
-    run(ros=given(source=str(tmp_path / "none"), sensor=STL[2], autostart=False), executable="lidarspec_node")
+def test_it_cannot_be_configured_with_what_cannot_be_opened_and_then_can(
+    run: Any, client: Client, tmp_path: Path
+) -> None:
+    run(
+        ros=given(source=str(tmp_path / "none"), sensor=STL[2], autostart=False),
+        executable="lidarspec_node",
+    )
     assert not client.change("configure")
     assert client.state == "unconfigured"
     assert client.set("source", STL[0]) == ""
@@ -102,30 +119,59 @@ def test_it_cannot_be_configured_with_what_cannot_be_opened_and_then_can(run: An
 @pytest.mark.parametrize(
     ("words", "parameters"),
     [
-        (["sim:ldrobot-stl27l", "-s", "ldrobot-stl27"], {"source": "sim:ldrobot-stl27l", "sensor": "ldrobot-stl27"}),
-        (["sim:ldrobot-stl27l", "-s", "ldrobot-stl27l", "-O", "answer"], {"source": STL[0], "sensor": STL[2], "options": "[answer]"}),
-        (["sim:ldrobot-stl27l?bad=1", "-s", "ldrobot-stl27l"], {"source": "sim:ldrobot-stl27l?bad=1", "sensor": STL[2]}),
-        (["absent.pcap", "-s", "robosense-m1"], {"source": "absent.pcap", "sensor": "robosense-m1"}),
+        (
+            ["sim:ldrobot-stl27l", "-s", "ldrobot-stl27"],
+            {"source": "sim:ldrobot-stl27l", "sensor": "ldrobot-stl27"},
+        ),
+        (
+            ["sim:ldrobot-stl27l", "-s", "ldrobot-stl27l", "-O", "answer"],
+            {"source": STL[0], "sensor": STL[2], "options": "[answer]"},
+        ),
+        (
+            ["sim:ldrobot-stl27l?bad=1", "-s", "ldrobot-stl27l"],
+            {"source": "sim:ldrobot-stl27l?bad=1", "sensor": STL[2]},
+        ),
+        (
+            ["absent.pcap", "-s", "robosense-m1"],
+            {"source": "absent.pcap", "sensor": "robosense-m1"},
+        ),
     ],
 )
-def test_what_cannot_be_is_refused_as_on_the_command_line(run: Any, tmp_path: Path, words: list[str], parameters: dict[str, Any]) -> None:
+def test_what_cannot_be_is_refused_as_on_the_command_line(
+    run: Any, tmp_path: Path, words: list[str], parameters: dict[str, Any]
+) -> None:
     stats = [sys.executable, "-m", "lidarspec", "stats", *words]
-    known = subprocess.run(stats, capture_output=True, text=True, check=False, cwd=tmp_path, timeout=PATIENCE)
+    known = subprocess.run(
+        stats, capture_output=True, text=True, check=False, cwd=tmp_path, timeout=PATIENCE
+    )
     reason = known.stderr.splitlines()[0]
     for process in (run(*words), run(ros=given(**parameters), executable="lidarspec_node")):
         _, complaints = process.communicate(timeout=PATIENCE)
         assert (process.returncode, reason in complaints) == (known.returncode, True)
 
 
-def test_parameters_are_described_and_changed_where_that_makes_sense(run: Any, client: Client) -> None:
+def test_parameters_are_described_and_changed_where_that_makes_sense(
+    run: Any, client: Client
+) -> None:
     scans = client.listen("scan", LaserScan)
     run(*STL, ros=given(qos="reliable", frame_id="front"))
     client.until(lambda: scans)
-    for parameter, descriptor in zip(PARAMETERS, client.described(*(one.name for one in PARAMETERS)), strict=True):
+    for parameter, descriptor in zip(
+        PARAMETERS, client.described(*(one.name for one in PARAMETERS)), strict=True
+    ):
         kind = getattr(ParameterType, f"PARAMETER_{parameter.kind.upper()}")
         assert (descriptor.description, descriptor.type) == (parameter.text, kind)
-    assert (client.value("frame_id"), client.value("beams"), client.value("source")) == ("front", 0, STL[0])
-    assert client.set("beams", 450) == client.set("range_max", 3.0) == client.set("frame_id", "rear") == ""
+    assert (client.value("frame_id"), client.value("beams"), client.value("source")) == (
+        "front",
+        0,
+        STL[0],
+    )
+    assert (
+        client.set("beams", 450)
+        == client.set("range_max", 3.0)
+        == client.set("frame_id", "rear")
+        == ""
+    )
     assert client.set("angle_min", -1.0) == client.set("angle_max", 1.0) == ""
 
     def newest() -> Any:
@@ -135,24 +181,38 @@ def test_parameters_are_described_and_changed_where_that_makes_sense(run: Any, c
     assert (len(newest().ranges), newest().range_max, newest().angle_min) == (450, 3.0, -1.0)
     assert all(one <= 3.0 or one == float("inf") for one in newest().ranges)
     assert "source is read on configuring" in client.set("source", "udp://")
-    assert client.set("scan_z_min", 2.0) == "from scan_z_min 2.0 up to scan_z_max 0.0 there is nothing"
+    assert (
+        client.set("scan_z_min", 2.0) == "from scan_z_min 2.0 up to scan_z_max 0.0 there is nothing"
+    )
     assert "5.0 to 3.0" in client.set("range_min", 5.0)
     assert client.set("beams", -1)
     assert (client.value("scan_z_min"), client.value("range_min")) == (0.0, 0.0)
-    assert client.set("angle_min", 2.0) == ""  # on through the back, to where the last beam looks a turn on
+    assert (
+        client.set("angle_min", 2.0) == ""
+    )  # on through the back, to where the last beam looks a turn on
     client.until(lambda: newest().angle_min == 2.0)
     assert newest().angle_max == pytest.approx(1.0 + 2 * math.pi)
 
 
 def test_a_parameter_that_is_none_is_said(run: Any, client: Client) -> None:
-    process = run(*STL, ros=[*given(beam=720, qos="reliable"), "-p", "qos_overrides./points.publisher.depth:=5"])
+    process = run(
+        *STL,
+        ros=[*given(beam=720, qos="reliable"), "-p", "qos_overrides./points.publisher.depth:=5"],
+    )
     client.until(lambda: client.diagnostics)
     code, complaints = ended(process)
     (said,) = complaints.splitlines()
-    assert (code, said.endswith("parameter 'beam' is left out, as there is none of that name; did you mean 'beams'?")) == (0, True)
+    assert (
+        code,
+        said.endswith(
+            "parameter 'beam' is left out, as there is none of that name; did you mean 'beams'?"
+        ),
+    ) == (0, True)
 
 
-def test_quality_is_sensor_datas_unless_it_is_asked_for_or_overridden(run: Any, client: Client) -> None:
+def test_quality_is_sensor_datas_unless_it_is_asked_for_or_overridden(
+    run: Any, client: Client
+) -> None:
     client.listen("/points", PointCloud2, reliable=False)
     for words, is_reliable in (
         ([], False),
@@ -166,14 +226,27 @@ def test_quality_is_sensor_datas_unless_it_is_asked_for_or_overridden(run: Any, 
         client.until(lambda: not client.reliable("/points"))
 
 
-def test_a_ring_that_the_sensor_lacks_is_a_warning_and_clouds_go_on(run: Any, client: Client) -> None:
+def test_a_ring_that_the_sensor_lacks_is_a_warning_and_clouds_go_on(
+    run: Any, client: Client
+) -> None:
     clouds, scans = client.listen("points", PointCloud2), client.listen("scan", LaserScan)
-    run("sim:velodyne-vlp16", "-s", "velodyne-vlp16", ros=given(qos="reliable", scan_ring=7, frame_id="mast"))
+    run(
+        "sim:velodyne-vlp16",
+        "-s",
+        "velodyne-vlp16",
+        ros=given(qos="reliable", scan_ring=7, frame_id="mast"),
+    )
     client.until(lambda: len(scans) > 1)
     assert message(scans[-1], SCAN).header.frame_id == "mast"
     assert client.set("scan_ring", 99) == ""
     asked = "ring 99 is asked for"
-    client.until(lambda: any(asked in text for said in client.diagnostics[-1:] for text in values(said.status[0]).values()))
+    client.until(
+        lambda: any(
+            asked in text
+            for said in client.diagnostics[-1:]
+            for text in values(said.status[0]).values()
+        )
+    )
     number = len(clouds)
     client.until(lambda: len(clouds) > number)
 
@@ -182,7 +255,10 @@ def test_commands_are_services_with_arguments_as_parameters(run: Any, client: Cl
     run("sim:ldrobot-ld14p", "-s", "ldrobot-ld14p")
     client.until(lambda: client.diagnostics)
     refused = client.trigger("set_speed")
-    assert (refused.success, refused.message) == (False, "ldrobot-ld14p set_speed: field 'speed' is missing")
+    assert (refused.success, refused.message) == (
+        False,
+        "ldrobot-ld14p set_speed: field 'speed' is missing",
+    )
     assert client.set("set_speed.speed", 9000.0) == ""
     assert "outside 720 .. 2880" in client.trigger("set_speed").message
     assert client.set("set_speed.speed", "6turns") == ""
@@ -208,7 +284,10 @@ def test_diagnostics_say_how_the_sensor_is_doing(run: Any, client: Client) -> No
     client.until(lambda: len(client.diagnostics) > 3)
     (status,) = client.diagnostics[-1].status
     found = values(status)
-    assert (status.name, status.hardware_id) == ("lidar: ldrobot-stl27l", "sim:ldrobot-stl27l?errors=0.001")
+    assert (status.name, status.hardware_id) == (
+        "lidar: ldrobot-stl27l",
+        "sim:ldrobot-stl27l?errors=0.001",
+    )
     assert float(found["speed [Hz]"]) == pytest.approx(10, rel=0.2)
     assert float(found["errors [%]"]) > 0
     assert (found["state"], found["lifecycle"]) == ("streaming", "active")
@@ -216,13 +295,20 @@ def test_diagnostics_say_how_the_sensor_is_doing(run: Any, client: Client) -> No
     assert client.diagnostics[-1].header.stamp.sec > 0
 
 
-def test_a_file_is_played_with_its_times_on_clock_and_then_the_node_ends(run: Any, client: Client, tmp_path: Path) -> None:
+def test_a_file_is_played_with_its_times_on_clock_and_then_the_node_ends(
+    run: Any, client: Client, tmp_path: Path
+) -> None:
     file = tmp_path / "drive.lsr"
     ran = subprocess.run(
         [sys.executable, "-m", "lidarspec", "sim", "ldrobot-stl27l", "--to", str(file), "-t", "6s"],
         capture_output=True, text=True, check=True, timeout=PATIENCE)  # fmt: skip
     scans, clock = client.listen("scan", LaserScan), client.listen("/clock", Clock)
-    process = run(str(file), "-s", "ldrobot-stl27l", ros=given(use_sim_time=True, qos="reliable", replay_speed=2.0))
+    process = run(
+        str(file),
+        "-s",
+        "ldrobot-stl27l",
+        ros=given(use_sim_time=True, qos="reliable", replay_speed=2.0),
+    )
     client.until(lambda: len(scans) > 2)
     assert client.state == "active"
     client.until(lambda: process.poll() is not None)
@@ -235,11 +321,24 @@ def test_a_file_is_played_with_its_times_on_clock_and_then_the_node_ends(run: An
 
 
 @pytest.mark.parametrize(
-    ("roll", "pitch", "yaw", "inverted"), [(0.0, 0.0, 90.0, False), (10.0, -20.0, 130.0, True), (0.0, 90.0, 5.0, False)]
+    ("roll", "pitch", "yaw", "inverted"),
+    [(0.0, 0.0, 90.0, False), (10.0, -20.0, 130.0, True), (0.0, 90.0, 5.0, False)],
 )
-def test_a_transform_turns_as_the_mount_does(roll: float, pitch: float, yaw: float, inverted: bool) -> None:
-    given = {"mount.x": 0.5, "mount.roll_deg": roll, "mount.pitch_deg": pitch, "mount.yaw_deg": yaw, "mount.inverted": inverted}
-    settings = Settings({one.name: one.default for one in PARAMETERS} | given | {"source": "udp://", "frame_id": "mast"})
+def test_a_transform_turns_as_the_mount_does(
+    roll: float, pitch: float, yaw: float, inverted: bool
+) -> None:
+    given = {
+        "mount.x": 0.5,
+        "mount.roll_deg": roll,
+        "mount.pitch_deg": pitch,
+        "mount.yaw_deg": yaw,
+        "mount.inverted": inverted,
+    }
+    settings = Settings(
+        {one.name: one.default for one in PARAMETERS}
+        | given
+        | {"source": "udp://", "frame_id": "mast"}
+    )
     found = transform(settings, Time(sec=5))
     q = found.transform.rotation
     turned = [
@@ -250,7 +349,11 @@ def test_a_transform_turns_as_the_mount_does(roll: float, pitch: float, yaw: flo
     mount = settings.mount()
     assert mount is not None
     np.testing.assert_allclose(turned, mount.rotation, atol=1e-12)
-    assert (found.header.frame_id, found.child_frame_id, found.transform.translation.x) == ("base_link", "mast", 0.5)
+    assert (found.header.frame_id, found.child_frame_id, found.transform.translation.x) == (
+        "base_link",
+        "mast",
+        0.5,
+    )
 
 
 def test_a_transform_is_refused_where_ros_has_no_message_for_it(run: Any, client: Client) -> None:
@@ -267,7 +370,18 @@ def plugged(tmp_path: Path) -> Iterator[Callable[..., tuple[Path, int]]]:
 
     def started(*words: str) -> tuple[Path, int]:
         link = tmp_path / "port"
-        command = [sys.executable, "-m", "lidarspec", "sim", "ldrobot-stl27l", "--to", "pty", "--link", str(link), *words]
+        command = [
+            sys.executable,
+            "-m",
+            "lidarspec",
+            "sim",
+            "ldrobot-stl27l",
+            "--to",
+            "pty",
+            "--link",
+            str(link),
+            *words,
+        ]
         begun.append(subprocess.Popen(command, stdout=subprocess.PIPE, text=True))
         assert begun[-1].stdout is not None
         assert begun[-1].stdout.readline()
@@ -279,7 +393,9 @@ def plugged(tmp_path: Path) -> Iterator[Callable[..., tuple[Path, int]]]:
         process.communicate()
 
 
-def test_a_port_that_goes_away_makes_the_node_inactive_until_it_is_back(run: Any, client: Client, plugged: Any) -> None:
+def test_a_port_that_goes_away_makes_the_node_inactive_until_it_is_back(
+    run: Any, client: Client, plugged: Any
+) -> None:
     port, _ = plugged("--unplug", "5s", "--absent", "3s")
     scans = client.listen("scan", LaserScan)
     run(str(port), "-s", "ldrobot-stl27l", ros=given(qos="reliable"))
@@ -295,7 +411,9 @@ def test_a_port_that_goes_away_makes_the_node_inactive_until_it_is_back(run: Any
     client.until(lambda: client.diagnostics[-1].status[0].level != b"\2")
 
 
-def test_a_sensor_that_falls_silent_makes_the_node_inactive_until_it_sends(run: Any, client: Client) -> None:
+def test_a_sensor_that_falls_silent_makes_the_node_inactive_until_it_sends(
+    run: Any, client: Client
+) -> None:
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as sender:
         sender.bind(("127.0.0.1", 0))
         free = sender.getsockname()[1] + 1
@@ -317,7 +435,9 @@ def test_a_sensor_that_falls_silent_makes_the_node_inactive_until_it_sends(run: 
             client.until(lambda: client.state == "active")
             sends.clear()
             client.until(lambda: client.state == "inactive")
-            client.until(lambda: client.diagnostics and client.diagnostics[-1].status[0].level == b"\2")
+            client.until(
+                lambda: client.diagnostics and client.diagnostics[-1].status[0].level == b"\2"
+            )
             assert "nothing has arrived" in client.diagnostics[-1].status[0].message
             sends.set()
             client.until(lambda: client.state == "active")
@@ -346,7 +466,9 @@ def test_nothing_is_left_behind(run: Any, client: Client, plugged: Any, by: int)
 
 def shared(pid: int) -> set[str]:
     """The files of shared memory that a process has."""
-    return set(re.findall(r"/dev/shm/fast\w+", Path(f"/proc/{pid}/maps").read_text(encoding="utf-8")))
+    return set(
+        re.findall(r"/dev/shm/fast\w+", Path(f"/proc/{pid}/maps").read_text(encoding="utf-8"))
+    )
 
 
 def holders(port: Path) -> list[str]:
@@ -354,6 +476,9 @@ def holders(port: Path) -> list[str]:
     found = []
     for pid in filter(str.isdecimal, os.listdir("/proc")):
         with contextlib.suppress(OSError):
-            opened = {os.path.realpath(f"/proc/{pid}/fd/{number}") for number in os.listdir(f"/proc/{pid}/fd")}
+            opened = {
+                os.path.realpath(f"/proc/{pid}/fd/{number}")
+                for number in os.listdir(f"/proc/{pid}/fd")
+            }
             found += [pid] * (os.path.realpath(port) in opened)
     return found

@@ -1,4 +1,6 @@
-"""Packets that a node publishes are decoded again: by a node that takes the topic as its source, and out of a bag that has them."""
+"""Packets that a node publishes are decoded again: by a node that takes the topic as its source,
+and out of a bag that has them.
+"""
 
 from __future__ import annotations
 
@@ -21,20 +23,34 @@ def test_a_node_decodes_what_another_one_publishes(run: Any, client: Client) -> 
     first, again = client.listen("scan", LaserScan), client.listen("again", LaserScan)
     client.diagnostics.clear()
     grid = given(qos="reliable", **GRID)
-    run("ros2:/packets", "-s", "ldrobot-stl27l", ros=["-r", "__node:=again", "-r", "scan:=again", *grid])
+    run(
+        "ros2:/packets",
+        "-s",
+        "ldrobot-stl27l",
+        ros=["-r", "__node:=again", "-r", "scan:=again", *grid],
+    )
     client.until(lambda: client.diagnostics)  # it listens
-    run("sim:ldrobot-stl27l?seed=5", "-s", "ldrobot-stl27l", ros=[*grid, *given(publish_packets=True)])
+    run(
+        "sim:ldrobot-stl27l?seed=5",
+        "-s",
+        "ldrobot-stl27l",
+        ros=[*grid, *given(publish_packets=True)],
+    )
 
     def shared() -> set[tuple[float, ...]]:
         """The scans that both published; on a busy computer packets may be lost between them."""
-        one, other = ({tuple(message(data, SCAN).ranges) for data in scans} for scans in (first, again))
+        one, other = (
+            {tuple(message(data, SCAN).ranges) for data in scans} for scans in (first, again)
+        )
         return one & other
 
     client.until(lambda: len(shared()) > 5)
 
 
 @pytest.mark.parametrize("sensor", ["ldrobot-stl27l", "velodyne-vlp16"])
-def test_a_bag_with_packets_is_a_source(run: Any, client: Client, tmp_path: Path, sensor: str) -> None:
+def test_a_bag_with_packets_is_a_source(
+    run: Any, client: Client, tmp_path: Path, sensor: str
+) -> None:
     packets = client.listen("packets", UInt8MultiArray)
     run(f"sim:{sensor}", "-s", sensor, ros=given(publish_packets=True, qos="reliable"))
     client.until(lambda: len(packets) > 500)
@@ -47,7 +63,9 @@ def test_a_bag_with_packets_is_a_source(run: Any, client: Client, tmp_path: Path
     with ls.open(tmp_path / "bag", sensor) as device:
         found = list(device.packets())
     data = b"".join(chunk.data for chunk in chunks)
-    wanted = ls.sensor(sensor).decode(data if sensor == "ldrobot-stl27l" else [chunk.data for chunk in chunks])
+    wanted = ls.sensor(sensor).decode(
+        data if sensor == "ldrobot-stl27l" else [chunk.data for chunk in chunks]
+    )
     assert sum(map(len, found)) == len(wanted) > 100
     np.testing.assert_array_equal(np.concatenate([batch.raw for batch in found]), wanted.raw)
     assert set(np.concatenate([batch.host_ns for batch in found])) <= {chunk.at for chunk in chunks}

@@ -30,12 +30,18 @@ def read_by_ros(words: list[str]) -> dict[str, Any]:
     context = rclpy.Context()
     rclpy.init(args=words, context=context)
     try:
-        node = rclpy.create_node("lidar", context=context, automatically_declare_parameters_from_overrides=True)
-        values = {name: parameter.value for name, parameter in node.get_parameters_by_prefix("").items()}
+        node = rclpy.create_node(
+            "lidar", context=context, automatically_declare_parameters_from_overrides=True
+        )
+        values = {
+            name: parameter.value for name, parameter in node.get_parameters_by_prefix("").items()
+        }
         node.destroy_node()
     finally:
         rclpy.shutdown(context=context)
-    return {name: value for name, value in values.items() if name in ("source", "sensor", "options")}
+    return {
+        name: value for name, value in values.items() if name in ("source", "sensor", "options")
+    }
 
 
 @pytest.mark.parametrize(
@@ -74,5 +80,14 @@ def test_a_file_that_ros_refuses_is_ignored(tmp_path: Path, content: str | None)
 
 
 def test_words_that_are_not_for_ros_are_ignored() -> None:
-    words = ["-p", "sensor:=before", "--ros-args", "-p", "source:=udp://", "--", "-p", "sensor:=after"]
+    words = [
+        "-p",
+        "sensor:=before",
+        "--ros-args",
+        "-p",
+        "source:=udp://",
+        "--",
+        "-p",
+        "sensor:=after",
+    ]
     assert read_parameters(words, "lidar") == {"source": "udp://"}

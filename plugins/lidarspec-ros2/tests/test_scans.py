@@ -1,4 +1,6 @@
-"""What a subscriber in another process gets is what the library makes of the same bytes, value for value."""
+"""What a subscriber in another process gets is what the library makes of the same bytes, value for
+value.
+"""
 
 from __future__ import annotations
 
@@ -28,7 +30,8 @@ from lidarspec.transports.protocol import Chunk
 
 MESSAGES = Messages("ROS2_HUMBLE")
 WHOLE, STAMP = 6, 1_700_000_000_123_456_789
-#: bytes between fields that a message of ours has at the most: three before each number behind a text.
+#: bytes between fields that a message of ours has at the most: three before each number behind a
+#: text.
 PADDING = 64
 #: seconds of the long test.
 SOAK = float(os.environ.get("LIDARSPEC_SOAK", "600"))
@@ -48,7 +51,9 @@ def expected(path: Path, sensor: str, kind: str) -> list[Any]:
     with ls.open(path, sensor) as device:
         for scan in device.scans():
             if scan.whole and kind == CLOUD:
-                found.append(MESSAGES.cloud(scan, 0, every_point=scan.points.shape is not None).data)
+                found.append(
+                    MESSAGES.cloud(scan, 0, every_point=scan.points.shape is not None).data
+                )
             elif scan.whole and (planar := planes.scan(scan)) is not None:
                 found.append(MESSAGES.laserscan(scan, planar, 0).data)
     return [unstamped(message(bytes(data), kind)) for data in found]
@@ -60,9 +65,11 @@ def unstamped(content: Any) -> dict[str, Any]:
 
 
 def same(one: dict[str, Any], other: dict[str, Any]) -> bool:
-    return all(np.array_equal(value, other[name], equal_nan=False) for name, value in one.items() if name != "fields") and str(
-        one.get("fields")
-    ) == str(other.get("fields"))
+    return all(
+        np.array_equal(value, other[name], equal_nan=False)
+        for name, value in one.items()
+        if name != "fields"
+    ) and str(one.get("fields")) == str(other.get("fields"))
 
 
 @pytest.mark.parametrize(
@@ -70,11 +77,22 @@ def same(one: dict[str, Any], other: dict[str, Any]) -> bool:
     [("ldrobot-stl27l", "scan", SCAN, LaserScan), ("robosense-m1", "points", CLOUD, PointCloud2)],
 )
 def test_messages_are_what_the_library_makes_of_the_same_bytes(
-    run: Callable[..., Any], client: Client, tmp_path: Path, sensor: str, topic: str, kind: str, message_class: Any
+    run: Callable[..., Any],
+    client: Client,
+    tmp_path: Path,
+    sensor: str,
+    topic: str,
+    kind: str,
+    message_class: Any,
 ) -> None:
     packets = client.listen("packets", UInt8MultiArray)
     received = client.listen(topic, message_class)
-    run(f"sim:{sensor}?loss=0.0005&seed=3", "-s", sensor, ros=given(publish_packets=True, qos="reliable", **GRID))
+    run(
+        f"sim:{sensor}?loss=0.0005&seed=3",
+        "-s",
+        sensor,
+        ros=given(publish_packets=True, qos="reliable", **GRID),
+    )
     client.until(lambda: len(received) > WHOLE)
     number = len(received)
     client.until(lambda: len(received) > number)  # whose packets have come
@@ -84,41 +102,83 @@ def test_messages_are_what_the_library_makes_of_the_same_bytes(
     assert number - begin >= WHOLE - 2
     for content, one in zip(found[begin:], wanted, strict=False):
         assert same(content, one)
-    assert len({np.asarray(content["ranges" if kind == SCAN else "data"]).tobytes() for content in wanted}) > 1
+    assert (
+        len(
+            {
+                np.asarray(content["ranges" if kind == SCAN else "data"]).tobytes()
+                for content in wanted
+            }
+        )
+        > 1
+    )
 
 
-def test_what_an_imu_felt_is_what_the_library_makes_of_the_same_bytes(run: Callable[..., Any], client: Client, tmp_path: Path) -> None:
+def test_what_an_imu_felt_is_what_the_library_makes_of_the_same_bytes(
+    run: Callable[..., Any], client: Client, tmp_path: Path
+) -> None:
     packets = client.listen("packets", UInt8MultiArray)
     received = client.listen("imu", Imu)
-    # A quarter of the sensor's rate: this process cannot take 2,000 packets a second on every computer.
+    # A quarter of the sensor's rate: this process cannot take 2,000 packets a second on every
+    # computer.
     source = "sim:livox-mid360?shake=0.5&seed=3&rate=0.25"
-    run(source, "-s", "livox-mid360", ros=given(publish_packets=True, qos="reliable", frame_id="head"))
+    run(
+        source,
+        "-s",
+        "livox-mid360",
+        ros=given(publish_packets=True, qos="reliable", frame_id="head"),
+    )
     client.until(lambda: packets)  # the topic may be found later than that of the IMU
     first = len(received)
     client.until(lambda: len(received) > first + 400)
-    with ls.open(recorded(packets, tmp_path / "packets.lsr", "livox-mid360"), "livox-mid360") as device:
+    with ls.open(
+        recorded(packets, tmp_path / "packets.lsr", "livox-mid360"), "livox-mid360"
+    ) as device:
         wanted = [
-            row for felt in device.imu() for row in np.concatenate([felt.angular_velocity, felt.linear_acceleration], axis=1).tolist()
+            row
+            for felt in device.imu()
+            for row in np.concatenate(
+                [felt.angular_velocity, felt.linear_acceleration], axis=1
+            ).tolist()
         ]
     read = [deserialize_message(data, Imu) for data in received[first : first + 400]]
-    found = [[getattr(part, axis) for part in (one.angular_velocity, one.linear_acceleration) for axis in "xyz"] for one in read]
-    shared = [row for row in found if row in wanted]  # on a busy computer some of either may be lost
+    found = [
+        [
+            getattr(part, axis)
+            for part in (one.angular_velocity, one.linear_acceleration)
+            for axis in "xyz"
+        ]
+        for one in read
+    ]
+    shared = [
+        row for row in found if row in wanted
+    ]  # on a busy computer some of either may be lost
     assert shared == [row for row in wanted if row in found]
     assert (len(shared) > 100, {one.header.frame_id for one in read}) == (True, {"head"})
 
 
-@pytest.mark.parametrize(("sensor", "every_point"), [("robosense-m1", True), ("robosense-m1", False), ("ldrobot-stl27l", False)])
+@pytest.mark.parametrize(
+    ("sensor", "every_point"),
+    [("robosense-m1", True), ("robosense-m1", False), ("ldrobot-stl27l", False)],
+)
 def test_bytes_are_those_of_ros_itself(sensor: str, every_point: bool) -> None:
-    """What rclpy makes of a message that it has read, or that its own classes hold, is the same byte for byte."""
+    """What rclpy makes of a message that it has read, or that its own classes hold, is the same
+    byte for byte.
+    """
     spec, planes = ls.sensor(sensor), Planes()
     scan = next(scan for scan in spec.scans(simulate(spec, 2000)) if scan.whole)
     made = [(MESSAGES.cloud(scan, STAMP, every_point=every_point), PointCloud2)]
     if (planar := planes.scan(scan)) is not None:
         made.append((MESSAGES.laserscan(scan, planar, STAMP), LaserScan))
-        values = {name: getattr(planar, name) for name in LaserScan.get_fields_and_field_types() if name != "header"}
+        values = {
+            name: getattr(planar, name)
+            for name in LaserScan.get_fields_and_field_types()
+            if name != "header"
+        }
         by_ros = LaserScan(header=header(scan.frame_id), **values)
         assert alike(bytes(made[1][0].data), serialize_message(by_ros))
-    felt = ImuSamples(np.array([STAMP]), np.array([[0.1, -0.2, np.nan]]), np.array([[0.0, 0.5, 9.81]]))
+    felt = ImuSamples(
+        np.array([STAMP]), np.array([[0.1, -0.2, np.nan]]), np.array([[0.0, 0.5, 9.81]])
+    )
     made.append((MESSAGES.imu(felt, 0, STAMP, "imu"), Imu))
     made.append((MESSAGES.raw(Chunk(b"\x54\x2c\xff", STAMP), datagram=True), UInt8MultiArray))
     for known, message_class in made:
@@ -127,17 +187,27 @@ def test_bytes_are_those_of_ros_itself(sensor: str, every_point: bool) -> None:
 
 
 def test_what_an_imu_felt_is_told_as_rep_145_asks() -> None:
-    felt = ImuSamples(np.array([STAMP]), np.array([[0.1, -0.2, np.nan]]), np.array([[0.0, 0.5, 9.81]]))
+    felt = ImuSamples(
+        np.array([STAMP]), np.array([[0.1, -0.2, np.nan]]), np.array([[0.0, 0.5, 9.81]])
+    )
     read = deserialize_message(bytes(MESSAGES.imu(felt, 0, STAMP, "imu").data), Imu)
     assert (read.header, read.orientation_covariance[0]) == (header("imu"), -1)
     assert (read.angular_velocity_covariance[0], read.linear_acceleration_covariance[0]) == (-1, 0)
-    assert (read.linear_acceleration.x, read.linear_acceleration.y, read.linear_acceleration.z) == (0.0, 0.5, 9.81)
+    assert (read.linear_acceleration.x, read.linear_acceleration.y, read.linear_acceleration.z) == (
+        0.0,
+        0.5,
+        9.81,
+    )
 
 
 def alike(ours: bytes, theirs: bytes) -> bool:
-    """Whether bytes are the same, but for those between the fields, which ROS leaves as they are in memory, and ours are 0."""
+    """Whether bytes are the same, but for those between the fields, which ROS leaves as they are in
+    memory, and ours are 0.
+    """
     one, other = (np.frombuffer(data, np.uint8) for data in (ours, theirs))
-    return len(ours) == len(theirs) and not one[one != other].any() and (one != other).sum() < PADDING
+    return (
+        len(ours) == len(theirs) and not one[one != other].any() and (one != other).sum() < PADDING
+    )
 
 
 def header(frame_id: str) -> Header:
@@ -146,7 +216,8 @@ def header(frame_id: str) -> Header:
 
 @pytest.mark.soak
 @pytest.mark.parametrize(
-    ("sensor", "topic", "message_class"), [("ldrobot-stl27l", "scan", LaserScan), ("robosense-m1", "points", PointCloud2)]
+    ("sensor", "topic", "message_class"),
+    [("ldrobot-stl27l", "scan", LaserScan), ("robosense-m1", "points", PointCloud2)],
 )
 @pytest.mark.parametrize("qos", ["reliable", "best_effort"])
 def test_no_scan_is_lost_in_ten_minutes(
@@ -170,7 +241,10 @@ def test_no_scan_is_lost_in_ten_minutes(
         return int(said[f"{topic} sent"]), received[0]
 
     client.listen(topic, message_class, reliable=qos == "reliable", take=note)
-    run(ros=given(source=f"sim:{sensor}", sensor=sensor, qos=qos, autostart=False), executable="lidarspec_node")
+    run(
+        ros=given(source=f"sim:{sensor}", sensor=sensor, qos=qos, autostart=False),
+        executable="lidarspec_node",
+    )
     assert client.change("configure")
     (sent, came), (all_sent, all_came) = counted(3.0), counted(SOAK)
     print(f"{sensor}, {qos}: {all_came - came} of {all_sent - sent} came")

@@ -21,7 +21,11 @@ import lidarspec as ls
 from lidarspec_ros2.parameters import NAMED
 from tests.docs import pages
 
-DRIVERS, HOW_TO, NODES = "reference/ros2-drivers.md", "how-to/ros2.md", ("/front/lidar", "/back/lidar")
+DRIVERS, HOW_TO, NODES = (
+    "reference/ros2-drivers.md",
+    "how-to/ros2.md",
+    ("/front/lidar", "/back/lidar"),
+)
 
 
 @pytest.fixture(autouse=True)
@@ -37,7 +41,10 @@ def share(*parts: str) -> Path:
 def files() -> dict[str, Any]:
     """The files of parameters, by name, as YAML."""
     (mine,) = [block.text for block in pages.blocks(HOW_TO) if block.title == "mine.yaml"]
-    return {"mine": yaml.safe_load(mine), "two_lidars": yaml.safe_load(share("config", "two_lidars.yaml").read_text())}
+    return {
+        "mine": yaml.safe_load(mine),
+        "two_lidars": yaml.safe_load(share("config", "two_lidars.yaml").read_text()),
+    }
 
 
 def test_the_files_of_parameters_name_parameters_and_installed_sensors() -> None:
@@ -48,12 +55,28 @@ def test_the_files_of_parameters_name_parameters_and_installed_sensors() -> None
             assert ls.sensor(node["ros__parameters"]["sensor"])
 
 
-@pytest.mark.parametrize(("name", "topic", "kind"), [("front", "scan", LaserScan), ("back", "points", PointCloud2)])
-def test_a_node_of_the_launch_file_has_its_parameters_from_the_file(client: Client, name: str, topic: str, kind: Any) -> None:
-    program = Path(get_package_prefix("lidarspec_ros2"), "lib", "lidarspec_ros2", "lidarspec_node")  # where launch looks for it
+@pytest.mark.parametrize(
+    ("name", "topic", "kind"), [("front", "scan", LaserScan), ("back", "points", PointCloud2)]
+)
+def test_a_node_of_the_launch_file_has_its_parameters_from_the_file(
+    client: Client, name: str, topic: str, kind: Any
+) -> None:
+    program = Path(
+        get_package_prefix("lidarspec_ros2"), "lib", "lidarspec_ros2", "lidarspec_node"
+    )  # where launch looks for it
     config = share("config", "two_lidars.yaml")
-    words = ["--ros-args", "-r", f"__ns:=/{name}", "-r", "__node:=lidar", "--params-file", str(config)]
-    received = client.listen(f"/{name}/{topic}", kind, reliable=name == "back")  # the node's own choice for that one
+    words = [
+        "--ros-args",
+        "-r",
+        f"__ns:=/{name}",
+        "-r",
+        "__node:=lidar",
+        "--params-file",
+        str(config),
+    ]
+    received = client.listen(
+        f"/{name}/{topic}", kind, reliable=name == "back"
+    )  # the node's own choice for that one
     with subprocess.Popen([program, *words]) as node:
         client.until(lambda: received)
         node.terminate()
@@ -63,13 +86,17 @@ def test_a_node_of_the_launch_file_has_its_parameters_from_the_file(client: Clie
 
 
 def test_the_launch_file_starts_both() -> None:
-    pytest.importorskip("launch_ros", reason="there is no wheel of launch: the file is run where ROS is sourced")
+    pytest.importorskip(
+        "launch_ros", reason="there is no wheel of launch: the file is run where ROS is sourced"
+    )
     from launch.launch_description_sources import PythonLaunchDescriptionSource
 
     from launch import LaunchContext
 
     context = LaunchContext()
-    description = PythonLaunchDescriptionSource(str(share("launch", "two_lidars.launch.py"))).get_launch_description(context)
+    description = PythonLaunchDescriptionSource(
+        str(share("launch", "two_lidars.launch.py"))
+    ).get_launch_description(context)
     argument, *nodes = description.entities
     argument.execute(context)
     for node in nodes:
@@ -79,7 +106,10 @@ def test_the_launch_file_starts_both() -> None:
 
 def test_the_transforms_of_the_page_are_those_of_the_frames_in_the_files() -> None:
     (block,) = [block for block in pages.blocks(HOW_TO) if block.language == "xml"]
-    links = {lidar.get("name") for lidar in ElementTree.fromstring(block.text).iter("{http://www.ros.org/wiki/xacro}lidar")}
+    links = {
+        lidar.get("name")
+        for lidar in ElementTree.fromstring(block.text).iter("{http://www.ros.org/wiki/xacro}lidar")
+    }
     for file in files().values():
         assert {node["ros__parameters"]["frame_id"] for node in file.values()} == links
 
@@ -87,11 +117,17 @@ def test_the_transforms_of_the_page_are_those_of_the_frames_in_the_files() -> No
 def rows(page: str) -> list[list[str]]:
     """The cells of the tables of a page."""
     text = (pages.DOCS / page).read_text(encoding="utf-8")
-    return [[cell.strip() for cell in row.strip("|").split("|")] for row in re.findall(r"^\|.*\|$", text, re.MULTILINE)]
+    return [
+        [cell.strip() for cell in row.strip("|").split("|")]
+        for row in re.findall(r"^\|.*\|$", text, re.MULTILINE)
+    ]
 
 
 def test_every_row_of_the_vendors_parameters_names_one_of_ours_or_a_reason() -> None:
-    topics, services = {"scan", "points", "imu", "packets", "/diagnostics"}, ls.sensor("hesai-xt32").commands
+    topics, services = (
+        {"scan", "points", "imu", "packets", "/diagnostics"},
+        ls.sensor("hesai-xt32").commands,
+    )
     told = [row for row in rows(DRIVERS) if len(row) == 3]
     assert len(told) > 80
     for theirs, ours, why in told:
@@ -107,14 +143,36 @@ def commands() -> list[list[str]]:
 
 
 @pytest.mark.parametrize("words", commands(), ids=" ".join)
-def test_what_the_page_has_typed_starts_a_node(run: Callable[..., Any], client: Client, tmp_path: Path, words: list[str]) -> None:
+def test_what_the_page_has_typed_starts_a_node(
+    run: Callable[..., Any], client: Client, tmp_path: Path, words: list[str]
+) -> None:
     place = words.index("--ros-args") if "--ros-args" in words else len(words)
     source, *others = words[:place]
     simulated = "sim:ldrobot-stl27l" if source.startswith("/dev/") else source
     if source.endswith(".lsr"):
-        subprocess.run([sys.executable, "-m", "lidarspec", "sim", "ldrobot-stl27l", "--to", source, "-t", "5s"], check=True, cwd=tmp_path)
+        subprocess.run(
+            [
+                sys.executable,
+                "-m",
+                "lidarspec",
+                "sim",
+                "ldrobot-stl27l",
+                "--to",
+                source,
+                "-t",
+                "5s",
+            ],
+            check=True,
+            cwd=tmp_path,
+        )
     node = run(simulated, *others, ros=words[place + 1 :])
     if "publish_tf:=true" in words and importlib.util.find_spec("tf2_msgs") is None:
         assert "publish_tf takes tf2_msgs" in node.communicate(timeout=PATIENCE)[1]
     else:
-        client.until(lambda: any(status.message == "streaming" for array in client.diagnostics for status in array.status))
+        client.until(
+            lambda: any(
+                status.message == "streaming"
+                for array in client.diagnostics
+                for status in array.status
+            )
+        )

@@ -59,7 +59,9 @@ def test_the_segment_has_room_for_eight_clouds_of_the_sensor() -> None:
     assert not memory.warning
 
 
-@pytest.mark.parametrize("sensor", ["ldrobot-stl27l", "hokuyo-utm30lx", "ydlidar-tg15", "sick-tim571"])
+@pytest.mark.parametrize(
+    "sensor", ["ldrobot-stl27l", "hokuyo-utm30lx", "ydlidar-tg15", "sick-tim571"]
+)
 def test_a_planar_sensor_needs_no_profile(sensor: str) -> None:
     memory = choose(sensor)
     assert (memory.segment_bytes, memory.notice, memory.warning) == (0, "", "")
@@ -87,7 +89,9 @@ def test_a_system_without_its_folder_is_left_alone(monkeypatch: pytest.MonkeyPat
 
 
 @pytest.mark.parametrize(("free", "segment"), [(42, 21), (41, 11), (22, 11)])
-def test_the_segment_takes_half_of_the_free_memory_at_most(monkeypatch: pytest.MonkeyPatch, free: int, segment: int) -> None:
+def test_the_segment_takes_half_of_the_free_memory_at_most(
+    monkeypatch: pytest.MonkeyPatch, free: int, segment: int
+) -> None:
     monkeypatch.setattr(shared_memory, "free_bytes", lambda: free * 10**6)
     memory = choose("robosense-m1")
     assert (memory.segment_bytes, memory.warning) == (segment * 10**6, "")
@@ -97,7 +101,14 @@ def test_little_shared_memory_is_a_warning_with_a_remedy(monkeypatch: pytest.Mon
     monkeypatch.setattr(shared_memory, "free_bytes", lambda: 21 * 10**6)
     memory = choose("robosense-m1")
     assert (memory.segment_bytes, memory.notice) == (0, "")
-    for part in ("2.5 MB", "21 MB free", "22 MB are needed", "--shm-size", "--ipc=host", "qos:=reliable"):
+    for part in (
+        "2.5 MB",
+        "21 MB free",
+        "22 MB are needed",
+        "--shm-size",
+        "--ipc=host",
+        "qos:=reliable",
+    ):
         assert part in memory.warning
 
 
@@ -117,9 +128,16 @@ def test_a_sensor_that_is_not_installed_is_left_to_the_node() -> None:
 
 @pytest.mark.parametrize(
     ("sensor", "packets", "slowest_share"),
-    [("robosense-m1", 1300, 1.0), ("livox-mid360", 500, 1.0), ("velodyne-vlp16", 200, 0.5), ("hokuyo-utm30lx", 4, 1.0)],
+    [
+        ("robosense-m1", 1300, 1.0),
+        ("livox-mid360", 500, 1.0),
+        ("velodyne-vlp16", 200, 0.5),
+        ("hokuyo-utm30lx", 4, 1.0),
+    ],
 )
-def test_the_calculated_size_is_that_of_a_message(sensor: str, packets: int, slowest_share: float) -> None:
+def test_the_calculated_size_is_that_of_a_message(
+    sensor: str, packets: int, slowest_share: float
+) -> None:
     """The VLP-16 is simulated at 10 scans a second and calculated for 5."""
     spec = ls.sensor(sensor)
     data = simulate(spec, packets)
@@ -138,7 +156,9 @@ def test_the_calculated_size_is_that_of_a_message(sensor: str, packets: int, slo
         ({"ROS_LOCALHOST_ONLY": "1"}, False),
     ],
 )
-def test_the_profile_leaves_udp_to_ros_if_discovery_is_local(environment: dict[str, str], has_udp: bool) -> None:
+def test_the_profile_leaves_udp_to_ros_if_discovery_is_local(
+    environment: dict[str, str], has_udp: bool
+) -> None:
     profile = make_profile(5_000_000, environment)
     transports = profile.partition("<userTransports>")[2].partition("</userTransports>")[0]
     assert ("udp" in transports) == has_udp
@@ -169,7 +189,9 @@ def sent_clouds(client: Client) -> int:
     return int(values.get("points sent", 0))
 
 
-def test_clouds_arrive_with_best_effort_at_the_full_rate(run: Callable[..., Any], client: Client) -> None:
+def test_clouds_arrive_with_best_effort_at_the_full_rate(
+    run: Callable[..., Any], client: Client
+) -> None:
     received = client.listen("points", PointCloud2, qos=qos_profile_sensor_data)
     process = run("sim:robosense-m1", "-s", "robosense-m1")
     client.until(lambda: client.diagnostics and sent_clouds(client) > 1)
@@ -200,12 +222,22 @@ def test_larger_clouds_than_foreseen_are_a_warning(run: Callable[..., Any], clie
     assert "qos:=reliable" in log
 
 
-def test_nothing_of_the_profile_is_left(run: Callable[..., Any], client: Client, tmp_path: Path) -> None:
+def test_nothing_of_the_profile_is_left(
+    run: Callable[..., Any], client: Client, tmp_path: Path
+) -> None:
     scratch = tmp_path / "scratch"
     scratch.mkdir()
     environment = os.environ | {"TMPDIR": str(scratch)}
-    command = [str(Path(sys.executable).with_name("lidarspec")), "ros2", "sim:robosense-m1", "-s", "robosense-m1"]
-    with subprocess.Popen(command, env=environment, cwd=tmp_path, text=True, stderr=subprocess.PIPE) as process:
+    command = [
+        str(Path(sys.executable).with_name("lidarspec")),
+        "ros2",
+        "sim:robosense-m1",
+        "-s",
+        "robosense-m1",
+    ]
+    with subprocess.Popen(
+        command, env=environment, cwd=tmp_path, text=True, stderr=subprocess.PIPE
+    ) as process:
         client.until(lambda: client.diagnostics, patience=PATIENCE)
         code, log = ended(process)
     assert (code, "shared memory of" in log) == (0, True)

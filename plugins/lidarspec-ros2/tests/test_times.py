@@ -1,4 +1,6 @@
-"""The times of what is published: a recording's are those of its bag, /clock goes with them, and an IMU's go with the points'."""
+"""The times of what is published: a recording's are those of its bag, /clock goes with them, and an
+IMU's go with the points'.
+"""
 
 from __future__ import annotations
 
@@ -24,7 +26,8 @@ from lidarspec.transports.protocol import Chunk
 BEGAN, SECOND, LATEST = 1_767_225_600_000_000_000, 1_000_000_000, 5_000_000
 #: scans that are waited for.
 WANTED = 10
-#: how many packets a recording of some seconds has, the topic, the class of its messages, and how `convert` is told to shape them.
+#: how many packets a recording of some seconds has, the topic, the class of its messages, and how
+#: `convert` is told to shape them.
 SENSORS = {
     "ldrobot-stl27l": (14_400, "scan", LaserScan, ["--beams", "360"]),
     "velodyne-vlp16": (4_500, "points", PointCloud2, ["--organized"]),
@@ -32,14 +35,17 @@ SENSORS = {
 
 
 def recorded(path: Path, sensor: str, *, jumps: int = 0) -> tuple[Path, int]:
-    """A recording of a simulated sensor, each of whose packets arrived up to 5 ms late, and what its clock is behind.
+    """A recording of a simulated sensor, each of whose packets arrived up to 5 ms late, and what
+    its clock is behind.
 
     Args:
         jumps: by how many packets its clock is set in the middle.
     """
     spec, random, at, number = ls.sensor(sensor), np.random.default_rng(0), 0, SENSORS[sensor][0]
     times = spec.decode(b"".join(simulate(spec, number))).time_ns
-    packets = simulate(spec, number // 2) + simulate(spec, number - number // 2, start=number // 2 + jumps)
+    packets = simulate(spec, number // 2) + simulate(
+        spec, number - number // 2, start=number // 2 + jumps
+    )
     with Recorder(path, spec) as recorder:
         for packet, sent in zip(packets, times.tolist(), strict=True):
             at = max(at, sent - int(times[0]) + int(random.integers(0, LATEST)))
@@ -48,15 +54,31 @@ def recorded(path: Path, sensor: str, *, jumps: int = 0) -> tuple[Path, int]:
 
 
 @pytest.mark.parametrize("sensor", SENSORS)
-def test_the_messages_of_a_recording_are_those_of_its_bag(run: Callable[..., Any], client: Client, tmp_path: Path, sensor: str) -> None:
+def test_the_messages_of_a_recording_are_those_of_its_bag(
+    run: Callable[..., Any], client: Client, tmp_path: Path, sensor: str
+) -> None:
     path, _ = recorded(tmp_path / "drive.lsr", sensor)
     _, topic, kind, shape = SENSORS[sensor]
-    words = ["convert", path, tmp_path / "drive.rosbag2", "--time", "host", "--frame-id", "front", *shape]
+    words = [
+        "convert",
+        path,
+        tmp_path / "drive.rosbag2",
+        "--time",
+        "host",
+        "--frame-id",
+        "front",
+        *shape,
+    ]
     subprocess.run([sys.executable, "-m", "lidarspec", *words], check=True)
     with Reader(tmp_path / "drive.rosbag2") as bag:
         wanted = {data for link, _, data in bag.messages() if link.topic == f"/{topic}"}
     clock, received = client.listen("/clock", Clock), client.listen(topic, kind)
-    run(str(path), ros=given(use_sim_time=True, use_device_time=False, qos="reliable", frame_id="front", beams=360))
+    run(
+        str(path),
+        ros=given(
+            use_sim_time=True, use_device_time=False, qos="reliable", frame_id="front", beams=360
+        ),
+    )
     client.until(lambda: len(received) >= WANTED and len(clock) > WANTED)
     assert set(received) < wanted
     clocked = [stamp(message(data, "rosgraph_msgs/msg/Clock").clock) for data in clock]
@@ -75,24 +97,36 @@ def test_stamps_by_the_sensors_clock_are_closer_to_the_truth_than_arrivals(
     received = client.listen(topic, kind)
     run(str(path), ros=given(qos="reliable"))
     client.until(lambda: len(received) >= WANTED)
-    stamps = np.array([stamp(message(data, f"sensor_msgs/msg/{kind.__name__}").header.stamp) for data in received])
+    stamps = np.array(
+        [stamp(message(data, f"sensor_msgs/msg/{kind.__name__}").header.stamp) for data in received]
+    )
     errors = np.abs(stamps[:, None] - truths).min(axis=1)
     assert errors[1:].max() < LATEST / 10
     assert (np.diff(stamps) > 0).all()
 
 
-def test_a_clock_that_is_set_is_reported(run: Callable[..., Any], client: Client, tmp_path: Path) -> None:
-    path, _ = recorded(tmp_path / "drive.lsr", "velodyne-vlp16", jumps=7540)  # packets of ten seconds
+def test_a_clock_that_is_set_is_reported(
+    run: Callable[..., Any], client: Client, tmp_path: Path
+) -> None:
+    path, _ = recorded(
+        tmp_path / "drive.lsr", "velodyne-vlp16", jumps=7540
+    )  # packets of ten seconds
     clouds = client.listen("points", PointCloud2)
     run(str(path), ros=given(qos="reliable"))
     client.until(lambda: any("clock was set by +10.0" in text for text in told(client)))
-    stamps = np.array([stamp(message(data, "sensor_msgs/msg/PointCloud2").header.stamp) for data in clouds])
+    stamps = np.array(
+        [stamp(message(data, "sensor_msgs/msg/PointCloud2").header.stamp) for data in clouds]
+    )
     assert (np.diff(stamps) > 0).all()
     assert stamps[-1] < BEGAN + 10 * SECOND
 
 
-@pytest.mark.parametrize("sensor", ["livox-avia", "ouster-os0"])  # whose samples have no clock, and that of the points
-def test_what_an_imu_felt_is_stamped_beside_the_points(run: Callable[..., Any], client: Client, sensor: str) -> None:
+@pytest.mark.parametrize(
+    "sensor", ["livox-avia", "ouster-os0"]
+)  # whose samples have no clock, and that of the points
+def test_what_an_imu_felt_is_stamped_beside_the_points(
+    run: Callable[..., Any], client: Client, sensor: str
+) -> None:
     felt, clouds = client.listen("imu", Imu), client.listen("points", PointCloud2)
     run(f"sim:{sensor}", "-s", sensor, ros=given(qos="reliable"))
     client.until(lambda: len(felt) > WANTED and len(clouds) > 2)
@@ -103,7 +137,12 @@ def test_what_an_imu_felt_is_stamped_beside_the_points(run: Callable[..., Any], 
 
 def told(client: Client) -> list[str]:
     """What all diagnostics have said."""
-    return [entry.value for array in client.diagnostics for status in array.status for entry in status.values]
+    return [
+        entry.value
+        for array in client.diagnostics
+        for status in array.status
+        for entry in status.values
+    ]
 
 
 def stamp(time_of: Any) -> int:

@@ -1,14 +1,18 @@
-"""Seyond (once Innovusion) Falcon: a lidar that looks ahead, over UDP, with blocks of four channels in spherical coordinates.
+"""Seyond (once Innovusion) Falcon: a lidar that looks ahead, over UDP, with blocks of four channels
+in spherical coordinates.
 
-    6A 17 major minor, sequence(2) | checksum(4) size(4) source type | start of the frame(8) mode status
-    frame(8) part(2) packet(2) | item type, count(3) item size(2) topic(4) flags(2) region(4) [reserved(16), from version 2]
-    count x [angles and their differences, 17 bytes, 4 points of 4 bytes, or 8 with two returns]
+    6A 17 major minor, sequence(2) | checksum(4) size(4) source type | start of the frame(8) mode
+    status frame(8) part(2) packet(2) | item type, count(3) item size(2) topic(4) flags(2) region(4)
+    [reserved(16), from version 2] count x [angles and their differences, 17 bytes, 4 points of 4
+    bytes, or 8 with two returns]
 
-What the checksum covers is public, which CRC it is is not: it is not held. The vendor's SDK moves points by some centimetres beside the
-axis, by a table of its own, which is left out. How many blocks a packet holds, and the pattern of a simulated one, are assumed.
+What the checksum covers is public, which CRC it is is not: it is not held. The vendor's SDK moves
+points by some centimetres beside the axis, by a table of its own, which is left out. How many
+blocks a packet holds, and the pattern of a simulated one, are assumed.
 
-Source: Innovusion SDK 3.102, inno_lidar_packet.h (fields, units, bits) and inno_lidar_packet_utils.h (angles of the channels); its ROS
-driver (port 8010); data sheet of the Falcon K (120 by 25 degrees, 500 m). No packet of a sensor was seen.
+Source: Innovusion SDK 3.102, inno_lidar_packet.h (fields, units, bits) and
+inno_lidar_packet_utils.h (angles of the channels); its ROS driver (port 8010); data sheet of the
+Falcon K (120 by 25 degrees, 500 m). No packet of a sensor was seen.
 """
 
 from __future__ import annotations
@@ -37,13 +41,29 @@ from construct import (
     this,
 )
 
-from lidarspec.spec import Clock, Fields, Frame, OnChange, Polar, Scaled, Sensor, Simulation, Udp, hookimpl
+from lidarspec.spec import (
+    Clock,
+    Fields,
+    Frame,
+    OnChange,
+    Polar,
+    Scaled,
+    Sensor,
+    Simulation,
+    Udp,
+    hookimpl,
+)
 
 UNIT = np.pi / 32768  # of angles
 CHANNELS = 4
 APART = 196  # units from channel to channel, to which their own differences are added
 DATAGRAM = 1472
-SHORT, HEADER, BLOCK, POINT = 54, 70, 17, 4  # bytes: header of version 1 and from 2 on, head of a block, point
+SHORT, HEADER, BLOCK, POINT = (
+    54,
+    70,
+    17,
+    4,
+)  # bytes: header of version 1 and from 2 on, head of a block, point
 SIZE = {1: BLOCK + CHANNELS * POINT, 2: BLOCK + 2 * CHANNELS * POINT}  # of a block, by the returns
 PACKETS, LINES = 60, 12  # of a simulated frame
 RATE = 10
@@ -56,7 +76,9 @@ def difference(name: str, bits: int) -> Any:
 
 
 HEAD = (
-    "angle" / Scaled(Int16sl, UNIT, "rad") * "horizontal, of the first channel: 0 ahead, to the right positive",
+    "angle"
+    / Scaled(Int16sl, UNIT, "rad")
+    * "horizontal, of the first channel: 0 ahead, to the right positive",
     "tilt" / Scaled(Int16sl, UNIT, "rad") * "vertical: up positive",
     "after" / Scaled(Int16ul, 1e-5, "s") * "the start of the frame",
     "line_index" / Int16ul,
@@ -78,7 +100,9 @@ PIXEL = ByteSwapped(
         "type" / BitsInteger(2) * "0 normal, 1 ground, 2 fog",
         "second" / BitsInteger(1) * "1: second return",
         "strength" / BitsInteger(8) * "reflectance or intensity, by the flags; 255: a reflector",
-        "radius" / Scaled(BitsInteger(17), 0.005, "m") * "twice that with long distances; 0: no return",
+        "radius"
+        / Scaled(BitsInteger(17), 0.005, "m")
+        * "twice that with long distances; 0: no return",
     )
 )
 
@@ -116,7 +140,9 @@ def packet(returns: int) -> Struct:
                 "last_packet" / BitsInteger(1),
                 "last_part" / BitsInteger(1),
                 "confidence" / BitsInteger(2),
-                "returns" / BitsInteger(3) * "1 one, 2 the two strongest, 3 the strongest and the farthest",
+                "returns"
+                / BitsInteger(3)
+                * "1 one, 2 the two strongest, 3 the strongest and the farthest",
                 "reflectance" / BitsInteger(1) * "1: strength is reflectance, else intensity",
                 "upwards" / BitsInteger(1),
             )
@@ -140,7 +166,10 @@ def points(f: Fields) -> Polar:
     channel = pixels.index % CHANNELS
     angle, tilt = (
         np.where(channel == 0, 0, np.where(channel == 1, one, np.where(channel == 2, two, three)))
-        for one, two, three in ((more.angle_1, more.angle_2, more.angle_3), (more.tilt_1, more.tilt_2, more.tilt_3))
+        for one, two, three in (
+            (more.angle_1, more.angle_2, more.angle_3),
+            (more.tilt_1, more.tilt_2, more.tilt_3),
+        )
     )
     return Polar(
         range=pixels.radius * np.where(f.flags.long == 1, 2, 1),
@@ -204,7 +233,10 @@ FALCON = Sensor(
     vendor_axes=("up", "right", "forward"),
     aliases=("seyond-falcon-k", "innovusion-falcon"),
     status="manual",
-    source="Innovusion SDK 3.102 (inno_lidar_packet.h, inno_lidar_packet_utils.h); no packet of a sensor was seen",
+    source=(
+        "Innovusion SDK 3.102 (inno_lidar_packet.h, inno_lidar_packet_utils.h); no packet of a"
+        " sensor was seen"
+    ),
 )
 
 

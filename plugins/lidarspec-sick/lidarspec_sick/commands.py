@@ -1,7 +1,8 @@
 """What can be asked of a scanner, and what it answers, in CoLa B or CoLa A.
 
-Source: the telegram listing 8014631; 8023202 (LMS4000), tables 14 to 16, prints how a stream is started. `login` is needed before anything
-is changed, and `run` afterwards; what is set is lost with the power unless it is saved.
+Source: the telegram listing 8014631; 8023202 (LMS4000), tables 14 to 16, prints how a stream is
+started. `login` is needed before anything is changed, and `run` afterwards; what is set is lost
+with the power unless it is saved.
 """
 
 from __future__ import annotations
@@ -15,7 +16,10 @@ from construct import Bytes, Const, Construct, Enum, Int8ub, Int16ub, Int32sb, I
 from lidarspec.spec import Command, Frame, Scaled
 from lidarspec_sick.telegrams import binary, text
 
-CLIENT, PASSWORD = 3, 0xF472_4744  # the user level "authorised client", and the hash of its password
+CLIENT, PASSWORD = (
+    3,
+    0xF472_4744,
+)  # the user level "authorised client", and the hash of its password
 MOST_TEXT = 200  # bytes of an answer with texts in it
 STRING = ("size" / Int16ub, "text" / Bytes(this.size))
 RANGE = (
@@ -77,9 +81,17 @@ MESSAGES: dict[str, tuple[str, str, tuple[Construct, ...]]] = {
     "run": ("sMN", "Run", ()),
     "running": ("sAN", "Run", ("done" / Int8ub,)),
     "ask_state": ("sRN", "SCdevicestate", ()),
-    "state": ("sRA", "SCdevicestate", ("readiness" / Int8ub * "0 busy, 1 ready, 2 error, 3 standby",)),
+    "state": (
+        "sRA",
+        "SCdevicestate",
+        ("readiness" / Int8ub * "0 busy, 1 ready, 2 error, 3 standby",),
+    ),
     "ask_identity": ("sRN", "DeviceIdent", ()),
-    "identity": ("sRA", "DeviceIdent", (*STRING, "version_size" / Int16ub, "version" / Bytes(this.version_size))),
+    "identity": (
+        "sRA",
+        "DeviceIdent",
+        (*STRING, "version_size" / Int16ub, "version" / Bytes(this.version_size)),
+    ),
     "ask_firmware": ("sRN", "FirmwareVersion", ()),
     "firmware": ("sRA", "FirmwareVersion", STRING),
     "ask_range": ("sRN", "LMPoutputRange", ()),
@@ -90,21 +102,33 @@ MESSAGES: dict[str, tuple[str, str, tuple[Construct, ...]]] = {
     "content_set": ("sWA", "LMDscandatacfg", ()),
     "save": ("sMN", "mEEwriteall", ()),
     "saved": ("sAN", "mEEwriteall", ("done" / Int8ub,)),
-    "refused": ("sFA", "", ("error" / Enum(Int16ub, **{name: number for number, name in enumerate(ERRORS, 1)}),)),
+    "refused": (
+        "sFA",
+        "",
+        ("error" / Enum(Int16ub, **{name: number for number, name in enumerate(ERRORS, 1)}),),
+    ),
 }
 ASKED = ("sMN", "sRN", "sWN", "sEN")
 
 
 def message(cola: str, kind: str, method: str, content: tuple[Construct, ...]) -> Frame:
-    """One message; in CoLa B what the scanner answers has a space behind the method even where nothing follows."""
+    """One message; in CoLa B what the scanner answers has a space behind the method even where
+    nothing follows.
+    """
     out = kind in ASKED
     direction, most = "out" if out else "in", MOST_TEXT if set(STRING) & set(content) else 0
     if cola == "A":
-        names = ["kind" / Const(kind.encode()), *(["method" / Const(method.encode())] if method else [])]
+        names = [
+            "kind" / Const(kind.encode()),
+            *(["method" / Const(method.encode())] if method else []),
+        ]
         return text(*names, *content, direction=direction)
     head = f"{kind} {method} " if method else f"{kind} "
     return binary(
-        "method" / Const(head.rstrip(" " if out and not content else "").encode()), *content, direction=direction, max_length=most
+        "method" / Const(head.rstrip(" " if out and not content else "").encode()),
+        *content,
+        direction=direction,
+        max_length=most,
     )
 
 
@@ -121,12 +145,23 @@ def asking(frame: str, reply: str, values: Mapping[str, Any] | None = None, **mo
 
 def commands(scan: str) -> dict[str, Command]:
     """All commands of a scanner whose scans are such frames."""
-    content = {"reserved": 0, "wide": 1, "unit": 0, "encoders": 0, "position": 0, "name": 0, "comment": 0, "time": 1}
+    content = {
+        "reserved": 0,
+        "wide": 1,
+        "unit": 0,
+        "encoders": 0,
+        "position": 0,
+        "name": 0,
+        "comment": 0,
+        "time": 1,
+    }
     return {
         "start": asking("set_stream", "stream", {"active": 1}, echoes=("active",), starts=True),
         "stop": asking("set_stream", "stream", {"active": 0}, echoes=("active",), stops=True),
         "get_scan": asking("ask_scan", scan),
-        "login": asking("login", "logged_in", {"level": CLIENT, "password": PASSWORD}, matches={"done": 1}),
+        "login": asking(
+            "login", "logged_in", {"level": CLIENT, "password": PASSWORD}, matches={"done": 1}
+        ),
         "run": asking("run", "running", matches={"done": 1}),
         "start_measuring": asking("measure", "measuring", matches={"error": 0}),
         "stop_measuring": asking("halt", "halted", matches={"error": 0}),
@@ -138,13 +173,21 @@ def commands(scan: str) -> dict[str, Command]:
             "set_range",
             "range_set",
             {"sectors": 1},
-            args={"step": ("step", 0.0833, 1.0), "start": ("start", -47.5, 227.5), "stop": ("stop", -47.5, 227.5)},
+            args={
+                "step": ("step", 0.0833, 1.0),
+                "start": ("start", -47.5, 227.5),
+                "stop": ("stop", -47.5, 227.5),
+            },
         ),
         "set_content": asking(
             "set_content",
             "content_set",
             content,
-            args={"echoes": ("echoes", 1, 31), "strength": ("strength", 0, 1), "interval": ("interval", 1, 50_000)},
+            args={
+                "echoes": ("echoes", 1, 31),
+                "strength": ("strength", 0, 1),
+                "interval": ("interval", 1, 50_000),
+            },
         ),
         "save": asking("save", "saved", matches={"done": 1}),
     }

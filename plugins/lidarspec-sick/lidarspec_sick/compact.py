@@ -1,9 +1,10 @@
 """multiScan100 and picoScan100: telegrams in the compact format over UDP, of scans and of the IMU.
 
-Source: sick_scan_xd (compact_parser.cpp and its unit tests) for the layout, of versions 3 and 4; multiScan136 operating instructions
-8027119 for segments and layers. A telegram is a chain of modules under one CRC; each has its own layers, beams and echoes, and its
-azimuths on the wire, or evenly between those of its first and last beam. Elevation counts downwards. The property of a beam says by
-bit 0 that a reflector was seen.
+Source: sick_scan_xd (compact_parser.cpp and its unit tests) for the layout, of versions 3 and 4;
+multiScan136 operating instructions 8027119 for segments and layers. A telegram is a chain of
+modules under one CRC; each has its own layers, beams and echoes, and its azimuths on the wire, or
+evenly between those of its first and last beam. Elevation counts downwards. The property of a beam
+says by bit 0 that a reflector was seen.
 """
 
 from __future__ import annotations
@@ -13,7 +14,21 @@ from functools import partial
 from typing import Any
 
 import numpy as np
-from construct import Array, BitsInteger, BitStruct, Const, Construct, Float32l, If, Int8ul, Int16ul, Int32ul, Int64ul, Struct, this
+from construct import (
+    Array,
+    BitsInteger,
+    BitStruct,
+    Const,
+    Construct,
+    Float32l,
+    If,
+    Int8ul,
+    Int16ul,
+    Int32ul,
+    Int64ul,
+    Struct,
+    this,
+)
 
 from lidarspec.spec import (
     Checksummed,
@@ -32,7 +47,9 @@ from lidarspec.spec import (
     Udp,
 )
 
-CRC = Crc(32, 0x04C11DB7, init=0xFFFFFFFF, refin=True, refout=True, xorout=0xFFFFFFFF, order="little")
+CRC = Crc(
+    32, 0x04C11DB7, init=0xFFFFFFFF, refin=True, refout=True, xorout=0xFFFFFFFF, order="little"
+)
 MAGIC = "magic" / Const(b"\x02\x02\x02\x02")
 LONGEST = 16_384  # bytes: three echoes of the 900 beams of a segment of a multiScan136 take 14 160
 STEP, ZERO = 1 / 5215, 16_384  # radians for each step of an azimuth, and the step straight ahead
@@ -41,13 +58,20 @@ TURNS = 20.0  # turns a second of a simulated one
 
 def module(version: int) -> Struct:
     """A module of a telegram of version 3 or 4: beams of all its layers."""
-    azimuth = "azimuth" / If(this._.beam_content.has_azimuth == 1, Scaled(Int16ul, STEP, "rad", -ZERO * STEP))
-    properties = "property" / If(this._.beam_content.has_property == 1, Int8ul) * "bit 0: a reflector"
+    azimuth = "azimuth" / If(
+        this._.beam_content.has_azimuth == 1, Scaled(Int16ul, STEP, "rad", -ZERO * STEP)
+    )
+    properties = (
+        "property" / If(this._.beam_content.has_property == 1, Int8ul) * "bit 0: a reflector"
+    )
     echo = Struct(
         "distance" / If(this._._.echo_content.has_distance == 1, Scaled(Int16ul, 0.001, "m")),
         "strength" / If(this._._.echo_content.has_strength == 1, Int16ul),
     )
-    beam = Struct("echoes" / Array(this._.echo_count, echo), *((properties, azimuth) if version == 4 else (azimuth, properties)))
+    beam = Struct(
+        "echoes" / Array(this._.echo_count, echo),
+        *((properties, azimuth) if version == 4 else (azimuth, properties)),
+    )
     return Struct(
         "segment" / Int64ul,
         "turn" / Int64ul,
@@ -63,8 +87,18 @@ def module(version: int) -> Struct:
         *(["scale" / Float32l] if version == 4 else []),
         "next_size" / Int32ul * "bytes of the next module, 0 behind the last",
         "available" / Int8ul,
-        "echo_content" / BitStruct("reserved" / BitsInteger(6), "has_strength" / BitsInteger(1), "has_distance" / BitsInteger(1)),
-        "beam_content" / BitStruct("reserved" / BitsInteger(6), "has_azimuth" / BitsInteger(1), "has_property" / BitsInteger(1)),
+        "echo_content"
+        / BitStruct(
+            "reserved" / BitsInteger(6),
+            "has_strength" / BitsInteger(1),
+            "has_distance" / BitsInteger(1),
+        ),
+        "beam_content"
+        / BitStruct(
+            "reserved" / BitsInteger(6),
+            "has_azimuth" / BitsInteger(1),
+            "has_property" / BitsInteger(1),
+        ),
         "reserved" / Int8ul,
         "beams" / Array(this.beam_count, Array(this.layer_count, beam)),
     )
@@ -119,10 +153,15 @@ def points(f: Fields, version: int) -> Polar:
 
 def imu(f: Fields) -> Imu:
     """What is felt, gravity included."""
-    return Imu((f.turning_x, f.turning_y, f.turning_z), (f.acceleration_x, f.acceleration_y, f.acceleration_z))
+    return Imu(
+        (f.turning_x, f.turning_y, f.turning_z),
+        (f.acceleration_x, f.acceleration_y, f.acceleration_z),
+    )
 
 
-def sweep(i: int, version: int, elevations: tuple[float, ...], beams: int, segments: int) -> dict[str, Any]:
+def sweep(
+    i: int, version: int, elevations: tuple[float, ...], beams: int, segments: int
+) -> dict[str, Any]:
     """Telegram i: one segment of a turn, in one module, with one echo."""
     layers, begin = len(elevations), i / segments / TURNS * 1e6
     width = 360 / segments
@@ -151,13 +190,32 @@ def sweep(i: int, version: int, elevations: tuple[float, ...], beams: int, segme
 def scans(version: int, sweep: Callable[..., Mapping[str, Any]]) -> Frame:
     """The telegram of scans of this version, and what is simulated in it."""
     read = {"modules": partial(points, version=version)}
-    return Frame(telegram(version), data=True, max_length=LONGEST, points=read, simulation=Simulation(partial(sweep, version=version)))
+    return Frame(
+        telegram(version),
+        data=True,
+        max_length=LONGEST,
+        points=read,
+        simulation=Simulation(partial(sweep, version=version)),
+    )
 
 
-IMU_FRAME = Frame(IMU, imu=imu, clock=Clock("time"), simulation=Simulation(lambda i: {"time": i * 10_000}, rate=100))
-#: id -> model, elevations of the layers in degrees, beams of a segment, segments of a turn, limits of range, status.
+IMU_FRAME = Frame(
+    IMU,
+    imu=imu,
+    clock=Clock("time"),
+    simulation=Simulation(lambda i: {"time": i * 10_000}, rate=100),
+)
+#: id -> model, elevations of the layers in degrees, beams of a segment, segments of a turn, limits
+#: of range, status.
 MODELS: dict[str, tuple[str, tuple[float, ...], int, int, tuple[float, float], str]] = {
-    "sick-multiscan136": ("multiScan136", tuple(np.linspace(22.5, -42.5, 16)), 30, 12, (0.05, 60), "capture"),
+    "sick-multiscan136": (
+        "multiScan136",
+        tuple(np.linspace(22.5, -42.5, 16)),
+        30,
+        12,
+        (0.05, 60),
+        "capture",
+    ),
     "sick-picoscan150": ("picoScan150", (0.0,), 300, 12, (0.05, 75), "manual"),
 }
 
@@ -180,7 +238,10 @@ def scanner(name: str) -> Sensor:
         relatives={other: "how many layers its modules have" for other in MODELS if other != name},
         aliases=(model.lower(),),
         status=status,
-        source="sick_scan_xd, compact_parser.cpp; 8027119 for segments. Assumed: ranges, turns, beams, elevations of simulated layers",
+        source=(
+            "sick_scan_xd, compact_parser.cpp; 8027119 for segments. Assumed: ranges, turns, beams,"
+            " elevations of simulated layers"
+        ),
     )
 
 

@@ -1,9 +1,11 @@
-"""TiM5xx, TiM7xx, TiM871S, LMS1xx, LMS5xx and MRS1000: scanners that send LMDscandata over TCP, in CoLa B or CoLa A.
+"""TiM5xx, TiM7xx, TiM871S, LMS1xx, LMS5xx and MRS1000: scanners that send LMDscandata over TCP, in
+CoLa B or CoLa A.
 
-Source: the telegram listing 8014631; TiM55x, TiM56x and TiM57x operating instructions 8015883 (steps, rate and angles, 5.3), LMS5xx 8013796
-(steps, 3.5), MRS1000 8020494 (layers, 3.5.10). Assumed, since no sheet was at hand: the steps, rates and angles of TiM7xx and LMS1xx,
-the rates of an LMS5xx, and the ranges of all. What can be set stands in the telegrams, so that models are told apart by what others
-cannot be set to; what cannot be told, they answer to `get_identity`.
+Source: the telegram listing 8014631; TiM55x, TiM56x and TiM57x operating instructions 8015883
+(steps, rate and angles, 5.3), LMS5xx 8013796 (steps, 3.5), MRS1000 8020494 (layers, 3.5.10).
+Assumed, since no sheet was at hand: the steps, rates and angles of TiM7xx and LMS1xx, the rates of
+an LMS5xx, and the ranges of all. What can be set stands in the telegrams, so that models are told
+apart by what others cannot be set to; what cannot be told, they answer to `get_identity`.
 """
 
 from __future__ import annotations
@@ -16,7 +18,18 @@ from typing import Any
 import numpy as np
 
 from lidarspec import UsageError
-from lidarspec.spec import Clock, Fields, Frame, OnChange, OnFlag, Relative, Sensor, Sequence, Simulation, Tcp
+from lidarspec.spec import (
+    Clock,
+    Fields,
+    Frame,
+    OnChange,
+    OnFlag,
+    Relative,
+    Sensor,
+    Sequence,
+    Simulation,
+    Tcp,
+)
 from lidarspec_sick.commands import ANSWERS, commands, messages
 from lidarspec_sick.telegrams import scans
 
@@ -28,7 +41,8 @@ NEAR = 1e-4  # degrees that an angle on the wire may be off
 
 @dataclass(frozen=True)
 class Kind:
-    """What the models of a family can be set to: scans a second, steps in degrees, the first angle; what a simulated one does is first.
+    """What the models of a family can be set to: scans a second, steps in degrees, the first angle;
+    what a simulated one does is first.
 
     Attributes:
         layers: in the order in which they come, degrees downwards.
@@ -45,7 +59,12 @@ class Kind:
         """Whether a scan can be one of these."""
         steps = [np.abs(f.dist1.step - step) < NEAR for step in self.steps]
         rates = [f.scan_rate == rate for rate in self.rates]
-        return any_of(steps) & any_of(rates) & (f.dist1.start > self.start - NEAR) & any_of([f.layer == layer for layer in self.layers])
+        return (
+            any_of(steps)
+            & any_of(rates)
+            & (f.dist1.start > self.start - NEAR)
+            & any_of([f.layer == layer for layer in self.layers])
+        )
 
 
 def any_of(conditions: list[Any]) -> Any:
@@ -104,13 +123,20 @@ def frames(kind: Kind, cola: str) -> dict[str, Frame]:
     forms = sorted("AB", key=lambda form: form != cola)
     own = {{"A": "text", "B": "scan"}[form]: scans(form, 1) for form in forms}
     if kind.echoes > 1:
-        names, simulation = {"A": "echoes_text", "B": "echoes"}, Simulation(partial(sweep, kind=kind, echoes=kind.echoes))
-        own |= {names[form]: dataclasses.replace(scans(form, kind.echoes), simulation=simulation) for form in forms}
+        names, simulation = (
+            {"A": "echoes_text", "B": "echoes"},
+            Simulation(partial(sweep, kind=kind, echoes=kind.echoes)),
+        )
+        own |= {
+            names[form]: dataclasses.replace(scans(form, kind.echoes), simulation=simulation)
+            for form in forms
+        }
     return own | dict(messages(cola))
 
 
 def configure(sensor: Sensor, *, cola: str = "B", echoes: int = 0) -> Sensor:
-    """The scanner that is spoken to in CoLa "A" or "B"; scans are read in either form, with one echo and with so many, by default all.
+    """The scanner that is spoken to in CoLa "A" or "B"; scans are read in either form, with one
+    echo and with so many, by default all.
 
     Raises:
         UsageError: for another form, or more echoes than the scanner has.
@@ -121,14 +147,18 @@ def configure(sensor: Sensor, *, cola: str = "B", echoes: int = 0) -> Sensor:
     if echoes not in range(kind.echoes + 1):
         raise UsageError(f"{sensor.id}: echoes is a number from 1 to {kind.echoes}, not {echoes!r}")
     own = frames(dataclasses.replace(kind, echoes=echoes or kind.echoes), cola)
-    return dataclasses.replace(sensor, frames=own, commands=commands("text" if cola == "A" else "scan"))
+    return dataclasses.replace(
+        sensor, frames=own, commands=commands("text" if cola == "A" else "scan")
+    )
 
 
 def relative(own: Kind, other: Kind) -> str | Relative:
     """What tells a scanner of another kind."""
     if own == other:
         return "nothing in its scans: its answer to get_identity, or the label on the housing"
-    return Relative("the rate, the steps or the first angle", lambda f: other.fits(f) & ~own.fits(f))
+    return Relative(
+        "the rate, the steps or the first angle", lambda f: other.fits(f) & ~own.fits(f)
+    )
 
 
 def scanner(name: str) -> Sensor:
@@ -140,7 +170,9 @@ def scanner(name: str) -> Sensor:
         model=model,
         frames=frames(kind, "B"),
         points=None,
-        scan=OnChange("telegram_counter") if len(kind.layers) == 1 else OnFlag("layer", kind.layers[0]),
+        scan=OnChange("telegram_counter")
+        if len(kind.layers) == 1
+        else OnFlag("layer", kind.layers[0]),
         clock=Clock("time", wraps_at=WRAP),
         sequence=Sequence("telegram_counter"),
         links={"data": Tcp(2112)},
@@ -148,7 +180,8 @@ def scanner(name: str) -> Sensor:
         on_open=("start",),
         on_close=("stop",),
         simulation=Simulation(
-            partial(sweep, kind=kind), answers={**ANSWERS, "get_scan": (("scan", {**sweep(0, kind), "kind": ANSWERED}),)}
+            partial(sweep, kind=kind),
+            answers={**ANSWERS, "get_scan": (("scan", {**sweep(0, kind), "kind": ANSWERED}),)},
         ),
         configure=configure,
         range_limits=limits,

@@ -1,10 +1,12 @@
-"""The telegram of a scan, LMDscandata, in CoLa B, which is binary, and in CoLa A, the same fields as hexadecimal text.
+"""The telegram of a scan, LMDscandata, in CoLa B, which is binary, and in CoLa A, the same fields
+as hexadecimal text.
 
-Source: SICK Telegram Listing LiDAR sensors 8014631 and the tables of LMDscandata in the operating instructions 8023198 (LMS4000), with the
-values below 16 that are no distances; 8020494 (MRS1000) for the layers; sick_scan_xd for where angles count from. A telegram has
-one layer. Its channels of 16 bits are DIST1 to DISTn; RSSI1 to RSSIn follow if they are asked for, in 16 bits or in 8. Where both are
-there, the intensity is that of 8 bits. Telegrams with channels of other kinds (ANGL, VANG, QLTY) are not read. A third of a degree is
-0.3333 on the wire, and is left so.
+Source: SICK Telegram Listing LiDAR sensors 8014631 and the tables of LMDscandata in the operating
+instructions 8023198 (LMS4000), with the values below 16 that are no distances; 8020494 (MRS1000)
+for the layers; sick_scan_xd for where angles count from. A telegram has one layer. Its channels of
+16 bits are DIST1 to DISTn; RSSI1 to RSSIn follow if they are asked for, in 16 bits or in 8. Where
+both are there, the intensity is that of 8 bits. Telegrams with channels of other kinds (ANGL, VANG,
+QLTY) are not read. A third of a degree is 0.3333 on the wire, and is left so.
 """
 
 from __future__ import annotations
@@ -13,11 +15,27 @@ from functools import cache, partial
 from typing import Any
 
 import numpy as np
-from construct import Array, Bytes, Const, Construct, Float32b, If, Int8ub, Int16sb, Int16ub, Int32sb, Int32ub, Rebuild, Struct, this
+from construct import (
+    Array,
+    Bytes,
+    Const,
+    Construct,
+    Float32b,
+    If,
+    Int8ub,
+    Int16sb,
+    Int16ub,
+    Int32sb,
+    Int32ub,
+    Rebuild,
+    Struct,
+    this,
+)
 
 from lidarspec.spec import Checksummed, Fields, Frame, Polar, Scaled, SizeOf, Tokens, Xor, stack
 
-LEAST = 0.016  # metres before scaling: the smallest value that is a distance is 16 (8023198, reserved values)
+# metres before scaling: the smallest value that is a distance is 16 (8023198, reserved values)
+LEAST = 0.016
 AHEAD = 90.0  # degrees on the wire that lie straight ahead (sick_scan_xd)
 DISTANCE = Scaled(Int16ub, 0.001, "m") * "to be scaled; below 16: none"
 HIGHEST = 1e6  # Hz; rates above are in Hz, not in 100 Hz, as sick_scan_xd says of some firmware
@@ -27,15 +45,25 @@ MOST_BEAMS = 1141  # of an LMS5xx with steps of a sixth of a degree
 def binary(*parts: Construct, max_length: int = 0, **more: Any) -> Frame:
     """A telegram of CoLa B: four times 02, a length, the content, and the XOR of it."""
     struct = Struct(
-        "magic" / Const(b"\x02\x02\x02\x02"), "length" / SizeOf(Int32ub, plus=-9) * "of the content", *parts, "checksum" / Int8ub
+        "magic" / Const(b"\x02\x02\x02\x02"),
+        "length" / SizeOf(Int32ub, plus=-9) * "of the content",
+        *parts,
+        "checksum" / Int8ub,
     )
-    sealed = Checksummed(struct, field="checksum", algorithm=Xor(), over=tuple(part.name for part in parts))
+    sealed = Checksummed(
+        struct, field="checksum", algorithm=Xor(), over=tuple(part.name for part in parts)
+    )
     return Frame(sealed, max_length=max_length, **more)
 
 
 def text(*parts: Construct, max_length: int = 200, **more: Any) -> Frame:
     """A telegram of CoLa A: 02, tokens, 03."""
-    return Frame(Struct(*parts), wire=Tokens(start=b"\x02", sep=b" ", end=b"\x03", base=16), max_length=max_length, **more)
+    return Frame(
+        Struct(*parts),
+        wire=Tokens(start=b"\x02", sep=b" ", end=b"\x03", base=16),
+        max_length=max_length,
+        **more,
+    )
 
 
 def channel(content: str, values: Construct, *, first: bool = False, name: str = "") -> Construct:
@@ -65,13 +93,18 @@ def scan(echoes: int) -> list[Construct]:
     """What stands behind the name of a telegram with so many echoes of each beam."""
     others = [channel(f"DIST{number}", DISTANCE) for number in range(2, echoes + 1)]
     strengths = [channel(f"RSSI{number}", Int16ub) for number in range(1, echoes + 1)]
-    strengths8 = [channel(f"RSSI{number}", Int8ub, name=f"rssi{number}_8bit") for number in range(1, echoes + 1)]
+    strengths8 = [
+        channel(f"RSSI{number}", Int8ub, name=f"rssi{number}_8bit")
+        for number in range(1, echoes + 1)
+    ]
     named = ("length" / Int8ub, "text" / Bytes(this.length))
     return [
         "version" / Int16ub,
         "device" / Int16ub,
         "serial" / Int32ub,
-        "status" / Array(2, Int8ub) * "0 0 ok, 0 1 error, 0 2 pollution warning, 0 4 pollution error",
+        "status"
+        / Array(2, Int8ub)
+        * "0 0 ok, 0 1 error, 0 2 pollution warning, 0 4 pollution error",
         "telegram_counter" / Int16ub,
         "scan_counter" / Int16ub,
         "time" / Scaled(Int32ub, 1, "us") * "since power-up, when the scan began",
@@ -88,12 +121,31 @@ def scan(echoes: int) -> list[Construct]:
         *others,
         *(part.name / If(this.channels == 2 * echoes, part.subcon) for part in strengths),
         "channels8" / Int16ub * "of 8 bits",
-        *(part.name / If(this.channels8 >= number, part.subcon) for number, part in enumerate(strengths8, 1)),
-        *optional("position", *(axis / Float32b for axis in ("x", "y", "z", "rx", "ry", "rz")), "rotation" / Int8ub, "named" / Int8ub),
+        *(
+            part.name / If(this.channels8 >= number, part.subcon)
+            for number, part in enumerate(strengths8, 1)
+        ),
+        *optional(
+            "position",
+            *(axis / Float32b for axis in ("x", "y", "z", "rx", "ry", "rz")),
+            "rotation" / Int8ub,
+            "named" / Int8ub,
+        ),
         *optional("name", *named),
         *optional("comment", *named),
-        *optional("date", "year" / Int16ub, *(name / Int8ub for name in ("month", "day", "hour", "minute", "second")), "us" / Int32ub),
-        *optional("event", "type" / Bytes(4), "encoder" / Int32ub, "time" / Int32ub, "angle" / Scaled(Int32sb, 1e-4, "deg")),
+        *optional(
+            "date",
+            "year" / Int16ub,
+            *(name / Int8ub for name in ("month", "day", "hour", "minute", "second")),
+            "us" / Int32ub,
+        ),
+        *optional(
+            "event",
+            "type" / Bytes(4),
+            "encoder" / Int32ub,
+            "time" / Int32ub,
+            "angle" / Scaled(Int32sb, 1e-4, "deg"),
+        ),
     ]
 
 
@@ -114,7 +166,9 @@ def points(f: Fields, echoes: int) -> Polar:
     distances = [getattr(f, f"dist{number}") for number in range(1, echoes + 1)]
     strengths = [getattr(f, f"rssi{number}") for number in range(1, echoes + 1)]
     strengths8 = [getattr(f, f"rssi{number}_8bit") for number in range(1, echoes + 1)]
-    ranges = [(one.samples * one.scale + one.offset * 0.001).on("dist1.samples") for one in distances]
+    ranges = [
+        (one.samples * one.scale + one.offset * 0.001).on("dist1.samples") for one in distances
+    ]
     missing = [(one.samples < LEAST).on("dist1.samples") for one in distances]
     intensity = [
         np.where(f.channels8 == echoes, scaled_intensity(narrow), scaled_intensity(wide))
@@ -142,7 +196,15 @@ def scans(cola: str, echoes: int) -> Frame:
     """The telegram of a scan with so many echoes, in CoLa "A" or "B"."""
     longest = 200 + echoes * 2 * (40 + 2 * MOST_BEAMS)
     kind = "kind" / Bytes(3) * "sSN sent by itself, sRA asked for"
-    more = {"data": True, "plausible": partial(plausible, echoes=echoes), "points": partial(points, echoes=echoes)}
+    more = {
+        "data": True,
+        "plausible": partial(plausible, echoes=echoes),
+        "points": partial(points, echoes=echoes),
+    }
     if cola == "A":
-        return text(kind, "method" / Const(b"LMDscandata"), *scan(echoes), max_length=3 * longest, **more)
-    return binary(kind, "method" / Const(b" LMDscandata "), *scan(echoes), max_length=longest, **more)
+        return text(
+            kind, "method" / Const(b"LMDscandata"), *scan(echoes), max_length=3 * longest, **more
+        )
+    return binary(
+        kind, "method" / Const(b" LMDscandata "), *scan(echoes), max_length=longest, **more
+    )

@@ -1,4 +1,6 @@
-"""SICK scanners: a TiM871S in CoLa B, a TiM5xx in CoLa A, a multiScan136; what tells models, and what cannot be told."""
+"""SICK scanners: a TiM871S in CoLa B, a TiM5xx in CoLa A, a multiScan136; what tells models, and
+what cannot be told.
+"""
 
 from __future__ import annotations
 
@@ -21,7 +23,11 @@ MRS1104, MULTISCAN = ls.sensor("sick-mrs1104"), ls.sensor("sick-multiscan136")
 
 def telegrams() -> list[bytes]:
     """The datagrams of the multiScan capture, each behind its length."""
-    data, found, start = capture("sick/multiscan_compact_test01_udp_scandata.telegrams.bin").read_bytes(), list[bytes](), 0
+    data, found, start = (
+        capture("sick/multiscan_compact_test01_udp_scandata.telegrams.bin").read_bytes(),
+        list[bytes](),
+        0,
+    )
     while start < len(data):
         size = struct.unpack_from("<I", data, start)[0]
         found.append(data[start + 4 : start + 4 + size])
@@ -37,7 +43,9 @@ def test_every_scan_of_a_tim871s_is_read() -> None:
     assert (packets.stats.frames["scan"], packets.stats.lost, len(cloud)) == (150, 0, 150 * 811)
     raw = np.frombuffer(data, ">u2", 811, data.index(b"DIST1") + 21)
     np.testing.assert_allclose(cloud.range[:811][raw >= 50], raw[raw >= 50] * 0.001, atol=1e-6)
-    np.testing.assert_allclose(cloud.azimuth[:811], np.deg2rad(-135 + 0.3333 * np.arange(811)), atol=1e-5)
+    np.testing.assert_allclose(
+        cloud.azimuth[:811], np.deg2rad(-135 + 0.3333 * np.arange(811)), atol=1e-5
+    )
     np.testing.assert_array_equal(cloud.valid[:811], raw >= 50)
     assert len(list(TIM871S.scans(data))) == 150
     named = {one.sensor.id for one in verdict(Heard("", (data,))).alike}
@@ -52,7 +60,9 @@ def test_a_telegram_in_text_is_read_and_built_again() -> None:
     np.testing.assert_allclose(cloud.azimuth, np.deg2rad(np.arange(271) - 135.0), atol=1e-5)
     assert cloud.intensity is not None
     tokens = data.split(b" ")
-    assert cloud.intensity.tolist() == [int(token, 16) for token in tokens[tokens.index(b"RSSI1") + 6 :][:271]]
+    assert cloud.intensity.tolist() == [
+        int(token, 16) for token in tokens[tokens.index(b"RSSI1") + 6 :][:271]
+    ]
 
 
 def test_a_telegram_without_strengths_beside_one_that_has_them() -> None:
@@ -67,15 +77,28 @@ def test_a_telegram_without_strengths_beside_one_that_has_them() -> None:
 
 @pytest.mark.slow
 @pytest.mark.parametrize("cola", ["A", "B"])
-@pytest.mark.parametrize(("name", "echoes"), [("sick-lms111", 2), ("sick-lms511", 3), ("sick-lms511", 5), ("sick-mrs1104", 3)])
-def test_any_number_of_echoes_is_read_with_their_strengths(name: str, echoes: int, cola: str) -> None:
+@pytest.mark.parametrize(
+    ("name", "echoes"),
+    [("sick-lms111", 2), ("sick-lms511", 3), ("sick-lms511", 5), ("sick-mrs1104", 3)],
+)
+def test_any_number_of_echoes_is_read_with_their_strengths(
+    name: str, echoes: int, cola: str
+) -> None:
     sensor = ls.sensor(name).configure(cola=cola, echoes=echoes)
     frame = "echoes_text" if cola == "A" else "echoes"
     values = sensor.parse(ls.simulate(sensor, 1)[0])
     first, beams = dict(values.dist1), values.dist1.count
     for number in range(1, echoes + 1):
-        values[f"dist{number}"] = {**first, "content": f"DIST{number}".encode(), "samples": [1000 * number] * beams}
-        values[f"rssi{number}"] = {**first, "content": f"RSSI{number}".encode(), "samples": [10 * number] * beams}
+        values[f"dist{number}"] = {
+            **first,
+            "content": f"DIST{number}".encode(),
+            "samples": [1000 * number] * beams,
+        }
+        values[f"rssi{number}"] = {
+            **first,
+            "content": f"RSSI{number}".encode(),
+            "samples": [10 * number] * beams,
+        }
         values[f"rssi{number}_8bit"] = None
     data = sensor.build(frame, {**values, "channels": 2 * echoes, "channels8": 0})
     packets = sensor.decode(data * 2)
@@ -92,7 +115,9 @@ def test_any_number_of_echoes_is_read_with_their_strengths(name: str, echoes: in
 
 @pytest.mark.parametrize("cola", ["A", "B"])
 @pytest.mark.parametrize("bits", [0, 8, 16])
-@pytest.mark.parametrize("echoes", [1, 2, *(pytest.param(echoes, marks=pytest.mark.slow) for echoes in (3, 4, 5))])
+@pytest.mark.parametrize(
+    "echoes", [1, 2, *(pytest.param(echoes, marks=pytest.mark.slow) for echoes in (3, 4, 5))]
+)
 def test_strengths_come_in_8_or_16_bits_or_not_at_all(echoes: int, bits: int, cola: str) -> None:
     sensor = LMS511.configure(cola=cola, echoes=echoes)
     frame = sensor.data_frames[0] if echoes == 1 else {"A": "echoes_text", "B": "echoes"}[cola]
@@ -105,7 +130,10 @@ def test_strengths_come_in_8_or_16_bits_or_not_at_all(echoes: int, bits: int, co
         values[f"rssi{number}_8bit"] = strengths if bits == 8 else None
     for name in ("position", "name", "comment", "date", "event"):
         values |= {f"has_{name}": 0, name: None}
-    values |= {"channels": echoes * (2 if bits == 16 else 1), "channels8": echoes if bits == 8 else 0}
+    values |= {
+        "channels": echoes * (2 if bits == 16 else 1),
+        "channels8": echoes if bits == 8 else 0,
+    }
     values |= {"encoder_count": 0, "encoders": [], "scan_rate": 5000, "beam_rate": 360}
     data = sensor.build(frame, values)
     assert sensor.build(frame, sensor.parse(data, frame)) == data
@@ -114,7 +142,9 @@ def test_strengths_come_in_8_or_16_bits_or_not_at_all(echoes: int, bits: int, co
     cloud = packets.points()
     np.testing.assert_allclose(cloud.range[:echoes], np.arange(1, echoes + 1))
     assert cloud.intensity is not None
-    assert cloud.intensity[:echoes].tolist() == [10 * number if bits else 0 for number in range(1, echoes + 1)]
+    assert cloud.intensity[:echoes].tolist() == [
+        10 * number if bits else 0 for number in range(1, echoes + 1)
+    ]
 
 
 @pytest.mark.parametrize("cola", ["A", "B"])
@@ -123,9 +153,16 @@ def test_a_refusal_is_told_at_once_and_in_words(cola: str) -> None:
     if cola == "A":
         assert sensor.parse(b"\x02sFA 3\x03", "refused").error == "variable_unknown"
     refused = (("refused", {"error": 4}),)
-    sensor = replace(sensor, simulation=replace(sensor.simulation, answers={**sensor.simulation.answers, "set_range": refused}))
+    sensor = replace(
+        sensor,
+        simulation=replace(
+            sensor.simulation, answers={**sensor.simulation.answers, "set_range": refused}
+        ),
+    )
     with ls.open("sim:", sensor) as device:
-        with pytest.raises(CommandError, match=r"set_range: the sensor refuses it: error value_not_allowed \(4\)$"):
+        with pytest.raises(
+            CommandError, match=r"set_range: the sensor refuses it: error value_not_allowed \(4\)$"
+        ):
             device.send("set_range", timeout=60, step=0.5, start=0, stop=90)
         assert device.send("get_state", timeout=60).confirmed
 
@@ -136,7 +173,11 @@ def test_every_telegram_of_a_multiscan_is_read() -> None:
     cloud = packets.points()
     assert (dict(packets.stats.frames), len(cloud)) == ({"scan": 66, "imu": 28}, 59_400)
     assert [len(scan) for scan in MULTISCAN.scans(data) if scan.complete] == [10_800] * 5
-    assert 9.5 < np.median(np.linalg.norm(MULTISCAN.decode(data, "imu").imu().linear_acceleration, axis=1)) < 10.1
+    assert (
+        9.5
+        < np.median(np.linalg.norm(MULTISCAN.decode(data, "imu").imu().linear_acceleration, axis=1))
+        < 10.1
+    )
 
 
 def test_what_the_imu_of_a_multiscan_felt_is_that_published() -> None:
@@ -145,17 +186,29 @@ def test_what_the_imu_of_a_multiscan_felt_is_that_published() -> None:
     samples, orientation = packets.imu(), [packets[f"orientation_{axis}"][0] for axis in "wxyz"]
     assert samples.linear_acceleration[0].tolist() == pytest.approx(expected["acc"])
     assert samples.angular_velocity[0].tolist() == pytest.approx([0.01, 0.02, 0.03])
-    assert (orientation, packets.time_ns.tolist()) == (expected["quat_wxyz"], [expected["ts_us"] * 1000])
+    assert (orientation, packets.time_ns.tolist()) == (
+        expected["quat_wxyz"],
+        [expected["ts_us"] * 1000],
+    )
 
 
-@pytest.mark.parametrize("name", ["sick_compact_estmultiscan2layerscompactv4", "sick_compact_unittestcompactv4"])
+@pytest.mark.parametrize(
+    "name", ["sick_compact_estmultiscan2layerscompactv4", "sick_compact_unittestcompactv4"]
+)
 def test_modules_of_a_multiscan_are_those_published(name: str) -> None:
-    data, expected = vector_bytes("vectors_udp3d.json", name), vectors("vectors_udp3d.json")[name]["expected"]
+    data, expected = (
+        vector_bytes("vectors_udp3d.json", name),
+        vectors("vectors_udp3d.json")[name]["expected"],
+    )
     parsed = MULTISCAN.parse(data)
     assert MULTISCAN.build("scan", parsed) == data
     decoded(MULTISCAN, [data])
     for module, known in zip(parsed.modules, filter(None, expected["modules"]), strict=False):
-        assert (module.segment, module.turn, module.beam_count) == (known["segment"], known["frame"], known["beams"])
+        assert (module.segment, module.turn, module.beam_count) == (
+            known["segment"],
+            known["frame"],
+            known["beams"],
+        )
         for beam in known["first"]:
             found = module.beams[beam["beam"]][beam["layer"]]
             assert [[echo.distance, echo.strength] for echo in found.echoes] == beam["echoes"]
@@ -165,7 +218,12 @@ def test_modules_of_a_multiscan_are_those_published(name: str) -> None:
 def test_a_turn_of_an_mrs1000_is_four_layers() -> None:
     whole = [scan for scan in MRS1104.scans(b"".join(ls.simulate(MRS1104, 13))) if scan.complete]
     assert [len(scan) for scan in whole] == [4 * 1101] * 2
-    assert sorted({float(angle) for angle in np.rad2deg(whole[0].points.elevation).round(2)}) == [-2.5, 0.0, 2.5, 5.0]
+    assert sorted({float(angle) for angle in np.rad2deg(whole[0].points.elevation).round(2)}) == [
+        -2.5,
+        0.0,
+        2.5,
+        5.0,
+    ]
 
 
 def test_a_scanner_in_cola_a_is_asked_in_text() -> None:

@@ -1,23 +1,30 @@
-"""Slamtec RPLIDAR A1 to A3, S1 to S3, T1 and C1: 360 degree lidars of one family, which answer in six kinds of data frames.
+"""Slamtec RPLIDAR A1 to A3, S1 to S3, T1 and C1: 360 degree lidars of one family, which answer in
+six kinds of data frames.
 
-Source: RPLIDAR interface protocol and the vendor's SDK (sl_lidar_cmd.h, handler_capsules.cpp, sl_lidar_driver.cpp); bauds and ports
-from the SDK (_getNativeBaudRate) and the launch files of sllidar_ros2, ranges from the models' data sheets where `source` names them.
+Source: RPLIDAR interface protocol and the vendor's SDK (sl_lidar_cmd.h, handler_capsules.cpp,
+sl_lidar_driver.cpp); bauds and ports from the SDK (_getNativeBaudRate) and the launch files of
+sllidar_ros2, ranges from the models' data sheets where `source` names them.
 
-A response descriptor says which kind follows, and each kind is looked for after its descriptor alone. The kind that comes
-first in an input is its data. ``configure(answer="express")`` chooses another one, and starts as if its descriptor had been
-seen, for recordings that begin in the middle. The kinds: `node`, `express`, `ultra`, `dense`, `ultra_dense` and `hq`.
+A response descriptor says which kind follows, and each kind is looked for after its descriptor
+alone. The kind that comes first in an input is its data. ``configure(answer="express")`` chooses
+another one, and starts as if its descriptor had been seen, for recordings that begin in the middle.
+The kinds: `node`, `express`, `ultra`, `dense`, `ultra_dense` and `hq`.
 
-One rule cuts scans for all of them: where the azimuth of the points passes zero. Nodes and HQ capsules mark the first node
-past zero by a bit, which is the same place; a turn of capsules ends where the start angle drops, which lies up to a capsule
-beside it. So scans begin at the same angle whatever the answer.
+One rule cuts scans for all of them: where the azimuth of the points passes zero. Nodes and HQ
+capsules mark the first node past zero by a bit, which is the same place; a turn of capsules ends
+where the start angle drops, which lies up to a capsule beside it. So scans begin at the same angle
+whatever the answer.
 
-Nodes have no checksum, and are believed in unbroken runs of ten: the module `nodes` has the measured rates of false ones.
-No frame says when its points were taken: all points of one bear its time.
+Nodes have no checksum, and are believed in unbroken runs of ten: the module `nodes` has the
+measured rates of false ones. No frame says when its points were taken: all points of one bear its
+time.
 
-How far it is proven: requests, descriptors, information and configuration answers against a live A1's exchange; nodes,
-express and ultra capsules against bytes built after the SDK; dense, ultra-dense and HQ capsules against the SDK's arithmetic
-by hand. Whether a C1 obeys the speed command is not known: the SDK's rule by model number would take PWM for it. That an S2L
-has the numbers of an S2 is assumed: nothing in the bytes tells these two apart. A T1 is asked over UDP, and sends its stream there.
+How far it is proven: requests, descriptors, information and configuration answers against a live
+A1's exchange; nodes, express and ultra capsules against bytes built after the SDK; dense,
+ultra-dense and HQ capsules against the SDK's arithmetic by hand. Whether a C1 obeys the speed
+command is not known: the SDK's rule by model number would take PWM for it. That an S2L has the
+numbers of an S2 is assumed: nothing in the bytes tells these two apart. A T1 is asked over UDP, and
+sends its stream there.
 """
 
 from __future__ import annotations
@@ -34,7 +41,9 @@ from lidarspec_slamtec.commands import BY_DTR, BY_PWM, BY_SPEED, COMMANDS, expre
 from lidarspec_slamtec.requests import REQUESTS
 
 #: why no field of a capsule is in metres.
-CODED = "a code word says itself how many millimetres one of its steps is (SDK, sl_lidar_driver.cpp)"
+CODED = (
+    "a code word says itself how many millimetres one of its steps is (SDK, sl_lidar_driver.cpp)"
+)
 #: why asking for any key is not always answered.
 KEYS = "a unit answers for the keys that it knows (answers.py)"
 DTHETA = ("unsigned", "signed")
@@ -57,7 +66,9 @@ FRAMES = {
         capsules.EXPRESS,
         data=True,
         points=capsules.express_points,
-        simulation=Simulation(partial(capsules.sweep, degrees=capsules.EXPRESS_STEP), rate=capsules.EXPRESS_RATE),
+        simulation=Simulation(
+            partial(capsules.sweep, degrees=capsules.EXPRESS_STEP), rate=capsules.EXPRESS_RATE
+        ),
         plausible=capsules.plausible,
         after="express_descriptor",
     ),
@@ -65,7 +76,11 @@ FRAMES = {
         capsules.ULTRA,
         data=True,
         points=capsules.ultra_points,
-        simulation=Simulation(partial(capsules.sweep, degrees=capsules.ULTRA_STEP), capsules.ultra_codes, capsules.ULTRA_RATE),
+        simulation=Simulation(
+            partial(capsules.sweep, degrees=capsules.ULTRA_STEP),
+            capsules.ultra_codes,
+            capsules.ULTRA_RATE,
+        ),
         plausible=capsules.plausible,
         after="ultra_descriptor",
         acknowledged={"LS201 cabins.predict2": CODED},
@@ -74,7 +89,9 @@ FRAMES = {
         capsules.DENSE,
         data=True,
         points=capsules.dense_points,
-        simulation=Simulation(partial(capsules.sweep, degrees=capsules.DENSE_STEP), rate=capsules.DENSE_RATE),
+        simulation=Simulation(
+            partial(capsules.sweep, degrees=capsules.DENSE_STEP), rate=capsules.DENSE_RATE
+        ),
         plausible=capsules.plausible,
         after="dense_descriptor",
     ),
@@ -83,7 +100,9 @@ FRAMES = {
         data=True,
         points=capsules.ultra_dense_points,
         simulation=Simulation(
-            partial(capsules.sweep, degrees=capsules.ULTRA_DENSE_STEP), capsules.ultra_dense_codes, capsules.ULTRA_DENSE_RATE
+            partial(capsules.sweep, degrees=capsules.ULTRA_DENSE_STEP),
+            capsules.ultra_dense_codes,
+            capsules.ULTRA_DENSE_RATE,
         ),
         plausible=capsules.plausible,
         after="ultra_dense_descriptor",
@@ -104,8 +123,10 @@ def configure(sensor: Sensor, *, dtheta: str | None = None, mode: int | None = N
     """The sensor with another reading of express capsules, or another scan mode when it is opened.
 
     Args:
-        dtheta: "unsigned" (as the SDK reads the compensation of express capsules) or "signed" (as the protocol says).
-        mode: the scan mode that opening starts, instead of a scan of nodes; `answer` has to be the kind that it answers in.
+        dtheta: "unsigned" (as the SDK reads the compensation of express capsules) or "signed" (as
+            the protocol says).
+        mode: the scan mode that opening starts, instead of a scan of nodes; `answer` has to be the
+            kind that it answers in.
 
     Raises:
         UsageError: for another dtheta, or a mode that is not a number from 0 to 255.
@@ -113,12 +134,18 @@ def configure(sensor: Sensor, *, dtheta: str | None = None, mode: int | None = N
     if dtheta is not None:
         if dtheta not in DTHETA:
             raise UsageError(f"{sensor.id}: dtheta is one of {', '.join(DTHETA)}, not {dtheta!r}")
-        changed = dataclasses.replace(sensor.frames["express"], points=partial(capsules.express_points, signed=dtheta == "signed"))
+        changed = dataclasses.replace(
+            sensor.frames["express"],
+            points=partial(capsules.express_points, signed=dtheta == "signed"),
+        )
         sensor = dataclasses.replace(sensor, frames={**sensor.frames, "express": changed})
     if mode is not None:
         if mode not in range(0x100):
             raise UsageError(f"{sensor.id}: mode is a number from 0 to 255, not {mode!r}")
-        answers = {**sensor.simulation.answers, "mode_scan": sensor.simulation.answers["express_scan"]}
+        answers = {
+            **sensor.simulation.answers,
+            "mode_scan": sensor.simulation.answers["express_scan"],
+        }
         sensor = dataclasses.replace(
             sensor,
             commands={**sensor.commands, "mode_scan": express(mode)},
@@ -151,23 +178,39 @@ def rplidar(
         scan=OnWrap("azimuth"),
         links={"data": link},
         commands=commands,
-        simulation=Simulation(answers={name: answer for name, answer in unit.answers().items() if name in commands}),
+        simulation=Simulation(
+            answers={name: answer for name, answer in unit.answers().items() if name in commands}
+        ),
         configure=configure,
         on_open=("stop", "start_motor", "scan"),
         on_close=("stop", "stop_motor"),
         acknowledged={
             **dict.fromkeys(("LS604 commands.get_config", "LS604 commands.get_mode_config"), KEYS),
-            **({} if status == "manual" else {"LS710": "the exchange is a unit's of others: the project's tests read it where it is"}),
+            **(
+                {}
+                if status == "manual"
+                else {
+                    "LS710": (
+                        "the exchange is a unit's of others: the project's tests read it where"
+                        " it is"
+                    )
+                }
+            ),
         },
         range_limits=range_limits,
         vendor_axes=("forward", "right", "up"),
         turn=turn,
         relatives={
-            f"slamtec-rplidar-{other.lower()}": "nothing public: the label" if {name, other} == {*TWINS} else "info.model"
+            f"slamtec-rplidar-{other.lower()}": (
+                "nothing public: the label" if {name, other} == {*TWINS} else "info.model"
+            )
             for other in MODELS
             if other != name
         },
-        info={"serial": "info.serial", "model": "info.model"},  # the firmware stands in two fields, major and minor
+        info={
+            "serial": "info.serial",
+            "model": "info.model",
+        },  # the firmware stands in two fields, major and minor
         status=status,
         source=f"RPLIDAR interface protocol and SDK; {source}",
         aliases=(f"rplidar-{name.lower()}", *aliases),

@@ -1,11 +1,13 @@
-"""What comes back: single answers behind their descriptors, and the descriptors that announce a stream of data frames.
+"""What comes back: single answers behind their descriptors, and the descriptors that announce a
+stream of data frames.
 
-Every descriptor is ``A5 5A``, 30 bits of length, 2 bits of mode (0: one answer, 1: an endless stream) and a type. A single
-answer is one frame together with its descriptor. A descriptor of a stream is a frame of its own: the data frames of its
-kind are looked for from there on, until another one comes.
+Every descriptor is ``A5 5A``, 30 bits of length, 2 bits of mode (0: one answer, 1: an endless
+stream) and a type. A single answer is one frame together with its descriptor. A descriptor of a
+stream is a frame of its own: the data frames of its kind are looked for from there on, until
+another one comes.
 
-Source: RPLIDAR interface protocol, "response descriptors" and "requests with single response"; configuration keys and the
-widths of their values from the vendor's SDK (sl_lidar_cmd.h).
+Source: RPLIDAR interface protocol, "response descriptors" and "requests with single response";
+configuration keys and the widths of their values from the vendor's SDK (sl_lidar_cmd.h).
 """
 
 from __future__ import annotations
@@ -13,20 +15,44 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
-from construct import BitsInteger, BitStruct, Bytes, ByteSwapped, Const, Construct, Int8ul, Int16ul, Int32ul, Struct, Switch, this
+from construct import (
+    BitsInteger,
+    BitStruct,
+    Bytes,
+    ByteSwapped,
+    Const,
+    Construct,
+    Int8ul,
+    Int16ul,
+    Int32ul,
+    Struct,
+    Switch,
+    this,
+)
 
 from lidarspec.spec import Fields, Frame, Scaled, take
 
 SINGLE, STREAM = 0, 1  # the modes of a descriptor
 LONGEST_NAME = 64  # bytes of the name of a scan mode (SDK, LidarScanMode)
 
-#: series by the high nibble of the model (SDK, GetModelNameStringByModelID), and the models in them: an A2M8 is 28.
+#: series by the high nibble of the model (SDK, GetModelNameStringByModelID), and the models in
+#: them: an A2M8 is 28.
 SERIES = {0x1: ("A1", (8,)), 0x2: ("A2", (4, 6, 7, 8, 12)), 0x3: ("A3", (1,)), 0x4: ("C1", (1,))}
 SERIES |= {0x6: ("S1", (1,)), 0x7: ("S2", (1, 2)), 0x8: ("S3", (1, 2)), 0x9: ("T1", (1,))}
-MODEL_NUMBERS = ", ".join(f"0x{high:x}{low:x} RPLIDAR {name}" for high, (name, models) in SERIES.items() for low in models)
+MODEL_NUMBERS = ", ".join(
+    f"0x{high:x}{low:x} RPLIDAR {name}" for high, (name, models) in SERIES.items() for low in models
+)
 
-#: keys of configuration values; the first two are of the sensor, the others of one of its scan modes.
-MODE_COUNT, TYPICAL_MODE, US_PER_SAMPLE, MAX_DISTANCE, ANSWER_TYPE, MODE_NAME = 0x70, 0x7C, 0x71, 0x74, 0x75, 0x7F
+#: keys of configuration values; the first two are of the sensor, the others of one of its scan
+#: modes.
+MODE_COUNT, TYPICAL_MODE, US_PER_SAMPLE, MAX_DISTANCE, ANSWER_TYPE, MODE_NAME = (
+    0x70,
+    0x7C,
+    0x71,
+    0x74,
+    0x75,
+    0x7F,
+)
 
 #: the values of fixed width.
 VALUES: dict[int, Construct] = {
@@ -34,7 +60,9 @@ VALUES: dict[int, Construct] = {
     TYPICAL_MODE: "typical_mode" / Int16ul,
     US_PER_SAMPLE: "us_per_sample" / Scaled(Int32ul, 1 / 256, "us"),
     MAX_DISTANCE: "max_distance" / Scaled(Int32ul, 1 / 256, "m"),
-    ANSWER_TYPE: "answer_type" / Int8ul * "type of the descriptor that announces the mode's data frames",
+    ANSWER_TYPE: "answer_type"
+    / Int8ul
+    * "type of the descriptor that announces the mode's data frames",
 }
 _SIZES = np.full(MODE_NAME + 1, np.nan)
 _SIZES[list(VALUES)] = [value.sizeof() for value in VALUES.values()]
@@ -42,8 +70,15 @@ _SIZES[list(VALUES)] = [value.sizeof() for value in VALUES.values()]
 
 def descriptor(kind: int, mode: int, length: Construct) -> tuple[Construct, ...]:
     """The fields of a descriptor of this type and mode."""
-    block = BitStruct("mode" / Const(mode, BitsInteger(2)) * "0: one answer, 1: an endless stream", "length" / length)
-    return ("start" / Const(b"\xa5\x5a"), "descriptor" / ByteSwapped(block), "type" / Const(kind, Int8ul))
+    block = BitStruct(
+        "mode" / Const(mode, BitsInteger(2)) * "0: one answer, 1: an endless stream",
+        "length" / length,
+    )
+    return (
+        "start" / Const(b"\xa5\x5a"),
+        "descriptor" / ByteSwapped(block),
+        "type" / Const(kind, Int8ul),
+    )
 
 
 def single(kind: int, size: int, *fields: Construct) -> Frame:
@@ -63,7 +98,9 @@ def config_plausible(f: Fields) -> Any:
 
 
 def config(key: int, value: Any) -> tuple[str, dict[str, Any]]:
-    """The answer that holds a configuration value in its unit, or its bytes where its width is not fixed: the frame and its values."""
+    """The answer that holds a configuration value in its unit, or its bytes where its width is not
+    fixed: the frame and its values.
+    """
     known = VALUES.get(key)
     name, size = (known.name, known.sizeof()) if known else ("data", len(value))
     return "config", {"descriptor.length": 4 + size, "key": key, f"value.{name}": value}
@@ -76,7 +113,9 @@ CONFIG = Struct(
     / Switch(
         this.key,
         {key: Struct(value) for key, value in VALUES.items()},
-        default=Struct("data" / Bytes(this._.descriptor.length - 4) * "7F: the mode's name, ends with 00"),
+        default=Struct(
+            "data" / Bytes(this._.descriptor.length - 4) * "7F: the mode's name, ends with 00"
+        ),
     ),
 )
 CONFIG_SET = Struct(
@@ -96,10 +135,14 @@ ANSWERS = {
         "serial" / Bytes(16),
     ),
     "health": single(0x06, 3, "status" / Int8ul * "0 good, 1 warning, 2 error", "error" / Int16ul),
-    "sample_rate": single(0x15, 4, "standard" / Scaled(Int16ul, 1, "us"), "express" / Scaled(Int16ul, 1, "us")),
+    "sample_rate": single(
+        0x15, 4, "standard" / Scaled(Int16ul, 1, "us"), "express" / Scaled(Int16ul, 1, "us")
+    ),
     "config": Frame(CONFIG, max_length=7 + 4 + LONGEST_NAME, plausible=config_plausible),
     "config_set": Frame(CONFIG_SET, max_length=7 + 4 + LONGEST_NAME),
-    "accessory": single(0xFF, 4, "flags" / Int32ul * "bit 0: the accessory board drives the motor by PWM"),
+    "accessory": single(
+        0xFF, 4, "flags" / Int32ul * "bit 0: the accessory board drives the motor by PWM"
+    ),
 }
 
 DESCRIPTORS = {

@@ -1,13 +1,16 @@
-"""Capsules: many distances behind the angle of the first one. The other angles need the start of the next capsule.
+"""Capsules: many distances behind the angle of the first one. The other angles need the start of
+the next capsule.
 
-Point k of N stands at ``start + (next start - start) * k / N``, less a compensation of its own. Where bytes were lost, at the
-end of the input, and before a capsule with the S bit (the first after a start) there is no next capsule, and the points of
-the last one have no direction. All four kinds begin alike: their checksum, the XOR of the bytes from the third on, stands
-in two nibbles beside the sync nibbles A and 5.
+Point k of N stands at ``start + (next start - start) * k / N``, less a compensation of its own.
+Where bytes were lost, at the end of the input, and before a capsule with the S bit (the first after
+a start) there is no next capsule, and the points of the last one have no direction. All four kinds
+begin alike: their checksum, the XOR of the bytes from the third on, stands in two nibbles beside
+the sync nibbles A and 5.
 
-Source: RPLIDAR interface protocol, "EXPRESS_SCAN"; what it does not say (dense and ultra-dense capsules, the ultra capsule's
-angles, that dtheta is unsigned) from the vendor's SDK (sl_lidar_cmd.h, handler_capsules.cpp). The SDK averages neighbours
-of an ultra-dense capsule that differ by up to 2 mm; that is a filter, and is left out.
+Source: RPLIDAR interface protocol, "EXPRESS_SCAN"; what it does not say (dense and ultra-dense
+capsules, the ultra capsule's angles, that dtheta is unsigned) from the vendor's SDK
+(sl_lidar_cmd.h, handler_capsules.cpp). The SDK averages neighbours of an ultra-dense capsule that
+differ by up to 2 mm; that is a filter, and is left out.
 """
 
 from __future__ import annotations
@@ -16,7 +19,17 @@ from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
-from construct import Array, BitsInteger, BitStruct, ByteSwapped, Const, Construct, Int16ul, Int32ul, Struct
+from construct import (
+    Array,
+    BitsInteger,
+    BitStruct,
+    ByteSwapped,
+    Const,
+    Construct,
+    Int16ul,
+    Int32ul,
+    Struct,
+)
 
 from lidarspec.spec import Checksummed, Fields, Polar, Scaled, Xor, following, stack, take, wrap
 
@@ -24,10 +37,14 @@ EXPRESS_CABINS, ULTRA_CABINS, DENSE_CABINS, ULTRA_DENSE_CABINS = 16, 32, 40, 32
 SIGNED = 32  # dtheta has six bits; read as signed, this one and those above are negative
 #: degrees of a simulated capsule: 720, 1440, 800 and 800 points a turn.
 EXPRESS_STEP, ULTRA_STEP, DENSE_STEP, ULTRA_DENSE_STEP = 16.0, 24.0, 18.0, 28.8
-#: simulated capsules a second: 254 and 127 us a point, a live A1's, for 5.5 turns; 125 us, assumed, for 10 turns.
-EXPRESS_RATE, ULTRA_RATE, DENSE_RATE, ULTRA_DENSE_RATE = (1e6 / us / points for us, points in ((254, 32), (127, 96), (125, 40), (125, 64)))
+#: simulated capsules a second: 254 and 127 us a point, a live A1's, for 5.5 turns; 125 us, assumed,
+#: for 10 turns.
+EXPRESS_RATE, ULTRA_RATE, DENSE_RATE, ULTRA_DENSE_RATE = (
+    1e6 / us / points for us, points in ((254, 32), (127, 96), (125, 40), (125, 64))
+)
 
-#: the ultra capsule's scale: values from STARTS on begin at BASES millimetres and go on in steps of 1, 2, 4, 8 and 16.
+#: the ultra capsule's scale: values from STARTS on begin at BASES millimetres and go on in steps of
+#: 1, 2, 4, 8 and 16.
 _STARTS, _BASES = np.array([0, 512, 1280, 1792, 3328]), np.array([0, 512, 2048, 4096, 16384])
 _CODES = np.arange(1 << 12)
 LEVELS = np.searchsorted(_STARTS, _CODES, side="right") - 1
@@ -69,7 +86,9 @@ EXPRESS = capsule(
         Struct(
             "first" / sample(),
             "second" / sample(),
-            "dtheta_low" / BitStruct("second" / BitsInteger(4), "first" / BitsInteger(4)) * "1/8 degree",
+            "dtheta_low"
+            / BitStruct("second" / BitsInteger(4), "first" / BitsInteger(4))
+            * "1/8 degree",
         ),
     ),
 )
@@ -80,14 +99,18 @@ ULTRA = capsule(
         ULTRA_CABINS,
         ByteSwapped(
             BitStruct(
-                "predict2" / BitsInteger(10, signed=True) * "from the next major; 511, -512: no return",
+                "predict2"
+                / BitsInteger(10, signed=True)
+                * "from the next major; 511, -512: no return",
                 "predict1" / BitsInteger(10, signed=True) * "from this major; 511, -512: no return",
                 "major" / BitsInteger(12) * "0: no return",
             )
         ),
     ),
 )
-DENSE = capsule(start(), "distances" / Array(DENSE_CABINS, Scaled(Int16ul, 0.001, "m")) * "0: no return")
+DENSE = capsule(
+    start(), "distances" / Array(DENSE_CABINS, Scaled(Int16ul, 0.001, "m")) * "0: no return"
+)
 ULTRA_DENSE = capsule(
     "time_stamp" / Int32ul * "unit not documented",
     "status" / Int16ul,
@@ -123,7 +146,9 @@ def step(f: Fields, count: int) -> Any:
 def headings(f: Fields, cabins: int, points: int) -> Any:
     """Degrees clockwise of each point, not compensated, (n, cabins, points)."""
     count, between = cabins * points, step(f, cabins * points)
-    return stack(*(f.start.angle + between * np.arange(place, count, points) for place in range(points)))
+    return stack(
+        *(f.start.angle + between * np.arange(place, count, points) for place in range(points))
+    )
 
 
 def express_points(f: Fields, *, signed: bool = False) -> Polar:
@@ -143,37 +168,57 @@ def dense_points(f: Fields) -> Polar:
 
 
 def predicted(base: Any, level: Any, prediction: Any) -> Any:
-    """Millimetres of a predicted distance, in steps of its base's scale; 0 for the two values that mean no return."""
-    return np.where((prediction == 511) | (prediction == -512), 0, base + prediction * np.exp2(level))
+    """Millimetres of a predicted distance, in steps of its base's scale; 0 for the two values that
+    mean no return.
+    """
+    return np.where(
+        (prediction == 511) | (prediction == -512), 0, base + prediction * np.exp2(level)
+    )
 
 
 def compensation(mm: Any) -> Any:
     """Degrees that an ultra capsule's point lies before its heading, by its distance.
 
-    Source: handler_capsules.cpp: 7.5 degrees below 50 mm, else 8 degrees less two terms in 1/65536 rad of 98361 by the
-    distance in quarters of a millimetre, a whole number.
+    Source: handler_capsules.cpp: 7.5 degrees below 50 mm, else 8 degrees less two terms in 1/65536
+    rad of 98361 by the distance in quarters of a millimetre, a whole number.
     """
     ratio = np.floor(98361 / np.maximum(mm * 4, 200))
     return np.where(mm >= 50, 8 - np.rad2deg((ratio * 64 + ratio**3 / 98304) / 65536), 7.5)
 
 
 def ultra_points(f: Fields) -> Polar:
-    """96 points a capsule: a major distance in each cabin, and two that are predicted from it and from the next one's."""
+    """96 points a capsule: a major distance in each cabin, and two that are predicted from it and
+    from the next one's.
+    """
     code, code_after = f.cabins.major, following(f.cabins.major)
-    major, after, after_level = take(MILLIMETRES, code), take(MILLIMETRES, code_after), take(LEVELS, code_after)
+    major, after, after_level = (
+        take(MILLIMETRES, code),
+        take(MILLIMETRES, code_after),
+        take(LEVELS, code_after),
+    )
     lacking = (major == 0) & (after > 0)
-    base, level = np.where(lacking, after, major), np.where(lacking, after_level, take(LEVELS, code))
+    base, level = (
+        np.where(lacking, after, major),
+        np.where(lacking, after_level, take(LEVELS, code)),
+    )
     first = predicted(base, level, f.cabins.predict1)
     second = predicted(after, after_level, f.cabins.predict2)
     mm = stack(major, first, second)
-    return Polar(range=mm / 1000, azimuth=-np.deg2rad(headings(f, ULTRA_CABINS, 3) - compensation(mm)))
+    return Polar(
+        range=mm / 1000, azimuth=-np.deg2rad(headings(f, ULTRA_CABINS, 3) - compensation(mm))
+    )
 
 
 def ultra_dense_points(f: Fields) -> Polar:
-    """64 points a capsule: by its scale, 10 to 13 bits of distance in steps of 2 to 5 mm, and above them 8 to 5 bits of quality."""
+    """64 points a capsule: by its scale, 10 to 13 bits of distance in steps of 2 to 5 mm, and above
+    them 8 to 5 bits of quality.
+    """
     cabins = f.cabins
     scale = stack(cabins.first_scale, cabins.second_scale)
-    code = stack(cabins.first_high * (1 << 14) + cabins.first_low, cabins.second_high * (1 << 14) + cabins.second_low)
+    code = stack(
+        cabins.first_high * (1 << 14) + cabins.first_low,
+        cabins.second_high * (1 << 14) + cabins.second_low,
+    )
     size = np.exp2(10 + scale)
     quality = np.floor(code / size)
     return Polar(
@@ -184,30 +229,40 @@ def ultra_dense_points(f: Fields) -> Polar:
 
 
 def ultra_codes(polar: Polar) -> Mapping[str, Any]:
-    """The fields of ultra capsules that hold these ranges; a prediction that cannot reach its point says that there is no return."""
+    """The fields of ultra capsules that hold these ranges; a prediction that cannot reach its point
+    says that there is no return.
+    """
     mm = np.asarray(polar.range) * 1000
     code = nearest(mm[..., 0])
     after = np.append(code.reshape(-1)[1:], 0).reshape(code.shape)
     base = np.where(code > 0, code, after)
-    first, second = (prediction(mm[..., place], reference) for place, reference in ((1, base), (2, after)))
+    first, second = (
+        prediction(mm[..., place], reference) for place, reference in ((1, base), (2, after))
+    )
     return {"cabins.major": code, "cabins.predict1": first, "cabins.predict2": second}
 
 
 def nearest(mm: Any) -> Any:
     """The codes of the scale's values next to these distances."""
     above = np.clip(np.searchsorted(MILLIMETRES, mm), 1, len(MILLIMETRES) - 1)
-    return np.where(mm - MILLIMETRES[above - 1] < MILLIMETRES[above] - mm, above - 1, above) * (mm > 0)
+    return np.where(mm - MILLIMETRES[above - 1] < MILLIMETRES[above] - mm, above - 1, above) * (
+        mm > 0
+    )
 
 
 def prediction(mm: Any, code: Any) -> Any:
     """Steps from the distance that a code stands for to another one; 511 for no return."""
     base, scale = MILLIMETRES[code], np.exp2(LEVELS[code])
     steps = np.rint((mm - base) / scale)
-    return np.where((mm > 0) & (base + steps * scale > 0) & (np.abs(steps) < 511), steps, 511).astype(np.int64)
+    return np.where(
+        (mm > 0) & (base + steps * scale > 0) & (np.abs(steps) < 511), steps, 511
+    ).astype(np.int64)
 
 
 def ultra_dense_codes(polar: Polar) -> Mapping[str, Any]:
-    """The fields of ultra-dense capsules that hold these ranges, each in the finest scale that reaches it, of one quality."""
+    """The fields of ultra-dense capsules that hold these ranges, each in the finest scale that
+    reaches it, of one quality.
+    """
     mm = np.asarray(polar.range) * 1000
     scale = np.searchsorted(SCALES, mm, side="right") - 1
     steps = np.rint((mm - SCALES[scale]) / (2 + scale)).astype(np.int64)
@@ -215,7 +270,11 @@ def ultra_dense_codes(polar: Polar) -> Mapping[str, Any]:
     fields: dict[str, Any] = {}
     for place, name in enumerate(("first", "second")):
         own = code[..., place]
-        fields |= {f"cabins.{name}_low": own & 0x3FFF, f"cabins.{name}_high": own >> 14, f"cabins.{name}_scale": scale[..., place]}
+        fields |= {
+            f"cabins.{name}_low": own & 0x3FFF,
+            f"cabins.{name}_high": own >> 14,
+            f"cabins.{name}_scale": scale[..., place],
+        }
     return fields
 
 

@@ -1,7 +1,9 @@
-"""What can be asked of an RPLIDAR, and how its motor is driven: by the line DTR, by PWM or by a speed.
+"""What can be asked of an RPLIDAR, and how its motor is driven: by the line DTR, by PWM or by a
+speed.
 
-Source: RPLIDAR interface protocol, "requests"; how long to wait after them and the motor's commands from the vendor's SDK
-(sl_lidar_driver.cpp). While scan data is sent, what asks for information is not answered; another scan begins anew.
+Source: RPLIDAR interface protocol, "requests"; how long to wait after them and the motor's commands
+from the vendor's SDK (sl_lidar_driver.cpp). While scan data is sent, what asks for information is
+not answered; another scan begins anew.
 """
 
 from __future__ import annotations
@@ -20,7 +22,13 @@ USUAL_SPEED = 600  # rpm: 10 turns a second (data sheets of S2 and C1)
 
 
 #: the descriptors that announce capsules (SDK, startScanExpress).
-CAPSULES = ("express_descriptor", "ultra_descriptor", "dense_descriptor", "ultra_dense_descriptor", "hq_descriptor")
+CAPSULES = (
+    "express_descriptor",
+    "ultra_descriptor",
+    "dense_descriptor",
+    "ultra_dense_descriptor",
+    "hq_descriptor",
+)
 ANY_KEY = ("key", 0, 0xFFFF_FFFF)
 
 
@@ -29,9 +37,15 @@ def plain(cmd: int, **more: Any) -> Command:
     return Command("request", {"cmd.number": cmd}, **more)
 
 
-def asking(frame: str, reply: str | tuple[str, ...], values: Mapping[str, int] | None = None, **more: Any) -> Command:
-    """A request with a reply; it does no harm twice: what a sensor is stays the same, and a scan begins anew."""
-    return Command(frame, values or {}, reply=reply, retries=1, only_stopped=not more.get("starts"), **more)
+def asking(
+    frame: str, reply: str | tuple[str, ...], values: Mapping[str, int] | None = None, **more: Any
+) -> Command:
+    """A request with a reply; it does no harm twice: what a sensor is stays the same, and a scan
+    begins anew.
+    """
+    return Command(
+        frame, values or {}, reply=reply, retries=1, only_stopped=not more.get("starts"), **more
+    )
 
 
 def about_sensor(key: int) -> Command:
@@ -41,7 +55,13 @@ def about_sensor(key: int) -> Command:
 
 def about_mode(key: int) -> Command:
     """The request for a configuration value of one of its scan modes."""
-    return asking("mode_config_request", "config", {"key": key}, args={"mode": ("mode", 0, 0xFFFF)}, echoes=("key",))
+    return asking(
+        "mode_config_request",
+        "config",
+        {"key": key},
+        args={"mode": ("mode", 0, 0xFFFF)},
+        echoes=("key",),
+    )
 
 
 def express(mode: int | None = None) -> Command:
@@ -64,7 +84,12 @@ COMMANDS = {
     "get_health": asking("request", "health", {"cmd.number": 0x52}),
     "get_samplerate": asking("request", "sample_rate", {"cmd.number": 0x59}),
     "get_config": asking("config_request", "config", args={"key": ANY_KEY}, echoes=("key",)),
-    "get_mode_config": asking("mode_config_request", "config", args={"key": ANY_KEY, "mode": ("mode", 0, 0xFFFF)}, echoes=("key",)),
+    "get_mode_config": asking(
+        "mode_config_request",
+        "config",
+        args={"key": ANY_KEY, "mode": ("mode", 0, 0xFFFF)},
+        echoes=("key",),
+    ),
     "get_mode_count": about_sensor(answers.MODE_COUNT),
     "get_typical_mode": about_sensor(answers.TYPICAL_MODE),
     "get_us_per_sample": about_mode(answers.US_PER_SAMPLE),

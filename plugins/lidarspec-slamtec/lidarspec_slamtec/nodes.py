@@ -1,8 +1,11 @@
-"""Points that carry their own angle: the five-byte nodes of a scan, and the HQ capsules of 96 nodes with a CRC-32.
+"""Points that carry their own angle: the five-byte nodes of a scan, and the HQ capsules of 96 nodes
+with a CRC-32.
 
-A node has no checksum. What holds it together is that S and its inverse differ, that the check bit is 1 and that the angle
-is below 360 degrees: 17.6 % of all random five bytes pass. So nodes are weak frames, believed in unbroken runs of
-`CONFIRM` alone. Measured, nodes accepted where none was sent, with a run of one, of 6, of 8, and of ten as chosen:
+A node has no checksum. What holds it together is that S and its inverse differ, that the check bit
+is 1 and that the angle is below 360 degrees: 17.6 % of all random five bytes pass. So nodes are
+weak frames, believed in unbroken runs of
+`CONFIRM` alone. Measured, nodes accepted where none was sent, with a run of one, of 6, of 8, and of
+ten as chosen:
 
     random bytes, 8 MiB                          865 530    1 192      32       0
     express capsules, 2 MiB                      227 743    3 767     551     159
@@ -12,12 +15,15 @@ is below 360 degrees: 17.6 % of all random five bytes pass. So nodes are weak fr
     joining nodes in the middle of one, 300 x        135        9       0       0
     nodes with 1 % of the bytes damaged, 2 MiB     7 430    1 811   1 760   1 732
 
-Distances that hardly change put the same bits in every cabin of a capsule, hence rows two and three; but nodes are looked
-for after the descriptor 81 alone, so that they are met only where a later descriptor was lost. The last row counts what
-goes on at a shifted place in a run that was believed already, which no confirmation prevents: of 419 430 nodes sent, a run of
-one brings 411 423 back, a run of ten 395 728. The streams have noise of a few millimetres; a test repeats this on less.
+Distances that hardly change put the same bits in every cabin of a capsule, hence rows two and
+three; but nodes are looked for after the descriptor 81 alone, so that they are met only where a
+later descriptor was lost. The last row counts what goes on at a shifted place in a run that was
+believed already, which no confirmation prevents: of 419 430 nodes sent, a run of one brings 411 423
+back, a run of ten 395 728. The streams have noise of a few millimetres; a test repeats this on
+less.
 
-Source: RPLIDAR interface protocol, "SCAN"; HQ capsules: the vendor's SDK (sl_lidar_cmd.h, handler_hqnode.cpp).
+Source: RPLIDAR interface protocol, "SCAN"; HQ capsules: the vendor's SDK (sl_lidar_cmd.h,
+handler_hqnode.cpp).
 """
 
 from __future__ import annotations
@@ -26,7 +32,18 @@ from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
-from construct import Array, BitsInteger, BitStruct, ByteSwapped, Const, Int8ul, Int16ul, Int32ul, Int64ul, Struct
+from construct import (
+    Array,
+    BitsInteger,
+    BitStruct,
+    ByteSwapped,
+    Const,
+    Int8ul,
+    Int16ul,
+    Int32ul,
+    Int64ul,
+    Struct,
+)
 
 from lidarspec.spec import Checksummed, Crc, Fields, Polar, Scaled, ZeroPadded
 
@@ -44,7 +61,12 @@ NODE = Struct(
         "inverse" / BitsInteger(1) * "the inverse of start",
         "start" / BitsInteger(1) * "S, 1: first node of a turn",
     ),
-    "beam" / ByteSwapped(BitStruct("angle" / Scaled(BitsInteger(15), 1 / 64, "deg"), "check" / Const(1, BitsInteger(1)))),
+    "beam"
+    / ByteSwapped(
+        BitStruct(
+            "angle" / Scaled(BitsInteger(15), 1 / 64, "deg"), "check" / Const(1, BitsInteger(1))
+        )
+    ),
     "distance" / Scaled(Int16ul, 0.00025, "m") * "0: no return",
 )
 
@@ -83,7 +105,9 @@ def node_points(f: Fields) -> Polar:
 
 def hq_points(f: Fields) -> Polar:
     """A point for each of the 96 nodes."""
-    return Polar(range=f.nodes.distance, azimuth=-np.deg2rad(f.nodes.angle), intensity=f.nodes.quality)
+    return Polar(
+        range=f.nodes.distance, azimuth=-np.deg2rad(f.nodes.angle), intensity=f.nodes.quality
+    )
 
 
 def node_sweep(i: int) -> Mapping[str, Any]:

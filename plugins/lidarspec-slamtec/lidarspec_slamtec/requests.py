@@ -1,11 +1,24 @@
-"""What the host sends: ``A5 cmd``, or, where bit 7 of the command is set, ``A5 cmd size payload xor8``.
+"""What the host sends: ``A5 cmd``, or, where bit 7 of the command is set, ``A5 cmd size payload
+xor8``.
 
-Source: RPLIDAR interface protocol, "request packets"; A8, F0 and FF from the vendor's SDK (sl_lidar_cmd.h).
+Source: RPLIDAR interface protocol, "request packets"; A8, F0 and FF from the vendor's SDK
+(sl_lidar_cmd.h).
 """
 
 from __future__ import annotations
 
-from construct import BitsInteger, BitStruct, Bytes, Const, Construct, Int8ul, Int16ul, Int32ul, Struct, this
+from construct import (
+    BitsInteger,
+    BitStruct,
+    Bytes,
+    Const,
+    Construct,
+    Int8ul,
+    Int16ul,
+    Int32ul,
+    Struct,
+    this,
+)
 
 from lidarspec.spec import Checksummed, Frame, Scaled, Xor
 
@@ -14,19 +27,30 @@ START = Const(b"\xa5")
 
 def sealed(*fields: Construct) -> Checksummed:
     """A request of these fields, between its start byte and the XOR of all bytes before that."""
-    return Checksummed(Struct("start" / START, *fields, "checksum" / Int8ul), field="checksum", algorithm=Xor())
+    return Checksummed(
+        Struct("start" / START, *fields, "checksum" / Int8ul), field="checksum", algorithm=Xor()
+    )
 
 
 def asking(cmd: int, size: int, *payload: Construct) -> Frame:
     """The request of one command with a payload of `size` bytes."""
-    return Frame(sealed("cmd" / Const(cmd, Int8ul), "size" / Const(size, Int8ul), *payload), direction="out")
+    return Frame(
+        sealed("cmd" / Const(cmd, Int8ul), "size" / Const(size, Int8ul), *payload), direction="out"
+    )
 
 
 PLAIN = Struct(
     "start" / START,
-    "cmd" / BitStruct("payload" / Const(0, BitsInteger(1)) * "0: none follows", "number" / BitsInteger(7)),
+    "cmd"
+    / BitStruct(
+        "payload" / Const(0, BitsInteger(1)) * "0: none follows", "number" / BitsInteger(7)
+    ),
 )
-PAYLOAD = sealed("cmd" / Int8ul * "80 and above", "size" / Int8ul * "of the payload", "payload" / Bytes(this.size))
+PAYLOAD = sealed(
+    "cmd" / Int8ul * "80 and above",
+    "size" / Int8ul * "of the payload",
+    "payload" / Bytes(this.size),
+)
 
 REQUESTS = {
     "request": Frame(PLAIN, direction="out"),
@@ -38,9 +62,13 @@ REQUESTS = {
         "param" / Int16ul,
     ),
     "config_request": asking(0x84, 4, "key" / Int32ul),
-    "mode_config_request": asking(0x84, 6, "key" / Int32ul, "mode" / Int16ul * "the scan mode that is asked about"),
+    "mode_config_request": asking(
+        0x84, 6, "key" / Int32ul, "mode" / Int16ul * "the scan mode that is asked about"
+    ),
     "rpm_request": asking(0xA8, 2, "speed" / Scaled(Int16ul, 1, "rpm") * "0: stand still"),
     "pwm_request": asking(0xF0, 2, "duty" / Int16ul * "0: stand still, 1023: full"),
     "accessory_request": asking(0xFF, 4, "reserved" / Int32ul),
-    "payload_request": Frame(PAYLOAD, direction="out", max_length=4 + 255, plausible=lambda f: f.cmd >= 0x80),
+    "payload_request": Frame(
+        PAYLOAD, direction="out", max_length=4 + 255, plausible=lambda f: f.cmd >= 0x80
+    ),
 }

@@ -1,7 +1,9 @@
-"""What a simulated unit of each model says of itself: information, scan modes, and the descriptor that announces each mode.
+"""What a simulated unit of each model says of itself: information, scan modes, and the descriptor
+that announces each mode.
 
-Source: the information and the mode Sensitivity of the A1 are a live A1's answers. The rest is assumed: the times and reaches of the
-other modes are those that the vendor's SDK prints for such models, and only the kinds of capsules of a model are told apart.
+Source: the information and the mode Sensitivity of the A1 are a live A1's answers. The rest is
+assumed: the times and reaches of the other modes are those that the vendor's SDK prints for such
+models, and only the kinds of capsules of a model are told apart.
 """
 
 from __future__ import annotations
@@ -13,15 +15,28 @@ from typing import Any
 from lidarspec_slamtec import answers
 
 NODE, EXPRESS, ULTRA, DENSE = 0x81, 0x82, 0x84, 0x85
-DESCRIPTOR = {NODE: "scan_descriptor", EXPRESS: "express_descriptor", ULTRA: "ultra_descriptor", DENSE: "dense_descriptor"}
+DESCRIPTOR = {
+    NODE: "scan_descriptor",
+    EXPRESS: "express_descriptor",
+    ULTRA: "ultra_descriptor",
+    DENSE: "dense_descriptor",
+}
 #: what asks for configuration values, of the sensor and of one of its scan modes.
 OF_SENSOR = ("get_config", "get_mode_count", "get_typical_mode")
-OF_MODE = ("get_mode_config", "get_us_per_sample", "get_max_distance", "get_answer_type", "get_mode_name")
+OF_MODE = (
+    "get_mode_config",
+    "get_us_per_sample",
+    "get_max_distance",
+    "get_answer_type",
+    "get_mode_name",
+)
 
 
 @dataclass(frozen=True)
 class Mode:
-    """A scan mode: its name, microseconds from point to point, reach in metres, and the type of its descriptor."""
+    """A scan mode: its name, microseconds from point to point, reach in metres, and the type of its
+    descriptor.
+    """
 
     name: str
     us_per_sample: float
@@ -38,8 +53,17 @@ class Unit:
 
     def answers(self) -> dict[str, Any]:
         """What this unit answers, by command, where that is more than the reply as it stands."""
-        information = {"model": self.model, "firmware_minor": 29, "firmware_major": 1, "hardware": 7, "serial": bytes(range(1, 17))}
-        times = {"standard": round(self.modes[0].us_per_sample), "express": round(self.modes[-1].us_per_sample)}
+        information = {
+            "model": self.model,
+            "firmware_minor": 29,
+            "firmware_major": 1,
+            "hardware": 7,
+            "serial": bytes(range(1, 17)),
+        }
+        times = {
+            "standard": round(self.modes[0].us_per_sample),
+            "express": round(self.modes[-1].us_per_sample),
+        }
         return {
             "get_info": (("info", information),),
             "get_samplerate": (("sample_rate", times),),
@@ -49,7 +73,9 @@ class Unit:
         }
 
     def config(self, request: Mapping[str, Any]) -> tuple[tuple[str, Mapping[str, Any]], ...]:
-        """The answer to a request for a configuration value; none for a key or mode that it does not have."""
+        """The answer to a request for a configuration value; none for a key or mode that it does
+        not have.
+        """
         key, number = request["key"], request.get("mode", 0)
         if number >= len(self.modes):
             return ()
@@ -65,7 +91,9 @@ class Unit:
         return (answers.config(key, values[key]),) if key in values else ()
 
     def descriptor(self, request: Mapping[str, Any]) -> tuple[str, ...]:
-        """The descriptor of the scan mode that is asked for; mode 0 of an express request is the plain express scan."""
+        """The descriptor of the scan mode that is asked for; mode 0 of an express request is the
+        plain express scan.
+        """
         number = request["mode"]
         if number >= len(self.modes):
             return ()
@@ -92,7 +120,12 @@ A2 = Unit(
 )
 A3 = Unit(
     0x31,
-    (Mode("Standard", 250, 16, NODE), Mode("Express", 125, 16, EXPRESS), Mode("Boost", 63, 25, ULTRA), Mode("Sensitivity", 63, 25, ULTRA)),
+    (
+        Mode("Standard", 250, 16, NODE),
+        Mode("Express", 125, 16, EXPRESS),
+        Mode("Boost", 63, 25, ULTRA),
+        Mode("Sensitivity", 63, 25, ULTRA),
+    ),
 )
 S1 = Unit(0x61, (Mode("Standard", 217, 40, NODE), Mode("Express", 109, 40, EXPRESS)))
 S2 = Unit(0x71, (Mode("Standard", 125, 30, NODE), Mode("DenseBoost", 31, 30, DENSE)))

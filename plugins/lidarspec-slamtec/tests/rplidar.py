@@ -31,15 +31,24 @@ def capsule(answer: str, source: random.Random, degrees: float) -> bytes:
 def capsules(answer: str, number: int, *, step: float = 17.0, seed: int = 1) -> bytes:
     """A stream of such capsules behind their descriptor."""
     source = random.Random(seed)
-    return A1.example(f"{answer}_descriptor") + b"".join(capsule(answer, source, index * step) for index in range(number))
+    return A1.example(f"{answer}_descriptor") + b"".join(
+        capsule(answer, source, index * step) for index in range(number)
+    )
 
 
 def turns(number: int, *, seed: int = 1) -> bytes:
     """Nodes of turns of 500, with a few millimetres of noise and one in ten without a return."""
     source, found = random.Random(seed), bytearray()
     for index in range(number):
-        distance = 0.0 if source.random() < 0.1 else 2 + math.sin(index / 80) + source.gauss(0, 0.004)
-        found += node((index % 500 * 0.72 + source.uniform(0, 0.02)), distance, quality=source.randrange(48), start=index % 500 == 0)
+        distance = (
+            0.0 if source.random() < 0.1 else 2 + math.sin(index / 80) + source.gauss(0, 0.004)
+        )
+        found += node(
+            (index % 500 * 0.72 + source.uniform(0, 0.02)),
+            distance,
+            quality=source.randrange(48),
+            start=index % 500 == 0,
+        )
     return bytes(found)
 
 

@@ -1,4 +1,6 @@
-"""Streams of RPLIDARs: every kind of capsule against the oracle, switched answers, scans, and how rare false nodes are."""
+"""Streams of RPLIDARs: every kind of capsule against the oracle, switched answers, scans, and how
+rare false nodes are.
+"""
 
 from __future__ import annotations
 
@@ -42,7 +44,9 @@ def test_a_descriptor_switches_to_its_own_frames_alone(answer: str) -> None:
 
 # Of 781 bytes, 1 % of damage leaves nothing whole; so HQ capsules are tried with less, too.
 @pytest.mark.slow
-@pytest.mark.parametrize(("answer", "rate"), [*((answer, 0.01) for answer in ANSWERS), ("hq", 0.001)])
+@pytest.mark.parametrize(
+    ("answer", "rate"), [*((answer, 0.01) for answer in ANSWERS), ("hq", 0.001)]
+)
 def test_a_damaged_stream_equals_the_oracle(answer: str, rate: float) -> None:
     number = {("hq", 0.001): 16, ("hq", 0.01): 6, ("ultra_dense", 0.01): 60}.get((answer, rate), 30)
     data = damaged(capsules(answer, number), rate, 11)
@@ -61,9 +65,20 @@ def test_damaged_nodes_equal_the_oracle() -> None:
 
 
 def test_a_conversation_with_several_answers_equals_the_oracle() -> None:
-    parts = [A1.example("info"), A1.example("scan_descriptor"), turns(30), A1.example("health"), capsules("dense", 6), capsules("hq", 3)]
-    data = damaged(b"".join(parts) + A1.example("scan_descriptor") + turns(40, seed=2), 0.004, 5, burst=8)
-    assert [(item.frame, item.offset, item.data) for item in A1.split(data)] == Oracle(A1, data).frames()
+    parts = [
+        A1.example("info"),
+        A1.example("scan_descriptor"),
+        turns(30),
+        A1.example("health"),
+        capsules("dense", 6),
+        capsules("hq", 3),
+    ]
+    data = damaged(
+        b"".join(parts) + A1.example("scan_descriptor") + turns(40, seed=2), 0.004, 5, burst=8
+    )
+    assert [(item.frame, item.offset, item.data) for item in A1.split(data)] == Oracle(
+        A1, data
+    ).frames()
 
 
 @pytest.mark.slow
@@ -83,7 +98,9 @@ def test_joining_in_the_middle_of_a_node_finds_the_true_ones() -> None:
     for runs in wrong:
         sensor = believing(runs)
         for spot in range(1, len(data) - 400, 211):
-            wrong[runs] += sum((offset + spot) % 5 != 0 for offset in nodes_in(sensor, data[spot : spot + 400]))
+            wrong[runs] += sum(
+                (offset + spot) % 5 != 0 for offset in nodes_in(sensor, data[spot : spot + 400])
+            )
     assert wrong[1] > 10
     assert wrong[CONFIRM] == 0
 
@@ -96,7 +113,10 @@ def test_a_short_run_of_nodes_is_not_believed() -> None:
 
 @pytest.mark.parametrize("answer", ["node", "express", "dense", "hq"])
 def test_scans_begin_where_the_azimuth_passes_zero(answer: str) -> None:
-    sensor, number = A1.configure(answer=answer), {"node": 1440, "express": 90, "dense": 80, "hq": 40}[answer]
+    sensor, number = (
+        A1.configure(answer=answer),
+        {"node": 1440, "express": 90, "dense": 80, "hq": 40}[answer],
+    )
     scans = list(sensor.scans(b"".join(simulate(sensor, number))))
     whole = [scan for scan in scans if scan.complete]
     assert len(whole) >= 2

@@ -1,4 +1,6 @@
-"""TI IWR6843: points with velocities, what stands beside them, frames without any, and what is of another radar."""
+"""TI IWR6843: points with velocities, what stands beside them, frames without any, and what is of
+another radar.
+"""
 
 from __future__ import annotations
 
@@ -13,7 +15,10 @@ from lidarspec.detect.identification import verdict
 from tests.evidence import decoded
 
 RADAR = ls.sensor("ti-iwr6843")
-AHEAD, ASIDE = (0.5, 4.0, 0.25, -1.0), (-2.0, 1.0, -0.5, 0.75)  # x to the right, y ahead, z up, velocity
+AHEAD, ASIDE = (
+    (0.5, 4.0, 0.25, -1.0),
+    (-2.0, 1.0, -0.5, 0.75),
+)  # x to the right, y ahead, z up, velocity
 
 
 def points(*those: tuple[float, ...]) -> tuple[int, bytes]:
@@ -24,13 +29,20 @@ def frame(number: int, *parts: tuple[int, bytes], platform: int = 0xA6843) -> by
     """A frame as TI's table of the header has it, its filling not of zeros."""
     body = b"".join(struct.pack("<II", kind, len(content)) + content for kind, content in parts)
     size = -(-(40 + len(body)) // 32) * 32
-    header = struct.pack("<8I", 0x03050004, size, platform, number, number * 20_000_000 % 2**32, 0, len(parts), 0)
+    header = struct.pack(
+        "<8I", 0x03050004, size, platform, number, number * 20_000_000 % 2**32, 0, len(parts), 0
+    )
     return (bytes([2, 1, 4, 3, 6, 5, 8, 7]) + header + body).ljust(size, b"\x0f")
 
 
 def test_points_are_turned_to_our_axes_and_have_velocities() -> None:
     side = (7, struct.pack("<4h", 180, 600, 95, 610))
-    packets = decoded(RADAR, frame(1, points(AHEAD, ASIDE), side) + frame(2) + frame(3, (99, b"what is this"), points(ASIDE)))
+    packets = decoded(
+        RADAR,
+        frame(1, points(AHEAD, ASIDE), side)
+        + frame(2)
+        + frame(3, (99, b"what is this"), points(ASIDE)),
+    )
     cloud = packets.points()
     assert cloud.xyz.tolist() == [[4.0, -0.5, 0.25], [1.0, 2.0, -0.5], [1.0, 2.0, -0.5]]
     assert cloud.extra["velocity"].tolist() == [-1.0, 0.75, 0.75]
@@ -55,7 +67,9 @@ def test_each_frame_is_a_scan_and_is_known_by_its_own() -> None:
     wire = b"".join(ls.simulate(RADAR, 12))
     scans = list(RADAR.scans(wire))
     assert [len(scan.points) for scan in scans] == [24] * 12
-    assert [one.sensor.id for one in verdict(Heard("a wire", (wire,), datagrams=False)).alike] == ["ti-iwr6843"]
+    assert [one.sensor.id for one in verdict(Heard("a wire", (wire,), datagrams=False)).alike] == [
+        "ti-iwr6843"
+    ]
 
 
 @pytest.mark.slow

@@ -1,12 +1,15 @@
-"""Velodyne VLP-16 (Puck, Puck LITE), Puck Hi-Res, HDL-32E, VLP-32C and VLS-128: spinning lidars of 16 to 128 lasers over UDP.
+"""Velodyne VLP-16 (Puck, Puck LITE), Puck Hi-Res, HDL-32E, VLP-32C and VLS-128: spinning lidars of
+16 to 128 lasers over UDP.
 
-Source: velodyne_decoder (calibration files, calib_db.cpp, packet_decoder.cpp) and ros-drivers/velodyne (rawdata), which
-cite the vendor's user manuals: laser angles, firing times, focal distances. The vertical offsets that follow from the
-focal distance are documented for the VLP-16 (11.2 mm at -15 degrees); ros-drivers and nebula leave them out, so their z
-differs by up to 11 mm (VLP-16), 17 mm (HDL-32E), 20 mm (VLP-32C) and 27 mm (VLS-128).
+Source: velodyne_decoder (calibration files, calib_db.cpp, packet_decoder.cpp) and
+ros-drivers/velodyne (rawdata), which cite the vendor's user manuals: laser angles, firing times,
+focal distances. The vertical offsets that follow from the focal distance are documented for the
+VLP-16 (11.2 mm at -15 degrees); ros-drivers and nebula leave them out, so their z differs by up to
+11 mm (VLP-16), 17 mm (HDL-32E), 20 mm (VLP-32C) and 27 mm (VLS-128).
 
-The times of a VLS-128's lasers differ by sources: ros-drivers has one idle slot after eight groups and 8.7 us before the packet's
-time, velodyne_decoder two and 7 us, which is what stands here; directions differ by 0.01 degrees.
+The times of a VLS-128's lasers differ by sources: ros-drivers has one idle slot after eight groups
+and 8.7 us before the packet's time, velodyne_decoder two and 7 us, which is what stands here;
+directions differ by 0.01 degrees.
 """
 
 from __future__ import annotations
@@ -43,7 +46,8 @@ from lidarspec_velodyne.hdl64e import HDL64E_S2, HDL64E_S3
 SLOT = np.arange(SLOTS)
 
 VLP16_FIRINGS = Firings(
-    # 16 lasers, two firings of each in a block: 2.304 us apart, the second round 55.296 us after the first
+    # 16 lasers, two firings of each in a block: 2.304 us apart, the second round 55.296 us after
+    # the first
     elevation=np.tile([-15.0, 1, -13, 3, -11, 5, -9, 7, -7, 9, -5, 11, -3, 13, -1, 15], 2),
     delay=(SLOT // 16 * 55.296 + SLOT % 16 * 2.304) * 1e-6,
     period=2 * 55.296e-6,
@@ -51,8 +55,42 @@ VLP16_FIRINGS = Firings(
     product=0x22,
 )
 
-LOWER = [-30.67, -29.33, -28.00, -26.67, -25.33, -24.00, -22.67, -21.33, -20.00, -18.67, -17.33, -16.00, -14.67, -13.33, -12.00, -10.67]
-UPPER = [-9.33, -8.00, -6.67, -5.33, -4.00, -2.67, -1.33, 0.00, 1.33, 2.67, 4.00, 5.33, 6.67, 8.00, 9.33, 10.67]
+LOWER = [
+    -30.67,
+    -29.33,
+    -28.00,
+    -26.67,
+    -25.33,
+    -24.00,
+    -22.67,
+    -21.33,
+    -20.00,
+    -18.67,
+    -17.33,
+    -16.00,
+    -14.67,
+    -13.33,
+    -12.00,
+    -10.67,
+]
+UPPER = [
+    -9.33,
+    -8.00,
+    -6.67,
+    -5.33,
+    -4.00,
+    -2.67,
+    -1.33,
+    0.00,
+    1.33,
+    2.67,
+    4.00,
+    5.33,
+    6.67,
+    8.00,
+    9.33,
+    10.67,
+]
 
 HDL32E_FIRINGS = Firings(
     # 32 lasers 1.152 us apart, by turns of the lower and of the upper half
@@ -81,12 +119,33 @@ VLS128_ELEVATION = (
     3.51, -6.06, -0.67, 4.72, -3.97, 2.3, -6.39, -1, 4.39, -5.18, 0.21, 6.98, -3.09, 4.98, -3.75, 1.64, -8.352, -2.54, 2.85, -5.84,
     -0.45, 8.43, -2.87, 2.52, -6.17, -1.66, 3.73, -4.96, 0.43,
 )
-VLS128_OFFSET = (-6.354, -4.548, -2.732, -0.911, 0.911, 2.732, 4.548, 6.354)  # of each eight lasers, which fire together
+# of each eight lasers, which fire together
+VLS128_OFFSET = (-6.354, -4.548, -2.732, -0.911, 0.911, 2.732, 4.548, 6.354)
 # fmt: on
 
 HI_RES_FIRINGS = dataclasses.replace(
     VLP16_FIRINGS,
-    elevation=np.tile([-10.0, 0.667, -8.667, 2, -7.333, 3.333, -6, 4.667, -4.667, 6, -3.333, 7.333, -2, 8.667, -0.667, 10], 2),
+    elevation=np.tile(
+        [
+            -10.0,
+            0.667,
+            -8.667,
+            2,
+            -7.333,
+            3.333,
+            -6,
+            4.667,
+            -4.667,
+            6,
+            -3.333,
+            7.333,
+            -2,
+            8.667,
+            -0.667,
+            10,
+        ],
+        2,
+    ),
     product=0x24,
 )
 
@@ -100,12 +159,16 @@ VLP32C_FIRINGS = Firings(
     product=VLP32C_PRODUCT,
 )
 
-GROUP = 8 / 3 * 1e-6  # seconds from eight lasers of a VLS-128 to the next eight; 2.89 us from firmware 5.2.3 on
+GROUP = (
+    8 / 3 * 1e-6
+)  # seconds from eight lasers of a VLS-128 to the next eight; 2.89 us from firmware 5.2.3 on
 VLS128_LASERS = np.arange(4 * SLOTS).reshape(4, SLOTS)
 
 
 def vls128_firings(returns: int) -> Firings:
-    """128 lasers in four blocks, or in four pairs with dual return; eight fire at once, and after eight of these there is a pause."""
+    """128 lasers in four blocks, or in four pairs with dual return; eight fire at once, and after
+    eight of these there is a pause.
+    """
 
     def blocks(values: Any) -> Any:
         table = np.reshape(values, (4, SLOTS))
@@ -127,14 +190,25 @@ def vls128_firings(returns: int) -> Firings:
 VLS128_SINGLE, VLS128_DUAL = vls128_firings(1), vls128_firings(2)
 VLS128_FRAMES = {
     "data": Frame(
-        packet(BANK, 0.004, Int8ul * "0x37 strongest, 0x38 last", Const(VLS128_PRODUCT, Int8ul) * "0xA1 VLS-128"),
+        packet(
+            BANK,
+            0.004,
+            Int8ul * "0x37 strongest, 0x38 last",
+            Const(VLS128_PRODUCT, Int8ul) * "0xA1 VLS-128",
+        ),
         data=True,
         plausible=plausible_single,
         points=partial(points, model=VLS128_SINGLE),
         simulation=Simulation(partial(sweep, model=VLS128_SINGLE, flags=np.tile(BANKS, (3, 1)))),
     ),
     "data_dual": Frame(
-        packet(BANK, 0.004, Const(DUAL, Int8ul), Const(VLS128_PRODUCT, Int8ul) * "0xA1 VLS-128", blocks=8),
+        packet(
+            BANK,
+            0.004,
+            Const(DUAL, Int8ul),
+            Const(VLS128_PRODUCT, Int8ul) * "0xA1 VLS-128",
+            blocks=8,
+        ),
         data=True,
         plausible=plausible_dual,
         points=partial(points, model=VLS128_DUAL),
@@ -143,8 +217,11 @@ VLS128_FRAMES = {
     "position": POSITION_FRAME,
 }
 
-# the same packets by other products (velodyne_decoder, types.h); 0x21 tells nothing: a VLP-16 with old firmware sends it too
-OTHERS = {"velodyne-vlp32a": Relative("product 0x23, VLP-32A or VLP-32B", lambda f: f.product == 0x23)}
+# the same packets by other products (velodyne_decoder, types.h); 0x21 tells nothing: a VLP-16 with
+# old firmware sends it too
+OTHERS = {
+    "velodyne-vlp32a": Relative("product 0x23, VLP-32A or VLP-32B", lambda f: f.product == 0x23)
+}
 HI_RES = {"velodyne-puck-hi-res": Relative("product 0x24", lambda f: f.product == 0x24)}
 
 
@@ -156,7 +233,9 @@ VLP16 = Sensor(
     points=partial(points, model=VLP16_FIRINGS),
     scan=OnWrap("blocks.azimuth"),
     links={"data": Udp(2368, 8308)},
-    clock=Clock("timestamp", wraps_at=HOUR, pace=partial(pace, model=VLP16_FIRINGS), told=("position", told)),
+    clock=Clock(
+        "timestamp", wraps_at=HOUR, pace=partial(pace, model=VLP16_FIRINGS), told=("position", told)
+    ),
     simulation=Simulation(partial(sweep, model=VLP16_FIRINGS)),
     configure=configure,
     range_limits=(0.4, 130.0),  # the default of ros-drivers/velodyne for this model
@@ -164,15 +243,23 @@ VLP16 = Sensor(
     turn=TURN,
     # 12 blocks, or 6 shots: periods of 110.592 and 46.080 us
     relatives={
-        "velodyne-hdl32e": "timestamp: a packet each 1327 us, with dual return 664 us; an HDL-32E's 553 and 276 us",
+        "velodyne-hdl32e": (
+            "timestamp: a packet each 1327 us, with dual return 664 us; an HDL-32E's 553 and 276 us"
+        ),
         **HI_RES,
         **OTHERS,
     },
     info={"temperature": "position.top_board_temperature"},  # the product byte is not to be trusted
     aliases=("vlp16", "puck", "puck-lite", "velodyne-puck-lite"),
     status="capture",
-    acknowledged={"LS710": "the captures are others', and too large: the project's tests read them where they are"},
-    source="velodyne_decoder and ros-drivers/velodyne, citing the VLP-16 user manual; three captures",
+    acknowledged={
+        "LS710": (
+            "the captures are others', and too large: the project's tests read them where they are"
+        )
+    },
+    source=(
+        "velodyne_decoder and ros-drivers/velodyne, citing the VLP-16 user manual; three captures"
+    ),
 )
 
 
@@ -183,7 +270,9 @@ def relative(id: str, model: str, firings: Firings, **facts: Any) -> Sensor:
         id=id,
         model=model,
         points=partial(points, model=firings),
-        clock=Clock("timestamp", wraps_at=HOUR, pace=partial(pace, model=firings), told=("position", told)),
+        clock=Clock(
+            "timestamp", wraps_at=HOUR, pace=partial(pace, model=firings), told=("position", told)
+        ),
         simulation=Simulation(partial(sweep, model=firings)),
         **facts,
     )
@@ -195,7 +284,13 @@ HDL32E = relative(
     HDL32E_FIRINGS,
     aliases=("hdl32e",),
     range_limits=(0.9, 130.0),  # likewise
-    relatives={"velodyne-vlp16": Relative("product 0x22; or a packet each 1327 us", lambda f: f.product == 0x22), **HI_RES, **OTHERS},
+    relatives={
+        "velodyne-vlp16": Relative(
+            "product 0x22; or a packet each 1327 us", lambda f: f.product == 0x22
+        ),
+        **HI_RES,
+        **OTHERS,
+    },
     source="velodyne_decoder and ros-drivers/velodyne, citing the HDL-32E user manual; one capture",
 )
 
@@ -205,13 +300,19 @@ PUCK_HI_RES = relative(
     HI_RES_FIRINGS,
     aliases=("puck-hi-res", "vlp16-hi-res"),
     relatives={
-        "velodyne-vlp16": Relative("product 0x22, or 0x21 of old firmware", lambda f: (f.product == 0x22) | (f.product == 0x21)),
+        "velodyne-vlp16": Relative(
+            "product 0x22, or 0x21 of old firmware",
+            lambda f: (f.product == 0x22) | (f.product == 0x21),
+        ),
         "velodyne-hdl32e": Relative("product 0x21", lambda f: f.product == 0x21),
         **OTHERS,
     },
     status="manual",
     acknowledged={},
-    source="velodyne_decoder (Puck Hi-Res.yml, packet_decoder.cpp), citing the VLP-16 user manual; no packet of this model was seen",
+    source=(
+        "velodyne_decoder (Puck Hi-Res.yml, packet_decoder.cpp), citing the VLP-16 user manual; no"
+        " packet of this model was seen"
+    ),
 )
 
 VLP32C = relative(
@@ -224,7 +325,10 @@ VLP32C = relative(
     relatives={},
     info={"model": "data.product", **VLP16.info},
     status="vectors",
-    source="velodyne_decoder (VLP-32C.yml, packet_decoder.cpp), citing the VLP-32C user manual; one captured packet of tier4/nebula",
+    source=(
+        "velodyne_decoder (VLP-32C.yml, packet_decoder.cpp), citing the VLP-32C user manual; one"
+        " captured packet of tier4/nebula"
+    ),
 )
 
 VLS128 = relative(
@@ -237,7 +341,10 @@ VLS128 = relative(
     relatives={},
     info={"model": "data.product", **VLP16.info},
     status="vectors",
-    source="velodyne_decoder (Alpha Prime.yml, packet_decoder.cpp, which cites VeloView); one captured packet of tier4/nebula",
+    source=(
+        "velodyne_decoder (Alpha Prime.yml, packet_decoder.cpp, which cites VeloView); one captured"
+        " packet of tier4/nebula"
+    ),
 )
 
 

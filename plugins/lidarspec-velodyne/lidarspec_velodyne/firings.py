@@ -1,18 +1,22 @@
-"""Where and when the lasers of a spinning sensor fire: from blocks that share an azimuth to a direction for each firing.
+"""Where and when the lasers of a spinning sensor fire: from blocks that share an azimuth to a
+direction for each firing.
 
-The azimuth of a block is that of its first firing; the others lie on the way to the next block, in proportion to their
-time. With dual return two blocks in a row hold the two returns of the same firings and share an azimuth, so that the
-next one is two blocks on.
+The azimuth of a block is that of its first firing; the others lie on the way to the next block, in
+proportion to their time. With dual return two blocks in a row hold the two returns of the same
+firings and share an azimuth, so that the next one is two blocks on.
 
-Where nothing follows, or what follows is further than the sensor can have turned (packets carry no sequence, so this is
-how a loss shows; a sector masked in the sensor's settings looks the same), the rule for the last block decides:
+Where nothing follows, or what follows is further than the sensor can have turned (packets carry no
+sequence, so this is
+how a loss shows; a sector masked in the sensor's settings looks the same), the rule for the last
+block decides:
 
-* "previous", the default: the last good step is used again, as ros-drivers and nebula do for the last block of every
-  packet; velodyne_decoder takes the mean of the packet. On real packets these differ by up to 0.04 degrees.
+* "previous", the default: the last good step is used again, as ros-drivers and nebula do for the
+  last block of every packet; velodyne_decoder takes the mean of the packet. On real packets these
+  differ by up to 0.04 degrees.
 * "invalid": these firings have no direction, and their points are not valid.
 
-Source: ros-drivers/velodyne rawdata.cc (azimuths); velodyne_decoder packet_decoder.cpp and calib_db.cpp (firing times,
-vertical offset of the lasers).
+Source: ros-drivers/velodyne rawdata.cc (azimuths); velodyne_decoder packet_decoder.cpp and
+calib_db.cpp (firing times, vertical offset of the lasers).
 """
 
 from __future__ import annotations
@@ -39,12 +43,16 @@ class Firings:
     """The firing pattern of a model.
 
     Attributes:
-        elevation: (32,) degrees, of the laser of each slot of a block; (blocks, 32) where these hold different lasers.
-        delay: likewise, seconds from the beginning of the firings that share an azimuth to the firing of each slot.
+        elevation: (32,) degrees, of the laser of each slot of a block; (blocks, 32) where these
+            hold different lasers.
+        delay: likewise, seconds from the beginning of the firings that share an azimuth to the
+            firing of each slot.
         period: seconds from one azimuth to the next.
-        focal_distance: metres; lasers leave the lens at different heights and cross at this distance.
+        focal_distance: metres; lasers leave the lens at different heights and cross at this
+            distance.
         product: the product byte that the model should send.
-        offset: as `elevation`, degrees by which the laser of each slot looks to the left of the azimuth.
+        offset: as `elevation`, degrees by which the laser of each slot looks to the left of the
+            azimuth.
         sharing: how many blocks of single return share an azimuth: banks of lasers.
         returns: of each firing, in packets that always have so many; 0 where these say it.
         start: seconds from the time of the packet to its first firing.
@@ -80,13 +88,18 @@ def points(f: Fields, model: Firings, last_block: str = "previous") -> Polar:
     """The sensor turns clockwise from its forward axis; heights are along the axis of rotation."""
     dual = model.returns == 2 if model.returns else f.return_mode == DUAL
     block = np.arange(model.blocks)[:, None]
-    clockwise = f.blocks.azimuth + _step(f, dual, model, last_block) * (model.delay / model.period) - model.offset
+    clockwise = (
+        f.blocks.azimuth
+        + _step(f, dual, model, last_block) * (model.delay / model.period)
+        - model.offset
+    )
     return Polar(
         range=f.blocks.channels.distance,
         azimuth=-np.deg2rad(clockwise),
         elevation=np.deg2rad(model.elevation),
         intensity=f.blocks.channels.intensity,
-        time=np.where(dual, block // (2 * model.sharing), block // model.sharing) * model.period + (model.delay + model.start),
+        time=np.where(dual, block // (2 * model.sharing), block // model.sharing) * model.period
+        + (model.delay + model.start),
         ring=model.ring,
         return_index=np.where(dual, block % 2, 0),
         origin=(0, 0, model.height),
@@ -105,25 +118,31 @@ def _step(f: Fields, dual: Any, model: Firings, last_block: str) -> Any:
 
 
 def difference(start: Any, end: Any) -> Any:
-    """The shorter way round from start to end, degrees: a reading that falls back by jitter is no turn."""
+    """The shorter way round from start to end, degrees: a reading that falls back by jitter is no
+    turn.
+    """
     step = end - start
     return step - 360 * np.rint(step / 360)
 
 
 def configure(sensor: Sensor, /, *, last_block: str) -> Sensor:
-    """The sensor with another rule for the last block, "previous" or "invalid" (see the module's text).
+    """The sensor with another rule for the last block, "previous" or "invalid" (see the module's
+    text).
 
     Raises:
         UsageError: for another rule.
     """
     if last_block not in LAST_BLOCK:
-        raise UsageError(f"{sensor.id}: last_block is one of {', '.join(LAST_BLOCK)}, not {last_block!r}")
+        raise UsageError(
+            f"{sensor.id}: last_block is one of {', '.join(LAST_BLOCK)}, not {last_block!r}"
+        )
 
     def ruled(function: Any) -> Any:
         return function and partial(function, last_block=last_block)
 
     frames = {
-        name: dataclasses.replace(frame, points=ruled(frame.points)) if frame.points else frame for name, frame in sensor.frames.items()
+        name: dataclasses.replace(frame, points=ruled(frame.points)) if frame.points else frame
+        for name, frame in sensor.frames.items()
     }
     return dataclasses.replace(sensor, points=ruled(sensor.points), frames=frames)
 
@@ -135,10 +154,23 @@ def pace(f: Fields, model: Firings) -> Any:
 
 
 def sweep(i: int, model: Firings, flags: Any = None) -> dict[str, Any]:
-    """Packet i of packets with so many returns, one where these say it themselves, at 10 turns a second; with the flags of its blocks."""
+    """Packet i of packets with so many returns, one where these say it themselves, at 10 turns a
+    second; with the flags of its blocks.
+    """
     dual = model.returns == 2
     sharing = model.sharing * (2 if dual else 1)
     shots = model.blocks // sharing
-    azimuth = np.round((i * shots + np.arange(model.blocks) // sharing) * model.period * 10 * 360, 2) % 360
-    values = {"blocks.azimuth": azimuth, "timestamp": i * shots * model.period % HOUR, "return_mode": DUAL if dual else STRONGEST}
-    return {**values, "product": model.product, **({} if flags is None else {"blocks.flag": flags.ravel()})}
+    azimuth = (
+        np.round((i * shots + np.arange(model.blocks) // sharing) * model.period * 10 * 360, 2)
+        % 360
+    )
+    values = {
+        "blocks.azimuth": azimuth,
+        "timestamp": i * shots * model.period % HOUR,
+        "return_mode": DUAL if dual else STRONGEST,
+    }
+    return {
+        **values,
+        "product": model.product,
+        **({} if flags is None else {"blocks.flag": flags.ravel()}),
+    }

@@ -1,7 +1,9 @@
-"""The packets of the family: data on UDP port 2368, in three forms, and position on port 8308, the same from all models.
+"""The packets of the family: data on UDP port 2368, in three forms, and position on port 8308, the
+same from all models.
 
-Source: velodyne_decoder (types.h, telemetry_packet.h) and ros-drivers/velodyne, which cite the vendor's user manuals;
-the leading zeros and inertial readings of position packets: VeloView's position reader.
+Source: velodyne_decoder (types.h, telemetry_packet.h) and ros-drivers/velodyne, which cite the
+vendor's user manuals; the leading zeros and inertial readings of position packets: VeloView's
+position reader.
 """
 
 from __future__ import annotations
@@ -11,7 +13,18 @@ import re
 from typing import Any
 
 import numpy as np
-from construct import Array, Bytes, Const, Construct, Int8ul, Int16sl, Int16ub, Int16ul, Int32ul, Struct
+from construct import (
+    Array,
+    Bytes,
+    Const,
+    Construct,
+    Int8ul,
+    Int16sl,
+    Int16ub,
+    Int16ul,
+    Int32ul,
+    Struct,
+)
 
 from lidarspec.spec import Fields, Frame, Scaled, Simulation
 
@@ -27,7 +40,9 @@ NMEA = 128  # bytes that a sentence may have (velodyne_decoder)
 BANKS = np.array([0xFFEE, 0xFFDD, 0xFFCC, 0xFFBB])[:, None]
 
 
-def packet(flag: Construct, unit: float, mode: Construct, product: Construct, *, blocks: int = BLOCKS) -> Struct:
+def packet(
+    flag: Construct, unit: float, mode: Construct, product: Construct, *, blocks: int = BLOCKS
+) -> Struct:
     """A data packet of so many blocks that hold points, with distances in steps of `unit` metres."""
     channel = Struct(
         "distance" / Scaled(Int16ul, unit, "m") * "0: no return",
@@ -35,7 +50,9 @@ def packet(flag: Construct, unit: float, mode: Construct, product: Construct, *,
     )
     block = Struct(
         "flag" / flag,
-        "azimuth" / Scaled(Int16ul, 0.01, "deg") * "clockwise from the forward axis, at the first firing of the block",
+        "azimuth"
+        / Scaled(Int16ul, 0.01, "deg")
+        * "clockwise from the forward axis, at the first firing of the block",
         "channels" / Array(SLOTS, channel),
     )
     empty: list[Construct] = ["empty" / Bytes((BLOCKS - blocks) * 100)] if blocks < BLOCKS else []
@@ -50,7 +67,11 @@ def packet(flag: Construct, unit: float, mode: Construct, product: Construct, *,
 
 MODE = Int8ul * "0x37 strongest, 0x38 last, 0x39 dual; not set by HDL-32E firmware before 2.2.20"
 BANK = Int16ub * "0xFFEE lasers 1 to 32, 0xFFDD 33 to 64, 0xFFCC 65 to 96, 0xFFBB 97 to 128"
-PRODUCT = Int8ul * "0x21 HDL-32E, 0x22 VLP-16, 0x24 Puck Hi-Res; not to be trusted: VLP-16 with old firmware sends 0x21"
+PRODUCT = (
+    Int8ul
+    * "0x21 HDL-32E, 0x22 VLP-16, 0x24 Puck Hi-Res; not to be trusted: VLP-16 with old firmware"
+    " sends 0x21"
+)
 
 POSITION = Struct(
     "zeros" / Const(bytes(14)),
@@ -58,14 +79,18 @@ POSITION = Struct(
     / Array(
         3,
         Struct(
-            "gyro" / Int16ul * "HDL-32E: signed, in the low 12 bits; 0.09766 deg/s; the VLP-16 sends 0",
+            "gyro"
+            / Int16ul
+            * "HDL-32E: signed, in the low 12 bits; 0.09766 deg/s; the VLP-16 sends 0",
             "temperature" / Int16ul * "likewise; 0.1453 degC, from 25 degC",
             "accel_x" / Int16ul * "likewise; 0.001221 g",
             "accel_y" / Int16ul * "likewise; 0.001221 g",
         ),
     ),
     "reserved" / Bytes(149),
-    "top_board_temperature" / Scaled(Int8ul, 1, "degC") * "this and the other readings but time, PPS and NMEA: firmware since 2018",
+    "top_board_temperature"
+    / Scaled(Int8ul, 1, "degC")
+    * "this and the other readings but time, PPS and NMEA: firmware since 2018",
     "bottom_board_temperature" / Scaled(Int8ul, 1, "degC"),
     "adc_temperature" / Scaled(Int8ul, 1, "degC") * "when the ADC was calibrated last",
     "adc_temperature_change" / Scaled(Int16sl, 1, "degC") * "since then",
@@ -77,13 +102,17 @@ POSITION = Struct(
     "thermal_status" / Int8ul * "0 ok, 1 shut down",
     "shutdown_temperature" / Scaled(Int8ul, 1, "degC") * "at the last thermal shutdown",
     "power_up_temperature" / Scaled(Int8ul, 1, "degC"),
-    "nmea" / Bytes(NMEA) * "a GPRMC or GPGGA sentence, filled up with zeros; all 0 without a GPS receiver",
+    "nmea"
+    / Bytes(NMEA)
+    * "a GPRMC or GPGGA sentence, filled up with zeros; all 0 without a GPS receiver",
     "unused" / Bytes(178),
 )
 
 
 def plausible(f: Fields) -> Any:
-    """Azimuths of at most a whole turn (documented to 359.99 degrees; old firmware sends 360.00), and none of a VLP-32C's packets."""
+    """Azimuths of at most a whole turn (documented to 359.99 degrees; old firmware sends 360.00),
+    and none of a VLP-32C's packets.
+    """
     return (f.blocks.azimuth <= 360) & (f.product != VLP32C_PRODUCT)
 
 
@@ -94,7 +123,11 @@ def plausible_turn(f: Fields) -> Any:
 
 def plausible_single(f: Fields) -> Any:
     """Four banks in a row, three times, and no dual return."""
-    return (f.blocks.azimuth <= 360) & (f.blocks.flag == np.tile(BANKS, (3, 1))) & (f.return_mode != DUAL)
+    return (
+        (f.blocks.azimuth <= 360)
+        & (f.blocks.flag == np.tile(BANKS, (3, 1)))
+        & (f.return_mode != DUAL)
+    )
 
 
 def plausible_dual(f: Fields) -> Any:
@@ -103,17 +136,22 @@ def plausible_dual(f: Fields) -> Any:
 
 
 def plausible_position(f: Fields) -> Any:
-    """Known states of the PPS, and text where the NMEA sentence stands: a stretch of a data packet has flags there."""
+    """Known states of the PPS, and text where the NMEA sentence stands: a stretch of a data packet
+    has flags there.
+    """
     return (f.pps <= 3) & ((f.nmea == 0) | ((f.nmea >= 9) & (f.nmea < 127)))
 
 
-#: time, that it is valid, and date of a sentence; what stands in between is the position and the movement.
+#: time, that it is valid, and date of a sentence; what stands in between is the position and the
+#: movement.
 _RMC = re.compile(rb"\$G[A-Z]RMC,(\d{6})(?:\.\d*)?,A,(?:[^,]*,){6}(\d{6})[,*]")
 LOCKED = 2  # state of the PPS
 
 
 def told(f: Fields) -> Any:
-    """Seconds since 1970 of each NMEA sentence; nan of one that is not valid, or while no PPS holds the clock to it."""
+    """Seconds since 1970 of each NMEA sentence; nan of one that is not valid, or while no PPS holds
+    the clock to it.
+    """
     locked = np.asarray(f.pps).reshape(-1) == LOCKED
     found, sentences = np.full(len(locked), np.nan), np.asarray(f.nmea).astype(np.uint8)
     for row in np.flatnonzero(locked).tolist():
@@ -126,25 +164,41 @@ def told(f: Fields) -> Any:
 def _seconds(nmea: bytes) -> float:
     sentence = _RMC.match(nmea)
     try:
-        moment = datetime.datetime.strptime((sentence[2] + sentence[1]).decode(), "%d%m%y%H%M%S") if sentence else None
+        moment = (
+            datetime.datetime.strptime((sentence[2] + sentence[1]).decode(), "%d%m%y%H%M%S")
+            if sentence
+            else None
+        )
     except ValueError:
         moment = None
     return moment.replace(tzinfo=datetime.UTC).timestamp() if moment else float("nan")
 
 
 def sweep_position(i: int) -> dict[str, Any]:
-    """Position packet i of a sensor that was switched on at the beginning of 2024, with a GPS receiver that knows the time alone."""
-    moment = datetime.datetime(2024, 1, 1, tzinfo=datetime.UTC) + datetime.timedelta(seconds=i // POSITIONS)
+    """Position packet i of a sensor that was switched on at the beginning of 2024, with a GPS
+    receiver that knows the time alone.
+    """
+    moment = datetime.datetime(2024, 1, 1, tzinfo=datetime.UTC) + datetime.timedelta(
+        seconds=i // POSITIONS
+    )
     text = moment.strftime("GPRMC,%H%M%S,A,,,,,,,%d%m%y,,,A").encode()
     sentence = b"$%s*%02X\r\n" % (text, np.bitwise_xor.reduce(np.frombuffer(text, np.uint8)))
-    return {"timestamp": i / POSITIONS % HOUR, "pps": LOCKED, "nmea": np.frombuffer(sentence.ljust(NMEA, b"\0"), np.uint8)}
+    return {
+        "timestamp": i / POSITIONS % HOUR,
+        "pps": LOCKED,
+        "nmea": np.frombuffer(sentence.ljust(NMEA, b"\0"), np.uint8),
+    }
 
 
 POSITION_FRAME = Frame(
     POSITION,
     plausible=plausible_position,
     simulation=Simulation(sweep_position, rate=POSITIONS),
-    acknowledged={"LS201 inertial.temperature": "signed in the low 12 bits from an HDL-32E, and no number at all from a VLP-16"},
+    acknowledged={
+        "LS201 inertial.temperature": (
+            "signed in the low 12 bits from an HDL-32E, and no number at all from a VLP-16"
+        )
+    },
 )
 FLAG = Const(b"\xff\xee")
 PUCK_FRAMES = {
@@ -152,6 +206,10 @@ PUCK_FRAMES = {
     "position": POSITION_FRAME,
 }
 VLP32C_FRAMES = {
-    "data": Frame(packet(FLAG, 0.004, MODE, Const(VLP32C_PRODUCT, Int8ul) * "0x28 VLP-32C"), data=True, plausible=plausible_turn),
+    "data": Frame(
+        packet(FLAG, 0.004, MODE, Const(VLP32C_PRODUCT, Int8ul) * "0x28 VLP-32C"),
+        data=True,
+        plausible=plausible_turn,
+    ),
     "position": POSITION_FRAME,
 }

@@ -1,15 +1,18 @@
-"""Velodyne HDL-64E, series S2 and S3: 64 lasers in two banks, blocks of which take turns, each laser with corrections of its own.
+"""Velodyne HDL-64E, series S2 and S3: 64 lasers in two banks, blocks of which take turns, each
+laser with corrections of its own.
 
-Source: velodyne_decoder (calibration files of an example unit of each series, packet_decoder.cpp: firing times) and ros-drivers/velodyne
-(rawdata.cc: corrections; gen_calibration.py: names and units in db.xml), which cite the vendor's manuals. Blocks with 0xFFEE hold lasers 1
-to 32, those with 0xFFDD lasers 33 to 64 of the same firing; with dual return, four blocks in a row share an azimuth (velodyne_decoder), the
-two of the strongest return first.
+Source: velodyne_decoder (calibration files of an example unit of each series, packet_decoder.cpp:
+firing times) and ros-drivers/velodyne (rawdata.cc: corrections; gen_calibration.py: names and units
+in db.xml), which cite the vendor's manuals. Blocks with 0xFFEE hold lasers 1 to 32, those with
+0xFFDD lasers 33 to 64 of the same firing; with dual return, four blocks in a row share an azimuth
+(velodyne_decoder), the two of the strongest return first.
 
-Every unit has corrections of its own, in the file that comes with it (db.xml), and a byte at a time in `status_value`: those of an example
-unit stand here, and clouds say that they are nominal, until `configure(calibration=...)` names the file. Not expressed: the second
-correction of near distances (below 25 m), intensity by focal distance, and the calibration in the status bytes. No packet of this model
-was seen; points of simulated ones lie within 8 cm of those of velodyne_decoder, which makes that second correction. Nothing completes its
-clock: the date is in the status bytes.
+Every unit has corrections of its own, in the file that comes with it (db.xml), and a byte at a time
+in `status_value`: those of an example unit stand here, and clouds say that they are nominal, until
+`configure(calibration=...)` names the file. Not expressed: the second correction of near distances
+(below 25 m), intensity by focal distance, and the calibration in the status bytes. No packet of
+this model was seen; points of simulated ones lie within 8 cm of those of velodyne_decoder, which
+makes that second correction. Nothing completes its clock: the date is in the status bytes.
 """
 
 from __future__ import annotations
@@ -25,13 +28,31 @@ import numpy as np
 from construct import Array, Int8ul, Int16ub, Int16ul, Int32ul, Struct
 
 from lidarspec import UsageError
-from lidarspec.spec import Clock, Fields, Frame, OnWrap, Polar, Scaled, Sensor, Simulation, Udp, between_blocks, following
+from lidarspec.spec import (
+    Clock,
+    Fields,
+    Frame,
+    OnWrap,
+    Polar,
+    Scaled,
+    Sensor,
+    Simulation,
+    Udp,
+    between_blocks,
+    following,
+)
 from lidarspec_velodyne.firings import FASTEST, JITTER
 from lidarspec_velodyne.frames import BLOCKS, HOUR, SLOTS, TURN
 
 UPPER, LOWER = 0xFFEE, 0xFFDD
 LARGEST = 1 << 20  # bytes of a calibration file at most
-NAMES = ("rotCorrection_", "vertCorrection_", "distCorrection_", "vertOffsetCorrection_", "horizOffsetCorrection_")
+NAMES = (
+    "rotCorrection_",
+    "vertCorrection_",
+    "distCorrection_",
+    "vertOffsetCorrection_",
+    "horizOffsetCorrection_",
+)
 FLAGS = np.tile([[UPPER], [LOWER]], (BLOCKS // 2, 1))
 TURNS = 10
 
@@ -144,7 +165,9 @@ BLOCK = Struct(
 DATA = Struct(
     "blocks" / Array(BLOCKS, BLOCK),
     "timestamp" / Scaled(Int32ul, 1e-6, "s") * "of the first firing, since the top of the hour",
-    "status_type" / Int8ul * "a letter: H, M, S time, D, N, Y date, G GPS, T temperature, V version, W others by turns",
+    "status_type"
+    / Int8ul
+    * "a letter: H, M, S time, D, N, Y date, G GPS, T temperature, V version, W others by turns",
     "status_value" / Int8ul,
 )
 
@@ -194,14 +217,31 @@ def configure(unit: Unit, sensor: Sensor, /, *, calibration: str | Path) -> Sens
     try:
         with open(calibration, "rb") as file:
             lasers = ElementTree.fromstring(file.read(LARGEST)).findall("DB/points_/item/px")
-        table = {int(_number(laser, "id_")): [_number(laser, name) for name in NAMES] for laser in lasers}
+        table = {
+            int(_number(laser, "id_")): [_number(laser, name) for name in NAMES] for laser in lasers
+        }
     except (OSError, ElementTree.ParseError, ValueError) as error:
-        raise UsageError(f"{calibration!s}: not the calibration of an HDL-64E (db.xml): {error}") from None
+        raise UsageError(
+            f"{calibration!s}: not the calibration of an HDL-64E (db.xml): {error}"
+        ) from None
     if len(lasers) != 2 * SLOTS or set(table) != set(range(2 * SLOTS)):
-        raise UsageError(f"{calibration!s}: lists {len(table)} lasers of {len(lasers)}, and an HDL-64E has 0 to {2 * SLOTS - 1}, each once")
-    offset, vertical, *metres = (tuple(column) for column in np.array([table[laser] for laser in sorted(table)]).T)
+        raise UsageError(
+            f"{calibration!s}: lists {len(table)} lasers of {len(lasers)}, and an HDL-64E has 0 to"
+            f" {2 * SLOTS - 1}, each once"
+        )
+    offset, vertical, *metres = (
+        tuple(column) for column in np.array([table[laser] for laser in sorted(table)]).T
+    )
     distance, height, aside = (tuple(value / 100 for value in column) for column in metres)
-    own = replace(unit, vertical=vertical, offset=offset, distance=distance, height=height, aside=aside, nominal=False)
+    own = replace(
+        unit,
+        vertical=vertical,
+        offset=offset,
+        distance=distance,
+        height=height,
+        aside=aside,
+        nominal=False,
+    )
     return replace(sensor, points=partial(points, unit=own))
 
 
@@ -222,7 +262,12 @@ def sweep(i: int, unit: Unit) -> dict[str, Any]:
     """Packet i of single return."""
     shot = i * (BLOCKS // 2) + np.arange(BLOCKS) // 2
     azimuth = np.round(shot * unit.period * TURNS * 360, 2) % 360
-    return {"blocks.azimuth": azimuth, "blocks.flag": FLAGS[:, 0], "timestamp": i * 6 * unit.period % HOUR, "status_type": ord("V")}
+    return {
+        "blocks.azimuth": azimuth,
+        "blocks.flag": FLAGS[:, 0],
+        "timestamp": i * 6 * unit.period % HOUR,
+        "status_type": ord("V"),
+    }
 
 
 FRAMES = {"data": Frame(DATA, data=True, plausible=plausible)}
@@ -244,9 +289,17 @@ def model(series: str, unit: Unit, other: str) -> Sensor:
         range_limits=(0.9, 120.0),  # data sheet
         vendor_axes=("right", "forward", "up"),
         turn=TURN,
-        relatives={f"velodyne-hdl64e-{other}": "timestamp: a packet each 288 us of an S2, 346 us of an S3; with dual return half of these"},
+        relatives={
+            f"velodyne-hdl64e-{other}": (
+                "timestamp: a packet each 288 us of an S2, 346 us of an S3; with dual return half"
+                " of these"
+            )
+        },
         status="manual",
-        source="velodyne_decoder (calibrations of an example unit, packet_decoder.cpp) and ros-drivers/velodyne (rawdata.cc)",
+        source=(
+            "velodyne_decoder (calibrations of an example unit, packet_decoder.cpp) and"
+            " ros-drivers/velodyne (rawdata.cc)"
+        ),
         aliases=(f"hdl64e-{series}", *(("velodyne-hdl64e", "hdl64e") if series == "s2" else ())),
     )
 

@@ -1,4 +1,6 @@
-"""Velodyne VLP-16 and HDL-32E: real captures against what other decoders published or give for the same bytes."""
+"""Velodyne VLP-16 and HDL-32E: real captures against what other decoders published or give for the
+same bytes.
+"""
 
 from __future__ import annotations
 
@@ -23,7 +25,9 @@ OLD = "velodyne/vlp16_old_firmware/vlp-16-test-90deg-1-50-frames.pcap"
 HDL = "velodyne/hdl32e/sample_velodyne_hdl32.pcap"
 RAW = "velodyne/vlp16_raw/recording.bin"
 
-PCD = np.dtype("f4, f4, f4, u1, u1, u2, f4, f4, f4, u4")  # x y z intensity return_type channel azimuth elevation distance time
+PCD = np.dtype(
+    "f4, f4, f4, u1, u1, u2, f4, f4, f4, u4"
+)  # x y z intensity return_type channel azimuth elevation distance time
 
 
 @functools.cache
@@ -65,9 +69,14 @@ def test_old_firmware_published_points() -> None:
     cloud = cloud[cloud.valid]
     assert cloud.ring is not None
     assert cloud.intensity is not None
-    for index, ring, intensity, xyz in [(0, 0, 4, (0.0801272, 6.04037, -1.61865)), (13859, 15, 29, (-0.0094354, 4.91462, 1.31687))]:
+    for index, ring, intensity, xyz in [
+        (0, 0, 4, (0.0801272, 6.04037, -1.61865)),
+        (13859, 15, 29, (-0.0094354, 4.91462, 1.31687)),
+    ]:
         np.testing.assert_allclose(cloud.xyz[index, :2], xyz[:2], atol=1e-5)
-        offset = 0.04191 * np.tan(np.deg2rad(15)) * (1 if ring == 0 else -1)  # published without the vertical offset of the laser
+        offset = (
+            0.04191 * np.tan(np.deg2rad(15)) * (1 if ring == 0 else -1)
+        )  # published without the vertical offset of the laser
         assert cloud.xyz[index, 2] - offset == pytest.approx(xyz[2], abs=1e-5)
         assert (cloud.ring[index], cloud.intensity[index]) == (ring, intensity)
 
@@ -96,14 +105,22 @@ def test_dual_return_pieces() -> None:
     scans = list(VLP16.scans(payloads(DUAL)))
     assert [scan.complete for scan in scans] == [False, True, True, True, False]
     assert [scan.rate_hz for scan in scans[1:4]] == [pytest.approx(10, abs=0.02)] * 3
-    assert all(len(scan) % 64 == 0 for scan in scans)  # never cut between the two blocks of a firing
+    assert all(
+        len(scan) % 64 == 0 for scan in scans
+    )  # never cut between the two blocks of a firing
 
 
 def test_recording_without_any_header_is_a_stream() -> None:
     data = capture(RAW).read_bytes()
     packets = VLP16.decode(data)
-    assert (len(packets), packets.stats.bytes_skipped, packets.stats.frames) == (1000, 0, {"data": 1000})
-    assert VLP16.parse(capture("velodyne/vlp16_raw/packet.bin").read_bytes()).timestamp == 0x9EEA6B9B
+    assert (len(packets), packets.stats.bytes_skipped, packets.stats.frames) == (
+        1000,
+        0,
+        {"data": 1000},
+    )
+    assert (
+        VLP16.parse(capture("velodyne/vlp16_raw/packet.bin").read_bytes()).timestamp == 0x9EEA6B9B
+    )
 
 
 @pytest.mark.parametrize("start", range(1, 1206, 173))
@@ -127,7 +144,11 @@ def test_a_lost_packet_moves_no_point_of_the_others() -> None:
 
 def published() -> NDArray[Any]:
     """The points that nebula published for one turn of the dual return capture."""
-    _, _, body = capture("velodyne/vlp16_dual/1673400472138016708.pcd").read_bytes().partition(b"DATA binary\n")
+    _, _, body = (
+        capture("velodyne/vlp16_dual/1673400472138016708.pcd")
+        .read_bytes()
+        .partition(b"DATA binary\n")
+    )
     return np.frombuffer(body, PCD)
 
 
@@ -140,38 +161,55 @@ def test_dual_return_against_the_published_cloud() -> None:
     places = defaultdict(list)
     for index in np.flatnonzero(cloud.valid).tolist():
         firing = index // 64 % 6 * 2 + index // 16 % 2
-        places[firing, int(cloud.ring[index]), round(float(cloud.range[index]) / 0.002)].append(index)
+        places[firing, int(cloud.ring[index]), round(float(cloud.range[index]) / 0.002)].append(
+            index
+        )
     apart, pair = np.empty((len(expected), 3)), np.empty(len(expected))
     for row, (*xyz, _, _, ring, _, _, distance, time) in enumerate(expected.tolist()):
         round_of_lasers = time // 55_296  # published times count blocks, not pairs of blocks
         firing = round_of_lasers // 4 * 2 + round_of_lasers % 2
         differences = np.abs(xyz_of[places[firing, ring, round(distance / 0.002)]] - xyz)
-        apart[row], pair[row] = differences[np.linalg.norm(differences, axis=1).argmin()], firing // 2
+        apart[row], pair[row] = (
+            differences[np.linalg.norm(differences, axis=1).argmin()],
+            firing // 2,
+        )
     assert np.median(np.linalg.norm(apart, axis=1)) < 0.010
     assert apart[:, 2].max() < 0.0115  # published without the vertical offsets of the lasers
-    # in the published cloud the last pair of a packet does not turn, and echoes that only the second block of a pair has are a pair ahead
+    # in the published cloud the last pair of a packet does not turn, and echoes that only the
+    # second block of a pair has are a pair ahead
     level = np.hypot(apart[:, 0], apart[:, 1])
     assert np.quantile(level[pair < 5], 0.99) < 0.005
 
 
 def other_decoder(data: bytes, name: str) -> NDArray[Any]:
     """What velodyne-decoder makes of one packet: x y z time ring, duplicates of dual return merged."""
-    peer = pytest.importorskip("velodyne_decoder", reason="velodyne-decoder, a peer to compare with, is not installed")
+    peer = pytest.importorskip(
+        "velodyne_decoder", reason="velodyne-decoder, a peer to compare with, is not installed"
+    )
     config = peer.Config(model=getattr(peer.Model, name), min_range=0, max_range=1000)
-    found = peer.ScanDecoder(config).decode(peer.PacketVector([peer.VelodynePacket(0.0, data)]), as_pcl_structs=True)
+    found = peer.ScanDecoder(config).decode(
+        peer.PacketVector([peer.VelodynePacket(0.0, data)]), as_pcl_structs=True
+    )
     return np.asarray(found[1])
 
 
 @pytest.mark.parametrize(
-    ("sensor", "model", "name", "product"), [(VLP16, "VLP16", DUAL, 0x22), (VLP16, "VLP16", OLD, 0x22), (HDL32E, "HDL32E", HDL, 0x21)]
+    ("sensor", "model", "name", "product"),
+    [(VLP16, "VLP16", DUAL, 0x22), (VLP16, "VLP16", OLD, 0x22), (HDL32E, "HDL32E", HDL, 0x21)],
 )
-def test_agreement_with_velodyne_decoder(sensor: ls.Sensor, model: str, name: str, product: int) -> None:
+def test_agreement_with_velodyne_decoder(
+    sensor: ls.Sensor, model: str, name: str, product: int
+) -> None:
     data = [datagram for datagram in payloads(name) if len(datagram) == 1206]
     cloud = sensor.decode(data).points()
     assert cloud.ring is not None
     each = 2 if name == DUAL else 1
     shape = (len(data), 12 // each, each, 32)
-    xyz, ring, time = cloud.xyz.reshape(*shape, 3), cloud.ring.reshape(shape), cloud.time.reshape(shape)
+    xyz, ring, time = (
+        cloud.xyz.reshape(*shape, 3),
+        cloud.ring.reshape(shape),
+        cloud.time.reshape(shape),
+    )
     distances = []
     for number, datagram in enumerate(data):
         theirs = other_decoder(datagram[:1205] + bytes([product]), model)
@@ -179,7 +217,9 @@ def test_agreement_with_velodyne_decoder(sensor: ls.Sensor, model: str, name: st
         turn, slot = np.divmod(np.abs(firing - theirs["time"][:, None]).argmin(axis=1), 32)
         assert np.abs(firing[32 * turn + slot] - theirs["time"]).max() < 2e-8
         assert (ring[number, turn, 0, slot] == theirs["ring"]).all()
-        apart = xyz[number, turn, :, slot] - np.stack([theirs[axis] for axis in "xyz"], axis=1)[:, None]
+        apart = (
+            xyz[number, turn, :, slot] - np.stack([theirs[axis] for axis in "xyz"], axis=1)[:, None]
+        )
         distances.append(np.nanmin(np.linalg.norm(apart, axis=2), axis=1))
     found = np.concatenate(distances)
     assert len(found) == (59414 if name == DUAL else cloud.valid.sum())

@@ -1,11 +1,13 @@
-"""YDLIDAR's 360 degree lidars over a UART: one packet, with samples in eight forms; most models are started by a request.
+"""YDLIDAR's 360 degree lidars over a UART: one packet, with samples in eight forms; most models are
+started by a request.
 
 Source: YDLIDAR SDK, "YDLidar-SDK Communication Protocol" (scan command response, angle analysis).
 
-Known errors and gaps: the angles of the protocol's example, 217.0178 and 235.6326 degrees, are 217.0191 and 235.6313 by its own formula.
-Packets do not say which form their samples have, only how many bytes they are can be told: choose the model by its name. Models with one
-channel, which have no receiving line, send by themselves. Not here: GS1, GS2, GS5 and TIA, whose protocols are others, and the network
-models T15 and T30.
+Known errors and gaps: the angles of the protocol's example, 217.0178 and 235.6326 degrees, are
+217.0191 and 235.6313 by its own formula. Packets do not say which form their samples have, only how
+many bytes they are can be told: choose the model by its name. Models with one channel, which have
+no receiving line, send by themselves. Not here: GS1, GS2, GS5 and TIA, whose protocols are others,
+and the network models T15 and T30.
 """
 
 from __future__ import annotations
@@ -16,7 +18,18 @@ from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
-from construct import Array, BitsInteger, BitStruct, ByteSwapped, Const, Construct, Int8ul, Int16ul, Struct, this
+from construct import (
+    Array,
+    BitsInteger,
+    BitStruct,
+    ByteSwapped,
+    Const,
+    Construct,
+    Int8ul,
+    Int16ul,
+    Struct,
+    this,
+)
 
 from lidarspec.spec import (
     Checksummed,
@@ -41,19 +54,33 @@ from lidarspec_ydlidar.samples import Form
 
 FULL = 40  # samples of a full packet (protocol, LSN)
 SPEED = 6.0  # turns a second of simulated sensors, which all models can
-STATE = 0.8  # what a T-mini Pro has most often in the bits of the scan frequency while nothing is wrong (its packets)
+# what a T-mini Pro has most often in the bits of the scan frequency while nothing is wrong (its
+# packets)
+STATE = 0.8
 #: the same packet, by the bytes of a sample, whose bits mean something else.
-CSPC = {2: ("cspc-m1c1-mini-v11",), 3: ("cspc-m1c1-mini", "cspc-coin-d4", "cspc-coin-d4a", "cspc-coin-d6")}
+CSPC = {
+    2: ("cspc-m1c1-mini-v11",),
+    3: ("cspc-m1c1-mini", "cspc-coin-d4", "cspc-coin-d4a", "cspc-coin-d6"),
+}
 
 
 def angle() -> Construct:
     """FSA and LSA: 1/64 degree above a check bit that is always 1."""
-    return ByteSwapped(BitStruct("angle" / Scaled(BitsInteger(15), 1 / 64, "deg"), "check" / Const(1, BitsInteger(1))))
+    return ByteSwapped(
+        BitStruct(
+            "angle" / Scaled(BitsInteger(15), 1 / 64, "deg"), "check" / Const(1, BitsInteger(1))
+        )
+    )
 
 
 def plausible(f: Fields) -> Any:
     """Angles below 360 degrees, a sample at least, and in a zero packet one alone."""
-    return (f.fsa.angle < 360) & (f.lsa.angle < 360) & (f.lsn >= 1) & ((f.ct.start == 0) | (f.lsn == 1))
+    return (
+        (f.fsa.angle < 360)
+        & (f.lsa.angle < 360)
+        & (f.lsn >= 1)
+        & ((f.ct.start == 0) | (f.lsn == 1))
+    )
 
 
 @cache
@@ -64,7 +91,10 @@ def data(form: Form) -> Frame:
         "header" / Const(b"\xaa\x55"),
         "ct"
         / BitStruct(
-            "frequency" / frequency * "of scans, in a zero packet, raw 0: not given; in others the state of a T-mini or an X4 Pro",
+            "frequency"
+            / frequency
+            * "of scans, in a zero packet, raw 0: not given; in others the state of a T-mini or an"
+            " X4 Pro",
             "start" / BitsInteger(1) * "1: zero packet, a turn begins",
         ),
         "lsn" / Int8ul * "number of samples",
@@ -84,10 +114,14 @@ def reader(form: Form) -> Callable[[Fields], Points]:
 
 
 def points(f: Fields, form: Form) -> Polar:
-    """Even steps from FSA to LSA, corrected for the distance where the lidar triangulates ("angle analysis")."""
+    """Even steps from FSA to LSA, corrected for the distance where the lidar triangulates ("angle
+    analysis").
+    """
     raw = spread(f.fsa.angle, f.lsa.angle, f.lsn, full=360.0)  # degrees, (n, LSN)
     clockwise = raw if form.correction is None else raw + form.correction(f.samples.distance)
-    rate = last(f.ct.frequency, where=(f.ct.start == 1) & (f.ct.frequency > form.slowest)) * 360  # degrees per second
+    rate = (
+        last(f.ct.frequency, where=(f.ct.start == 1) & (f.ct.frequency > form.slowest)) * 360
+    )  # degrees per second
     return Polar(
         range=f.samples.distance,
         azimuth=-np.deg2rad(clockwise),
@@ -117,22 +151,39 @@ def slug(name: str) -> str:
 
 
 def tells_state(f: Fields, slowest: float) -> Any:
-    """Whether a packet that begins no turn says something where most models say nothing (protocol, CT)."""
+    """Whether a packet that begins no turn says something where most models say nothing (protocol,
+    CT).
+    """
     return (f.ct.start == 0) & (f.ct.frequency > slowest)
 
 
 def relative(own: Model, other: Model) -> str | Relative:
     """What tells another model apart whose samples have the same size."""
     if other.tells_state and not own.tells_state:
-        return Relative("CT has bits set in packets that begin no turn", partial(tells_state, slowest=own.form.slowest))
-    return "info.model" if own.number and other.number else "nothing in the packets: the baud rate, or the label on the housing"
+        return Relative(
+            "CT has bits set in packets that begin no turn",
+            partial(tells_state, slowest=own.form.slowest),
+        )
+    return (
+        "info.model"
+        if own.number and other.number
+        else "nothing in the packets: the baud rate, or the label on the housing"
+    )
 
 
 def relatives(name: str) -> dict[str, str | Relative]:
-    """The models whose packets look like this one's; a CSPC sends the packet with three bytes a sample as well."""
+    """The models whose packets look like this one's; a CSPC sends the packet with three bytes a
+    sample as well.
+    """
     own = MODELS[name]
-    found = {slug(other): relative(own, model) for other, model in MODELS.items() if other != name and model.form.size == own.form.size}
-    return found | dict.fromkeys(CSPC.get(own.form.size, ()), "info, which a CSPC sends when it is started")
+    found = {
+        slug(other): relative(own, model)
+        for other, model in MODELS.items()
+        if other != name and model.form.size == own.form.size
+    }
+    return found | dict.fromkeys(
+        CSPC.get(own.form.size, ()), "info, which a CSPC sends when it is started"
+    )
 
 
 def lidar(name: str) -> Sensor:
@@ -143,12 +194,19 @@ def lidar(name: str) -> Sensor:
         slug(name),
         vendor="YDLIDAR",
         model=name,
-        frames={**ANSWERS, "data": data(model.form), "request": REQUEST} if talks else {"scan_start": SCAN_START, "data": data(model.form)},
+        frames=(
+            {**ANSWERS, "data": data(model.form), "request": REQUEST}
+            if talks
+            else {"scan_start": SCAN_START, "data": data(model.form)}
+        ),
         points=reader(model.form),
         scan=OnFlag("ct.start"),
         links={"data": Serial(model.baud)},
         commands=COMMANDS if talks else {},
-        simulation=Simulation(partial(sweep, model=model), answers={"get_info": (("info", {"model": model.number}),)} if talks else {}),
+        simulation=Simulation(
+            partial(sweep, model=model),
+            answers={"get_info": (("info", {"model": model.number}),)} if talks else {},
+        ),
         on_open=("start_motor", "stop", "scan") if talks else (),
         on_close=("stop", "stop_motor") if talks else (),
         range_limits=model.range_limits,
@@ -158,12 +216,15 @@ def lidar(name: str) -> Sensor:
         info={"serial": "info.serial", "model": "info.model"} if talks else {},
         aliases=(slug(name).removeprefix("ydlidar-"),) if name.startswith("T-") else (),
         status=model.proof,
-        source="YDLIDAR SDK: communication protocol, data set of models" + "; packets of a unit" * (model.proof == "capture"),
+        source="YDLIDAR SDK: communication protocol, data set of models"
+        + "; packets of a unit" * (model.proof == "capture"),
     )
 
 
 #: every model as an attribute, by what its id has after the vendor: `SENSORS.tmini_pro`.
-SENSORS = SimpleNamespace(**{slug(name).removeprefix("ydlidar-").replace("-", "_"): lidar(name) for name in MODELS})
+SENSORS = SimpleNamespace(
+    **{slug(name).removeprefix("ydlidar-").replace("-", "_"): lidar(name) for name in MODELS}
+)
 
 
 @hookimpl

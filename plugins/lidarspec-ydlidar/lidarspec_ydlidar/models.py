@@ -1,6 +1,7 @@
 """The models: what differs between them.
 
-Source: YDLIDAR SDK, "Dataset" (bauds, rates, ranges and turns), core/common/DriverInterface.h (numbers of models); data sheets.
+Source: YDLIDAR SDK, "Dataset" (bauds, rates, ranges and turns), core/common/DriverInterface.h
+(numbers of models); data sheets.
 """
 
 from __future__ import annotations
@@ -23,7 +24,8 @@ class Model:
         turn: the slowest and the fastest number of scans a second.
         number: what it calls itself in its information; 0: no public source says.
         one_channel: whether it only sends.
-        tells_state: whether packets that begin no turn tell the state of the device in the bits of the scan frequency.
+        tells_state: whether packets that begin no turn tell the state of the device in the bits of
+            the scan frequency.
         proof: its status.
     """
 
@@ -40,11 +42,25 @@ class Model:
 
 MODELS = {
     "F4": Model(samples.TRIANGLE, 115_200, 4000, (0.12, 12), (5, 12), 1),
-    "X2": Model(samples.TRIANGLE, 115_200, 3000, (0.1, 8), (4, 8), one_channel=True, proof="vectors"),
-    "X3": Model(samples.TRIANGLE, 115_200, 3000, (0.1, 8), (4, 8), one_channel=True, proof="vectors"),
+    "X2": Model(
+        samples.TRIANGLE, 115_200, 3000, (0.1, 8), (4, 8), one_channel=True, proof="vectors"
+    ),
+    "X3": Model(
+        samples.TRIANGLE, 115_200, 3000, (0.1, 8), (4, 8), one_channel=True, proof="vectors"
+    ),
     "X4": Model(samples.TRIANGLE, 128_000, 5000, (0.12, 10), (5, 12), 6, proof="vectors"),
-    "X4 Pro": Model(samples.TRIANGLE_FLAGGED, 128_000, 5000, (0.12, 10), (5, 12), one_channel=True, tells_state=True),
-    "S2": Model(samples.TRIANGLE, 115_200, 3000, (0.1, 8), (4, 8), one_channel=True, proof="vectors"),
+    "X4 Pro": Model(
+        samples.TRIANGLE_FLAGGED,
+        128_000,
+        5000,
+        (0.12, 10),
+        (5, 12),
+        one_channel=True,
+        tells_state=True,
+    ),
+    "S2": Model(
+        samples.TRIANGLE, 115_200, 3000, (0.1, 8), (4, 8), one_channel=True, proof="vectors"
+    ),
     "S4": Model(samples.TRIANGLE, 115_200, 4000, (0.1, 8), (5, 12), 4, proof="vectors"),
     "S4B": Model(samples.TRIANGLE_8, 153_600, 4000, (0.1, 8), (5, 12), 11),
     "G1": Model(samples.TRIANGLE, 230_400, 9000, (0.28, 16), (5, 12), 19, proof="vectors"),
@@ -64,7 +80,11 @@ MODELS = {
     "TG30": Model(samples.TOF, 512_000, 20_000, (0.05, 30), (3, 15.7), 101),
     "TG50": Model(samples.TOF, 512_000, 20_000, (0.05, 50), (3, 15.7), 102),
     "T-mini": Model(samples.TOF_8, 230_400, 4000, (0.02, 12), (6, 12), 140, tells_state=True),
-    "T-mini Pro": Model(samples.TOF_8, 230_400, 4000, (0.02, 12), (6, 12), 150, tells_state=True, proof="capture"),
+    "T-mini Pro": Model(
+        samples.TOF_8, 230_400, 4000, (0.02, 12), (6, 12), 150, tells_state=True, proof="capture"
+    ),
     "T-mini Plus": Model(samples.TOF_8, 230_400, 4000, (0.05, 12), (6, 12), 151, tells_state=True),
-    "T-mini Plus SH": Model(samples.TOF_16, 230_400, 4000, (0.05, 12), (6, 12), 152, tells_state=True),
+    "T-mini Plus SH": Model(
+        samples.TOF_16, 230_400, 4000, (0.05, 12), (6, 12), 152, tells_state=True
+    ),
 }

@@ -1,8 +1,10 @@
 """What the host asks, ``A5 cmd``, and what a YDLIDAR answers.
 
-Source: YDLIDAR SDK, "YDLidar-SDK Communication Protocol" (system commands); core/common/ydlidar_protocol.h (stamps). Health is asked with
-92 in the SDK and with 91 in older manuals, a reset with 80 and 40; the order of the two bytes of the firmware differs between manuals (a
-T-mini's 00 01 is 1.0). Commands that only some models know (low power, constant frequency, heartbeat, zero offset, pitch) are left out.
+Source: YDLIDAR SDK, "YDLidar-SDK Communication Protocol" (system commands);
+core/common/ydlidar_protocol.h (stamps). Health is asked with 92 in the SDK and with 91 in older
+manuals, a reset with 80 and 40; the order of the two bytes of the firmware differs between manuals
+(a T-mini's 00 01 is 1.0). Commands that only some models know (low power, constant frequency,
+heartbeat, zero offset, pitch) are left out.
 """
 
 from __future__ import annotations
@@ -24,27 +26,46 @@ def answer(kind: int, *fields: Construct, size: int) -> Frame:
     return Frame(Struct("descriptor" / Const(header), *fields))
 
 
-SCAN_START = Frame(Struct("descriptor" / Const(b"\xa5\x5a\x05\x00\x00\x40\x81") * "packets follow without end"))
+SCAN_START = Frame(
+    Struct("descriptor" / Const(b"\xa5\x5a\x05\x00\x00\x40\x81") * "packets follow without end")
+)
 ANSWERS = {
     "scan_start": SCAN_START,
     "info": answer(
         0x04,
-        "model" / Int8ul * ", ".join(f"{model.number} {name}" for name, model in MODELS.items() if model.number),
+        "model"
+        / Int8ul
+        * ", ".join(f"{model.number} {name}" for name, model in MODELS.items() if model.number),
         "firmware" / Struct("minor" / Int8ul, "major" / Int8ul),
         "hardware" / Int8ul,
         "serial" / Bytes(16) * "a digit a byte",
         size=20,
     ),
-    "health": answer(0x06, "status" / Int8ul * "0 good, 1 warning, 2 error", "error" / Int16ul, size=3),
+    "health": answer(
+        0x06, "status" / Int8ul * "0 good, 1 warning, 2 error", "error" / Int16ul, size=3
+    ),
     "speed": answer(0x04, "frequency" / Scaled(Int32ul, 0.01, "Hz") * "of scans", size=4),
-    "setting": answer(0x04, "value" / Int8ul * "number of the sampling rate, or of the direction of rotation", size=1),
+    "setting": answer(
+        0x04,
+        "value" / Int8ul * "number of the sampling rate, or of the direction of rotation",
+        size=1,
+    ),
     "stamp": Frame(
         Checksummed(
-            Struct("header" / Const(b"\xaa\x66"), "cs" / Int8ul, "time" / Scaled(Int32ul, 0.001, "s"), "reserved" / Bytes(1)),
+            Struct(
+                "header" / Const(b"\xaa\x66"),
+                "cs" / Int8ul,
+                "time" / Scaled(Int32ul, 0.001, "s"),
+                "reserved" / Bytes(1),
+            ),
             field="cs",
             algorithm=Xor(),
         ),
-        acknowledged={"LS206": "it has no more to be told by, and no points: noise makes one in 16 million bytes"},
+        acknowledged={
+            "LS206": (
+                "it has no more to be told by, and no points: noise makes one in 16 million bytes"
+            )
+        },
     ),
 }
 REQUEST = Frame(Struct("start" / Const(b"\xa5"), "cmd" / Int8ul), direction="out")

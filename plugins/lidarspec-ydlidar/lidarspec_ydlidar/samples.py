@@ -1,6 +1,7 @@
 """What a YDLIDAR sample holds: two, three or four bytes, in eight forms.
 
-Source: YDLIDAR SDK, "YDLidar-SDK Communication Protocol" (scan command response) and core/common/ydlidar_protocol.h.
+Source: YDLIDAR SDK, "YDLidar-SDK Communication Protocol" (scan command response) and
+core/common/ydlidar_protocol.h.
 """
 
 from __future__ import annotations
@@ -65,4 +66,6 @@ TRIANGLE_10 = Form(packed("intensity" / BitsInteger(10)), 3, (1, 2), between, in
 HALF = Form(alone(0.0005), correction=between)
 TOF = Form(alone(0.001), slowest=3.0)
 TOF_8 = Form(EIGHT, 3, (1, 2), intense=True)
-TOF_16 = Form(Struct("intensity" / Int16ul, "distance" / Scaled(Int16ul, 0.001, "m") * NONE), 4, intense=True)
+TOF_16 = Form(
+    Struct("intensity" / Int16ul, "distance" / Scaled(Int16ul, 0.001, "m") * NONE), 4, intense=True
+)

@@ -1,4 +1,6 @@
-"""YDLIDAR: the protocol's examples, packets of real units of three models, and what tells the models apart."""
+"""YDLIDAR: the protocol's examples, packets of real units of three models, and what tells the
+models apart.
+"""
 
 from __future__ import annotations
 
@@ -26,20 +28,35 @@ PACKETS = {
     "yd_tmini_wrap": TMINI,
     "yd_tg15_capture": TG15,
 }
-ANSWERS = {"yd_scan_desc": X4, "yd_health": TMINI, "yd_devinfo_tmini_pro": TMINI, "yd_devinfo_tmini_plus": PLUS, "yd_stamp_synth": TMINI}
+ANSWERS = {
+    "yd_scan_desc": X4,
+    "yd_health": TMINI,
+    "yd_devinfo_tmini_pro": TMINI,
+    "yd_devinfo_tmini_plus": PLUS,
+    "yd_stamp_synth": TMINI,
+}
 EXCERPTS = {"yd_angle_doc", "yd_si2_doc", "yd_si3_doc"}
 
 
 def test_every_vector_of_the_family_is_used() -> None:
-    assert {name for name in vectors(FILE) if name.startswith("yd_")} == PACKETS.keys() | ANSWERS.keys() | EXCERPTS
+    assert {
+        name for name in vectors(FILE) if name.startswith("yd_")
+    } == PACKETS.keys() | ANSWERS.keys() | EXCERPTS
 
 
 @pytest.mark.parametrize("name", PACKETS)
 def test_a_packet_is_what_it_is_published_as(name: str) -> None:
-    sensor, data, expected = PACKETS[name], vector_bytes(FILE, name), vectors(FILE)[name]["expected"]
+    sensor, data, expected = (
+        PACKETS[name],
+        vector_bytes(FILE, name),
+        vectors(FILE)[name]["expected"],
+    )
     packets = decoded(sensor, data)
     assert sensor.build("data", sensor.parse(data)) == data
-    assert (packets.raw["ct"]["start"].tolist(), packets.raw["lsn"].tolist()) == ([expected["t"]], [expected.get("lsn", data[3])])
+    assert (packets.raw["ct"]["start"].tolist(), packets.raw["lsn"].tolist()) == (
+        [expected["t"]],
+        [expected.get("lsn", data[3])],
+    )
     assert packets["fsa.angle"].tolist() == [expected["fsa_deg"]]
     assert packets["lsa.angle"].tolist() == [expected.get("lsa_deg", expected["fsa_deg"])]
     samples = sensor.parse(data).samples
@@ -57,7 +74,11 @@ def test_a_packet_is_what_it_is_published_as(name: str) -> None:
 
 @pytest.mark.parametrize("name", ANSWERS)
 def test_an_answer_is_what_it_is_published_as(name: str) -> None:
-    sensor, data, expected = ANSWERS[name], vector_bytes(FILE, name), vectors(FILE)[name]["expected"]
+    sensor, data, expected = (
+        ANSWERS[name],
+        vector_bytes(FILE, name),
+        vectors(FILE)[name]["expected"],
+    )
     parsed = sensor.parse(data)
     assert sensor.build(sensor.split(data)[0].frame, parsed) == data
     if "hw" in expected:
@@ -67,23 +88,48 @@ def test_an_answer_is_what_it_is_published_as(name: str) -> None:
 
 
 def test_the_examples_of_single_samples_and_of_the_angles() -> None:
-    angle, two, three = (vectors(FILE)[name]["expected"] for name in ("yd_angle_doc", "yd_si2_doc", "yd_si3_doc"))
-    ends = {"fsa": {"angle": angle["fsa"]}, "lsa": {"angle": angle["lsa"]}, "ct": {"frequency": 0, "start": 0}}
-    data = X4.build("data", units=True, samples=[{"distance": metres} for metres in (1.0, *[3.0] * 38, 8.0)], **ends)
+    angle, two, three = (
+        vectors(FILE)[name]["expected"] for name in ("yd_angle_doc", "yd_si2_doc", "yd_si3_doc")
+    )
+    ends = {
+        "fsa": {"angle": angle["fsa"]},
+        "lsa": {"angle": angle["lsa"]},
+        "ct": {"frequency": 0, "start": 0},
+    }
+    data = X4.build(
+        "data",
+        units=True,
+        samples=[{"distance": metres} for metres in (1.0, *[3.0] * 38, 8.0)],
+        **ends,
+    )
     assert data[3:8] == vector_bytes(FILE, "yd_angle_doc")
-    np.testing.assert_allclose(clockwise(decoded(X4, data).points())[[0, 39]], [angle["a1"], angle["an"]], atol=2e-5)
+    np.testing.assert_allclose(
+        clockwise(decoded(X4, data).points())[[0, 39]], [angle["a1"], angle["an"]], atol=2e-5
+    )
 
     def alone(sensor: ls.Sensor, name: str) -> ls.PointCloud:
-        sample = sensor.frames["data"].struct.subcon.samples.subcon.subcon.parse(vector_bytes(FILE, name))
+        sample = sensor.frames["data"].struct.subcon.samples.subcon.subcon.parse(
+            vector_bytes(FILE, name)
+        )
         return decoded(
-            sensor, sensor.build("data", samples=[sample], fsa={"angle": 0}, lsa={"angle": 0}, ct={"frequency": 0, "start": 0})
+            sensor,
+            sensor.build(
+                "data",
+                samples=[sample],
+                fsa={"angle": 0},
+                lsa={"angle": 0},
+                ct={"frequency": 0, "start": 0},
+            ),
         ).points()
 
     assert alone(X4, "yd_si2_doc").range.tolist() == [pytest.approx(two["mm"] / 1000)]
     assert alone(TG15, "yd_si2_doc").range.tolist() == [pytest.approx(28.645)]
     cloud = alone(G4B, "yd_si3_doc")
     assert cloud.intensity is not None
-    assert (cloud.range.tolist(), cloud.intensity.tolist()) == ([pytest.approx(three["mm"] / 1000)], [three["q"]])
+    assert (cloud.range.tolist(), cloud.intensity.tolist()) == (
+        [pytest.approx(three["mm"] / 1000)],
+        [three["q"]],
+    )
 
 
 def test_packets_of_a_tmini_pro() -> None:
@@ -95,7 +141,9 @@ def test_packets_of_a_tmini_pro() -> None:
     cloud = packets.points()
     assert cloud.intensity is not None
     assert len(cloud) == len(said)
-    assert np.where(cloud.valid, np.round(cloud.range * 1000), 0).tolist() == [sample[0] for sample in said]
+    assert np.where(cloud.valid, np.round(cloud.range * 1000), 0).tolist() == [
+        sample[0] for sample in said
+    ]
     assert cloud.intensity.tolist() == [sample[1] for sample in said]
     assert packets["fsa.angle"].tolist() == [one["fsa_deg"] for one in right]
 
@@ -105,17 +153,31 @@ def test_a_tmini_is_told_from_other_makes_and_models_by_what_its_packets_say_of_
     tminis = {"ydlidar-tmini", "ydlidar-tmini-plus", "ydlidar-tmini-pro"}
     heard = Heard("", (capture("ydlidar/packets_checksum_ok_concat.bin").read_bytes(),))
     assert {score.sensor.id for score in verdict(heard).alike} == tminis
-    information = TMINI.build("info", model=150, firmware={"minor": 0, "major": 1}, hardware=2, serial=bytes(16))
+    information = TMINI.build(
+        "info", model=150, firmware={"minor": 0, "major": 1}, hardware=2, serial=bytes(16)
+    )
     found = verdict(Heard("", (information + heard.chunks[0],)))
     assert (found.sensor, found.alike[0].why) == (TMINI, "info.model says T-mini Pro")
     others = verdict(Heard("", tuple(simulate(ls.sensor("ydlidar-g2"), 60))))
-    assert {"cspc-coin-d4", "ydlidar-g2", "ydlidar-s4b"} <= {score.sensor.id for score in others.alike}
-    assert verdict(Heard("", tuple(simulate(ls.sensor("ydlidar-tmini-plus-sh"), 60)))).sensor is ls.sensor("ydlidar-tmini-plus-sh")
+    assert {"cspc-coin-d4", "ydlidar-g2", "ydlidar-s4b"} <= {
+        score.sensor.id for score in others.alike
+    }
+    assert verdict(
+        Heard("", tuple(simulate(ls.sensor("ydlidar-tmini-plus-sh"), 60)))
+    ).sensor is ls.sensor("ydlidar-tmini-plus-sh")
 
 
 def test_a_relative_whose_other_frames_differ_contradicts_nothing() -> None:
     coin = ls.sensor("cspc-coin-d4")
-    info = coin.build("info", model=b"COIN-D4".ljust(12, b"\0"), zero_angle=0, direction=0, correction=0, reserved=bytes(3), revision=1)
+    info = coin.build(
+        "info",
+        model=b"COIN-D4".ljust(12, b"\0"),
+        zero_angle=0,
+        direction=0,
+        correction=0,
+        reserved=bytes(3),
+        revision=1,
+    )
     started = coin.split(info + b"".join(simulate(coin, 20)))
     assert started[0].frame == "info"
     assert contradiction(coin, started) == ""

@@ -9,7 +9,9 @@ from tests.broken import sound
 
 
 def points(f):
-    return Polar(f.samples.distance, sound.points(f).azimuth + np.pi / 2, intensity=f.samples.quality)
+    return Polar(
+        f.samples.distance, sound.points(f).azimuth + np.pi / 2, intensity=f.samples.quality
+    )
 
 
 @hookimpl

@@ -1,7 +1,8 @@
-"""The Acme X1, a sensor that nobody makes: written with the public names alone, as a stranger would.
+"""The Acme X1, a sensor that nobody makes: written with the public names alone, as a stranger
+would.
 
-It has a variable count, bit fields, a checksum in the middle, an outgoing command, state from another packet, a look
-at the next packet, and a calibration file.
+It has a variable count, bit fields, a checksum in the middle, an outgoing command, state from
+another packet, a look at the next packet, and a calibration file.
 """
 
 from __future__ import annotations
@@ -12,7 +13,17 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from construct import Array, BitsInteger, BitStruct, ByteSwapped, Const, Int8ul, Int16ul, Struct, this
+from construct import (
+    Array,
+    BitsInteger,
+    BitStruct,
+    ByteSwapped,
+    Const,
+    Int8ul,
+    Int16ul,
+    Struct,
+    this,
+)
 
 from lidarspec import Sensor, UsageError
 from lidarspec.spec import (
@@ -45,17 +56,27 @@ DATA = Checksummed(
         "samples"
         / Array(
             this.count,
-            ByteSwapped(BitStruct("distance" / Scaled(BitsInteger(16), 0.001, "m"), "row" / BitsInteger(2), "quality" / BitsInteger(6))),
+            ByteSwapped(
+                BitStruct(
+                    "distance" / Scaled(BitsInteger(16), 0.001, "m"),
+                    "row" / BitsInteger(2),
+                    "quality" / BitsInteger(6),
+                )
+            ),
         ),
     ),
     field="crc",
     algorithm=Crc(16, 0x1021, init=0xFFFF),
 )
 MOUNT = Checksummed(
-    Struct("header" / Const(b"\xac\x3f"), "zero" / Scaled(Int16ul, 0.01, "deg"), "check" / Int8ul), field="check", algorithm=Xor()
+    Struct("header" / Const(b"\xac\x3f"), "zero" / Scaled(Int16ul, 0.01, "deg"), "check" / Int8ul),
+    field="check",
+    algorithm=Xor(),
 )
 ORDER = Checksummed(
-    Struct("header" / Const(b"\xac\x01"), "rate" / Scaled(Int8ul, 0.1, "Hz"), "check" / Int8ul), field="check", algorithm=Xor()
+    Struct("header" / Const(b"\xac\x01"), "rate" / Scaled(Int8ul, 0.1, "Hz"), "check" / Int8ul),
+    field="check",
+    algorithm=Xor(),
 )
 
 NOMINAL = (-1.5, -0.5, 0.5, 1.5)
@@ -71,7 +92,10 @@ def points_with(elevations: Iterable[float]) -> Any:
         step = np.where(np.isfinite(step), step, wrap(f.start - previous(f.start), 360)) / f.count
         clockwise = f.start - f.state.mount.zero + step * f.count.steps()
         return Polar(
-            range=f.samples.distance, azimuth=-np.deg2rad(clockwise), elevation=take(table, f.samples.row), intensity=f.samples.quality
+            range=f.samples.distance,
+            azimuth=-np.deg2rad(clockwise),
+            elevation=take(table, f.samples.row),
+            intensity=f.samples.quality,
         )
 
     return points
@@ -96,7 +120,12 @@ X1 = Sensor(
     vendor="Acme",
     model="X1",
     frames={
-        "data": Frame(DATA, data=True, max_length=7 + 3 * LONGEST, plausible=lambda f: (f.count >= 1) & (f.start < 360)),
+        "data": Frame(
+            DATA,
+            data=True,
+            max_length=7 + 3 * LONGEST,
+            plausible=lambda f: (f.count >= 1) & (f.start < 360),
+        ),
         "mount": Frame(MOUNT, max_length=5, plausible=lambda f: f.zero < 360),
         "order": Frame(ORDER, direction="out", max_length=4),
     },

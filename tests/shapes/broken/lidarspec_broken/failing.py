@@ -1,4 +1,6 @@
-"""Sensors that load, and then fail at work: in a checksum, an expression of the struct, `plausible` and `points`."""
+"""Sensors that load, and then fail at work: in a checksum, an expression of the struct, `plausible`
+and `points`.
+"""
 
 from __future__ import annotations
 
@@ -11,7 +13,12 @@ from construct import Array, Const, Int8ul, Struct, this
 from lidarspec import Sensor
 from lidarspec.spec import Checksum, Checksummed, Fields, Frame, OnWrap, Polar, Serial, hookimpl
 
-BODY = ("header" / Const(b"\xbb\xad"), "angle" / Int8ul, "distances" / Array(4, Int8ul), "check" / Int8ul)
+BODY = (
+    "header" / Const(b"\xbb\xad"),
+    "angle" / Int8ul,
+    "distances" / Array(4, Int8ul),
+    "check" / Int8ul,
+)
 
 
 class Fails(Checksum):
@@ -61,8 +68,20 @@ def framed(struct: Any, **options: Any) -> dict[str, Frame]:
 @hookimpl
 def lidarspec_sensors() -> list[Sensor]:
     return [
-        plain("broken-checksum", frames=framed(Checksummed(Struct(*BODY), field="check", algorithm=Fails()))),
-        plain("broken-parse", frames=framed(Struct(*BODY[:2], "distances" / Array(4 + 1 // (this.angle - this.angle), Int8ul), BODY[3]))),
+        plain(
+            "broken-checksum",
+            frames=framed(Checksummed(Struct(*BODY), field="check", algorithm=Fails())),
+        ),
+        plain(
+            "broken-parse",
+            frames=framed(
+                Struct(
+                    *BODY[:2],
+                    "distances" / Array(4 + 1 // (this.angle - this.angle), Int8ul),
+                    BODY[3],
+                )
+            ),
+        ),
         plain("broken-plausible", frames=framed(Struct(*BODY), plausible=fails)),
         plain("broken-points", points=fails),
         plain("broken-field", points=lambda f: Polar(range=f.distance, azimuth=0)),
