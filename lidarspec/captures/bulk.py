@@ -117,12 +117,12 @@ def alike(record: bytes, headers: Headers, source: Sender, form: Form) -> Alike 
     mask = np.zeros(size, np.uint8)
     mask[:start] = 0xFF
     told = pattern.uncut if headers.size else ()  # headers say how long the payload is
-    mask[[*pattern.free, *told, *(head + place for place in headers.free)]] = 0
+    mask[[*pattern.free, *told, *(head + offset for offset in headers.variable_offsets)]] = 0
     value = np.frombuffer(record[:start].ljust(size, b"\0"), np.uint64)
     return Alike(
         len(record),
         start,
-        headers.payload,
+        headers.payload_size,
         source,
         pattern.times,
         value,
@@ -269,7 +269,7 @@ class CaptureBatches(CaptureReader):
     def batches(self) -> Iterator[Batch]:
         """The datagrams of the file, as many at once as were read at once."""
         known: list[Alike] = []
-        with self._to_the_end():
+        with self._count_end():
             form = self._form = self._form or records(self._source)
             while self._source.begin_record():
                 starts, stuck = walked(
@@ -286,7 +286,7 @@ class CaptureBatches(CaptureReader):
                 if self._source.place != place:
                     continue  # somebody has gone on to another time
                 if isinstance(ended, Damaged):
-                    self._pass_over(form)
+                    self._skip_damage(form)
                 elif ended is not None:
                     raise ended
                 known = found.still_known()
@@ -426,7 +426,7 @@ class _Records:
     def _read_plainly(self, index: int) -> None:
         self._source.begin_record()
         packet = self._form.read()
-        datagram = self._reader.datagram(packet)
+        datagram = self._reader.to_datagram(packet)
         if datagram is None or isinstance(packet, Passed):
             return
         self._plain[index] = datagram

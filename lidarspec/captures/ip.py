@@ -1,19 +1,19 @@
-"""From captured frames to UDP payloads, and back: link layers, IPv4, IPv6, fragments.
+"""Extract UDP payloads from captured frames, and build frames around payloads.
 
-Knows nothing of files. A frame goes through `ip_packet`, if it is a fragment then through
-`Reassembly.add`, and through `udp`; whichever step finds that no datagram comes of it raises
-`Refused` with the reason.
+This module handles link layers, IPv4, IPv6 and fragments; it knows nothing of files. `parse_ip`
+takes a captured frame. A fragment goes through `Reassembly.add`, and the whole packet through
+`parse_udp`. A step that cannot continue raises `NoDatagramError` with the reason.
 
-Two fields are not trusted. Checksums: where the capturing machine is the sender, its network card
-fills them in only after the capture. The length of an unfragmented packet, where more is claimed
-than is there, or 0: a lidar in the field puts the IPv4 length of its data packets, 1234, also into
-packets of 540 bytes, and a network card that cuts packets up fills it in after the capture. UDP's
-own length decides whether the payload is whole.
+Two header fields are ignored because they are wrong in valid captures:
+
+* Checksums. If the capturing machine sent the packet, its network card fills them in only after
+  the capture.
+* The length of an unfragmented IP packet, if it is 0 or longer than the frame. Segmentation by a
+  network card leaves 0, and a lidar in the field sends the length of its data packets, 1234, in
+  packets of 540 bytes. The length in the UDP header decides whether the payload is complete.
 
 Source: RFC 768 (UDP), RFC 791 (IPv4), RFC 8200 (IPv6), RFC 5722 (overlapping fragments), RFC 6946
-(atomic fragments), RFC 1661 and 1662 (PPP), RFC 2516 (PPPoE), RFC 3032 (MPLS), IEEE 802.1Q (VLAN
-tags), IEEE 802.11 9.2 and 9.3.2 (data frames), radiotap.org (its header), and the link-layer header
-types of tcpdump.org.
+(atomic fragments), IEEE 802.1Q (VLAN tags), and the link-layer header types of tcpdump.org.
 """
 
 from __future__ import annotations
@@ -26,71 +26,99 @@ from functools import lru_cache
 from typing import Literal, NamedTuple
 
 ETHERNET = 1
-LARGEST_PAYLOAD = 65_507  # 65,535 bytes of IPv4 packet, less 20 of its header and 8 of UDP's
-_LARGEST_PACKET = 65_535
+#: 65,535 bytes of IPv4 packet, less 20 of its header and 8 of the UDP header.
+MAX_PAYLOAD_BYTES = 65_507
+_MAX_PACKET_BYTES = 65_535
 
-_LOOPBACK = {0, 108}
-_RAW = {12, 101, 228, 229}
+_LOOPBACK_LINKS = {0, 108}
+_RAW_IP_LINKS = {12, 101, 228, 229}
+#: By link type: the offset of the EtherType, and the length of the header.
 _ETHERTYPE_LINKS = {
     ETHERNET: (12, 14),
-    113: (14, 16),
-    276: (0, 20),
-}  # offset of the EtherType, length of the header
-_VLAN_TAGS = {0x8100, 0x88A8, 0x9100}
-_IP_ETHERTYPES = {0x0800, 0x86DD}
-_IP_FAMILIES = {
-    2,
-    10,
-    24,
-    28,
-    30,
-}  # AF_INET everywhere; AF_INET6 of Linux, NetBSD, FreeBSD and macOS
-_PPP_LINKS = {9: 0, 50: 0, 51: 6}  # what stands before PPP's header: nothing, or that of PPPoE
-_PPPOE, _MPLS, _PPP_IP = 0x8864, {0x8847, 0x8848}, {0x0021, 0x0057}
-_WIFI, _RADIOTAP = 105, 127
-#: what packets are called that are no UDP, by EtherType and by IP protocol.
-_ETHERTYPES = {
+    113: (14, 16),  # Linux "cooked" capture, SLL
+    276: (0, 20),  # SLL2
+}
+#: The names of common link layers that are not read.
+_UNSUPPORTED_LINKS = {
+    9: "PPP",
+    50: "PPP",
+    51: "PPPoE",
+    105: "802.11",
+    127: "802.11 with radiotap",
+}
+_UNSUPPORTED_ETHERTYPES = {0x8847: "MPLS", 0x8848: "MPLS", 0x8864: "PPPoE"}
+_VLAN_ETHERTYPES = {0x8100, 0x88A8, 0x9100}
+_VLAN_TAG_BYTES = 4
+_IPV4_ETHERTYPE = 0x0800
+_IPV6_ETHERTYPE = 0x86DD
+#: Smaller values in the place of an EtherType are lengths (802.3).
+_MIN_ETHERTYPE = 0x0600
+#: AF_INET of all systems; AF_INET6 of Linux, NetBSD, FreeBSD and macOS.
+_IP_FAMILIES = {2, 10, 24, 28, 30}
+_LOOPBACK_HEADER_BYTES = 4
+
+#: Names of packets that are not UDP, by EtherType and by IP protocol.
+_ETHERTYPE_NAMES = {
     0x0806: "ARP",
     0x8863: "PPPoE discovery",
     0x888E: "802.1X",
     0x88CC: "LLDP",
     0x88F7: "PTP",
 }
-_PROTOCOLS = {1: "ICMP", 2: "IGMP", 6: "TCP", 47: "GRE", 50: "ESP", 58: "ICMPv6", 132: "SCTP"}
+_PROTOCOL_NAMES = {
+    1: "ICMP",
+    2: "IGMP",
+    6: "TCP",
+    47: "GRE",
+    50: "ESP",
+    58: "ICMPv6",
+    132: "SCTP",
+}
 
-_UDP = 17
-_FRAGMENT = 44
-_EXTENSIONS = {0, 43, 60}  # hop-by-hop options, routing, destination options
+_UDP_PROTOCOL = 17
+_FRAGMENT_PROTOCOL = 44
+#: Extension headers of IPv6: hop-by-hop options, routing, destination options.
+_EXTENSION_PROTOCOLS = {0, 43, 60}
 
 _ETHERNET_HEADER = struct.Struct(">6s6sH")
 _IPV4_HEADER = struct.Struct(">BxHHHBB2s4s4s")
 _IPV6_HEADER = struct.Struct(">4xHBx16s16s")
+_FRAGMENT_HEADER = struct.Struct(">BxHI")
 _UDP_HEADER = struct.Struct(">HHHH")
-_SNAP_HEADER, _SNAP = struct.Struct(">6sH"), bytes.fromhex("aaaa03000000")
-_TO_MAC, _FROM_MAC = (
-    bytes.fromhex("020000000001"),
-    bytes.fromhex("020000000002"),
-)  # locally administered, nobody's
-_DO_NOT_FRAGMENT, _TIME_TO_LIVE = 0x4000, 64
+#: Offsets within an IPv4 header: identification and header checksum.
+_IPV4_VARIABLE_OFFSETS = (4, 5, 10, 11)
+
+# Locally administered addresses, which belong to no device.
+_DESTINATION_MAC = bytes.fromhex("020000000001")
+_SOURCE_MAC = bytes.fromhex("020000000002")
+_DO_NOT_FRAGMENT = 0x4000
+_TIME_TO_LIVE = 64
 
 
-class Refused(Exception):
-    """A packet that gives no datagram.
+class NoDatagramError(Exception):
+    """A packet from which no datagram can be read.
 
     Attributes:
-        reason: "other" (not UDP), "short" (fewer bytes than its headers say) or "malformed"
-            (headers that cannot be).
-        what: the name of what it is instead of UDP.
+        reason: "other" (not UDP over IP), "link" (an unsupported link layer), "short" (fewer bytes
+            than the headers claim) or "malformed" (contradicting headers).
+        name: the protocol for "other", the link layer for "link".
     """
 
-    def __init__(self, reason: Literal["other", "short", "malformed"], what: str = "") -> None:
+    def __init__(
+        self, reason: Literal["other", "link", "short", "malformed"], name: str = ""
+    ) -> None:
         super().__init__(reason)
-        self.reason, self.what = reason, what
+        self.reason = reason
+        self.name = name
 
 
 class Fragment(NamedTuple):
-    """Where the body of a packet belongs in the whole: bytes from `start` on, with `more` to come
-    after it.
+    """The position of a fragment in the whole packet.
+
+    Attributes:
+        ident: the identification that all fragments of a packet share.
+        start: the offset of the fragment's first byte in the body of the whole packet.
+        more: whether other fragments follow it.
     """
 
     ident: int
@@ -99,20 +127,25 @@ class Fragment(NamedTuple):
 
 
 class IpPacket(NamedTuple):
-    """An IP packet that carries UDP, or a fragment of one; addresses as on the wire, 4 or 16 bytes;
-    `at`: where in the frame `body` is.
+    """An IP packet that carries UDP, or a fragment of one.
+
+    Attributes:
+        source, destination: addresses as on the wire, 4 or 16 bytes.
+        protocol: of the first header in `body`.
+        body: the bytes after the IP header.
+        body_offset: the offset of `body` in the frame; 0 for a reassembled packet.
     """
 
     source: bytes
     destination: bytes
     protocol: int
     body: bytes
-    at: int = 0
+    body_offset: int = 0
     fragment: Fragment | None = None
 
 
 class UdpPacket(NamedTuple):
-    """Ports, and which part of the IP packet's body the payload is."""
+    """Ports, and the range of the payload in the body of the IP packet."""
 
     source: int
     destination: int
@@ -121,367 +154,373 @@ class UdpPacket(NamedTuple):
 
 
 class Headers(NamedTuple):
-    """What stands before the payload of an unfragmented UDP packet.
+    """The headers in front of the payload of an unfragmented UDP packet.
 
     Attributes:
-        size: of all headers together, which is where the payload starts.
-        payload: its length.
-        free: the places of bytes that may differ between packets of one stream and tell nothing
-            about it: the identification of an unfragmented IPv4 packet, and checksums.
+        size: length of all headers together, which is the offset of the payload.
+        payload_size: length of the payload.
+        variable_offsets: offsets of bytes that may differ between packets of one stream: checksums
+            and the identification of an unfragmented IPv4 packet.
     """
 
     size: int
-    payload: int
-    free: tuple[int, ...]
+    payload_size: int
+    variable_offsets: tuple[int, ...]
 
 
-def ip_packet(frame: bytes, link: int) -> IpPacket:
-    """The IP packet in a captured frame, padding cut off.
+def parse_ip(frame: bytes, link: int) -> IpPacket:
+    """Return the IP packet in a captured frame, without padding.
 
     Args:
-        frame: the bytes from the link layer's first on, as many as were captured.
+        frame: the captured bytes, from the first one of the link layer on.
         link: the link-layer type, as in a pcap header.
 
     Raises:
-        Refused: the frame carries no UDP over IP, or not all of it.
+        NoDatagramError: if the frame carries no UDP over IP, or is incomplete.
     """
     try:
-        start = _ip_start(frame, link)
+        start = _find_ip(frame, link)
         version = frame[start] >> 4
         if version == 4:
-            return _ipv4(frame, start)
+            return _parse_ipv4(frame, start)
         if version == 6:
-            return _ipv6(frame, start)
+            return _parse_ipv6(frame, start)
     except (struct.error, IndexError):
-        raise Refused("short") from None
-    raise Refused("malformed")
+        raise NoDatagramError("short") from None
+    raise NoDatagramError("malformed")
 
 
-def udp(packet: IpPacket) -> UdpPacket:
-    """The UDP header of a whole packet.
+def parse_udp(packet: IpPacket) -> UdpPacket:
+    """Return the UDP header of a whole packet.
 
     Raises:
-        Refused: no UDP follows the extension headers, or its length does not fit.
+        NoDatagramError: if no UDP header follows the extension headers, or its length is wrong.
     """
     try:
-        protocol, at = _past_extensions(packet.protocol, packet.body)
-        if protocol != _UDP:
-            raise Refused("malformed") if protocol == _FRAGMENT else _not_udp(protocol)
-        source, destination, length, _ = _UDP_HEADER.unpack_from(packet.body, at)
+        protocol, start = _skip_extensions(packet.protocol, packet.body)
+        if protocol == _FRAGMENT_PROTOCOL:
+            raise NoDatagramError("malformed")
+        if protocol != _UDP_PROTOCOL:
+            raise _other_protocol_error(protocol)
+        source, destination, length, _ = _UDP_HEADER.unpack_from(packet.body, start)
     except struct.error:
-        raise Refused("short") from None
+        raise NoDatagramError("short") from None
     if length < _UDP_HEADER.size:
-        raise Refused("malformed")
-    if at + length > len(packet.body):
-        raise Refused("short")
-    return UdpPacket(source, destination, at + _UDP_HEADER.size, at + length)
+        raise NoDatagramError("malformed")
+    if start + length > len(packet.body):
+        raise NoDatagramError("short")
+    return UdpPacket(source, destination, start + _UDP_HEADER.size, start + length)
 
 
-def headers(frame: bytes, link: int) -> Headers | None:
-    """Where the payload stands in a frame, and which bytes before it decide that; None for
-    fragments.
+def parse_headers(frame: bytes, link: int) -> Headers | None:
+    """Return the extent of the headers of a frame; None for a fragment.
 
-    Frames of the same link type and length, whose headers are equal but for the free bytes, have
-    their payload in the same place and come from the same sender: nothing else is looked at by
-    `ip_packet` and `udp`.
+    Frames of one link type and one length, with equal headers except for the variable bytes, have
+    their payload at the same offset and come from the same sender: `parse_ip` and `parse_udp` read
+    nothing else.
 
     Raises:
-        Refused: as `ip_packet` and `udp`.
+        NoDatagramError: as `parse_ip` and `parse_udp`.
     """
-    packet = ip_packet(frame, link)
+    packet = parse_ip(frame, link)
     if packet.fragment is not None:
         return None
-    part = udp(packet)
-    size = packet.at + part.start
-    start = _ip_start(frame, link)
-    free = [size - 2, size - 1]
-    if frame[start] >> 4 == 4:
-        free += [start + at for at in (4, 5, 10, 11)]
-    return Headers(size, part.stop - part.start, tuple(free))
+    udp = parse_udp(packet)
+    size = packet.body_offset + udp.start
+    variable_offsets = [size - 2, size - 1]  # the checksum of UDP
+    ip_start = _find_ip(frame, link)
+    if frame[ip_start] >> 4 == 4:
+        variable_offsets += [ip_start + offset for offset in _IPV4_VARIABLE_OFFSETS]
+    return Headers(size, udp.stop - udp.start, tuple(variable_offsets))
 
 
 @lru_cache(maxsize=256)
-def address(packed: bytes) -> str:
-    """The usual text of an address of 4 or 16 bytes."""
+def format_address(packed: bytes) -> str:
+    """Return the usual text of an address of 4 or 16 bytes."""
     return str(ipaddress.ip_address(packed))
 
 
-def udp_frame(payload: bytes, source: tuple[bytes, int], destination: tuple[bytes, int]) -> bytes:
-    """An Ethernet frame with an IP and a UDP header before `payload`; over IPv4 the UDP checksum is
-    0 (not computed).
+def build_udp_frame(
+    payload: bytes, source: tuple[bytes, int], destination: tuple[bytes, int]
+) -> bytes:
+    """Return an Ethernet frame with an IP header, a UDP header and the payload.
 
     Args:
-        payload: at most `LARGEST_PAYLOAD` bytes, over IPv6 20 more.
-        source, destination: address, of 4 bytes both or of 16, and port.
+        payload: at most `MAX_PAYLOAD_BYTES` bytes, and 20 more over IPv6.
+        source, destination: address and port; both addresses have 4 bytes, or both have 16.
     """
-    ends, length = source[0] + destination[0], _UDP_HEADER.size + len(payload)
-    if len(ends) == 32:
-        kind, ip_header = 0x86DD, struct.pack(">IHBB", 6 << 28, length, _UDP, _TIME_TO_LIVE) + ends
-        parts = (
-            ends,
-            struct.pack(">II", length, _UDP),
-            _UDP_HEADER.pack(source[1], destination[1], length, 0),
-            payload,
-        )
-        checksum = _checksum(b"".join(parts) + bytes(len(payload) % 2)) or 0xFFFF
+    length = _UDP_HEADER.size + len(payload)
+    if len(source[0]) == 16:
+        ethertype = _IPV6_ETHERTYPE
+        ip_header = _build_ipv6_header(length, source[0], destination[0])
+        checksum = _udp_checksum_over_ipv6(payload, source, destination)
     else:
-        kind, checksum = 0x0800, 0
-        fields = (0x45, _IPV4_HEADER.size + length, 0, _DO_NOT_FRAGMENT, _TIME_TO_LIVE, _UDP)
-        blank = _IPV4_HEADER.pack(*fields, b"\0\0", source[0], destination[0])
-        ip_header = _IPV4_HEADER.pack(
-            *fields, _checksum(blank).to_bytes(2), source[0], destination[0]
-        )
+        ethertype = _IPV4_ETHERTYPE
+        ip_header = _build_ipv4_header(length, source[0], destination[0])
+        checksum = 0  # not computed, which IPv4 allows
+    link_header = _ETHERNET_HEADER.pack(_DESTINATION_MAC, _SOURCE_MAC, ethertype)
     udp_header = _UDP_HEADER.pack(source[1], destination[1], length, checksum)
-    return _ETHERNET_HEADER.pack(_TO_MAC, _FROM_MAC, kind) + ip_header + udp_header + payload
+    return link_header + ip_header + udp_header + payload
 
 
-def _checksum(words: bytes) -> int:
-    """The ones' complement of the ones' complement sum of 16-bit words: all of it as one number
-    modulo 0xFFFF, which stands for 0.
+def _build_ipv4_header(body_size: int, source: bytes, destination: bytes) -> bytes:
+    fields = (
+        0x45,  # version 4, a header of 5 words
+        _IPV4_HEADER.size + body_size,
+        0,
+        _DO_NOT_FRAGMENT,
+        _TIME_TO_LIVE,
+        _UDP_PROTOCOL,
+    )
+    without_checksum = _IPV4_HEADER.pack(*fields, b"\0\0", source, destination)
+    checksum = _internet_checksum(without_checksum).to_bytes(2)
+    return _IPV4_HEADER.pack(*fields, checksum, source, destination)
+
+
+def _build_ipv6_header(body_size: int, source: bytes, destination: bytes) -> bytes:
+    head = struct.pack(">IHBB", 6 << 28, body_size, _UDP_PROTOCOL, _TIME_TO_LIVE)
+    return head + source + destination
+
+
+def _udp_checksum_over_ipv6(
+    payload: bytes, source: tuple[bytes, int], destination: tuple[bytes, int]
+) -> int:
+    length = _UDP_HEADER.size + len(payload)
+    pseudo_header = source[0] + destination[0] + struct.pack(">II", length, _UDP_PROTOCOL)
+    header = _UDP_HEADER.pack(source[1], destination[1], length, 0)
+    padding = bytes(len(payload) % 2)
+    checksum = _internet_checksum(pseudo_header + header + payload + padding)
+    return checksum or 0xFFFF  # 0 would mean "not computed"
+
+
+def _internet_checksum(words: bytes) -> int:
+    """Return the ones' complement of the ones' complement sum of 16-bit words.
+
+    The sum is the number that all bytes form, modulo 0xFFFF, and 0xFFFF in the place of 0.
     """
     return 0xFFFF - (int.from_bytes(words) % 0xFFFF or 0xFFFF)
 
 
-def _ip_start(frame: bytes, link: int) -> int:
-    if link in _RAW:
+def _find_ip(frame: bytes, link: int) -> int:
+    """Return the offset of the IP header."""
+    if link in _RAW_IP_LINKS:
         return 0
-    if link in _LOOPBACK:
-        # The family stands in the byte order of the capturing machine; families are small, so the
-        # smaller reading is right.
-        if (
-            min(*struct.unpack_from("<I", frame), *struct.unpack_from(">I", frame))
-            not in _IP_FAMILIES
-        ):
-            raise Refused("other", "loopback without IP")
-        return 4
-    if link in _PPP_LINKS:
-        return _past_ppp(frame, _PPP_LINKS[link])
-    if link in (_WIFI, _RADIOTAP):
-        return _past_ethertype(frame, *_past_wifi(frame, link))
-    if link not in _ETHERTYPE_LINKS:
-        raise Refused("other", f"link type {link}")
-    at, start = _ETHERTYPE_LINKS[link]
-    return _past_ethertype(frame, frame[at] << 8 | frame[at + 1], start)
+    if link in _LOOPBACK_LINKS:
+        return _skip_loopback_header(frame)
+    if link in _ETHERTYPE_LINKS:
+        type_offset, header_size = _ETHERTYPE_LINKS[link]
+        return _skip_ethertype(frame, _ethertype_at(frame, type_offset), header_size)
+    raise NoDatagramError("link", _UNSUPPORTED_LINKS.get(link, f"link type {link}"))
 
 
-def _past_ethertype(frame: bytes, ethertype: int, start: int) -> int:
-    """Where IP begins behind an EtherType, with whatever tags and labels."""
-    while ethertype in _VLAN_TAGS:
-        ethertype = frame[start + 2] << 8 | frame[start + 3]
-        start += 4
-    if ethertype == _PPPOE:
-        return _past_ppp(frame, start + 6)
-    if ethertype in _MPLS:
-        while not frame[start + 2] & 1:  # the bottom of the stack of labels
-            start += 4
-        if frame[start + 4] >> 4 not in (4, 6):
-            raise Refused("other", "MPLS without IP")
-        return start + 4
-    if ethertype not in _IP_ETHERTYPES:
-        what = _ETHERTYPES.get(ethertype, f"EtherType 0x{ethertype:04x}")
-        raise Refused("other", what if ethertype >= 0x0600 else "802.3 without EtherType")
-    return start
+def _skip_loopback_header(frame: bytes) -> int:
+    (little,) = struct.unpack_from("<I", frame)
+    (big,) = struct.unpack_from(">I", frame)
+    # The family has the byte order of the capturing machine. Families are small numbers, and the
+    # wrong order gives a large one.
+    if min(little, big) not in _IP_FAMILIES:
+        raise NoDatagramError("other", "loopback without IP")
+    return _LOOPBACK_HEADER_BYTES
 
 
-def _past_ppp(frame: bytes, at: int) -> int:
-    """Where IP begins behind PPP's header, of which address and control, and the upper byte of the
-    protocol, may be left out.
-    """
-    at += 2 * (frame[at] == 0xFF)
-    short = frame[at] & 1
-    protocol = frame[at] if short else frame[at] << 8 | frame[at + 1]
-    if protocol not in _PPP_IP:
-        raise Refused("other", f"PPP protocol 0x{protocol:04x}")
-    return at + 2 - short
+def _skip_ethertype(frame: bytes, ethertype: int, start: int) -> int:
+    """Return the offset of IP after an EtherType and VLAN tags."""
+    while ethertype in _VLAN_ETHERTYPES:
+        ethertype = _ethertype_at(frame, start + 2)
+        start += _VLAN_TAG_BYTES
+    if ethertype in (_IPV4_ETHERTYPE, _IPV6_ETHERTYPE):
+        return start
+    if ethertype in _UNSUPPORTED_ETHERTYPES:
+        raise NoDatagramError("link", _UNSUPPORTED_ETHERTYPES[ethertype])
+    if ethertype < _MIN_ETHERTYPE:
+        raise NoDatagramError("other", "802.3 without EtherType")
+    name = _ETHERTYPE_NAMES.get(ethertype, f"EtherType 0x{ethertype:04x}")
+    raise NoDatagramError("other", name)
 
 
-def _past_wifi(frame: bytes, link: int) -> tuple[int, int]:
-    """The EtherType in a data frame of 802.11, and where what it names begins."""
-    at, is_padded = _past_radiotap(frame) if link == _RADIOTAP else (0, False)
-    control, flags = frame[at], frame[at + 1]
-    if control & 0x4C != 0x08:
-        raise Refused("other", "802.11 without data")
-    if flags & 0x40:
-        raise Refused("other", "encrypted 802.11")
-    size = 30 if flags & 3 == 3 else 24
-    is_whole = not flags & 0x04 and not frame[at + 22] & 0x0F
-    if control & 0x80:  # QoS
-        is_whole = is_whole and not frame[at + size] & 0x80
-        size += 6 if flags & 0x80 else 2
-    if not is_whole:
-        raise Refused("other", "802.11 in fragments or aggregates")
-    start = at + size + (-size % 4 if is_padded else 0)
-    snap, ethertype = _SNAP_HEADER.unpack_from(frame, start)
-    if snap != _SNAP:
-        raise Refused("other", "802.11 without EtherType")
-    return ethertype, start + _SNAP_HEADER.size
+def _ethertype_at(frame: bytes, offset: int) -> int:
+    return frame[offset] << 8 | frame[offset + 1]
 
 
-def _past_radiotap(frame: bytes) -> tuple[int, bool]:
-    """The length of a radiotap header, and whether the header behind it is padded to words of 4
-    bytes, which its flags say.
-    """
-    length, present = struct.unpack_from("<HI", frame, 2)
-    at, more = 8, present
-    while more & 1 << 31:
-        (more,) = struct.unpack_from("<I", frame, at)
-        at += 4
-    at = at + -at % 8 + 8 if present & 1 else at
-    return length, bool(present & 2 and frame[at] & 0x20)
+def _other_protocol_error(protocol: int) -> NoDatagramError:
+    return NoDatagramError("other", _PROTOCOL_NAMES.get(protocol, f"IP protocol {protocol}"))
 
 
-def _not_udp(protocol: int) -> Refused:
-    return Refused("other", _PROTOCOLS.get(protocol, f"IP protocol {protocol}"))
-
-
-def _ipv4(frame: bytes, start: int) -> IpPacket:
-    first, total, ident, place, _, protocol, _, source, destination = _IPV4_HEADER.unpack_from(
-        frame, start
+def _parse_ipv4(frame: bytes, start: int) -> IpPacket:
+    version_and_words, length, ident, flags_and_offset, _, protocol, _, source, destination = (
+        _IPV4_HEADER.unpack_from(frame, start)
     )
-    header, total = (first & 0x0F) * 4, total or len(frame) - start
-    if header < _IPV4_HEADER.size or total < header:
-        raise Refused("malformed")
-    if protocol != _UDP:
-        raise _not_udp(protocol)
-    body = frame[start + header : start + total]
-    fragment = _fragment(ident, (place & 0x1FFF) * 8, total - header, more=bool(place & 0x2000))
-    if fragment is not None and len(body) < total - header:
-        raise Refused("short")
-    return IpPacket(source, destination, protocol, body, start + header, fragment)
+    header_size = (version_and_words & 0x0F) * 4
+    length = length or len(frame) - start
+    if header_size < _IPV4_HEADER.size or length < header_size:
+        raise NoDatagramError("malformed")
+    if protocol != _UDP_PROTOCOL:
+        raise _other_protocol_error(protocol)
+    body_start = start + header_size
+    body = frame[body_start : start + length]
+    fragment = _make_fragment(
+        ident,
+        start=(flags_and_offset & 0x1FFF) * 8,
+        size=length - header_size,
+        more=bool(flags_and_offset & 0x2000),
+    )
+    if fragment is not None and len(body) < length - header_size:
+        raise NoDatagramError("short")
+    return IpPacket(source, destination, protocol, body, body_start, fragment)
 
 
-def _ipv6(frame: bytes, start: int) -> IpPacket:
+def _parse_ipv6(frame: bytes, start: int) -> IpPacket:
     length, protocol, source, destination = _IPV6_HEADER.unpack_from(frame, start)
     body_start = start + _IPV6_HEADER.size
     body = frame[body_start : body_start + length]
-    missing = length - len(body)
+    missing_bytes = length - len(body)
     fragment = None
-    protocol, at = _past_extensions(protocol, body)
-    if protocol == _FRAGMENT:
-        protocol, place, ident = struct.unpack_from(">BxHI", body, at)
-        at += 8
-        fragment = _fragment(ident, place & 0xFFF8, len(body) - at + missing, more=bool(place & 1))
-    if protocol != _UDP and protocol not in _EXTENSIONS:
-        raise _not_udp(protocol)
-    if fragment is not None and missing:
-        raise Refused("short")
-    return IpPacket(source, destination, protocol, body[at:], body_start + at, fragment)
+    protocol, offset = _skip_extensions(protocol, body)
+    if protocol == _FRAGMENT_PROTOCOL:
+        protocol, offset_and_flags, ident = _FRAGMENT_HEADER.unpack_from(body, offset)
+        offset += _FRAGMENT_HEADER.size
+        fragment = _make_fragment(
+            ident,
+            start=offset_and_flags & 0xFFF8,
+            size=len(body) - offset + missing_bytes,
+            more=bool(offset_and_flags & 1),
+        )
+    if protocol != _UDP_PROTOCOL and protocol not in _EXTENSION_PROTOCOLS:
+        raise _other_protocol_error(protocol)
+    if fragment is not None and missing_bytes:
+        raise NoDatagramError("short")
+    return IpPacket(source, destination, protocol, body[offset:], body_start + offset, fragment)
 
 
-def _past_extensions(protocol: int, body: bytes) -> tuple[int, int]:
-    """The protocol after the extension headers, and where it starts in the body."""
-    at = 0
-    while protocol in _EXTENSIONS:
-        protocol, units = struct.unpack_from(">BB", body, at)
-        at += (units + 1) * 8
-    return protocol, at
+def _skip_extensions(protocol: int, body: bytes) -> tuple[int, int]:
+    """Return the protocol after the extension headers of IPv6, and its offset in the body."""
+    offset = 0
+    while protocol in _EXTENSION_PROTOCOLS:
+        protocol, extra_units = struct.unpack_from(">BB", body, offset)
+        offset += (extra_units + 1) * 8
+    return protocol, offset
 
 
-def _fragment(ident: int, start: int, size: int, *, more: bool) -> Fragment | None:
+def _make_fragment(ident: int, *, start: int, size: int, more: bool) -> Fragment | None:
+    """Return the fragment that header fields describe; None for a whole packet.
+
+    Raises:
+        NoDatagramError: if no valid packet has such a fragment.
+    """
     if not more and not start:
         return None
-    if not size or (more and size % 8) or start + size > _LARGEST_PACKET:
-        raise Refused("malformed")
+    is_cut_in_eights = not more or size % 8 == 0
+    if not size or not is_cut_in_eights or start + size > _MAX_PACKET_BYTES:
+        raise NoDatagramError("malformed")
     return Fragment(ident, start, more)
 
 
-class _Partial:
-    """The fragments of one packet, none overlapping another."""
+class _PartialPacket:
+    """The fragments of one packet that have arrived; none overlaps another."""
 
-    __slots__ = ("at", "parts", "protocol", "size", "starts", "total")
+    __slots__ = ("arrival_ns", "parts", "protocol", "size", "starts", "total_size")
 
-    def __init__(self, at: int) -> None:
-        self.at = at
+    def __init__(self, arrival_ns: int) -> None:
+        self.arrival_ns = arrival_ns
         self.parts: dict[int, bytes] = {}
         self.starts: list[int] = []  # the keys of `parts`, sorted
         self.size = 0
-        self.total: int | None = None
-        self.protocol = _UDP
+        self.total_size: int | None = None
+        self.protocol = _UDP_PROTOCOL
 
     def add(self, start: int, body: bytes, *, more: bool) -> bool:
-        """Whether the body was taken in: it overlaps nothing and agrees with the others about the
-        end.
-        """
+        """Add a fragment unless it contradicts the others; return whether it was added."""
         stop = start + len(body)
         index = bisect_left(self.starts, start)
-        before, after = self.starts[index - 1 : index], self.starts[index : index + 1]
-        if any(earlier + len(self.parts[earlier]) > start for earlier in before) or any(
-            later < stop for later in after
-        ):
+        if self._overlaps(index, start, stop):
             return False
-        if more and self.total is not None and stop > self.total:
-            return False
-        if not more and (after or self.total is not None):
-            return False
-        if not more:
-            self.total = stop
+        if more:
+            if self.total_size is not None and stop > self.total_size:
+                return False
+        else:
+            has_later_fragments = index < len(self.starts)
+            if has_later_fragments or self.total_size is not None:
+                return False
+            self.total_size = stop
         self.starts.insert(index, start)
         self.parts[start] = body
         self.size += len(body)
         return True
 
+    def _overlaps(self, index: int, start: int, stop: int) -> bool:
+        if index > 0:
+            previous = self.starts[index - 1]
+            if previous + len(self.parts[previous]) > start:
+                return True
+        return index < len(self.starts) and self.starts[index] < stop
+
 
 class Reassembly:
-    """Puts fragments together, in whatever order they come, in bounded memory.
+    """Reassembles IP fragments that arrive in any order, in bounded memory.
 
-    A packet whose fragments overlap is given up (RFC 5722), except that a fragment seen twice is
-    ignored. The oldest packets are given up where more than `MOST_PACKETS` or `MOST_BYTES` wait,
-    and those older than `PATIENCE_NS`.
+    A packet whose fragments overlap is dropped (RFC 5722), but a repeated fragment is ignored. The
+    oldest packets are dropped if more than `MAX_PACKETS` or `MAX_BYTES` wait for fragments, or if
+    they are older than `TIMEOUT_NS`.
 
     Attributes:
-        dropped: fragments of packets that were given up.
+        dropped: the number of fragments of packets that were dropped.
     """
 
-    MOST_PACKETS = 256
-    MOST_BYTES = 4 << 20
-    # at 10,000 datagrams/s the 16-bit identification of IPv4 comes round after 6.5 s
-    PATIENCE_NS = 5_000_000_000
-    _OVERHEAD = (
-        160  # bytes of objects around each fragment, so that tiny ones count for what they take
-    )
+    MAX_PACKETS = 256
+    MAX_BYTES = 4 << 20
+    #: At 10,000 datagrams a second the 16-bit identification of IPv4 repeats after 6.5 s.
+    TIMEOUT_NS = 5_000_000_000
+    #: Bytes of Python objects around each fragment, so that many tiny ones are bounded too.
+    _OVERHEAD_BYTES = 160
 
     def __init__(self) -> None:
         self.dropped = 0
-        self._partials: OrderedDict[tuple[bytes, bytes, int], _Partial] = OrderedDict()
-        self._held = 0
+        self._partials: OrderedDict[tuple[bytes, bytes, int], _PartialPacket] = OrderedDict()
+        self._held_bytes = 0
 
-    def add(self, packet: IpPacket, fragment: Fragment, at: int) -> IpPacket | None:
-        """The whole packet, if this fragment was the last one missing.
+    def add(self, packet: IpPacket, fragment: Fragment, arrival_ns: int) -> IpPacket | None:
+        """Add a fragment; return the whole packet if this was the last one missing.
 
         Args:
-            packet: what `ip_packet` returned, with its `fragment`.
-            at: capture time in ns.
+            packet: the result of `parse_ip`, with its `fragment`.
+            arrival_ns: the capture time.
         """
-        while self._partials and next(iter(self._partials.values())).at < at - self.PATIENCE_NS:
-            self._drop()
+        self._drop_older(arrival_ns - self.TIMEOUT_NS)
         key = packet.source, packet.destination, fragment.ident
-        partial = self._partials.setdefault(key, _Partial(at))
+        partial = self._partials.setdefault(key, _PartialPacket(arrival_ns))
         if partial.parts.get(fragment.start) == packet.body:
             return None
         if not partial.add(fragment.start, packet.body, more=fragment.more):
             self.dropped += 1
             self._drop(key)
             return None
-        self._held += len(packet.body) + self._OVERHEAD
+        self._held_bytes += len(packet.body) + self._OVERHEAD_BYTES
         if fragment.start == 0:
             partial.protocol = packet.protocol
-        if partial.size == partial.total:
+        if partial.size == partial.total_size:
             self._remove(key)
             body = b"".join(partial.parts[start] for start in partial.starts)
             return IpPacket(packet.source, packet.destination, partial.protocol, body)
-        while len(self._partials) > self.MOST_PACKETS or self._held > self.MOST_BYTES:
-            self._drop()
+        while len(self._partials) > self.MAX_PACKETS or self._held_bytes > self.MAX_BYTES:
+            self._drop(next(iter(self._partials)))
         return None
 
     def finish(self) -> None:
-        """Gives up all that is still incomplete."""
+        """Drop all packets that are still incomplete."""
         while self._partials:
-            self._drop()
+            self._drop(next(iter(self._partials)))
 
-    def _drop(self, key: tuple[bytes, bytes, int] | None = None) -> None:
-        self.dropped += len(self._remove(key or next(iter(self._partials))).parts)
+    def _drop_older(self, limit_ns: int) -> None:
+        while self._partials:
+            key, partial = next(iter(self._partials.items()))
+            if partial.arrival_ns >= limit_ns:
+                return
+            self._drop(key)
 
-    def _remove(self, key: tuple[bytes, bytes, int]) -> _Partial:
+    def _drop(self, key: tuple[bytes, bytes, int]) -> None:
+        self.dropped += len(self._remove(key).parts)
+
+    def _remove(self, key: tuple[bytes, bytes, int]) -> _PartialPacket:
         partial = self._partials.pop(key)
-        self._held -= partial.size + self._OVERHEAD * len(partial.parts)
+        self._held_bytes -= partial.size + self._OVERHEAD_BYTES * len(partial.parts)
         return partial

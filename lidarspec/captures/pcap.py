@@ -1,9 +1,9 @@
-"""Captures: the UDP datagrams of a pcap or pcapng file, and the records of those that are written.
+"""Read the UDP datagrams of a pcap or pcapng file, and make the records of new files.
 
-Theory of operation: `records` walks the records of the file, `ip` takes the captured frames apart,
-and this module joins the two and counts in `CaptureStats` whatever gives no datagram. Captures are
-hostile input: past the first four bytes nothing in them raises, and memory follows the bytes that
-are there, never a length that they claim.
+`records` iterates over the records of the file and `ip` parses the captured frames. This module
+joins the two and counts every packet that gives no datagram in `CaptureStats`. Captures are
+untrusted input: after the first four bytes no content raises, and memory use follows the bytes
+that are present, not the lengths that they claim.
 """
 
 from __future__ import annotations
@@ -19,15 +19,15 @@ from typing import BinaryIO
 
 from lidarspec.captures.containers import opened
 from lidarspec.captures.ip import (
-    LARGEST_PAYLOAD,
+    MAX_PAYLOAD_BYTES,
     Headers,
+    NoDatagramError,
     Reassembly,
-    Refused,
-    address,
-    headers,
-    ip_packet,
-    udp,
-    udp_frame,
+    build_udp_frame,
+    format_address,
+    parse_headers,
+    parse_ip,
+    parse_udp,
 )
 from lidarspec.captures.records import (
     CapturedPacket,
@@ -44,14 +44,16 @@ from lidarspec.captures.source import SMALLEST, Source, Truncated
 from lidarspec.errors import SourceError, UsageError
 from lidarspec.transports.protocol import Closing
 
-#: the link types kept for private use: captures of byte streams have the first.
+#: Link types for private use. Captures of byte streams are written with the first one.
 USER_LINKS = range(147, 163)
-#: kinds of packets that are counted by their names.
-MOST_KINDS = 16
-#: who sent a datagram, and to whom, where nobody knows.
-NOBODY = ("0.0.0.0", 0)
-#: what an IPv4 address has before it as an IPv6 one.
-_MAPPED = bytes.fromhex("00000000000000000000ffff")
+#: Packets of further kinds are counted together.
+MAX_COUNTED_KINDS = 16
+#: The address and port of a datagram with unknown sender or receiver.
+UNKNOWN_ENDPOINT = ("0.0.0.0", 0)
+#: The bytes in front of an IPv4 address that is written as an IPv6 address (RFC 4291).
+_IPV4_MAPPED_PREFIX = bytes.fromhex("00000000000000000000ffff")
+#: More bytes fit into a datagram over IPv6, whose length does not count its header.
+_EXTRA_PAYLOAD_BYTES_IPV6 = 20
 
 
 @dataclass(frozen=True, slots=True)
@@ -60,8 +62,8 @@ class Datagram:
 
     Attributes:
         data: the payload.
-        at: capture time in ns since 1970, of its last fragment where it came in several; 0 where
-            the file has no times.
+        at: capture time in ns since 1970, of the last fragment of a fragmented datagram; 0 if the
+            file has no times.
         source, destination: address and port.
     """
 
@@ -73,22 +75,22 @@ class Datagram:
 
 @dataclass(slots=True)
 class CaptureStats:
-    """What a capture held so far.
+    """The contents of a capture so far.
 
     Attributes:
-        packets: captured packets, of whatever kind.
-        datagrams: UDP datagrams handed out.
+        packets: captured packets of all kinds.
+        datagrams: UDP datagrams that were returned.
         other: packets that are not UDP over IP.
-        others: how many of them by what they are, "ARP" or "TCP"; of so many kinds at most.
-        truncated_tail: whether the file ends in the middle of a record; all before it was read.
-        snapped: UDP packets that the capture's snap length cut short; they are not handed out.
+        others: the number of them by protocol, such as "ARP" or "TCP".
+        unsupported: packets with a link layer that is not read, by its name, such as "802.11".
+        truncated_tail: whether the file ends within a record; all records before it were read.
+        snapped: UDP packets that the snap length of the capture cut short; they are not returned.
         fragments: UDP packets that were IP fragments.
-        incomplete_fragments: those whose datagram never became whole.
-        malformed: packets and records that contradict themselves.
-        damaged: places where a record could not be read, and bytes were passed over to the next one
-            that could.
-        lost: bytes that were passed over there.
-        stopped_at: file offset of the truncated or malformed record that ended the reading, else
+        incomplete_fragments: those of datagrams that stayed incomplete.
+        malformed: packets and records with contradicting fields.
+        damaged: unreadable records after which another readable one was searched.
+        lost: bytes that these searches skipped.
+        stopped_at: file offset of the truncated or malformed record that ended the reading, or
             None.
     """
 
@@ -96,6 +98,7 @@ class CaptureStats:
     datagrams: int = 0
     other: int = 0
     others: Counter[str] = field(default_factory=Counter, compare=False)
+    unsupported: Counter[str] = field(default_factory=Counter)
     truncated_tail: bool = False
     snapped: int = 0
     fragments: int = 0
@@ -105,27 +108,39 @@ class CaptureStats:
     lost: int = 0
     stopped_at: int | None = None
 
-    def leave(self, what: str) -> None:
-        """Count a packet that is no UDP over IP."""
+    def count_other(self, name: str) -> None:
+        """Count a packet that is not UDP over IP."""
         self.other += 1
-        self.others[what if what in self.others or len(self.others) < MOST_KINDS else "more"] += 1
+        _count_name(self.others, name)
+
+    def count_unsupported(self, link_layer: str) -> None:
+        """Count a packet with a link layer that is not read."""
+        _count_name(self.unsupported, link_layer)
+
+
+def _count_name(counts: Counter[str], name: str) -> None:
+    """Count a name; a hostile file cannot make the number of names grow without limit."""
+    if name not in counts and len(counts) >= MAX_COUNTED_KINDS:
+        name = "more"
+    counts[name] += 1
 
 
 class CaptureReader(Closing):
-    """The UDP datagrams of a capture, in file order, each once: an iterator goes on where the last
-    one stopped.
+    """The UDP datagrams of a capture in file order, each of them once.
+
+    A second iterator continues where the first one stopped.
 
     Args:
-        file: an open binary file, also a pipe, which stays open; or a path, whose file is closed
-            after the last datagram, and which may be compressed.
+        file: an open binary file or pipe, which stays open; or a path, which may be compressed and
+            is closed after the last datagram.
 
     Attributes:
-        stats: what was met so far.
-        largest: bytes that are read at once, at most.
+        stats: the contents so far.
+        largest: the number of bytes that are read at once, at most.
 
     Raises:
-        SourceError: the file cannot be read, or is no capture at all. Damage further on is counted,
-            never raised.
+        SourceError: if the file cannot be read, or is not a capture. Later damage is counted and
+            does not raise.
     """
 
     largest = SMALLEST
@@ -134,7 +149,8 @@ class CaptureReader(Closing):
         self.stats = CaptureStats()
         self._owned: BinaryIO | None = None
         if isinstance(file, str | os.PathLike):
-            file = self._owned = opened(file)  # closed by `close`
+            self._owned = opened(file)
+            file = self._owned
         self._source = Source(file, largest=self.largest)
         self._fragments = Reassembly()
         self._form: Form | None = None
@@ -152,56 +168,57 @@ class CaptureReader(Closing):
 
     @property
     def place(self) -> int:
-        """Where in the file the next record begins."""
+        """The file offset of the next record."""
         return self._source.place
 
     def __iter__(self) -> Iterator[Datagram]:
-        if (
-            self._datagrams is None
-            # and not before: it holds the reader, which would live on until the garbage is collected
-        ):
-            self._datagrams = self._walk()
+        # Not in __init__: the generator refers to the reader, and such a cycle keeps an unused
+        # reader alive until the garbage collector runs.
+        if self._datagrams is None:
+            self._datagrams = self._iter_datagrams()
         return self._datagrams
 
     def skip(self, at: int) -> bool:
-        """Go on close before the first datagram that came at a time, ns since 1970, or later, where
-        a file can be sought: whether it did.
+        """Seek shortly before the first datagram at or after a time; return whether it was possible.
 
-        What is passed over is not counted, and datagrams whose fragments stand on both sides are
-        left out.
+        Skipped datagrams are not counted. Datagrams with fragments on both sides are lost.
+
+        Args:
+            at: ns since 1970.
         """
         return self._form is not None and sought(self._source, self._form, at)
 
     def close(self) -> None:
-        """Closes the file, if it was given as a path."""
+        """Close the file if it was given as a path."""
         if self._owned is not None:
             self._owned.close()
 
-    def _walk(self) -> Iterator[Datagram]:
-        with self._to_the_end():
-            form = self._form = records(self._source)
+    def _iter_datagrams(self) -> Iterator[Datagram]:
+        with self._count_end():
+            form = records(self._source)
+            self._form = form
             while self._source.begin_record():
                 try:
-                    datagram = self.datagram(form.read())
+                    datagram = self.to_datagram(form.read())
                 except Damaged:
-                    self._pass_over(form)
+                    self._skip_damage(form)
                     continue
                 if datagram is not None:
                     self.stats.datagrams += 1
                     yield datagram
 
-    def _pass_over(self, form: Form) -> None:
-        """Goes behind a damaged record, to the next one or the end; counts what is lost."""
-        begun = self._source.record
-        found = resume(self._source, form)
+    def _skip_damage(self, form: Form) -> None:
+        """Continue at the next readable record or at the end, and count the lost bytes."""
+        damage_start = self._source.record
+        has_more = resume(self._source, form)
         self.stats.malformed += 1
         self.stats.damaged += 1
-        self.stats.lost += self._source.place - begun
-        self.stats.stopped_at = None if found else begun
+        self.stats.lost += self._source.place - damage_start
+        self.stats.stopped_at = None if has_more else damage_start
 
     @contextmanager
-    def _to_the_end(self) -> Iterator[None]:
-        """Around the reading of all records: counts what ends it."""
+    def _count_end(self) -> Iterator[None]:
+        """Close the file after the records were read, and count how it ended."""
         try:
             yield
         except Truncated:
@@ -212,117 +229,140 @@ class CaptureReader(Closing):
         self._fragments.finish()
         self.stats.incomplete_fragments = self._fragments.dropped
 
-    def datagram(self, packet: CapturedPacket | Passed) -> Datagram | None:
-        """The datagram that this packet is, or makes whole; counts what it is otherwise."""
-        stats = self.stats
+    def to_datagram(self, packet: CapturedPacket | Passed) -> Datagram | None:
+        """Return the datagram that this packet contains or completes, and count the packet."""
         if isinstance(packet, Passed):
-            stats.malformed += packet is Passed.MALFORMED
+            if packet is Passed.MALFORMED:
+                self.stats.malformed += 1
             return None
-        stats.packets += 1
+        self.stats.packets += 1
         try:
-            ip = ip_packet(packet.data, packet.link)
+            ip = parse_ip(packet.data, packet.link)
             if ip.fragment is not None:
-                stats.fragments += 1
+                self.stats.fragments += 1
                 whole = self._fragments.add(ip, ip.fragment, packet.at)
-                stats.incomplete_fragments = self._fragments.dropped
+                self.stats.incomplete_fragments = self._fragments.dropped
                 if whole is None:
                     return None
                 ip = whole
-            part = udp(ip)
-        except Refused as refused:
-            if refused.reason == "other":
-                stats.leave(refused.what)
-            elif refused.reason == "short" and len(packet.data) < packet.original:
-                stats.snapped += 1
-            else:
-                stats.malformed += 1
+            udp = parse_udp(ip)
+        except NoDatagramError as error:
+            self._count_unread(packet, error)
             return None
-        ends = (address(ip.source), part.source), (address(ip.destination), part.destination)
-        return Datagram(ip.body[part.start : part.stop], packet.at, *ends)
+        return Datagram(
+            ip.body[udp.start : udp.stop],
+            packet.at,
+            (format_address(ip.source), udp.source),
+            (format_address(ip.destination), udp.destination),
+        )
+
+    def _count_unread(self, packet: CapturedPacket, error: NoDatagramError) -> None:
+        is_cut = len(packet.data) < packet.original
+        if error.reason == "other":
+            self.stats.count_other(error.name)
+        elif error.reason == "link":
+            self.stats.count_unsupported(error.name)
+        elif error.reason == "short" and is_cut:
+            self.stats.snapped += 1
+        else:
+            self.stats.malformed += 1
 
     def headers(self, packet: CapturedPacket) -> Headers | None:
-        """Where the payload of a packet that gave a datagram stands, and so that of packets like
-        it; None where others may differ.
+        """Return the headers of a packet that gave a datagram.
+
+        None if other packets with equal headers may have their payload elsewhere.
         """
-        return headers(packet.data, packet.link)
+        return parse_headers(packet.data, packet.link)
 
 
 class StreamReader(CaptureReader):
-    """The packets of a capture of a byte stream, link type USER0 to USER15, as datagrams that
-    nobody sent.
+    """The packets of a captured byte stream, link type USER0 to USER15, as datagrams.
+
+    Their sender and receiver are `UNKNOWN_ENDPOINT`.
     """
 
-    def datagram(self, packet: CapturedPacket | Passed) -> Datagram | None:
-        """What the packet holds; counts it where it is of another link type."""
+    def to_datagram(self, packet: CapturedPacket | Passed) -> Datagram | None:
+        """Return the content of the packet; count a packet of another link type."""
         if isinstance(packet, Passed):
             return None
         self.stats.packets += 1
         if packet.link not in USER_LINKS:
-            self.stats.leave(f"link type {packet.link}")
+            self.stats.count_unsupported(f"link type {packet.link}")
             return None
-        self.stats.snapped += len(packet.data) < packet.original
-        return Datagram(packet.data, packet.at, NOBODY, NOBODY)
+        if len(packet.data) < packet.original:
+            self.stats.snapped += 1
+        return Datagram(packet.data, packet.at, UNKNOWN_ENDPOINT, UNKNOWN_ENDPOINT)
 
     def headers(self, packet: CapturedPacket) -> Headers | None:
-        """None for a packet that was cut, which is counted."""
-        return Headers(0, len(packet.data), ()) if len(packet.data) == packet.original else None
+        """Return the headers of a packet, which are empty; None for a packet that was cut."""
+        if len(packet.data) < packet.original:
+            return None
+        return Headers(0, len(packet.data), ())
 
 
 def datagram_record(datagram: Datagram) -> bytes:
-    """The record of one datagram in a pcap file.
+    """Return the pcap record of one datagram.
 
     Raises:
-        UsageError: as `datagram_frame`, and for a time that no record can hold.
+        UsageError: as `datagram_frame`, and for a time outside the range of a record.
     """
     return packet_record(datagram_frame(datagram), datagram.at)
 
 
 def datagram_frame(datagram: Datagram) -> bytes:
-    """One datagram, unfragmented, as Ethernet, IP and UDP.
+    """Return one datagram as an Ethernet frame with IP and UDP headers, unfragmented.
 
     Raises:
-        UsageError: more bytes than UDP carries, an address that is none, or a port that there is
-            not.
+        UsageError: for too many bytes, an invalid address or an invalid port.
     """
-    source, destination = _endpoints(datagram.source, datagram.destination)
-    most = LARGEST_PAYLOAD + 20 * (len(source[0]) == 16)
-    if len(datagram.data) > most:
-        raise UsageError(f"a datagram of {len(datagram.data)} bytes: UDP carries at most {most}")
-    return udp_frame(datagram.data, source, destination)
+    source, destination = _pack_endpoints(datagram.source, datagram.destination)
+    limit = MAX_PAYLOAD_BYTES
+    if len(source[0]) == 16:
+        limit += _EXTRA_PAYLOAD_BYTES_IPV6
+    if len(datagram.data) > limit:
+        raise UsageError(f"a datagram of {len(datagram.data)} bytes: UDP carries at most {limit}")
+    return build_udp_frame(datagram.data, source, destination)
 
 
 def is_stream_capture(head: bytes) -> bool:
-    """Whether a file that begins so is a capture of a byte stream, little-endian; 24 bytes of pcap
-    tell, 64 of pcapng as written here.
+    """Return whether a little-endian capture begins with the private link type of a byte stream.
+
+    Args:
+        head: the first bytes of a file; 24 bytes of pcap and 64 of pcapng are enough.
     """
-    link = 20
-    if head.startswith(b"\x0a\x0d\x0d\x0a"):
-        link = 8 + int.from_bytes(head[4:8], "little")
-        if head[link - 8 : link - 4] != b"\x01\0\0\0":  # no interface
+    if head.startswith(b"\x0a\x0d\x0d\x0a"):  # a section of pcapng, with an interface after it
+        interface = int.from_bytes(head[4:8], "little")
+        if head[interface : interface + 4] != b"\x01\0\0\0":
             return False
-    elif head[:1] not in (b"\x4d", b"\xd4"):
+        link_offset = interface + 8
+    elif head[:1] in (b"\x4d", b"\xd4"):  # little-endian pcap
+        link_offset = 20
+    else:
         return False
-    return (
-        is_capture(head)
-        and len(head) >= link + 4
-        and int.from_bytes(head[link : link + 2], "little") in USER_LINKS
-    )
+    if not is_capture(head) or len(head) < link_offset + 4:
+        return False
+    return int.from_bytes(head[link_offset : link_offset + 2], "little") in USER_LINKS
 
 
 @lru_cache(maxsize=256)
-def _endpoints(*ends: tuple[str, int]) -> list[tuple[bytes, int]]:
-    """Addresses, of 4 bytes or 16 as the longest of them is, and ports."""
-    packed = []
-    for host, port in ends:
+def _pack_endpoints(*endpoints: tuple[str, int]) -> list[tuple[bytes, int]]:
+    """Return packed addresses, all of 4 or all of 16 bytes, and ports."""
+    addresses = []
+    for host, port in endpoints:
         try:
-            packed.append(ipaddress.ip_address(host).packed)
+            addresses.append(ipaddress.ip_address(host).packed)
         except ValueError:
-            raise UsageError(f"{host!r} is no address, which is what a capture holds") from None
+            raise UsageError(f"{host!r} is not an IP address, which a capture requires") from None
         if not 0 <= port < 1 << 16:
             raise UsageError(f"{port} is not a UDP port")
-    if len({len(address) for address in packed}) > 1:
-        packed = [
-            address if len(address) == 16 else _MAPPED + address if any(address) else bytes(16)
-            for address in packed
-        ]
-    return [(address, port) for address, (_, port) in zip(packed, ends, strict=True)]
+    if len({len(address) for address in addresses}) > 1:
+        addresses = [_to_ipv6(address) for address in addresses]
+    return [(address, port) for address, (_, port) in zip(addresses, endpoints, strict=True)]
+
+
+def _to_ipv6(address: bytes) -> bytes:
+    if len(address) == 16:
+        return address
+    if not any(address):
+        return bytes(16)
+    return _IPV4_MAPPED_PREFIX + address

@@ -18,7 +18,7 @@ from typing import Any, Literal
 
 from lidarspec._version import __version__
 from lidarspec.captures.ip import ETHERNET
-from lidarspec.captures.pcap import NOBODY, USER_LINKS, Datagram, datagram_frame
+from lidarspec.captures.pcap import UNKNOWN_ENDPOINT, USER_LINKS, Datagram, datagram_frame
 from lidarspec.captures.records import WRITINGS
 from lidarspec.errors import UnknownFormat, UsageError
 from lidarspec.framing.decoder import Decoder
@@ -144,7 +144,7 @@ class PcapRecorder(Appender):
     def __init__(self, path: str | Path, *, port: int = 0, overwrite: bool = False) -> None:
         self._writing = WRITINGS[check_suffix(path)]
         super().__init__(path, self._writing.size, overwrite=overwrite)
-        self._receiver = (NOBODY[0], port)
+        self._receiver = (UNKNOWN_ENDPOINT[0], port)
         self._put(self._writing.head(ETHERNET))
 
     def write(self, chunk: Chunk, direction: Literal["in", "out"] = "in") -> None:
@@ -156,7 +156,10 @@ class PcapRecorder(Appender):
         """
         if direction == "in":
             datagram = Datagram(
-                chunk.data, chunk.at or 0, chunk.sender or NOBODY, chunk.receiver or self._receiver
+                chunk.data,
+                chunk.at or 0,
+                chunk.sender or UNKNOWN_ENDPOINT,
+                chunk.receiver or self._receiver,
             )
             self._put(self._writing.record(datagram_frame(datagram), datagram.at), len(chunk.data))
 

@@ -11,6 +11,7 @@ from __future__ import annotations
 import contextlib
 import json
 import sys
+from collections import Counter
 from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
@@ -227,10 +228,16 @@ class FileTransport(Transport):
                 f"{self._path}: {stats.snapped} packets were cut by the capture's snap length"
             )
         if stats.other > stats.datagrams:
-            kinds = ", ".join(f"{number} {what}" for what, number in stats.others.most_common())
             self.warnings.append(
                 f"{self._path}: {stats.other} of {stats.packets} packets are no UDP over IP, and"
-                f" were not read: {kinds}"
+                f" were not read: {_list_counts(stats.others)}"
+            )
+        if stats.unsupported:
+            self.warnings.append(
+                f"{self._path}: {stats.unsupported.total()} of {stats.packets} packets have an"
+                f" unsupported link layer, and were not read: {_list_counts(stats.unsupported)};"
+                " next: editcap -C BYTES -T rawip IN.pcap OUT.pcap, which removes the BYTES before"
+                " the IP header"
             )
         if not stats.packets:
             self.warnings.append(f"{self._path} is a capture without a packet")
@@ -244,6 +251,10 @@ class FileTransport(Transport):
                 f"{self._path}: {contradicting} packets were left out, since their headers"
                 " contradict themselves"
             )
+
+
+def _list_counts(counts: Counter[str]) -> str:
+    return ", ".join(f"{number} {name}" for name, number in counts.most_common())
 
 
 class HexTransport(FileTransport):

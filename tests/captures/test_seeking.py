@@ -14,7 +14,7 @@ import lidarspec as ls
 import lidarspec.captures.records
 from lidarspec.captures.bulk import CaptureBatches
 from lidarspec.captures.ip import ETHERNET
-from lidarspec.captures.pcap import NOBODY, Datagram, StreamReader, datagram_frame
+from lidarspec.captures.pcap import UNKNOWN_ENDPOINT, Datagram, StreamReader, datagram_frame
 from lidarspec.captures.records import WRITINGS
 from lidarspec.explaining import contents
 from lidarspec.scans import selection
@@ -29,7 +29,7 @@ NUMBER = 2000
 NEAR = 1 << 18
 #: of a capture of a byte stream.
 USER0 = 147
-SENT = Datagram(bytes(1000), 0, ("192.168.1.201", 2368), NOBODY)
+SENT = Datagram(bytes(1000), 0, ("192.168.1.201", 2368), UNKNOWN_ENDPOINT)
 
 
 @pytest.fixture(autouse=True)

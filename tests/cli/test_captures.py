@@ -5,7 +5,9 @@ several senders, containers.
 from __future__ import annotations
 
 import io
+import shutil
 import sqlite3
+import subprocess
 import tarfile
 from pathlib import Path
 
@@ -98,6 +100,45 @@ def test_every_verb_says_what_is_in_a_capture_of_which_nothing_is_read(
     assert output.count(said) == 1, output
     assert "holds no bytes" not in output
     assert "nothing came" not in output
+
+
+@pytest.mark.parametrize(
+    ("verb", "code"), [("read", 4), ("info", 4), ("detect", 4), ("stats", 4), ("view", 4)]
+)
+def test_an_unsupported_link_layer_is_named_with_a_way_to_read_it(
+    verb: str, code: int, tmp_path: Path
+) -> None:
+    packets = [b"\xff\x03\x00\x21" + made.ipv4(made.udp(bytes(1210)))] * 3
+    path = capture(tmp_path / "ppp.pcap", *map(made.record, packets), link=9)
+    words = (verb, path) if verb in ("info", "detect") else (verb, path, "-s", M1)
+    output = ran(*words, code=code).output
+    message = f"{path}: 3 of 3 packets have an unsupported link layer, and were not read: 3 PPP"
+    assert output.count(message) == 1, output
+    assert output.count("editcap -C BYTES -T rawip") == 1
+    assert "holds no bytes" not in output
+
+
+def test_a_few_packets_of_an_unsupported_link_layer_are_named_too(tmp_path: Path) -> None:
+    tagged = made.record(made.ethernet(bytes(4) + made.ipv4(made.udp(b"x")), ethertype=0x8847))
+    path = capture(tmp_path / "some.pcap", *records(2), tagged)
+    assert "1 of 3 packets have an unsupported link layer" in ran("read", path, "-s", M1).stderr
+
+
+@pytest.mark.skipif(shutil.which("editcap") is None, reason="editcap is not installed")
+@pytest.mark.parametrize(
+    ("header", "link"),
+    [(4, 9), (22, ETHERNET), (18, ETHERNET), (32, 105), (34, 105)],
+    ids=["PPP", "PPPoE", "MPLS", "802.11", "802.11 QoS"],
+)
+def test_editcap_makes_raw_ip_of_unsupported_link_layers(
+    header: int, link: int, tmp_path: Path
+) -> None:
+    packets = [bytes(header) + made.ipv4(made.udp(data)) for data in simulate(ls.sensor(M1), 2)]
+    path = capture(tmp_path / "link.pcap", *map(made.record, packets), link=link)
+    raw = tmp_path / "raw.pcap"
+    subprocess.run(["editcap", "-C", str(header), "-T", "rawip", path, raw], check=True)
+    done = ran("read", raw, "-s", M1, "--packets", "--json")
+    assert done.stdout.count("\n") == 2
 
 
 def test_what_is_beside_the_datagrams_is_said_where_it_is_the_most(tmp_path: Path) -> None:

@@ -289,8 +289,8 @@ def _datagrams(data: bytes) -> list[bytes]:
     return found
 
 
-#: link types of captures that are known, and two that are not.
-LINKS = (0, 1, 9, 12, 50, 51, 101, 105, 108, 113, 127, 228, 229, 276, 147, 999)
+#: Link types of captures that are read, and some that are not.
+LINKS = (0, 1, 12, 101, 108, 113, 228, 229, 276, 9, 105, 147, 999)
 
 
 def _capture() -> Target:
