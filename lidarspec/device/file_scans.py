@@ -29,7 +29,7 @@ from lidarspec.errors import UsageError
 from lidarspec.expressions.columns import AROUND
 from lidarspec.frames.frame_table import Records, Rows, Table
 from lidarspec.framing.decoder import Decoder
-from lidarspec.framing.frame_engine import RecodedCodec, codec
+from lidarspec.framing.frame_engine import codec
 from lidarspec.framing.results import Counters
 from lidarspec.packets.packets import Packets, StateOf
 from lidarspec.scans.scans import Scan, ScanStream
@@ -242,10 +242,7 @@ class _Loader(pickle.Unpickler):
 
 
 def _table(sensor: Sensor, frame: str, frames: list[bytes]) -> Table:
-    known = codec(sensor.frames[frame])
-    return (known.engine if isinstance(known, RecodedCodec) else known).table(
-        frames
-    )  # of which they are the rows
+    return codec(sensor.frames[frame]).table_of_structs(frames)
 
 
 def _of_these(table: Table | None, which: Any) -> StateOf:

@@ -17,7 +17,8 @@ from numpy.typing import NDArray
 
 from lidarspec.explaining.wording import Value
 from lidarspec.frames.arrays import counted
-from lidarspec.framing.frame_engine import Codec, CompiledCodec, codec
+from lidarspec.framing.frame_codec import Codec
+from lidarspec.framing.frame_engine import CompiledCodec, codec
 from lidarspec.framing.results import VALID
 from lidarspec.spec import Frame
 from lidarspec.spec.tree import formulas, nodes, refs

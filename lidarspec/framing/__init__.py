@@ -8,8 +8,10 @@ in reading order:
 * `results`: `Frames`, which each module passes on to the next; frames one by one; the counters.
 * `plausibility`: whether candidates of one layout are frames, many at a time.
 * `many_lengths`: candidates of layouts that differ only in the length of an array, judged together.
-* `frame_engine`: one frame type: its candidates judged, and its frames as columns; compiled, and
-  interpreted by construct.
+* `frame_codec`: the interface of the engine of one frame type: its candidates judged, and its frames
+  as columns.
+* `text_frames`: this engine for frames with a wire form.
+* `frame_engine`: this engine for binary frames: compiled, and interpreted by construct.
 * `candidates`: the candidates in a piece of a stream, of the types that are looked for.
 * `weak_frames`: types that are believed in runs alone.
 * `search`: the rule of a stream: the leftmost valid candidate, then on after its last byte.

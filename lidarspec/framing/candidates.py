@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from lidarspec.errors import PluginError
 from lidarspec.frames.layout import Marks, Sums, words
-from lidarspec.framing.frame_engine import Codec
+from lidarspec.framing.frame_codec import Codec
 from lidarspec.framing.results import CONSTANT, COUNTED, PLUGIN, SHORT, VALID, Frames
 
 #: candidates of one type in a piece; where there are more, the piece is made shorter, so that

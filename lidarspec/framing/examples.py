@@ -25,7 +25,8 @@ from lidarspec.frames.layout_tree import TooLong, Unknown, layout_of
 from lidarspec.frames.parts import Measure
 from lidarspec.frames.schema import schema
 from lidarspec.frames.slots import recoder
-from lidarspec.framing.frame_engine import Codec, CompiledCodec, codec
+from lidarspec.framing.frame_codec import Codec
+from lidarspec.framing.frame_engine import codec
 from lidarspec.framing.plausibility import plausibility
 from lidarspec.framing.results import VALID
 from lidarspec.spec.description import Frame, Spec
@@ -68,10 +69,9 @@ def random_frame(sensor: Spec, frame: str, source: random.Random, drawn: Drawn =
     Args:
         drawn: field path -> what draws its raw value, for what random values never make.
     """
-    known = codec(sensor.frames[frame])
-    engine = known.compiled
-    if engine is None or engine.schema.parts:
-        return _interpreted(sensor, frame, known, source, drawn)
+    engine = codec(sensor.frames[frame])
+    if not engine.is_compiled or engine.schema.parts:
+        return _interpreted(sensor, frame, engine, source, drawn)
     largest = LARGEST_BATCH if recoder(engine.frame) is None else WRITTEN
     for attempt in range(
         TRIES if sensor.simulation_of(frame).sweep is None else TRIES_BEFORE_SWEEP
@@ -87,7 +87,7 @@ def random_frame(sensor: Spec, frame: str, source: random.Random, drawn: Drawn =
 
 
 def header(
-    engine: CompiledCodec, source: random.Random, drawn: Drawn = NOTHING
+    engine: Codec, source: random.Random, drawn: Drawn = NOTHING
 ) -> tuple[Layout, dict[str, int]]:
     """A layout of a header chosen at random, with the values of the fields it depends on, by path.
 
@@ -153,9 +153,7 @@ def _some_value(source: random.Random, leaf: Leaf, keys: list[int]) -> int:
     return value - (1 << leaf.info.bits) if is_negative else value
 
 
-def _random(
-    engine: CompiledCodec, layout: Layout, number: int, source: random.Random
-) -> NDArray[np.uint8]:
+def _random(engine: Codec, layout: Layout, number: int, source: random.Random) -> NDArray[np.uint8]:
     """So many rows of random bytes, of which the wire form can write every value, with values that
     fields may have.
     """
@@ -254,7 +252,7 @@ def _sent(sensor: Spec, frame: str, layout: Layout, rows: NDArray[np.uint8]) -> 
 
 
 def _make_along_sweep(
-    sensor: Spec, frame: str, engine: CompiledCodec, source: random.Random, drawn: Drawn
+    sensor: Spec, frame: str, engine: Codec, source: random.Random, drawn: Drawn
 ) -> bytes:
     """A frame around the values that the sensor's `sweep` declares, where random ones are never
     plausible.
@@ -311,7 +309,7 @@ def _store_drawn(
             )
 
 
-def _stated(engine: CompiledCodec, values: Mapping[str, Any]) -> Drawn:
+def _stated(engine: Codec, values: Mapping[str, Any]) -> Drawn:
     """What gives the numbers of a sweep, raw, where a header asks for them."""
     fields = engine.schema.fields
     found: dict[str, Callable[[random.Random], Any]] = {}

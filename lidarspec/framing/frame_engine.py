@@ -6,8 +6,7 @@ Both codecs answer the same questions with the same results; every test runs on 
 it is judged, and its layout goes with it into the columns. `InterpretedCodec` lets construct parse
 one candidate at a time, for structs that have no computable layout and as the reference.
 
-`RecodedCodec` stands before either of them for frames with a wire form, text or escaped bytes: the
-form finds where candidates end, and gives rows, which the other one judges as if they had come so.
+Frames with a wire form have an engine of their own (`lidarspec.framing.text_frames`).
 """
 
 from __future__ import annotations
@@ -23,13 +22,13 @@ from numpy.typing import NDArray
 from lidarspec.errors import PluginError, SpecError
 from lidarspec.frames.arrays import alike, counted, repeated
 from lidarspec.frames.compilability import NotCompilable
-from lidarspec.frames.frame_table import Group, Records, Rows, Table
-from lidarspec.frames.layout import Layout, Refused, Sums, marks, right, rows_at, words
-from lidarspec.frames.layout_tree import frame_layouts, prefix_of
-from lidarspec.frames.schema import schema
-from lidarspec.frames.slots import Recoder, recoder
+from lidarspec.frames.frame_table import Group, Records, Rows
+from lidarspec.frames.layout import Layout, Refused, Sums, rows_at
+from lidarspec.frames.layout_tree import frame_layouts
+from lidarspec.frames.slots import recoder
+from lidarspec.framing.frame_codec import Codec
 from lidarspec.framing.many_lengths import AlikeLayouts, LayoutGroup, Together
-from lidarspec.framing.plausibility import Conditions, Judge, plausibility
+from lidarspec.framing.plausibility import plausibility
 from lidarspec.framing.results import (
     CHECKSUM,
     CONSTANT,
@@ -39,80 +38,14 @@ from lidarspec.framing.results import (
     SHORT,
     VALID,
     Frames,
-    Recoded,
     Status,
 )
+from lidarspec.framing.text_frames import TextCodec
 from lidarspec.spec.description import Frame
-from lidarspec.spec.syntax import Mismatch, fixed_size, has_conditions
+from lidarspec.spec.syntax import Mismatch, has_conditions
 
 #: bytes of candidates looked at in one go, so that memory stays small on hostile streams.
 BLOCK = 1 << 19
-
-
-class Codec:
-    """The engine of one frame type.
-
-    Attributes:
-        prefix: the constants at the start: offset -> (mask, value).
-        marks: these, whole bytes first, which tell the most.
-        size: that of all its frames, None where they differ.
-        layout: that of all its frames, None where they differ or construct parses them.
-    """
-
-    layout: Layout | None = None
-
-    @property
-    def compiled(self) -> CompiledCodec | None:
-        """What knows the layouts of its frames, or of their rows; None where construct alone reads
-        them.
-        """
-        return None
-
-    def __init__(self, frame: Frame) -> None:
-        self.frame, self.schema = frame, schema(frame.tree)
-        self.prefix, self.size = (
-            prefix_of(frame.tree, frame.room),
-            fixed_size(frame.prepared) or None,
-        )
-        self.marks = marks(self.prefix)
-
-    def survey(
-        self,
-        buffer: NDArray[np.uint8],
-        offsets: NDArray[np.intp],
-        stops: NDArray[np.intp] | None = None,
-        *,
-        kind: int = 0,
-        gathered: bool = True,
-        sums: Sums | None = None,
-    ) -> Frames:
-        """The candidates at these offsets, each with its layout and whether it is a frame.
-
-        Args:
-            offsets: those whose prefix does not match must be left out.
-            stops: where their bytes end, and no more will come; by default with those of the
-                buffer.
-            kind: index of this type.
-            gathered: whether their bytes are wanted too, as `Frames.rows`.
-            sums: what computes checksums; by default their algorithms.
-        """
-        raise NotImplementedError
-
-    def survey_rows(
-        self, rows: NDArray[np.uint8], *, sums: Sums | None = None
-    ) -> tuple[Layout, Status, tuple[PluginError, ...]] | None:
-        """The layout of candidates of one size, one a row, the status of each, and failures of the
-        plugin; None where they have not one.
-        """
-        return None
-
-    def table(self, frames: Iterable[bytes]) -> Table:
-        """Frames known to be of this type, as columns."""
-        raise NotImplementedError
-
-    def gather(self, frames: Frames) -> Table:
-        """Frames that were found, all of this type, as columns."""
-        return self.table(map(frames.data, range(len(frames))))
 
 
 class CompiledCodec(Codec):
@@ -129,12 +62,7 @@ class CompiledCodec(Codec):
         super().__init__(frame)
         self.tree, layout = layouts, layouts.layout(b"")
         self.layout = layout if isinstance(layout, Layout) else None
-        self._conditions: Conditions | None = None
         self._alike = AlikeLayouts()
-
-    @property
-    def compiled(self) -> CompiledCodec:
-        return self
 
     def survey(
         self,
@@ -328,24 +256,13 @@ class CompiledCodec(Codec):
             )
         return Rows(self.schema, groups)
 
-    def judge(self, layout: Layout) -> Judge:
-        """What judges candidates of a layout that have the constants at the start."""
-        judge = layout.notes.get(Judge)
-        if judge is None:
-            self._conditions = self._conditions or Conditions(
-                self.frame.plausible, self.schema, layout
-            )
-            tests = self._conditions.met(layout), self._conditions.checks(layout)
-            judge = layout.notes[Judge] = Judge(
-                self.frame, self.schema, layout, self.prefix, *tests
-            )
-        return judge
-
 
 class InterpretedCodec(Codec):
     """A frame type that construct parses, one candidate at a time; `reason` says why it is not
     compiled.
     """
+
+    is_compiled = False
 
     def __init__(self, frame: Frame, reason: str = "") -> None:
         super().__init__(frame)
@@ -428,122 +345,6 @@ class InterpretedCodec(Codec):
         ), size
 
 
-class RecodedCodec(Codec):
-    """A frame type with a wire form: its rows are what `engine` knows as frames.
-
-    Raises:
-        SpecError: for a struct whose fields have no computable place.
-    """
-
-    def __init__(
-        self, frame: Frame, recoder: Recoder, engine: CompiledCodec | InterpretedCodec
-    ) -> None:
-        super().__init__(frame)
-        self.recoder, self.engine, self.size = recoder, engine, None
-        self.prefix = {spot: (0xFF, byte) for spot, byte in recoder.prefix.items()}
-        self.marks = marks(self.prefix)
-
-    @property
-    def compiled(self) -> CompiledCodec | None:
-        return self.engine.compiled
-
-    def survey(
-        self,
-        buffer: NDArray[np.uint8],
-        offsets: NDArray[np.intp],
-        stops: NDArray[np.intp] | None = None,
-        *,
-        kind: int = 0,
-        gathered: bool = True,
-        sums: Sums | None = None,
-    ) -> Frames:
-        if not len(
-            offsets
-        ):  # as most types of a sensor have none, the buffer is not gone through for each
-            return Frames(buffer, repeated(kind, 0), offsets, offsets, status=np.zeros(0, np.uint8))
-        reading = self.recoder.reading(buffer, offsets)
-        told = offsets + max(self.prefix, default=-1) < (
-            len(buffer) if stops is None else stops
-        )  # else it may be no candidate at all
-        status, errors = (
-            np.where((reading.sizes == 0) | ~told, SHORT, LENGTH).astype(np.uint8),
-            list[PluginError](),
-        )
-        whole = np.flatnonzero((reading.sizes > 0) & told)
-        if reading.intact is not None:
-            status[whole[~reading.intact[whole]]] = CHECKSUM
-            whole = whole[reading.intact[whole]]
-        groups = list[tuple[Layout, NDArray[np.intp], NDArray[np.uint8]]]()
-        for layout, which, rows, is_read in self.recoder.rows(
-            reading, offsets[whole], reading.sizes[whole]
-        ):
-            if isinstance(layout, Refused):
-                status[whole[which]] = PLUGIN if layout.error else LENGTH
-                errors += [layout.error] if layout.error else []
-                continue
-            own = whole[which] if is_read.all() else whole[which[is_read]]
-            if not len(own):
-                continue
-            good = rows if len(own) == len(which) else rows[is_read]
-            status[own] = self._judged(layout, good, errors, sums)
-            groups.append((layout, own, good))
-        recoded = (Recoded(kind, offsets, tuple(groups)),) if groups else ()
-        kinds, sizes = repeated(kind, len(offsets)), np.maximum(reading.sizes, 0)
-        return Frames(
-            buffer, kinds, offsets, sizes, status=status, errors=tuple(errors), recoded=recoded
-        )
-
-    def _judged(
-        self, layout: Layout, rows: NDArray[np.uint8], errors: list[PluginError], sums: Sums | None
-    ) -> NDArray[np.uint8]:
-        """The status of rows of one layout."""
-        if isinstance(self.engine, CompiledCodec):
-            held = right(words(self.engine.marks), rows)
-            status = self.engine.judge(layout)(rows, errors, sums)
-            return status if held is None else np.where(held, status, np.uint8(CONSTANT))
-        surveys = [self.engine.survey(row, np.zeros(1, np.intp)) for row in rows]
-        errors += [error for survey in surveys for error in survey.errors]
-        judged = ((survey.status.item(0), survey.sizes.item(0)) for survey in surveys)
-        return np.array(
-            [
-                LENGTH if status in (VALID, SHORT) and size != layout.size else status
-                for status, size in judged
-            ],
-            np.uint8,
-        )
-
-    def table(self, frames: Iterable[bytes]) -> Table:
-        frames = list(frames)
-        sizes = np.array([len(frame) for frame in frames], np.intp)
-        joined = np.frombuffer(b"".join(frames), np.uint8)
-        return self.gather(
-            Frames(joined, repeated(0, len(frames)), np.cumsum(sizes) - sizes, sizes)
-        )
-
-    def gather(self, frames: Frames) -> Table:
-        known = next(
-            (one.only(frames.starts) for one in frames.recoded if one.kind == alike(frames.kinds)),
-            None,
-        )
-        if known is None:
-            reading = self.recoder.reading(frames.buffer, frames.starts)
-            read = self.recoder.rows(reading, frames.starts, frames.sizes)
-            known = [
-                (layout, which[right], rows[right])
-                for layout, which, rows, right in read
-                if isinstance(layout, Layout)
-            ]
-        groups = [Group(*group) for group in known]
-        if isinstance(self.engine, CompiledCodec):
-            return Rows(self.schema, groups)
-        rows = {
-            spot: row.tobytes()
-            for group in groups
-            for spot, row in zip(group.where.tolist(), group.rows, strict=True)
-        }
-        return self.engine.table(rows[spot] for spot in sorted(rows))
-
-
 def _partial(
     buffer: NDArray[np.uint8],
     offsets: NDArray[np.intp],
@@ -573,22 +374,19 @@ def _partial(
 
 def codec(
     frame: Frame, *, interpreted: bool = False
-) -> CompiledCodec | InterpretedCodec | RecodedCodec:
-    """Return the engine of a frame type: compiled if that is possible and construct is not asked
-    for; always the same one.
+) -> CompiledCodec | InterpretedCodec | TextCodec:
+    """Return the engine of a frame type, always the same one.
+
+    It is compiled if that is possible and construct is not asked for.
     """
     return _codec(frame, interpreted)
 
 
 @functools.lru_cache(maxsize=2048)
-def _codec(frame: Frame, interpreted: bool) -> CompiledCodec | InterpretedCodec | RecodedCodec:
+def _codec(frame: Frame, interpreted: bool) -> CompiledCodec | InterpretedCodec | TextCodec:
     recoding = recoder(frame)
     if recoding is not None:
-        return RecodedCodec(
-            frame,
-            recoding,
-            InterpretedCodec(frame, "asked for") if interpreted else CompiledCodec(frame),
-        )
+        return TextCodec(frame, recoding)
     if interpreted:
         return InterpretedCodec(frame, "asked for")
     try:

@@ -21,7 +21,8 @@ from lidarspec.expressions.columns import Batch
 from lidarspec.frames.arrays import alike, repeated, some
 from lidarspec.frames.frame_table import Table
 from lidarspec.frames.schema import Schema
-from lidarspec.framing.frame_engine import Codec, codec
+from lidarspec.framing.frame_codec import Codec
+from lidarspec.framing.frame_engine import codec
 from lidarspec.framing.results import Counters, Frames, Numbers
 from lidarspec.packets.clock_order import ClockOrder
 from lidarspec.packets.clocks import (

@@ -37,12 +37,10 @@ class FrameMaker:
     """
 
     def __init__(self, sensor: Spec, frame: str) -> None:
-        known = codec(sensor.frames[frame])
-        engine = known.compiled
-        if engine is None:
-            reason = known.reason if isinstance(known, InterpretedCodec) else ""
+        engine = codec(sensor.frames[frame])
+        if isinstance(engine, InterpretedCodec):
             raise SpecError(
-                f"cannot be simulated, since it is not compiled: {reason}",
+                f"cannot be simulated, since it is not compiled: {engine.reason}",
                 path=frame,
                 sensor=sensor.id,
             )

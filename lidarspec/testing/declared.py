@@ -217,7 +217,7 @@ def _frame(subject: Subject, name: str, frame: Frame) -> Findings:
     engine = codec(frame)
     if not isinstance(frame.tree, Struct | Sealed):
         yield "LS114", f"it is a {type(frame.struct).__name__}", name
-    if engine.compiled is None:
+    if not engine.is_compiled:
         yield "LS116", getattr(engine, "reason", "its layout cannot be computed"), name
     elif engine.size is not None and engine.size != frame.max_length:
         yield (

@@ -26,7 +26,7 @@ def _no_sweep(subject: Subject) -> str:
     names = subject.sensor.data_frames
     if not any(subject.sensor.simulation_of(name).sweep for name in names):
         return "it declares no `sweep`, and cannot be simulated"
-    alone = [name for name in names if codec(subject.sensor.frames[name]).compiled is None]
+    alone = [name for name in names if not codec(subject.sensor.frames[name]).is_compiled]
     return f"{', '.join(alone)} is not compiled, and cannot be simulated" if alone else ""
 
 

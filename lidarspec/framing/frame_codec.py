@@ -1,0 +1,105 @@
+"""The interface of the engines of frame types: which candidates are frames, and frames as columns.
+
+`lidarspec.framing.frame_engine` has the engines of binary frames, `lidarspec.framing.text_frames`
+that of frames with a wire form.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lidarspec.errors import PluginError
+from lidarspec.frames.frame_table import Table
+from lidarspec.frames.layout import Layout, Sums, marks
+from lidarspec.frames.layout_tree import prefix_of
+from lidarspec.frames.schema import schema
+from lidarspec.framing.plausibility import Conditions, Judge
+from lidarspec.framing.results import Frames, Status
+from lidarspec.spec.description import Frame
+from lidarspec.spec.syntax import fixed_size
+
+
+class Codec:
+    """The engine of one frame type.
+
+    Attributes:
+        prefix: the constants at the start: offset -> (mask, value).
+        marks: these, whole bytes first, which tell the most.
+        size: that of all its frames, None where they differ.
+        layout: that of all its frames, None where they differ or construct parses them.
+        is_compiled: whether its layouts can be computed; else construct parses each frame.
+    """
+
+    layout: Layout | None = None
+    is_compiled = True
+
+    def __init__(self, frame: Frame) -> None:
+        self.frame = frame
+        self.schema = schema(frame.tree)
+        self.prefix = prefix_of(frame.tree, frame.room)
+        self.marks = marks(self.prefix)
+        self.size = fixed_size(frame.prepared) or None
+        self._conditions: Conditions | None = None
+
+    def survey(
+        self,
+        buffer: NDArray[np.uint8],
+        offsets: NDArray[np.intp],
+        stops: NDArray[np.intp] | None = None,
+        *,
+        kind: int = 0,
+        gathered: bool = True,
+        sums: Sums | None = None,
+    ) -> Frames:
+        """The candidates at these offsets, each with its layout and whether it is a frame.
+
+        Args:
+            offsets: those whose prefix does not match must be left out.
+            stops: where their bytes end, and no more will come; by default with those of the
+                buffer.
+            kind: index of this type.
+            gathered: whether their bytes are wanted too, as `Frames.rows`.
+            sums: what computes checksums; by default their algorithms.
+        """
+        raise NotImplementedError
+
+    def survey_rows(
+        self, rows: NDArray[np.uint8], *, sums: Sums | None = None
+    ) -> tuple[Layout, Status, tuple[PluginError, ...]] | None:
+        """The layout of candidates of one size, one a row, the status of each, and failures of the
+        plugin; None where they have not one.
+        """
+        return None
+
+    def table(self, frames: Iterable[bytes]) -> Table:
+        """Frames known to be of this type, as columns."""
+        raise NotImplementedError
+
+    def table_of_structs(self, structs: Iterable[bytes]) -> Table:
+        """Frames of this type, given as the bytes of their structs, as columns."""
+        return self.table(structs)
+
+    def gather(self, frames: Frames) -> Table:
+        """Frames that were found, all of this type, as columns."""
+        return self.table(map(frames.data, range(len(frames))))
+
+    @property
+    def _checked_constants(self) -> Mapping[int, tuple[int, int]]:
+        """The constants that candidates are known to have before they are judged."""
+        return self.prefix
+
+    def judge(self, layout: Layout) -> Judge:
+        """What judges candidates of a layout that have the constants at the start."""
+        judge = layout.notes.get(Judge)
+        if judge is None:
+            self._conditions = self._conditions or Conditions(
+                self.frame.plausible, self.schema, layout
+            )
+            tests = self._conditions.met(layout), self._conditions.checks(layout)
+            judge = layout.notes[Judge] = Judge(
+                self.frame, self.schema, layout, self._checked_constants, *tests
+            )
+        return judge
