@@ -12,6 +12,7 @@ from typing import Any
 
 import by_hand
 import libraries
+from hostile_streams import streams
 from inputs import QUICKER, Inputs
 from measure import Contender, Rates, times
 from peers import STRUCTS
@@ -22,7 +23,6 @@ from lidarspec.captures.bulk import CaptureBatches
 from lidarspec.captures.pcap import CaptureReader
 from lidarspec.packets.stream import PacketStream
 from lidarspec.spec import Serial
-from lidarspec.testing.hostile import streams
 from lidarspec.testing.subject import Subject
 
 RATE = 6300  # packets per second of an RS-LiDAR-M1

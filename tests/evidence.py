@@ -15,7 +15,7 @@ import numpy as np
 import pytest
 
 from lidarspec import Packets, PointCloud, Sensor
-from lidarspec.testing.agreement import assert_same_points
+from tests.agreement import assert_same_points
 
 _SHARED = Path(__file__).resolve().parents[2] / "shared"
 CAPTURES = Path(os.environ.get("LIDARSPEC_CAPTURES", _SHARED / "captures"))

@@ -18,8 +18,8 @@ reading order:
 * `consistency`: whether angles, clock and times of points agree.
 * `geometry`: whether points are where the manual has them.
 * `commands`: requests, replies, and the simulated sensor's answers.
-* `agreement`: two ways to the same result.
-* `hostile`: streams that cost most, made of the sensor's own frames.
+* `streams`: streams of frames, decoded twice and in batches.
+* `clouds`: assertions about point clouds.
 * `vectors`: golden frames out of a manual or capture.
 * `check`: all of it without pytest, for a name, file, distribution or folder.
 * `plugin`, `fixtures`: fixtures for pytest; simulated sensors on real ports.
@@ -43,8 +43,8 @@ def __getattr__(name: str) -> Any:
         raise AttributeError(f"module 'lidarspec.testing' has no attribute {name!r}")
     import_library("hypothesis", "testing")
     pytest = import_library("pytest", "testing")
-    if "lidarspec.testing.agreement" not in sys.modules:  # pytest warns of one that is
-        pytest.register_assert_rewrite("lidarspec.testing.agreement")
+    if "lidarspec.testing.clouds" not in sys.modules:  # pytest warns of one that is
+        pytest.register_assert_rewrite("lidarspec.testing.clouds")
     from lidarspec.testing import conformance
 
     return getattr(conformance, name)

@@ -94,14 +94,9 @@ LS311 examples are not repeatable or too long | what fails once cannot be looked
 LS312 a field that `Rebuild` fills in, and nothing holds | a frame that says otherwise is taken, and built as another
       | the same in `plausible`: f.length == f.size + 5
 LS401 a clean stream loses bytes | good frames are lost without any damage | frames whose parts are declared in full
-LS402 compiled and interpreted differ | results depend on which engine is at work | expressions that need nothing but the frame
-LS403 single packets and a batch differ | live and recorded data give different points | `points` without memory of its own
 LS404 scans depend on how packets arrive | the same revolution is cut elsewhere | `points` without memory of its own
-LS405 the split of a stream changes its frames | a header at the end of a chunk is dropped | Sensor.decoder as it is
 LS414 the plugin fails at work | what it fails on is lost, and only counted | functions that hold for every valid frame
 LS415 the same bytes give different results | nothing can be reproduced | functions of the fields, without clock or chance
-LS416 a stream that costs far more than frames do | whoever sends it holds up the reader, and fills its memory
-      | lengths and keys as expressions of fields, which are seen through; no work of one's own for each header
 LS501 a cloud that breaks the conventions | x y z mean something else than users expect | what Polar asks for: metres, radians, 0: no return
 LS502 degrees where radians are due | points go everywhere but where they are | np.deg2rad(...)
 LS503 no direction for a single point | a count of 1 divides by count - 1 | spread(start, end, count, full=360.0)

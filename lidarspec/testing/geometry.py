@@ -41,7 +41,7 @@ from lidarspec.spec.fields import factor
 from lidarspec.spec.tree import FieldInfo
 from lidarspec.spec.vocabulary import LookUp
 from lidarspec.testing import subject as material
-from lidarspec.testing.agreement import assert_well_formed
+from lidarspec.testing.clouds import assert_well_formed
 from lidarspec.testing.findings import Violation, require
 from lidarspec.testing.frames import acceptable
 from lidarspec.testing.subject import Subject

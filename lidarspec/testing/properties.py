@@ -1,8 +1,7 @@
 """The table of properties that every sensor must have, for `lidarspec check` and for pytest.
 
 A property is a function of a `Subject` that raises an exception if it does not hold. It proves the
-declaration, not the engine: the engine is tested on its own. One property tests both, because a
-declaration may contain functions (`agreement.parse_decode_and_any_cutting_agree`).
+declaration, not the engine, which has tests of its own.
 
 This module imports neither pytest nor hypothesis, so that it can be imported without the extra
 `testing`; `conformance` makes a test for pytest of it.
@@ -17,7 +16,7 @@ from pathlib import Path
 
 from lidarspec.errors import SpecError
 from lidarspec.framing.frame_engine import codec
-from lidarspec.testing import agreement, commands, consistency, frames, geometry, hostile, vectors
+from lidarspec.testing import commands, consistency, frames, geometry, streams, vectors
 from lidarspec.testing.findings import Finding, Violation
 from lidarspec.testing.subject import Subject
 
@@ -188,36 +187,15 @@ PROPERTIES = (
         unless=(*FAILS, "LS509"),
     ),
     Property(
-        agreement.the_same_bytes_give_the_same_points,
+        streams.the_same_bytes_give_the_same_points,
         "sensor",
         "LS415",
         unless=FAILS,
         depends_on=READING,
     ),
-    Property(agreement.a_clean_input_loses_nothing, "sensor", "LS401", depends_on=READING),
+    Property(streams.a_clean_input_loses_nothing, "sensor", "LS401", depends_on=READING),
     Property(
-        agreement.parse_decode_and_any_cutting_agree,
-        "sensor",
-        "LS402",
-        unless=("LS308", "LS306", "LS401", *FAILS, "LS415"),
-        depends_on=READING,
-    ),
-    Property(
-        hostile.no_stream_costs_much_more_than_frames,
-        "sensor",
-        "LS416",
-        unless=("LS301", *FAILS),
-        depends_on=("frames",),
-    ),
-    Property(
-        agreement.single_packets_equal_a_batch,
-        "sensor",
-        "LS403",
-        unless=("LS415",),
-        depends_on=READING,
-    ),
-    Property(
-        agreement.scans_do_not_depend_on_batches,
+        streams.scans_do_not_depend_on_batches,
         "sensor",
         "LS404",
         unless=(*FAILS, "LS415"),

@@ -11,9 +11,9 @@ from lidarspec import Sensor
 from lidarspec.framing.frame_engine import CompiledCodec, InterpretedCodec, codec
 from lidarspec.spec import Frame
 from lidarspec.testing import subject as material
-from lidarspec.testing.agreement import assert_backends_agree
 from lidarspec.testing.frames import acceptable, free
 from lidarspec.testing.subject import Subject
+from tests.agreement import assert_backends_agree
 
 DAMAGED_CONVERSATIONS = 2
 EDGE_EXAMPLES = 5

@@ -10,8 +10,8 @@ from __future__ import annotations
 
 from lidarspec import Sensor
 from lidarspec.testing import subject as material
-from lidarspec.testing.agreement import cuts
 from lidarspec.testing.subject import Subject
+from tests.agreement import cuts
 from tests.engine.oracle import Cut, Oracle
 from tests.engine.streams import (
     LENGTH,

@@ -14,8 +14,8 @@ from lidarspec import Counters, Sensor, SpecError
 from lidarspec.framing.examples import header, random_frame
 from lidarspec.framing.frame_engine import CompiledCodec, codec
 from lidarspec.testing import subject as material
-from lidarspec.testing.agreement import cuts
 from lidarspec.testing.subject import Subject
+from tests.agreement import cuts
 from tests.engine.oracle import Cut
 
 #: about so many bytes to a stream: the oracle takes its time.

@@ -25,7 +25,7 @@ from lidarspec.expressions.graph import (
 from lidarspec.points.evaluate import evaluated
 from lidarspec.points.plain import evaluate as plainly
 from lidarspec.spec import Fields, Polar, stack, take
-from lidarspec.testing.agreement import assert_same_points
+from tests.agreement import assert_same_points
 
 STL27L = lidarspec.sensor("ldrobot-stl27l")
 PACKETS = STL27L.decode(b"".join(STL27L.example("data", seed=seed) for seed in range(5)))

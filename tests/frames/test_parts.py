@@ -14,7 +14,7 @@ from construct import Array, Bytes, Const, Int8ub, Int16ub, Int32ub, Struct, thi
 from lidarspec import Sensor, SpecError, UsageError, WireError
 from lidarspec.frames.layout_tree import HeaderNode, HeaderTree
 from lidarspec.spec import Checksummed, Frame, Parts, Simulation, Sum, Xor
-from lidarspec.testing.agreement import assert_backends_agree
+from tests.agreement import assert_backends_agree
 from tests.engine import against_construct
 from tests.engine.streams import Books
 from tests.shapes import SHAPES

@@ -29,7 +29,8 @@ from lidarspec.points.cloud import LazyCloud, Mount
 from lidarspec.points.evaluate import evaluated
 from lidarspec.points.plain import evaluate
 from lidarspec.spec import Cartesian, Extra, Fields, Frame, Polar, Scaled, Simulation, along, take
-from lidarspec.testing.agreement import assert_same_points, assert_well_formed
+from lidarspec.testing.clouds import assert_well_formed
+from tests.agreement import assert_same_points
 from tests.points.backends import BACKENDS, EVERY_BACKEND
 from tests.shapes import SHAPES
 

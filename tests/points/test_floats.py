@@ -17,7 +17,8 @@ from lidarspec.points.cloud import LazyCloud
 from lidarspec.points.evaluate import evaluated
 from lidarspec.points.plain import evaluate
 from lidarspec.spec import Cartesian
-from lidarspec.testing.agreement import assert_same_points, assert_well_formed
+from lidarspec.testing.clouds import assert_well_formed
+from tests.agreement import assert_same_points
 from tests.points.backends import BACKENDS
 from tests.shapes import SHAPES
 from tests.shapes.coordinates import POINTS, SENSORS

@@ -30,8 +30,8 @@ from lidarspec.points.plan import Plan, plan_for
 from lidarspec.simulation.simulator import opening
 from lidarspec.spec import Checksum, Checksummed, Crc, Fields, Polar, WordXor, Xor
 from lidarspec.spec.links import is_datagram
-from lidarspec.testing.agreement import assert_same_points
 from lidarspec.testing.subject import Subject
+from tests.agreement import assert_same_points
 from tests.engine import against_construct
 from tests.installed import sensor_modules, sensors_in
 from tests.points.backends import COMPILED

@@ -20,8 +20,8 @@ from lidarspec.points.plain import evaluate
 from lidarspec.points.plan import Plan, plan_for
 from lidarspec.spec import Fields, Polar, Scaled, take
 from lidarspec.spec.links import is_datagram
-from lidarspec.testing.agreement import assert_same_points
 from lidarspec.testing.subject import Subject
+from tests.agreement import assert_same_points
 from tests.broken import sound
 from tests.engine.against_construct import clouds_agree, sensor
 from tests.engine.random_specs import made

@@ -12,7 +12,7 @@ from lidarspec import PointCloud, UsageError, simulate
 from lidarspec.points.evaluate import evaluated
 from lidarspec.points.plain import evaluate
 from lidarspec.spec import Fields, Polar, stack
-from lidarspec.testing.agreement import assert_same_points
+from tests.agreement import assert_same_points
 from tests.points.backends import EVERY_BACKEND
 from tests.shapes import SHAPES
 from tests.shapes.columns import AZIMUTHS, COLUMNS, PIXELS, TURN

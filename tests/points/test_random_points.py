@@ -18,7 +18,7 @@ from lidarspec.points.evaluate import evaluated
 from lidarspec.points.plain import evaluate
 from lidarspec.points.plan import Plan, plan_for
 from lidarspec.spec import Fields, Polar, following, previous, spread, take, wrap
-from lidarspec.testing.agreement import assert_same_points
+from tests.agreement import assert_same_points
 
 Expression = Callable[[Fields], Any]
 

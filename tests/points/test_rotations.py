@@ -17,7 +17,7 @@ from lidarspec.expressions.columns import remainder
 from lidarspec.points.evaluate import evaluated
 from lidarspec.points.plain import evaluate
 from lidarspec.spec import Fields, Polar, spread
-from lidarspec.testing.agreement import assert_same_points
+from tests.agreement import assert_same_points
 
 OFFSETS = np.linspace(-40, 25, 12)
 

@@ -27,7 +27,7 @@ from lidarspec.spec import (
     steps,
     wrap,
 )
-from lidarspec.testing.agreement import assert_same_points
+from tests.agreement import assert_same_points
 from tests.engine import against_construct
 from tests.shapes import SHAPES, calibration
 

@@ -92,7 +92,6 @@ DECLARED = {
     "not_held": {"LS312"},
     "blind_checksum": {"LS310"},
     "points_fail": {"LS414"},
-    "dear_headers": {"LS416"},
     "with_memory": {"LS415"},
     "degrees": {"LS502"},
     "bare_coordinates": {"LS201", "LS502"},

@@ -19,7 +19,6 @@ from typing import Any
 import numpy as np
 import pytest
 from construct import (
-    Adapter,
     Array,
     Bytes,
     Const,
@@ -38,7 +37,7 @@ from hypothesis import strategies as st
 
 from lidarspec import Sensor
 from lidarspec.framing.examples import random_frame
-from lidarspec.framing.frame_engine import CompiledCodec, InterpretedCodec
+from lidarspec.framing.frame_engine import CompiledCodec
 from lidarspec.spec import (
     Checksummed,
     Command,
@@ -55,7 +54,6 @@ from lidarspec.spec import (
     take,
 )
 from lidarspec.testing import frames
-from lidarspec.testing.agreement import parse_decode_and_any_cutting_agree
 from lidarspec.testing.check import Target, reports
 from lidarspec.testing.commands import the_simulated_sensor_answers
 from lidarspec.testing.declared import declared
@@ -65,13 +63,11 @@ from lidarspec.testing.frames import (
     values_survive_building_and_parsing,
 )
 from lidarspec.testing.geometry import the_points_turn_as_the_axes_do
-from lidarspec.testing.hostile import MAX_CALLS_PER_BYTE, calls_per_byte, streams
 from lidarspec.testing.properties import PROPERTIES, Property
 from lidarspec.testing.subject import Subject
 from lidarspec.testing.vectors import vectors_hold
 from tests.broken import (
     code_for_range,
-    dear_headers,
     intensity_of_distance,
     no_example,
     no_wrap_aligned,
@@ -165,14 +161,6 @@ def test_the_plugin_loads_nothing_of_the_engine(tmp_path: Path) -> None:
     assert done.returncode == 0, done.stdout
 
 
-def test_cost_of_a_stream_is_counted_in_function_calls() -> None:
-    (dear,) = dear_headers.lidarspec_sensors()
-    heads = "heads of frames"
-    for sensor, is_dear in ((dear, True), (sound.sensor(), False)):
-        stream = streams(Subject(sensor), length=1500)[heads]
-        assert (calls_per_byte(sensor, stream) > MAX_CALLS_PER_BYTE) == is_dear
-
-
 #: bytes of a frame that is too long to try everything with it, and of its copies with flipped bits
 #: that are tried.
 LONG = 100_000
@@ -219,35 +207,6 @@ def test_work_with_a_long_frame_is_limited_in_bytes(
     monkeypatch.setattr(Sensor, "parse", counting_parse)
     monkeypatch.setattr(CompiledCodec, "survey", counting_survey)
     check.function(Subject(sensor), "picture")
-
-
-def test_a_long_frame_that_construct_alone_reads_is_not_begun_anew_for_each_byte(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    class Unknown(Adapter):
-        def _decode(self, obj: int, context: Any, path: str) -> int:
-            return obj
-
-        def _encode(self, obj: int, context: Any, path: str) -> int:
-            return obj
-
-    struct = Struct(
-        "header" / Const(b"\x91\x37\xc9"), "kind" / Unknown(Int8ul), "picture" / Bytes(LONG - 4)
-    )
-    sensor = sound.sensor(
-        frames={**sound.sensor().frames, "picture": Frame(struct, max_length=LONG)}
-    )
-    read = 0
-    judge = InterpretedCodec._judge
-
-    def counting_judge(self: InterpretedCodec, data: bytes, errors: list[Any]) -> tuple[int, int]:
-        nonlocal read
-        read += len(data)
-        return judge(self, data, errors)
-
-    monkeypatch.setattr(InterpretedCodec, "_judge", counting_judge)
-    parse_decode_and_any_cutting_agree(Subject(sensor))
-    assert read <= 120 * LONG
 
 
 def test_progress_names_each_case_before_it_begins() -> None:

@@ -14,7 +14,7 @@ import pytest
 import lidarspec as ls
 from lidarspec import simulate
 from lidarspec.detect.identification import Heard, verdict
-from lidarspec.testing.agreement import assert_same_points
+from tests.agreement import assert_same_points
 from tests.evidence import assert_points, clockwise, decoded, vector_bytes, vectors
 
 FILE = "vectors_serial2d.json"

@@ -18,10 +18,10 @@ from lidarspec import simulate
 from lidarspec.detect.identification import Heard, verdict
 from lidarspec.simulation.faults import Faults
 from lidarspec.spec import Learned, Tcp, Udp
-from lidarspec.testing.agreement import assert_same_points
 from lidarspec.testing.fixtures import virtual_port
 from lidarspec_hesai import at128
 from lidarspec_hesai.xt import TABLE_32
+from tests.agreement import assert_same_points
 from tests.evidence import PROTOCOLS, assert_points, decoded, vector_bytes, vectors
 from tests.lines import SLACK, free_port
 

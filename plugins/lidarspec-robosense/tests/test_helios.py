@@ -16,7 +16,7 @@ import lidarspec as ls
 from lidarspec import simulate
 from lidarspec.captures.pcap import CaptureReader
 from lidarspec.packets.stream import PacketStream
-from lidarspec.testing.agreement import assert_same_points
+from tests.agreement import assert_same_points
 from tests.evidence import assert_points, capture, clockwise, decoded, vector_bytes, vectors
 
 FILE = "vectors_udp3d.json"

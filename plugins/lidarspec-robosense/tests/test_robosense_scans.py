@@ -12,7 +12,7 @@ import pytest
 import lidarspec as ls
 from lidarspec.packets.stream import PacketStream
 from lidarspec.scans.scans import ScanStream
-from lidarspec.testing.agreement import assert_same_points
+from tests.agreement import assert_same_points
 from tests.evidence import decoded, vector_bytes, vectors
 
 FILE = "vectors_udp3d.json"

@@ -1,0 +1,103 @@
+"""Assertions about point clouds: conventions of one cloud, equality of two.
+
+Two evaluations of the same packets round differently, because batches and single packets take
+different paths through NumPy. `assert_same_places` allows for that and for nothing else.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lidarspec.points.cloud import PointCloud
+
+#: Tolerance of coordinates and angles, in units in the last place at the size of the range.
+ULPS = 4
+#: Tolerance of times in seconds; batches begin at different packets.
+TIME_TOLERANCE_S = 1e-6
+#: Tolerance of the stamp of a cloud.
+STAMP_TOLERANCE_NS = 1000
+
+
+def assert_well_formed(cloud: PointCloud) -> None:
+    """Fail unless the cloud keeps the conventions: types, angles, REP-117, no place without return."""
+    valid = cloud.valid
+    assert cloud.x.dtype == cloud.y.dtype == cloud.z.dtype == cloud.range.dtype == np.float32
+    assert cloud.time.dtype == np.float64
+    assert all(len(column) == len(cloud) for column in cloud.columns.values())
+    assert np.isfinite(cloud.xyz[valid]).all()
+    assert np.isfinite(cloud.range[valid]).all()
+    assert np.isnan(cloud.xyz[~valid]).all()
+    assert (cloud.range[valid] >= 0).all()
+    known = cloud.azimuth[np.isfinite(cloud.azimuth)]
+    assert ((known >= -np.pi) & (known < np.pi)).all()
+
+
+def assert_same_places(one: PointCloud, other: PointCloud, *, ulps: int = ULPS) -> None:
+    """Fail unless both clouds have the same columns, masks, places, directions and times.
+
+    Coordinates are compared at the size of the range, azimuths on the circle, times to a
+    microsecond. All other columns have to be equal.
+
+    Args:
+        ulps: tolerance of coordinates and angles in units in the last place.
+    """
+    assert one.columns.keys() == other.columns.keys()
+    assert same(one.valid, other.valid)
+    reach = _reach(one)
+    range_tolerance = ulps * np.spacing(np.minimum(reach, np.abs(one.range)))
+    tolerances: dict[str, tuple[Any, float]] = {
+        **dict.fromkeys("xyz", (ulps * np.spacing(reach), 0.0)),
+        "range": (range_tolerance, 0.0),
+        **dict.fromkeys(
+            ("azimuth", "elevation"), (ulps * np.spacing(np.float32(np.pi)), 2 * np.pi)
+        ),
+    }
+    for name in one.columns.keys() - {"time"}:
+        first = one.columns[name]
+        second = other.columns[name]
+        if name in tolerances:
+            tolerance, full_circle = tolerances[name]
+            assert _is_close(first, second, tolerance, full_circle), f"{name} differs"
+        else:
+            assert same(first, second), f"{name} differs"
+    assert one.time.shape == other.time.shape
+    assert np.allclose(one.time, other.time, rtol=1e-12, atol=TIME_TOLERANCE_S, equal_nan=True)
+    assert abs(one.stamp_ns - other.stamp_ns) <= STAMP_TOLERANCE_NS
+    assert one.shape == other.shape
+
+
+def _reach(cloud: PointCloud) -> NDArray[np.float32]:
+    """Return the largest coordinate of each point, at least 1 m, as the size of its rounding."""
+    lengths = np.stack([cloud.range, cloud.x, cloud.y, cloud.z, np.ones(len(cloud))])
+    with np.errstate(invalid="ignore"):
+        size = np.nanmax(np.abs(lengths), axis=0, initial=0).astype(np.float32)
+    return np.where(np.isfinite(size), size, 1).astype(np.float32)
+
+
+def _is_close(
+    one: NDArray[Any], other: NDArray[Any], tolerance: Any, full_circle: float = 0.0
+) -> bool:
+    """Return whether two arrays differ by no more than a tolerance, on a circle if one is given.
+
+    NaN equals NaN, and an infinity itself.
+    """
+    if one.dtype != other.dtype or one.shape != other.shape:
+        return False
+    with np.errstate(invalid="ignore"):
+        apart = np.abs(one.astype(np.float64) - other.astype(np.float64))
+        if full_circle:
+            apart = np.minimum(apart, np.abs(full_circle - apart))
+        both_nan = np.isnan(one) & np.isnan(other)
+        return bool(((apart <= tolerance) | (one == other) | both_nan).all())
+
+
+def same(one: NDArray[Any], other: NDArray[Any]) -> bool:
+    """Return whether two arrays are equal in shape, type and value; NaN equals NaN."""
+    return (
+        one.dtype == other.dtype
+        and one.shape == other.shape
+        and np.array_equal(one, other, equal_nan=one.dtype.kind == "f")
+    )

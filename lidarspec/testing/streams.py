@@ -1,0 +1,110 @@
+"""Properties of a sensor's streams: no frame is lost, results repeat, scans keep their cuts.
+
+The frame types of a sensor may hide each other, and its functions (`plausible`, `points`, `clock`)
+may depend on more than the frame that they are given: on memory, on chance, or on the other packets
+of a batch. The engine itself is proved by lidarspec's own tests.
+"""
+
+from __future__ import annotations
+
+from lidarspec.framing.decoder import Decoder
+from lidarspec.framing.results import Found, packed
+from lidarspec.packets.stream import PacketStream
+from lidarspec.points.plain import evaluate
+from lidarspec.scans.scans import Scan, scans_of
+from lidarspec.spec.sensor import Sensor
+from lidarspec.testing import subject as material
+from lidarspec.testing.clouds import assert_same_places, assert_well_formed
+from lidarspec.testing.findings import Violation, require
+from lidarspec.testing.subject import Subject
+
+#: Rounds of a conversation if a shorter one has no scan, since few random frames of a sensor have
+#: points.
+MORE_ROUNDS = 12
+#: Packets that come at a time when scans are cut again.
+BATCH_SIZES = (1, 3)
+
+
+def a_clean_input_loses_nothing(subject: Subject) -> None:
+    """Frames back to back are found as they are, with every byte."""
+    sent = subject.conversation()
+    data = material.delivery(subject.sensor, sent)
+    found = [(item.frame, item.data) for item in subject.sensor.split(data)]
+    if found != sent:
+        raise _loss(sent, found)
+    stats = subject.sensor.decode(data).stats
+    require(not stats.plugin_errors, "LS414", str(stats.failure("")))
+    require(
+        (stats.bytes_skipped, stats.pending) == (0, 0),
+        "LS401",
+        f"{stats.bytes_skipped} bytes skipped, {stats.pending} pending",
+    )
+
+
+def _loss(sent: list[tuple[str, bytes]], found: list[tuple[str, bytes]]) -> Violation:
+    """Return the violation for the first frame that is not found as it was sent."""
+    equal = 0
+    for one, other in zip(sent, found, strict=False):
+        if one != other:
+            break
+        equal += 1
+    name = sent[min(equal, len(sent) - 1)][0]
+    text = f"of {len(sent)} frames, number {equal} is not found"
+    if equal < len(found) and found[equal][0] != name:
+        return Violation("LS306", f"{text}; a {found[equal][0]!r} frame is found there", name)
+    return Violation("LS401", text, name)
+
+
+def the_same_bytes_give_the_same_points(subject: Subject) -> None:
+    """Decoding the same bytes twice gives the same points.
+
+    `points` is called for each run: the plan of a traced function would not call it again.
+    """
+    data = material.delivery(subject.sensor, subject.conversation(rounds=1))
+    one = evaluate(subject.sensor.decode(data).with_points).cloud
+    other = evaluate(subject.sensor.decode(data).with_points).cloud
+    require(len(one) == len(other), "LS415", "two runs give different numbers of points")
+    for name, column in one.columns.items():
+        require(
+            column.tobytes() == other.columns[name].tobytes(),
+            "LS415",
+            f"two runs give another {name}",
+            f"{subject.sensor.data_frame}.points",
+        )
+
+
+def scans_do_not_depend_on_batches(subject: Subject) -> None:
+    """Scans are cut alike, with the same points, however many packets come at a time."""
+    for rounds in (None, MORE_ROUNDS):
+        data = material.delivery(subject.sensor, subject.conversation(rounds=rounds))
+        found = subject.sensor.split(data)
+        whole = _scans_in_batches(subject.sensor, found, len(found))
+        if whole:
+            break
+    require(whole, "LS404", "there is no scan")
+    for size in BATCH_SIZES:
+        parts = _scans_in_batches(subject.sensor, found, size)
+        require(
+            [_cut(scan) for scan in parts] == [_cut(scan) for scan in whole],
+            "LS404",
+            f"{size} packets at a time give other scans than all at once",
+        )
+        for part, other in zip(parts, whole, strict=True):
+            assert_well_formed(part.points)
+            assert_same_places(part.points, other.points)
+
+
+def _scans_in_batches(sensor: Sensor, found: list[Found], size: int) -> list[Scan]:
+    """Return the scans of frames that come `size` at a time."""
+    stats = Decoder(sensor, stream=True).stats
+    stream = PacketStream(sensor, sensor.data_frame, stats)
+    starts = range(0, len(found), size)
+    batches = [stream.add([packed(found[start : start + size])]) for start in starts]
+    scans = list(scans_of(sensor, batches))
+    require(not stats.plugin_errors, "LS414", str(stats.failure("")))
+    return scans
+
+
+def _cut(scan: Scan) -> tuple[int, bool, bool]:
+    """Return how many points a scan has, and whether it is whole and complete."""
+    return len(scan), scan.whole, scan.complete

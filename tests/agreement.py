@@ -1,0 +1,90 @@
+"""Assertions that two ways through the engine give the same frames, packets and points."""
+
+from __future__ import annotations
+
+import copy
+from collections.abc import Iterable, Sequence
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lidarspec import Packets, PointCloud, Sensor, SpecError
+from lidarspec.framing.decoder import Decoder, frames_of, is_stream
+from lidarspec.framing.results import Found, Frames
+from lidarspec.packets.stream import PacketStream
+from lidarspec.testing.clouds import ULPS, assert_same_places, assert_well_formed, same
+
+
+def cuts(found: Iterable[Found]) -> list[tuple[str, int, bytes]]:
+    """Return (type, offset, bytes) of frames, without their times."""
+    return [(item.frame, item.offset, item.data) for item in found]
+
+
+def assert_same_packets(one: Packets, other: Packets) -> None:
+    """Fail unless both hold the same raw numbers, places, times, breaks and counters."""
+    assert one.raw.dtype == other.raw.dtype
+    for path in one.table.schema.fields:
+        assert same(one.table.raw(path), other.table.raw(path)), f"raw {path} differs"
+        assert same(one[path], other[path]), f"{path} differs"
+    for array in one.table.schema.arrays:
+        assert same(_lengths(one, array), _lengths(other, array)), f"the lengths of {array} differ"
+    for name in ("offset", "time_ns", "host_ns", "index", "breaks"):
+        assert same(getattr(one, name), getattr(other, name)), f"{name} differs"
+    assert one.stats == other.stats
+    for axis, node in one.table.schema.parts.items():
+        assert same(one.count(axis), other.count(axis)), f"the numbers of {axis} differ"
+        for kind in node.kinds:
+            parts = f"{axis}.{kind.name}".rstrip(".")
+            assert_same_packets(one.parts(parts), other.parts(parts))
+
+
+def _lengths(packets: Packets, array: str) -> NDArray[np.intp]:
+    """Return the lengths of an array in each packet; none if elements of one frame differ in it."""
+    try:
+        return packets.count(array)
+    except SpecError:
+        return np.empty(0, np.intp)
+
+
+def assert_same_points(one: PointCloud, other: PointCloud, *, ulps: int = ULPS) -> None:
+    """Fail unless both clouds have the same points, masks, places, times and stamps.
+
+    Args:
+        ulps: tolerance of coordinates and angles in units in the last place.
+    """
+    assert_same_places(one, other, ulps=ulps)
+    assert np.allclose(one.time, other.time, rtol=0, atol=1e-11, equal_nan=True)
+    assert (one.stamp_ns, bool(one.nominal)) == (other.stamp_ns, bool(other.nominal))
+
+
+def assert_backends_agree(sensor: Sensor, data: Any) -> None:
+    """Fail unless the compiled and the interpreted path agree and no plugin failed.
+
+    Frames, packets, points and counters are compared.
+
+    Args:
+        data: bytes, or a list of datagrams.
+    """
+    decoders = [
+        sensor.decoder(stream=is_stream(data), backend=backend) for backend in ("auto", "construct")
+    ]
+    found = [frames_of(decoder, data) for decoder in decoders]
+    split = [cuts(frame for frames in each for frame in frames.found()) for each in found]
+    assert split[0] == split[1]
+    for name in dict.fromkeys((sensor.data_frame, *(name for name, _, _ in split[0]))):
+        compiled, interpreted = (
+            _packets(decoder, name, each) for decoder, each in zip(decoders, found, strict=True)
+        )
+        assert not compiled.stats.plugin_errors, compiled.stats.tracebacks[0]
+        assert_same_packets(compiled, interpreted)
+        if sensor.frames[name].data:
+            cloud = compiled.points()
+            assert_well_formed(cloud)
+            assert_same_points(cloud, interpreted.points())
+
+
+def _packets(decoder: Decoder, name: str, found: Sequence[Frames]) -> Packets:
+    """Return the packets of one type among the frames of a whole input."""
+    stats = copy.deepcopy(decoder.stats)
+    return PacketStream(decoder.sensor, name, stats, backend=decoder.backend).add(found, whole=True)

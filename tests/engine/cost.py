@@ -1,0 +1,58 @@
+"""Cost of finding frames in a stream, counted in function calls and in bytes of memory.
+
+A time would depend on the other work of the machine.
+"""
+
+from __future__ import annotations
+
+import cProfile
+import gc
+import tracemalloc
+
+from lidarspec import Sensor
+from lidarspec.framing.results import Frames
+
+#: Function calls for each byte of a stream. Compiled frames need up to 16.
+MAX_CALLS_PER_BYTE = 100
+#: Bytes of memory for each byte of a stream that its frames are kept in.
+MAX_KEPT_PER_BYTE = 64
+
+
+def calls_per_byte(sensor: Sensor, data: bytes) -> float:
+    """Return the number of function calls per byte that it takes to find the frames of a stream.
+
+    Calls of functions written in C count too; the work inside one of them does not.
+    """
+    profile = cProfile.Profile()
+    collects = gc.isenabled()
+    gc.disable()  # a collection calls finalizers of other objects
+    profile.enable()
+    try:
+        _find_frames(sensor, data)
+    finally:
+        profile.disable()
+        if collects:
+            gc.enable()
+    return sum(entry.callcount for entry in profile.getstats()) / len(data)
+
+
+def kept_per_byte(sensor: Sensor, data: bytes) -> float:
+    """Return the number of bytes per byte that the frames of a stream take beside its own bytes."""
+    gc.freeze()  # collections skip the objects that exist already
+    tracemalloc.start()
+    try:
+        before = tracemalloc.get_traced_memory()[0]
+        found = _find_frames(sensor, data)
+        gc.collect()
+        kept = tracemalloc.get_traced_memory()[0] - before
+        return kept / len(data) if found else 0.0
+    finally:
+        tracemalloc.stop()
+        gc.unfreeze()
+
+
+def _find_frames(sensor: Sensor, data: bytes) -> list[Frames]:
+    decoder = sensor.decoder()
+    if sensor.datagrams:
+        return [decoder.datagrams([data])]
+    return [*decoder.frames(data), *decoder.rest()]
