@@ -32,11 +32,12 @@ from lidarspec.recording.appending import Appender
 from lidarspec.recording.recorders import SUFFIXES, Recorder, check_suffix, declared_port
 from lidarspec.scans.selection import Selection
 from lidarspec.spec.sensor import Sensor
+from lidarspec.transports.destinations import replay_outlet
 from lidarspec.transports.files import RecordingTransport
 from lidarspec.transports.open_url import is_live, live_address, transport
-from lidarspec.transports.outlets import FileOutlet, Outlet, replay_outlet
+from lidarspec.transports.outlets import Outlet
 from lidarspec.transports.protocol import Transport
-from lidarspec.transports.serving import LATE, Replay
+from lidarspec.transports.replays import LATE_NS, Replay
 
 
 @click.command()
@@ -210,7 +211,7 @@ def _view_of(kept: Appender, sensor: Sensor | None) -> str:
     """The command that shows what was recorded."""
     if isinstance(kept, Recorder) and kept.header.sensor:
         return f"lidarspec view {shlex.quote(kept.path)}"
-    return f"lidarspec {_shown(sensor, kept.path)}"
+    return f"lidarspec {_view_words(sensor, kept.path)}"
 
 
 @click.command()
@@ -268,48 +269,52 @@ def replay(
         refuse_overwriting(place, file, sensor_id)
     with contextlib.ExitStack() as undo:
         source = undo.enter_context(contextlib.closing(transport(file)))
-        sensor = _sensor(source, sensor_id)
-        outlet = (
-            _file(source, file, place, sensor, force=force)
-            if is_file
-            else replay_outlet(place, datagrams=source.datagrams, port=declared_port(sensor))
-        )
+        sensor = _find_sensor(source, sensor_id)
+        destination: Outlet | Appender
+        if is_file:
+            destination = _make_file(source, file, place, sensor, force=force)
+        else:
+            port = declared_port(sensor)
+            destination = replay_outlet(place, datagrams=source.datagrams, port=port)
         undo.pop_all()  # the replay closes it
-    _announce(file, outlet, sensor, as_json=as_json)
-    factor = (None if is_file else 1.0) if speed is None else speed or None
+    if isinstance(destination, Outlet):
+        place = destination.place
+        _announce(file, place, sensor, as_json=as_json)
+    factor = speed or None  # 0 is as fast as possible
+    if speed is None and not is_file:
+        factor = 1.0
     played = Replay(
         file,
-        outlet,
+        destination,
         speed=factor,
         needs_times=speed is not None,
         loop=loop,
         source=source,
         times=selection.times,
     )
-    is_interrupted = _run(played, outlet, file)
-    _sum_up(file, outlet, sensor, played, as_json=as_json)
+    is_interrupted = _run(played, destination, file)
+    _print_summary(file, place, sensor, played, is_file=is_file, as_json=as_json)
     if is_interrupted:
         raise click.exceptions.Exit(INTERRUPTED)
 
 
-def _run(played: Replay, outlet: Outlet, file: str) -> bool:
-    """Whether it was interrupted before its end."""
-    with contextlib.closing(outlet), Progress() as progress:
+def _run(played: Replay, destination: Outlet | Appender, file: str) -> bool:
+    """Run a replay; return whether it was interrupted before its end."""
+    with contextlib.closing(destination), Progress() as progress:
         try:
-            progress.follow(played.run(), lambda: _told(played))
+            progress.follow(played.run(), lambda: _describe_progress(played))
         except KeyboardInterrupt:
             return True
         except WireError as error:
             raise suggest(error, f"lidarspec show {shlex.quote(file)}") from None
         finally:
-            outlet.finish()
+            if isinstance(destination, Outlet):
+                destination.finish()
     return False
 
 
-def _sensor(source: Transport, sensor_id: str | Sensor | None) -> Sensor | None:
-    """The sensor that is named, or the one of the recording if it is installed; None where nobody
-    knows.
-    """
+def _find_sensor(source: Transport, sensor_id: str | Sensor | None) -> Sensor | None:
+    """Return the sensor that was named, or that of the recording if it is installed."""
     if sensor_id:
         return named_sensor(sensor_id)
     with contextlib.suppress(LidarSpecError):
@@ -317,55 +322,62 @@ def _sensor(source: Transport, sensor_id: str | Sensor | None) -> Sensor | None:
     return None
 
 
-def _file(
+def _make_file(
     source: Transport, file: str, place: str, sensor: Sensor | None, *, force: bool
-) -> FileOutlet:
-    """A new file in the place of the old one's source."""
+) -> Appender:
+    """Return a new file for the bytes of another one."""
     try:
-        return FileOutlet(recorder_like(source, file, place, sensor, overwrite=force))
+        return recorder_like(source, file, place, sensor, overwrite=force)
     except UsageError as error:
-        raise (
-            suggest(error, "the same with --force, or with another file")
-            if os.path.exists(place) and not force
-            else error
-        ) from None
+        if os.path.exists(place) and not force:
+            raise suggest(error, "the same with --force, or with another file") from None
+        raise
 
 
-def _announce(file: str, outlet: Outlet, sensor: Sensor | None, *, as_json: bool) -> None:
-    """Where it plays to, on standard output unless that is for JSON, and what to type there."""
-    if isinstance(outlet, FileOutlet):
-        return
-    place = outlet.place
-    if place.startswith("udp:") and ":" not in place.removeprefix("udp://"):
-        place = "udp://" if sensor else "udp://:PORT"
-    waits = "" if place.startswith("udp:") else ", as soon as it is opened"
+def _announce(file: str, place: str, sensor: Sensor | None, *, as_json: bool) -> None:
+    """Print the destination, unless standard output is for JSON, and the next command."""
     if not as_json:
-        say(outlet.place)
-    note(f"playing {file} to {outlet.place}{waits}")
-    note(f"next: lidarspec {_shown(sensor, place)}")
+        say(place)
+    if not place.startswith("udp:"):
+        note(f"playing {file} to {place}, as soon as it is opened")
+        note(f"next: lidarspec {_view_words(sensor, place)}")
+        return
+    source = place
+    has_port = ":" in place.removeprefix("udp://")
+    if not has_port:
+        source = "udp://" if sensor else "udp://:PORT"
+    note(f"playing {file} to {place}")
+    note(f"next: lidarspec {_view_words(sensor, source)}")
 
 
-def _shown(sensor: Sensor | None, place: str) -> str:
-    """The verb that shows what is there."""
-    return f"view {shlex.quote(place)} -s {sensor.id}" if sensor else f"detect {shlex.quote(place)}"
+def _view_words(sensor: Sensor | None, place: str) -> str:
+    """Return the words after `lidarspec` that show the data at a place."""
+    if sensor is None:
+        return f"detect {shlex.quote(place)}"
+    return f"view {shlex.quote(place)} -s {sensor.id}"
 
 
-def _told(played: Replay) -> str:
+def _describe_progress(played: Replay) -> str:
     return f"{played.chunks} chunks, {size(played.bytes)} in {played.seconds:.1f} s"
 
 
-def _sum_up(
-    file: str, outlet: Outlet, sensor: Sensor | None, played: Replay, *, as_json: bool
+def _print_summary(
+    file: str,
+    place: str,
+    sensor: Sensor | None,
+    played: Replay,
+    *,
+    is_file: bool,
+    as_json: bool,
 ) -> None:
-    is_file = isinstance(outlet, FileOutlet)
-    note(f"{file} to {outlet.place}: {_told(played)}")
+    note(f"{file} to {place}: {_describe_progress(played)}")
     if not played.is_timed:
         note(
             f"{file} does not say when its bytes arrived: they went out as fast as they were taken"
         )
     if played.late:
         note(
-            f"{played.late} chunks went out more than {LATE // 1_000_000} ms late, up to"
+            f"{played.late} chunks went out more than {LATE_NS // 1_000_000} ms late, up to"
             f" {played.latest / 1e6:.0f} ms"
         )
     if len(played.senders) > 1 and not is_file:
@@ -374,16 +386,16 @@ def _sum_up(
             f" choose one with '{file}?src=ADDRESS'"
         )
     if is_file:
-        note(f"next: lidarspec {_shown(sensor, outlet.place)}")
+        note(f"next: lidarspec {_view_words(sensor, place)}")
     if as_json:
-        facts = {
+        summary = {
             "source": file,
-            "to": outlet.place,
+            "to": place,
             "chunks": played.chunks,
             "bytes": played.bytes,
             "sha256": played.digest.hexdigest(),
+            "seconds": played.seconds,
+            "late": played.late,
+            "latest_ns": played.latest,
         }
-        emit_json(
-            {**facts, "seconds": played.seconds, "late": played.late, "latest_ns": played.latest},
-            None,
-        )
+        emit_json(summary, None)

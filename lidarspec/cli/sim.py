@@ -32,9 +32,11 @@ from lidarspec.simulation.scenes import read_scene
 from lidarspec.spec.links import Serial
 from lidarspec.spec.sensor import Sensor
 from lidarspec.transports.base import data_link
-from lidarspec.transports.outlets import HERE, Outlet, has_terminals, simulated_outlet
-from lidarspec.transports.serving import serve, write_file
-from lidarspec.transports.simulated import rate_of
+from lidarspec.transports.destinations import simulated_outlet
+from lidarspec.transports.outlets import LOCALHOST, Outlet, has_terminals
+from lidarspec.transports.serving import serve
+from lidarspec.transports.simulated import parse_rate
+from lidarspec.transports.simulated_files import write_file
 from lidarspec.view.polar import picture
 
 if TYPE_CHECKING:
@@ -139,7 +141,7 @@ def sim(
     sensor = named_sensor(sensor_id)
     faults = Faults(errors, loss, reorder, unplug or 0.0, absent, rotor or "", shake)
     seen = read_scene(scene) if scene is not None else None
-    device = SimulatedDevice(sensor, scene=seen, seed=seed, rate=rate_of(rate), faults=faults)
+    device = SimulatedDevice(sensor, scene=seen, seed=seed, rate=parse_rate(rate), faults=faults)
     place = to or ("udp://" if sensor.datagrams else "pty")
     if place != "pty" and "://" not in place:
         if link is not None:
@@ -158,16 +160,16 @@ def sim(
     except UsageError as error:
         raise suggest(
             error,
-            f"lidarspec sim {sensor.id} --to {'udp://' + HERE if sensor.datagrams else 'pty'}",
+            f"lidarspec sim {sensor.id} --to {'udp://' + LOCALHOST if sensor.datagrams else 'pty'}",
         ) from None
     try:
         controls = {name: control.place for name, control in opened.controls.items()}
         _tell(sensor, opened.place, opened.source, controls, as_json=as_json)
         with ended_by_terminate(), Progress() as progress:
-            serve(device, opened, seconds=duration, turn=_watching(device, opened, progress))
+            serve(device, opened, seconds=duration, on_pass=_watching(device, opened, progress))
     finally:
         opened.close()
-        lost = f"; nobody was there for {size(opened.unsent)}" if opened.unsent else ""
+        lost = f"; nobody was there for {size(opened.unsent_bytes)}" if opened.unsent_bytes else ""
         note(f"{_sent(device)}{lost}")
 
 

@@ -27,7 +27,8 @@ from lidarspec.simulation.faults import Faults
 from lidarspec.spec.links import Serial
 from lidarspec.spec.sensor import Sensor
 from lidarspec.transports.base import data_link
-from lidarspec.transports.outlets import HERE, has_terminals, simulated_outlet
+from lidarspec.transports.destinations import simulated_outlet
+from lidarspec.transports.outlets import LOCALHOST, has_terminals
 from lidarspec.transports.serving import Served
 
 #: seconds that the scans may take beyond those that they last.
@@ -112,13 +113,13 @@ def _live(
     """
     if sensor.datagrams:
         port = _free_port()
-        at = f"udp://{HERE}:{port}"
+        at = f"udp://{LOCALHOST}:{port}"
         with (
             open_device(at, sensor, start=False, record=path) as device,
             Served(simulated, simulated_outlet(sensor, at)) as served,
         ):
             return at, *_read(device, served, turns)
-    to = "pty" if has_terminals() and data_link(sensor, Serial) else f"tcp://{HERE}:0"
+    to = "pty" if has_terminals() and data_link(sensor, Serial) else f"tcp://{LOCALHOST}:0"
     with (
         Served(simulated, simulated_outlet(sensor, to), patient=True) as served,
         open_device(served.path, sensor, start=False, record=path) as device,
@@ -135,7 +136,7 @@ def _read(
     for scan in device.scans(wait=0.1):
         scans += [scan] if scan is not None else []
         if sum(one.whole for one in scans) >= turns:
-            served.rest()
+            served.stop_sending()
             while device.newest(QUIET) is not None:
                 pass  # what is still on the way counts as sent, so it is read too
             break
@@ -151,5 +152,5 @@ def _read(
 
 def _free_port() -> int:
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
-        probe.bind((HERE, 0))
+        probe.bind((LOCALHOST, 0))
         return int(probe.getsockname()[1])

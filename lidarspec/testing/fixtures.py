@@ -12,7 +12,7 @@ from lidarspec.simulation.device import SimulatedDevice
 from lidarspec.simulation.faults import Faults
 from lidarspec.simulation.scenes import Scene
 from lidarspec.spec.sensor import Sensor
-from lidarspec.transports.outlets import simulated_outlet
+from lidarspec.transports.destinations import simulated_outlet
 from lidarspec.transports.serving import Served
 
 

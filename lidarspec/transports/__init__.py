@@ -7,15 +7,17 @@ Modules in reading order:
 * `open_url`: from a SOURCE to the transport that opens it.
 * `base`: what they share: addresses, the clock, failures with the next command.
 * `serial`, `udp`, `tcp`: live sources.
-* `http`: the web server of a sensor, and that of a simulated one.
-* `simulated`: `sim:`, a sensor that is not there.
+* `http`: requests to the web server of a sensor.
+* `simulated`: `sim:`, a simulated sensor in this process.
 * `bags`: robotics logs, which hold packets as ROS's messages.
 * `hexadecimal`: bytes as people print them.
 * `files`: recordings, captures, raw bytes, standard input.
 * `ports`: which serial and UDP ports this computer has, and who holds them.
 
-The other way round, for what stands in the place of a sensor:
+In the opposite direction, in the place of a sensor:
 
-* `outlets`: a pseudo-terminal, datagrams, TCP connections, a file.
-* `serving`: a simulated sensor, or a recording, sent through an outlet by the clock.
+* `outlets`: pseudo-terminals, UDP and TCP in one loop; `http_line` adds HTTP.
+* `destinations`: from a destination as text to its outlet.
+* `serving`: a simulated sensor at an outlet, in real time; `simulated_files` writes it to a file.
+* `replays`: a recording that is sent again at its recorded times.
 """

@@ -1,32 +1,30 @@
-"""Outlets: where bytes go in the place of a sensor: a pseudo-terminal, datagrams, TCP connections,
-a file.
+"""Send bytes in the place of a sensor, over pseudo-terminals, UDP, TCP and HTTP.
 
-One mechanism for simulated sensors and for replays; `serving` drives both by the clock. As a real
-sensor would, an outlet takes what it is sent whether somebody listens or not, and counts what
-nobody took. Only where `patient` is asked for it waits for its reader: a replay, which is to arrive
-whole, and a simulated sensor without a pace of its own.
+Simulated sensors and replays use the same mechanism. A `Line` is the sensor's end of one link: it
+sends without waiting and returns the commands that have arrived. An `Outlet` holds the line of the
+data and the lines of the sensor's other links, and waits for all of them in one loop.
+
+As a real sensor does, an outlet sends whether or not somebody listens, and counts the bytes that
+nobody read. With `patient=True` it waits for a slow reader instead. A replay requires that, because
+it has to arrive complete; so does a simulated sensor that runs as fast as it is read.
 """
 
 from __future__ import annotations
 
 import contextlib
 import errno
+import itertools
+import math
 import os
-import queue
 import select
 import socket
 import time
-from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import replace
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from pathlib import Path
-from types import MappingProxyType
 
 from lidarspec.errors import SourceError, UsageError
-from lidarspec.recording.appending import Appender
-from lidarspec.spec.links import Http, Link, Tcp, Udp
-from lidarspec.spec.sensor import Sensor
-from lidarspec.transports.base import Address, failure, ready, reason, with_option
-from lidarspec.transports.protocol import POLL, Chunk
+from lidarspec.transports.base import failure, ready, reason, with_option
+from lidarspec.transports.protocol import POLL, Chunk, Disconnected, Sender
 
 try:
     import fcntl
@@ -35,219 +33,324 @@ try:
 except ImportError:  # no POSIX
     termios = None  # type: ignore[assignment]
 
-#: bytes of commands read at once, and bytes that wait for a slow reader at most: of a connection,
-#: and of a pseudo-terminal.
-BLOCK, BACKLOG, PTY_BACKLOG = 1 << 16, 1 << 20, 1 << 18
-HERE, EVERYBODY_HERE, NOBODY = "127.0.0.1", "127.255.255.255", ("127.0.0.1", 9)
-#: seconds between two looks at whether somebody listens; what a listener takes to settle, since
-#: many drop what came while they opened.
-LOOK, SETTLE = 0.02, 0.25
-#: seconds between two looks at a pseudo-terminal that nobody has open.
-UNHEARD = 0.005
-#: seconds that the last bytes are given to be fetched.
-FAREWELL = 5.0
+LOCALHOST = "127.0.0.1"
+_LOOPBACK_BROADCAST = "127.255.255.255"
+_READ_BYTES = 1 << 16
+#: Bytes that may wait for a slow reader before further ones are dropped.
+_MAX_CONNECTION_BACKLOG_BYTES = 1 << 20
+_MAX_PTY_BACKLOG_BYTES = 1 << 18
+_SEND_BUFFER_BYTES = 1 << 20
+#: Attempts to send a datagram while the buffer is full or its receiver refuses.
+_SEND_ATTEMPTS = 2
+#: A reader has to stay for this long before a replay begins: many drop the bytes that arrive while
+#: they open a port.
+_READER_SETTLE_S = 0.25
+_LISTENER_POLL_S = 0.02
+#: The interval at which a pseudo-terminal without a reader is checked.
+_ABSENT_READER_POLL_S = 0.005
+#: The time that readers have to fetch the last bytes.
+FETCH_TIMEOUT_S = 5.0
+#: A pseudo-terminal counts as read after so many checks without waiting bytes.
+_EMPTY_CHECKS = 3
+#: A port without a server, for finding the address of a host.
+_DISCARD_PORT = 9
 
 
-class Outlet:
-    """Where bytes go, and commands come from.
+class Line:
+    """The sensor's end of one link.
 
     Attributes:
-        place: what to open to listen, as a SOURCE.
-        heard: whether somebody listens, as far as that can be known.
-        unsent: bytes that nobody took in time.
-        port: where it listens, 0 where it does not.
-        controls: the outlets of the sensor's other links, by name, over which it is asked and
-            answers.
+        place: the SOURCE that a listener on this computer opens.
+        port: the port that it listens on, 0 for none.
+        has_listener: whether somebody listens, as far as this is known.
+        unsent_bytes: the number of bytes that nobody read in time.
     """
 
     place: str = ""
-    heard: bool = True
-    unsent: int = 0
     port: int = 0
-    controls: Mapping[str, Outlet] = MappingProxyType({})
+    has_listener: bool = True
+    unsent_bytes: int = 0
 
     @property
     def source(self) -> str:
-        """The SOURCE by which a program elsewhere listens."""
-        return self._controlled(self.place)
+        """The SOURCE that a listener on the destination computer opens."""
+        return self.place
 
-    def _controlled(self, source: str) -> str:
-        """A SOURCE with the address that commands go to: with its port where there is one only."""
-        ports = {control.port for control in self.controls.values()}
-        return (
-            with_option(source, "control", f"{HERE}:{ports.pop()}" if len(ports) == 1 else HERE)
-            if ports
-            else source
-        )
+    @property
+    def max_wait_s(self) -> float:
+        """The time after which `receive` has to be called again without an event."""
+        return math.inf
+
+    def readable(self) -> Collection[int | socket.socket]:
+        """Return the descriptors from which input may arrive."""
+        return ()
+
+    def writable(self) -> Collection[int | socket.socket]:
+        """Return the descriptors for which bytes are waiting."""
+        return ()
+
+    def receive(self) -> list[bytes]:
+        """Return the commands that have arrived, and write bytes that wait; does not block."""
+        return []
 
     def send(self, chunks: Sequence[Chunk], *, patient: bool) -> None:
-        """Send, in order, and where `patient`, wait until there is room.
+        """Send chunks in order.
+
+        Args:
+            patient: wait until there is room, instead of dropping bytes.
 
         Raises:
-            SourceError: where that cannot ever work.
-            UsageError: for a datagram of which nobody says the port.
+            SourceError: if nothing can be sent at all.
+            UsageError: for a datagram without a known port.
         """
         raise NotImplementedError
 
-    def receive(self, wait: float) -> list[bytes]:
-        """What arrives within `wait` seconds at most: commands, as they came."""
-        time.sleep(wait)
-        return []
-
     def await_listener(self) -> None:
-        """Returns when somebody listens who can have everything from its beginning on, where that
-        can be known.
-        """
+        """Wait for a listener that can receive everything from the beginning, if it is known."""
 
     def unplug(self) -> None:
-        """The device is gone: nobody can listen."""
+        """Disconnect every listener until `plug` is called."""
 
     def plug(self) -> None:
-        """The device is back."""
+        """Let listeners connect again."""
 
     def finish(self) -> None:
-        """Returns when the last bytes have been fetched, or nobody fetches them."""
+        """Wait until the last bytes have been read, or nobody reads them."""
 
     def close(self) -> None:
-        """Give everything back."""
+        """Close the line."""
         self.unplug()
-        for control in self.controls.values():
-            control.close()
 
 
-class UdpOutlet(Outlet):
-    """Datagrams to an address; commands are taken from the same host.
+class _Backlog:
+    """Bytes that wait until a slow reader has room for them.
 
     Args:
-        host: the name or address of a computer.
-        ports: one port takes everything; otherwise each datagram goes to the one that it was sent
-            to.
-        port: for datagrams that do not say where they went.
-
-    Attributes:
-        host: its address.
-
-    Raises:
-        SourceError: for a host that is none.
+        write: writes without blocking, and returns the number of bytes written.
+        max_bytes: more are not accepted.
     """
 
-    def __init__(self, host: str = HERE, ports: Sequence[int] = (), *, port: int = 0) -> None:
-        self._only, self._port = ports[0] if len(ports) == 1 else 0, port
-        listed = (
-            f":{ports[0]}"
-            if len(ports) == 1
-            else f"?port={','.join(map(str, ports))}"
-            if ports
-            else ""
-        )
+    def __init__(self, write: Callable[[bytearray], int], max_bytes: int) -> None:
+        self._write = write
+        self._max_bytes = max_bytes
+        self._waiting = bytearray()
+
+    def __len__(self) -> int:
+        return len(self._waiting)
+
+    def has_room(self, data: bytes) -> bool:
+        return len(self._waiting) + len(data) <= self._max_bytes
+
+    def add(self, data: bytes) -> None:
+        self._waiting += data
+
+    def clear(self) -> None:
+        self._waiting.clear()
+
+    def flush(self) -> None:
+        """Write as much as the reader has room for.
+
+        Raises:
+            OSError: if the reader has gone.
+        """
+        with contextlib.suppress(BlockingIOError):
+            while self._waiting:
+                del self._waiting[: self._write(self._waiting)]
+
+
+class UdpLine(Line):
+    """UDP datagrams to one host, or to the sender of the last command.
+
+    `UdpLine.to` and `UdpLine.replying` make one.
+    """
+
+    def __init__(
+        self,
+        place: str,
+        sockets: Sequence[socket.socket],
+        *,
+        host: str = "",
+        ports: Sequence[int] = (),
+        default_port: int = 0,
+    ) -> None:
+        self.place = place
+        self._sockets = sockets
+        self._host = host
+        self._ports = ports
+        self._default_port = default_port
+        self._last_sender: Sender | None = None
+        for one in sockets:
+            one.setblocking(False)
+
+    @classmethod
+    def to(
+        cls, host: str = LOCALHOST, ports: Sequence[int] = (), *, default_port: int = 0
+    ) -> UdpLine:
+        """Return a line that sends to a host, and takes commands from that host only.
+
+        Args:
+            host: name or address.
+            ports: a single port receives all datagrams; otherwise each datagram goes to the port of
+                its `receiver`.
+            default_port: for datagrams without a receiver.
+
+        Raises:
+            SourceError: for an unknown host.
+        """
+        port_list = _format_ports(ports)
         try:
             family, kind, _, _, address = socket.getaddrinfo(
-                host, self._only or 9, type=socket.SOCK_DGRAM
+                host, _DISCARD_PORT, type=socket.SOCK_DGRAM
             )[0]
         except OSError as error:
             raise failure(
-                f"udp://{host}{listed}: there is no host {host!r} ({reason(error)})", f"ping {host}"
+                f"udp://{host}{port_list}: there is no host {host!r} ({reason(error)})",
+                f"ping {host}",
             ) from None
-        self.host = str(address[0])
-        self.place = (
-            f"udp://[{self.host}]{listed}" if ":" in self.host else f"udp://{self.host}{listed}"
-        )
-        self._socket = socket.socket(family, kind)
-        self._socket.setblocking(False)
+        numeric_host = str(address[0])
+        bracketed = f"[{numeric_host}]" if ":" in numeric_host else numeric_host
+        sender = socket.socket(family, kind)
         with contextlib.suppress(OSError):
-            self._socket.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, BACKLOG)
+            sender.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, _SEND_BUFFER_BYTES)
+        place = f"udp://{bracketed}{port_list}"
+        return cls(place, [sender], host=numeric_host, ports=ports, default_port=default_port)
+
+    @classmethod
+    def replying(cls, host: str, port: int) -> UdpLine:
+        """Return a line that replies to the sender of the last command.
+
+        It also receives broadcasts within this computer.
+
+        Args:
+            port: where to listen; 0 takes any free one.
+
+        Raises:
+            OSError: if the address is not available.
+        """
+        first = _bind_udp(host, port)
+        port = int(first.getsockname()[1])
+        sockets = [first]
+        with contextlib.suppress(OSError):
+            sockets.append(_bind_udp(_LOOPBACK_BROADCAST, port))
+        line = cls(f"udp://{host}:{port}", sockets)
+        line.port = port
+        return line
 
     @property
     def source(self) -> str:
-        """The SOURCE by which a program on that computer listens: datagrams from elsewhere come in
-        at every interface.
-        """
-        return self._controlled(
-            self.place
-            if self.host == HERE
-            else "udp://" + self.place.removeprefix(f"udp://{self.host}")
-        )
+        """The SOURCE for the destination computer.
 
-    def receive(self, wait: float) -> list[bytes]:
-        if ready([self._socket], [], wait)[0]:
-            with contextlib.suppress(
-                OSError
-            ):  # what a destination that does not listen is told with
-                data, sender = self._socket.recvfrom(BLOCK)
-                return [data] if sender[0] == self.host else []
-        return []
+        Datagrams from another computer arrive at any of its interfaces, so that no host is named.
+        """
+        if not self._host or self._host == LOCALHOST:
+            return self.place
+        return "udp://" + _format_ports(self._ports)
+
+    def readable(self) -> Collection[int | socket.socket]:
+        return self._sockets
+
+    def receive(self) -> list[bytes]:
+        commands = []
+        for one in self._sockets:
+            # Also raised because an earlier datagram met a closed port.
+            with contextlib.suppress(OSError):
+                data, sender = one.recvfrom(_READ_BYTES)
+                if not self._host:
+                    self._last_sender = sender
+                    commands.append(data)
+                elif sender[0] == self._host:
+                    commands.append(data)
+        return commands
 
     def send(self, chunks: Sequence[Chunk], *, patient: bool) -> None:
         for chunk in chunks:
-            port = self._only or (chunk.receiver[1] if chunk.receiver else 0) or self._port
-            if not port:
-                text = "the datagrams do not say which port they went to: name one, as in"
-                raise UsageError(f"{self.place}: {text} udp://{self.host}:2368")
-            while not self._sent(chunk.data, port) and not self._sent(chunk.data, port):
-                if not patient:
-                    self.unsent += len(chunk.data)
-                    break
+            receiver = self._find_receiver(chunk)
+            if receiver is None or not self._send(chunk.data, receiver, patient=patient):
+                self.unsent_bytes += len(chunk.data)
 
     def close(self) -> None:
-        super().close()
-        self._socket.close()
+        for one in self._sockets:
+            one.close()
 
-    def _sent(self, data: bytes, port: int) -> bool:
-        """Whether a datagram went out; where it did not, it is worth another attempt."""
+    def _find_receiver(self, chunk: Chunk) -> Sender | None:
+        if not self._host:
+            return self._last_sender
+        if len(self._ports) == 1:
+            return self._host, self._ports[0]
+        port = chunk.receiver[1] if chunk.receiver else 0
+        port = port or self._default_port
+        if not port:
+            text = "the datagrams do not say which port they went to: name one, as in"
+            raise UsageError(f"{self.place}: {text} udp://{self._host}:2368")
+        return self._host, port
+
+    def _send(self, data: bytes, receiver: Sender, *, patient: bool) -> bool:
+        attempts = itertools.count() if patient else range(_SEND_ATTEMPTS)
+        return any(self._try_send(data, receiver) for _ in attempts)
+
+    def _try_send(self, data: bytes, receiver: Sender) -> bool:
+        """Send a datagram; return False if another attempt may succeed."""
         try:
-            self._socket.sendto(data, (self.host, port))
+            self._sockets[0].sendto(data, receiver)
         except OSError as error:
             if error.errno in (errno.EAGAIN, errno.EWOULDBLOCK):
-                ready([], [self._socket], POLL)
+                ready([], [self._sockets[0]], POLL)
             elif error.errno == errno.ENOBUFS:
-                time.sleep(LOOK)
-            elif error.errno != errno.ECONNREFUSED:  # which is the answer to an earlier datagram
+                time.sleep(_LISTENER_POLL_S)
+            elif error.errno != errno.ECONNREFUSED and self._host:
+                # ECONNREFUSED is the answer to an earlier datagram.
                 raise SourceError(f"{self.place}: nothing can be sent: {reason(error)}") from None
             return False
         return True
 
 
-class TcpOutlet(Outlet):
-    """Connections that are accepted at an address; each gets what comes after it.
+class TcpLine(Line):
+    """TCP connections to one address; each receives the bytes that are sent from then on.
 
     Args:
-        host, port: where to listen; port 0 takes any that is free.
-        sole: for one listener at a time; the next one is heard when `await_listener` is called.
+        host, port: where to listen; port 0 takes any free one.
+        sole: accept one connection at a time, and the next one only in `await_listener`.
 
     Raises:
-        SourceError: where the address cannot be had.
+        SourceError: if the address is not available.
     """
 
     def __init__(self, host: str, port: int, *, sole: bool = False) -> None:
-        self._sole, self._clients, self.heard = sole, dict[socket.socket, bytearray](), False
-        self._listener = listener(host, port)
+        self._sole = sole
+        self._clients: dict[socket.socket, _Backlog] = {}
+        self._listener: socket.socket | None = listen(host, port)
+        self.has_listener = False
         self.port = int(self._listener.getsockname()[1])
-        self._address = (host, self.port)
+        self._host = host
         self.place = f"tcp://{host}:{self.port}"
 
-    def receive(self, wait: float) -> list[bytes]:
-        if self._listener.fileno() < 0:
-            time.sleep(wait)
-            return []
-        behind = [client for client, waiting in self._clients.items() if waiting]
-        doors = [] if self._sole and self._clients else [self._listener]
-        readable, writable = ready([*doors, *self._clients], behind, wait)
-        for client in writable:
+    def readable(self) -> Collection[int | socket.socket]:
+        if self._listener is None or not self._accepts():
+            return list(self._clients)
+        return [self._listener, *self._clients]
+
+    def writable(self) -> Collection[int | socket.socket]:
+        return [client for client, backlog in self._clients.items() if backlog]
+
+    def receive(self) -> list[bytes]:
+        commands = []
+        for client in list(self._clients):
             self._flush(client)
-        commands = [self._read(client) for client in readable if client in self._clients]
-        if self._listener in readable:
-            self._accept()
-        return [data for data in commands if data]
+            if data := self._read(client):
+                commands.append(data)
+        if self._listener is not None and self._accepts():
+            self._accept(self._listener)
+        return commands
 
     def send(self, chunks: Sequence[Chunk], *, patient: bool) -> None:
         data = b"".join(chunk.data for chunk in chunks)
         if not self._clients:
-            self.unsent += len(data)
-        for client, waiting in list(self._clients.items()):
-            if len(waiting) + len(data) > BACKLOG and not patient:
-                self.unsent += len(data)
+            self.unsent_bytes += len(data)
+        for client, backlog in list(self._clients.items()):
+            if not patient and not backlog.has_room(data):
+                self.unsent_bytes += len(data)
                 continue
-            waiting.extend(data)
+            backlog.add(data)
             self._flush(client)
             while patient and self._clients.get(client):
                 ready([], [client], POLL)
@@ -256,283 +359,216 @@ class TcpOutlet(Outlet):
     def await_listener(self) -> None:
         self.finish()
         while not self._clients:
-            self.receive(LOOK * 10)
+            wait_for([self], 1.0)
+            self.receive()
 
     def unplug(self) -> None:
         for client in list(self._clients):
-            self._forget(client)
-        self._listener.close()
+            self._disconnect(client)
+        if self._listener is not None:
+            self._listener.close()
+        self._listener = None
 
     def plug(self) -> None:
-        self._listener = listener(*self._address)
+        self._listener = listen(self._host, self.port)
 
     def finish(self) -> None:
-        """Hang up when the last bytes have been sent: closing with something unread would take back
-        what is on its way.
+        """Disconnect after the last bytes have been sent.
 
-        Whoever goes on sending is not waited for longer than who keeps silent.
+        Closing a socket with unread input would discard bytes that are on their way. The limit
+        holds for a client that keeps sending as well as for a silent one.
         """
-        limit = time.monotonic() + FAREWELL
+        limit = time.monotonic() + FETCH_TIMEOUT_S
         for client in list(self._clients):
             with contextlib.suppress(OSError):
                 client.shutdown(socket.SHUT_WR)
-                while (left := limit - time.monotonic()) > 0:
-                    client.settimeout(left)
-                    if not client.recv(BLOCK):
+                while (remaining := limit - time.monotonic()) > 0:
+                    client.settimeout(remaining)
+                    if not client.recv(_READ_BYTES):
                         break
-            self._forget(client)
+            self._disconnect(client)
 
-    def _accept(self) -> None:
+    def _accepts(self) -> bool:
+        return not (self._sole and self._clients)
+
+    def _accept(self, listener: socket.socket) -> None:
         with contextlib.suppress(OSError):
-            client, _ = self._listener.accept()
+            client, _ = listener.accept()
             client.setblocking(False)
             client.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
-            self._clients[client], self.heard = bytearray(), True
+            self._clients[client] = _Backlog(client.send, _MAX_CONNECTION_BACKLOG_BYTES)
+            self.has_listener = True
 
     def _read(self, client: socket.socket) -> bytes:
+        if client not in self._clients:
+            return b""
         try:
-            data = client.recv(BLOCK)
+            data = client.recv(_READ_BYTES)
         except BlockingIOError:
             return b""
         except OSError:
             data = b""
         if not data:
-            self._forget(client)
+            self._disconnect(client)
         return data
 
     def _flush(self, client: socket.socket) -> None:
-        waiting = self._clients.get(client)
-        if not waiting:
-            return
         try:
-            del waiting[: client.send(waiting)]
-        except BlockingIOError:
-            pass
+            self._clients[client].flush()
         except OSError:
-            self._forget(client)
+            self._disconnect(client)
 
-    def _forget(self, client: socket.socket) -> None:
+    def _disconnect(self, client: socket.socket) -> None:
         self._clients.pop(client, None)
-        self.heard = bool(self._clients)
+        self.has_listener = bool(self._clients)
         client.close()
 
 
-class AnsweringOutlet(Outlet):
-    """Datagrams that are answered: what is sent goes to whoever asked last.
+class PtyLine(Line):
+    """A pseudo-terminal that programs open by its path, POSIX only.
+
+    Bytes that are sent while nobody has it open are lost, as on a serial cable.
 
     Args:
-        host, port: where to listen; port 0 takes any that is free. What is broadcast within this
-            computer is heard too.
-
-    Raises:
-        OSError: where the address cannot be had.
-    """
-
-    def __init__(self, host: str, port: int) -> None:
-        self._socket, self._asker = _bound(host, port), NOBODY
-        self.port = int(self._socket.getsockname()[1])
-        self.place, self._sockets = f"udp://{host}:{self.port}", [self._socket]
-        with contextlib.suppress(OSError):
-            self._sockets.append(_bound(EVERYBODY_HERE, self.port))
-
-    def receive(self, wait: float) -> list[bytes]:
-        found = []
-        for one in ready(self._sockets, [], wait)[0]:
-            with contextlib.suppress(OSError):
-                data, self._asker = one.recvfrom(BLOCK)
-                found.append(data)
-        return found
-
-    def send(self, chunks: Sequence[Chunk], *, patient: bool) -> None:
-        for chunk in chunks:
-            with contextlib.suppress(OSError):  # who asked has gone
-                self._socket.sendto(chunk.data, self._asker)
-
-    def close(self) -> None:
-        for one in self._sockets:
-            one.close()
-
-
-class HttpOutlet(Outlet):
-    """The web server of a simulated sensor.
-
-    Args:
-        host, port: where to listen; port 0 takes any that is free.
-
-    Raises:
-        OSError: where the address cannot be had.
-    """
-
-    def __init__(self, host: str, port: int) -> None:
-        from lidarspec.transports.http import Server
-
-        self._server = Server(host, port)
-        self.port = int(self._server.server_address[1])
-        self.place = f"http://{host}:{self.port}"
-
-    def receive(self, wait: float) -> list[bytes]:
-        with contextlib.suppress(queue.Empty):
-            return [
-                self._server.asked.get(timeout=wait) if wait else self._server.asked.get_nowait()
-            ]
-        return []
-
-    def send(self, chunks: Sequence[Chunk], *, patient: bool) -> None:
-        for chunk in chunks:
-            with contextlib.suppress(
-                IndexError
-            ):  # who asked has been told already that there is no answer
-                self._server.waiting.popleft().put(chunk.data)
-
-    def close(self) -> None:
-        self._server.server_close()
-
-
-def _bound(host: str, port: int) -> socket.socket:
-    found = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
-    try:
-        found.setblocking(False)
-        found.bind((host, port))
-    except BaseException:
-        found.close()
-        raise
-    return found
-
-
-class PtyOutlet(Outlet):
-    """A serial port that programs open by its path, POSIX only; bytes sent while nobody has it open
-    are lost, as on a wire.
-
-    Args:
-        link: a symbolic link that leads to it, and comes and goes with it.
+        link: a symbolic link to the terminal, which is created and removed with it.
 
     Attributes:
-        path: of the port itself, which is another one after each `plug`.
+        path: the path of the terminal, which is another one after each `plug`.
 
     Raises:
-        SourceError: where there is none to be had, or the link cannot be made.
+        SourceError: if there is no free terminal, or the link cannot be made.
     """
 
     def __init__(self, link: str | Path | None = None) -> None:
-        self._link = Path(link) if link is not None else None
-        self._master, self.path, self.heard, self._waiting = -1, "", False, bytearray()
+        self._link = None if link is None else Path(link)
+        self._master = -1
+        self._backlog = _Backlog(self._write, _MAX_PTY_BACKLOG_BYTES)
+        self.path = ""
         self.plug()
 
+    @property
+    def max_wait_s(self) -> float:
+        """The interval of checks for a reader: no event tells that the terminal was opened."""
+        if self._master >= 0 and not self.has_listener:
+            return _ABSENT_READER_POLL_S
+        return math.inf
+
+    def readable(self) -> Collection[int | socket.socket]:
+        return [self._master] if self.has_listener else []
+
+    def writable(self) -> Collection[int | socket.socket]:
+        return [self._master] if self._backlog else []
+
     def plug(self) -> None:
-        """Make the port, in raw mode, with nobody on it."""
+        """Make a terminal in raw mode that nobody has open."""
         if not has_terminals():
-            raise failure(
-                "this system has no pseudo-terminals", f"the same with --to tcp://{HERE}:2111"
-            )
+            raise _missing_terminal_error("this system has no pseudo-terminals")
         try:
             self._master, slave = os.openpty()
         except OSError as error:
-            raise failure(
-                f"no pseudo-terminal can be had: {reason(error)}",
-                f"the same with --to tcp://{HERE}:2111",
+            raise _missing_terminal_error(
+                f"no pseudo-terminal is available: {reason(error)}"
             ) from None
         self.path = os.ttyname(slave)
         self.place = str(self._link or self.path)
         tty.setraw(slave)
         os.close(slave)
         os.set_blocking(self._master, False)
-        self.heard = False
+        self.has_listener = False
         if self._link is not None:
             self._make_link(self._link)
 
     def unplug(self) -> None:
-        """Hang up, and take the link away."""
-        if (
-            self._link is not None
-            and self._link.is_symlink()
-            and os.readlink(self._link) == self.path
-        ):
-            self._link.unlink()
+        """Hang up, and remove the link."""
+        link = self._link
+        if link is not None and link.is_symlink() and os.readlink(link) == self.path:
+            link.unlink()
         if self._master >= 0:
             os.close(self._master)
         self._master = -1
-        self._waiting.clear()
+        self.has_listener = False
+        self._backlog.clear()
 
-    def receive(self, wait: float) -> list[bytes]:
+    def receive(self) -> list[bytes]:
         if self._master < 0:
-            time.sleep(wait)
-            return []
-        if not self.heard:
-            time.sleep(min(wait, UNHEARD))
-        elif not any(ready([self._master], [self._master] if self._waiting else [], wait)):
             return []
         self._flush()
         try:
-            data = os.read(self._master, BLOCK)
+            data = os.read(self._master, _READ_BYTES)
         except BlockingIOError:
-            self.heard = True
+            self.has_listener = True
             return []
         except OSError:
             data = b""
-        self.heard = self.heard or bool(data)
         if not data:
-            self._left()
-        return [data] if data else []
+            self._handle_hangup()
+            return []
+        self.has_listener = True
+        return [data]
 
     def send(self, chunks: Sequence[Chunk], *, patient: bool) -> None:
         data = b"".join(chunk.data for chunk in chunks)
-        if not self.heard or (len(self._waiting) + len(data) > PTY_BACKLOG and not patient):
-            self.unsent += len(data)
+        has_room = patient or self._backlog.has_room(data)
+        if not self.has_listener or not has_room:
+            self.unsent_bytes += len(data)
             return
-        self._waiting += data
+        self._backlog.add(data)
         self._flush()
-        while patient and self._waiting and self.heard:
+        while patient and self._backlog:
             ready([], [self._master], POLL)
             if self._is_alone():
-                self._left()
+                self._handle_hangup()
             self._flush()
 
     def await_listener(self) -> None:
-        """Returns when somebody has opened it, and kept it open for a moment."""
+        """Wait until a reader has had the terminal open for a moment."""
         since = time.monotonic()
-        while time.monotonic() - since < SETTLE:
-            self.receive(LOOK)
-            if not self.heard:
+        while time.monotonic() - since < _READER_SETTLE_S:
+            wait_for([self], _LISTENER_POLL_S)
+            self.receive()
+            if not self.has_listener:
                 since = time.monotonic()
 
     def finish(self) -> None:
-        """Returns when nothing is left to be read: what is, is lost when the terminal goes away."""
-        empty, limit = 0, time.monotonic() + FAREWELL
-        while empty < 3 and time.monotonic() < limit and not self._is_alone():
-            with self._other_end() as slave:
+        """Wait until nothing is left to read; unread bytes are lost with the terminal."""
+        limit = time.monotonic() + FETCH_TIMEOUT_S
+        empty_checks = 0
+        while empty_checks < _EMPTY_CHECKS and time.monotonic() < limit and not self._is_alone():
+            with self._open_slave() as slave:
                 waiting = fcntl.ioctl(slave, termios.FIONREAD, bytes(4))
-            empty = empty + 1 if waiting == bytes(4) else 0
-            time.sleep(LOOK)
+            empty_checks = empty_checks + 1 if waiting == bytes(4) else 0
+            time.sleep(_LISTENER_POLL_S)
 
     def _is_alone(self) -> bool:
-        """Whether nobody has the port open."""
+        """Return whether nobody has the terminal open."""
         poller = select.poll()
         poller.register(self._master, select.POLLIN)
-        return any(happened & select.POLLHUP for _, happened in poller.poll(0))
+        return any(event & select.POLLHUP for _, event in poller.poll(0))
+
+    def _write(self, data: bytearray) -> int:
+        return os.write(self._master, data)
 
     def _flush(self) -> None:
-        """Write what the reader has room for; where nobody is there any more, what waits is lost."""
-        while self._waiting:
-            try:
-                del self._waiting[: os.write(self._master, self._waiting)]
-            except BlockingIOError:
-                return
-            except OSError:
-                self._left()
+        try:
+            self._backlog.flush()
+        except OSError:
+            self._handle_hangup()
 
-    def _left(self) -> None:
-        """Whoever had it open has gone: what was meant for him is not for the next one."""
-        self.unsent += len(self._waiting)
-        self._waiting.clear()
-        if self.heard:
-            self.heard = False
-            time.sleep(LOOK)  # what was written last is still on its way to where it is thrown away
-            with contextlib.suppress(OSError, termios.error), self._other_end() as slave:
-                termios.tcflush(slave, termios.TCIFLUSH)
+    def _handle_hangup(self) -> None:
+        """Discard all bytes for the reader that has gone, so that the next one does not get them."""
+        self.unsent_bytes += len(self._backlog)
+        self._backlog.clear()
+        if not self.has_listener:
+            return
+        self.has_listener = False
+        # The bytes that were written last may still be on their way to the terminal's buffer.
+        time.sleep(_LISTENER_POLL_S)
+        with contextlib.suppress(OSError, termios.error), self._open_slave() as slave:
+            termios.tcflush(slave, termios.TCIFLUSH)
 
     @contextlib.contextmanager
-    def _other_end(self) -> Iterator[int]:
-        """The descriptor of the end that readers open."""
+    def _open_slave(self) -> Iterator[int]:
+        """Open the end that readers open."""
         slave = os.open(self.path, os.O_RDWR | os.O_NOCTTY | os.O_NONBLOCK)
         try:
             yield slave
@@ -552,188 +588,155 @@ class PtyOutlet(Outlet):
             ) from None
 
 
-class FileOutlet(Outlet):
-    """A new recording, capture or raw file, with the times of the chunks."""
+class Outlet:
+    """The lines of one sensor.
 
-    def __init__(self, recorder: Appender) -> None:
-        self.place, self._recorder = recorder.path, recorder
+    Args:
+        data: the line of the data.
+        controls: the lines of the other links by name, over which the sensor receives commands and
+            replies.
+    """
 
-    def receive(self, wait: float) -> list[bytes]:
-        """A file gives no commands."""
-        return []
+    def __init__(self, data: Line, controls: Mapping[str, Line] | None = None) -> None:
+        self.data = data
+        self.controls = dict(controls or {})
+        self._lines = {"data": data, **self.controls}
 
-    def send(self, chunks: Sequence[Chunk], *, patient: bool) -> None:
-        for chunk in chunks:
-            self._recorder.keep_up()
-            self._recorder.write(chunk)
+    @property
+    def place(self) -> str:
+        """The SOURCE that a listener on this computer opens for the data."""
+        return self.data.place
+
+    @property
+    def source(self) -> str:
+        """The SOURCE that a listener on the destination computer opens, with `control=`."""
+        ports = {line.port for line in self.controls.values()}
+        if not ports:
+            return self.data.source
+        if len(ports) > 1:
+            return with_option(self.data.source, "control", LOCALHOST)
+        return with_option(self.data.source, "control", f"{LOCALHOST}:{ports.pop()}")
+
+    @property
+    def has_listener(self) -> bool:
+        """Whether somebody listens to the data, as far as this is known."""
+        return self.data.has_listener
+
+    @property
+    def unsent_bytes(self) -> int:
+        """The number of data bytes that nobody read in time."""
+        return self.data.unsent_bytes
+
+    def receive(self, wait: float) -> list[tuple[str, bytes]]:
+        """Wait for commands on all links; return the link and the bytes of each.
+
+        Args:
+            wait: seconds, at most.
+        """
+        wait_for(self._lines.values(), wait)
+        return [(name, data) for name, line in self._lines.items() for data in line.receive()]
+
+    def send(self, link: str, chunks: Sequence[Chunk], *, patient: bool = False) -> None:
+        """Send chunks over a link; see `Line.send`."""
+        self._lines[link].send(chunks, patient=patient)
+
+    def deliver(self, chunk: Chunk) -> None:
+        """Send a chunk of the data and wait until the listener has room for it.
+
+        Commands that the listener sends are ignored.
+
+        Raises:
+            Disconnected: if nobody listens any more.
+            SourceError, UsageError: as `Line.send`.
+        """
+        self.data.receive()
+        if self.data.has_listener:
+            self.data.send([chunk], patient=True)
+        if not self.data.has_listener:
+            raise Disconnected(f"{self.place}: nobody reads any more")
+
+    def await_listener(self) -> None:
+        """Wait for a listener that can receive all data from the beginning, if it is known."""
+        self.data.await_listener()
+
+    def unplug(self) -> None:
+        """Disconnect every listener until `plug` is called."""
+        for line in self._lines.values():
+            line.unplug()
+
+    def plug(self) -> None:
+        """Let listeners connect again."""
+        for line in self._lines.values():
+            line.plug()
+
+    def finish(self) -> None:
+        """Wait until the last bytes of the data have been read, or nobody reads them."""
+        self.data.finish()
 
     def close(self) -> None:
-        self._recorder.close()
+        """Close all lines."""
+        for line in self._lines.values():
+            line.close()
 
 
-def listener(host: str, port: int) -> socket.socket:
-    """A TCP socket that listens at an address, and never waits; port 0 takes any that is free.
+def wait_for(lines: Collection[Line], timeout: float) -> None:
+    """Wait until one of the lines has something to receive or can write bytes that wait.
+
+    Args:
+        timeout: seconds, at most.
+    """
+    timeout = min([timeout, *(line.max_wait_s for line in lines)])
+    reading = [descriptor for line in lines for descriptor in line.readable()]
+    writing = [descriptor for line in lines for descriptor in line.writable()]
+    if reading or writing:
+        ready(reading, writing, timeout)
+    else:
+        time.sleep(timeout)
+
+
+def listen(host: str, port: int) -> socket.socket:
+    """Return a non-blocking TCP socket that listens at an address; port 0 takes any free one.
 
     Raises:
-        SourceError: where the address cannot be had.
+        SourceError: if the address is not available.
     """
+    family = socket.AF_INET6 if ":" in host else socket.AF_INET
     try:
-        server = socket.create_server(
-            (host, port), family=socket.AF_INET6 if ":" in host else socket.AF_INET
-        )
+        server = socket.create_server((host, port), family=family)
     except OSError as error:
-        text = f"tcp://{host}:{port}: cannot listen there: {reason(error)}"
-        is_taken = error.errno == errno.EADDRINUSE
+        following = f"the same with tcp://{LOCALHOST}:{port}"
+        if error.errno == errno.EADDRINUSE:
+            following = f"ss -ltnp 'sport = :{port}'"
         raise failure(
-            text,
-            f"ss -ltnp 'sport = :{port}'" if is_taken else f"the same with tcp://{HERE}:{port}",
+            f"tcp://{host}:{port}: cannot listen there: {reason(error)}", following
         ) from None
     server.setblocking(False)
     return server
 
 
 def has_terminals() -> bool:
-    """Whether the system has pseudo-terminals."""
+    """Return whether the system has pseudo-terminals."""
     return termios is not None
 
 
-def _controls(sensor: Sensor) -> dict[str, Outlet]:
-    """Where a simulated sensor is asked over its other links: on this computer, at the declared
-    ports, or free ones if these are taken.
-    """
-    found: dict[str, Outlet] = {}
-    for name in {command.link for command in sensor.commands.values()} - {"data"}:
-        declared = sensor.links[name]
-        for port in (declared_port(declared), 0):
-            with contextlib.suppress(OSError, SourceError):
-                if isinstance(declared, Tcp):
-                    found[name] = TcpOutlet(HERE, port)
-                elif isinstance(declared, Udp):
-                    found[name] = AnsweringOutlet(HERE, port)
-                elif isinstance(declared, Http):
-                    found[name] = HttpOutlet(HERE, port)
-                break
-    return found
+def _missing_terminal_error(text: str) -> SourceError:
+    return failure(text, f"the same with --to tcp://{LOCALHOST}:2111")
 
 
-def declared_port(link: Link) -> int:
-    """The port at which a sensor is asked over a link, 0 where it declares none."""
-    return (
-        link.port
-        if isinstance(link, Tcp | Http)
-        else (*link.ports, link.broadcast)[0]
-        if isinstance(link, Udp)
-        else 0
-    )
+def _bind_udp(host: str, port: int) -> socket.socket:
+    bound = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+    try:
+        bound.bind((host, port))
+    except BaseException:
+        bound.close()
+        raise
+    return bound
 
 
-def simulated_outlet(sensor: Sensor, place: str, link: str | Path | None = None) -> Outlet:
-    """The outlet of a simulated sensor, with those of its other links as `controls`.
-
-    Args:
-        place, link: as of the outlet of its data.
-
-    Raises:
-        UsageError: for what is no destination, and one that cannot carry what the sensor sends.
-        SourceError: where it cannot be had.
-    """
-    outlet = _data_outlet(sensor, place, link)
-    outlet.controls = _controls(sensor)
-    return outlet
-
-
-def _data_outlet(sensor: Sensor, place: str, link: str | Path | None) -> Outlet:
-    """The outlet of a simulated sensor: "pty", "udp://HOST:PORT" or "tcp://HOST:PORT"; TCP port 0
-    takes one that is free.
-
-    Without a UDP port, data goes to the first one that the sensor declares and the rest to its
-    second.
-
-    Args:
-        link: a path that leads to the pseudo-terminal.
-
-    Raises:
-        UsageError: for what is no destination, and one that cannot carry what the sensor sends.
-        SourceError: where it cannot be had.
-    """
-    if place == "pty":
-        if sensor.datagrams:
-            raise UsageError(
-                f"{sensor.id} sends datagrams, which a serial port cannot carry: simulate it to"
-                f" udp://{HERE}"
-            )
-        return PtyOutlet(link)
-    scheme = place.partition("://")[0] if "://" in place else ""
-    if scheme not in ("udp", "tcp"):
-        raise UsageError(
-            f"{place!r} is no destination: pty, udp://HOST:PORT, tcp://HOST:PORT, or a file (.lsr,"
-            " .pcap, .pcapng, .bin)"
-        )
-    if link is not None:
-        raise UsageError("a link leads to a pseudo-terminal: it goes with pty alone")
-    host, port = _host_and_port(place)
-    declared = sensor.links.get("data")
-    if scheme == "tcp":
-        port = declared.port if port is None and isinstance(declared, Tcp) else port
-        if port is None:
-            raise UsageError(f"{sensor.id} declares no TCP port: name one, as in tcp://{host}:2111")
-        return TcpOutlet(host, port)
-    if not isinstance(declared, Udp) or not sensor.datagrams:
-        raise UsageError(
-            f"{sensor.id} sends a stream of bytes, no datagrams: simulate it to pty or tcp://"
-        )
-    ports = (port,) if port else declared.ports[:2]
+def _format_ports(ports: Sequence[int]) -> str:
+    """Return the ports as they follow the host of a SOURCE."""
     if not ports:
-        raise UsageError(f"{sensor.id} declares no port: name one, as in udp://{host}:2368")
-    return UdpOutlet(host, ports)
-
-
-def replay_outlet(place: str, *, datagrams: bool, port: int = 0) -> Outlet:
-    """The outlet of a replay: "pty", "udp://HOST" or "tcp://HOST:PORT"; TCP port 0 takes one that
-    is free.
-
-    Args:
-        datagrams: whether datagrams were recorded. Without a UDP port, each goes to the one that it
-            was sent to then.
-        port: for datagrams that do not say where they went.
-
-    Raises:
-        UsageError: for what is no destination, and one that cannot take the place of what was
-            recorded.
-        SourceError: where it cannot be had.
-    """
-    if place == "pty" or place.startswith("tcp:"):
-        if datagrams:
-            raise UsageError(
-                f"datagrams were recorded, and {place} is a byte stream: play them to udp://{HERE}"
-            )
-        if place == "pty":
-            return PtyOutlet()
-    elif not place.startswith("udp:"):
-        raise UsageError(
-            "a replay goes to pty, udp://host:port, tcp://host:port or a new file, not to"
-            f" {place!r}"
-        )
-    elif not datagrams:
-        raise UsageError(
-            f"a byte stream was recorded, and {place} takes datagrams: play it to pty or"
-            f" tcp://{HERE}:PORT"
-        )
-    host, named = _host_and_port(place)
-    if place.startswith("udp:"):
-        return UdpOutlet(host, (named,) if named else (), port=port)
-    if named is None:
-        raise UsageError(f"{place}: name the port to listen on, as in tcp://{HERE}:2111")
-    return TcpOutlet(host, named, sole=True)
-
-
-def _host_and_port(place: str) -> tuple[str, int | None]:
-    """Host, this computer where it is left out, and port of a destination; 0 where any free one
-    will do.
-    """
-    address = Address.parse(place)
-    address.check(())
-    if address.scheme == "tcp" and address.place.endswith(":0"):
-        return replace(address, place=address.place[:-2]).host_and_port()[0] or HERE, 0
-    host, port = address.host_and_port()
-    return host or HERE, port
+        return ""
+    if len(ports) == 1:
+        return f":{ports[0]}"
+    return f"?port={','.join(map(str, ports))}"

@@ -1,4 +1,4 @@
-"""``sim:ID``: a simulated sensor as a live source, in this process, in real time or any other."""
+"""``sim:ID``: a simulated sensor as a live source in this process."""
 
 from __future__ import annotations
 
@@ -18,21 +18,23 @@ from lidarspec.transports.base import Address, HostClock, failure
 from lidarspec.transports.protocol import Chunk, Disconnected, LiveTransport
 
 OPTIONS = ("rate", "scene", "seed", *FAULTS)
-#: ns between two reads, in which a fast sensor gathers some packets.
-PAUSE = 2_000_000
+#: The shortest time between two reads, so that a fast sensor gathers some packets.
+_MIN_READ_INTERVAL_NS = 2_000_000
 
 
 class SimulatedTransport(LiveTransport):
-    """A link of a simulated device; that of the data switches it on, and reading it makes time pass
-    for all.
+    """One link of a simulated device.
+
+    Opening the data link switches the device on, and reading it advances the device's time for all
+    links.
 
     Args:
-        name: of the link.
-        data: the data link of the same device, for another one.
+        name: the name of the link.
+        data: the data link of the same device, for another link.
 
     Attributes:
-        sensor, device: which is simulated.
-        baud: of its serial line, None where it has none.
+        sensor, device: the simulated sensor and device.
+        baud: the baud rate of a serial link, None for another one.
     """
 
     def __init__(
@@ -43,35 +45,42 @@ class SimulatedTransport(LiveTransport):
         name: str = "data",
         data: SimulatedTransport | None = None,
     ) -> None:
-        self.label, self.device, self.sensor, self._name = label, device, sensor, name
+        self.label = label
+        self.sensor = sensor
+        self.device = device
+        self._name = name
         link = sensor.links.get(name)
         self.datagrams = is_datagram(link)
         self.baud = link.baud if isinstance(link, Serial) else None
         self.overflow = "block" if math.isinf(device.rate) else "drop_oldest"
-        self._changed: threading.Condition = data._changed if data else threading.Condition()
         self._clock = HostClock()
-        #: what has left the device on the links that are open, and was not read yet.
-        self._left: dict[str, list[bytes]] = data._left if data else {}
-        self._left[name] = []
-        self._rested = 0
+        self._next_read_ns = 0
+        self._changed: threading.Condition
+        #: The bytes that the device has sent over each open link and that were not read.
+        self._unread: dict[str, list[bytes]]
         if data is None:
+            self._changed = threading.Condition()
+            self._unread = {}
             device.start(time.monotonic_ns())
+        else:
+            self._changed = data._changed
+            self._unread = data._unread
+        self._unread[name] = []
 
     def link(self, name: str) -> SimulatedTransport:
         with self._changed:
             return SimulatedTransport(self.label, self.sensor, self.device, name, self)
 
     def read(self, timeout: float) -> list[Chunk]:
-        end = time.monotonic_ns() + int(timeout * SECOND)
+        deadline = time.monotonic_ns() + int(timeout * SECOND)
         with self._changed:
             while not self.closed:
                 now = time.monotonic_ns()
-                chunks = self._arrived(now) if now >= self._rested else []
-                if chunks or now >= end:
+                chunks = self._take(now) if now >= self._next_read_ns else []
+                if chunks or now >= deadline:
                     return chunks
-                due = self.device.deadline if self._name == "data" else None
-                wake = end if due is None else min(end, max(due, self._rested))
-                self._changed.wait(max(wake - now, 0) / SECOND)
+                wake_ns = min(deadline, self._next_data_ns())
+                self._changed.wait(max(wake_ns - now, 0) / SECOND)
         return []
 
     def write(self, data: bytes) -> None:
@@ -88,67 +97,47 @@ class SimulatedTransport(LiveTransport):
                 raise failure(f"{self.label}: the simulated sensor is unplugged", "wait")
 
     def lines(self, *, dtr: bool | None = None, rts: bool | None = None) -> None:
-        """Control lines have no effect on a simulated device."""
+        """Do nothing: control lines have no effect on a simulated device."""
 
     def close(self) -> None:
         with self._changed:
             self.closed = True
             self._changed.notify_all()
 
-    def _arrived(self, now: int) -> list[Chunk]:
-        for link, data in self.device.outgoing(now) if self._name == "data" else ():
-            if link in self._left:
-                self._left[link].append(data)
-                self._changed.notify_all()
-        out, self._left[self._name] = self._left[self._name], []
+    def _next_data_ns(self) -> float:
+        """Return the time at which the device sends again; the other links wait for the data link."""
+        deadline = self.device.deadline if self._name == "data" else None
+        if deadline is None:
+            return math.inf
+        return max(deadline, self._next_read_ns)
+
+    def _take(self, now: int) -> list[Chunk]:
+        """Advance the device's time over the data link, and return the bytes of this link."""
+        if self._name == "data":
+            for link, data in self.device.outgoing(now):
+                if link in self._unread:
+                    self._unread[link].append(data)
+                    self._changed.notify_all()
+        unread = self._unread[self._name]
+        self._unread[self._name] = []
         if not self.device.present:
             raise Disconnected(f"{self.label}: the simulated sensor was unplugged")
-        self._rested = now + PAUSE if out and math.isfinite(self.device.rate) else now
+        self._next_read_ns = now
+        if unread and math.isfinite(self.device.rate):
+            self._next_read_ns += _MIN_READ_INTERVAL_NS
         at = self._clock.now()
-        return [Chunk(data, at) for data in out]
-
-
-def simulated_device(sensor: Sensor, options: Mapping[str, str]) -> SimulatedDevice:
-    """The device that options name by text: ``{"rate": "2", "scene": "hall.toml", "errors":
-    "0.01"}``.
-
-    Raises:
-        UsageError: for a value that is not of its kind, and where the sensor cannot be simulated.
-        SourceError: where the scene cannot be read.
-    """
-    scene = read_scene(options["scene"]) if "scene" in options else None
-    faults = faults_of({name: text for name, text in options.items() if name in FAULTS})
-    seed = options.get("seed", "0")
-    if not seed.isdecimal():
-        raise UsageError(f"seed is a whole number, not {seed!r}")
-    return SimulatedDevice(
-        sensor, scene=scene, seed=int(seed), rate=rate_of(options.get("rate", "1")), faults=faults
-    )
-
-
-def rate_of(text: str) -> float:
-    """How many times faster than in reality; inf for "max" and 0.
-
-    Raises:
-        UsageError: for anything else but a number above 0.
-    """
-    try:
-        rate = math.inf if text in ("max", "0") else float(text)
-    except ValueError:
-        rate = -1.0
-    if not rate > 0:
-        raise UsageError(f"rate is a number above 0, or max, not {text!r}")
-    return rate
+        return [Chunk(data, at) for data in unread]
 
 
 def connect(address: Address, sensor: Sensor | None = None) -> SimulatedTransport:
-    """The open transport of ``sim:ID?rate=2&errors=0.01``.
+    """Return the open transport of ``sim:ID?rate=2&errors=0.01``.
 
     Args:
-        sensor: who reads it; where it is the same sensor, it is simulated with the same options.
+        sensor: the sensor that reads it. If it has the same id, it is simulated with its options.
 
     Raises:
-        UnknownSensor, UnknownOption, UsageError: for what the source says.
+        UnknownSensor, UnknownOption, UsageError: for an invalid source.
+        SourceError: if the scene cannot be read.
     """
     address.check(OPTIONS)
     if not address.place and sensor is None:
@@ -157,4 +146,32 @@ def connect(address: Address, sensor: Sensor | None = None) -> SimulatedTranspor
         )
     if sensor is None or (address.place and named_sensor(address.place).id != sensor.id):
         sensor = named_sensor(address.place)
-    return SimulatedTransport(address.text, sensor, simulated_device(sensor, address.options))
+    return SimulatedTransport(address.text, sensor, _make_device(sensor, address.options))
+
+
+def parse_rate(text: str) -> float:
+    """Return a factor of the speed of real time; inf for "max" and "0".
+
+    Raises:
+        UsageError: unless it is a number above 0, or "max".
+    """
+    if text in ("max", "0"):
+        return math.inf
+    try:
+        rate = float(text)
+    except ValueError:
+        rate = math.nan
+    if not rate > 0:
+        raise UsageError(f"rate is a number above 0, or max, not {text!r}")
+    return rate
+
+
+def _make_device(sensor: Sensor, options: Mapping[str, str]) -> SimulatedDevice:
+    """Return a device for options such as ``{"rate": "2", "scene": "hall.toml"}``."""
+    scene = read_scene(options["scene"]) if "scene" in options else None
+    faults = faults_of({name: text for name, text in options.items() if name in FAULTS})
+    seed = options.get("seed", "0")
+    if not seed.isdecimal():
+        raise UsageError(f"seed is a whole number, not {seed!r}")
+    rate = parse_rate(options.get("rate", "1"))
+    return SimulatedDevice(sensor, scene=scene, seed=int(seed), rate=rate, faults=faults)

@@ -35,7 +35,7 @@ STAMPED = {
     ("unfinished.py", "time.time"),
     ("recording/recorders.py", "datetime.now"),
     ("recording/recorders.py", "time.time_ns"),
-    ("transports/serving.py", "time.time_ns"),
+    ("transports/simulated_files.py", "time.time_ns"),
 }
 
 

@@ -10,7 +10,7 @@ import sys
 import threading
 import time
 import tty
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import numpy as np
@@ -21,16 +21,10 @@ from lidarspec.errors import SourceError, UsageError
 from lidarspec.recording.recorders import Recorder, recorder
 from lidarspec.spec import Chunk, Disconnected
 from lidarspec.transports import outlets
+from lidarspec.transports.destinations import replay_outlet
 from lidarspec.transports.open_url import transport
-from lidarspec.transports.outlets import (
-    FileOutlet,
-    Outlet,
-    PtyOutlet,
-    TcpOutlet,
-    UdpOutlet,
-    replay_outlet,
-)
-from lidarspec.transports.serving import Deadlines, replayed
+from lidarspec.transports.outlets import Outlet, PtyLine, TcpLine, UdpLine
+from lidarspec.transports.replays import Deadlines, Replay, iter_paced
 from tests.lines import TIMEOUT_S, until, working
 
 STREAM, DATAGRAMS = "ldrobot-stl27l", "velodyne-vlp16"
@@ -83,8 +77,8 @@ def playing(
             if began is not None:
                 began.append(time.monotonic())
             with contextlib.closing(transport(path)) as source:
-                for _ in replayed(source.chunks(), target, speed=speed):
-                    pass
+                for chunk, _ in iter_paced(source.chunks(), speed=speed):
+                    target.deliver(chunk)
         except BaseException as error:
             failed.append(error)
         finally:
@@ -133,7 +127,7 @@ def until_the_end(read: Callable[[], bytes]) -> Iterator[bytes]:
 def test_a_stream_comes_out_as_it_went_in_at_every_speed(
     stream: Path, kind: str, speed: float | None
 ) -> None:
-    target = PtyOutlet() if kind == "pty" else TcpOutlet("127.0.0.1", 0, sole=True)
+    target = Outlet(PtyLine() if kind == "pty" else TcpLine("127.0.0.1", 0, sole=True))
     with playing(stream, target, speed=speed) as failed:
         received = (from_pty if kind == "pty" else from_tcp)(target.place)
     assert not failed
@@ -150,7 +144,8 @@ def test_datagrams_come_out_as_they_went_in_at_every_speed(
         receiver.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 1 << 20)
         receiver.bind(("127.0.0.1", 0))
         receiver.settimeout(TIMEOUT_S)
-        with playing(datagrams, UdpOutlet(ports=receiver.getsockname()[1:]), speed=speed) as failed:
+        target = Outlet(UdpLine.to(ports=receiver.getsockname()[1:]))
+        with playing(datagrams, target, speed=speed) as failed:
             received = [receiver.recv(65536) for _ in range(100)]
     assert not failed
     with contextlib.closing(transport(datagrams)) as source:
@@ -165,11 +160,8 @@ def test_into_a_file_datagrams_keep_their_times_and_addresses(
     datagrams: Path, tmp_path: Path, suffix: str
 ) -> None:
     copy = tmp_path / f"copy{suffix}"
-    with playing(
-        datagrams, FileOutlet(recorder(copy, DATAGRAMS, datagrams=True)), speed=None
-    ) as failed:
-        pass
-    assert not failed
+    with contextlib.closing(recorder(copy, DATAGRAMS, datagrams=True)) as log:
+        assert not any(Replay(str(datagrams), log, speed=None).run())
     with (
         contextlib.closing(transport(datagrams)) as before,
         contextlib.closing(transport(copy)) as after,
@@ -188,7 +180,7 @@ def test_datagrams_go_to_the_ports_of_then(datagrams: Path) -> None:
         for receiver in receivers:
             receiver.bind(("127.0.0.1", 0))
             receiver.settimeout(TIMEOUT_S)
-        target = stack.enter_context(contextlib.closing(UdpOutlet()))
+        target = stack.enter_context(contextlib.closing(UdpLine.to()))
         for number, receiver in enumerate(receivers):
             target.send(
                 [Chunk(bytes([number]), receiver=("10.0.0.1", receiver.getsockname()[1]))],
@@ -202,7 +194,7 @@ def test_datagrams_go_to_the_ports_of_then(datagrams: Path) -> None:
 @posix
 @pytest.mark.parametrize("speed", [2.0, pytest.param(1.0, marks=pytest.mark.slow)])
 def test_arrivals_keep_the_times_of_then(stream: Path, speed: float) -> None:
-    target, began, arrived = PtyOutlet(), list[float](), list[tuple[float, int]]()
+    target, began, arrived = Outlet(PtyLine()), list[float](), list[tuple[float, int]]()
     with playing(stream, target, speed=speed, began=began):
         descriptor, total = os.open(target.place, os.O_RDWR | os.O_NOCTTY), 0
         with contextlib.suppress(OSError):
@@ -229,74 +221,46 @@ class Clock:
         self.time += round(seconds * SECOND) + 3 * MS
 
 
-class Listener(Outlet):
-    """Remembers when each chunk came."""
-
-    def __init__(self, clock: Clock) -> None:
-        self.clock, self.times = clock, list[int]()
-
-    def receive(self, wait: float) -> list[bytes]:
-        return []
-
-    def send(self, chunks: Sequence[Chunk], *, patient: bool) -> None:
-        self.times.append(self.clock.now())
-
-    def close(self) -> None: ...
-
-
 @pytest.mark.parametrize("speed", [0.25, 1.0, 3.0])
 def test_oversleeping_does_not_add_up(speed: float) -> None:
     clock = Clock()
-    listener = Listener(clock)
     chunks = [Chunk(b"x", 10**18 + number * MS) for number in range(10_000)]
-    late = [
-        late
-        for _, late in replayed(chunks, listener, speed=speed, now=clock.now, sleep=clock.sleep)
-    ]
+    times, late = [], []
+    for _, late_ns in iter_paced(chunks, speed=speed, now=clock.now, sleep=clock.sleep):
+        times.append(clock.now())
+        late.append(late_ns)
     due = [round(number * MS / speed) for number in range(10_000)]
-    errors = [at - listener.times[0] - when for at, when in zip(listener.times, due, strict=True)]
+    errors = [at - times[0] - when for at, when in zip(times, due, strict=True)]
     assert 0 <= min(errors) <= max(errors) <= 3 * MS
     assert late == errors
 
 
 def test_as_fast_as_possible_never_waits() -> None:
     clock = Clock()
-    listener = Listener(clock)
-    assert (
-        len(
-            list(
-                replayed(
-                    [Chunk(b"", SECOND * n) for n in range(9)],
-                    listener,
-                    speed=None,
-                    now=clock.now,
-                    sleep=clock.sleep,
-                )
-            )
-        )
-        == 9
-    )
-    assert set(listener.times) == {5 * SECOND}
+    chunks = [Chunk(b"", SECOND * number) for number in range(9)]
+    sent = list(iter_paced(chunks, speed=None, now=clock.now, sleep=clock.sleep))
+    assert sent == [(chunk, 0) for chunk in chunks]
+    assert clock.now() == 5 * SECOND
 
 
 def test_times_that_go_back_hold_nothing_up() -> None:
     deadlines = Deadlines(1.0, 0)
-    overtaken = [deadlines.due(10**18 + at * MS) for at in (0, 10, 5, 20, 12, 30)]
+    overtaken = [deadlines.find(10**18 + at * MS) for at in (0, 10, 5, 20, 12, 30)]
     assert overtaken == [0, 10 * MS, 5 * MS, 20 * MS, 12 * MS, 30 * MS]
-    set_back = [deadlines.due(at * MS) for at in (0, 10, 20)]
+    set_back = [deadlines.find(at * MS) for at in (0, 10, 20)]
     assert set_back == [30 * MS, 40 * MS, 50 * MS]
-    assert deadlines.due(None) == 0
+    assert deadlines.find(None) == 0
 
 
 @posix
 def test_a_reader_that_leaves_is_noticed(stream: Path) -> None:
-    target = PtyOutlet()
+    target = Outlet(PtyLine())
     with playing(stream, target, speed=1.0) as failed:
         descriptor = os.open(target.place, os.O_RDWR | os.O_NOCTTY)
         os.read(descriptor, 1)
         os.close(descriptor)
     assert [type(error) for error in failed] == [Disconnected]
-    server = TcpOutlet("127.0.0.1", 0, sole=True)
+    server = Outlet(TcpLine("127.0.0.1", 0, sole=True))
     with (
         playing(stream, server, speed=1.0) as failed,
         socket.create_connection(("127.0.0.1", int(server.place.split(":")[2]))) as reader,
@@ -306,8 +270,8 @@ def test_a_reader_that_leaves_is_noticed(stream: Path) -> None:
 
 
 def test_a_reader_that_floods_does_not_hold_up_the_end(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(outlets, "FAREWELL", 0.2)
-    target = TcpOutlet("127.0.0.1", 0, sole=True)
+    monkeypatch.setattr(outlets, "FETCH_TIMEOUT_S", 0.2)
+    target = TcpLine("127.0.0.1", 0, sole=True)
     with socket.create_connection(("127.0.0.1", int(target.place.split(":")[2]))) as reader:
         target.await_listener()
 
@@ -325,7 +289,7 @@ def test_a_reader_that_floods_does_not_hold_up_the_end(monkeypatch: pytest.Monke
 
 @posix
 def test_the_last_bytes_reach_a_slow_reader(stream: Path) -> None:
-    target = PtyOutlet()
+    target = Outlet(PtyLine())
     received = bytearray()
     with playing(stream, target, speed=None):
         descriptor = os.open(target.place, os.O_RDWR | os.O_NOCTTY)
@@ -359,12 +323,12 @@ def test_an_address_in_use_is_told() -> None:
         socket.create_server(("127.0.0.1", 0)) as taken,
         pytest.raises(SourceError, match="in use"),
     ):
-        TcpOutlet("127.0.0.1", taken.getsockname()[1])
+        TcpLine("127.0.0.1", taken.getsockname()[1])
 
 
 @pytest.mark.skipif(sys.platform != "linux", reason="counts descriptors in /proc")
 def test_players_give_everything_back(stream: Path) -> None:
     before = len(os.listdir("/proc/self/fd"))
-    for made in (PtyOutlet(), TcpOutlet("127.0.0.1", 0, sole=True), UdpOutlet(ports=[9])):
+    for made in (PtyLine(), TcpLine("127.0.0.1", 0, sole=True), UdpLine.to(ports=[9])):
         made.close()
     assert len(os.listdir("/proc/self/fd")) == before

@@ -28,8 +28,9 @@ from lidarspec.simulation.faults import Faults
 from lidarspec.simulation.scenes import Room, read_scene
 from lidarspec.spec import Command, Simulation, Udp
 from lidarspec.testing.fixtures import virtual_port
-from lidarspec.transports.outlets import simulated_outlet
-from lidarspec.transports.serving import Served, Turns, write_file
+from lidarspec.transports.destinations import simulated_outlet
+from lidarspec.transports.serving import FairLock, Served
+from lidarspec.transports.simulated_files import write_file
 from lidarspec.view.screen import Keyboard
 from tests.broken import sound
 from tests.lines import TIMEOUT_S, free_port, read_until, until
@@ -173,7 +174,7 @@ def test_what_is_sent_while_nobody_listens_is_lost_as_on_a_wire() -> None:
                 sent = port.device.sent["data"]
                 assert abs(int(first["timestamp"][0] * 1800) - sent) < 0.5 * 1800
             time.sleep(0.2)
-        assert port.outlet.unsent > 0.3 * 84_600
+        assert port.outlet.unsent_bytes > 0.3 * 84_600
 
 
 @posix
@@ -413,20 +414,20 @@ def test_many_simulators_take_turns_and_end() -> None:
 
 
 def test_turns_come_in_the_order_of_asking_and_nobody_waits_who_is_to_end() -> None:
-    turns, came = Turns(), list[tuple[int, bool]]()
+    turns, came = FairLock(), list[tuple[int, bool]]()
     stops = [threading.Event() for _ in range(4)]
 
     def work(number: int) -> None:
-        with turns.turn(stops[number]) as is_ours:
+        with turns.hold(stops[number]) as is_ours:
             came.append((number, is_ours))
 
     waiting = [threading.Thread(target=work, args=(number,)) for number in (1, 2, 3)]
-    with turns.turn(stops[0]) as is_ours:
+    with turns.hold(stops[0]) as is_ours:
         assert is_ours
         for number, thread in enumerate(waiting, start=2):
             thread.start()
             until(lambda number=number: len(turns._tickets) == number)  # type: ignore[misc]
-        turns.end(stops[2])
+        turns.cancel(stops[2])
         waiting[1].join(TIMEOUT_S)
         assert came == [(2, False)]
     for thread in waiting:

@@ -24,7 +24,7 @@ from lidarspec.errors import LidarSpecError
 from lidarspec.scans.selection import EVERYTHING, Selection
 from lidarspec.simulation.device import SimulatedDevice
 from lidarspec.transports.open_url import is_live
-from lidarspec.transports.serving import write_file
+from lidarspec.transports.simulated_files import write_file
 from lidarspec.view.feed import LOOK
 from lidarspec.view.live import Switch
 from tests.libraries import Library

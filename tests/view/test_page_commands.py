@@ -10,7 +10,7 @@ import pytest
 import lidarspec as ls
 from lidarspec.explaining.assignments import arguments
 from lidarspec.simulation.device import SimulatedDevice
-from lidarspec.transports.outlets import simulated_outlet
+from lidarspec.transports.destinations import simulated_outlet
 from lidarspec.transports.serving import Served
 from tests.installed import sensor_modules, sensors_in
 from tests.view.pages import FLAT, Page, Station, recorded

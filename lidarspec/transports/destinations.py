@@ -1,0 +1,164 @@
+"""Make outlets from destinations: "pty", "udp://HOST:PORT" and "tcp://HOST:PORT"."""
+
+from __future__ import annotations
+
+import contextlib
+from dataclasses import replace
+from pathlib import Path
+
+from lidarspec.errors import SourceError, UsageError
+from lidarspec.spec.links import Http, Link, Tcp, Udp
+from lidarspec.spec.sensor import Sensor
+from lidarspec.transports.base import Address
+from lidarspec.transports.outlets import LOCALHOST, Line, Outlet, PtyLine, TcpLine, UdpLine
+
+
+def simulated_outlet(sensor: Sensor, place: str, link: str | Path | None = None) -> Outlet:
+    """Return the outlet of a simulated sensor, with lines for all links that take commands.
+
+    Args:
+        place: "pty", "udp://HOST:PORT" or "tcp://HOST:PORT"; TCP port 0 takes any free one. Without
+            a UDP port, data frames go to the first port that the sensor declares, and all others to
+            the second.
+        link: a symbolic link to the pseudo-terminal.
+
+    Raises:
+        UsageError: for an invalid destination, or one that cannot carry the sensor's frames.
+        SourceError: if the destination is not available.
+    """
+    data = _make_data_line(sensor, place, link)
+    return Outlet(data, _make_control_lines(sensor))
+
+
+def replay_outlet(place: str, *, datagrams: bool, port: int = 0) -> Outlet:
+    """Return the outlet of a replay.
+
+    Args:
+        place: "pty", "udp://HOST" or "tcp://HOST:PORT"; TCP port 0 takes any free one.
+        datagrams: whether datagrams were recorded. Without a UDP port, each goes to the port that
+            it was recorded at.
+        port: for datagrams whose port was not recorded.
+
+    Raises:
+        UsageError: for an invalid destination, or one that cannot carry the recorded data.
+        SourceError: if the destination is not available.
+    """
+    if place.startswith("udp:"):
+        return Outlet(_make_udp_replay_line(place, datagrams=datagrams, port=port))
+    if place != "pty" and not place.startswith("tcp:"):
+        raise UsageError(
+            "a replay goes to pty, udp://host:port, tcp://host:port or a new file, not to"
+            f" {place!r}"
+        )
+    if datagrams:
+        raise UsageError(
+            f"datagrams were recorded, and {place} is a byte stream: play them to udp://{LOCALHOST}"
+        )
+    if place == "pty":
+        return Outlet(PtyLine())
+    host, named_port = _parse_host_and_port(place)
+    if named_port is None:
+        raise UsageError(f"{place}: name the port to listen on, as in tcp://{LOCALHOST}:2111")
+    return Outlet(TcpLine(host, named_port, sole=True))
+
+
+def _make_udp_replay_line(place: str, *, datagrams: bool, port: int) -> UdpLine:
+    if not datagrams:
+        raise UsageError(
+            f"a byte stream was recorded, and {place} takes datagrams: play it to pty or"
+            f" tcp://{LOCALHOST}:PORT"
+        )
+    host, named_port = _parse_host_and_port(place)
+    ports = (named_port,) if named_port else ()
+    return UdpLine.to(host, ports, default_port=port)
+
+
+def _make_data_line(sensor: Sensor, place: str, link: str | Path | None) -> Line:
+    if place == "pty":
+        if sensor.datagrams:
+            raise UsageError(
+                f"{sensor.id} sends datagrams, which a serial port cannot carry: simulate it to"
+                f" udp://{LOCALHOST}"
+            )
+        return PtyLine(link)
+    if not place.startswith(("udp://", "tcp://")):
+        raise UsageError(
+            f"{place!r} is no destination: pty, udp://HOST:PORT, tcp://HOST:PORT, or a file (.lsr,"
+            " .pcap, .pcapng, .bin)"
+        )
+    if link is not None:
+        raise UsageError("a link leads to a pseudo-terminal: it goes with pty alone")
+    if place.startswith("tcp://"):
+        return _make_tcp_data_line(sensor, place)
+    return _make_udp_data_line(sensor, place)
+
+
+def _make_tcp_data_line(sensor: Sensor, place: str) -> TcpLine:
+    host, port = _parse_host_and_port(place)
+    declared = sensor.links.get("data")
+    if port is None and isinstance(declared, Tcp):
+        port = declared.port
+    if port is None:
+        raise UsageError(f"{sensor.id} declares no TCP port: name one, as in tcp://{host}:2111")
+    return TcpLine(host, port)
+
+
+def _make_udp_data_line(sensor: Sensor, place: str) -> UdpLine:
+    host, port = _parse_host_and_port(place)
+    declared = sensor.links.get("data")
+    if not isinstance(declared, Udp) or not sensor.datagrams:
+        raise UsageError(
+            f"{sensor.id} sends a stream of bytes, no datagrams: simulate it to pty or tcp://"
+        )
+    ports = (port,) if port else declared.ports[:2]
+    if not ports:
+        raise UsageError(f"{sensor.id} declares no port: name one, as in udp://{host}:2368")
+    return UdpLine.to(host, ports)
+
+
+def _make_control_lines(sensor: Sensor) -> dict[str, Line]:
+    """Return a line on this computer for each link that takes commands, except the data link."""
+    lines = {}
+    for name in {command.link for command in sensor.commands.values()} - {"data"}:
+        line = _make_control_line(sensor.links[name])
+        if line is not None:
+            lines[name] = line
+    return lines
+
+
+def _make_control_line(link: Link) -> Line | None:
+    """Return a line at the declared port, or at a free one if that is taken.
+
+    None for a link of a kind that only a plugin knows.
+    """
+    for port in (_declared_port(link), 0):
+        with contextlib.suppress(OSError, SourceError):
+            if isinstance(link, Tcp):
+                return TcpLine(LOCALHOST, port)
+            if isinstance(link, Udp):
+                return UdpLine.replying(LOCALHOST, port)
+            if isinstance(link, Http):
+                from lidarspec.transports.http_line import HttpLine
+
+                return HttpLine(LOCALHOST, port)
+    return None
+
+
+def _declared_port(link: Link) -> int:
+    """Return the port at which a sensor takes commands over a link, 0 if it declares none."""
+    if isinstance(link, Tcp | Http):
+        return link.port
+    if isinstance(link, Udp):
+        return link.ports[0] if link.ports else link.broadcast
+    return 0
+
+
+def _parse_host_and_port(place: str) -> tuple[str, int | None]:
+    """Return the host, by default this computer, and the port; 0 for any free TCP port."""
+    address = Address.parse(place)
+    address.check(())
+    if address.scheme == "tcp" and address.place.endswith(":0"):
+        host, _ = replace(address, place=address.place.removesuffix(":0")).host_and_port()
+        return host or LOCALHOST, 0
+    host, port = address.host_and_port()
+    return host or LOCALHOST, port

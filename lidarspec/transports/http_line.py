@@ -1,0 +1,130 @@
+"""Serve HTTP in the place of a sensor.
+
+The standard library's server parses requests in threads of its own. Each thread passes its request
+on as a frame of `HttpRequest`, and waits for the frame of `HttpReply` that the simulated sensor
+sends. A request without a reply in time is answered with status 504.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import queue
+import threading
+from collections import deque
+from collections.abc import Sequence
+from functools import partial
+from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
+from typing import Any
+
+from lidarspec.spec.fields import HttpReply, HttpRequest
+from lidarspec.transports.outlets import Line
+from lidarspec.transports.protocol import Chunk
+
+_MAX_BODY_BYTES = 1 << 20
+_REPLY_TIMEOUT_S = 2.0
+#: The interval at which requests are fetched from the threads.
+_REQUEST_POLL_S = 0.01
+_SHUTDOWN_POLL_S = 0.05
+
+_ReplyQueue = queue.SimpleQueue[bytes]
+
+
+class HttpLine(Line):
+    """The web server of a simulated sensor.
+
+    Args:
+        host, port: where to listen; port 0 takes any free one.
+
+    Raises:
+        OSError: if the address is not available.
+    """
+
+    def __init__(self, host: str, port: int) -> None:
+        self._lock = threading.Lock()
+        self._requests: queue.SimpleQueue[bytes] = queue.SimpleQueue()
+        # In the order of the requests. A request that timed out is no longer among them.
+        self._waiting: deque[_ReplyQueue] = deque()
+        self._server = ThreadingHTTPServer((host, port), partial(_Handler, self))
+        self._server.daemon_threads = True
+        self.port = int(self._server.server_address[1])
+        self.place = f"http://{host}:{self.port}"
+        threading.Thread(
+            target=self._server.serve_forever,
+            kwargs={"poll_interval": _SHUTDOWN_POLL_S},
+            name=self.place,
+            daemon=True,
+        ).start()
+
+    @property
+    def max_wait_s(self) -> float:
+        return _REQUEST_POLL_S
+
+    def receive(self) -> list[bytes]:
+        requests = []
+        with contextlib.suppress(queue.Empty):
+            while True:
+                requests.append(self._requests.get_nowait())
+        return requests
+
+    def send(self, chunks: Sequence[Chunk], *, patient: bool) -> None:
+        for chunk in chunks:
+            with contextlib.suppress(IndexError):  # the request has timed out
+                self._waiting.popleft().put(chunk.data)
+
+    def close(self) -> None:
+        self._server.shutdown()
+        self._server.server_close()
+
+    def ask(self, request: bytes) -> bytes | None:
+        """Return the reply of the simulated sensor to a request; None if there is none in time."""
+        reply = _ReplyQueue()
+        with self._lock:
+            self._waiting.append(reply)
+            self._requests.put(request)
+        try:
+            return reply.get(timeout=_REPLY_TIMEOUT_S)
+        except queue.Empty:
+            with contextlib.suppress(ValueError):
+                self._waiting.remove(reply)
+            return None
+
+
+class _Handler(BaseHTTPRequestHandler):
+    timeout = _REPLY_TIMEOUT_S
+
+    def __init__(self, line: HttpLine, *arguments: Any) -> None:
+        self._line = line
+        super().__init__(*arguments)  # handles the request
+
+    def _pass_on(self) -> None:
+        path = self.path.encode("latin-1")
+        body = self._read_body()
+        request = HttpRequest.build(
+            {
+                "method": self.command,
+                "path_size": len(path),
+                "path": path,
+                "size": len(body),
+                "body": body,
+            }
+        )
+        answer = self._line.ask(request)
+        if answer is None:
+            self.send_error(504, "the simulated sensor has no answer to that")
+            return
+        reply = HttpReply.parse(answer)
+        self.send_response(reply.status)
+        self.send_header("Content-Length", str(reply.size))
+        self.end_headers()
+        self.wfile.write(reply.body)
+
+    do_GET = do_PUT = do_POST = do_DELETE = _pass_on
+
+    def _read_body(self) -> bytes:
+        size = self.headers.get("Content-Length", "0")
+        if not size.isdecimal() or int(size) > _MAX_BODY_BYTES:
+            return b""
+        return self.rfile.read(int(size))
+
+    def log_message(self, format: str, *args: object) -> None:
+        """Print nothing: the simulator prints the commands that it recognizes."""

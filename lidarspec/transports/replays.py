@@ -1,0 +1,204 @@
+"""Send a recording again, byte for byte, at its recorded times or at another speed.
+
+Each chunk has a deadline on the monotonic clock. Deadlines are computed from the first chunk, not
+from the previous one, so that late wake-ups do not add up. A late chunk is sent at once.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import hashlib
+import time
+from collections.abc import Callable, Iterable, Iterator
+
+from lidarspec.errors import UsageError, WireError
+from lidarspec.recording.appending import Appender
+from lidarspec.scans.selection import Times, received
+from lidarspec.transports.open_url import transport
+from lidarspec.transports.outlets import Outlet
+from lidarspec.transports.protocol import Chunk, Disconnected, Sender, Transport, sender_names
+
+_SECOND_NS = 1_000_000_000
+#: A chunk that is sent later than this counts as late.
+LATE_NS = 20_000_000
+#: Recorded times that go back further than this come from a clock that was set.
+_MAX_REORDERING_NS = _SECOND_NS
+
+
+class Deadlines:
+    """The deadline of each chunk of a replay, in ns of the monotonic clock.
+
+    Times that go back by at most a second, as those of reordered datagrams, are due at once. After
+    a larger step, as when a clock was set, the time continues from there.
+
+    Args:
+        speed: 2.0 is twice as fast as recorded; None is as fast as possible.
+        start: the deadline of the first chunk.
+    """
+
+    def __init__(self, speed: float | None, start: int) -> None:
+        self._speed = speed
+        self._start = start
+        self._origin: int | None = None
+        self._latest = 0
+
+    def find(self, at: int | None) -> int:
+        """Return the deadline of a chunk; the start for an unknown arrival time.
+
+        Args:
+            at: its arrival time in ns.
+        """
+        if self._speed is None or at is None:
+            return self._start
+        if self._origin is None:
+            self._origin = at
+            self._latest = at
+        elif at < self._latest - _MAX_REORDERING_NS:
+            self._origin += at - self._latest
+            self._latest = at
+        self._latest = max(self._latest, at)
+        return self._start + round((at - self._origin) / self._speed)
+
+
+def iter_paced(
+    chunks: Iterable[Chunk],
+    *,
+    speed: float | None = 1.0,
+    now: Callable[[], int] = time.monotonic_ns,
+    sleep: Callable[[float], None] = time.sleep,
+) -> Iterator[tuple[Chunk, int]]:
+    """Yield each chunk when it is due, with its lateness in ns.
+
+    Args:
+        speed: 2.0 is twice as fast as recorded; None is as fast as possible.
+    """
+    deadlines: Deadlines | None = None
+    for chunk in chunks:
+        if deadlines is None:
+            deadlines = Deadlines(speed, now())
+        deadline = deadlines.find(chunk.at)
+        while (remaining := deadline - now()) > 0:
+            sleep(remaining / _SECOND_NS)
+        yield chunk, 0 if speed is None else -remaining
+
+
+class Replay:
+    """A recording that is sent again.
+
+    Args:
+        file: the SOURCE of a recording, capture or raw file.
+        destination: an outlet, or a new file; it stays open.
+        speed: 2.0 is twice as fast as recorded; None is as fast as possible.
+        needs_times: refuse a file without times, instead of sending it as fast as possible.
+        loop: start again at the end, for each listener from the beginning.
+        source: the open file, if it is open already; standard input has to be. It is used for the
+            first turn and closed after it.
+        times: send a part only, by arrival times, as in `Selection`.
+
+    Attributes:
+        chunks, bytes: numbers sent so far.
+        late: the number of chunks that were sent more than 20 ms late.
+        latest: the greatest lateness in ns.
+        is_timed: whether the file has times.
+        digest: SHA-256 of all bytes.
+    """
+
+    def __init__(
+        self,
+        file: str,
+        destination: Outlet | Appender,
+        *,
+        speed: float | None = 1.0,
+        needs_times: bool = False,
+        loop: bool = False,
+        source: Transport | None = None,
+        times: Times = (None, None),
+    ) -> None:
+        self._file = file
+        self._destination = destination
+        self._speed = speed
+        self._needs_times = needs_times
+        self._loop = loop
+        self._source = source
+        self._times = times
+        self._start = time.monotonic()
+        self._endpoints: set[tuple[Sender | None, Sender | None]] = set()
+        self.chunks = 0
+        self.bytes = 0
+        self.late = 0
+        self.latest = 0
+        self.is_timed = True
+        self.digest = hashlib.sha256()
+
+    @property
+    def seconds(self) -> float:
+        """The time since the first listener came."""
+        return time.monotonic() - self._start
+
+    @property
+    def senders(self) -> set[str]:
+        """The names of the recorded senders of datagrams."""
+        return set(sender_names(self._endpoints).values()) - {""}
+
+    def run(self) -> Iterator[str]:
+        """Send the file once, or repeatedly; yield a message or "" after each chunk.
+
+        Raises:
+            UsageError: for a file without times, if they are required.
+            WireError: for an empty file.
+            SourceError: if the file cannot be read, or nothing can be sent.
+        """
+        while True:
+            if isinstance(self._destination, Outlet):
+                self._destination.await_listener()
+            if not self.chunks:
+                self._start = time.monotonic()
+            yield from self._run_once()
+            if not self.chunks:
+                raise WireError(f"{self._file} holds nothing that was received")
+            if not self._loop:
+                return
+
+    def _run_once(self) -> Iterator[str]:
+        opened = self._source or transport(self._file)
+        self._source = None
+        with contextlib.closing(opened) as source:
+            chunks = self._check_times(received(source, self._times, self._file))
+            try:
+                for chunk, late_ns in iter_paced(chunks, speed=self._speed):
+                    self._send(chunk)
+                    self._count(chunk, late_ns)
+                    yield ""
+            except Disconnected as error:
+                yield str(error)
+                return
+            if not self._loop:
+                yield from source.warnings
+
+    def _send(self, chunk: Chunk) -> None:
+        if isinstance(self._destination, Outlet):
+            self._destination.deliver(chunk)
+        else:
+            self._destination.keep_up()
+            self._destination.write(chunk)
+
+    def _check_times(self, chunks: Iterable[Chunk]) -> Iterator[Chunk]:
+        """Yield the chunks; a chunk without time makes it impossible to keep a speed."""
+        for chunk in chunks:
+            if chunk.at is None and self._speed is not None and self.is_timed:
+                if self._needs_times:
+                    raise UsageError(
+                        f"{self._file} does not say when its bytes arrived: only --speed max can be"
+                        " kept"
+                    )
+                self.is_timed = False
+            yield chunk
+
+    def _count(self, chunk: Chunk, late_ns: int) -> None:
+        self.chunks += 1
+        self.bytes += len(chunk.data)
+        self.digest.update(chunk.data)
+        if late_ns > LATE_NS:
+            self.late += 1
+        self.latest = max(self.latest, late_ns)
+        self._endpoints.add((chunk.sender, chunk.receiver))

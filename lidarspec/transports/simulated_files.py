@@ -1,0 +1,124 @@
+"""Write the bytes of a simulated sensor to a file, without waiting.
+
+The times in the file are those of the device. The file has the content of a recording that begins
+when the device is switched on and opened.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import itertools
+import time
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Literal
+
+from lidarspec.errors import LidarSpecError, SpecError, UsageError
+from lidarspec.frames.build import build_command
+from lidarspec.recording.recorders import recorder
+from lidarspec.simulation.device import SECOND, SimulatedDevice
+from lidarspec.spec.description import Spec
+from lidarspec.transports.protocol import Chunk
+from lidarspec.transports.serving import due_chunks
+
+#: The device's time between two calls; the health of the file is checked as often.
+_STEP_NS = SECOND // 100
+
+_Transfer = tuple[Chunk, Literal["in", "out"]]
+
+
+def write_file(
+    device: SimulatedDevice, path: str | Path, seconds: float, *, overwrite: bool = False
+) -> int:
+    """Write the bytes that a device sends in a period, from its start on.
+
+    The commands that open the device are sent to it, and recorded too. The file is only made if
+    there is something to write.
+
+    Args:
+        path: an .lsr, .pcap, .pcapng or .bin file.
+
+    Returns:
+        The number of bytes that the device sent.
+
+    Raises:
+        UnknownFormat, UsageError: if the file exists or cannot hold the bytes, or nothing is sent
+            in this time.
+        SpecError: if the sensor, as it is declared, never sends anything.
+        SourceError: if the file cannot be written.
+    """
+    transfers = _simulate_opened(device, seconds)
+    until_first_data = _take_until_data(transfers)
+    if not until_first_data:
+        raise _explain_silence(device, seconds)
+    sensor = device.sensor
+    sent_bytes = 0
+    with contextlib.closing(
+        recorder(path, sensor, f"sim:{sensor.id}", datagrams=sensor.datagrams, overwrite=overwrite)
+    ) as log:
+        for chunk, direction in itertools.chain(until_first_data, transfers):
+            log.write(chunk, direction)
+            log.keep_up()
+            if direction == "in":
+                sent_bytes += len(chunk.data)
+    return sent_bytes
+
+
+def _take_until_data(transfers: Iterator[_Transfer]) -> list[_Transfer]:
+    """Return the transfers up to the first data of the device; empty if there is no data."""
+    taken = []
+    for transfer in transfers:
+        taken.append(transfer)
+        if transfer[1] == "in":
+            return taken
+    return []
+
+
+def _simulate_opened(device: SimulatedDevice, seconds: float) -> Iterator[_Transfer]:
+    """Yield the transfers over the data link of a device, and the commands that open it."""
+    sensor = device.sensor
+    start_ns = time.time_ns()
+    opening = _commands_on_open(sensor)
+    now = 0
+    device.start(now)
+    while now < seconds * SECOND:
+        if opening:
+            name = opening.pop(0)
+            data = build_command(sensor, name, {})
+            yield Chunk(data, start_ns + now), "out"
+            device.receive(data, now, sensor.commands[name].link)
+        now += _STEP_NS
+        for chunk in due_chunks(device, now, start_ns + now).get("data", []):
+            yield chunk, "in"
+
+
+def _commands_on_open(sensor: Spec) -> list[str]:
+    """Return the commands that open a device and have a frame: others only move control lines."""
+    return [name for name in sensor.on_open if sensor.commands[name].frame]
+
+
+def _explain_silence(device: SimulatedDevice, seconds: float) -> LidarSpecError:
+    """Return the error that says why a device has sent nothing over its data link."""
+    sensor = device.sensor
+    sent = {name: device.sent[name] for name in sensor.data_frames if device.sent[name]}
+    if sent:
+        frames = ", ".join(f"{number} {name}" for name, number in sent.items())
+        return UsageError(
+            f"nothing was written: {frames} frames were sent, and all of them were lost"
+        )
+    if device.deadline is not None:
+        due = f"its next frame is due after {device.deadline / SECOND:g} s"
+        return UsageError(
+            f"nothing was written: the simulated {sensor.id} sends nothing in the first {seconds:g}"
+            f" s; {due}"
+        )
+    recognized = ", ".join(device.heard) or "no command"
+    missed = [name for name in _commands_on_open(sensor) if name not in device.heard]
+    cause = f"nothing starts its data after {recognized}"
+    if missed:
+        cause = f"{missed[0]!r} was sent to it, and it recognized {recognized}"
+    return SpecError(
+        f"nothing was written: the simulated sensor sends nothing; {cause}",
+        path="on_open",
+        sensor=sensor.id,
+    )
