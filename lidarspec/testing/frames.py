@@ -111,7 +111,7 @@ def every_raw_value_survives(subject: Subject, name: str) -> None:
     Such a frame may contain functions of the author's own, which may lose values.
     """
     engine = codec(subject.sensor.frames[name])
-    if engine.compiled is not None:
+    if engine.is_compiled:
         return
     sealed = material.seals(subject.sensor, name, b"")
     follows = {

@@ -43,7 +43,7 @@ def _interpreted(sensors: dict[str, ls.Sensor]) -> set[str]:
         f"{sensor_id} {name}"
         for sensor_id, sensor in sensors.items()
         for name, frame in sensor.frames.items()
-        if codec(frame).compiled is None
+        if not codec(frame).is_compiled
     }
 
 
