@@ -40,7 +40,7 @@ WRITERS := $(VENV)/.installed-docs
 PEERS := $(VENV)/.installed-bench
 ROBOTS := $(VENV)/.installed-ros2
 FUZZERS := $(VENV)/.installed-fuzz
-PAGE := lidarspec/view/page
+PAGE := plugins/lidarspec-web/page
 MODULES := $(PAGE)/node_modules/.installed
 RECENT := import sys; sys.exit(sys.version_info < (3, 11))
 BUILD_TOOLS := pip 'hatchling>=1.26' 'editables>=0.5'
@@ -142,7 +142,7 @@ $(USERS): $(PROJECTS)
 		else \
 			$(PYTHON) -m venv $(VENV) && $(PIP) install --quiet $(BUILD_TOOLS); \
 		fi; }
-	@echo "building lidarspec and $(words $(PLUGINS)) distributions with sensors, editable"
+	@echo "building lidarspec and $(words $(PLUGINS)) plugins, editable"
 	@rm -rf $(EDITABLES)
 	@$(BIN)/python .ci/build.py --editable $(EDITABLES) . $(PLUGINS)
 	@if [ -e $(BIN)/lidarspec ]; then $(PIP) uninstall --quiet --yes lidarspec $(notdir $(PLUGINS)); fi

@@ -20,8 +20,12 @@ from typing import Any, NamedTuple
 
 from lidarspec.errors import SpecError
 
-#: the groups of modules with hooks, of sensors, and of verbs.
-GROUP, SENSORS, VERBS = "lidarspec", "lidarspec.sensors", "lidarspec.verbs"
+#: the group of modules with hooks, which are loaded before any sensor is handed out.
+GROUP = "lidarspec"
+SENSORS = "lidarspec.sensors"
+VERBS = "lidarspec.verbs"
+#: the group of the module that serves the page of `lidarspec view --web`.
+PAGE = "lidarspec.page"
 _FOLDERS = (".dist-info", ".egg-info")
 
 

@@ -36,7 +36,6 @@ EXTRAS: dict[str, dict[str, Requirement]] = {
         "laspy": Requirement("laspy", "2.5"),
         "lazrs": Requirement("lazrs", "0.5"),
     },
-    "notebook": {"anywidget": Requirement("anywidget", "0.9.13")},
     "pandas": {"pandas": Requirement("pandas", "2.1")},
     "pcd": {"lzf": Requirement("python-neo-lzf", "0.3")},
     "plot": {"matplotlib": Requirement("matplotlib", "3.9")},
@@ -49,11 +48,6 @@ EXTRAS: dict[str, dict[str, Requirement]] = {
     "testing": {
         "hypothesis": Requirement("hypothesis", "6.100"),
         "pytest": Requirement("pytest", "8.0"),
-    },
-    "web": {
-        "starlette": Requirement("starlette", "0.40"),
-        "uvicorn": Requirement("uvicorn", "0.35"),
-        "websockets": Requirement("websockets", "13.0"),
     },
     "zarr": {"zarr": Requirement("zarr", "3.0.8")},
     "zstd": {"backports.zstd": Requirement("backports.zstd", "1.0")},

@@ -34,7 +34,7 @@ from zlib import crc32
 
 import pluggy
 
-from lidarspec.entry_points import GROUP, SENSORS, VERBS, EntryPoint, entry_points, normal
+from lidarspec.entry_points import GROUP, PAGE, SENSORS, VERBS, EntryPoint, entry_points, normal
 from lidarspec.errors import (
     LidarSpecError,
     SourceError,
@@ -98,6 +98,31 @@ def lidarspec_link(source: str, link: Link, host: str | None) -> Any:
 def lidarspec_verbs() -> Iterable[click.Command]:  # type: ignore[empty-body]
     """The verbs of the command line that a module adds, which the entry-point group
     `lidarspec.verbs` names.
+    """
+
+
+@hookspec(firstresult=True)
+def lidarspec_page(
+    source: str,
+    sensor: str | Sensor | None,
+    selection: Any,
+    host: str,
+    port: int,
+    control: bool,
+    report: Callable[[str], None],
+) -> Any:
+    """Open a source and return the server of its page, a `lidarspec.view.page_server.PageServer`.
+
+    `lidarspec view --web` calls it. The entry-point group `lidarspec.page` names the module.
+
+    Args:
+        source: as the user typed it.
+        sensor: None to identify it.
+        selection: the scans to show.
+        host: to listen at.
+        port: to listen at; 0 for any free port.
+        control: whether pages may send commands to a real sensor.
+        report: called with each remark for the user.
     """
 
 
@@ -743,7 +768,7 @@ def tried() -> list[Plugin]:
 def _modules() -> list[EntryPoint]:
     """The entry points of modules with hooks, of each module the first."""
     found: dict[Home, EntryPoint] = {}
-    for entry in entry_points(GROUP) + entry_points(VERBS):
+    for entry in entry_points(GROUP) + entry_points(VERBS) + entry_points(PAGE):
         found.setdefault((entry.distribution, entry.module), entry)
     return list(found.values())
 
@@ -822,22 +847,31 @@ def load_alone() -> None:
     os._exit(0)  # whatever is left behind
 
 
-def verb(entry: EntryPoint) -> click.Command:
-    """The verb that an entry point names, as the hook of its module gives it.
+def load_hooks(entry: EntryPoint) -> Registry:
+    """Return a registry with the hooks of one entry point.
 
     Raises:
-        SpecError: where the plugin cannot be loaded, or has no such verb.
+        SpecError: if its plugin cannot be loaded.
     """
-    local, place = Registry(), f"{entry.distribution}:{entry.module}"
-    loaded = _loaded(entry, entry.name, functools.partial(local.add, name=place))
+    hooks = Registry()
+    place = f"{entry.distribution}:{entry.module}"
+    loaded = _loaded(entry, entry.name, functools.partial(hooks.add, name=place))
     if loaded.error:
         raise SpecError(loaded.error, path=entry.distribution)
-    found: dict[str, click.Command] = {
-        one.name: one for verbs in local.call("lidarspec_verbs") for one in verbs
-    }
-    if entry.name not in found:
-        raise SpecError(f"its lidarspec_verbs has no verb {entry.name!r}", path=entry.distribution)
-    return found[entry.name]
+    return hooks
+
+
+def verb(entry: EntryPoint) -> click.Command:
+    """Return the verb that an entry point names, from the hook of its module.
+
+    Raises:
+        SpecError: if the plugin cannot be loaded, or has no such verb.
+    """
+    for commands in load_hooks(entry).call("lidarspec_verbs"):
+        for command in commands:
+            if command.name == entry.name:
+                return command  # type: ignore[no-any-return]
+    raise SpecError(f"its lidarspec_verbs has no verb {entry.name!r}", path=entry.distribution)
 
 
 @contextlib.contextmanager

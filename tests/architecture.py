@@ -64,8 +64,10 @@ CONFINED = {
     "serial": {"transports.serial", "transports.ports"},
     "click": {"cli"},
     "rich": {"cli", "view"},
-    "starlette": {"view.access", "view.saving", "view.server"},
-    "uvicorn": {"view.connections", "view.server"},
+    "starlette": set(),  # these four are for lidarspec-web
+    "uvicorn": set(),
+    "websockets": set(),
+    "anywidget": set(),
     "hypothesis": {"testing"},
     "pytest": {"testing"},
 }
@@ -82,6 +84,31 @@ SYNTAX = "lidarspec.spec.syntax"
 
 PLUGINS_MAY_IMPORT = {"construct", "numpy"} | sys.stdlib_module_names
 FACES = ("lidarspec", "lidarspec.spec")
+#: modules of the core that lidarspec-web imports beside the public names. Keep this list short: a
+#: change to one of them may break the page.
+PAGE_MAY_IMPORT = {
+    "errors",
+    "explaining.assignments",
+    "explaining.contents",
+    "explaining.explanation",
+    "explaining.pieces",
+    "explaining.wording",
+    "exports.reference",
+    "formats",
+    "frames.build",
+    "framing.results",
+    "points.cloud",
+    "points.conventions",
+    "points.look",
+    "recording.switch",
+    "scans.scans",
+    "spec.arguments",
+    "transports.base",
+    "transports.open_url",
+    "transports.protocol",
+    "view.feed",
+    "view.svg",
+}
 
 
 @dataclass(frozen=True)
@@ -285,6 +312,20 @@ def private_imports(
             f"{module.name}:{line} uses {name}, which is not public" for line, name in used
         ]
     return complaints
+
+
+def core_modules(
+    modules: Mapping[str, Module], core: Mapping[str, Module], public: Mapping[str, Collection[str]]
+) -> set[str]:
+    """Return the modules of the core that a program imports beside public names.
+
+    Args:
+        public: the names of `lidarspec` and of `lidarspec.spec`.
+    """
+    faces = {f"{face}.{name}" for face, names in public.items() for name in names}
+    imported = {name for module in modules.values() for _, name in module.imports}
+    inside = {resolve(name, core) for name in imported - faces} - {None, *public}
+    return {str(name).removeprefix("lidarspec.") for name in inside}
 
 
 def attributes(module: Module) -> Iterator[tuple[int, str]]:

@@ -24,7 +24,7 @@ MISSING = (
         "Python packages",
         "make test-all, which installs them",
     ),
-    (r"axe-core", "axe-core", "npm ci in lidarspec/view/page"),
+    (r"axe-core", "axe-core", "npm ci in plugins/lidarspec-web/page"),
     (r"Chromium", "Chromium", "apt-get install chromium"),
     (r"open3d", "Open3D", "pip install open3d"),
     (

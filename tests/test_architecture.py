@@ -16,8 +16,10 @@ import pytest
 import lidarspec
 from tests.architecture import (
     FACES,
+    PAGE_MAY_IMPORT,
     climbing,
     construct_asked,
+    core_modules,
     misplaced_imports,
     named_sensors,
     private_imports,
@@ -76,6 +78,12 @@ def test_plugins_import_public_names_only(plugin: Path) -> None:
     )
 
 
+def test_the_page_imports_few_modules_of_the_core() -> None:
+    page = read(ROOT / "plugins" / "lidarspec-web" / "lidarspec_web")
+    public = {face: importlib.import_module(face).__all__ for face in FACES}
+    assert core_modules(page, CORE, public) == PAGE_MAY_IMPORT
+
+
 def test_the_extra_all_names_every_distribution() -> None:
     project = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]
     assert sorted(project["optional-dependencies"]["all"]) == sorted(
@@ -85,7 +93,8 @@ def test_the_extra_all_names_every_distribution() -> None:
 
 def projects() -> dict[str, dict[str, Any]]:
     """What each distribution says of itself, by its folder."""
-    folders = [".", *(path.parent.relative_to(ROOT).as_posix() for path in PLUGINS)]
+    distributions = sorted((ROOT / "plugins").glob("*/pyproject.toml"))
+    folders = [".", *(path.parent.relative_to(ROOT).as_posix() for path in distributions)]
     return {
         folder: tomllib.loads((ROOT / folder / "pyproject.toml").read_text(encoding="utf-8"))[
             "project"

@@ -14,8 +14,8 @@ from lidarspec.formats import write
 from lidarspec.libraries import EXTRAS, import_library, release_numbers
 
 ROOT = Path(__file__).parents[1]
-#: extras that install sensors or tools, and no library that lidarspec imports.
-TOOL_EXTRAS = {"all", "bench", "dev", "docs", "test"}
+#: extras that install plugins or tools, and no library that lidarspec imports.
+TOOL_EXTRAS = {"all", "bench", "dev", "docs", "notebook", "test", "web"}
 REQUIREMENT = re.compile(r"([\w.-]+)(?:\[[\w,]+\])?>=([\w.]+)")
 IMPORT_CALL = re.compile(r'import_library\("([\w.]+)", "(\w+)"\)')
 

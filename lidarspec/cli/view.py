@@ -9,8 +9,8 @@ import shutil
 import sys
 import time
 import webbrowser
+from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import click
 
@@ -20,20 +20,18 @@ from lidarspec.cli.output import drawn
 from lidarspec.cli.terminal import ended_by_terminate, note, say
 from lidarspec.device.device import Device, open as open_device
 from lidarspec.errors import UsageError
-from lidarspec.libraries import import_library
 from lidarspec.points.look import look
+from lidarspec.recording.switch import RecordingSwitch
 from lidarspec.scans.selection import Selection
 from lidarspec.spec.sensor import Sensor
 from lidarspec.transports.open_url import is_live
 from lidarspec.transports.protocol import Origin
 from lidarspec.view.canvas import Cells
 from lidarspec.view.feed import LOOK, Feed
-from lidarspec.view.live import Switch, Window
+from lidarspec.view.live import Window
+from lidarspec.view.page_server import PageServer, open_page_server
 from lidarspec.view.polar import picture
 from lidarspec.view.screen import Screen, Terminated, encodable, interactive, keyboard
-
-if TYPE_CHECKING:
-    from lidarspec.view.server import Site
 
 
 @click.command()
@@ -124,7 +122,7 @@ def view(
             say(_printed(device, source, ramp, duration or PATIENCE, selection), colour=True)
             conclude(device)
         return
-    switch = Switch(source, Path.cwd()) if is_live(source) else None
+    switch = RecordingSwitch(source, Path.cwd()) if is_live(source) else None
     with open_device(
         source, sensor_id, record=switch.attached if switch else None, period=LOOK
     ) as device:
@@ -142,16 +140,15 @@ def view(
             taken=source == "-",
         )
         conclude(device)
-    _tell_recordings(switch)
+    if switch is not None:
+        _report_recordings(switch.written, switch.trouble)
 
 
-def _tell_recordings(switch: Switch | None) -> None:
-    if switch is None:
-        return
-    for path, size in switch.written:
+def _report_recordings(recordings: Sequence[tuple[str, int]], trouble: str) -> None:
+    for path, size in recordings:
         note(f"recorded {size} bytes; next: lidarspec view {Path(path).name}")
-    if switch.trouble:
-        note(switch.trouble)
+    if trouble:
+        note(trouble)
 
 
 def _serve(
@@ -164,52 +161,41 @@ def _serve(
     address: str | None,
     control: bool,
 ) -> None:
-    """The page, until the time is over or somebody ends it."""
-    host, port = listening(address)
-    for name in ("starlette", "uvicorn", "websockets"):
-        import_library(name, "web")
-    from lidarspec.view.broadcast import Broadcast
-    from lidarspec.view.server import Site
-
-    switch = Switch(source, Path.cwd()) if is_live(source) else None
-    device = open_device(source, sensor_id, record=switch.attached if switch else None, period=LOOK)
-    if switch is not None:
-        switch.sensor_id = device.sensor.id
-    broadcast = Broadcast(
+    """Serve the page until the duration is over or the user interrupts it."""
+    host, port = parse_address(address)
+    server = open_page_server(
         source,
-        device,
-        reopened=lambda: open_device(source, device.sensor),
-        select=selection,
-        switch=switch,
+        sensor_id,
+        selection=selection,
+        host=host,
+        port=port,
+        control=control,
+        report=note,
     )
     try:
-        with (
-            ended_by_terminate(),
-            broadcast,
-            Site(broadcast, host=host, port=port, control=control, say=note) as site,
-        ):
-            say(site.link)
-            if opens and not _open_in_browser(site):
+        with ended_by_terminate(), server:
+            say(server.link)
+            if opens and not _open_in_browser(server):
                 note("no browser was found: open the link yourself")
-            broadcast.run(math.inf if duration is None else time.monotonic() + duration)
-            conclude(broadcast.device)
+            server.run(duration)
+            conclude(server.device)
     finally:
-        _tell_recordings(switch)
+        _report_recordings(server.recordings, server.trouble)
 
 
-def _open_in_browser(site: Site) -> bool:
+def _open_in_browser(server: PageServer) -> bool:
     """Open the page in the browser, and return whether there is one."""
     try:
-        return webbrowser.open(site.opening_page())
+        return webbrowser.open(server.opening_page())
     except OSError:
         return False
 
 
-def listening(address: str | None) -> tuple[str, int]:
-    """The host and the port that an address of a page names; port 0 is a free one.
+def parse_address(address: str | None) -> tuple[str, int]:
+    """Return the host and the port of the page; port 0 stands for any free port.
 
     Raises:
-        UsageError: for a port that is none.
+        UsageError: if the port is not a number.
     """
     try:
         origin = Origin.parse(address or "127.0.0.1")

@@ -4,7 +4,7 @@ high ones.
 The scale is a helix in the colour space OKLab, in which equal steps look equal. Its lightness rises
 all the way, so that readers who confuse red and green, or blue and yellow, still see the order.
 Each theme takes its own part of the lightness, so that every colour has a contrast of 3:1 with the
-ground. The page of ``view --web`` has the same scale in ``view/page/src/colours.ts``.
+ground. The page of ``view --web`` has the same scale, in ``colours.ts`` of `lidarspec-web`.
 
 Source: Ottosson, A perceptual color space for image processing (2020), for the matrices.
 """

@@ -7,5 +7,6 @@ reading order:
   past it.
 * `recorders`: `Recorder` and others, by the suffix of the file: everything, packets for Wireshark,
   the bytes alone.
+* `switch`: a recorder that is switched on and off while a source is read.
 * `appending`: the thread that writes whole records, so that a slow disk holds nothing up.
 """

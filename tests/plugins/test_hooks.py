@@ -167,5 +167,5 @@ def test_every_hook_has_its_documentation() -> None:
     manager = pluggy.PluginManager(hookspecs.NAMESPACE)
     manager.add_hookspecs(hookspecs)
     hooks = [name for name in dir(manager.hook) if name.startswith("lidarspec_")]
-    assert len(hooks) == 7
+    assert len(hooks) == 8
     assert all(getattr(hookspecs, name).__doc__ for name in hooks)

@@ -4,21 +4,16 @@ everybody.
 
 from __future__ import annotations
 
-import json
-
 import numpy as np
 import pytest
 
 from lidarspec.points.colours import SCALES, Theme, colour, make_ramp, to_hex
 from lidarspec.points.look import STEPS, look
 from lidarspec.view.canvas import FIRST_STEP, INKS
-from lidarspec.view.server import PAGE
 from lidarspec.view.svg import svg
 from tests.libraries import Library, needs
 from tests.view.test_polar import cloud
 
-#: what the tests of the page compare its own scale with.
-OF_PAGE = PAGE.parent / "tests" / "ramp.json"
 #: the grounds of an SVG.
 PAPERS: dict[Theme, str] = {"dark": "#14161b", "light": "#ffffff"}
 
@@ -28,12 +23,6 @@ def luminance(colours: list[tuple[int, int, int]]) -> np.ndarray:
     parts = np.array(colours) / 255
     linear = np.where(parts <= 0.04045, parts / 12.92, ((parts + 0.055) / 1.055) ** 2.4)
     return np.asarray(linear @ (0.2126, 0.7152, 0.0722))
-
-
-@pytest.mark.parametrize("theme", SCALES)
-def test_the_page_has_the_same_scale(theme: Theme) -> None:
-    of_page = json.loads(OF_PAGE.read_text(encoding="utf-8"))[theme]
-    assert [to_hex(rgb) for rgb in make_ramp(theme, len(of_page))] == of_page
 
 
 @pytest.mark.parametrize("theme", SCALES)

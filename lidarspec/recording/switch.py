@@ -1,0 +1,125 @@
+"""The recorder of a live source that is switched on and off while the source is read."""
+
+from __future__ import annotations
+
+import itertools
+import threading
+import time
+from pathlib import Path
+from typing import Any, Literal
+
+from lidarspec.errors import LidarSpecError, SourceError
+from lidarspec.recording.appending import Appender, Log
+from lidarspec.recording.recorders import recorder
+from lidarspec.transports.protocol import Chunk, Transport
+
+
+class RecordingSwitch:
+    """The recorder of a source, which starts a new file each time that it is switched on.
+
+    Any thread may switch: one change at a time is made.
+
+    Args:
+        source: as the user called it.
+        folder: for the files.
+
+    Attributes:
+        trouble: why the last change did not do what was asked, "" if it did.
+        written: closed files, and the bytes of the wire in them.
+    """
+
+    def __init__(self, source: str, folder: Path) -> None:
+        self._source = source
+        self._folder = folder
+        self._changing = threading.Lock()
+        self._opened: Transport | None = None
+        self._recorder: Appender | None = None
+        self.sensor_id = ""
+        self.trouble = ""
+        self.written: list[tuple[str, int]] = []
+
+    def attached(self, opened: Transport) -> Log:
+        """Itself, as the recorder of an open transport: what `open(record=...)` calls."""
+        self._opened = opened
+        return self
+
+    def toggle(self) -> None:
+        """Start a file named after the sensor and the time, or end the one that is being written."""
+        with self._changing:
+            self._change(on=self._recorder is None)
+
+    def set(self, *, on: bool) -> None:
+        """Start a file, or end it; does nothing if that is done already."""
+        with self._changing:
+            if on == (self._recorder is None):
+                self._change(on=on)
+
+    @property
+    def recording(self) -> tuple[str, int] | None:
+        """The name of the file that is being written, and the bytes of the wire in it."""
+        current = self._recorder
+        return None if current is None else (Path(current.path).name, current.bytes)
+
+    @property
+    def error(self) -> SourceError | None:
+        """What went wrong with the file that is being written."""
+        return self._recorder.error if self._recorder is not None else None
+
+    def write(self, chunk: Chunk, direction: Literal["in", "out"] = "in") -> None:
+        """Record what arrived or was sent, while it is on."""
+        if (current := self._recorder) is not None:
+            current.write(chunk, direction)
+
+    def event(self, name: str, at: int | None = None, **details: Any) -> None:
+        """Record that something happened, while it is on."""
+        if (current := self._recorder) is not None:
+            current.event(name, at, **details)
+
+    def close(self) -> None:
+        """End the file that is being written.
+
+        Raises:
+            SourceError: where it could not be written.
+        """
+        with self._changing:
+            self._end()
+
+    def _change(self, *, on: bool) -> None:
+        self.trouble = ""
+        try:
+            if on:
+                self._begin()
+            else:
+                self._end()
+        except LidarSpecError as error:
+            self.trouble = str(error)
+
+    def _begin(self) -> None:
+        opened = self._opened
+        assert opened is not None
+        begin = f"{self.sensor_id}-{time.strftime('%Y%m%d-%H%M%S')}"
+        paths = (
+            self._folder / f"{begin}{f'-{number}' if number else ''}.lsr"
+            for number in itertools.count()
+        )
+        path = next(path for path in paths if not path.exists())
+        self._recorder = recorder(
+            path, self.sensor_id, self._source, datagrams=opened.datagrams, baud=opened.baud
+        )
+
+    def _end(self) -> None:
+        current = self._recorder
+        if current is None:
+            return
+        self._recorder = None
+        try:
+            current.close()
+        finally:
+            if current.records:
+                self.written.append((current.path, current.bytes))
+            else:
+                current.discard()
+        if not current.records:
+            self.trouble = (
+                f"nothing came while {Path(current.path).name} was recorded: it is removed"
+            )

@@ -1,0 +1,123 @@
+"""A source that is read and whose page is served: what `lidarspec view --web` runs."""
+
+from __future__ import annotations
+
+import math
+import time
+from collections.abc import Callable, Sequence
+from functools import partial
+from pathlib import Path
+from types import TracebackType
+from typing import Self
+
+from lidarspec import Device, Selection, Sensor, open as open_device
+from lidarspec.recording.switch import RecordingSwitch
+from lidarspec.transports.open_url import is_live
+from lidarspec.view.feed import LOOK
+from lidarspec_web.broadcast import Broadcast
+from lidarspec_web.server import Site
+
+
+class SourceServer:
+    """Serves the page of a source while its context lasts, and then closes the source.
+
+    Args:
+        source: port, socket, file or ``sim:`` URL.
+        sensor: None to identify it.
+        selection: the scans to show.
+        host: to listen at.
+        port: to listen at; 0 for any free port.
+        control: whether pages may send commands to a real sensor.
+        report: called with a line for each page that is opened or closed.
+        page: the folder with the files of the page; by default the built one.
+        folder: of the recordings that pages make; by default the working directory.
+
+    Raises:
+        LidarSpecError: if the source cannot be opened, or the server cannot listen.
+    """
+
+    def __init__(
+        self,
+        source: str,
+        sensor: str | Sensor | None = None,
+        *,
+        selection: Selection | None = None,
+        host: str = "127.0.0.1",
+        port: int = 0,
+        control: bool = False,
+        report: Callable[[str], None] = lambda text: None,
+        page: Path | None = None,
+        folder: Path | None = None,
+    ) -> None:
+        self.switch: RecordingSwitch | None = None
+        if is_live(source):
+            self.switch = RecordingSwitch(source, folder or Path.cwd())
+        record = None if self.switch is None else self.switch.attached
+        device = open_device(source, sensor, record=record, period=LOOK)
+        if self.switch is not None:
+            self.switch.sensor_id = device.sensor.id
+        self.broadcast = Broadcast(
+            source,
+            device,
+            reopened=partial(open_device, source, device.sensor),
+            select=selection or Selection(),
+            switch=self.switch,
+        )
+        try:
+            self.site = Site(
+                self.broadcast, host=host, port=port, control=control, page=page, say=report
+            )
+        except BaseException:
+            self.broadcast.close()
+            raise
+
+    @property
+    def link(self) -> str:
+        """The URL of the page, with its token."""
+        return self.site.link
+
+    @property
+    def device(self) -> Device:
+        """The open source."""
+        return self.broadcast.device
+
+    @property
+    def recordings(self) -> Sequence[tuple[str, int]]:
+        """Path of each recording that pages have made, and the bytes of the wire in it."""
+        return () if self.switch is None else self.switch.written
+
+    @property
+    def trouble(self) -> str:
+        """The reason why the last recording could not be started or written, "" if it could."""
+        return "" if self.switch is None else self.switch.trouble
+
+    def opening_page(self) -> str:
+        """Return the URL of a file that leads to the link, to start a browser with.
+
+        Raises:
+            OSError: if it cannot be written.
+        """
+        return self.site.opening_page()
+
+    def run(self, duration_s: float | None = None) -> None:
+        """Read the source for some time; None: until `broadcast.stop`, or an interrupt.
+
+        Raises:
+            LidarSpecError: if the source fails.
+        """
+        self.broadcast.run(math.inf if duration_s is None else time.monotonic() + duration_s)
+
+    def __enter__(self) -> Self:
+        self.site.__enter__()
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
+    ) -> None:
+        try:
+            self.site.__exit__(kind, error, trace)
+        finally:
+            self.broadcast.close()

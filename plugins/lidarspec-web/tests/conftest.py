@@ -1,0 +1,24 @@
+"""A browser for the tests of what is shown in one."""
+
+from __future__ import annotations
+
+import contextlib
+from collections.abc import Iterator
+from typing import Any
+
+import pytest
+
+from .browser import FLAGS, installed
+
+
+@pytest.fixture(scope="module")
+def browser() -> Iterator[Any]:
+    """A browser of playwright's, closed at the end."""
+    api = pytest.importorskip("playwright.sync_api", reason="playwright is not installed")
+    with (
+        api.sync_playwright() as running,
+        contextlib.closing(
+            running.chromium.launch(executable_path=installed(), args=FLAGS)
+        ) as started,
+    ):
+        yield started

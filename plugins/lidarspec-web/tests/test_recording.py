@@ -1,0 +1,44 @@
+"""Recordings that pages switch on and off: one at a time, however many press at once."""
+
+from __future__ import annotations
+
+import threading
+from pathlib import Path
+
+import pytest
+
+import lidarspec as ls
+
+from .pages import FLAT, Station
+
+
+def test_pages_that_press_at_once_agree(tmp_path: Path) -> None:
+    """Each asks for the state that its button offers, and all see the same file."""
+    station = Station(f"sim:{FLAT}", tmp_path)
+    with station, station.page() as one, station.page() as other:
+        for page in (one, other, one, other):
+            page.say("record", on=True)
+        states = [page.state(lambda state: state["recording"]) for page in (one, other)]
+        names = {state["recording"]["name"] for state in states}
+        one.state(lambda state: state["recording"]["bytes"])
+        assert len(names) == 1
+        for page in (one, other):
+            page.say("record", on=False)
+        for page in (one, other):
+            page.state(lambda state: state["recording"] is None)
+        assert one.asked("record", on="yes")["text"] == "on is true or false"
+    assert {path.name for path in tmp_path.glob("*.lsr")} == names
+    with ls.open(tmp_path / names.pop()) as again:
+        assert sum(len(packets) for packets in again.packets())
+
+
+@pytest.mark.slow
+def test_every_second_press_ends_the_recording(tmp_path: Path) -> None:
+    """The message without `on` changes the state, whatever that is."""
+    with Station(f"sim:{FLAT}", tmp_path) as station, station.page() as page:
+        for _ in range(4):
+            page.say("record")
+        page.scan()
+        page.state(lambda state: state["recording"] is None)
+        start = f"recorder of {tmp_path}"
+        assert not any(thread.name.startswith(start) for thread in threading.enumerate())

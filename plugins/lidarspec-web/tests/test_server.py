@@ -1,0 +1,378 @@
+"""The server of the page: what it says of scans, figures and bytes, to one page and to ten."""
+
+from __future__ import annotations
+
+import contextlib
+import re
+import socket
+import time
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import lidarspec as ls
+from lidarspec import UsageError
+from lidarspec.scans.selection import Selection
+
+from .pages import DEADLINE, FLAT, SOLID, Station, masked, recorded
+
+
+@pytest.mark.parametrize(
+    ("sensor", "planar"), [(FLAT, True), pytest.param(SOLID, False, marks=pytest.mark.slow)]
+)
+def test_a_page_is_told_what_it_shows(tmp_path: Path, sensor: str, planar: bool) -> None:
+    with Station(f"sim:{sensor}", tmp_path) as station, station.page() as page:
+        hello = page.until("hello")
+        assert (hello["sensor"], hello["source"], hello["live"], hello["planar"]) == (
+            sensor,
+            f"sim:{sensor}",
+            True,
+            planar,
+        )
+        assert (hello["duration"], hello["records"]) == (None, True)
+        assert {"pcd", "csv", "svg"} <= set(hello["saves"])
+        state = page.state(lambda state: state["figures"])
+        assert 0 < state["position"] < 10  # since the first scan
+        assert (state["state"], state["paused"], state["damaged"]) == (
+            "streaming",
+            False,
+            {"total": 0, "newest": []},
+        )
+        assert state["figures"]["speed_hz"] == pytest.approx(10, rel=0.2)
+        assert {"lost", "disconnects", "latency_s", "jitter_s", "loss_rate", "at"} <= state[
+            "figures"
+        ].keys()
+
+
+@pytest.mark.slow
+def test_the_figures_of_the_last_minute_are_told_to_who_comes_later(tmp_path: Path) -> None:
+    with Station(f"sim:{FLAT}", tmp_path) as station, station.page() as first:
+        first.state(lambda state: state["figures"])
+        with station.page() as second:
+            assert second.until("hello")["history"]
+
+
+def test_scans_are_those_of_the_sensor_and_always_the_newest(tmp_path: Path) -> None:
+    with Station(f"sim:{FLAT}", tmp_path) as station, station.page() as page:
+        first, _ = page.scan()
+        until = station.broadcast.shown
+        assert until is not None
+        while station.broadcast.shown.number < first["scan"] + 4:  # type: ignore[union-attr]
+            time.sleep(0.01)
+        header, columns = page.scan()
+        assert header["scan"] >= first["scan"] + 4  # those between were not waited for
+        shown = station.broadcast.numbered(header["scan"])
+        assert shown is not None
+        assert np.array_equal(columns["x"], shown.scan.points.x[columns["index"]])
+        assert header["position"] > first["position"]
+
+
+def test_a_scan_is_sent_only_where_one_was_asked_for(tmp_path: Path) -> None:
+    with Station(f"sim:{FLAT}", tmp_path) as station, station.page() as page:
+        page.scan()
+        page.scan(most=100)
+        with pytest.raises(TimeoutError):
+            page.heard(lambda message: isinstance(message, tuple), within=1.0)
+        header, _ = page.scan(most=100)
+        assert 90 < header["points"] <= 100 < header["of"]
+
+
+@pytest.mark.slow
+def test_one_scan_is_made_once_for_pages_that_ask_alike(tmp_path: Path) -> None:
+    path = recorded(tmp_path)
+    with Station(path, tmp_path) as station, station.page() as one, station.page() as other:
+        one.scan()
+        one.say("pause")
+        one.state(lambda state: state["state"] == "paused")
+        other.scan()
+        shown = station.broadcast.shown
+        assert shown is not None
+        assert shown.message(1 << 20) is shown.message(1 << 20)
+
+
+@pytest.mark.slow
+def test_ten_pages_see_one_source(tmp_path: Path) -> None:
+    with Station(f"sim:{SOLID}?rate=0.3", tmp_path) as station, contextlib.ExitStack() as opened:
+        pages = [opened.enter_context(station.page()) for _ in range(10)]
+        for page in pages:
+            page.say("next", most=5000)
+        seen = {page.heard(lambda message: isinstance(message, tuple))[0]["scan"] for page in pages}
+        assert len(seen) < 10  # they share scans
+        for page in pages:
+            assert page.scan(most=5000)[1]["x"].size
+        assert station.broadcast.device.stats.queue_dropped == 0
+    assert station.said[-1].endswith("0 open")
+
+
+@pytest.mark.slow
+def test_a_page_that_goes_and_one_that_comes_are_told_of(tmp_path: Path) -> None:
+    with Station(f"sim:{FLAT}", tmp_path) as station:
+        with station.page() as page:
+            page.until("hello")
+        with station.page() as page:
+            page.until("hello")
+            assert station.said == [
+                "page 1 opened by 127.0.0.1; 1 open",
+                "page 1 closed; 0 open",
+                "page 2 opened by 127.0.0.1; 1 open",
+            ]
+
+
+@pytest.mark.slow
+def test_a_live_source_that_a_page_pauses_goes_on_for_the_others(tmp_path: Path) -> None:
+    with (
+        Station(f"sim:{FLAT}", tmp_path) as station,
+        station.page() as paused,
+        station.page() as other,
+    ):
+        header, columns = paused.scan()
+        paused.say("pause")
+        stands = paused.state(lambda state: state["paused"])
+        assert (stands["state"], stands["position"]) == ("paused", header["position"])
+        paused.say("next", most=1000)
+        first, _ = other.scan()
+        assert not other.state()["paused"]
+        while other.scan()[0]["scan"] < first["scan"] + 5:
+            pass
+        with pytest.raises(TimeoutError):
+            paused.heard(lambda message: isinstance(message, tuple), within=0.5)
+        frame = paused.asked(
+            "frame", point={"scan": header["scan"], "index": int(columns["index"][3])}
+        )
+        assert frame["is"] == "frame"
+        paused.say("play")
+        assert (
+            paused.heard(lambda message: isinstance(message, tuple))[0]["scan"] >= first["scan"] + 5
+        )
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("word", ["step", "seek", "speed"])
+def test_a_live_source_cannot_be_moved_through(tmp_path: Path, word: str) -> None:
+    with Station(f"sim:{FLAT}", tmp_path) as station, station.page() as page:
+        refused = page.asked(word, to=1, times=2)
+        assert (refused["is"], refused["of"]) == ("refused", word)
+        assert f"sim:{FLAT}" in refused["text"]
+
+
+@pytest.mark.parametrize("suffix", [".lsr", pytest.param(".pcap", marks=pytest.mark.slow)])
+def test_a_file_is_paused_stepped_and_moved_through(tmp_path: Path, suffix: str) -> None:
+    sensor = FLAT if suffix == ".lsr" else SOLID
+    path = recorded(tmp_path, sensor, suffix=suffix)
+    first, *scans = ls.open(path, sensor).scans()
+    times = [(scan.stamp_ns - first.stamp_ns) * 1e-9 for scan in scans]
+    with Station(path, tmp_path, sensor) as station, station.page() as page:
+        hello = page.until("hello")
+        assert (hello["live"], hello["duration"]) == (False, pytest.approx(5, abs=0.3))
+        page.say("pause")
+        assert page.state(lambda state: state["paused"])["state"] == "paused"
+        page.scan()
+        page.say("seek", to=times[20])
+        header, columns = page.scan_at(times[20])
+        assert header["position"] == pytest.approx(times[20], abs=0.21)
+        which = int(np.argmin(np.abs(np.array(times) - header["position"])))
+        assert np.array_equal(columns["x"], scans[which].points.x[columns["index"]])
+        for further in (1, 2):
+            page.say("step")
+            header, columns = page.scan()
+            assert np.array_equal(columns["x"], scans[which + further].points.x[columns["index"]])
+        assert page.state()["state"] == "paused"
+        page.say("seek", to=0)
+        page.scan_at(0.0)
+
+
+@pytest.mark.slow
+def test_a_file_is_played_at_its_speed_and_at_another(tmp_path: Path) -> None:
+    """Two stretches, compared with each other and with the clock."""
+    with Station(recorded(tmp_path, seconds=20), tmp_path) as station, station.page() as page:
+        page.say("pause")
+
+        def speed(times: float) -> float:
+            page.say("speed", times=times)
+            page.say("play")
+            before, began = page.scan()[0]["position"], time.monotonic()
+            while time.monotonic() < began + 1.5:
+                header, _ = page.scan()
+            return float(header["position"] - before) / (time.monotonic() - began)
+
+        slow, quick = speed(1), speed(4)
+        assert 0.5 < slow < 1.5
+        assert 2.5 < quick / slow < 6
+        assert page.state()["speed"] == 4
+        assert page.asked("speed", times=0)["is"] == "refused"
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("sensor", "suffix"), [(FLAT, ".bin"), (FLAT, ".lsr"), (SOLID, ".pcap")])
+def test_a_file_is_read_as_it_is_played(tmp_path: Path, sensor: str, suffix: str) -> None:
+    """Figures, bytes and damaged frames are those of the scans that are shown, and not of the rest
+    of the file.
+    """
+    path = recorded(tmp_path, sensor, 8, suffix)
+    with Station(path, tmp_path, sensor) as station, station.page() as page:
+        header, _ = page.scan()
+        page.say("pause")
+        position = page.state(lambda state: state["paused"])["position"]
+        assert station.broadcast.device.stats.bytes_in < path.stat().st_size * (position + 1.5) / 8
+        assert header["position"] < 3
+
+
+@pytest.mark.slow
+def test_a_file_ends_and_is_played_again(tmp_path: Path) -> None:
+    path = recorded(tmp_path, seconds=1)
+    with Station(path, tmp_path) as station, station.page() as page:
+        assert "sent.lsr has ended" in page.until("ended")["text"]
+        assert page.state()["state"] == "ended"
+        page.scan()
+        page.say("play")
+        page.scan_at(0.2)
+        assert page.until("ended")
+
+
+@pytest.mark.slow
+def test_behind_the_end_of_a_file_is_its_end(tmp_path: Path) -> None:
+    with Station(recorded(tmp_path, seconds=1), tmp_path) as station, station.page() as page:
+        page.say("seek", to=100)
+        page.until("ended")
+        page.say("seek", to=0)
+        page.scan()
+        assert station.failure is None
+
+
+@pytest.mark.slow
+def test_what_is_selected_of_a_file_is_not_moved_through(tmp_path: Path) -> None:
+    path = recorded(tmp_path)
+    with (
+        Station(path, tmp_path, select=Selection(times=(1.0, 2.0))) as station,
+        station.page() as page,
+    ):
+        assert page.until("hello")["duration"] is None
+        assert "moved" in page.asked("seek", to=1)["text"]
+        page.until("ended")
+
+
+def test_a_failing_source_is_told_of(tmp_path: Path) -> None:
+    with (
+        Station(recorded(tmp_path), tmp_path, select=Selection(times=(100.0, 200.0))) as station,
+        station.page() as page,
+    ):
+        assert "nothing of that is asked for" in page.until("ended")["text"]
+    assert isinstance(station.failure, UsageError)
+
+
+NONSENSE = (
+    "{",
+    "[" * 5000,
+    "17",
+    '{"do":"dance"}',
+    '{"do":["next"]}',
+    '{"do":"next"}',
+    '{"do":"next","most":-1}',
+    '{"do":"next","most":1e400}',
+    '{"do":"next","most":true}',
+    '{"do":"frame","point":{"scan":"1","index":0}}',
+    '{"do":"frame","number":null}',
+    '{"do":"compose","command":7}',
+    '{"do":"send","command":"x","arguments":{"a":1}}',
+)
+
+
+def test_nonsense_is_refused_with_a_word_and_ends_nothing(tmp_path: Path) -> None:
+    with Station(f"sim:{FLAT}", tmp_path) as station, station.page() as page:
+        for message in NONSENSE:
+            page.socket.send(message)
+            assert page.until("refused")["text"], message
+            page.socket.send(message.encode())  # as a binary message
+            assert page.until("refused")["text"], message
+        assert page.scan()[1]["x"].size
+
+
+def test_a_message_that_is_too_long_ends_its_page_alone(tmp_path: Path) -> None:
+    with (
+        Station(f"sim:{FLAT}", tmp_path) as station,
+        station.page() as page,
+        station.page() as other,
+    ):
+        page.socket.send(" " * (1 << 17))
+        with pytest.raises(Exception, match=r"1009|too big"):
+            page.heard(lambda message: False)
+        assert other.scan()[1]["x"].size
+
+
+def test_a_scan_is_saved_as_it_is_shown(tmp_path: Path) -> None:
+    with Station(f"sim:{FLAT}", tmp_path) as station, station.page() as page:
+        header, columns = page.scan()
+        page.say("pause")
+        page.state(lambda state: state["paused"])
+        for suffix in page.until("hello")["saves"]:
+            status, headers, body = station.answered(f"/save/{header['scan']}.{suffix}")
+            assert (status, len(body) > 1000) == (200, True), suffix
+            assert re.search(
+                rf'filename="{FLAT}-\d+\.\d{{3}}s\.{suffix}"', headers["content-disposition"]
+            )
+            assert headers["cache-control"] == "no-store"
+            if suffix == "csv":
+                x = np.array(
+                    [float(line.split(b",")[0]) for line in body.splitlines()[1:]], np.float32
+                )
+                assert np.allclose(x, columns["x"])
+        for name in (
+            "9999.pcd",
+            f"{header['scan']}.exe",
+            f"{header['scan']}.",
+            "x.pcd",
+            "..%2f..%2fetc%2fpasswd",
+            "-1.pcd",
+        ):
+            assert station.answered(f"/save/{name}")[0] == 404, name
+
+
+def test_a_recording_is_switched_on_and_off(tmp_path: Path) -> None:
+    with Station(f"sim:{FLAT}", tmp_path) as station, station.page() as page:
+        page.scan()
+        assert page.state()["recording"] is None
+        page.say("record")
+        recording = page.state(
+            lambda state: state["recording"] and state["recording"]["bytes"] > 10_000
+        )["recording"]
+        page.say("record")
+        page.state(lambda state: state["recording"] is None)
+    with ls.open(tmp_path / recording["name"]) as again:
+        assert sum(scan.whole for scan in again.scans()) > 1
+
+
+@pytest.mark.slow
+def test_a_file_is_not_recorded(tmp_path: Path) -> None:
+    with Station(recorded(tmp_path), tmp_path) as station, station.page() as page:
+        assert not page.until("hello")["records"]
+        assert "file" in page.asked("record")["text"]
+
+
+@pytest.mark.slow
+def test_a_page_that_takes_nothing_is_dropped_and_a_recording_loses_nothing(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """It asks for scan after scan and reads none of them, until its window is full."""
+    monkeypatch.setattr("lidarspec_web.server.STALLED", 2.0)
+    with (
+        Station(f"sim:{SOLID}", tmp_path) as station,
+        station.page() as healthy,
+        socket.create_connection(("127.0.0.1", station.port)) as raw,
+    ):
+        healthy.say("record")
+        name = healthy.state(lambda state: state["recording"])["recording"]["name"]
+        raw.sendall(station.handshake())
+        end = time.monotonic() + DEADLINE
+        while not any("dropped" in text for text in station.said) and time.monotonic() < end:
+            with contextlib.suppress(OSError):
+                raw.sendall(masked({"do": "next", "most": 1 << 20}))
+            assert healthy.scan(most=2000)[1]["x"].size
+        assert station.said[-1].startswith("page 2 dropped: it ")
+        healthy.say("record")
+        healthy.state(lambda state: state["recording"] is None)
+    with ls.open(tmp_path / name) as again:
+        for _ in again.scans():
+            pass
+        assert (again.stats.lost, again.stats.queue_dropped, again.stats.disconnects) == (0, 0, 0)
+        assert again.stats.frames["data"] > 1000
