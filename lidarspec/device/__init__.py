@@ -3,7 +3,8 @@
 In: a SOURCE and a sensor. Out: packets and scans as they come, replies to commands, counters,
 warnings. Modules in reading order:
 
-* `device`: `Device`, which users hold: packets and scans out of what its input gives.
+* `device`: `Device`, the public class.
+* `packet_reader`: packets of one type, and scans, out of the frames that arrive.
 * `arrivals`: what an input is, live or not, and that of a file.
 * `first_frames`: frames of a file that apply from its start: its first state, and the first
   reference of its clock.
@@ -12,7 +13,7 @@ warnings. Modules in reading order:
 * `live_input`: frames as they come, decoded every few milliseconds; how the source is doing.
 * `capture_thread`: the thread behind it, which reads, records and queues.
 * `session`: commands and their replies, sans-IO.
-* `async_device`: a device whose waits are awaited.
+* `async_device`: `Device` for asyncio.
 * `settings`: devices by name, from `lidarspec.toml`.
 * `source_recording`: a source into a file, decoded no further than to be counted.
 * `demo`: all of it against a simulated sensor.

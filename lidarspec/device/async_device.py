@@ -1,8 +1,8 @@
-"""A device for asyncio: each wait goes on in a thread of the device's own, so that the event loop
-is never held up.
+"""A `Device` for asyncio.
 
-What a thread has found is kept where the next call finds it: a call that is cancelled loses
-nothing.
+`AsyncDevice` calls the methods of a `Device` in threads of its own, so that the event loop is never
+blocked. An item that a thread has found stays in a `_Feed` until a call fetches it: a cancelled
+call loses nothing.
 """
 
 from __future__ import annotations
@@ -28,30 +28,30 @@ from lidarspec.scans.selection import EVERYTHING, Selection, Sieve
 from lidarspec.spec.sensor import Sensor
 
 T = TypeVar("T")
-#: seconds that a thread waits before it looks whether it is still wanted.
-STEP = 0.2
+#: A thread waits for so long before it returns to the event loop, which may have cancelled the call.
+_WAIT_S = 0.2
 
 
 class AsyncDevice:
     """A `Device` whose waits are awaited; an asynchronous context manager.
 
+    Its methods and properties are those of `Device`, with the same arguments, results and errors.
+
     Args:
-        opening: what opens the device.
+        opening: opens the device.
     """
 
     def __init__(self, opening: Callable[[], Device]) -> None:
         self._opening = opening
         self._device: Device | None = None
-        self._reader = ThreadPoolExecutor(1, "reader of a device")
-        self._sender = ThreadPoolExecutor(1, "sender of a device")
-        self._scans: _Feed[Scan] | None = None
-        self._imu: _Feed[ImuSamples] | None = None
-        self._packets: dict[str | None, _Feed[Packets]] = {}
+        self._reading = ThreadPoolExecutor(1, "reader of a device")
+        self._sending = ThreadPoolExecutor(1, "sender of a device")
+        self._feeds: dict[tuple[str, ...], _Feed[Any]] = {}
         self._newest: Scan | None = None
 
     @property
     def device(self) -> Device:
-        """The device underneath.
+        """The device that is used.
 
         Raises:
             UsageError: before it is opened.
@@ -64,55 +64,36 @@ class AsyncDevice:
 
     @property
     def sensor(self) -> Sensor:
-        """The sensor, given or detected."""
+        """The sensor; see `Device.sensor`."""
         return self.device.sensor
 
     @property
     def stats(self) -> Counters:
-        """The counters of everything read so far."""
+        """The counters; see `Device.stats`."""
         return self.device.stats
 
     @property
     def warnings(self) -> list[str]:
-        """What is to be said about the source now."""
+        """The present warnings; see `Device.warnings`."""
         return self.device.warnings
 
     @property
     def state(self) -> str:
-        """How the source is doing: "streaming", "waiting", "silent", "no frames", "disconnected",
-        "ended" or "closed".
-        """
+        """The state of the source; see `Device.state`."""
         return self.device.state
 
     async def packets(self, frame: str | None = None) -> AsyncIterator[Packets]:
-        """The packets of the data frame, or of another type, in batches, until the input ends or
-        the device is closed.
-
-        Raises:
-            SourceError: where a file has been read to its end before.
-        """
-        feed = self._packets.setdefault(
-            frame, _Feed(self.device.packets(frame, wait=STEP), lambda packets: not len(packets))
-        )
-        async for packets in self._drained(feed):
+        """Yield packets in batches; see `Device.packets`."""
+        feed = self._get_feed("packets", *filter(None, [frame]))
+        async for packets in self._fetch(feed):
             yield packets
 
     async def scans(self, *, select: Selection = EVERYTHING) -> AsyncIterator[Scan]:
-        """Every scan; the first and last piece, and those before and after an interruption, are
-        marked ``complete=False``.
-
-        Args:
-            select: which of them, and what of each; those before the first that is wanted are read.
-
-        Raises:
-            SourceError: where a file has been read to its end before.
-            UsageError: where none of its scans is wanted.
-        """
-        if self._scans is None:
-            self._scans = _Feed(self.device.scans(wait=STEP), lambda scan: scan is None)
+        """Yield scans; see `Device.scans`. Scans before the first selected one are read."""
         sieve = Sieve(select, self.device.source)
-        async for scan in self._drained(self._scans):
-            if (wanted := sieve.take(scan)) is not None:
+        async for scan in self._fetch(self._get_feed("scans")):
+            wanted = sieve.take(scan)
+            if wanted is not None:
                 yield wanted
             if sieve.ended:
                 break
@@ -120,83 +101,42 @@ class AsyncDevice:
             raise sieve.missing()
 
     async def imu(self) -> AsyncIterator[ImuSamples]:
-        """What the sensor's IMU felt, in batches, until the input ends or the device is closed.
-
-        Raises:
-            UsageError: where no frame of the sensor says what an IMU felt.
-            SourceError: where a file has been read to its end before.
-        """
-        if self._imu is None:
-            self._imu = _Feed(self.device.imu(wait=STEP), lambda samples: not len(samples))
-        async for samples in self._drained(self._imu):
+        """Yield the samples of the sensor's IMU; see `Device.imu`."""
+        async for samples in self._fetch(self._get_feed("imu")):
             yield samples
 
     async def latest(self, timeout: float | None = None) -> Scan:
-        """The newest whole scan, newer than the one that the last call gave; from a file the next.
-
-        Args:
-            timeout: seconds to wait.
-
-        Raises:
-            SourceTimeout: where none comes in time; SourceError where the input has ended or the
-                device was closed.
-        """
+        """Wait for the newest whole scan; see `Device.latest`."""
         deadline = None if timeout is None else time.monotonic() + timeout
-        while True:
-            if self._newest is None:
-                await self._run(self._reader, partial(self._look, deadline))
-            newest, self._newest = self._newest, None
-            if newest is not None:
-                return newest
+        while self._newest is None:
+            await _run(self._reading, partial(self._find_newest, deadline))
+        newest = self._newest
+        self._newest = None
+        return newest
 
     async def send(self, name: str, /, *, timeout: float | None = None, **arguments: Any) -> Reply:
-        """The reply to a command; at once with ``confirmed=False`` where none is documented.
-
-        Args:
-            name: of the command.
-            timeout: seconds to wait for the reply; by default what the sensor declares.
-            arguments: by name, in units.
-
-        Raises:
-            UnknownCommand, UnknownField, MissingField, OutOfRange: for what the sensor does not
-                take; nothing is sent.
-            CommandError: where the device refuses, or the connection is lost; ReplyTimeout where it
-                keeps silent.
-        """
-        return await self._run(
-            self._sender, partial(self.device.send, name, timeout=timeout, **arguments)
-        )
+        """Send a command and return the reply; see `Device.send`."""
+        send = partial(self.device.send, name, timeout=timeout, **arguments)
+        return await _run(self._sending, send)
 
     async def write(self, data: bytes, link: str = "data") -> None:
-        """Send bytes by hand, as they are; nothing is waited for, and what answers them comes with
-        everything else.
-
-        Args:
-            data: the bytes; nobody looks at what they say, so that a sensor that they start is not
-                stopped on closing.
-            link: over which of the sensor's links.
-
-        Raises:
-            UsageError: for a text, and for a link that the sensor does not have.
-            SourceError: where the connection is lost, or there is no device.
-        """
-        await self._run(self._sender, partial(self.device.write, data, link))
+        """Send bytes as they are; see `Device.write`."""
+        await _run(self._sending, partial(self.device.write, data, link))
 
     async def close(self) -> None:
-        """Stop the sensor where it was started, and give the source back; a second call does
-        nothing.
-        """
+        """Stop the sensor and close the source; see `Device.close`."""
         if self._device is not None:
-            await _whole(asyncio.get_running_loop().run_in_executor(None, self._device.close))
-        self._reader.shutdown(wait=False)
-        self._sender.shutdown(wait=False)
+            await _finish(asyncio.get_running_loop().run_in_executor(None, self._device.close))
+        self._reading.shutdown(wait=False)
+        self._sending.shutdown(wait=False)
 
     async def __aenter__(self) -> AsyncDevice:
-        opening = asyncio.get_running_loop().run_in_executor(self._sender, self._opening)
+        opening = asyncio.get_running_loop().run_in_executor(self._sending, self._opening)
         try:
-            self._device = await _whole(opening)
+            self._device = await _finish(opening)
         except BaseException:
-            if opening.done() and not opening.cancelled() and opening.exception() is None:
+            is_open = opening.done() and not opening.cancelled() and opening.exception() is None
+            if is_open:
                 self._device = opening.result()
             await self.close()
             raise
@@ -210,55 +150,74 @@ class AsyncDevice:
     ) -> None:
         await self.close()
 
-    async def _run(self, executor: ThreadPoolExecutor, function: Callable[[], T]) -> T:
-        return await asyncio.get_running_loop().run_in_executor(executor, function)
+    def _get_feed(self, method: str, *arguments: str) -> _Feed[Any]:
+        """Return the feed of an iterator of the device; later calls continue with the same one."""
+        key = (method, *arguments)
+        if key not in self._feeds:
+            self._feeds[key] = _Feed(getattr(self.device, method)(*arguments, wait=_WAIT_S))
+        return self._feeds[key]
 
-    async def _drained(self, feed: _Feed[T]) -> AsyncIterator[T]:
-        """What a feed finds, until it ends."""
+    async def _fetch(self, feed: _Feed[T]) -> AsyncIterator[T]:
+        """Yield the items of a feed until it ends."""
         while True:
-            while feed.found:
-                yield feed.found.popleft()
+            while feed.items:
+                yield feed.items.popleft()
             if feed.ended:
                 return
-            await self._run(self._reader, feed.step)
+            await _run(self._reading, feed.find_next)
 
-    def _look(self, deadline: float | None) -> None:
-        """Wait for the newest scan a little while; in the thread."""
-        if self._newest is None:
-            left = STEP if deadline is None else min(STEP, max(deadline - time.monotonic(), 0.0))
-            self._newest = self.device.newest(left)
-            if self._newest is None and deadline is not None and time.monotonic() >= deadline:
-                raise self.device.overdue()
+    def _find_newest(self, deadline: float | None) -> None:
+        """Wait a short time for the newest scan; called in the thread."""
+        if self._newest is not None:
+            return  # found by the thread of a call that was cancelled
+        wait = _WAIT_S
+        if deadline is not None:
+            wait = min(wait, max(deadline - time.monotonic(), 0.0))
+        self._newest = self.device.newest(wait)
+        is_late = deadline is not None and time.monotonic() >= deadline
+        if self._newest is None and is_late:
+            raise self.device.make_timeout_error()
 
 
 class _Feed(Generic[T]):
-    """What an iterator yields, found in a thread and fetched in the event loop.
+    """The items of an iterator, found in a thread and fetched in the event loop.
 
     Args:
-        source: the iterator; what it yields when nothing came is passed over.
-        empty: whether something it yields is that.
+        source: the iterator. If nothing has come it yields None, or a batch without rows.
+
+    Attributes:
+        items: the items that were found and not fetched.
+        ended: whether the iterator has ended.
     """
 
-    def __init__(self, source: Iterator[Any], empty: Callable[[Any], bool]) -> None:
-        self._source, self._empty = source, empty
-        self.found: deque[T] = deque()
+    def __init__(self, source: Iterator[Any]) -> None:
+        self._source = source
+        self.items: deque[T] = deque()
         self.ended = False
 
-    def step(self) -> None:
-        """Wait for the next; in the thread."""
-        if self.found or self.ended:
-            return  # the step of a call that was cancelled has found something
+    def find_next(self) -> None:
+        """Wait a short time for the next item; called in the thread."""
+        if self.items or self.ended:
+            return  # found by the thread of a call that was cancelled
         try:
             item = next(self._source)
         except StopIteration:
             self.ended = True
             return
-        if not self._empty(item):
-            self.found.append(item)
+        is_batch = isinstance(item, Packets | ImuSamples)
+        if item is not None and not (is_batch and not len(item)):
+            self.items.append(item)
 
 
-async def _whole(future: asyncio.Future[T]) -> T:
-    """The result of something that must not be left half done: a cancellation waits for its end."""
+async def _run(executor: ThreadPoolExecutor, function: Callable[[], T]) -> T:
+    return await asyncio.get_running_loop().run_in_executor(executor, function)
+
+
+async def _finish(future: asyncio.Future[T]) -> T:
+    """Return the result of a future; a cancellation waits for its end.
+
+    A device that is half open or half closed would keep its port.
+    """
     try:
         return await asyncio.shield(future)
     except asyncio.CancelledError:
@@ -269,7 +228,8 @@ async def _whole(future: asyncio.Future[T]) -> T:
 def open_async(
     source: str | Path, sensor: str | Sensor | None = None, **options: Any
 ) -> AsyncDevice:
-    """A sensor on any SOURCE, to be used with ``async with``; arguments and errors are those of
-    `open`.
+    """Open a sensor on any SOURCE, for ``async with``.
+
+    The arguments and errors are those of `open`.
     """
     return AsyncDevice(partial(open_device, source, sensor, **options))

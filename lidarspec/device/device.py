@@ -1,8 +1,7 @@
-"""A sensor on a source: packets and scans as they come, commands, counters.
+"""A sensor on a source: packets and scans as they arrive, commands, counters.
 
-A `Device` asks its input for what has arrived: a `FileInput` or a `LiveInput`, which look the same
-from here. `PacketReader` makes packets of one type out of it, with what one batch has to know of
-the one before, and scans out of those.
+A `Device` takes the frames that have arrived from its input, which is a `FileInput` or a
+`LiveInput` with the same interface. `PacketReader` makes packets and scans out of them.
 """
 
 from __future__ import annotations
@@ -18,147 +17,41 @@ from typing import Any, NoReturn, overload
 
 from lidarspec.detect.identification import contradiction, detected, said, simulated_sensor
 from lidarspec.device.arrivals import Arrival, FileInput, Input
-from lidarspec.device.first_frames import FirstFrames
 from lidarspec.device.live_input import PERIOD, LiveInput
+from lidarspec.device.packet_reader import PacketReader
 from lidarspec.device.session import Reply
 from lidarspec.device.settings import named
 from lidarspec.errors import SourceError, SourceTimeout, UsageError, suggest
-from lidarspec.framing.decoder import Decoder, Witness
-from lidarspec.framing.results import Counters, Found, Frames
+from lidarspec.framing.decoder import Witness
+from lidarspec.framing.results import Counters, Found
 from lidarspec.packets.imu import ImuSamples, joined
 from lidarspec.packets.packets import Packets
-from lidarspec.packets.stream import ImuStream, PacketStream, data_frame
 from lidarspec.plugins import sensor as named_sensor
 from lidarspec.points.cloud import Mount
 from lidarspec.recording.appending import Log
 from lidarspec.recording.recorders import RecordTo, recorder_for
-from lidarspec.scans.scans import Scan, ScanStream, handed_out
+from lidarspec.scans.scans import Scan, ScanStream
 from lidarspec.scans.selection import Selection, Sieve
 from lidarspec.spec.sensor import Sensor
 from lidarspec.transports.open_url import transport
 from lidarspec.transports.protocol import Closing, LiveTransport, Transport
 
-#: batches kept while nobody knows yet which data frame the sensor answers in.
-UNDECIDED = 256
-#: frames that are asked whether they are another sensor's.
-EXAMINED = 64
-#: samples of an IMU kept at least while no scan ends.
-FELT = 1 << 16
-#: seconds that one wait for data takes where there is no end to waiting.
-LONG = 3600.0
-
-
-class PacketReader:
-    """The packets of one type out of what arrives.
-
-    Args:
-        frame: the type; where the sensor has several data frames and none is named, the first that
-            arrives decides.
-        decoder: where the frames come from.
-        state: frames of other types, by name, that count as seen before the first packet.
-
-    Attributes:
-        last: the packets of the last arrival.
-        imu: what the sensor's IMU felt.
-        felt: the samples of the last arrival.
-    """
-
-    def __init__(
-        self, sensor: Sensor, frame: str | None, decoder: Decoder, first: FirstFrames
-    ) -> None:
-        self._sensor = sensor
-        self._decoder = decoder
-        self._first = first
-        self._named = frame
-        self._waiting: deque[Frames] = deque(maxlen=UNDECIDED)
-        self._stream = self._made(frame) if frame is not None else None
-        self.last: Packets | None = None
-        self.imu, self.felt = self._feeling(), joined([])
-
-    def feel(self, arrival: Arrival, data: Packets | None) -> None:
-        """Take the IMU's samples of an arrival, and of its packets."""
-        if arrival.replaced:
-            waiting, self.imu = self.imu.waiting, self._feeling()
-            self.imu.waiting = waiting
-        self.felt = self.imu.add(arrival.found, data)
-        if self.imu.waiting is not None:
-            self.imu.waiting.keep(FELT)
-        if arrival.interrupted:
-            self.imu.interrupt()
-
-    def _feeling(self) -> ImuStream:
-        return ImuStream(
-            self._sensor,
-            self._decoder.stats,
-            backend=self._decoder.backend,
-            state=self._first.state,
-        )
-
-    def add(self, arrival: Arrival) -> Packets | None:
-        """The packets among these frames; None while nobody knows of which type."""
-        if arrival.replaced:
-            self._waiting.clear()
-            self._stream = None if self._named is None else self._made(self._named)
-        self._waiting += arrival.found
-        found = list(self._waiting)
-        if self._stream is None:
-            name = data_frame(self._sensor, found)
-            self._stream = self._made(name) if name is not None else None
-        if self._stream is None:
-            return None
-        self._waiting.clear()
-        self.last = self._stream.add(found)
-        if arrival.interrupted:
-            self._stream.interrupt()
-        return self.last
-
-    def none(self) -> Packets:
-        """A batch of no packets."""
-        return (self._stream or self._made(self._sensor.data_frame)).add([])
-
-    def scans(self, stream: ScanStream, arrival: Arrival, *, read: bool = False) -> Iterator[Scan]:
-        """The scans that an arrival completes; an interruption ends the one under way, and the
-        stream with it.
-
-        Args:
-            read: it is the last one, of which packets were made before.
-        """
-        packets = self.last
-        if not read:
-            packets = self.add(arrival)
-            self.feel(arrival, packets)
-        if packets is not None and len(packets):
-            yield from handed_out(stream.add(packets))
-        if arrival.interrupted:
-            yield from stream.finish()
-
-    def __getstate__(self) -> dict[str, Any]:
-        """What is pickled goes on with the next packets, without the last ones."""
-        return {**vars(self), "last": None, "felt": joined([])}
-
-    def _made(self, name: str) -> PacketStream:
-        decoder = self._decoder
-        first = self._first
-        return PacketStream(
-            self._sensor,
-            name,
-            decoder.stats,
-            backend=decoder.backend,
-            state=first.state,
-            reference=first.reference,
-        )
+#: The first frames, which are checked for being another sensor's.
+_MAX_CHECKED_FRAMES = 64
+#: The length of one wait for data, if the whole wait has no end.
+_LONG_WAIT_S = 3600.0
 
 
 class Device(Closing):
-    """A sensor read from a source; a context manager.
+    """A sensor on a source; a context manager.
 
     Attributes:
-        felt: what the sensor's IMU felt with the last batch of `packets`, in the carrier's axes
-            where the sensor is mounted.
-        source: where it is read from.
+        source: the source that is read.
         sensor: the sensor, given or detected.
-        mount: how it is mounted, where `lidarspec.toml` says so: scans come in the carrier's axes,
-            packets in the sensor's.
+        mount: the pose of the sensor, if `lidarspec.toml` has one. Scans are then in the axes of
+            the carrier, and packets in those of the sensor.
+        imu_samples: the IMU samples that arrived with the last batch of `packets`, in the axes of
+            the carrier if the sensor has a mount.
     """
 
     def __init__(
@@ -173,17 +66,20 @@ class Device(Closing):
         period: float = PERIOD,
         mount: Mount | None = None,
     ) -> None:
-        self.sensor, self.source, self.mount, self.felt = sensor, source, mount, joined([])
-        self._streams: dict[str | None, PacketReader] = {}
-        self._latest: ScanStream | None = None
-        self._unseen = deque[Scan]()
+        self.sensor = sensor
+        self.source = source
+        self.mount = mount
+        self.imu_samples = joined([])
+        self._readers: dict[str | None, PacketReader] = {}
+        self._latest_stream: ScanStream | None = None
+        self._unseen_scans: deque[Scan] = deque()
+        # The arrival in which `latest` found its last scan of a file.
         self._ahead: Arrival | None = None
-        self._first, self._another = (
-            list[Found](),
-            None if sensor.relatives or "model" in sensor.info else "",
-        )
-        self._own_recorders = list[Log]()
-        self._input = self._opened(backend, record, overflow, period, learns=start)
+        self._first_frames: list[Found] = []
+        self._is_checked = not sensor.relatives and "model" not in sensor.info
+        self._contradiction = ""
+        self._own_recorders: list[Log] = []
+        self._input = self._open_input(backend, record, overflow, period, learns=start)
         self._finalizer = weakref.finalize(self, _close, self._input, self._own_recorders)
         if start:
             try:
@@ -193,10 +89,10 @@ class Device(Closing):
                 raise
         if self.learned:
             self.sensor = self._input.sensor
-            self._latest = ScanStream(self.sensor, mount)
+            self._latest_stream = ScanStream(self.sensor, mount)
 
     async def __aenter__(self) -> NoReturn:
-        """Raise: `async with` takes the device of `open_async`.
+        """Raise an error that names `open_async`.
 
         Raises:
             UsageError: always.
@@ -208,7 +104,7 @@ class Device(Closing):
         )
 
     async def __aexit__(self, *_: object) -> None:
-        """Exist beside `__aenter__`, without which Python raises its own TypeError."""
+        """Do nothing; without this method Python raises a TypeError before `__aenter__`."""
 
     @property
     def stats(self) -> Counters:
@@ -217,110 +113,94 @@ class Device(Closing):
 
     @property
     def warnings(self) -> list[str]:
-        """What is to be said about the source now: a file that is cut off, silence, a likely wrong
-        baud rate, a small buffer, frames that are another sensor's, scans without an end, times
-        without a date, a nominal calibration; and what the plugin failed at."""
-        failure = self.stats.failure(self.sensor.id)
-        nominal = [_nominal(self.sensor)] if self.stats.nominal else []
-        partial = [
-            f"{self.source}: {text}"
-            for text in (self.stats.unended, self.stats.undated, self.stats.masked)
-            if text
-        ]
-        return [
-            *self._input.warnings,
-            *self._doubts(),
-            *partial,
-            *nominal,
-            *([] if failure is None else [str(failure)]),
-        ]
+        """The present warnings about the source and the sensor.
+
+        Among them: a truncated file, silence, a baud rate that is probably wrong, a small receive
+        buffer, frames of another sensor, scans without an end, times without a date, a nominal
+        calibration, and errors of the plugin.
+        """
+        stats = self.stats
+        warnings = [*self._input.warnings, *self._check_first_frames()]
+        for text in (stats.unended, stats.undated, stats.masked):
+            if text:
+                warnings.append(f"{self.source}: {text}")
+        if stats.nominal:
+            warnings.append(_describe_nominal(self.sensor))
+        failure = stats.failure(self.sensor.id)
+        if failure is not None:
+            warnings.append(str(failure))
+        return warnings
 
     @property
     def learned(self) -> Mapping[str, Any]:
-        """The options that the sensor has said of itself on opening; `sensor` is configured with
-        them.
-        """
+        """The options that the sensor reported when it was opened; `sensor` is configured with them."""
         return self._input.learned
 
     @property
     def info(self) -> dict[str, str]:
-        """What the sensor has said of itself so far: of "serial", "firmware", "model" and
-        "temperature" those that its frames have.
+        """The identity that the sensor has reported so far.
+
+        Keys are those of "serial", "firmware", "model" and "temperature" that its frames contain.
         """
         return said(self.sensor, self._input.told.values())
 
     @property
     def state(self) -> str:
-        """How the source is doing: "streaming", "waiting" (for a first frame), "silent" (for three
-        seconds), "no frames" (bytes only), "disconnected", "ended" (a file) or "closed"."""
+        """The state of the source.
+
+        "streaming", "waiting" (for a first frame), "silent" (for three seconds), "no frames" (bytes
+        only), "disconnected", "ended" (a file) or "closed".
+        """
         return self._input.state
 
     @property
     def queued(self) -> int | None:
-        """Chunks that have arrived and wait to be decoded; None for a file."""
+        """The number of chunks that wait to be decoded; None for a file."""
         return self._input.queued
 
     @property
     def place(self) -> tuple[int, int] | None:
-        """How many bytes of a file were read, as it is stored, compressed or not, and how many
-        there are; None where nobody knows.
+        """The number of bytes read of the stored file, and its size; None if unknown.
+
+        Both are those of the compressed file, if it is one.
         """
         return self._input.place
 
     @property
     def is_live(self) -> bool:
-        """Whether data come at their own pace, and not from a file."""
+        """Whether data arrive at their own pace, and not from a file."""
         return self._input.is_live
 
-    def spans(self) -> Iterator[list[Frames]]:
-        """Every incoming frame of all types, in batches."""
-        for arrival in self._arrivals(None):
-            if arrival is not None and arrival.found:
-                yield arrival.found
-
     def packets(self, frame: str | None = None, *, wait: float | None = None) -> Iterator[Packets]:
-        """The packets of the data frame, or of another type, in batches, until the input ends or
-        the device is closed.
+        """Yield packets in batches, until the input ends or the device is closed.
 
-        A file is read once, whoever reads it. After `latest` they begin with the batch in which its
-        scan was found.
+        A file is read once, by all iterators together. After `latest` they begin with the batch in
+        which its scan was found.
 
         Args:
-            frame: the name of a frame type.
-            wait: yield a batch of no packets where none have come for so many seconds, so that the
-                caller has a turn.
+            frame: the name of a frame type; by default the data frame.
+            wait: yield an empty batch if none has come for so many seconds, so that the caller can
+                do something else.
 
         Raises:
-            SourceError: where a file has been read to its end before.
+            SourceError: if a file has been read to its end before.
         """
-        reader, ahead, turn = self._reader(frame), self._taken_back(), time.monotonic()
-        for arrival in self._arrivals(wait, ahead):
-            packets = (
-                None
-                if arrival is None
-                else reader.last
-                if arrival is ahead and frame is None
-                else reader.add(arrival)
-            )
-            if (
-                frame is None
-                and arrival is not None
-                and arrival is not ahead
-                and self.sensor.imu_frames
-            ):
-                reader.feel(arrival, packets)
-            self.felt, is_due = (
-                self._felt(reader, arrival),
-                wait is not None and time.monotonic() - turn >= wait,
-            )
-            if (
-                (packets is not None and len(packets))
-                or len(self.felt)
-                or arrival is None
-                or is_due
-            ):
-                yield reader.none() if packets is None else packets
-                turn = time.monotonic()
+        reader = self._get_reader(frame)
+        ahead = self._take_ahead()
+        pace = _Pace(wait)
+        for arrival in self._iter_arrivals(wait, ahead):
+            packets = None
+            if arrival is not None and arrival is ahead and frame is None:
+                packets = reader.last
+            elif arrival is not None:
+                packets = reader.add(arrival)
+                if frame is None:
+                    reader.add_imu(arrival, packets)
+            self.imu_samples = self._get_imu_samples(reader, arrival)
+            has_data = (packets is not None and len(packets)) or len(self.imu_samples)
+            if has_data or arrival is None or pace.is_due():
+                yield reader.make_empty_batch() if packets is None else packets
+                pace.restart()
 
     @overload
     def scans(self, *, select: Selection | None = None) -> Iterator[Scan]: ...
@@ -329,211 +209,192 @@ class Device(Closing):
     def scans(self, *, wait: float, select: Selection | None = None) -> Iterator[Scan | None]: ...
 
     def scans(self, *, wait: float | None = None, select: Selection | None = None) -> Iterator[Any]:
-        """Every scan; the first and last piece, and those before and after an interruption, are
-        marked ``complete=False``.
+        """Yield scans, until the input ends or the device is closed.
 
-        Where a scan does not end within twice the slowest turn, what there is of it is handed out,
-        and `warnings` says so.
+        The first and the last one, and those before and after an interruption, have
+        ``complete=False``. A scan that does not end within twice the slowest turn is yielded as it
+        is, and `warnings` names it.
 
-        A file is read once, whoever reads it. After `latest` they begin with the batch in which its
-        scan was found.
+        A file is read once, by all iterators together. After `latest` they begin with the batch in
+        which its scan was found.
 
         Args:
-            wait: yield None where no scan has come for so many seconds, so that the caller has a
-                turn.
-            select: which of them, and what of each; nothing is read behind the last that is wanted,
-                and of a recording nothing that lies long before the first.
+            wait: yield None if no scan has come for so many seconds, so that the caller can do
+                something else.
+            select: the scans and the parts of them to yield. Nothing is read after the last one,
+                and long stretches of a recording before the first one are skipped.
 
         Raises:
-            SourceError: where a file has been read to its end before.
-            UsageError: where none of its scans is wanted.
+            SourceError: if a file has been read to its end before.
+            UsageError: if no scan is selected.
         """
-        return (
-            self._scans(wait)
-            if select is None
-            else Sieve(select, self.source, self.skip).of(self._scans(wait))
-        )
-
-    def _scans(self, wait: float | None) -> Iterator[Scan | None]:
-        reader, ahead, turn = self._reader(None), self._taken_back(), time.monotonic()
-        stream = self._scan_stream()
-        for arrival in self._arrivals(wait, ahead):
-            for scan in (
-                () if arrival is None else reader.scans(stream, arrival, read=arrival is ahead)
-            ):
-                yield scan
-                del scan  # nobody is to keep it but the caller
-                turn = time.monotonic()
-            if wait is not None and (arrival is None or time.monotonic() - turn >= wait):
-                yield None
-                turn = time.monotonic()
-            stream = self._scan_stream() if arrival is not None and arrival.interrupted else stream
-        yield from stream.finish()
+        scans = self._iter_scans(wait)
+        if select is None:
+            return scans
+        return Sieve(select, self.source, self.skip).of(scans)
 
     def imu(self, *, wait: float | None = None) -> Iterator[ImuSamples]:
-        """What the sensor's IMU felt, in batches as it comes, in the carrier's axes where the
-        sensor is mounted, until the input ends.
+        """Yield the samples of the sensor's IMU in batches, until the input ends.
 
-        Scans have what was felt during them in `Scan.imu`. A file is read once, whoever reads it.
+        They are in the axes of the carrier if the sensor has a mount. `Scan.imu` has the samples
+        that belong to a scan. A file is read once, by all iterators together.
 
         Args:
-            wait: yield no samples where none have come for so many seconds, so that the caller has
-                a turn.
+            wait: yield no samples if none have come for so many seconds, so that the caller can do
+                something else.
 
         Raises:
-            UsageError: where no frame of the sensor says what an IMU felt.
-            SourceError: where a file has been read to its end before.
+            UsageError: if no frame of the sensor has IMU samples.
+            SourceError: if a file has been read to its end before.
         """
         if not self.sensor.imu_frames:
             raise UsageError(f"{self.sensor.id}: no frame says what an IMU felt")
-        reader, ahead, turn = self._reader(None), self._taken_back(), time.monotonic()
-        for arrival in self._arrivals(wait, ahead):
+        reader = self._get_reader(None)
+        ahead = self._take_ahead()
+        pace = _Pace(wait)
+        for arrival in self._iter_arrivals(wait, ahead):
             if arrival is not None and arrival is not ahead:
-                reader.feel(arrival, reader.add(arrival))
-            if reader.imu.waiting is not None:
-                reader.imu.waiting.until(None)  # no scan asks for them
-            felt = self._felt(reader, arrival)
-            if (
-                len(felt)
-                or arrival is None
-                or (wait is not None and time.monotonic() - turn >= wait)
-            ):
-                yield felt
-                turn = time.monotonic()
-
-    def skip(self, at: int) -> bool:
-        """Pass over what arrived before a time, ns since 1970, where the source can do so without
-        reading it: whether it does.
-
-        What was read already is still given; then the stream goes on as behind an interruption.
-        """
-        return self._input.skip(at)
-
-    def gather(self, until: float) -> None:
-        """Let what comes of a live source wait up to a time of `time.monotonic`, to be decoded
-        together, which takes less of the processor.
-
-        It waits no longer than the `wait` of whoever iterates.
-        """
-        self._input.gather(until)
-
-    def read_ahead(self, size: int) -> None:
-        """Read a file in portions of about so many bytes from now on, for whoever shows it at the
-        pace of its times: then counters, and what a `Witness` is shown, are not far ahead of what
-        is seen. 0: as many as are decoded quickest."""
-        self._input.read_ahead(size)
-
-    def witnessed(self, by: Witness) -> None:
-        """Show someone everything that is decoded from now on, and the frames that are found in it,
-        in the thread that reads.
-        """
-        self._input.decoder.witness = by
+                reader.add_imu(arrival, reader.add(arrival))
+            if reader.waiting_imu is not None:
+                reader.waiting_imu.until(None)  # no scan will take them
+            samples = self._get_imu_samples(reader, arrival)
+            if len(samples) or arrival is None or pace.is_due():
+                yield samples
+                pace.restart()
 
     def latest(self, timeout: float | None = None) -> Scan:
-        """The newest whole scan, newer than the one that the last call gave; waits for it. Older
-        ones are passed over.
+        """Wait for the newest whole scan, newer than that of the last call; skip older ones.
 
-        A file has no newest scan: it gives one after another.
+        A file has no newest scan: each call returns the next one.
 
         Args:
             timeout: seconds to wait.
 
         Raises:
-            SourceTimeout: where none comes in time; SourceError where the input has ended or the
-                device was closed.
+            SourceTimeout: if none comes in time.
+            SourceError: if the input has ended or the device was closed.
         """
         deadline = None if timeout is None else time.monotonic() + timeout
-        while (
-            found := self.newest(
-                LONG if deadline is None else max(deadline - time.monotonic(), 0.0)
-            )
-        ) is None:
+        while True:
+            wait = _LONG_WAIT_S if deadline is None else max(deadline - time.monotonic(), 0.0)
+            scan = self.newest(wait)
+            if scan is not None:
+                return scan
             if deadline is not None and time.monotonic() >= deadline:
-                raise self.overdue()
-        return found
+                raise self.make_timeout_error()
 
     def newest(self, wait: float) -> Scan | None:
-        """The newest whole scan, newer than the one given last; None where none comes within `wait`
-        seconds.
+        """Return the newest whole scan, as `latest`; None if none comes within `wait` seconds.
 
         Raises:
-            SourceError: where the input has ended or the device was closed.
+            SourceError: if the input has ended or the device was closed.
         """
-        deadline, mark, reader = time.monotonic() + wait, self._input.mark(), self._reader(None)
-        while not (self._unseen and self._input.caught_up(mark)):
+        deadline = time.monotonic() + wait
+        mark = self._input.mark()
+        while not (self._unseen_scans and self._input.caught_up(mark)):
             if self._input.ended:
                 raise SourceError(
                     f"{self.source}: no further scan, since the input is {self._input.state}"
                 )
-            arrival = self._next(max(deadline - time.monotonic(), 0.0))
+            arrival = self._next_arrival(max(deadline - time.monotonic(), 0.0))
             if arrival is not None:
-                self._latest = self._latest or self._scan_stream()
-                found = [scan for scan in reader.scans(self._latest, arrival) if scan.whole]
-                self._ahead = arrival if found and not self.is_live else None
-                self._unseen += found
-                self._latest = None if arrival.interrupted else self._latest
-            if (
-                not self._unseen
-                and time.monotonic() >= deadline
-                and (arrival is None or self._input.caught_up(mark))
-            ):
+                self._find_whole_scans(arrival)
+            has_no_more = arrival is None or self._input.caught_up(mark)
+            if not self._unseen_scans and has_no_more and time.monotonic() >= deadline:
                 return None
         if not self.is_live:
-            return self._unseen.popleft()
-        newest = self._unseen[-1]
-        self._unseen.clear()
-        return newest
+            return self._unseen_scans.popleft()
+        scan = self._unseen_scans[-1]
+        self._unseen_scans.clear()
+        return scan
 
-    def overdue(self) -> SourceTimeout:
-        """What to say when a scan did not come in time."""
+    def make_timeout_error(self) -> SourceTimeout:
+        """Return the error for a scan that did not come in time."""
         error = SourceTimeout(f"{self.source}: no scan in time; the source is {self.state}")
         return suggest(error, f"lidarspec doctor {quote(str(self.source))} -s {self.sensor.id}")
 
-    def send(self, name: str, /, *, timeout: float | None = None, **arguments: Any) -> Reply:
-        """The reply to a command; at once with ``confirmed=False`` where none is documented.
+    def skip(self, at: int) -> bool:
+        """Skip input that arrived before a time, without reading it; return whether it is possible.
+
+        Frames that were read already are still returned. After them the stream continues as after
+        an interruption.
 
         Args:
-            name: of the command.
-            timeout: seconds to wait for the reply; by default what the sensor declares.
+            at: ns since 1970.
+        """
+        return self._input.skip(at)
+
+    def gather(self, until: float) -> None:
+        """Let arriving data of a live source wait, to decode it together with less processor time.
+
+        It does not wait longer than the `wait` of an iterator.
+
+        Args:
+            until: a time of `time.monotonic`.
+        """
+        self._input.gather(until)
+
+    def read_ahead(self, size: int) -> None:
+        """Read a file in portions of about `size` bytes from now on; 0 for the fastest size.
+
+        A program that shows a file at its recorded pace uses this: counters, and the input of a
+        `Witness`, are then not far ahead of the picture.
+        """
+        self._input.read_ahead(size)
+
+    def observe(self, witness: Witness) -> None:
+        """Show all input that is decoded from now on, and its frames, to a witness.
+
+        It is called in the thread that reads.
+        """
+        self._input.decoder.witness = witness
+
+    def send(self, name: str, /, *, timeout: float | None = None, **arguments: Any) -> Reply:
+        """Send a command and return the reply.
+
+        Returns at once with ``confirmed=False`` if the sensor documents no reply.
+
+        Args:
+            name: the name of the command.
+            timeout: seconds to wait for the reply; by default as the sensor declares.
             arguments: by name, in units.
 
         Raises:
-            UnknownCommand, UnknownField, MissingField, OutOfRange: for what the sensor does not
-                take; nothing is sent.
-            CommandError: where the device refuses, or the connection is lost; ReplyTimeout where it
-                keeps silent.
+            UnknownCommand, UnknownField, MissingField, OutOfRange: for an invalid command; nothing
+                is sent.
+            CommandError: if the device refuses, or the connection is lost.
+            ReplyTimeout: if no reply comes in time.
         """
         return self._input.send(name, timeout=timeout, **arguments)
 
     def write(self, data: bytes, link: str = "data") -> None:
-        """Send bytes by hand, as they are; nothing is waited for, and what answers them comes with
-        everything else.
+        """Send bytes as they are, without waiting for a reply.
+
+        A reply arrives among the other frames. The bytes are not interpreted, so that a sensor that
+        they start is not stopped on closing.
 
         Args:
-            data: the bytes; nobody looks at what they say, so that a sensor that they start is not
-                stopped on closing.
-            link: over which of the sensor's links.
+            data: the bytes.
+            link: the name of one of the sensor's links.
 
         Raises:
-            UsageError: for a text, and for a link that the sensor does not have.
-            SourceError: where the connection is lost, or there is no device.
+            UsageError: for a text, or an unknown link.
+            SourceError: if the connection is lost, or there is no device.
         """
         self._input.write(data, link)
 
     def leave_on(self) -> None:
-        """Let the sensor go on as it is when the device is closed."""
+        """Leave the sensor as it is when the device is closed."""
         self._input.stays_on = True
 
     def close(self) -> None:
-        """Stop the sensor where it was started, and give the source back; a second call does
-        nothing.
-        """
+        """Stop the sensor if it was started, and close the source; a second call does nothing."""
         self._finalizer()
 
     def __repr__(self) -> str:
         return f"Device({self.sensor.id} on {self.source}, {self.state}: {self.stats})"
 
-    def _opened(
+    def _open_input(
         self,
         backend: str,
         record: RecordTo | None,
@@ -548,17 +409,17 @@ class Device(Closing):
                 if record is not None:
                     raise UsageError(f"{self.source} is a file already: there is nothing to record")
                 return FileInput(self.source, self.sensor, opened, backend=backend)
-            policy = opened.overflow if overflow is None else overflow
-            recorder = partial(
-                _recorder, record, self.source, opened, self._own_recorders
-            )  # which holds no device: it may be forgotten
+            # This must not refer to the device, which otherwise is never garbage.
+            make_recorder = partial(
+                _make_recorder, record, self.source, opened, self._own_recorders
+            )
             return LiveInput(
                 self.source,
                 self.sensor,
                 opened,
                 backend=backend,
-                policy=policy,
-                record=recorder,
+                policy=opened.overflow if overflow is None else overflow,
+                record=make_recorder,
                 learns=learns,
                 period=period,
             )
@@ -566,102 +427,123 @@ class Device(Closing):
             _close(opened, self._own_recorders)
             raise
 
-    def _reader(self, frame: str | None) -> PacketReader:
-        if frame not in self._streams:
-            self._streams[frame] = PacketReader(
+    def _get_reader(self, frame: str | None) -> PacketReader:
+        if frame not in self._readers:
+            self._readers[frame] = PacketReader(
                 self.sensor, frame, self._input.decoder, self._input.first_frames()
             )
-        return self._streams[frame]
+        return self._readers[frame]
 
-    def _felt(self, reader: PacketReader, arrival: Arrival | None) -> ImuSamples:
-        """What came with an arrival of what the IMU felt."""
-        felt = joined([]) if arrival is None else reader.felt
-        return felt if self.mount is None else felt.turned(self.mount.rotation)
+    def _get_imu_samples(self, reader: PacketReader, arrival: Arrival | None) -> ImuSamples:
+        if arrival is None:
+            return joined([])
+        if self.mount is None:
+            return reader.imu_samples
+        return reader.imu_samples.turned(self.mount.rotation)
 
-    def _scan_stream(self) -> ScanStream:
-        return ScanStream(self.sensor, self.mount, self._reader(None).imu.waiting)
+    def _make_scan_stream(self) -> ScanStream:
+        return ScanStream(self.sensor, self.mount, self._get_reader(None).waiting_imu)
 
-    def _taken_back(self) -> Arrival | None:
-        """What of a file `latest` found its last scan in, for another to begin with; its further
-        scans are then no longer waited for.
+    def _iter_scans(self, wait: float | None) -> Iterator[Scan | None]:
+        reader = self._get_reader(None)
+        ahead = self._take_ahead()
+        pace = _Pace(wait)
+        stream = self._make_scan_stream()
+        for arrival in self._iter_arrivals(wait, ahead):
+            if arrival is not None:
+                for scan in reader.find_scans(stream, arrival, is_added=arrival is ahead):
+                    yield scan
+                    del scan  # only the caller may keep it alive
+                    pace.restart()
+                if arrival.interrupted:
+                    stream = self._make_scan_stream()
+            if pace.is_due() or (arrival is None and wait is not None):
+                yield None
+                pace.restart()
+        yield from stream.finish()
+
+    def _find_whole_scans(self, arrival: Arrival) -> None:
+        """Add the whole scans that an arrival completes to the unseen ones."""
+        if self._latest_stream is None:
+            self._latest_stream = self._make_scan_stream()
+        reader = self._get_reader(None)
+        scans = [scan for scan in reader.find_scans(self._latest_stream, arrival) if scan.whole]
+        self._unseen_scans += scans
+        self._ahead = arrival if scans and not self.is_live else None
+        if arrival.interrupted:
+            self._latest_stream = None
+
+    def _take_ahead(self) -> Arrival | None:
+        """Return the arrival in which `latest` found its last scan of a file.
+
+        A new iterator begins with it, and `latest` forgets its further scans.
         """
-        ahead, self._ahead = self._ahead, None
+        ahead = self._ahead
+        self._ahead = None
         if ahead is not None:
-            self._latest = None
-            self._unseen.clear()
+            self._latest_stream = None
+            self._unseen_scans.clear()
         elif self._input.state == "ended":
             raise SourceError(
                 f"{self.source} has been read to its end: open it again to read it once more"
             )
         return ahead
 
-    def _arrivals(
+    def _iter_arrivals(
         self, wait: float | None, ahead: Arrival | None = None
     ) -> Iterator[Arrival | None]:
-        """What arrives, until the end; None where nothing has for `wait` seconds."""
+        """Yield what arrives, until the end; None if nothing has come for `wait` seconds."""
         if ahead is not None:
             yield ahead
         while not self._input.ended:
-            arrival = self._next(LONG if wait is None else wait)
+            arrival = self._next_arrival(_LONG_WAIT_S if wait is None else wait)
             if arrival is not None or not self._input.ended:
                 yield arrival
 
-    def _next(self, wait: float) -> Arrival | None:
-        """What arrives next; the first frames are kept until somebody asks whether they are another
-        sensor's.
-        """
+    def _next_arrival(self, wait: float) -> Arrival | None:
+        """Return the next arrival, and keep the first frames for `warnings`."""
         arrival = self._input.next(wait)
-        if self._another is None and arrival is not None and len(self._first) < EXAMINED:
-            for frames in arrival.found:
-                self._first += frames.only(slice(0, EXAMINED)).found()
+        if self._is_checked or arrival is None or len(self._first_frames) >= _MAX_CHECKED_FRAMES:
+            return arrival
+        for frames in arrival.found:
+            self._first_frames += frames.only(slice(0, _MAX_CHECKED_FRAMES)).found()
         return arrival
 
-    def _doubts(self) -> list[str]:
-        """That the first frames are another sensor's, or name another model: found out once, when
-        there are enough of them.
+    def _check_first_frames(self) -> list[str]:
+        """Return a warning if the first frames are another sensor's, or name another model.
+
+        They are checked once, when there are enough of them.
         """
-        if self._another is None and (len(self._first) >= EXAMINED or self._input.ended):
+        has_enough = len(self._first_frames) >= _MAX_CHECKED_FRAMES or self._input.ended
+        if not self._is_checked and has_enough:
+            self._is_checked = True
             simulated = simulated_sensor(self.source)
-            is_certain = simulated is not None and simulated.id == self.sensor.id
-            self._another = "" if is_certain else contradiction(self.sensor, self._first)
-        if not self._another:
+            if simulated is None or simulated.id != self.sensor.id:
+                self._contradiction = contradiction(self.sensor, self._first_frames)
+        if not self._contradiction:
             return []
-        text = f"{self.source}: read as {self.sensor.id}, and {self._another}"
-        return [f"{text}; next: lidarspec detect {quote(str(self.source))}"]
+        return [
+            f"{self.source}: read as {self.sensor.id}, and {self._contradiction}; next: lidarspec"
+            f" detect {quote(str(self.source))}"
+        ]
 
 
-def _nominal(sensor: Sensor) -> str:
-    """That a default calibration stood in, and how the sensor's own is given."""
-    text = f"{sensor.id}: points by the nominal calibration of the model, not of this unit"
-    if files := [name for name in sensor.configure.files if name not in sensor.options]:
-        return f"{text}; its own: -O {files[0]}=FILE, in Python sensor.configure({files[0]}=FILE)"
-    return text + (f", where no {' or '.join(sensor.state)} frame had come" if sensor.state else "")
+class _Pace:
+    """Tells an iterator when its caller is due for a turn.
 
-
-def _recorder(
-    record: RecordTo | None,
-    source: str | Path,
-    opened: LiveTransport,
-    own: list[Log],
-    sensor: Sensor,
-) -> Log | None:
-    """What is to record a sensor as it is read, None for nothing; added to `own` where it is to be
-    closed with the device.
+    Args:
+        wait: seconds between two turns; None if the caller needs none.
     """
-    if record is None:
-        return None
-    kept, is_own = recorder_for(record, sensor, source, opened)
-    own += [kept] * is_own
-    return kept
 
+    def __init__(self, wait: float | None) -> None:
+        self._wait = wait
+        self._last_turn = time.monotonic()
 
-def _close(source: Input | Transport, recorders: list[Log]) -> None:
-    """Give everything back; the recording is closed even where the source fails."""
-    try:
-        source.close()
-    finally:
-        for recorder in recorders:
-            recorder.close()
+    def is_due(self) -> bool:
+        return self._wait is not None and time.monotonic() - self._last_turn >= self._wait
+
+    def restart(self) -> None:
+        self._last_turn = time.monotonic()
 
 
 def open(
@@ -674,31 +556,29 @@ def open(
     overflow: str | None = None,
     period: float = PERIOD,
 ) -> Device:
-    """A sensor on any SOURCE: a port, a socket, a simulated device, a file, or "-" for standard
-    input.
+    """Open a sensor on any SOURCE.
 
     Args:
-        source: "/dev/ttyUSB0", "serial:///dev/ttyUSB0?baud=230400", "udp://", "tcp://host:port",
-            "capture.pcap", or a name of `lidarspec.toml` ...
-        sensor: an id, a path to a sensor's module, or a Sensor; found out where left out.
-        backend: what evaluates `points`: "auto", "numpy", "jit" or "construct".
-        start: False leaves out the commands that the sensor declares for its start, and for its
-            end.
-        record: a new file, or a `Recorder`, for everything that arrives and is sent; or what makes
-            one of the open transport.
-        overflow: what a live source does when the consumer is too slow: "drop_oldest", or "block";
-            by default the first, but a simulated sensor without a pace of its own waits.
-        period: seconds between two decodings of what has come.
+        source: a port, a socket, a simulated device, a file, or "-" for standard input:
+            "/dev/ttyUSB0", "serial:///dev/ttyUSB0?baud=230400", "udp://", "tcp://host:port",
+            "capture.pcap", or a name of `lidarspec.toml`.
+        sensor: an id, a path to a sensor's module, or a Sensor; by default it is detected.
+        backend: evaluates `points`: "auto", "numpy", "jit" or "construct".
+        start: False omits the commands that the sensor declares for opening and closing.
+        record: a new file, or a `Recorder`, for everything that arrives and is sent; or a function
+            that makes one for the open transport.
+        overflow: the policy of a live source with a slow consumer: "drop_oldest" or "block". By
+            default only a simulated sensor without a pace of its own blocks.
+        period: seconds between two decodings of the data that have arrived.
 
     Raises:
-        SourceError: where the source cannot be opened.
-        UsageError, WireError: where several sensors fit, or none, and `sensor` was left out.
-        CommandError: where the device does not start.
+        SourceError: if the source cannot be opened.
+        UsageError, WireError: if the sensor was omitted and several fit, or none.
+        CommandError: if the device does not start.
     """
-    device = named(source)
+    settings = named(source)
     if sensor is None:
         sensor = detected(source)
-    mount = None if device is None else device.mount
     return Device(
         source,
         named_sensor(sensor),
@@ -707,5 +587,44 @@ def open(
         record=record,
         overflow=overflow,
         period=period,
-        mount=mount,
+        mount=None if settings is None else settings.mount,
     )
+
+
+def _describe_nominal(sensor: Sensor) -> str:
+    """Return a warning about a default calibration, with the way to give the sensor's own one."""
+    text = f"{sensor.id}: points by the nominal calibration of the model, not of this unit"
+    files = [name for name in sensor.configure.files if name not in sensor.options]
+    if files:
+        return f"{text}; its own: -O {files[0]}=FILE, in Python sensor.configure({files[0]}=FILE)"
+    if sensor.state:
+        return f"{text}, where no {' or '.join(sensor.state)} frame had come"
+    return text
+
+
+def _make_recorder(
+    record: RecordTo | None,
+    source: str | Path,
+    opened: LiveTransport,
+    own_recorders: list[Log],
+    sensor: Sensor,
+) -> Log | None:
+    """Return the recorder that was asked for.
+
+    It is added to `own_recorders` if the device has to close it.
+    """
+    if record is None:
+        return None
+    log, is_own = recorder_for(record, sensor, source, opened)
+    if is_own:
+        own_recorders.append(log)
+    return log
+
+
+def _close(source: Input | Transport, recorders: list[Log]) -> None:
+    """Close everything; recordings are closed even if the source fails."""
+    try:
+        source.close()
+    finally:
+        for recorder in recorders:
+            recorder.close()

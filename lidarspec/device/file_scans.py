@@ -24,7 +24,7 @@ from typing import Any
 import numpy as np
 
 from lidarspec.device.arrivals import FileInput
-from lidarspec.device.device import PacketReader
+from lidarspec.device.packet_reader import PacketReader
 from lidarspec.errors import UsageError
 from lidarspec.expressions.columns import AROUND
 from lidarspec.frames.frame_table import Records, Rows, Table
@@ -114,12 +114,12 @@ class FileScans(Closing):
         return None if arrival is None else self._scans(arrival)
 
     def _scans(self, arrival: Any) -> Iterator[Scan]:
-        yield from self._reader.scans(self._stream, arrival)
+        yield from self._reader.find_scans(self._stream, arrival)
         if arrival.interrupted:
             self._stream = self._scan_stream()
 
     def _scan_stream(self) -> ScanStream:
-        return ScanStream(self._sensor, imu=self._reader.imu.waiting)
+        return ScanStream(self._sensor, imu=self._reader.waiting_imu)
 
     @property
     def _place(self) -> int:

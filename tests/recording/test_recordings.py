@@ -451,9 +451,11 @@ def test_a_recording_is_read_like_any_file(path: Path) -> None:
     )
     with ls.open(path) as device:
         assert device.sensor.id == STREAM
-        found = [found for spans in device.spans() for one in spans for found in one.found()]
-    assert [item.data for item in found] == [one, two, three]
-    assert [item.at for item in found] == [1_000, 2_000, 3_000]
+        batches = list(device.packets())
+    raw = np.concatenate([packets.raw for packets in batches])
+    assert raw.tobytes() == ls.sensor(STREAM).decode(one + two + three).raw.tobytes()
+    arrivals = [at for packets in batches for at in packets.host_ns.tolist()]
+    assert arrivals == [1_000, 2_000, 3_000]
 
 
 @pytest.mark.parametrize("interruption", ["flag", "event"])

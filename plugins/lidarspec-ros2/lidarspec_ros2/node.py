@@ -213,7 +213,7 @@ class LidarNode(LifecycleNode):
     def _publish(self, feed: Feed, topics: Topics) -> None:
         if feed.packets is not None and len(feed.packets):
             topics.learn(feed.packets)
-        topics.feel(feed.device.felt)
+        topics.feel(feed.device.imu_samples)
         for scan in feed.scans:
             if scan.whole:
                 topics.publish(scan)

@@ -243,7 +243,7 @@ class Broadcast(Closing):
         self._guarded(self._feed.step)
 
     def _fed(self, select: Selection) -> Feed:
-        self.device.witnessed(self.backlog)
+        self.device.observe(self.backlog)
         return Feed(self.device, played=True, select=select)
 
     def _look(self) -> None:
