@@ -35,7 +35,7 @@ from lidarspec.errors import (
     suggest,
     system_errors,
 )
-from lidarspec.frames.parse import parse_typed
+from lidarspec.frames.parse import identify
 from lidarspec.plugins import sensors
 from lidarspec.scans.scans import Scan
 from lidarspec.scans.selection import Selection, Times, received
@@ -259,7 +259,7 @@ def no_frame(sensor: Sensor, given: Heard) -> WireError:
         )
         return suggest(error, "lidarspec sensors")
     try:
-        parse_typed(sensor, data)
+        identify(sensor, data)
     except WireError as error:
         return suggest(error, command)
     return suggest(WireError("the bytes are not plausible", sensor=sensor.id, data=data), command)

@@ -33,7 +33,7 @@ from lidarspec.drafting.checksum_search import search
 from lidarspec.errors import CommandError, LidarSpecError, UsageError, WireError, suggest
 from lidarspec.expressions.columns import Fields
 from lidarspec.frames.layout import Bytes2D, Seal, Sums
-from lidarspec.frames.parse import parse_typed
+from lidarspec.frames.parse import identify
 from lidarspec.frames.schema import schema
 from lidarspec.framing.decoder import Decoder
 from lidarspec.framing.frame_engine import codec
@@ -682,7 +682,7 @@ def nearest(data: bytes) -> WireError | None:
     faults = []
     for sensor in sensors().values():
         try:
-            parse_typed(sensor, data)
+            identify(sensor, data)
         except LidarSpecError as fault:
             faults += [fault] if isinstance(fault, WireError) else []
     return max(

@@ -24,7 +24,7 @@ from dataclasses import dataclass, field
 from typing import Any
 
 from lidarspec.errors import CommandError, ReplyTimeout, UnknownField, UsageError
-from lidarspec.frames.build import steps
+from lidarspec.frames.field_paths import steps
 from lidarspec.framing.frame_engine import codec
 from lidarspec.framing.results import Found
 from lidarspec.spec.arguments import Address, Filled

@@ -14,7 +14,9 @@ from fractions import Fraction
 from typing import Any
 
 from lidarspec.errors import OutOfRange, UnknownCommand, UnknownField, UsageError
-from lidarspec.frames.build import Steps, argument_slot, given_value, is_index, put, steps
+from lidarspec.frames.commands import argument_slot
+from lidarspec.frames.encode import given_value
+from lidarspec.frames.field_paths import Steps, is_index, put, steps
 from lidarspec.frames.schema import Schema
 from lidarspec.spec.arguments import Octets, Range
 from lidarspec.spec.fields import factor, split_unit

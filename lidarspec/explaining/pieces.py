@@ -20,7 +20,7 @@ from lidarspec.explaining.damage import changes
 from lidarspec.explaining.explanation import Explanation, explain
 from lidarspec.explaining.wording import Row
 from lidarspec.frames.layout import Layout
-from lidarspec.frames.parse import layout_of, parse_typed
+from lidarspec.frames.parse import identify, layout_of
 from lidarspec.frames.slots import recoder
 from lidarspec.framing.frame_engine import codec
 from lidarspec.spec import Sensor
@@ -93,7 +93,7 @@ def pieces(
         )
         return
     try:
-        yield Piece(0, whole, parse_typed(sensor, whole, frame=frame)[0])
+        yield Piece(0, whole, identify(sensor, whole, frame=frame))
     except LidarSpecError:
         found = list(
             _cut(sensor if frame is None else _preferring(sensor, frame), head, datagrams=datagrams)
@@ -205,7 +205,7 @@ def likely_starts(sensor: Sensor, data: bytes) -> list[int]:
 def _nearest(sensor: Sensor, data: bytes) -> str:
     """The type of frame that bytes begin like; "" for none."""
     try:
-        return parse_typed(sensor, data[: _longest(sensor)])[0]
+        return identify(sensor, data[: _longest(sensor)])
     except WireError as fault:
         return fault.frame
 

@@ -173,6 +173,17 @@ class Leaf:
                 bits = (column >> part.target << part.low).astype(np.uint8) & np.uint8(part.mask)
                 view[...] = (view & np.uint8(~part.mask & 0xFF)) | bits
 
+    def offsets(self, depth: int | None = None) -> list[int]:
+        """Return the offset of each element, row by row.
+
+        Args:
+            depth: number of arrays that are followed; by default all outside a bit block.
+        """
+        offsets = [self.offset]
+        for length, stride in list(zip(self.shape, self.strides, strict=False))[:depth]:
+            offsets = [offset + stride * index for offset in offsets for index in range(length)]
+        return offsets
+
     def raw(self, given: Sequence[Any]) -> NDArray[Any]:
         """Physical values of n frames as raw ones, (n, ...), with room for the arrays that the
         field is in; bytes fill up with zeros.
@@ -317,6 +328,8 @@ class Seal:
     spans: tuple[tuple[int, int], ...]
     algorithm: Checksum
     absent: tuple[int, ...]
+    #: the byte after the sealed struct.
+    end: int = 0
 
     def covers(self, other: Seal) -> bool:
         """Whether a field that holds another checksum is among what this one covers."""
@@ -413,14 +426,17 @@ class Condition:
 
     fields: tuple[FieldInfo, ...]
     formula: Formula | None
+    #: of a check, its path; else that of the field.
+    path: str = ""
 
     @classmethod
     @lru_cache(maxsize=4096)
     def of(cls, what: FieldInfo | Check) -> Condition:
         """That a field has one of the values that it may have, or a check; the same in all layouts."""
         if isinstance(what, FieldInfo):
-            return cls((what,), None)
-        return cls(tuple(ref.info for ref in refs(what.condition)), what.condition)
+            return cls((what,), None, what.path)
+        fields = tuple(ref.info for ref in refs(what.condition))
+        return cls(fields, what.condition, what.path)
 
     def values(self, raw: Mapping[str, NDArray[Any]]) -> NDArray[np.bool_]:
         """Whether it holds, element by element, by the raw values of its fields; not where one is
@@ -553,20 +569,26 @@ class Layout:
         """Which frames, given as rows of bytes, meet all conditions, (n,)."""
         met = np.ones(len(rows), np.bool_)
         for condition in self.conditions:
-            met &= holding(condition, self.leaves, rows)
+            met &= self.meets_condition(condition, rows)
         return met
 
+    def meets_condition(self, condition: Condition, rows: Bytes2D) -> NDArray[np.bool_]:
+        """Return which frames, given as rows of bytes, meet one of the conditions, (n,)."""
+        return holding(condition, self.leaves, rows)
+
     def seal(self, rows: Bytes2D) -> None:
-        """Write what follows from the header, the constants and the checksums into frames given as
-        rows of bytes.
-        """
+        """Write constants, lengths and checksums into frames given as rows of bytes."""
+        self.seal_header(rows)
+        for seal in self.seals:
+            seal.fill(rows)
+
+    def seal_header(self, rows: Bytes2D) -> None:
+        """Write the constants, and the values that follow from the header, into rows of bytes."""
         for leaf, value in self.following:
             leaf.store(rows, value)
         if self.known:
             spots, facts = list(self.known), np.array(list(self.known.values()), np.uint8)
             rows[:, spots] = rows[:, spots] & ~facts[:, 0] | facts[:, 1]
-        for seal in self.seals:
-            seal.fill(rows)
 
 
 #: constants: offset, mask, value.

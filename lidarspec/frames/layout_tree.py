@@ -46,7 +46,17 @@ class Unknown(Exception):
 
 
 class TooLong(Exception):
-    """The header claims more than the longest length that the frame declares, or no byte at all."""
+    """The header claims more than the longest length that the frame declares, or no byte at all.
+
+    Attributes:
+        path: of the part that is too long.
+        number: the count or length that cannot be, None if all parts together are too long.
+    """
+
+    def __init__(self, path: str, number: int | None = None) -> None:
+        self.path = path
+        self.number = number
+        super().__init__(path)
 
 
 class Unlike(Exception):
@@ -74,10 +84,15 @@ def layout_of(
         NotCompilable: where construct alone can tell what comes next.
         Exception: whatever a formula raises on these values.
     """
-    return _walked(_Walk(values, limit, given or {}), root)
+    return walk_layout(Walk(values, limit, given or {}), root)
 
 
-def _walked(walk: _Walk, root: tree.Node) -> Layout:
+def walk_layout(walk: Walk, root: tree.Node) -> Layout:
+    """Return the layout that a walk leads to.
+
+    Raises:
+        Exception: as `layout_of`, or what `walk.asked` raises; the walk then keeps what it found.
+    """
     walk.visit(root, "")
     if not walk.cursor:
         raise TooLong("")
@@ -86,7 +101,7 @@ def _walked(walk: _Walk, root: tree.Node) -> Layout:
 
 def prefix_of(root: tree.Node, limit: int) -> dict[int, tuple[int, int]]:
     """The constants whose place depends on no header field: offset -> (mask, value)."""
-    walk = _Walk({}, limit)
+    walk = Walk({}, limit)
     with contextlib.suppress(
         Exception
     ):  # whatever an expression of the struct raises: what comes before counts
@@ -94,15 +109,15 @@ def prefix_of(root: tree.Node, limit: int) -> dict[int, tuple[int, int]]:
     return walk.constants
 
 
-def _unknown(leaf: Leaf | Measure, _: _Walk) -> int:
+def _unknown(leaf: Leaf | Measure, _: Walk) -> int:
     raise Unknown(leaf)
 
 
-Asked = Callable[[Leaf | Measure, "_Walk"], int]
+Asked = Callable[[Leaf | Measure, "Walk"], int]
 
 
 @dataclass
-class _Walk:
+class Walk:
     """One walk through a tree: the values of header fields, how far it came, and what it found."""
 
     values: Mapping[str, int]
@@ -120,6 +135,8 @@ class _Walk:
     branches: dict[tree.Node, tree.Node] = field(default_factory=dict)
     lengths: dict[str, int] = field(default_factory=dict)
     regions: dict[str, Region] = field(default_factory=dict)
+    #: those whose size is not known yet.
+    open_regions: dict[str, Region] = field(default_factory=dict)
     #: what values have to meet; each once, as a key.
     conditions: dict[tree.FieldInfo | tree.Check, Condition] = field(default_factory=dict)
     #: elements without a byte, of all arrays.
@@ -234,8 +251,6 @@ class _Walk:
     ) -> None:
         count, start = self._count(node.count, path), self.cursor
         self.lengths[node.axis] = 0 if 0 in shape else count
-        if count > self.limit:
-            raise TooLong(path)
         if count:
             self.visit(node.element, path, (*shape, count), (*strides, 0))
         else:
@@ -275,6 +290,7 @@ class _Walk:
             rule.within,
         )
         self.parts[node.total.path] = Measure(node.total, region)
+        self.open_regions[node.axis] = region
         size = (
             rule.within
             if rule.within is not None
@@ -393,7 +409,7 @@ class _Walk:
             held = sorted(leaf.held for leaf in leaves)
             edges = [start, *(edge for span in held for edge in span), self.cursor]
             spans = [(a, b) for a, b in zip(edges[::2], edges[1::2], strict=True) if b > a]
-        self.seals.append(Seal(leaves, tuple(spans), node.algorithm, node.absent))
+        self.seals.append(Seal(leaves, tuple(spans), node.algorithm, node.absent, self.cursor))
 
     def _held(self) -> dict[int, tuple[int, int]]:
         """What fields have to be that say how long parts are, as constants, which they are in one
@@ -408,7 +424,7 @@ class _Walk:
             if rebuilt is not None:
                 value = operator.index(tree.evaluated(rebuilt, self._read_known))
                 if not low <= value <= high:
-                    raise TooLong(leaf.info.path)
+                    raise TooLong(leaf.info.path, value)
                 leaf.store(
                     rows,
                     np.array([value, -1 if low else high], leaf.info.dtype).reshape(
@@ -440,8 +456,8 @@ class _Walk:
 
     def _count(self, formula: tree.Formula, path: str) -> int:
         count = operator.index(self._value(formula))
-        if count < 0:
-            raise TooLong(path)
+        if not 0 <= count <= self.limit:
+            raise TooLong(path, count)
         return count
 
 
@@ -851,7 +867,7 @@ class HeaderTree:
             is_all: there are no more bytes of this frame.
         """
 
-        def asked(leaf: Leaf | Measure, walk: _Walk) -> int:
+        def asked(leaf: Leaf | Measure, walk: Walk) -> int:
             nonlocal node
             node.leaf, node.before, node.told, node.constants = (
                 leaf,
@@ -870,9 +886,9 @@ class HeaderTree:
         if is_all and len(data) < node.least:
             return node
         self._size += not node.least  # it is known, where it was cut off before
-        walk = _Walk(node.values, self._limit, self._given, asked, len(data) if is_all else None)
+        walk = Walk(node.values, self._limit, self._given, asked, len(data) if is_all else None)
         try:
-            node.result = _walked(walk, self._frame)
+            node.result = walk_layout(walk, self._frame)
         except Unknown:
             pass
         except CutOff:
@@ -895,7 +911,7 @@ class HeaderTree:
             above.told = above.told.refused([*node.values.values()][-1])
         return node
 
-    def _behind(self, walk: _Walk) -> dict[int, tuple[int, int]]:
+    def _behind(self, walk: Walk) -> dict[int, tuple[int, int]]:
         """The constants found by a walk, without those that all frames begin with, which candidates
         are known to have.
         """

@@ -1,34 +1,33 @@
-"""One frame from bytes: as its layout says where it is sound, else as construct does, whose faults
-become a `WireError` with a place.
+"""Parse one frame: by its layout if it is sound, else with the first fault as a `WireError`.
 
-Most frames are sound, and their layout is known: then all values of a field are unpacked at once,
-for all elements of the arrays that it is in, and the containers and lists around them are made from
-the innermost ones outwards (`unpacked`).
+All values of a field are unpacked at once, for all elements of the arrays that it is in, and the
+containers and lists around them are made from the innermost ones outwards (`unpacked`). Frames that
+have no layout are parsed by construct (`lidarspec.frames.plain`).
 """
 
 from __future__ import annotations
 
 import functools
-import io
-import re
 import struct
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any, Literal
 
-import construct
 import numpy as np
 from construct import Container, ListContainer
 
 from lidarspec.errors import SpecError, UnknownFrame, WireError, refuse_text
+from lidarspec.frames import diagnose
 from lidarspec.frames.compilability import NotCompilable
 from lidarspec.frames.layout import Layout, Leaf, Refused
 from lidarspec.frames.layout_tree import frame_layouts, prefix_of
 from lidarspec.frames.parts import Region
+from lidarspec.frames.plain import parse_plain, plain_fault
 from lidarspec.frames.schema import schema
 from lidarspec.frames.slots import SPELLING, Recoder, recoder
+from lidarspec.frames.wire_fields import Examined, examine
 from lidarspec.spec.bits import BitField
-from lidarspec.spec.description import Spec
-from lidarspec.spec.syntax import Mismatch, WireNaN, clean, field_path, seen, unnamed
+from lidarspec.spec.description import Frame, Spec
+from lidarspec.spec.syntax import WireNaN, seen, unnamed
 from lidarspec.spec.tree import (
     Blob,
     Block,
@@ -47,10 +46,10 @@ from lidarspec.spec.tree import (
 def parse(
     sensor: Spec, data: bytes, *, frame: str | None = None, verify: bool = True, units: bool = False
 ) -> Any:
-    """The Container of raw values of one frame, exactly.
+    """Return the Container of raw values of exactly one frame.
 
     Args:
-        frame: its type; found out where left out.
+        frame: its type; found out if left out.
         verify: False accepts wrong constants, a wrong checksum and trailing bytes.
         units: scaled values in the units of their fields.
 
@@ -58,43 +57,181 @@ def parse(
         WireError: for bytes that are no such frame.
         UnknownFrame: for a type that the sensor does not have.
     """
-    if not isinstance(data, bytes):
-        refuse_text(data)
-        data = bytes(data)
-    found = _compiled(sensor, data, frame)
+    data = _as_bytes(data)
+    found = _find_sound(sensor, data, frame)
     if found is None:
-        name, values = parse_typed(sensor, data, frame=frame, verify=verify)
-        found = name, clean(values)
+        found = _parse_unsound(sensor, data, frame, verify=verify)
     name, values = found
     return _physical(schema(sensor.frames[name].tree).all_fields, values, "") if units else values
 
 
-def _compiled(sensor: Spec, data: bytes, frame: str | None) -> tuple[str, Any] | None:
-    """The type and values of a frame that is sound, by its layout; None where construct has to read
-    it.
+def identify(sensor: Spec, data: bytes, *, frame: str | None = None) -> str:
+    """Return the name of the frame type that bytes are a frame of.
+
+    Args:
+        frame: the only type that is tried; by default all.
+
+    Raises:
+        WireError: for bytes that are no frame, by the type that they come nearest to.
+        UnknownFrame: for a type that the sensor does not have.
     """
-    try:
-        for name in sensor.frames if frame is None or frame not in sensor.frames else (frame,):
-            recoding = recoder(sensor.frames[name])
-            if recoding is not None:
-                if (found := recoding.row(data)) is not None and found[0].sound(found[1]):
-                    return name, spelled(
-                        unpacked(sensor.frames[name].tree, *found), recoding, *found, data
-                    )
-                continue
-            layouts = frame_layouts(sensor.frames[name])
-            if isinstance(layouts, NotCompilable):
-                break  # it may be of this type, which comes first
-            layout = layouts.layout(data)
-            if isinstance(layout, Layout) and layout.sound(data):
-                return name, unpacked(sensor.frames[name].tree, layout, data)
-    except SpecError:
-        raise
-    # a plugin's expression, checksum or wire form may raise anything: construct meets it again, and
-    # tells the place
-    except Exception:
-        pass
+    data = _as_bytes(data)
+    found = _find_sound(sensor, data, frame)
+    return found[0] if found is not None else _parse_unsound(sensor, data, frame, verify=True)[0]
+
+
+def _as_bytes(data: bytes) -> bytes:
+    if isinstance(data, bytes):
+        return data
+    refuse_text(data)
+    return bytes(data)
+
+
+def _find_sound(sensor: Spec, data: bytes, frame: str | None) -> tuple[str, Any] | None:
+    """Return type and values of a frame that nothing is wrong with; else None."""
+    names = sensor.frames if frame is None or frame not in sensor.frames else (frame,)
+    for name in names:
+        try:
+            found = _parse_sound(sensor.frames[name], data)
+        except SpecError:
+            raise
+        except Exception:
+            continue  # an expression of the plugin failed: the search for the fault meets it again
+        if found is not None:
+            return name, found[0]
     return None
+
+
+def _parse_sound(frame: Frame, data: bytes) -> tuple[Any] | None:
+    """Return the values of a sound frame; else None."""
+    recoding = recoder(frame)
+    if recoding is not None:
+        row = recoding.row(data)
+        if row is None or not row[0].sound(row[1]):
+            return None
+        return (spelled(unpacked(frame.tree, *row), recoding, *row, data),)
+    layouts = frame_layouts(frame)
+    if isinstance(layouts, NotCompilable):
+        values, size = parse_plain(frame, data)
+        return (values,) if size == len(data) else None
+    layout = layouts.layout(data)
+    if isinstance(layout, Layout) and layout.sound(data):
+        return (unpacked(frame.tree, layout, data),)
+    return None
+
+
+def _parse_unsound(
+    sensor: Spec, data: bytes, frame: str | None, *, verify: bool
+) -> tuple[str, Any]:
+    """Return type and values of a frame that something is wrong with, if that is not verified.
+
+    Raises:
+        WireError: if it is verified, or the values cannot be read.
+    """
+    if frame is not None:
+        if frame not in sensor.frames:
+            raise UnknownFrame(frame, sensor.frames, place=sensor.id)
+        if verify:
+            raise _find_fault(sensor, frame, data)
+        return frame, _parse_unverified(sensor, frame, data)
+    if not sensor.frames:
+        raise UnknownFrame(
+            "data", (), place=sensor.id, hint="; configure the sensor with its file first"
+        )
+    faults = [_find_fault(sensor, name, data) for name in sensor.frames]
+    if not verify:
+        for likely in sorted(faults, key=functools.partial(_progress, sensor), reverse=True):
+            try:
+                return likely.frame, _parse_unverified(sensor, likely.frame, data)
+            except WireError:
+                continue
+    raise _likeliest(sensor, data, faults)
+
+
+def _find_fault(sensor: Spec, name: str, data: bytes) -> WireError:
+    """Return what is wrong with the bytes of a frame."""
+    frame = sensor.frames[name]
+    recoding = recoder(frame)
+    if recoding is not None:
+        row = recoding.row(data)
+        if row is None:
+            where = {"sensor": sensor.id, "frame": name, "data": data}
+            return _unreadable(recoding, data, where)
+        place = functools.partial(recoding.place, data)
+        return _error_of(sensor, name, data, examine(frame.tree, row[1], frame.room), place)
+    if isinstance(frame_layouts(frame), NotCompilable):
+        return plain_fault(sensor, name, data)
+    return _error_of(sensor, name, data, examine(frame.tree, data, frame.room), int)
+
+
+def _error_of(
+    sensor: Spec, name: str, data: bytes, examined: Examined, place: Callable[[int], int]
+) -> WireError:
+    """Return the first fault of a frame as an error.
+
+    Args:
+        place: from an offset in the frame to one on the wire.
+    """
+    fault = _named(sensor, name, diagnose.find_fault, examined)
+    if fault is None:  # a plugin's checksum that gives another value each time
+        return WireError("not a valid frame", sensor=sensor.id, frame=name, data=data)
+    return _wire_error(sensor, name, data, fault, place)
+
+
+def _named(
+    sensor: Spec,
+    name: str,
+    find: Callable[[Examined], diagnose.Fault | None],
+    examined: Examined,
+) -> diagnose.Fault | None:
+    """Return what a search finds; a failing expression names sensor and frame."""
+    try:
+        return find(examined)
+    except SpecError as error:
+        raise SpecError(error.reason, path=name, sensor=sensor.id) from error
+
+
+def _wire_error(
+    sensor: Spec, name: str, data: bytes, fault: diagnose.Fault, place: Callable[[int], int]
+) -> WireError:
+    offset = place(fault.offset)
+    return WireError(
+        fault.reason(offset),
+        offset=offset,
+        path=fault.path,
+        expected=fault.expected,
+        got=fault.got,
+        sensor=sensor.id,
+        frame=name,
+        data=data,
+    )
+
+
+def _parse_unverified(sensor: Spec, name: str, data: bytes) -> Any:
+    """Return the values of a frame whatever is wrong with it.
+
+    Raises:
+        WireError: if its bytes end, or lead to no layout.
+    """
+    frame = sensor.frames[name]
+    recoding = recoder(frame)
+    place: Callable[[int], int] = int
+    row = data
+    if recoding is not None:
+        found = recoding.row(data)
+        row = recoding.legible(data).row if found is None else found[1]
+        place = functools.partial(recoding.place, data)
+    elif isinstance(frame_layouts(frame), NotCompilable):
+        try:
+            return parse_plain(frame, data, verify=False)[0]
+        except Exception:
+            raise plain_fault(sensor, name, data) from None
+    examined = examine(frame.tree, row, frame.room)
+    shortage = _named(sensor, name, diagnose.find_shortage, examined)
+    if shortage is not None or examined.layout is None:
+        assert shortage is not None
+        raise _wire_error(sensor, name, data, shortage, place)
+    return unpacked(frame.tree, examined.layout, row[: examined.layout.size])
 
 
 def spelled(values: Any, recoding: Recoder, layout: Layout, row: bytes, data: bytes) -> Any:
@@ -218,14 +355,6 @@ def _parts_of(region: Region, frame: bytes) -> Sequence[ListContainer]:
     ]
 
 
-def _offsets(leaf: Leaf, shape: Sequence[int]) -> list[int]:
-    """Where each element of a field begins, row by row."""
-    offsets = [leaf.offset]
-    for length, stride in zip(shape, leaf.strides, strict=False):
-        offsets = [offset + stride * index for offset in offsets for index in range(length)]
-    return offsets
-
-
 def _unpack(offsets: Sequence[int], order: str, code: str) -> Reader:
     """What unpacks a value of this format code at each offset; they ascend."""
     form, size, end = list[str](), struct.calcsize(order + code), offsets[0]
@@ -237,8 +366,8 @@ def _unpack(offsets: Sequence[int], order: str, code: str) -> Reader:
 
 def _words(node: Number | Blob, leaf: Leaf) -> Reader:
     if isinstance(node, Blob):
-        return _unpack(_offsets(leaf, leaf.shape[:-1]), "<", f"{leaf.size}s")
-    offsets, order = _offsets(leaf, leaf.shape), "<" if node.order == "little" else ">"
+        return _unpack(leaf.offsets(len(leaf.shape) - 1), "<", f"{leaf.size}s")
+    offsets, order = leaf.offsets(), "<" if node.order == "little" else ">"
     if leaf.wire is None:
         raw = _unpack(offsets, order, f"{leaf.size}s")
         return _labelled(
@@ -296,7 +425,7 @@ def _bits(node: Block, path: str, layout: Layout, count: int) -> Reader:
     its parts where construct has them.
     """
     leaf = layout.leaves[".".join(name for name in (path, *node.parts[0].names) if name)]
-    offsets = _offsets(leaf, leaf.shape[: len(leaf.strides)])
+    offsets = leaf.offsets()
     orders = [
         (order, [_runs(part.bits, node.size, order) for part in node.parts]) for order in ENDS
     ]
@@ -383,58 +512,6 @@ def _rows(readers: Sequence[Reader], frame: bytes) -> Sequence[ListContainer]:
     return [ListContainer(row) for row in zip(*(reader(frame) for reader in readers), strict=True)]
 
 
-def parse_typed(
-    sensor: Spec, data: bytes, *, frame: str | None = None, verify: bool = True
-) -> tuple[str, Any]:
-    """The name of the frame type, and the frame as construct parses it.
-
-    Raises:
-        WireError: for bytes that are no such frame.
-        UnknownFrame: for a type that the sensor does not have.
-    """
-    if not isinstance(data, bytes):
-        refuse_text(data)
-        data = bytes(data)
-    if frame is not None:
-        if frame not in sensor.frames:
-            raise UnknownFrame(frame, sensor.frames, place=sensor.id)
-        return frame, _parse_as(sensor, frame, data, verify=verify)
-    if not sensor.frames:
-        raise UnknownFrame(
-            "data", (), place=sensor.id, hint="; configure the sensor with its file first"
-        )
-    faults: list[WireError] = []
-    for name in sensor.frames:
-        try:
-            return name, _parse_as(sensor, name, data, verify=True)
-        except WireError as fault:
-            faults.append(fault)
-    if not verify:
-        for likely in sorted(faults, key=functools.partial(_progress, sensor), reverse=True):
-            try:
-                return likely.frame, _parse_as(sensor, likely.frame, data, verify=False)
-            except WireError:
-                continue
-    raise _likeliest(sensor, data, faults)
-
-
-def _parse_as(sensor: Spec, name: str, data: bytes, *, verify: bool) -> Any:
-    recoding, where = (
-        recoder(sensor.frames[name]),
-        {"sensor": sensor.id, "frame": name, "data": data},
-    )
-    if recoding is None:
-        return _parse_row(sensor, name, data, where, int, verify=verify)
-    found = recoding.row(data)
-    if verify and found is None:
-        raise _unreadable(recoding, data, where)
-    row = recoding.legible(data).row if found is None else found[1]
-    parsed = _parse_row(
-        sensor, name, row, where, functools.partial(recoding.place, data), verify=verify
-    )
-    return parsed if found is None else spelled(parsed, recoding, *found, data)
-
-
 def _unreadable(recoding: Recoder, data: bytes, where: Mapping[str, Any]) -> WireError:
     """Why bytes are no frame of a wire form, with the place of the first slot that cannot be read."""
     begins = recoding.begins
@@ -469,121 +546,6 @@ def _unreadable(recoding: Recoder, data: bytes, where: Mapping[str, Any]) -> Wir
         got=got,
         **where,
     )
-
-
-def _parse_row(
-    sensor: Spec,
-    name: str,
-    data: bytes,
-    where: dict[str, Any],
-    place: Callable[[int], int],
-    *,
-    verify: bool,
-) -> Any:
-    """The frame as construct parses it; `place`: from where a field is in it to where it is on the
-    wire.
-    """
-    frame, stream = sensor.frames[name], io.BytesIO(data)
-    try:
-        parsed = frame.prepared.parse_stream(stream, _verify=verify)
-    except Mismatch as fault:
-        path = field_path(fault.path)
-        offset = place(_first_byte(sensor, name, data, path, fault.offset))
-        raise WireError(
-            f"{path} at byte {offset}: {fault.reason} {fault.got}, expected {fault.expected}",
-            offset=offset,
-            path=path,
-            expected=fault.expected,
-            got=fault.got,
-            **where,
-        ) from None
-    except construct.StreamError as fault:
-        raise _truncated(sensor, name, data, field_path(fault.path)) from None
-    except construct.ConstructError as fault:
-        path = field_path(fault.path)
-        reason = str(fault).partition("\n")[2].strip() or type(fault).__name__
-        raise WireError(
-            f"{path}: {reason}", offset=place(stream.tell()), path=path, **where
-        ) from None
-    except SpecError:
-        raise
-    except Exception as fault:
-        raise SpecError(
-            f"an expression of the struct failed: {type(fault).__name__}: {fault}",
-            path=name,
-            sensor=sensor.id,
-        ) from fault
-    size = stream.tell()
-    if verify and size != len(data):
-        raise WireError(
-            f"{len(data) - size} more bytes after the frame's {size}",
-            offset=size,
-            expected=size,
-            got=len(data),
-            **where,
-        )
-    if size > frame.room:
-        raise WireError(
-            f"{size} bytes, and the longest is {frame.room}", expected=frame.room, got=size, **where
-        )
-    return parsed
-
-
-def _first_byte(sensor: Spec, name: str, data: bytes, path: str, offset: int) -> int:
-    """Where a field begins; within a bit block construct counts bits, and the layout knows the
-    byte.
-    """
-    layout = layout_of(sensor, name, data)
-    leaf = layout.leaves.get(_without_indices(path)) if isinstance(layout, Layout) else None
-    if leaf is None or leaf.wire is not None or not leaf.elements:
-        return offset
-    indices = [int(part.partition("]")[0]) for part in path.split("[")[1:]]
-    start = leaf.offset + sum(
-        index * stride for index, stride in zip(indices, leaf.strides, strict=False)
-    )
-    return start + min(segment.byte for segment in leaf.elements[0].segments)
-
-
-def _truncated(sensor: Spec, name: str, data: bytes, path: str) -> WireError:
-    """Where the bytes end, and what the field there would have needed."""
-    layout = layout_of(sensor, name, data)
-    total = f" of {layout.size}" if isinstance(layout, Layout) else ""
-    needs, left = "", 0
-    if isinstance(layout, Layout):
-        size, start = _at_end(layout, path, len(data))
-        left = len(data) - start
-        needs = f" needs {size} byte{'s' if size != 1 else ''}, {left} left"
-    reason = (
-        f"frame ends at byte {len(data)}{total}:"
-        f" {path or 'the first field'}{needs or ' is cut off'}"
-    )
-    whole = layout.size if isinstance(layout, Layout) else None
-    return WireError(
-        reason,
-        offset=len(data) - left,
-        path=path,
-        sensor=sensor.id,
-        frame=name,
-        expected=whole,
-        got=len(data),
-        data=data,
-    )
-
-
-def _at_end(layout: Layout, path: str, end: int) -> tuple[int, int]:
-    """Size and start of the element that the end of the data falls into or precedes."""
-    plain = _without_indices(path)
-    for known, leaf in layout.leaves.items():
-        if known == plain or known.startswith(f"{plain}."):
-            starts = _offsets(leaf, leaf.shape[: len(leaf.shape) - (leaf.info.kind == "bytes")])
-            return leaf.size, min(
-                next((start for start in starts if start + leaf.size > end), end), end
-            )
-    return 0, end
-
-
-def _without_indices(path: str) -> str:
-    return re.sub(r"\[\d+\]", "", path)
 
 
 def layout_of(sensor: Spec, name: str, data: bytes) -> Layout | Refused | None:

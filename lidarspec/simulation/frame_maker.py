@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lidarspec.errors import SpecError
-from lidarspec.frames.build import fill_in, kind_of
+from lidarspec.frames.encode import fill_in, kind_of
 from lidarspec.frames.frame_table import Group, Rows
 from lidarspec.frames.layout import Layout
 from lidarspec.frames.layout_tree import TooLong, Unknown, layout_of

@@ -201,7 +201,7 @@ class Sensor(Spec):
         Raises:
             UnknownCommand, OutOfRange: for what the sensor does not take.
         """
-        from lidarspec.frames.build import build_command
+        from lidarspec.frames.commands import build_command
 
         return build_command(self, name, arguments)
 

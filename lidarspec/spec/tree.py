@@ -74,6 +74,8 @@ class FieldInfo:
             order; None for any.
         rebuilt: what its value in a frame that is made follows from, None where it is given
             (construct's Rebuild).
+        default: the value that a frame gets if none is given: raw, or a formula; of bytes, a
+            pattern of one byte that fills the field.
         held: whether a frame that comes is held to that (`SizeOf`).
         labels: meanings of raw values (construct's Enum).
         optional: whether some headers leave it out.
@@ -92,6 +94,7 @@ class FieldInfo:
     const: Any = None
     allowed: tuple[int, ...] | None = None
     rebuilt: Formula | None = None
+    default: Any = None
     held: bool = False
     labels: Mapping[int, str] = field(default_factory=dict)
     optional: bool = False
@@ -565,6 +568,7 @@ class Repeat:
     axis: str
     count: Formula
     element: Node
+    default: Any = None
 
 
 @dataclass(frozen=True, eq=False)

@@ -11,8 +11,8 @@ from typing import Any
 from lidarspec.device.session import Reply, Session, found_at, learned
 from lidarspec.errors import CommandError, LidarSpecError, SpecError, UsageError
 from lidarspec.explaining.wording import asked
-from lidarspec.frames.build import argument_slot, raw_argument
-from lidarspec.frames.parse import parse_typed
+from lidarspec.frames.commands import argument_slot, raw_argument
+from lidarspec.frames.parse import identify
 from lidarspec.framing.results import Found
 from lidarspec.simulation.device import SimulatedDevice
 from lidarspec.spec.arguments import Address, Range, Text
@@ -133,7 +133,7 @@ def an_exchange_holds(
         require(command.replies, "LS605", "it has a reply here, and none is declared", place)
         session = Session(sensor)
         pending = session.request(name, 0, **given)
-        kind, _ = parse_typed(sensor, answer)
+        kind = identify(sensor, answer)
         session.receive([Found(kind, 0, answer)], 1, link=command.link)
         session.tick(math.ceil(1e9 * (1 + command.timeout) * (2 + command.retries)))
         pending.result()

@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import Literal
 
 from lidarspec.errors import LidarSpecError, SpecError, UsageError
-from lidarspec.frames.build import build_command
+from lidarspec.frames.commands import build_command
 from lidarspec.recording.recorders import recorder
 from lidarspec.simulation.device import SECOND, SimulatedDevice
 from lidarspec.spec.description import Spec

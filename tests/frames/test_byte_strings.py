@@ -324,7 +324,7 @@ def test_elements_without_a_byte_are_bounded_together(backend: str) -> None:
     ).stats  # 3 + 9 + 27 elements; too many
     assert (stats.frames, stats.bad_length, stats.plugin_errors) == ({"data": 1}, 2, 0)
     assert len(ours.parse(b"\0\3").v[2][2]) == 3
-    with pytest.raises(WireError, match="61"):
+    with pytest.raises(WireError, match=r"v: .*60"):
         ours.parse(b"\0\x3c", verify=False)
 
 
@@ -389,7 +389,7 @@ def test_greedy_parts_with_an_end_are_read_and_built(name: str) -> None:
 
 
 def test_of_a_greedy_array_no_byte_is_dropped() -> None:
-    with pytest.raises(WireError, match=r"v\[1\]"):
+    with pytest.raises(WireError, match="v_size at byte 0: length 3, expected 2"):
         sensor(Struct("v" / Prefixed(Int8ub, GreedyRange(Int16ub)))).parse(b"\3\0\1\0")
     with pytest.raises(WireError, match=r"v\[0\]"):
         sensor(Struct("v" / Prefixed(Int8ub, GreedyRange(Struct())))).parse(b"\1\0")

@@ -224,7 +224,7 @@ def test_a_wrong_part_is_reported_with_its_place() -> None:
     assert CHANNELS.decode(data[:-1] + b"\x05" + data).stats.bad_checksum == 1
     with pytest.raises(WireError) as fault:
         against_construct.sensor(COUNTED).parse(bytes.fromhex("01 09 00 09"))
-    assert (fault.value.path, fault.value.offset) == ("parts[0]", 1)
+    assert (fault.value.path, fault.value.offset) == ("parts[0].kind", 1)
 
 
 def test_a_part_of_no_kind_is_counted_alike_by_both_engines() -> None:

@@ -14,7 +14,7 @@ from construct import Array, Byte, Const, Int8ub, Int16ub, Struct, this
 
 import lidarspec as ls
 import lidarspec.spec
-from lidarspec import Sensor
+from lidarspec import Sensor, UsageError
 from lidarspec.framing.frame_engine import CompiledCodec, codec
 from lidarspec.spec import Checksummed, Frame, Sum
 from lidarspec.testing.subject import Subject, mutated
@@ -202,7 +202,11 @@ def test_the_longest_length_itself_is_allowed() -> None:
     frame = sensor.build("data", first=0, last=100, samples=samples)
     assert len(frame) == sensor.frames["data"].max_length
     assert [data for _, _, data in decoded(sensor, frame)] == [frame]
-    longer = sensor.build("data", first=0, last=100, samples=[*samples, samples[0]])
+    too_many = dict(first=0, last=100, samples=[*samples, samples[0]])
+    with pytest.raises(UsageError, match=r"samples: .* at most 129 bytes"):
+        sensor.build("data", too_many)
+    roomy = dataclasses.replace(sensor.frames["data"], max_length=len(frame) + 3)
+    longer = dataclasses.replace(sensor, frames={"data": roomy}).build("data", too_many)
     assert decoded(sensor, longer) == []
 
 

@@ -197,9 +197,8 @@ class _Builder:
         if isinstance(inner, Array):
             axis = axis_path(info)
             count = self._formula(inner.count, place)
-            return tree.Repeat(
-                name, axis, count, self.node(inner.subcon, place.inside(axes=(*info.axes, axis)))
-            )
+            inside = place.inside(axes=(*info.axes, axis), default=None)
+            return tree.Repeat(name, axis, count, self.node(inner.subcon, inside), info.default)
         if isinstance(inner, Partition):
             return self._parts(inner, place)
         if isinstance(inner, construct.IfThenElse):
@@ -250,9 +249,15 @@ class _Builder:
                 self.rebuilding = True
                 known = None if place.scope is None else self._known.get(place.scope.path)
                 place = place.inside(rebuilt=self._formula(con.func, place, known))
-            elif not isinstance(con, construct.Default):
+            elif isinstance(con, construct.Default):
+                place = place.inside(default=self._default(con.value, place))
+            else:
                 return con, place
             con = con.subcon
+
+    def _default(self, value: Any, place: _Place) -> Any:
+        """Return the value of a construct Default: itself, or a formula of a function."""
+        return self._formula(value, place) if callable(value) else value
 
     def _formula(
         self,
@@ -353,8 +358,13 @@ class _Builder:
         self._measured[scope] = []
         for child in con.subcons:
             path = ".".join(part for part in (info.path, child.name) if part)
+            default = info.default.get(child.name) if isinstance(info.default, dict) else None
             said = tree.FieldInfo(
-                path, info.axes, docs=info.docs if place.in_bits else "", optional=info.optional
+                path,
+                info.axes,
+                docs=info.docs if place.in_bits else "",
+                optional=info.optional,
+                default=default,
             )
             inside = _Place(said, scope, child.name or "", place.in_bits)
             part = unwrap(child)
@@ -542,6 +552,8 @@ class _Builder:
         elif isinstance(con, BytesInteger) and not _is_odd(con):
             node = _number(info, con.length, is_big=not con.swapped)
         elif place.room is not None and (isinstance(con, Filler) or con is construct.GreedyBytes):
+            if isinstance(con, Filler):
+                info = replace(info, default=con.pattern)
             node = tree.Blob(name, info, place.room, info.const)
         elif isinstance(con, Bytes) and not isinstance(con, Filler):
             node = tree.Blob(name, info, self._formula(con.length, place), info.const)

@@ -16,7 +16,7 @@ from lidarspec.explaining.contents import duration
 from lidarspec.explaining.explanation import Explanation, reply_text
 from lidarspec.explaining.wording import asked
 from lidarspec.exports.reference import effect
-from lidarspec.frames.build import argument_slot
+from lidarspec.frames.commands import argument_slot
 from lidarspec.points.look import is_flat
 from lidarspec.scans.scans import Place
 from lidarspec.spec.arguments import Range

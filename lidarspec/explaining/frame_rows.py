@@ -1,0 +1,216 @@
+"""One frame as rows of values: every byte is in exactly one row, also of a truncated frame."""
+
+from __future__ import annotations
+
+import functools
+import itertools
+import re
+from collections.abc import Iterator, Sequence
+from dataclasses import replace
+
+from lidarspec.errors import WireError
+from lidarspec.explaining.wording import Row, Value
+from lidarspec.frames.compilability import NotCompilable
+from lidarspec.frames.layout_tree import frame_layouts
+from lidarspec.frames.plain import plain_fields
+from lidarspec.frames.schema import schema
+from lidarspec.frames.slots import recoder
+from lidarspec.frames.wire_fields import UNNAMED, PlacedSeal, WireField, examine
+from lidarspec.frames.wire_table import bit_text, hexed
+from lidarspec.spec import Frame
+from lidarspec.spec.tree import FieldInfo, exact, listed
+
+#: most decimals that steps are told apart by, and those that may be added to show one in full.
+MAX_DIGITS = 12
+MAX_SPARE_DIGITS = 2
+
+
+class FrameRows:
+    """The rows of one frame, as far as its bytes go.
+
+    Args:
+        fault: what is wrong with the frame, which is said at its row.
+
+    Attributes:
+        after: the byte after the frame.
+    """
+
+    def __init__(self, frame: Frame, data: bytes, fault: WireError | None = None) -> None:
+        self._data = data
+        self._schema = schema(frame.tree)
+        self._fault = fault
+        self._recoder = recoder(frame)
+        self._axes = self._array_axes()
+        #: byte of the frame at which each byte of its row stands; None without a wire form.
+        self._places: list[int] | None = None
+        row = data
+        if self._recoder is not None:
+            row, self._places = self._recoder.places(data)
+        self._verdicts: dict[str, tuple[str, bool]] = {}
+        fields = self._read_fields(frame, row)
+        self._is_cut_off = fields is None or any(each.raw is None for each in fields)
+        self._fields = [self._placed(each) for each in fields or () if each.raw is not None]
+        self._blocks = {plain(each.block) for each in self._fields if each.bits is not None}
+        self._first = 0 if self._places is None else self._places[0]
+        self._end = max((each.end for each in self._fields), default=self._first)
+        self._is_whole_text = (
+            self._recoder is not None
+            and not self._is_cut_off
+            and self._recoder.row(data) is not None
+        )
+        self.after = len(data) if self._is_whole_text else self._end
+
+    def _array_axes(self) -> list[str]:
+        """Return the axes of all arrays, those of byte strings left out."""
+        axes: list[str] = []
+        for info in self._schema.all_fields.values():
+            axes += info.axes[:-1] if info.kind == "bytes" else info.axes
+        return axes
+
+    def _read_fields(self, frame: Frame, row: bytes) -> list[WireField] | None:
+        """Return the fields of the frame, the last one maybe cut off; None if it has no end."""
+        if self._recoder is None and isinstance(frame_layouts(frame), NotCompilable):
+            return plain_fields(frame, row)
+        examined = examine(frame.tree, row, frame.room)
+        self._verdicts = {seal.path: _verdict(seal) for seal in examined.seals()}
+        fields = list(examined.fields())
+        if examined.layout is None and all(each.raw is not None for each in fields):
+            cut_off = WireField("", "", FieldInfo(""), len(row), len(row), None, None)
+            fields.append(cut_off)
+        return fields
+
+    def _placed(self, each: WireField) -> WireField:
+        """Return a field with its place on the wire."""
+        if self._places is None:
+            return each
+        return replace(each, start=self._places[each.start], end=self._places[each.end], bits=None)
+
+    def rows(self) -> Iterator[Row]:
+        """Return a row for each field or bit block, and for the marks of a wire form.
+
+        The fields of an array element are one row if it holds no further array.
+        """
+        if self._first:
+            yield Row(0, self._data[: self._first], "(start)", (), (), right=True)
+        for path, group in itertools.groupby(self._fields, lambda each: self._row_path(each.block)):
+            yield self._row(path, list(group))
+        if self._is_whole_text and self._end < len(self._data):
+            yield Row(self._end, self._data[self._end :], "(end)", (), (), right=True)
+
+    def values(self) -> dict[str, Value]:
+        """Return every value by its path."""
+        return {value.path: value for row in self.rows() for value in row.values}
+
+    def rest(self, fault: WireError | None) -> Iterator[Row]:
+        """Return the bytes in no field: those of one that is cut off, or after the frame."""
+        left = self._data[self.after :]
+        if self._is_cut_off and fault is not None:
+            yield Row(self.after, left, fault.path, (), (fault.reason,), right=False)
+        elif fault is not None and self._recoder is not None and not left:
+            yield Row(self.after, left, "(end)", (), (fault.reason,), right=False)
+        elif left:
+            yield Row(self.after, left, "", (), ("after the frame's end",), right=False)
+
+    def _row_path(self, path: str) -> str:
+        """Return the innermost array element that a field stands in, or the field itself."""
+        head, bracket, _ = path.rpartition("]")
+        array = plain(head + bracket)
+        in_blocks = tuple(f"{block}." for block in self._blocks)
+        further = any(
+            axis.startswith(f"{array}.") and not axis.startswith(in_blocks) for axis in self._axes
+        )
+        return path if not bracket or further else head + bracket
+
+    def _row(self, path: str, group: Sequence[WireField]) -> Row:
+        start = group[0].start
+        end = group[-1].end
+        values: list[Value] = []
+        remarks: list[str] = []
+        right = True
+        for each in group:
+            info = self._info(each)
+            values.append(_value(each, info))
+            wrong = self._remark(each, info)
+            if wrong:
+                remarks.append(wrong)
+                right = False
+            if each.path in self._verdicts:
+                text, is_right = self._verdicts[each.path]
+                remarks.append(text)
+                right = right and is_right
+        return Row(start, self._data[start:end], path, tuple(values), tuple(remarks), right)
+
+    def _info(self, each: WireField) -> FieldInfo:
+        docs = "constant" if each.path.endswith(UNNAMED) else ""
+        unknown = replace(each.info, path=plain(each.path), docs=docs)
+        found: FieldInfo = self._schema.all_fields.get(plain(each.path), unknown)
+        return found
+
+    def _remark(self, each: WireField, info: FieldInfo) -> str:
+        """Return what is wrong with a value; "" if nothing is."""
+        if info.const is not None and each.raw != info.const:
+            shown = hexed(each.raw, info.bits)
+            return f"wrong: {shown}, expected {hexed(info.const, info.bits)}"
+        if info.allowed is not None and each.raw not in info.allowed:
+            return f"wrong: {each.raw}, expected {listed(info.allowed)}"
+        if info.held and self._fault is not None and self._fault.path == each.path:
+            return f"wrong: {each.raw}, expected {self._fault.expected}"
+        return ""
+
+
+def plain(path: str) -> str:
+    """Return a path without indices: "points[1].intensity" is "points.intensity"."""
+    return re.sub(r"\[\d*\]", "", path)
+
+
+def _value(each: WireField, info: FieldInfo) -> Value:
+    size = each.end - each.start
+    is_number = isinstance(each.raw, int | float)
+    return Value(
+        each.path,
+        each.raw,
+        float(info.physical(each.raw)) if is_number else None,
+        info.unit,
+        None if info.kind == "float" else _digits(info.scale, info.offset),
+        info.labels.get(each.raw, "") if isinstance(each.raw, int) else "",
+        "" if each.bits is None else bit_text(each.bits),
+        info.docs,
+        each.start,
+        b"\xff" * size if each.bits is None else each.bits.masks(size),
+    )
+
+
+@functools.lru_cache
+def _digits(scale: float, offset: float) -> int:
+    """Decimals that tell every step of a field from the next; a few more where these show it in
+    full.
+    """
+    steps = (exact(scale), exact(offset))
+    apart = next(
+        (digits for digits in range(MAX_DIGITS) if abs(steps[0]) * 10**digits >= 1), MAX_DIGITS
+    )
+    return next(
+        (
+            digits
+            for digits in range(apart, apart + MAX_SPARE_DIGITS + 1)
+            if all(step * 10**digits % 1 == 0 for step in steps)
+        ),
+        apart,
+    )
+
+
+def _verdict(seal: PlacedSeal) -> tuple[str, bool]:
+    """Return what a checksum says, and whether it is right."""
+    algorithm = seal.seal.algorithm
+    count = sum(end - start for start, end in seal.seal.spans)
+    plural = "s" if count != 1 else ""
+    stored = hexed(seal.stored, algorithm.width)
+    computed = hexed(seal.computed, algorithm.width)
+    if seal.stored == seal.computed:
+        verdict = "ok"
+    elif seal.is_right:
+        verdict = "means not filled"
+    else:
+        verdict = f"wrong, expected {computed}"
+    how = f"({algorithm.describe()} over {count} byte{plural})"
+    return f"{stored} {verdict} {how}", seal.is_right

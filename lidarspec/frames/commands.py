@@ -1,0 +1,200 @@
+"""Build the frame of a command from its arguments."""
+
+from __future__ import annotations
+
+import copy
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from lidarspec.errors import (
+    MissingField,
+    OutOfRange,
+    SpecError,
+    UnknownCommand,
+    UnknownField,
+    UsageError,
+)
+from lidarspec.frames.build import build
+from lidarspec.frames.field_paths import put, steps
+from lidarspec.frames.schema import schema
+from lidarspec.spec.arguments import Address, Count, Filled, Range, Taken
+from lidarspec.spec.description import Spec
+from lidarspec.spec.tree import FieldInfo
+
+
+def build_command(sensor: Spec, name: str, arguments: Mapping[str, Any]) -> bytes:
+    """The bytes of a command, none for one that only moves lines.
+
+    Args:
+        arguments: by name, in the units of their fields; a value that is found out when it is sent
+            by its path.
+
+    Raises:
+        UnknownCommand: for a command that the sensor does not have.
+        UnknownField, MissingField: for an argument that it does not take, or that is left out.
+        OutOfRange: for one beyond its limits.
+    """
+    if name not in sensor.commands:
+        raise UnknownCommand(name, sensor.commands, place=sensor.id)
+    command, place = sensor.commands[name], f"{sensor.id} {name}"
+    unknown = set(arguments) - set(command.args) - set(command.filled)
+    if unknown:
+        raise UnknownField(min(unknown), command.args, place=place)
+    if command.frame is None:
+        return b""
+    values: Any = {}
+    for path, value in command.values.items():
+        filled = (
+            _found_out(sensor, name, path, value, arguments.get(path))
+            if path in command.filled
+            else copy.deepcopy(value)
+        )
+        values = put(values, steps(path), filled)
+    for argument, declared in command.arguments.items():
+        slot = argument_slot(sensor, name, argument)
+        if argument not in arguments:
+            raise MissingField(argument, place=place)
+        values = put(
+            values,
+            steps(declared.path),
+            raw_argument(slot, declared.kind, arguments[argument], argument, place),
+        )
+    return build(sensor, command.frame, None, values)
+
+
+@dataclass(frozen=True)
+class Slot:
+    """Where an argument goes: its field; and how many bytes, or numbers of an array, there are for
+    it, None where that varies.
+    """
+
+    info: FieldInfo
+    room: int | None
+    is_array: bool = False
+
+
+def argument_slot(sensor: Spec, name: str, argument: str) -> Slot:
+    """Where an argument of a command goes.
+
+    Raises:
+        SpecError: where its kind of value cannot stand there.
+    """
+    declared, place = sensor.commands[name].arguments[argument], f"commands.{name}.args.{argument}"
+    slot = _slot(sensor, name, declared.path, place)
+    takes = (
+        {"int", "float"}
+        if isinstance(declared.kind, Range)
+        else {"bytes", "other"} | ({"int"} if slot.is_array else set())
+    )
+    takes |= {"int"} if isinstance(declared.kind, Address) else set()
+    if slot.info.kind not in takes or (slot.is_array and isinstance(declared.kind, Range)):
+        what = (
+            f"an array, of which an element is {declared.path}[0]"
+            if slot.is_array
+            else f"a field of kind {slot.info.kind!r}"
+        )
+        raise SpecError(
+            f"{type(declared.kind).__name__} cannot stand in {declared.path!r}, which is {what}",
+            path=place,
+            sensor=sensor.id,
+        )
+    return slot
+
+
+def _slot(sensor: Spec, name: str, path: str, place: str) -> Slot:
+    frame, names = sensor.commands[name].frame or "", steps(path)
+    table = schema(sensor.frames[frame].tree) if frame else None
+    info = (
+        table.all_fields.get(".".join(step for step in names if isinstance(step, str)))
+        if table is not None
+        else None
+    )
+    if table is None or info is None:
+        raise SpecError(
+            f"{frame or 'a command without a frame'} has no field {path!r}",
+            path=place,
+            sensor=sensor.id,
+        )
+    arrays = dict(table.arrays)
+    for axis, node in table.parts.items():
+        arrays |= {
+            f"{axis}.{below}": count
+            for kind in node.kinds
+            for below, count in schema(kind.root).arrays.items()
+        }
+    indices, counts = (
+        [step for step in names if isinstance(step, int)],
+        [arrays.get(axis) for axis in info.axes],
+    )
+    left = counts[len(indices) :]
+    if len(left) > 1 or len(indices) > len(counts) - (info.kind == "bytes"):
+        reason = (
+            f"{path!r} names {len(indices)} elements of the {len(counts) - (info.kind == 'bytes')}"
+            " arrays that its field is in"
+        )
+        raise SpecError(reason, path=place, sensor=sensor.id)
+    for index, count in zip(indices, counts, strict=False):
+        if isinstance(count, int) and index >= count:
+            raise SpecError(
+                f"{path!r}: there are {count} elements, of which {index} is none",
+                path=place,
+                sensor=sensor.id,
+            )
+    room = left[0] if left else info.bits // 8 if info.kind == "int" else None
+    return Slot(info, room if isinstance(room, int) else None, bool(left) and info.kind != "bytes")
+
+
+def raw_argument(slot: Slot, kind: Taken, value: Any, argument: str, place: str) -> Any:
+    """The raw value of a field that an argument stands for.
+
+    Raises:
+        UsageError: for what it does not take.
+    """
+    info = slot.info
+    if isinstance(kind, Range):
+        if not isinstance(value, int | float | np.number):
+            raise UsageError(f"{place}: {argument} is a number, not {value!r:.60}")
+        if not kind.low <= value <= kind.high:
+            raise OutOfRange(argument, value, kind.low, kind.high, unit=info.unit, place=place)
+        raw = info.raw(value)
+        bottom, top = info.limits if info.kind == "int" else (raw, raw)
+        return min(max(raw, bottom), top)
+    try:
+        data = kind.packed(value, slot.room)
+    except ValueError:
+        raise UsageError(
+            f"{place}: {argument} is {kind.words(slot.room)}, not {value!r:.60}"
+        ) from None
+    if info.kind == "other":
+        return data if isinstance(value, bytes) else str(value)
+    return _placed(slot, data)
+
+
+def _placed(slot: Slot, data: bytes) -> Any:
+    """Bytes as the raw value of a field that is plain bytes, an array of numbers, or one number in
+    network order.
+    """
+    return (
+        data
+        if slot.info.kind == "bytes"
+        else list(data)
+        if slot.is_array
+        else int.from_bytes(data, "big")
+    )
+
+
+def _found_out(sensor: Spec, name: str, path: str, value: Filled, given: Any) -> Any:
+    """A value that is found out when a command is sent; where nobody says it, the first number, and
+    no address.
+    """
+    if isinstance(value, Count):
+        return value.first if given is None else given
+    slot = _slot(sensor, name, path, f"commands.{name}.values.{path}")
+    return (
+        _placed(slot, bytes(slot.room or 4))
+        if given is None
+        else raw_argument(slot, value, given, path, f"{sensor.id} {name}")
+    )

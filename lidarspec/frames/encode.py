@@ -1,0 +1,557 @@
+"""Encode one frame from the values of its fields, by its layout.
+
+The values are completed first: fields that count elements or bytes follow from what is counted. Then
+the values of the header fields select the layout, every value is stored at its place, and lengths,
+constants and checksums are written last. A part of a frame (`Parts`) is encoded like a frame, and
+copied into the frame around it.
+"""
+
+from __future__ import annotations
+
+import bisect
+import functools
+import itertools
+from collections.abc import Iterable, Mapping
+from typing import Any
+
+import numpy as np
+from construct import Container
+from numpy.typing import NDArray
+
+from lidarspec.errors import MissingField, OutOfRange, UsageError
+from lidarspec.frames.field_paths import steps
+from lidarspec.frames.layout import Layout, Leaf, Seal
+from lidarspec.frames.layout_tree import TooLong, Unknown, layout_of
+from lidarspec.frames.parts import FOUND
+from lidarspec.frames.schema import Schema, schema
+from lidarspec.spec.syntax import WireNaN, member
+from lidarspec.spec.tree import (
+    Blob,
+    Block,
+    FieldInfo,
+    Formula,
+    Kind,
+    Node,
+    Number,
+    Parts,
+    Read,
+    Repeat,
+    Sealed,
+    Select,
+    Struct,
+    When,
+    evaluated,
+    listed,
+    nodes,
+    refs,
+)
+
+#: The largest value that is tried for a field that counts.
+MAX_COUNT_TRIED = 65535
+
+
+def encode(root: Node, given: Container, limit: int, place: str) -> bytes:
+    """Return the bytes of a frame.
+
+    Args:
+        given: raw values by name, nested as in the struct; completed in place.
+        limit: the longest frame, in bytes.
+        place: sensor and frame, for messages.
+
+    Raises:
+        UsageError: for a missing value, or one that its field cannot hold.
+    """
+    return _Encoder(root, given, limit, place).encode()
+
+
+class _Encoder:
+    """The values of one frame, or of one part of it, on their way to bytes."""
+
+    def __init__(
+        self,
+        root: Node,
+        given: Container,
+        limit: int,
+        place: str,
+        prefix: str = "",
+        around: Mapping[str, int] | None = None,
+    ) -> None:
+        self._root = root
+        self._given = given
+        self._limit = limit
+        self._place = place
+        #: path of the part in the frame around it, for messages; "" for a frame.
+        self._prefix = prefix
+        #: values of fields of the frame around a part, by their path there.
+        self._around = around or {}
+        self._schema = schema(root)
+        self._sealing = {path for seal in _seals(root) for path in seal.fields}
+        #: raw values of each field, element by element.
+        self._columns: dict[str, list[Any]] = {}
+        #: index of the element that is being collected, by the axis of its array.
+        self._indices: dict[str, int] = {}
+
+    def encode(self) -> bytes:
+        fill_counts(self._given, self._schema)
+        parts = {axis: self._encode_parts(node) for axis, node in self._schema.parts.items()}
+        totals = {
+            node.total.path: len(b"".join(parts[axis])) for axis, node in self._schema.parts.items()
+        }
+        layout = self._layout(totals)
+        self._collect(self._root, self._given, "", self._prefix, layout)
+        row = np.zeros((1, layout.size), np.uint8)
+        for path, leaf in layout.leaves.items():
+            if path in self._columns:
+                self._store(row, leaf, self._columns[path])
+        for axis, region in layout.regions.items():
+            data = b"".join(parts[axis])
+            row[0, region.start : region.start + len(data)] = np.frombuffer(data, np.uint8)
+        layout.seal_header(row)
+        for seal in layout.seals:
+            if not self._is_absent(seal, row):
+                seal.fill(row)
+        self._check(layout, row, parts)
+        return row.tobytes()
+
+    def _layout(self, totals: Mapping[str, int]) -> Layout:
+        """Return the layout that the values of the header fields lead to."""
+        values = dict(totals)
+        while True:
+            try:
+                return layout_of(self._root, values, self._limit, self._around)
+            except Unknown as unknown:
+                path = unknown.leaf.info.path
+                found = self.read(path)
+                if not isinstance(found, tuple):
+                    raise self._uncounted(path) from None
+                values[path] = int(found[1])
+            except TooLong as fault:
+                raise UsageError(
+                    f"{self._place}: {self._prefix or fault or 'the frame'}: these values give no"
+                    f" frame of at most {self._limit} bytes"
+                ) from None
+
+    def read(self, path: str) -> tuple[FieldInfo, Any] | str | None:
+        """Return the value at a path, as formulas read it (`lidarspec.spec.tree.Read`)."""
+        if path.startswith("_."):
+            return FieldInfo(path), self._around[path[2:]]
+        value: Any = self._given
+        names = ""
+        for step in steps(path):
+            if isinstance(value, list) and not isinstance(step, int):
+                value = value[self._indices[names]]
+            if isinstance(step, int):
+                value = value[step]
+            else:
+                names = f"{names}.{step}".lstrip(".")
+                value = value.get(step) if isinstance(value, Mapping) else None
+        if isinstance(value, list) and names in self._indices:
+            value = value[self._indices[names]]
+        if path not in self._schema.fields:
+            return None if value is None else path
+        info = self._schema.fields[path]
+        if value is None or (info.rebuilt is not None and not info.held):
+            value = self._implied(info)
+        return None if value is None else (info, raw_of(info, value))
+
+    def _implied(self, info: FieldInfo) -> Any:
+        """Return the value that a field has if none is given; None if it has to be given."""
+        if info.const is not None:
+            return info.const
+        if info.rebuilt is not None and not info.held:
+            return evaluated(info.rebuilt, self.read)
+        return evaluated(info.default, self.read)
+
+    def _encode_parts(self, node: Parts) -> list[bytes]:
+        """Return the bytes of parts, and fill in the fields that count or measure them."""
+        given = member(self._given, node.axis, None)
+        if given is None:
+            raise self._missing(node.axis)
+        if not isinstance(given, list) or not all(isinstance(part, dict) for part in given):
+            raise self._wrong(self._shown(node.axis), "a list of its parts", given)
+        around = {}
+        for ref in node.outer:
+            found = self.read(ref.path)
+            if isinstance(found, tuple):
+                around[ref.path] = int(found[1])
+        kinds = [kind_of(node, part) for part in given]
+        encoded: list[bytes] = []
+        following = 0
+        # From the last to the first: a part of a chain says how long the next one is.
+        for index in reversed(range(len(given))):
+            kind, part = kinds[index], given[index]
+            fill_in(kind.following, part, following, schema(kind.root).fields, node.axis)
+            prefix = self._shown(f"{node.axis}[{index}]")
+            encoder = _Encoder(kind.root, part, self._limit, self._place, prefix, around)
+            encoded.insert(0, encoder.encode())
+            following = len(encoded[0])
+        total = sum(map(len, encoded))
+        fields = self._schema.fields
+        fill_in(node.count, self._given, len(encoded), fields, node.axis)
+        fill_in(node.size, self._given, following, fields, node.axis)
+        fill_in(node.within, self._given, total, fields, node.axis)
+        return encoded
+
+    def _collect(self, node: Node, value: Any, path: str, shown: str, layout: Layout) -> None:
+        """Add the values of a node to the columns.
+
+        Args:
+            value: the value that is given, None if there is none.
+            path, shown: of the node, without and with indices.
+        """
+        match node:
+            case Sealed():
+                self._collect(node.body, value, path, shown, layout)
+            case Struct():
+                self._collect_struct(node, value, shown, layout)
+            case Repeat():
+                self._collect_array(node, value, path, shown, layout)
+            case When() | Select():
+                self._collect(layout.branches[node], value, path, shown, layout)
+            case Block():
+                self._collect_block(node, value, path, shown)
+            case Number() | Blob() if path and node.name:
+                self._add(node.info, path, shown, value, _size(layout, path))
+
+    def _collect_struct(self, node: Struct, value: Any, shown: str, layout: Layout) -> None:
+        if value is None:
+            value = {}
+        if not isinstance(value, Mapping):
+            raise self._wrong(shown, "a mapping of its fields", value)
+        for child in node.members:
+            path = f"{node.path}.{child.name}".strip(".")
+            below = f"{shown}.{child.name}".strip(".")
+            self._collect(child, value.get(child.name), path, below, layout)
+
+    def _collect_array(
+        self, node: Repeat, value: Any, path: str, shown: str, layout: Layout
+    ) -> None:
+        count = node.count if isinstance(node.count, int) else layout.lengths[node.axis]
+        if value is None:
+            value = node.default
+        if value is None:
+            if not count:
+                return
+            raise MissingField(shown, place=self._place)
+        if not isinstance(value, list | tuple | bytes):
+            raise self._wrong(shown, "a list of its elements", value)
+        if len(value) != count:
+            raise UsageError(
+                f"{self._place}: {shown}: expected {count} elements, found {len(value)}"
+            )
+        for index, element in enumerate(value):
+            self._indices[node.axis] = index
+            self._collect(node.element, element, path, f"{shown}[{index}]", layout)
+        self._indices.pop(node.axis, None)
+
+    def _collect_block(self, node: Block, value: Any, path: str, shown: str) -> None:
+        for part in node.parts:
+            names = ".".join(name for name in (path, *part.names) if name)
+            if not names:
+                continue
+            below = shown
+            found = value
+            for key in part.bits.keys:
+                if isinstance(key, int):
+                    below = f"{below}[{key}]"
+                    found = self._element(found, key, below, node)
+                else:
+                    below = f"{below}.{key}".strip(".")
+                    if found is not None and not isinstance(found, Mapping):
+                        raise self._wrong(below, "a mapping of its fields", found)
+                    found = None if found is None else found.get(key)
+            if part.bits.flag and found is not None:
+                found = int(bool(found))
+            self._add(part.info, names, below, found, 0)
+
+    def _element(self, array: Any, index: int, shown: str, node: Block) -> Any:
+        """Return an element of an array in a bit block."""
+        if array is None:
+            return None
+        if not isinstance(array, list | tuple | bytes):
+            raise self._wrong(shown, "a list of its elements", array)
+        if index >= len(array):
+            raise MissingField(shown, place=self._place)
+        return array[index]
+
+    def _add(self, info: FieldInfo, path: str, shown: str, value: Any, size: int) -> None:
+        """Add one value to the column of its field.
+
+        Args:
+            size: of a byte string, in bytes.
+        """
+        column = self._columns.setdefault(path, [])
+        if info.held and info.rebuilt is not None:
+            column.append(0)  # written with the lengths of the layout
+            return
+        if value is None or info.rebuilt is not None:
+            value = self._implied(info)
+            if info.kind == "bytes" and isinstance(value, bytes) and len(value) == 1:
+                value *= size  # a pattern that fills the field
+        if value is None:
+            if path not in self._sealing:
+                raise MissingField(shown, place=self._place)
+            self._sealing.discard(path)
+            column.append(bytes(size) if info.kind == "bytes" else 0)
+            return
+        if info.const is not None and raw_of(info, value) != info.const:
+            raise self._wrong(shown, _hexed(info.const), value)
+        if info.kind == "bytes":
+            column.append(self._bytes(shown, value, size))
+        elif info.kind == "float":
+            column.append(self._float(shown, value))
+        else:
+            column.append(self._integer(info, shown, value))
+
+    def _bytes(self, shown: str, value: Any, size: int) -> bytes:
+        if isinstance(value, int) and 0 <= value < 1 << 8 * size:
+            value = value.to_bytes(size, "big")
+        if not isinstance(value, bytes | bytearray):
+            raise self._wrong(shown, f"{size} bytes", value)
+        if len(value) != size:
+            raise UsageError(f"{self._place}: {shown}: expected {size} bytes, found {len(value)}")
+        return bytes(value)
+
+    def _float(self, shown: str, value: Any) -> float:
+        if not isinstance(value, int | float):
+            raise self._wrong(shown, "a number", value)
+        return value
+
+    def _integer(self, info: FieldInfo, shown: str, value: Any) -> int:
+        raw = raw_of(info, value)
+        if not isinstance(raw, int):
+            if info.labels and isinstance(raw, str):
+                raise self._wrong(shown, f"one of {', '.join(info.labels.values())}", raw)
+            raise self._wrong(shown, "an integer", raw)
+        low, high = info.limits
+        if not low <= raw <= high:
+            raise OutOfRange(shown, raw, low, high, place=self._place)
+        if info.allowed is not None and raw not in info.allowed:
+            raise self._wrong(shown, listed(info.allowed), raw)
+        return raw
+
+    def _store(self, row: NDArray[np.uint8], leaf: Leaf, column: list[Any]) -> None:
+        """Write the values of a field into the row."""
+        if not column:
+            return
+        if leaf.info.kind == "bytes":
+            leaf.store(row, np.frombuffer(b"".join(column), np.uint8).reshape(1, *leaf.shape))
+            return
+        values = np.array(column, leaf.info.dtype).reshape(1, *leaf.shape)
+        leaf.store(row, values)
+        if leaf.info.kind == "float":
+            self._check_floats(leaf, column, values)
+            self._store_payloads(row, leaf, column)
+
+    def _check_floats(self, leaf: Leaf, column: list[Any], values: NDArray[Any]) -> None:
+        """Raise OutOfRange for a finite number that became infinite."""
+        wide = np.array(column, np.float64).reshape(values.shape)
+        lost = np.isinf(values) & np.isfinite(wide)
+        if lost.any():
+            largest = float(np.finfo(values.dtype).max)
+            number = float(wide[lost][0])
+            raise OutOfRange(leaf.info.path, number, -largest, largest, place=self._place)
+
+    def _store_payloads(self, row: NDArray[np.uint8], leaf: Leaf, column: list[Any]) -> None:
+        """Write the NaNs that keep their bits."""
+        for value, offset in zip(column, leaf.offsets(), strict=True):
+            if isinstance(value, WireNaN) and len(value.raw) == leaf.size:
+                row[0, offset : offset + leaf.size] = np.frombuffer(value.raw, np.uint8)
+
+    def _is_absent(self, seal: Seal, row: NDArray[np.uint8]) -> bool:
+        """Return whether the given checksum means "not filled"."""
+        if not seal.absent or any(
+            member(self._given, leaf.info.path, None) is None for leaf in seal.leaves
+        ):
+            return False
+        return int(seal.stored(row)[0]) in seal.absent
+
+    def _check(
+        self, layout: Layout, row: NDArray[np.uint8], parts: Mapping[str, list[bytes]]
+    ) -> None:
+        """Raise UsageError if the frame announces other parts, or breaks a condition."""
+        for axis, region in layout.regions.items():
+            count = region.rule.count
+            if count is not None and count != len(parts[axis]):
+                raise UsageError(
+                    f"{self._place}: {self._shown(axis)}: {count} parts are announced, and"
+                    f" {len(parts[axis])} are given"
+                )
+            _, walked = region.in_rows(row)
+            if walked.status[0] != FOUND or walked.sizes[0] != region.size:
+                raise UsageError(
+                    f"{self._place}: {self._shown(axis)}: the parts have other sizes than the"
+                    " frame announces"
+                )
+        for condition in layout.conditions:
+            if not layout.meets_condition(condition, row)[0]:
+                named = ", ".join(info.path for info in condition.fields)
+                raise UsageError(f"{self._place}: a condition on {named} does not hold")
+
+    def _shown(self, path: str) -> str:
+        return f"{self._prefix}.{path}".strip(".")
+
+    def _uncounted(self, path: str) -> UsageError:
+        """Return why a field that decides the layout has no value."""
+        for axis, count in self._schema.arrays.items():
+            array = member(self._given, axis, None)
+            if array is not None and counting_field(count, self._schema.fields) == path:
+                return self._wrong(self._shown(axis), "a list of its elements", array)
+        return self._missing(path)
+
+    def _missing(self, path: str) -> MissingField:
+        return MissingField(self._shown(path), place=self._place)
+
+    def _wrong(self, shown: str, expected: str, found: object) -> UsageError:
+        return UsageError(
+            f"{self._place}: {shown or 'frame'}: expected {expected}, got {found!r:.60}"
+        )
+
+
+def _size(layout: Layout, path: str) -> int:
+    return layout.leaves[path].size
+
+
+def _hexed(value: object) -> str:
+    if isinstance(value, bytes):
+        return value.hex(" ")
+    return f"0x{value:x}" if isinstance(value, int) else repr(value)
+
+
+def _seals(node: Node) -> Iterable[Sealed]:
+    return [each for each in nodes(node) if isinstance(each, Sealed)]
+
+
+def raw_of(info: FieldInfo, value: Any) -> Any:
+    """Return the raw value of a field: the number behind a name of an Enum, else the value."""
+    if isinstance(value, str) and info.labels:
+        return next((raw for raw, name in info.labels.items() if name == value), value)
+    if info.kind == "int" and isinstance(value, bytes) and len(value) == info.bits // 8 == 1:
+        return value[0]
+    return value
+
+
+def fill_counts(given: Container, table: Schema) -> None:
+    """Set the header fields that arrays take their length from.
+
+    A field that is given stays as it is, unless it always follows from the array.
+    """
+    counted = set[str]()
+    for axis, count in table.arrays.items():
+        array = member(given, axis, None)
+        path = counting_field(count, table.fields)
+        if not isinstance(array, list | bytes) or path is None or path in counted:
+            continue
+        counted.add(path)
+        if table.fields[path].held:
+            holder, name = _holder(given, path)
+            holder.pop(name, None)
+        fill_in(count, given, len(array), table.fields, axis)
+
+
+def counting_field(formula: Formula | None, fields: Mapping[str, FieldInfo]) -> str | None:
+    """Return the path of the field that a count or length follows from; None if there is none."""
+    asked = () if formula is None else refs(formula)
+    return next((ref.path for ref in asked if ref.path in fields and "[" not in ref.path), None)
+
+
+def fill_in(
+    formula: Formula | None,
+    given: Container,
+    value: int,
+    fields: Mapping[str, FieldInfo],
+    axis: str,
+) -> None:
+    """Set the field that a formula depends on, if it is not given, so that it gives a value."""
+    path = counting_field(formula, fields)
+    if formula is None or path is None:
+        return
+    holder, name = _holder(given, path)
+    if isinstance(holder, dict) and holder.get(name) is None:
+        read = functools.partial(given_value, given, fields)
+        holder[name] = _find_count(formula, read, holder, name, value, fields[path], axis)
+
+
+def _holder(values: Any, path: str) -> tuple[Any, str]:
+    """Return the mapping that holds a field, and its name there; missing mappings are made."""
+    *parents, last = path.split(".")
+    for parent in parents:
+        values = values.setdefault(parent, Container())
+    return values, last
+
+
+def _find_count(
+    count: Formula,
+    read: Read,
+    holder: Container,
+    field: str,
+    length: int,
+    info: FieldInfo,
+    axis: str,
+) -> int:
+    """Return the value of the count field that gives this length, and leave it in its holder."""
+    top = int(info.limits[1]) if info.kind == "int" else MAX_COUNT_TRIED
+
+    def length_for(value: int) -> Any:
+        holder[field] = value
+        try:
+            return evaluated(count, read)
+        except Exception:  # an expression of the struct, that may divide by what is tried
+            return -1
+
+    tried = range(min(top, MAX_COUNT_TRIED) + 1)
+    # Mostly the length itself, or a number that the length grows with.
+    if length <= top and length_for(length) == length:
+        return length
+    guess = bisect.bisect_left(tried, length, key=length_for)
+    for value in itertools.chain((guess,), tried):
+        if value <= top and length_for(value) == length:
+            return value
+    raise UsageError(f"{axis}: no value of {field} gives {length}")
+
+
+def kind_of(node: Parts, part: Mapping[str, Any]) -> Kind:
+    """Return the kind of a part that is given by its values.
+
+    It is the first that has all fields of these, and no other constant; else the first.
+    """
+    for kind in node.kinds:
+        fields = schema(kind.root)
+        constants = [(info, part.get(path)) for path, info in fields.fields.items()]
+        is_known = part.keys() <= {*known_paths(kind.root), *fields.parts}
+        if is_known and all(
+            value in (None, info.const, info.labels.get(info.const))
+            for info, value in constants
+            if info.const is not None
+        ):
+            return kind
+    return node.kinds[0]
+
+
+@functools.lru_cache(maxsize=1024)
+def known_paths(root: Node) -> frozenset[str]:
+    """Return the paths of all fields of a frame type, and of the structs and arrays around them."""
+    table = schema(root)
+    paths = {*table.all_fields, *table.arrays}
+    for node in nodes(root):
+        if isinstance(node, Struct):
+            paths |= {f"{node.path}.{child.name}".strip(".") for child in node.members}
+    split = [path.split(".") for path in paths]
+    return frozenset(".".join(names[:depth]) for names in split for depth in range(len(names) + 1))
+
+
+def given_value(
+    given: Mapping[str, Any], fields: Mapping[str, FieldInfo], path: str
+) -> tuple[FieldInfo, Any] | str | None:
+    """Return a value that is given for a frame, as formulas read it (`lidarspec.spec.tree.Read`).
+
+    Raises:
+        LookupError: if there is none.
+    """
+    value: Any = given
+    for step in steps(path):
+        value = value[step]
+    if isinstance(value, Mapping) or path not in fields:
+        return path
+    info = fields[path]
+    return None if value is None else (info, raw_of(info, value))

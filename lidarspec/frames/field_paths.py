@@ -1,0 +1,52 @@
+"""Paths of fields, such as "points[3].distance", as names and indices."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable
+from typing import Any
+
+#: names of fields, and indices: a number, or "*" for every element.
+Steps = list[int | str]
+
+
+def steps(path: str) -> Steps:
+    """Return the names and indices of a path: ["points", 3, "distance"] of "points[3].distance"."""
+    return [int(step) if step.isdigit() else step for step in re.findall(r"\w+|\*", path)]
+
+
+def is_index(step: int | str) -> bool:
+    """Return whether a step of a path leads to elements of an array."""
+    return step == "*" or isinstance(step, int)
+
+
+def put(
+    target: Any,
+    path: Steps,
+    value: Any,
+    length: Callable[[str], int] = lambda array: 0,
+    place: str = "",
+) -> Any:
+    """Return a struct or array, or a new one for None, with a value set in it.
+
+    Args:
+        length: returns the number of elements of the array at a path, 0 if it is not known; "*"
+            stands for each of them.
+    """
+    if not path:
+        return value
+    step, *rest = path
+    if not is_index(step):
+        target = {} if target is None else target
+        below = f"{place.removesuffix('[]')}.{step}".removeprefix(".")
+        target[step] = put(target.get(step), rest, value, length, below)
+        return target
+    target = [] if target is None else list(target)
+    indices = range(length(place) or len(target)) if step == "*" else [int(step)]
+    for index in indices:
+        target.extend([None] * (index + 1 - len(target)))
+        element = target[index]
+        if isinstance(element, dict):
+            element = dict(element)
+        target[index] = put(element, rest, value, length, f"{place}[]")
+    return target

@@ -1,0 +1,370 @@
+"""The fields of one frame in the order of the wire, with their places: of a damaged or truncated one too.
+
+`examine` finds the layout of the bytes, or as much of it as the bytes tell, and `Examined.fields`
+goes along the frame tree with it. Errors (`lidarspec.frames.diagnose`) and explanations are made of
+that.
+"""
+
+from __future__ import annotations
+
+import struct
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+
+from lidarspec.frames.layout import Layout, Leaf, Seal
+from lidarspec.frames.layout_tree import Unknown, Walk, walk_layout
+from lidarspec.frames.parts import FOUND, Kind, Measure, Piece, Region
+from lidarspec.spec import tree
+from lidarspec.spec.bits import BitField
+
+#: the path of a constant without a name.
+UNNAMED = "(constant)"
+
+
+@dataclass(frozen=True)
+class WireField:
+    """One value on the wire.
+
+    Attributes:
+        path: with indices, "points[1].intensity".
+        block: path of the bit block that holds it, with indices; else its own path.
+        info: the field; of a constant without a name one with no path.
+        start, end: its bytes in the frame; of a value in a bit block those of the block.
+        bits: its bits in the block, None outside one.
+        raw: the value; None if the bytes end before it does.
+    """
+
+    path: str
+    block: str
+    info: tree.FieldInfo
+    start: int
+    end: int
+    bits: BitField | None
+    raw: Any
+
+    @property
+    def first_byte(self) -> int:
+        """The first byte that holds a bit of it."""
+        if self.bits is None:
+            return self.start
+        return self.start + min(segment.byte for segment in self.bits.segments)
+
+
+@dataclass(frozen=True)
+class PlacedSeal:
+    """A checksum in the bytes of a frame: `prefix` is the path of the part that it is in."""
+
+    seal: Seal
+    prefix: str
+    start: int
+    stored: int
+    computed: int
+
+    @property
+    def path(self) -> str:
+        """The path of the first field that holds it."""
+        return f"{self.prefix}.{self.seal.leaves[0].info.path}".strip(".")
+
+    @property
+    def offset(self) -> int:
+        """The first byte of that field."""
+        return self.start + self.seal.leaves[0].held[0]
+
+    @property
+    def end(self) -> int:
+        """The byte after the struct that it seals."""
+        return self.start + self.seal.end
+
+    @property
+    def is_right(self) -> bool:
+        """Whether the frame carries the right value, or one that means "not filled"."""
+        return self.stored == self.computed or self.stored in self.seal.absent
+
+
+@dataclass(frozen=True)
+class ExaminedParts:
+    """The parts of a frame at a path; the last one is broken unless `is_whole`.
+
+    Attributes:
+        end: the byte of the frame after the last valid part.
+    """
+
+    parts: list[Examined]
+    end: int
+    is_whole: bool
+
+
+@dataclass(frozen=True, eq=False)
+class Examined:
+    """What the bytes of one frame, or of a part of one, tell of its layout.
+
+    Attributes:
+        root: the frame type.
+        data: the bytes.
+        known: the layout; or as much of it as is known before `failure`.
+        failure: what ended the walk through the tree: `Unknown` if the bytes end, `TooLong`,
+            `Unlike`, or an error of an expression; None for a layout.
+        start: of a part, its first byte in the frame.
+        prefix: of a part, its path in the frame.
+    """
+
+    root: tree.Node
+    data: bytes
+    known: Layout | Walk
+    failure: Exception | None
+    limit: int
+    start: int = 0
+    prefix: str = ""
+    _parts: dict[str, ExaminedParts] = field(default_factory=dict)
+
+    @property
+    def layout(self) -> Layout | None:
+        """The layout; None if the bytes do not lead to one."""
+        return self.known if isinstance(self.known, Layout) else None
+
+    def fields(self) -> Iterator[WireField]:
+        """Return the fields in the order of the wire; the last one may be cut off (`raw` is None)."""
+        cursor = _Cursor(self)
+        yield from cursor.visit(self.root, "", self.prefix)
+
+    def seals(self) -> Iterator[PlacedSeal]:
+        """Return the checksums, inner ones first, of structs whose bytes are all there."""
+        rows = np.frombuffer(self.data, np.uint8).reshape(1, -1)
+        for seal in self.known.seals:
+            if seal.end <= len(self.data):
+                stored, computed = int(seal.stored(rows)[0]), int(seal.computed(rows)[0])
+                yield PlacedSeal(seal, self.prefix, self.start, stored, computed)
+        axes = [*self.known.regions]
+        if isinstance(self.known, Walk):
+            axes += [axis for axis in self.known.open_regions if axis not in axes]
+        for axis in axes:
+            for part in self.parts_of(axis):
+                yield from part.seals()
+
+    def region(self, axis: str) -> Region | None:
+        """Return the place of the parts at a path; None if it is not known."""
+        if axis in self.known.regions:
+            return self.known.regions[axis]
+        return self.known.open_regions.get(axis) if isinstance(self.known, Walk) else None
+
+    def parts_of(self, axis: str) -> list[Examined]:
+        """Return the parts at a path, as far as they can be told apart."""
+        return self._examined_parts(axis).parts
+
+    def end_of_parts(self, axis: str) -> int:
+        """Return the byte of this frame after the last whole part at a path."""
+        return self._examined_parts(axis).end
+
+    def broken_part(self, axis: str) -> Examined | None:
+        """Return the part at a path that is no valid part; None if all are there."""
+        found = self._examined_parts(axis)
+        return None if found.is_whole else found.parts[-1]
+
+    def _examined_parts(self, axis: str) -> ExaminedParts:
+        if axis not in self._parts:
+            self._parts[axis] = _examine_parts(self, axis)
+        return self._parts[axis]
+
+
+def examine(
+    root: tree.Node,
+    data: bytes,
+    limit: int,
+    given: Mapping[str, int] | None = None,
+    start: int = 0,
+    prefix: str = "",
+) -> Examined:
+    """Find the layout of one frame, as far as its bytes tell.
+
+    Args:
+        limit: the longest frame, in bytes.
+        given: of a part, values of fields of the frame around it, by their path there.
+        start, prefix: of a part, its place and path in the frame.
+    """
+
+    def read(leaf: Leaf | Measure, walk: Walk) -> int:
+        value = leaf.of(data)
+        if value is None:
+            raise Unknown(leaf)
+        walk.values = {**walk.values, leaf.info.path: value}
+        return value
+
+    walk = Walk({}, limit, given or {}, read)
+    try:
+        layout = walk_layout(walk, root)
+    except Exception as failure:  # an expression of the struct may raise anything
+        return Examined(root, data, walk, failure, limit, start, prefix)
+    return Examined(root, data, layout, None, limit, start, prefix)
+
+
+def _examine_parts(around: Examined, axis: str) -> ExaminedParts:
+    """Examine the parts at a path."""
+    region = around.region(axis)
+    assert region is not None
+    data = np.frombuffer(around.data, np.uint8)
+    walked = region.walked(data, np.zeros(1, np.intp))
+    pieces = [piece for pieces in walked.rounds for piece in pieces]
+    found = [
+        _examined_piece(around, region, axis, index, piece) for index, piece in enumerate(pieces)
+    ]
+    end = region.start + int(walked.sizes[0])
+    is_whole = bool(walked.status[0] == FOUND) and region.size in (None, end - region.start)
+    if not is_whole:
+        kind = _likely_kind(region, around.data[end:])
+        stop = len(around.data)
+        if region.rule.within is not None:
+            stop = min(stop, region.start + region.rule.within)
+        found.append(_examine_part(around, region, axis, len(found), kind, end, stop))
+    return ExaminedParts(found, end, is_whole)
+
+
+def _examined_piece(
+    around: Examined, region: Region, axis: str, index: int, piece: Piece
+) -> Examined:
+    start = int(piece.spots[0])
+    return _examine_part(
+        around, region, axis, index, region.kinds[piece.kind], start, start + piece.layout.size
+    )
+
+
+def _examine_part(
+    around: Examined, region: Region, axis: str, index: int, kind: Kind, start: int, end: int
+) -> Examined:
+    prefix = f"{around.prefix}.{axis}[{index}]".strip(".")
+    data = around.data[start:end]
+    return examine(kind.node.root, data, around.limit, region.given, around.start + start, prefix)
+
+
+def _likely_kind(region: Region, data: bytes) -> Kind:
+    """Return the kind of part that bytes begin like; the last one if they begin like none."""
+    for kind in region.kinds:
+        known = [
+            data[spot] & mask == value
+            for spot, (mask, value) in kind.prefix.items()
+            if spot < len(data)
+        ]
+        if all(known):
+            return kind
+    return region.kinds[-1]
+
+
+class _Cursor:
+    """A walk along the fields of one frame."""
+
+    def __init__(self, examined: Examined) -> None:
+        self._examined = examined
+        self._known = examined.known
+        self._data = examined.data
+        self._offset = 0
+        self._empty_elements = 0
+        self._is_over = False
+
+    def visit(self, node: tree.Node, path: str, shown: str) -> Iterator[WireField]:
+        """Return the fields of a node; `path` and `shown` without and with indices."""
+        if self._is_over:
+            return
+        match node:
+            case tree.Sealed():
+                yield from self.visit(node.body, path, shown)
+            case tree.Struct():
+                for child in node.members:
+                    name = child.name or UNNAMED
+                    below = f"{node.path}.{child.name}".strip(".")
+                    yield from self.visit(child, below, f"{shown}.{name}".strip("."))
+            case tree.Repeat():
+                yield from self._array(node, path, shown)
+            case tree.Parts():
+                yield from self._parts(node)
+            case tree.When() | tree.Select():
+                branch = self._known.branches.get(node)
+                if branch is None:
+                    self._is_over = True
+                else:
+                    yield from self.visit(branch, path, shown)
+            case tree.Number():
+                yield self._value(node.info, shown, node.size, _number(node))
+            case tree.Blob():
+                yield from self._blob(node, path, shown)
+            case tree.Block():
+                yield from self._block(node, shown)
+
+    def _array(self, node: tree.Repeat, path: str, shown: str) -> Iterator[WireField]:
+        count = node.count if isinstance(node.count, int) else self._known.lengths.get(node.axis)
+        if count is None:
+            self._is_over = True
+            return
+        for index in range(count):
+            start = self._offset
+            yield from self.visit(node.element, path, f"{shown}[{index}]")
+            if self._offset == start:
+                self._empty_elements += 1
+            if self._is_over or self._empty_elements > self._examined.limit:
+                self._is_over = True
+                return
+
+    def _parts(self, node: tree.Parts) -> Iterator[WireField]:
+        axis = node.axis
+        if self._examined.region(axis) is None:
+            self._is_over = True
+            return
+        for part in self._examined.parts_of(axis):
+            for each in part.fields():
+                yield each
+                if each.raw is None:
+                    self._is_over = True
+            if part.failure is not None:
+                self._is_over = True
+        self._offset = self._examined.end_of_parts(axis)
+        if axis not in self._known.regions:
+            self._is_over = True
+
+    def _blob(self, node: tree.Blob, path: str, shown: str) -> Iterator[WireField]:
+        if node.const is not None and not node.name:
+            info = tree.FieldInfo("", kind="bytes", const=node.const)
+            yield self._value(info, shown, len(node.const), bytes)
+        elif path not in self._known.leaves:
+            self._is_over = True
+        else:
+            yield self._value(node.info, shown, self._known.leaves[path].size, bytes)
+
+    def _block(self, node: tree.Block, shown: str) -> Iterator[WireField]:
+        start = self._examined.start + self._offset
+        block = self._take(node.size)
+        for part in node.parts:
+            keys = [f"[{key}]" if isinstance(key, int) else f".{key}" for key in part.bits.keys]
+            path = (shown + "".join(keys)).strip(".")
+            raw: Any = None
+            if block is not None:
+                raw = part.bits.value(block)
+                raw = bool(raw) if part.bits.flag else raw
+            yield WireField(path, shown, part.info, start, start + node.size, part.bits, raw)
+            if block is None:
+                return
+
+    def _value(self, info: tree.FieldInfo, shown: str, size: int, decode: Any) -> WireField:
+        start = self._examined.start + self._offset
+        data = self._take(size)
+        raw = None if data is None else decode(data)
+        return WireField(shown, shown, info, start, start + size, None, raw)
+
+    def _take(self, size: int) -> bytes | None:
+        """Return the next bytes; None if they are not all there."""
+        end = self._offset + size
+        if end > len(self._data):
+            self._is_over = True
+            return None
+        data = self._data[self._offset : end]
+        self._offset = end
+        return data
+
+
+def _number(node: tree.Number) -> Any:
+    """Return the function from the bytes of a number to its value."""
+    if node.kind == "float":
+        order = "<" if node.order == "little" else ">"
+        code = struct.Struct(order + {2: "e", 4: "f", 8: "d"}[node.size])
+        return lambda data: code.unpack(data)[0]
+    return lambda data: int.from_bytes(data, node.order, signed=node.kind == "int")
