@@ -105,7 +105,7 @@ PAGE_MAY_IMPORT = {
     "recording.switch",
     "scans.scans",
     "spec.arguments",
-    "transports.base",
+    "transports.host_clock",
     "transports.open_url",
     "transports.protocol",
     "view.feed",

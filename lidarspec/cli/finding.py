@@ -40,7 +40,8 @@ from lidarspec.known_sensors import KnownSensor, find_known_sensor, install_comm
 from lidarspec.plugins import sensor as named_sensor, sensors
 from lidarspec.spec.links import Serial, Udp
 from lidarspec.spec.sensor import Sensor
-from lidarspec.transports.base import data_link, with_option
+from lidarspec.transports.addresses import with_option
+from lidarspec.transports.base import data_link
 from lidarspec.transports.open_url import live_address, resolved
 from lidarspec.transports.ports import SerialPort, User, serial_ports, udp_users
 from lidarspec.transports.protocol import no_bytes

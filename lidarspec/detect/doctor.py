@@ -17,7 +17,8 @@ from lidarspec.errors import LidarSpecError, UsageError, printable, suggestion
 from lidarspec.spec.links import Serial, Udp
 from lidarspec.spec.sensor import Sensor
 from lidarspec.transports import ports
-from lidarspec.transports.base import Address, data_link, with_option
+from lidarspec.transports.addresses import Address, with_option
+from lidarspec.transports.base import data_link
 from lidarspec.transports.open_url import live_address, resolved
 from lidarspec.transports.protocol import no_bytes
 from lidarspec.transports.udp import BUFFER, shortfall

@@ -21,7 +21,8 @@ from lidarspec.framing.decoder import Decoder
 from lidarspec.plugins import sensors
 from lidarspec.spec.links import Serial, Udp
 from lidarspec.spec.sensor import Sensor
-from lidarspec.transports.base import data_link, with_option
+from lidarspec.transports.addresses import with_option
+from lidarspec.transports.base import data_link
 from lidarspec.transports.open_url import live, live_address, transport
 from lidarspec.transports.protocol import Chunk, Disconnected, LiveTransport, endpoint, sender_names
 

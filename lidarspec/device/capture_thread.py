@@ -22,7 +22,7 @@ from enum import Enum
 
 from lidarspec.errors import SourceError, UsageError
 from lidarspec.recording.appending import Log
-from lidarspec.transports.base import HostClock
+from lidarspec.transports.host_clock import HostClock
 from lidarspec.transports.protocol import POLL, Chunk, Disconnected, LiveTransport
 
 #: what waits in a queue at most: chunks, and bytes in them; several seconds of the fastest sensors.
@@ -252,7 +252,7 @@ class Capture:
         """Where the wall clock was set before a chunk came, arrival times go on as before; it is
         said once, and recorded each time.
         """
-        ahead = self._clock.parted()
+        ahead = self._clock.find_step()
         if ahead is None:
             return
         self.warnings = [

@@ -38,7 +38,8 @@ from lidarspec.recording.appending import Log
 from lidarspec.spec.arguments import Address
 from lidarspec.spec.links import Http, Link, Udp
 from lidarspec.spec.sensor import Sensor
-from lidarspec.transports.base import HostClock, own_address, with_option
+from lidarspec.transports.addresses import find_own_address, with_option
+from lidarspec.transports.host_clock import HostClock
 from lidarspec.transports.open_url import control_link, has_control
 from lidarspec.transports.protocol import Chunk, LiveTransport, Sender, endpoint
 
@@ -393,7 +394,7 @@ class LiveInput(Input):
             isinstance(value, Address) for value in command.filled.values()
         ):
             peer = self._opened(command.link).peer()
-            self._session.host = own_address(peer) if peer else None
+            self._session.host = find_own_address(peer) if peer else None
 
     def write(self, data: bytes, link: str = "data") -> None:
         refuse_text(data)

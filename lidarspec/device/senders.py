@@ -20,7 +20,7 @@ from lidarspec.errors import UsageError, suggest
 from lidarspec.framing.decoder import Decoder
 from lidarspec.framing.results import Frames
 from lidarspec.spec.sensor import Sensor
-from lidarspec.transports.base import with_option
+from lidarspec.transports.addresses import with_option
 from lidarspec.transports.protocol import Chunk, Sender, endpoint
 
 #: senders that are looked at while nobody knows the sensor, and ports that are remembered of it.

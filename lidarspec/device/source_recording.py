@@ -26,8 +26,8 @@ from lidarspec.recording.format import Header
 from lidarspec.recording.recorders import MadeFor, recorder
 from lidarspec.spec.description import Spec
 from lidarspec.spec.sensor import Sensor
-from lidarspec.transports.base import HostClock
 from lidarspec.transports.files import RecordingTransport
+from lidarspec.transports.host_clock import HostClock
 from lidarspec.transports.open_url import is_live, transport
 from lidarspec.transports.protocol import Chunk, LiveTransport, Transport
 

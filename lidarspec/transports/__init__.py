@@ -5,7 +5,8 @@ Modules in reading order:
 
 * `protocol`: what a transport is, live or not; plugins derive from it.
 * `open_url`: from a SOURCE to the transport that opens it.
-* `base`: what they share: addresses, the clock, failures with the next command.
+* `addresses`, `host_clock`: a live SOURCE as a value; the times of arrivals.
+* `base`: what live transports share: reading a stream, waiting, errors of the system.
 * `serial`, `udp`, `tcp`: live sources.
 * `http`: requests to the web server of a sensor.
 * `simulated`: `sim:`, a simulated sensor in this process.

@@ -9,7 +9,7 @@ from pathlib import Path
 from lidarspec.errors import SourceError, UsageError
 from lidarspec.spec.links import Http, Link, Tcp, Udp
 from lidarspec.spec.sensor import Sensor
-from lidarspec.transports.base import Address
+from lidarspec.transports.addresses import Address
 from lidarspec.transports.outlets import LOCALHOST, Line, Outlet, PtyLine, TcpLine, UdpLine
 
 

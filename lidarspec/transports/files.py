@@ -26,8 +26,8 @@ from lidarspec.errors import SourceError, UnknownSensor, UsageError, system_erro
 from lidarspec.recording.format import MAGIC, Header, Record, Recording
 from lidarspec.spec.sensor import Sensor
 from lidarspec.stores import file_of, is_stored
+from lidarspec.transports.addresses import parse_origin
 from lidarspec.transports.bags import BagTransport, log_of
-from lidarspec.transports.base import origin
 from lidarspec.transports.hexadecimal import hex_chunks, is_hexadecimal
 from lidarspec.transports.protocol import Chunk, Transport
 
@@ -66,7 +66,7 @@ class RecordingTransport(Transport):
         self.header: Header = self._recording.header
         self.datagrams, self._origin = (
             self.header.datagrams,
-            None if sender is None else origin(sender),
+            None if sender is None else parse_origin(sender),
         )
         self.warnings: list[str] = []
         self._no_events, self._was_set, self._has_skipped = 0, False, False
@@ -279,7 +279,7 @@ class CaptureTransport(FileTransport):
 
     def __init__(self, path: str, file: BinaryIO, *, sender: str | None = None) -> None:
         super().__init__(path, file)
-        self._origin = None if sender is None else origin(sender)
+        self._origin = None if sender is None else parse_origin(sender)
         self.reader: CaptureBatches | None = None
         self._has_skipped = False
 

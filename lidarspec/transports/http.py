@@ -15,7 +15,8 @@ import threading
 from lidarspec.errors import UsageError
 from lidarspec.spec.fields import HttpReply, HttpRequest
 from lidarspec.spec.links import Http
-from lidarspec.transports.base import HostClock, reason
+from lidarspec.transports.base import system_reason
+from lidarspec.transports.host_clock import HostClock
 from lidarspec.transports.protocol import Chunk, LiveTransport
 
 
@@ -50,7 +51,7 @@ class HttpTransport(LiveTransport):
         try:
             status, body, location = self._send_request(str(request.method), path, request.body)
         except (OSError, http.client.HTTPException, ValueError) as error:
-            cause = reason(error) or f"no answer within {self._link.timeout:g} s"
+            cause = system_reason(error) or f"no answer within {self._link.timeout:g} s"
             self.warnings = [f"{self.label}{path}: {cause}"]
             return []
         if location:

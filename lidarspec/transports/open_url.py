@@ -15,7 +15,8 @@ from lidarspec.plugins import registry
 from lidarspec.spec.links import Http, Link, Tcp, Udp
 from lidarspec.spec.sensor import Sensor
 from lidarspec.stores import is_stored
-from lidarspec.transports.base import Address, failure, numeric
+from lidarspec.transports.addresses import Address, resolve_host
+from lidarspec.transports.base import source_error
 from lidarspec.transports.files import open_file
 from lidarspec.transports.protocol import LiveTransport, Transport
 
@@ -148,7 +149,7 @@ def control_link(source: str | Path, name: str, link: Link, host: str | None) ->
             address.options.get("broadcast", "255.255.255.255") if address is not None else ""
         )
         remote = (
-            numeric(known or everybody, str(source)),
+            resolve_host(known or everybody, str(source)),
             port or (link.ports[0] if known and link.ports else link.broadcast),
         )
         own, label = "::" if ":" in remote[0] else "", f"udp://{_bracketed(remote[0])}:{remote[1]}"
@@ -173,7 +174,7 @@ def control_link(source: str | Path, name: str, link: Link, host: str | None) ->
             f"{source}: no plugin is installed that opens a {type(link).__name__} link, which"
             f" {name} is"
         )
-    raise failure(
+    raise source_error(
         f"{source}: nobody knows the address of the {name} link",
         f"the same with ?control=ADDRESS in {source}",
     )

@@ -23,7 +23,8 @@ from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from pathlib import Path
 
 from lidarspec.errors import SourceError, UsageError
-from lidarspec.transports.base import failure, ready, reason, with_option
+from lidarspec.transports.addresses import with_option
+from lidarspec.transports.base import source_error, system_reason, wait_ready
 from lidarspec.transports.protocol import POLL, Chunk, Disconnected, Sender
 
 try:
@@ -203,8 +204,8 @@ class UdpLine(Line):
                 host, _DISCARD_PORT, type=socket.SOCK_DGRAM
             )[0]
         except OSError as error:
-            raise failure(
-                f"udp://{host}{port_list}: there is no host {host!r} ({reason(error)})",
+            raise source_error(
+                f"udp://{host}{port_list}: there is no host {host!r} ({system_reason(error)})",
                 f"ping {host}",
             ) from None
         numeric_host = str(address[0])
@@ -294,12 +295,14 @@ class UdpLine(Line):
             self._sockets[0].sendto(data, receiver)
         except OSError as error:
             if error.errno in (errno.EAGAIN, errno.EWOULDBLOCK):
-                ready([], [self._sockets[0]], POLL)
+                wait_ready([], [self._sockets[0]], POLL)
             elif error.errno == errno.ENOBUFS:
                 time.sleep(_LISTENER_POLL_S)
             elif error.errno != errno.ECONNREFUSED and self._host:
                 # ECONNREFUSED is the answer to an earlier datagram.
-                raise SourceError(f"{self.place}: nothing can be sent: {reason(error)}") from None
+                raise SourceError(
+                    f"{self.place}: nothing can be sent: {system_reason(error)}"
+                ) from None
             return False
         return True
 
@@ -353,7 +356,7 @@ class TcpLine(Line):
             backlog.add(data)
             self._flush(client)
             while patient and self._clients.get(client):
-                ready([], [client], POLL)
+                wait_ready([], [client], POLL)
                 self._flush(client)
 
     def await_listener(self) -> None:
@@ -467,7 +470,7 @@ class PtyLine(Line):
             self._master, slave = os.openpty()
         except OSError as error:
             raise _missing_terminal_error(
-                f"no pseudo-terminal is available: {reason(error)}"
+                f"no pseudo-terminal is available: {system_reason(error)}"
             ) from None
         self.path = os.ttyname(slave)
         self.place = str(self._link or self.path)
@@ -515,7 +518,7 @@ class PtyLine(Line):
         self._backlog.add(data)
         self._flush()
         while patient and self._backlog:
-            ready([], [self._master], POLL)
+            wait_ready([], [self._master], POLL)
             if self._is_alone():
                 self._handle_hangup()
             self._flush()
@@ -583,8 +586,8 @@ class PtyLine(Line):
         except OSError as error:
             self._link = None
             self.unplug()
-            raise failure(
-                f"{link}: the link cannot be made: {reason(error)}", f"ls -l {link}"
+            raise source_error(
+                f"{link}: the link cannot be made: {system_reason(error)}", f"ls -l {link}"
             ) from None
 
 
@@ -689,7 +692,7 @@ def wait_for(lines: Collection[Line], timeout: float) -> None:
     reading = [descriptor for line in lines for descriptor in line.readable()]
     writing = [descriptor for line in lines for descriptor in line.writable()]
     if reading or writing:
-        ready(reading, writing, timeout)
+        wait_ready(reading, writing, timeout)
     else:
         time.sleep(timeout)
 
@@ -707,8 +710,8 @@ def listen(host: str, port: int) -> socket.socket:
         following = f"the same with tcp://{LOCALHOST}:{port}"
         if error.errno == errno.EADDRINUSE:
             following = f"ss -ltnp 'sport = :{port}'"
-        raise failure(
-            f"tcp://{host}:{port}: cannot listen there: {reason(error)}", following
+        raise source_error(
+            f"tcp://{host}:{port}: cannot listen there: {system_reason(error)}", following
         ) from None
     server.setblocking(False)
     return server
@@ -720,7 +723,7 @@ def has_terminals() -> bool:
 
 
 def _missing_terminal_error(text: str) -> SourceError:
-    return failure(text, f"the same with --to tcp://{LOCALHOST}:2111")
+    return source_error(text, f"the same with --to tcp://{LOCALHOST}:2111")
 
 
 def _bind_udp(host: str, port: int) -> socket.socket:

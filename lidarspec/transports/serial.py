@@ -20,17 +20,17 @@ import serial
 from lidarspec.errors import SourceError, UsageError
 from lidarspec.spec.links import Serial
 from lidarspec.spec.sensor import Sensor
+from lidarspec.transports.addresses import Address
 from lidarspec.transports.base import (
-    Address,
     StreamTransport,
     data_link,
+    disconnected_error,
     error_numbers,
-    failure,
-    lost,
-    named,
-    readable,
-    ready,
-    reason,
+    sensor_option,
+    source_error,
+    system_reason,
+    wait_readable,
+    wait_ready,
 )
 
 try:
@@ -88,7 +88,7 @@ class SerialTransport(StreamTransport):
             else:
                 self._port.write(data)
         except GONE as error:
-            raise lost(self.label, error) from None
+            raise disconnected_error(self.label, error) from None
 
     def _send(self, descriptor: int, left: memoryview) -> None:
         """Write through the descriptor, of whatever number: pyserial asks `select`, which knows
@@ -96,7 +96,7 @@ class SerialTransport(StreamTransport):
         """
         limit = time.monotonic() + WRITE_TIMEOUT
         while left:
-            if not ready([], [descriptor], max(limit - time.monotonic(), 0.0))[1]:
+            if not wait_ready([], [descriptor], max(limit - time.monotonic(), 0.0))[1]:
                 raise TimeoutError(errno.ETIMEDOUT, os.strerror(errno.ETIMEDOUT))
             with contextlib.suppress(BlockingIOError):
                 left = left[os.write(descriptor, left) :]
@@ -112,7 +112,7 @@ class SerialTransport(StreamTransport):
                 if not {errno.ENOTTY, errno.EINVAL} & set(
                     error_numbers(error)
                 ):  # of a port without such lines, as a pseudo-terminal
-                    raise lost(self.label, error) from None
+                    raise disconnected_error(self.label, error) from None
 
     def reopen(self) -> None:
         self._shut()
@@ -146,28 +146,30 @@ class SerialTransport(StreamTransport):
         """Why the port does not open, and what to type."""
         number, source = (
             error.errno if isinstance(error, OSError) else None,
-            f"serial://{self.label}{named(self._sensor)}",
+            f"serial://{self.label}{sensor_option(self._sensor)}",
         )
         if number == errno.ENOENT or "FileNotFoundError" in str(error):
-            return failure(f"{self.label}: no such port", "lidarspec ports")
+            return source_error(f"{self.label}: no such port", "lidarspec ports")
         if number == errno.EACCES:
-            return failure(f"{self.label}: permission denied", f"lidarspec doctor {quote(source)}")
+            return source_error(
+                f"{self.label}: permission denied", f"lidarspec doctor {quote(source)}"
+            )
         if (
             number in (errno.EBUSY, errno.EAGAIN)
             or "exclusively lock" in str(error)
             or "PermissionError" in str(error)
         ):
-            return failure(
+            return source_error(
                 f"{self.label}: in use by another program", f"lidarspec doctor {quote(source)}"
             )
         if isinstance(error, ValueError) or "baud" in str(error).lower():
-            return failure(
+            return source_error(
                 f"{self.label}: it cannot run at {self.baud} baud: {error}",
                 f"lidarspec detect {quote(self.label)}",
             )
-        return failure(f"{self.label}: {reason(error)}", "lidarspec ports")
+        return source_error(f"{self.label}: {system_reason(error)}", "lidarspec ports")
 
-    def _received(self, timeout: float) -> bytes:
+    def _receive(self, timeout: float) -> bytes:
         if os.name != "posix":
             self._port.timeout = timeout
             return bytes(self._port.read(max(1, self._port.in_waiting)))
@@ -177,11 +179,11 @@ class SerialTransport(StreamTransport):
                 # as a rule, after the pause; nothing may mean a hang-up, which the system tells
                 # only who waits
                 return data
-        if not readable(descriptor, timeout):
+        if not wait_readable(descriptor, timeout):
             return b""
         data = os.read(descriptor, BLOCK)
         if not data:
-            raise lost(self.label, "it hung up")
+            raise disconnected_error(self.label, "it hung up")
         return data
 
 

@@ -14,7 +14,9 @@ from lidarspec.simulation.faults import FAULTS, faults_of
 from lidarspec.simulation.scenes import read_scene
 from lidarspec.spec.links import Serial, is_datagram
 from lidarspec.spec.sensor import Sensor
-from lidarspec.transports.base import Address, HostClock, failure
+from lidarspec.transports.addresses import Address
+from lidarspec.transports.base import source_error
+from lidarspec.transports.host_clock import HostClock
 from lidarspec.transports.protocol import Chunk, Disconnected, LiveTransport
 
 OPTIONS = ("rate", "scene", "seed", *FAULTS)
@@ -94,7 +96,7 @@ class SimulatedTransport(LiveTransport):
         with self._changed:
             self.device.outgoing(time.monotonic_ns())
             if not self.device.present:
-                raise failure(f"{self.label}: the simulated sensor is unplugged", "wait")
+                raise source_error(f"{self.label}: the simulated sensor is unplugged", "wait")
 
     def lines(self, *, dtr: bool | None = None, rts: bool | None = None) -> None:
         """Do nothing: control lines have no effect on a simulated device."""

@@ -10,15 +10,15 @@ from shlex import quote
 from lidarspec.errors import SourceError, SourceTimeout, UsageError, suggest
 from lidarspec.spec.links import Tcp
 from lidarspec.spec.sensor import Sensor
+from lidarspec.transports.addresses import Address
 from lidarspec.transports.base import (
-    Address,
     StreamTransport,
     data_link,
-    failure,
-    lost,
-    named,
-    readable,
-    reason,
+    disconnected_error,
+    sensor_option,
+    source_error,
+    system_reason,
+    wait_readable,
 )
 from lidarspec.transports.protocol import Disconnected
 
@@ -45,8 +45,8 @@ class TcpTransport(StreamTransport):
         self._address = (host, port)
         self._socket = self._connected(PATIENCE)
 
-    def _received(self, timeout: float) -> bytes:
-        if not readable(self._socket.fileno(), timeout):
+    def _receive(self, timeout: float) -> bytes:
+        if not wait_readable(self._socket.fileno(), timeout):
             return b""
         data = self._socket.recv(BLOCK)
         if not data:
@@ -57,7 +57,7 @@ class TcpTransport(StreamTransport):
         try:
             self._socket.sendall(data)
         except OSError as error:
-            raise lost(self.label, error) from None
+            raise disconnected_error(self.label, error) from None
 
     def reopen(self) -> None:
         self._socket.close()
@@ -83,17 +83,21 @@ class TcpTransport(StreamTransport):
 
     def _refused(self, error: OSError) -> SourceError:
         host, port = self._address
-        doctor = f"lidarspec doctor {quote(self.label)}{named(self._sensor)}"
+        doctor = f"lidarspec doctor {quote(self.label)}{sensor_option(self._sensor)}"
         if isinstance(error, socket.gaierror):
-            return failure(f"{self.label}: there is no host {host!r}", doctor)
+            return source_error(f"{self.label}: there is no host {host!r}", doctor)
         if error.errno == errno.ECONNREFUSED:
-            return failure(f"{self.label}: {host} refuses connections to TCP port {port}", doctor)
+            return source_error(
+                f"{self.label}: {host} refuses connections to TCP port {port}", doctor
+            )
         if isinstance(error, TimeoutError) or error.errno in (errno.ETIMEDOUT, errno.EHOSTUNREACH):
             return suggest(
                 SourceTimeout(f"{self.label}: {host} does not answer on TCP port {port}"),
                 f"ping {host}",
             )
-        return failure(f"{self.label}: TCP port {port} of {host}: {reason(error)}", doctor)
+        return source_error(
+            f"{self.label}: TCP port {port} of {host}: {system_reason(error)}", doctor
+        )
 
 
 def connect(address: Address, sensor: Sensor | None = None) -> TcpTransport:

@@ -32,18 +32,15 @@ from shlex import quote
 from lidarspec.errors import SourceError, UsageError
 from lidarspec.spec.links import Udp, is_datagram
 from lidarspec.spec.sensor import Sensor
+from lidarspec.transports.addresses import Address, parse_origin, resolve_host, with_option
 from lidarspec.transports.base import (
-    Address,
-    HostClock,
-    failure,
-    lost,
-    named,
-    numeric,
-    origin,
-    reason,
-    rest,
-    with_option,
+    disconnected_error,
+    sensor_option,
+    sleep_until,
+    source_error,
+    system_reason,
 )
+from lidarspec.transports.host_clock import HostClock
 from lidarspec.transports.protocol import Chunk, LiveTransport, Sender
 
 #: datagrams in one call, and the room for each: memory that is not written to costs nothing.
@@ -242,7 +239,7 @@ class UdpTransport(LiveTransport):
         self.clock = HostClock()
         self.label, self.datagrams = label, datagrams
         self._origin, self._remote, self._sensor = (
-            None if sender is None else origin(sender),
+            None if sender is None else parse_origin(sender),
             remote,
             sensor,
         )
@@ -270,7 +267,7 @@ class UdpTransport(LiveTransport):
         self.warnings = shortfall(BUFFER, smallest)
 
     def read(self, timeout: float) -> list[Chunk]:
-        rest(self._rested)
+        sleep_until(self._rested)
         found: list[Chunk] = []
         ready = [] if self.closed else [key.data for key, _ in self._selector.select(timeout)]
         for one in ready:
@@ -285,11 +282,13 @@ class UdpTransport(LiveTransport):
             text = (
                 f"{self.label}: no frame of the sensor has arrived yet, so nobody knows its address"
             )
-            raise failure(text, f"the same with {with_option(self.label, 'src', 'ADDRESS:PORT')}")
+            raise source_error(
+                text, f"the same with {with_option(self.label, 'src', 'ADDRESS:PORT')}"
+            )
         try:
             self._sockets[0].socket.sendto(data, self._remote)
         except OSError as error:
-            raise lost(self.label, error) from None
+            raise disconnected_error(self.label, error) from None
 
     @property
     def addressed(self) -> bool:
@@ -328,7 +327,7 @@ class UdpTransport(LiveTransport):
             return  # somebody's answer to what was sent, not to be read as the end
         except OSError as error:
             if not self.closed:
-                raise SourceError(f"{self.label}: {reason(error)}") from None
+                raise SourceError(f"{self.label}: {system_reason(error)}") from None
         _order_times(found, start)
 
     def _bound(self, host: str, port: int, group: str | None) -> socket.socket:
@@ -347,25 +346,27 @@ class UdpTransport(LiveTransport):
         return found
 
     def _refused(self, error: OSError, host: str, port: int, group: str | None) -> SourceError:
-        doctor = f"lidarspec doctor {quote(self.label)}{named(self._sensor)}"
+        doctor = f"lidarspec doctor {quote(self.label)}{sensor_option(self._sensor)}"
         if error.errno == errno.EADDRINUSE:
-            return failure(f"{self.label}: UDP port {port} is in use by another program", doctor)
+            return source_error(
+                f"{self.label}: UDP port {port} is in use by another program", doctor
+            )
         if error.errno == errno.EACCES:
-            return failure(
+            return source_error(
                 f"{self.label}: UDP port {port} needs rights that you do not have", doctor
             )
         if error.errno == errno.EADDRNOTAVAIL:
-            return failure(
+            return source_error(
                 f"{self.label}: {host or group} is no address of this computer",
                 f"lidarspec doctor udp://:{port}",
             )
         if group is not None and error.errno in (errno.ENODEV, errno.ENETUNREACH):
-            return failure(
+            return source_error(
                 f"{self.label}: no interface has a route to the group {group}; name one, as in"
                 f" udp://ADDRESS:{port}",
                 doctor,
             )
-        return failure(f"{self.label}: UDP port {port}: {reason(error)}", doctor)
+        return source_error(f"{self.label}: UDP port {port}: {system_reason(error)}", doctor)
 
 
 class _Socket:
@@ -472,7 +473,7 @@ def connect(address: Address, sensor: Sensor | None = None) -> UdpTransport:
     """
     address.check(OPTIONS)
     host, port = address.host_and_port()
-    host = host and numeric(host, address.text)
+    host = host and resolve_host(host, address.text)
     link = sensor.links.get("data") if sensor is not None else None
     ports = _ports(address) or (
         [port] if port else list(link.ports) if isinstance(link, Udp) else []

@@ -20,7 +20,7 @@ from typing import Any, Self, TextIO
 import numpy as np
 from rich.console import Console
 
-from lidarspec.transports.base import readable
+from lidarspec.transports.base import wait_readable
 from lidarspec.view.canvas import Cells, Depth, sgr
 
 #: what the cursor keys send on POSIX, after escape, and on Windows, after a byte of their own.
@@ -120,7 +120,7 @@ else:
 
         def read(self, timeout: float) -> list[str]:
             """The keys that came within some seconds."""
-            if not readable(self._descriptor, timeout):
+            if not wait_readable(self._descriptor, timeout):
                 return []
             data = os.read(self._descriptor, 1024)
             if not data:  # the terminal went away

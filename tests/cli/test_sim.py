@@ -16,7 +16,7 @@ import lidarspec as ls
 from lidarspec.cli.options import DURATION
 from lidarspec.simulation.faults import faults_of
 from lidarspec.spec.fields import duration
-from lidarspec.transports.base import Address
+from lidarspec.transports.addresses import Address
 from lidarspec.transports.simulated import connect
 from tests.cli.running import process, ran
 from tests.lines import SLACK

@@ -21,7 +21,7 @@ from lidarspec.device.source_recording import SourceRecording
 from lidarspec.recording.format import Recording
 from lidarspec.recording.recorders import Recorder
 from lidarspec.spec import Fields
-from lidarspec.transports.base import HostClock
+from lidarspec.transports.host_clock import HostClock
 from lidarspec.transports.open_url import live
 from tests.lines import free_port, paced, turning, udp, until, working
 from tests.shapes import SHAPES
@@ -165,7 +165,7 @@ def test_arrival_times_count_a_suspend() -> None:
     ):
         pytest.skip("this system has no namespaces of time")
     program = (
-        "import time; from lidarspec.transports.base import steady_ns; print((steady_ns() -"
+        "import time; from lidarspec.transports.host_clock import steady_ns; print((steady_ns() -"
         " time.monotonic_ns()) // 10**9)"
     )
     assert (

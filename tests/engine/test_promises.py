@@ -29,7 +29,7 @@ from tests.shapes import SHAPES
 SECOND = 10**9
 TURNING = SHAPES["shape-commands"]
 #: Readings of the wall clock, and where they are allowed: as a stamp, or beside the time of a file.
-#: `transports.base.HostClock` is the one that carries a stamp on.
+#: `transports.host_clock.HostClock` continues a stamp.
 WALL = {"time.time", "time.time_ns", "datetime.now", "datetime.utcnow"}
 STAMPED = {
     ("unfinished.py", "time.time"),

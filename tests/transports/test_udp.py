@@ -11,7 +11,8 @@ import pytest
 import lidarspec as ls
 from lidarspec.errors import SourceError, UsageError
 from lidarspec.spec import Chunk
-from lidarspec.transports.base import HostClock, origin
+from lidarspec.transports.addresses import parse_origin
+from lidarspec.transports.host_clock import HostClock
 from lidarspec.transports.open_url import transport
 from lidarspec.transports.protocol import Origin, endpoint
 from lidarspec.transports.udp import BUFFER, UdpTransport, _order_times, _Socket, shortfall
@@ -90,7 +91,7 @@ def test_a_sender_is_an_address_or_a_port_of_it(text: str, origin: Origin) -> No
 
 @pytest.mark.parametrize("name", ["localhost", "0:0:0:0:0:0:0:1", "[::1]:2368"])
 def test_a_sender_is_asked_for_by_any_name_of_its_address(name: str) -> None:
-    assert origin(name).host in ("127.0.0.1", "::1")
+    assert parse_origin(name).host in ("127.0.0.1", "::1")
 
 
 @pytest.mark.parametrize(

@@ -30,7 +30,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from lidarspec.transports.base import HostClock
+from lidarspec.transports.host_clock import HostClock
 from lidarspec_ros2.parameters import Settings
 
 Times = NDArray[np.int64]
@@ -96,7 +96,7 @@ class Stamps:
         """
         known = host_ns > 0
         self.clock.observe(device_ns[known], host_ns[known])
-        ahead = None if self._wall is None else self._wall.parted()
+        ahead = None if self._wall is None else self._wall.find_step()
         self._ahead = self._ahead if ahead is None else ahead
 
     def of(self, device_ns: int, host_ns: int, settings: Settings) -> int:

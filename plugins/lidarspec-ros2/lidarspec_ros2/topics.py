@@ -28,7 +28,7 @@ from lidarspec.scans.scans import Scan
 from lidarspec.scans.selection import Sieve
 from lidarspec.spec.sensor import Sensor
 from lidarspec.transports.bags import RAW
-from lidarspec.transports.base import HostClock
+from lidarspec.transports.host_clock import HostClock
 from lidarspec.transports.protocol import Chunk
 from lidarspec_ros2.clock import Stamps
 from lidarspec_ros2.parameters import Settings

@@ -11,7 +11,7 @@ from clocks import BEGAN, JITTERS, SET, simulated
 from hypothesis import given, settings, strategies as st
 from numpy.typing import NDArray
 
-from lidarspec.transports.base import HostClock
+from lidarspec.transports.host_clock import HostClock
 from lidarspec_ros2.clock import DeviceClock, Stamps
 from lidarspec_ros2.parameters import PARAMETERS, Settings
 

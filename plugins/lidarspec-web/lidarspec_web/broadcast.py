@@ -18,7 +18,7 @@ from typing import Any
 
 from lidarspec import Device, LidarSpecError, Scan, Selection, UsageError
 from lidarspec.recording.switch import RecordingSwitch
-from lidarspec.transports.base import HostClock
+from lidarspec.transports.host_clock import HostClock
 from lidarspec.transports.protocol import Closing
 from lidarspec.view.feed import LOOK, STEP, Feed
 from lidarspec_web.backlog import Backlog

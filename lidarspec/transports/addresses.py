@@ -1,0 +1,168 @@
+"""Parse live SOURCEs and resolve hosts.
+
+A live SOURCE is a scheme, a place and options: ``udp://:2368?src=10.0.0.5``.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import re
+import socket
+from collections.abc import Collection, Mapping
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from urllib.parse import parse_qs
+
+from lidarspec.errors import UnknownOption, UsageError, suggest
+from lidarspec.transports.protocol import Origin
+
+#: Options of every live SOURCE: the address for commands, if it is not that of the data, and the
+#: broadcast address.
+_COMMON_OPTIONS = frozenset({"control", "broadcast"})
+_SWITCH_VALUES = {"0": False, "1": True, "false": False, "true": True, "off": False, "on": True}
+#: Host and port; an IPv6 host is in brackets.
+_HOST_AND_PORT = re.compile(r"(?:\[([^\]]+)\]|([^:/]*))(?::(\d*))?/?")
+#: A port for finding the route to a host; nothing is sent.
+_DISCARD_PORT = 9
+
+
+@dataclass(frozen=True)
+class Address:
+    """The parts of a live SOURCE.
+
+    Attributes:
+        text: the whole text.
+        scheme: "serial", "udp", "tcp" and so on.
+        place: a path, or host and port.
+        options: the options behind the question mark; of a repeated one, the last value.
+    """
+
+    text: str
+    scheme: str
+    place: str
+    options: Mapping[str, str] = field(default_factory=dict)
+
+    @classmethod
+    def parse(cls, text: str, *, scheme: str = "") -> Address:
+        """Return the address that a text stands for.
+
+        Args:
+            text: "udp://:2368?src=10.0.0.5"; or, if `scheme` is given, a place with options.
+        """
+        if "://" in text:
+            written_scheme, _, rest = text.partition("://")
+            scheme = scheme or written_scheme
+        elif scheme or ":" not in text:
+            scheme = scheme or text
+            rest = text
+        else:
+            scheme, _, rest = text.partition(":")
+        place, _, query = rest.partition("?")
+        values = parse_qs(query, keep_blank_values=True)
+        return cls(text, scheme, place, {name: given[-1] for name, given in values.items()})
+
+    def check(self, known: Collection[str]) -> None:
+        """Check the names of the options.
+
+        Args:
+            known: the options that the source takes, besides those of every source.
+
+        Raises:
+            UnknownOption: for the first unknown one.
+        """
+        for name in sorted(set(self.options) - set(known) - _COMMON_OPTIONS):
+            raise UnknownOption(name, [*known, *_COMMON_OPTIONS], place=self.text)
+
+    def number(self, name: str, low: int, high: int) -> int | None:
+        """Return the whole number that an option has, None if it is not given.
+
+        Raises:
+            UsageError: unless it is a number from `low` to `high`.
+        """
+        text = self.options.get(name)
+        if text is None:
+            return None
+        if not text.isdecimal() or not low <= int(text) <= high:
+            raise UsageError(f"{self.text}: {name} is a number from {low} to {high}, not {text!r}")
+        return int(text)
+
+    def switch(self, name: str) -> bool | None:
+        """Return whether an option is on, None if it is not given.
+
+        Raises:
+            UsageError: for any other word.
+        """
+        text = self.options.get(name)
+        if text is None:
+            return None
+        if text.lower() not in _SWITCH_VALUES:
+            raise UsageError(f"{self.text}: {name} is 0 or 1, not {text!r}")
+        return _SWITCH_VALUES[text.lower()]
+
+    def host_and_port(self) -> tuple[str, int | None]:
+        """Return host and port of the place; "" and None if they are omitted.
+
+        Raises:
+            UsageError: for an invalid host or port.
+        """
+        match = _HOST_AND_PORT.fullmatch(self.place)
+        if match is None:
+            raise UsageError(f"{self.text}: {self.place!r} is no host:port")
+        port = int(match[3]) if match[3] else None
+        if port is not None and not 0 < port < 65536:
+            raise UsageError(f"{self.text}: a port is a number from 1 to 65535, not {port}")
+        return match[1] or match[2] or "", port
+
+
+def with_option(source: str | Path, name: str, value: object) -> str:
+    """Return a SOURCE with an option, which replaces one of the same name."""
+    place, _, query = str(source).partition("?")
+    options = [
+        option for option in query.split("&") if option and not option.startswith(f"{name}=")
+    ]
+    return f"{place}?{'&'.join([*options, f'{name}={value}'])}"
+
+
+def parse_origin(text: str) -> Origin:
+    """Return the sender that `src=` names, by its address.
+
+    Raises:
+        UsageError: for an invalid port or an unknown host.
+    """
+    origin = Origin.parse(text)
+    return replace(origin, host=resolve_host(origin.host, f"src={text}"))
+
+
+def resolve_host(host: str, place: str) -> str:
+    """Return the numeric address of a host; the IPv4 one if it has both.
+
+    Args:
+        host: an address or a name.
+        place: the option or SOURCE that names it, for the message.
+
+    Raises:
+        UsageError: for an unknown host.
+    """
+    for family in (socket.AF_INET, socket.AF_INET6):
+        with contextlib.suppress(OSError, ValueError):
+            return socket.inet_ntop(family, socket.inet_pton(family, host.partition("%")[0]))
+    # The system resolves an incomplete address, such as 192.168.1, to another one.
+    is_incomplete_address = re.fullmatch(r"[\d.]*", host) is not None
+    if not is_incomplete_address:
+        for family in (socket.AF_INET, socket.AF_INET6):
+            with contextlib.suppress(OSError, ValueError):
+                return str(socket.getaddrinfo(host, None, family, socket.SOCK_DGRAM)[0][4][0])
+    error = UsageError(
+        f"{place}: there is no host {host!r}; name one, or its address, such as 192.168.1.200"
+    )
+    raise suggest(error, "lidarspec detect udp://")
+
+
+def find_own_address(host: str) -> str | None:
+    """Return the address of this computer on the route to a host, None without a route."""
+    family = socket.AF_INET6 if ":" in host else socket.AF_INET
+    with contextlib.suppress(OSError), socket.socket(family, socket.SOCK_DGRAM) as probe:
+        probe.setsockopt(socket.SOL_SOCKET, socket.SO_BROADCAST, 1)
+        probe.connect((host, _DISCARD_PORT))
+        return str(probe.getsockname()[0])
+    return None
