@@ -313,7 +313,7 @@ def stats(
 
     A line for each interval, and a summary at the end. Errors are frames whose checksum, length or
     values are wrong; loss counts
-    what is missing by the sensor's own numbers or clock. A file is read as fast as possible, in
+    what is missing by the sensor's own counter or clock. A file is read as fast as possible, in
     batches, and by the time of its packets: there an interval can be longer than asked for. Several
     sources are read in turn.
     """

@@ -137,12 +137,16 @@ def show(sensor_id: str, as_plan: bool, as_json: bool, output: str | None) -> No
         commands = {name: _command(sensor, name) for name in sensor.commands}
         emit_json({**_facts(sensor), "frames": frames, "commands": commands}, output)
         return
+    from lidarspec.exports.reference import describe_losses
+
     low, high = sensor.range_limits
+    losses = describe_losses(sensor).replace("`", "")
     links = _links(summarize_links(sensor))
     parts = [
         f"{sensor.id}: {sensor.vendor} {sensor.model}"
         + (f", also {', '.join(sensor.aliases)}" if sensor.aliases else ""),
-        f"  link    {links}\n  range   {low:g} .. {high:g} m\n  status  {sensor.status}\n  source  {sensor.source}",
+        f"  link    {links}\n  range   {low:g} .. {high:g} m\n  losses  {losses}"
+        f"\n  status  {sensor.status}\n  source  {sensor.source}",
     ]
     units = {role: _unit(sensor, path) for role, path in sensor.info.items()}
     parts += (

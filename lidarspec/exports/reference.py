@@ -65,7 +65,7 @@ def _facts(sensor: Sensor) -> Iterator[str]:
         ("scan", f"ends {_rule(sensor.scan)}"),
     ]
     rows += [("clock", _clock(sensor.clock))] if sensor.clock else []
-    rows += [("counter", f"`{sensor.sequence.field}`; a jump is a loss")] if sensor.sequence else []
+    rows += [("losses", describe_losses(sensor))]
     rows += [("fillers", f"`{sensor.fillers.hex(' ')}` between frames")] if sensor.fillers else []
     rows += [
         ("proven", f"{sensor.status}: {STATUSES[sensor.status]}"),
@@ -116,6 +116,15 @@ def _clock(clock: Clock) -> str:
     )
     again = f", starts again at {clock.wraps_at:g} s" if clock.wraps_at else ""
     return fields + again + (f", completed by {clock.told[0]} frames" if clock.told else "")
+
+
+def describe_losses(sensor: Sensor) -> str:
+    """Return how lost packets are counted, or why they are not."""
+    if sensor.sequence is not None:
+        return f"counted by `{sensor.sequence.field}`"
+    if sensor.counts_losses:
+        return "counted by the clock"
+    return "not counted: the packets have no counter, and no clock with a declared pace"
 
 
 def _commands(sensor: Sensor) -> Iterator[str]:

@@ -1,4 +1,4 @@
-"""Order of datagrams that only their clock numbers.
+"""Order of datagrams that have a clock and no counter.
 
 `ClockOrder` judges datagrams as they arrive: each is the next one, or late, or doubled, or the
 first one after a gap or after the clock was set. It remembers the newest packets in the order of
@@ -12,7 +12,8 @@ are no doubles, and leaps by `2 * MAX_STEP_NS` where the clock was set or the se
 Packets sorted by it and judged by another `ClockOrder` give the index and the breaks that they
 would have got without any disorder.
 
-A gap at a masked sector (`masked_sector`) is no loss.
+If the pace of the clock is not declared, order and duplicates are known, but not what is missing:
+the index then runs on without gaps. A gap at a masked sector (`masked_sector`) is no loss.
 """
 
 from __future__ import annotations
@@ -30,7 +31,8 @@ from lidarspec.expressions.columns import Batch
 from lidarspec.framing.results import Counters, Numbers
 from lidarspec.packets.clocks import Times
 from lidarspec.packets.masked_sector import MaskedGaps
-from lidarspec.packets.pace import Pace, Paces
+from lidarspec.packets.pace import Paces, read_paces, shortest_pace
+from lidarspec.spec.timing import Clock
 
 #: places that a packet may be late; a clock that goes back further was set, or the sensor started
 #: again.
@@ -71,13 +73,13 @@ class ClockOrder:
 
     Args:
         stats: counts what is lost, late and doubled.
-        pace: how long a packet takes.
+        clock: of the packets.
         gaps: tells masked sectors from losses; None to count them as losses.
     """
 
-    def __init__(self, stats: Counters, pace: Pace, gaps: MaskedGaps | None = None) -> None:
+    def __init__(self, stats: Counters, clock: Clock, gaps: MaskedGaps | None = None) -> None:
         self._stats = stats
-        self._pace = pace
+        self._clock = clock
         self._arrived: int | None = None  # time of the packet that arrived last, ns
         self._newest: Neighbour | None = None
         self._neighbours = list[Neighbour]()  # by their times
@@ -94,13 +96,13 @@ class ClockOrder:
         Args:
             times: by the sensor's clock, (n,) ns.
         """
-        paces = self._pace.of(batch, times)
+        paces = read_paces(self._clock, batch)
         if self._gaps is not None:
             self._gaps.read(batch.table)
         odd_rows = self._find_odd(times, paces)
         count = len(times)
         self._arrived = times.item(-1)
-        if not odd_rows and self._follows(times.item(0), paces.at(0)):
+        if not odd_rows and self._follows(times.item(0), paces.item(0)):
             first = self._add_run(batch, times, 0, count)
             self._trim()
             return range(first, first + count), times + self._offset
@@ -111,14 +113,14 @@ class ClockOrder:
         while row < count:
             while odd_rows[next_odd] <= row:
                 next_odd += 1
-            if self._follows(times.item(row), paces.at(row)):
+            if self._follows(times.item(row), paces.item(row)):
                 stop = odd_rows[next_odd]
                 first = self._add_run(batch, times, row, stop)
                 index[row:stop] = np.arange(first, first + stop - row)
                 order[row:stop] = times[row:stop] + self._offset
                 row = stop
             else:
-                place = self._place(batch, row, times.item(row), paces.at(row))
+                place = self._place(batch, row, times.item(row), paces.item(row))
                 index[row] = place.index
                 order[row] = place.order
                 row += 1
@@ -133,19 +135,16 @@ class ClockOrder:
         self._neighbours.clear()
         if self._gaps is not None:
             self._gaps.forget()
-        self._pace.forget()
 
     def _find_odd(self, times: Times, paces: Paces) -> list[int]:
         """Return the packets that do not follow the one that arrived before them."""
         passed = np.empty(len(times), np.int64)
         passed[0] = 1 if self._arrived is None else times.item(0) - self._arrived
         np.subtract(times[1:], times[:-1], out=passed[1:])
-        if passed.min() > 0 and passed.max() <= min(1.5 * paces.shortest, MAX_STEP_NS):
+        if passed.min() > 0 and passed.max() <= min(1.5 * shortest_pace(paces), MAX_STEP_NS):
             return []
-        each = paces.at_each(np.arange(len(times)))
-        return np.flatnonzero(
-            (passed <= 0) | (passed > MAX_STEP_NS) | (passed > 1.5 * each)
-        ).tolist()
+        is_odd = (passed <= 0) | (passed > MAX_STEP_NS) | (passed > 1.5 * paces)
+        return np.flatnonzero(is_odd).tolist()
 
     def _follows(self, time: int, pace: float) -> bool:
         """Return whether a packet is the next one after the newest."""
@@ -155,7 +154,7 @@ class ClockOrder:
         return 0 < passed <= MAX_STEP_NS and not passed > 1.5 * pace
 
     def _add_run(self, batch: Batch, times: Times, start: int, stop: int) -> int:
-        """Add packets that follow one another after the newest; return the index of the first one."""
+        """Add packets that follow one another after the newest; return the index of the first."""
         assert self._newest is not None
         first = self._newest.index + 1
         for row in range(max(start, stop - MAX_PLACES_LATE), stop):

@@ -38,8 +38,7 @@ class Packets:
         time_ns: (n,) int64, by the sensor's clock, unwrapped; else the host's.
         host_ns: (n,) int64 arrival times; 0 where the caller gave none.
         breaks: (n,) True where something was lost before the packet.
-        grain_ns: the step of the sensor's clock, 0 if a function computes it, if the clock alone
-            orders the packets; None if not.
+        is_clocked: whether the packets are ordered by the sensor's clock instead of by a counter.
         state: for each other frame type, its frames and which of them was last before each packet.
         masked: (n,) packets that are missing before each since a masked sector leaves them out;
             None if there are none.
@@ -62,12 +61,11 @@ class Packets:
         stats: Counters,
         backend: str = "auto",
         order: NDArray[np.int64] | None = None,
-        grain_ns: float | None = None,
         masked: NDArray[np.int64] | None = None,
     ) -> None:
         self.sensor, self.frame, self.table = sensor, frame, table
         self._order = order
-        self.grain_ns = grain_ns
+        self.is_clocked = order is not None
         self.masked = masked
         self._offset, self.time_ns, self.host_ns, self._index, self.breaks = (
             offset,
@@ -206,7 +204,7 @@ class Packets:
         columns: dict[str, Any] = {name: getattr(self, name)[indices] for name in _COLUMNS}
         order = None if self._order is None else self._order[indices]
         masked = None if self.masked is None else self.masked[indices]
-        return {**columns, "order": order, "grain_ns": self.grain_ns, "masked": masked}
+        return {**columns, "order": order, "masked": masked}
 
     def parts(self, path: str) -> Packets:
         """The parts of all packets, in stream order, as packets: with the times, numbers and state
@@ -285,9 +283,8 @@ def joined(parts: Sequence[Packets]) -> Packets:
     columns: dict[str, Any] = {
         key: np.concatenate([getattr(part, key) for part in parts]) for key in _COLUMNS
     }
-    if all(part.grain_ns is not None for part in parts):
+    if all(part.is_clocked for part in parts):
         columns["order"] = np.concatenate([part.order for part in parts])
-        columns["grain_ns"] = head.grain_ns
     if any(part.masked is not None for part in parts):
         columns["masked"] = np.concatenate(
             [

@@ -1,14 +1,14 @@
 """Packets in order, each once.
 
 A packet whose predecessor has not arrived is held until it arrives, or until more than `WINDOW`
-packets are held. Doubled packets are left out, and so are packets whose successors were released
-before they arrived. All other packets pass at once, so that order costs no time while nothing is
-late. At the start `START_WINDOW` packets are held, since the first packet to arrive may be late as
-well.
+packets are held. Duplicates are left out, and so are packets whose successors were released before
+they arrived. All other packets pass at once, so that order costs no time while nothing is late. At
+the start `WINDOW` packets are held, since the first packet to arrive may be late as well.
 
 `Packets.order` gives the place of each packet. With a counter it is the index. With a clock alone
 it is a time, and the packets are judged again once they are in order: scans depend on the packets,
-not on the order in which they arrive.
+not on the order in which they arrive. A clock without a declared pace does not show that a packet
+is missing, so `WINDOW` packets are always held.
 """
 
 from __future__ import annotations
@@ -22,14 +22,10 @@ from numpy.typing import NDArray
 from lidarspec.expressions.columns import Batch
 from lidarspec.framing.results import Counters
 from lidarspec.packets.clock_order import ClockOrder
-from lidarspec.packets.pace import FIRST_LESSONS, Pace
 from lidarspec.packets.packets import Packets, joined
 
-#: packets that are held while one before them is missing.
+#: packets that are held while one before them may be missing.
 WINDOW = 10
-#: packets that are held at the start if only the clock numbers them: the pace is learned from the
-#: first ones to arrive.
-START_WINDOW = WINDOW + FIRST_LESSONS[0][1]
 
 
 class Reorder:
@@ -50,12 +46,16 @@ class Reorder:
         """Return the packets that are now in order; at most one batch."""
         if not self._enabled or not len(packets):
             return [packets] if len(packets) else []
-        if self._held is None:
-            order = packets.order
-            is_ascending = bool((order[1:] > order[:-1]).all())
-            if is_ascending and (self._next is None or order.item(0) > self._released):
-                return self._push_ascending(packets)
-        return self._push_disordered(packets)
+        held_count = 0
+        if self._held is not None:
+            held_count = len(self._held)
+            packets = joined([self._held, packets])
+            self._held = None
+        order = packets.order
+        is_ascending = bool((order[1:] > order[:-1]).all())
+        if is_ascending and (self._next is None or order.item(0) > self._released):
+            return self._push_ascending(packets)
+        return self._push_disordered(packets, held_count)
 
     def finish(self) -> list[Packets]:
         """Return the packets that are still held."""
@@ -65,10 +65,6 @@ class Reorder:
             return []
         return [self._mark(held.take(np.argsort(held.order, kind="stable")), self._next)]
 
-    def _window(self, packets: Packets) -> int:
-        """Return the number of packets that are held until the next one that is missing arrives."""
-        return START_WINDOW if self._next is None and packets.grain_ns is not None else WINDOW
-
     def _push_ascending(self, packets: Packets) -> list[Packets]:
         """Release packets none of which is late, up to the first gap that may still be filled."""
         index = packets.index
@@ -77,36 +73,40 @@ class Reorder:
         steps = index[1:] - index[:-1]
         if len(steps) and int(steps.max()) > 1:
             gaps += (np.flatnonzero(steps > 1) + 1).tolist()
+        first_held = len(packets) - WINDOW  # those from there on are held if there is a gap
         end = len(packets)
+        if not _shows_gaps(packets):
+            end = max(first_held, 0)
         for gap in gaps:
-            if gap >= len(packets) - (self._window(packets) if gap == 0 else WINDOW):
-                end = gap
+            if gap >= first_held:
+                end = min(gap, end)
                 break
         if end < len(packets):
             self._held = packets.take(slice(end, None))
             packets = packets.take(slice(0, end))
         if not end:
             return []
-        self._release_to(packets)
+        self._next = packets.index.item(-1) + 1
+        self._released = packets.order.item(-1)
         has_gap = len(gaps) > (before is None) or bool(packets.breaks.any())
-        if packets.grain_ns is None and not has_gap:
+        if not packets.is_clocked and not has_gap:
             return [packets]
         return [self._mark(packets, before)]
 
-    def _push_disordered(self, packets: Packets) -> list[Packets]:
-        """Put packets between those that are held, and release all that have no gap before them."""
-        known = 0
-        everything = packets
-        if self._held is not None:
-            known = len(self._held)
-            everything = joined([self._held, packets])
-        orders = everything.order.tolist()
-        indices = everything.index.tolist()
-        held = sorted((orders[row], row) for row in range(known))
-        window = self._window(packets)
+    def _push_disordered(self, packets: Packets, held_count: int) -> list[Packets]:
+        """Put packets between those that are held, and release all that have no gap before them.
+
+        Args:
+            packets: those that are held, and the ones that arrived after them.
+            held_count: how many are held.
+        """
+        orders = packets.order.tolist()
+        indices = packets.index.tolist()
+        shows_gaps = _shows_gaps(packets)
+        held = sorted((orders[row], row) for row in range(held_count))
         rows = list[int]()
         before = self._next
-        for row in range(known, len(orders)):
+        for row in range(held_count, len(orders)):
             order = orders[row]
             if self._next is not None and order <= self._released:
                 continue
@@ -114,19 +114,19 @@ class Reorder:
             if position < len(held) and held[position][0] == order:
                 continue
             insort(held, (order, row))
-            if len(held) > window:
+            is_full = len(held) > WINDOW
+            if is_full:
                 self._next = indices[held[0][1]]
-                window = WINDOW
+            if not (shows_gaps or is_full):
+                continue
             while held and self._next is not None and indices[held[0][1]] <= self._next:
                 self._released, released = held.pop(0)
                 self._next = max(self._next, indices[released] + 1)
                 rows.append(released)
-        self._held = everything.take(np.array([row for _, row in held], np.intp)) if held else None
-        return [self._mark(everything.take(np.array(rows, np.intp)), before)] if rows else []
-
-    def _release_to(self, packets: Packets) -> None:
-        self._next = packets.index.item(-1) + 1
-        self._released = packets.order.item(-1)
+                if not shows_gaps:
+                    break
+        self._held = packets.take(np.array([row for _, row in held], np.intp)) if held else None
+        return [self._mark(packets.take(np.array(rows, np.intp)), before)] if rows else []
 
     def _mark(self, packets: Packets, before: int | None) -> Packets:
         """Return packets in order with a break wherever the index leaves out a number, and nowhere
@@ -137,21 +137,25 @@ class Reorder:
                 none.
         """
         marked = copy.copy(packets)
-        if packets.grain_ns is not None:
-            marked.index, marked.breaks = self._judge(packets, packets.grain_ns)
+        if packets.is_clocked:
+            marked.index, marked.breaks = self._judge(packets)
             return marked
         start = packets.index.item(0) if before is None else before
         marked.breaks = np.diff(packets.index, prepend=start - 1) != 1
         return marked
 
-    def _judge(
-        self, packets: Packets, grain_ns: float
-    ) -> tuple[NDArray[np.int64], NDArray[np.bool_]]:
+    def _judge(self, packets: Packets) -> tuple[NDArray[np.int64], NDArray[np.bool_]]:
         """Return the index and the breaks of packets in order, by their clock."""
         if self._clock_order is None:
             assert packets.sensor.clock is not None
-            self._clock_order = ClockOrder(Counters(), Pace(packets.sensor.clock, grain_ns))
+            self._clock_order = ClockOrder(Counters(), packets.sensor.clock)
         breaks = np.zeros(len(packets), np.bool_)
         batch = Batch(packets.table, breaks, packets.state, packets.sensor.state)
         index, _ = self._clock_order.push(batch, packets.order)
         return np.asarray(index, np.int64), breaks
+
+
+def _shows_gaps(packets: Packets) -> bool:
+    """Return whether the index of packets leaves out what is missing."""
+    clock = packets.sensor.clock
+    return not packets.is_clocked or (clock is not None and clock.pace is not None)

@@ -1,8 +1,9 @@
-"""From frames to packets: clocks unwrapped, their continuity judged, other frames kept as state.
+"""From frames to packets: times, losses and order, and the other frames that packets depend on.
 
-A `PacketStream` remembers between batches what the next one needs: the last clock reading, the last
-sequence number, the last frame of each other type, and whether bytes were skipped since the last
-packet.
+A `PacketStream` remembers between batches what the next one needs: the last clock reading, the
+newest packet, the last frame of each other type, and whether bytes were skipped since the last
+packet. Losses are judged by the counter of the packets (`counter_order`), for datagrams without one
+by their clock (`clock_order`), else by arrival (`arrival_order`).
 """
 
 from __future__ import annotations
@@ -24,6 +25,7 @@ from lidarspec.frames.schema import Schema
 from lidarspec.framing.frame_codec import Codec
 from lidarspec.framing.frame_engine import codec
 from lidarspec.framing.results import Counters, Frames, Numbers
+from lidarspec.packets.arrival_order import ArrivalOrder
 from lidarspec.packets.clock_order import ClockOrder
 from lidarspec.packets.clocks import (
     ClockReference,
@@ -35,24 +37,31 @@ from lidarspec.packets.clocks import (
     held,
     paths,
 )
-from lidarspec.packets.continuity import Continuity
+from lidarspec.packets.counter_order import CounterOrder
 from lidarspec.packets.imu import ImuSamples, Waiting, joined
 from lidarspec.packets.masked_sector import MaskedGaps
-from lidarspec.packets.pace import Pace
 from lidarspec.packets.packets import Index, Packets, StateOf, joined_tables
 from lidarspec.spec.description import Spec
 from lidarspec.spec.timing import Clock
 
+Integers = NDArray[np.int64]
+#: frames of another type, and the number of packets before each, (k,).
+Earlier = tuple[Frames, NDArray[np.intp]]
+
 
 class PacketStream:
-    """The packets of one frame type out of a decoder's frames.
+    """Makes packets of one type from the frames that a decoder finds.
 
     Args:
-        sensor, frame: whose, and of which type.
+        sensor: that sends them.
+        frame: their type.
         stats: the decoder's counters; lost, duplicate and late packets are added to them.
         backend: what makes points of the packets, "auto", "numpy", "jit" or "construct".
         state: frames of other types, by name, that count as seen before the first packet.
         reference: tells the turn of the clock from the first packet on.
+
+    Raises:
+        UnknownFrame: if the sensor has no such type.
     """
 
     def __init__(
@@ -67,121 +76,129 @@ class PacketStream:
     ) -> None:
         if frame not in sensor.frames:
             raise UnknownFrame(frame, sensor.frames, place=sensor.id)
-        self.sensor, self.frame, self.stats, self._backend = sensor, frame, stats, backend
+        self.sensor = sensor
+        self.frame = frame
+        self.stats = stats
+        self._backend = backend
         self._codec = self._codec_of(frame)
         self._others = [
             name for name, other in sensor.incoming.items() if not other.data and name != frame
         ]
         self._state: dict[str, bytes] = dict(state or {})
-        data = sensor.frames[frame].data
-        counted = (
-            sensor.sequence is not None and data and _has(sensor, frame, sensor.sequence.field)
-        )
-        clock = _clock_of(sensor, frame, self._codec.schema)
-        self._timer = (
-            replace(sensor, clock=clock)
-            if clock is not None and clock is not sensor.clock
-            else sensor
-        )
-        timed = data and clock is not None
-        self._clock = Unwrapper(clock.wraps_at) if clock else None
-        self._turn = repeated(0, 0)  # what completes the times of the packets at hand
-        self._epoch: Epoch | None = None
-        if timed and clock is not None and clock.told is not None:
-            self._epoch = Epoch(self._timer, clock, reference)
-        in_parts = timed and clock_parts(sensor, self._codec.schema) is not None
-        terms = (
-            clock_terms(paths(sensor.clock), self._codec.schema, sensor.id)
-            if sensor.clock and timed and not in_parts
-            else []
-        )
-        grain = float(min((step for _, step, _, _ in terms), default=0))
-        # a frame without the parts that have the clock says nothing of time, so that only a counter
-        # tells what was lost beside it
-        self._continuity = Continuity(
-            sensor, stats, counted=counted, timed=timed and (counted or not in_parts), grain=grain
-        )
-        self._grain_ns = grain
-        self._clock_order: ClockOrder | None = None
-        if sensor.clock is not None and timed and not counted and not in_parts and sensor.datagrams:
-            self._clock_order = ClockOrder(stats, Pace(sensor.clock, grain), MaskedGaps(sensor))
-        self._skipped = 0  # bytes since the last packet
-        self._time: int | None = None  # of the last packet with parts that have the clock
         self._tables: dict[str, tuple[bytes, Table]] = {}
+        self._skipped = 0  # bytes since the last packet
+
+        is_data = sensor.frames[frame].data
+        clock = _clock_of(sensor, frame, self._codec.schema)
+        self._timer = sensor  # with the clock of these packets
+        if clock is not None and clock is not sensor.clock:
+            self._timer = replace(sensor, clock=clock)
+        self._clock = Unwrapper(clock.wraps_at) if clock else None
+        self._time: int | None = None  # of the last packet with parts that have the clock
+        self._turn = repeated(0, 0)  # completes the times of the packets at hand
+        self._epoch: Epoch | None = None
+        if is_data and clock is not None and clock.told is not None:
+            self._epoch = Epoch(self._timer, clock, reference)
+
+        data_clock = sensor.clock if is_data and clock is not None else None
+        is_in_parts = data_clock is not None and self._has_clock_in_parts()
+        self._counter_order: CounterOrder | None = None
+        self._clock_order: ClockOrder | None = None
+        if is_data and _has_counter(sensor, frame):
+            self._counter_order = CounterOrder(sensor, stats, data_clock)
+        elif data_clock is not None and not is_in_parts and sensor.datagrams:
+            self._clock_order = ClockOrder(stats, data_clock, MaskedGaps(sensor))
+        # a frame without the parts that have the clock does not show how much time has passed
+        frame_clock = None if is_in_parts else data_clock
+        self._arrival_order = ArrivalOrder(stats, frame_clock, self._step_ns(frame_clock))
 
     def add(self, found: Sequence[Frames], *, whole: bool = False) -> Packets:
-        """The packets among these frames.
+        """Return the packets among some frames.
 
         Args:
             whole: the frames are a whole input: packets before the first frame of another type see
                 that one as state.
         """
         parts = [_Part.of(frames, self.frame) for frames in found if len(frames)]
-        table, skipped = (
-            self._table(parts),
-            _all_or_joined([self._bytes_skipped(part) for part in parts]),
-        )
+        table = self._table(parts)
+        skipped = _all_or_joined([self._bytes_skipped(part) for part in parts])
         state = self._states(parts, len(table), whole=whole)
-        offset, host = _offsets(parts), _times([part.column(part.frames.at) for part in parts])
+        host = _times([part.column(part.frames.at) for part in parts])
+        breaks = np.zeros(len(table), np.bool_)
+        if alike(skipped) != 0:
+            breaks = skipped > 0
+        time = None
         index: Index = range(0)
-        order: NDArray[np.int64] | None = None
-        breaks, time = np.zeros(len(table), np.bool_) if alike(skipped) == 0 else skipped > 0, None
+        order: Integers | None = None
         if len(table):
-            batch, otherwise = (
-                Batch(table, breaks, state, self.sensor.state),
-                (range(len(table)), breaks),
-            )
+            batch = Batch(table, breaks, state, self.sensor.state)
             with np.errstate(all="ignore"):
-                time = (
-                    self._guarded("clock", self._times, None, batch, host, whole)
-                    if self._clock is not None
-                    else None
-                )
-                if self._clock_order is not None and time is not None:
-                    index, order = self._guarded(
-                        "clock", self._clock_order.push, (otherwise[0], None), batch, time
-                    )
-                else:
-                    index, breaks = self._guarded(
-                        "sequence", self._continuity.push, otherwise, batch, time, skipped
-                    )
-        time = host if time is None else self._complete(time)
-        columns: dict[str, Any] = {
-            "offset": offset,
-            "time_ns": time,
-            "host_ns": host,
-            "index": index,
-            "breaks": breaks,
-        }
-        if order is not None:
-            columns |= {"order": order, "grain_ns": self._grain_ns}
+                if self._clock is not None:
+                    time = self._guarded("clock", self._times, None, batch, host, whole)
+                index, breaks, order = self._judge(batch, time, skipped)
         return Packets(
             self.sensor,
             self.frame,
             table,
-            **columns,
+            offset=_offsets(parts),
+            time_ns=host if time is None else self._complete(time),
+            host_ns=host,
+            index=index,
+            breaks=breaks,
+            order=order,
             state=state,
             stats=self.stats,
             backend=self._backend,
         )
 
     def interrupt(self) -> None:
-        """Input was lost here: there is a break before the next packet."""
+        """Mark a break before the next packet: input was lost here."""
         self._skipped = max(self._skipped, 1)
-        self._continuity.forget()
-        if self._clock_order is not None:
-            self._clock_order.forget()
+        for judge in (self._counter_order, self._clock_order, self._arrival_order):
+            if judge is not None:
+                judge.forget()
+
+    def _has_clock_in_parts(self) -> bool:
+        return clock_parts(self.sensor, self._codec.schema) is not None
+
+    def _step_ns(self, clock: Clock | None) -> float:
+        """Return the step of a clock, ns; 0 if it has no fields."""
+        if clock is None:
+            return 0
+        terms = clock_terms(paths(clock), self._codec.schema, self.sensor.id)
+        return float(min((step for _, step, _, _ in terms), default=0))
+
+    def _judge(
+        self, batch: Batch, time: Integers | None, skipped: Integers
+    ) -> tuple[Index, NDArray[np.bool_], Integers | None]:
+        """Return the index of packets, the breaks before them, and their order if the clock shows
+        it.
+        """
+        unjudged = (range(len(batch)), batch.breaks)
+        if self._clock_order is not None and time is not None:
+            push = self._clock_order.push
+            index, order = self._guarded("clock", push, (unjudged[0], None), batch, time)
+            return index, batch.breaks, order
+        if self._counter_order is not None:
+            push_counted = self._counter_order.push
+            index, breaks = self._guarded("sequence", push_counted, unjudged, batch, time)
+        else:
+            push_arrived = self._arrival_order.push
+            index, breaks = self._guarded("clock", push_arrived, unjudged, batch, time, skipped)
+        return index, breaks, None
 
     def _guarded(
-        self, what: str, function: Callable[..., Any], otherwise: Any, batch: Batch, *args: Any
+        self, place: str, function: Callable[..., Any], otherwise: Any, batch: Batch, *args: Any
     ) -> Any:
+        """Return the result of a function that calls a plugin; count its errors."""
         try:
             return function(batch, *args)
         except Exception as error:
-            self.stats.error(PluginError.of(error, what), len(batch))
+            self.stats.error(PluginError.of(error, place), len(batch))
             return otherwise
 
-    def _times(self, batch: Batch, host: NDArray[np.int64], whole: bool) -> NDArray[np.int64]:
+    def _times(self, batch: Batch, host: Integers, whole: bool) -> Integers:
+        """Return the times of packets by their clock, (n,) ns."""
         assert self._clock is not None
         which, readings = clocked(self._timer, batch)
         if which is None:
@@ -191,11 +208,12 @@ class PacketStream:
             return times
         times = self._clock.push(readings, host[which])
         before = host if self._time is None else repeated(self._time, len(host))
-        self._time = int(times[-1]) if len(times) else self._time
+        if len(times):
+            self._time = times.item(-1)
         return held(which, times, before)
 
-    def _complete(self, times: NDArray[np.int64]) -> NDArray[np.int64]:
-        """Times with the turn of the clock that other frames have told, if they have."""
+    def _complete(self, times: Integers) -> Integers:
+        """Return times with the turn of the clock that other frames have told, if they have."""
         if self._epoch is None or not len(times):
             return times
         if self._epoch.ns is None:
@@ -207,9 +225,10 @@ class PacketStream:
         self.stats.undated = ""
         return times + self._turn
 
-    def _bytes_skipped(self, part: _Part) -> NDArray[np.int64]:
-        """The bytes in no frame before each of our frames, since ours before it, (n,)."""
-        gaps, own = part.frames.gaps, part.own
+    def _bytes_skipped(self, part: _Part) -> Integers:
+        """Return the bytes in no frame between each of our frames and the one before, (n,)."""
+        gaps = part.frames.gaps
+        own = part.own
         if alike(gaps) == 0 and not self._skipped:
             return repeated(0, part.number)
         if isinstance(own, slice) and part.number:
@@ -218,9 +237,9 @@ class PacketStream:
             self._skipped = int(gaps[own.stop :].sum())
             return skipped
         sums = self._skipped + np.cumsum(gaps)
-        marks = sums[own]
-        self._skipped = int(sums[-1]) - (int(marks[-1]) if part.number else 0)
-        return np.diff(marks, prepend=0)
+        own_sums = sums[own]
+        self._skipped = int(sums[-1]) - (int(own_sums[-1]) if part.number else 0)
+        return np.diff(own_sums, prepend=0)
 
     def _table(self, parts: Sequence[_Part]) -> Table:
         tables = [
@@ -231,7 +250,7 @@ class PacketStream:
         return joined_tables(tables) if tables else self._codec.table([])
 
     def _states(self, parts: Sequence[_Part], number: int, *, whole: bool) -> dict[str, StateOf]:
-        """The frames of each other type, and which of them was the last before each packet."""
+        """Return the frames of each other type, and which was the last before each packet."""
         if not self._state and all(part.where is None for part in parts):
             return dict.fromkeys(self._others, (None, repeated(-1, number)))
         seen = self._others_in(parts)
@@ -240,24 +259,23 @@ class PacketStream:
             for name in self._others
         }
 
-    def _others_in(
-        self, parts: Sequence[_Part]
-    ) -> dict[str, list[tuple[Frames, NDArray[np.intp]]]]:
-        """The frames of other types, and how many of ours came before each, (k,)."""
-        seen: dict[str, list[tuple[Frames, NDArray[np.intp]]]] = {}
+    def _others_in(self, parts: Sequence[_Part]) -> dict[str, list[Earlier]]:
+        """Return the frames of other types, by name."""
+        seen: dict[str, list[Earlier]] = {}
         number = 0
         for part in parts:
             if part.where is not None:
                 mask = np.ones(len(part.frames), np.bool_)
                 mask[part.own] = False
                 others = np.flatnonzero(mask)
-                kinds, before = part.frames.kinds[others], number + others - np.arange(len(others))
+                kinds = part.frames.kinds[others]
+                before = number + others - np.arange(len(others))
                 for kind in np.unique(kinds).tolist():
-                    which, name = kinds == kind, part.frames.names[kind]
+                    name = part.frames.names[kind]
                     if name in self._others:
-                        seen.setdefault(name, []).append(
-                            (part.frames.only(others[which]), before[which])
-                        )
+                        which = kinds == kind
+                        frames = part.frames.only(others[which])
+                        seen.setdefault(name, []).append((frames, before[which]))
             number += part.number
         return seen
 
@@ -265,31 +283,25 @@ class PacketStream:
         return codec(self.sensor.frames[name], interpreted=self._backend == "construct")
 
     def _last(self, name: str) -> Table:
-        """The last frame of another type, as a table."""
+        """Return the last frame of another type, as a table."""
         data = self._state[name]
-        known = self._tables.get(name)
-        if known is None or known[0] is not data:
-            known = self._tables[name] = (data, self._codec_of(name).table([data]))
-        return known[1]
+        cached = self._tables.get(name)
+        if cached is None or cached[0] is not data:
+            cached = (data, self._codec_of(name).table([data]))
+            self._tables[name] = cached
+        return cached[1]
 
-    def _state_of(
-        self,
-        name: str,
-        seen: Sequence[tuple[Frames, NDArray[np.intp]]],
-        *,
-        number: int,
-        whole: bool,
-    ) -> StateOf:
+    def _state_of(self, name: str, seen: Sequence[Earlier], *, number: int, whole: bool) -> StateOf:
+        """Return the frames of another type, and which of them was the last before each packet."""
         if not seen:
-            return (
-                (self._last(name), repeated(0, number))
-                if name in self._state
-                else (None, repeated(-1, number))
-            )
+            if name in self._state:
+                return self._last(name), repeated(0, number)
+            return None, repeated(-1, number)
         tables: list[Table] = [self._codec_of(name).gather(frames) for frames, _ in seen]
         before = np.concatenate([places for _, places in seen])
         if name in self._state:
-            tables, before = [self._last(name), *tables], np.concatenate(([0], before))
+            tables = [self._last(name), *tables]
+            before = np.concatenate(([0], before))
         elif whole:
             before[0] = 0
         last = seen[-1][0]
@@ -299,13 +311,14 @@ class PacketStream:
 
 
 class ImuStream:
-    """What a sensor's IMU felt, out of a decoder's frames: of every type that has it.
+    """Makes IMU samples from the frames that a decoder finds, of every type that has them.
 
     Args:
+        sensor: that sends them.
         stats, backend, state: as of `PacketStream`.
 
     Attributes:
-        waiting: for samples until the scan that they belong to ends; None where there is no IMU, or
+        waiting: for samples until the scan that they belong to ends; None if there is no IMU, or
             not by the clock of the points.
     """
 
@@ -318,36 +331,37 @@ class ImuStream:
         state: Mapping[str, bytes] | None = None,
     ) -> None:
         self._names = [name for name in sensor.imu_frames if not sensor.frames[name].data]
-        self._made, self._new = (
-            dict[str, PacketStream](),
-            partial(PacketStream, sensor, stats=stats, backend=backend, state=state),
-        )
-        kinds = {
-            _clock_of(sensor, name, codec(sensor.frames[name]).schema) is None
+        self._streams = dict[str, PacketStream]()
+        self._make_stream = partial(PacketStream, sensor, stats=stats, backend=backend, state=state)
+        has_clock = {
+            _clock_of(sensor, name, codec(sensor.frames[name]).schema) is not None
             for name in (*self._names, *sensor.data_frames)
         }
-        self.waiting = Waiting() if sensor.imu_frames and len(kinds) == 1 else None
+        self.waiting = Waiting() if sensor.imu_frames and len(has_clock) == 1 else None
 
     def add(
         self, found: Sequence[Frames], data: Packets | None, *, whole: bool = False
     ) -> ImuSamples:
-        """The samples among these frames; those that wait have them too. A failing plugin is
-        counted.
+        """Return the samples among some frames, and add them to those that wait.
+
+        Errors of a plugin are counted.
 
         Args:
             data: the packets of the data among them.
             whole: the frames are a whole input.
         """
-        own = [data] if data is not None and data.sensor.frames[data.frame].imu is not None else []
+        batches = list[Packets]()
+        if data is not None and data.sensor.frames[data.frame].imu is not None:
+            batches.append(data)
+        for name in self._names:
+            if not whole or any(_Part.of(frames, name).number for frames in found):
+                batches.append(self._stream(name).add(found, whole=whole))
         parts = list[ImuSamples]()
-        names = [
-            name
-            for name in self._names
-            if not whole or any(_Part.of(frames, name).number for frames in found)
-        ]
-        for packets in (*own, *(self._stream(name).add(found, whole=whole) for name in names)):
+        for packets in batches:
+            if not len(packets):
+                continue
             try:
-                parts += [packets.imu()] if len(packets) else []
+                parts.append(packets.imu())
             except SpecError as error:
                 packets.stats.error(PluginError.of(error, f"imu of {packets.frame}"), len(packets))
         samples = joined(parts)
@@ -356,20 +370,26 @@ class ImuStream:
         return samples
 
     def interrupt(self) -> None:
-        """Input was lost here."""
+        """Mark a break before the next sample: input was lost here."""
         for name in self._names:
             self._stream(name).interrupt()
 
     def _stream(self, name: str) -> PacketStream:
-        """The packets of one type, from when there are some on."""
-        if name not in self._made:
-            self._made[name] = self._new(name)
-        return self._made[name]
+        """Return the packets of one type; made when the first ones arrive."""
+        if name not in self._streams:
+            self._streams[name] = self._make_stream(name)
+        return self._streams[name]
 
 
 @dataclass(frozen=True, eq=False)
 class _Part:
-    """Our frames in a piece of input: indices, or None where all are ours."""
+    """The frames of one type in a piece of input.
+
+    Attributes:
+        frames: all frames of the piece.
+        where: the rows of those of the type; None if all are of it.
+        number: how many are of it.
+    """
 
     frames: Frames
     where: NDArray[np.intp] | None
@@ -377,34 +397,37 @@ class _Part:
 
     @classmethod
     def of(cls, frames: Frames, name: str) -> _Part:
-        """The frames of one type in a piece."""
-        own, kind = frames.names.index(name) if name in frames.names else -1, alike(frames.kinds)
-        mine = None if kind is not None and kind == own else frames.kinds == own
-        if mine is None or mine.all():
+        """Return the frames of one type in a piece."""
+        own = frames.names.index(name) if name in frames.names else -1
+        kind = alike(frames.kinds)
+        if kind is not None and kind == own:
             return cls(frames, None, len(frames))
-        where = np.flatnonzero(mine)
+        is_own = frames.kinds == own
+        if is_own.all():
+            return cls(frames, None, len(frames))
+        where = np.flatnonzero(is_own)
         return cls(frames, where, len(where))
 
     @cached_property
     def own(self) -> NDArray[np.intp] | slice:
-        """Which frames are ours, as a slice where they follow one another."""
+        """The rows of the type, as a slice if they follow one another."""
         where = self.where
         if where is None or not len(where):
             return slice(0, self.number)
-        first, last = where.item(0), where.item(-1)
+        first = where.item(0)
+        last = where.item(-1)
         return slice(first, last + 1) if last - first == len(where) - 1 else where
 
-    def column(self, array: NDArray[np.int64]) -> NDArray[np.int64]:
-        """What an array of the piece, (n,), holds for our frames."""
+    def column(self, array: Integers) -> Integers:
+        """Return the rows of the type from an array of the piece."""
         return array if self.where is None else some(array, self.own)
 
 
 def data_frame(sensor: Spec, found: Sequence[Frames]) -> str | None:
-    """The data frame type that an input is read by where none is asked for: the configured one, or
-    the first that arrived.
+    """Return the type of data frame that an input is read by if none is asked for.
 
-    Returns:
-        None where the sensor has several, none is configured, and none has arrived yet.
+    It is the configured one, or the first that arrived; None if the sensor has several, none is
+    configured, and none has arrived yet.
     """
     names = sensor.data_frames
     if len(names) < 2 or sensor.options.get("answer") in names:
@@ -418,22 +441,26 @@ def data_frame(sensor: Spec, found: Sequence[Frames]) -> str | None:
 
 
 def _clock_of(sensor: Spec, frame: str, schema: Schema) -> Clock | None:
-    """The clock that is read in frames of a type: the sensor's in data, and where an IMU's frames
-    have it; else their own, if any.
+    """Return the clock of frames of a type: the sensor's in data, and in an IMU's frames that have
+    its fields; else their own, if any.
     """
-    declared, shared = sensor.frames[frame], sensor.clock
+    declared = sensor.frames[frame]
+    shared = sensor.clock
     if declared.clock is not None or shared is None:
         return declared.clock
     if declared.data:
-        return shared if all(_has(sensor, frame, path) for path in paths(shared)) else None
-    known = declared.imu is not None and paths(shared)
-    return shared if known and all(path in schema.fields for path in known) else None
+        return shared if all(_has_field(sensor, frame, path) for path in paths(shared)) else None
+    if declared.imu is None or not paths(shared):
+        return None
+    return shared if all(path in schema.fields for path in paths(shared)) else None
 
 
-def _has(sensor: Spec, frame: str, path: str) -> bool:
-    """Whether packets of this type are to have a field, such as the counter: not, if only other
-    data frames have it.
-    """
+def _has_counter(sensor: Spec, frame: str) -> bool:
+    return sensor.sequence is not None and _has_field(sensor, frame, sensor.sequence.field)
+
+
+def _has_field(sensor: Spec, frame: str, path: str) -> bool:
+    """Return whether packets of this type have a field, or should, since no data frame has it."""
     schemas = {name: codec(sensor.frames[name]).schema for name in sensor.data_frames}
     having = [
         name
@@ -444,34 +471,36 @@ def _has(sensor: Spec, frame: str, path: str) -> bool:
 
 
 def _offsets(parts: Sequence[_Part]) -> Numbers:
-    """Where our frames begin in the input; as a range, where all have one size and follow one
+    """Return the offsets of frames in the input; as a range, if all have one size and follow one
     another.
     """
     runs = [part.frames.places for part in parts if part.where is None]
     ranges = [places for places in runs if isinstance(places, range)]
-    follow = all(
+    are_joined = all(
         before.stop == after.start and before.step == after.step
         for before, after in pairwise(ranges)
     )
-    if ranges and len(ranges) == len(parts) and follow:
+    if ranges and len(ranges) == len(parts) and are_joined:
         return range(ranges[0].start, ranges[-1].stop, ranges[0].step)
     return _joined([part.column(part.frames.offsets) for part in parts], np.int64)
 
 
-def _times(parts: Sequence[NDArray[np.int64]]) -> NDArray[np.int64]:
-    """Arrival times, 0 where nobody knows them."""
-    found = _all_or_joined(parts)
-    only = alike(found)
+def _times(parts: Sequence[Integers]) -> Integers:
+    """Return arrival times, 0 if unknown."""
+    times = _all_or_joined(parts)
+    only = alike(times)
     if only is not None:
-        return repeated(max(only, 0), len(found))
-    return np.maximum(found, 0) if len(found) and int(found.min()) < 0 else found
+        return repeated(max(only, 0), len(times))
+    return np.maximum(times, 0) if len(times) and int(times.min()) < 0 else times
 
 
-def _all_or_joined(parts: Sequence[NDArray[np.int64]]) -> NDArray[np.int64]:
-    """Arrays joined; `repeated`, where all are of one value."""
-    known = {alike(part) for part in parts if len(part)}
-    if len(known) == 1 and (only := known.pop()) is not None:
-        return repeated(only, sum(map(len, parts)))
+def _all_or_joined(parts: Sequence[Integers]) -> Integers:
+    """Return arrays joined; as one `repeated` value, if all of them are of it."""
+    values = {alike(part) for part in parts if len(part)}
+    if len(values) == 1:
+        only = values.pop()
+        if only is not None:
+            return repeated(only, sum(map(len, parts)))
     return _joined(parts, np.int64)
 
 

@@ -464,6 +464,13 @@ class Spec:
         """Whether frames come one to a datagram."""
         return is_datagram(self.links.get("data"))
 
+    @property
+    def counts_losses(self) -> bool:
+        """Whether lost packets are counted: by a counter, or a clock with a declared pace."""
+        if self.sequence is not None:
+            return True
+        return self.clock is not None and self.clock.pace is not None
+
     def __repr__(self) -> str:
         options = "".join(f", {name}={value!r}" for name, value in self.options.items())
         return (

@@ -98,10 +98,11 @@ class Clock:
             `Fields` that returns a column, or several that add up, in seconds. Terms are summed as
             integer nanoseconds.
         wraps_at: seconds after which it starts again at 0; None if it does not.
-        pace: a function of `Fields`: by how many seconds it advances from a packet to the next. It
-            says what is missing where there is no counter, and is learned from the stream where it
-            is left out. It tells relatives apart, left out by the pace of a simulation, and is
-            needed where it depends on a mode that the packets name.
+        pace: a function of `Fields`: by how many seconds it advances from a packet to the next, nan
+            if that is unknown. If there is no counter, it shows what is missing. Beside a counter
+            it shows how often a short one has wrapped in a gap, and whether a number that jumps is
+            damaged: there it has to be right in every mode. Without it the clock counts no loss.
+            It tells relatives apart; if it is left out, the pace of a simulation does.
         told: what completes a clock that starts again: another frame type that has the clock's
             field too, and a function of its `Fields` to the seconds since 1970 that it tells, nan
             where it tells none. The turn of the clock is the one closest to what the first frame
@@ -133,7 +134,7 @@ class Clock:
 
 @dataclass(frozen=True)
 class Sequence:
-    """A counter of packets; a jump is a loss, unless the clock denies it.
+    """A counter of packets; a jump is a loss, unless a clock with a declared pace shows none.
 
     Args:
         field: path of the counter.

@@ -107,14 +107,14 @@ class Tally:
         if np.isfinite(rate_hz):
             self._rates.append(rate_hz)
 
-    def reading(self, counters: Counters, *, seconds: float | None, sequenced: bool) -> Reading:
+    def reading(self, counters: Counters, *, seconds: float | None, counts_losses: bool) -> Reading:
         """The figures up to now.
 
         Args:
             counters: now.
             seconds: how long it was by the caller's clock; taken from the arrivals where it is left
                 out.
-            sequenced: whether the sensor numbers its packets, or says when they were sent.
+            counts_losses: whether lost packets are counted (`Sensor.counts_losses`).
         """
         spanned = self._spanned or None
         lasted = seconds or spanned
@@ -134,7 +134,7 @@ class Tally:
             valid=_mean([valid for _, valid in self._sizes]),
             error_rate=_share(change["rejected"], change["frames"]),
             skipped_rate=_share(change["skipped"], change["bytes_in"] - change["skipped"]),
-            loss_rate=_share(change["lost"], self.packets) if sequenced else None,
+            loss_rate=_share(change["lost"], self.packets) if counts_losses else None,
             jitter_s=math.sqrt(max(self._squares / self._gaps - mean * mean, 0.0))
             if spanned and self._by_host
             else None,
@@ -146,8 +146,8 @@ class Tally:
 class Meter:
     """Counts packets and scans as they come: since the last reading, and all of them."""
 
-    def __init__(self, counters: Counters, *, sequenced: bool) -> None:
-        self._sequenced = sequenced
+    def __init__(self, counters: Counters, *, counts_losses: bool) -> None:
+        self._counts_losses = counts_losses
         self._last: int | None = None
         self._recent, self._all = Tally(counters), Tally(counters)
 
@@ -170,13 +170,13 @@ class Meter:
 
     def reading(self, counters: Counters, seconds: float | None = None) -> Reading:
         """The figures since the reading before this; then it starts anew."""
-        found = self._recent.reading(counters, seconds=seconds, sequenced=self._sequenced)
+        found = self._recent.reading(counters, seconds=seconds, counts_losses=self._counts_losses)
         self._recent = Tally(counters)
         return found
 
     def summary(self, counters: Counters, seconds: float | None = None) -> Reading:
         """The figures of everything."""
-        return self._all.reading(counters, seconds=seconds, sequenced=self._sequenced)
+        return self._all.reading(counters, seconds=seconds, counts_losses=self._counts_losses)
 
 
 def totals(counters: Counters) -> dict[str, int]:
@@ -335,9 +335,7 @@ class Feed:
     def _meter(self) -> Meter:
         """One that counts from here on."""
         sensor = self.device.sensor
-        return Meter(
-            self.device.stats, sequenced=sensor.sequence is not None or sensor.clock is not None
-        )
+        return Meter(self.device.stats, counts_losses=sensor.counts_losses)
 
     def _within(self, packets: Packets) -> Packets:
         """Those of some packets that are wanted by their times."""

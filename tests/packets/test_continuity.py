@@ -1,4 +1,4 @@
-"""What was lost, came twice or late: by the counter, the clock and the bytes together."""
+"""Lost, duplicate and late packets, by the counter and by a clock with a declared pace."""
 
 from __future__ import annotations
 
@@ -13,11 +13,10 @@ import pytest
 import lidarspec as ls
 from lidarspec import Counters, Packets, Sensor, simulate
 from lidarspec.packets.stream import PacketStream
-from lidarspec.spec import Clock
 from tests.representatives import load_sensor
 
 #: sensors without a counter, and what tells their packets apart.
-UNCOUNTED = ["velodyne-vlp16", "velodyne-hdl32e", "hesai-pandar40p"]
+UNCOUNTED = ["velodyne-vlp16", "velodyne-hdl32e", "hesai-pandar40p", "hesai-pandar64"]
 
 
 def counted(packets: Packets) -> tuple[int, int, int]:
@@ -45,6 +44,11 @@ def test_sensors_without_a_counter_are_known() -> None:
     for name in UNCOUNTED:
         sequence = ls.sensor(name).sequence
         assert sequence is None or sequence.field not in str(ls.sensor(name).frames["data"])
+
+
+def test_sensors_with_datagrams_that_count_no_losses_are_known() -> None:
+    datagrams = [sensor for sensor in ls.sensors().values() if sensor.datagrams]
+    assert [sensor.id for sensor in datagrams if not sensor.counts_losses] == ["seyond-falcon"]
 
 
 @pytest.mark.parametrize("name", ["shape-paced", *UNCOUNTED, "ldrobot-ld06", "robosense-m1"])
@@ -135,21 +139,18 @@ def test_what_the_counter_wraps_over_is_counted_by_the_clock(lost: int) -> None:
     assert int(packets.breaks.sum()) == 1
 
 
-def helios(number: int, counter: int | None = None) -> bytes:
+def helios(number: int, counter: int) -> bytes:
     sensor = ls.sensor("robosense-helios16p")
     (frame,) = simulate(sensor, 1, start=number)
-    return (
-        frame
-        if counter is None
-        else sensor.build("data", {**sensor.parse(frame), "bottom_packet_count": counter})
-    )
+    return sensor.build("data", {**sensor.parse(frame), "bottom_packet_count": counter})
 
 
-@pytest.mark.parametrize("counter", [294_968_297, 0, 103, 95, 99, 2**32 - 1])
+@pytest.mark.parametrize("counter", [40_000, 0, 103, 95, 99, 2**16 - 1])
 def test_a_counter_that_jumps_without_the_clock_is_damage_and_no_loss(counter: int) -> None:
-    sensor = ls.sensor("robosense-helios16p")
+    sensor = load_sensor("shape-extras")
     frames = simulate(sensor, 300)
-    packets = sensor.decode([*frames[:100], helios(100, counter), *frames[101:]])
+    damaged = sensor.build("data", {**sensor.parse(frames[100]), "number": counter})
+    packets = sensor.decode([*frames[:100], damaged, *frames[101:]])
     assert counted(packets) == (0, 0, 0)
     assert np.diff(packets.index).tolist() == [1] * 299
     assert not packets.breaks.any()
@@ -181,24 +182,27 @@ def test_a_clock_that_is_set_and_a_sensor_that_starts_again_lose_nothing() -> No
             assert counted(sensor.decode(again))[0] <= 630
 
 
-def test_a_pace_that_nobody_declares_is_learned_and_learned_anew() -> None:
+def test_a_clock_without_a_declared_pace_counts_no_loss() -> None:
     vlp16 = ls.sensor("velodyne-vlp16")
     assert vlp16.clock is not None
     sensor = dataclasses.replace(vlp16, clock=dataclasses.replace(vlp16.clock, pace=None))
-    frames = simulate(vlp16, 2000)
-    assert counted(sensor.decode(frames[:500] + frames[510:])) == (10, 0, 0)
-    halved = sensor.decode(frames[:500] + simulate(vlp16, 4000)[500::2])
-    assert 0 < counted(halved)[0] < 600, "taken for losses until the new pace is learned"
+    frames = simulate(vlp16, 600)
+    packets = sensor.decode(frames[:300] + frames[310:])
+    assert counted(packets) == (0, 0, 0)
+    assert vlp16.counts_losses
+    assert not sensor.counts_losses
 
 
-def test_a_clock_that_does_not_advance_evenly_says_nothing() -> None:
-    vlp16 = ls.sensor("velodyne-vlp16")
-    sensor = dataclasses.replace(vlp16, clock=Clock("timestamp", wraps_at=3600.0))
-    draw, time, frames = random.Random(1), 0, list[bytes]()
-    for frame in simulate(vlp16, 400):
-        time += draw.choice([100, 500, 3000, 9000])
-        frames.append(frame[:1200] + time.to_bytes(4, "little") + frame[1204:])
-    assert counted(sensor.decode(frames)) == (0, 0, 0)
+@pytest.mark.parametrize("lost", [0, 3])
+@pytest.mark.parametrize("counter", [294_968_297, 1_000, 2**32 - 1])
+def test_one_damaged_counter_without_a_pace_is_two_breaks_and_no_loss(
+    counter: int, lost: int
+) -> None:
+    sensor = ls.sensor("robosense-helios16p")
+    frames = simulate(sensor, 300)
+    packets = sensor.decode([*frames[:200], helios(200, counter), *frames[201 + lost :]])
+    assert counted(packets) == (0, 0, 0)
+    assert np.flatnonzero(packets.breaks).tolist() == [200, 201]
 
 
 @pytest.mark.parametrize(

@@ -13,7 +13,7 @@ import lidarspec as ls
 from lidarspec import Scan, Sensor, UsageError, simulate
 from lidarspec.packets.stream import PacketStream
 from lidarspec.scans.scans import ScanStream
-from lidarspec.spec import Clock, OnChange, OnWrap, Simulation
+from lidarspec.spec import Clock, Fields, OnChange, OnWrap, Simulation
 from tests.packets.test_reorder import assert_same_scans
 from tests.representatives import load_sensor
 from tests.shapes.extras import BLOCKS
@@ -59,6 +59,10 @@ def blocks_of(
     return list(sent[: len(sent) // BLOCKS * BLOCKS].reshape(-1, BLOCKS))
 
 
+def pace(f: Fields) -> float:
+    return BLOCKS * STEP_S
+
+
 def rotating(
     packets: Sequence[np.ndarray], *, counted: bool = False, clockwise: bool = False
 ) -> Sensor:
@@ -79,7 +83,7 @@ def rotating(
     return dataclasses.replace(
         EXTRAS,
         scan=OnWrap("blocks.azimuth"),
-        clock=None if counted else Clock("time", wraps_at=4294.967296),
+        clock=None if counted else Clock("time", wraps_at=4294.967296, pace=pace),
         sequence=EXTRAS.sequence if counted else None,
         simulation=Simulation(sweep, rate=100.0),
         turn=(5.0, 20.0),

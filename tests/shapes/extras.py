@@ -34,6 +34,8 @@ from lidarspec.spec import (
 )
 
 BLOCKS, CHANNELS = 4, 3
+#: seconds from a packet to the next.
+PACE_S = 0.01
 
 DATA = Checksummed(
     Struct(
@@ -95,12 +97,12 @@ SENSOR = Sensor(
     points=points,
     scan=Every(0.1),
     links={"data": Udp(56_310)},
-    clock=Clock("time", wraps_at=4294.967296),
+    clock=Clock("time", wraps_at=4294.967296, pace=lambda f: PACE_S),
     sequence=Sequence("number"),
     simulation=Simulation(
         lambda i: {
             "number": i % 65_536,
-            "time": i * 0.01 % 4294.967296,
+            "time": i * PACE_S % 4294.967296,
             "blocks.azimuth": (np.arange(BLOCKS) + i * BLOCKS) * 9 % 360,
             "blocks.signal": np.arange(BLOCKS) + 2**24 + 1,
         }

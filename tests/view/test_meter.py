@@ -26,7 +26,7 @@ class Bench:
         sensor = ls.sensor(ID)
         self.frames = simulate(sensor, frames)
         self.decoder: Decoder = sensor.decoder()
-        self.meter = Meter(self.decoder.stats, sequenced=False)
+        self.meter = Meter(self.decoder.stats, counts_losses=False)
         self._packets, self._scans = (
             PacketStream(sensor, "data", self.decoder.stats),
             ScanStream(sensor),
@@ -90,7 +90,7 @@ def test_lost_packets_are_a_share_where_the_sensor_numbers_them() -> None:
     sensor = ls.sensor("robosense-m1")
     decoder = sensor.decoder()
     meter, stream = (
-        Meter(decoder.stats, sequenced=True),
+        Meter(decoder.stats, counts_losses=True),
         PacketStream(sensor, "data", decoder.stats),
     )
     frames = [frame for number, frame in enumerate(simulate(sensor, 200)) if number % 10 != 5]

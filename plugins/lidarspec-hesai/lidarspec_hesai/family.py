@@ -33,6 +33,7 @@ def spinning(
     """
     defaults: dict[str, Any] = {
         "turn": TURN,
+        "clock": Clock(clock),
         "acknowledged": UNPUBLISHED,
         "scan": OnWrap(azimuth),
         "vendor_axes": ("right", "forward", "up"),
@@ -45,7 +46,6 @@ def spinning(
         links={"data": Udp(2368), "control": ptc.CONTROL},
         commands=ptc.commands((300, 1200)),
         on_open=("get_calibration",),
-        clock=Clock(clock),
         sequence=Sequence("sequence"),
         simulation=Simulation(
             sweep, answers={"get_calibration": (("answer", {"payload": table.told()}),)}

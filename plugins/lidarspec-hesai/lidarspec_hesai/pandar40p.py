@@ -12,15 +12,16 @@ tier4/nebula.
 
 from __future__ import annotations
 
+from functools import partial
 from typing import Any
 
 import numpy as np
 from construct import Array, Const, Int8ul, Int16ul, Int32ul, Struct
 
-from lidarspec.spec import Fields, Frame, Polar, Scaled
+from lidarspec.spec import Clock, Fields, Frame, Polar, Scaled
 from lidarspec_hesai.calibration import Calibration, nominal
 from lidarspec_hesai.family import spinning
-from lidarspec_hesai.parts import TAIL_40P, beams, returns_of, turning
+from lidarspec_hesai.parts import TAIL_40P, beams, clock, returns_of, turning
 
 BLOCKS, CHANNELS = 10, 40
 PER_TURN = 1800  # blocks in a turn at 10 Hz and single return: 0.2 degrees
@@ -90,6 +91,16 @@ def points(f: Fields, channels: Calibration) -> Polar:
     )
 
 
+def pace(f: Fields, blocks: int) -> Any:
+    """Return the seconds that the shots of a packet take (HesaiLidar_SDK_2.0)."""
+    return SHOT * blocks / returns_of(f.return_mode)
+
+
+def paced_clock(blocks: int) -> Clock:
+    """Return the clock of packets with so many blocks, which may lack the sequence."""
+    return Clock(clock, pace=partial(pace, blocks=blocks))
+
+
 def sweep(i: int) -> dict[str, Any]:
     """Packet i at 10 Hz with single return."""
     return turning(i, BLOCKS, PER_TURN)
@@ -107,6 +118,7 @@ PANDAR40P = spinning(
     TABLE,
     sweep,
     model="Pandar40P",
+    clock=paced_clock(BLOCKS),
     range_limits=(0.3, 200.0),
     aliases=("pandar40p",),
     status="capture",

@@ -20,7 +20,7 @@ from lidarspec.spec import Fields, Frame, Polar, Scaled
 from lidarspec_hesai.calibration import Calibration, nominal
 from lidarspec_hesai.family import spinning
 from lidarspec_hesai.headed import USUAL_UNIT, distance
-from lidarspec_hesai.pandar40p import SHOT
+from lidarspec_hesai.pandar40p import SHOT, paced_clock
 from lidarspec_hesai.parts import TAIL_40P, beams, returns_of, turning
 
 BLOCKS, CHANNELS = 6, 64
@@ -105,6 +105,7 @@ PANDAR64 = spinning(
     TABLE,
     sweep,
     model="Pandar64",
+    clock=paced_clock(BLOCKS),
     range_limits=(0.3, 200.0),
     aliases=("pandar64",),
     status="vectors",

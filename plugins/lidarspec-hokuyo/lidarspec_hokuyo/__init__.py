@@ -34,7 +34,7 @@ from lidarspec.spec import (
     hookimpl,
 )
 from lidarspec_hokuyo.commands import TOLD_BY, commands, messages, telling
-from lidarspec_hokuyo.scans import KINDS, WRAP, Asked, Geometry, number, scan, sweep
+from lidarspec_hokuyo.scans import KINDS, WRAP, Asked, Geometry, number, pace, scan, sweep
 
 URG = Geometry(1024, 44, 725, 384, end=768, rate=10.0, kinds=("distances", "short"))
 UST = Geometry(1440, 0, 1080, 540, end=1080, rate=40.0, kinds=("distances", "intensities", "short"))
@@ -138,7 +138,7 @@ def scanner(name: str) -> Sensor:
         model=model,
         points=None,
         scan=OnChange("time"),
-        clock=Clock("time", wraps_at=WRAP),
+        clock=Clock("time", wraps_at=WRAP, pace=partial(pace, rate=geometry.rate)),
         links={"data": link},
         **conversation(name, "distances", Asked(geometry.first, geometry.last, 1)),
         on_open=("stop", "start"),

@@ -179,6 +179,18 @@ def scan(command: str, geometry: Geometry) -> Frame:
     )
 
 
+def pace(f: Fields, rate: float) -> Any:
+    """Return the seconds from a scan to the next, nan if scans are asked for one by one.
+
+    Turns are left out between scans as the command asks for (SCIP 2.0, 8.1).
+
+    Args:
+        rate: turns a second.
+    """
+    skipped = getattr(f, "skip", None)
+    return np.nan if skipped is None else (1 + skipped) / rate
+
+
 def sweep(i: int, geometry: Geometry, asked: Asked) -> dict[str, Any]:
     """Scan i of those that were asked for."""
     steps = (

@@ -155,6 +155,18 @@ def keeps_pace(f: Fields, rate: int) -> Any:
     return np.min(off, axis=0) == off[0]
 
 
+def pace(f: Fields, rate: int, older_rate: int | None = None) -> Any:
+    """Return the seconds from a frame to the next, at so many points a second.
+
+    Args:
+        older_rate: of older units, which are told apart by the angles of their frames.
+    """
+    seconds = POINTS / rate
+    if older_rate is None:
+        return seconds
+    return np.where(keeps_pace(f, older_rate), POINTS / older_rate, seconds)
+
+
 def relatives(own: str) -> dict[str, str | Relative]:
     """What tells the others apart: how far they turn from point to point at the speed that they
     tell.
@@ -184,10 +196,14 @@ def lidar(
     *,
     turns: int = 10,
     aside: bool = False,
+    older_rate: int | None = None,
     frames: Mapping[str, Frame] | None = None,
     **more: Any,
 ) -> Sensor:
-    """One model, simulated at so many turns a second, with the frames that it has beside the data."""
+    """One model, simulated at so many turns a second, with the frames that it has beside the data.
+
+    `older_rate`: points a second of older units.
+    """
     rate = RATES[name]
     return Sensor(
         slug(name),
@@ -196,7 +212,11 @@ def lidar(
         frames={"data": DATA_FRAME, **(frames or {})},
         points=partial(points, rate=rate, aside=True) if aside else partial(points, rate=rate),
         scan=OnWrap("azimuth"),
-        clock=Clock("timestamp", wraps_at=30.0),
+        clock=Clock(
+            "timestamp",
+            wraps_at=30.0,
+            pace=partial(pace, rate=rate, older_rate=older_rate),
+        ),
         simulation=Simulation(partial(sweep, rate=rate, turns=turns)),
         vendor_axes=("forward", "right", "up"),
         relatives=relatives(name),
@@ -265,6 +285,7 @@ LD14P = lidar(
     "LD14P",
     turns=6,
     aside=True,
+    older_rate=RATES["LD14"],
     frames={**TOLD, "command": Frame(COMMAND, direction="out")},
     links={"data": Serial(230_400)},
     commands={

@@ -17,7 +17,7 @@ parameters of commands 0B to 0D.
 from __future__ import annotations
 
 from collections.abc import Mapping
-from functools import cache
+from functools import cache, partial
 from typing import Any
 
 import numpy as np
@@ -39,6 +39,7 @@ from lidarspec.spec import (
     SizeOf,
     Udp,
     along,
+    take,
 )
 from lidarspec_livox.points import (
     DEPTH,
@@ -137,6 +138,14 @@ TYPES: dict[str, tuple[int, int, int, tuple[Any, ...]]] = {
     "triple": (7, 30, 3, (echoes(3, *MILLIMETRES),)),
     "triple_spherical": (8, 30, 3, (*DIRECTION, echoes(3, *DEPTH))),
 }
+
+
+def pace(f: Fields, rate: float) -> Any:
+    """Return the seconds that the shots of a packet take, of so many shots a second."""
+    shots = np.zeros(max(kind for kind, *_ in TYPES.values()) + 1)
+    for kind, count, _, _ in TYPES.values():
+        shots[kind] = count
+    return take(shots, f.data_type) / rate
 
 
 def data_frame(name: str, rate: float, **more: Any) -> Frame:
@@ -474,7 +483,7 @@ def lidar(name: str) -> Sensor:
             "control": Udp(65_000, local=COMMAND_PORT),
         },
         commands=COMMANDS,
-        clock=Clock(clock),
+        clock=Clock(clock, pace=partial(pace, rate=rate)),
         simulation=simulation(
             first, rate, view, answers={"handshake": (("ack", DONE), ("broadcast", who)), **ANSWERS}
         ),

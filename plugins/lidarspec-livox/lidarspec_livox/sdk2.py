@@ -554,7 +554,8 @@ def lidar(name: str) -> Sensor:
                 for what, (source, port) in ports.items()
             },
         },
-        clock=Clock("timestamp"),
+        # the counter restarts with each frame, of which nothing says how many packets it has
+        clock=Clock("timestamp", pace=lambda f: f.time_interval),
         sequence=Sequence("udp_cnt"),
         simulation=simulation(
             rate, view, answers={"discover": (("discovery", found),), "get_state": told}

@@ -73,7 +73,11 @@ TIME = (
     "millisecond" / Scaled(Int16ub, 0.001, "s"),
     "microsecond" / Scaled(Int16ub, 1e-6, "s"),
 )
-CLOCK = Clock(("hour", "minute", "second", "millisecond", "microsecond"), wraps_at=86_400.0)
+CLOCK = Clock(
+    ("hour", "minute", "second", "millisecond", "microsecond"),
+    wraps_at=86_400.0,
+    pace=lambda f: f.period,
+)
 
 
 def summed(size: Construct, samples: Construct, *rest: Construct) -> Frame:

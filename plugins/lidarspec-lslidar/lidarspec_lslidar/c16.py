@@ -141,6 +141,11 @@ def points(f: Fields, unit: float = UNITS[0]) -> Polar:
     )
 
 
+def pace(f: Fields) -> Any:
+    """Return the seconds that the blocks of a packet take; with dual return, two are one firing."""
+    return np.where(f.return_mode == DUAL, BLOCKS // 2, BLOCKS) * BLOCK
+
+
 def rotor_step(f: Fields, dual: Any) -> Any:
     """Degrees from each firing's azimuth to the next one's; over a loss as before it."""
     azimuth = f.blocks.azimuth
@@ -195,7 +200,7 @@ C16 = Sensor(
     points=points,
     scan=OnWrap("blocks.azimuth"),
     links={"data": Udp(2368, 2369)},
-    clock=Clock(("hour", "minute", "second", "nanosecond"), wraps_at=86_400.0),
+    clock=Clock(("hour", "minute", "second", "nanosecond"), wraps_at=86_400.0, pace=pace),
     simulation=Simulation(sweep),
     configure=configure,
     range_limits=(0.3, 200.0),  # the defaults of the driver

@@ -96,6 +96,15 @@ def points(f: Fields, unit: Unit) -> Polar:
     )
 
 
+def pace(f: Fields, columns: int) -> Any:
+    """Return the seconds from a packet to the next, by the times of its columns.
+
+    Each column has a timestamp in nanoseconds (Software User Manual, lidar data packet format).
+    """
+    span = f.columns[columns - 1].timestamp - f.columns[0].timestamp
+    return span * 1e-9 * columns / (columns - 1)
+
+
 def sweep(unit: Unit, i: int) -> dict[str, Any]:
     """Packet i, at ten turns a second where nothing else is said."""
     numbers = unit.columns * i + np.arange(unit.columns)
@@ -134,7 +143,10 @@ def shaped(sensor: Sensor, unit: Unit) -> Sensor:
             angle="columns[0].measurement_id",
             full=unit.turn,
         ),
-        clock=Clock("columns[0].timestamp"),
+        clock=Clock(
+            "columns[0].timestamp",
+            pace=partial(pace, columns=unit.columns) if unit.columns > 1 else None,
+        ),
         info={} if legacy else {"serial": "data.serial"},
         simulation=Simulation(
             partial(sweep, unit),

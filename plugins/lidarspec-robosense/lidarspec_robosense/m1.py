@@ -154,6 +154,11 @@ def packets_per_frame(f: Fields) -> Any:
     return np.where(f.wave_mode == 0, DUAL, SINGLE)
 
 
+def pace(f: Fields) -> Any:
+    """Return the seconds from a packet to the next."""
+    return 1 / (FRAME_RATE * packets_per_frame(f))
+
+
 def points(f: Fields) -> Polar:
     """Range and direction as on the wire, which has REP-103 axes already (M1P user guide, page 13)."""
     channels = f.blocks.channels
@@ -231,7 +236,7 @@ M1 = Sensor(
     points=points,
     scan=OnRewind("pkt_psn"),
     links={"data": Udp(6699, 7788)},
-    clock=Clock(("seconds", "microseconds")),
+    clock=Clock(("seconds", "microseconds"), pace=pace),
     sequence=Sequence("pkt_psn", first=1, last=packets_per_frame),
     simulation=Simulation(sweep),
     range_limits=(0.2, 200.0),  # rs_driver's limits for this model

@@ -277,6 +277,17 @@ def beams(
     )
 
 
+def pace(f: Fields, shots: float, period: float, dual: int) -> Any:
+    """Return the seconds from a packet to the next, by the return mode that DIFOP tells.
+
+    Args:
+        shots: of a packet with single return; with dual return it has half as many.
+        period: seconds from shot to shot.
+        dual: the return mode with two returns.
+    """
+    return np.where(f.state.difop.return_mode == dual, shots / 2, shots) * period
+
+
 def rotor_step(ahead: Any, behind: Any, usual: Any) -> Any:
     """Degrees to the next shot; over a loss or a gap as before it, or as the rotor was set to turn."""
     ahead, behind = wrap(ahead, 360), wrap(behind, 360)

@@ -32,6 +32,7 @@ from lidarspec_robosense.rotor import (
     blocks,
     difop_first,
     halves,
+    pace,
     pairs,
     sweep as turning,
     sweep_difop,
@@ -161,6 +162,11 @@ def clock(f: Fields) -> tuple[Any, Any, Any]:
     return 86_400 * days + 3600 * f.hour + 60 * f.minute + f.second, f.milliseconds, f.microseconds
 
 
+def clock_of(source: Any, shots: int, model: Rotor) -> Clock:
+    """Return the clock of packets with so many firings of all lasers."""
+    return Clock(source, pace=partial(pace, shots=shots, period=model.period, dual=DUAL))
+
+
 def points_16(f: Fields) -> Polar:
     """Two firings in a block; angles up and down alone, with their signs as they are in every unit."""
     up = np.where(np.arange(16) < 8, -1, 1) * f.state.difop.pitch.on("channels")
@@ -219,7 +225,7 @@ RS32 = Sensor(
     },
     aliases=("rs32", "rs-lidar-32"),
     source="rs_driver (decoder_RS32.hpp); angles of an example unit in ros_rslidar",
-    **{**COMMON, "clock": Clock(clock)},
+    **{**COMMON, "clock": clock_of(clock, BLOCKS, RS32_ROTOR)},
 )
 
 RS16 = dataclasses.replace(
@@ -235,6 +241,7 @@ RS16 = dataclasses.replace(
         "difop": Frame(DIFOP_16, simulation=INFORMATION),
     },
     points=points_16,
+    clock=clock_of(clock, 2 * BLOCKS, RS16_ROTOR),
     state={
         "difop": {"rpm": TURNS * 60, "return_mode": STRONGEST, "pitch": np.abs(RS16_ROTOR.vertical)}
     },
@@ -256,6 +263,7 @@ BPEARL = dataclasses.replace(
         "difop": Frame(difop(0.01), simulation=INFORMATION),
     },
     points=partial(points, model=BPEARL_ROTOR),
+    clock=clock_of(clock, BLOCKS, BPEARL_ROTOR),
     state=BPEARL_ROTOR.state(return_mode=STRONGEST),
     simulation=Simulation(partial(sweep, shots=55.52, lidar_type=0)),
     range_limits=(0.1, 150.0),  # likewise
@@ -277,7 +285,7 @@ BPEARL_V4 = dataclasses.replace(
         "difop": BPEARL.frames["difop"],
     },
     points=partial(points, model=BPEARL_V4_ROTOR),
-    clock=Clock(("seconds", "microseconds")),
+    clock=clock_of(("seconds", "microseconds"), BLOCKS, BPEARL_V4_ROTOR),
     state=BPEARL_V4_ROTOR.state(return_mode=STRONGEST),
     simulation=Simulation(
         lambda i: turning(i, BLOCKS, BPEARL_V4_ROTOR.period, series=V4[0], version=V4[1])

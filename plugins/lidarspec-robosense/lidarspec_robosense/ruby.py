@@ -29,7 +29,7 @@ import numpy as np
 from construct import BitsInteger, BitStruct, Bytes, Const, Int8ub, Int16ub, Struct
 from numpy.typing import NDArray
 
-from lidarspec.spec import Fields, Frame, Polar, Relative, Sensor, Simulation
+from lidarspec.spec import Clock, Fields, Frame, Polar, Relative, Sensor, Simulation
 from lidarspec_robosense.rotor import (
     COMMON,
     DIFOP_HEAD,
@@ -113,6 +113,11 @@ def points(f: Fields, model: Rotor, variant: NDArray[np.float64] | None = None) 
     return pairs(f, f.wave_mode.returns == DUAL, model, late=late)
 
 
+def pace(f: Fields, shots: int, period: float) -> Any:
+    """Return the seconds from a packet to the next; with dual return, two blocks are one shot."""
+    return np.where(f.wave_mode.returns == DUAL, shots / 2, shots) * period
+
+
 def staged(times: Any, counts: Any) -> NDArray[np.float64]:
     """Seconds of lasers of which so many fire at each of some times in microseconds."""
     return np.repeat(np.asarray(times, np.float64), counts) * 1e-6
@@ -185,7 +190,13 @@ def model(
         },
         aliases=aliases,
         source="RS-Ruby Plus and RS-Ruby user manuals; rs_driver; no packet of this model was seen",
-        **COMMON,
+        **{
+            **COMMON,
+            "clock": Clock(
+                ("seconds", "microseconds"),
+                pace=partial(pace, shots=BLOCKS[lasers], period=rotor.period),
+            ),
+        },
     )
 
 

@@ -33,7 +33,17 @@ from construct import (
     Struct,
 )
 
-from lidarspec.spec import Fields, Frame, Imu, Polar, Scaled, Sequence, Simulation, stack
+from lidarspec.spec import (
+    Clock,
+    Fields,
+    Frame,
+    Imu,
+    Polar,
+    Scaled,
+    Sequence,
+    Simulation,
+    stack,
+)
 from lidarspec_robosense.m1 import FRAME_RATE, HEADER, M1
 from lidarspec_robosense.rotor import TIME
 
@@ -156,6 +166,25 @@ def packets(f: Fields, model: Scanner, dual: tuple[int, ...]) -> Any:
     return np.where(twice, 2 * model.packets, model.packets) + model.first - 1
 
 
+def pace(f: Fields, model: Scanner, dual: tuple[int, ...]) -> Any:
+    """Return the seconds from a packet to the next."""
+    return 1 / (FRAME_RATE * (packets(f, model, dual) - model.first + 1))
+
+
+def counted(model: Scanner, dual: tuple[int, ...] = ()) -> dict[str, Any]:
+    """Return the counter of a model, which restarts with each frame, and its clock.
+
+    Args:
+        dual: the return modes with twice as many packets in a frame.
+    """
+    return {
+        "sequence": Sequence(
+            "pkt_psn", first=model.first, last=partial(packets, model=model, dual=dual)
+        ),
+        "clock": Clock(("seconds", "microseconds"), pace=partial(pace, model=model, dual=dual)),
+    }
+
+
 def direction(f: Fields) -> dict[str, Any]:
     """Azimuth, elevation, and what points of every model have besides; REP-103 axes, as on the
     wire.
@@ -265,7 +294,7 @@ M2 = dataclasses.replace(
         ),
     },
     points=partial(points, returns=True),
-    sequence=Sequence("pkt_psn", first=1, last=partial(packets, model=M2_SCANNER, dual=(DUAL,))),
+    **counted(M2_SCANNER, (DUAL,)),
     simulation=Simulation(partial(sweep, model=M2_SCANNER)),
     range_limits=(0.2, 250.0),  # rs_driver's limits for these models
     aliases=("rs-m2", "rs-lidar-m2"),
@@ -288,7 +317,7 @@ MX = dataclasses.replace(
         "difop": Frame(MX_DIFOP, simulation=Simulation(lambda i: {}, rate=1)),
     },
     points=points_mx,
-    sequence=Sequence("pkt_psn", first=1, last=partial(packets, model=MX_SCANNER, dual=())),
+    **counted(MX_SCANNER),
     simulation=Simulation(
         partial(sweep, model=MX_SCANNER, mode=DUAL)
     ),  # whose packets have a second radius that is used
@@ -312,7 +341,7 @@ E1 = dataclasses.replace(
         "difop": Frame(E1_DIFOP, imu=imu, simulation=Simulation(sweep_e1, rate=1)),
     },
     points=points,
-    sequence=Sequence("pkt_psn", last=partial(packets, model=E1_SCANNER, dual=(9, 10, 11))),
+    **counted(E1_SCANNER, (9, 10, 11)),
     simulation=Simulation(partial(sweep, model=E1_SCANNER)),
     range_limits=(0.1, 200.0),  # E1 user manual, Table 1; rs_driver's
     info={"serial": "difop.serial_number", "firmware": "difop.software"},

@@ -1,0 +1,137 @@
+"""Losses in packets that always arrive in order: those of byte streams, and datagrams without
+a counter and a clock.
+
+`ArrivalOrder` numbers the packets as they arrive and leaves out as many numbers as packets are
+missing. Skipped bytes count as packets of the largest size so far. A step of the clock that is
+longer than the declared pace counts as lost packets. A clock whose steps are as long as a packet
+takes, or longer, shows only long gaps, so then the larger of both counts applies.
+"""
+
+from __future__ import annotations
+
+from functools import partial
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lidarspec.expressions.columns import Batch
+from lidarspec.frames.arrays import alike
+from lidarspec.framing.results import Counters
+from lidarspec.packets.clocks import Times
+from lidarspec.packets.pace import read_paces, shortest_pace
+from lidarspec.packets.packets import Index
+from lidarspec.spec.timing import Clock
+
+#: a clock that advances by more from one packet to the next was set.
+MAX_STEP_NS = 3600 * 10**9
+
+
+class ArrivalOrder:
+    """Judges the packets of one stream, which are all numbered in the order of their arrival.
+
+    Args:
+        stats: counts what is lost.
+        clock: of the packets; None to judge by skipped bytes alone.
+        grain_ns: the step of the clock; 0 if it is fine or computed by a function.
+    """
+
+    def __init__(self, stats: Counters, clock: Clock | None, grain_ns: float) -> None:
+        self._stats = stats
+        self._clock = clock
+        self._grain_ns = grain_ns
+        self._time: int | None = None  # of the packet that arrived last, ns
+        self._index = -1  # of that packet
+        self._largest = 1  # bytes of the largest packet so far
+
+    def push(
+        self, batch: Batch, times: Times | None, skipped: NDArray[np.int64]
+    ) -> tuple[Index, NDArray[np.bool_]]:
+        """Return the index of each packet, (n,), and whether there is a break before it, (n,).
+
+        Args:
+            batch: the packets; `breaks` are those at skipped bytes, and further ones are marked.
+            times: by the sensor's clock, (n,) ns; None if it has none.
+            skipped: bytes in no frame before each packet, (n,).
+        """
+        count = len(batch)
+        first = self._index + 1
+        skipped_rows, skipped_packets = self._count_skipped(batch, skipped)
+        if first == 0 and len(skipped_rows) and skipped_rows[0] == 0:
+            skipped_packets[0] = 0  # nothing is known to be lost before the first packet
+        if self._clock is None or times is None:
+            rows = skipped_rows
+            missing = skipped_packets
+        else:
+            rows, missing = self._read_clock(
+                self._clock, batch, times, skipped_rows, skipped_packets
+            )
+        if not missing.any():
+            self._index += count
+            return range(first, first + count), batch.breaks
+        batch.breaks[rows] |= missing > 0
+        self._index += count + int(missing.sum())
+        return partial(_index_with_gaps, first, count, rows, missing), batch.breaks
+
+    def forget(self) -> None:
+        """Ignore the clock at the next packet: time has passed that no packet shows."""
+        self._time = None
+
+    def _count_skipped(
+        self, batch: Batch, skipped: NDArray[np.int64]
+    ) -> tuple[NDArray[np.intp], NDArray[np.int64]]:
+        """Return the rows that have skipped bytes before them, and the packets these would be."""
+        sizes = batch.table.sizes
+        size = alike(sizes)
+        rows = np.empty(0, np.intp)
+        packets = np.empty(0, np.int64)
+        if alike(skipped) != 0:
+            rows = np.flatnonzero(skipped > 0)
+            largest = sizes[rows] if size is not None else np.maximum.accumulate(sizes)[rows]
+            packets = np.rint(skipped[rows] / np.maximum(largest, self._largest)).astype(np.int64)
+        self._largest = max(self._largest, int(sizes.max()) if size is None else size)
+        return rows, packets
+
+    def _read_clock(
+        self,
+        clock: Clock,
+        batch: Batch,
+        times: Times,
+        skipped_rows: NDArray[np.intp],
+        skipped_packets: NDArray[np.int64],
+    ) -> tuple[NDArray[np.intp], NDArray[np.int64]]:
+        """Return the rows that may have a gap before them, and the packets missing there.
+
+        Only losses that the clock confirms are counted in `lost`: skipped bytes are no packets.
+        """
+        steps = np.diff(times, prepend=times.item(0) - 1 if self._time is None else self._time)
+        self._time = times.item(-1)
+        paces = read_paces(clock, batch)
+        shortest = shortest_pace(paces)
+        limit = min(shortest + max(self._grain_ns, shortest / 2), MAX_STEP_NS)
+        if int(steps.min()) >= 0 and int(steps.max()) <= limit and not skipped_packets.any():
+            return skipped_rows, skipped_packets
+        is_odd = (steps < 0) | (steps > limit)
+        is_odd[skipped_rows] = True
+        rows = np.flatnonzero(is_odd)
+        by_bytes = np.zeros(len(rows), np.int64)
+        by_bytes[np.searchsorted(rows, skipped_rows)] = skipped_packets
+        own_steps = steps[rows]
+        own_paces = paces[rows]
+        tolerance = np.maximum(self._grain_ns, own_paces / 2)
+        by_clock = np.fmax(np.ceil((own_steps - tolerance) / own_paces) - 1, 0).astype(np.int64)
+        is_fine = self._grain_ns <= own_paces / 2
+        missing = np.where(is_fine, by_clock, np.maximum(by_clock, by_bytes))
+        was_set = (own_steps < 0) | (own_steps > MAX_STEP_NS)
+        self._stats.lost += int(missing[~was_set].sum())
+        missing[was_set] = 1
+        return rows, missing
+
+
+def _index_with_gaps(
+    first: int, count: int, rows: NDArray[np.intp], missing: NDArray[np.int64]
+) -> NDArray[np.int64]:
+    """Return consecutive numbers from `first` on, (count,), without those missing before rows."""
+    index = np.ones(count, np.int64)
+    index[:1] = first
+    index[rows] += missing
+    return np.cumsum(index, out=index)

@@ -1,0 +1,395 @@
+"""Losses, duplicates and order of packets that have a counter (`PacketCounter`).
+
+`CounterOrder` gives each packet an index, which is the counter made to run on: it leaves out as
+many numbers as packets are missing, and late packets get the number that was left out. Lost, late
+and duplicated packets and the completeness of scans follow from it.
+
+A clock with a declared pace answers two questions that the counter leaves open: how often a counter
+has wrapped in a gap, and whether a number that jumps is damaged. Without such a clock, a gap of
+a whole turn of the counter is not seen, and a single damaged number makes two breaks, but no loss.
+
+A gap at a masked sector (`masked_sector`) is no loss.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lidarspec.errors import SpecError
+from lidarspec.expressions.columns import Batch
+from lidarspec.expressions.graph import header_function
+from lidarspec.framing.results import Counters
+from lidarspec.packets.clocks import Times
+from lidarspec.packets.masked_sector import MaskedGaps
+from lidarspec.packets.pace import Paces, read_paces, shortest_pace
+from lidarspec.packets.packets import Index
+from lidarspec.spec.description import Spec
+from lidarspec.spec.timing import Clock, Sequence
+
+#: places that a packet may be late; if it is further back, the sensor has started again.
+MAX_PLACES_LATE = 64
+#: the same for a packet that would come before the first one, where a wrap of the counter during
+#: a loss is more likely.
+MAX_PLACES_EARLY = 10
+#: a counter with at least so many values starts again at 0 only if the sensor does.
+LONG_PERIOD = 1 << 16
+#: a counter with more values fills 64 bits: its differences wrap by themselves.
+MAX_SIGNED_PERIOD = 1 << 63
+#: an index starts below this, and advances by less, so that it fits 64 bits for any counter.
+MAX_INDEX_STEP = 1 << 32
+#: a clock that advances by more from one packet to the next was set.
+MAX_STEP_NS = 3600 * 10**9
+
+
+@dataclass(frozen=True, eq=False)
+class Readings:
+    """The counter and the clock in the packets of a batch.
+
+    Attributes:
+        numbers: the counter, (n,).
+        periods: the number of values that the counter takes, one for all packets or (n,).
+        has_counter: whether each packet has the counter, (n,); None if all have it.
+        times: (n,) ns; None without a clock that has a declared pace.
+        steps: from the packet that arrived before to each, (n,) ns; None without such a clock.
+        paces: (n,) ns.
+    """
+
+    numbers: NDArray[Any]
+    periods: int | NDArray[np.int64]
+    has_counter: NDArray[np.bool_] | None
+    times: Times | None
+    steps: Times | None
+    paces: Paces
+
+    def number(self, row: int) -> int | None:
+        """Return the counter of a packet."""
+        if self.has_counter is not None and not self.has_counter[row]:
+            return None
+        return int(self.numbers.item(row))
+
+    def time(self, row: int) -> int | None:
+        """Return the time of a packet, ns."""
+        return None if self.times is None else self.times.item(row)
+
+    def period(self, row: int) -> int:
+        """Return the number of values that the counter of a packet takes."""
+        period = self.periods if isinstance(self.periods, int) else self.periods.item(row)
+        return max(period, 1)
+
+
+@dataclass
+class CountedLoss:
+    """Packets that are missing by the counter, and that a masked sector leaves out (see
+    `masked_sector.Loss`).
+    """
+
+    missing: int
+    masked: int = 0
+
+
+@dataclass(frozen=True)
+class Jump:
+    """A jump of the counter, which one damaged number may have caused.
+
+    Attributes:
+        number: of the packet before it.
+        loss: that was counted for it; None if the sensor seemed to have started again.
+    """
+
+    number: int
+    loss: CountedLoss | None
+
+
+class CounterOrder:
+    """Judges the packets of one stream by their counter.
+
+    Args:
+        sensor: with the counter.
+        stats: counts what is lost, late and duplicated.
+        clock: of the packets; it is used if its pace is declared.
+    """
+
+    def __init__(self, sensor: Spec, stats: Counters, clock: Clock | None) -> None:
+        assert sensor.sequence is not None
+        self._rule: Sequence = sensor.sequence
+        self._clock = clock if clock is not None and clock.pace is not None else None
+        self._stats = stats
+        self._gaps = MaskedGaps(sensor)
+        self._arrived: int | None = None  # time of the packet that arrived last, ns
+        self._number: int | None = None  # of the newest packet
+        self._time: int | None = None  # of the newest packet, ns
+        self._angle = math.nan  # of the newest packet, in turns
+        self._period = 0
+        self._index = -1  # of the newest packet
+        self._first = 0  # index of the first packet since the sensor started
+        self._missing = dict[int, CountedLoss]()  # by index
+        self._suspect: tuple[int, int] | None = None  # number and time of a damaged packet, perhaps
+        self._jump: Jump | None = None  # before the newest packet
+
+    def push(self, batch: Batch, times: Times | None) -> tuple[Index, NDArray[np.bool_]]:
+        """Return the index of each packet, (n,), and whether there is a break before it, (n,).
+
+        Args:
+            batch: the packets; `breaks` are those at skipped bytes, and further ones are marked.
+            times: by the sensor's clock, (n,) ns; None if it has none.
+
+        Raises:
+            SpecError: if the counter is no field of the header.
+        """
+        count = len(batch)
+        readings = self._read(batch, times)
+        self._gaps.read(batch.table)
+        index = np.empty(count, np.int64)
+        odd_rows = [*self._find_odd(readings), count]
+        next_odd = row = 0
+        while row < count:
+            while odd_rows[next_odd] <= row:
+                next_odd += 1
+            ahead, number = self._count_places_ahead(readings, row)
+            if ahead == 1 and number == readings.number(row):
+                stop = odd_rows[next_odd]
+                first = self._index + 1
+                self._index += stop - row
+                self._jump = None
+                self._set_newest(readings.number(stop - 1), readings.time(stop - 1), stop - 1)
+                if stop - row == count:
+                    return range(first, first + count), batch.breaks
+                index[row:stop] = np.arange(first, first + stop - row)
+                row = stop
+            else:
+                index[row], is_break = self._place(readings, row, ahead, number)
+                batch.breaks[row] |= is_break
+                row += 1
+        return index, batch.breaks
+
+    def forget(self) -> None:
+        """Ignore the clock at the next packet: time has passed that no packet shows."""
+        self._time = None
+        self._arrived = None
+        self._gaps.forget()
+
+    def _read(self, batch: Batch, times: Times | None) -> Readings:
+        """Return the counter and the clock of a batch."""
+        info = batch.table.schema.fields.get(self._rule.field)
+        if info is None or info.axes:
+            raise SpecError("a sequence is a field of the header", path=self._rule.field)
+        numbers = batch.table.raw(self._rule.field)
+        periods = self._last(batch, (1 << info.bits) - 1) - self._rule.first + 1
+        if not isinstance(periods, int) or periods <= MAX_SIGNED_PERIOD:
+            numbers = numbers.astype(np.int64)
+        has_counter = batch.table.present(self._rule.field)
+        if self._clock is None or times is None:
+            unknown = np.broadcast_to(np.nan, (len(batch),))
+            return Readings(numbers, periods, has_counter, None, None, unknown)
+        first_step = 1 if self._arrived is None else times.item(0) - self._arrived
+        self._arrived = times.item(-1)
+        steps = np.empty(len(times), np.int64)
+        steps[0] = first_step
+        np.subtract(times[1:], times[:-1], out=steps[1:])
+        paces = read_paces(self._clock, batch)
+        return Readings(numbers, periods, has_counter, times, steps, paces)
+
+    def _last(self, batch: Batch, largest: int) -> int | NDArray[np.int64]:
+        """Return the highest number of the counter, for each packet or for all."""
+        last = self._rule.last
+        if callable(last):
+            (values,) = header_function(last, batch.table.schema, _integers)(batch)
+            return values.item(0) if (values == values[0]).all() else values
+        return largest if last is None else int(last)
+
+    def _find_odd(self, readings: Readings) -> list[int]:
+        """Return the packets that do not follow the one that arrived before them, without the first
+        one.
+        """
+        numbers = readings.numbers
+        if readings.has_counter is not None and not readings.has_counter.all():
+            return list(range(len(numbers)))
+        steps = numbers[1:] - numbers[:-1]
+        is_odd = steps != 1
+        periods = readings.periods
+        if isinstance(periods, int):
+            each: Any = periods
+            least = periods
+            if periods <= MAX_SIGNED_PERIOD and is_odd.any():
+                is_odd &= (steps - 1) % periods != 0
+        else:
+            each = np.maximum(periods, 1)
+            least = int(each.min())
+            is_odd &= (steps - 1) % each[1:] != 0
+            is_odd |= each[1:] != each[:-1]
+        if readings.steps is not None and least < LONG_PERIOD:
+            longest = max(int(readings.steps.max()), -int(readings.steps.min()))
+            if longest > shortest_pace(readings.paces) * least / 2:  # the counter may have wrapped
+                is_odd |= (np.abs(readings.steps) > readings.paces * each / 2)[1:]
+        return (np.flatnonzero(is_odd) + 1).tolist()
+
+    def _count_places_ahead(self, readings: Readings, row: int) -> tuple[int | None, int | None]:
+        """Return how many places a packet is ahead of the newest one, and its corrected number.
+
+        Places are None if the sensor has started again.
+        """
+        number = readings.number(row)
+        if number is None:
+            return 1, self._number
+        period = readings.period(row)
+        if self._number is None or period != self._period:
+            self._period = period
+            return None, number
+        ahead = (number - self._number) % period
+        time = readings.time(row)
+        pace = readings.paces.item(row)
+        if time is None or self._time is None or not pace > 0:
+            return self._count_by_number(ahead, period), number
+        passed = time - self._time
+        if abs(passed) > MAX_STEP_NS:
+            return self._count_by_number(ahead, period), number
+        by_clock = passed / pace
+        near = ahead + period * round((by_clock - ahead) / period)
+        if _agree(near, by_clock) and near >= -MAX_PLACES_LATE:
+            self._suspect = None
+            return (None if near == -MAX_PLACES_LATE else near), number
+        if ahead == 1:  # the clock was set, or a recording begins anew
+            self._suspect = None
+            return 1, number
+        if by_clock <= -MAX_PLACES_LATE:
+            return None, number
+        if by_clock <= 0.5:  # late, from before the numbers started again or after it
+            return round(by_clock), number
+        return self._correct(number, time, pace, by_clock)
+
+    def _count_by_number(self, ahead: int, period: int) -> int | None:
+        """Return the places ahead by the counter alone; None if the sensor has started again."""
+        if ahead == 0:
+            return 0
+        behind = period - ahead
+        reach = MAX_PLACES_LATE if self._index - behind >= self._first else MAX_PLACES_EARLY
+        if behind <= min(reach, period // 2):
+            return -behind
+        if period >= LONG_PERIOD and ahead > min(period // 2, MAX_INDEX_STEP):
+            return None
+        return ahead
+
+    def _correct(self, number: int, time: int, pace: float, by_clock: float) -> tuple[int, int]:
+        """Return the places ahead and the number of a packet, by the clock, if its own number does
+        not fit.
+
+        If two such numbers follow one another, the counter has started again there.
+        """
+        ahead = max(round(by_clock), 1)
+        suspect = self._suspect
+        self._suspect = (number, time)
+        if suspect is not None:
+            number_before, time_before = suspect
+            places = (number - number_before) % self._period
+            if _agree(places, (time - time_before) / pace):
+                return ahead, number
+        assert self._number is not None
+        return ahead, self._number + ahead
+
+    def _place(
+        self, readings: Readings, row: int, ahead: int | None, number: int | None
+    ) -> tuple[int, bool]:
+        """Return the index of a packet that does not follow the newest one, and whether there is
+        a break before it.
+        """
+        if ahead is not None and ahead <= 0:
+            return self._place_late(-ahead), False
+        jump = self._jump
+        self._jump = None
+        is_first = self._index < 0
+        if jump is not None and self._returns(jump, number):
+            if jump.loss is not None:
+                self._stats.lost -= jump.loss.missing
+            self._begin(number)
+            is_break = True
+        elif ahead is None:
+            self._note_jump(None)
+            self._begin(number)
+            is_break = not is_first
+        else:
+            loss = self._add_loss(row, ahead)
+            if ahead > MAX_PLACES_LATE:
+                self._note_jump(loss)
+            is_break = not is_first and loss.missing > 0
+        self._set_newest(number, readings.time(row), row)
+        return self._index, is_break
+
+    def _note_jump(self, loss: CountedLoss | None) -> None:
+        """Remember that the counter jumps here, unless a clock tells damage from losses."""
+        if self._clock is None and self._number is not None:
+            self._jump = Jump(self._number, loss)
+
+    def _returns(self, jump: Jump, number: int | None) -> bool:
+        """Return whether a number goes on from before a jump, which was damage then."""
+        if number is None:
+            return False
+        return 0 < (number - jump.number) % self._period <= MAX_PLACES_LATE
+
+    def _add_loss(self, row: int, ahead: int) -> CountedLoss:
+        """Advance the index to a packet, and count the packets between as lost if they are not
+        masked.
+        """
+        loss = CountedLoss(ahead - 1)
+        before = self._index
+        self._index += ahead
+        if loss.missing:
+            angle = self._gaps.angle_at(row)
+            loss.masked = self._gaps.count_masked(self._angle, angle, loss.missing)
+            loss.missing -= loss.masked
+            self._stats.lost += loss.missing
+            if loss.missing:
+                self._stats.lost -= self._gaps.find_unlost(row, self._angle, angle, loss)
+        oldest = self._index - MAX_PLACES_LATE
+        kept = {index: each for index, each in self._missing.items() if index > oldest}
+        added = range(max(before + 1, oldest), self._index)
+        self._missing = kept | dict.fromkeys(added, loss)
+        return loss
+
+    def _begin(self, number: int | None) -> None:
+        """Begin with a first packet, or anew after the sensor started again.
+
+        Nothing is known to be lost there; the index leaves out one number.
+        """
+        if self._index < 0 and number is not None:
+            self._index = (number - self._rule.first) % self._period % MAX_INDEX_STEP
+        else:
+            self._index += 2
+        self._first = self._index
+        self._missing = {}
+        self._suspect = None
+
+    def _place_late(self, behind: int) -> int:
+        """Return the index of a packet that is late or a duplicate, and count it."""
+        index = self._index - behind
+        if index in self._missing:
+            loss = self._missing.pop(index)
+            if loss.missing:
+                self._stats.lost -= 1
+                loss.missing -= 1
+            self._stats.late += 1
+        elif behind and index < self._first:
+            self._stats.late += 1
+        else:
+            self._stats.duplicates += 1
+        return index
+
+    def _set_newest(self, number: int | None, time: int | None, row: int) -> None:
+        self._number = number
+        self._time = time
+        self._angle = self._gaps.angle_at(row)
+
+
+def _agree(ahead: int, by_clock: float) -> bool:
+    """Return whether the counter and the clock show about the same number of packets."""
+    is_near = abs(ahead - by_clock) <= 1 + abs(by_clock) / 8
+    return is_near and (ahead > 0) == (by_clock > 0.5)
+
+
+def _integers(values: Any, count: int) -> NDArray[np.int64]:
+    integers = np.asarray(values, np.float64).reshape(-1).astype(np.int64)
+    return integers if len(integers) == 1 else np.broadcast_to(integers, (count,))
