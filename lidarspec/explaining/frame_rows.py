@@ -15,10 +15,10 @@ from lidarspec.frames.layout_tree import frame_layouts
 from lidarspec.frames.plain import plain_fields
 from lidarspec.frames.schema import schema
 from lidarspec.frames.slots import recoder
-from lidarspec.frames.wire_fields import UNNAMED, PlacedSeal, WireField, examine
+from lidarspec.frames.wire_fields import PlacedSeal, WireField, examine
 from lidarspec.frames.wire_table import bit_text, hexed
 from lidarspec.spec import Frame
-from lidarspec.spec.tree import FieldInfo, exact, listed
+from lidarspec.spec.tree import UNNAMED, FieldInfo, exact, listed
 
 #: most decimals that steps are told apart by, and those that may be added to show one in full.
 MAX_DIGITS = 12

@@ -20,9 +20,6 @@ from lidarspec.frames.parts import FOUND, Kind, Measure, Piece, Region
 from lidarspec.spec import tree
 from lidarspec.spec.bits import BitField
 
-#: the path of a constant without a name.
-UNNAMED = "(constant)"
-
 
 @dataclass(frozen=True)
 class WireField:
@@ -271,7 +268,7 @@ class _Cursor:
                 yield from self.visit(node.body, path, shown)
             case tree.Struct():
                 for child in node.members:
-                    name = child.name or UNNAMED
+                    name = child.name or tree.UNNAMED
                     below = f"{node.path}.{child.name}".strip(".")
                     yield from self.visit(child, below, f"{shown}.{name}".strip("."))
             case tree.Repeat():

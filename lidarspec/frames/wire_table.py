@@ -16,7 +16,6 @@ from dataclasses import dataclass, replace
 from lidarspec.spec import tree
 from lidarspec.spec.bits import BitField
 from lidarspec.spec.description import Frame
-from lidarspec.spec.syntax import UNNAMED
 
 INDICES = "ijklmn"
 
@@ -139,7 +138,7 @@ def _count(node: tree.Repeat) -> int | str:
 
 def _member(shown: str, member: tree.Node) -> str:
     """How a member of what is shown so is shown."""
-    return ".".join(filter(None, (shown, member.name or UNNAMED)))
+    return ".".join(filter(None, (shown, member.name or tree.UNNAMED)))
 
 
 def _element(shown: str) -> tuple[str, str]:

@@ -233,7 +233,6 @@ class Checksummed(layer.Sealing):
         start = stream.tell()
         obj = self._marked._parsereport(stream, context, path)
         end = stream.tell()
-        layer.note(context, path, start, end, obj, self)
         if not layer.verifying(context, "checksums"):
             return obj
         stream.seek(start)
@@ -409,7 +408,6 @@ class Parts(layer.Partition):
             kind = self._kind(stream, context, place)
             part = self.cases[kind]._parsereport(stream, context, place)
             self._take(found, kind, part, (spot, stream.tell()), announced, place)
-            layer.note(context, place, spot, stream.tell(), part)
             if stream.tell() - start > self.limit:
                 raise RangeError("parts longer than the frame can be", path=place)
         return found

@@ -52,6 +52,9 @@ from lidarspec.errors import SpecError
 from lidarspec.spec.bits import BitField
 from lidarspec.spec.checksums import Checksum
 
+#: the name that is shown for a constant without one.
+UNNAMED = "(constant)"
+
 
 def exact(number: float | int) -> Fraction:
     """The decimal number that was written, not the binary one nearest to it: 0.001 is 1/1000."""

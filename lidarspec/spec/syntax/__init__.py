@@ -14,7 +14,6 @@ it means. Modules in reading order:
 from __future__ import annotations
 
 from lidarspec.spec.syntax.classes import (
-    UNNAMED as UNNAMED,
     Describing as Describing,
     Fault as Fault,
     MarkedStruct as MarkedStruct,
@@ -22,7 +21,6 @@ from lidarspec.spec.syntax.classes import (
     Partition as Partition,
     Pieces as Pieces,
     Sealing as Sealing,
-    Seen as Seen,
     Sizing as Sizing,
     WireNaN as WireNaN,
     bit_width as bit_width,
@@ -36,7 +34,6 @@ from lidarspec.spec.syntax.classes import (
     is_struct as is_struct,
     leaves as leaves,
     member as member,
-    note as note,
     prepare as prepare,
     random_value as random_value,
     seals as seals,

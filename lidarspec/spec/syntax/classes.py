@@ -17,7 +17,7 @@ import re
 import struct
 import sys
 from collections.abc import Callable, Iterable, Iterator, Mapping
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, Any
 
 import construct
 from construct import (
@@ -46,10 +46,6 @@ if TYPE_CHECKING:
 
 _MISSING = object()
 
-#: what a constant without a name is called.
-UNNAMED = "(constant)"
-
-
 #: what construct raises where bytes or values do not fit a struct.
 Fault = construct.ConstructError
 
@@ -60,29 +56,6 @@ class Mismatch(construct.ConstructError):  # type: ignore[misc]
     def __init__(self, path: str, offset: int, expected: object, got: object, reason: str) -> None:
         super().__init__(f"{reason}: expected {expected}, got {got}", path=path)
         self.offset, self.expected, self.got, self.reason = offset, expected, got, reason
-
-
-class Seen(NamedTuple):
-    """A part that was parsed: construct's path, first byte and the one after its last, the value,
-    and the construct if it is a seal.
-
-    Within a bit block `start` and `end` count what the block was unpacked to.
-    """
-
-    path: str
-    start: int
-    end: int
-    value: Any
-    seal: Any = None
-
-
-def note(context: Any, path: str, start: int, end: int, value: Any, seal: Any = None) -> None:
-    """Add a `Seen` to the list that a parse was given as ``_trail``, so that a parse that fails has
-    still said how far it came.
-    """
-    trail = context._params.get("_trail")
-    if trail is not None:
-        trail.append(Seen(path, start, end, value, seal))
 
 
 class WireNaN(float):
@@ -108,13 +81,10 @@ class MarkedStruct(Struct):  # type: ignore[misc]
         obj = Container()
         inner = self._inner(stream, context, is_parsing=True)
         marks = inner._marks
-        trail = context._params.get("_trail")
         for con in self.subcons:
             start = stream.tell()
             value = con._parsereport(stream, inner, path)
             end = stream.tell()
-            if trail is not None:  # as `note` does; most parses have no trail, and need no path
-                trail.append(Seen(f"{path} -> {con.name or UNNAMED}", start, end, value))
             if con.name:
                 obj[con.name] = inner[con.name] = value
                 marks[con.name] = (start, end)
@@ -180,15 +150,12 @@ class IndexedArray(Array):  # type: ignore[misc]
     def _parse(self, stream: Any, context: Any, path: str) -> Any:
         count = bounded(construct.evaluate(self.count, context), self.limit, "count", path)
         found = construct.ListContainer()
-        trail = context._params.get("_trail")
         for index in range(count):
             context._index = index
             start = stream.tell()
             place = f"{path}[{index}]"
             element = self.subcon._parsereport(stream, context, place)
             found.append(element)
-            if trail is not None:
-                trail.append(Seen(place, start, stream.tell(), element))
             if stream.tell() == start and not self.in_bits:
                 context._params["_empty"] = bounded(
                     context._params.get("_empty", 0) + 1, self.limit, "count", path
@@ -224,7 +191,6 @@ class FullRange(construct.GreedyRange):  # type: ignore[misc]
             stream.seek(-1, io.SEEK_CUR)
             context._index, start, place = len(found), stream.tell(), f"{path}[{len(found)}]"
             found.append(self.subcon._parsereport(stream, context, place))
-            note(context, place, start, stream.tell(), found[-1])
             if stream.tell() == start:
                 raise construct.RangeError("an element without a byte never ends", path=place)
         return found
