@@ -53,9 +53,12 @@ COMMON = 1 / 200
 FIRST_LENGTHS, LENGTHS = 3, 12
 #: example frames in whose payloads the sync pattern is counted, with the usual number of examples.
 SYNC_EXAMPLES = 12
-#: bits of constants and checksums below which noise makes a frame every few megabytes, on a stream
-#: and in a datagram.
-WEAK, WEAK_DATAGRAM = 24, 8
+#: Bits of constants and checksums up to which a frame is weak: noise makes one every few megabytes.
+WEAK_BITS = 24
+#: The same for a frame without points, which does no harm to a picture.
+WEAK_BITS_WITHOUT_POINTS = 16
+#: The same in datagrams, which have checksums of their own.
+WEAK_BITS_IN_DATAGRAMS = 8
 #: how many times the length of the longest random frame a longest length may be.
 FAR = 8
 #: seconds after which nobody cares any more that a clock starts again.
@@ -218,7 +221,8 @@ def _frame(subject: Subject, name: str, frame: Frame) -> Findings:
     if not isinstance(frame.tree, Struct | Sealed):
         yield "LS114", f"it is a {type(frame.struct).__name__}", name
     if not engine.is_compiled:
-        yield "LS116", getattr(engine, "reason", "its layout cannot be computed"), name
+        if not _is_reply(subject.sensor, name):  # a reply comes once, when it is asked for
+            yield "LS116", getattr(engine, "reason", "its layout cannot be computed"), name
     elif engine.size is not None and engine.size != frame.max_length:
         yield (
             "LS203",
@@ -240,6 +244,11 @@ def _frame(subject: Subject, name: str, frame: Frame) -> Findings:
         if frame.direction == "in":
             yield from _sync(subject, name, frame, engine)
             yield from _strength(subject, name, frame, layouts)
+
+
+def _is_reply(sensor: Sensor, name: str) -> bool:
+    """Return whether a frame type is the reply to a command."""
+    return any(name in command.replies for command in sensor.commands.values())
 
 
 def _longest(subject: Subject, name: str, frame: Frame) -> Findings:
@@ -334,13 +343,17 @@ def _multiplied(subject: Subject, name: str) -> set[str]:
     return {info.path for info in infos if info is not None} if known else set()
 
 
-def _measured(frame: Frame) -> set[str]:
-    """The paths of fields that are pure numbers: declared with Scaled, and no steps of anything."""
+def _measured(frame: Frame, *, with_scale: bool = False) -> set[str]:
+    """Return the paths of fields that are declared as pure numbers: Scaled with an empty unit.
+
+    Args:
+        with_scale: whether a factor may be declared too, as of the components of a direction.
+    """
     return {
         info.path
         for node in nodes(frame.tree)
         for info in infos(node)
-        if info.measured and not info.unit and not info.scaled
+        if info.measured and not info.unit and (with_scale or not info.scaled)
     }
 
 
@@ -367,7 +380,10 @@ def _plausible(subject: Subject, name: str, frame: Frame) -> Findings:
 
 
 def _covered(name: str, layouts: list[Layout]) -> Findings:
-    """Fields of a sealed frame that no checksum of it covers."""
+    """Yield fields of a sealed frame that none of its checksums covers.
+
+    Many checksums begin behind the header. Fields in front of all checksums are no findings.
+    """
     reported: set[str] = set()
     for layout in layouts:
         if not layout.seals:
@@ -390,7 +406,7 @@ def _covered(name: str, layouts: list[Layout]) -> Findings:
                 if leaf.wire is not None
                 else {leaf.offset + part.byte for part in leaf.elements[0].segments}
             )
-            if not own <= under:
+            if not own <= under and max(own) > min(under):
                 reported.add(path)
                 yield (
                     "LS205",
@@ -436,7 +452,7 @@ def _strength(subject: Subject, name: str, frame: Frame, layouts: list[Layout]) 
     ]
     constant = [sum(mask.bit_count() for mask, _ in layout.known.values()) for layout in layouts]
     weakest = min(map(sum, zip(checked, constant, strict=True)))
-    if weakest <= (WEAK_DATAGRAM if subject.sensor.datagrams else WEAK):
+    if weakest <= _weak_bits(subject.sensor, frame):
         yield (
             "LS206",
             (
@@ -445,6 +461,13 @@ def _strength(subject: Subject, name: str, frame: Frame, layouts: list[Layout]) 
             ),
             name,
         )
+
+
+def _weak_bits(sensor: Sensor, frame: Frame) -> int:
+    """Return the bits of constants and checksums up to which a frame type is weak."""
+    if sensor.datagrams:
+        return WEAK_BITS_IN_DATAGRAMS
+    return WEAK_BITS if frame.data else WEAK_BITS_WITHOUT_POINTS
 
 
 def _points(subject: Subject, name: str) -> Findings:
@@ -542,7 +565,8 @@ def _column(
         factor(info.unit, unit) is not None for info in infos if info is not None for unit in units
     ):
         bare = [info for info in free if not is_unit(info.unit)]
-        if bare and not {info.path for info in bare} & _measured(subject.sensor.frames[name]):
+        pure = _measured(subject.sensor.frames[name], with_scale=column == "azimuth")
+        if bare and not {info.path for info in bare} & pure:
             order = list(subject.fields(name))
             first = min(
                 bare,

@@ -68,7 +68,7 @@ LS209 an acknowledgement of nothing | it would hide the next finding of its kind
 LS210 a range limit that its field cannot hold | scale or limit is wrong | the scale of the manual, and its limit in metres
 LS211 a part of the declaration is missing | nothing can open, decode or find the sensor | vendor, model, a data frame and a data link
 LS212 a checksum that nobody checks | damaged frames are taken for good ones
-      | Checksummed(Struct(...), field="crc", algorithm=...); `lidarspec crc` finds the algorithm
+      | Checksummed(Struct(...), field="crc", algorithm=...), which `lidarspec crc` finds; or a remark, "crc" / Int16ul * "not checked: ..."
 LS213 Python asks whether a column is true | it takes one answer, and a column has one for each packet
       | (f.a < 1) & (f.b < 2), with | and ~, and np.where in place of `if`
 LS214 columns that do not fit together | a point needs one value of each

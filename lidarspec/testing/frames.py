@@ -46,7 +46,7 @@ SAMPLES = 3
 LEAST_SAMPLES = 2
 #: bytes that are checked for the flipped bits of one frame: in a longer one than this allows, some
 #: of its bytes are chosen.
-FLIPPED_BYTES = 1 << 25
+FLIPPED_BYTES = 1 << 23
 
 
 def examples_are_valid_and_repeat(subject: Subject, name: str) -> None:

@@ -74,7 +74,7 @@ class Property:
         names = {
             "frame": subject.frames,
             "data": subject.sensor.data_frames,
-            "command": subject.sensor.commands,
+            "command": subject.commands,
         }
         return [(name,) for name in names[self.each]]
 

@@ -181,6 +181,7 @@ class Subject:
         picture: what was measured of points, likewise: to be held against the manual.
         traced: what `points` returns for traced columns of each data frame, as far as it could be
             traced.
+        placed: data frames of which golden vectors place points in two quadrants.
         swept: packets along the `sweep` of each data frame, as far as a property needed them.
     """
 
@@ -193,6 +194,7 @@ class Subject:
     measured: dict[str, str] = field(default_factory=dict)
     picture: dict[str, str] = field(default_factory=dict)
     traced: dict[str, Any] = field(default_factory=dict, repr=False)
+    placed: set[str] = field(default_factory=set, repr=False)
     swept: dict[str, list[bytes]] = field(default_factory=dict, repr=False)
     _known: dict[tuple[str, int], bytes] = field(default_factory=dict, repr=False)
     _drawers: dict[str, dict[str, Callable[[random.Random], int]]] = field(
@@ -206,6 +208,19 @@ class Subject:
         return {
             name: frame for name, frame in self.sensor.frames.items() if id(frame) not in tested
         }
+
+    @property
+    def commands(self) -> list[str]:
+        """The commands that are tested one by one.
+
+        A related model that is tested too may have the same command with the same frames, links
+        and answers.
+        """
+        return [
+            name
+            for name in self.sensor.commands
+            if not any(_has_same_exchange(self.sensor, other, name) for other in self.tested)
+        ]
 
     def fields(self, frame: str) -> Mapping[str, FieldInfo]:
         """The fields of a frame type, by path."""
@@ -298,6 +313,20 @@ class Subject:
     def stream(self, *, seed: int = 0, rounds: int | None = None) -> bytes:
         """The bytes of a conversation."""
         return b"".join(data for _, data in self.conversation(seed=seed, rounds=rounds))
+
+
+def _has_same_exchange(one: Sensor, other: Sensor, name: str) -> bool:
+    """Return whether a command of one sensor and its reply are those of another sensor too."""
+    command = one.commands[name]
+    if other.commands.get(name) != command:
+        return False
+    types = [command.frame, *command.replies] if command.frame else command.replies
+    return (
+        all(one.frames[kind] is other.frames.get(kind) for kind in types)
+        and one.simulation.answers.get(name) == other.simulation.answers.get(name)
+        and one.links.get(command.link) == other.links.get(command.link)
+        and one.datagrams == other.datagrams
+    )
 
 
 def _pooled(strategy: Any) -> Callable[[random.Random], int]:

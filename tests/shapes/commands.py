@@ -61,9 +61,7 @@ SENSOR = Sensor(
     model="Commands",
     frames={
         "data": Frame(DATA, data=True, max_length=11, plausible=lambda f: f.angle < 360),
-        "ack": Frame(
-            ACK, max_length=5, acknowledged={"LS206": "no line is noisy enough for a shape"}
-        ),
+        "ack": Frame(ACK, max_length=5),
         "order": Frame(ORDER, direction="out", max_length=6),
     },
     points=points,

@@ -49,9 +49,7 @@ SENSOR = Sensor(
     vendor="Shapes",
     model="Weak",
     frames={
-        "info": Frame(
-            INFO, max_length=5, acknowledged={"LS206": "no line is noisy enough for a shape"}
-        ),
+        "info": Frame(INFO, max_length=5),
         "data": Frame(
             DATA,
             data=True,

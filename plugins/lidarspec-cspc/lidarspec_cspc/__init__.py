@@ -453,9 +453,6 @@ def coin_simulation(model: str, **turns: Any) -> Simulation:
 COIN_D4 = coin(
     "COIN-D4",
     status="capture",
-    acknowledged={
-        "LS710": "the start-up is another's capture: the project's tests read it where it is"
-    },
     source=(
         "the M1C1_Mini's manual; baud rate from the vendor's SDK; a captured start-up of a COIN-D4"
     ),

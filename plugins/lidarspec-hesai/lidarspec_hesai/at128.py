@@ -248,7 +248,6 @@ AT128 = spinning(
             data=True,
             max_length=longest(BLOCKS, 3 + 4 * LASERS),
             plausible=plausible,
-            acknowledged={"LS212": UNSEEN},
         )
     },
     points,
@@ -261,7 +260,6 @@ AT128 = spinning(
     range_limits=(1.0, 180.0),
     aliases=("at128", "at128e2x", "pandarat128"),
     status="manual",
-    acknowledged={"LS711": UNSEEN},
     source=(
         "HesaiLidar_SDK_2.0 (udp_protocol_v4_3.h, AT128E2X correction files), tier4/nebula (times,"
         f" range); {UNSEEN}"

@@ -9,7 +9,7 @@ from typing import Any
 from lidarspec.spec import Clock, Frame, OnWrap, Points, Sensor, Sequence, Simulation, Udp
 from lidarspec_hesai import ptc
 from lidarspec_hesai.calibration import Calibration, configure
-from lidarspec_hesai.parts import TURN, UNPUBLISHED, clock
+from lidarspec_hesai.parts import TURN, clock
 
 
 def spinning(
@@ -34,7 +34,6 @@ def spinning(
     defaults: dict[str, Any] = {
         "turn": TURN,
         "clock": Clock(clock),
-        "acknowledged": UNPUBLISHED,
         "scan": OnWrap(azimuth),
         "vendor_axes": ("right", "forward", "up"),
     }

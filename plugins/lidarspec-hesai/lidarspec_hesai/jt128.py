@@ -99,7 +99,6 @@ JT128 = spinning(
             data=True,
             max_length=longest(MOST, 2 + 6 * LASERS),
             plausible=plausible,
-            acknowledged={"LS212": UNSEEN},
         )
     },
     points,
@@ -111,6 +110,5 @@ JT128 = spinning(
     aliases=("jt128",),
     relatives=relatives("hesai-jt128"),
     status="manual",
-    acknowledged={"LS711": UNSEEN},
     source=f"HesaiLidar_SDK_2.0 (udp_protocol_v1_4.h, JT128 correction files); {UNSEEN}",
 )

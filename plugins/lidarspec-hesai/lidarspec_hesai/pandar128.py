@@ -168,7 +168,6 @@ FRAMES = {
         data=True,
         max_length=longest(BLOCKS, 2 + 6 * LASERS),
         plausible=plausible,
-        acknowledged={"LS212": UNSEEN},
     )
 }
 
@@ -236,7 +235,6 @@ PANDAR128 = spinning(
     aliases=("pandar128", "pandar128e3x", "hesai-pandar128e3x"),
     relatives=relatives("hesai-pandar128"),
     status="manual",
-    acknowledged={"LS711": UNSEEN},
     source=(
         "HesaiLidar_SDK_2.0 (udp_protocol_v1_4.h, Pandar128E3X correction files), Pandar128E3X"
         f" user manual; {UNSEEN}"
@@ -255,6 +253,5 @@ OT128 = spinning(
     aliases=("ot128", "pandar128e4x", "hesai-pandar128e4x"),
     relatives=relatives("hesai-ot128"),
     status="manual",
-    acknowledged={"LS711": UNSEEN},
     source=f"HesaiLidar_SDK_2.0 (udp_protocol_v1_4.h, OT128 correction files); {UNSEEN}",
 )

@@ -28,11 +28,6 @@ TURN = (
     # turns a second, slowest and fastest: 300 to 1200 rpm (tier4/nebula, rotation_speed of all models)
 )
 
-#: why no data frames are among the golden vectors.
-UNPUBLISHED = {
-    "LS711": "the captures are others', and too large: the project's tests read them where they are"
-}
-
 UTC = Struct(
     "year"
     / Int8ul

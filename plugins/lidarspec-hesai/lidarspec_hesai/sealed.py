@@ -37,14 +37,21 @@ LASERS, BLOCKS = 128, 2
 TWO = Const(BLOCKS, Int8ul)
 CRC = Crc(32, poly=0x04C11DB7, init=0xFFFFFFFF)  # CRC-32/MPEG-2
 
-SAFETY = Struct(
-    "version" / Int8ul,
-    "status" / Int8ul * "bits 7 to 5 state, 4 and 3 type of the fault, 2 to 0 a counter",
-    "fault_number" / Int8ul * "how many faults, in the high half, and which of them this is",
-    "fault_code" / Int16ul,
-    "reserved" / Bytes(8),
-    "crc" / Int32ul,
-)
+UNCHECKED = "not checked: what it covers is not known of this model"
+
+
+def safety_part(crc: Construct) -> Construct:
+    """Return the part on functional safety."""
+    return Struct(
+        "version" / Int8ul,
+        "status" / Int8ul * "bits 7 to 5 state, 4 and 3 type of the fault, 2 to 0 a counter",
+        "fault_number" / Int8ul * "how many faults, in the high half, and which of them this is",
+        "fault_code" / Int16ul,
+        "reserved" / Bytes(8),
+        "crc" / crc,
+    )
+
+
 SAFE = ("status", "fault_number", "fault_code", "reserved")  # what its CRC covers
 FLAGS = BitStruct(
     "reserved" / BitsInteger(1),
@@ -89,6 +96,8 @@ def packet(
         held: whether CRCs are held; where nobody has seen what they cover, they are fields like
             others.
     """
+    crc = Int32ul if held else Int32ul * UNCHECKED
+    safety_struct = safety_part(crc)
     finer = [] if block is None else ["fine_azimuth" / block]
     body = Struct(
         "blocks"
@@ -96,7 +105,7 @@ def packet(
             this._.block_count,
             Struct("azimuth" / Scaled(Int16ul, 0.01, "deg"), *finer, "channels" / channels),
         ),
-        "crc" / Int32ul,
+        "crc" / crc,
     )
     frame = Struct(
         "sync" / Const(b"\xee\xff"),
@@ -117,7 +126,7 @@ def packet(
                 "safety"
                 / If(
                     this.flags.safety == 1,
-                    Checksummed(SAFETY, "crc", CRC, over=SAFE) if held else SAFETY,
+                    Checksummed(safety_struct, "crc", CRC, over=SAFE) if held else safety_struct,
                 )
             ]
             if safety
@@ -126,7 +135,7 @@ def packet(
         *tail,
         "sequence" / If(this.flags.sequence == 1, Int32ul),
         *(["imu" / If(this.flags.imu == 1, IMU)] if imu else []),
-        "tail_crc" / Int32ul,
+        "tail_crc" / crc,
         "signature" / If(this.flags.signature == 1, Bytes(32)),
     )
     names = [part.name for part in frame.subcons]

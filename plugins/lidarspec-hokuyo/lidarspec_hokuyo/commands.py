@@ -94,9 +94,7 @@ def told(command: bytes, lines: Mapping[str, str]) -> Frame:
         *(line(*one) for one in lines.items()),
         "end" / Const(b"\n"),
     )
-    return Frame(
-        struct, max_length=1000, acknowledged={"LS116": "it comes once, when it is asked for"}
-    )
+    return Frame(struct, max_length=1000)
 
 
 def telling(name: str, values: Mapping[str, str]) -> bytes:

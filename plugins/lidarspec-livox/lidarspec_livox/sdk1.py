@@ -64,12 +64,6 @@ GPS = 3  # the type of timestamps that are a date
 IMU_RATE = 200  # samples a second
 MODEL_TYPES = "1 Mid-40, 2 Tele-15, 3 Horizon LiDAR, 6 Mid-70, 7 Avia"
 STATES = "0 starts, 1 normal, 2 saves power, 3 stands by, 4 error"
-LONG = {
-    "LS711": (
-        "packets of points have up to 1362 bytes: those that were worked out are in the project's"
-        " tests"
-    )
-}
 COMMAND_PORT, DATA_PORT, IMU_PORT = 55_501, 56_001, 56_002  # of this computer
 
 #: in pieces that keep 64 bits of nanoseconds exact, and hold a date as well.
@@ -170,7 +164,6 @@ def data_frame(name: str, rate: float, **more: Any) -> Frame:
         data=True,
         points=points,
         plausible=plausible,
-        acknowledged=LONG,
         **more,
     )
 

@@ -78,7 +78,6 @@ REBOOT, FACTORY_SETTINGS, SET_GPS_TIME = 0x0200, 0x0201, 0x0202
 CRC32 = Crc(32, 0x04C11DB7, init=0xFFFFFFFF, refin=True, refout=True, xorout=0xFFFFFFFF)
 CRC16 = Crc(16, 0x1021, init=0xFFFF)
 LONGEST = 1472  # bytes of a datagram that is not cut into fragments
-UNSEALED = {"LS205": "the CRC begins with the timestamp (Mid-360 protocol document)"}
 ANY_NUMBER = {"LS203": "a datagram holds any number of parameters"}
 SHOTS, IMU_RATE = np.arange(96), 200  # of a simulated packet; IMU samples a second
 TYPES = "9 MID-360, 10 HAP, 15 HAP, 35 MID-360S"
@@ -129,7 +128,6 @@ def points_frame(kind: int, points: Any, *members: Any, **more: Any) -> Frame:
         max_length=LONGEST,
         plausible=filled,
         points=points,
-        acknowledged=UNSEALED,
         **more,
     )
 
@@ -326,7 +324,6 @@ FRAMES: dict[str, Frame] = {
         imu=imu,
         plausible=lambda f: f.dot_num == 1,
         simulation=Simulation(inertia, rate=IMU_RATE),
-        acknowledged=UNSEALED,
     ),
     "state": Frame(
         message(0x0102, "count" / Int16ul, RESERVED, *LIST, ack=False),

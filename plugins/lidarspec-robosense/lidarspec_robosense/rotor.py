@@ -41,12 +41,6 @@ from lidarspec.spec import Clock, Fields, OnWrap, Polar, Scaled, Udp, following,
 # degrees; a longer step between blocks is the edge of the field of view that was set (rs_driver)
 GAP = 1.0
 TURNS = 10  # per second, the factory's setting
-CLOCKWISE = {
-    "LS511": (
-        "the rotor turns clockwise, and the angle on the wire with it, in axes that are"
-        " right-handed"
-    )
-}
 
 BLOCK: Construct = Const(b"\xff\xee")  # what a block begins with
 #: of most models: the low byte first, its sign in a bit of its own.
@@ -327,5 +321,4 @@ COMMON: dict[str, Any] = {
     "vendor_axes": ("forward", "left", "up"),
     "turn": (5.0, 20.0),
     "status": "manual",
-    "acknowledged": CLOCKWISE,
 }

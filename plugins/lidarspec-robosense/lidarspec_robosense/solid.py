@@ -103,12 +103,8 @@ TWO = (
     ATTRIBUTE,
 )
 RETURN = "return_seq" / Int8ub * "0 single return, 1 first, 2 second"
-#: what is true and meant of every data frame.
-UNCHECKED = {
-    "LS212 crc": "nobody says in public what it is over",
-    "LS201 blocks.channels.x": "a component of a direction of length 1, not an angle",
-}
-SEALED = ("crc" / Int32ub, "rolling_counter" / Int16ub)
+UNCHECKED = "not checked: what it covers is not published"
+SEALED = ("crc" / Int32ub * UNCHECKED, "rolling_counter" / Int16ub)
 
 M2_SCANNER = Scanner(25, 5, 1260, 1, wide=120, high=25)
 MX_SCANNER = Scanner(50, 2, 630, 1, wide=120, high=25)
@@ -120,7 +116,7 @@ E1_TAIL = (
     "data_length" / Const(1200, Int16ub),
     "counter" / Int16ub,
     "data_id" / Const(0xE5C, Int32ub),
-    "crc" / Int32ub,
+    "crc" / Int32ub * UNCHECKED,
 )
 E1_DATA = packet(E1_SCANNER, Int16ub, (), ONE, "reserved_end" / Bytes(4), *E1_TAIL)
 E1_DIFOP = Struct(
@@ -290,7 +286,6 @@ M2 = dataclasses.replace(
             M2_DATA,
             data=True,
             plausible=partial(plausible, model=M2_SCANNER),
-            acknowledged=UNCHECKED,
         ),
     },
     points=partial(points, returns=True),
@@ -299,7 +294,6 @@ M2 = dataclasses.replace(
     range_limits=(0.2, 250.0),  # rs_driver's limits for these models
     aliases=("rs-m2", "rs-lidar-m2"),
     status="manual",
-    acknowledged={},
     source="rs_driver (decoder_RSM2.hpp); no packet of this model was seen",
 )
 
@@ -312,7 +306,6 @@ MX = dataclasses.replace(
             MX_DATA,
             data=True,
             plausible=partial(plausible, model=MX_SCANNER),
-            acknowledged=UNCHECKED,
         ),
         "difop": Frame(MX_DIFOP, simulation=Simulation(lambda i: {}, rate=1)),
     },
@@ -336,7 +329,6 @@ E1 = dataclasses.replace(
             E1_DATA,
             data=True,
             plausible=partial(plausible, model=E1_SCANNER),
-            acknowledged=UNCHECKED,
         ),
         "difop": Frame(E1_DIFOP, imu=imu, simulation=Simulation(sweep_e1, rate=1)),
     },

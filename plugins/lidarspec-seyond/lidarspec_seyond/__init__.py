@@ -114,7 +114,7 @@ def packet(returns: int) -> Struct:
         "major" / Int8ul,
         "minor" / Int8ul,
         "firmware_sequence" / Int16ul,
-        "checksum" / Int32ul,
+        "checksum" / Int32ul * "not checked: the vendor's header does not say which CRC it is",
         "size" / Int32ul,
         "source" / Int8ul * "number of the lidar below, kind of time above",
         "lidar_type" / Int8ul,
@@ -213,7 +213,6 @@ def frame(returns: int) -> Frame:
         plausible=plausible,
         simulation=Simulation(partial(sweep, returns=returns)),
         acknowledged={
-            "LS212": "the vendor's header says what it covers, and not which CRC it is",
             "LS506": "a frame is lines, each of which begins on the left",
         },
     )

@@ -40,12 +40,6 @@ from lidarspec_slamtec.answers import ANSWERS, DESCRIPTORS
 from lidarspec_slamtec.commands import BY_DTR, BY_PWM, BY_SPEED, COMMANDS, express
 from lidarspec_slamtec.requests import REQUESTS
 
-#: why no field of a capsule is in metres.
-CODED = (
-    "a code word says itself how many millimetres one of its steps is (SDK, sl_lidar_driver.cpp)"
-)
-#: why asking for any key is not always answered.
-KEYS = "a unit answers for the keys that it knows (answers.py)"
 DTHETA = ("unsigned", "signed")
 MODELS = ("A1", "A2", "A3", "S1", "S2", "S2L", "S3", "T1", "C1")
 TWINS = ("S2", "S2L")
@@ -83,7 +77,6 @@ FRAMES = {
         ),
         plausible=capsules.plausible,
         after="ultra_descriptor",
-        acknowledged={"LS201 cabins.predict2": CODED},
     ),
     "dense": Frame(
         capsules.DENSE,
@@ -106,7 +99,6 @@ FRAMES = {
         ),
         plausible=capsules.plausible,
         after="ultra_dense_descriptor",
-        acknowledged={"LS201 cabins.second_high": CODED},
     ),
     "hq": Frame(
         nodes.HQ,
@@ -184,18 +176,10 @@ def rplidar(
         configure=configure,
         on_open=("stop", "start_motor", "scan"),
         on_close=("stop", "stop_motor"),
-        acknowledged={
-            **dict.fromkeys(("LS604 commands.get_config", "LS604 commands.get_mode_config"), KEYS),
-            **(
-                {}
-                if status == "manual"
-                else {
-                    "LS710": (
-                        "the exchange is a unit's of others: the project's tests read it where"
-                        " it is"
-                    )
-                }
-            ),
+        acknowledged={}
+        if status == "manual"
+        else {
+            "LS710": "the exchange is a unit's of others: the project's tests read it where it is"
         },
         range_limits=range_limits,
         vendor_axes=("forward", "right", "up"),

@@ -100,8 +100,8 @@ ULTRA = capsule(
         ByteSwapped(
             BitStruct(
                 "predict2"
-                / BitsInteger(10, signed=True)
-                * "from the next major; 511, -512: no return",
+                / Scaled(BitsInteger(10, signed=True), 1, "")
+                * "in steps that the code word tells, from the next major; 511, -512: no return",
                 "predict1" / BitsInteger(10, signed=True) * "from this major; 511, -512: no return",
                 "major" / BitsInteger(12) * "0: no return",
             )
@@ -120,7 +120,7 @@ ULTRA_DENSE = capsule(
         ULTRA_DENSE_CABINS,
         ByteSwapped(
             BitStruct(
-                "second_high" / BitsInteger(4),
+                "second_high" / Scaled(BitsInteger(4), 1, ""),
                 "first_high" / BitsInteger(4),
                 "second_low" / BitsInteger(14),
                 "second_scale" / BitsInteger(2),

@@ -225,6 +225,8 @@ OTHERS = {
 HI_RES = {"velodyne-puck-hi-res": Relative("product 0x24", lambda f: f.product == 0x24)}
 
 
+UNPUBLISHED = {"LS710": "the packet is of others: the project's tests read it where it is"}
+
 VLP16 = Sensor(
     "velodyne-vlp16",
     vendor="Velodyne",
@@ -252,11 +254,6 @@ VLP16 = Sensor(
     info={"temperature": "position.top_board_temperature"},  # the product byte is not to be trusted
     aliases=("vlp16", "puck", "puck-lite", "velodyne-puck-lite"),
     status="capture",
-    acknowledged={
-        "LS710": (
-            "the captures are others', and too large: the project's tests read them where they are"
-        )
-    },
     source=(
         "velodyne_decoder and ros-drivers/velodyne, citing the VLP-16 user manual; three captures"
     ),
@@ -308,7 +305,6 @@ PUCK_HI_RES = relative(
         **OTHERS,
     },
     status="manual",
-    acknowledged={},
     source=(
         "velodyne_decoder (Puck Hi-Res.yml, packet_decoder.cpp), citing the VLP-16 user manual; no"
         " packet of this model was seen"
@@ -325,6 +321,7 @@ VLP32C = relative(
     relatives={},
     info={"model": "data.product", **VLP16.info},
     status="vectors",
+    acknowledged=UNPUBLISHED,
     source=(
         "velodyne_decoder (VLP-32C.yml, packet_decoder.cpp), citing the VLP-32C user manual; one"
         " captured packet of tier4/nebula"
@@ -341,6 +338,7 @@ VLS128 = relative(
     relatives={},
     info={"model": "data.product", **VLP16.info},
     status="vectors",
+    acknowledged=UNPUBLISHED,
     source=(
         "velodyne_decoder (Alpha Prime.yml, packet_decoder.cpp, which cites VeloView); one captured"
         " packet of tier4/nebula"

@@ -82,7 +82,7 @@ POSITION = Struct(
             "gyro"
             / Int16ul
             * "HDL-32E: signed, in the low 12 bits; 0.09766 deg/s; the VLP-16 sends 0",
-            "temperature" / Int16ul * "likewise; 0.1453 degC, from 25 degC",
+            "temperature" / Scaled(Int16ul, 1, "") * "likewise; 0.1453 degC, from 25 degC",
             "accel_x" / Int16ul * "likewise; 0.001221 g",
             "accel_y" / Int16ul * "likewise; 0.001221 g",
         ),
@@ -194,11 +194,6 @@ POSITION_FRAME = Frame(
     POSITION,
     plausible=plausible_position,
     simulation=Simulation(sweep_position, rate=POSITIONS),
-    acknowledged={
-        "LS201 inertial.temperature": (
-            "signed in the low 12 bits from an HDL-32E, and no number at all from a VLP-16"
-        )
-    },
 )
 FLAG = Const(b"\xff\xee")
 PUCK_FRAMES = {

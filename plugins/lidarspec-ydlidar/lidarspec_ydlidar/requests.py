@@ -61,11 +61,6 @@ ANSWERS = {
             field="cs",
             algorithm=Xor(),
         ),
-        acknowledged={
-            "LS206": (
-                "it has no more to be told by, and no points: noise makes one in 16 million bytes"
-            )
-        },
     ),
 }
 REQUEST = Frame(Struct("start" / Const(b"\xa5"), "cmd" / Int8ul), direction="out")

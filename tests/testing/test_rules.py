@@ -1,0 +1,116 @@
+"""Rules of `lidarspec check` that a correct declaration could break before: where they end."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from construct import Array, Const, Float32l, Int8ul, Int16sl, Int16ul, Struct, this
+
+from lidarspec import Sensor
+from lidarspec.spec import (
+    Checksummed,
+    Command,
+    Fields,
+    Frame,
+    Polar,
+    Scaled,
+    Simulation,
+    Sum,
+    Xor,
+)
+from lidarspec.testing.commands import the_simulated_sensor_answers
+from lidarspec.testing.declared import declared
+from lidarspec.testing.findings import left_over
+from lidarspec.testing.geometry import the_points_turn_as_the_axes_do
+from lidarspec.testing.properties import PROPERTIES
+from lidarspec.testing.subject import Subject
+from lidarspec.testing.vectors import every_checksum_is_checked
+from tests.broken import interpreted, sound
+
+
+def declared_codes(sensor: Sensor) -> set[str]:
+    """Return the rules that a declaration alone breaks."""
+    return {finding.code for finding in left_over(declared(Subject(sensor)), sensor, whole=True)}
+
+
+def found_by(function: Any, sensor: Sensor) -> set[str]:
+    """Return the rules that one property finds broken."""
+    (held,) = [one for one in PROPERTIES if one.function is function]
+    return {finding.code for finding in held.findings(Subject(sensor))}
+
+
+def with_frame(name: str, frame: Frame, **changes: Any) -> Sensor:
+    """Return the sound sensor with a further frame type."""
+    return sound.sensor(frames={**sound.sensor().frames, name: frame}, **changes)
+
+
+def test_a_reply_need_not_be_compiled() -> None:
+    answer = Frame(interpreted.ACK, max_length=5)
+    asking = {"ask": Command("order", {"code": 2}, reply="answer")}
+    assert declared_codes(with_frame("answer", answer)) == {"LS116"}
+    assert declared_codes(with_frame("answer", answer, commands=asking)) == set()
+
+
+def test_a_weak_frame_without_points_may_have_three_bytes_to_be_known_by() -> None:
+    def stamp(header: bytes) -> Frame:
+        struct = Struct("header" / Const(header), "cs" / Int8ul, "value" / Int16ul)
+        return Frame(Checksummed(struct, field="cs", algorithm=Xor()), max_length=5)
+
+    assert declared_codes(with_frame("stamp", stamp(b"\xaa\x66"))) == set()
+    assert declared_codes(with_frame("stamp", stamp(b"\xaa"))) >= {"LS206"}
+
+
+def test_a_checksum_may_begin_behind_the_header() -> None:
+    def covering(*names: str) -> set[str]:
+        struct = sound.struct()
+        sealed = Checksummed(struct, field="sum", algorithm=Sum(16), over=names)
+        return declared_codes(sound.sensor(sound.frame(sealed)))
+
+    behind = ("time", "tilt", "first", "last", "count", "samples")
+    assert covering(*behind) == set()
+    assert covering(*behind[:-1]) == {"LS205"}
+
+
+def test_components_of_a_direction_are_no_angle() -> None:
+    def points(f: Fields) -> Polar:
+        return Polar(f.samples.distance, np.arctan2(f.samples.y, f.samples.x))
+
+    def codes(component: Any) -> set[str]:
+        sample = Struct("distance" / Scaled(Int16ul, 0.001, "m"), "x" / component, "y" / component)
+        frame = sound.frame(sound.sealed(samples=Array(this.count, sample)), max_length=200)
+        return declared_codes(sound.sensor(frame, points=points))
+
+    assert codes(Scaled(Int16sl, 1 / 32768, "")) == set()
+    assert codes(Float32l) == {"LS201"}
+
+
+def test_a_checksum_that_is_not_documented_has_a_remark() -> None:
+    def frame(check: Any) -> Sensor:
+        return sound.sensor(sound.frame(sound.struct(sum=check)))
+
+    assert found_by(every_checksum_is_checked, frame(Int16ul)) == {"LS212"}
+    assert found_by(every_checksum_is_checked, frame(Int16ul * "over the samples")) == {"LS212"}
+    assert found_by(every_checksum_is_checked, frame(Int16ul * "not checked: unknown")) == set()
+
+
+def test_answers_that_decide_by_the_arguments_may_keep_silent() -> None:
+    def answering(*keys: int) -> Sensor:
+        def answer(request: Any) -> Any:
+            return [("ack", {"code": 1})] if request["code"] in keys else []
+
+        ask = Command("order", {}, reply="ack", args={"key": ("code", 0, 200)})
+        simulation = Simulation(sound.sweep, answers={"ask": answer})
+        return sound.sensor(commands={"ask": ask}, simulation=simulation)
+
+    assert found_by(the_simulated_sensor_answers, answering(0)) == set()
+    assert found_by(the_simulated_sensor_answers, answering(3)) == set()
+
+
+def test_vectors_in_two_quadrants_prove_the_sense_of_the_points() -> None:
+    subject = Subject(sound.sensor(vendor_axes=("forward", "right", "up")))
+    (held,) = [one for one in PROPERTIES if one.function is the_points_turn_as_the_axes_do]
+    assert [finding.code for finding in held.findings(subject)] == ["LS511"]
+    subject.placed.add("data")
+    assert held.findings(subject) == []
+    assert "data: sense" in subject.picture
