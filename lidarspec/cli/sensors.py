@@ -137,7 +137,7 @@ def show(sensor_id: str, as_plan: bool, as_json: bool, output: str | None) -> No
         commands = {name: _command(sensor, name) for name in sensor.commands}
         emit_json({**_facts(sensor), "frames": frames, "commands": commands}, output)
         return
-    from lidarspec.exports.reference import describe_losses
+    from lidarspec.explaining.wording import describe_losses
 
     low, high = sensor.range_limits
     losses = describe_losses(sensor).replace("`", "")

@@ -5,6 +5,7 @@ each frame, and its lines; of a file what is in it.
 Modules in reading order:
 
 * `explanation`: `explain`: from bytes to rows, verdict and points.
+* `frame_rows`: one frame as rows of values.
 * `damage`: the flipped bit, the lost or inserted byte that explains a damage.
 * `pieces`: a stream in pieces: frames, and what was one before it was damaged.
 * `wording`: the words for values, bits, rows, points and differences.

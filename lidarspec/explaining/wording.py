@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 from lidarspec.errors import WireError
 from lidarspec.spec.arguments import Range, Taken
+from lidarspec.spec.description import Spec
 
 if TYPE_CHECKING:
     from lidarspec.points.cloud import PointCloud
@@ -364,3 +365,12 @@ def _marked(error: WireError) -> int:
         digits = error.got.removeprefix("0x").replace(" ", "")
         return min((len(digits) + 1) // 2, left) or 1
     return left if error.got == len(error.data) else 1
+
+
+def describe_losses(sensor: Spec) -> str:
+    """Return how lost packets are counted, or why they are not."""
+    if sensor.sequence is not None:
+        return f"counted by `{sensor.sequence.field}`"
+    if sensor.counts_losses:
+        return "counted by the clock"
+    return "not counted: the packets have no counter, and no clock with a declared pace"

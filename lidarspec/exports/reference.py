@@ -14,7 +14,7 @@ from xml.sax.saxutils import escape
 import numpy as np
 
 from lidarspec.errors import LidarSpecError
-from lidarspec.explaining.wording import asked
+from lidarspec.explaining.wording import asked, describe_losses
 from lidarspec.frames.wire_table import frame_size, wire_table
 from lidarspec.framing.results import Counters, Found, packed
 from lidarspec.packets.stream import PacketStream
@@ -116,15 +116,6 @@ def _clock(clock: Clock) -> str:
     )
     again = f", starts again at {clock.wraps_at:g} s" if clock.wraps_at else ""
     return fields + again + (f", completed by {clock.told[0]} frames" if clock.told else "")
-
-
-def describe_losses(sensor: Sensor) -> str:
-    """Return how lost packets are counted, or why they are not."""
-    if sensor.sequence is not None:
-        return f"counted by `{sensor.sequence.field}`"
-    if sensor.counts_losses:
-        return "counted by the clock"
-    return "not counted: the packets have no counter, and no clock with a declared pace"
 
 
 def _commands(sensor: Sensor) -> Iterator[str]:

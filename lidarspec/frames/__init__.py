@@ -12,7 +12,13 @@ Modules in reading order:
 * `slots`: frames of a wire form as rows, and back.
 * `row_checksums`: the checksums of many frames at once.
 * `frame_table`: many frames as columns of raw values.
-* `parse`, `build`: one frame from bytes, and one from values.
+* `parse`: one frame from bytes.
+* `build`, `encode`: one frame from values: checked, then stored by the layout.
+* `wire_fields`: the fields of one frame with their places, also of a damaged one.
+* `diagnose`: the first fault of a frame.
+* `plain`: frames without a layout, parsed and built by construct.
+* `commands`: the frame of a command from its arguments.
+* `field_paths`: paths of fields as names and indices.
 * `wire_table`: a frame type as people read it: offsets, widths, meanings.
 * `arrays`: arrays that cost next to nothing, for all of these.
 """

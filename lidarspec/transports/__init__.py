@@ -17,8 +17,10 @@ Modules in reading order:
 
 In the opposite direction, in the place of a sensor:
 
-* `outlets`: pseudo-terminals, UDP and TCP in one loop; `http_line` adds HTTP.
+* `outlets`: pseudo-terminals, UDP and TCP in one loop.
+* `http_line`: HTTP in the same loop.
 * `destinations`: from a destination as text to its outlet.
-* `serving`: a simulated sensor at an outlet, in real time; `simulated_files` writes it to a file.
+* `serving`: a simulated sensor at an outlet, in real time.
+* `simulated_files`: a simulated sensor written to a file.
 * `replays`: a recording that is sent again at its recorded times.
 """

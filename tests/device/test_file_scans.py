@@ -21,7 +21,7 @@ from lidarspec.captures.pcap import USER_LINKS, Datagram, datagram_record
 from lidarspec.captures.records import capture_head, packet_record
 from lidarspec.device.file_scans import FileScans
 from lidarspec.errors import UsageError
-from lidarspec.packets.reorder import START_WINDOW
+from lidarspec.packets.reorder import WINDOW
 from tests.made_captures import DESTINATION, SOURCE, pcap_head
 from tests.shapes import SHAPES
 
@@ -149,7 +149,7 @@ def test_pieces_have_the_scans_of_one_pass(
     assert pieces == whole
     assert len(sizes) >= 2
     # At the start of a stream and behind a gap, packets wait to be put in order.
-    assert max(sizes) < 60_000 + START_WINDOW * longest, sizes
+    assert max(sizes) < 60_000 + WINDOW * longest, sizes
 
 
 @pytest.mark.slow
