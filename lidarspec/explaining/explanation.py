@@ -21,7 +21,7 @@ from lidarspec.explaining.listing import Line, Listing, text
 from lidarspec.explaining.wording import Difference, Point, Row, Span, Value
 from lidarspec.frames.parse import identify
 from lidarspec.frames.schema import schema
-from lidarspec.frames.slots import recoder
+from lidarspec.frames.wire_coder import frame_coder
 from lidarspec.frames.wire_fields import examine
 from lidarspec.framing.frame_engine import codec
 from lidarspec.framing.results import IMPLAUSIBLE, Counters, Found, packed
@@ -253,9 +253,8 @@ def _parts(sensor: Sensor, name: str, data: bytes) -> list[str]:
     if place is None:
         return []
     axis, kind_name, _ = place
-    recoding = recoder(frame)
-    row = None if recoding is None else recoding.row(data)
-    examined = examine(frame.tree, data if row is None else row[1], frame.room)
+    struct = frame_coder(frame).decode(data).struct
+    examined = examine(frame.tree, struct, frame.room)
     node = schema(frame.tree).parts[axis]
     kind = next(kind for kind in node.kinds if kind.name == kind_name)
     return [part.prefix for part in examined.parts_of(axis) if part.root is kind.root]

@@ -14,7 +14,7 @@ from lidarspec.frames.compilability import NotCompilable
 from lidarspec.frames.layout_tree import frame_layouts
 from lidarspec.frames.plain import plain_fields
 from lidarspec.frames.schema import schema
-from lidarspec.frames.slots import recoder
+from lidarspec.frames.wire_coder import frame_coder
 from lidarspec.frames.wire_fields import PlacedSeal, WireField, examine
 from lidarspec.frames.wire_table import bit_text, hexed
 from lidarspec.spec import Frame
@@ -39,25 +39,19 @@ class FrameRows:
         self._data = data
         self._schema = schema(frame.tree)
         self._fault = fault
-        self._recoder = recoder(frame)
+        self._has_form = frame.wire is not None
         self._axes = self._array_axes()
-        #: byte of the frame at which each byte of its row stands; None without a wire form.
-        self._places: list[int] | None = None
-        row = data
-        if self._recoder is not None:
-            row, self._places = self._recoder.places(data)
+        decoded = frame_coder(frame).decode(data)
+        #: offset in the frame of each byte of its struct.
+        self._offsets = decoded.offsets
         self._verdicts: dict[str, tuple[str, bool]] = {}
-        fields = self._read_fields(frame, row)
+        fields = self._read_fields(frame, decoded.struct)
         self._is_cut_off = fields is None or any(each.raw is None for each in fields)
         self._fields = [self._placed(each) for each in fields or () if each.raw is not None]
         self._blocks = {plain(each.block) for each in self._fields if each.bits is not None}
-        self._first = 0 if self._places is None else self._places[0]
+        self._first = self._offsets[0]
         self._end = max((each.end for each in self._fields), default=self._first)
-        self._is_whole_text = (
-            self._recoder is not None
-            and not self._is_cut_off
-            and self._recoder.row(data) is not None
-        )
+        self._is_whole_text = self._has_form and not self._is_cut_off and decoded.problem is None
         self.after = len(data) if self._is_whole_text else self._end
 
     def _array_axes(self) -> list[str]:
@@ -67,23 +61,25 @@ class FrameRows:
             axes += info.axes[:-1] if info.kind == "bytes" else info.axes
         return axes
 
-    def _read_fields(self, frame: Frame, row: bytes) -> list[WireField] | None:
+    def _read_fields(self, frame: Frame, struct: bytes) -> list[WireField] | None:
         """Return the fields of the frame, the last one maybe cut off; None if it has no end."""
-        if self._recoder is None and isinstance(frame_layouts(frame), NotCompilable):
-            return plain_fields(frame, row)
-        examined = examine(frame.tree, row, frame.room)
+        if isinstance(frame_layouts(frame), NotCompilable):
+            return plain_fields(frame, struct)
+        examined = examine(frame.tree, struct, frame.room)
         self._verdicts = {seal.path: _verdict(seal) for seal in examined.seals()}
         fields = list(examined.fields())
         if examined.layout is None and all(each.raw is not None for each in fields):
-            cut_off = WireField("", "", FieldInfo(""), len(row), len(row), None, None)
+            cut_off = WireField("", "", FieldInfo(""), len(struct), len(struct), None, None)
             fields.append(cut_off)
         return fields
 
     def _placed(self, each: WireField) -> WireField:
         """Return a field with its place on the wire."""
-        if self._places is None:
+        if not self._has_form:
             return each
-        return replace(each, start=self._places[each.start], end=self._places[each.end], bits=None)
+        return replace(
+            each, start=self._offsets[each.start], end=self._offsets[each.end], bits=None
+        )
 
     def rows(self) -> Iterator[Row]:
         """Return a row for each field or bit block, and for the marks of a wire form.
@@ -106,7 +102,7 @@ class FrameRows:
         left = self._data[self.after :]
         if self._is_cut_off and fault is not None:
             yield Row(self.after, left, fault.path, (), (fault.reason,), right=False)
-        elif fault is not None and self._recoder is not None and not left:
+        elif fault is not None and self._has_form and not left:
             yield Row(self.after, left, "(end)", (), (fault.reason,), right=False)
         elif left:
             yield Row(self.after, left, "", (), ("after the frame's end",), right=False)

@@ -13,15 +13,13 @@ import re
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, replace
 
-import numpy as np
-
 from lidarspec.errors import LidarSpecError, UnknownFrame, WireError
 from lidarspec.explaining.damage import changes
 from lidarspec.explaining.explanation import Explanation, explain
 from lidarspec.explaining.wording import Row
 from lidarspec.frames.layout import Layout
 from lidarspec.frames.parse import identify, layout_of
-from lidarspec.frames.slots import recoder
+from lidarspec.frames.wire_coder import frame_coder
 from lidarspec.framing.frame_engine import codec
 from lidarspec.spec import Sensor
 from lidarspec.spec.description import with_frames
@@ -222,11 +220,9 @@ def _end(sensor: Sensor, data: bytes, start: int, name: str, ends: list[int]) ->
     else where the first thing does.
     """
     following = [end for end in ends if end > start]
-    if (recoding := recoder(sensor.frames[name])) is not None:
-        size = recoding.reading(
-            np.frombuffer(data[start:], np.uint8), np.zeros(1, np.intp)
-        ).sizes.item(0)
-        return start + size if size > 0 else following[0]
+    size = frame_coder(sensor.frames[name]).find_size(data[start:])
+    if size is not None:
+        return start + size
     layout = layout_of(sensor, name, data[start : start + sensor.frames[name].max_length])
     if not isinstance(layout, Layout):
         return following[0]

@@ -9,7 +9,7 @@ Modules in reading order:
 * `layout`: where each field of one kind of header is, as data; loading by it.
 * `parts`: frames within a frame, found from part to part, in many frames at once.
 * `layout_tree`: the layouts of a frame type, by the fields of the header that decide.
-* `slots`: frames of a wire form as rows, and back.
+* `wire_coder`: frames as they are sent, and as the bytes of their structs.
 * `row_checksums`: the checksums of many frames at once.
 * `frame_table`: many frames as columns of raw values.
 * `parse`: one frame from bytes.

@@ -11,11 +11,10 @@ from construct import Container
 from lidarspec.errors import OutOfRange, UnknownField, UnknownFrame, UsageError
 from lidarspec.frames.compilability import NotCompilable
 from lidarspec.frames.encode import encode, fill_counts, known_paths
-from lidarspec.frames.layout import Layout
 from lidarspec.frames.layout_tree import frame_layouts
 from lidarspec.frames.plain import build_plain
 from lidarspec.frames.schema import Schema, schema
-from lidarspec.frames.slots import SPELLING, Recoder, recoder
+from lidarspec.frames.wire_coder import SPELLING, frame_coder
 from lidarspec.spec.description import Spec
 from lidarspec.spec.syntax import WireNaN
 from lidarspec.spec.tree import FieldInfo
@@ -45,34 +44,11 @@ def build(
     if isinstance(frame_layouts(declared), NotCompilable):
         fill_counts(given, schema(declared.tree))
         return build_plain(declared, given, place)
-    data = encode(declared.tree, given, declared.room, place)
-    recoding = recoder(declared)
-    if recoding is None:
-        return data
-    return _written(recoding, data, (value or {}).get(SPELLING), place)
-
-
-def _written(recoding: Recoder, row: bytes, spelling: object, place: str) -> bytes:
-    """A row on the wire, as it was spelled if it says the same.
-
-    Raises:
-        UsageError: for values that its form cannot write.
-    """
-    if (
-        isinstance(spelling, bytes)
-        and (known := recoding.row(spelling)) is not None
-        and known[1] == row
-    ):
-        return spelling
-    layout = recoding.tree.layout(row)
-    data = (
-        recoding.written(np.frombuffer(row, np.uint8).reshape(1, -1), layout)[0]
-        if isinstance(layout, Layout)
-        else None
-    )
+    struct = encode(declared.tree, given, declared.room, place)
+    data = frame_coder(declared).encode(struct, (value or {}).get(SPELLING))
     if data is None:
         raise UsageError(
-            f"{place}: {recoding.form} cannot write these values: a number is too large for its"
+            f"{place}: {declared.wire} cannot write these values: a number is too large for its"
             " digits, or a text has a mark in it"
         )
     return data

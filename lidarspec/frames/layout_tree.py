@@ -778,8 +778,7 @@ class HeaderTree:
         Args:
             places: where they are, if their fields can be read one by one as well.
         """
-        if self._size > REMEMBERED:
-            self._root, self._size = HeaderNode(), 0
+        self._forget_many()
         groups: list[Group] = []
         stack = [(self._root, np.arange(number))] if number else []
         while stack:
@@ -837,6 +836,26 @@ class HeaderTree:
                 return None
             node = node.child(values.item(0))
         return node.result if isinstance(node.result, Layout) else None
+
+    def header(
+        self, frame: bytes, *, since: HeaderNode | None = None, is_all: bool = False
+    ) -> HeaderNode:
+        """Return how far the header of a frame leads with the bytes that there are: to a result, or
+        to a field that they end before.
+
+        Args:
+            since: how far it led with fewer bytes.
+            is_all: there are no more bytes of this frame.
+        """
+        if since is None:
+            self._forget_many()
+        return self._end(frame, since or self._root, is_all=is_all)
+
+    def _forget_many(self) -> None:
+        """Forget all nodes if they are too many."""
+        if self._size > REMEMBERED:
+            self._root = HeaderNode()
+            self._size = 0
 
     def layout(self, frame: bytes) -> Layout | Refused | None:
         """The layout of one frame, or None where its header is not all there."""

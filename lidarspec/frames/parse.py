@@ -12,18 +12,17 @@ import struct
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any, Literal
 
-import numpy as np
 from construct import Container, ListContainer
 
 from lidarspec.errors import SpecError, UnknownFrame, WireError, refuse_text
 from lidarspec.frames import diagnose
 from lidarspec.frames.compilability import NotCompilable
 from lidarspec.frames.layout import Layout, Leaf, Refused
-from lidarspec.frames.layout_tree import frame_layouts, prefix_of
+from lidarspec.frames.layout_tree import frame_layouts
 from lidarspec.frames.parts import Region
 from lidarspec.frames.plain import parse_plain, plain_fault
 from lidarspec.frames.schema import schema
-from lidarspec.frames.slots import SPELLING, Recoder, recoder
+from lidarspec.frames.wire_coder import frame_coder
 from lidarspec.frames.wire_fields import Examined, examine
 from lidarspec.spec.bits import BitField
 from lidarspec.spec.description import Frame, Spec
@@ -104,19 +103,18 @@ def _find_sound(sensor: Spec, data: bytes, frame: str | None) -> tuple[str, Any]
 
 def _parse_sound(frame: Frame, data: bytes) -> tuple[Any] | None:
     """Return the values of a sound frame; else None."""
-    recoding = recoder(frame)
-    if recoding is not None:
-        row = recoding.row(data)
-        if row is None or not row[0].sound(row[1]):
-            return None
-        return (spelled(unpacked(frame.tree, *row), recoding, *row, data),)
     layouts = frame_layouts(frame)
     if isinstance(layouts, NotCompilable):
         values, size = parse_plain(frame, data)
         return (values,) if size == len(data) else None
-    layout = layouts.layout(data)
-    if isinstance(layout, Layout) and layout.sound(data):
-        return (unpacked(frame.tree, layout, data),)
+    coder = frame_coder(frame)
+    decoded = coder.decode(data)
+    if decoded.problem is not None:
+        return None
+    layout = layouts.layout(decoded.struct)
+    if isinstance(layout, Layout) and layout.sound(decoded.struct):
+        values = unpacked(frame.tree, layout, decoded.struct)
+        return (coder.keep_spelling(values, decoded.struct, data),)
     return None
 
 
@@ -151,17 +149,23 @@ def _parse_unsound(
 def _find_fault(sensor: Spec, name: str, data: bytes) -> WireError:
     """Return what is wrong with the bytes of a frame."""
     frame = sensor.frames[name]
-    recoding = recoder(frame)
-    if recoding is not None:
-        row = recoding.row(data)
-        if row is None:
-            where = {"sensor": sensor.id, "frame": name, "data": data}
-            return _unreadable(recoding, data, where)
-        place = functools.partial(recoding.place, data)
-        return _error_of(sensor, name, data, examine(frame.tree, row[1], frame.room), place)
     if isinstance(frame_layouts(frame), NotCompilable):
         return plain_fault(sensor, name, data)
-    return _error_of(sensor, name, data, examine(frame.tree, data, frame.room), int)
+    decoded = frame_coder(frame).decode(data)
+    problem = decoded.problem
+    if problem is not None:
+        return WireError(
+            problem.reason,
+            sensor=sensor.id,
+            frame=name,
+            offset=problem.offset,
+            path=problem.path,
+            expected=problem.expected,
+            got=problem.got,
+            data=data,
+        )
+    examined = examine(frame.tree, decoded.struct, frame.room)
+    return _error_of(sensor, name, data, examined, decoded.offset)
 
 
 def _error_of(
@@ -214,33 +218,18 @@ def _parse_unverified(sensor: Spec, name: str, data: bytes) -> Any:
         WireError: if its bytes end, or lead to no layout.
     """
     frame = sensor.frames[name]
-    recoding = recoder(frame)
-    place: Callable[[int], int] = int
-    row = data
-    if recoding is not None:
-        found = recoding.row(data)
-        row = recoding.legible(data).row if found is None else found[1]
-        place = functools.partial(recoding.place, data)
-    elif isinstance(frame_layouts(frame), NotCompilable):
+    if isinstance(frame_layouts(frame), NotCompilable):
         try:
             return parse_plain(frame, data, verify=False)[0]
         except Exception:
             raise plain_fault(sensor, name, data) from None
-    examined = examine(frame.tree, row, frame.room)
+    decoded = frame_coder(frame).decode(data)
+    examined = examine(frame.tree, decoded.struct, frame.room)
     shortage = _named(sensor, name, diagnose.find_shortage, examined)
     if shortage is not None or examined.layout is None:
         assert shortage is not None
-        raise _wire_error(sensor, name, data, shortage, place)
-    return unpacked(frame.tree, examined.layout, row[: examined.layout.size])
-
-
-def spelled(values: Any, recoding: Recoder, layout: Layout, row: bytes, data: bytes) -> Any:
-    """Values of a frame with a wire form, with the frame itself as `SPELLING` where `build` would
-    write them otherwise.
-    """
-    if recoding.written(np.frombuffer(row, np.uint8).reshape(1, -1), layout) != [data]:
-        values[SPELLING] = data
-    return values
+        raise _wire_error(sensor, name, data, shortage, decoded.offset)
+    return unpacked(frame.tree, examined.layout, decoded.struct[: examined.layout.size])
 
 
 def _physical(fields: Mapping[str, FieldInfo], value: Any, path: str) -> Any:
@@ -269,9 +258,6 @@ def unpacked(root: Node, layout: Layout, frame: bytes) -> Any:
 
 #: the byte orders in which a bit block is a number.
 ENDS: tuple[Literal["little"], Literal["big"]] = ("little", "big")
-
-#: bytes that are shown of what cannot be read.
-SHOWN = 12
 
 #: from the bytes of a frame (below a bit block: from the numbers in its place) to the values of a
 #: part of it, one for each element of the arrays that it is in, row by row.
@@ -512,42 +498,6 @@ def _rows(readers: Sequence[Reader], frame: bytes) -> Sequence[ListContainer]:
     return [ListContainer(row) for row in zip(*(reader(frame) for reader in readers), strict=True)]
 
 
-def _unreadable(recoding: Recoder, data: bytes, where: Mapping[str, Any]) -> WireError:
-    """Why bytes are no frame of a wire form, with the place of the first slot that cannot be read."""
-    begins = recoding.begins
-    if not data or not data.startswith(begins):
-        reason = (
-            f"begins with {data[: len(begins)].hex(' ') or 'nothing'}, expected {begins.hex(' ')}"
-        )
-        return WireError(reason, offset=0, expected=begins, got=data[: len(begins)], **where)
-    reading = recoding.reading(np.frombuffer(data, np.uint8), np.zeros(1, np.intp))
-    size, legible = reading.sizes.item(0), recoding.legible(data)
-    start, path, wanted = legible.stop, legible.path, legible.wanted
-    if 0 < size < len(data):
-        return WireError(
-            f"{len(data) - size} more bytes after the frame's {size}",
-            offset=size,
-            expected=size,
-            got=len(data),
-            **where,
-        )
-    if size <= 0:
-        return WireError(
-            f"frame has no end in its {len(data)} bytes", offset=len(data), got=len(data), **where
-        )
-    if reading.intact is not None and not reading.intact[0]:
-        return WireError("a check character of its lines is wrong", offset=start, **where)
-    got = data[start : start + SHOWN]
-    return WireError(
-        f"{path or 'frame'} at byte {start}: {got!r} is not {wanted}",
-        offset=start,
-        path=path,
-        expected=wanted,
-        got=got,
-        **where,
-    )
-
-
 def layout_of(sensor: Spec, name: str, data: bytes) -> Layout | Refused | None:
     """The layout that the header of this frame leads to; None where it is not compiled or not all
     there.
@@ -576,11 +526,7 @@ def _likeliest(sensor: Spec, data: bytes, faults: list[WireError]) -> WireError:
         return best
     starts = []
     for name, frame in sensor.frames.items():
-        prefix, recoding = prefix_of(frame.tree, frame.room), recoder(frame)
-        run = bytes(
-            prefix[spot][1] for spot in range(len(prefix)) if prefix.get(spot, (0, 0))[0] == 0xFF
-        )
-        starts.append(f"{name} {(run if recoding is None else recoding.begins).hex(' ')}".strip())
+        starts.append(f"{name} {frame_coder(frame).begins.hex(' ')}".strip())
     begins = f"begins with {data[:4].hex(' ')}" if data else "is empty"
     return WireError(
         f"no frame type fits: the data {begins}, expected {', '.join(starts)}",

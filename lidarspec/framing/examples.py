@@ -24,7 +24,7 @@ from lidarspec.frames.layout import Layout, Leaf
 from lidarspec.frames.layout_tree import TooLong, Unknown, layout_of
 from lidarspec.frames.parts import Measure
 from lidarspec.frames.schema import schema
-from lidarspec.frames.slots import recoder
+from lidarspec.frames.wire_coder import frame_coder
 from lidarspec.framing.frame_codec import Codec
 from lidarspec.framing.frame_engine import codec
 from lidarspec.framing.plausibility import plausibility
@@ -43,8 +43,6 @@ GROWTH = 4
 LARGEST_BATCH = 64
 #: Bytes of such a batch, beyond its first frame.
 BATCH_BYTES = 1 << 22
-#: At most so many of a wire form, which are written one slot after another.
-WRITTEN = 8
 #: random headers of which one at least gives a frame.
 HEADERS = 400
 #: field path -> what draws a raw value of it.
@@ -72,12 +70,11 @@ def random_frame(sensor: Spec, frame: str, source: random.Random, drawn: Drawn =
     engine = codec(sensor.frames[frame])
     if not engine.is_compiled or engine.schema.parts:
         return _interpreted(sensor, frame, engine, source, drawn)
-    largest = LARGEST_BATCH if recoder(engine.frame) is None else WRITTEN
     for attempt in range(
         TRIES if sensor.simulation_of(frame).sweep is None else TRIES_BEFORE_SWEEP
     ):
         layout, chosen = header(engine, source, drawn)
-        number = min(GROWTH**attempt, largest, max(BATCH_BYTES // max(layout.size, 1), 1))
+        number = min(GROWTH**attempt, LARGEST_BATCH, max(BATCH_BYTES // max(layout.size, 1), 1))
         rows = _random(engine, layout, number, source)
         _store_drawn(layout, rows, chosen, drawn, source)
         found = _plausible(sensor, frame, layout, _headed(rows, layout, chosen))
@@ -162,9 +159,7 @@ def _random(engine: Codec, layout: Layout, number: int, source: random.Random) -
         .reshape(number, layout.size)
         .copy()
     )
-    recoding = recoder(engine.frame)
-    if recoding is not None:
-        recoding.legal(rows, layout)
+    frame_coder(engine.frame).make_encodable(rows, layout)
     for leaf in layout.leaves.values():
         if leaf.info.allowed:
             leaf.store(
@@ -244,11 +239,10 @@ def _plausible(sensor: Spec, frame: str, layout: Layout, rows: NDArray[np.uint8]
 
 
 def _sent(sensor: Spec, frame: str, layout: Layout, rows: NDArray[np.uint8]) -> list[bytes]:
-    """Frames as they stand on the wire, without those that are too long there or cannot be written."""
-    recoding = recoder(sensor.frames[frame])
-    if recoding is None:
-        return [row.tobytes() for row in rows]
-    return [data for data in recoding.written(rows, layout) if data is not None]
+    """Return the first frame that can be written in the form of its type, or none."""
+    encode = frame_coder(sensor.frames[frame]).encode
+    frames = (encode(row.tobytes()) for row in rows)
+    return next(([data] for data in frames if data is not None), [])
 
 
 def _make_along_sweep(

@@ -25,7 +25,7 @@ from lidarspec.frames.compilability import NotCompilable
 from lidarspec.frames.frame_table import Group, Records, Rows
 from lidarspec.frames.layout import Layout, Refused, Sums, rows_at
 from lidarspec.frames.layout_tree import frame_layouts
-from lidarspec.frames.slots import recoder
+from lidarspec.frames.wire_coder import FormCoder, frame_coder
 from lidarspec.framing.frame_codec import Codec
 from lidarspec.framing.many_lengths import AlikeLayouts, LayoutGroup, Together
 from lidarspec.framing.plausibility import plausibility
@@ -384,9 +384,9 @@ def codec(
 
 @functools.lru_cache(maxsize=2048)
 def _codec(frame: Frame, interpreted: bool) -> CompiledCodec | InterpretedCodec | TextCodec:
-    recoding = recoder(frame)
-    if recoding is not None:
-        return TextCodec(frame, recoding)
+    coder = frame_coder(frame)
+    if isinstance(coder, FormCoder):
+        return TextCodec(frame, coder)
     if interpreted:
         return InterpretedCodec(frame, "asked for")
     try:

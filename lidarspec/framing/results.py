@@ -175,33 +175,6 @@ class Found:
         return f"Found({self.frame} at byte {self.offset}, {len(self.data)} bytes: {begin})"
 
 
-@dataclass(frozen=True, eq=False)
-class Recoded:
-    """Rows of frames of one type with a wire form: where they begin on the wire, ascending, and by
-    layout the index and row of each.
-    """
-
-    kind: int
-    starts: Indices
-    groups: tuple[tuple[Layout, Indices, Bytes2D], ...]
-
-    def only(self, starts: Indices) -> list[tuple[Layout, Indices, Bytes2D]] | None:
-        """The groups of the frames that begin at these places; None where not all are known."""
-        place = np.full(len(self.starts) + 1, -1, np.intp)
-        spots = self.starts.searchsorted(starts)
-        if (
-            not len(self.starts)
-            or (self.starts[np.minimum(spots, len(self.starts) - 1)] != starts).any()
-        ):
-            return None
-        place[spots] = np.arange(len(starts))
-        found = list[tuple[Layout, Indices, Bytes2D]]()
-        for layout, which, rows in self.groups:
-            kept = place[which] >= 0
-            found.append((layout, place[which][kept], rows if kept.all() else rows[kept]))
-        return found
-
-
 class Frames:
     """Frames, or candidates for frames, in a piece of input, in its order: n of each array.
 
@@ -219,7 +192,6 @@ class Frames:
         rows: the bytes of each, one a row, where all have one layout and somebody gathered them; of
             candidates, of as many from the first one on as are whole.
         errors: failures of the plugin.
-        recoded: the rows of frames with a wire form that have been read already.
     """
 
     def __init__(
@@ -234,7 +206,6 @@ class Frames:
         status: Status | None = None,
         rows: Bytes2D | None = None,
         errors: tuple[PluginError, ...] = (),
-        recoded: tuple[Recoded, ...] = (),
     ) -> None:
         number = len(kinds)
         self.buffer, self.kinds, self.sizes, self.layouts, self.rows, self.errors = (
@@ -249,7 +220,6 @@ class Frames:
         self.forms = repeated(0 if layouts else -1, number) if forms is None else forms
         self.status = repeated(VALID, number) if status is None else status
         self.names: tuple[str, ...] = ()
-        self.recoded = recoded
 
     @classmethod
     def none(cls, buffer: NDArray[np.uint8]) -> Frames:
@@ -276,7 +246,6 @@ class Frames:
                 [_shifted(part.forms, firsts[id(part.layouts)]) for part in parts]
             ),
             status=np.concatenate([part.status for part in parts]),
-            recoded=tuple({id(one): one for part in parts for one in part.recoded}.values()),
         )
 
     def __len__(self) -> int:

@@ -1,24 +1,25 @@
 """The engine of frames with a wire form: text, or escaped bytes.
 
-The form finds where candidates end, and decodes them to the bytes of the struct; these are judged
-by their layouts, as binary frames are.
+The form finds where candidates end, and decodes them to the bytes of the struct, one at a time.
+These are grouped by layout and judged in bulk, as binary frames are.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 
 import numpy as np
 from numpy.typing import NDArray
 
-from lidarspec.errors import PluginError
-from lidarspec.frames.arrays import alike, repeated
+from lidarspec.errors import PluginError, SpecError
+from lidarspec.frames.arrays import repeated
 from lidarspec.frames.frame_table import Group, Rows, Table
-from lidarspec.frames.layout import Layout, Refused, Sums, marks, rows_at
-from lidarspec.frames.slots import Recoder
+from lidarspec.frames.layout import Refused, Sums, marks, rows_at
+from lidarspec.frames.wire_coder import FormCoder
 from lidarspec.framing.frame_codec import Codec
-from lidarspec.framing.results import CHECKSUM, LENGTH, PLUGIN, SHORT, Frames, Recoded
+from lidarspec.framing.results import CHECKSUM, LENGTH, PLUGIN, SHORT, VALID, Frames
 from lidarspec.spec.description import Frame
+from lidarspec.spec.wire_forms import NO_END
 
 
 class TextCodec(Codec):
@@ -28,12 +29,13 @@ class TextCodec(Codec):
         SpecError: for a struct whose fields have no computable place.
     """
 
-    def __init__(self, frame: Frame, recoder: Recoder) -> None:
+    def __init__(self, frame: Frame, coder: FormCoder) -> None:
         super().__init__(frame)
-        self.recoder = recoder
-        self.tree = recoder.tree
+        self._coder = coder
+        #: Structs of the frames that were found last, since these become columns next.
+        self._found = dict[bytes, bytes]()
         self.size = None
-        self.prefix = {offset: (0xFF, byte) for offset, byte in recoder.prefix.items()}
+        self.prefix = {offset: (0xFF, byte) for offset, byte in coder.prefix.items()}
         self.marks = marks(self.prefix)
 
     @property
@@ -50,73 +52,91 @@ class TextCodec(Codec):
         gathered: bool = True,
         sums: Sums | None = None,
     ) -> Frames:
-        if not len(
-            offsets
-        ):  # as most types of a sensor have none, the buffer is not gone through for each
-            return Frames(buffer, repeated(kind, 0), offsets, offsets, status=np.zeros(0, np.uint8))
-        reading = self.recoder.reading(buffer, offsets)
-        told = offsets + max(self.prefix, default=-1) < (
-            len(buffer) if stops is None else stops
-        )  # else it may be no candidate at all
-        status, errors = (
-            np.where((reading.sizes == 0) | ~told, SHORT, LENGTH).astype(np.uint8),
-            list[PluginError](),
-        )
-        whole = np.flatnonzero((reading.sizes > 0) & told)
-        if reading.intact is not None:
-            status[whole[~reading.intact[whole]]] = CHECKSUM
-            whole = whole[reading.intact[whole]]
-        groups = list[tuple[Layout, NDArray[np.intp], NDArray[np.uint8]]]()
-        for layout, which, rows, is_read in self.recoder.rows(
-            reading, offsets[whole], reading.sizes[whole]
-        ):
+        status = np.full(len(offsets), LENGTH, np.uint8)
+        sizes = np.zeros(len(offsets), np.intp)
+        errors = list[PluginError]()
+        structs = dict[int, bytes]()
+        limits = offsets + self.frame.max_length
+        ends = np.minimum(limits, len(buffer) if stops is None else stops)
+        for index, (offset, end) in enumerate(zip(offsets.tolist(), ends.tolist(), strict=True)):
+            data = buffer[offset:end].tobytes()
+            try:
+                status[index], sizes[index], struct = self._decode(data, errors)
+            except SpecError:
+                raise
+            except Exception as error:
+                errors.append(PluginError.of(error, "struct"))
+                status[index] = PLUGIN
+                continue
+            if struct is not None:
+                structs[index] = struct
+        which = np.array(list(structs), np.intp)
+        groups, refused = self._group(list(structs.values()))
+        for group in groups:
+            judge = self.judge(group.layout)
+            status[which[group.where]] = judge(group.rows, errors, sums)
+        for refusal, where in refused:
+            if refusal.error is not None:
+                errors.append(refusal.error)
+                status[which[where]] = PLUGIN
+        self._found = {
+            buffer[offsets[index] : offsets[index] + sizes[index]].tobytes(): struct
+            for index, struct in structs.items()
+            if status[index] == VALID
+        }
+        kinds = repeated(kind, len(offsets))
+        return Frames(buffer, kinds, offsets, sizes, status=status, errors=tuple(errors))
+
+    def _decode(self, data: bytes, errors: list[PluginError]) -> tuple[int, int, bytes | None]:
+        """Return the status of a candidate and its size, and its struct if that is to be judged,
+        which replaces the status.
+
+        Args:
+            data: the bytes from the candidate on, at most as many as the longest frame has.
+        """
+        if len(data) <= max(self.prefix, default=-1):
+            return SHORT, 0, None  # it may be no candidate at all
+        size = self._coder.form.find_end(data)
+        if size == NO_END and len(data) < self.frame.max_length:
+            return SHORT, 0, None
+        if size <= 0:
+            return LENGTH, 0, None
+        decoded = self._coder.decode_whole(data[:size])
+        if decoded.problem is None:
+            return LENGTH, size, decoded.struct
+        if decoded.problem.is_checksum:
+            return CHECKSUM, size, None
+        refusal = self._coder.refusal(decoded.struct)
+        if refusal is not None and refusal.error is not None:
+            errors.append(refusal.error)
+            return PLUGIN, size, None
+        return LENGTH, size, None
+
+    def _group(
+        self, structs: Sequence[bytes]
+    ) -> tuple[list[Group], list[tuple[Refused, NDArray[np.intp]]]]:
+        """Return structs by layout, without those that have none of their size; and the indices of
+        those that are refused.
+        """
+        sizes = np.array([len(struct) for struct in structs], np.intp)
+        starts = np.cumsum(sizes) - sizes
+        joined = np.frombuffer(b"".join(structs), np.uint8)
+        groups = list[Group]()
+        refused = list[tuple[Refused, NDArray[np.intp]]]()
+        for layout, which in self._coder.tree.classify(joined, starts, starts + sizes):
             if isinstance(layout, Refused):
-                status[whole[which]] = PLUGIN if layout.error else LENGTH
-                errors += [layout.error] if layout.error else []
+                refused.append((layout, which))
                 continue
-            own = whole[which] if is_read.all() else whole[which[is_read]]
-            if not len(own):
-                continue
-            good = rows if len(own) == len(which) else rows[is_read]
-            status[own] = self.judge(layout)(good, errors, sums)
-            groups.append((layout, own, good))
-        recoded = (Recoded(kind, offsets, tuple(groups)),) if groups else ()
-        kinds, sizes = repeated(kind, len(offsets)), np.maximum(reading.sizes, 0)
-        return Frames(
-            buffer, kinds, offsets, sizes, status=status, errors=tuple(errors), recoded=recoded
-        )
+            fitting = which[sizes[which] == layout.size]
+            groups.append(Group(layout, fitting, rows_at(joined, starts[fitting], layout.size)))
+        return groups, refused
 
     def table(self, frames: Iterable[bytes]) -> Table:
-        frames = list(frames)
-        sizes = np.array([len(frame) for frame in frames], np.intp)
-        joined = np.frombuffer(b"".join(frames), np.uint8)
-        return self.gather(
-            Frames(joined, repeated(0, len(frames)), np.cumsum(sizes) - sizes, sizes)
+        found = self._found
+        return self.table_of_structs(
+            found[frame] if frame in found else self._coder.decode_whole(frame).struct
+            for frame in frames
         )
-
-    def gather(self, frames: Frames) -> Table:
-        known = next(
-            (one.only(frames.starts) for one in frames.recoded if one.kind == alike(frames.kinds)),
-            None,
-        )
-        if known is None:
-            reading = self.recoder.reading(frames.buffer, frames.starts)
-            read = self.recoder.rows(reading, frames.starts, frames.sizes)
-            known = [
-                (layout, which[right], rows[right])
-                for layout, which, rows, right in read
-                if isinstance(layout, Layout)
-            ]
-        return Rows(self.schema, [Group(*group) for group in known])
 
     def table_of_structs(self, structs: Iterable[bytes]) -> Table:
-        structs = list(structs)
-        sizes = np.array([len(struct) for struct in structs], np.intp)
-        joined = np.frombuffer(b"".join(structs), np.uint8)
-        starts = np.cumsum(sizes) - sizes
-        groups = [
-            Group(layout, which, rows_at(joined, starts[which], layout.size))
-            for layout, which in self.tree.classify(joined, starts, starts + sizes)
-            if isinstance(layout, Layout)
-        ]
-        return Rows(self.schema, groups)
+        return Rows(self.schema, self._group(list(structs))[0])

@@ -6,7 +6,7 @@ made by evaluating the expression for every value: byte order, bits, scale, "0 i
 and cosines then cost nothing while decoding, and need no rule each. Both compilers of points use
 these tables, and the plan asks them whether an expression can be anything but a number.
 
-Text and other wire forms (M4) have no windows of their own: their slots do.
+Windows of frames with a wire form are those of their structs.
 """
 
 from __future__ import annotations

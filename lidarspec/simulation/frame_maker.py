@@ -20,7 +20,7 @@ from lidarspec.frames.frame_table import Group, Rows
 from lidarspec.frames.layout import Layout
 from lidarspec.frames.layout_tree import TooLong, Unknown, layout_of
 from lidarspec.frames.schema import schema, without_indices
-from lidarspec.frames.slots import Recoder, recoder
+from lidarspec.frames.wire_coder import Coder, frame_coder
 from lidarspec.framing.frame_engine import InterpretedCodec, codec
 from lidarspec.spec.description import Spec
 from lidarspec.spec.syntax import member
@@ -47,14 +47,14 @@ class FrameMaker:
         others = sensor.data_frames if sensor.frames[frame].data else ()
         elsewhere = {path for other in others for path in codec(sensor.frames[other]).schema.fields}
         self.engine = engine
-        self._recoder: Recoder | None = recoder(engine.frame)
+        self._coder: Coder | None = frame_coder(engine.frame)
         self._makes(sensor.id, engine.frame.tree, engine.frame.room, {}, elsewhere)
 
     @classmethod
     def _of_parts(cls, sensor: str, root: Node, limit: int, given: Mapping[str, int]) -> FrameMaker:
         """Makes parts of one kind, in frames whose fields have the values that they ask for."""
         maker = cls.__new__(cls)
-        maker._recoder = None  # parts have none of their own
+        maker._coder = None  # parts have none of their own
         maker._makes(sensor, root, limit, given, set())
         return maker
 
@@ -116,20 +116,19 @@ class FrameMaker:
         Raises:
             SpecError: where its wire form cannot write a value.
         """
-        frames = sealed(table)
-        if self._recoder is None:
-            return frames
-        for group in table.groups:
-            for place, data in zip(
-                group.where.tolist(), self._recoder.written(group.rows, group.layout), strict=True
-            ):
-                if data is None:
-                    raise SpecError(
-                        f"{self._recoder.form} cannot write these values",
-                        path="simulation",
-                        sensor=self._sensor,
-                    )
-                frames[place] = data
+        structs = sealed(table)
+        if self._coder is None:
+            return structs
+        frames = list[bytes]()
+        for struct in structs:
+            data = self._coder.encode(struct)
+            if data is None:
+                raise SpecError(
+                    f"{self.engine.frame.wire} cannot write these values",
+                    path="simulation",
+                    sensor=self._sensor,
+                )
+            frames.append(data)
         return frames
 
     def _with_counts(self, values: Values) -> Values:

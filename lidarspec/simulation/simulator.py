@@ -31,7 +31,6 @@ from numpy.typing import NDArray
 from lidarspec.errors import SpecError, UsageError, plugin_errors
 from lidarspec.expressions.columns import AROUND, Batch, Column, Fields, of_points
 from lidarspec.frames.frame_table import Group, Rows, Table
-from lidarspec.frames.slots import slot_of
 from lidarspec.framing.examples import example
 from lidarspec.framing.frame_engine import codec
 from lidarspec.packets.clocks import clock_ns
@@ -251,9 +250,7 @@ class Measurement:
         leaves = [
             group.layout.leaves[path] for group in table.groups if path in group.layout.leaves
         ]
-        return (
-            most if form is None else min(most, *(form.largest(slot_of(leaf)) for leaf in leaves))
-        )
+        return most if form is None else min(most, *(form.largest(leaf.size) for leaf in leaves))
 
     def _traced(self, table: Rows) -> tuple[Target, ...]:
         """The fields in metres that the ranges of the points answer to."""

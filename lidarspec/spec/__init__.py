@@ -14,7 +14,7 @@ order:
 * `arguments`: what a command is told, and what is found out when it is sent.
 * `fields`: units and seals, as parts of a struct.
 * `checksums`: algorithms as values; of one message.
-* `wire_forms`: what has to be recoded before its fields have places: tokens, lines, escapes.
+* `wire_forms`: frames whose fields have no fixed places on the wire: tokens, lines, escapes.
 * `links`: how a sensor is connected.
 * `timing`: clocks, counters, where scans end.
 * `results`, `vocabulary`: what a `points` function returns, and what it is written with.
@@ -94,16 +94,18 @@ if TYPE_CHECKING:
         wrap as wrap,
     )
     from lidarspec.spec.wire_forms import (
+        Decoded as Decoded,
         Echoes as Echoes,
         Escaped as Escaped,
         Lines as Lines,
-        Reading as Reading,
+        NumberRun as NumberRun,
+        Problem as Problem,
         Scip as Scip,
         SixBits as SixBits,
-        Slot as Slot,
+        TextRun as TextRun,
         Tokens as Tokens,
-        Unescaped as Unescaped,
         WireForm as WireForm,
+        decode_runs as decode_runs,
     )
     from lidarspec.transports.protocol import (
         Chunk as Chunk,
@@ -153,9 +155,11 @@ _NAMES = {
         "Scip",
         "Escaped",
         "WireForm",
-        "Reading",
-        "Slot",
-        "Unescaped",
+        "Decoded",
+        "Problem",
+        "TextRun",
+        "NumberRun",
+        "decode_runs",
     ),
     "plugins": ("hookimpl",),
     "transports.protocol": ("Format", "Transport", "LiveTransport", "Chunk", "Disconnected"),

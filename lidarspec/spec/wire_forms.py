@@ -1,180 +1,277 @@
-"""Wire forms: what stands on the wire where a number has no fixed place, as text, in lines,
-escaped; both ways, in bulk.
+"""Wire forms: frames whose fields have no fixed places on the wire, as text or escaped bytes.
 
-A form frames by marks of its own and turns many candidates into rows, in which each field of the
-struct has its slot, its own bytes; and rows back into what is sent. Nothing else of the engine
-knows of it: layouts, checksums, plans and simulation work on the rows.
+A form works on one frame at a time: `find_end` finds where a frame ends, `decode` turns its bytes
+into those of the struct, and `encode` turns these into the bytes that are sent. Everything else
+works on the bytes of the struct, as it does for binary frames.
 
-A form of a plugin (varints, packed messages) is any object with the two functions of `WireForm`;
-what most of them need is in `Unescaped`, which reads frames whose bytes only have to be collected.
+Which field comes next in a text often depends on fields before it, such as counts. So `decode` asks
+for the runs of fields that follow the bytes decoded so far, until there are none left. A run is one
+text, or consecutive numbers, whose digits NumPy converts at once.
 """
 
 from __future__ import annotations
 
 import itertools
-from collections.abc import Sequence
+import re
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property, lru_cache
-from typing import Any, ClassVar, Literal, Protocol
+from typing import Any, ClassVar, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
 from lidarspec.errors import SpecError
 
-Bytes1D = NDArray[np.uint8]
-Bytes2D = NDArray[np.uint8]
-Numbers = NDArray[np.intp]
-#: the bytes of a text, None for each that may be any.
+Offsets = NDArray[np.intp]
+Values = NDArray[np.uint64]
+#: The bytes of a text, None for each that varies.
 Characters = Sequence[int | None]
 
-#: what `Reading.sizes` says of candidates without an end so far, and of those that are no frames.
-SHORT, NONE = 0, -1
-#: tokens that are read at once, so that they stay in the cache; elements of an array that is read
-#: by itself, as others are longer.
-AT_ONCE, MANY = 1 << 14, 16
-#: what stands for a character that is no digit.
-NO_DIGIT = 0xFF
-#: from each count of bytes the mask that leaves so many of eight.
-KEPT = np.array([(1 << 8 * count) - 1 for count in range(9)], np.uint64)
+#: Results of `WireForm.find_end`: the end is not among the bytes; the bytes are no frame.
+NO_END = 0
+NO_FRAME = -1
+#: Most digits of a number in a token.
+MAX_DIGITS = 16
+#: The largest value of each number of bytes.
+LARGEST_OF_BYTES = np.array([256**size - 1 for size in range(9)], np.uint64)
+#: Bits of a character of `SixBits`.
+CHARACTER_BITS = 6
+NEWLINE = 0x0A
+PLUS = 0x2B
+MINUS = 0x2D
 
 
 @dataclass(frozen=True)
-class Slot:
-    """Fields of one kind, one behind the other in a row.
+class TextRun:
+    """A field of bytes, which is text on the wire.
 
     Attributes:
-        kind: "text" for bytes; else numbers of that kind.
-        size: the bytes of each.
-        count: how many.
-        little: whether their bytes come lowest first.
+        size: in bytes.
     """
 
-    kind: Literal["text", "uint", "int", "float"]
     size: int
-    count: int = 1
-    little: bool = False
 
-    def numbers(self, part: Bytes2D) -> NDArray[np.uint64]:
-        """The bits of the numbers in their part of the rows, (n, count)."""
-        wide = np.zeros((len(part), self.count, 8), np.uint8)
-        each = part.reshape(len(part), self.count, self.size)
-        wide[:, :, 8 - self.size :] = each[:, :, ::-1] if self.little else each
-        return wide.view(">u8")[:, :, 0].astype(np.uint64)
+    def __len__(self) -> int:
+        return 1
+
+    @property
+    def sizes(self) -> Offsets:
+        """The bytes of each field, (1,)."""
+        return np.array([self.size], np.intp)
 
 
-class Reading(Protocol):
-    """Candidates in one buffer, as a form reads them.
+@dataclass(frozen=True, eq=False)
+class NumberRun:
+    """Consecutive numbers of a struct.
 
     Attributes:
-        sizes: their bytes, marks included, (n,); `SHORT` where the end is not there yet, `NONE`
-            where they are no frames.
-        intact: whether checks that are the form's own are right, (n,); None where it has none.
+        sizes: the bytes of each number in the struct, (n,).
+        kinds: "u", "i" or "f" for each, as in `numpy.dtype.kind`, (n,).
+        is_little: whether the bytes of each are in little-endian order, (n,).
     """
 
-    sizes: Numbers
-    intact: NDArray[np.bool_] | None
+    sizes: Offsets
+    kinds: NDArray[np.str_]
+    is_little: NDArray[np.bool_]
 
-    def rows(self, at: Numbers, stops: Numbers, slots: Sequence[Slot]) -> tuple[Bytes2D, Numbers]:
-        """The slots that follow from places in the buffer on.
+    def __len__(self) -> int:
+        return len(self.sizes)
 
-        Args:
-            at: where in the buffer each candidate is read on, (n,): at first behind
-                `WireForm.start`, then where it was left.
-            stops: where each ends, marks included, (n,).
+    @cached_property
+    def ends(self) -> Offsets:
+        """The offset after each number, from the first byte of the run, (n,)."""
+        return np.cumsum(self.sizes)
 
-        Returns:
-            Their bytes, (n, sum of size * count); and where each goes on, (n,): `stops` where
-            nothing follows, `NONE` where a slot cannot be read.
-        """
+    @cached_property
+    def owners(self) -> Offsets:
+        """The index of the number that each byte of the run belongs to, (bytes,)."""
+        return np.arange(len(self)).repeat(self.sizes)
 
-    def starts(self, at: int, slots: Sequence[Slot]) -> Numbers:
-        """Where each of the slots begins that follow from a place in the buffer on and can be read,
-        one for each of their `count`.
-        """
+    @cached_property
+    def remaining(self) -> Offsets:
+        """How many bytes of the same number follow each byte of the run, (bytes,)."""
+        return self.ends[self.owners] - 1 - np.arange(len(self.owners))
+
+    @cached_property
+    def largest(self) -> Values:
+        """The largest value of each as an unsigned number, which is all of its bits, (n,)."""
+        return LARGEST_OF_BYTES[self.sizes]
+
+    @cached_property
+    def highest(self) -> Values:
+        """The largest value of each with a sign; 0 for floats, (n,)."""
+        highest = np.where(self.kinds == "i", self.largest >> np.uint64(1), self.largest)
+        return np.where(self.kinds == "f", np.uint64(0), highest)
+
+    @cached_property
+    def lowest(self) -> Values:
+        """The magnitude of the most negative value of each, (n,)."""
+        lowest = (self.largest >> np.uint64(1)) + np.uint64(1)
+        return np.where(self.kinds == "i", lowest, np.uint64(0))
+
+    @cached_property
+    def _word_offsets(self) -> Offsets:
+        """Where each byte of the run is among the big-endian words of eight bytes."""
+        significance = np.where(
+            self.is_little[self.owners],
+            self.sizes[self.owners] - 1 - self.remaining,
+            self.remaining,
+        )
+        return 8 * self.owners + 7 - significance
+
+    def to_bytes(self, values: Values) -> bytes:
+        """Return the first numbers of the run as bytes of the struct; higher bits are lost."""
+        size = self.ends.item(len(values) - 1) if len(values) else 0
+        words = values.astype(">u8").view(np.uint8)
+        return words[self._word_offsets[:size]].tobytes()
+
+    def from_bytes(self, data: bytes) -> Values:
+        """Return the bits of all numbers of the run, (n,)."""
+        words = np.zeros(8 * len(self), np.uint8)
+        words[self._word_offsets] = np.frombuffer(data, np.uint8)
+        return words.view(">u8").astype(np.uint64)
+
+
+Run = TextRun | NumberRun
+#: Returns the runs of fields that follow the first bytes of a struct, as far as these determine
+#: them; none where the struct is complete, or no frame can begin so.
+NextRuns = Callable[[bytes], Sequence[Run]]
+
+
+@dataclass(frozen=True)
+class Problem:
+    """The first reason why bytes are no frame of a form.
+
+    Attributes:
+        offset: in the frame.
+        reason: "" for a field that cannot be read.
+        is_checksum: whether a checksum of the form itself is wrong.
+        path: of the field.
+        expected, got: values for the error.
+    """
+
+    offset: int
+    reason: str = ""
+    is_checksum: bool = False
+    path: str = ""
+    expected: Any = None
+    got: Any = None
+
+
+@dataclass(frozen=True, eq=False)
+class Decoded:
+    """The bytes of a struct that a frame stands for, as far as it could be decoded.
+
+    Attributes:
+        struct: the bytes.
+        spans: for successive fields the offset of each in the frame, and its bytes in the struct.
+        end: offset of the first byte of the frame that belongs to no field.
+        problem: None if the whole frame was decoded.
+    """
+
+    struct: bytes
+    spans: Sequence[tuple[Offsets, Offsets]]
+    end: int
+    problem: Problem | None = None
+
+    @property
+    def offsets(self) -> list[int]:
+        """Where in the frame the field of each byte of the struct begins, and at last `end`."""
+        starts = [begins.repeat(sizes) for begins, sizes in self.spans]
+        return [*np.concatenate([np.zeros(0, np.intp), *starts]).tolist(), self.end]
+
+    def offset(self, place: int) -> int:
+        """Return where in the frame the field of a byte of the struct begins."""
+        return self.offsets[min(place, len(self.struct))]
 
 
 class WireForm(Protocol):
-    """How frames stand on the wire.
+    """How the frames of one type stand on the wire.
 
     Attributes:
-        start: the bytes that each begins with, before its first slot.
-        is_text: whether its bytes are characters, so that examples of text are letters.
+        is_text: whether fields of bytes are printable characters, so that examples are letters.
     """
 
     is_text: ClassVar[bool]
 
-    @property
-    def start(self) -> bytes: ...
-
     def begins(self, texts: Sequence[Characters]) -> Characters:
-        """The first bytes on the wire of frames that begin with these texts, as far as the place of
-        each is always the same.
+        """Return the first bytes of frames whose structs begin with these texts, as far as they are
+        always at the same offsets.
         """
 
-    def read(self, buffer: Bytes1D, starts: Numbers, limit: int) -> Reading:
-        """Rows out of bytes: the candidates that begin at `starts`, (n,) ascending, of at most
-        `limit` bytes.
+    def find_end(self, data: bytes) -> int:
+        """Return the size of the frame that begins with the first byte, `NO_END` if its end is not
+        among these bytes, and `NO_FRAME` if no frame begins here, whatever follows.
         """
 
-    def write(self, rows: Bytes2D, slots: Sequence[Slot]) -> list[bytes]:
-        """Bytes out of rows, (n, size): each frame as it is sent. What cannot be written is read
-        back as something else.
+    def decode(self, data: bytes, next_runs: NextRuns) -> Decoded:
+        """Decode one frame, or what there is of it; see `decode_runs`."""
+
+    def encode(self, struct: bytes, runs: Sequence[Run]) -> bytes:
+        """Return the frame for the bytes of a struct, which consists of these runs.
+
+        Values that the form cannot express may become any bytes: frames are decoded again before
+        they are sent.
         """
 
-    def largest(self, slot: Slot) -> int:
-        """The largest number that can be written for a slot, as bits."""
+    def largest(self, size: int) -> int:
+        """Return the largest number that can be written for a field of so many bytes."""
 
 
-def ended(starts: Numbers, ends: Numbers, limit: int, length: int) -> Numbers:
-    """The bytes from each start to the end mark behind it, that included, as `Reading.sizes` has
-    them.
+class RunReader(Protocol):
+    """Reads the fields of one frame in order."""
+
+    @property
+    def position(self) -> int:
+        """Offset of the next field in the frame; that of its end if there is none."""
+
+    def read(self, run: Run) -> tuple[bytes, Offsets]:
+        """Return the bytes in the struct and the offsets of the fields of a run, up to the first
+        that cannot be read.
+        """
+
+
+def decode_runs(reader: RunReader, next_runs: NextRuns, size: int | None) -> Decoded:
+    """Read the fields of a frame.
 
     Args:
-        ends: the last bytes of marks, ascending.
-        length: of the buffer.
+        size: of the frame, the last byte of which marks its end; None if it has no end.
     """
-    if not len(ends):
-        return np.where(length - starts >= limit, NONE, SHORT)
-    index = ends.searchsorted(starts, "right")
-    sizes = ends[np.minimum(index, len(ends) - 1)] - starts + 1
-    missing = index == len(ends)
-    sizes[missing] = length - starts[missing]
-    return np.where(
-        (sizes > limit) | (missing & (sizes >= limit)), NONE, np.where(missing, SHORT, sizes)
-    )
+    struct = b""
+    spans = list[tuple[Offsets, Offsets]]()
+    is_readable = True
+    while is_readable and (runs := next_runs(struct)):
+        for run in runs:
+            part, begins = reader.read(run)
+            struct += part
+            spans.append((begins, run.sizes[: len(begins)]))
+            is_readable = len(begins) == len(run)
+            if not is_readable:
+                break
+    position = reader.position
+    if is_readable and position == size:
+        return Decoded(struct, spans, size - 1)
+    end = position if size is None else min(position, size - 1)
+    return Decoded(struct, spans, end, Problem(position))
 
 
 @lru_cache(maxsize=64)
-def _digits(base: int, first: int | None = None) -> NDArray[np.uint8]:
-    """The value of each character as a digit: 0 to 9 and letters of both cases, or characters in a
-    row from `first` on.
-    """
-    values = np.full(256, NO_DIGIT, np.uint8)
-    if first is not None:
-        values[first : first + base] = np.arange(base)
-        return values
+def _digit_values(base: int) -> tuple[Values, NDArray[np.bool_]]:
+    """Return the value of each character as a digit of a base, and whether it is one, (256,)."""
+    values = np.zeros(256, np.uint64)
+    is_digit = np.zeros(256, np.bool_)
     for value, character in enumerate("0123456789ABCDEF"[:base]):
-        values[ord(character)] = values[ord(character.lower())] = value
-    return values
+        for code in (ord(character), ord(character.lower())):
+            values[code] = value
+            is_digit[code] = True
+    return values, is_digit
 
 
-def _combined(digits: NDArray[Any], base: int) -> NDArray[Any]:
-    """The numbers of four or eight digits each, one a byte, the first highest."""
-    number = digits.dtype.type
-    for width, mask in (
-        (8, 0x00FF00FF00FF00FF),
-        (16, 0x0000FFFF0000FFFF),
-        (32, 0x00000000FFFFFFFF),
-    )[: digits.itemsize // 4 + 1]:
-        kept = number(mask & (1 << 8 * digits.itemsize) - 1)
-        high = digits >> number(width)
-        high &= kept
-        high *= number(base)
-        digits = digits & kept
-        digits += high
-        base *= base
-    return digits
+@lru_cache(maxsize=64)
+def _digit_weights(base: int) -> Values:
+    """Return the weight of a digit by its distance from the end of its token, 0 beyond a number."""
+    return np.array([0, *(base**place for place in range(MAX_DIGITS)), 0], np.uint64)
 
 
 @dataclass(frozen=True)
@@ -216,347 +313,119 @@ class Tokens:
             )
 
     def begins(self, texts: Sequence[Characters]) -> Characters:
-        return [
-            *self.start,
-            *[byte for text in texts if len(text) for byte in (*text, self.sep[0])][:-1],
-        ]
+        tokens = [[*text, self.sep[0]] for text in texts if len(text)]
+        return [*self.start, *itertools.chain(*tokens)][: None if not tokens else -1]
 
-    def read(self, buffer: Bytes1D, starts: Numbers, limit: int) -> Reading:
-        return _TokenReading(self, buffer, starts, limit)
+    def find_end(self, data: bytes) -> int:
+        end = data.find(self.end, 1)
+        if data.find(self.start, 1, end if end > 0 else len(data)) > 0:
+            return NO_FRAME
+        return end + 1 if end > 0 else NO_END
 
-    def write(self, rows: Bytes2D, slots: Sequence[Slot]) -> list[bytes]:
-        number, first = len(rows), 0
-        characters, used = [_repeated(self.start, (number, 1))], [np.ones((number, 1), np.bool_)]
-        for is_text, run in itertools.groupby(
-            (slot for slot in slots if slot.size), lambda slot: slot.kind == "text"
-        ):
-            for some in ((slot,) for slot in run) if is_text else (tuple(run),):
-                part = rows[
-                    :, first : (first := first + sum(slot.size * slot.count for slot in some))
-                ]
-                written, told = self._texts(part, some[0]) if is_text else self._numbers(part, some)
-                ends = _repeated(self.sep, (*written.shape[:2], 1))
-                characters += [np.concatenate([written, ends], axis=2).reshape(number, -1)]
-                used += [
-                    np.concatenate([told, np.ones(ends.shape, np.bool_)], axis=2).reshape(
-                        number, -1
-                    )
-                ]
-        whole, which = np.concatenate(characters, axis=1), np.concatenate(used, axis=1)
-        whole[:, -1] = self.end[0]
-        return _pieces(whole, which)
+    def decode(self, data: bytes, next_runs: NextRuns) -> Decoded:
+        size = len(data) if data.endswith(self.end) else None
+        return decode_runs(_TokenReader(self, data), next_runs, size)
 
-    def largest(self, slot: Slot) -> int:
-        return int(256**slot.size - 1)
+    def encode(self, struct: bytes, runs: Sequence[Run]) -> bytes:
+        tokens = list[bytes]()
+        offset = 0
+        for run in runs:
+            part = struct[offset : offset + int(run.sizes.sum())]
+            offset += len(part)
+            tokens += [part] if isinstance(run, TextRun) else self._number_tokens(run, part)
+        return self.start + self.sep.join(tokens) + self.end
 
-    def _texts(self, part: Bytes2D, slot: Slot) -> tuple[NDArray[np.uint8], NDArray[np.bool_]]:
-        texts = part.reshape(len(part), slot.count, slot.size)
-        return texts, np.ones(texts.shape, np.bool_)
+    def _number_tokens(self, run: NumberRun, data: bytes) -> list[bytes]:
+        values = run.from_bytes(data)
+        if self.base == 16:
+            return [b"%0*X" % (self.width, value) for value in values.tolist()]
+        is_negative = (run.kinds == "i") & (values > run.highest)
+        magnitudes = np.where(is_negative, run.largest - values + np.uint64(1), values)
+        signs = np.where(is_negative, "-", "")
+        pairs = zip(signs.tolist(), magnitudes.tolist(), strict=True)
+        return [f"{sign}{value:0{self.width}d}".encode() for sign, value in pairs]
 
-    def _numbers(
-        self, part: Bytes2D, run: tuple[Slot, ...]
-    ) -> tuple[NDArray[np.uint8], NDArray[np.bool_]]:
-        """The characters of numbers, (n, count, most), and which of them are written."""
-        fixed = _places(run)
-        sizes = fixed.sizes
-        wide = np.zeros((len(part), 8 * len(sizes)), np.uint8)
-        wide[:, fixed.index] = part
-        values = wide.view(">u8").astype(np.uint64)
-        is_negative = np.zeros(values.shape, np.bool_)
-        if self.base == 10:
-            is_signed = fixed.lowest > 0
-            is_negative = (values >> (8 * sizes - 1).astype(np.uint64)).astype(np.bool_) & is_signed
-            values = np.where(is_negative, (~values + np.uint64(1)) & KEPT[sizes], values)
-        most = max(
-            len(f"{256 ** int(sizes.max()) - 1:{'X' if self.base == 16 else 'd'}}"), self.width
-        )
-        digits = np.empty((*values.shape, most), np.uint8)
-        for place in range(most - 1, -1, -1):
-            values, digits[:, :, place] = np.divmod(values, np.uint64(self.base))
-        shown = np.logical_or.accumulate(digits != 0, axis=2)
-        shown[:, :, most - max(self.width, 1) :] = True
-        signs = np.full((*values.shape, 1), ord("-"), np.uint8)
-        characters = np.concatenate(
-            [signs, np.frombuffer(b"0123456789ABCDEF", np.uint8)[digits]], axis=2
-        )
-        return characters, np.concatenate([is_negative[:, :, None], shown], axis=2)
+    def largest(self, size: int) -> int:
+        return int(256**size - 1)
 
 
-class _TokenReading:
-    """Candidates of `Tokens` in one buffer."""
+class _TokenReader:
+    """Reads the tokens of one frame; all numbers are converted when it is made."""
 
-    intact: NDArray[np.bool_] | None = None
+    def __init__(self, form: Tokens, data: bytes) -> None:
+        self._form = form
+        self._data = data
+        self.position = 1
+        characters = np.frombuffer(data, np.uint8)
+        is_mark = (characters == form.sep[0]) | (characters == form.end[0])
+        is_mark[:1] = False
+        #: Offset of the mark behind each token.
+        self._marks = is_mark.nonzero()[0]
+        self._begins = np.append(1, self._marks + 1)[: len(self._marks)]
+        self._magnitudes = np.zeros(len(self._marks), np.uint64)
+        self._is_number = np.zeros(len(self._marks), np.bool_)
+        self._signs: NDArray[np.uint8] | None = None
+        if len(self._marks):
+            self._convert_numbers(characters)
+            if b"+" in data or b"-" in data:
+                self._convert_signed(characters[self._begins])
 
-    def __init__(self, form: Tokens, buffer: Bytes1D, starts: Numbers, limit: int) -> None:
-        self._form, self._buffer = form, buffer
-        self._ends = np.flatnonzero(buffer == form.end[0])
-        self.sizes = ended(starts, self._ends, limit, len(buffer))
-        begins = np.flatnonzero(buffer == form.start[0])
-        index = begins.searchsorted(starts, "right")
-        again = np.append(begins, len(buffer))[
-            index
-        ]  # where the next frame begins, if it does before this one ends
-        self.sizes[
-            (again < len(buffer)) & (again - starts < np.where(self.sizes > 0, self.sizes, limit))
-        ] = NONE
+    def _convert_numbers(self, characters: NDArray[np.uint8]) -> None:
+        """Convert all tokens that are digits without a sign."""
+        values, is_digit = _digit_values(self._form.base)
+        lengths = self._marks - self._begins
+        body = characters[1 : self._marks[-1] + 1]
+        distances = self._marks.repeat(lengths + 1) - np.arange(1, len(body) + 1)
+        weights = _digit_weights(self._form.base).take(distances, mode="clip")
+        self._magnitudes = np.add.reduceat(values[body] * weights, self._begins - 1)
+        is_wrong = ~(is_digit[body] | (distances == 0))
+        has_wrong = np.logical_or.reduceat(is_wrong, self._begins - 1)
+        self._is_number = ~has_wrong & (lengths > 0) & (lengths <= MAX_DIGITS)
 
-    @cached_property
-    def _stops(self) -> Numbers:
-        """Where tokens may end."""
-        return np.flatnonzero(
-            (self._buffer == self._form.sep[0]) | (self._buffer == self._form.end[0])
-        )
+    def _convert_signed(self, first_characters: NDArray[np.uint8]) -> None:
+        """Convert the tokens with a sign, which are decimal."""
+        self._signs = first_characters
+        has_sign = (first_characters == PLUS) | (first_characters == MINUS)
+        for index in np.flatnonzero(has_sign).tolist():
+            digits = self._data[self._begins[index] + 1 : self._marks[index]]
+            if digits.isdigit() and len(digits) <= MAX_DIGITS:
+                self._magnitudes[index] = int(digits)
+                self._is_number[index] = True
 
-    @cached_property
-    def _digits(self) -> NDArray[np.uint8]:
-        """The digits in the buffer, which begins 16 before it."""
-        return np.concatenate([np.zeros(16, np.uint8), _digits(self._form.base)[self._buffer]])
+    def read(self, run: Run) -> tuple[bytes, Offsets]:
+        return self._read_text(run) if isinstance(run, TextRun) else self._read_numbers(run)
 
-    def _window(self, ends: Numbers, lengths: Numbers, width: int) -> NDArray[Any]:
-        """The last digits, at most `width`, of tokens, one a byte."""
-        windows: NDArray[Any] = np.ndarray(
-            (len(self._digits) - width + 1,), f">u{width}", self._digits, 0, (1,)
-        )
-        found = windows[ends + (16 - width)].astype(f"u{width}")
-        found &= KEPT.astype(f"u{width}")[np.minimum(lengths, width)]
-        return found
+    def _read_text(self, run: TextRun) -> tuple[bytes, Offsets]:
+        begin = self.position
+        end = begin + run.size
+        if self._data[end : end + 1] not in (self._form.sep, self._form.end):
+            return b"", np.zeros(0, np.intp)
+        self.position = end + 1
+        return self._data[begin:end], np.array([begin])
 
-    @cached_property
-    def _has_signs(self) -> bool:
-        return bool(
-            np.count_nonzero(self._buffer == ord("+")) or np.count_nonzero(self._buffer == ord("-"))
-        )
-
-    def rows(self, at: Numbers, stops: Numbers, slots: Sequence[Slot]) -> tuple[Bytes2D, Numbers]:
-        tokens = sum(slot.count for slot in slots)
-        if not len(at) or not len(self._stops):
-            return np.zeros(
-                (len(at), sum(slot.size * slot.count for slot in slots)), np.uint8
-            ), np.full(len(at), NONE)
-        step = max(AT_ONCE // max(tokens, 1), 1)
-        parts = [
-            self._read(at[first : first + step], stops[first : first + step], slots)
-            for first in range(0, len(at), step)
-        ]
-        if len(parts) == 1:
-            return parts[0]
-        rows, ends = zip(*parts, strict=True)
-        return np.concatenate(rows), np.concatenate(ends)
-
-    def starts(self, at: int, slots: Sequence[Slot]) -> Numbers:
-        found = [np.zeros(0, np.intp)]
-        for slot in slots:
-            if slot.kind == "text":  # which may have a separator inside
-                begins = at + (slot.size + 1 if slot.size else 0) * np.arange(slot.count + 1)
-            else:
-                first = self._stops.searchsorted(at)
-                begins = np.append(at, self._stops[first : first + slot.count] + 1)
-            found.append(begins[:-1])
-            at = begins[-1]
-        return np.concatenate(found)
-
-    def _read(self, at: Numbers, stops: Numbers, slots: Sequence[Slot]) -> tuple[Bytes2D, Numbers]:
-        parts = [np.empty((len(at), 0), np.uint8)]
-        for (is_text, _), group in itertools.groupby(
-            slots, lambda slot: (slot.kind == "text", slot if slot.count >= MANY else None)
-        ):
-            run = tuple(group)
-            part, at = self._texts(at, stops, run) if is_text else self._numbers(at, stops, run)
-            parts.append(part)
-        return np.concatenate(parts, axis=1), at
-
-    def _texts(self, at: Numbers, stops: Numbers, run: tuple[Slot, ...]) -> tuple[Bytes2D, Numbers]:
-        parts = list[Bytes2D]()
-        marks = (self._form.sep[0], self._form.end[0])
-        for size in (slot.size for slot in run for _ in range(slot.count if slot.size else 0)):
-            inside = (at >= 0) & (at + size < stops)
-            at = np.where(inside, at, 0)
-            parts.append(
-                self._buffer[np.minimum(at[:, None] + np.arange(size), len(self._buffer) - 1)]
-            )
-            after = self._buffer[np.minimum(at + size, len(self._buffer) - 1)]
-            at = np.where(inside & ((after == marks[0]) | (after == marks[1])), at + size + 1, NONE)
-        return np.concatenate([np.empty((len(at), 0), np.uint8), *parts], axis=1), at
-
-    def _numbers(
-        self, at: Numbers, stops: Numbers, run: tuple[Slot, ...]
-    ) -> tuple[Bytes2D, Numbers]:
-        fixed = _places(run)
-        number = len(fixed.sizes)
-        index = self._stops.searchsorted(at)
-        inside = (at >= 0) & (index + number <= len(self._stops))
-        ends = self._stops[np.minimum(index[:, None] + np.arange(number), len(self._stops) - 1)]
-        begins = np.empty_like(ends)
-        begins[:, 0] = np.clip(at, 0, len(self._buffer) - 1)
-        np.minimum(ends[:, :-1] + 1, len(self._buffer) - 1, out=begins[:, 1:])
-        values, right = self._values(begins, ends, fixed)
-        right = inside & (ends[:, -1] < stops) & right
-        at = np.where(right, ends[:, -1] + 1, NONE)
-        if len(run) == 1 and run[0].size in (1, 2, 4, 8):
-            slot = run[0]
-            return (
-                values.astype(f"{'<' if slot.little else '>'}u{slot.size}")
-                .view(np.uint8)
-                .reshape(len(at), -1),
-                at,
-            )
-        wide: NDArray[Any] = values.astype(">u8").view(np.uint8).reshape(len(at), -1)
-        return wide.take(fixed.index, axis=1), at
-
-    def _values(
-        self, begins: Numbers, ends: Numbers, fixed: _Places
-    ) -> tuple[NDArray[Any], NDArray[np.bool_]]:
-        """The numbers that tokens from `begins` to `ends` say, (n, k); and in which rows all are
-        numbers that their slots hold, (n,).
-        """
-        base, lengths = self._form.base, ends - begins
-        if self._has_signs and (signs := np.isin(self._buffer[begins], (ord("+"), ord("-")))).any():
-            return self._signed(begins, ends, fixed, signs)
-        longest, shortest = (int(lengths.max()), int(lengths.min())) if lengths.size else (1, 1)
-        width = 4 if longest <= 4 else 8
-        if shortest < 1 or longest > 16:
-            lengths = np.clip(lengths, 0, 17)
-        digits = self._window(ends, lengths, width)
-        wrong = digits & digits.dtype.type(0xF0F0F0F0F0F0F0F0 & (1 << 8 * width) - 1)
-        values = _combined(digits, base)
-        if longest > 8:
-            above = self._window(ends - 8, np.maximum(lengths - 8, 0), 8)
-            wrong |= above & np.uint64(0xF0F0F0F0F0F0F0F0)
-            values += _combined(above, base) * np.uint64(base**8)
-        right = ~wrong.any(axis=1)
-        if shortest < 1 or longest > 16:
-            right &= ((lengths >= 1) & (lengths <= 16)).all(axis=1)
-        if width == 8 or fixed.smallest < 2 or base != 16:
-            right &= (values <= fixed.largest).all(axis=1)
-        return values, right
-
-    def _signed(
-        self, begins: Numbers, ends: Numbers, fixed: _Places, signs: NDArray[np.bool_]
-    ) -> tuple[NDArray[np.uint64], NDArray[np.bool_]]:
-        """The same of tokens of which some have signs, and are decimal."""
-        lengths = np.clip(ends - begins - signs, 0, 17)
-        parts = (
-            self._window(ends - 8, np.maximum(lengths - 8, 0), 8),
-            self._window(ends, lengths, 8),
-        )
-        wrong = (parts[0] | parts[1]) & np.uint64(0xF0F0F0F0F0F0F0F0)
-        letters = (
-            (parts[0] + np.uint64(0x0606060606060606)) | (parts[1] + np.uint64(0x0606060606060606))
-        ) & np.uint64(0x1010101010101010)
-        values, tens = (
-            _combined(parts[0], base) * np.uint64(base**8) + _combined(parts[1], base)
-            for base in (self._form.base, 10)
-        )
-        minus = signs & (self._buffer[begins] == ord("-"))
-        held = np.where(
-            signs,
-            (letters == 0) & (tens <= np.where(minus, fixed.lowest, fixed.highest)),
-            values <= fixed.largest,
-        )
-        right = held & (wrong == 0) & (lengths >= 1) & (lengths <= 16)
-        return np.where(signs, np.where(minus, ~tens + np.uint64(1), tens), values), right.all(
-            axis=1
-        )
-
-
-@dataclass(frozen=True)
-class _Places:
-    """Where the bytes of numbers go: the index of each among theirs of eight bytes; the bytes of
-    each; the largest number that it holds as bits, as a number above 0, and below it;
-    the size of the smallest."""
-
-    index: Numbers
-    sizes: Numbers
-    smallest: int
-    largest: NDArray[np.uint64]
-    highest: NDArray[np.uint64]
-    lowest: NDArray[np.uint64]
-
-
-@lru_cache(maxsize=1024)
-def _places(run: tuple[Slot, ...]) -> _Places:
-    each = [slot for slot in run for _ in range(slot.count)]
-    spots = [
-        range(8 * i + 8 - slot.size, 8 * i + 8)[:: -1 if slot.little else 1]
-        for i, slot in enumerate(each)
-    ]
-    sizes, kinds = (
-        np.array([slot.size for slot in each], np.intp),
-        np.array([slot.kind for slot in each]),
-    )
-    largest = KEPT[sizes]
-    half = largest >> np.uint64(1)
-    lowest = np.where(kinds == "int", half + np.uint64(1), np.uint64(0))
-    highest = np.where(
-        kinds == "int", half, np.where(kinds == "uint", largest, np.uint64(0))
-    )  # no float has a sign before its bits
-    return _Places(
-        np.array([spot for part in spots for spot in part], np.intp),
-        sizes,
-        int(sizes.min()),
-        largest,
-        highest,
-        lowest,
-    )
-
-
-class Unescaped:
-    """A `Reading` of frames whose bytes need only be collected, and their numbers perhaps be read
-    from characters.
-
-    Args:
-        sizes, intact: as in `Reading`.
-        places: where in the buffer the bytes stand that are collected, ascending.
-        values: these bytes.
-        numbers: how numbers are written; None where they are as they are.
-    """
-
-    def __init__(
-        self,
-        sizes: Numbers,
-        places: Numbers,
-        values: Bytes1D,
-        intact: NDArray[np.bool_] | None = None,
-        numbers: SixBits | None = None,
-    ) -> None:
-        self.sizes, self.intact, self.places, self.values, self.numbers = (
-            sizes,
-            intact,
-            places,
-            values,
-            numbers,
-        )
-
-    def rows(self, at: Numbers, stops: Numbers, slots: Sequence[Slot]) -> tuple[Bytes2D, Numbers]:
-        size, number = sum(slot.size * slot.count for slot in slots), len(self.places)
-        first = self.places.searchsorted(at)
-        inside = (at >= 0) & (first + size <= number)
-        first = np.where(inside, first, 0)
-        ends = np.append(self.places, np.iinfo(np.intp).max)  # where each byte stands, and none
-        inside &= (size == 0) | (ends[np.minimum(first + max(size - 1, 0), number)] < stops)
-        rows = np.zeros((len(at), size), np.uint8)
-        if 0 < size <= number:
-            windows: NDArray[Any] = np.ndarray(
-                (number - size + 1,), f"V{size}", self.values, 0, (1,)
-            )
-            rows = windows[np.where(inside, first, 0)].view(np.uint8).reshape(len(at), size)
-        follows = ends[np.minimum(first + size, number)]
-        goes_on = np.where(inside, np.where(follows >= stops, stops, follows), NONE)
-        if self.numbers is None or not rows.size:
-            return rows, goes_on
-        rows, right = self.numbers.read(rows, slots)
-        return rows, np.where(right, goes_on, NONE)
-
-    def starts(self, at: int, slots: Sequence[Slot]) -> Numbers:
-        sizes = np.repeat([slot.size for slot in slots], [slot.count for slot in slots])
-        found: Numbers = self.places[self.places.searchsorted(at) + np.cumsum(sizes) - sizes]
-        return found
+    def _read_numbers(self, run: NumberRun) -> tuple[bytes, Offsets]:
+        first = int(self._marks.searchsorted(self.position))
+        tokens = slice(first, first + len(run))
+        values = self._magnitudes[tokens]
+        count = len(values)
+        fits = values <= run.largest[:count]
+        if self._signs is not None:
+            is_negative = self._signs[tokens] == MINUS
+            fits = np.where(self._signs[tokens] == PLUS, values <= run.highest[:count], fits)
+            fits = np.where(is_negative, values <= run.lowest[:count], fits)
+            values = np.where(is_negative, ~values + np.uint64(1), values)
+        fits &= self._is_number[tokens]
+        if not fits.all():
+            count = int(fits.argmin())
+        if count:
+            self.position = self._marks.item(first + count - 1) + 1
+        return run.to_bytes(values[:count]), self._begins[first : first + count]
 
 
 @dataclass(frozen=True)
 class Echoes:
-    """Steps of one to some echoes each, joined by a mark; in a row each step has places for all,
-    and an echo that is missing is 0.
+    """Steps of one to some echoes each, joined by a mark; in the struct each step has places for
+    all, and an echo that is missing is 0.
 
     An echo whose numbers are all 0 is not sent when none follows it in its step, but for the first.
 
@@ -570,83 +439,89 @@ class Echoes:
     most: int
     mark: bytes = b"&"
 
-    def apart(
-        self, places: Numbers, values: Bytes1D, begins: Numbers, ends: Numbers, zero: int
-    ) -> tuple[Numbers, Bytes1D]:
-        """Characters and where they stand, with all echoes of all steps in their places.
+    @cached_property
+    def _step(self) -> re.Pattern[bytes]:
+        """A step: a mark joins two echoes if another character follows it."""
+        mark = re.escape(self.mark)
+        echo = b"[^%b].{%d}" % (mark, self.size - 1)
+        return re.compile(b"%b(?:%b%b){0,%d}" % (echo, mark, echo, self.most - 1), re.DOTALL)
+
+    def expand(
+        self, characters: bytes, offsets: Offsets, end: int, zero: bytes, *, is_whole: bool
+    ) -> tuple[bytes, Offsets]:
+        """Insert the echoes that were not sent.
 
         Args:
-            begins, ends: in the buffer, of what stands behind the head of each frame, (n,)
-                ascending; of frames in one another the first counts.
-            zero: what stands for a character that is missing.
+            offsets: of the characters in the frame, (n,).
+            end: offset of what follows them.
+            zero: the digit of a missing echo.
+            is_whole: whether these are all characters of the frame.
+
+        Returns:
+            The characters, and the offset of each, which for a missing echo is that of the next
+            one. A mark that joins no echoes stays, and can be read as no number.
         """
-        pieces, done = list[tuple[Numbers, Bytes1D]](), 0
-        for begin, end, stop in zip(
-            places.searchsorted(begins), places.searchsorted(ends), ends - 1, strict=True
-        ):
-            if begin >= done:
-                steps = self._steps(places[begin:end], values[begin:end], stop, zero)
-                pieces += [(places[done:begin], values[done:begin]), steps]
-                done = end
-        at, characters = zip(*pieces, (places[done:], values[done:]), strict=True)
-        return np.concatenate(at), np.concatenate(characters)
+        parts = list[bytes]()
+        begins = list[int]()
+        counts = list[int]()
+        begin = 0
+        stride = self.size + len(self.mark)
+        while match := self._step.match(characters, begin):
+            step = match[0]
+            count = -(-len(step) // stride)
+            echoes = [step[at : at + self.size] for at in range(0, len(step), stride)]
+            parts.append(b"".join(echoes).ljust(self.most * self.size, zero))
+            begins.append(begin)
+            counts.append(count)
+            begin = match.end()
+        numbers = np.arange(self.most)
+        follows = np.array([*begins[1:], begin], np.intp)[: len(begins), None, None]
+        firsts = np.array(begins, np.intp)[:, None] + stride * numbers
+        indices = np.where(
+            (numbers < np.array(counts, np.intp)[:, None])[:, :, None],
+            firsts[:, :, None] + np.arange(self.size),
+            follows,
+        )
+        steps = b"".join(parts)
+        places = np.append(offsets, end)[indices.reshape(-1)]
+        rest = characters[begin:]
+        if counts and counts[-1] < self.most and self._begins_echo(rest, is_whole=is_whole):
+            # The last step goes on with an echo that is cut off, so that none is missing.
+            size = len(steps) - (self.most - counts[-1]) * self.size
+            steps = steps[:size]
+            places = places[:size]
+            begin += len(self.mark)
+        return steps + characters[begin:], np.append(places, offsets[begin:])
 
-    def _steps(
-        self, places: Numbers, values: Bytes1D, stop: int, zero: int
-    ) -> tuple[Numbers, Bytes1D]:
-        """The same of the steps of one frame; a mark that joins no echoes stays, where no number
-        can be read.
+    def _begins_echo(self, characters: bytes, *, is_whole: bool) -> bool:
+        """Return whether characters begin with a mark that joins an echo."""
+        if not characters.startswith(self.mark):
+            return False
+        following = characters[len(self.mark) : len(self.mark) + 1]
+        return following != self.mark if following else not is_whole
 
-        A missing echo stands where the next one does that is there, or at `stop`.
+    def join(self, characters: bytes, zero: bytes) -> bytes:
+        """Return the steps as they are sent.
+
+        Raises:
+            SpecError: for characters that are no steps.
         """
-        marks = np.flatnonzero(values == self.mark[0])
-        number = np.arange(len(marks))
-        before = marks - number  # characters, without marks
-        goes_on = np.diff(before, prepend=0) == self.size
-        echo = number - np.maximum.accumulate(np.where(goes_on, 0, number)) + 1
-        follows = np.append(values, self.mark[0])[marks + 1]
-        right = (
-            (before > 0)
-            & (before % self.size == 0)
-            & (echo < self.most)
-            & (follows != self.mark[0])
-        )
-        used = np.ones(len(values), np.bool_)
-        used[marks[right]] = False
-        places, values = places[used], values[used]
-        whole = len(values) // self.size
-        nth = np.zeros(whole + 1, np.intp)  # of its step is each echo
-        nth[before[right] // self.size] = echo[right]
-        firsts = np.flatnonzero(nth[:whole] == 0)
-        slots = (np.cumsum(nth[:whole] == 0) - 1) * self.most + nth[:whole]
-        characters = np.full((len(firsts) * self.most, self.size), zero, np.uint8)
-        characters[slots] = values[: whole * self.size].reshape(-1, self.size)
-        spots = (
-            np.append(places, stop)[self.size * np.append(firsts, whole)[1:]]
-            .repeat(self.most * self.size)
-            .reshape(-1, self.size)
-        )
-        spots[slots] = places[: whole * self.size].reshape(-1, self.size)
-        rest = slice(whole * self.size, None)
-        return np.append(spots, places[rest]), np.append(characters, values[rest])
-
-    def joined(self, characters: Bytes2D, zero: int) -> list[bytes]:
-        """The steps of each row as they are sent."""
-        number, size = characters.shape
-        if size % (self.most * self.size):
+        room = self.most * self.size
+        if len(characters) % room:
             raise SpecError(
-                f"{size} characters behind the head are no steps of {self.most} echoes of"
-                f" {self.size}",
+                f"{len(characters)} characters behind the head are no steps of {self.most} echoes"
+                f" of {self.size}",
                 path="wire",
             )
-        echoes = characters.reshape(number, -1, self.most, self.size)
-        used = np.logical_or.accumulate((echoes != zero).any(axis=3)[:, :, ::-1], axis=2)[
-            :, :, ::-1, None
-        ].repeat(self.size + 1, axis=3)
-        used[:, :, 0] = True
-        used[:, :, 0, 0] = False  # no mark before the first
-        marked = np.concatenate([_repeated(self.mark, (*echoes.shape[:3], 1)), echoes], axis=3)
-        return _pieces(marked.reshape(number, -1), used.reshape(number, -1))
+        steps = list[bytes]()
+        missing = zero * self.size
+        for begin in range(0, len(characters), room):
+            step = characters[begin : begin + room]
+            echoes = [step[at : at + self.size] for at in range(0, room, self.size)]
+            while len(echoes) > 1 and echoes[-1] == missing:
+                echoes.pop()
+            steps.append(self.mark.join(echoes))
+        return b"".join(steps)
 
 
 @dataclass(frozen=True)
@@ -673,7 +548,7 @@ class SixBits:
         each = self.echoes
         if each is not None and (
             len(each.mark) != 1
-            or _digits(64, self.first[0])[each.mark[0]] < 64
+            or each.mark[0] - self.first[0] in range(1 << CHARACTER_BITS)
             or min(each.size, each.most) < 1
         ):
             raise SpecError(
@@ -682,41 +557,66 @@ class SixBits:
                 path="wire",
             )
 
-    def read(self, rows: Bytes2D, slots: Sequence[Slot]) -> tuple[Bytes2D, NDArray[np.bool_]]:
-        """Rows with numbers in place of their characters; and in which all are digits, (n,)."""
-        values, right, start = _digits(64, self.first[0])[rows], np.ones(len(rows), np.bool_), 0
-        made = rows.copy()
-        for slot in slots:
-            part = slice(start, start := start + slot.size * slot.count)
-            if slot.kind != "text" and slot.count:
-                digits = values[:, part].reshape(len(rows), slot.count, slot.size)
-                right &= (digits < 64).all(axis=(1, 2))
-                made[:, part] = self._bytes(digits, slot).reshape(len(rows), -1)
-        return made, right
+    def encode(self, struct: bytes, runs: Sequence[Run]) -> bytes:
+        """Return the characters of a struct; of numbers that are too large the low bits."""
+        parts = list[bytes]()
+        offset = 0
+        for run in runs:
+            part = struct[offset : offset + int(run.sizes.sum())]
+            offset += len(part)
+            if isinstance(run, NumberRun):
+                shifts = (CHARACTER_BITS * run.remaining).astype(np.uint64)
+                digits = run.from_bytes(part)[run.owners] >> shifts
+                digits &= np.uint64((1 << CHARACTER_BITS) - 1)
+                part = (digits.astype(np.uint8) + self.first[0]).tobytes()
+            parts.append(part)
+        return b"".join(parts)
 
-    @staticmethod
-    def _bytes(digits: NDArray[np.uint8], slot: Slot) -> NDArray[np.uint8]:
-        """The bytes of numbers of these digits, (n, count, size)."""
-        total = np.zeros(digits.shape[:2], np.uint64 if slot.size > 4 else np.uint32)
-        for place in range(slot.size):
-            total = (total << total.dtype.type(6)) | digits[:, :, place]
-        wide = (
-            total.astype(total.dtype.newbyteorder(">"))
-            .view(np.uint8)
-            .reshape(*digits.shape[:2], -1)[:, :, total.itemsize - slot.size :]
-        )
-        return wide[:, :, ::-1] if slot.little else wide
 
-    def write(self, rows: Bytes2D, slots: Sequence[Slot]) -> Bytes2D:
-        """Rows with the characters of numbers in their place; of larger ones the low bits."""
-        made, start = rows.copy(), 0
-        for slot in slots:
-            part = slice(start, start := start + slot.size * slot.count)
-            if slot.kind != "text":
-                shifts = np.arange(6 * slot.size - 6, -1, -6, dtype=np.uint64)
-                digits = slot.numbers(rows[:, part])[:, :, None] >> shifts & np.uint64(63)
-                made[:, part] = (digits.astype(np.uint8) + self.first[0]).reshape(len(rows), -1)
-        return made
+class _SixBitReader:
+    """Reads numbers of `SixBits` from characters.
+
+    Args:
+        offsets: of the characters in the frame, (n,).
+        end: offset of what follows them.
+    """
+
+    def __init__(self, form: SixBits, characters: bytes, offsets: Offsets, end: int) -> None:
+        self._characters = characters
+        self._digits = np.frombuffer(characters, np.uint8) - np.uint8(form.first[0])
+        self._offsets = offsets
+        self._end = end
+        self._index = 0
+
+    @property
+    def position(self) -> int:
+        return self._offsets.item(self._index) if self._index < len(self._offsets) else self._end
+
+    def read(self, run: Run) -> tuple[bytes, Offsets]:
+        return self._read_text(run) if isinstance(run, TextRun) else self._read_numbers(run)
+
+    def _read_text(self, run: TextRun) -> tuple[bytes, Offsets]:
+        text = self._characters[self._index : self._index + run.size]
+        if len(text) < run.size:
+            return b"", np.zeros(0, np.intp)
+        begins = self._offsets[self._index : self._index + 1]
+        self._index += run.size
+        return text, begins
+
+    def _read_numbers(self, run: NumberRun) -> tuple[bytes, Offsets]:
+        digits = self._digits[self._index : self._index + run.ends.item(-1)]
+        is_wrong = digits >= 1 << CHARACTER_BITS
+        size = int(is_wrong.argmax()) if is_wrong.any() else len(digits)
+        count = int(run.ends.searchsorted(size, "right"))
+        size = run.ends.item(count - 1) if count else 0
+        begins = run.ends[:count] - run.sizes[:count]
+        shifts = (CHARACTER_BITS * run.remaining[:size]).astype(np.uint64)
+        values = np.zeros(0, np.uint64)
+        if count:
+            values = np.add.reduceat(digits[:size].astype(np.uint64) << shifts, begins)
+        offsets = self._offsets[self._index + begins]
+        self._index += size
+        return run.to_bytes(values), offsets
 
 
 @dataclass(frozen=True)
@@ -725,9 +625,9 @@ class Scip:
     2.0, C-42-03320B, 5).
     """
 
-    def __call__(self, sums: NDArray[np.int64]) -> NDArray[np.uint8]:
-        """The characters for the sums of lines."""
-        return (sums & 0x3F).astype(np.uint8) + np.uint8(0x30)
+    def __call__(self, line: bytes) -> int:
+        """Return the check character of a line."""
+        return (sum(line) & 0x3F) + 0x30
 
 
 @dataclass(frozen=True)
@@ -739,8 +639,7 @@ class Lines:
         width: the characters of each line but the last, without its check.
         head: the characters of the first lines, which have lengths of their own.
         bare: how many of the first lines have no check character.
-        check: from the sums of lines to their check characters, such as `Scip`; None where there
-            are none.
+        check: from a line to its check character, such as `Scip`; None where there are none.
         numbers: how numbers are written; None for bytes as they are.
 
     Raises:
@@ -770,131 +669,93 @@ class Lines:
     def __or__(self, numbers: SixBits) -> Lines:
         return replace(self, numbers=numbers)
 
-    @property
-    def start(self) -> bytes:
-        return b""
-
     def begins(self, texts: Sequence[Characters]) -> Characters:
-        first = self.head[0] if self.head else self.width
-        known = list(itertools.chain(*texts))[:first]
-        end = first + (self.check is not None and not self.bare)
-        return [*known, *[None] * (end - len(known)), 0x0A] if self.head else known
+        characters = list(itertools.chain(*texts))
+        if not self.head:
+            return characters[: self.width]
+        size = self.head[0]
+        known = characters[:size]
+        unknown = [None] * (size - len(known) + self._has_check(0))
+        return [*known, *unknown, NEWLINE]
 
-    def read(self, buffer: Bytes1D, starts: Numbers, limit: int) -> Reading:
-        stops = np.flatnonzero(buffer == 0x0A)
-        ends = stops[1:][np.diff(stops) == 1]
-        sizes = ended(starts, ends, limit, len(buffer))
-        whole = np.flatnonzero(sizes > 0)
-        first, last = self._lines(starts[whole], starts[whole] + sizes[whole] - 1, stops)
-        sizes[whole[first < 0]] = NONE
-        whole, first, last = whole[first >= 0], first[first >= 0], last[first >= 0]
-        kept, intact = buffer != 0x0A, np.ones(len(starts), np.bool_)
-        kept[stops[-1] + 1 if len(stops) else 0 :] = (
-            False  # a line without an end: nobody knows what is its check
-        )
-        cut = starts[sizes == SHORT]  # for who explains it
-        heads = np.concatenate([first, stops.searchsorted(cut)])
-        if self.check is not None:
-            checked = np.ones(len(stops), np.bool_)
-            bare = (heads[:, None] + np.arange(self.bare)).reshape(-1)
-            checked[bare[bare < len(stops)]] = False
-            checked &= stops > 0
-            kept[stops[checked] - 1] = False
-            intact[whole] = self._intact(buffer, starts[whole], stops, first, last)
-        places = np.flatnonzero(kept)
-        values = buffer[places]
-        if self.numbers is not None and self.numbers.echoes is not None:
-            ends = np.concatenate([starts[whole] + sizes[whole], np.full(len(cut), len(buffer))])
-            begins = np.append(stops + 1, len(buffer))[
-                np.minimum(heads + len(self.head) - 1, len(stops))
-            ]
-            places, values = self.numbers.echoes.apart(
-                places, values, begins, ends, self.numbers.first[0]
+    def find_end(self, data: bytes) -> int:
+        end = data.find(b"\n\n")
+        return end + 2 if end >= 0 else NO_END
+
+    def _has_check(self, number: int) -> bool:
+        return self.check is not None and number >= self.bare
+
+    def decode(self, data: bytes, next_runs: NextRuns) -> Decoded:
+        characters, offsets, problem = self._strip(data)
+        is_whole = data.endswith(b"\n\n")
+        end = len(data) if is_whole else int(offsets[-1:].sum()) + 1
+        end_mark = end - 1 if is_whole else end
+        if self.numbers is None:
+            spans = [(offsets, np.ones(len(offsets), np.intp))]
+            return Decoded(characters, spans, end_mark, problem)
+        if self.numbers.echoes is not None:
+            size = sum(self.head)
+            steps, places = self.numbers.echoes.expand(
+                characters[size:], offsets[size:], end_mark, self.numbers.first, is_whole=is_whole
             )
-        return Unescaped(sizes, places, values, intact, self.numbers)
+            characters = characters[:size] + steps
+            offsets = np.append(offsets[:size], places)
+        reader = _SixBitReader(self.numbers, characters, offsets, end)
+        decoded = decode_runs(reader, next_runs, len(data) if is_whole else None)
+        return decoded if problem is None else replace(decoded, problem=problem)
 
-    def _lines(self, starts: Numbers, ends: Numbers, stops: Numbers) -> tuple[Numbers, Numbers]:
-        """Among `stops`, the end of the first line of each frame and the one after its last; -1
-        where lines have other lengths.
+    def _strip(self, data: bytes) -> tuple[bytes, Offsets, Problem | None]:
+        """Return the characters of all lines without checks, their offsets, and what is wrong; they
+        end before a line of another length.
         """
-        marks = np.append(stops, -1)
-        first, check = stops.searchsorted(starts), int(self.check is not None)
-        right, begin, index = np.ones(len(starts), np.bool_), starts, first
-        for number, length in enumerate(self.head):
-            begin = begin + length + check * (number >= self.bare) + 1
-            right &= (marks[np.minimum(index, len(stops))] == begin - 1) & (begin <= ends)
-            index = index + 1
-        step = self.width + check + 1
-        left = np.maximum(ends - begin, 0)
-        full, rest = left // step, left % step
-        uneven = (
-            np.maximum.accumulate(
-                np.where(np.diff(stops, prepend=-1) != step, np.arange(len(stops)), -1)
-            )
-            if len(stops)
-            else stops
-        )
-        inner = np.minimum(index + full - 1, len(stops) - 1)
-        right &= (full == 0) | (
-            (marks[np.minimum(index, len(stops))] == begin + step - 1)
-            & ((full == 1) | (uneven[inner] <= index))
-        )
-        right &= (rest == 0) | (
-            (rest >= check + 2) & (marks[np.minimum(index + full, len(stops))] == ends - 1)
-        )
-        right &= marks[np.minimum(index + full + (rest > 0), len(stops))] == ends
-        return np.where(right, first, -1), index + full + (rest > 0)
+        *lines, _ = data.split(b"\n")
+        if lines and not lines[-1]:
+            lines.pop()  # the empty line at the end
+        texts = list[bytes]()
+        problem = None
+        begin = 0
+        for number, line in enumerate(lines):
+            has_check = self._has_check(number)
+            text = line[:-1] if has_check else line
+            length = self.head[number] if number < len(self.head) else self.width
+            is_shorter_last = number == len(lines) - 1 >= len(self.head) and 0 < len(text) < length
+            if len(text) != length and not is_shorter_last:
+                reason = f"line {number + 1} has {len(text)} characters, expected {length}"
+                problem = Problem(begin, reason)
+                break
+            if self.check is not None and has_check and self.check(text) != line[-1]:
+                reason = f"the check character of line {number + 1} is wrong"
+                problem = problem or Problem(begin + len(text), reason, is_checksum=True)
+            texts.append(text)
+            begin += len(line) + 1
+        characters = np.frombuffer(data, np.uint8)[:begin]
+        is_kept = characters != NEWLINE
+        if self.check is not None:
+            is_kept[np.flatnonzero(~is_kept)[self.bare :] - 1] = False
+        return b"".join(texts), np.flatnonzero(is_kept), problem
 
-    def _intact(
-        self, buffer: Bytes1D, starts: Numbers, stops: Numbers, first: Numbers, last: Numbers
-    ) -> NDArray[np.bool_]:
-        """Whether all check characters of frames are right, (n,)."""
-        assert self.check is not None
-        sums = np.concatenate([[0], np.cumsum(buffer, dtype=np.int64)])
-        begins = np.concatenate([[0], stops[:-1] + 1])
-        begins[first] = starts
-        inside = stops - 1 > begins
-        spots = np.maximum(stops - 1, 0)
-        wrong = inside & (
-            self.check(sums[spots] - sums[np.minimum(begins, spots)]) != buffer[spots]
-        )
-        counts = np.concatenate([[0], np.cumsum(wrong)])
-        return np.asarray(counts[last] == counts[first + self.bare])
+    def encode(self, struct: bytes, runs: Sequence[Run]) -> bytes:
+        characters = struct
+        if self.numbers is not None:
+            characters = self.numbers.encode(struct, runs)
+            if self.numbers.echoes is not None:
+                size = sum(self.head)
+                steps = self.numbers.echoes.join(characters[size:], self.numbers.first)
+                characters = characters[:size] + steps
+        lines = list[bytes]()
+        begin = 0
+        while begin < len(characters):
+            number = len(lines)
+            length = self.head[number] if number < len(self.head) else self.width
+            line = characters[begin : begin + length]
+            begin += length
+            if self.check is not None and self._has_check(number):
+                line += bytes([self.check(line)])
+            lines.append(line)
+        return b"\n".join([*lines, b"", b""])
 
-    def write(self, rows: Bytes2D, slots: Sequence[Slot]) -> list[bytes]:
-        rows = rows if self.numbers is None else self.numbers.write(rows, slots)
-        if self.numbers is None or self.numbers.echoes is None:
-            return self._in_lines(rows)
-        head = sum(self.head)
-        steps = self.numbers.echoes.joined(rows[:, head:], self.numbers.first[0])
-        each = (row.tobytes() + part for row, part in zip(rows[:, :head], steps, strict=True))
-        return [self._in_lines(np.frombuffer(characters, np.uint8)[None])[0] for characters in each]
-
-    def _in_lines(self, rows: Bytes2D) -> list[bytes]:
-        """Rows of characters with the ends of lines, and their checks."""
-        parts, start, line = list[Bytes2D](), 0, 0
-        while start < rows.shape[1]:
-            is_head, left = line < len(self.head), rows.shape[1] - start
-            length = min(self.head[line] if is_head else self.width, left)
-            count = 1 if is_head else left // length
-            part = rows[:, start : (start := start + count * length)].reshape(
-                len(rows), count, length
-            )
-            checks = (
-                [self.check(part.sum(axis=2, dtype=np.int64))[:, :, None]]
-                if self.check is not None and line >= self.bare
-                else []
-            )
-            closed = np.concatenate(
-                [part, *checks, _repeated(b"\n", (len(rows), count, 1))], axis=2
-            )
-            parts.append(closed.reshape(len(rows), -1))
-            line += 1
-        whole = np.concatenate([*parts, _repeated(b"\n", (len(rows), 1))], axis=1)
-        return [row.tobytes() for row in whole]
-
-    def largest(self, slot: Slot) -> int:
-        return int((256 if self.numbers is None else 64) ** slot.size - 1)
+    def largest(self, size: int) -> int:
+        return int((256 if self.numbers is None else 1 << CHARACTER_BITS) ** size - 1)
 
 
 @dataclass(frozen=True)
@@ -930,55 +791,38 @@ class Escaped:
                 path="wire",
             )
 
-    @property
-    def start(self) -> bytes:
-        return bytes([self.flag])
-
     def begins(self, texts: Sequence[Characters]) -> Characters:
-        return self.start  # any byte behind it may be escaped
+        return [self.flag]  # any byte behind it may be escaped
 
-    def read(self, buffer: Bytes1D, starts: Numbers, limit: int) -> Reading:
-        is_escape, is_flag = buffer == self.escape, buffer == self.flag
-        sizes = ended(starts, np.flatnonzero(is_flag), limit, len(buffer))
-        escaped = np.concatenate([[False], is_escape[:-1]])
-        wrong = np.concatenate([[0], np.cumsum(escaped & (is_escape | is_flag))])
-        sizes[
-            (sizes > 0)
-            & (
-                (wrong[np.minimum(starts + np.maximum(sizes, 1), len(buffer))] > wrong[starts + 1])
-                | (sizes == 2)
-            )
-        ] = NONE
-        places = np.flatnonzero(~(is_escape | is_flag))
-        turned = escaped[places]
-        return Unescaped(
-            sizes, places - turned, buffer[places] ^ np.where(turned, self.xor, 0).astype(np.uint8)
-        )
+    def find_end(self, data: bytes) -> int:
+        end = data.find(self.flag, 1)
+        if end == 1:
+            return NO_FRAME
+        return end + 1 if end > 0 else NO_END
 
-    def write(self, rows: Bytes2D, slots: Sequence[Slot]) -> list[bytes]:
-        special = (rows == self.flag) | (rows == self.escape)
-        both = np.stack(
-            [
-                np.full(rows.shape, self.escape, np.uint8),
-                np.where(special, rows ^ np.uint8(self.xor), rows),
-            ],
-            axis=2,
-        )
-        flags = _repeated(self.start, (len(rows), 1))
-        used = np.stack([special, np.ones(rows.shape, np.bool_)], axis=2).reshape(len(rows), -1)
-        edge = np.ones((len(rows), 1), np.bool_)
-        whole = np.concatenate([flags, both.reshape(len(rows), -1), flags], axis=1)
-        return _pieces(whole, np.concatenate([edge, used, edge], axis=1))
+    def decode(self, data: bytes, next_runs: NextRuns) -> Decoded:
+        end = data.find(self.flag, 1)
+        body = np.frombuffer(data[1:end] if end > 0 else data[1:], np.uint8)
+        is_escape = body == self.escape
+        is_escaped = np.append(False, is_escape)[: len(body)]
+        is_wrong = is_escape & np.append(is_escaped[1:] & is_escape[1:], True)[: len(body)]
+        problem = None
+        if is_wrong.any():
+            problem = Problem(1 + int(is_wrong.argmax()), "an escape is followed by no such byte")
+        places = np.flatnonzero(~is_escape)
+        struct = body[places] ^ (is_escaped[places] * np.uint8(self.xor))
+        spans = [(1 + places - is_escaped[places], np.ones(len(places), np.intp))]
+        return Decoded(struct.tobytes(), spans, 1 + len(body), problem)
 
-    def largest(self, slot: Slot) -> int:
-        return int(256**slot.size - 1)
+    def encode(self, struct: bytes, runs: Sequence[Run]) -> bytes:
+        frame = bytearray([self.flag])
+        for byte in struct:
+            if byte in (self.flag, self.escape):
+                frame += bytes([self.escape, byte ^ self.xor])
+            else:
+                frame.append(byte)
+        frame.append(self.flag)
+        return bytes(frame)
 
-
-def _repeated(byte: bytes, shape: tuple[int, ...]) -> NDArray[np.uint8]:
-    return np.full(shape, byte[0], np.uint8)
-
-
-def _pieces(characters: Bytes2D, used: NDArray[np.bool_]) -> list[bytes]:
-    """The characters of each row that are used."""
-    data, ends = characters[used].tobytes(), np.cumsum(used.sum(axis=1)).tolist()
-    return [data[first:end] for first, end in zip([0, *ends], ends, strict=False)]
+    def largest(self, size: int) -> int:
+        return int(256**size - 1)

@@ -1,0 +1,362 @@
+"""Frames as they are sent, and as the bytes of their structs.
+
+Most frames are the bytes of their struct (`Coder`). A frame type with a wire form
+(`lidarspec.spec.wire_forms`) has a `FormCoder`: it tells the form which fields come next, by the
+layouts of the struct, and says what is wrong with bytes that are no frame of the form.
+"""
+
+from __future__ import annotations
+
+import functools
+import itertools
+from collections.abc import Sequence
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lidarspec.errors import SpecError
+from lidarspec.frames.compilability import NotCompilable
+from lidarspec.frames.layout import Bytes2D, Layout, Leaf, Refused
+from lidarspec.frames.layout_tree import HeaderNode, HeaderTree, frame_layouts, prefix_of
+from lidarspec.frames.parts import Measure
+from lidarspec.spec.description import Frame
+from lidarspec.spec.wire_forms import Decoded, NumberRun, Problem, Run, TextRun, WireForm
+
+#: The name under which a parsed frame keeps its bytes, if `encode` would write others.
+SPELLING = "_wire"
+#: Bytes that are shown of a field that cannot be read.
+SHOWN_BYTES = 12
+
+
+class _Undecoded(Decoded):
+    """The bytes of a frame, which are those of its struct."""
+
+    @property
+    def offsets(self) -> list[int]:
+        return list(range(len(self.struct) + 1))
+
+    def offset(self, place: int) -> int:
+        return place
+
+
+class Coder:
+    """Frames that are sent as the bytes of their struct.
+
+    Attributes:
+        begins: the bytes that all frames begin with.
+    """
+
+    def __init__(self, frame: Frame) -> None:
+        known = prefix_of(frame.tree, frame.room)
+        self.begins = _run_of_bytes(
+            {offset: value for offset, (mask, value) in known.items() if mask == 0xFF}
+        )
+
+    def decode(self, data: bytes) -> Decoded:
+        """Return the bytes of the struct of one frame, as far as it can be decoded."""
+        return _Undecoded(data, (), len(data))
+
+    def encode(self, struct: bytes, spelling: object = None) -> bytes | None:
+        """Return the frame for the bytes of a struct.
+
+        Args:
+            spelling: a frame that is returned if it stands for the same struct.
+
+        Returns:
+            None if the wire form cannot write one of the values.
+        """
+        return struct
+
+    def keep_spelling(self, values: Any, struct: bytes, data: bytes) -> Any:
+        """Return parsed values, with the frame as `SPELLING` if `encode` would write another."""
+        return values
+
+    def find_size(self, data: bytes) -> int | None:
+        """Return the size of the frame that bytes begin with; None if its header has to tell it, or
+        its end is missing.
+        """
+        return None
+
+    def make_encodable(self, rows: Bytes2D, layout: Layout) -> None:
+        """Change random structs of a layout, one a row, so that each value can be written."""
+
+
+class _FieldFinder:
+    """Finds the runs of fields that follow the first bytes of one struct, as these grow."""
+
+    def __init__(self, tree: HeaderTree) -> None:
+        self._tree = tree
+        self._node = tree.header(b"")
+
+    def __call__(self, struct: bytes) -> Sequence[Run]:
+        self._node = self._tree.header(struct, since=self._node)
+        if isinstance(self._node.leaf, Measure):
+            raise SpecError(
+                "parts are found by their bytes, and these frames are text",
+                path=self._node.leaf.info.path,
+            )
+        leaves, end = _known_fields(self._node)
+        return runs_between(leaves, len(struct), end)
+
+
+def _known_fields(node: HeaderNode) -> tuple[tuple[Leaf, ...], int]:
+    """Return the fields that a header leads to, and the offset in the struct after the last."""
+    if isinstance(node.result, Layout):
+        return tuple(node.result.leaves.values()), node.result.size
+    if isinstance(node.leaf, Leaf):
+        return tuple(node.before.values()), node.leaf.offset + node.leaf.size
+    return (), 0
+
+
+class FormCoder(Coder):
+    """Frames with a wire form.
+
+    Attributes:
+        form: the form.
+        tree: the layouts of the struct.
+        prefix: the bytes that all frames have at the same offsets, those of the texts before the
+            first number.
+
+    Raises:
+        SpecError: for a struct whose fields have no computable offset.
+    """
+
+    def __init__(self, frame: Frame, form: WireForm) -> None:
+        tree = frame_layouts(frame)
+        if isinstance(tree, NotCompilable):
+            raise SpecError(
+                f"a wire form needs fields with computable places: {tree.reason}", path=tree.path
+            )
+        self.form = form
+        self.tree: HeaderTree = tree
+        self._limit = frame.max_length
+        self.prefix = self._find_prefix()
+        self.begins = _run_of_bytes(self.prefix)
+
+    def _find_prefix(self) -> dict[int, int]:
+        leaves, constants = self.tree.first()
+        known = {offset: value for offset, (mask, value) in constants.items() if mask == 0xFF}
+        texts = list[list[int | None]]()
+        offset = 0
+        for run in runs_between(leaves, 0, max(constants, default=-1) + 1):
+            if isinstance(run, NumberRun):
+                break
+            texts.append([known.get(place) for place in range(offset, offset + run.size)])
+            offset += run.size
+        begins = self.form.begins(texts)
+        return {offset: byte for offset, byte in enumerate(begins) if byte is not None}
+
+    def decode(self, data: bytes) -> Decoded:
+        size = self.form.find_end(data[: self._limit])
+        if not data:
+            decoded = Decoded(b"", [], 0)
+        elif size > 0:
+            decoded = self.decode_whole(data[:size])
+        else:
+            decoded = self.form.decode(data, _FieldFinder(self.tree))
+        return replace(decoded, problem=self._problem(data, size, decoded))
+
+    def decode_whole(self, data: bytes) -> Decoded:
+        """Decode a frame that ends where the form says; a problem has no words."""
+        return self.form.decode(data, _FieldFinder(self.tree))
+
+    def find_size(self, data: bytes) -> int | None:
+        size = self.form.find_end(data[: self._limit])
+        return size if size > 0 else None
+
+    def refusal(self, struct: bytes) -> Refused | None:
+        """Return why the header of a struct leads to no layout; None if that is not known."""
+        result = self.tree.header(struct).result
+        return result if isinstance(result, Refused) else None
+
+    def encode(self, struct: bytes, spelling: object = None) -> bytes | None:
+        if isinstance(spelling, bytes):
+            known = self.decode(spelling)
+            if known.problem is None and known.struct == struct:
+                return spelling
+        layout = self.tree.header(struct, is_all=True).result
+        if not isinstance(layout, Layout) or layout.size != len(struct):
+            return None
+        data = self.form.encode(struct, runs_of(layout))
+        decoded = self.decode(data)
+        return data if decoded.problem is None and decoded.struct == struct else None
+
+    def keep_spelling(self, values: Any, struct: bytes, data: bytes) -> Any:
+        if self.encode(struct) != data:
+            values[SPELLING] = data
+        return values
+
+    def make_encodable(self, rows: Bytes2D, layout: Layout) -> None:
+        begin = 0
+        for run in runs_of(layout):
+            part = rows[:, begin : begin + int(run.sizes.sum())]
+            begin += part.shape[1]
+            if isinstance(run, NumberRun):
+                largest = np.array(
+                    [self.form.largest(size) for size in run.sizes.tolist()], np.uint64
+                )
+                for row in part:
+                    values = run.from_bytes(row.tobytes())
+                    row[:] = np.frombuffer(run.to_bytes(_within(values, largest)), np.uint8)
+            elif self.form.is_text:
+                part[:] = part % 26 + ord("A")
+
+    def _problem(self, data: bytes, size: int, decoded: Decoded) -> Problem | None:
+        """Return what is wrong with bytes that should be one frame, in words."""
+        begins = self.begins
+        if not data or not data.startswith(begins):
+            got = data[: len(begins)]
+            reason = f"begins with {got.hex(' ') or 'nothing'}, expected {begins.hex(' ')}"
+            return Problem(0, reason, expected=begins, got=got)
+        if 0 < size < len(data):
+            reason = f"{len(data) - size} more bytes after the frame's {size}"
+            return Problem(size, reason, expected=size, got=len(data))
+        if size <= 0:
+            reason = f"frame has no end in its {len(data)} bytes"
+            return Problem(len(data), reason, got=len(data))
+        if decoded.problem is not None and decoded.problem.reason:
+            return decoded.problem
+        struct = decoded.struct
+        node = self.tree.header(struct, is_all=True)
+        is_layout = isinstance(node.result, Layout) and node.result.size == len(struct)
+        if decoded.problem is None and is_layout:
+            return None
+        leaves, end = _known_fields(node)
+        path, begin, expected = _describe_field(leaves, min(len(struct), end), end)
+        offset = decoded.offset(begin) if decoded.problem is None else decoded.problem.offset
+        if not leaves:
+            reason = f"the header does not fit the frame's {size} bytes"
+            return Problem(offset, reason, got=size)
+        got = data[offset : offset + SHOWN_BYTES]
+        reason = f"{path or 'frame'} at byte {offset}: {got!r} is not {expected}"
+        return Problem(offset, reason, path=path, expected=expected, got=got)
+
+
+def _describe_field(leaves: tuple[Leaf, ...], offset: int, end: int) -> tuple[str, int, str]:
+    """Return the path of the field that holds a byte of the struct, its offset there, and what it
+    should be.
+
+    Args:
+        end: of the struct.
+    """
+    offsets, owners = _places(leaves)
+    index = int(offsets.searchsorted(offset, "right")) - 1
+    path = ""
+    if index >= 0 and offset < offsets[index] + leaves[owners[index]].size:
+        offset = offsets.item(index)
+        path = leaves[owners[index]].info.path
+    runs = runs_between(leaves, offset, end)
+    if not runs:
+        return "", offset, "the end of the frame"
+    size = runs[0].sizes.item(0)
+    is_text = isinstance(runs[0], TextRun)
+    expected = f"{size} characters of text" if is_text else f"a number of {size} bytes"
+    return path, offset, expected
+
+
+@functools.lru_cache(maxsize=2048)
+def frame_coder(frame: Frame) -> Coder:
+    """Return the coder of a frame type, always the same one."""
+    return Coder(frame) if frame.wire is None else FormCoder(frame, frame.wire)
+
+
+def runs_of(layout: Layout) -> Sequence[Run]:
+    """Return the runs of fields that the structs of a layout consist of."""
+    return runs_between(tuple(layout.leaves.values()), 0, layout.size)
+
+
+@functools.lru_cache(maxsize=1024)
+def runs_between(leaves: tuple[Leaf, ...], first: int, end: int) -> tuple[Run, ...]:
+    """Return the runs of fields from one byte of the struct to another.
+
+    Bytes between fields, such as constants without a name, are text.
+    """
+    offsets, owners = _places(leaves)
+    inside = slice(int(offsets.searchsorted(first)), int(offsets.searchsorted(end)))
+    offsets = offsets[inside]
+    owners = owners[inside]
+    all_sizes, all_kinds, all_little = _number_types(leaves)
+    sizes = all_sizes[owners]
+    ends = offsets + sizes
+    is_text = all_kinds[owners] == "S"
+    is_border = is_text[1:] | is_text[:-1] | (offsets[1:] != ends[:-1])
+    runs = list[Run]()
+    reached = first
+    for part in np.split(np.arange(len(offsets)), np.flatnonzero(is_border) + 1):
+        if not len(part):
+            break
+        begin = offsets.item(part[0])
+        if begin > reached:
+            runs.append(TextRun(begin - reached))
+        if is_text[part[0]]:
+            runs.append(TextRun(sizes.item(part[0])))
+        else:
+            fields = owners[part]
+            runs.append(NumberRun(sizes[part], all_kinds[fields], all_little[fields]))
+        reached = ends.item(part[-1])
+    if reached < end:
+        runs.append(TextRun(end - reached))
+    return tuple(runs)
+
+
+def _number_types(
+    leaves: Sequence[Leaf],
+) -> tuple[NDArray[np.intp], NDArray[np.str_], NDArray[np.bool_]]:
+    """Return the bytes, the kind ("S" for bytes) and whether it is little-endian of one element of
+    each field; a block of bits is one number.
+    """
+    kinds = list[str]()
+    is_little = list[bool]()
+    for leaf in leaves:
+        kind = "u"
+        order = ""
+        if leaf.info.kind == "bytes":
+            kind = "S"
+        elif leaf.wire is not None:
+            kind = leaf.wire.kind
+            order = leaf.wire.byteorder
+        else:
+            element = leaf.elements[0]
+            if element.run is not None and element.is_whole:
+                order = element.run[0]
+                kind = "i" if element.signed else "u"
+        kinds.append(kind)
+        is_little.append(order == "<")
+    sizes = np.array([leaf.size for leaf in leaves], np.intp)
+    return sizes, np.array(kinds, np.str_), np.array(is_little, np.bool_)
+
+
+@functools.lru_cache(maxsize=256)
+def _places(leaves: tuple[Leaf, ...]) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
+    """Return the offset of each element of each field, ascending, and the index of its field.
+
+    Of the fields in one block of bits the first counts.
+    """
+    offsets = [np.zeros(0, np.intp)]
+    owners = [np.zeros(0, np.intp)]
+    for index, leaf in enumerate(leaves):
+        if not leaf.size:
+            continue
+        depth = len(leaf.strides) - (leaf.info.kind == "bytes")
+        places = np.array([leaf.offset], np.intp)
+        for length, stride in zip(leaf.shape[:depth], leaf.strides, strict=False):
+            places = (places[:, None] + np.arange(length) * stride).reshape(-1)
+        offsets.append(places)
+        owners.append(np.full(len(places), index))
+    all_offsets, first = np.unique(np.concatenate(offsets), return_index=True)
+    return all_offsets, np.concatenate(owners)[first]
+
+
+def _run_of_bytes(known: dict[int, int]) -> bytes:
+    """Return the known bytes from the first one on, up to the first that is not known."""
+    return bytes(
+        known[offset] for offset in itertools.takewhile(known.__contains__, itertools.count())
+    )
+
+
+def _within(values: NDArray[np.uint64], largest: NDArray[np.uint64]) -> NDArray[np.uint64]:
+    """Return values that are at most the largest ones."""
+    count = largest + np.uint64(1)  # 0 where all values of eight bytes are allowed
+    return np.where(count == 0, values, values % np.maximum(count, 1))
