@@ -107,7 +107,6 @@ PAGE_MAY_IMPORT = {
     "spec.arguments",
     "transports.host_clock",
     "transports.open_url",
-    "transports.protocol",
     "view.feed",
     "view.svg",
 }

@@ -11,6 +11,7 @@ Modules in reading order:
 * `backlog`: the newest bytes of the source, frame by frame, and damaged bytes.
 * `scan_message`: one scan as the binary message that a page draws.
 * `answers`: all other messages to a page, as JSON.
+* `command_forms`: the commands of the sensor, as forms of the page.
 * `open_page`: one page that is open: its socket, its requests and what is sent to it.
 * `page_requests`: limits on the requests of one page, and the threads that serve them.
 * `server`: the HTTP server of the page's files, its sockets and saved scans.

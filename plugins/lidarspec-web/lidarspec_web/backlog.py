@@ -1,9 +1,9 @@
-"""The newest bytes of a source, and what they say: frames by number and place, and those that were
-damaged on their way.
+"""The newest bytes of a source: its frames by number and offset, and its damaged bytes.
 
-What is decoded is kept as it came, up to a bound; no frame is looked at before somebody asks for
-it. Damaged bytes are where the decoder passed some over: only then they are cut out and kept, so
-that they can be explained later.
+A decoder shows the backlog its input and the frames that it found (`Witness`). Both are kept as
+they are, up to a limit, so that reading is not slowed down; a frame is cut out when it is asked
+for. Bytes that the decoder skipped are cut out at once, because their input is dropped soon: they
+are explained when a page asks for them.
 """
 
 from __future__ import annotations
@@ -24,23 +24,26 @@ from lidarspec.explaining.pieces import Piece, explained
 from lidarspec.framing.results import Frames, Numbers, array_of
 from lidarspec.scans.scans import Place
 
-#: bytes, and decodings, that are kept; and of what was damaged how many pieces, and bytes of each.
-BYTES, DECODINGS = 1 << 23, 1024
-DAMAGED, LONGEST = 500, 1 << 13
-#: bytes that are in no frame which stand at the beginning of a stream: whoever begins to listen
-#: hears the end of a frame.
-_BEGINNING = "the end of a frame that began before"
+#: of input that are kept.
+MAX_INPUT_BYTES = 1 << 23
+#: results of the decoder that are kept.
+MAX_RESULTS = 1024
+#: damaged pieces that are kept.
+MAX_DAMAGED = 500
+#: of one damaged piece that are kept.
+MAX_DAMAGED_BYTES = 1 << 13
 
 
 @dataclass(frozen=True)
 class Damaged:
-    """Bytes that were a frame before they were damaged, or that never were one.
+    """Bytes in no frame: a damaged frame, or bytes of another kind.
 
     Attributes:
-        number: how many there were before it.
-        offset, size: where in the input they stand.
-        at: when the frame behind them arrived, ns since 1970; -1 where nobody knows it.
-        data: they; of very many the first.
+        number: counts the damaged pieces, from 0 on.
+        offset: in the input.
+        size: in bytes.
+        at: when the frame behind them arrived, ns since 1970; -1 if that is not known.
+        data: the bytes, or the first of them.
         datagram: whether they are one whole datagram.
     """
 
@@ -52,7 +55,7 @@ class Damaged:
     datagram: bool
 
     def verdict(self, sensor: Sensor) -> str:
-        """What is wrong with them, in one sentence."""
+        """Return what is wrong with the bytes, in one sentence."""
         if not self.data:
             return "a message of which datagrams are missing"
         try:
@@ -64,7 +67,14 @@ class Damaged:
 
 @dataclass(frozen=True)
 class Taken:
-    """One frame; `at` as in `Damaged`, `number` None where it has gone out of the backlog."""
+    """One frame of the backlog.
+
+    Attributes:
+        number: counts the frames, from 0 on; None if the frame is kept by its scan only.
+        frame: its type.
+        at: when it arrived, ns since 1970; -1 if that is not known.
+        data: its bytes.
+    """
 
     number: int | None
     frame: str
@@ -72,167 +82,225 @@ class Taken:
     data: bytes
 
 
-class Backlog:
-    """What a decoder was fed last and found in it: a `Witness`. One thread adds to it, any may ask.
+@dataclass(frozen=True)
+class _Input:
+    """What the decoder was given at once.
 
     Attributes:
-        sensor: whose.
+        offset: of its first byte in the whole input.
+        buffer: has its bytes, and maybe others.
+        starts: offset of each part in the buffer: one for a stream, one for each datagram.
+        sizes: of the parts, in bytes.
+    """
+
+    offset: int
+    buffer: NDArray[np.uint8]
+    starts: Numbers
+    sizes: NDArray[np.intp]
+
+    @property
+    def size(self) -> int:
+        return int(self.sizes.sum())
+
+
+@dataclass(frozen=True)
+class _Result:
+    """Frames that the decoder found at once, and the number of the first."""
+
+    first_number: int
+    frames: Frames
+
+    @property
+    def offset(self) -> int:
+        return int(self.frames.places[0])
+
+    @property
+    def last_offset(self) -> int:
+        return int(self.frames.places[-1])
+
+    def take(self, index: int) -> Taken:
+        frames = self.frames
+        kind = int(frames.kinds[index])
+        return Taken(
+            self.first_number + index,
+            frames.names[kind],
+            int(frames.at[index]),
+            frames.data(index),
+        )
+
+
+class Backlog:
+    """Keeps the newest input of a decoder and the frames in it: a `Witness`.
+
+    One thread adds to it; any thread may read it.
+
+    Attributes:
+        sensor: sends the bytes.
         damaged: how many damaged pieces there were.
     """
 
     def __init__(self, sensor: Sensor) -> None:
-        self.sensor, self.damaged = sensor, 0
-        self._stream, self._joins, self._lock = True, False, threading.Lock()
-        self._raw = deque[tuple[int, NDArray[np.uint8], Numbers, NDArray[np.intp]]]()
-        self._found = deque[tuple[int, Frames]]()
-        self._broken = deque[Damaged](maxlen=DAMAGED)
-        self._size = self._number = self._end = 0
+        self.sensor = sensor
+        self.damaged = 0
+        self._lock = threading.Lock()
+        self._is_stream = True
+        self._joins_datagrams = False
+        self._inputs = deque[_Input]()
+        self._input_size = 0
+        self._results = deque[_Result]()
+        self._frame_count = 0
+        self._end = 0  # of the last frame, an offset in the input
+        self._damaged = deque[Damaged](maxlen=MAX_DAMAGED)
 
     def fed(
         self, decoder: Decoder, buffer: NDArray[np.uint8], starts: Numbers, sizes: NDArray[np.intp]
     ) -> None:
-        """What a decoder is fed."""
+        """Keep what the decoder is given."""
         with self._lock:
-            self._stream, self._joins = decoder.stream, decoder.joins
-            self._raw.append((decoder.stats.bytes_in, buffer, starts, sizes))
-            self._size += int(sizes.sum())
-            while self._size > BYTES and len(self._raw) > 1:
-                self._size -= int(self._raw.popleft()[3].sum())
-            oldest = self._raw[0][0]
-            while len(self._found) > 1 and (
-                len(self._found) > DECODINGS or self._found[0][1].places[-1] < oldest
-            ):
-                self._found.popleft()
-            while len(self._raw) > 2 * DECODINGS:
-                self._size -= int(self._raw.popleft()[3].sum())
+            self._is_stream = decoder.stream
+            self._joins_datagrams = decoder.joins
+            added = _Input(decoder.stats.bytes_in, buffer, starts, sizes)
+            self._inputs.append(added)
+            self._input_size += added.size
+            self._drop_old()
 
     def found(self, frames: Frames) -> None:
-        """Frames of the input, in its order."""
+        """Keep frames of the input, in its order."""
         if not len(frames):
             return
         with self._lock:
             if frames.gaps.any():
-                self._note(frames)
-            self._found.append((self._number, frames))
-            self._number += len(frames)
+                self._keep_skipped(frames)
+            self._results.append(_Result(self._frame_count, frames))
+            self._frame_count += len(frames)
             self._end = int(frames.places[-1]) + int(frames.sizes[-1])
 
     def forget(self) -> None:
-        """The input begins anew; numbers go on."""
+        """Forget the bytes, because the input begins anew; frames are still counted on."""
         with self._lock:
-            self._raw.clear()
-            self._found.clear()
-            self._size = self._end = 0
+            self._inputs.clear()
+            self._results.clear()
+            self._input_size = 0
+            self._end = 0
 
     def frozen(self) -> Backlog:
-        """It as it is now, which nothing is added to; the bytes are shared."""
-        still = Backlog(self.sensor)
+        """Return a backlog of the frames and damaged pieces of now, to which nothing is added."""
+        copy = Backlog(self.sensor)
         with self._lock:
-            still._found, still._broken = deque(self._found), deque(self._broken)
-            still._number, still.damaged = self._number, self.damaged
-        return still
+            copy._results = deque(self._results)
+            copy._damaged = deque(self._damaged)
+            copy._frame_count = self._frame_count
+            copy.damaged = self.damaged
+        return copy
 
     @property
     def newest(self) -> int:
-        """The number of the newest frame; -1 before there is one."""
-        return self._number - 1
+        """The number of the newest frame; -1 if there is none yet."""
+        return self._frame_count - 1
 
     def frame(self, number: int) -> Taken | None:
-        """A frame by its number, from 0 on; None where it is not kept, any more or yet."""
+        """Return a frame by its number, None if it is not kept."""
         with self._lock:
-            spot = bisect_right(self._found, number, key=lambda entry: entry[0]) - 1
-            first, frames = self._found[spot] if spot >= 0 else (0, None)
-        return (
-            None
-            if frames is None or not 0 <= number - first < len(frames)
-            else _taken(first, frames, number - first)
-        )
+            following = bisect_right(self._results, number, key=lambda one: one.first_number)
+            result = self._results[following - 1] if following else None
+        if result is None or number - result.first_number >= len(result.frames):
+            return None
+        return result.take(number - result.first_number)
 
     def at(self, place: Place) -> Taken | None:
-        """The frame that a point came from; None where it is not kept any more, and the scan has
-        its bytes in another form.
+        """Return the frame that a point came from.
+
+        None if it is not kept, and the scan does not have its bytes as they were sent.
         """
         with self._lock:
-            spot = (
-                bisect_right(self._found, place.offset, key=lambda entry: int(entry[1].places[0]))
-                - 1
-            )
-            first, frames = self._found[spot] if spot >= 0 else (0, None)
-        if frames is not None:
-            index = int(frames.offsets.searchsorted(place.offset))
-            if index < len(frames) and frames.offsets[index] == place.offset:
-                return _taken(first, frames, index)
-        return (
-            Taken(None, place.frame, place.host_ns or -1, place.data)
-            if self.sensor.frames[place.frame].wire is None
-            else None
-        )
+            following = bisect_right(self._results, place.offset, key=lambda one: one.offset)
+            result = self._results[following - 1] if following else None
+        if result is not None:
+            offsets = result.frames.offsets
+            index = int(offsets.searchsorted(place.offset))
+            if index < len(offsets) and offsets[index] == place.offset:
+                return result.take(index)
+        if self.sensor.frames[place.frame].wire is not None:
+            return None
+        return Taken(None, place.frame, place.host_ns or -1, place.data)
 
     def broken(self, number: int) -> Damaged | None:
-        """A damaged piece by its number; None where it is not kept any more."""
+        """Return a damaged piece by its number, None if it is not kept."""
         return next((piece for piece in self.since(number) if piece.number == number), None)
 
     def since(self, number: int) -> list[Damaged]:
-        """The damaged pieces from a number on that are kept."""
+        """Return the damaged pieces that are kept, from a number on."""
         with self._lock:
-            return [piece for piece in self._broken if piece.number >= number]
+            return [piece for piece in self._damaged if piece.number >= number]
 
-    def mended(self, piece: Damaged) -> dict[str, Any]:
-        """A damaged piece in one explanation: what was a frame in it, with what would explain the
-        damage, and what is between these.
+    def explain_damaged(self, piece: Damaged) -> dict[str, Any]:
+        """Return one explanation of a damaged piece, as `Explanation.to_dict`.
+
+        It has the rows of each damaged frame in it, with the change that would explain the damage,
+        and of the bytes between them.
         """
         parts = list(explained(self.sensor, Piece(piece.offset, piece.data, "", piece.datagram)))
-        whole = [part for _, part in parts if part.frame]
-        rows = [
-            row.to_dict() | {"offset": row.offset + place.offset - piece.offset}
-            for place, part in parts
-            for row in part.rows
-        ]
-        named = whole[0] if whole else Explanation(self.sensor.id, "", piece.data, ())
-        notes = [note for part in whole for note in part.notes]
-        return named.to_dict() | {"size": len(piece.data), "notes": notes, "rows": rows}
+        frames = [explanation for _, explanation in parts if explanation.frame]
+        rows = []
+        for part, explanation in parts:
+            shift = part.offset - piece.offset
+            rows += [row.to_dict() | {"offset": row.offset + shift} for row in explanation.rows]
+        notes = [note for explanation in frames for note in explanation.notes]
+        first = frames[0] if frames else Explanation(self.sensor.id, "", piece.data, ())
+        return first.to_dict() | {"size": len(piece.data), "notes": notes, "rows": rows}
 
-    def _note(self, frames: Frames) -> None:
-        """Keep the bytes that were passed over before some of these frames."""
-        offsets, ends = (
-            frames.offsets,
-            np.concatenate([[self._end], (frames.offsets + frames.sizes)[:-1]]),
-        )
-        for index in np.flatnonzero(frames.gaps).tolist()[-DAMAGED:]:
-            at, end = int(frames.at[index]), int(offsets[index])
-            if self._joins:
-                self._keep(end, int(frames.gaps[index]), at, b"", datagram=False)
-                continue
-            for offset, size, data in self._between(int(ends[index]), end):
-                self._keep(offset, size, at, data, datagram=not self._stream)
+    def _drop_old(self) -> None:
+        """Drop the oldest inputs and results beyond the limits."""
+        inputs, results = self._inputs, self._results
+        while self._input_size > MAX_INPUT_BYTES and len(inputs) > 1:
+            self._input_size -= inputs.popleft().size
+        oldest = inputs[0].offset
+        while len(results) > 1 and (len(results) > MAX_RESULTS or results[0].last_offset < oldest):
+            results.popleft()
+        # Inputs without frames give no results.
+        while len(inputs) > 2 * MAX_RESULTS:
+            self._input_size -= inputs.popleft().size
 
-    def _keep(self, offset: int, size: int, at: int, data: bytes, *, datagram: bool) -> None:
-        self._broken.append(Damaged(self.damaged, offset, size, at, data, datagram))
+    def _keep_skipped(self, frames: Frames) -> None:
+        """Keep the bytes that were skipped before some of these frames."""
+        ends = frames.offsets + frames.sizes
+        previous_ends = np.concatenate([[self._end], ends[:-1]])
+        for index in np.flatnonzero(frames.gaps).tolist()[-MAX_DAMAGED:]:
+            at = int(frames.at[index])
+            begin = int(previous_ends[index])
+            end = int(frames.offsets[index])
+            if self._joins_datagrams:
+                size = int(frames.gaps[index])
+                self._keep_damaged(end, size, at, b"", is_datagram=False)
+            elif self._is_stream:
+                data = self._stream_bytes(begin, end)
+                self._keep_damaged(begin, end - begin, at, data, is_datagram=False)
+            else:
+                for offset, data in self._datagrams(begin, end):
+                    self._keep_damaged(offset, len(data), at, data, is_datagram=True)
+
+    def _keep_damaged(
+        self, offset: int, size: int, at: int, data: bytes, *, is_datagram: bool
+    ) -> None:
+        data = data[:MAX_DAMAGED_BYTES]
+        self._damaged.append(Damaged(self.damaged, offset, size, at, data, is_datagram))
         self.damaged += 1
 
-    def _between(self, start: int, end: int) -> Iterator[tuple[int, int, bytes]]:
-        """The bytes from one place of the input to another, each datagram by itself: where, how
-        many, and they.
-        """
-        if self._stream:
-            parts = [
-                bytes(buffer[max(start - first, 0) : end - first])
-                for first, buffer, _, _ in self._raw
-                if first < end
-            ]
-            yield start, end - start, b"".join(parts)[:LONGEST]
-            return
-        for first, buffer, starts, sizes in self._raw:
-            places = first + np.cumsum(sizes) - sizes
-            for index in np.flatnonzero((places >= start) & (places < end)).tolist():
-                spot, size = int(array_of(starts)[index]), int(sizes[index])
-                yield int(places[index]), size, buffer[spot : spot + size].tobytes()[:LONGEST]
+    def _stream_bytes(self, begin: int, end: int) -> bytes:
+        """Return the bytes of a stream from one offset to another, as far as they are kept."""
+        parts = [
+            bytes(one.buffer[max(begin - one.offset, 0) : end - one.offset])
+            for one in self._inputs
+            if one.offset < end
+        ]
+        return b"".join(parts)
 
-
-def _taken(first: int, frames: Frames, index: int) -> Taken:
-    return Taken(
-        first + index,
-        frames.names[int(frames.kinds[index])],
-        int(frames.at[index]),
-        frames.data(index),
-    )
+    def _datagrams(self, begin: int, end: int) -> Iterator[tuple[int, bytes]]:
+        """Yield offset and bytes of each datagram that begins in a range of offsets."""
+        for one in self._inputs:
+            offsets = one.offset + np.cumsum(one.sizes) - one.sizes
+            starts = array_of(one.starts)
+            for index in np.flatnonzero((offsets >= begin) & (offsets < end)).tolist():
+                start = int(starts[index])
+                data = one.buffer[start : start + int(one.sizes[index])]
+                yield int(offsets[index]), data.tobytes()

@@ -1,9 +1,11 @@
-"""A source that is read once and shown to any number of viewers: the newest scan, how the sensor is
-doing, its newest bytes.
+"""A source that is read once and shown to any number of viewers.
 
-One thread reads, and whoever asks in another sees what has come by then. A file is played: it can
-be paused, moved through, and played at another speed, for all viewers together. What is live goes
-on whatever they do.
+One thread reads (`run`); other threads see the newest scan, the figures, and the newest bytes.
+A file is played: it can be paused, moved through, and played at another speed, for all viewers
+together. A live source goes on whatever its viewers do.
+
+Requests of other threads (`seek`, `step`, `play`) only leave a note, which the reading thread
+carries out at its next turn.
 """
 
 from __future__ import annotations
@@ -19,60 +21,69 @@ from typing import Any
 from lidarspec import Device, LidarSpecError, Scan, Selection, UsageError
 from lidarspec.recording.switch import RecordingSwitch
 from lidarspec.transports.host_clock import HostClock
-from lidarspec.transports.protocol import Closing
 from lidarspec.view.feed import LOOK, STEP, Feed
 from lidarspec_web.backlog import Backlog
 from lidarspec_web.scan_message import message
 
-#: seconds of figures that are kept, and how fast a file is played at the slowest and the fastest.
-HISTORY, SLOWEST, FASTEST = 60.0, 0.01, 100.0
-#: seconds after which a picture that stands is looked at again.
-IDLE = 0.25
-#: seconds between two readings of the figures.
-FIGURES = 1.0
+#: of figures that are kept.
+HISTORY_S = 60.0
+#: between two readings of the figures.
+FIGURES_PERIOD_S = 1.0
+#: how many times as fast as it was recorded a file is played.
+MIN_SPEED = 0.01
+MAX_SPEED = 100.0
+#: until a file that is paused is looked at again.
+PAUSED_CHECK_S = 0.25
 
 
 class Shown:
-    """A scan as viewers are shown it.
+    """A scan that viewers are shown.
 
     Attributes:
-        number: how many were shown before it.
+        scan: its points.
+        number: counts the scans that are shown, from 0 on.
         position: seconds from the first scan of the source.
         sent: when its last packet arrived; of a file, when it was shown; seconds since 1970.
     """
 
     def __init__(self, scan: Scan, number: int, position: float, sent: float) -> None:
-        self.scan, self.number, self.position, self.sent = scan, number, position, sent
-        self._message, self._most = b"", -1
+        self.scan = scan
+        self.number = number
+        self.position = position
+        self.sent = sent
+        self._message = b""
+        self._message_most = -1
 
     def message(self, most: int) -> bytes:
-        """The scan as a message of so many points at most, made once for all who ask alike."""
-        if most != self._most:
+        """Return the scan as a message of at most so many points; it is made once for each limit."""
+        if most != self._message_most:
             self._message = message(
                 self.scan, self.number, position=self.position, sent=self.sent, most=most
             )
-            self._most = most
+            self._message_most = most
         return self._message
 
 
-class Broadcast(Closing):
-    """A device that is read for viewers.
+class Broadcast:
+    """Reads a device for viewers. A context manager that closes the device.
 
     Args:
-        source: as the user called it.
-        device: open; closed with this.
-        reopened: opens the source once more, where it is a file that is moved through.
-        select: which scans, and what of each.
-        switch: what records the source, where it is live.
+        source: as the user typed it.
+        device: open.
+        reopen: opens the source once more; called for a file that is moved through.
+        select: the scans to show; by default all.
+        switch: records the source, if it is live.
 
     Attributes:
-        shown: the newest scan; None before there is one.
+        shown: the newest scan; None before the first.
         backlog: the newest bytes.
-        paused, speed: of a file.
-        warnings, info: those of the device.
-        history: the figures of the last minute, one after another, by name.
-        failure: what ended the reading; None while it goes on.
-        news: called in the thread that reads, whenever there is something new.
+        paused: whether a file is paused.
+        speed: of a file, as a multiple of its own.
+        warnings: of the device.
+        info: of the device, such as its serial number, by name.
+        history: the figures of the last minute, one dict for each second.
+        failure: the error that ended the reading, None while it goes on.
+        news: called in the reading thread if there is something new.
     """
 
     def __init__(
@@ -80,220 +91,306 @@ class Broadcast(Closing):
         source: str,
         device: Device,
         *,
-        reopened: Callable[[], Device],
+        reopen: Callable[[], Device],
         select: Selection | None = None,
         switch: RecordingSwitch | None = None,
     ) -> None:
-        self.source, self.device, self.switch = source, device, switch
-        self._reopened = reopened
-        self._select = select or Selection()
+        self.source = source
+        self.device = device
+        self.switch = switch
         self.shown: Shown | None = None
-        self.paused, self.speed = False, 1.0
-        self.warnings, self.info = list[str](), dict[str, str]()
-        self.history = deque[dict[str, Any]](maxlen=round(HISTORY / FIGURES))
+        self.backlog = Backlog(device.sensor)
+        self.paused = False
+        self.speed = 1.0
+        self.warnings: list[str] = []
+        self.info: dict[str, str] = {}
+        self.history = deque[dict[str, Any]](maxlen=round(HISTORY_S / FIGURES_PERIOD_S))
         self.failure: LidarSpecError | None = None
         self.news: Callable[[], None] = lambda: None
-        self.backlog = Backlog(device.sensor)
-        self._numbered = weakref.WeakValueDictionary[int, Shown]()
-        self._number, self._seen, self._has_ended = 0, 0, False
-        self._first: Scan | None = None
-        self._moved, self._steps = False, 0
-        self._target: float | None = None
-        self._stirred, self._stopped, self._measured = threading.Event(), False, time.monotonic()
+        self._reopen = reopen
+        self._select = select or Selection()
         self._clock = HostClock()
-        self._feed = self._fed(self._select)
+        self._first_scan: Scan | None = None
+        self._scan_count = 0
+        self._by_number = weakref.WeakValueDictionary[int, Shown]()
+        self._seek_target: float | None = None
+        self._steps = 0  # asked for, and not done yet
+        self._has_moved = False
+        self._has_ended = False
+        self._is_stopped = False
+        self._has_request = threading.Event()
+        self._measured_at = time.monotonic()
+        self._feed = self._make_feed(self._select)
+        self._seen_count = 0  # scans of the feed that were taken over
+
+    def __enter__(self) -> Broadcast:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
 
     @property
     def is_live(self) -> bool:
-        """Whether data come at their own pace, and not from a file."""
+        """Whether data arrive at the pace of a sensor, and not from a file."""
         return self.device.is_live
 
     @property
     def can_seek(self) -> bool:
-        """Whether it can be moved through: a file, of which no scans were chosen by time or number."""
+        """Whether it is a file that can be moved through.
+
+        A file is not, if its scans were selected by number.
+        """
         return not self.is_live and not self._select.is_counted and self.source != "-"
 
     @property
     def state(self) -> str:
-        """What `Device.state` says; of a file "playing", "paused" or "ended"."""
+        """The `Device.state` of a live source; of a file "playing", "paused" or "ended"."""
         if self.is_live:
             return self.device.state
-        return "ended" if self._feed.ended else "paused" if self.paused else "playing"
+        if self._feed.ended:
+            return "ended"
+        return "paused" if self.paused else "playing"
 
     @property
     def has_ended(self) -> bool:
-        """Whether nothing more comes, unless a file is played again."""
+        """Whether the source has failed, or a file is at its end."""
         return self.failure is not None or self._has_ended
 
     @property
     def ending(self) -> str:
-        """Why nothing more comes."""
+        """The reason why no more scans come."""
         if self.failure is not None:
             return str(self.failure)
         return "; ".join([f"{self.source} has ended", *self.warnings])
 
-    def now(self) -> float:
-        """Seconds since 1970, as times of arrival count them."""
-        return self._clock.now() * 1e-9
-
     @property
     def began_ns(self) -> int:
-        """When the first packet of the first scan arrived, ns since 1970; 0 where nobody knows it."""
-        return self._first.host_ns if self._first is not None else 0
+        """When the first packet of the first scan arrived, ns since 1970; 0 if that is not known."""
+        return 0 if self._first_scan is None else self._first_scan.host_ns
+
+    def now(self) -> float:
+        """Return the time in seconds since 1970, by the clock that stamps arrivals."""
+        return self._clock.now() * 1e-9
 
     def numbered(self, number: int) -> Shown | None:
-        """A scan by its number, while anybody holds it."""
-        return self._numbered.get(number)
+        """Return a scan by its number, None if no page holds it any more."""
+        return self._by_number.get(number)
 
     def pause(self) -> None:
-        """Let a file stand still."""
+        """Pause a file.
+
+        Raises:
+            UsageError: if the source is live.
+        """
         self._refuse_live("pauses for its viewers, each by itself")
         self.paused = True
 
     def play(self) -> None:
-        """Go on; a file that has ended begins anew."""
+        """Continue a file; at its end, play it from the beginning.
+
+        Raises:
+            UsageError: if the source is live.
+        """
         self._refuse_live("plays by itself")
         if self._feed.ended:
             self.seek(0.0)
         self.paused = False
-        self._stirred.set()
+        self._has_request.set()
 
     def step(self) -> None:
-        """Show the next scan, and stand still there."""
+        """Show the next scan of a file, and pause there.
+
+        Raises:
+            UsageError: if the source is live.
+        """
         self._refuse_live("has no next scan before it comes")
         self.paused = True
         self._steps += 1
-        self._stirred.set()
+        self._has_request.set()
 
     def seek(self, to: float) -> None:
-        """Go on from a time, in seconds from the first scan."""
+        """Continue a file at a time in seconds from its first scan.
+
+        Raises:
+            UsageError: if the source cannot be moved through.
+        """
         if not self.can_seek:
             raise UsageError(f"{self.source} cannot be moved through")
-        self._target = max(to, 0.0)
-        self._stirred.set()
+        self._seek_target = max(to, 0.0)
+        self._has_request.set()
 
     def play_at(self, times: float) -> None:
-        """Play so many times as fast as it was."""
+        """Play a file at a multiple of its own speed.
+
+        Raises:
+            UsageError: if the source is live, or the speed is out of range.
+        """
         self._refuse_live("comes as fast as it does")
-        if not SLOWEST <= times <= FASTEST:
+        if not MIN_SPEED <= times <= MAX_SPEED:
             raise UsageError(
-                f"a file is played {SLOWEST:g} to {FASTEST:g} times as fast, not {times:g} times"
+                f"a file is played {MIN_SPEED:g} to {MAX_SPEED:g} times as fast, not"
+                f" {times:g} times"
             )
         self.speed = times
 
     def run(self, until: float) -> None:
-        """Read up to a time of `time.monotonic`, or until it is stopped.
+        """Read until a time of `time.monotonic`, or until `stop`.
 
         Raises:
-            LidarSpecError: where the source fails; `failure` has it then.
+            LidarSpecError: if the source fails; `failure` is this error then.
         """
         try:
-            while not self._stopped and time.monotonic() < until:
-                self._turn()
+            while not self._is_stopped and time.monotonic() < until:
+                self._read_or_wait()
+                self._update()
         except LidarSpecError as error:
             self.failure = error
             self.news()
             raise
 
     def stop(self) -> None:
-        """Let `run` end."""
-        self._stopped = True
-        self._stirred.set()
+        """Let `run` return."""
+        self._is_stopped = True
+        self._has_request.set()
 
     def close(self) -> None:
-        """Give the source back."""
+        """Close the device."""
         self.device.close()
 
-    def _turn(self) -> None:
-        """Read for a moment, or stand still for one."""
-        feed, target = self._feed, self._target
+    def _read_or_wait(self) -> None:
+        """Carry out one request, read for a moment, or wait for a moment."""
+        feed = self._feed
+        target = self._seek_target
         if target is not None:
-            self._target = None
+            self._seek_target = None
             self._move(target)
         elif self._steps:
             self._steps -= 1
-            self._guarded(feed.step)
-        elif self.is_live or not (self.paused or feed.ended):
+            self._read(feed.step)
+        elif self._is_playing:
             feed.speed = self.speed
-            self._guarded(lambda: feed.pump(time.monotonic() + LOOK))
+            self._read(lambda: feed.pump(time.monotonic() + LOOK))
         else:
             feed.rest()
-            self._stirred.wait(IDLE)
-            self._stirred.clear()
-        self._look()
+            self._has_request.wait(PAUSED_CHECK_S)
+            self._has_request.clear()
 
-    def _guarded(self, read: Callable[[], None]) -> None:
-        """Read; behind the end of a file that was moved through there is nothing."""
+    @property
+    def _is_playing(self) -> bool:
+        return self.is_live or not (self.paused or self._feed.ended)
+
+    def _read(self, read: Callable[[], None]) -> None:
+        """Read from the feed.
+
+        After a move beyond the end of a file, its selection of no packets is not an error.
+        """
         try:
             read()
         except UsageError:
-            if not self._moved:
+            if not self._has_moved:
                 raise
 
     def _move(self, target: float) -> None:
         """Open a file once more, and show its first scan from a time on."""
-        device = self._reopened()
+        device = self._reopen()
         self.device.close()
-        self.device, self._moved = device, target > 0
+        self.device = device
+        self._has_moved = target > 0
         self.backlog.forget()
-        self._seen = 0
-        self._feed = self._fed(
-            replace(self._select, times=(target, None)) if target else self._select
-        )
-        self._guarded(self._feed.step)
+        self._seen_count = 0
+        select = self._select
+        if self._has_moved:
+            select = replace(select, times=(target, None))
+        self._feed = self._make_feed(select)
+        self._read(self._feed.step)
 
-    def _fed(self, select: Selection) -> Feed:
+    def _make_feed(self, select: Selection) -> Feed:
         self.device.observe(self.backlog)
         return Feed(self.device, played=True, select=select)
 
-    def _look(self) -> None:
-        """Take note of a new scan, and of how the sensor is doing."""
-        feed, now, is_new = self._feed, time.monotonic(), False
-        if feed.scan is not None and feed.number != self._seen:
-            self._seen, is_new = feed.number, True
-            self._first = self._first or next(iter(feed.scans), feed.scan)
-            self.shown = Shown(
-                feed.scan, self._number, self._position(feed.scan), self._sent(feed.scan)
-            )
-            self._numbered[self._number] = self.shown
-            self._number += 1
-        if now - self._measured >= FIGURES:
-            if self.is_live or not (self.paused or feed.ended):
-                self.history.append(self._figures(now - self._measured))
-            self.warnings, self.info = self.device.warnings, self.device.info
-            self._measured, is_new = now, True
-        if is_new or feed.ended != self._has_ended:
-            self._has_ended = feed.ended
-            self.warnings = self.device.warnings if feed.ended else self.warnings
+    def _update(self) -> None:
+        """Take over a new scan, the figures, and the end of a file; announce what is new."""
+        has_news = self._update_scan()
+        if self._update_figures():
+            has_news = True
+        if self._update_end():
+            has_news = True
+        if has_news:
             self.news()
 
-    def _figures(self, seconds: float) -> dict[str, Any]:
+    def _update_scan(self) -> bool:
+        """Show the newest scan, and return whether there is a new one."""
+        feed = self._feed
+        if feed.scan is None or feed.number == self._seen_count:
+            return False
+        self._seen_count = feed.number
+        if self._first_scan is None:
+            self._first_scan = feed.scans[0] if feed.scans else feed.scan
+        number = self._scan_count
+        self.shown = Shown(feed.scan, number, self._position(feed.scan), self._arrival(feed.scan))
+        self._by_number[number] = self.shown
+        self._scan_count += 1
+        return True
+
+    def _update_figures(self) -> bool:
+        """Read the figures once a second, and return whether that was done."""
+        now = time.monotonic()
+        duration_s = now - self._measured_at
+        if duration_s < FIGURES_PERIOD_S:
+            return False
+        self._measured_at = now
+        if self._is_playing:
+            self.history.append(self._figures(duration_s))
+        self.warnings = self.device.warnings
+        self.info = self.device.info
+        return True
+
+    def _update_end(self) -> bool:
+        """Return whether a file has ended or begun again since the last turn."""
+        ended = self._feed.ended
+        if ended == self._has_ended:
+            return False
+        self._has_ended = ended
+        if ended:
+            self.warnings = self.device.warnings
+        return True
+
+    def _figures(self, duration_s: float) -> dict[str, Any]:
         stats = self.device.stats
-        reading = self._feed.meter.reading(stats, seconds if self.is_live else None).to_dict()
-        at = self.now()
-        latency = at - self.shown.sent if self.is_live and self.shown is not None else None
+        reading = self._feed.meter.reading(stats, duration_s if self.is_live else None)
+        now = self.now()
+        latency_s = None
+        if self.is_live and self.shown is not None:
+            latency_s = now - self.shown.sent
         return {
-            "at": at,
-            **reading,
+            "at": now,
+            **reading.to_dict(),
             "lost": stats.lost,
             "disconnects": stats.disconnects,
-            "latency_s": latency,
+            "latency_s": latency_s,
         }
 
-    def _sent(self, scan: Scan) -> float:
-        """When the last packet of a scan arrived; of a file: now."""
-        arrived = scan.provenance(len(scan) - 1).host_ns if self.is_live and len(scan) else 0
-        return arrived * 1e-9 if arrived else self.now()
+    def _arrival(self, scan: Scan) -> float:
+        """Return when the last packet of a scan arrived, in seconds since 1970; of a file: now."""
+        if self.is_live and len(scan):
+            host_ns = scan.provenance(len(scan) - 1).host_ns
+            if host_ns:
+                return host_ns * 1e-9
+        return self.now()
 
     def _position(self, scan: Scan) -> float:
-        """Seconds from the first scan: by arrival, of a file as its scans are selected, or by their
-        number where they bear no times.
+        """Return the seconds from the first scan.
+
+        By arrival if the source is live, else by the times that select its scans, or by their
+        number if they have no times.
         """
-        assert self._first is not None
+        first = self._first_scan
+        assert first is not None
         if self.is_live:
-            return (scan.host_ns - self._first.host_ns) * 1e-9
-        has_times = scan.host_ns or scan.sensor.clock is not None
-        return (scan.stamp_ns - self._first.stamp_ns) * 1e-9 if has_times else self._number * STEP
+            return (scan.host_ns - first.host_ns) * 1e-9
+        if scan.host_ns or scan.sensor.clock is not None:
+            return (scan.stamp_ns - first.stamp_ns) * 1e-9
+        return self._scan_count * STEP
 
     def _refuse_live(self, reason: str) -> None:
         if self.is_live:

@@ -1,9 +1,12 @@
-"""A scan as the message that a page draws: a header in JSON, then the columns of its points as they
-are in memory.
+"""A scan as the binary message that a page draws.
 
-A message is the length of its header, 4 bytes, little-endian; the header, with spaces up to the
-next multiple of 8 bytes of the message; and each column that the header names, with zeros up to the
-next one. So a page lays its typed arrays over the bytes that it received.
+The message is, in this order:
+
+1. the length of the header, 4 bytes, little-endian;
+2. the header, JSON, with spaces up to the next multiple of 8 bytes of the message;
+3. each column that the header names, as in memory, with zeros up to the next multiple of 8 bytes.
+
+So the page uses its typed arrays on the received bytes without a copy.
 """
 
 from __future__ import annotations
@@ -20,30 +23,33 @@ from lidarspec import PointCloud, Scan
 from lidarspec.points.cloud import source_of
 from lidarspec.points.conventions import UNITS
 
-#: what begins in a message begins at a multiple of so many bytes.
-ALIGNED = 8
-_LENGTH = struct.Struct("<I")
-#: the columns that are sent, the last two where a sensor has them.
+#: header and columns begin at a multiple of this in the message.
+ALIGNMENT_BYTES = 8
+#: the columns in a message; intensity and ring only if the sensor has them.
 COLUMNS = ("x", "y", "z", "range", "intensity", "ring")
-#: the golden section: the fractions of its multiples are even over every stretch, and in step with
-#: nothing that a sensor repeats.
-_SECTION = (math.sqrt(5) - 1) / 2
+_HEADER_LENGTH = struct.Struct("<I")
+#: the golden section: the fractional parts of its multiples are evenly distributed over every
+#: interval, and have no common period with the pattern of a sensor.
+_GOLDEN_SECTION = (math.sqrt(5) - 1) / 2
 
 
 def message(scan: Scan, number: int, *, position: float, sent: float, most: int) -> bytes:
-    """A scan as a message, without the points that have no return.
+    """Return a scan as a message, without the points that have no return.
 
     Args:
-        number: of the scan, by which the page asks for what it is made of.
+        scan: its points.
+        number: of the scan, by which the page asks for the frame of a point.
         position: of its first point, seconds since the first packet of the source.
         sent: when its last packet arrived, seconds since 1970 by this computer's clock.
-        most: points at most; of more of them the message has an even choice, the same for the same
-            points.
+        most: the most points; of more points an even selection is sent, always the same one.
     """
-    source_of(scan.points).prepare((*COLUMNS, "valid"))
-    returns = np.flatnonzero(scan.points.valid)
-    indices = returns if len(returns) <= most else thinned(returns, most)
-    columns = _columns(scan.points, indices)
+    points = scan.points
+    source_of(points).prepare((*COLUMNS, "valid"))
+    returns = np.flatnonzero(points.valid)
+    indices = returns
+    if len(returns) > most:
+        indices = thin_out(returns, most)
+    columns = _take_columns(points, indices)
     header = {
         "scan": number,
         "position": position,
@@ -52,31 +58,38 @@ def message(scan: Scan, number: int, *, position: float, sent: float, most: int)
         "of": len(returns),
         "whole": scan.whole,
         "rate_hz": scan.rate_hz if math.isfinite(scan.rate_hz) else None,
-        "nominal": bool(scan.points.nominal),
+        "nominal": bool(points.nominal),
         "columns": [
             {"name": name, "type": column.dtype.str[1:], "unit": UNITS.get(name, "")}
             for name, column in columns.items()
         ],
     }
     text = json.dumps(header).encode()
-    text += b" " * (-(_LENGTH.size + len(text)) % ALIGNED)
-    parts: list[Any] = [_LENGTH.pack(len(text)), text]
+    text += b" " * _padding(_HEADER_LENGTH.size + len(text))
+    parts: list[Any] = [_HEADER_LENGTH.pack(len(text)), text]
     for column in columns.values():
-        parts += [column, bytes(-column.nbytes % ALIGNED)]
+        parts += [column, bytes(_padding(column.nbytes))]
     return b"".join(parts)
 
 
-def thinned(indices: NDArray[np.intp], most: int) -> NDArray[np.intp]:
-    """An even choice of at most so many of some indices, in their order."""
-    kept = np.arange(len(indices)) * _SECTION % 1 < most / len(indices)
-    return indices[kept][:most]
+def thin_out(indices: NDArray[np.intp], most: int) -> NDArray[np.intp]:
+    """Return an even selection of indices, (m,) with m <= `most`, in their order."""
+    fractions = np.arange(len(indices)) * _GOLDEN_SECTION % 1
+    return indices[fractions < most / len(indices)][:most]
 
 
-def _columns(cloud: PointCloud, indices: NDArray[np.intp]) -> dict[str, NDArray[Any]]:
-    """The columns of some points by name, little-endian, and the points' numbers among them."""
-    columns = {
-        name: column[indices] for name in COLUMNS if (column := getattr(cloud, name)) is not None
-    }
+def _padding(size: int) -> int:
+    """Return the bytes from the end of a part to the next multiple of the alignment."""
+    return -size % ALIGNMENT_BYTES
+
+
+def _take_columns(points: PointCloud, indices: NDArray[np.intp]) -> dict[str, NDArray[Any]]:
+    """Return the columns of some points by name, little-endian, and their indices as `index`."""
+    columns: dict[str, NDArray[Any]] = {}
+    for name in COLUMNS:
+        column = getattr(points, name)
+        if column is not None:
+            columns[name] = column[indices]
     columns["index"] = indices.astype(np.uint32)
     return {
         name: column.astype(column.dtype.newbyteorder("<"), copy=False)

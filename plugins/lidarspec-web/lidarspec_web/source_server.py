@@ -59,13 +59,13 @@ class SourceServer:
         self.broadcast = Broadcast(
             source,
             device,
-            reopened=partial(open_device, source, device.sensor),
+            reopen=partial(open_device, source, device.sensor),
             select=selection or Selection(),
             switch=self.switch,
         )
         try:
             self.site = Site(
-                self.broadcast, host=host, port=port, control=control, page=page, say=report
+                self.broadcast, host=host, port=port, control=control, page=page, report=report
             )
         except BaseException:
             self.broadcast.close()

@@ -1,4 +1,8 @@
-"""A sensor at work in a cell of a notebook, drawn by the same code as the page."""
+"""A source in a cell of a notebook, drawn by the code of the page.
+
+A thread reads the source. The cell asks for each scan after it has drawn the one before (`next`),
+as a page does, and says hello when it is shown. The messages are those of the page (`answers`).
+"""
 
 from __future__ import annotations
 
@@ -8,32 +12,32 @@ import threading
 import time
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any
+from types import TracebackType
+from typing import Any, Self
 
 from lidarspec import LidarSpecError, Selection, Sensor, UsageError, open as open_device
 from lidarspec.errors import suggest, suggestion
-from lidarspec.transports.protocol import Closing
 from lidarspec.view.feed import LOOK
 from lidarspec_web.answers import Answers
 from lidarspec_web.broadcast import Broadcast
 
-#: what draws, as it was built; the height of the picture in pixels; and seconds from one state to
-#: the next.
-DRAWING, HEIGHT, STATE = Path(__file__).parent / "page" / "widget.js", 420, 0.5
+#: the built widget.
+SCRIPT = Path(__file__).parent / "page" / "widget.js"
+HEIGHT_PIXELS = 420
+STATE_PERIOD_S = 0.5
 
 
-class Viewer(Closing):
-    """A source in the cell whose value this is: ``Viewer("/dev/ttyUSB0", "vendor-model")``; a file
-    is played.
+class Viewer:
+    """Shows a source in the cell whose value it is: ``Viewer("/dev/ttyUSB0", "vendor-model")``.
 
-    It reads in a thread of its own until it is closed, by `close` or with its cell. What is wrong
-    with the source stands in the cell.
+    Files are played. The source is read until `close` is called or the cell is removed. If it
+    cannot be read, the cell says why.
 
     Args:
         source: port, socket, file or ``sim:`` URL.
-        sensor: found out where it is left out.
-        select: which scans, and what of each.
-        height: of the picture, pixels.
+        sensor: by default the one that sends.
+        select: the scans to show; by default all.
+        height: of the picture, in pixels.
 
     Raises:
         UsageError: if anywidget is not installed.
@@ -45,29 +49,45 @@ class Viewer(Closing):
         sensor: str | Sensor | None = None,
         *,
         select: Selection | None = None,
-        height: int = HEIGHT,
+        height: int = HEIGHT_PIXELS,
     ) -> None:
-        self._source, self._sensor, self._select = str(source), sensor, select
-        self._lock, self._closed = threading.RLock(), False
+        self._source = str(source)
+        self._sensor = sensor
+        self._select = select
+        self._lock = threading.RLock()  # the reading thread and that of the notebook send
         self._broadcast: Broadcast | None = None
         self._answers: Answers | None = None
-        self._greets, self._most, self._sent, self._failure, self._ending = False, 0, -1, "", ""
-        self._due = (
-            math.inf
-        )  # when the cell, once it has asked who it is, is told how that is doing
-        self._widget = _widget(height)
-        self._widget.on_msg(lambda widget, message, buffers: self._hear(message))
-        self._thread = threading.Thread(target=self._run, name=f"viewer of {source}", daemon=True)
+        self._is_closed = False
+        self._failure = ""
+        self._ending = ""
+        self._wants_hello = False
+        self._wanted_points = 0  # of the scan that was asked for; 0 if none was
+        self._sent_scan = -1
+        self._state_due = math.inf  # no state before the hello
+        self._widget = _make_widget(height)
+        self._widget.on_msg(lambda widget, message, buffers: self._handle(message))
+        self._thread = threading.Thread(target=self._read, name=f"viewer of {source}", daemon=True)
         self._thread.start()
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
+    ) -> None:
+        self.close()
 
     @property
     def failure(self) -> str:
-        """What is wrong with the source, and what helps, in one line; "" where nothing is."""
+        """The reason why the source cannot be read, and what to do; "" if it can."""
         return self._failure
 
     def close(self) -> None:
-        """Give the source back; the last picture stays."""
-        self._closed = True
+        """Close the source; the last picture stays."""
+        self._is_closed = True
         if self._broadcast is not None:
             self._broadcast.stop()
         if self._thread is not threading.current_thread():
@@ -76,64 +96,75 @@ class Viewer(Closing):
     def _repr_mimebundle_(self, **_: Any) -> Any:
         return self._widget._repr_mimebundle_()
 
-    def _run(self) -> None:
-        """Read until the end, which the cell is told of."""
+    def _read(self) -> None:
+        """Read the source until it ends, and tell the cell why."""
         try:
-            device = open_device(self._source, self._sensor, period=LOOK)
-            reopened = functools.partial(open_device, self._source, device.sensor)
-            with Broadcast(
-                self._source, device, reopened=reopened, select=self._select
-            ) as broadcast:
-                broadcast.news = self._tell
-                self._broadcast, self._answers = broadcast, Answers(broadcast, control=False)
-                if not self._closed:
-                    broadcast.run(math.inf)
+            self._show_source()
         except LidarSpecError as error:
             self._failure = "; next: ".join(filter(None, (str(error), suggestion(error))))
         self._ending = self._failure or f"{self._source} is closed"
-        self._tell()
+        self._send_news()
 
-    def _hear(self, message: Mapping[str, Any]) -> None:
-        """Do what the cell asks for."""
-        word, broadcast = message.get("do"), self._broadcast
+    def _show_source(self) -> None:
+        device = open_device(self._source, self._sensor, period=LOOK)
+        reopen = functools.partial(open_device, self._source, device.sensor)
+        with Broadcast(self._source, device, reopen=reopen, select=self._select) as broadcast:
+            broadcast.news = self._send_news
+            self._answers = Answers(broadcast, control=False)
+            self._broadcast = broadcast
+            if not self._is_closed:
+                broadcast.run(math.inf)
+
+    def _handle(self, message: Mapping[str, Any]) -> None:
+        """Handle a message of the cell."""
+        word = message.get("do")
+        broadcast = self._broadcast
         if word == "next":
-            self._most = int(message["most"])
+            self._wanted_points = int(message["most"])
         elif word == "hello":
-            self._greets, self._sent = True, -1
+            self._wants_hello = True
+            self._sent_scan = -1
         elif word == "close":
             threading.Thread(target=self.close, daemon=True).start()
-        elif word in ("pause", "play") and broadcast is not None and not broadcast.is_live:
-            getattr(broadcast, word)()
-        self._tell()
+        elif broadcast is not None and not broadcast.is_live:
+            if word == "pause":
+                broadcast.pause()
+            elif word == "play":
+                broadcast.play()
+        self._send_news()
 
-    def _tell(self) -> None:
-        """Answer with what there is: who it is with the first scan, then each scan that was asked
-        for.
-        """
+    def _send_news(self) -> None:
+        """Send what the cell has asked for, as far as it is there."""
         with self._lock:
-            shown = self._broadcast.shown if self._broadcast is not None else None
-            if shown is not None and self._answers is not None:
-                if self._greets:
-                    self._greets, self._due = False, 0.0
-                    self._say(self._answers.hello())
-                if time.monotonic() >= self._due:
-                    self._due = time.monotonic() + STATE
-                    self._say(
-                        self._answers.state(
-                            frozen=False, since=self._answers.broadcast.backlog.damaged
-                        )
-                    )
-                if self._most and shown.number != self._sent:
-                    most, self._most, self._sent = self._most, 0, shown.number
-                    self._say({"is": "scan"}, shown.message(most))
+            if self._broadcast is not None and self._answers is not None:
+                self._send_scan(self._broadcast, self._answers)
             if self._ending:
-                self._say({"is": "ended", "text": self._ending})
+                self._send({"is": "ended", "text": self._ending})
 
-    def _say(self, message: Mapping[str, Any], *buffers: bytes) -> None:
+    def _send_scan(self, broadcast: Broadcast, answers: Answers) -> None:
+        """Send the newest scan, after hello and state if they are due."""
+        shown = broadcast.shown
+        if shown is None:
+            return
+        if self._wants_hello:
+            self._wants_hello = False
+            self._state_due = 0.0
+            self._send(answers.hello())
+        now = time.monotonic()
+        if now >= self._state_due:
+            self._state_due = now + STATE_PERIOD_S
+            self._send(answers.state(frozen=False, since=broadcast.backlog.damaged))
+        if self._wanted_points and shown.number != self._sent_scan:
+            most = self._wanted_points
+            self._wanted_points = 0
+            self._sent_scan = shown.number
+            self._send({"is": "scan"}, shown.message(most))
+
+    def _send(self, message: Mapping[str, Any], *buffers: bytes) -> None:
         self._widget.send(message, list(buffers))
 
 
-def _widget(height: int) -> Any:
+def _make_widget(height: int) -> Any:
     """Return the widget that draws in the cell.
 
     Raises:
@@ -145,5 +176,5 @@ def _widget(height: int) -> Any:
     except ImportError as error:
         text = f"the viewer in notebooks needs anywidget, which cannot be imported: {error}"
         raise suggest(UsageError(text), "pip install 'anywidget>=0.9.13'") from error
-    attributes = {"_esm": DRAWING, "height": traitlets.Int(height).tag(sync=True)}
+    attributes = {"_esm": SCRIPT, "height": traitlets.Int(height).tag(sync=True)}
     return type("Viewer", (anywidget.AnyWidget,), attributes)()

@@ -136,11 +136,11 @@ KEYS_OF_AN_ARGUMENT = {"name", "text", "unit", "low", "high", "choices", "defaul
 @pytest.mark.slow
 @pytest.mark.parametrize("module", sensor_modules())
 def test_every_command_of_every_sensor_has_a_form(module: str) -> None:
-    from lidarspec_web.answers import form
+    from lidarspec_web.command_forms import make_form
 
     for sensor in sensors_in(module):
         for name in sensor.commands:
-            described = form(sensor, name)
+            described = make_form(sensor, name)
             assert described["name"] == name, sensor.id
             assert all(
                 argument.keys() == KEYS_OF_AN_ARGUMENT for argument in described["arguments"]

@@ -10,7 +10,7 @@ import pytest
 
 import lidarspec as ls
 from lidarspec import Scan
-from lidarspec_web.scan_message import message, thinned
+from lidarspec_web.scan_message import message, thin_out
 
 from .messages import parsed
 
@@ -80,7 +80,7 @@ def test_points_are_thinned_to_what_is_asked(most: int) -> None:
 @pytest.mark.parametrize("period", [2, 5, 16, 128])
 def test_thinning_is_even_over_stretches_and_over_rings(period: int) -> None:
     """One of two points, of a sensor whose rings come in turn: each ring keeps its half."""
-    kept = thinned(np.arange(100_000), 50_000)
+    kept = thin_out(np.arange(100_000), 50_000)
     assert len(np.unique(kept)) == len(kept)
     assert abs(np.diff(np.searchsorted(kept, np.arange(0, 100_001, 100))) - 50).max() <= 3
     of_ring = np.bincount(kept % period, minlength=period) / (100_000 / period)

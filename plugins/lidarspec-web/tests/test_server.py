@@ -354,7 +354,7 @@ def test_a_page_that_takes_nothing_is_dropped_and_a_recording_loses_nothing(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """It asks for scan after scan and reads none of them, until its window is full."""
-    monkeypatch.setattr("lidarspec_web.server.STALLED", 2.0)
+    monkeypatch.setattr("lidarspec_web.open_page.SEND_TIMEOUT_S", 2.0)
     with (
         Station(f"sim:{SOLID}", tmp_path) as station,
         station.page() as healthy,

@@ -15,7 +15,7 @@ from typing import Any
 import pytest
 
 from lidarspec_web import Viewer
-from lidarspec_web.viewer import DRAWING
+from lidarspec_web.viewer import SCRIPT
 from tests.cli.running import ran
 from tests.libraries import needs
 
@@ -65,7 +65,7 @@ class Cell:
             "<body style='background:#111;color:#ddd'><div id=cell style='width:600px'></div>"
         )
         page.expose_function("toKernel", self._to_kernel)
-        page.evaluate(CELL, DRAWING.read_text(encoding="utf-8"))
+        page.evaluate(CELL, SCRIPT.read_text(encoding="utf-8"))
 
     def _to_kernel(self, content: dict[str, Any]) -> None:
         self.asked.append(content["do"])

@@ -1,0 +1,65 @@
+"""The commands of a sensor as forms of the page."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from lidarspec import Sensor
+from lidarspec.explaining.wording import asked
+from lidarspec.exports.reference import effect
+from lidarspec.frames.commands import argument_slot
+from lidarspec.spec.arguments import Range
+
+
+def make_form(sensor: Sensor, name: str) -> dict[str, Any]:
+    """Return the form of a command: its text, and its arguments with their ranges and units."""
+    command = sensor.commands[name]
+    return {
+        "name": name,
+        "group": _group(sensor, name),
+        "only_stopped": command.only_stopped,
+        "text": effect(sensor, name),
+        "arguments": [_argument(sensor, name, argument) for argument in command.args],
+    }
+
+
+def find_restart(sensor: Sensor) -> dict[str, str] | None:
+    """Return the commands that stop the data and start it again, as on opening.
+
+    None if the sensor has none without arguments.
+    """
+    names = [*sensor.on_open, *sensor.commands]
+    plain = [name for name in names if not sensor.commands[name].args]
+    stop = next((name for name in plain if sensor.commands[name].stops), None)
+    start = next((name for name in plain if sensor.commands[name].starts), None)
+    if stop is None or start is None:
+        return None
+    return {"stop": stop, "start": start}
+
+
+def _group(sensor: Sensor, name: str) -> str:
+    """Return the group of a command.
+
+    "switch" if it starts or stops the data, "ask" if it changes nothing, else "set".
+    """
+    command = sensor.commands[name]
+    if command.starts or command.stops:
+        return "switch"
+    return "ask" if name.startswith("get_") else "set"
+
+
+def _argument(sensor: Sensor, name: str, argument: str) -> dict[str, Any]:
+    """Return the input of an argument."""
+    kind = sensor.commands[name].arguments[argument].kind
+    info = argument_slot(sensor, name, argument).info
+    field = {"name": argument, "unit": info.unit, "default": None}
+    if not isinstance(kind, Range):
+        text = ": ".join(filter(None, (info.docs, asked(kind))))
+        return {**field, "text": text, "low": None, "high": None, "choices": []}
+    labels = {float(info.physical(raw)): label for raw, label in info.labels.items()}
+    choices = [
+        {"value": f"{value:g}", "text": label}
+        for value, label in labels.items()
+        if kind.low <= value <= kind.high
+    ]
+    return {**field, "text": info.docs, "low": kind.low, "high": kind.high, "choices": choices}

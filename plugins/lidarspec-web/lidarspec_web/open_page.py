@@ -1,0 +1,430 @@
+"""One page that is open: its requests, and the messages that it is sent.
+
+A page asks for each scan after it has drawn the one before, and gets the newest. So a slow or
+hidden page costs nothing, and no page is ever behind. Requests are JSON objects whose `do` names
+the handler; requests that take a while are done in threads (`page_requests`). Between scans the
+page is sent replies, the state of the source twice a second and, while its bytes are shown, the
+newest frame.
+
+A live source goes on while a page is paused: the page keeps the bytes as they were (`_frozen`).
+"""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import json
+import math
+import time
+from collections import deque
+from collections.abc import Callable, Mapping
+from typing import Any
+
+from starlette.websockets import WebSocket, WebSocketDisconnect
+
+from lidarspec import LidarSpecError, UsageError
+from lidarspec.errors import suggestion
+from lidarspec_web.answers import Answers
+from lidarspec_web.backlog import Backlog
+from lidarspec_web.broadcast import Shown
+from lidarspec_web.page_requests import (
+    MESSAGES_AT_ONCE,
+    MESSAGES_PER_S,
+    Lane,
+    RateLimit,
+    Request,
+    Workers,
+)
+
+#: replies that wait to be sent before no further request is read.
+MAX_REPLIES = 16
+#: until a page with too many requests is looked at again.
+BUSY_CHECK_S = 0.05
+STATE_PERIOD_S = 0.5
+FRAME_PERIOD_S = 0.5
+#: after which a page that takes no message is dropped.
+SEND_TIMEOUT_S = 20.0
+#: a page waits so long for a first scan before it is told about the source.
+GREETING_TIMEOUT_S = 3.0
+GREETING_CHECK_S = 0.05
+#: codes with which browsers close a socket.
+CLOSE_CODES = (1000, 1001, 1012)
+#: the most points that a page may ask for.
+MAX_POINTS = 1 << 24
+#: scans that a page may ask about: the one that is drawn, and the one that is on its way.
+HELD_SCANS = 2
+#: the largest number in a request.
+MAX_NUMBER = 1e12
+
+
+class OpenPage:
+    """Serves one page.
+
+    Args:
+        answers: makes the messages.
+        socket: to the page.
+        workers: the threads for requests that take a while.
+    """
+
+    def __init__(self, answers: Answers, socket: WebSocket, workers: Workers) -> None:
+        self._answers = answers
+        self._broadcast = answers.broadcast
+        self._socket = socket
+        self._workers = workers
+        self._replies = deque[dict[str, Any]]()
+        self._has_news = asyncio.Event()
+        self._rate_limit = RateLimit(MESSAGES_AT_ONCE, MESSAGES_PER_S)
+        self._questions = Lane(workers.answers, self._finish)
+        self._commands = Lane(workers.commands, self._finish)
+        self._wanted_points: int | None = None  # of the scan that was asked for
+        self._held = deque[Shown](maxlen=HELD_SCANS)
+        self._frozen: Backlog | None = None
+        self._shows_frames = False
+        self._sent_frame = -1
+        self._sent_damaged = 0
+        self._sent_end = False
+        self._sent_recording = ("", "")
+        self._state_due = 0.0
+        self._frame_due = math.inf
+
+    async def serve(self) -> str:
+        """Serve the page until it goes away, and return what became of it."""
+        await self._socket.accept()
+        works = (
+            self._receive_requests(),
+            self._send_messages(),
+            self._questions.run(),
+            self._commands.run(),
+        )
+        tasks: set[asyncio.Task[str]] = {asyncio.create_task(work) for work in works}
+        try:
+            done, _ = await asyncio.wait(tasks, return_when=asyncio.FIRST_COMPLETED)
+            return next(iter(done)).result()
+        finally:
+            for task in tasks:
+                task.cancel()
+            await asyncio.gather(*tasks, return_exceptions=True)
+
+    def notify(self) -> None:
+        """Look whether there is a message for the page."""
+        self._has_news.set()
+
+    # Messages to the page.
+
+    async def _send_messages(self) -> str:
+        try:
+            await self._greet()
+            while True:
+                self._has_news.clear()
+                message = await self._next_message()
+                if message is None:
+                    await self._wait_for_news()
+                elif not await self._is_taken(message):
+                    return "dropped: it takes nothing any more"
+        except WebSocketDisconnect:
+            return "closed"
+
+    async def _is_taken(self, message: bytes | dict[str, Any]) -> bool:
+        """Send a message, and return whether the page takes it in time."""
+        try:
+            await asyncio.wait_for(self._send(message), SEND_TIMEOUT_S)
+        except TimeoutError:
+            return False
+        return True
+
+    async def _greet(self) -> None:
+        """Tell the page about the source after its first scan, or if that takes too long."""
+        end = time.monotonic() + GREETING_TIMEOUT_S
+        while self._broadcast.shown is None and time.monotonic() < end:
+            await asyncio.sleep(GREETING_CHECK_S)
+        await self._send(await self._run_in_thread(self._answers.hello))
+
+    async def _wait_for_news(self) -> None:
+        due = min(self._state_due, self._frame_due)
+        with contextlib.suppress(TimeoutError):
+            await asyncio.wait_for(self._has_news.wait(), max(due - time.monotonic(), 0.0))
+
+    async def _run_in_thread(self, work: Callable[[], dict[str, Any]]) -> dict[str, Any]:
+        loop = asyncio.get_running_loop()
+        return await loop.run_in_executor(self._workers.answers, work)
+
+    async def _send(self, message: bytes | dict[str, Any]) -> None:
+        if isinstance(message, bytes):
+            await self._socket.send_bytes(message)
+        else:
+            await self._socket.send_text(json.dumps(message, allow_nan=False))
+
+    async def _next_message(self) -> bytes | dict[str, Any] | None:
+        """Return the message to send now, None if there is none."""
+        if self._replies:
+            return self._replies.popleft()
+        return (
+            self._next_scan_message()
+            or self._end_message()
+            or await self._frame_message()
+            or self._state_message()
+        )
+
+    def _next_scan_message(self) -> bytes | None:
+        most = self._wanted_points
+        shown = self._unseen_scan()
+        if most is None or shown is None:
+            return None
+        self._wanted_points = None
+        self._held.append(shown)
+        # Made in this thread: glibc would keep large blocks of memory for each further thread.
+        return shown.message(most)
+
+    def _end_message(self) -> dict[str, Any] | None:
+        has_ended = self._broadcast.has_ended
+        is_new = has_ended and not self._sent_end
+        self._sent_end = has_ended
+        return {"is": "ended", "text": self._broadcast.ending} if is_new else None
+
+    async def _frame_message(self) -> dict[str, Any] | None:
+        if not self._shows_frames:
+            self._frame_due = math.inf
+            return None
+        now = time.monotonic()
+        if now < self._frame_due:
+            return None
+        self._frame_due = now + FRAME_PERIOD_S
+        number = self._backlog.newest
+        taken = self._backlog.frame(number)
+        if taken is None or number == self._sent_frame:
+            return None
+        self._sent_frame = number
+        try:
+            return await self._run_in_thread(lambda: self._answers.frame(taken, "last"))
+        except LidarSpecError:
+            return None  # a frame without an explanation is not shown
+
+    def _state_message(self) -> dict[str, Any] | None:
+        now = time.monotonic()
+        recording = self._recording()
+        if now < self._state_due and recording == self._sent_recording:
+            return None
+        self._state_due = now + STATE_PERIOD_S
+        self._sent_recording = recording
+        is_frozen = self._frozen is not None
+        state = self._answers.state(
+            frozen=is_frozen,
+            since=self._sent_damaged,
+            at=self._held[-1] if is_frozen else None,
+        )
+        self._sent_damaged = state["damaged"]["total"]
+        return state
+
+    def _recording(self) -> tuple[str, str]:
+        """Return the name of the file that is being written, and why the last one failed."""
+        switch = self._broadcast.switch
+        if switch is None:
+            return "", ""
+        current = switch.recording
+        return current[0] if current is not None else "", switch.trouble
+
+    def _unseen_scan(self) -> Shown | None:
+        """Return the newest scan, None if the page has it or is paused."""
+        shown = self._broadcast.shown
+        if shown is None or self._frozen is not None:
+            return None
+        if self._held and self._held[-1].number == shown.number:
+            return None
+        return shown
+
+    @property
+    def _backlog(self) -> Backlog:
+        return self._frozen or self._broadcast.backlog
+
+    # Requests of the page.
+
+    async def _receive_requests(self) -> str:
+        while True:
+            message = await self._socket.receive()
+            if message["type"] != "websocket.receive":
+                break
+            await asyncio.sleep(self._rate_limit.delay_s(time.monotonic()))
+            self._handle(message.get("text") or "")
+            while self._is_busy:
+                await asyncio.sleep(BUSY_CHECK_S)
+        if message.get("code") in CLOSE_CODES:
+            return "closed"
+        return "dropped: it does not answer any more"
+
+    @property
+    def _is_busy(self) -> bool:
+        """Whether the page asks faster than it is answered, or does not read the answers."""
+        return len(self._replies) > MAX_REPLIES or self._questions.is_full or self._commands.is_full
+
+    def _handle(self, text: str) -> None:
+        """Handle a request, or refuse it with the reason."""
+        word = ""
+        try:
+            request = json.loads(text)
+            if isinstance(request, dict):
+                word = str(request.get("do"))
+            if word not in self._handlers:
+                raise UsageError(f"a message says what to do: {', '.join(self._handlers)}")
+            self._handlers[word](self, request)
+        except (ValueError, RecursionError):
+            self._refuse(word, UsageError("a message is an object in JSON"))
+        except LidarSpecError as error:
+            self._refuse(word, error)
+
+    def _refuse(self, word: str, error: LidarSpecError, command: str = "") -> None:
+        reply = {"is": "refused", "of": word, "text": str(error)}
+        if command:
+            reply["command"] = command
+        if suggestion(error):
+            reply["next"] = suggestion(error)
+        self._reply(reply)
+
+    def _reply(self, reply: dict[str, Any]) -> None:
+        self._replies.append(reply)
+        self.notify()
+
+    def _reply_later(
+        self, word: str, work: Callable[[], dict[str, Any] | None], command: str = ""
+    ) -> None:
+        """Answer a question that takes a while, after those before it."""
+        self._questions.add(Request(word, command, work))
+
+    def _finish(self, request: Request, result: dict[str, Any] | Exception | None) -> None:
+        """Answer a request that was done in a thread."""
+        if isinstance(result, LidarSpecError):
+            self._refuse(request.word, result, request.command)
+        elif isinstance(result, Exception):
+            self._refuse(request.word, LidarSpecError(describe_bug(result)), request.command)
+        elif result is not None:
+            self._reply(result)
+        self.notify()
+
+    def _ask_for_scan(self, request: Mapping[str, Any]) -> None:
+        self._wanted_points = round(_number(request, "most", 1, MAX_POINTS))
+        self.notify()
+
+    def _pause(self, request: Mapping[str, Any]) -> None:
+        if not self._broadcast.is_live:
+            self._broadcast.pause()
+        elif not self._held:
+            raise UsageError("there is nothing to pause before the first scan")
+        elif self._frozen is not None:
+            return
+        else:
+            self._frozen = self._broadcast.backlog.frozen()
+        self._state_due = 0.0
+        self.notify()
+
+    def _play(self, request: Mapping[str, Any]) -> None:
+        if self._broadcast.is_live:
+            self._frozen = None
+        else:
+            self._broadcast.play()
+        self._state_due = 0.0
+        self.notify()
+
+    def _step(self, request: Mapping[str, Any]) -> None:
+        self._broadcast.step()
+
+    def _seek(self, request: Mapping[str, Any]) -> None:
+        self._broadcast.seek(_number(request, "to", 0.0, MAX_NUMBER))
+
+    def _set_speed(self, request: Mapping[str, Any]) -> None:
+        self._broadcast.play_at(_number(request, "times", 0.0, MAX_NUMBER))
+
+    def _watch(self, request: Mapping[str, Any]) -> None:
+        self._shows_frames = request.get("frames") is True
+        self._sent_frame = -1
+        self._frame_due = 0.0
+        self.notify()
+
+    def _show_frame(self, request: Mapping[str, Any]) -> None:
+        """Explain the frame of a point, a damaged frame, or a frame by its number."""
+        backlog = self._backlog
+        point = request.get("point")
+        if isinstance(point, dict):
+            scan = round(_number(point, "scan", 0, MAX_NUMBER))
+            index = round(_number(point, "index", 0, MAX_POINTS))
+            shown = next((held for held in self._held if held.number == scan), None)
+            self._reply_later("frame", lambda: self._answers.origin(shown, scan, index, backlog))
+        elif "damaged" in request:
+            number = round(_number(request, "damaged", 0, MAX_NUMBER))
+            self._reply_later("frame", lambda: self._answers.damaged(number, backlog))
+        else:
+            number = round(_number(request, "number", 0, MAX_NUMBER))
+            self._reply_later("frame", lambda: self._answers.numbered(number, backlog))
+
+    def _compose(self, request: Mapping[str, Any]) -> None:
+        name, arguments = _command(request)
+        self._reply_later("compose", lambda: self._answers.composed(name, arguments), name)
+
+    def _send_command(self, request: Mapping[str, Any]) -> None:
+        name, arguments = _command(request)
+        self._commands.add(Request("send", name, lambda: self._answers.sent(name, arguments)))
+
+    def _record(self, request: Mapping[str, Any]) -> None:
+        switch = self._broadcast.switch
+        if switch is None:
+            raise UsageError(
+                f"{self._broadcast.source} is a file already: there is nothing to record"
+            )
+        on = request.get("on")
+        if not isinstance(on, bool | None):
+            raise UsageError("on is true or false")
+
+        def change() -> None:
+            if on is None:
+                switch.toggle()
+            else:
+                switch.set(on=on)
+            self._broadcast.news()
+
+        self._reply_later("record", change)
+
+    _handlers: Mapping[str, Callable[[OpenPage, Mapping[str, Any]], None]] = {
+        "next": _ask_for_scan,
+        "pause": _pause,
+        "play": _play,
+        "step": _step,
+        "seek": _seek,
+        "speed": _set_speed,
+        "watch": _watch,
+        "frame": _show_frame,
+        "compose": _compose,
+        "send": _send_command,
+        "record": _record,
+    }
+
+
+def describe_bug(error: Exception) -> str:
+    """Return the line for an exception that is no error of the user's."""
+    return f"a bug in lidarspec: {type(error).__name__}: {error}"
+
+
+def _number(request: Mapping[str, Any], name: str, low: float, high: float) -> float:
+    """Return a number of a request.
+
+    Raises:
+        UsageError: if it is no number, or out of range.
+    """
+    value = request.get(name)
+    if isinstance(value, bool) or not isinstance(value, int | float) or not low <= value <= high:
+        raise UsageError(f"{name} is a number from {low:g} to {high:g}")
+    return value
+
+
+def _command(request: Mapping[str, Any]) -> tuple[str, dict[str, str]]:
+    """Return the name of a command, and its arguments as text, without empty ones.
+
+    Raises:
+        UsageError: if they are of another type.
+    """
+    name = request.get("command")
+    arguments = request.get("arguments", {})
+    if (
+        not isinstance(name, str)
+        or not isinstance(arguments, dict)
+        or not all(isinstance(text, str) for text in arguments.values())
+    ):
+        raise UsageError("a command has a name, and arguments that are texts")
+    return name, {argument: text for argument, text in arguments.items() if text}
