@@ -27,8 +27,8 @@ from lidarspec.exports.diagram import svg as diagram
 from lidarspec.points.look import fit, look
 from lidarspec.simulation.simulator import simulate
 from lidarspec.view.feed import Feed
-from lidarspec.view.live import FIGURES, Window
 from lidarspec.view.svg import svg
+from lidarspec.view.window import FIGURES_PERIOD_S, Window
 
 HERE = Path(__file__).parent / "pictures"
 #: pixels of the page, light or dark, milliseconds that it is let run, and colours of the PNG.
@@ -55,7 +55,7 @@ def terminal(folder: Path) -> str:
         window = Window(feed, "/dev/ttyUSB0")
         feed.pump(0.0)
         time.sleep(
-            FIGURES
+            FIGURES_PERIOD_S
         )  # after which the window reads its figures, which are by the packets' own times
         return drawn(window.cells(92, 28))
 

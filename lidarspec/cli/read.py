@@ -31,7 +31,8 @@ from lidarspec.points.conventions import UNITS
 from lidarspec.scans.scans import Scan
 from lidarspec.scans.selection import Selection, Slice
 from lidarspec.spec.sensor import Sensor
-from lidarspec.view.feed import LOOK, Feed, Reading, told
+from lidarspec.view.feed import LOOK_S, Feed
+from lidarspec.view.meter import Reading, format_figure
 
 #: width and decimals of the columns of points.
 POINTS = {
@@ -145,7 +146,7 @@ def _packets(
     if replace(selection, times=(None, None), time="device") != Selection():
         raise UsageError("packets are selected by --slice and --time alone")
     wanted, number = Slice(selection.times), 0
-    for batch in device.packets(frame, wait=LOOK):
+    for batch in device.packets(frame, wait=LOOK_S):
         patience.check()
         packets = batch.take(
             wanted.holds(batch.host_ns if selection.time == "host" else batch.time_ns)
@@ -212,16 +213,16 @@ def _plain(value: Any) -> Any:
 
 #: name and unit of each figure, the width of its column (0: only in the summary), and its text.
 FIGURES: tuple[tuple[str, str, int, Callable[[Reading], str]], ...] = (
-    ("speed", "Hz", 6, lambda r: told(r.speed_hz, "{:.2f}")),
-    ("packets", "/s", 8, lambda r: told(r.packet_rate_hz, "{:.1f}")),
-    ("points", "/scan", 7, lambda r: told(r.points, "{:.0f}")),
-    ("valid", "/scan", 7, lambda r: told(r.valid, "{:.0f}")),
-    ("errors", "%", 7, lambda r: told(r.error_rate, "{:.3f}", 100)),
-    ("skipped", "%", 7, lambda r: told(r.skipped_rate, "{:.3f}", 100)),
-    ("loss", "%", 7, lambda r: told(r.loss_rate, "{:.3f}", 100)),
-    ("jitter", "ms", 8, lambda r: told(r.jitter_s, "{:.3f}", 1e3)),
-    ("gap", "ms", 0, lambda r: told(r.longest_gap_s, "{:.2f}", 1e3)),
-    ("input", "kB/s", 0, lambda r: told(r.bytes_per_s, "{:.1f}", 1e-3)),
+    ("speed", "Hz", 6, lambda r: format_figure(r.speed_hz, "{:.2f}")),
+    ("packets", "/s", 8, lambda r: format_figure(r.packet_rate_hz, "{:.1f}")),
+    ("points", "/scan", 7, lambda r: format_figure(r.points, "{:.0f}")),
+    ("valid", "/scan", 7, lambda r: format_figure(r.valid, "{:.0f}")),
+    ("errors", "%", 7, lambda r: format_figure(r.error_rate, "{:.3f}", 100)),
+    ("skipped", "%", 7, lambda r: format_figure(r.skipped_rate, "{:.3f}", 100)),
+    ("loss", "%", 7, lambda r: format_figure(r.loss_rate, "{:.3f}", 100)),
+    ("jitter", "ms", 8, lambda r: format_figure(r.jitter_s, "{:.3f}", 1e3)),
+    ("gap", "ms", 0, lambda r: format_figure(r.longest_gap_s, "{:.2f}", 1e3)),
+    ("input", "kB/s", 0, lambda r: format_figure(r.bytes_per_s, "{:.1f}", 1e-3)),
 )
 COLUMNS = [figure for figure in FIGURES if figure[2]]
 #: of the columns of `stats`: the time, the figures, and what waits.
@@ -246,7 +247,12 @@ class Lines:
             say(_row(["s", *(unit for _, unit, _, _ in COLUMNS), ""], WIDTHS))
         self.printed += 1
         figures = [text(reading) for _, _, _, text in COLUMNS]
-        say(_row([told(at, "{:.1f}"), *figures, told(self.device.queued, "{}")], WIDTHS))
+        say(
+            _row(
+                [format_figure(at, "{:.1f}"), *figures, format_figure(self.device.queued, "{}")],
+                WIDTHS,
+            )
+        )
         sys.stdout.flush()
 
     def summary(self, reading: Reading) -> None:
@@ -322,7 +328,7 @@ def stats(
     for source in sources:
         if len(sources) > 1 and not as_json:
             say(f"{source}:")
-        with open_device(source, sensor_id, period=LOOK) as device:
+        with open_device(source, sensor_id, period=LOOK_S) as device:
             found = _print_stats(
                 source, Feed(device, select=selection), Lines(device, as_json), interval, lasting
             )

@@ -27,11 +27,11 @@ from lidarspec.spec.sensor import Sensor
 from lidarspec.transports.open_url import is_live
 from lidarspec.transports.protocol import Origin
 from lidarspec.view.canvas import Cells
-from lidarspec.view.feed import LOOK, Feed
-from lidarspec.view.live import Window
+from lidarspec.view.feed import LOOK_S, Feed
 from lidarspec.view.page_server import PageServer, open_page_server
 from lidarspec.view.polar import picture
 from lidarspec.view.screen import Screen, Terminated, encodable, interactive, keyboard
+from lidarspec.view.window import Window
 
 
 @click.command()
@@ -124,7 +124,7 @@ def view(
         return
     switch = RecordingSwitch(source, Path.cwd()) if is_live(source) else None
     with open_device(
-        source, sensor_id, record=switch.attached if switch else None, period=LOOK
+        source, sensor_id, record=switch.attached if switch else None, period=LOOK_S
     ) as device:
         if switch is not None:
             switch.sensor_id = device.sensor.id
@@ -224,7 +224,7 @@ def _in_rerun(
                 f"{target}: a recording for Rerun's viewer has the suffix {RERUN.suffix}"
             )
         refuse_overwriting([target], source, sensor_id)
-    with open_device(source, sensor_id, period=LOOK) as device:
+    with open_device(source, sensor_id, period=LOOK_S) as device:
         feed = Feed(device, select=selection)
         show(feed, target, ramp=ramp, until=time.monotonic() + (duration or math.inf))
         if feed.scan is None:

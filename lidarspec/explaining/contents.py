@@ -30,7 +30,8 @@ from lidarspec.transports.files import (
 )
 from lidarspec.transports.open_url import is_live, transport
 from lidarspec.transports.protocol import Chunk, Sender, Transport, endpoint
-from lidarspec.view.feed import Feed, Reading
+from lidarspec.view.feed import Feed
+from lidarspec.view.meter import Reading
 
 #: bytes, and packets, that are looked at from the beginning of a file, and bytes of a sensor that
 #: are decoded.

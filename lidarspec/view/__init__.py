@@ -3,8 +3,10 @@
 In: a device, or points. Out: pictures. The page in a browser is drawn by the distribution
 `lidarspec-web`. Modules in reading order:
 
-* `live`: the window that shows a sensor at work: keys in, pictures and figures out.
-* `feed`: what the device delivers, taken in and counted between two pictures.
+* `window`: shows a sensor at work in the terminal: keys in, pictures and figures out.
+* `window_parts`: title, figures, colours and keys around the picture.
+* `feed`: the scans of a device, counted, and played if they are of a file.
+* `meter`: speed, rates, losses and jitter of a sensor at work.
 * `polar`: points as seen from above and from the side.
 * `canvas`: pictures in character cells, and their inks.
 * `screen`: the terminal: cells that changed, single keys.

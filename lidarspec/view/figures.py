@@ -18,7 +18,8 @@ from lidarspec.libraries import import_library
 from lidarspec.points.colours import make_ramp, to_hex
 from lidarspec.points.look import Look, bounds
 from lidarspec.scans.scans import Scan
-from lidarspec.view.feed import Feed, totals
+from lidarspec.view.feed import Feed
+from lidarspec.view.meter import totals
 
 #: what `save` writes, by suffix.
 SUFFIXES = (".png", ".pdf", ".svg")

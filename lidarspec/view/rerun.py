@@ -8,7 +8,7 @@ import time
 
 from lidarspec.errors import UsageError, suggest, system_errors
 from lidarspec.formats.rerun import Log
-from lidarspec.view.feed import LOOK, Feed
+from lidarspec.view.feed import LOOK_S, Feed
 
 #: seconds between two readings of the figures, by the time of the scans.
 FIGURES = 1.0
@@ -33,7 +33,7 @@ def show(feed: Feed, target: str, *, ramp: str = "range", until: float) -> None:
         _open(log, target)
         read_at, last = time.monotonic(), None
         while not feed.ended and time.monotonic() < until:
-            feed.pump(time.monotonic() + LOOK)
+            feed.pump(time.monotonic() + LOOK_S)
             for scan in feed.scans:
                 log.scan(scan)
                 if last is None or not 0 <= scan.stamp_ns - last < FIGURES * 1e9:

@@ -10,8 +10,8 @@ import numpy as np
 import pytest
 
 from lidarspec.view.canvas import STRONG, Canvas
-from lidarspec.view.live import Choice
 from lidarspec.view.screen import decoded
+from lidarspec.view.window import Choice
 
 
 @pytest.mark.parametrize(

@@ -12,7 +12,7 @@ import lidarspec as ls
 from lidarspec import Decoder, Packets, simulate
 from lidarspec.packets.stream import PacketStream
 from lidarspec.scans.scans import ScanStream
-from lidarspec.view.feed import Meter
+from lidarspec.view.meter import Meter
 
 ID = "ldrobot-stl27l"
 FRAMES = 540

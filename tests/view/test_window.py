@@ -151,12 +151,12 @@ def test_a_failure_is_told_on_a_clean_terminal(tmp_path: Path) -> None:
 #: a sensor whose clock gives out in the middle of the stream with what no plugin is forgiven.
 _FAILING = """
 import lidarspec as ls
-from lidarspec.view import live
+from lidarspec.view import window
 
 def broken(self, columns, lines):
     raise MemoryError("by hand")
 
-live.Window.cells = broken
+window.Window.cells = broken
 from lidarspec.spec import hookimpl
 
 found = ls.sensor("ldrobot-stl27l")

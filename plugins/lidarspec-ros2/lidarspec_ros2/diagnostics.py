@@ -8,7 +8,7 @@ from diagnostic_msgs.msg import DiagnosticStatus, KeyValue
 
 from lidarspec.cli.read import FIGURES
 from lidarspec.device.device import Device
-from lidarspec.view.feed import Reading
+from lidarspec.view.meter import Reading
 
 #: states of a device in which nothing comes.
 LOST = ("disconnected", "silent")

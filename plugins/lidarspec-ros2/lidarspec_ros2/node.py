@@ -32,7 +32,8 @@ from lidarspec.device.device import Device
 from lidarspec.errors import LidarSpecError, UsageError, did_you_mean, suggestion
 from lidarspec.explaining.assignments import arguments
 from lidarspec.explaining.explanation import reply_text
-from lidarspec.view.feed import LOOK, Feed, Reading
+from lidarspec.view.feed import LOOK_S, Feed
+from lidarspec.view.meter import Reading
 from lidarspec_ros2.diagnostics import LOST, status
 from lidarspec_ros2.packets import PacketLog
 from lidarspec_ros2.parameters import NAMED, NODE_NAME, PARAMETERS, Parameter, Settings
@@ -194,7 +195,7 @@ class LidarNode(LifecycleNode):
         due, expected = time.monotonic(), 0.0
         try:
             while not self._stopping.is_set() and not feed.ended:
-                feed.pump(0.0 if device.is_live else time.monotonic() + LOOK)
+                feed.pump(0.0 if device.is_live else time.monotonic() + LOOK_S)
                 self._publish(feed, topics)
                 expected = _expected(expected, feed)
                 device.gather(
@@ -358,7 +359,7 @@ def _expected(before: float, feed: Feed) -> float:
     for scan in feed.scans:
         if scan.whole and math.isfinite(scan.rate_hz):
             return now + 1 / scan.rate_hz - EARLY
-    return before if now - before < LATE else now + LOOK
+    return before if now - before < LATE else now + LOOK_S
 
 
 def _descriptor(parameter: Parameter) -> ParameterDescriptor:

@@ -21,7 +21,7 @@ from typing import Any
 from lidarspec import Device, LidarSpecError, Scan, Selection, UsageError
 from lidarspec.recording.switch import RecordingSwitch
 from lidarspec.transports.host_clock import HostClock
-from lidarspec.view.feed import LOOK, STEP, Feed
+from lidarspec.view.feed import DEFAULT_STEP_S, LOOK_S, Feed
 from lidarspec_web.backlog import Backlog
 from lidarspec_web.scan_message import message
 
@@ -269,7 +269,7 @@ class Broadcast:
             self._read(feed.step)
         elif self._is_playing:
             feed.speed = self.speed
-            self._read(lambda: feed.pump(time.monotonic() + LOOK))
+            self._read(lambda: feed.pump(time.monotonic() + LOOK_S))
         else:
             feed.rest()
             self._has_request.wait(PAUSED_CHECK_S)
@@ -390,7 +390,7 @@ class Broadcast:
             return (scan.host_ns - first.host_ns) * 1e-9
         if scan.host_ns or scan.sensor.clock is not None:
             return (scan.stamp_ns - first.stamp_ns) * 1e-9
-        return self._scan_count * STEP
+        return self._scan_count * DEFAULT_STEP_S
 
     def _refuse_live(self, reason: str) -> None:
         if self.is_live:

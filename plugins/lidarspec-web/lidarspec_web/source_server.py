@@ -13,7 +13,7 @@ from typing import Self
 from lidarspec import Device, Selection, Sensor, open as open_device
 from lidarspec.recording.switch import RecordingSwitch
 from lidarspec.transports.open_url import is_live
-from lidarspec.view.feed import LOOK
+from lidarspec.view.feed import LOOK_S
 from lidarspec_web.broadcast import Broadcast
 from lidarspec_web.server import Site
 
@@ -53,7 +53,7 @@ class SourceServer:
         if is_live(source):
             self.switch = RecordingSwitch(source, folder or Path.cwd())
         record = None if self.switch is None else self.switch.attached
-        device = open_device(source, sensor, record=record, period=LOOK)
+        device = open_device(source, sensor, record=record, period=LOOK_S)
         if self.switch is not None:
             self.switch.sensor_id = device.sensor.id
         self.broadcast = Broadcast(

@@ -17,7 +17,7 @@ from typing import Any, Self
 
 from lidarspec import LidarSpecError, Selection, Sensor, UsageError, open as open_device
 from lidarspec.errors import suggest, suggestion
-from lidarspec.view.feed import LOOK
+from lidarspec.view.feed import LOOK_S
 from lidarspec_web.answers import Answers
 from lidarspec_web.broadcast import Broadcast
 
@@ -106,7 +106,7 @@ class Viewer:
         self._send_news()
 
     def _show_source(self) -> None:
-        device = open_device(self._source, self._sensor, period=LOOK)
+        device = open_device(self._source, self._sensor, period=LOOK_S)
         reopen = functools.partial(open_device, self._source, device.sensor)
         with Broadcast(self._source, device, reopen=reopen, select=self._select) as broadcast:
             broadcast.news = self._send_news

@@ -1,0 +1,240 @@
+"""Figures of a sensor at work: speed, rates, losses and jitter.
+
+A `Meter` counts packets and scans as they come, both since its last reading and from the beginning.
+"""
+
+from __future__ import annotations
+
+import math
+from collections import deque
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lidarspec.framing.results import Counters
+from lidarspec.packets.packets import Packets
+from lidarspec.scans.scans import Scan
+
+#: scans that means and medians are made of.
+KEPT_SCANS = 1 << 12
+Seconds = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Reading:
+    """Figures over some time; None if they are not known.
+
+    Attributes:
+        seconds: the duration.
+        speed_hz: scans per second, by their own times.
+        scans: whole scans.
+        packets: packets.
+        packet_rate_hz: packets per second.
+        points: points per scan.
+        valid: points with a return, per scan.
+        error_rate: frames with a wrong checksum, length or value, as a share of all, from 0 to 1.
+        skipped_rate: bytes in no frame and no declared filler, as a share of all.
+        loss_rate: lost packets, as a share of all; None if they are not counted.
+        jitter_s: standard deviation of the time between arrivals of packets.
+        longest_gap_s: the longest time between two arrivals.
+        bytes_per_s: of input.
+    """
+
+    seconds: float | None
+    speed_hz: float | None
+    scans: int
+    packets: int
+    packet_rate_hz: float | None
+    points: float | None
+    valid: float | None
+    error_rate: float
+    skipped_rate: float
+    loss_rate: float | None
+    jitter_s: float | None
+    longest_gap_s: float | None
+    bytes_per_s: float | None
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return the figures by name."""
+        return asdict(self)
+
+
+NOTHING = Reading(
+    seconds=None,
+    speed_hz=None,
+    scans=0,
+    packets=0,
+    packet_rate_hz=None,
+    points=None,
+    valid=None,
+    error_rate=0.0,
+    skipped_rate=0.0,
+    loss_rate=None,
+    jitter_s=None,
+    longest_gap_s=None,
+    bytes_per_s=None,
+)
+
+
+class Tally:
+    """Counts packets and scans from some moment on.
+
+    Args:
+        counters: of the decoder at this moment.
+    """
+
+    def __init__(self, counters: Counters) -> None:
+        self._totals_before = totals(counters)
+        self.scans = 0
+        self.packets = 0
+        self._rates = deque[float](maxlen=KEPT_SCANS)
+        self._sizes = deque[tuple[int, int]](maxlen=KEPT_SCANS)  # points, and valid ones
+        self._gap_count = 0
+        self._gap_sum = 0.0
+        self._gap_square_sum = 0.0
+        self._longest_gap = 0.0
+        self._is_by_host = True
+
+    def add_packets(self, count: int, gaps: Seconds, *, by_host: bool) -> None:
+        """Count packets.
+
+        Args:
+            count: how many.
+            gaps: seconds from each packet to the next, (n,).
+            by_host: whether these are times of arrival, and not of the sensor's clock.
+        """
+        self.packets += count
+        self._is_by_host = by_host
+        if len(gaps):
+            self._gap_count += len(gaps)
+            self._gap_sum += float(gaps.sum())
+            self._gap_square_sum += float(np.square(gaps).sum())
+            self._longest_gap = max(self._longest_gap, float(gaps.max()))
+
+    def add_scan(self, points: int, valid: int, rate_hz: float) -> None:
+        """Count a whole scan."""
+        self.scans += 1
+        self._sizes.append((points, valid))
+        if np.isfinite(rate_hz):
+            self._rates.append(rate_hz)
+
+    def reading(self, counters: Counters, *, seconds: float | None, counts_losses: bool) -> Reading:
+        """Return the figures up to now.
+
+        Args:
+            counters: of the decoder now.
+            seconds: the duration by the caller's clock; by default that of the packets.
+            counts_losses: whether lost packets are counted (`Sensor.counts_losses`).
+        """
+        duration = seconds or self._gap_sum or None
+        change = {
+            name: total - self._totals_before[name] for name, total in totals(counters).items()
+        }
+        good_bytes = change["bytes_in"] - change["skipped"]
+        return Reading(
+            seconds=duration,
+            speed_hz=float(np.median(self._rates)) if self._rates else None,
+            scans=self.scans,
+            packets=self.packets,
+            packet_rate_hz=self._packet_rate(duration),
+            points=_mean([points for points, _ in self._sizes]),
+            valid=_mean([valid for _, valid in self._sizes]),
+            error_rate=_share(change["rejected"], change["frames"]),
+            skipped_rate=_share(change["skipped"], good_bytes),
+            loss_rate=_share(change["lost"], self.packets) if counts_losses else None,
+            jitter_s=self._jitter() if self._has_arrivals else None,
+            longest_gap_s=self._longest_gap if self._has_arrivals else None,
+            bytes_per_s=change["bytes_in"] / duration if duration else None,
+        )
+
+    @property
+    def _has_arrivals(self) -> bool:
+        return self._gap_sum > 0 and self._is_by_host
+
+    def _packet_rate(self, duration: float | None) -> float | None:
+        """Return packets per second, by their own times if they have them."""
+        if self._gap_sum:
+            return self._gap_count / self._gap_sum
+        return self.packets / duration if duration else None
+
+    def _jitter(self) -> float:
+        mean = self._gap_sum / self._gap_count
+        return math.sqrt(max(self._gap_square_sum / self._gap_count - mean * mean, 0.0))
+
+
+class Meter:
+    """Counts packets and scans as they come.
+
+    Args:
+        counters: of the decoder now.
+        counts_losses: whether lost packets are counted (`Sensor.counts_losses`).
+    """
+
+    def __init__(self, counters: Counters, *, counts_losses: bool) -> None:
+        self._counts_losses = counts_losses
+        self._last_ns: int | None = None
+        self._recent = Tally(counters)
+        self._all = Tally(counters)
+
+    def packets(self, packets: Packets) -> None:
+        """Count a batch."""
+        arrivals = packets.host_ns[packets.host_ns > 0]
+        by_host = len(arrivals) > 0
+        times = arrivals if by_host else packets.time_ns
+        previous = np.array([] if self._last_ns is None else [self._last_ns], np.int64)
+        gaps = np.diff(np.concatenate([previous, times])) * 1e-9
+        if len(times):
+            self._last_ns = int(times[-1])
+        for tally in (self._recent, self._all):
+            tally.add_packets(len(packets), gaps, by_host=by_host)
+
+    def scan(self, scan: Scan) -> None:
+        """Count a whole scan; pieces of a scan say nothing about speed and points."""
+        if not scan.whole:
+            return
+        valid = int(scan.points.valid.sum())
+        for tally in (self._recent, self._all):
+            tally.add_scan(len(scan), valid, scan.rate_hz)
+
+    def reading(self, counters: Counters, seconds: float | None = None) -> Reading:
+        """Return the figures since the last reading, and begin the next one."""
+        reading = self._recent.reading(counters, seconds=seconds, counts_losses=self._counts_losses)
+        self._recent = Tally(counters)
+        return reading
+
+    def summary(self, counters: Counters, seconds: float | None = None) -> Reading:
+        """Return the figures from the beginning."""
+        return self._all.reading(counters, seconds=seconds, counts_losses=self._counts_losses)
+
+
+def totals(counters: Counters) -> dict[str, int]:
+    """Return the counts that the rates of a reading are made of."""
+    rejected = (
+        counters.bad_checksum + counters.bad_length + counters.bad_constant + counters.implausible
+    )
+    return {
+        "bytes_in": counters.bytes_in,
+        "frames": sum(counters.frames.values()),
+        "rejected": rejected,
+        "skipped": counters.bytes_skipped - counters.bytes_filler,
+        "lost": counters.lost,
+    }
+
+
+def format_figure(value: float | None, form: str, factor: float = 1) -> str:
+    """Return a figure times a factor as text, "-" if it is not known."""
+    if value is None or not math.isfinite(value):
+        return "-"
+    return form.format(value * factor)
+
+
+def _share(some: int, others: int) -> float:
+    total = some + others
+    return some / total if total > 0 else 0.0
+
+
+def _mean(values: Sequence[int]) -> float | None:
+    return float(np.mean(values)) if values else None
