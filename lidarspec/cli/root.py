@@ -70,14 +70,14 @@ GROUPS = {
     },
     "files": {
         "info": (
-            "files",
+            "info",
             "What is in a file: kind, times, senders, sensor, rates, loss, and how it is read.",
         ),
         "convert": (
-            "files",
+            "convert",
             "Write the points of a capture or raw file to a file, in the format of its suffix.",
         ),
-        "plot": ("files", "A scan as a picture; or intensities, ranges and rates over time."),
+        "plot": ("plot", "A scan as a picture; or intensities, ranges and rates over time."),
     },
     "bytes": {
         "parse": ("frames", "The fields of each frame in some bytes."),

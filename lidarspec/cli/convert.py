@@ -1,0 +1,399 @@
+"""`convert`: write the points, packets or IMU samples of a file to other files."""
+
+from __future__ import annotations
+
+import contextlib
+import itertools
+from collections import Counter
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from shlex import quote
+from typing import Any
+
+import click
+
+from lidarspec import batch
+from lidarspec.cli.failures import FINDINGS
+from lidarspec.cli.inputs import (
+    again,
+    conclude,
+    fits_instead,
+    nearest_fault,
+    no_frame,
+    refuse_overwriting,
+    scans_of,
+)
+from lidarspec.cli.options import BYTES, count_option, points_option, selecting, sensor_option
+from lidarspec.cli.output import Progress, emit_json, size
+from lidarspec.cli.terminal import note
+from lidarspec.detect.identification import detected
+from lidarspec.device.device import Device, open as open_device
+from lidarspec.device.source_recording import recorder_like
+from lidarspec.errors import UsageError, WireError, WriteError, suggest, suggestion
+from lidarspec.formats import check_holds, format_of, targets, write, write_imu
+from lidarspec.formats.writing import replacing
+from lidarspec.packets.imu import joined
+from lidarspec.plugins import sensor as named_sensor
+from lidarspec.recording.recorders import SUFFIXES
+from lidarspec.scans.scans import Scan
+from lidarspec.scans.selection import EVERYTHING, Selection, Times, received
+from lidarspec.spec.sensor import Sensor
+from lidarspec.stores import found
+from lidarspec.transports.open_url import is_live, transport
+from lidarspec.transports.protocol import Chunk, no_bytes
+
+#: The suffixes of files that hold packets. `.bin` means points here, as in KITTI's data set.
+_PACKET_SUFFIXES = tuple(suffix for suffix in SUFFIXES if suffix != ".bin")
+
+
+@dataclass
+class _Counts:
+    """The number of scans and points that were written, also shown as progress."""
+
+    device: Device
+    target: str
+    scans: int = 0
+    points: int = 0
+    units: Mapping[str, str] = field(default_factory=dict)
+
+    def __str__(self) -> str:
+        plural = "" if self.scans == 1 else "s"
+        return f"{self.target}: {self.points} points of {self.scans} scan{plural}"
+
+    def count(
+        self, scans: Iterable[Scan], progress: Progress, *, every_point: bool
+    ) -> Iterator[Scan]:
+        """Yield the scans, and count them."""
+        for scan in scans:
+            self.scans += 1
+            self.units = self.units or scan.points.units
+            self.points += len(scan) if every_point else int(scan.points.valid.sum())
+            progress(lambda: str(self), self.device.place)
+            yield scan
+
+
+@click.command()
+@click.argument("sources", metavar="IN...", nargs=-1)
+@click.argument("target", metavar="OUT")
+@sensor_option
+@count_option("scans")
+@selecting("times", "scans", "every", "ranges", "columns", "time", "beams", "frame_id")
+@points_option
+@click.option(
+    "--organized",
+    is_flag=True,
+    help="All points of a scan, as rows and columns; missing ones are nan.",
+)
+@click.option(
+    "--packets",
+    "with_packets",
+    is_flag=True,
+    help="The packets of IN as well, in a log of ROS, which is a SOURCE then.",
+)
+@click.option(
+    "--imu", "is_imu", is_flag=True, help="What the sensor's IMU felt, in place of the points."
+)
+@click.option("--force", is_flag=True, help="Overwrite OUT; with --to also what was done before.")
+@click.option(
+    "--to",
+    "suffix",
+    metavar="FORMAT",
+    help="Write each IN to a file of this format in the folder OUT, such as parquet.",
+)
+@click.option(
+    "--jobs", type=click.IntRange(min=1), metavar="N", help="With --to: so many processes."
+)
+@click.option(
+    "--dask", "scheduler", metavar="ADDRESS", help="With --to: the workers of this Dask scheduler."
+)
+@click.option(
+    "--piece",
+    "piece_size",
+    type=BYTES,
+    metavar="SIZE",
+    help="With --to: cut larger files into such pieces.  [default: 256MB]",
+)
+@click.option("--json", "as_json", is_flag=True, help="Print a summary as JSON.")
+def convert(
+    sources: Sequence[str],
+    target: str,
+    sensor_id: str | Sensor | None,
+    count: int | None,
+    selection: Selection,
+    every_point: bool,
+    organized: bool,
+    with_packets: bool,
+    is_imu: bool,
+    force: bool,
+    suffix: str | None,
+    jobs: int | None,
+    scheduler: str | None,
+    piece_size: float | None,
+    as_json: bool,
+) -> None:
+    """Write the points of a capture or raw file to a file, in the format of its suffix.
+
+    .csv and .npz hold x y z range azimuth elevation intensity time ring return_index column, those
+    that the sensor has, its further columns, and the number of the scan; metres, radians, and
+    seconds since the scan's stamp. .npy, .ply, .pcd and .lzf.pcd, which is compressed, hold x y z
+    intensity ring time, further columns and, of several scans, their number; .bin, as KITTI has it,
+    x y z intensity; .xyz x y z. For a file each scan put the place of a number into the name,
+    scans/%05d.pcd; %F, %H, %M and %S stand for date, hour, minute and second of the scans that
+    share a file.
+
+    .lsr, .pcap and .pcapng hold the packets themselves, as they were received.
+
+    Tables (.parquet, .arrow, .feather), surveys (.las, .laz, .e57), .zarr, logs of ROS (.mcap,
+    .bag, .rosbag2, .db3), of Foxglove (.foxglove.mcap) and of Rerun (.rrd) take libraries that are
+    not installed by default: lidarspec[arrow,las,e57,zarr,ros,foxglove,rerun].
+
+    With --to each IN is a file, a pattern in quotes, 'drives/**/*.pcap', or a URL,
+    s3://bucket/a.pcap, and OUT a folder. What is done is written down there, in manifest.jsonl: the
+    same command again does what is missing. A file that fails stops no other.
+    """
+    properties = {
+        "beams": selection.beams,
+        "frame-id": selection.frame_id,
+        "organized": organized,
+        "packets": with_packets,
+    }
+    for name, is_requested in properties.items():
+        if is_requested:
+            check_holds(target if suffix is None else f"{target}.{suffix.removeprefix('.')}", name)
+    if not sources:
+        raise UsageError(f"Missing argument 'OUT': where the points of {target} are to go")
+    if suffix is not None:
+        if count or is_imu or organized or with_packets:
+            raise UsageError("-n, --imu, --organized and --packets are for one file, without --to")
+        if jobs and scheduler:
+            raise UsageError("--dask has its own workers: leave out --jobs")
+        records = batch.convert(
+            sources,
+            target,
+            suffix.removeprefix("."),
+            sensor_id,
+            jobs=jobs or 1,
+            scheduler=scheduler or "",
+            size=int(piece_size or batch.PIECE),
+            every_point=every_point,
+            select=selection,
+            force=force,
+        )
+        file_count = len({path for pattern in sources for path, _ in found(pattern)})
+        _follow_batch(records, target, file_count, as_json=as_json)
+        return
+    if len(sources) > 1 or jobs or scheduler or piece_size:
+        error = UsageError(
+            "several files, and --jobs, --dask and --piece, go into a folder in one format"
+        )
+        raise suggest(error, "the same with --to parquet")
+    source = sources[0]
+    if Path(target).suffix.lower() in _PACKET_SUFFIXES:
+        if count or is_imu or replace(selection, times=(None, None), time="device") != EVERYTHING:
+            raise UsageError(f"{target} holds packets, which are selected by --slice alone")
+        refuse_overwriting([target], source, sensor_id, force=force)
+        _write_packets(source, target, sensor_id, selection.times, as_json=as_json)
+        return
+    format_of(target)
+    refuse_overwriting(targets(target), source, sensor_id, force=force)
+    sensor = _detect_sensor(source, target) if sensor_id is None else named_sensor(sensor_id)
+    with open_device(source, sensor) as device:
+        if is_imu:
+            summary = _write_imu(device, target, count)
+        else:
+            summary = _write_points(
+                device,
+                target,
+                itertools.islice(scans_of(device, source, selection), count),
+                every_point=every_point,
+                organized=organized,
+                with_packets=with_packets,
+            )
+        if as_json:
+            stats = device.stats.to_dict()
+            emit_json(
+                {"sensor": device.sensor.id, "output": target, **summary, "stats": stats}, None
+            )
+        conclude(device)
+
+
+def _write_imu(device: Device, target: str, count: int | None) -> dict[str, Any]:
+    """Write IMU samples; return the facts for the summary."""
+    samples = joined(list(device.imu()))[:count]
+    if not len(samples):
+        raise _no_data_error(device, target)
+    write_imu(target, samples)
+    note(f"{target}: {len(samples)} samples of the IMU of {device.sensor.id}; {device.stats}")
+    return {"samples": len(samples)}
+
+
+def _write_packets(
+    source: str, target: str, sensor_id: str | Sensor | None, times: Times, *, as_json: bool
+) -> None:
+    """Write packets as they were received."""
+    if is_live(source):
+        raise suggest(
+            UsageError(f"{source} is no file"),
+            f"lidarspec record {quote(source)} -o {quote(target)}",
+        )
+    with (
+        contextlib.closing(transport(source)) as opened,
+        Progress(size) as progress,
+        replacing(Path(target)) as part,
+    ):
+        sensor: Sensor | None = None
+        if sensor_id is not None:
+            sensor = named_sensor(sensor_id)
+        elif not opened.datagrams and Path(target).suffix.lower() != ".lsr":
+            # The packets of the new file are the frames of the sensor.
+            sensor = _detect_sensor(source, target)
+        try:
+            with recorder_like(opened, source, str(part), sensor, overwrite=True) as file:
+                for chunk in received(opened, times, source):
+                    file.keep_up()
+                    file.write(chunk)
+                    progress(lambda: f"{target}: {file.records} packets", opened.place)
+        except WriteError as error:  # its text names the temporary file
+            raise WriteError(target, error.reason, "nothing was written") from None
+        if not file.records:
+            raise suggest(
+                WireError(no_bytes(source, opened.warnings)), f"lidarspec info {quote(source)}"
+            )
+    note(f"{target}: {file.records} packets, {size(file.bytes)}")
+    for warning in opened.warnings:
+        note(warning)
+    if as_json:
+        emit_json({"output": target, "packets": file.records, "bytes": file.bytes}, None)
+
+
+def _write_points(
+    device: Device,
+    target: str,
+    scans: Iterator[Scan],
+    *,
+    every_point: bool,
+    organized: bool,
+    with_packets: bool,
+) -> dict[str, Any]:
+    """Write the points of scans; return the facts for the summary."""
+    counts = _Counts(device, target)
+    with (
+        Progress(size) as progress,
+        _open_packets(str(device.source), wanted=with_packets) as packets,
+    ):
+        first = next(scans, None)
+        if first is None:
+            raise _no_data_error(device, target)
+        counted = counts.count(
+            itertools.chain([first], scans), progress, every_point=every_point or organized
+        )
+        write(target, counted, every_point=every_point, organized=organized, packets=packets)
+    note(f"{counts} of {device.sensor.id}; {device.stats}")
+    if counts.units:
+        columns = [f"{name} [{unit}]" if unit else name for name, unit in counts.units.items()]
+        note(f"further columns: {', '.join(columns)}")
+    return {"scans": counts.scans, "points": counts.points, "units": dict(counts.units)}
+
+
+@contextlib.contextmanager
+def _open_packets(source: str, *, wanted: bool) -> Iterator[Iterator[Chunk] | None]:
+    """Open a file a second time for its packets; yield None if they are not wanted."""
+    if not wanted:
+        yield None
+        return
+    if is_live(source) or source == "-":
+        raise UsageError(
+            f"--packets reads IN twice, and {source} can be read only once: record it first"
+        )
+    with contextlib.closing(transport(source)) as opened:
+        if not opened.datagrams:
+            raise UsageError(f"{source} is a stream of bytes: packets are those of datagrams")
+        yield opened.chunks()
+
+
+def _follow_batch(
+    records: Iterable[tuple[batch.Record, bool]], folder: str, file_count: int, *, as_json: bool
+) -> None:
+    """Report the progress and the result of a batch; exit with 1 if a piece has failed."""
+    totals: Counter[str] = Counter()
+    failed: list[batch.Record] = []
+    done_before = 0
+    with Progress("{:.1f} files".format) as progress:
+        for record, is_old in records:
+            if is_old:
+                done_before += 1
+            if "error" in record:
+                failed.append(record)
+                reason = record["error"].removeprefix(f"{record['source']}: ")
+                progress.note(f"{record['source']}: {reason}")
+                continue
+            totals["files"] += int(record["last"])
+            totals["pieces"] += 1
+            totals["scans"] += record["scans"]
+            totals["points"] += record["points"]
+            progress(
+                lambda: f"{folder}: {totals['points']} points",
+                (totals["files"] + len(failed), file_count),
+            )
+    note(f"{folder}: {_describe_batch(totals, done_before, len(failed))}")
+    if as_json:
+        summary = {
+            "output": folder,
+            **totals,
+            "before": done_before,
+            "failed": {record["source"]: record["error"] for record in failed},
+        }
+        emit_json(summary, None)
+    if failed:
+        raise click.exceptions.Exit(FINDINGS)
+
+
+def _describe_batch(totals: Counter[str], done_before: int, failed_count: int) -> str:
+    # The number of pieces is only of interest if a file was cut.
+    names = [name for name in totals if name != "pieces" or totals[name] > totals["files"]]
+    parts = [", ".join(f"{totals[name]} {name}" for name in names) or "nothing"]
+    if done_before:
+        parts.append(f"{done_before} pieces were done before")
+    if failed_count:
+        parts.append(f"{failed_count} failed")
+    return "; ".join(parts)
+
+
+def _detect_sensor(source: str, target: str) -> Sensor:
+    try:
+        return detected(source)
+    except UsageError as error:
+        raise suggest(error, f"lidarspec convert {quote(source)} {quote(target)} -s ID") from None
+    except WireError as error:
+        given = None if suggestion(error) else again(source)
+        raise error if given is None else nearest_fault(given) from None
+
+
+def _no_data_error(device: Device, target: str) -> Exception:
+    """Return the error that explains why a file gave no data.
+
+    It is empty, damaged, from another sensor, or from no lidar at all.
+    """
+    sensor = device.sensor
+    stats = device.stats
+    source = str(device.source)
+    if stats.bytes_in == 0:
+        return suggest(
+            WireError(no_bytes(source, device.warnings), sensor=sensor.id),
+            f"lidarspec show {sensor.id}",
+        )
+    failure = stats.failure(sensor.id)
+    if failure is not None:
+        return failure
+    instead = fits_instead(sensor, source)
+    if instead is not None:
+        error = WireError(f"{source} {instead[0]}", sensor=sensor.id)
+        return suggest(error, f"lidarspec convert {quote(source)} {quote(target)} {instead[1]}")
+    given = again(source) if not stats.frames else None
+    if given is not None:
+        return no_frame(sensor, given)
+    return suggest(
+        WireError(f"no data frame in {source}: {stats}", sensor=sensor.id),
+        f"lidarspec explain {quote(source)} -s {sensor.id}",
+    )

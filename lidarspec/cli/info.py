@@ -1,0 +1,42 @@
+"""`info`: describe the contents of files."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterator, Sequence
+
+import click
+
+from lidarspec.cli.failures import NO_DATA
+from lidarspec.cli.output import emit_parts, output_options, size
+from lidarspec.cli.terminal import note
+from lidarspec.explaining.contents import contents, shown
+
+
+@click.command()
+@click.argument("files", metavar="FILE...", nargs=-1, required=True)
+@output_options
+def info(files: Sequence[str], as_json: bool, output: str | None) -> None:
+    """What is in a file: kind, times, senders, sensor, rates, loss, and how it is read.
+
+    FILE is anything that is read: a recording, a capture, a robotics log, bytes. Of a long one the
+    beginning is looked at, and when it ends. Several files are printed in turn.
+    """
+    unknown_files = []
+
+    def iter_texts() -> Iterator[str]:
+        for file in files:
+            held = contents(file)
+            if as_json:
+                yield json.dumps(held.to_dict(), indent=2, allow_nan=False)
+            else:
+                yield f"{held.path}: {held.kind}, {size(held.size)}"
+                yield from (f"  {word:<8}  {text}" for word, text in shown(held))
+            for warning in held.warnings:
+                note(warning)
+            if not any(content.sensors for content in held.contents):
+                unknown_files.append(file)
+
+    emit_parts(iter_texts(), output)
+    if unknown_files:
+        raise click.exceptions.Exit(NO_DATA)

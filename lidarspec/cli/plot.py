@@ -1,0 +1,175 @@
+"""`plot`: draw a scan, or figures over time."""
+
+from __future__ import annotations
+
+import io
+import math
+import time
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import click
+
+from lidarspec.cli.inputs import PATIENCE, conclude, nothing_came, refuse_overwriting, scans_of
+from lidarspec.cli.options import DURATION, colour_option, selecting, sensor_option
+from lidarspec.cli.output import emit
+from lidarspec.cli.terminal import note
+from lidarspec.device.device import Device, open as open_device
+from lidarspec.errors import UsageError
+from lidarspec.formats.writing import replacing
+from lidarspec.points.look import fit, look
+from lidarspec.scans.scans import Scan
+from lidarspec.scans.selection import Selection
+from lidarspec.spec.sensor import Sensor
+from lidarspec.view import figures
+from lidarspec.view.feed import Feed
+from lidarspec.view.svg import svg
+
+
+@click.command()
+@click.argument("source", metavar="IN")
+@click.option(
+    "-o",
+    "--output",
+    metavar="FILE",
+    required=True,
+    help="Where to: .svg, .png or .pdf; - is standard output, as SVG.",
+)
+@sensor_option
+@click.option(
+    "--kind",
+    type=click.Choice(["scan", "intensity", "ranges", "rates"]),
+    default="scan",
+    show_default=True,
+    help="What of it.",
+)
+@click.option(
+    "--scan",
+    "number",
+    type=click.IntRange(min=1),
+    metavar="NUMBER",
+    default=1,
+    show_default=True,
+    help="Which whole scan.",
+)
+@click.option(
+    "-t",
+    "--duration",
+    type=DURATION,
+    help="Of a live source so long.  [default: 10s, but for a scan]",
+)
+@selecting("times", "scans", "every", "ranges", "time")
+@colour_option
+@click.option(
+    "--max-range",
+    type=click.FloatRange(min=0, min_open=True),
+    metavar="METRES",
+    help="From the middle to the edge.",
+)
+def plot(
+    source: str,
+    output: str,
+    sensor_id: str | Sensor | None,
+    kind: str,
+    number: int,
+    duration: float | None,
+    selection: Selection,
+    ramp: str,
+    max_range: float | None,
+) -> None:
+    """A scan as a picture; or intensities, ranges and rates over time.
+
+    A scan is drawn to scale, from above, and from the side where the points are not in one plane.
+    --kind intensity counts how often each intensity comes, ranges says how many returns there are
+    at each range over time, and rates how many packets and scans a second, with what is lost or
+    wrong among them. All but the SVG of a scan takes matplotlib: lidarspec[plot].
+    """
+    suffix = ".svg" if output == "-" else Path(output).suffix.lower()
+    if suffix not in figures.SUFFIXES:
+        raise UsageError(f"{output}: pictures are written as {', '.join(figures.SUFFIXES)}")
+    refuse_overwriting(output, source, sensor_id)
+    with open_device(source, sensor_id) as device:
+        if kind == "scan":
+            scan = _find_scan(device, source, selection, number)
+            conclude(device)  # before drawing, during which a live source continues
+            title = f"{device.sensor.id}: {scan}"
+            _draw_scan(scan, title, ramp, max_range, output, suffix)
+        else:
+            title = f"{kind} of {device.sensor.id}"
+            default_duration = PATIENCE if device.is_live else math.inf
+            end_s = time.monotonic() + (duration or default_duration)
+            _save(_draw_over_time(device, source, selection, kind, end_s), output, suffix)
+        if output != "-":
+            note(f"{output}: {title}")
+
+
+def _draw_scan(
+    scan: Scan, title: str, ramp: str, max_range: float | None, output: str, suffix: str
+) -> None:
+    view = look(scan.points, ramp=ramp, reach=max_range)
+    if max_range is None:
+        view = fit(scan.points, view)
+    if suffix == ".svg":
+        emit(svg(scan.points, view, title), output)
+    else:
+        _save(figures.of_scan(scan, view, title), output, suffix)
+
+
+def _find_scan(device: Device, source: str, selection: Selection, number: int) -> Scan:
+    """Return a whole scan by its number, counted from 1.
+
+    If there are fewer whole scans it is the last whole one, or an incomplete one if there is none.
+    """
+    chosen: Scan | None = None
+    whole_count = 0
+    for scan in scans_of(device, source, selection):
+        if scan.whole:
+            whole_count += 1
+        if scan.whole or chosen is None or not chosen.whole:
+            chosen = scan
+        if whole_count == number:
+            break
+    if chosen is None:
+        raise nothing_came(device, source)
+    if whole_count < number:
+        plural = "" if whole_count == 1 else "s"
+        note(
+            f"{source} has {whole_count} whole scan{plural}; drawn is the last piece of it that"
+            " could be"
+        )
+    return chosen
+
+
+def _draw_over_time(
+    device: Device, source: str, selection: Selection, kind: str, end_s: float
+) -> Any:
+    """Return a figure of the data that come up to a time of `time.monotonic`."""
+    title = f"{device.sensor.id}, {Path(source).name if device.place else source}"
+    if kind == "rates":
+        rates = figures.Rates(Feed(device, select=selection), end_s)
+        conclude(device)
+        return figures.of_rates(rates, title)
+    scans = scans_of(device, source, selection, until=end_s)
+    first = next(scans, None)
+    if first is None:
+        raise nothing_came(device, source)
+
+    def iter_scans() -> Iterator[Scan]:
+        yield first
+        yield from scans
+        conclude(device)
+
+    if kind == "ranges":
+        return figures.of_ranges(iter_scans(), title)
+    return figures.of_intensities(iter_scans(), title)
+
+
+def _save(figure: Any, output: str, suffix: str) -> None:
+    if output == "-":
+        text = io.BytesIO()
+        figures.save(figure, text, suffix)
+        emit(text.getvalue().decode(), output)
+        return
+    with replacing(Path(output)) as part:
+        figures.save(figure, part, suffix)
