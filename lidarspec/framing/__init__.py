@@ -1,9 +1,8 @@
 """Where frames are: from bytes as they come to frames of known type and layout.
 
 In: a byte stream in any pieces, or datagrams. Out: `Frames`, a struct of arrays of those that were
-found, and counters of what became of
-every other byte. No clock, port or thread in here, and no exception for any bytes whatever. Modules
-in reading order:
+found, and counters for all other bytes. No clock, port or thread in here, and no exception for any
+bytes whatever. Modules in reading order:
 
 * `results`: `Frames`, which each module passes on to the next; frames one by one; the counters.
 * `plausibility`: whether candidates of one layout are frames, many at a time.
@@ -12,8 +11,8 @@ in reading order:
   as columns.
 * `text_frames`: this engine for frames with a wire form.
 * `frame_engine`: this engine for binary frames: compiled, and interpreted by construct.
+* `weak_frames`: types that are accepted only in runs: the runs among their candidates.
 * `candidates`: the candidates in a piece of a stream, of the types that are looked for.
-* `weak_frames`: types that are believed in runs alone.
 * `search`: the rule of a stream: the leftmost valid candidate, then on after its last byte.
 * `steady`: frames at one distance, which need no search: in streams, in datagrams, in arrays.
 * `assembly`: messages that come in several datagrams.

@@ -1,9 +1,10 @@
-"""The candidates in a piece of a stream: which types are looked for, where their constants stand,
-and what is judged of them.
+"""The candidates in a piece of a stream: the offsets with the constants of a type, and their
+verdicts.
 
 A type with `after` is looked for only while the frame that it names is the last seen of those named
-by any `after`. All candidates of a piece are judged in bulk, those of each type once, when it is
-looked for first: what is looked for may change with every frame.
+by any `after`. All candidates of a piece are judged in bulk, those of each type once, when the type
+is looked for first: the types that are looked for may change with every frame. Weak types are
+judged as all others; of their candidates, those that begin a run are live (`weak_frames`).
 """
 
 from __future__ import annotations
@@ -19,10 +20,11 @@ from lidarspec.errors import PluginError
 from lidarspec.frames.layout import Marks, Sums, words
 from lidarspec.framing.frame_codec import Codec
 from lidarspec.framing.results import CONSTANT, COUNTED, PLUGIN, SHORT, VALID, Frames
+from lidarspec.framing.weak_frames import Runs, find_runs
 
-#: candidates of one type in a piece; where there are more, the piece is made shorter, so that
-#: memory stays small.
-MOST = 1 << 15
+#: candidates of one type in a piece; if there are more, the piece is made shorter, so that memory
+#: stays small.
+MAX_CANDIDATES = 1 << 15
 
 Bytes1D = NDArray[np.uint8]
 Offsets = NDArray[np.intp]
@@ -30,11 +32,14 @@ Offsets = NDArray[np.intp]
 
 @dataclass
 class Mode:
-    """What is remembered between pieces: the last frame named by any `after`, a run of weak frames
-    under way, the last frame's size.
+    """What is remembered between pieces.
 
     Attributes:
+        after: the last frame named by any `after`.
         changed: where in the stream what is looked for changed last.
+        run: the weak type of the last run that was taken.
+        run_end: where in the stream that run ends so far.
+        size: of the last frame.
         steady: frames of that size seem to follow one another without a byte between.
     """
 
@@ -48,13 +53,13 @@ class Mode:
 
 @dataclass
 class Piece:
-    """The outcome for one piece.
+    """The result for one piece of a stream.
 
     Attributes:
         frames: those that are taken; their places are those in the piece.
-        end: where the rest begins, which has to be looked at again.
-        waiting: whether the rest makes sense only together with bytes that follow the piece.
-        need: how long the rest has to be at least before that; 0 if unknown.
+        end: where the rest begins, which has to be searched again.
+        waiting: whether the rest can only be judged with bytes that follow the piece.
+        need: the shortest rest that is worth a search; 0 if unknown.
         rejected: number of rejected candidates by counter.
         errors: failures of the plugin.
     """
@@ -67,7 +72,7 @@ class Piece:
     errors: list[PluginError] = field(default_factory=list)
 
     def reject(self, numbers: Sequence[int], errors: Sequence[PluginError]) -> None:
-        """Count candidates as rejected: how many of each status."""
+        """Count rejected candidates, given the number of each status."""
         for reason, number in enumerate(numbers):
             name = COUNTED.get(reason)
             if number and name:
@@ -85,14 +90,16 @@ class Framing:
     """
 
     def __init__(self, codecs: Mapping[str, Codec], sums: Sums | None = None) -> None:
-        self.names, self.codecs, self.sums = tuple(codecs), list(codecs.values()), sums
+        self.names = tuple(codecs)
+        self.codecs = list(codecs.values())
+        self.sums = sums
         self.named = {codec.frame.after for codec in self.codecs} - {None}
         self.marks = [codec.marks for codec in self.codecs]
         self.words = [words(marks) for marks in self.marks]
-        #: bytes up to the end of the last of those.
+        #: bytes up to the end of the last constant of each type.
         self.ends = [
-            max((spot + dtype.itemsize for spot, dtype, _, _ in found), default=0)
-            for found in self.words
+            max((offset + dtype.itemsize for offset, dtype, _, _ in own), default=0)
+            for own in self.words
         ]
         lengths = [codec.frame.max_length for codec in self.codecs]
         #: no candidate waits for more bytes than these.
@@ -103,29 +110,28 @@ class Framing:
         self._active: dict[str | None, list[int]] = {}
 
     def active(self, mode: Mode) -> list[int]:
-        """The types that are looked for now, in order."""
-        known = self._active.get(mode.after)
-        if known is None:
-            known = self._active[mode.after] = [
-                i for i, codec in enumerate(self.codecs) if codec.frame.after in (None, mode.after)
+        """Return the types that are looked for now, in order."""
+        active = self._active.get(mode.after)
+        if active is None:
+            active = [
+                kind
+                for kind, codec in enumerate(self.codecs)
+                if codec.frame.after in (None, mode.after)
             ]
-        return known
+            self._active[mode.after] = active
+        return active
 
-    def weak(self, kind: int) -> bool:
-        """Whether frames of a type are believed in runs alone."""
+    def is_weak(self, kind: int) -> bool:
+        """Return whether frames of a type are accepted only in runs."""
         return kind in self._weak
 
-    def any_weak(self, mode: Mode) -> bool:
-        """Whether any type that is looked for now is weak."""
-        return bool(self._weak) and not self._weak.isdisjoint(self.active(mode))
-
     def switches(self, kind: int, mode: Mode) -> bool:
-        """Whether a frame of this type changes what is looked for."""
+        """Return whether a frame of a type changes which types are looked for."""
         return self.names[kind] in self.named and self.names[kind] != mode.after
 
     def switching(self, mode: Mode) -> NDArray[np.bool_]:
-        """Whether a frame of each type changes what is looked for, (types + 1,), by its index; the
-        last, for -1, is False.
+        """Return whether a frame of each type changes which types are looked for, (types + 1,), by
+        its index; the last, for -1, is False.
         """
         return np.array([*(self.switches(kind, mode) for kind in range(len(self.names))), False])
 
@@ -138,8 +144,8 @@ class Framing:
         *,
         gathered: bool = True,
     ) -> Frames:
-        """The candidates of a type at these offsets, which have its constants, each with its layout
-        and whether it is a frame.
+        """Return the candidates of a type at some offsets that have its constants, each with its
+        layout and its status.
         """
         return self.codecs[kind].survey(
             buffer, offsets, stops, kind=kind, gathered=gathered, sums=self.sums
@@ -147,7 +153,7 @@ class Framing:
 
 
 def matches(buffer: Bytes1D, constants: Marks) -> Offsets:
-    """The offsets where the constants are right as far as the bytes go, (k,), ascending."""
+    """Return the offsets at which the constants are right as far as the bytes go, ascending."""
     if not constants:
         return np.arange(len(buffer))
     length = len(buffer)
@@ -165,26 +171,48 @@ def matches(buffer: Bytes1D, constants: Marks) -> Offsets:
 
 
 def _right(buffer: Bytes1D, spot: int, mask: int, value: int) -> NDArray[np.bool_]:
-    """At which offsets a constant is right, for those where it is there."""
-    there = buffer[spot:]
-    return np.asarray((there if mask == 0xFF else there & np.uint8(mask)) == np.uint8(value))
+    """Return whether a constant is right at each offset at which its byte has arrived."""
+    values = buffer[spot:]
+    if mask != 0xFF:
+        values = values & np.uint8(mask)
+    return np.asarray(values == np.uint8(value))
 
 
 def fitting(buffer: Bytes1D, offsets: Offsets, constants: Marks) -> Offsets:
-    """The offsets, in order, where the constants are right as far as the bytes go, (k,)."""
+    """Return those of some ascending offsets at which the constants are right as far as the bytes
+    go.
+    """
     for spot, mask, value in constants:
         if not len(offsets):
             break
         inside = int(offsets.searchsorted(len(buffer) - spot))
-        found = buffer.take(offsets[:inside] + spot)
-        kept = np.flatnonzero((found if mask == 0xFF else found & np.uint8(mask)) == value)
+        values = buffer.take(offsets[:inside] + spot)
+        if mask != 0xFF:
+            values &= np.uint8(mask)
+        kept = np.flatnonzero(values == value)
         if len(kept) < inside:
             offsets = np.concatenate([offsets[kept], offsets[inside:]])
     return offsets
 
 
+@dataclass(frozen=True, eq=False)
+class Live:
+    """The candidates of a piece that may be taken while the same types are looked for.
+
+    Attributes:
+        frames: those that are valid or wait for bytes, by offset, at each the one whose type comes
+            first; of weak types the heads of runs.
+        ends: where each ends, (n,); of a head, where its run ends.
+        runs: those of weak types, by the index of the type.
+    """
+
+    frames: Frames
+    ends: Offsets
+    runs: dict[int, Runs]
+
+
 class Candidates:
-    """The candidates of strong types in a piece of a stream.
+    """The candidates in a piece of a stream.
 
     Args:
         buffer: the bytes not yet decided and those after them.
@@ -192,77 +220,105 @@ class Candidates:
         final: give up candidates that need more bytes than there are.
 
     Attributes:
-        buffer: the bytes; fewer of them where there are too many candidates.
+        buffer: the bytes; fewer of them if there are too many candidates.
         is_whole: whether these are all.
         judged: the candidates of each type that was looked for and has some, by its index.
     """
 
     def __init__(self, framing: Framing, buffer: Bytes1D, mode: Mode, *, final: bool) -> None:
-        self._framing, self.buffer = framing, buffer
+        self._framing = framing
+        self.buffer = buffer
+        if not all(framing.marks[kind] for kind in framing.active(mode)):
+            self.buffer = buffer[: max(MAX_CANDIDATES, framing.reach)]  # each offset is one
         self._begun: dict[Marks, Offsets] = {}
         self.judged: dict[int, Frames] = {}
         self._known: set[int] = set()
-        spots = self._spots(mode)
+        found = self._find(mode)
         limit = min(
-            (int(offsets[MOST]) for offsets in spots.values() if len(offsets) > MOST),
-            default=len(buffer),
+            (
+                int(offsets[MAX_CANDIDATES])
+                for offsets in found.values()
+                if len(offsets) > MAX_CANDIDATES
+            ),
+            default=len(self.buffer),
         )
-        if limit < len(buffer):
-            self.buffer = buffer[: max(limit, framing.reach)]
+        if limit < len(self.buffer):
+            self.buffer = self.buffer[: max(limit, framing.reach)]
             self._begun.clear()
-            spots = {
+            found = {
                 kind: offsets[: int(np.searchsorted(offsets, len(self.buffer)))]
-                for kind, offsets in spots.items()
+                for kind, offsets in found.items()
             }
         self.is_whole = len(self.buffer) == len(buffer)
         self.final = final and self.is_whole
-        self._judge(spots)
+        self._judge(found)
 
-    def live(self, mode: Mode) -> Frames | None:
-        """Those that are valid or wait for bytes, by offset, at each the one whose type comes
-        first; None where there are too many.
-        """
-        spots = self._spots(mode)
-        if any(len(offsets) > MOST for offsets in spots.values()):
+    def live(self, mode: Mode) -> Live | None:
+        """Return the candidates that may be taken; None if there are too many."""
+        found = self._find(mode)
+        if any(len(offsets) > MAX_CANDIDATES for offsets in found.values()):
             return None
-        self._judge(spots)
-        own = [self.judged[kind] for kind in self._framing.active(mode) if kind in self.judged]
-        return merged(own, final=self.final) if own else Frames.none(self.buffer)
-
-    def _spots(self, mode: Mode) -> dict[int, Offsets]:
-        """Where the constants of types stand that have not been looked for before."""
-        spots: dict[int, Offsets] = {}
+        self._judge(found)
+        parts = list[Frames]()
+        all_runs = dict[int, Runs]()
         for kind in self._framing.active(mode):
-            if kind not in self._known and not self._framing.weak(kind):
-                begin, rest = (
-                    self._framing.marks[kind][:2],
-                    self._framing.marks[kind][2:],
-                )  # many types begin alike
+            own = self.judged.get(kind)
+            if own is None:
+                continue
+            if self._framing.is_weak(kind):
+                runs = find_runs(
+                    own,
+                    self._merge(parts),
+                    confirm=self._framing.codecs[kind].frame.confirm,
+                    is_single=self._framing.switches(kind, mode),
+                    final=self.final,
+                )
+                all_runs[kind] = runs
+                own = runs.heads
+            parts.append(own)
+        frames = self._merge(parts)
+        ends = frames.starts + frames.sizes
+        for kind, runs in all_runs.items():
+            is_own = frames.kinds == kind
+            ends[is_own] = runs.ends[runs.frames.starts.searchsorted(frames.starts[is_own])]
+        return Live(frames, ends, all_runs)
+
+    def _merge(self, parts: Sequence[Frames]) -> Frames:
+        return merged(parts, final=self.final) if parts else Frames.none(self.buffer)
+
+    def _find(self, mode: Mode) -> dict[int, Offsets]:
+        """Return where the constants of types stand that have not been looked for before."""
+        found: dict[int, Offsets] = {}
+        for kind in self._framing.active(mode):
+            if kind not in self._known:
+                marks = self._framing.marks[kind]
+                begin = marks[:2]  # many types begin alike
                 if begin not in self._begun:
                     self._begun[begin] = matches(self.buffer, begin)
-                spots[kind] = fitting(self.buffer, self._begun[begin], rest)
-        return spots
+                found[kind] = fitting(self.buffer, self._begun[begin], marks[2:])
+        return found
 
-    def _judge(self, spots: Mapping[int, Offsets]) -> None:
-        self._known |= spots.keys()
-        for kind, offsets in spots.items():
+    def _judge(self, found: Mapping[int, Offsets]) -> None:
+        self._known |= found.keys()
+        for kind, offsets in found.items():
             if not len(offsets):
                 continue
             own = self._framing.survey(kind, self.buffer, offsets)
-            self.judged[kind] = (
-                own if own.is_sound or (right := own.status != CONSTANT).all() else own.only(right)
-            )
+            if not own.is_sound:
+                is_right = own.status != CONSTANT
+                own = own if is_right.all() else own.only(is_right)
+            self.judged[kind] = own
 
 
 def merged(candidates: Sequence[Frames], *, final: bool) -> Frames:
-    """The candidates of several types that are valid or wait for bytes, by offset, at each the one
-    whose type comes first.
+    """Return the candidates of several types that are valid or wait for bytes, by offset, at each
+    the one whose type comes first.
     """
     worst = VALID if final else SHORT
-    parts = [
-        own if own.is_sound or bool((own.status <= worst).all()) else own.only(own.status <= worst)
-        for own in candidates
-    ]
+    parts = list[Frames]()
+    for own in candidates:
+        is_live = own.status <= worst
+        parts.append(own if own.is_sound or bool(is_live.all()) else own.only(is_live))
     live = Frames.joined([part for part in parts if len(part)] or parts[:1])
     if len(parts) == 1:
         return live

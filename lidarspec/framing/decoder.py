@@ -318,12 +318,15 @@ class Decoder:
         return start
 
     def _piece(self, buffer: Bytes1D, *, final: bool) -> Piece:
-        """A piece of a stream cut into frames: as rows while nothing disturbs and no weak type is
-        looked for; else by search.
+        """Return a piece of a stream cut into frames: as rows while nothing disturbs, else by
+        search.
         """
-        framing, mode = self.framing, self._mode
-        piece = None if final or framing.any_weak(mode) else steady_stream(framing, buffer, mode)
-        return leftmost(framing, buffer, mode, self._base, final=final) if piece is None else piece
+        piece = None
+        if not final:
+            piece = steady_stream(self.framing, buffer, self._mode, self._base)
+        if piece is None:
+            piece = leftmost(self.framing, buffer, self._mode, self._base, final=final)
+        return piece
 
     def _entered(self, buffer: NDArray[np.uint8], piece: Piece, at: int | None) -> Frames:
         """The frames of a piece with their place in the input, and all that was found in it

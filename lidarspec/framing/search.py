@@ -3,29 +3,34 @@
 A stream decodes to the leftmost valid candidate, then on after its last byte; an invalid candidate
 advances by one byte. At one offset the order of the frame types decides. A type with `after` is
 looked for only while the frame that it names is the last seen of those named by any `after`; a type
-with `confirm` counts only in unbroken runs.
+with `confirm` counts only in unbroken runs (`lidarspec.framing.weak_frames`).
 
 All candidates of a piece are judged in bulk, and those that are taken are found in bulk too, with a
-step for each conflict only, and one for each frame that changes what is looked for; while types
-with `confirm` are, `lidarspec.framing.weak_frames` goes from run to run. So the work is linear in
-the input however often headers or changes appear in it, and the result is that of the byte-by-byte
-rule.
+step for each conflict only, and one for each frame that changes what is looked for. So the work is
+linear in the input however often headers or changes appear in it, and the result is that of the
+byte-by-byte rule.
 """
 
 from __future__ import annotations
 
 import bisect
-from typing import Protocol
 
 import numpy as np
 
-from lidarspec.framing.candidates import Bytes1D, Candidates, Framing, Mode, Offsets, Piece
-from lidarspec.framing.results import SHORT, VALID, Frames
-from lidarspec.framing.weak_frames import Runs
+from lidarspec.framing.candidates import (
+    Bytes1D,
+    Candidates,
+    Framing,
+    Live,
+    Mode,
+    Offsets,
+    Piece,
+)
+from lidarspec.framing.results import IMPLAUSIBLE, SHORT, VALID, Frames
 
 #: bytes from one change of what is looked for to the next, at which a piece ends there, and the
 #: next one is judged for what follows alone.
-SELDOM = 1 << 12
+MIN_STAY_BYTES = 1 << 12
 
 
 def leftmost(framing: Framing, buffer: Bytes1D, mode: Mode, base: int, *, final: bool) -> Piece:
@@ -39,133 +44,164 @@ def leftmost(framing: Framing, buffer: Bytes1D, mode: Mode, base: int, *, final:
     """
     candidates = Candidates(framing, buffer, mode, final=final)
     piece = Piece(Frames.none(candidates.buffer), len(candidates.buffer))
-    stays, walks = [(0, mode.after)], dict[str | None, Walk]()
+    stays = [(0, mode.after)]
+    walks = dict[str | None, _Walk]()
     position = 0
     while position < piece.end:
-        walk = walks.get(after := mode.after)
+        after = mode.after
+        walk = walks.get(after)
         if walk is None:
             live = candidates.live(mode)
             if live is None:
                 piece.end = position
                 break
-            walk = walks[after] = _walk(framing, candidates, live, mode, base)
+            walk = walks[after] = _Walk(framing, candidates, live, mode, base)
         position = walk.advance(position, piece)
         if mode.after == after:
             break
-        before, mode.changed = mode.changed, base + position
-        if mode.changed - before >= SELDOM:
+        before = mode.changed
+        mode.changed = base + position
+        if mode.changed - before >= MIN_STAY_BYTES:
             piece.end = position
             break
         stays.append((position, mode.after))
-    frames = [frames for walk in walks.values() if len(frames := walk.frames())]
-    if frames:
-        piece.frames = joined = Frames.joined(frames)
-        if len(frames) > 1:
-            piece.frames = joined.only(np.argsort(joined.starts))
-        if not framing.weak(piece.frames.kinds.item(-1)):
-            _remember_size(mode, piece.frames, stays[-1][0])
+    parts = [frames for walk in walks.values() for frames in walk.frames()]
+    if parts:
+        piece.frames = Frames.joined(parts)
+        if len(parts) > 1:
+            piece.frames = piece.frames.only(np.argsort(piece.frames.starts))
+        _remember_size(mode, piece.frames, stays[-1][0])
     count_rejected(framing, piece, candidates, stays)
     return piece
 
 
-class Walk(Protocol):
-    """What goes through a piece while the same types are looked for, as often as they are again."""
+class _Walk:
+    """A walk through a piece while the same types are looked for, as often as they are again.
+
+    Args:
+        live: the candidates that are valid or wait for bytes; one that waits takes all that there
+            are.
+        base: offset of the piece in the stream.
+    """
+
+    def __init__(
+        self, framing: Framing, candidates: Candidates, live: Live, mode: Mode, base: int
+    ) -> None:
+        self._framing = framing
+        self._mode = mode
+        self._base = base
+        self._is_whole = candidates.is_whole
+        self._frames = frames = live.frames
+        self._runs = live.runs
+        self._ends = ends = live.ends
+        self._after: Offsets | None = None  # the row that follows each candidate, if not the next
+        stops = np.zeros(len(frames), np.bool_)
+        stops[-1:] = True
+        if len(frames) > 1:
+            if not frames.is_sound:
+                ends[frames.status == SHORT] = len(candidates.buffer) + 1
+            if bool((frames.starts[1:] < ends[:-1]).any()):
+                self._after = frames.starts.searchsorted(ends)
+                stops |= self._after != np.arange(1, len(frames) + 1)
+        self._changes = bytes(len(frames))
+        if framing.named:
+            changes = framing.switching(mode)[frames.kinds] & (frames.status == VALID)
+            self._changes = changes.tobytes()
+            stops |= changes
+        self._stops: list[int] = np.flatnonzero(stops).tolist()
+        self._starts: list[int] = frames.starts.tolist() if any(self._changes) else []
+        self._taken: list[tuple[int, int]] = []  # first and last rows that follow one another
+        self._continued: list[tuple[int, int]] = []  # kinds and offsets of runs that go on
 
     def advance(self, position: int, piece: Piece) -> int:
         """Take what is valid from an offset on, until the end or a frame that changes what is
-        looked for; where that frame ends.
+        looked for; return where that frame ends.
 
         Args:
             piece: where it ends and what it waits for is entered into it, unless what is looked for
                 changes.
         """
-
-    def frames(self) -> Frames:
-        """All that were taken."""
-
-
-def _walk(framing: Framing, candidates: Candidates, live: Frames, mode: Mode, base: int) -> Walk:
-    if framing.any_weak(mode):
-        return Runs(framing, candidates, live, mode, base)
-    return _Chain(framing, candidates, live, mode)
-
-
-class _Chain:
-    """A `Walk` while no weak type is looked for.
-
-    Args:
-        live: the candidates that are valid or wait for bytes; one that waits takes all that there
-            are.
-    """
-
-    def __init__(self, framing: Framing, candidates: Candidates, live: Frames, mode: Mode) -> None:
-        self._framing, self._mode, self._live, self._is_whole = (
-            framing,
-            mode,
-            live,
-            candidates.is_whole,
-        )
-        ends, self._after = live.starts + live.sizes, None
-        stops = np.zeros(len(live), np.bool_)
-        stops[-1:] = True
-        if len(live) > 1:
-            if not live.is_sound:
-                ends[live.status == SHORT] = len(candidates.buffer) + 1
-            if bool((live.starts[1:] < ends[:-1]).any()):
-                self._after = live.starts.searchsorted(ends)
-                stops |= self._after != np.arange(1, len(live) + 1)
-        self._changes, self._kinds, self._ends = bytes(len(live)), list[int](), list[int]()
-        if framing.named:
-            changes = framing.switching(mode)[live.kinds] & (live.status == VALID)
-            self._changes, self._kinds, self._ends = (
-                changes.tobytes(),
-                live.kinds.tolist(),
-                ends.tolist(),
-            )
-            stops |= changes
-        self._stops: list[int] = np.flatnonzero(stops).tolist()
-        self._starts: list[int] = live.starts.tolist() if any(self._changes) else []
-        self._runs: list[tuple[int, int]] = []
-
-    def advance(self, position: int, piece: Piece) -> int:
-        live, first = self._live, 0
+        position = self._continue_run(position)
+        frames = self._frames
+        row = 0
         if position:
-            first = (
-                bisect.bisect_left(self._starts, position)
-                if self._starts
-                else int(live.starts.searchsorted(position))
-            )
-        while first < len(live):
-            last = self._stops[bisect.bisect_left(self._stops, first)]
+            if self._starts:
+                row = bisect.bisect_left(self._starts, position)
+            else:
+                row = int(frames.starts.searchsorted(position))
+        while row < len(frames):
+            last = self._stops[bisect.bisect_left(self._stops, row)]
             if self._changes[last]:
-                self._runs.append((first, last))
-                self._mode.after = self._framing.names[self._kinds[last]]
-                return self._ends[last]
-            if live.status.item(last) == SHORT:
-                self._runs.append((first, last - 1))
-                piece.end, piece.waiting, piece.need = (
-                    live.starts.item(last),
-                    self._is_whole,
-                    live.sizes.item(last),
-                )
+                self._take(row, last)
+                self._mode.after = self._framing.names[frames.kinds.item(last)]
+                return self._ends.item(last)
+            if frames.status.item(last) == SHORT:
+                self._take(row, last - 1)
+                piece.end = frames.starts.item(last)
+                piece.waiting = self._is_whole
+                piece.need = frames.sizes.item(last)
                 break
-            self._runs.append((first, last))
-            first = last + 1 if self._after is None else self._after.item(last)
+            self._take(row, last)
+            row = last + 1 if self._after is None else self._after.item(last)
         return piece.end
 
-    def frames(self) -> Frames:
-        if len(self._runs) == 1:
-            (first, last), *_ = self._runs
-            return self._live.only(slice(first, last + 1))
-        return self._live.only(_counted(np.array(self._runs, np.intp).reshape(-1, 2)))
+    def frames(self) -> list[Frames]:
+        """Return all that were taken, in parts that may lie between one another."""
+        if len(self._taken) == 1:
+            first, last = self._taken[0]
+            taken = self._frames.only(slice(first, last + 1))
+        else:
+            taken = self._frames.only(_rows_of(np.array(self._taken, np.intp).reshape(-1, 2)))
+        parts = [taken]
+        if self._runs:
+            is_weak = np.isin(taken.kinds, list(self._runs))
+            parts = [taken.only(~is_weak)]
+            for kind, runs in self._runs.items():
+                continued = [offset for other, offset in self._continued if other == kind]
+                offsets = [taken.starts[taken.kinds == kind], np.array(continued, np.intp)]
+                parts.append(runs.members(np.concatenate(offsets)))
+        return [part for part in parts if len(part)]
+
+    def _take(self, first: int, last: int) -> None:
+        """Take the candidates of some rows, which follow one another."""
+        self._taken.append((first, last))
+        if self._runs and last >= first:
+            kind = self._frames.kinds.item(last)
+            if kind in self._runs:
+                self._mode.run = self._framing.names[kind]
+                self._mode.run_end = self._base + self._ends.item(last)
+
+    def _continue_run(self, position: int) -> int:
+        """Take the rest of a run that ends at an offset so far; return where it ends now."""
+        if self._mode.run_end != self._base + position:
+            return position
+        for kind, runs in self._runs.items():
+            if self._framing.names[kind] != self._mode.run or self._is_earlier(kind, position):
+                continue
+            row = runs.row_at(position)
+            if row is not None:
+                self._continued.append((kind, position))
+                position = runs.ends.item(row)
+                self._mode.run_end = self._base + position
+                break
+        return position
+
+    def _is_earlier(self, kind: int, position: int) -> bool:
+        """Return whether a type that is earlier in the order than another is live at an offset."""
+        starts = self._frames.starts
+        row = int(starts.searchsorted(position))
+        if row == len(starts) or starts.item(row) != position:
+            return False
+        return self._frames.kinds.item(row) < kind
 
 
-def _counted(runs: Offsets) -> Offsets:
-    """The numbers from each first to each last, (k,)."""
-    firsts, numbers = runs[:, 0], runs[:, 1] - runs[:, 0] + 1
-    begins = np.cumsum(numbers) - numbers
-    offsets: Offsets = np.arange(int(numbers.sum())) + np.repeat(firsts - begins, numbers)
-    return offsets
+def _rows_of(runs: Offsets) -> Offsets:
+    """Return the numbers from each first to each last, (k,)."""
+    firsts = runs[:, 0]
+    counts = runs[:, 1] - firsts + 1
+    begins = np.cumsum(counts) - counts
+    rows: Offsets = np.arange(int(counts.sum())) + np.repeat(firsts - begins, counts)
+    return rows
 
 
 def _remember_size(mode: Mode, frames: Frames, since: int) -> None:
@@ -187,27 +223,30 @@ def count_rejected(
     Args:
         stays: from which offset on which types were looked for.
     """
-    frames, begins = piece.frames, np.array([begin for begin, _ in stays])
+    frames = piece.frames
+    begins = np.array([begin for begin, _ in stays])
     numbers = {name: number for number, name in enumerate({name for _, name in stays})}
     modes = np.array([numbers[name] for _, name in stays])
     for kind, own in candidates.judged.items():
-        refused = (
-            np.flatnonzero(own.status > (VALID if candidates.final else SHORT))
-            if not own.is_sound
-            else ()
-        )
+        status = own.status
+        if framing.is_weak(kind):  # valid ones that are not taken are in no run
+            status = np.where(status == VALID, IMPLAUSIBLE, status)
+        elif own.is_sound:
+            continue
+        refused = np.flatnonzero(status > (VALID if candidates.final else SHORT))
         if not len(refused):
             continue
-        spots = own.starts[refused]
-        counted = spots < piece.end
-        if len(stays) > 1 and (after := framing.codecs[kind].frame.after) is not None:
-            counted &= modes[begins.searchsorted(spots, side="right") - 1] == numbers.get(after, -1)
+        offsets = own.starts[refused]
+        is_counted = offsets < piece.end
+        after = framing.codecs[kind].frame.after
+        if len(stays) > 1 and after is not None:
+            own_modes = modes[begins.searchsorted(offsets, side="right") - 1]
+            is_counted &= own_modes == numbers.get(after, -1)
         if len(frames):
-            before = np.searchsorted(frames.starts, spots, side="right") - 1
+            before = np.searchsorted(frames.starts, offsets, side="right") - 1
             held = np.maximum(before, 0)
-            inside = (before >= 0) & (spots < frames.starts[held] + frames.sizes[held])
-            counted &= ~inside | (
-                (spots == frames.starts[held]) & (own.kinds[refused] < frames.kinds[held])
-            )
-        if counted.any():
-            piece.reject(np.bincount(own.status[refused[counted]]).tolist(), own.errors)
+            is_inside = (before >= 0) & (offsets < frames.starts[held] + frames.sizes[held])
+            is_first_byte = offsets == frames.starts[held]
+            is_counted &= ~is_inside | (is_first_byte & (kind < frames.kinds[held]))
+        if is_counted.any():
+            piece.reject(np.bincount(status[refused[is_counted]]).tolist(), own.errors)

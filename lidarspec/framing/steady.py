@@ -26,12 +26,15 @@ FEW, SMALL = 64, 1 << 16
 TOLD = 4
 
 
-def steady_stream(framing: Framing, buffer: NDArray[np.uint8], mode: Mode) -> Piece | None:
+def steady_stream(
+    framing: Framing, buffer: NDArray[np.uint8], mode: Mode, base: int
+) -> Piece | None:
     """The frames of a piece from its first byte on; None where they are to be searched for.
 
     Args:
         buffer: the bytes not yet decided and those after them.
         mode: as after the piece before; remembered in it is whether this was worth its time.
+        base: offset of the buffer in the stream.
     """
     number = len(buffer) // mode.size if mode.size and (mode.steady or len(buffer) <= SMALL) else 0
     if not number:
@@ -41,6 +44,9 @@ def steady_stream(framing: Framing, buffer: NDArray[np.uint8], mode: Mode) -> Pi
         lead = leading(framing, kind, rows)
         if lead is None:
             continue
+        is_weak = framing.is_weak(kind)
+        if is_weak and (mode.run, mode.run_end) != (framing.names[kind], base):
+            return None
         frames = (
             judged(framing, kind, buffer, rows[:lead], 0)
             if 2 * lead > number and not framing.switches(kind, mode)
@@ -50,7 +56,11 @@ def steady_stream(framing: Framing, buffer: NDArray[np.uint8], mode: Mode) -> Pi
             return None
         valid = lead if frames.is_sound else int((frames.status != 0).argmax())
         mode.steady = 2 * valid > number
-        return _piece(framing, mode, frames.only(slice(0, valid))) if mode.steady else None
+        if not mode.steady:
+            return None
+        if is_weak:
+            mode.run_end = base + valid * mode.size
+        return _piece(framing, mode, frames.only(slice(0, valid)))
     return None
 
 
