@@ -1,11 +1,10 @@
-"""Frames at one distance, as the rows of an array: found without a search, in a stream as in
-datagrams.
+"""Frames at equal distances, judged as the rows of an array instead of by a search.
 
-In a stream that nothing disturbs, frames follow one another without a byte between; datagrams of
-one size stand in a capture at one distance, and in an array without one. Where all of them are
-frames of one layout, and nothing that comes first in the order stands at their first bytes, the
-search would take the same. So they are judged as rows, which takes a few calls: of a stream up to
-the first that is none, where the search goes on; of datagrams all or none.
+In an undisturbed stream frames follow one another without a byte between; datagrams of one size
+stand at equal distances in a capture, and back to back in an array. If all of them are frames of
+one layout, and no earlier type begins at their first bytes, the search would take the same. So
+they are judged as rows, which takes a few calls: of a stream up to the first invalid row, where the
+search goes on; of datagrams all or none. Rows of a weak type go on with a run that is under way.
 """
 
 from __future__ import annotations
@@ -18,25 +17,27 @@ from lidarspec.frames.layout import Bytes2D, Layout, Marks, exclude, right
 from lidarspec.framing.candidates import Framing, Mode, Piece
 from lidarspec.framing.results import Frames, Indices, Numbers
 
-#: rows that are looked at before all are; bytes of a piece that is looked at so even after a piece
-#: with damaged frames.
-FEW, SMALL = 64, 1 << 16
-
-#: constants that tell the types of most datagrams.
-TOLD = 4
+#: rows whose constants are compared before those of all rows.
+FIRST_ROWS = 64
+#: bytes of a piece that is judged as rows even after a piece with damaged frames.
+SMALL_PIECE_BYTES = 1 << 16
+#: constants that distinguish the types of most datagrams.
+DISTINCTIVE_CONSTANTS = 4
 
 
 def steady_stream(
     framing: Framing, buffer: NDArray[np.uint8], mode: Mode, base: int
 ) -> Piece | None:
-    """The frames of a piece from its first byte on; None where they are to be searched for.
+    """Return the frames of a piece from its first byte on; None if it has to be searched.
 
     Args:
         buffer: the bytes not yet decided and those after them.
-        mode: as after the piece before; remembered in it is whether this was worth its time.
+        mode: as after the piece before; whether rows were worth their time is noted in it.
         base: offset of the buffer in the stream.
     """
-    number = len(buffer) // mode.size if mode.size and (mode.steady or len(buffer) <= SMALL) else 0
+    if not mode.size or not (mode.steady or len(buffer) <= SMALL_PIECE_BYTES):
+        return None
+    number = len(buffer) // mode.size
     if not number:
         return None
     rows = buffer[: number * mode.size].reshape(number, mode.size)
@@ -47,11 +48,9 @@ def steady_stream(
         is_weak = framing.is_weak(kind)
         if is_weak and (mode.run, mode.run_end) != (framing.names[kind], base):
             return None
-        frames = (
-            judged(framing, kind, buffer, rows[:lead], 0)
-            if 2 * lead > number and not framing.switches(kind, mode)
-            else None
-        )
+        if 2 * lead <= number or framing.switches(kind, mode):
+            return None
+        frames = judge_rows(framing, kind, buffer, rows[:lead], 0)
         if frames is None:
             return None
         valid = lead if frames.is_sound else int((frames.status != 0).argmax())
@@ -67,33 +66,32 @@ def steady_stream(
 def steady_datagrams(
     framing: Framing, buffer: NDArray[np.uint8], starts: Numbers, sizes: Indices, mode: Mode
 ) -> Frames | None:
-    """Datagrams of one size at one distance, judged as frames of one type and layout; None where
-    they may be anything else.
+    """Return datagrams of one size at equal distances, judged as frames of one type and layout.
 
-    So they may where they have not all the constants of one type and none of those before it, and
-    where they change what is looked for.
+    Returns:
+        None if they may be anything else: if some lack the constants of that type or have those of
+        an earlier one, or if they change which types are looked for.
     """
     rows = _rows(buffer, starts, sizes)
-    kind = None if rows is None else _likely(framing, rows, mode)
-    if (
-        rows is None
-        or kind is None
-        or right(framing.words[kind], rows) is not None
-        or framing.switches(kind, mode)
-    ):
+    if rows is None:
         return None
-    return judged(framing, kind, buffer, rows, int(starts[0]))
+    kind = _likely(framing, rows, mode)
+    if kind is None or right(framing.words[kind], rows) is not None:
+        return None
+    if framing.switches(kind, mode):
+        return None
+    return judge_rows(framing, kind, buffer, rows, int(starts[0]))
 
 
-def judged(
+def judge_rows(
     framing: Framing, kind: int, buffer: NDArray[np.uint8], rows: Bytes2D, first: int
 ) -> Frames | None:
-    """Rows with the constants of a type as candidates of one layout; None where they have not one
-    of their size.
+    """Return rows with the constants of a type as candidates of one layout; None if the type has no
+    layout of their size.
 
     Args:
-        rows: of the buffer, at one distance.
-        first: where they begin in it.
+        rows: of the buffer, at equal distances.
+        first: the offset of the first one.
     """
     survey = framing.codecs[kind].survey_rows(rows, sums=framing.sums)
     if survey is None:
@@ -102,49 +100,52 @@ def judged(
     number, size = rows.shape
     step = rows.strides[0] if number > 1 else size
     starts = range(first, first + number * step, step)
-    kinds, sizes = repeated(kind, number), repeated(size, number)
     return Frames(
-        buffer, kinds, starts, sizes, layouts=(layout,), status=status, rows=rows, errors=errors
+        buffer,
+        repeated(kind, number),
+        starts,
+        repeated(size, number),
+        layouts=(layout,),
+        status=status,
+        rows=rows,
+        errors=errors,
     )
 
 
 def leading(framing: Framing, kind: int, rows: Bytes2D) -> int | None:
-    """How many rows from the first on have the constants of a type, as far as the rows go; None
-    where no row has them.
+    """Return how many rows from the first on have the constants of a type, as far as the rows go;
+    None if no row has them.
     """
-    told = tuple(
+    constants = tuple(
         word for word in framing.words[kind] if word[0] + word[1].itemsize <= rows.shape[1]
     )
-    for some in (rows[:FEW], rows):
-        marked = right(told, some)
+    for some in (rows[:FIRST_ROWS], rows):
+        marked = right(constants, some)
         if marked is not None and np.count_nonzero(marked):
             return int(marked.argmin())
     return len(rows) if marked is None else None
 
 
 def step_between(starts: Indices) -> int:
-    """The bytes from each start to the next, where they are the same for all; else 0."""
+    """Return the bytes from each start to the next; 0 if they differ."""
     steps = starts[1:] - starts[:-1]
     step = steps.item(0) if len(steps) else 0
     return step if step > 0 and np.count_nonzero(steps == step) == len(steps) else 0
 
 
 def _piece(framing: Framing, mode: Mode, frames: Frames) -> Piece:
-    """A piece that ends with these frames, and waits for a next one where that is there in part."""
-    number, size = len(frames), mode.size
-    rest = frames.buffer[number * size :]
-    kind, layout = frames.kinds.item(0), frames.layout
-    need = (
-        _awaited(framing, mode, kind, layout, rest.tobytes())
-        if layout is not None and 0 < len(rest) < size
-        else 0
-    )
-    return Piece(frames, number * size, need > 0, need)
+    """Return a piece that ends with some frames, and waits for a next one that has begun."""
+    end = len(frames) * mode.size
+    rest = frames.buffer[end:]
+    need = 0
+    if frames.layout is not None and 0 < len(rest) < mode.size:
+        need = _count_needed(framing, mode, frames.kinds.item(0), frames.layout, rest.tobytes())
+    return Piece(frames, end, need > 0, need)
 
 
-def _awaited(framing: Framing, mode: Mode, kind: int, layout: Layout, rest: bytes) -> int:
-    """How many bytes tell more of a next frame of the same layout, of which so much is there; 0
-    where it may be something else.
+def _count_needed(framing: Framing, mode: Mode, kind: int, layout: Layout, rest: bytes) -> int:
+    """Return how many bytes are needed to judge a next frame of the same layout that has begun; 0
+    if it may be something else.
     """
     first = next(
         (other for other in framing.active(mode) if _begins(framing.marks[other], rest)), None
@@ -152,52 +153,56 @@ def _awaited(framing: Framing, mode: Mode, kind: int, layout: Layout, rest: byte
     if first != kind or framing.codecs[kind].size != layout.size:
         return 0
     need = layout.size
-    for spot, (mask, value) in layout.known.items():
-        if spot >= len(rest):
-            need = min(need, spot + 1)
-        elif rest[spot] & mask != value:
+    for offset, (mask, value) in layout.known.items():
+        if offset >= len(rest):
+            need = min(need, offset + 1)
+        elif rest[offset] & mask != value:
             return 0
     return need
 
 
 def _begins(marks: Marks, data: bytes) -> bool:
-    return all(spot >= len(data) or data[spot] & mask == value for spot, mask, value in marks)
+    """Return whether the constants are right as far as the bytes go."""
+    return all(offset >= len(data) or data[offset] & mask == value for offset, mask, value in marks)
 
 
 def _rows(buffer: NDArray[np.uint8], starts: Numbers, sizes: Indices) -> Bytes2D | None:
-    """Datagrams as the rows of an array, where they have one size and stand at one distance, one
-    after another; else None.
+    """Return datagrams of one size at equal distances as the rows of an array; None if they are
+    not.
     """
     count = len(sizes)
     size = sizes.item(0) if count else 0
     if not size or (alike(sizes) is None and np.count_nonzero(sizes == size) < count):
         return None
-    step = (
-        starts.step if isinstance(starts, range) else size if count == 1 else step_between(starts)
-    )
-    return (
-        np.ndarray((count, size), np.uint8, buffer, int(starts[0]), (step, 1))
-        if step >= size
-        else None
-    )
+    if isinstance(starts, range):
+        step = starts.step
+    else:
+        step = size if count == 1 else step_between(starts)
+    if step < size:
+        return None
+    return np.ndarray((count, size), np.uint8, buffer, int(starts[0]), (step, 1))
 
 
 def _likely(framing: Framing, rows: Bytes2D, mode: Mode) -> int | None:
-    """The type that the first datagram resembles, if none of those with its constants resembles one
-    that comes first; else None.
+    """Return the type with the constants of the first datagram; None if there is none, or if any
+    datagram with its constants has those of an earlier type as well.
     """
-    first, before = rows[0].tobytes(), list[int]()
+    first = rows[0].tobytes()
+    before = list[int]()
     for kind in framing.active(mode):
         if framing.codecs[kind].size not in (None, len(first)) or framing.ends[kind] > len(first):
             continue
-        if all(first[spot] & mask == value for spot, mask, value in framing.marks[kind][:TOLD]):
-            return None if any(_resembled(framing, other, kind, rows) for other in before) else kind
+        constants = framing.marks[kind][:DISTINCTIVE_CONSTANTS]
+        if all(first[offset] & mask == value for offset, mask, value in constants):
+            if any(_has_both(framing, other, kind, rows) for other in before):
+                return None
+            return kind
         before.append(kind)
     return None
 
 
-def _resembled(framing: Framing, kind: int, other: int, rows: Bytes2D) -> bool:
-    """Whether any row with the constants of the other type has those of this type as well."""
+def _has_both(framing: Framing, kind: int, other: int, rows: Bytes2D) -> bool:
+    """Return whether any row with the constants of one type has those of another as well."""
     if exclude(framing.marks[kind], framing.marks[other]):
         return False
     marked = right(framing.words[kind], rows)

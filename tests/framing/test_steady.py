@@ -13,7 +13,7 @@ from construct import Bytes, Const, Struct
 
 from lidarspec.frames.row_checksums import FEW, SHORT, registers
 from lidarspec.framing.results import Frames
-from lidarspec.framing.steady import SMALL
+from lidarspec.framing.steady import SMALL_PIECE_BYTES
 from lidarspec.spec import Checksummed, Frame, Xor
 from lidarspec.testing.subject import Subject
 from tests.engine.streams import Books, damaged
@@ -114,7 +114,7 @@ def test_long_pieces_are_taken_up_to_the_first_damage(faults: int) -> None:
         )
     assert whole.stats == parts.stats
     longest = max(len(spans) * len(frames[0]) for spans in found if is_steady(spans) or faults > 2)
-    assert longest > SMALL
+    assert longest > SMALL_PIECE_BYTES
 
 
 def test_a_type_that_comes_first_is_looked_for_at_each_frame() -> None:
