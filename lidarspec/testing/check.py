@@ -170,10 +170,8 @@ def _distribution(entries: list[EntryPoint]) -> Target:
         found.sensors += [
             sensor for sensor in sensors if sensor.id not in {one.id for one in found.sensors}
         ]
-    found.vectors, found.family = (
-        _vectors(found.files),
-        tuple(sensor.id for sensor in found.sensors),
-    )
+    found.vectors = _vectors(found.files)
+    found.family = tuple(sensor.id for sensor in found.sensors)
     names = {_normal(entry.distribution) for entry in entries}
     failing = [
         plugin
@@ -368,7 +366,8 @@ def _function(frame: str, name: str, sensor: Sensor | None) -> Spot | None:
     """Where a function of a frame type is written."""
     if sensor is None or frame not in sensor.frames:
         return None
-    own, simulated = sensor.frames[frame], sensor.simulation_of(frame)
+    own = sensor.frames[frame]
+    simulated = sensor.simulation_of(frame)
     functions = {
         "points": own.points or sensor.points,
         "plausible": own.plausible,
@@ -527,8 +526,10 @@ def _short_write(call: ast.Call, *, sockets: bool) -> bool:
     return False
 
 
-#: rules without which there is nothing to try, and what is skipped then.
-FATAL, ELSE = frozenset({"LS213", "LS114", "LS115", "LS301"}), "everything else"
+#: Rules without which there is nothing to try.
+FATAL = frozenset({"LS213", "LS114", "LS115", "LS301"})
+#: Name of the properties that are skipped then.
+ELSE = "everything else"
 
 
 #: Called with what is looked at, and with how many properties are done, of how many.
@@ -617,7 +618,8 @@ def _watch_sensor(watch: Watch, before: int, total: int, text: str, done: int) -
 
 def _beside(subject: Subject) -> Iterator[tuple[str, str]]:
     """What the picture of a sensor has to be held against."""
-    sensor, missing = subject.sensor, lacking(subject)
+    sensor = subject.sensor
+    missing = lacking(subject)
     if missing:
         yield "vectors", f"{missing}; x and y of points in two quadrants would prove the picture"
     yield (

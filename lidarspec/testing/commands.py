@@ -36,7 +36,8 @@ def arguments(subject: Subject, name: str, share: float) -> dict[str, Any]:
 
 
 def _value(sensor: Sensor, name: str, key: str, share: float) -> Any:
-    slot, kind = argument_slot(sensor, name, key), sensor.commands[name].arguments[key].kind
+    slot = argument_slot(sensor, name, key)
+    kind = sensor.commands[name].arguments[key].kind
     match kind:
         case Range(low, high):
             return low + share * (high - low)
@@ -74,11 +75,10 @@ def _parses_back(sensor: Sensor, name: str, given: dict[str, float]) -> None:
             f"{path} is {found_at(parsed, path)}, and {value} is meant"
         )
     for argument, value in given.items():
-        slot, declared = argument_slot(sensor, name, argument), command.arguments[argument]
-        read, raw = (
-            found_at(parsed, declared.path),
-            raw_argument(slot, declared.kind, value, argument, name),
-        )
+        slot = argument_slot(sensor, name, argument)
+        declared = command.arguments[argument]
+        read = found_at(parsed, declared.path)
+        raw = raw_argument(slot, declared.kind, value, argument, name)
         if isinstance(declared.kind, Range):
             read = slot.info.physical(read)
             assert abs(read - value) <= abs(slot.info.scale) * 0.5001, (
@@ -204,8 +204,10 @@ def _asked(subject: Subject, name: str, given: dict[str, float]) -> Reply:
     Raises:
         CommandError: where there is none, or another one.
     """
-    command, sensor = subject.sensor.commands[name], subject.sensor
-    device, session = SimulatedDevice(sensor), Session(sensor)
+    command = subject.sensor.commands[name]
+    sensor = subject.sensor
+    device = SimulatedDevice(sensor)
+    session = Session(sensor)
     device.start(0)
     stops = next(
         (

@@ -49,8 +49,10 @@ MEASURES = frozenset(
 )
 #: share of the places in a payload at which a sync pattern may stand by chance.
 COMMON = 1 / 200
-#: Examples whose length is looked at before a frame is simulated for it, and all of them.
-FIRST_LENGTHS, LENGTHS = 3, 12
+#: Examples whose length is looked at before a frame is simulated for it.
+FIRST_LENGTHS = 3
+#: Examples whose length is looked at in all.
+LENGTHS = 12
 #: example frames in whose payloads the sync pattern is counted, with the usual number of examples.
 SYNC_EXAMPLES = 12
 #: Bits of constants and checksums up to which a frame is weak: noise makes one every few megabytes.
@@ -434,10 +436,9 @@ def _sync(subject: Subject, name: str, frame: Frame, engine: CompiledCodec) -> F
     for offset, (mask, value) in engine.prefix.items():
         matching &= (data[offset : offset + len(matching)] & mask) == value
     expected = 2.0 ** -sum(mask.bit_count() for mask, _ in engine.prefix.values())
-    share, chance = (
-        float(matching.mean()),
-        COMMON + 4 * (COMMON / len(matching)) ** 0.5,
-    )  # beyond what chance makes of so few bytes
+    share = float(matching.mean())
+    # of few bytes chance alone makes a larger share
+    chance = COMMON + 4 * (COMMON / len(matching)) ** 0.5
     share = expected if expected > COMMON else share
     if expected > COMMON or share > chance:
         yield "LS204", f"its constants stand at {share:.1%} of the places in payloads", name

@@ -193,7 +193,9 @@ class Violation(AssertionError):
     """A property that does not hold: the test kit's failure, and the check's finding."""
 
     def __init__(self, code: str, what: str, path: str = "") -> None:
-        self.code, self.what, self.path = code, what, path
+        self.code = code
+        self.what = what
+        self.path = path
         rule = RULES[code]
         head = f"{code} {rule.title}\n  where: {path or 'the sensor'}"
         super().__init__(f"{head}\n  what:  {what}\n  why:   {rule.why}\n  write: {rule.write}")

@@ -33,8 +33,10 @@ from lidarspec.testing.subject import MANY, Subject
 CHANGED_EXAMPLES = 3
 #: Values that each of their bytes is changed to, with the usual number of examples.
 CHANGES = 8
-#: example frames that edits begin with, and the most edits at once.
-BASES, MOST = 8, 3
+#: Example frames that edits begin with.
+BASES = 8
+#: Edits of one frame, at most.
+MOST = 3
 #: places at which a frame is cut short or changed, at least.
 LEAST_SPOTS = 12
 #: bytes of a long frame's cuts together: each is parsed as far as it goes.
@@ -157,7 +159,8 @@ def what_follows_is_held(subject: Subject, name: str) -> None:
     """A frame in which a field is not what its `Rebuild` says is refused: it would be built as
     another.
     """
-    sensor, engine = subject.sensor, codec(subject.sensor.frames[name])
+    sensor = subject.sensor
+    engine = codec(subject.sensor.frames[name])
     if not isinstance(engine, CompiledCodec):
         return
     for data in (subject.example(name, seed=seed) for seed in range(3)):
@@ -173,7 +176,8 @@ def what_follows_is_held(subject: Subject, name: str) -> None:
             leaf.store(rows, leaf.scalar(data) + step)
             for seal in layout.seals:
                 seal.fill(rows)
-            other, place = rows.tobytes(), f"{name}.{leaf.info.path}"
+            other = rows.tobytes()
+            place = f"{name}.{leaf.info.path}"
             if other != data and engine.survey(rows[0], np.zeros(1, np.intp)).status[0] == VALID:
                 built = sensor.build(name, sensor.parse(other, frame=name))
                 require(
@@ -284,7 +288,8 @@ def values_survive_building_and_parsing(subject: Subject, name: str) -> None:
     """A few drawn fields of a frame, set to drawn values, are read back as they were written."""
     from hypothesis import HealthCheck, given, seed, settings, strategies as st
 
-    sensor, fields = subject.sensor, subject.fields(name)
+    sensor = subject.sensor
+    fields = subject.fields(name)
     number = len(subject.seeds(name))
     bases = [
         sensor.parse(subject.example(name, seed=base), frame=name)
@@ -338,8 +343,10 @@ def _check(subject: Subject, name: str, parsed: Any, spots: list[Any], edits: li
         return
     sealed = material.seals(subject.sensor, name, built)
     for place in edits:
-        (holder, key, path), (target, found, _) = spots[place], read[place]
-        wanted, got = holder[key], target[found]
+        (holder, key, path) = spots[place]
+        (target, found, _) = read[place]
+        wanted = holder[key]
+        got = target[found]
         require(
             got == wanted or path in sealed,
             "LS305",
@@ -404,7 +411,8 @@ def a_truncated_frame_is_a_wire_error(subject: Subject, name: str) -> None:
 
 def a_damaged_frame_is_at_worst_a_wire_error(subject: Subject, name: str) -> None:
     """Hostile mutations of a frame parse, or are a `WireError`, whether or not they are verified."""
-    sensor, source = subject.sensor, subject.source(f"mutations {name}")
+    sensor = subject.sensor
+    source = subject.source(f"mutations {name}")
     types = (name, None) if len(sensor.frames) <= MANY else (name,)
     for seed in subject.seeds(name, share=4):
         data = material.mutated(subject.example(name, seed=seed % 8), source)

@@ -58,11 +58,16 @@ COUNTER_BYTES = 1 << 24
 SCENE_BYTES = 1 << 21
 #: packets that are made at least, however long their frames are.
 LEAST_PACKETS = 8
-#: radians beyond which an azimuth along a sweep, or a drawn one, can only be degrees.
-TURNS, DRAWN = 4 * np.pi, 15 * np.pi
-#: share of the steps that go one way where a sensor rotates, and the step against it that is too
-#: much, radians and medians.
-ONE_WAY, BACK, MEDIANS = 0.8, np.deg2rad(1.5), 4
+#: Radians beyond which an azimuth along a sweep can only be degrees.
+TURNS = 4 * np.pi
+#: Radians beyond which a drawn azimuth can only be degrees.
+DRAWN = 15 * np.pi
+#: Share of the steps that go one way if a sensor rotates, at least.
+ONE_WAY = 0.8
+#: A step against the direction that is too long, in radians.
+BACK = np.deg2rad(1.5)
+#: The same in medians of all steps.
+MEDIANS = 4
 #: raw steps by which an angle is moved to see whether the points move with it.
 SMALL = 4
 #: examples that values are put into, until one has points, with the usual number of examples.
@@ -71,9 +76,10 @@ BASES = 8
 SEEN = 1e-5
 #: share of a direction along one of two axes from which on it is that axis's.
 ALONG = 0.9
-#: metres by which a point may be off its surface beyond half a step: float32, and steps that a
-#: header or a code word widens.
-EXACT, UNTOLD = 2e-6, 0.004
+#: Metres by which float32 puts a point off its surface.
+EXACT = 2e-6
+#: Metres of half a step that a header or a code word may widen.
+UNTOLD = 0.004
 
 
 def make_sweep(subject: Subject, name: str, packets: int, total: int = SWEEP_BYTES) -> list[bytes]:
@@ -242,7 +248,8 @@ def a_single_point_has_a_direction(subject: Subject, name: str) -> None:
     """Where the number of points is in the header, frames with one point have as sound a direction
     as others.
     """
-    engine, source = codec(subject.sensor.frames[name]), random.Random(subject.sensor.id)
+    engine = codec(subject.sensor.frames[name])
+    source = random.Random(subject.sensor.id)
     if not isinstance(engine, CompiledCodec) or engine.schema.parts:
         return
     counts = [
@@ -363,11 +370,13 @@ def angles_are_in_order(subject: Subject, name: str) -> None:
         if found.counts.ndim > 1
         else found.counts
     )
-    cloud, packet = found.cloud, np.repeat(np.arange(found.ready), counts)
+    cloud = found.cloud
+    packet = np.repeat(np.arange(found.ready), counts)
     rings = cloud.ring if cloud.ring is not None else np.zeros(len(cloud))
     for ring in np.unique(rings)[:4]:
         mine = (rings == ring) & np.isfinite(cloud.azimuth)
-        angle, number = cloud.azimuth[mine].astype(np.float64), packet[mine]
+        angle = cloud.azimuth[mine].astype(np.float64)
+        number = packet[mine]
         steps = (np.diff(angle) + np.pi) % (2 * np.pi) - np.pi
         moving = np.abs(steps) > 1e-9
         if moving.sum() < 8:

@@ -20,9 +20,10 @@ from lidarspec.framing.frame_engine import codec
 from lidarspec.spec import Frame, Sensor
 from lidarspec.spec.tree import FieldInfo, Sealed, nodes
 
-#: frames up to this length are cut at every byte, longer ones at both ends and at so many places by
-#: chance.
-SHORT, SPOTS = 300, 50
+#: Bytes up to which a frame is cut at every byte.
+SHORT = 300
+#: Random places at which a longer frame is cut, beside both ends.
+SPOTS = 50
 
 
 def delivery(sensor: Sensor, frames: list[tuple[str, bytes]]) -> Any:
@@ -149,8 +150,10 @@ def seals(sensor: Sensor, name: str, data: bytes) -> set[str]:
 #: examples of each frame type that a property tries, and those for which numbers of rounds are
 #: stated.
 USUAL_EXAMPLES = 40
-#: Rounds of a conversation with the usual number of examples, and at least.
-USUAL_ROUNDS, LEAST_ROUNDS = 3, 2
+#: Rounds of a conversation with the usual number of examples.
+USUAL_ROUNDS = 3
+#: Rounds of a conversation, at least.
+LEAST_ROUNDS = 2
 EXAMPLES = int(os.environ.get("LIDARSPEC_EXAMPLES", USUAL_EXAMPLES))
 #: sensors with more frame types than this are tried with less of each.
 MANY = 8
@@ -263,7 +266,8 @@ class Subject:
         there are some.
         """
         if (frame, seed) not in self._known:
-            drawn, source = self.drawers(frame), random.Random(f"{self.sensor.id} {frame} {seed}")
+            drawn = self.drawers(frame)
+            source = random.Random(f"{self.sensor.id} {frame} {seed}")
             example = (
                 random_frame(self.sensor, frame, source, drawn)
                 if drawn

@@ -427,7 +427,8 @@ def _is_of(subject: Subject, vector: Mapping[str, Any], place: str) -> bool:
     """Whether an entry is of the sensor; one that could be of nobody, or of any of several, is a
     finding.
     """
-    named, family = vector.get("sensor", []), subject.family
+    named = vector.get("sensor", [])
+    family = subject.family
     ids = [named] if isinstance(named, str) else named
     told = (
         f'it names no sensor, and the file is shared by {", ".join(family)}: "sensor":'
@@ -466,12 +467,14 @@ def _values(
     subject: Subject, name: str, data: bytes, parsed: Any, vector: Mapping[str, Any], place: str
 ) -> None:
     """Hold the fields of a vector to its values, raw and in units."""
-    fields, found = subject.fields(name), dict(leaves(parsed))
+    fields = subject.fields(name)
+    found = dict(leaves(parsed))
     wanted = [(path, value, False) for path, value in vector.get("values", {}).items()]
     wanted += [(path, value, True) for path, value in vector.get("units", {}).items()]
     for path, value, in_units in wanted:
         require(path in found, "LS702", f"the frame has no field {path!r}", f"{place} {name}")
-        info, raw = fields.get(re.sub(r"\[\d+\]", "", path)), found[path]
+        info = fields.get(re.sub(r"\[\d+\]", "", path))
+        raw = found[path]
         plain: Any = (
             raw.hex(" ")
             if isinstance(raw, bytes)
