@@ -71,11 +71,13 @@ from lidarspec.stores import (
 )
 
 #: bytes of a piece that is written to a file, and of one that is a partition in memory.
-PIECE, PARTITION = 256_000_000, 32_000_000
+PIECE = 256_000_000
+PARTITION = 32_000_000
 MANIFEST = "manifest.jsonl"
 #: tasks handed to an executor at a time, and seconds between two writings of a manifest that cannot
 #: be appended to.
-AHEAD, PERIOD = 1000, 2.0
+AHEAD = 1000
+PERIOD = 2.0
 VERSIONS = {"lidarspec": __version__, "numpy": np.__version__, "python": platform.python_version()}
 
 Record = dict[str, Any]
@@ -140,11 +142,10 @@ class Piece:
 
     def opened(self) -> FileScans:
         """The file, from where the piece begins."""
-        named = (
-            _configured(self.sensor, tuple(self.options.items()))
-            if self.sensor
-            else detected(self.source)
-        )
+        if self.sensor:
+            named = _configured(self.sensor, tuple(self.options.items()))
+        else:
+            named = detected(self.source)
         return FileScans(self.source, named, self.bookmark)
 
     def record(self, **more: Any) -> Record:
@@ -258,9 +259,12 @@ def pieces(
         SourceError: where there is none.
         UsageError: where two results would have one name.
     """
-    name, options = (
-        (sensor.id, dict(sensor.options)) if isinstance(sensor, Sensor) else (sensor or "", {})
-    )
+    if isinstance(sensor, Sensor):
+        name = sensor.id
+        options = dict(sensor.options)
+    else:
+        name = sensor or ""
+        options = {}
     made: dict[str, Piece] = {}
     for source, below in (pair for pattern in sources for pair in found(str(pattern))):
         target = f"{folder.rstrip('/')}/{below.rpartition('.')[0] or below}.{to}" if to else source
@@ -560,7 +564,8 @@ def _run(
     made again.
     """
     ended = queue.SimpleQueue[tuple[Piece, Future[Any]]]()
-    tasks, running = deque((survey if _is_large(piece) else converted, piece) for piece in todo), 0
+    tasks = deque((survey if _is_large(piece) else converted, piece) for piece in todo)
+    running = 0
     ahead = 1 if isinstance(executor, _Here) else AHEAD
 
     def hand_over(function: Callable[[Piece], Any], piece: Piece) -> None:
@@ -652,7 +657,8 @@ def read(
         SourceError: where there is no such file.
         UsageError: where a library is missing.
     """
-    dask, frames = import_library("dask", "dask"), import_library("dask.dataframe", "dask")
+    dask = import_library("dask", "dask")
+    frames = import_library("dask.dataframe", "dask")
     import_library("pyarrow", "arrow")
     todo = pieces(
         [urls] if isinstance(urls, str) else urls,
@@ -670,7 +676,8 @@ def _cut(piece: Piece) -> list[Piece]:
     """All pieces of a file."""
     if not _is_large(piece):
         return [piece]
-    found, following = list[Piece](), [piece]
+    found = list[Piece]()
+    following = [piece]
     while following:
         first, *following = survey(following[0])
         found.append(first)

@@ -146,9 +146,11 @@ def _by_metadata(group: str) -> list[EntryPoint]:
 
     found: dict[str, list[EntryPoint]] = {}
     for distribution in importlib.metadata.distributions():
-        name, version = str(getattr(distribution, "_path", "?")), "?"
+        name = str(getattr(distribution, "_path", "?"))
+        version = "?"
         try:
-            name, version = distribution.name or name, distribution.version
+            name = distribution.name or name
+            version = distribution.version
             entries = [
                 EntryPoint(e.name, e.value, name, version)
                 for e in distribution.entry_points.select(group=group)

@@ -32,7 +32,10 @@ class SpecError(LidarSpecError):
     """
 
     def __init__(self, reason: str, *, path: str = "", sensor: str = "", rule: str = "") -> None:
-        self.reason, self.path, self.sensor, self.rule = reason, path, sensor, rule
+        self.reason = reason
+        self.path = path
+        self.sensor = sensor
+        self.rule = rule
         super().__init__(": ".join(part for part in (sensor, path, reason) if part))
 
 
@@ -60,7 +63,9 @@ class PluginError(SpecError):
         line: int = 0,
         traceback: str = "",
     ) -> None:
-        self.file, self.line, self.traceback = file, line, traceback
+        self.file = file
+        self.line = line
+        self.traceback = traceback
         super().__init__(reason, path=path, sensor=sensor, rule=rule)
 
     @classmethod
@@ -86,7 +91,8 @@ class PluginError(SpecError):
         file, line = raised_at(error)
         code = getattr(getattr(function, "func", function), "__code__", None)
         if not file and code is not None:
-            file, line = code.co_filename, code.co_firstlineno
+            file = code.co_filename
+            line = code.co_firstlineno
         place = f" ({shown_path(file)}:{line})" if file else ""
         kind = "" if type(error) is SpecError else f"{type(error).__name__}: "
         reason = f"{kind}{' '.join(str(error).split())}{place}"
@@ -122,11 +128,9 @@ def printable(text: str) -> str:
 
 def shown_path(file: str) -> str:
     """A path as it is typed in the folder that one is in; as it is where it lies elsewhere."""
-    return (
-        os.path.relpath(file)
-        if os.path.abspath(file).startswith(os.path.join(os.getcwd(), ""))
-        else file
-    )
+    if os.path.abspath(file).startswith(os.path.join(os.getcwd(), "")):
+        return os.path.relpath(file)
+    return file
 
 
 def raised_at(error: BaseException) -> tuple[str, int]:
@@ -181,14 +185,14 @@ class WireError(LidarSpecError):
         got: object = None,
         data: bytes = b"",
     ) -> None:
-        self.reason, self.sensor, self.frame, self.offset, self.path = (
-            reason,
-            sensor,
-            frame,
-            offset,
-            path,
-        )
-        self.expected, self.got, self.data = expected, got, data
+        self.reason = reason
+        self.sensor = sensor
+        self.frame = frame
+        self.offset = offset
+        self.path = path
+        self.expected = expected
+        self.got = got
+        self.data = data
         super().__init__(
             ": ".join(
                 part
@@ -226,9 +230,10 @@ class LibraryError(UsageError):
         self.least_version = least_version
         self.installed_version = installed_version
         needed = f"{distribution} {least_version} or later" if least_version else distribution
-        found = (
-            f"version {installed_version} is installed" if installed_version else "it is missing"
-        )
+        if installed_version:
+            found = f"version {installed_version} is installed"
+        else:
+            found = "it is missing"
         super().__init__(f"this needs {needed}; {found}" + (f" ({cause})" if cause else ""))
         suggest(self, f"pip install 'lidarspec[{extra}]'")
 
@@ -327,7 +332,9 @@ class UnknownName(UsageError):
         hint: str = "",
         aliases: Mapping[str, str] = MappingProxyType({}),
     ) -> None:
-        self.name, self.known, self.place = name, tuple(sorted(known)), place
+        self.name = name
+        self.known = tuple(sorted(known))
+        self.place = place
         suggestion = did_you_mean(
             name, self.known, alike=self.alike, aliases=aliases, max_parts=self.max_parts
         )
@@ -426,7 +433,10 @@ class OutOfRange(UsageError):
         unit: str = "",
         place: str = "",
     ) -> None:
-        self.path, self.value, self.low, self.high = path, value, low, high
+        self.path = path
+        self.value = value
+        self.low = low
+        self.high = high
         end = f" {unit}" if unit else ""
         super().__init__(
             f"{place + ': ' if place else ''}{path} = {value} is outside {low} .. {high}{end}"

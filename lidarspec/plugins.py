@@ -248,9 +248,10 @@ class Registry:
         ]
         if lost and not plugin.error:
             holder = self._holder(lost[0])
-            others = (
-                [holder] if holder else [other for other in self._claims[lost[0]] if other != home]
-            )
+            if holder:
+                others = [holder]
+            else:
+                others = [other for other in self._claims[lost[0]] if other != home]
             whose = ", ".join(":".join(other) for other in others)
             plugin = replace(
                 plugin, error=f"{lost[0]}: another sensor has this id already: that of {whose}"
@@ -471,7 +472,8 @@ class Registry:
             )
             found = self._find(name)
         if found is not None and found.id != name:
-            own, name = found, found.id  # whoever has the id has its aliases too
+            own = found
+            name = found.id  # whoever has the id has its aliases too
             found = self._find(name)
             found = found if found is not None and found.id == own.id else None
         if found is None:
@@ -512,11 +514,9 @@ class Registry:
         def asked(function: Any) -> Any:
             if isinstance(function, Mapping):
                 return {path: asked(own) for path, own in function.items()}
-            return (
-                function
-                if function is None or isinstance(function, HookedPoints)
-                else HookedPoints(sensor, function, points)
-            )
+            if function is None or isinstance(function, HookedPoints):
+                return function
+            return HookedPoints(sensor, function, points)
 
         frames = {
             name: replace(frame, points=asked(frame.points)) for name, frame in frames.items()
@@ -684,9 +684,10 @@ def _loaded(entry: EntryPoint, names: str, add: Callable[[Any], list[str]]) -> P
     except KeyboardInterrupt:
         raise
     except BaseException as error:
-        reason = (
-            str(error) if isinstance(error, LidarSpecError) else f"{type(error).__name__}: {error}"
-        )
+        if isinstance(error, LidarSpecError):
+            reason = str(error)
+        else:
+            reason = f"{type(error).__name__}: {error}"
         return replace(plugin, error=reason, traceback=traceback.format_exc())
 
 
@@ -795,7 +796,8 @@ def _trial(*homes: Home) -> tuple[str, str]:
     environment = os.environ | {"PYTHONPATH": os.pathsep.join(filter(None, sys.path))}
     names = [name for home in homes for name in home]
     command = [sys.executable, "-P", "-c", code, *names, mark, str(LIMIT)]
-    hangs, pipe = f"it hangs: not loaded after {LIMIT:g} s", subprocess.PIPE
+    hangs = f"it hangs: not loaded after {LIMIT:g} s"
+    pipe = subprocess.PIPE
     try:
         done = subprocess.run(
             command,

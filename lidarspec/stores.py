@@ -117,20 +117,16 @@ def files_in(folder: str) -> set[str]:
         }
     system = system_of(folder)
     with _failures(folder):
-        return (
-            {plain(system.unstrip_protocol(path)) for path in system.find(folder)}
-            if system.exists(folder)
-            else set()
-        )
+        if system.exists(folder):
+            return {plain(system.unstrip_protocol(path)) for path in system.find(folder)}
+        return set()
 
 
 def plain(path: object) -> str:
     """One spelling of a path or URL, to be compared: memory:///a is memory://a, and ./a is a."""
-    return (
-        str(path).partition("://")[2].lstrip("/")
-        if is_stored(path)
-        else Path(str(path)).as_posix().removeprefix("./")
-    )
+    if is_stored(path):
+        return str(path).partition("://")[2].lstrip("/")
+    return Path(str(path)).as_posix().removeprefix("./")
 
 
 def stamp(path: str) -> dict[str, Any]:

@@ -26,7 +26,8 @@ _ENDLESS_KEY = re.compile(rb"(?:\.[^.=,\]\n]{0,80}){32}")
 FILE = "lidarspec.toml"
 #: the file of the folders that are allowed, a line each, and the variable that names one for a
 #: single run.
-TRUSTED, VARIABLE = "trusted", "LIDARSPEC_TRUST"
+TRUSTED = "trusted"
+VARIABLE = "LIDARSPEC_TRUST"
 _WRITABLE_BY_ALL = stat.S_IWOTH
 
 

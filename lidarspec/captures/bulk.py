@@ -73,11 +73,11 @@ class Alike:
         same = lengths == self.length
         if not same.all():
             found = np.zeros(len(starts), np.bool_)
-            some, at = (
-                self.find(storage, starts[same], lengths[same])
-                if same.any()
-                else (None, np.empty(0, np.int64))
-            )
+            if same.any():
+                some, at = self.find(storage, starts[same], lengths[same])
+            else:
+                some = None
+                at = np.empty(0, np.int64)
             found[same] = True if some is None else some
             return found, at
         heads = _windows(storage, starts, self.value.nbytes)
@@ -110,7 +110,8 @@ def alike(record: bytes, headers: Headers, source: Sender, form: Form) -> Alike 
     pattern = form.pattern(record)
     if pattern is None:
         return None
-    head, start = pattern.head, pattern.head + headers.size
+    head = pattern.head
+    start = pattern.head + headers.size
     if start > WIDEST or not pattern.times.fits():
         return None
     size = start + -start % 8
@@ -137,7 +138,10 @@ def walked(storage: NDArray[np.uint8], start: int, stop: int, form: Form) -> tup
     """
     pieces: list[Indices] = []
     single: list[int] = []
-    at, before, patience, length = start, 0, 0, -1
+    at = start
+    before = 0
+    patience = 0
+    length = -1
     view = storage.data
     if stop - at < _HEAD:
         return np.array([at], np.intp), False
@@ -145,10 +149,14 @@ def walked(storage: NDArray[np.uint8], start: int, stop: int, form: Form) -> tup
         if length == before and not patience and stop - at >= _RUN * length:
             run = _same(storage, at, (stop - at) // length, length, form)
             pieces += [np.array(single, np.intp), np.arange(at, at + run * length, length)]
-            single, at, patience = [], at + run * length, 2 * _RUN if run < _RUN else 0
+            single = []
+            at = at + run * length
+            patience = 2 * _RUN if run < _RUN else 0
             continue
         single.append(at)
-        at, before, patience = at + length, length, max(patience - 1, 0)
+        at = at + length
+        before = length
+        patience = max(patience - 1, 0)
     return np.concatenate([*pieces, np.array([*single, at], np.intp)]), length == 0
 
 
@@ -279,7 +287,8 @@ class CaptureBatches(CaptureReader):
                     continue
                 starts = starts if len(starts) > 1 else np.array([self._source.at])
                 found = _Records(self, self._source, form, starts, known)
-                ended, place = found.read(), self._source.place
+                ended = found.read()
+                place = self._source.place
                 if len(batch := found.batch()):
                     self.stats.datagrams += len(batch)
                     yield batch
@@ -302,7 +311,10 @@ class _Records:
     def __init__(
         self, reader: CaptureReader, source: Source, form: Form, starts: Indices, known: list[Alike]
     ) -> None:
-        self._reader, self._source, self._form, self._known = reader, source, form, known
+        self._reader = reader
+        self._source = source
+        self._form = form
+        self._known = known
         number = max(len(starts) - 1, 1)
         self._are_whole = len(starts) > 1
         self._starts, self._lengths = (
@@ -317,9 +329,9 @@ class _Records:
         )
         self._only: Alike | None = None  # what all records are like
         self._section = form.sections
-        self._storage, self._buffer = (
-            source.storage,
-            source.lent(),
+        self._storage = source.storage
+        self._buffer = (
+            source.lent()
         )  # of another the source may be, once it has looked further ahead
 
     def read(self) -> Exception | None:
@@ -369,11 +381,10 @@ class _Records:
             ],
             np.intp,
         ).reshape(-1, 3)
-        starts, sizes, senders = (
-            facts[kinds].T
-            if len(facts) != 1
-            else (np.full(len(known), fact) for fact in facts.ravel())
-        )
+        if len(facts) != 1:
+            starts, sizes, senders = facts[kinds].T
+        else:
+            starts, sizes, senders = (np.full(len(known), fact) for fact in facts.ravel())
         columns = [self._starts[known] + starts, sizes, self._at[known], senders]
         buffer = self._buffer if len(known) else np.empty(0, np.uint8)
         if self._plain:
@@ -447,11 +458,13 @@ class _Records:
         """Whether all records are now known; those before `since` were read: what was malformed
         there may be right by now.
         """
-        alike, number = self._known[kind], len(self._kinds)
+        alike = self._known[kind]
+        number = len(self._kinds)
         if kind == since == 0 and self._are_whole:
             found, at = alike.find(self._storage, self._starts[:number], self._lengths)
             if found is None:
-                self._only, self._at = alike, at
+                self._only = alike
+                self._at = at
                 self._kinds = np.broadcast_to(np.intp(0), number)
                 return True
             left = np.flatnonzero(found)

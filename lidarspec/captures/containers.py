@@ -29,7 +29,8 @@ from lidarspec.stores import file_of
 HEAD = 512
 #: bytes that are unpacked in one step, and by one reading of a file; of a pipe, it gives what has
 #: come.
-STEP, FILLED = 1 << 13, 1 << 20
+STEP = 1 << 13
+FILLED = 1 << 20
 #: a capture may be compressed and lie in a zip archive; what is packed more often is none.
 DEEPEST = 2
 #: files of an archive that a message names.
@@ -111,7 +112,9 @@ class Unpacking(io.RawIOBase):
     """
 
     def __init__(self, name: str, packed: BinaryIO, file: Any) -> None:
-        self.name, self._packed, self._file = name, packed, file
+        self.name = name
+        self._packed = packed
+        self._file = file
         self.damage: Damage | None = None
         self._step = FILLED if packed.seekable() else HEAD
         self._count = 0
@@ -120,7 +123,8 @@ class Unpacking(io.RawIOBase):
         return True
 
     def readinto(self, buffer: Any) -> int:
-        room, count = min(len(buffer), self._step), 0
+        room = min(len(buffer), self._step)
+        count = 0
         while count < room and (data := self._next(room - count)):
             buffer[count : count + len(data)] = data
             count += len(data)
@@ -196,7 +200,8 @@ def unpacked(name: str, file: BinaryIO, member: str = "") -> BinaryIO:
         if packing is None:
             break
         if packing is ZIP:
-            content, member = _of_archive(name, file, member), ""
+            content = _of_archive(name, file, member)
+            member = ""
         else:
             content = import_library(packing.module, "zstd").open(file)
         file = cast(BinaryIO, io.BufferedReader(Unpacking(name, file, content), FILLED))
@@ -228,11 +233,10 @@ def _of_archive(name: str, file: BinaryIO, member: str) -> Any:
     except (UsageError, SourceError):
         raise
     except Exception as error:  # of a damaged one, too, zipfile raises what it will
-        command = (
-            f"zip -FF {quote(name)} --out mended.zip"
-            if isinstance(error, zipfile.BadZipFile)
-            else f"unzip {quote(name)}"
-        )
+        if isinstance(error, zipfile.BadZipFile):
+            command = f"zip -FF {quote(name)} --out mended.zip"
+        else:
+            command = f"unzip {quote(name)}"
         raise suggest(
             SourceError(f"{name} is a zip archive, and is not read: {error}"), command
         ) from error

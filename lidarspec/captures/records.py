@@ -36,24 +36,31 @@ _PCAP = {  # magic: byte order, nanoseconds in a unit of time
     b"\xa1\xb2\x3c\x4d": (">", 1),
 }
 #: the head of a file that is written, little-endian, and that of a record in it.
-_HEAD, _RECORD = struct.Struct("<4sHHiIII"), struct.Struct("<IIII")
+_HEAD = struct.Struct("<4sHHiIII")
+_RECORD = struct.Struct("<IIII")
 _SECTION = b"\x0a\x0d\x0d\x0a"  # the same in both byte orders
 _SECTION_KIND = int.from_bytes(_SECTION)
 _ORDERS = {b"\x4d\x3c\x2b\x1a": "<", b"\x1a\x2b\x3c\x4d": ">"}
-_INTERFACE, _OBSOLETE_PACKET, _SIMPLE_PACKET, ENHANCED_PACKET = 1, 2, 3, 6
+_INTERFACE = 1
+_OBSOLETE_PACKET = 2
+_SIMPLE_PACKET = 3
+ENHANCED_PACKET = 6
 _PACKETS = {_OBSOLETE_PACKET, _SIMPLE_PACKET, ENHANCED_PACKET}
 _LAST_KIND = 10  # that the draft gives a number, but for the section's
-_TIME_RESOLUTION, _TIME_OFFSET = 9, 14  # options of an interface
+_TIME_RESOLUTION = 9
+_TIME_OFFSET = 14  # options of an interface
 
 LARGEST_BLOCK = 1 << 20  # a packet with its options; longer blocks are passed over unread
 #: places that are looked at together for the next record, and bytes behind each that may be needed:
 #: a packet, its options, a head.
-_STEP, _REACH = 1 << 16, LARGEST_PACKET + (1 << 12)
+_STEP = 1 << 16
+_REACH = LARGEST_PACKET + (1 << 12)
 #: bytes before a time that is sought which are read all the same.
 NEAR = 1 << 21
 #: seconds between two packets in a row, and between two of a file, at most, where a record may
 #: begin.
-_DAY, _YEAR = 86_400, 31_536_000
+_DAY = 86_400
+_YEAR = 31_536_000
 _MOST_INTERFACES = 1024
 _SECOND = 1_000_000_000
 _FURTHEST = 4_000_000_000  # seconds; times further on are read one by one, so that none overflows
@@ -119,7 +126,8 @@ class Times:
         are.
         """
         words = heads.view(self.word)
-        high, low = words[:, self.high].astype(np.int64), words[:, self.low]
+        high = words[:, self.high].astype(np.int64)
+        low = words[:, self.low]
         if self.is_split:
             high *= _SECOND
             high += low * np.int64(_SECOND // self.ticks)
@@ -237,7 +245,8 @@ class PcapRecords:
         behind = places + self._head.size + captured[places]
         right = (behind == len(data)) & (captured[places] == original[places]) & is_end
         followed = behind < count
-        before, after = places[followed], behind[followed]
+        before = places[followed]
+        after = behind[followed]
         right[followed] = (
             (captured[after] <= original[after])
             & (original[after] <= LARGEST_PACKET)
@@ -254,7 +263,8 @@ class PcapRecords:
         """Whether a record is longer or shorter than it says: none begins where it ends, and others
         do within it or its whole packet.
         """
-        size, within = self._head.size + captured, max(captured, min(original, LARGEST_PACKET) + 1)
+        size = self._head.size + captured
+        within = max(captured, min(original, LARGEST_PACKET) + 1)
         data = self._source.ahead(self._head.size + within + _REACH)
         is_end = len(data) < self._head.size + within + _REACH
         if len(data) == size or self.first_place(data[size:], 1, is_end=is_end) is not None:
@@ -309,7 +319,8 @@ class PcapngBlocks:
         kind, _, number = struct.unpack_from(self.order + "III", record)
         if kind != ENHANCED_PACKET:
             return None
-        interface, word = self._interfaces[number], f"{self.order}u4"
+        interface = self._interfaces[number]
+        word = f"{self.order}u4"
         times = Times(word, 3, 4, interface.ticks, False, interface.offset)
         return Pattern(28, tuple(range(12, 20)), tuple(range(24, 28)), times, word)
 
@@ -325,12 +336,10 @@ class PcapngBlocks:
         if head[:4] == _SECTION:
             if head[8:] not in _ORDERS:
                 raise Damaged
-            self.order, self._interfaces, self._knows_all, self.sections = (
-                _ORDERS[head[8:]],
-                [],
-                True,
-                self.sections + 1,
-            )
+            self.order = _ORDERS[head[8:]]
+            self._interfaces = []
+            self._knows_all = True
+            self.sections = self.sections + 1
         kind, length = struct.unpack_from(self.order + "II", head)
         if self._is_false(kind, length):
             self._knows_all = self._knows_all and kind != _INTERFACE
@@ -344,11 +353,9 @@ class PcapngBlocks:
                 self._knows_all = False
                 raise Damaged
             self._interfaces.append(_interface(self.order, body))
-        return (
-            _block_packet(self.order, kind, body, self._interfaces) or Passed.MALFORMED
-            if kind in _PACKETS
-            else Passed.NO_PACKET
-        )
+        if kind in _PACKETS:
+            return _block_packet(self.order, kind, body, self._interfaces) or Passed.MALFORMED
+        return Passed.NO_PACKET
 
     def first_place(self, data: memoryview, stop: int, *, is_end: bool) -> int | None:
         """The first place below `stop` where a whole block begins, or a section; the latter alone
@@ -362,12 +369,14 @@ class PcapngBlocks:
         if not self._knows_all or count <= 0:
             return section
         words = np.ndarray((count + 8,), f"{self.order}u4", data, 0, (1,))
-        kinds, lengths = words[:-8][:stop], words[4:-4][:stop]
+        kinds = words[:-8][:stop]
+        lengths = words[4:-4][:stop]
         places = np.flatnonzero(
             (kinds > 0) & (kinds <= _LAST_KIND) & (lengths >= 12) & (lengths <= _REACH)
         )
         ends = places + lengths[places]
-        places, ends = places[ends <= len(data)], ends[ends <= len(data)]
+        places = places[ends <= len(data)]
+        ends = ends[ends <= len(data)]
         right = places[words[ends - 4] == lengths[places]].tolist()
         return min([*right[:1], *([section] if section is not None else [])], default=None)
 
@@ -464,7 +473,9 @@ def _can_be(length: int) -> bool:
 
 def _interface(order: str, body: bytes) -> Interface:
     link, snap_length = struct.unpack_from(order + "HxxI", body)
-    ticks, offset, at = 1_000_000, 0, 8
+    ticks = 1_000_000
+    offset = 0
+    at = 8
     while at + 4 <= len(body):
         code, size = struct.unpack_from(order + "HH", body, at)
         value = body[at + 4 : at + 4 + size]

@@ -50,7 +50,9 @@ class Source:
     """
 
     def __init__(self, file: BinaryIO, *, largest: int = SMALLEST) -> None:
-        self._file, self._into, self._largest = file, _into(file), largest
+        self._file = file
+        self._into = _into(file)
+        self._largest = largest
         self._kept: list[tuple[NDArray[np.uint8], weakref.ref[Any]]] = []
         self._lent: weakref.ref[Any] | None = None
         self._data = memoryview(b"")
@@ -162,7 +164,8 @@ class Source:
     def _turn(self, have: int) -> None:
         """Puts what is not read yet to the front of a buffer that nobody holds."""
         size = len(self.storage) - SLACK
-        tail, at = self.storage[self.at : self.at + have], self.at
+        tail = self.storage[self.at : self.at + have]
+        at = self.at
         if len(self._data) == size:
             size = 2 * size if have == size else max(size, min(2 * size, self._largest))
         if self._lent is not None:
@@ -185,7 +188,8 @@ class Source:
     def _adopt(self, storage: NDArray[np.uint8], have: int) -> None:
         self.storage = storage
         self._view = storage.data
-        self._data, self.at = self._view[:have], 0
+        self._data = self._view[:have]
+        self.at = 0
 
 
 def _source_at(file: BinaryIO, largest: int, place: int) -> Source:

@@ -81,11 +81,10 @@ def new(
             UsageError(f"{folder} exists already: nothing was written"),
             f"lidarspec new {quote(sensor_id)} --distribution NAME",
         )
-    texts = (
-        invented(names, "udp" if link == "udp" else "serial")
-        if capture is None
-        else _drafted(names, link, capture)
-    )
+    if capture is None:
+        texts = invented(names, "udp" if link == "udp" else "serial")
+    else:
+        texts = _drafted(names, link, capture)
     texts = joining(folder, names, texts) if folder.exists() else texts
     write(folder, texts)
     for name in texts:

@@ -29,7 +29,8 @@ from lidarspec.transports.open_url import is_live
 from lidarspec.transports.protocol import Chunk
 
 #: seconds to wait for what comes back on bytes sent by hand, and of silence behind it that end it.
-ANSWERED, QUIET = 1.0, 0.2
+ANSWERED = 1.0
+QUIET = 0.2
 
 
 @click.command()
@@ -112,7 +113,8 @@ def send(
     """
     if (command is None) == (digits is None):
         raise UsageError("send takes either the name of a command, or bytes: --hex 'a5 50'")
-    data, answer = b"" if digits is None else _bytes(digits), _Answer()
+    data = b"" if digits is None else _bytes(digits)
+    answer = _Answer()
     record = (lambda _: answer) if digits is not None and is_live(source) else None
     with open_device(source, sensor_id, start=False, record=record) as device:
         device.leave_on()
@@ -158,10 +160,13 @@ class _Answer:
         """The chunks behind the first so many: until the line has been quiet for a moment, or so
         many seconds have passed.
         """
-        end, heard, quiet = time.monotonic() + seconds, number, math.inf
+        end = time.monotonic() + seconds
+        heard = number
+        quiet = math.inf
         while (now := time.monotonic()) < min(end, quiet):
             if len(self.chunks) > heard:
-                heard, quiet = len(self.chunks), now + QUIET
+                heard = len(self.chunks)
+                quiet = now + QUIET
             time.sleep(QUIET / 10)
         return self.chunks[number:]
 
@@ -180,7 +185,8 @@ def _write(
     only counted.
     """
     _refuse_file(device, source)
-    sensor, before = device.sensor, len(answer.chunks)
+    sensor = device.sensor
+    before = len(answer.chunks)
     device.write(data)
     note(f"sent {len(data)} byte{'s' * (len(data) != 1)}: {data.hex(' ')}")
     heard = answer.after(before, ANSWERED if timeout is None else timeout)

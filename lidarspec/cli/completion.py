@@ -105,11 +105,10 @@ def _sources(ctx: click.Context, incomplete: str) -> Iterable[str]:
     """Devices, ports, simulated sensors, and files beside them; where there are files alone the
     shell does that better.
     """
-    simulated = (
-        [f"sim:{name}" for name in registry().names()]
-        if incomplete.startswith("sim:")
-        else ["sim:"]
-    )
+    if incomplete.startswith("sim:"):
+        simulated = [f"sim:{name}" for name in registry().names()]
+    else:
+        simulated = ["sim:"]
     places = [*devices(), *(port.path for port in serial_ports()), "udp://", "tcp://", *simulated]
     if not any(place.startswith(incomplete) for place in places):
         return []
@@ -145,19 +144,15 @@ def _commands(ctx: click.Context, incomplete: str) -> Iterable[str]:
 
 def _assignments(ctx: click.Context, incomplete: str) -> Iterable[str]:
     """Fields of a frame, or arguments of a command."""
-    sensor, frame, command = (
-        _sensor(ctx),
-        ctx.params.get("frame") or "",
-        ctx.params.get("command") or "",
-    )
+    sensor = _sensor(ctx)
+    frame = ctx.params.get("frame") or ""
+    command = ctx.params.get("command") or ""
     if sensor and frame in sensor.frames:
         fields = schema(sensor.frames[frame].tree).all_fields
         return [f"{_assigned(path, info)}=" for path, info in fields.items() if info.const is None]
-    return (
-        [f"{argument}=" for argument in sensor.commands[command].args]
-        if sensor and command in sensor.commands
-        else ()
-    )
+    if sensor and command in sensor.commands:
+        return [f"{argument}=" for argument in sensor.commands[command].args]
+    return ()
 
 
 def _assigned(path: str, info: FieldInfo) -> str:

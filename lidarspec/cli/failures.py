@@ -12,7 +12,12 @@ from lidarspec import errors
 from lidarspec.cli.terminal import note, voice
 from lidarspec.known_sensors import no_sensors
 
-FINDINGS, USAGE, SOURCE, NO_DATA, DEVICE, INTERRUPTED = 1, 2, 3, 4, 5, 130
+FINDINGS = 1
+USAGE = 2
+SOURCE = 3
+NO_DATA = 4
+DEVICE = 5
+INTERRUPTED = 130
 
 #: error class -> exit code and the next command; the first that fits, "{sensor}" and "{verb}"
 #: filled in.
@@ -38,10 +43,8 @@ def report(error: Exception, verb: str) -> int:
         ((code, command) for kind, code, command in CODES if isinstance(error, kind)),
         (FINDINGS, ""),
     )
-    is_detailed, voice.loudness = (
-        voice.loudness > 0 or (not command and bool(os.environ.get("LIDARSPEC_DEBUG"))),
-        0,
-    )
+    is_detailed = voice.loudness > 0 or (not command and bool(os.environ.get("LIDARSPEC_DEBUG")))
+    voice.loudness = 0
     if is_detailed:
         note("".join(traceback.format_exception(error)))
     if not command:
@@ -94,9 +97,9 @@ def _following(error: Exception, command: str, verb: str) -> str:
     from lidarspec.plugins import registry
 
     if isinstance(error, errors.UnknownSensor):
-        return (
-            "lidarspec plugins" if any(plugin.error for plugin in registry().plugins) else command
-        )
+        if any(plugin.error for plugin in registry().plugins):
+            return "lidarspec plugins"
+        return command
     sensor = str(getattr(error, "sensor", "") or getattr(error, "place", "")).partition(" ")[0]
     if isinstance(error, errors.SpecError) and error.path.endswith(".py"):
         return f"lidarspec check {shlex.quote(error.path)}"

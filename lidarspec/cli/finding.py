@@ -50,7 +50,8 @@ from lidarspec.transports.protocol import no_bytes
 WEAK = 12
 #: matches that are printed, and the texts that read as hexadecimal.
 PRINTED = 4
-HEX, LONGEST = (".hex", ".txt"), 1 << 16
+HEX = (".hex", ".txt")
+LONGEST = 1 << 16
 #: checksums that are told of unknown bytes.
 TOLD = 2
 
@@ -59,7 +60,8 @@ TOLD = 2
 @output_options
 def ports(as_json: bool, output: str | None) -> None:
     """The serial ports of this computer, and the UDP ports that installed sensors send to."""
-    serial, udp = serial_ports(), {port: udp_users(port) for port in udp_ports()}
+    serial = serial_ports()
+    udp = {port: udp_users(port) for port in udp_ports()}
     if as_json:
         listed = [{**vars(port), "users": [vars(user) for user in port.users]} for port in serial]
         emit_json(
@@ -169,7 +171,8 @@ def _of_file(path: str, period: int | None, offset: int) -> list[bytes]:
             raise suggest(WireError(no_bytes(path, heard.warnings)), "lidarspec sensors")
         for warning in heard.warnings:
             note(warning)
-        chunks, datagrams = heard.chunks, heard.datagrams
+        chunks = heard.chunks
+        datagrams = heard.datagrams
     else:
         given = read([path])
         chunks = tuple(chunk for chunk in given.chunks if chunk)
@@ -207,11 +210,10 @@ def checksum_told(match: Match) -> dict[str, Any]:
 def _text(match: Match, length: int) -> str:
     order = f", {match.order}-endian" if match.place.size > 1 else ""
     name = f" ({match.name})" if match.name else ""
-    chance = (
-        f"one wrong guess in {match.odds} would be"
-        if match.doubt >= WEAK
-        else "which may be chance"
-    )
+    if match.doubt >= WEAK:
+        chance = f"one wrong guess in {match.odds} would be"
+    else:
+        chance = "which may be chance"
     lines = [
         (
             f"{match.algorithm.describe()}{name}: right in {match.right} of {match.total} frames;"
@@ -328,11 +330,9 @@ def _everywhere(duration: float, *, start: bool) -> Iterator[Verdict]:
 def _unknown(found: Sequence[Verdict]) -> Structure | None:
     """What the bytes are made of that fit no sensor."""
     heard = max((one.heard for one in found), key=lambda heard: heard.size, default=None)
-    return (
-        structure(heard.chunks, datagrams=heard.datagrams)
-        if heard is not None and heard.size
-        else None
-    )
+    if heard is not None and heard.size:
+        return structure(heard.chunks, datagrams=heard.datagrams)
+    return None
 
 
 def _detected_text(found: Sequence[Verdict], output: str | None) -> str:
@@ -343,13 +343,12 @@ def _detected_text(found: Sequence[Verdict], output: str | None) -> str:
         if voice.loudness <= 0 and (one.alike or one.others):
             listed = one.alike  # without those that were ruled out
         for score in listed:
-            verdict_of = (
-                "no"
-                if score.sensor.id not in alike
-                else "yes"
-                if one.sensor is not None
-                else "perhaps"
-            )
+            if score.sensor.id not in alike:
+                verdict_of = "no"
+            elif one.sensor is not None:
+                verdict_of = "yes"
+            else:
+                verdict_of = "perhaps"
             rows.append(
                 [
                     _place(one.heard),
@@ -470,7 +469,8 @@ def _following(source: str | None, unknown: Structure | None) -> str:
 
 def _again(one: Verdict) -> str:
     """The source as it has to be opened for the sensor that was found."""
-    source, heard = one.heard.source, one.heard
+    source = one.heard.source
+    heard = one.heard
     link = data_link(one.sensor, Serial)
     if heard.baud is not None and "baud=" not in source and not (link and link.baud == heard.baud):
         source = with_option(source, "baud", heard.baud)

@@ -175,14 +175,13 @@ def listing(
     for index, (piece, part) in enumerate(parts):
         yield from [()] * bool(index)
         title = Span(_title(sensor, piece, part.frame), "title")
-        place = (
-            ""
-            if at is None
-            else next(
+        if at is None:
+            place = ""
+        else:
+            place = next(
                 (value.path for value in part.fields.values() if value.covers(at - piece.offset)),
                 "",
             )
-        )
         verdict = f": {part.verdict}" if verdicts and part.fault is not None else ""
         yield (title, Span(f"; byte {at} is in {place}" if place else ""), Span(verdict, "bad"))
         yield from part.lines(every=every)
@@ -215,16 +214,16 @@ class Selection:
         at: int | None = None,
         stretch: str | None = None,
     ) -> None:
-        self._sensor, self._frame, self._count, self._bad = (
-            sensor,
-            frame,
-            math.inf if count is None else count,
-            bad,
-        )
+        self._sensor = sensor
+        self._frame = frame
+        self._count = math.inf if count is None else count
+        self._bad = bad
         stretched: tuple[float, float] = _stretch(stretch) if at is None else (at, at + 1)
         self._from, self._to = stretched
         self._fault: WireError | None = None
-        self._shown, self._end, self._ended = 0, 0, False
+        self._shown = 0
+        self._end = 0
+        self._ended = False
         self.valid = self.damaged = self.unframed = self.others = 0
 
     def frames(self, found: Iterable[Piece]) -> Iterator[Piece]:
@@ -317,9 +316,11 @@ def _stretch(text: str | None) -> tuple[float, float]:
     """From which byte up to which."""
     first, colon, last = (text or ":").partition(":")
     try:
-        start, end = int(first or "0", 0), int(last, 0) if last else math.inf
+        start = int(first or "0", 0)
+        end = int(last, 0) if last else math.inf
     except ValueError:
-        start, end = 0, 0
+        start = 0
+        end = 0
     if not colon or not 0 <= start < end:
         raise UsageError(f"{text!r} is no FROM:TO, such as 940:1034, 0x3ac: or :47")
     return start, end
@@ -414,11 +415,9 @@ def _title(sensor: Sensor, piece: Piece, frame: str) -> str:
 def _raw_text(raw: Any) -> str:
     if not isinstance(raw, bytes | bytearray):
         return str(raw)
-    return (
-        raw.hex(" ")
-        if len(raw) <= 2 * LINED
-        else f"{raw[: 2 * LINED].hex(' ')} ... ({len(raw)} bytes)"
-    )
+    if len(raw) <= 2 * LINED:
+        return raw.hex(" ")
+    return f"{raw[: 2 * LINED].hex(' ')} ... ({len(raw)} bytes)"
 
 
 def plain(parsed: Any) -> Any:
@@ -431,10 +430,8 @@ def plain(parsed: Any) -> Any:
         return [plain(value) for value in parsed]
     if isinstance(parsed, bytes | bytearray):
         return parsed.hex(" ")
-    return (
-        getattr(parsed, "intvalue", None)
-        if isinstance(parsed, str)
-        else int(parsed)
-        if isinstance(parsed, int)
-        else number(parsed)
-    )
+    if isinstance(parsed, str):
+        return getattr(parsed, "intvalue", None)
+    if isinstance(parsed, int):
+        return int(parsed)
+    return number(parsed)

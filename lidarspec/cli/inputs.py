@@ -48,7 +48,8 @@ if TYPE_CHECKING:
     from lidarspec.transports.files import FileTransport
 
 #: longest hexadecimal text that is repeated in the next command, and of other text in a message.
-REPEATED, QUOTED = 400, 64
+REPEATED = 400
+QUOTED = 64
 #: bytes of an input of which the beginning is enough.
 MOST = 1 << 20
 #: seconds that a device is given for its first frame.
@@ -105,11 +106,10 @@ def _file(path: str, times: Times) -> Iterator[tuple[Heard, Iterator[Chunk]]]:
     from lidarspec.transports.open_url import transport
 
     with contextlib.closing(transport(path)) as file:
-        chunks = (
-            _standard_input(file)
-            if path == "-" and type(file) is FileTransport
-            else received(file, times, path)
-        )
+        if path == "-" and type(file) is FileTransport:
+            chunks = _standard_input(file)
+        else:
+            chunks = received(file, times, path)
         with _beginning(path, chunks, datagrams=file.datagrams, warnings=file.warnings) as given:
             yield given
         for warning in file.warnings if given[0].chunks else ():
@@ -138,7 +138,8 @@ def _standard_input(file: FileTransport) -> Iterator[Chunk]:
     """What comes over standard input, as it comes; hexadecimal text as the bytes that it stands
     for.
     """
-    head, stdin = sys.stdin.buffer.read(LOOKED_AT), sys.stdin.buffer
+    head = sys.stdin.buffer.read(LOOKED_AT)
+    stdin = sys.stdin.buffer
     if not is_hexadecimal(head, whole=len(head) < LOOKED_AT):
         yield Chunk(head)
         yield from file.chunks()
@@ -147,11 +148,9 @@ def _standard_input(file: FileTransport) -> Iterator[Chunk]:
 
     def readline(size: int) -> bytes:
         line = looked_at.readline(size)
-        return (
-            line
-            if line.endswith(b"\n") or len(line) == size
-            else line + stdin.readline(size - len(line))
-        )
+        if line.endswith(b"\n") or len(line) == size:
+            return line
+        return line + stdin.readline(size - len(line))
 
     yield from hex_chunks("standard input", readline)
 
@@ -202,11 +201,10 @@ def refuse_overwriting(
     ]
     files = [file for file in existing if os.path.isfile(file)]
     for path in [path for given in inputs for path in _read_for(given)] if files else ():
-        same = (
-            next((file for file in files if os.path.samefile(path, file)), None)
-            if os.path.exists(path)
-            else None
-        )
+        if os.path.exists(path):
+            same = next((file for file in files if os.path.samefile(path, file)), None)
+        else:
+            same = None
         if same is not None:
             name = "standard input" if path == 0 else f"read as {path}" if path != same else "read"
             raise UsageError(f"{same} is {name}: it would be overwritten")
@@ -276,11 +274,10 @@ def nearest_fault(given: Heard) -> WireError:
         return fault
     best = nearest(given.data)
     if best is None:
-        text = (
-            f"no frame of any of the {len(sensors())} installed sensors"
-            if sensors()
-            else "no frame of an installed sensor"
-        )
+        if sensors():
+            text = f"no frame of any of the {len(sensors())} installed sensors"
+        else:
+            text = "no frame of an installed sensor"
         if given.is_text:
             text = f"{given.source}: this is text, and {text} is in it"
         error = suggest_installation(WireError(text, data=given.data[:QUOTED]), given)
@@ -293,18 +290,19 @@ def _never_right(given: Heard) -> WireError | None:
     from lidarspec.detect.identification import never_right
 
     fault = never_right(given.chunks, datagrams=given.datagrams)
-    return (
-        suggest(WireError(f"{given.source}: {fault}"), f"lidarspec crc {quote(given.source)}")
-        if fault
-        else None
-    )
+    if fault:
+        return suggest(
+            WireError(f"{given.source}: {fault}"), f"lidarspec crc {quote(given.source)}"
+        )
+    return None
 
 
 def nothing_came(device: Device, source: str, seconds: float | None = None) -> LidarSpecError:
     """Why there is nothing to show: a plugin that raises, no data frame in a file, a silent device,
     or one whose bytes are no frames.
     """
-    sensor, stats = device.sensor, device.stats
+    sensor = device.sensor
+    stats = device.stats
     if (failure := stats.failure(sensor.id)) is not None:
         return failure
     if not device.is_live:
@@ -318,11 +316,10 @@ def nothing_came(device: Device, source: str, seconds: float | None = None) -> L
         if given is not None and given.is_text:
             error = WireError(f"{source} is text, and has no data frame: {stats}", sensor=sensor.id)
             return suggest(error, f"lidarspec detect {quote(source)}")
-        said = (
-            "; ".join([f"{source} has no data frame: {stats}", *device.warnings])
-            if stats.bytes_in
-            else no_bytes(source, device.warnings)
-        )
+        if stats.bytes_in:
+            said = "; ".join([f"{source} has no data frame: {stats}", *device.warnings])
+        else:
+            said = no_bytes(source, device.warnings)
         return suggest(
             WireError(said, sensor=sensor.id), f"lidarspec explain {quote(source)} -s {sensor.id}"
         )
@@ -409,7 +406,9 @@ class Patience:
     """
 
     def __init__(self, device: Device, source: str, frame: str | None = None) -> None:
-        self._device, self._source, self._began = device, source, time.monotonic()
+        self._device = device
+        self._source = source
+        self._began = time.monotonic()
         self._awaited = device.sensor.data_frames if frame is None else (frame,)
 
     def check(self) -> None:

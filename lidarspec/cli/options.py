@@ -141,7 +141,9 @@ class Number(click.ParamType):  # type: ignore[type-arg]  # older versions of cl
     """
 
     def __init__(self, name: str, parse: Callable[[str], Any], form: str) -> None:
-        self.name, self._parse, self._form = name, parse, form
+        self.name = name
+        self._parse = parse
+        self._form = form
 
     def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> Any:
         """The number."""

@@ -32,7 +32,9 @@ Function = TypeVar("Function", bound=Callable[..., Any])
 PERIOD = 0.2
 #: blanks between columns of a table; those before prose below its row; the least width of prose
 #: beside it.
-GAP, HANGING, PROSE = 2, 6, 24
+GAP = 2
+HANGING = 6
+PROSE = 24
 
 
 def output_options(function: Function) -> Function:
@@ -75,7 +77,8 @@ class Progress(contextlib.AbstractContextManager["Progress"]):
     """
 
     def __init__(self, unit: Callable[[float], str] = str, period: float = PERIOD) -> None:
-        self._is_shown, self._due = sys.stderr.isatty() and voice.loudness >= 0, 0.0
+        self._is_shown = sys.stderr.isatty() and voice.loudness >= 0
+        self._due = 0.0
         self._unit = unit
         self._period = period
         self._bar: Bar | None = None
@@ -115,7 +118,8 @@ class Progress(contextlib.AbstractContextManager["Progress"]):
         """Take the line away."""
         if self._bar is not None:
             self._bar.stop()
-            self._bar, self._due = None, 0.0
+            self._bar = None
+            self._due = 0.0
 
     def __exit__(self, *_: object) -> None:
         self.clear()
@@ -222,11 +226,10 @@ def table(headers: Sequence[str], rows: Sequence[Sequence[str]], output: str | N
     little for the last column, which has the prose, it stands in lines of its own below each row.
     """
     lines = [headers, *rows]
-    room = (
-        shutil.get_terminal_size().columns
-        if output is None and sys.stdout.isatty()
-        else sys.maxsize
-    )
+    if output is None and sys.stdout.isatty():
+        room = shutil.get_terminal_size().columns
+    else:
+        room = sys.maxsize
     widths = _widths(lines, room)
     full = max(len(line[-1]) for line in lines)
     hangs = widths[-1] < min(full, PROSE) or sum(widths) + GAP * (len(widths) - 1) > room
@@ -249,11 +252,9 @@ def _folded(line: Sequence[str], widths: Sequence[int], room: int) -> Iterator[s
     """The lines of one row; cells for which there is no width below it."""
 
     def wrapped(cell: str, width: int) -> list[str]:
-        return (
-            textwrap.wrap(cell, width, break_long_words=False, break_on_hyphens=False)
-            if len(cell) > width
-            else [cell]
-        )
+        if len(cell) > width:
+            return textwrap.wrap(cell, width, break_long_words=False, break_on_hyphens=False)
+        return [cell]
 
     cells = [wrapped(cell, width) for cell, width in zip(line, widths, strict=False)]
     for parts in itertools.zip_longest(*cells, fillvalue=""):

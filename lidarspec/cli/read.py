@@ -48,7 +48,9 @@ POINTS = {
 }
 #: digits of a packet's field, of a further column of points in float32, and the width of a column
 #: at least.
-DIGITS, SINGLE, NARROWEST = 10, 7, 8
+DIGITS = 10
+SINGLE = 7
+NARROWEST = 8
 #: digits of a float64 in JSON.
 KEPT = 14
 
@@ -134,7 +136,8 @@ def _points(scans: Iterable[Scan], *, every_point: bool) -> Iterator[tuple[Units
     units: Units = UNITS
     for number, scan in enumerate(scans):
         cloud = scan.points if every_point else scan.points[scan.points.valid]
-        columns, units = dict(cloud.columns), {**units, **cloud.units}
+        columns = dict(cloud.columns)
+        units = {**units, **cloud.units}
         for values in zip(*columns.values(), strict=True):
             yield units, {"scan": number, **dict(zip(columns, values, strict=True))}
 
@@ -145,7 +148,8 @@ def _packets(
     """The packets one by one, with the fields of their header in units; arrays as arrays."""
     if replace(selection, times=(None, None), time="device") != Selection():
         raise UsageError("packets are selected by --slice and --time alone")
-    wanted, number = Slice(selection.times), 0
+    wanted = Slice(selection.times)
+    number = 0
     for batch in device.packets(frame, wait=LOOK_S):
         patience.check()
         packets = batch.take(
@@ -194,20 +198,16 @@ def _plain(value: Any) -> Any:
     """A value as JSON takes it: null for nan and infinity, whole numbers without a point."""
     if isinstance(value, np.ndarray):
         return [_plain(item) for item in value]
-    number, single = (
-        value.item() if isinstance(value, np.generic) else value,
-        isinstance(value, np.float32),
-    )
+    number = value.item() if isinstance(value, np.generic) else value
+    single = isinstance(value, np.float32)
     if isinstance(number, float):
         if not math.isfinite(number):
             return None
         # a float32 has the digits that it prints; scales of ten leave their rounding in the last
         # digits of a float64
-        return (
-            int(number)
-            if number.is_integer() and abs(number) < 2**53
-            else float(str(value) if single else f"{number:.{KEPT}g}")
-        )
+        if number.is_integer() and abs(number) < 2**53:
+            return int(number)
+        return float(str(value) if single else f"{number:.{KEPT}g}")
     return number
 
 
@@ -395,7 +395,8 @@ def _by_the_packets(feed: Feed, lines: Lines, interval: float, lasting: float) -
     batch at least.
     """
     start: int | None = None
-    edges, passed = 0, 0.0
+    edges = 0
+    passed = 0.0
     while not feed.ended and passed < lasting:
         feed.pump(0.0)
         if not feed.packets:

@@ -187,14 +187,14 @@ def _plan(sensor: Sensor, frame: str) -> list[str]:
     from lidarspec.simulation.frame_maker import FrameMaker
 
     try:
-        made, sweep = FrameMaker(sensor, frame), sensor.simulation_of(frame).sweep
+        made = FrameMaker(sensor, frame)
+        sweep = sensor.simulation_of(frame).sweep
     except SpecError as error:
         return [f"plain evaluation: {error}"]
-    frames = (
-        made.sealed(made.table([sweep(index) for index in range(PACKETS)]))
-        if sweep
-        else [sensor.example(frame)]
-    )
+    if sweep:
+        frames = made.sealed(made.table([sweep(index) for index in range(PACKETS)]))
+    else:
+        frames = [sensor.example(frame)]
     sent = packed([Found(frame, 0, data) for data in frames])
     packets = PacketStream(sensor, frame, Counters()).add([sent]).with_points
     if not isinstance(packets.table, Rows) or not packets.table.groups:
@@ -297,11 +297,10 @@ def _command_text(sensor: Sensor, name: str) -> str:
         f" {name}={asked(argument.kind)}"
         for name, argument in sensor.commands[name].arguments.items()
     )
-    answer = (
-        f", answered by {command['reply']}{' while it is stopped' if command['only_stopped'] else ''}"
-        if command["reply"]
-        else ""
-    )
+    if command["reply"]:
+        answer = f", answered by {command['reply']}{' while it is stopped' if command['only_stopped'] else ''}"
+    else:
+        answer = ""
     return f"{args}{': ' if command['hex'] else ''}{command['hex']}{answer}"
 
 

@@ -45,7 +45,9 @@ if TYPE_CHECKING:
 #: seconds that go into a file where nobody says how many.
 IN_A_FILE = 10.0
 #: cells of the picture at most, and lines that are kept for the summary.
-WIDEST, HIGHEST, SUMMARY = 100, 42, 8
+WIDEST = 100
+HIGHEST = 42
+SUMMARY = 8
 PLACES = (
     f"pty, udp://HOST:PORT, tcp://HOST:PORT, or a file ({', '.join(SUFFIXES)}).  [default: pty or"
     " udp]"
@@ -199,7 +201,9 @@ def _watching(device: SimulatedDevice, opened: Outlet, progress: Progress) -> Ca
     """What is called while the sensor is at work: says which commands arrive, and that the plug was
     pulled.
     """
-    began, heard, present = time.monotonic(), 0, True
+    began = time.monotonic()
+    heard = 0
+    present = True
 
     def turn() -> None:
         nonlocal heard, present
@@ -208,7 +212,8 @@ def _watching(device: SimulatedDevice, opened: Outlet, progress: Progress) -> Ca
             events += [f"plugged in again, {opened.place}" if device.present else "unplugged"]
         for event in events:
             progress.note(f"{time.monotonic() - began:.1f} s: {event}")
-        heard, present = len(device.heard), device.present
+        heard = len(device.heard)
+        present = device.present
         progress(lambda: f"{time.monotonic() - began:.0f} s, {_sent(device)}")
 
     return turn
@@ -252,18 +257,21 @@ def demo(sensor_id: str | Sensor | None, count: int, errors: float, as_json: boo
 
 def _picture(scan: Scan) -> Text:
     columns, lines = shutil.get_terminal_size((80, HIGHEST))
-    width, height = min(columns, WIDEST), max(min(lines - SUMMARY, HIGHEST), 12)
+    width = min(columns, WIDEST)
+    height = max(min(lines - SUMMARY, HIGHEST), 12)
     return picture(scan.points, width=width, height=height, look=look(scan.points)).text()
 
 
 def _summary(result: Demonstration, whole: list[Scan], errors: float) -> list[str]:
-    stats, name = result.stats, result.sensor.id
+    stats = result.stats
+    name = result.sensor.id
     frames = sum(stats.frames.values())
     harm = "of the datagrams lost" if result.sensor.datagrams else "of the bytes damaged"
     lacks_pty = data_link(result.sensor, Serial) and not has_terminals()
-    where = (
-        f"{result.place}, since this system has no pseudo-terminals" if lacks_pty else result.place
-    )
+    if lacks_pty:
+        where = f"{result.place}, since this system has no pseudo-terminals"
+    else:
+        where = result.place
     passed = f"{errors:.1%} {harm}, {result.intact} came through unharmed"
     told = [
         f"{name}, simulated on {where}: {result.sent} frames sent, {passed}",

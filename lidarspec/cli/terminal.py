@@ -48,11 +48,10 @@ def say(content: str | bytes, *, nl: bool = True, colour: bool | None = None) ->
         SourceError: where it cannot be written otherwise.
     """
     if isinstance(content, str):
-        content = (
-            printable(content)
-            if colour is None
-            else "".join(map(_coloured, _COLOURS.split(content)))
-        )
+        if colour is None:
+            content = printable(content)
+        else:
+            content = "".join(map(_coloured, _COLOURS.split(content)))
     with _written():
         click.echo(content, nl=nl, color=colour)
 

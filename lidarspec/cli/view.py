@@ -254,7 +254,8 @@ def _printed(device: Device, source: str, ramp: str, patience: float, selection:
     Raises:
         WireError, CommandError: where none comes.
     """
-    feed, end = Feed(device, select=selection), time.monotonic() + patience
+    feed = Feed(device, select=selection)
+    end = time.monotonic() + patience
     while (
         not feed.ended
         and time.monotonic() < end

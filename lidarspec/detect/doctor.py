@@ -80,9 +80,10 @@ def computer() -> Iterator[Finding]:
 
 
 def _file(path: str, sensor: Sensor | None) -> Iterator[Finding]:
-    name = (
-        path if os.path.exists(path) else path.rpartition("?")[0]
-    )  # what stands behind it chooses a sender
+    if os.path.exists(path):
+        name = path
+    else:
+        name = path.rpartition("?")[0]  # what stands behind it chooses a sender
     if not os.path.exists(name):
         yield Finding(False, f"{path}: no such file or port", "lidarspec ports")
     elif not os.access(name, os.R_OK):
@@ -141,13 +142,15 @@ def _in_use(port: str) -> Iterator[Finding]:
 
 
 def _udp(source: str, address: Address, sensor: Sensor | None, seconds: float) -> Iterator[Finding]:
-    numbers, host = _udp_numbers(address, sensor), address.host_and_port()[0]
+    numbers = _udp_numbers(address, sensor)
+    host = address.host_and_port()[0]
     busy = [finding for number in numbers for finding in _port_in_use(number)]
     yield from busy
     yield from _buffer()
     if busy:
         return
-    before, began = ports.received(), time.monotonic()
+    before = ports.received()
+    began = time.monotonic()
     found = list(_heard(source, sensor, seconds))
     yield from found
     if any("nothing came" in finding.text for finding in found):
@@ -159,7 +162,8 @@ def _udp(source: str, address: Address, sensor: Sensor | None, seconds: float) -
 
 
 def _udp_numbers(address: Address, sensor: Sensor | None) -> list[int]:
-    port, given = address.host_and_port()[1], address.options.get("port", "")
+    port = address.host_and_port()[1]
+    given = address.options.get("port", "")
     if given:
         return [int(part) for part in given.split(",") if part.isdecimal()]
     link = data_link(sensor, Udp)
@@ -225,11 +229,10 @@ def _interfaces(numbers: list[int], host: str, rates: dict[str, float]) -> Itera
 def _heard(source: str, sensor: Sensor | None, seconds: float) -> Iterator[Finding]:
     """What comes, and whether it is what should come."""
     try:
-        tried = (
-            [verdict(heard) for heard in heard_as(source, sensor, seconds)]
-            if sensor is not None
-            else []
-        )
+        if sensor is not None:
+            tried = [verdict(heard) for heard in heard_as(source, sensor, seconds)]
+        else:
+            tried = []
         if not any(one.scores for one in tried):
             tried += verdicts(source, seconds=seconds)
     except LidarSpecError as error:
@@ -260,7 +263,8 @@ def _several(source: str, found: Sequence[Verdict]) -> Iterator[Finding]:
 
 def _verdict(source: str, found: Verdict, sensor: Sensor | None) -> Finding:
     """One finding on what was heard."""
-    heard, ids = found.heard, [score.sensor.id for score in found.scores]
+    heard = found.heard
+    ids = [score.sensor.id for score in found.scores]
     may_be = {score.sensor.id: score.why for score in found.alike} or dict(found.others)
     quoted = quote(source)
     if not heard.size and heard.warnings:
@@ -288,9 +292,10 @@ def _verdict(source: str, found: Verdict, sensor: Sensor | None) -> Finding:
     name = sensor.id if sensor is not None else ids[0]
     if name not in may_be:
         other, why = next(iter(may_be.items()))
-        command = (
-            f"lidarspec view {quoted} -s {other}" if found.alike else f"lidarspec detect {quoted}"
-        )
+        if found.alike:
+            command = f"lidarspec view {quoted} -s {other}"
+        else:
+            command = f"lidarspec detect {quoted}"
         return Finding(False, f"it sends frames of {other} ({why}){at}, not of {name}", command)
     score = next(score for score in found.scores if score.sensor.id == name)
     link = data_link(score.sensor, Serial)

@@ -75,7 +75,8 @@ def beginning(opened: Transport, most: int, *, number: int | None = None) -> lis
 
 def leading(chunks: Iterable[Chunk], most: int) -> list[Chunk]:
     """The first chunks, up to the one with which there are so many bytes."""
-    found, size = list[Chunk](), 0
+    found = list[Chunk]()
+    size = 0
     for chunk in chunks:
         found.append(chunk)
         size += len(chunk.data)

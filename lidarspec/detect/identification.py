@@ -52,13 +52,17 @@ from lidarspec.transports.protocol import no_bytes
 
 #: share by which the pace of a clock may be off, frames of a type that are looked into for names,
 #: and packets simulated.
-OFF, READ, PACKETS = 0.03, 3, 64
+OFF = 0.03
+READ = 3
+PACKETS = 64
 _VALUE = re.compile(r"\b(0x[0-9a-fA-F]+|\d+)\s+([^,;:]+)")
 #: bytes that an error shows.
 SHOWN = 16
 #: share of the bytes that has to be in a sensor's frames for it to fit, how close to the best
 #: another is as good, and what is beyond doubt.
-FITS, AS_GOOD, CLEAR = 0.2, 0.01, 0.9
+FITS = 0.2
+AS_GOOD = 0.01
+CLEAR = 0.9
 #: data frames one after another that are no chance even where no checksum is right.
 RHYTHM = 3
 
@@ -85,10 +89,8 @@ def told_apart(candidates: Sequence[Sensor], found: Mapping[str, Sequence[Found]
         candidates: sensors whose data frames these are alike.
         found: frames as each of them reads the bytes, by id, in the order of their arrival.
     """
-    ids, shown = (
-        {sensor.id for sensor in candidates},
-        {sensor.id: _shown(sensor, found[sensor.id]) for sensor in candidates},
-    )
+    ids = {sensor.id for sensor in candidates}
+    shown = {sensor.id: _shown(sensor, found[sensor.id]) for sensor in candidates}
     left = [sensor for sensor in candidates if not shown[sensor.id]]
     if not left:
         return Told(
@@ -181,15 +183,15 @@ def _by_clock(sensor: Sensor, found: Sequence[Found]) -> str:
             else [item.data for item in data]
         )
     )
-    expected = (
-        _pace(sensor.id, sensor)
-        if sensor.clock.pace is None
-        else _declared_pace(sensor.clock.pace, packets)
-    )
+    if sensor.clock.pace is None:
+        expected = _pace(sensor.id, sensor)
+    else:
+        expected = _declared_pace(sensor.clock.pace, packets)
     if expected is None or len(packets) < 3:
         return ""
     if sensor.datagrams:  # lost, doubled and swapped ones leave most steps as they were
-        step, grain = float(np.median(np.diff(np.sort(packets.time_ns)))), 0.0
+        step = float(np.median(np.diff(np.sort(packets.time_ns))))
+        grain = 0.0
     else:  # a clock may be coarse, and what is lost is seen
         follows = np.array(
             [
@@ -201,9 +203,9 @@ def _by_clock(sensor: Sensor, found: Sequence[Found]) -> str:
         steps = steps[(steps >= 0) & (steps <= 10 * expected)]
         if len(steps) < 2:
             return ""
-        step, grain = (
-            float(steps.mean()),
-            min(float(np.ptp(steps)), expected) / (2 * len(steps) ** 0.5),
+        step = float(steps.mean())
+        grain = min(float(np.ptp(steps)), expected) / (
+            2 * len(steps) ** 0.5
         )  # as uneven as its steps
     if abs(step - expected) > OFF * expected + grain:
         return ""
@@ -258,7 +260,8 @@ def said(sensor: Sensor, found: Iterable[Found]) -> dict[str, str]:
     """What the last of these frames say of the device itself, as the sensor's `info` declares: role
     -> text, a number with its unit.
     """
-    last, told = {item.frame: item for item in found}, dict[str, str]()
+    last = {item.frame: item for item in found}
+    told = dict[str, str]()
     for role, path in sensor.info.items():
         frame, _, field = path.partition(".")
         if frame in last:
@@ -267,11 +270,10 @@ def said(sensor: Sensor, found: Iterable[Found]) -> dict[str, str]:
                 told[role] = ".".join(map(str, value))  # a version
             elif isinstance(value, bytes):
                 text = value.rstrip(b"\0 ")
-                told[role] = (
-                    text.decode("ascii")
-                    if text.isascii() and text.decode("ascii").isprintable()
-                    else value.hex()
-                )
+                if text.isascii() and text.decode("ascii").isprintable():
+                    told[role] = text.decode("ascii")
+                else:
+                    told[role] = value.hex()
             else:
                 told[role] = _text(value, info) or (
                     f"{info.physical(value):g} {info.unit}".rstrip()
@@ -285,11 +287,13 @@ def _field(sensor: Sensor, item: Found, path: str) -> tuple[Any, FieldInfo]:
     """The raw value of a field of a frame, or of the first of its parts that has it ("" where none
     has), and what is known of the field.
     """
-    fields, parsed = schema(sensor.frames[item.frame].tree), sensor.parse(item.data, item.frame)
+    fields = schema(sensor.frames[item.frame].tree)
+    parsed = sensor.parse(item.data, item.frame)
     axis, _, rest = fields.within(path) or ("", "", path)
-    wholes = (
-        [part for part in _at(parsed, axis) if rest.partition(".")[0] in part] if axis else [parsed]
-    )
+    if axis:
+        wholes = [part for part in _at(parsed, axis) if rest.partition(".")[0] in part]
+    else:
+        wholes = [parsed]
     return next((_at(whole, rest) for whole in wholes), ""), fields.named[path]
 
 
@@ -442,13 +446,11 @@ def _score(
         items = decoder.feed(b"".join(chunks))
     items += decoder.finish()
     number = sum(decoder.stats.frames.get(name, 0) for name in sensor.data_frames)
-    return (
-        Score(
+    if number:
+        return Score(
             sensor, 1 - decoder.stats.bytes_skipped / decoder.stats.bytes_in, number, tuple(items)
         )
-        if number
-        else None
-    )
+    return None
 
 
 def _from_the_middle(sensor: Sensor, chunks: Sequence[bytes], *, datagrams: bool) -> Score | None:
@@ -648,11 +650,10 @@ def _nothing(source: str, found: Sequence[Verdict]) -> Exception:
         return suggest_installation(error, heard)
     if live_address(source) is None:
         return WireError(no_bytes(source, heard.warnings))
-    why = (
-        heard.warnings[0]
-        if heard.warnings
-        else f"{source}: nothing comes; a sensor that has to be started first is named with -s"
-    )
+    if heard.warnings:
+        why = heard.warnings[0]
+    else:
+        why = f"{source}: nothing comes; a sensor that has to be started first is named with -s"
     return suggest(CommandError(why), f"lidarspec doctor {quote(source)}")
 
 

@@ -27,12 +27,15 @@ from lidarspec.transports.open_url import live, live_address, transport
 from lidarspec.transports.protocol import Chunk, Disconnected, LiveTransport, endpoint, sender_names
 
 #: datagrams that are looked at; of a live source, bytes that are enough.
-DATAGRAMS, PLENTY = 400, 1 << 14
+DATAGRAMS = 400
+PLENTY = 1 << 14
 #: seconds to listen for, and between two looks.
-LISTEN, LOOK = 1.2, 0.1
+LISTEN = 1.2
+LOOK = 0.1
 #: seconds to wait for data: of a device that has answered, and a motor may have to come up; and of
 #: one that has not.
-ANSWERED, UNANSWERED = 4.0, 1.0
+ANSWERED = 4.0
+UNANSWERED = 1.0
 #: seconds that one read takes at most, and after which the line counts as silent.
 TURN = 0.05
 #: seconds for the commands that stop it again.
@@ -77,7 +80,8 @@ def hear(
     Raises:
         SourceError: where it cannot be opened.
     """
-    text, address = str(source), live_address(source)
+    text = str(source)
+    address = live_address(source)
     if address is not None and address.scheme == "serial" and "baud" not in address.options:
         if has_no_baud(address.place):
             tell(text)
@@ -122,18 +126,16 @@ def has_no_baud(port: str) -> bool:
 def _heard(source: str, seconds: float, baud: int | None, name: str) -> Iterator[Heard]:
     with contextlib.closing(transport(source)) as opened:
         number = DATAGRAMS if opened.datagrams else None
-        chunks = (
-            _listened(opened, seconds)
-            if isinstance(opened, LiveTransport)
-            else beginning(opened, LOOKED_AT, number=number)
-        )
-        said = (
-            tuple(opened.warnings)
-            if not isinstance(opened, LiveTransport)
-            else ()
-            if chunks
-            else _strangers(opened)
-        )
+        if isinstance(opened, LiveTransport):
+            chunks = _listened(opened, seconds)
+        else:
+            chunks = beginning(opened, LOOKED_AT, number=number)
+        if not isinstance(opened, LiveTransport):
+            said = tuple(opened.warnings)
+        elif chunks:
+            said = ()
+        else:
+            said = _strangers(opened)
     yield from _by_sender(Heard(name, (), opened.datagrams, baud, warnings=said), chunks)
 
 
@@ -161,15 +163,16 @@ def heard_as(source: str | Path, sensor: Sensor, seconds: float) -> list[Heard]:
     """What comes over a live source within some seconds, of each sender, where it is opened as a
     sensor declares; [] where nothing does.
     """
-    address, chunks = live_address(source), list[Chunk]()
+    address = live_address(source)
+    chunks = list[Chunk]()
     with contextlib.closing(transport(source, sensor)) as opened:
         end = time.monotonic() + seconds
         while (left := end - time.monotonic()) > 0 and isinstance(opened, LiveTransport):
             chunks += opened.read(min(left, LOOK))
     baud = None if address is not None and has_no_baud(address.place) else opened.baud
-    return (
-        list(_by_sender(Heard(str(source), (), opened.datagrams, baud), chunks)) if chunks else []
-    )
+    if chunks:
+        return list(_by_sender(Heard(str(source), (), opened.datagrams, baud), chunks))
+    return []
 
 
 def _listened(opened: LiveTransport, seconds: float) -> list[Chunk]:
@@ -201,7 +204,8 @@ def probe(source: str | Path) -> Iterator[Heard]:
     Raises:
         SourceError: where the port cannot be opened.
     """
-    address, tried = live_address(source), set[object]()
+    address = live_address(source)
+    tried = set[object]()
     if address is None or address.scheme != "serial":
         return
     plain = has_no_baud(address.place)
@@ -222,8 +226,10 @@ class _Probe:
     """One conversation with a port."""
 
     def __init__(self, sensor: Sensor, opened: LiveTransport) -> None:
-        self._sensor, self._opened = sensor, opened
-        self._session, self._decoder = Session(sensor), Decoder(sensor, stream=True)
+        self._sensor = sensor
+        self._opened = opened
+        self._session = Session(sensor)
+        self._decoder = Decoder(sensor, stream=True)
         self._heard: list[bytes] = []
 
     def run(self) -> list[bytes]:
@@ -256,11 +262,10 @@ class _Probe:
                     self._opened.lines(**out.lines)
                 self._opened.write(out.data)
             chunks = self._opened.read(TURN)
-            found = (
-                [item for chunk in chunks for item in self._decoder.feed(chunk.data)]
-                if chunks
-                else self._decoder.idle()
-            )
+            if chunks:
+                found = [item for chunk in chunks for item in self._decoder.feed(chunk.data)]
+            else:
+                found = self._decoder.idle()
             self._heard += [chunk.data for chunk in chunks]
             self._session.receive(found, time.monotonic_ns())
 

@@ -77,11 +77,10 @@ class Input(Protocol):
             for name in telling.intersection(frames.names):
                 where = np.flatnonzero(np.equal(frames.kinds, frames.names.index(name)))
                 for item in frames.only(where[-1:]).found():
-                    known = (
-                        [self.told[name]]
-                        if name in self.told and schema(self.sensor.frames[name].tree).parts
-                        else []
-                    )
+                    if name in self.told and schema(self.sensor.frames[name].tree).parts:
+                        known = [self.told[name]]
+                    else:
+                        known = []
                     if (
                         said(self.sensor, known).keys()
                         <= said(self.sensor, [item] if known else []).keys()
@@ -206,7 +205,8 @@ def _streamed(decoder: Decoder, packets: Batch, together: int) -> Iterator[list[
     """The frames that the packets of a byte stream complete, with the times of the packets that
     hold their last bytes.
     """
-    data, ends = packets.joined, decoder.stats.bytes_in + np.cumsum(packets.sizes)
+    data = packets.joined
+    ends = decoder.stats.bytes_in + np.cumsum(packets.sizes)
     at = np.where(packets.at, packets.at, -1)  # nobody knows
     for start in range(0, len(data), together):
         found = decoder.frames(data[start : start + together])
@@ -225,7 +225,8 @@ def answers(found: Sequence[Frames], awaited: frozenset[str]) -> list[Found]:
 
 
 #: bytes or datagrams decoded together.
-BATCH_BYTES, BATCH_CHUNKS = 1 << 18, 1024
+BATCH_BYTES = 1 << 18
+BATCH_CHUNKS = 1024
 
 
 class FileInput(Input):
@@ -242,7 +243,9 @@ class FileInput(Input):
     def __init__(
         self, source: str | Path, sensor: Sensor, opened: Transport, *, backend: str
     ) -> None:
-        self._source, self.sensor, self._transport = source, sensor, opened
+        self._source = source
+        self.sensor = sensor
+        self._transport = opened
         self.decoder: Decoder = sensor.decoder(stream=not opened.datagrams, backend=backend)
         self.senders = Senders(source, sensor)
         self._together = 0  # bytes; 0: as many as are worth it
@@ -254,7 +257,8 @@ class FileInput(Input):
 
     @property
     def warnings(self) -> list[str]:
-        said, stats = list(self._transport.warnings), self.decoder.stats
+        said = list(self._transport.warnings)
+        stats = self.decoder.stats
         if (
             self.state == "ended"
             and stats.bytes_in
@@ -270,11 +274,9 @@ class FileInput(Input):
     @property
     def stats(self) -> Counters:
         stats = self.decoder.stats
-        stats.foreign, stats.disconnects, stats.unread = (
-            self._transport.foreign,
-            self._transport.disconnects,
-            self._transport.unread,
-        )
+        stats.foreign = self._transport.foreign
+        stats.disconnects = self._transport.disconnects
+        stats.unread = self._transport.unread
         return stats
 
     @property
@@ -375,7 +377,8 @@ class FileInput(Input):
                 or len(found) >= BATCH_CHUNKS
             ):
                 yield found
-                found, size = [], 0
+                found = []
+                size = 0
             found.append(chunk)
             size += len(chunk.data)
         if found:

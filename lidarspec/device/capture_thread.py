@@ -26,9 +26,11 @@ from lidarspec.transports.host_clock import HostClock
 from lidarspec.transports.protocol import POLL, Chunk, Disconnected, LiveTransport
 
 #: what waits in a queue at most: chunks, and bytes in them; several seconds of the fastest sensors.
-CHUNKS, BYTES = 1 << 16, 1 << 25
+CHUNKS = 1 << 16
+BYTES = 1 << 25
 #: seconds between attempts to find a device again, at first and at most.
-SOON, LATER = 0.02, 0.25
+SOON = 0.02
+LATER = 0.25
 POLICIES = ("drop_oldest", "block")
 
 
@@ -61,7 +63,9 @@ class BoundedQueue:
     ) -> None:
         if policy not in POLICIES:
             raise UsageError(f"a full queue can {' or '.join(POLICIES)}, not {policy!r}")
-        self._blocks, self._most, self._largest = policy == "block", chunks, size
+        self._blocks = policy == "block"
+        self._most = chunks
+        self._largest = size
         self._events: deque[Event] = deque()
         self._kept: dict[Event, None] = {}
         self._cut: set[str] = set()
@@ -183,15 +187,17 @@ class Capture:
         log: Log | None = None,
         clock: HostClock | None = None,
     ) -> None:
-        self.transport, self.connected, self.disconnects, self.last = (
-            transport,
-            True,
-            0,
-            time.monotonic(),
-        )
-        self._queue, self._link, self._log = queue, link, log
-        self._clock, self.warnings = clock or HostClock(), list[str]()
-        self._stop, self._handing = threading.Event(), threading.Lock()
+        self.transport = transport
+        self.connected = True
+        self.disconnects = 0
+        self.last = time.monotonic()
+        self._queue = queue
+        self._link = link
+        self._log = log
+        self._clock = clock or HostClock()
+        self.warnings = list[str]()
+        self._stop = threading.Event()
+        self._handing = threading.Lock()
         self._thread = threading.Thread(target=self._run, name=f"capture of {link}", daemon=True)
         self._thread.start()
 
@@ -215,7 +221,9 @@ class Capture:
 
     def _run(self) -> None:
         try:
-            silence, gap, quiet = 0.0, False, False
+            silence = 0.0
+            gap = False
+            quiet = False
             while not self._stop.is_set():
                 began = time.monotonic()
                 try:
@@ -223,12 +231,16 @@ class Capture:
                 except Disconnected:
                     if not self._found_again():
                         return
-                    silence, gap, quiet = 0.0, True, False
+                    silence = 0.0
+                    gap = True
+                    quiet = False
                     continue
                 if chunks:
                     self.last = time.monotonic()
                     self._hand_on(chunks, gap=gap, quiet=quiet)
-                    silence, gap, quiet = 0.0, False, False
+                    silence = 0.0
+                    gap = False
+                    quiet = False
                     continue
                 silence += time.monotonic() - began
                 if silence >= self.transport.silence and not quiet:
@@ -276,7 +288,8 @@ class Capture:
                 self.transport.reopen()
             except SourceError:
                 continue
-            self.connected, self.last = True, time.monotonic()
+            self.connected = True
+            self.last = time.monotonic()
             self._tell(Mark.BACK, "reconnect")
             return True
         return False

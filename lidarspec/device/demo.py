@@ -84,7 +84,8 @@ def demonstrate(
     with tempfile.TemporaryDirectory(prefix="lidarspec-demo-") as folder:
         path = Path(folder) / "demo.lsr"
         place, replies, scans, stats = _live(sensor, simulated, path, turns)
-        line, recorded = simulated.lines["data"], path.stat().st_size
+        line = simulated.lines["data"]
+        recorded = path.stat().st_size
         with open_device(path, sensor) as recording:
             again = digest(
                 list(itertools.islice((scan for scan in recording.scans() if scan.whole), turns))

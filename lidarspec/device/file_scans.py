@@ -61,7 +61,8 @@ class FileScans(Closing):
         if isinstance(opened, LiveTransport):
             opened.close()
             raise UsageError(f"{source} is no file")
-        self._sensor, self._transport = sensor, opened
+        self._sensor = sensor
+        self._transport = opened
         try:
             self._input = FileInput(source, sensor, opened, backend="auto")
             if bookmark is None:
@@ -97,7 +98,8 @@ class FileScans(Closing):
         Args:
             size: bytes of the piece, at least.
         """
-        number, end = 0, self._place + size
+        number = 0
+        end = self._place + size
         while (scans := self._next()) is not None:
             number += sum(1 for _ in scans)
             if self._place >= end and (bookmark := self._bookmark()) is not None:
@@ -158,7 +160,8 @@ class FileScans(Closing):
 
 def _constants(sensor: Spec, decoder: Decoder) -> dict[tuple[Any, ...], Any]:
     """What no byte changes, by name: all that a sensor holds, and what is made of it alone."""
-    found, interpreted = dict[tuple[Any, ...], Any](), decoder.backend == "construct"
+    found = dict[tuple[Any, ...], Any]()
+    interpreted = decoder.backend == "construct"
     _walk(sensor, (), found, set())
     codecs = {
         ("codec", name): codec(frame, interpreted=interpreted)

@@ -49,7 +49,8 @@ PATIENCE = 0.9
 SILENT_AFTER_S = 3.0
 #: seconds between two decodings of what has come, and the longest that a wait goes on before others
 #: have their turn.
-PERIOD, TURN = 0.02, 0.05
+PERIOD = 0.02
+TURN = 0.05
 #: chunks decoded together.
 TOGETHER = 4096
 #: batches that are kept for whoever iterates next, while commands are sent.
@@ -74,15 +75,14 @@ class Watch:
         decoder: Decoder,
         kept: Kept,
     ) -> None:
-        self._source, self._sensor, self._transport, self._capture, self._decoder = (
-            source,
-            sensor,
-            opened,
-            capture,
-            decoder,
-        )
+        self._source = source
+        self._sensor = sensor
+        self._transport = opened
+        self._capture = capture
+        self._decoder = decoder
         self._kept = kept
-        self._framed, self._bytes = time.monotonic(), 0
+        self._framed = time.monotonic()
+        self._bytes = 0
         self._unframed_since: float | None = None
         self._strangers_since: float | None = None
         self.streams = False
@@ -94,11 +94,9 @@ class Watch:
     def saw(self, found: Sequence[Frames]) -> None:
         """Take note of what was decoded."""
         if any(map(len, found)):
-            self._framed, self._bytes, self._unframed_since = (
-                time.monotonic(),
-                self._decoder.stats.bytes_in,
-                None,
-            )
+            self._framed = time.monotonic()
+            self._bytes = self._decoder.stats.bytes_in
+            self._unframed_since = None
             if not self.streams:
                 self.streams = any(
                     frame.data and name in self._decoder.stats.frames
@@ -213,31 +211,45 @@ class LiveInput(Input):
         learns: bool = False,
         period: float = PERIOD,
     ) -> None:
-        self._source, self.sensor, self._record, self._period = source, sensor, record, period
-        self._teachers = (
-            [name for name in sensor.on_open if sensor.commands[name].learns is not None]
-            if learns
-            else []
-        )
+        self._source = source
+        self.sensor = sensor
+        self._record = record
+        self._period = period
+        if learns:
+            self._teachers = [
+                name for name in sensor.on_open if sensor.commands[name].learns is not None
+            ]
+        else:
+            self._teachers = []
         self._recorder = None if self._teachers else record(sensor)
         self.learned: dict[str, Any] = {}
         chosen = backend_named(backend)
-        self._backend = (
-            "numpy" if chosen == "auto" else chosen
-        )  # none by itself that stops to compile: nothing would be decoded meanwhile
-        self.queue, self._session = BoundedQueue(policy), Session(sensor)
+        if chosen == "auto":
+            self._backend = "numpy"
+        else:
+            self._backend = (
+                chosen  # none by itself that stops to compile: nothing would be decoded meanwhile
+            )
+        self.queue = BoundedQueue(policy)
+        self._session = Session(sensor)
         self.decoder: Decoder = sensor.decoder(stream=not opened.datagrams, backend=self._backend)
-        self._decoders, self._captures = {"data": self.decoder}, {}
-        self._kept, self._ready = Kept(source, sensor, datagrams=opened.datagrams), deque[Arrival]()
+        self._decoders = {"data": self.decoder}
+        self._captures = {}
+        self._kept = Kept(source, sensor, datagrams=opened.datagrams)
+        self._ready = deque[Arrival]()
         self._answering: dict[str, Kept] = {}  # who answers what was broadcast, by link
         self._clock = HostClock()
-        self._turn, self._talk = threading.RLock(), threading.RLock()
-        self._due, self._stops, self._closed = 0.0, False, False
+        self._turn = threading.RLock()
+        self._talk = threading.RLock()
+        self._due = 0.0
+        self._stops = False
+        self._closed = False
         self._failure: SourceError | None = None
         self.stays_on = False
         self._said: list[str] = []
         self._captures["data"] = Capture(opened, self.queue, log=self._recorder)
-        self._checked, self._silent = list[Pending](), list[CommandError]()
+        self._checked = list[Pending]()
+        self._silent = list[CommandError]()
         self._watch = Watch(
             source, sensor, opened, self._captures["data"], self.decoder, self._kept
         )
@@ -272,7 +284,8 @@ class LiveInput(Input):
 
     @property
     def stats(self) -> Counters:
-        stats, captures = self.decoder.stats, list(self._captures.values())
+        stats = self.decoder.stats
+        captures = list(self._captures.values())
         stats.kernel_drops = sum(capture.transport.kernel_drops for capture in captures)
         others = sum(kept.foreign for kept in self._answering.values())
         stats.foreign = (
@@ -515,11 +528,10 @@ class LiveInput(Input):
             elif run is Mark.BACK:
                 self._start_again()
         elif self._failure is None and not self._closed:
-            self._failure = (
-                run
-                if isinstance(run, SourceError)
-                else SourceError(f"{self._source}: nothing is read any more: {run}")
-            )
+            if isinstance(run, SourceError):
+                self._failure = run
+            else:
+                self._failure = SourceError(f"{self._source}: nothing is read any more: {run}")
             self._failure.__cause__ = None if run is self._failure else run
 
     def _decode(self, link: str, chunks: list[Chunk]) -> None:
@@ -594,10 +606,8 @@ class LiveInput(Input):
         """Say it where the sensor that came back says something else of itself: it may be another
         one.
         """
-        done, self._checked = (
-            [one for one in self._checked if one.done],
-            [one for one in self._checked if not one.done],
-        )
+        done = [one for one in self._checked if one.done]
+        self._checked = [one for one in self._checked if not one.done]
         for pending in done:
             with contextlib.suppress(CommandError):
                 again = learned(self.sensor, pending.result())

@@ -35,7 +35,8 @@ class Senders:
     """
 
     def __init__(self, source: str | Path, sensor: Sensor) -> None:
-        self._source, self._sensor = source, sensor
+        self._source = source
+        self._sensor = sensor
         self._owner: Sender | None = None
         self._now: dict[str, Sender] = {}  # who sends the frames of a type, and who did before
         self._before: dict[str, dict[Sender, None]] = {}
@@ -56,7 +57,8 @@ class Senders:
         """The port that frames of a type came from until now, where it took turns with this one;
         else None, and they come from this one.
         """
-        known, before = self._now.setdefault(name, sender), self._before.setdefault(name, {})
+        known = self._now.setdefault(name, sender)
+        before = self._before.setdefault(name, {})
         if sender == known or sender in before:
             return None if sender == known else known
         if len(before) == SENDERS:
@@ -91,9 +93,11 @@ class Kept(Senders):
 
     def __init__(self, source: str | Path, sensor: Sensor, *, datagrams: bool) -> None:
         super().__init__(source, sensor)
-        self.foreign, self.has_changed = 0, False
+        self.foreign = 0
+        self.has_changed = False
         self.stranger: Sender | None = None
-        self._is_sure, self._datagrams = False, datagrams
+        self._is_sure = False
+        self._datagrams = datagrams
         self._first: Sender | None = None  # whose stream is read while nobody has sent a frame
         self._probes: dict[Sender, Decoder] = {}
         self._strangers: dict[
@@ -112,7 +116,8 @@ class Kept(Senders):
 
     def choose(self, sender: Sender) -> None:
         """Take a sender for the sensor, since it has answered on another link."""
-        self._owner, self._is_sure = self._owner if self._is_sure else sender, True
+        self._owner = self._owner if self._is_sure else sender
+        self._is_sure = True
 
     @property
     def warnings(self) -> list[str]:
@@ -219,7 +224,8 @@ class Kept(Senders):
         return self._now[name]
 
     def _leave_out(self, sender: Sender | None) -> None:
-        self.foreign, self.stranger = self.foreign + 1, self.stranger or sender
+        self.foreign = self.foreign + 1
+        self.stranger = self.stranger or sender
 
 
 def frame_senders(chunks: Sequence[Chunk], found: Frames, end: int) -> list[tuple[str, Sender]]:

@@ -284,7 +284,9 @@ class Session:
     """
 
     def __init__(self, sensor: Sensor) -> None:
-        self.sensor, self.started, self.late = sensor, False, 0
+        self.sensor = sensor
+        self.started = False
+        self.late = 0
         self.host: str | None = None
         self.unanswered: dict[str, CommandError] = {}
         self._count = 0
@@ -331,7 +333,8 @@ class Session:
 
     def outgoing(self) -> list[Outgoing]:
         """What is to be sent now, in order; each is given out once."""
-        out, self._out = self._out, []
+        out = self._out
+        self._out = []
         return out
 
     def awaited(self, link: str = "data") -> frozenset[str]:
@@ -453,11 +456,10 @@ class Session:
         current = line.current
         if self._is_refusal(line, item, values, now):
             return
-        differs = (
-            ["not asked for"]
-            if current is None or current.expected is None
-            else current.expected.differs(item.frame, values)
-        )
+        if current is None or current.expected is None:
+            differs = ["not asked for"]
+        else:
+            differs = current.expected.differs(item.frame, values)
         if current is not None and not differs and now >= current.sent[0]:
             reply = Reply(
                 current.name, item.frame, values, True, now, item.data, self._table(item.frame)
@@ -566,11 +568,10 @@ def _silence(sensor: Sensor, request: _Request) -> CommandError:
     if request.wrong:
         return CommandError(f"{place}: the device answered with {request.wrong}")
     often = f", sent {len(request.sent)} times" if len(request.sent) > 1 else ""
-    stop = (
-        next((name for name, command in sensor.commands.items() if command.stops), "stop")
-        if request.command.only_stopped
-        else ""
-    )
+    if request.command.only_stopped:
+        stop = next((name for name, command in sensor.commands.items() if command.stops), "stop")
+    else:
+        stop = ""
     hint = f"; it is answered only while the sensor is stopped: send {stop!r} first" if stop else ""
     waited = f"{request.timeout / SECOND:g} s{often}"
     return ReplyTimeout(

@@ -75,11 +75,10 @@ class Named:
             return found
         place = f"{self.file}: [device.{self.name}]"
         try:
-            options = (
-                self.options
-                if self.believed
-                else found.configure.options_of_file(self.options, Path(self.file).parent)
-            )
+            if self.believed:
+                options = self.options
+            else:
+                options = found.configure.options_of_file(self.options, Path(self.file).parent)
         except UsageError as error:
             raise self._asking(UsageError(f"{place}: {error}")) from None
         try:
@@ -92,7 +91,9 @@ class Named:
         """Why a file that is not believed cannot have this device; None where it can."""
         if self.believed:
             return None
-        folder, file, reason = Path(self.file).parent, self.source.partition("?")[0], ""
+        folder = Path(self.file).parent
+        file = self.source.partition("?")[0]
+        reason = ""
         if self.sensor is not None and names_file(self.sensor):
             reason = f"sensor {self.sensor!r} is Python, which would run"
         elif is_stored(self.source):
@@ -175,7 +176,8 @@ def files() -> list[Path]:
     """The settings files that count here: the user's own, then the nearest one of a project;
     others' are passed over, with a warning.
     """
-    own, here = own_settings(), Path.cwd()
+    own = own_settings()
+    here = Path.cwd()
     found = [own] if os.path.isfile(own) else []
     for path in (folder / FILE for folder in (here, *here.parents)):
         if path == own or not os.path.isfile(path):
@@ -250,11 +252,10 @@ def _mount(path: Path, place: str, given: Mapping[str, Any]) -> Mount:
     kinds = {f.name: type(f.default) for f in fields(Mount)}
     _check_keys(path, f"{place} mount", given, kinds)
     for key, value in given.items():
-        right = (
-            isinstance(value, bool)
-            if kinds[key] is bool
-            else isinstance(value, int | float) and not isinstance(value, bool)
-        )
+        if kinds[key] is bool:
+            right = isinstance(value, bool)
+        else:
+            right = isinstance(value, int | float) and not isinstance(value, bool)
         if not right or value in (float("inf"), float("-inf")) or value != value:
             wanted = "true or false" if kinds[key] is bool else "a number"
             raise UsageError(f"{path}: {place}: mount.{key} is {wanted}, not {shown(value)}")
@@ -276,8 +277,6 @@ def _closest(word: str, known: Iterable[str]) -> str:
 
 def _beside(path: Path, value: Any) -> Any:
     """A path that begins with a dot as one from the file's folder; everything else as it is."""
-    return (
-        str(path.parent / value)
-        if isinstance(value, str) and value.startswith(("./", "../"))
-        else value
-    )
+    if isinstance(value, str) and value.startswith(("./", "../")):
+        return str(path.parent / value)
+    return value

@@ -46,12 +46,12 @@ def recorder_like(
     Raises:
         UnknownFormat, UsageError, SourceError: as `recorder`.
     """
-    header = (
-        opened.header
-        if isinstance(opened, RecordingTransport)
-        else Header(source=source, baud=opened.baud)
-    )
-    whose, link = sensor or header.sensor, opened.datagrams
+    if isinstance(opened, RecordingTransport):
+        header = opened.header
+    else:
+        header = Header(source=source, baud=opened.baud)
+    whose = sensor or header.sensor
+    link = opened.datagrams
     return recorder(
         target, whose, header.source, datagrams=link, baud=header.baud, overwrite=overwrite
     )
@@ -151,18 +151,20 @@ class SourceRecording:
         overwrite: bool = False,
         salvage: bool = False,
     ) -> None:
-        self._source, self._target, self._sensor, self._seconds, self._count = (
-            source,
-            target,
-            sensor,
-            seconds,
-            count,
-        )
-        self._start, self._overwrite, self._salvage = start, overwrite, salvage
+        self._source = source
+        self._target = target
+        self._sensor = sensor
+        self._seconds = seconds
+        self._count = count
+        self._start = start
+        self._overwrite = overwrite
+        self._salvage = salvage
         self.recorder: Appender | None = None
         self.device: Device | None = None
         self._log: TimedLog | None = None
-        self.packets, self.elapsed, self._began = 0, 0.0, 0.0
+        self.packets = 0
+        self.elapsed = 0.0
+        self._began = 0.0
 
     def run(self) -> Generator[str, None, None]:
         """Record until the end; again and again what is to be said, or "".
@@ -171,17 +173,17 @@ class SourceRecording:
             UsageError: for a file that exists, or cannot hold what the source gives.
             SourceError: where the source cannot be read, or the file not be written.
         """
-        return (
-            self._record_device(self._sensor)
-            if self._sensor is not None and is_live(self._source)
-            else self._record_bytes()
-        )
+        if self._sensor is not None and is_live(self._source):
+            return self._record_device(self._sensor)
+        return self._record_bytes()
 
     def _record_device(self, sensor: Sensor) -> Generator[str, None, None]:
         """What a sensor sends is recorded by a thread; here it is decoded to be counted, whatever
         that fails at.
         """
-        news, failures, known = list[str](), dict[str, None](), set[str]()
+        news = list[str]()
+        failures = dict[str, None]()
+        known = set[str]()
         with Device(
             self._source, sensor, start=self._start, record=MadeFor(self._open_log)
         ) as self.device:

@@ -37,7 +37,8 @@ SCREENED = 16
 CERTAIN = 0.95
 ANYWHERE = "an XOR of a whole frame fits at other places of it as well: of those that do, this is where bytes vary most"
 #: heads and groups of words that are tried.
-HEADS, GROUPS = (0, 2, 4, 6, 8, 10, 12), ((2,), (1, 2), (2, 1), (1, 1, 2))
+HEADS = (0, 2, 4, 6, 8, 10, 12)
+GROUPS = ((2,), (1, 2), (2, 1), (1, 1, 2))
 _PADDED = {"little": "", "big": '.ljust(2, b"\\0")'}
 
 
@@ -60,11 +61,12 @@ class WordSum(Checksum):
         )
 
     def batch(self, rows: NDArray[np.uint8]) -> Values:
-        low, high = (
-            (rows[:, 0::2], rows[:, 1::2])
-            if self.words == "little"
-            else (rows[:, 1::2], rows[:, 0::2])
-        )
+        if self.words == "little":
+            low = rows[:, 0::2]
+            high = rows[:, 1::2]
+        else:
+            low = rows[:, 1::2]
+            high = rows[:, 0::2]
         total: NDArray[np.uint64] = low.sum(axis=1, dtype=np.uint64) + (
             high.sum(axis=1, dtype=np.uint64) << np.uint64(8)
         )
@@ -149,7 +151,9 @@ def pasted(algorithm: Checksum) -> str:
 def plain_matches(samples: Samples, stands: Callable[[Place], bool] = anywhere) -> Iterator[Match]:
     """Every plain checksum that fits, in no special order."""
     few = samples.few(SCREENED)
-    tried, sure, certain = 0, False, False
+    tried = 0
+    sure = False
+    certain = False
     longest = len(few.frames[-1])
     for size, algorithms in ((4, (Sum(32),)), (2, _WIDE), (1, (Xor(), Sum(8)))):
         for place in filter(stands, few.places(size)):
@@ -215,7 +219,8 @@ def _fitting(
                 )
                 varied = 0.0
                 if isinstance(algorithm, Xor | WordXor) and span == Span():
-                    remarks, varied = (*remarks, ANYWHERE), samples.varied(place)
+                    remarks = (*remarks, ANYWHERE)
+                    varied = samples.varied(place)
                 yield Match(
                     one,
                     place,
@@ -277,7 +282,8 @@ _WIDE: tuple[Checksum, ...] = (
 def _class(algorithm: Checksum) -> str:
     """The source of a class for a checksum that the package has no name for."""
     changed = algorithm if isinstance(algorithm, Changed) else Changed(algorithm, 0)
-    base, steps = changed.of, []
+    base = changed.of
+    steps = []
     if isinstance(base, Xor | WordXor):
         value = f"{pasted(base)}(data) ^ 0x{changed.constant:X}"
     elif isinstance(base, WordSum):

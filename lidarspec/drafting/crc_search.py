@@ -38,7 +38,8 @@ DIVISION_WORK = 32
 QUICK_WORK = 1 << 23
 #: frames of one length that a polynomial is sought with; at the usual place other picks are tried
 #: where one fails, in case of damage.
-TAKEN, PICKS = 4, 6
+TAKEN = 4
+PICKS = 6
 #: most polynomials that are held against all frames for one place and span.
 WEIGHED = 64
 #: (size of what is covered, message with the checksum behind it) of each frame.
@@ -55,7 +56,8 @@ def remainder(a: int, b: int) -> int:
 
 def quotient(a: int, b: int) -> int:
     """a divided by b, without the remainder; b is not 0."""
-    size, found = b.bit_length(), 0
+    size = b.bit_length()
+    found = 0
     while (shift := a.bit_length() - size) >= 0:
         a ^= b << shift
         found |= 1 << shift
@@ -99,7 +101,8 @@ def divisors(polynomial: int, degree: int) -> list[int]:
 def _tried(polynomial: int, degree: int) -> list[int]:
     """The divisors of a small degree: every polynomial of it at once."""
     candidates = np.arange((1 << degree) | 1, 2 << degree, 2, dtype=np.uint32)
-    rest, top = np.zeros(len(candidates), np.uint32), np.uint32(degree)
+    rest = np.zeros(len(candidates), np.uint32)
+    top = np.uint32(degree)
     for bit in range(polynomial.bit_length() - 1, -1, -1):
         rest = rest << np.uint32(1) | np.uint32(polynomial >> bit & 1)
         rest ^= candidates * (rest >> top)
@@ -312,7 +315,8 @@ def _catalogued(
     few: Samples, place: Place, span: Span, reading: _Reading
 ) -> Iterator[tuple[Crc, int, tuple[str, ...]]]:
     """The CRCs of the catalogue that are right for one frame."""
-    rows, there = few.covered(place, span)[0][0].tobytes(), int(few.fields(place, reading.order)[0])
+    rows = few.covered(place, span)[0][0].tobytes()
+    there = int(few.fields(place, reading.order)[0])
     yield from ((crc, 0, ()) for crc in reading.known() if crc(rows) == there)
 
 
@@ -378,7 +382,8 @@ def _solved(
 ) -> Iterator[tuple[Crc, int, tuple[str, ...]]]:
     """Start value and final XOR from frames of several lengths, by linear equations."""
     (size, rest), *others = left.items()
-    equations, bits = [], range(reading.width)
+    equations = []
+    bits = range(reading.width)
     for other, other_rest in others:
         columns = [
             remainder(reading.started(1 << bit, size) ^ reading.started(1 << bit, other), poly)

@@ -40,30 +40,42 @@ CIRCLES = {
     3_600_000: (0.0001, "1/10 000 of a degree"),
 }
 #: frames below which only the ends of a frame are looked at, and how far these go.
-FEW, FRONT, BACK = 8, 16, 8
+FEW = 8
+FRONT = 16
+BACK = 8
 #: share of the steps that has to be regular, by which share of a step they may differ, and units
 #: that they always may.
-MOST, EVEN, GRAIN = 0.9, 0.05, 4
+MOST = 0.9
+EVEN = 0.05
+GRAIN = 4
 #: how much less even steps have to be without the lowest byte.
 ROUGH = 1.5
 #: part of all values that a step may be, and share of frames in which something may stay as it is
 #: (two returns of one firing).
-WIDE, STILL = 4, 0.75
+WIDE = 4
+STILL = 0.75
 #: bytes that are looked at, and the shortest and longest period.
-LOOKED_AT, SHORTEST, LONGEST = 1 << 15, 4, 4096
+LOOKED_AT = 1 << 15
+SHORTEST = 4
+LONGEST = 4096
 #: distances that are tried as a length, and the share of frames in which a byte that never changes
 #: is the same.
-LAGS, STEADY = 48, 0.9
+LAGS = 48
+STEADY = 0.9
 #: share of the bytes that has to be in frames, shares that are about the same, and many frames.
-HALF, CLOSE, MANY = 0.5, 0.03, 12
+HALF = 0.5
+CLOSE = 0.03
+MANY = 12
 #: part of the best weight that a shorter period needs.
 ALIKE = 0.75
 #: pairs of bytes that are tried as sync bytes, and frames that a structure needs.
-PAIRS, FRAMES = 32, 3
+PAIRS = 32
+FRAMES = 3
 #: A structure is refused if random bytes show one like it with a higher probability.
 CHANCE = 1e-3
 #: bytes behind the sync that may hold a length, and the largest size of one unit of it.
-HEADER, UNIT = 8, 16
+HEADER = 8
+UNIT = 16
 
 
 @dataclass(frozen=True)
@@ -169,7 +181,9 @@ def _counter(
 ) -> Iterator[Candidate]:
     """What rises by one each time, and falls back to where it began."""
     there = values(rows, offset, size, order)
-    steps, first, last = np.diff(there), int(there.min()), int(there.max())
+    steps = np.diff(there)
+    first = int(there.min())
+    last = int(there.max())
     back = (there[:-1] == last) & (there[1:] == first) & (last > first + 1)
     right = int((steps == 1).sum() + back.sum())
     if right >= MOST * len(steps) and (steps == 1).sum() >= 2:
@@ -225,7 +239,8 @@ def _low_byte_counts(there: NDArray[np.int64]) -> bool:
     """Whether the steps become less even without the lowest byte: else it belongs to something
     else.
     """
-    steps, coarse = np.diff(there), 256 * np.diff(there >> 8)
+    steps = np.diff(there)
+    coarse = 256 * np.diff(there >> 8)
     fine, rough = (np.abs(np.diff(each[steps != 0])) for each in (steps, coarse))
     forward = steps[steps != 0] > 0
     both = forward[1:] & forward[:-1]
@@ -300,11 +315,9 @@ def structure(chunks: Sequence[bytes], *, datagrams: bool) -> Structure | None:
     Args:
         chunks: datagrams, or pieces of a stream.
     """
-    return (
-        _of_datagrams(chunks)
-        if datagrams
-        else _of_stream(np.frombuffer(b"".join(chunks)[:LOOKED_AT], np.uint8))
-    )
+    if datagrams:
+        return _of_datagrams(chunks)
+    return _of_stream(np.frombuffer(b"".join(chunks)[:LOOKED_AT], np.uint8))
 
 
 def usual_bytes(rows: NDArray[np.uint8]) -> NDArray[np.uint8]:
@@ -342,7 +355,8 @@ def _of_datagrams(chunks: Sequence[bytes]) -> Structure | None:
 
 def _of_stream(data: NDArray[np.uint8]) -> Structure | None:
     """The reading that explains more of the bytes; one length for all frames is the simpler one."""
-    periodic, varying = _periodic(data), _by_length(data)
+    periodic = _periodic(data)
+    varying = _by_length(data)
     if periodic is None or varying is None:
         return periodic or varying
     few = len(periodic.frames) < MANY <= len(varying.frames)
@@ -399,11 +413,10 @@ def _framed(data: NDArray[np.uint8], period: int) -> Iterator[tuple[float, Struc
     count = len(data) // period
     rows = data[: count * period].reshape(count, period)
     usual = usual_bytes(rows)
-    steady = (
-        (rows == usual).mean(axis=0) >= STEADY
-        if count >= 2 * FRAMES
-        else (rows == usual).all(axis=0)
-    )
+    if count >= 2 * FRAMES:
+        steady = (rows == usual).mean(axis=0) >= STEADY
+    else:
+        steady = (rows == usual).all(axis=0)
     steady_count = int((steady & (usual != 0)).sum())
     if steady_count == 0 or steady.all() or _is_chance(data, steady_count, count, period):
         return
@@ -444,7 +457,8 @@ def _longest_run(steady: NDArray[np.bool_], usual: NDArray[np.uint8]) -> tuple[i
     """Start and length of the longest run of steady bytes, around the end too, without zeros in
     front: they tell little.
     """
-    turn, best = int(np.argmin(steady)), (-1, 0, 0)  # the circle is cut where no run is
+    turn = int(np.argmin(steady))
+    best = (-1, 0, 0)  # the circle is cut where no run is
     for start, end in runs(np.roll(steady, -turn)):
         run = np.roll(usual, -turn)[start:end]
         zeros = int(np.argmax(run != 0)) if run.any() else 0
@@ -491,10 +505,8 @@ def _explained(data: NDArray[np.uint8], starts: NDArray[np.intp], sync: bytes) -
     best: tuple[float, Length | None, NDArray[np.bool_]] = (0.0, None, np.zeros(0, np.bool_))
     kinds: tuple[tuple[int, ByteOrder], ...] = ((1, "little"), (2, "little"), (2, "big"))
     for place in range(2, HEADER):
-        low, high = (
-            data[starts[:-1] + place].astype(np.int64),
-            data[starts[:-1] + place + 1].astype(np.int64),
-        )
+        low = data[starts[:-1] + place].astype(np.int64)
+        high = data[starts[:-1] + place + 1].astype(np.int64)
         for (size, order), numbers in zip(
             kinds, (low, low | high << 8, high | low << 8), strict=True
         ):

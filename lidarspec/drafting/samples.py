@@ -18,12 +18,15 @@ from lidarspec.spec.checksums import ByteOrder, Checksum
 Part = Literal["all", "before", "behind"]
 
 #: frames up to this length are searched at every place, longer ones so near to their ends only.
-SHORT, NEAR = 64, 12
+SHORT = 64
+NEAR = 12
 #: bytes in front that a checksum at the end may leave out, and how far from the end that is.
-HEAD, TAIL = 6, 4
+HEAD = 6
+TAIL = 4
 #: how far apart the values of each byte of a checksum lie, and how much more likely the usual place
 #: is.
-APART, USUAL = 96, 1.1
+APART = 96
+USUAL = 1.1
 #: share of the frames that a checksum has to be right for: some may be damaged.
 ENOUGH = 0.6
 #: doubt at which a match is sure enough for the search to end: one wrong guess in a million looks
@@ -65,10 +68,8 @@ class Span:
         """The byte ranges in a frame of this length."""
         start = place.start(length)
         end = start + place.size
-        before, behind = (
-            (self.head, start),
-            (end + (self.head if self.part == "behind" else 0), length - self.tail),
-        )
+        before = (self.head, start)
+        behind = (end + (self.head if self.part == "behind" else 0), length - self.tail)
         chosen = {"all": [before, behind], "before": [before], "behind": [behind]}[self.part]
         return [(first, last) for first, last in chosen if last > first]
 
@@ -273,7 +274,8 @@ def spans(place: Place, samples: Samples) -> Iterator[Span]:
     other words is left out.
     """
     start = place.start(samples.shortest)
-    before, behind = start, samples.shortest - start - place.size
+    before = start
+    behind = samples.shortest - start - place.size
     at_end = behind <= TAIL
     told: set[tuple[tuple[int, int], ...]] = set()
     parts: tuple[tuple[Part, int, int], ...] = (

@@ -99,11 +99,10 @@ def _number(text: str, unit: str, place: str, wanted: str) -> tuple[Fraction, st
             f"{place} is in {unit or 'no unit'}, and {given!r} cannot be turned into that"
         )
     try:
-        number = (
-            Fraction(int(digits, 0))
-            if digits[:2].lower() in ("0x", "0b", "0o")
-            else Fraction(digits)
-        )
+        if digits[:2].lower() in ("0x", "0b", "0o"):
+            number = Fraction(int(digits, 0))
+        else:
+            number = Fraction(digits)
     except ValueError:
         raise UsageError(f"{place} takes {wanted}, not {text!r}") from None
     return number * per_unit, given
@@ -160,11 +159,9 @@ def arguments(sensor: Sensor, name: str, assignments: Sequence[str]) -> dict[str
             raise UsageError(f"{sensor.id} {name}: {text!r} is not argument=value")
         if argument not in command.args or command.frame is None:
             raise UnknownField(argument, command.args, place=f"{sensor.id} {name}")
-        slot, kind, place = (
-            argument_slot(sensor, name, argument),
-            command.arguments[argument].kind,
-            f"{sensor.id} {name}: {argument}",
-        )
+        slot = argument_slot(sensor, name, argument)
+        kind = command.arguments[argument].kind
+        place = f"{sensor.id} {name}: {argument}"
         if isinstance(kind, Range):
             unit = slot.info.unit
             number, _ = _number(

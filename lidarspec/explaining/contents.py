@@ -35,7 +35,9 @@ from lidarspec.view.meter import Reading
 
 #: bytes, and packets, that are looked at from the beginning of a file, and bytes of a sensor that
 #: are decoded.
-LOOKED_AT, PACKETS, DECODED = 1 << 26, 1 << 18, 1 << 24
+LOOKED_AT = 1 << 26
+PACKETS = 1 << 18
+DECODED = 1 << 24
 #: senders that are listed.
 FLOWS = 6
 #: later than any arrival, ns since 1970.
@@ -129,20 +131,16 @@ class Contents:
     @property
     def seconds(self) -> float | None:
         """From the first packet to the last; None where times are not known."""
-        return (
-            None
-            if self.first_ns is None or self.last_ns is None
-            else (self.last_ns - self.first_ns) * 1e-9
-        )
+        if self.first_ns is None or self.last_ns is None:
+            return None
+        return (self.last_ns - self.first_ns) * 1e-9
 
     @property
     def seen_seconds(self) -> float | None:
         """How long what was looked at took."""
-        return (
-            None
-            if self.first_ns is None or self.seen_ns is None
-            else (self.seen_ns - self.first_ns) * 1e-9
-        )
+        if self.first_ns is None or self.seen_ns is None:
+            return None
+        return (self.seen_ns - self.first_ns) * 1e-9
 
     def to_dict(self) -> dict[str, Any]:
         """The same for JSON."""
@@ -226,16 +224,15 @@ def duration(path: str | Path) -> float | None:
 
 
 def _size(path: Path) -> int:
-    return (
-        sum(part.stat().st_size for part in path.rglob("*"))
-        if path.is_dir()
-        else path.stat().st_size
-    )
+    if path.is_dir():
+        return sum(part.stat().st_size for part in path.rglob("*"))
+    return path.stat().st_size
 
 
 def _count(found: Contents, opened: Transport) -> None:
     """Count what is at the beginning, and find the last time."""
-    flows, left = dict[tuple[Sender | None, Sender | None], Flow](), LOOKED_AT
+    flows = dict[tuple[Sender | None, Sender | None], Flow]()
+    left = LOOKED_AT
     chunks = opened.chunks()
     for number, chunk in enumerate(chunks):
         flow = flows.setdefault((chunk.sender, chunk.receiver), Flow(chunk.sender, chunk.receiver))
@@ -247,7 +244,8 @@ def _count(found: Contents, opened: Transport) -> None:
         found.first_ns = chunk.at if found.first_ns is None else found.first_ns
         found.seen_ns = found.last_ns = chunk.at or found.last_ns
         if left <= 0 or number >= PACKETS:
-            found.last_ns, found.whole = _last(opened, chunks), False
+            found.last_ns = _last(opened, chunks)
+            found.whole = False
             break
     found.flows = sorted(flows.values(), key=lambda flow: -flow.bytes)
 
@@ -301,20 +299,18 @@ def shown(found: Contents) -> Sequence[tuple[str, str]]:
     if (header := found.header) is not None:
         lines.append(("recorded", f"{header.created} from {header.source or 'an unknown source'}"))
     if found.first_ns is not None:
-        until = (
-            f" to {dated(found.last_ns)}, {found.seconds:.3f} s"
-            if found.last_ns is not None
-            else ""
-        )
+        if found.last_ns is not None:
+            until = f" to {dated(found.last_ns)}, {found.seconds:.3f} s"
+        else:
+            until = ""
         lines.append(("time", f"{dated(found.first_ns)}{until}"))
     else:
         lines.append(("time", "it does not say when its bytes arrived"))
     seconds = found.seen_seconds or 0.0
-    rate = (
-        f", {found.packets / seconds:.1f}/s, {found.bytes / seconds / 1e3:.1f} kB/s"
-        if seconds
-        else ""
-    )
+    if seconds:
+        rate = f", {found.packets / seconds:.1f}/s, {found.bytes / seconds / 1e3:.1f} kB/s"
+    else:
+        rate = ""
     what = "packets" if any(flow.sender for flow in found.flows) else "pieces"
     lines.append(("holds", f"{found.packets} {what}, {found.bytes} bytes{rate}"))
     for flow in found.flows[:FLOWS]:
@@ -344,11 +340,10 @@ def _told(content: Content) -> Iterator[tuple[str, str]]:
     if not content.sensors:
         yield "sensor", f"none that is installed sends such bytes ({content.source})"
         return
-    sure = (
-        "as the file says"
-        if content.share is None
-        else f"{content.share:.1%} of the bytes are in its frames"
-    )
+    if content.share is None:
+        sure = "as the file says"
+    else:
+        sure = f"{content.share:.1%} of the bytes are in its frames"
     yield "sensor", f"{' or '.join(content.sensors)}: {sure}"
     if (reading := content.reading) is not None:
         if reading.speed_hz is not None:

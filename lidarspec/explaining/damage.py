@@ -27,7 +27,10 @@ from lidarspec.spec.tree import formulas, nodes, refs
 #: so often, and the longest in which lost bytes are looked for, of which there are 256 for each
 #: place; and on how many fields its layout may depend for that, since where they are many nearly
 #: each candidate has a layout of its own.
-BLOCK, INTERPRETED, SEARCHED, HEADED = 1 << 20, 128, 512, 4
+BLOCK = 1 << 20
+INTERPRETED = 128
+SEARCHED = 512
+HEADED = 4
 #: most changes that are told one by one.
 TOLD = 3
 #: what may have happened, the likeliest first: by how many bytes it made the frame longer, and how
@@ -51,7 +54,8 @@ class Change(NamedTuple):
 
     def mended(self, data: bytes) -> bytes:
         """The bytes as they were sent."""
-        before, after = data[: self.offset], data[self.offset :]
+        before = data[: self.offset]
+        after = data[self.offset :]
         if self.kind == "inserted byte":
             return before + after[1:]
         if self.kind == "lost byte":
@@ -109,13 +113,15 @@ def _found(
     if chosen is not None:
         places = places[np.isin(places, chosen)]
     offsets = np.repeat(places, values)
-    numbers = (
-        old[places] if values == 1 else np.tile(np.arange(values, dtype=np.uint8), len(places))
-    )
+    if values == 1:
+        numbers = old[places]
+    else:
+        numbers = np.tile(np.arange(values, dtype=np.uint8), len(places))
     if kind == "lost byte":
         is_new = numbers != old[offsets - 1]  # the same byte once more before an equal one
         is_new[offsets == 0] = True
-        offsets, numbers = offsets[is_new], numbers[is_new]
+        offsets = offsets[is_new]
+        numbers = numbers[is_new]
     step = max(1, BLOCK // size)
     for first in range(0, len(offsets), step):
         part = slice(first, first + step)
@@ -125,11 +131,10 @@ def _found(
             fits &= rows[:, spot] & mask == value
         which = np.flatnonzero(fits)
         survey = engine.survey(rows.reshape(-1), which * size) if len(which) else None
-        right = (
-            which[(survey.status == VALID) & (survey.sizes == size)]
-            if survey is not None
-            else which
-        )
+        if survey is not None:
+            right = which[(survey.status == VALID) & (survey.sizes == size)]
+        else:
+            right = which
         yield from (
             Change(kind, int(offsets[first + one]), int(numbers[first + one]))
             for one in right.tolist()
@@ -144,7 +149,8 @@ def _rows(
     size: int,
 ) -> NDArray[np.uint8]:
     """The bytes with each change undone, one a row."""
-    columns, places = counted(size), offsets[:, None]
+    columns = counted(size)
+    places = offsets[:, None]
     if kind == "inserted byte":
         return old[columns + (columns >= places)]
     if kind == "lost byte":

@@ -33,7 +33,8 @@ from lidarspec.spec import Sensor
 #: most points of a frame without arrays that are told.
 TOLD = 4
 #: most decimals that steps are told apart by, and those that may be added to show one in full.
-DIGITS, SPARE = 12, 2
+DIGITS = 12
+SPARE = 2
 
 Keys = tuple[str | int, ...]
 
@@ -103,7 +104,8 @@ class Explanation:
 
     def differences(self, other: Explanation) -> list[Difference]:
         """The fields that another frame does not have alike, in the order of the wire."""
-        before, after = self.fields, other.fields
+        before = self.fields
+        after = other.fields
         pairs = ((path, before.get(path), after.get(path)) for path in {**before, **after})
         compared = [
             Difference(path, old, new, self._bytes(old), other._bytes(new))
@@ -117,11 +119,14 @@ class Explanation:
 
     def to_dict(self) -> dict[str, Any]:
         """The explanation for JSON."""
-        fault = (
-            None
-            if self.fault is None
-            else {"reason": self.fault.reason, "offset": self.fault.offset, "path": self.fault.path}
-        )
+        if self.fault is None:
+            fault = None
+        else:
+            fault = {
+                "reason": self.fault.reason,
+                "offset": self.fault.offset,
+                "path": self.fault.path,
+            }
         head = {
             "sensor": self.sensor,
             "frame": self.frame,
@@ -146,11 +151,13 @@ def explain(data: bytes, sensor: Sensor, frame: str | None = None) -> Explanatio
         WireError: where the bytes do not even begin like a frame of this sensor.
         UnknownFrame: for a frame type that it does not have.
     """
-    data, fault = bytes(data), None
+    data = bytes(data)
+    fault = None
     try:
         name = identify(sensor, data, frame=frame)
     except WireError as error:
-        fault, name = error, error.frame or frame or ""
+        fault = error
+        name = error.frame or frame or ""
         if not name:
             raise
     listed_rows = FrameRows(sensor.frames[name], data, fault)
@@ -222,17 +229,18 @@ def _with_points(
         evaluated.cloud.nominal
     )
     points = [Point.of(evaluated.cloud, index) for index in range(len(evaluated.cloud))]
-    chain, parts = packets.table.schema.chain, _parts(sensor, name, data)
+    chain = packets.table.schema.chain
+    parts = _parts(sensor, name, data)
     if not chain and not parts:
         return rows, (*notes, *(f"point {point}" for point in points[:TOLD]))
     arrays = {axis for info in packets.table.schema.fields.values() for axis in info.axes}
     along = tuple(axis for axis in evaluated.axes if axis in arrays)
-    chain = (
-        along if len(along) == len(chain) else chain
-    )  # which of several arrays side by side points go with, they say
+    if len(along) == len(chain):
+        chain = along  # which of several arrays side by side points go with, they say
     inside = evaluated.counts.astype(np.bool_)
     numbers = np.where(inside, np.cumsum(inside).reshape(inside.shape) - 1, -1)
-    first, given = first_points(evaluated), list[Row]()
+    first = first_points(evaluated)
+    given = list[Row]()
     for row in rows:
         spot = next(
             (spot for spot, part in enumerate(parts) if f"{row.path}.".startswith(f"{part}.")),

@@ -15,12 +15,16 @@ from lidarspec.explaining.wording import Difference, Row, Span, Value, bit_pictu
 from lidarspec.frames.wire_table import hexed
 
 #: bytes in a line, spaces of a level of nesting, and the widest columns of bits and of names.
-LINED, LEVEL, PICTURES, NAMES = 8, 2, 35, 36
+LINED = 8
+LEVEL = 2
+PICTURES = 35
+NAMES = 36
 
 #: bytes of a field in a line of its differences.
 COMPARED = 4
 #: pieces of a line that are columns, and how much room there has to be beside them for folding.
-FIXED, FOLDED = 3, 24
+FIXED = 3
+FOLDED = 24
 
 Line = tuple[Span, ...]
 
@@ -37,7 +41,8 @@ def folded(line: Line, width: int) -> Line:
     indent = sum(len(span.text) for span in line[:FIXED])
     if len(text(line)) <= width or indent + FOLDED > width:
         return line
-    spans, column = list(line[:FIXED]), indent
+    spans = list(line[:FIXED])
+    column = indent
     for span in line[FIXED:]:
         for word in re.findall(r"\s*\S+", span.text):
             breaks = column + len(word) > width and column > indent
@@ -118,11 +123,10 @@ class Listing:
                 len(value.masks) - value.masks.count(0) > 1 and bool(value.bits)
             )
             words += [Span(f"; {value.docs}", "docs")] if value.docs else []
-            drawing = (
-                Span(bit_picture(*picture), "bits")
-                if value.bits
-                else Span(picture[0].hex(" "), role)
-            )
+            if value.bits:
+                drawing = Span(bit_picture(*picture), "bits")
+            else:
+                drawing = Span(picture[0].hex(" "), role)
             yield self._line(
                 value.start,
                 drawing,
@@ -182,7 +186,8 @@ def told(differences: list[Difference], sizes: tuple[int, int]) -> Iterator[Line
 
 
 def _lines(difference: Difference) -> Iterator[Line]:
-    old, new = difference.before, difference.after
+    old = difference.before
+    new = difference.after
     assert old is not None
     assert new is not None
     change = f" ({difference.change})" if difference.change else ""

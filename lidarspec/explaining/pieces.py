@@ -76,7 +76,9 @@ def pieces(
     """
     if frame is not None and frame not in sensor.frames:
         raise UnknownFrame(frame, sensor.frames, place=sensor.id)
-    chunks, head, longest = iter(chunks), list[Chunk](), _longest(sensor)
+    chunks = iter(chunks)
+    head = list[Chunk]()
+    longest = _longest(sensor)
     while (
         sum(len(chunk.data) for chunk in head) <= longest
         and (chunk := next(chunks, None)) is not None
@@ -109,7 +111,9 @@ def _preferring(sensor: Sensor, frame: str) -> Sensor:
 
 
 def _cut(sensor: Sensor, chunks: Iterable[Chunk], *, datagrams: bool) -> Iterator[Piece]:
-    decoder, held, start = sensor.decoder(stream=not datagrams), bytearray(), 0
+    decoder = sensor.decoder(stream=not datagrams)
+    held = bytearray()
+    start = 0
     for chunk in itertools.chain(chunks, [None]):
         found = decoder.finish() if chunk is None or chunk.gap else []
         if chunk is not None:
@@ -167,18 +171,18 @@ def _skipped(sensor: Sensor, piece: Piece) -> tuple[Piece, Explanation]:
 
 def _damaged(sensor: Sensor, piece: Piece) -> Iterator[Piece]:
     """The frames that some bytes were before they were damaged, in order."""
-    data, end = piece.data, 0
+    data = piece.data
+    end = 0
     starts = [start for start in likely_starts(sensor, data) if not piece.datagram or start == 0]
     for start in [*starts, len(data)]:
         if start > end and (name := _headless(sensor, data[end:start])):
             yield piece.part(end, start, name)
             end = start
         if end <= start < len(data) and (name := _nearest(sensor, data[start:])):
-            end = (
-                len(data)
-                if piece.datagram
-                else _end(sensor, data, start, name, [*starts, len(data)])
-            )
+            if piece.datagram:
+                end = len(data)
+            else:
+                end = _end(sensor, data, start, name, [*starts, len(data)])
             yield piece.part(start, end, name)
 
 

@@ -15,7 +15,8 @@ if TYPE_CHECKING:
     from lidarspec.points.cloud import PointCloud
 
 #: bytes in a line of a hexdump, and lines before the marked one.
-DUMPED, BEFORE = 16, 2
+DUMPED = 16
+BEFORE = 2
 DEGREES_PER_TURN = 360
 
 
@@ -110,9 +111,9 @@ class Value:
 
     def __str__(self) -> str:
         if self.physical is None:
-            return (
-                ascii_text(self.raw) if isinstance(self.raw, bytes | bytearray) else repr(self.raw)
-            )
+            if isinstance(self.raw, bytes | bytearray):
+                return ascii_text(self.raw)
+            return repr(self.raw)
         if self.label:
             return f"{self.raw} {self.label}"
         plain = isinstance(self.raw, int) and self.digits == 0 and self.physical == float(self.raw)
@@ -204,12 +205,12 @@ class Row:
         names = [value.name for value in self.values]
         words = []
         for value in self.values:
-            name = (
-                value.name
-                if names.count(value.name) == 1
-                else value.path.removeprefix(f"{self.path}.")
-            )
-            text, where = str(value), f" ({value.bits})" if value.bits and self.first else ""
+            if names.count(value.name) == 1:
+                name = value.name
+            else:
+                name = value.path.removeprefix(f"{self.path}.")
+            text = str(value)
+            where = f" ({value.bits})" if value.bits and self.first else ""
             says_enough = alone or units.count(value.unit) == 1
             words.append(
                 f"{text}{where}" if says_enough else f"{name} {text or value.raw.hex(' ')}{where}"
@@ -351,11 +352,9 @@ def hexdump(error: WireError) -> str:
     place = error.offset - first
     columns = [8 + 3 * index + (index >= 8) for index in (place, min(place + size, DUMPED) - 1)]
     marks = "^" * (max(columns[1], columns[0]) + 2 - columns[0])
-    return (
-        "\n".join([*lines, f"{' ' * columns[0]}{marks} {error.path}".rstrip()])
-        if error.data
-        else ""
-    )
+    if error.data:
+        return "\n".join([*lines, f"{' ' * columns[0]}{marks} {error.path}".rstrip()])
+    return ""
 
 
 def _marked(error: WireError) -> int:

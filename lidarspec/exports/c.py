@@ -83,7 +83,8 @@ def checksum(algorithm: Checksum, name: str) -> str:
     """
     inner = algorithm.algorithm if isinstance(algorithm, ZeroPadded) else algorithm
     body = _body(inner)
-    pad, is_counting = "", isinstance(algorithm, ZeroPadded) or isinstance(inner, WordXor | Fold15)
+    pad = ""
+    is_counting = isinstance(algorithm, ZeroPadded) or isinstance(inner, WordXor | Fold15)
     if isinstance(algorithm, ZeroPadded):
         if isinstance(inner, Fold15):
             raise Refused(
@@ -155,11 +156,10 @@ def _crc(crc: Crc) -> _Body:
         f"uint{size}_t total = {_literal(start if crc.refin else mirrored_bytes(start), size)};"
     )
     step = f"total = (uint{size}_t)(table[(total ^ byte) & 0xff] ^ total >> 8);"
-    result = (
-        "(uint64_t)total"
-        if crc.refin
-        else f"lidarspec_swapped(total, {size // 8}) >> {size - crc.width}"
-    )
+    if crc.refin:
+        result = "(uint64_t)total"
+    else:
+        result = f"lidarspec_swapped(total, {size // 8}) >> {size - crc.width}"
     if crc.refin != crc.refout:
         result = f"lidarspec_mirrored({result}, {crc.width})"
     return _Body(
@@ -212,7 +212,8 @@ def _frame(layout: CLayout, algorithms: Mapping[Checksum, str]) -> Iterator[str]
     """The functions of a frame type that are about the whole of it; `algorithms` are the names of
     the checksums' functions.
     """
-    length, longest = layout.name("", "frame_length"), layout.message.frame.max_length
+    length = layout.name("", "frame_length")
+    longest = layout.message.frame.max_length
     checks = _lines(_needs(layout))
     unused = "" if checks else "    (void)p;\n    (void)n;\n"
     yield _LENGTH.format(
@@ -223,11 +224,10 @@ def _frame(layout: CLayout, algorithms: Mapping[Checksum, str]) -> Iterator[str]
         if isinstance(
             entry.node, Sealed
         ):  # of several around one struct, the inner ones are called after their fields
-            path = (
-                entry.path
-                if layout.name(entry.path, "checksum_ok") not in seals
-                else entry.node.fields[0]
-            )
+            if layout.name(entry.path, "checksum_ok") not in seals:
+                path = entry.path
+            else:
+                path = entry.node.fields[0]
             seals[layout.name(path, "checksum_ok")] = entry, entry.node
     for name, (entry, seal) in seals.items():
         yield _checksum(layout, entry, seal, name, algorithms[seal.algorithm])
@@ -311,14 +311,17 @@ def _spans(
 
 def _stored(held: list[Entry], order: str) -> str:
     """The value that several fields hold, low bits first."""
-    terms, shift = [], 0
+    terms = []
+    shift = 0
     for access in held:
         node = access.node
         if isinstance(node, Blob):
             assert isinstance(node.size, int)
-            value, width = word(access.start, node.size, order), 8 * node.size
+            value = word(access.start, node.size, order)
+            width = 8 * node.size
         else:
-            value, width = access.expression, access.info.bits
+            value = access.expression
+            width = access.info.bits
         value = f"((uint64_t)({value}) & UINT64_C(0x{(1 << width) - 1:x}))"
         terms.append(f"({value} << {shift})" if shift else value)
         shift += width

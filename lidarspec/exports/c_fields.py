@@ -55,12 +55,9 @@ def identifier(text: str) -> str:
 def number_type(fields: Sequence[tree.FieldInfo]) -> str:
     """The C type that holds what any of these fields holds."""
     if any(info.kind == "float" for info in fields):
-        return (
-            "double"
-            if max(info.bits for info in fields) > 32
-            or any(info.kind != "float" for info in fields)
-            else "float"
-        )
+        if max(info.bits for info in fields) > 32 or any(info.kind != "float" for info in fields):
+            return "double"
+        return "float"
     signed = any(info.dtype is not None and info.dtype.kind == "i" for info in fields)
     mixed = signed and any(info.dtype is not None and info.dtype.kind == "u" for info in fields)
     width = next(
@@ -124,11 +121,9 @@ class Entry:
     @property
     def fields(self) -> list[Entry]:
         """What can be read there: an entry for each part of a bit block, else itself."""
-        return (
-            [replace(self, part=part) for part in self.node.parts]
-            if isinstance(self.node, tree.Block)
-            else [self]
-        )
+        if isinstance(self.node, tree.Block):
+            return [replace(self, part=part) for part in self.node.parts]
+        return [self]
 
     @property
     def info(self) -> tree.FieldInfo:
@@ -190,7 +185,8 @@ class CLayout:
     """
 
     def __init__(self, message: Message, name: Callable[[str, str], str]) -> None:
-        self.message, self.name = message, name
+        self.message = message
+        self.name = name
         self.entries: list[Entry] = []
         top = Entry("", message.root, Extent(), Extent())
         self.size = self.extent(top)
@@ -339,11 +335,10 @@ class CLayout:
         )
         if isinstance(node, tree.When):
             holds = self.formula(node.condition)
-            holds = (
-                holds[1:-1]
-                if isinstance(node.condition, tree.Op) and node.condition.symbol in tree.COMPARISONS
-                else f"{holds} != 0"
-            )
+            if isinstance(node.condition, tree.Op) and node.condition.symbol in tree.COMPARISONS:
+                holds = holds[1:-1]
+            else:
+                holds = f"{holds} != 0"
             cases = [(holds, node.then), (f"!({holds})", node.otherwise)]
         else:
             assert isinstance(node, tree.Select)
@@ -481,7 +476,8 @@ def _field(layout: CLayout, path: str) -> Iterator[str]:
     its values.
     """
     ways = accesses(layout, path)
-    name, first = layout.name(path, ""), ways[0]
+    name = layout.name(path, "")
+    first = ways[0]
     depth = first.depth + len(first.indices)
     yield from (
         f"#define {name.upper()}_{identifier(label).upper()} {value}"
@@ -536,19 +532,15 @@ def _function(kind: str, name: str, depth: int, ways: list[tuple[str, str]]) -> 
     ]
     lines += ["    return 0;"] * bool(ways[-1][0])
     head = f"static inline {kind}{'' if kind.endswith('*') else ' '}{name}({parameters(depth)})"
-    return (
-        f"{head} {{ {lines[0].strip()} }}"
-        if len(lines) == 1
-        else "\n".join([head, "{", *lines, "}"])
-    )
+    if len(lines) == 1:
+        return f"{head} {{ {lines[0].strip()} }}"
+    return "\n".join([head, "{", *lines, "}"])
 
 
 def _grouped(expression: str) -> str:
-    return (
-        f"({expression})"
-        if " " in expression and not expression.startswith(("lidarspec_", "p["))
-        else expression
-    )
+    if " " in expression and not expression.startswith(("lidarspec_", "p[")):
+        return f"({expression})"
+    return expression
 
 
 def _scaling(info: tree.FieldInfo, name: str, kind: str) -> Iterator[str]:

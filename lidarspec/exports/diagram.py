@@ -109,11 +109,10 @@ class _Cells:
                     (kind.name, self.visit(kind.element, Extent(0, ("i",)), depth + 1))
                     for kind in node.kinds
                 ]
-                items = (
-                    kinds[0][1]
-                    if len(kinds) == 1
-                    else tuple(Group(name, items, optional=True) for name, items in kinds)
-                )
+                if len(kinds) == 1:
+                    items = kinds[0][1]
+                else:
+                    items = tuple(Group(name, items, optional=True) for name, items in kinds)
                 return (Group(f"{node.name}: {ruled(node)}", items),)
             case tree.When() | tree.Select():
                 parts = (
@@ -136,7 +135,8 @@ class _Cells:
             start = start + extent(member, member.name)
 
     def _number(self, node: tree.Number, start: Extent) -> Cell:
-        width, is_long = 8 * node.size, node.size > 1
+        width = 8 * node.size
+        is_long = node.size > 1
         short = {"uint": "u", "int": "s", "float": "float "}[
             node.kind
         ] + f"{width}{f' {node.order[0]}e' * (self.mixed and is_long)}"
@@ -158,11 +158,10 @@ class _Cells:
 
     def _blob(self, node: tree.Blob, start: Extent) -> Cell:
         size = extent(node)
-        detail = (
-            node.const.hex(" ")
-            if node.const is not None and len(node.const) <= 8
-            else f"{size} byte{'s' * (str(size) != '1')}"
-        )
+        if node.const is not None and len(node.const) <= 8:
+            detail = node.const.hex(" ")
+        else:
+            detail = f"{size} byte{'s' * (str(size) != '1')}"
         return self._cell(node.info, node.name, 8 * size.number, detail, "bytes", start)
 
     def _block(self, node: tree.Block, start: Extent) -> list[Cell]:
@@ -176,7 +175,8 @@ class _Cells:
         ]
         runs: list[tuple[tree.Part, int, int, int]] = []
         for byte, _, run, part in sorted(segments, key=lambda entry: (entry[0], -entry[1])):
-            low, high = run.target, run.target + run.mask.bit_count() - 1
+            low = run.target
+            high = run.target + run.mask.bit_count() - 1
             if runs and runs[-1][0] is part and runs[-1][1] == high + 1:
                 runs[-1] = (part, low, *runs[-1][2:])
             else:
@@ -197,15 +197,14 @@ class _Cells:
         self, info: tree.FieldInfo, name: str, bits: int, detail: str, kind: str, start: Extent
     ) -> Cell:
         seal = self.seals.get(info.path)
-        role = (
-            "sum"
-            if seal
-            else "const"
-            if info.const is not None
-            else "spare"
-            if name.startswith(SPARE)
-            else ""
-        )
+        if seal:
+            role = "sum"
+        elif info.const is not None:
+            role = "const"
+        elif name.startswith(SPARE):
+            role = "spare"
+        else:
+            role = ""
         said = (
             info.path,
             kind,
@@ -225,7 +224,12 @@ class _Cells:
 
 #: bits in a row, pixels of a bit and of a row, of the offsets at the left, of a level of brackets,
 #: and around everything.
-BITS, BIT, ROW, LEFT, LEVEL, EDGE = 32, 22, 46, 104, 136, 16
+BITS = 32
+BIT = 22
+ROW = 46
+LEFT = 104
+LEVEL = 136
+EDGE = 16
 #: bits that are drawn in full; a longer field is a torn row.
 LONGEST = 128
 #: letters of an offset in one line.
@@ -233,7 +237,10 @@ FORMULA = 13
 FILLS = {"": "#ffffff", "const": "#e4e8ee", "sum": "#fde7b8", "spare": "#f4f4f2"}
 INK, FAINT, LINE = "#1c2430", "#64707f", "#4a5565"
 #: width of a letter in its size, and the sizes of names and of what stands below them.
-LETTER, NAMED, DETAILED, SMALLEST = 0.61, 13, 10.5, 8
+LETTER = 0.61
+NAMED = 13
+DETAILED = 10.5
+SMALLEST = 8
 
 
 def svg(sensor: Sensor) -> str:
@@ -316,7 +323,8 @@ class _Sheet:
 
     def document(self, title: str) -> str:
         """All of it."""
-        width, height = LEFT + BITS * BIT + EDGE + LEVEL * self.deepest, self.top - 26 + EDGE
+        width = LEFT + BITS * BIT + EDGE + LEVEL * self.deepest
+        height = self.top - 26 + EDGE
         head = (
             f'<svg xmlns="http://www.w3.org/2000/svg" viewBox="0 0 {width:g} {height:g}"'
             f' width="{width:g}" height="{height:g}" font-family="Helvetica, Arial, sans-serif">'
@@ -334,7 +342,8 @@ class _Sheet:
 
     def _row_ends(self) -> None:
         if self.used:
-            self.top, self.used = self.top + ROW, 0
+            self.top = self.top + ROW
+            self.used = 0
 
     def _group(self, group: Group, depth: int) -> None:
         """A part with a bracket at its right; it has rows of its own."""
@@ -354,13 +363,15 @@ class _Sheet:
     def _box(self, cell: Cell) -> None:
         """A field in as many pieces as it takes rows; the name stands in the widest."""
         pieces: list[Piece] = []
-        left, lead = cell.bits, self.used % 8
+        left = cell.bits
+        lead = self.used % 8
         while left:
             if self.used == 0:
                 self._offset(cell, (lead + cell.bits - left) // 8)
             taken = min(left, BITS - self.used)
             pieces.append((LEFT + self.used * BIT, self.top, taken))
-            self.used, left = self.used + taken, left - taken
+            self.used = self.used + taken
+            left = left - taken
             if self.used == BITS:
                 self._row_ends()
         widest = max(range(len(pieces)), key=lambda index: pieces[index][2])
@@ -384,7 +395,8 @@ class _Sheet:
             path = f"M{x - 4:g} {self.top:g}l8 {ROW / 3:g}l-8 {ROW / 3:g}l8 {ROW / 3:g}"
             self.parts.append(f'<path d="{path}" fill="none" stroke="{FAINT}"/>')
         self.parts += _label(LEFT, self.top, width, cell)
-        self.top, self.used = self.top + ROW, 0
+        self.top = self.top + ROW
+        self.used = 0
 
     def _offset(self, cell: Cell, more: int) -> None:
         """The offset of a row, so many bytes after the field's, left of it; a long formula in two
@@ -392,11 +404,10 @@ class _Sheet:
         """
         text = str(cell.offset + Extent(more))
         middle = text.find(" + ", len(text) // 2 - 4)
-        lines = (
-            [text]
-            if len(text) <= FORMULA or middle < 0
-            else [text[: middle + 2], text[middle + 3 :]]
-        )
+        if len(text) <= FORMULA or middle < 0:
+            lines = [text]
+        else:
+            lines = [text[: middle + 2], text[middle + 3 :]]
         for index, line in enumerate(lines):
             y = self.top + ROW / 2 + 4 + 13 * (index - (len(lines) - 1) / 2)
             size = min(11, (LEFT - 12) / (LETTER * len(line)))
@@ -419,10 +430,8 @@ def _outlined(pieces: Sequence[Piece], cell: Cell) -> Iterator[str]:
         x, y, bits = piece
         end = x + bits * BIT
         path += f"M{x:g} {y:g}v{ROW}M{end:g} {y:g}v{ROW}"
-        before, after = (
-            pieces[index - 1] if index else None,
-            pieces[index + 1] if index + 1 < len(pieces) else None,
-        )
+        before = pieces[index - 1] if index else None
+        after = pieces[index + 1] if index + 1 < len(pieces) else None
         path += (
             f"M{max(x, _end(before)):g} {y:g}H{end:g}"
             if before is None or _end(before) < end
@@ -458,11 +467,10 @@ def _label(x: float, y: float, width: float, cell: Cell, fill: str = INK) -> Ite
     middle = x + width / 2
     if size < SMALLEST and len(cell.name) > 1:
         tall = min(NAMED - 2, (ROW - 4) / (LETTER * len(cell.name)))
-        text = (
-            cell.name
-            if tall >= SMALLEST - 1
-            else cell.name[: int((ROW - 4) / (LETTER * (SMALLEST - 1)))]
-        )
+        if tall >= SMALLEST - 1:
+            text = cell.name
+        else:
+            text = cell.name[: int((ROW - 4) / (LETTER * (SMALLEST - 1)))]
         tall = max(tall, SMALLEST - 1)
         turned = f' transform="rotate(-90 {middle:g} {y + ROW / 2:g})"'
         yield _text(
@@ -484,7 +492,8 @@ def _label(x: float, y: float, width: float, cell: Cell, fill: str = INK) -> Ite
 
 def _lines(x: float, y: float, label: str) -> Iterator[str]:
     """The label of a bracket, in lines that fit its level."""
-    lines, room = [""], (LEVEL - 30) / (LETTER * 12)
+    lines = [""]
+    room = (LEVEL - 30) / (LETTER * 12)
     for word in label.split(" "):
         if lines[-1] and len(lines[-1]) + 1 + len(word) > room:
             lines.append("")

@@ -134,7 +134,9 @@ def truth(formula: tree.Formula, scope: Scope) -> str:
 Attribute = dict[str, Any]
 
 #: bits that Kaitai reads in one go, and bytes of its other integers and of its floats.
-WIDEST, INTEGERS, FLOATS = 64, (1, 2, 4, 8), (4, 8)
+WIDEST = 64
+INTEGERS = (1, 2, 4, 8)
+FLOATS = (4, 8)
 
 
 def block_type(
@@ -156,7 +158,8 @@ def block_type(
     seq: list[Attribute] = []
     instances: dict[str, Attribute] = {}
     for part in ordered[0]:
-        name, width = _name(part), part.bits.width
+        name = _name(part)
+        width = part.bits.width
         kind: Attribute = {"type": f"b{width}{ordered[1]}"}
         if part.bits.signed:
             instances[name] = {
@@ -176,7 +179,9 @@ def inline(
     """
     if len(block.parts) != 1 or block.parts[0].names or block.parts[0].indices or not block.name:
         return None
-    part, name, ordered = block.parts[0], identifier(block.name), _in_order(block)
+    part = block.parts[0]
+    name = identifier(block.name)
+    ordered = _in_order(block)
     if ordered is not None and not part.bits.signed and part.bits.width <= WIDEST:
         return {"id": name, "type": f"b{part.bits.width}{ordered[1]}", **more} | _valid(part), {}
     if "repeat" in more:
@@ -207,11 +212,9 @@ def _name(part: tree.Part) -> str:
 
 def _any_of(info: tree.FieldInfo) -> Attribute:
     """The values that a field may have, unless they are too many to be listed."""
-    return (
-        {"valid": {"any-of": list(info.allowed)}}
-        if info.allowed and len(info.allowed) <= LISTED
-        else {}
-    )
+    if info.allowed and len(info.allowed) <= LISTED:
+        return {"valid": {"any-of": list(info.allowed)}}
+    return {}
 
 
 def _valid(part: tree.Part) -> Attribute:
@@ -266,11 +269,9 @@ def _assembled(part: tree.Part, raw: str) -> str:
     value = " | ".join(terms)
     if part.bits.width == 1:
         return f"({value}) != 0"
-    return (
-        f"({value}) - ((({value}) >> {part.bits.width - 1}) << {part.bits.width})"
-        if part.bits.signed
-        else value
-    )
+    if part.bits.signed:
+        return f"({value}) - ((({value}) >> {part.bits.width - 1}) << {part.bits.width})"
+    return value
 
 
 def ksy(sensor: Sensor) -> str:
@@ -412,11 +413,10 @@ class _Types:
             more |= {"repeat": "expr", "repeat-expr": _size(node.count, scope)}
         elif node.size is not None and kind.following is not None:
             ends = tree.written(kind.following, lambda ref: f"_.{ref.path}", _OPERATIONS)
-            condition = (
-                f"({more['if']}) and {number(node.size, scope)} != 0"
-                if "if" in more
-                else f"{number(node.size, scope)} != 0"
-            )
+            if "if" in more:
+                condition = f"({more['if']}) and {number(node.size, scope)} != 0"
+            else:
+                condition = f"{number(node.size, scope)} != 0"
             more |= {"repeat": "until", "repeat-until": f"{ends} == 0", "if": condition}
         self._typed(kaitai, node.name, kind.element, scope, **more)
 
@@ -466,9 +466,10 @@ class _Types:
             types[value] = identifier(
                 f"{name}_{'other' if value == '_' else value.replace('-', 'minus_')}"
             )
-            kaitai.types[types[value]] = (
-                {"seq": []} if isinstance(case, tree.Empty) else self._type(case, scope)
-            )
+            if isinstance(case, tree.Empty):
+                kaitai.types[types[value]] = {"seq": []}
+            else:
+                kaitai.types[types[value]] = self._type(case, scope)
         kaitai.seq.append(
             {"id": identifier(name), "type": {"switch-on": key, "cases": types}, **more}
         )
@@ -495,11 +496,10 @@ class _Types:
 
     def _doc(self, info: tree.FieldInfo) -> Attribute:
         seal = self.seals.get(info.path)
-        sealed = (
-            ""
-            if seal is None
-            else f"{seal.algorithm.describe()} over {_span(seal)}; not checked here"
-        )
+        if seal is None:
+            sealed = ""
+        else:
+            sealed = f"{seal.algorithm.describe()} over {_span(seal)}; not checked here"
         unchecked = "a length, which is not checked here" if info.held else ""
         text = "; ".join(filter(None, (unit_text(info), meaning(info), unchecked, sealed)))
         return {"doc": text} if text else {}

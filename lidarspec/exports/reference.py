@@ -109,11 +109,10 @@ def _rule(scan: Split) -> str:
 
 def _clock(clock: Clock) -> str:
     names = [clock.source] if isinstance(clock.source, str) else clock.source
-    fields = (
-        "calculated from the packet"
-        if callable(names)
-        else " + ".join(f"`{name}`" for name in names)
-    )
+    if callable(names):
+        fields = "calculated from the packet"
+    else:
+        fields = " + ".join(f"`{name}`" for name in names)
     again = f", starts again at {clock.wraps_at:g} s" if clock.wraps_at else ""
     return fields + again + (f", completed by {clock.told[0]} frames" if clock.told else "")
 
@@ -141,11 +140,9 @@ def _asked(sensor: Sensor, name: str) -> str:
 
 
 def _answer(command: Command) -> str:
-    return (
-        " or ".join(f"`{name}`" for name in command.replies)
-        if command.replies
-        else "none documented"
-    )
+    if command.replies:
+        return " or ".join(f"`{name}`" for name in command.replies)
+    return "none documented"
 
 
 def effect(sensor: Sensor, name: str) -> str:
@@ -165,13 +162,12 @@ def effect(sensor: Sensor, name: str) -> str:
 
 
 def _frame(name: str, frame: Frame, picture: str) -> Iterator[str]:
-    kind = (
-        "to the sensor"
-        if frame.direction == "out"
-        else "points"
-        if frame.data
-        else "from the sensor"
-    )
+    if frame.direction == "out":
+        kind = "to the sensor"
+    elif frame.data:
+        kind = "points"
+    else:
+        kind = "from the sensor"
     yield f"## `{name}`: {kind}"
     size = frame_size(frame)
     said = [f"{size} bytes" if size.isdigit() else f"`{size}` bytes, at most {frame.max_length}"]
@@ -215,13 +211,12 @@ def _geometry(sensor: Sensor) -> Iterator[str]:
             f"`{column}` ({', '.join(filter(None, (cloud.units[column], values.dtype.name)))})"
             for column, values in cloud.extra.items()
         ]
-        many = (
-            "a point"
-            if len(cloud) == 1
-            else f"{len(cloud)} points"
-            if frame_size(frame).isdigit()
-            else "points by its header"
-        )
+        if len(cloud) == 1:
+            many = "a point"
+        elif frame_size(frame).isdigit():
+            many = f"{len(cloud)} points"
+        else:
+            many = "points by its header"
         yield ""
         yield f"A `{name}` frame has {many}" + (
             f", with {', '.join(more[:-1])}{' and ' * (len(more) > 1)}{more[-1]}." if more else "."

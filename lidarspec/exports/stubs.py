@@ -116,12 +116,11 @@ class _Classes:
         its name.
         """
         if isinstance(node, list):
-            kind, infos = "int" if len(node) == 1 else "Any", node
+            kind = "int" if len(node) == 1 else "Any"
+            infos = node
         else:
-            kind, infos = (
-                self._type(owner, name, node),
-                [node.info] if isinstance(node, Number | Blob | Block) else [],
-            )
+            kind = self._type(owner, name, node)
+            infos = [node.info] if isinstance(node, Number | Blob | Block) else []
         said = "; ".join(
             filter(None, (text(info) for info in infos[:1] for text in (unit_text, meaning)))
         )
@@ -164,11 +163,10 @@ def _sensor(sensor: Sensor, frames: tuple[Message, ...], names: dict[str, str]) 
     )
     builds = "\n".join(_build(message) for message in frames)
     commands = "\n".join(_command(name, command) for name, command in sensor.commands.items())
-    rest = (
-        "    @overload\n    def command(self, _name: str, /, **arguments: Any) -> bytes: ..."
-        if len(sensor.commands) > 0
-        else ""
-    )
+    if len(sensor.commands) > 0:
+        rest = "    @overload\n    def command(self, _name: str, /, **arguments: Any) -> bytes: ..."
+    else:
+        rest = ""
     literals = ", ".join(f'"{name}"' for name in names)
     data = next((message.frame for message in frames if message.frame.data), frames[0].frame)
     fields = ", ".join(f'"{path}"' for path in schema(data.tree).all_fields)

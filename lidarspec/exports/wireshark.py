@@ -128,7 +128,8 @@ class _Writer:
     """
 
     def __init__(self, message: Message, prefix: str) -> None:
-        self.message, self.prefix = message, prefix
+        self.message = message
+        self.prefix = prefix
         lengths = {path for node in tree.nodes(message.root) for path in held(node)}
         self.kept = {ref.path for ref in asked(message.root)} | message.seals.keys() | lengths
         self.marked = {path for seal in message.seals.values() for path in seal.over or ()}
@@ -159,7 +160,8 @@ class _Writer:
             case tree.Parts():
                 return self._parts(node)
             case tree.When():
-                then, otherwise = self.node(node.then, path), self.node(node.otherwise, path)
+                then = self.node(node.then, path)
+                otherwise = self.node(node.otherwise, path)
                 return {
                     "kind": "when",
                     "name": node.name,
@@ -239,11 +241,10 @@ class _Writer:
         letters = "INT" if part.bits.signed else "UINT"
         is_masked = order is not None and part.bits.width < 8 * block.size
         kind = f"{letters}{8 * block.size if is_masked else _width(part.bits.width)}"
-        mask = (
-            ((1 << part.bits.width) - 1) << (_run(part.bits, block.size, order) or 0)
-            if is_masked and order
-            else None
-        )
+        if is_masked and order:
+            mask = ((1 << part.bits.width) - 1) << (_run(part.bits, block.size, order) or 0)
+        else:
+            mask = None
         label = ".".join(part.names) + "".join(f"[{index}]" for index in part.indices)
         return {
             "name": part.info.name,
@@ -348,9 +349,10 @@ class _Writer:
             "unit": info.unit or None,
         }
         table |= {"labels": dict(info.labels) or None, "const": info.const}
-        table["allowed"] = (
-            None if info.allowed is None else [list(run) for run in tree.runs_of(info.allowed)]
-        )
+        if info.allowed is None:
+            table["allowed"] = None
+        else:
+            table["allowed"] = [list(run) for run in tree.runs_of(info.allowed)]
         return table | {"keep": self._keep(info.path)}
 
     def _new(
@@ -368,11 +370,14 @@ class _Writer:
         abbreviation = f"{self.prefix}.{path}"
         while self.types.setdefault(abbreviation, family) != family:
             abbreviation += "_"
-        valued = (
-            "{" + ", ".join(f"[{value}] = {quoted(text)}" for value, text in labels.items()) + "}"
-            if labels
-            else "nil"
-        )
+        if labels:
+            valued = (
+                "{"
+                + ", ".join(f"[{value}] = {quoted(text)}" for value, text in labels.items())
+                + "}"
+            )
+        else:
+            valued = "nil"
         masked = f"0x{mask:x}" if mask is not None else "nil"
         return Code(
             f"new({quoted(abbreviation)}, {quoted(name)}, ftypes.{kind}, base.{base}, {valued},"
@@ -383,11 +388,9 @@ class _Writer:
         return path if path in self.kept else None
 
     def _skip(self, info: tree.FieldInfo, size: int) -> int | None:
-        return (
-            None
-            if info.path in self.kept or info.const is not None or info.allowed is not None
-            else size
-        )
+        if info.path in self.kept or info.const is not None or info.allowed is not None:
+            return None
+        return size
 
     def _seal(self, node: tree.Sealed) -> Table:
         widths = {info.path: info.bits for below in tree.nodes(node) for info in tree.infos(below)}
@@ -531,11 +534,9 @@ def dissector(sensor: Sensor) -> str:
     Raises:
         Refused: where only Python code can decide what a frame is made of.
     """
-    name, title, link = (
-        sensor.id.replace("-", "_"),
-        f"{sensor.vendor} {sensor.model}",
-        sensor.links.get("data"),
-    )
+    name = sensor.id.replace("-", "_")
+    title = f"{sensor.vendor} {sensor.model}"
+    link = sensor.links.get("data")
     if isinstance(link, Udp) and link.assembled is not None:
         raise Refused(
             f"{sensor.id}: messages in several datagrams, which the dissector does not join"

@@ -122,13 +122,11 @@ class Column(NDArrayOperatorsMixin):
         source: str = "",
         frame: str = "",
     ) -> None:
-        self.array, self.axes, self.batch, self.source, self.frame = (
-            array,
-            axes,
-            batch,
-            source,
-            frame,
-        )
+        self.array = array
+        self.axes = axes
+        self.batch = batch
+        self.source = source
+        self.frame = frame
         self.ready = len(batch) if ready is None else ready
 
     @property
@@ -208,7 +206,8 @@ class Column(NDArrayOperatorsMixin):
         if len(axes) < len(own):
             raise SpecError(f"a column with {len(own)} axes cannot be put on {axes}")
         names = {schema.places[axis]: axis for axis in map(schema.axis, axes)}
-        places, array = sorted(names)[len(axes) - len(own) :], self.array
+        places = sorted(names)[len(axes) - len(own) :]
+        array = self.array
         for index, place in zip(own, places, strict=True):
             array = _reaching(array, 1 + index, self.batch.table, names[place])
         lengths = dict(zip(places, (array.shape[1 + index] for index in own), strict=True))
@@ -228,10 +227,8 @@ class Column(NDArrayOperatorsMixin):
         Raises:
             SpecError: where they are in none.
         """
-        schema, names = (
-            self.batch.table.schema,
-            [str(name).strip("?") for name in self.axes if name is not None],
-        )
+        schema = self.batch.table.schema
+        names = [str(name).strip("?") for name in self.axes if name is not None]
         if (
             not names and not self.frame and self.source in schema.fields
         ):  # of one element in all packets
@@ -244,18 +241,17 @@ class Column(NDArrayOperatorsMixin):
         """0, 1, 2 ... up to the largest value, (m,): the indices of the array of which this column
         is the count.
         """
-        schema, most = self.batch.table.schema, int(np.nanmax(self.array, initial=0))
+        schema = self.batch.table.schema
+        most = int(np.nanmax(self.array, initial=0))
         counted = [
             axis
             for axis, count in schema.arrays.items()
             if isinstance(count, Ref) and count.path == self.source and not self.frame
         ]
         axis = counted[0] if len(counted) == 1 else schema.chain[-1] if schema.chain else None
-        return (
-            np.arange(most)
-            if axis is None
-            else Along((axis,), np.arange(_reach(self.batch.table, axis, most)))
-        )
+        if axis is None:
+            return np.arange(most)
+        return Along((axis,), np.arange(_reach(self.batch.table, axis, most)))
 
     def gathered(self, table: NDArray[np.float64]) -> Column:
         """The rows of a table, (m + 1, k), the last one nan, at these indices, along the array of k
@@ -292,7 +288,9 @@ class Column(NDArrayOperatorsMixin):
         values = np.concatenate([carried, row.values]) if len(carried) else row.values
         edges = row.edges + len(carried)
         shifted = np.empty(len(values))
-        ahead, behind, inside = max(step, 0), max(-step, 0), max(len(values) - size, 0)
+        ahead = max(step, 0)
+        behind = max(-step, 0)
+        inside = max(len(values) - size, 0)
         shifted[behind : behind + inside] = values[ahead : ahead + inside]
         shifted[:behind] = shifted[behind + inside :] = np.nan
         for edge in edges.tolist() if size else ():
@@ -351,11 +349,10 @@ class RowOfValues:
 
     def __init__(self, column: Column) -> None:
         self._shape = (len(column.batch), *column.shape[1:])
-        full = (
-            column.array
-            if column.array.shape == self._shape
-            else np.broadcast_to(column.array, self._shape)
-        )
+        if column.array.shape == self._shape:
+            full = column.array
+        else:
+            full = np.broadcast_to(column.array, self._shape)
         flat = full.reshape(self._shape[0], math.prod(self._shape[1:]))
         self._mask = unpadded(column.axes, self._shape, column.batch)
         self.values = np.asarray(
@@ -393,11 +390,9 @@ def unpadded(
             len(counts), *(shape[1 + i] if i == index else 1 for i in range(len(axes)))
         )
         mask = inside if mask is None else mask & inside
-    return (
-        None
-        if mask is None
-        else np.broadcast_to(mask, shape).reshape(shape[0], math.prod(shape[1:]))
-    )
+    if mask is None:
+        return None
+    return np.broadcast_to(mask, shape).reshape(shape[0], math.prod(shape[1:]))
 
 
 def aligned(
@@ -430,7 +425,8 @@ def aligned(
         + [place + 1 for places in named.values() for place in places],
         default=0,
     )
-    axes, lengths = list[str | None]([None] * depth), [1] * depth
+    axes = list[str | None]([None] * depth)
+    lengths = [1] * depth
     for column in columns:
         for place, name in enumerate(column.axes):
             axes[place], lengths[place] = (
@@ -525,9 +521,10 @@ def _placed(
     for place in range(max(depth - array.ndim, 0), depth):
         if array.shape[place - depth] != 1 and axes[place] is None:
             chain = table.schema.chain
-            guess = (
-                "" if array.ndim > depth else "?"
-            )  # with an axis for the packets it was made of columns
+            if array.ndim > depth:
+                guess = ""
+            else:
+                guess = "?"  # with an axis for the packets it was made of columns
             axes[place] = f"{guess}{chain[place] if place < len(chain) else f'<{place}>'}"
     return array
 
@@ -624,11 +621,9 @@ def _reach(table: Table, axis: str, length: int) -> int:
     """How far along an axis values are; no further than the array where frames say its length and
     have no array around it.
     """
-    return (
-        min(length, table.length(axis))
-        if any((table.counts(other) == 0).any() for other in table.schema.outer(axis))
-        else length
-    )
+    if any((table.counts(other) == 0).any() for other in table.schema.outer(axis)):
+        return min(length, table.length(axis))
+    return length
 
 
 def _reaching(array: NDArray[Any], place: int, table: Table, axis: str) -> NDArray[Any]:
@@ -665,7 +660,8 @@ def _lengths(arrays: Mapping[str, NDArray[Any]], axes: tuple[str | None, ...]) -
     """How long arrays are along which axes: "range: samples 3, azimuth: samples 4"; those of one
     number are left out.
     """
-    names, told = ("packets", *((name or "").strip("?") for name in axes)), []
+    names = ("packets", *((name or "").strip("?") for name in axes))
+    told = []
     for what, array in arrays.items():
         own = [
             f"{name} {size}".strip()
@@ -739,10 +735,8 @@ def field_array(info: FieldInfo, table: Table, depth: int, *, raw: bool = False)
     Args:
         raw: as it was sent, of its own type.
     """
-    array, places = (
-        table.raw(info.path) if raw else physical(info, table),
-        [table.schema.places[axis] for axis in info.axes],
-    )
+    array = table.raw(info.path) if raw else physical(info, table)
+    places = [table.schema.places[axis] for axis in info.axes]
     if places and places[-1] >= len(places):  # an element of an array in which others stand
         lengths = dict(zip(places, array.shape[1:], strict=True))
         array = array.reshape(
@@ -788,7 +782,9 @@ class Fields:
     """
 
     def __init__(self, batch: Batch, prefix: str = "", frame: str = "") -> None:
-        self._batch, self._prefix, self._frame = batch, prefix, frame
+        self._batch = batch
+        self._prefix = prefix
+        self._frame = frame
 
     def __getattr__(self, name: str) -> Any:
         if name.startswith("__"):
@@ -797,7 +793,8 @@ class Fields:
             return _States(self._batch)
         if name == "frame" and not self._prefix and not self._frame and AROUND in self._batch.state:
             return Fields(self._batch, frame=AROUND)
-        path, known = f"{self._prefix}{name}", _paths(self._batch, self._frame)
+        path = f"{self._prefix}{name}"
+        known = _paths(self._batch, self._frame)
         base = without_indices(path)[0]
         if base in known:
             return _column(self._batch, self._frame, path)

@@ -167,7 +167,8 @@ class Traced(NDArrayOperatorsMixin):
     """A column that notes down what is done to it; offers what `Column` offers to expressions."""
 
     def __init__(self, node: Node, tape: Tape) -> None:
-        self.node, self._tape = node, tape
+        self.node = node
+        self._tape = tape
 
     @property
     def seen(self) -> NDArray[Any]:
@@ -303,12 +304,16 @@ class TracedFields:
         path: str = "",
         read: Callable[[Any], Any] = lambda fields: fields,
     ) -> None:
-        self._real, self._tape, self._path, self._read = real, tape, path, read
+        self._real = real
+        self._tape = tape
+        self._path = path
+        self._read = read
 
     def __getattr__(self, name: str) -> Any:
         if name.startswith("__"):
             raise AttributeError(name)
-        path, before = f"{self._path}.{name}".lstrip("."), self._read
+        path = f"{self._path}.{name}".lstrip(".")
+        before = self._read
         value, read = getattr(self._real, name), lambda fields: getattr(before(fields), name)
         if isinstance(value, Along):
             return value
@@ -394,7 +399,8 @@ def traverse(*values: Any, into: Callable[[Node], bool] = lambda node: True) -> 
     Args:
         into: whether to go on to what a node is made of.
     """
-    seen, waiting = set[Node](), [node_of(value) for value in values]
+    seen = set[Node]()
+    waiting = [node_of(value) for value in values]
     while waiting:
         node = waiting.pop()
         if isinstance(node, Node) and node not in seen:
@@ -494,7 +500,8 @@ class HeaderFunction:
     """
 
     def __init__(self, function: Callable[[Any], Any], made: Made) -> None:
-        self._function, self._made = function, made
+        self._function = function
+        self._made = made
         self._terms: list[_Term] | None = None
         self._is_tried = False
 
@@ -534,7 +541,8 @@ class _Term:
     def __init__(self, expression: Expression, made: Made) -> None:
         if any(info.axes or info.optional for info in expression.fields):
             raise Untraceable("not every packet has its fields once")
-        self._expression, self._made = expression, made
+        self._expression = expression
+        self._made = made
         self._known: dict[tuple[Any, ...], NDArray[np.int64]] = {}
 
     def __call__(self, table: Table) -> NDArray[np.int64]:
@@ -660,7 +668,8 @@ def terms(value: Any, width: int) -> list[Term]:
         return [Term(np.asarray(value, np.float64))]
     if not is_full(value, width) and value.width:
         return [Term(np.ones(()), low=value)]
-    function, args = value.function, value.args
+    function = value.function
+    args = value.args
     if value.kind == "call" and only_field(value) is None:
         if function in FACTORS:
             return _scaled(value, terms(args[0], width), FACTORS[function])
@@ -668,11 +677,10 @@ def terms(value: Any, width: int) -> list[Term]:
             sign = 1.0 if function is np.add else -1.0
             return terms(args[0], width) + [term.times(sign) for term in terms(args[1], width)]
         if function in (np.multiply, np.true_divide) and not isinstance(args[1], Node):
-            factor = (
-                np.asarray(args[1], np.float64)
-                if function is np.multiply
-                else 1 / np.asarray(args[1], np.float64)
-            )
+            if function is np.multiply:
+                factor = np.asarray(args[1], np.float64)
+            else:
+                factor = 1 / np.asarray(args[1], np.float64)
             return _scaled(value, terms(args[0], width), factor)
         if function is np.multiply and not isinstance(args[0], Node):
             return _scaled(value, terms(args[1], width), np.asarray(args[0], np.float64))

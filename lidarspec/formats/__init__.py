@@ -58,8 +58,10 @@ from lidarspec.transports.protocol import Chunk, Format
 #: which these are the letters of an ISO text.
 MOMENT = {"%F": slice(10), "%H": slice(11, 13), "%M": slice(14, 16), "%S": slice(17, 19)}
 PLACE = re.compile(rf"%0?\d?d|{'|'.join(MOMENT)}")
-ARRAYS, TABLES = (CSV, CSV_GZ, XYZ, NPZ, NPY, ZARR), (PARQUET, ARROW, FEATHER)
-CLOUDS, BAGS = (PCD, LZF_PCD, PLY, KITTI, LAS, LAZ, E57), (MCAP, FOXGLOVE, BAG, ROSBAG2, DB3, RERUN)
+ARRAYS = (CSV, CSV_GZ, XYZ, NPZ, NPY, ZARR)
+TABLES = (PARQUET, ARROW, FEATHER)
+CLOUDS = (PCD, LZF_PCD, PLY, KITTI, LAS, LAZ, E57)
+BAGS = (MCAP, FOXGLOVE, BAG, ROSBAG2, DB3, RERUN)
 BUILT_IN = {known.suffix: known for known in (*ARRAYS, *TABLES, *CLOUDS, *BAGS)}
 
 
@@ -109,7 +111,8 @@ def write_imu(path: str | Path, samples: ImuSamples) -> None:
         UnknownFormat: for another suffix.
         SourceError: where the file cannot be written.
     """
-    path, known = Path(path), {format.suffix: format for format in (CSV, NPZ)}
+    path = Path(path)
+    known = {format.suffix: format for format in (CSV, NPZ)}
     chosen = _longest(path, known) or _unknown(path, known)
     with replacing(path) as part:
         if chosen is CSV:
@@ -171,15 +174,10 @@ def write(
     if organized:
         check_holds(path, "organized")
         is_alone = "scans" not in chosen.holds
-        scans, every_point = (
-            _organized(path, scans, alone=is_alone and not PLACE.search(str(path))),
-            True,
-        )
-        chosen = (
-            dataclasses.replace(chosen, write=partial(chosen.write, organized=True))
-            if is_alone
-            else chosen
-        )
+        scans = _organized(path, scans, alone=is_alone and not PLACE.search(str(path)))
+        every_point = True
+        if is_alone:
+            chosen = dataclasses.replace(chosen, write=partial(chosen.write, organized=True))
     for target, held in _each(path, scans) if PLACE.search(str(path)) else [(path, scans)]:
         with replacing(target) as part:
             chosen.write(part, held, every_point=every_point, **beside)

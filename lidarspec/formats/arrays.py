@@ -26,7 +26,8 @@ from lidarspec.scans.scans import Scan
 from lidarspec.transports.protocol import Format
 
 #: numbers of a chunk of Zarr, and of one of those that have a number a scan.
-ROWS, SCANS = 1 << 18, 1 << 12
+ROWS = 1 << 18
+SCANS = 1 << 12
 #: what there is of each scan: type and unit, as xarray reads it.
 OF_SCANS: dict[str, tuple[DTypeLike, str]] = {
     "stamp_ns": (np.int64, "nanoseconds since 1970-01-01"),
@@ -62,16 +63,17 @@ def write(path: Path, scans: Iterable[Scan], *, every_point: bool, organized: bo
             "rate_hz": column(np.float64),
             "complete": column(np.bool_),
         }
-        numbers, columns, units = column(np.int32), dict[str, Spool](), dict[str, str]()
+        numbers = column(np.int32)
+        columns = dict[str, Spool]()
+        units = dict[str, str]()
         for number, scan in enumerate(scans):
             cloud = written(scan, every_point=every_point)
             own = cloud.columns
             if organized:
                 height = len(picture(cloud.valid, cloud))
                 own = {name: picture(column, cloud).ravel() for name, column in own.items()}
-            columns = (
-                columns if number else {name: column(values.dtype) for name, values in own.items()}
-            )
+            if not (number):
+                columns = {name: column(values.dtype) for name, values in own.items()}
             units = units if number else {name: unit for name, unit in cloud.units.items() if unit}
             columns = {name: kept for name, kept in columns.items() if name in own}
             for name, kept in columns.items():
@@ -137,7 +139,8 @@ class _ZarrColumn:
             dimension_names=(along,),
             attributes={"units": unit} if unit else {},
         )
-        self._waiting, self._length = list[NDArray[Any]](), 0
+        self._waiting = list[NDArray[Any]]()
+        self._length = 0
 
     def add(self, values: NDArray[Any] | None, length: int) -> None:
         """Append values; without any, nan or 0 as often as `length` says."""
@@ -153,7 +156,8 @@ class _ZarrColumn:
         """Write so many of the values that wait."""
         waiting = np.concatenate([np.empty(0, self._array.dtype), *self._waiting])
         self._array.append(waiting[:number])
-        self._waiting, self._length = [waiting[number:].copy()], len(waiting) - number
+        self._waiting = [waiting[number:].copy()]
+        self._length = len(waiting) - number
 
     def finish(self) -> None:
         """Write all that wait."""

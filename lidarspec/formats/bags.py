@@ -43,8 +43,10 @@ class Log:
     """
 
     def __init__(self, release: str) -> None:
-        self._messages, self._planes = Messages(release), Planes()
-        self.types, self.units = self._messages.types, dict[str, str]()
+        self._messages = Messages(release)
+        self._planes = Planes()
+        self.types = self._messages.types
+        self.units = dict[str, str]()
 
     def messages(
         self, scans: Iterable[Scan], packets: Iterable[Chunk], *, every_point: bool
@@ -75,7 +77,8 @@ def write_mcap(
 ) -> None:
     """Write an MCAP file as ROS 2 records it, which Foxglove, `ros2 bag` and PlotJuggler read."""
     mcap = import_library("mcap.writer", "ros")
-    held, channels = Log("ROS2_HUMBLE"), dict[str, int]()
+    held = Log("ROS2_HUMBLE")
+    channels = dict[str, int]()
     with path.open("wb") as file:
         log = mcap.Writer(file, chunk_size=CHUNK, compression=mcap.CompressionType.NONE)
         log.start(profile="ros2", library="lidarspec")

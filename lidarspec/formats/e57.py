@@ -42,7 +42,8 @@ LIMITS = {
 #: what the standard calls a point whose coordinates mean nothing.
 INVALID = 2
 #: prefix of the further columns, which are an extension, and what declares it.
-PREFIX, EXTENSION = "lidarspec", "urn:lidarspec:columns"
+PREFIX = "lidarspec"
+EXTENSION = "urn:lidarspec:columns"
 #: types that libE57Format does not take, and those that hold their numbers.
 TAKEN_AS = {
     "f2": np.float32,
@@ -61,7 +62,8 @@ def _write(path: Path, scans: Iterable[Scan], *, every_point: bool) -> None:
     `every_point`, a point without a return is at 0 with cartesianInvalidState 2. Headers are in
     memory until the file is closed, as the library has it.
     """
-    pye57, libe57 = import_library("pye57", "e57"), import_library("pye57.libe57", "e57")
+    pye57 = import_library("pye57", "e57")
+    libe57 = import_library("pye57.libe57", "e57")
     with contextlib.ExitStack() as files:
         try:
             file = pye57.E57(str(path), mode="w")
@@ -79,8 +81,10 @@ def _add(
     libe57: Any, file: Any, header: Mapping[str, Any], columns: Mapping[str, NDArray[Any]]
 ) -> None:
     """Add a scan to a file."""
-    image, length = file.image_file, len(columns["cartesianX"])
-    prototype, buffers = libe57.StructureNode(image), libe57.VectorSourceDestBuffer()
+    image = file.image_file
+    length = len(columns["cartesianX"])
+    prototype = libe57.StructureNode(image)
+    buffers = libe57.VectorSourceDestBuffer()
     for name, column in columns.items():
         prototype.set(name, _kind(libe57, image, column))
         buffers.append(libe57.SourceDestBuffer(image, name, column, max(length, 1), True, True))

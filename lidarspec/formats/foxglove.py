@@ -31,11 +31,10 @@ def write_foxglove(path: Path, scans: Iterable[Scan], *, every_point: bool) -> N
     Raises:
         UsageError: for a stamp before 1970.
     """
-    mcap, support = (
-        import_library("mcap.writer", "foxglove"),
-        import_library("mcap_protobuf.writer", "foxglove"),
-    )
-    planes, units = Planes(), dict[str, str]()
+    mcap = import_library("mcap.writer", "foxglove")
+    support = import_library("mcap_protobuf.writer", "foxglove")
+    planes = Planes()
+    units = dict[str, str]()
     with path.open("wb") as file:
         log = support.Writer(file, chunk_size=CHUNK, compression=mcap.CompressionType.NONE)
         for scan in scans:
@@ -49,7 +48,8 @@ def write_foxglove(path: Path, scans: Iterable[Scan], *, every_point: bool) -> N
                 )
             for topic, message in messages.items():
                 message.timestamp.FromNanoseconds(scan.stamp_ns)
-                message.frame_id, message.pose.orientation.w = scan.frame_id, 1
+                message.frame_id = scan.frame_id
+                message.pose.orientation.w = 1
                 log.write_message(topic, message, scan.stamp_ns, scan.stamp_ns)
         if units:
             log.add_metadata("units", units)

@@ -22,17 +22,23 @@ from lidarspec.transports.protocol import Format
 
 #: the columns that LAS has a place for, and those that are extra dimensions as the sensor's further
 #: ones are.
-PLACED, EXTRA = ("x", "y", "z", "intensity", "time", "return_index", "valid"), ("ring", "column")
+PLACED = ("x", "y", "z", "intensity", "time", "return_index", "valid")
+EXTRA = ("ring", "column")
 #: types that extra dimensions do not have, and those that hold their numbers.
 WIDER = {"f2": np.dtype(np.float32), "b1": np.dtype(np.uint8)}
 #: metres a step, and metres from 0 up to which places count from there; farther away they count
 #: from whole metres nearby.
-STEP, NEAR = 1e-4, 1e5
+STEP = 1e-4
+NEAR = 1e5
 #: ns since 1970 at what adjusted standard GPS time counts from.
 EPOCH = GPS_EPOCH + 10**18
 #: points put together at once; the farthest step, the largest intensity, the last number of a
 #: return, and the flag of what is withheld.
-ROWS, FARTHEST, BRIGHTEST, LAST, WITHHELD = 1 << 17, (1 << 31) - 1, 0xFFFF, 15, 1 << 2
+ROWS = 1 << 17
+FARTHEST = (1 << 31) - 1
+BRIGHTEST = 0xFFFF
+LAST = 15
+WITHHELD = 1 << 2
 
 
 def _write(path: Path, scans: Iterable[Scan], *, every_point: bool, is_compressed: bool) -> None:
@@ -52,7 +58,8 @@ def _write(path: Path, scans: Iterable[Scan], *, every_point: bool, is_compresse
     """
     laspy = import_library("laspy", "las")
     with contextlib.ExitStack() as files:
-        header, writer = laspy.LasHeader(point_format=6, version="1.4"), None
+        header = laspy.LasHeader(point_format=6, version="1.4")
+        writer = None
         opened = partial(
             laspy.open,
             files.enter_context(path.open("wb")),
@@ -97,10 +104,12 @@ def _describe(
             for name, label in further.items()
         ]
     )
-    header.scales, header.offsets = [STEP] * 3, [_offset(own[axis]) for axis in "xyz"]
+    header.scales = [STEP] * 3
+    header.offsets = [_offset(own[axis]) for axis in "xyz"]
     header.global_encoding.wkt = True  # as this point format has it
     header.global_encoding.gps_time_type = laspy.header.GpsTimeType.STANDARD
-    header.generating_software, header.system_identifier = "lidarspec", scan.sensor.id[:32]
+    header.generating_software = "lidarspec"
+    header.system_identifier = scan.sensor.id[:32]
     return further
 
 
@@ -112,11 +121,10 @@ def _offset(places: NDArray[Any]) -> float:
 
 def _returns(own: Mapping[str, NDArray[Any]]) -> NDArray[np.uint8]:
     """The number of each return, from 1 on, and above it how many there are, (n,)."""
-    numbers = (
-        np.minimum(own["return_index"], LAST - 1) + 1
-        if "return_index" in own
-        else np.ones(len(own["x"]), np.uint8)
-    )
+    if "return_index" in own:
+        numbers = np.minimum(own["return_index"], LAST - 1) + 1
+    else:
+        numbers = np.ones(len(own["x"]), np.uint8)
     returns: NDArray[np.uint8] = (numbers | numbers.max(initial=1) << 4).astype(np.uint8)
     return returns
 

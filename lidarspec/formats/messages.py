@@ -51,16 +51,19 @@ class Messages:
     def __init__(self, release: str) -> None:
         typesys = import_library("rosbags.typesys", "ros")
         self.types = typesys.get_typestore(typesys.Stores[release])
-        self._serialized = (
-            self.types.serialize_ros1 if release.startswith("ROS1") else self.types.serialize_cdr
-        )
+        if release.startswith("ROS1"):
+            self._serialized = self.types.serialize_ros1
+        else:
+            self._serialized = self.types.serialize_cdr
         self._counts = release.startswith("ROS1")
 
     def raw(self, packet: Chunk, *, datagram: bool = True) -> Message:
         """A packet as it was received, which `transports.bags` reads again; not a `datagram`: of a
         stream.
         """
-        at, size, types = packet.at or 0, len(packet.data), self.types.types
+        at = packet.at or 0
+        size = len(packet.data)
+        types = self.types.types
         dimension = types["std_msgs/msg/MultiArrayDimension"](
             label=DATAGRAM if datagram else STREAM, size=size, stride=size
         )

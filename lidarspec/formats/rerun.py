@@ -28,13 +28,16 @@ from lidarspec.scans.scans import Scan
 from lidarspec.transports.protocol import Format
 
 #: of a point on the screen, in its viewer's pixels; and metres of the axes of a sensor.
-RADIUS, AXES = 1.5, 0.3
+RADIUS = 1.5
+AXES = 0.3
 #: points that are handed over together, which bounds what is held.
 HELD = 1 << 13
 #: bytes that are taken out of a pipe at once.
 PIPED = 1 << 16
 #: the names of the timelines: by the sensor's clock, by arrival, by number.
-SENSOR, HOST, NUMBER = "sensor_time", "host_time", "scan"
+SENSOR = "sensor_time"
+HOST = "host_time"
+NUMBER = "scan"
 
 
 class Log:
@@ -54,8 +57,11 @@ class Log:
         self.stream = self._rerun.RecordingStream("lidarspec", send_properties=False)
         self.stream.set_log_time_enabled(False)  # when it was logged is not when it was measured
         self.stream.set_log_tick_enabled(False)
-        self._ramp, self._colours, self._number = ramp, _Colours(), 0
-        self._home, self._waiting = "", 0
+        self._ramp = ramp
+        self._colours = _Colours()
+        self._number = 0
+        self._home = ""
+        self._waiting = 0
         self._copy: _Copy | None = None
 
     def __enter__(self) -> Log:
@@ -152,15 +158,15 @@ class Log:
             raise self._copy.failure
 
     def _begin(self, scan: Scan) -> None:
-        self._home, rerun = f"/{scan.sensor.id}", self._rerun
+        self._home = f"/{scan.sensor.id}"
+        rerun = self._rerun
         self.stream.send_recording_name(scan.sensor.id)
         self.stream.log("/", rerun.ViewCoordinates.FLU, static=True)
         mount = scan.mount
-        turn = (
-            {"translation": (mount.x, mount.y, mount.z), "mat3x3": mount.rotation}
-            if mount
-            else {"translation": (0, 0, 0)}
-        )
+        if mount:
+            turn = {"translation": (mount.x, mount.y, mount.z), "mat3x3": mount.rotation}
+        else:
+            turn = {"translation": (0, 0, 0)}
         self.stream.log(
             f"{self._home}/sensor",
             rerun.Transform3D(**turn),

@@ -54,7 +54,9 @@ class Rows:
     ) -> None:
         scans = iter(scans)
         first = list(itertools.islice(scans, 2))
-        self._every_point, self.length, self.facts = every_point, 0, list[str]()
+        self._every_point = every_point
+        self.length = 0
+        self.facts = list[str]()
         self.shape: tuple[int, int] | None = None
         types: dict[str, Any] = dict.fromkeys("xyz", np.float32)
         if first:

@@ -53,8 +53,11 @@ def tables(scans: Iterable[Scan], path: Path | None = None, *, every_point: bool
         path: where they go; a column that a folder of it says already, such as scan=7, is left out,
             as Hive has it.
     """
-    arrow, of_scans = import_library("pyarrow", "arrow"), _of_scans(path)
-    schema, gathered, rows = None, list[Any](), 0
+    arrow = import_library("pyarrow", "arrow")
+    of_scans = _of_scans(path)
+    schema = None
+    gathered = list[Any]()
+    rows = 0
     for place, scan in enumerate(scans):
         cloud = written(scan, every_point=every_point)
         schema = schema or _schema(arrow, scan, cloud, of_scans)
@@ -64,7 +67,8 @@ def tables(scans: Iterable[Scan], path: Path | None = None, *, every_point: bool
         rows += len(cloud)
         if rows >= ROWS:
             yield _table(arrow, gathered, schema)
-            gathered, rows = [], 0
+            gathered = []
+            rows = 0
     if gathered or schema is None:
         yield _table(arrow, gathered, schema or arrow.schema(of_scans))
 
@@ -77,7 +81,8 @@ def _table(arrow: Any, batches: Sequence[Any], schema: Any) -> Any:
 
 def _of_scans(path: Path | None) -> list[Any]:
     """The fields that say of each point which scan it is from, but for those that a folder says."""
-    arrow, folders = import_library("pyarrow", "arrow"), path.parent.parts if path else ()
+    arrow = import_library("pyarrow", "arrow")
+    folders = path.parent.parts if path else ()
     said = {part.partition("=")[0] for part in folders if "=" in part}
     types = {"scan": arrow.int32(), "stamp": arrow.timestamp("ns"), "complete": arrow.bool_()}
     return [
@@ -102,11 +107,10 @@ def _batch(arrow: Any, schema: Any, cloud: PointCloud, number: int, scan: Scan) 
         own[name] = np.full(len(cloud), value)
     for field in schema:
         if field.name not in own:
-            own[field.name] = (
-                np.full(len(cloud), np.nan)
-                if not field.nullable
-                else arrow.nulls(len(cloud), field.type)
-            )
+            if not field.nullable:
+                own[field.name] = np.full(len(cloud), np.nan)
+            else:
+                own[field.name] = arrow.nulls(len(cloud), field.type)
     return arrow.RecordBatch.from_arrays(
         [_array(arrow, own[field.name], field.type) for field in schema], schema=schema
     )
@@ -118,11 +122,10 @@ def _array(arrow: Any, values: Any, kind: Any) -> Any:
     """
     if not isinstance(values, np.ndarray) or arrow.from_numpy_dtype(values.dtype) != kind:
         return arrow.array(values, kind)
-    data = (
-        np.packbits(values, bitorder="little")
-        if values.dtype == np.bool_
-        else np.ascontiguousarray(values).view(np.uint8)
-    )
+    if values.dtype == np.bool_:
+        data = np.packbits(values, bitorder="little")
+    else:
+        data = np.ascontiguousarray(values).view(np.uint8)
     return arrow.Array.from_buffers(kind, len(values), [None, arrow.py_buffer(data)])
 
 

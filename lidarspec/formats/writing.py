@@ -140,7 +140,8 @@ def picture(values: NDArray[Any], cloud: PointCloud) -> NDArray[Any]:
     a place stand side by side.
     """
     columns, rows = cloud.shape or (len(cloud), 1)
-    returns, height = len(cloud) // max(columns * rows, 1) or 1, rows
+    returns = len(cloud) // max(columns * rows, 1) or 1
+    height = rows
     if cloud.ring is not None and columns:
         rings = cloud.ring[: rows * returns : returns]
         once = len(np.unique(rings))
@@ -156,7 +157,8 @@ class Spool:
 
     def __init__(self, folder: Path, dtype: DTypeLike) -> None:
         self._file = tempfile.TemporaryFile(dir=folder)  # noqa: SIM115  closed by `close`
-        self.dtype, self.length = np.dtype(dtype), 0
+        self.dtype = np.dtype(dtype)
+        self.length = 0
 
     def add(self, values: NDArray[Any]) -> None:
         """Append the values of a scan."""

@@ -68,7 +68,8 @@ def by_value(values: NDArray[Any], few: int) -> list[tuple[int, NDArray[np.intp]
     Args:
         few: so many different ones are found one by one sooner than sorted.
     """
-    found, left = list[int](), values
+    found = list[int]()
+    left = values
     while len(left) and len(found) < few:
         found.append(left.item(0))
         left = left[left != left[0]]
@@ -85,9 +86,10 @@ def taken(
 ) -> NDArray[np.uint8]:
     """The rows of bytes that indices or a mask pick, (k, size), each copied as one piece."""
     whole = rows.view(f"V{rows.shape[1]}")[:, 0]
-    some = (
-        whole.take(which) if which.dtype != np.bool_ and rows.flags.c_contiguous else whole[which]
-    )
+    if which.dtype != np.bool_ and rows.flags.c_contiguous:
+        some = whole.take(which)
+    else:
+        some = whole[which]
     return some.view(np.uint8).reshape(-1, rows.shape[1])
 
 

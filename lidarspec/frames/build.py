@@ -60,7 +60,10 @@ class _Values:
     """
 
     def __init__(self, table: Schema, known: frozenset[str], place: str, *, units: bool) -> None:
-        self._table, self._known, self._place, self._units = table, known, place, units
+        self._table = table
+        self._known = known
+        self._place = place
+        self._units = units
 
     def checked(self, value: Any, path: str, shown: str = "") -> Any:
         info = self._table.all_fields.get(path)
@@ -112,11 +115,9 @@ class _Values:
         if isinstance(value, str | WireNaN | bytes):
             return value
         if info.kind not in ("int", "float"):
-            return (
-                info.raw(value)
-                if self._units and info.scaled and isinstance(value, int | float)
-                else value
-            )
+            if self._units and info.scaled and isinstance(value, int | float):
+                return info.raw(value)
+            return value
         if info.kind == "float":
             raw = info.raw(value) if self._units else value
             return raw if isinstance(raw, int) else float(raw)

@@ -39,7 +39,8 @@ def build_command(sensor: Spec, name: str, arguments: Mapping[str, Any]) -> byte
     """
     if name not in sensor.commands:
         raise UnknownCommand(name, sensor.commands, place=sensor.id)
-    command, place = sensor.commands[name], f"{sensor.id} {name}"
+    command = sensor.commands[name]
+    place = f"{sensor.id} {name}"
     unknown = set(arguments) - set(command.args) - set(command.filled)
     if unknown:
         raise UnknownField(min(unknown), command.args, place=place)
@@ -47,11 +48,10 @@ def build_command(sensor: Spec, name: str, arguments: Mapping[str, Any]) -> byte
         return b""
     values: Any = {}
     for path, value in command.values.items():
-        filled = (
-            _found_out(sensor, name, path, value, arguments.get(path))
-            if path in command.filled
-            else copy.deepcopy(value)
-        )
+        if path in command.filled:
+            filled = _found_out(sensor, name, path, value, arguments.get(path))
+        else:
+            filled = copy.deepcopy(value)
         values = put(values, steps(path), filled)
     for argument, declared in command.arguments.items():
         slot = argument_slot(sensor, name, argument)
@@ -82,20 +82,19 @@ def argument_slot(sensor: Spec, name: str, argument: str) -> Slot:
     Raises:
         SpecError: where its kind of value cannot stand there.
     """
-    declared, place = sensor.commands[name].arguments[argument], f"commands.{name}.args.{argument}"
+    declared = sensor.commands[name].arguments[argument]
+    place = f"commands.{name}.args.{argument}"
     slot = _slot(sensor, name, declared.path, place)
-    takes = (
-        {"int", "float"}
-        if isinstance(declared.kind, Range)
-        else {"bytes", "other"} | ({"int"} if slot.is_array else set())
-    )
+    if isinstance(declared.kind, Range):
+        takes = {"int", "float"}
+    else:
+        takes = {"bytes", "other"} | ({"int"} if slot.is_array else set())
     takes |= {"int"} if isinstance(declared.kind, Address) else set()
     if slot.info.kind not in takes or (slot.is_array and isinstance(declared.kind, Range)):
-        what = (
-            f"an array, of which an element is {declared.path}[0]"
-            if slot.is_array
-            else f"a field of kind {slot.info.kind!r}"
-        )
+        if slot.is_array:
+            what = f"an array, of which an element is {declared.path}[0]"
+        else:
+            what = f"a field of kind {slot.info.kind!r}"
         raise SpecError(
             f"{type(declared.kind).__name__} cannot stand in {declared.path!r}, which is {what}",
             path=place,
@@ -105,13 +104,13 @@ def argument_slot(sensor: Spec, name: str, argument: str) -> Slot:
 
 
 def _slot(sensor: Spec, name: str, path: str, place: str) -> Slot:
-    frame, names = sensor.commands[name].frame or "", steps(path)
+    frame = sensor.commands[name].frame or ""
+    names = steps(path)
     table = schema(sensor.frames[frame].tree) if frame else None
-    info = (
-        table.all_fields.get(".".join(step for step in names if isinstance(step, str)))
-        if table is not None
-        else None
-    )
+    if table is not None:
+        info = table.all_fields.get(".".join(step for step in names if isinstance(step, str)))
+    else:
+        info = None
     if table is None or info is None:
         raise SpecError(
             f"{frame or 'a command without a frame'} has no field {path!r}",
@@ -125,10 +124,8 @@ def _slot(sensor: Spec, name: str, path: str, place: str) -> Slot:
             for kind in node.kinds
             for below, count in schema(kind.root).arrays.items()
         }
-    indices, counts = (
-        [step for step in names if isinstance(step, int)],
-        [arrays.get(axis) for axis in info.axes],
-    )
+    indices = [step for step in names if isinstance(step, int)]
+    counts = [arrays.get(axis) for axis in info.axes]
     left = counts[len(indices) :]
     if len(left) > 1 or len(indices) > len(counts) - (info.kind == "bytes"):
         reason = (
@@ -177,13 +174,11 @@ def _placed(slot: Slot, data: bytes) -> Any:
     """Bytes as the raw value of a field that is plain bytes, an array of numbers, or one number in
     network order.
     """
-    return (
-        data
-        if slot.info.kind == "bytes"
-        else list(data)
-        if slot.is_array
-        else int.from_bytes(data, "big")
-    )
+    if slot.info.kind == "bytes":
+        return data
+    if slot.is_array:
+        return list(data)
+    return int.from_bytes(data, "big")
 
 
 def _found_out(sensor: Spec, name: str, path: str, value: Filled, given: Any) -> Any:
@@ -193,8 +188,6 @@ def _found_out(sensor: Spec, name: str, path: str, value: Filled, given: Any) ->
     if isinstance(value, Count):
         return value.first if given is None else given
     slot = _slot(sensor, name, path, f"commands.{name}.values.{path}")
-    return (
-        _placed(slot, bytes(slot.room or 4))
-        if given is None
-        else raw_argument(slot, value, given, path, f"{sensor.id} {name}")
-    )
+    if given is None:
+        return _placed(slot, bytes(slot.room or 4))
+    return raw_argument(slot, value, given, path, f"{sensor.id} {name}")

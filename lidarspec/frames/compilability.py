@@ -12,7 +12,8 @@ class NotCompilable(Exception):
     """A part of a struct that has no computable place; attributes `path` and `reason`."""
 
     def __init__(self, path: str, reason: str) -> None:
-        self.path, self.reason = path, reason
+        self.path = path
+        self.reason = reason
         super().__init__(f"{path}: {reason}" if path else reason)
 
 

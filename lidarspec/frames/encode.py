@@ -179,7 +179,8 @@ class _Encoder:
         following = 0
         # From the last to the first: a part of a chain says how long the next one is.
         for index in reversed(range(len(given))):
-            kind, part = kinds[index], given[index]
+            kind = kinds[index]
+            part = given[index]
             fill_in(kind.following, part, following, schema(kind.root).fields, node.axis)
             prefix = self._shown(f"{node.axis}[{index}]")
             encoder = _Encoder(kind.root, part, self._limit, self._place, prefix, around)

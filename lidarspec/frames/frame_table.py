@@ -76,7 +76,8 @@ class Rows:
     """A `Table` of frames whose layout is compiled."""
 
     def __init__(self, schema: Schema, groups: Sequence[Group]) -> None:
-        self.schema, self.groups = schema, [group for group in groups if len(group.where)]
+        self.schema = schema
+        self.groups = [group for group in groups if len(group.where)]
         self._length = sum(len(group.where) for group in self.groups)
         self._order: NDArray[np.intp] | slice | None = None
         self._walks: dict[str, list[tuple[Group, NDArray[np.uint8], Walked]]] = {}
@@ -195,7 +196,8 @@ class Rows:
         counts = np.zeros(len(self), np.intp)
         for piece in found:
             counts[piece.frames] += 1
-        ranks, following = list[NDArray[np.intp]](), np.cumsum(counts) - counts
+        ranks = list[NDArray[np.intp]]()
+        following = np.cumsum(counts) - counts
         for piece in found:  # round after round: in each a frame has one part at most
             ranks.append(following[piece.frames])
             following[piece.frames] += 1
@@ -298,7 +300,8 @@ def _merged(groups: list[Group]) -> Group:
 
 def _stacked(parts: list[Bytes2D]) -> Bytes2D:
     """Rows under one another; no copy where they stand so in memory already."""
-    base, width = parts[0].base, parts[0].shape[1]
+    base = parts[0].base
+    width = parts[0].shape[1]
     spots = [_address(part) for part in parts]
     follow = (
         spot + part.size == after
@@ -342,7 +345,9 @@ class Records:
     """
 
     def __init__(self, schema: Schema, parsed: Sequence[Any], frames: Sequence[bytes]) -> None:
-        self.schema, self._parsed, self._frames = schema, list(parsed), list(frames)
+        self.schema = schema
+        self._parsed = list(parsed)
+        self._frames = list(frames)
 
     def __len__(self) -> int:
         return len(self._parsed)
@@ -394,9 +399,11 @@ class Records:
         self, column: NDArray[Any], path: str, indices: Mapping[str, int]
     ) -> tuple[NDArray[Any], NDArray[np.bool_]]:
         """Some element of a field's arrays, and which frames have it, (n,)."""
-        inside, axes = np.ones(len(self), np.bool_), self.schema.fields[path].axes
+        inside = np.ones(len(self), np.bool_)
+        axes = self.schema.fields[path].axes
         for axis in sorted(indices, key=axes.index, reverse=True):
-            place, counts = 1 + axes.index(axis), self.counts(axis)
+            place = 1 + axes.index(axis)
+            counts = self.counts(axis)
             spots = indices[axis] + (counts if indices[axis] < 0 else 0)
             inside &= (spots >= 0) & (spots < counts)
             if not column.shape[place]:
@@ -420,11 +427,9 @@ class Records:
     def length(self, axis: str) -> int:
         """The longest length of an array."""
         declared = self.schema.arrays.get(axis)
-        return (
-            declared
-            if isinstance(declared, int)
-            else max((max(found, default=0) for found in self._lengths(axis)), default=0)
-        )
+        if isinstance(declared, int):
+            return declared
+        return max((max(found, default=0) for found in self._lengths(axis)), default=0)
 
     def _lengths(self, axis: str) -> list[set[int]]:
         brackets = axis.count("[]")
@@ -444,7 +449,8 @@ class Records:
         )
 
     def parts(self, axis: str, kind: str = "") -> tuple[Records, NDArray[np.intp]]:
-        node, found = self.schema.parts[axis], list[tuple[int, Any, bytes]]()
+        node = self.schema.parts[axis]
+        found = list[tuple[int, Any, bytes]]()
         for index, (parsed, frame) in enumerate(zip(self._parsed, self._frames, strict=True)):
             pieces = member(parsed, axis, None)
             if pieces is not None:

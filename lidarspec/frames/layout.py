@@ -80,7 +80,8 @@ def rows_at(
         return np.zeros((count, size), np.uint8)
     if size == 1:
         return buffer.take(offsets).reshape(count, 1)
-    first, step = offsets.item(0), offsets.item(1) - offsets.item(0) if count > 1 else size
+    first = offsets.item(0)
+    step = offsets.item(1) - offsets.item(0) if count > 1 else size
     even = offsets.item(-1) - first == (count - 1) * step
     if even and count > 2:
         even = np.count_nonzero(offsets[1:] - offsets[:-1] == step) == count - 1
@@ -287,7 +288,10 @@ class Leaf:
         info = element_of(self.info, path, indices)
         if info is None:
             return None
-        offset, shape, elements, kept = self.offset, list(self.shape), self.elements, 0
+        offset = self.offset
+        shape = list(self.shape)
+        elements = self.elements
+        kept = 0
         for place, (axis, length) in enumerate(zip(self.info.axes, self.shape, strict=True)):
             index = indices.get(axis, 0)
             if not -length <= index < length:
@@ -343,7 +347,8 @@ class Seal:
         """The values that stand in the frames, (n,)."""
         if len(self.leaves) == 1 and self.leaves[0].info.kind != "bytes":
             return self.leaves[0].load(rows).astype(np.uint64)
-        total, shift = np.zeros(len(rows), np.uint64), 0
+        total = np.zeros(len(rows), np.uint64)
+        shift = 0
         for leaf in self.leaves:
             values = leaf.load(rows).astype(np.uint64)
             if leaf.info.kind == "bytes":
@@ -368,7 +373,8 @@ class Seal:
 
     def fill(self, rows: Bytes2D) -> None:
         """Write the right value into each frame."""
-        values, shift = self.computed(rows), 0
+        values = self.computed(rows)
+        shift = 0
         for leaf in self.leaves:
             part = (values >> np.uint64(shift)) & np.uint64((1 << leaf.info.bits) - 1)
             if leaf.info.kind == "bytes":
@@ -404,17 +410,17 @@ class Seal:
         it, by default the algorithm.
         """
         stored = self.stored(rows)
-        filled = (
-            reduce(np.logical_and, (stored != np.uint64(value) for value in self.absent))
-            if self.absent
-            else None
-        )
+        if self.absent:
+            filled = reduce(np.logical_and, (stored != np.uint64(value) for value in self.absent))
+        else:
+            filled = None
         if filled is None or filled.all():
             return np.asarray(stored == self.computed(rows, sums))
         right = np.ones(len(rows), np.bool_)
-        right[filled] = (
-            stored[filled] == self.computed(rows[filled], sums) if filled.any() else True
-        )
+        if filled.any():
+            right[filled] = stored[filled] == self.computed(rows[filled], sums)
+        else:
+            right[filled] = True
         return right
 
 
@@ -587,7 +593,8 @@ class Layout:
         for leaf, value in self.following:
             leaf.store(rows, value)
         if self.known:
-            spots, facts = list(self.known), np.array(list(self.known.values()), np.uint8)
+            spots = list(self.known)
+            facts = np.array(list(self.known.values()), np.uint8)
             rows[:, spots] = rows[:, spots] & ~facts[:, 0] | facts[:, 1]
 
 
@@ -607,7 +614,8 @@ def marks(constants: Mapping[int, tuple[int, int]]) -> Marks:
 @lru_cache(maxsize=2048)
 def words(constants: Marks) -> tuple[Word, ...]:
     """Constants as few words of 1, 2, 4 or 8 bytes, each from a byte with a constant to another."""
-    left, found = {spot: (mask, value) for spot, mask, value in constants}, list[Word]()
+    left = {spot: (mask, value) for spot, mask, value in constants}
+    found = list[Word]()
     while left:
         first = min(left)
         size = next(size for size in (8, 4, 2, 1) if first + size - 1 in left)

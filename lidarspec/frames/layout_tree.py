@@ -147,11 +147,10 @@ class Walk:
 
     def layout(self) -> Layout:
         """What was found, as a value."""
-        held, self.asked = (
-            self._held(),
-            _unknown,
-        )  # what follows from the header asks for no more of it
-        seals, following = tuple(_in_order(self.seals)), tuple(self._following())
+        held = self._held()
+        self.asked = _unknown  # what follows from the header asks for no more of it
+        seals = tuple(_in_order(self.seals))
+        following = tuple(self._following())
         leaves = ByPath(self.leaves, Leaf.element)
         found = (
             self.cursor,
@@ -249,13 +248,15 @@ class Walk:
     def _array(
         self, node: tree.Repeat, path: str, shape: tuple[int, ...], strides: tuple[int, ...]
     ) -> None:
-        count, start = self._count(node.count, path), self.cursor
+        count = self._count(node.count, path)
+        start = self.cursor
         self.lengths[node.axis] = 0 if 0 in shape else count
         if count:
             self.visit(node.element, path, (*shape, count), (*strides, 0))
         else:
             self._no_element(node.element, path, (*shape, count), (*strides, 0))
-        size, depth = self.cursor - start, len(strides)
+        size = self.cursor - start
+        depth = len(strides)
         self.empty += 0 if size else math.prod(shape) * count
         if start + size * count > self.limit or self.empty > self.limit:
             raise TooLong(path)
@@ -291,11 +292,10 @@ class Walk:
         )
         self.parts[node.total.path] = Measure(node.total, region)
         self.open_regions[node.axis] = region
-        size = (
-            rule.within
-            if rule.within is not None
-            else int(self._value(tree.Ref(node.total.path, node.total)))
-        )
+        if rule.within is not None:
+            size = rule.within
+        else:
+            size = int(self._value(tree.Ref(node.total.path, node.total)))
         if size == -FAILED:
             raise ValueError(f"an expression in {path} fails")
         if size < 0:
@@ -310,7 +310,8 @@ class Walk:
         """Go through an element that the array has none of, for its fields alone: nothing is asked
         of it.
         """
-        start, constants = self.cursor, dict(self.constants)
+        start = self.cursor
+        constants = dict(self.constants)
         try:
             self.visit(node, path, shape, strides)
         except Unknown:
@@ -318,7 +319,8 @@ class Walk:
         except Exception:
             pass  # whatever an expression raises: what construct never looks at cannot fail
         finally:
-            self.cursor, self.constants = start, constants
+            self.cursor = start
+            self.constants = constants
 
     def _field(
         self,
@@ -415,10 +417,8 @@ class Walk:
         """What fields have to be that say how long parts are, as constants, which they are in one
         layout.
         """
-        rows, found = (
-            np.zeros((2, self.cursor), np.uint8),
-            [leaf for leaf in self.leaves.values() if leaf.info.held],
-        )
+        rows = np.zeros((2, self.cursor), np.uint8)
+        found = [leaf for leaf in self.leaves.values() if leaf.info.held]
         for leaf in found:
             (low, high), rebuilt = leaf.info.limits, leaf.info.rebuilt
             if rebuilt is not None:
@@ -575,13 +575,12 @@ class _Told:
                 if low <= key <= high
             )
             other = next((value for value in range(low, high + 1) if value not in keys), None)
-            return (
-                cls(info.limits, low, high)
-                if other is None
-                else cls(info.limits, low, high, keys, other)
-            )
+            if other is None:
+                return cls(info.limits, low, high)
+            return cls(info.limits, low, high, keys, other)
         if high - low < 1 << 62 and all(_counts(node, formula) for node, formula in asking):
-            values, spans = range(low, high + 1), []
+            values = range(low, high + 1)
+            spans = []
             for _, formula in asking:
                 count = functools.partial(_with_value, formula)
                 spans.append(
@@ -593,11 +592,10 @@ class _Told:
             firsts, lasts = zip(*spans, strict=True)
             # Why a frame with too many parts is refused depends on its parts, not on the number
             # alone.
-            rises = (
-                None
-                if any(isinstance(node, tree.Parts) for node, _ in asking)
-                else max(firsts) + low + 1
-            )
+            if any(isinstance(node, tree.Parts) for node, _ in asking):
+                rises = None
+            else:
+                rises = max(firsts) + low + 1
             return cls(
                 info.limits, max(min(firsts) + low, low), min(max(lasts) + low, high), rises=rises
             )
@@ -605,11 +603,9 @@ class _Told:
 
     def refused(self, value: int) -> _Told:
         """The same, where the frame of a value is known to be too long."""
-        return (
-            replace(self, high=value)
-            if self.rises is not None and self.rises <= value < self.high
-            else self
-        )
+        if self.rises is not None and self.rises <= value < self.high:
+            return replace(self, high=value)
+        return self
 
     def one(self, value: int) -> int:
         """The value that stands for one that means the same."""
@@ -685,7 +681,10 @@ class _Places:
         stops: NDArray[np.intp] | None,
         limit: int,
     ) -> None:
-        self._buffer, self._offsets, self.stops, self._limit = buffer, offsets, stops, limit
+        self._buffer = buffer
+        self._offsets = offsets
+        self.stops = stops
+        self._limit = limit
         self.refuted: list[NDArray[np.intp]] = []
 
     def longest(self, which: NDArray[np.intp]) -> bytes | memoryview:
@@ -722,10 +721,8 @@ class _Places:
         self, constants: Mapping[int, tuple[int, int]], which: NDArray[np.intp]
     ) -> NDArray[np.bool_]:
         """Which candidates have a wrong constant, as far as their bytes go, (n,)."""
-        offsets, stops = (
-            self._offsets[which],
-            len(self._buffer) if self.stops is None else self.stops[which],
-        )
+        offsets = self._offsets[which]
+        stops = len(self._buffer) if self.stops is None else self.stops[which]
         wrong = np.zeros(len(which), np.bool_)
         for spot, (mask, value) in constants.items() if len(which) else ():
             there = offsets + spot < stops
@@ -739,8 +736,11 @@ class HeaderTree:
     def __init__(
         self, frame: tree.Node, limit: int, given: Mapping[str, int] | None = None
     ) -> None:
-        self._frame, self._limit, self._given = frame, limit, given or {}
-        self._root, self._size = HeaderNode(), 0
+        self._frame = frame
+        self._limit = limit
+        self._given = given or {}
+        self._root = HeaderNode()
+        self._size = 0
         self._told: dict[str, _Told] = {}
 
     @functools.cached_property
@@ -810,9 +810,10 @@ class HeaderTree:
     def first(self) -> tuple[tuple[Leaf, ...], dict[int, tuple[int, int]]]:
         """The fields and the constants whose place depends on no header field."""
         self._explore(self._root)
-        known = (
-            self._root.result.leaves if isinstance(self._root.result, Layout) else self._root.before
-        )
+        if isinstance(self._root.result, Layout):
+            known = self._root.result.leaves
+        else:
+            known = self._root.before
         return tuple(known.values()), prefix_of(self._frame, self._limit)
 
     def common(self, rows: NDArray[np.uint8]) -> Layout | None:
@@ -911,7 +912,8 @@ class HeaderTree:
         except Unknown:
             pass
         except CutOff:
-            node.constants, node.least = self._behind(walk), walk.cursor
+            node.constants = self._behind(walk)
+            node.least = walk.cursor
         except TooLong:
             node.result = Refused(constants=self._behind(walk))
         except Unlike:

@@ -241,11 +241,9 @@ def _physical(fields: Mapping[str, FieldInfo], value: Any, path: str) -> Any:
         )
     if isinstance(value, list):
         return ListContainer(_physical(fields, part, path) for part in value)
-    return (
-        fields[path].physical(value)
-        if value is not None and path in fields and fields[path].scaled
-        else value
-    )
+    if value is not None and path in fields and fields[path].scaled:
+        return fields[path].physical(value)
+    return value
 
 
 def unpacked(root: Node, layout: Layout, frame: bytes) -> Any:
@@ -323,14 +321,12 @@ def _containers(
 
 def _lists(elements: Reader, count: int, length: int, frame: bytes) -> Sequence[ListContainer]:
     values = elements(frame)
-    return (
-        [
+    if length:
+        return [
             ListContainer(values[start : start + length])
             for start in range(0, count * length, length)
         ]
-        if length
-        else [ListContainer() for _ in range(count)]
-    )
+    return [ListContainer() for _ in range(count)]
 
 
 def _parts_of(region: Region, frame: bytes) -> Sequence[ListContainer]:
@@ -343,7 +339,9 @@ def _parts_of(region: Region, frame: bytes) -> Sequence[ListContainer]:
 
 def _unpack(offsets: Sequence[int], order: str, code: str) -> Reader:
     """What unpacks a value of this format code at each offset; they ascend."""
-    form, size, end = list[str](), struct.calcsize(order + code), offsets[0]
+    form = list[str]()
+    size = struct.calcsize(order + code)
+    end = offsets[0]
     for offset in offsets:
         form.append(f"{offset - end}x{code}" if offset > end else code)
         end = offset + size
@@ -353,7 +351,8 @@ def _unpack(offsets: Sequence[int], order: str, code: str) -> Reader:
 def _words(node: Number | Blob, leaf: Leaf) -> Reader:
     if isinstance(node, Blob):
         return _unpack(leaf.offsets(len(leaf.shape) - 1), "<", f"{leaf.size}s")
-    offsets, order = leaf.offsets(), "<" if node.order == "little" else ">"
+    offsets = leaf.offsets()
+    order = "<" if node.order == "little" else ">"
     if leaf.wire is None:
         raw = _unpack(offsets, order, f"{leaf.size}s")
         return _labelled(
@@ -448,7 +447,9 @@ def _runs(
         if runs and (
             low - first != segment.target - target or mask.bit_length() != segment.target - target
         ):
-            first, mask, target = low, 0, segment.target
+            first = low
+            mask = 0
+            target = segment.target
         elif runs:
             runs.pop()
         runs.append(

@@ -183,21 +183,23 @@ class _Walk:
     def __init__(
         self, region: Region, buffer: NDArray[np.uint8], starts: Offsets, stops: Offsets | None
     ) -> None:
-        self._region, self._buffer, self._starts, self._ends, self._stops = (
-            region,
-            buffer,
-            starts,
-            starts.copy(),
-            stops,
-        )
-        rule, room = region.rule, region.limit - region.start
-        self._rule, self._room = rule, room if rule.within is None else min(room, rule.within)
+        self._region = region
+        self._buffer = buffer
+        self._starts = starts
+        self._ends = starts.copy()
+        self._stops = stops
+        rule = region.rule
+        room = region.limit - region.start
+        self._rule = rule
+        self._room = room if rule.within is None else min(room, rule.within)
         self._announced = np.full(len(starts), ANY if rule.size is None else rule.size)
-        self._status, self._errors = np.zeros(len(starts), np.uint8), list[PluginError]()
+        self._status = np.zeros(len(starts), np.uint8)
+        self._errors = list[PluginError]()
 
     def walked(self) -> Walked:
         """What is found."""
-        rounds, active = list[list[Piece]](), np.arange(len(self._starts))
+        rounds = list[list[Piece]]()
+        active = np.arange(len(self._starts))
         while len(active := self._going_on(active, len(rounds))):
             rounds.append(self._round(active))
         return Walked(self._status, self._ends - self._starts, rounds, tuple(self._errors))
@@ -225,9 +227,12 @@ class _Walk:
             held = self._right(active, kind.start)
             if held is not None and not np.count_nonzero(held):
                 continue  # one of many kinds, that none of these parts is of
-            own, others = (
-                (active, [active[:0]]) if held is None else (active[held], [active[~held]])
-            )
+            if held is None:
+                own = active
+                others = [active[:0]]
+            else:
+                own = active[held]
+                others = [active[~held]]
             seen = np.zeros(len(own), np.bool_)
             for layout, which in kind.layouts.classify(
                 self._buffer, self._ends[own], self._stops_of(own)
@@ -255,16 +260,17 @@ class _Walk:
 
     def _right(self, which: Offsets, constants: tuple[Word, ...]) -> NDArray[np.bool_] | None:
         """In which frames constants of the next part are right, as `right_at` has it."""
-        return (
-            right_at(self._buffer, self._ends[which], constants, self._stops_of(which))
-            if constants
-            else None
-        )
+        if constants:
+            return right_at(self._buffer, self._ends[which], constants, self._stops_of(which))
+        return None
 
     def _refused(self, refused: Refused, which: Offsets) -> None:
-        self._status[which] = (
-            FAILED if refused.error else CONSTANT if refused.by_constant else LENGTH
-        )
+        if refused.error:
+            self._status[which] = FAILED
+        elif refused.by_constant:
+            self._status[which] = CONSTANT
+        else:
+            self._status[which] = LENGTH
         self._errors += [refused.error] if refused.error else []
 
     def _measured(self, layout: Layout, which: Offsets) -> Offsets:
@@ -277,7 +283,8 @@ class _Walk:
 
     def _whole(self, layout: Layout, which: Offsets) -> Offsets:
         """Those that have their part whole, and as long as was said; the status of the others."""
-        ends, announced = self._ends[which] + layout.size, self._announced[which]
+        ends = self._ends[which] + layout.size
+        announced = self._announced[which]
         wrong = (ends - self._starts[which] > self._room) | (layout.size == 0)
         cut_off = ends > (len(self._buffer) if self._stops is None else self._stops[which])
         other = (announced != ANY) & (announced != layout.size)
@@ -291,7 +298,8 @@ class _Walk:
 
     def _taken(self, kind: Kind, layout: Layout, which: Offsets) -> None:
         """Go on behind parts of one layout."""
-        formula, spots = kind.node.following, self._ends[which]
+        formula = kind.node.following
+        spots = self._ends[which]
         self._ends[which] = spots + layout.size
         if formula is None:
             return
@@ -373,10 +381,8 @@ class Measure:
     ) -> tuple[Offsets | None, NDArray[Any]]:
         """As `Leaf.read`; a negative number, of the status, for what cannot be a frame."""
         walked = self.region.walked(buffer, offsets, stops)
-        values, cut_off = (
-            np.where(walked.status == FOUND, walked.sizes, -walked.status.astype(np.int64)),
-            walked.status == CUT_OFF,
-        )
+        values = np.where(walked.status == FOUND, walked.sizes, -walked.status.astype(np.int64))
+        cut_off = walked.status == CUT_OFF
         if not np.count_nonzero(cut_off):
             return None, values
         is_all = cut_off & (

@@ -50,7 +50,8 @@ ONE_BY_ONE = 4  # rows that are done one by one sooner than together
 BLOCK_BYTES = (
     1 << 20
 )  # rows taken at a time: few enough for the caches, and many enough to hide NumPy's cost per call
-FEW, SHORT = 1 << 13, 1 << 7  # bytes of all rows, and of one, for which a table for each place pays
+FEW = 1 << 13
+SHORT = 1 << 7  # bytes of all rows, and of one, for which a table for each place pays
 MANY = 1024  # rows whose words are summed in less time than tables take
 
 #: width, polynomial and reflection of the one CRC that `zlib` has: on rows that are not short, one
@@ -60,7 +61,8 @@ ZLIB = (32, 0x04C11DB7, True)
 #: which bytes of a row: from one to another, one span after another.
 Spans = tuple[tuple[int, int], ...]
 
-_BYTE, _BYTE_BITS = np.uint64(0xFF), np.uint64(8)
+_BYTE = np.uint64(0xFF)
+_BYTE_BITS = np.uint64(8)
 
 
 def batch(algorithm: Checksum, rows: NDArray[np.uint8]) -> Values:
@@ -152,7 +154,8 @@ def _word_masks(
 
 def _fold15(algorithm: Fold15, rows: NDArray[np.uint8], spans: Spans) -> Values:
     rows = cut(rows, spans)
-    tail, total = rows[:, rows.shape[1] % 2 - 60 :], np.zeros(len(rows), np.uint64)
+    tail = rows[:, rows.shape[1] % 2 - 60 :]
+    total = np.zeros(len(rows), np.uint64)
     last = (tail.shape[1] - 1) // 2
     for place, byte in enumerate(tail.T):
         total += byte.astype(np.uint64) << np.uint64(last - place // 2 + 8 * (place % 2))
@@ -184,7 +187,8 @@ def words(
         rows = np.ascontiguousarray(np.pad(rows, ((0, 0), (0, 8))))
     count, size = rows.shape
     number, runs, parts = _pieces(spans, size, zeros_first)
-    found, begun = np.empty((number, count), "<u8"), -1
+    found = np.empty((number, count), "<u8")
+    begun = -1
     for first, length, start in runs:
         words = rows[:, start : start + 8].view("<u8")[:, 0]
         found[first : first + length] = np.lib.stride_tricks.as_strided(
@@ -215,11 +219,9 @@ def _pieces(
     """
     total = sum(stop - start for start, stop in spans)
     number = -(-total // 8)
-    runs, parts, spot = (
-        list[tuple[int, int, int]](),
-        list[tuple[Any, ...]](),
-        8 * number - total if zeros_first else 0,
-    )
+    runs = list[tuple[int, int, int]]()
+    parts = list[tuple[Any, ...]]()
+    spot = 8 * number - total if zeros_first else 0
     for first, stop in spans:
         start = first
         while start < stop:
@@ -231,11 +233,10 @@ def _pieces(
                 length = 8 * whole
             else:
                 place = min(start, size - 8)
-                mask = (
-                    None
-                    if start - place + length == 8 or byte + length == 8
-                    else np.uint64((1 << 8 * length) - 1)
-                )
+                if start - place + length == 8 or byte + length == 8:
+                    mask = None
+                else:
+                    mask = np.uint64((1 << 8 * length) - 1)
                 parts.append(
                     (word, place, np.uint64(8 * (start - place)), mask, np.uint64(8 * byte))
                 )
@@ -355,7 +356,8 @@ def _narrow(
     if len(rows) >= MANY and len(left) > 1:
         left = _summed(left, poly << 8 - width)[None]
     while len(left) > 1:
-        half, distance = len(left) // 2, (len(left) + 1) // 2
+        half = len(left) // 2
+        distance = (len(left) + 1) // 2
         moved = left[:half].tobytes().translate(_advance(8 * distance, width, poly, refin))
         left = left[half:]
         left[-half:] ^= np.frombuffer(moved, np.uint64).reshape(half, -1)
@@ -373,7 +375,8 @@ def _summed(columns: NDArray[np.uint64], poly: int) -> NDArray[np.uint64]:
     """
     shares = _shares(len(columns), poly)
     onto = np.uint64(sum(1 << 8 * (7 - power) for power in range(8) if poly >> power & 1))
-    total, first = np.zeros(columns.shape[1], np.uint64), np.empty(columns.shape[1], np.uint64)
+    total = np.zeros(columns.shape[1], np.uint64)
+    first = np.empty(columns.shape[1], np.uint64)
     highest = max(shares).bit_length() - 1
     for power in range(highest, -1, -1):
         if power < highest:
@@ -447,7 +450,8 @@ def _word_table(width: int, poly: int, refin: bool) -> NDArray[Any]:
     bits; shape (65536,).
     """
     table = np.array(byte_table(width, poly, refin), f"<u{REGISTER_BYTES[width]}")
-    first, second = np.tile(table, 256), np.repeat(np.arange(256, dtype=np.uint8), 256)
+    first = np.tile(table, 256)
+    second = np.repeat(np.arange(256, dtype=np.uint8), 256)
     return np.asarray(table[first.astype(np.uint8) ^ second] ^ first >> 8)
 
 

@@ -47,7 +47,8 @@ def without_indices(path: str) -> tuple[str, dict[str, int]]:
     """A path without the indices in it, and these, by the paths of their arrays: "a.b", {"a": 0}
     for "a[0].b".
     """
-    names, indices = "", dict[str, int]()
+    names = ""
+    indices = dict[str, int]()
     for name, *numbers in (
         _INDEX.split(part)[:1] + _INDEX.findall(part) for part in path.split(".")
     ):
@@ -72,7 +73,8 @@ class ByPath(dict[str, _Field]):
         element: Callable[[_Field, str, Mapping[str, int]], _Field | None],
     ) -> None:
         super().__init__(known)
-        self._element, self._elements = element, dict[str, _Field | None]()
+        self._element = element
+        self._elements = dict[str, _Field | None]()
 
     def __missing__(self, path: str) -> _Field:
         found: _Field | None = self.get(path)
@@ -145,7 +147,8 @@ class Schema:
         """
         for axis, node in self.parts.items():
             if path == axis or path.startswith(f"{axis}."):
-                names, rest = [kind.name for kind in node.kinds], path[len(axis) + 1 :]
+                names = [kind.name for kind in node.kinds]
+                rest = path[len(axis) + 1 :]
                 if names == [""]:
                     return axis, "", rest
                 kind, _, below = rest.partition(".")
@@ -171,11 +174,10 @@ class Schema:
             axis for axis in self.places if axis.rpartition(".")[2] == name
         ]
         if len(found) != 1:
-            reason = (
-                f"several arrays are called {name!r}"
-                if found
-                else f"there is no array {name!r} in the frame"
-            )
+            if found:
+                reason = f"several arrays are called {name!r}"
+            else:
+                reason = f"there is no array {name!r} in the frame"
             raise SpecError(
                 f"{reason}; there are {', '.join(found or self.places) or 'none'}", rule="LS214"
             )
@@ -225,19 +227,15 @@ def _element(
     """An element of a field, which is left out by some headers where these decide how many there
     are; None where there never is one.
     """
-    found, counts = (
-        element_of(info, path, indices),
-        [(arrays.get(axis), index) for axis, index in indices.items()],
-    )
+    found = element_of(info, path, indices)
+    counts = [(arrays.get(axis), index) for axis, index in indices.items()]
     if found is None or any(
         isinstance(count, int) and not -count <= index < count for count, index in counts
     ):
         return None
-    return (
-        found
-        if all(isinstance(count, int) for count, _ in counts)
-        else replace(found, optional=True)
-    )
+    if all(isinstance(count, int) for count, _ in counts):
+        return found
+    return replace(found, optional=True)
 
 
 def _docs_around(path: str, structs: Mapping[str, str]) -> str:
@@ -320,13 +318,12 @@ def _merged(known: FieldInfo, other: FieldInfo) -> FieldInfo:
     ):
         return replace(known, dtype=None, kind="other")
     dtype = np.promote_types(known.dtype, other.dtype)
-    bits = (
-        known.bits
-        if (known.bits, known.dtype) == (other.bits, other.dtype)
-        else 0
-        if known.kind == "bytes"
-        else 8 * dtype.itemsize
-    )
+    if (known.bits, known.dtype) == (other.bits, other.dtype):
+        bits = known.bits
+    elif known.kind == "bytes":
+        bits = 0
+    else:
+        bits = 8 * dtype.itemsize
     const = known.const if known.const == other.const else None
     labels = known.labels if known.labels == other.labels else {}
     return replace(

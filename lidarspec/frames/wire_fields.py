@@ -132,7 +132,8 @@ class Examined:
         rows = np.frombuffer(self.data, np.uint8).reshape(1, -1)
         for seal in self.known.seals:
             if seal.end <= len(self.data):
-                stored, computed = int(seal.stored(rows)[0]), int(seal.computed(rows)[0])
+                stored = int(seal.stored(rows)[0])
+                computed = int(seal.computed(rows)[0])
                 yield PlacedSeal(seal, self.prefix, self.start, stored, computed)
         axes = [*self.known.regions]
         if isinstance(self.known, Walk):

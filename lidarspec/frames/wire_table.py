@@ -125,11 +125,9 @@ def extent(node: tree.Node, shown: str = "") -> Extent:
 
 def _length(size: tree.Formula | None, shown: str) -> Extent:
     """A declared length; None for one that only the bytes tell."""
-    return (
-        Extent(size)
-        if isinstance(size, int)
-        else Extent(0, (f"size({shown})" if size is None else phrase(size),))
-    )
+    if isinstance(size, int):
+        return Extent(size)
+    return Extent(0, (f"size({shown})" if size is None else phrase(size),))
 
 
 def _count(node: tree.Repeat) -> int | str:
@@ -198,14 +196,14 @@ def _rows(
                     part.info, str(start), *_bits(part), _part(shown, part), condition, seals
                 )
         case tree.Number() | tree.Blob() | tree.Opaque():
-            length = (
-                "varies"
-                if isinstance(node, tree.Opaque) and node.size is None
-                else str(extent(node, shown))
-            )
-            info = (
-                replace(node.info, const=node.const) if isinstance(node, tree.Blob) else node.info
-            )
+            if isinstance(node, tree.Opaque) and node.size is None:
+                length = "varies"
+            else:
+                length = str(extent(node, shown))
+            if isinstance(node, tree.Blob):
+                info = replace(node.info, const=node.const)
+            else:
+                info = node.info
             yield _row(info, str(start), length, _type(node), shown, condition, seals)
 
 
@@ -255,7 +253,8 @@ def branches(node: tree.When | tree.Select) -> list[tuple[str, tree.Node]]:
     if isinstance(node, tree.When):
         asked = phrase(node.condition)
         return [(f"if {asked}", node.then), (f"unless {asked}", node.otherwise)]
-    key, labels = phrase(node.key), node.key.info.labels if isinstance(node.key, tree.Ref) else {}
+    key = phrase(node.key)
+    labels = node.key.info.labels if isinstance(node.key, tree.Ref) else {}
     cases = [(f"if {key} == {labels.get(value, value)!r}", case) for value, case in node.cases]
     return [*cases, (f"for other values of {key}", node.default)]
 
@@ -285,11 +284,10 @@ def phrase(formula: tree.Formula) -> str:
             value in ref.info.labels
         ):
             return f"{ref.path} {symbol} {ref.info.labels[value]!r}"
-    text = (
-        formula.text
-        if isinstance(formula, tree.Code)
-        else tree.written(formula, lambda ref: ref.path, {})
-    )
+    if isinstance(formula, tree.Code):
+        text = formula.text
+    else:
+        text = tree.written(formula, lambda ref: ref.path, {})
     return text[1:-1] if _is_enclosed(text) else text
 
 

@@ -25,7 +25,8 @@ from lidarspec.spec.links import Assembled
 
 #: messages that are waited for at a time, of which so many are remembered when they are done, and
 #: for how many nanoseconds.
-WAITING, PATIENCE = 8, 10**9
+WAITING = 8
+PATIENCE = 10**9
 
 #: the longest payload of a datagram.
 DATAGRAM = 65_535
@@ -88,7 +89,9 @@ class Assembly:
     """
 
     def __init__(self, rule: Assembled, longest: int, stats: Counters) -> None:
-        self._rule, self._longest, self._stats = rule, longest, stats
+        self._rule = rule
+        self._longest = longest
+        self._stats = stats
         layouts = frame_layouts(Frame(rule.struct, max_length=DATAGRAM))
         if isinstance(layouts, NotCompilable):
             raise rule.wrong(str(layouts))
@@ -113,13 +116,11 @@ class Assembly:
         """The messages that datagrams complete, among those that are no fragments; `base`: where
         these begin in the input.
         """
-        data, places, times, dropped, heads = (
-            list[bytes](),
-            list[int](),
-            list[int](),
-            list[int](),
-            0,
-        )
+        data = list[bytes]()
+        places = list[int]()
+        times = list[int]()
+        dropped = list[int]()
+        heads = 0
         for start, size, time in zip(
             np.asarray(starts).tolist(), sizes.tolist(), at.tolist(), strict=True
         ):
@@ -137,7 +138,8 @@ class Assembly:
                 self._dropped = 0
             base += size
         lengths = np.array(list(map(len, data)), np.intp)
-        left, self._dropped = self._dropped, 0
+        left = self._dropped
+        self._dropped = 0
         return Joined(
             np.frombuffer(b"".join(data), np.uint8),
             np.cumsum(lengths) - lengths,
@@ -152,7 +154,8 @@ class Assembly:
         """Wait for nothing any more; the bytes that were waiting."""
         for key in list(self._waiting):
             self._lose(key)
-        dropped, self._dropped = self._dropped, 0
+        dropped = self._dropped
+        self._dropped = 0
         return dropped
 
     def _fragment(self, datagram: bytes) -> _Fragment | None:
@@ -167,10 +170,8 @@ class Assembly:
         else:
             payload = datagram[layout.size :]
         key = tuple(layout.leaves[path].scalar(datagram) for path in rule.keys)
-        index, count = (
-            layout.leaves[rule.index].scalar(datagram) - rule.first,
-            layout.leaves[rule.count].scalar(datagram),
-        )
+        index = layout.leaves[rule.index].scalar(datagram) - rule.first
+        count = layout.leaves[rule.count].scalar(datagram)
         is_whole = len(datagram) == layout.size or not rule.payload
         return _Fragment(key, index, count, payload) if is_whole and 0 <= index < count else None
 

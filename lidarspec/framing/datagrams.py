@@ -68,19 +68,18 @@ class _Batch:
         sizes: Indices,
         steady: Frames | None,
     ) -> None:
-        self._framing, self._buffer, self._starts, self._sizes, self._steady = (
-            framing,
-            buffer,
-            starts,
-            sizes,
-            steady,
-        )
+        self._framing = framing
+        self._buffer = buffer
+        self._starts = starts
+        self._sizes = sizes
+        self._steady = steady
         self._known: dict[str | None, tuple[int, Frames, Status, list[int]]] = {}
         self._piece = Piece(Frames.none(buffer), len(buffer))
 
     def sorted(self, mode: Mode) -> Piece:
         """All of them."""
-        position, parts = 0, list[Frames]()
+        position = 0
+        parts = list[Frames]()
         while position < len(self._starts):
             part = self._from(position, mode)
             parts.append(part)
@@ -93,22 +92,20 @@ class _Batch:
         """The types from here up to the datagram that changes what is looked for."""
         if mode.after not in self._known:
             frames, reasons = self._judged(self._starts[position:], self._sizes[position:], mode)
-            spots = (
-                (np.flatnonzero(self._framing.switching(mode)[frames.kinds]) + position).tolist()
-                if self._framing.named
-                else []
-            )
+            if self._framing.named:
+                spots = (
+                    np.flatnonzero(self._framing.switching(mode)[frames.kinds]) + position
+                ).tolist()
+            else:
+                spots = []
             self._known[mode.after] = position, frames, reasons, spots
         first, frames, reasons, spots = self._known[mode.after]
         index = bisect.bisect_left(spots, position)
         stop = spots[index] + 1 if index < len(spots) else len(self._starts)
         frames = frames.only(slice(position - first, stop - first))
         lost = np.flatnonzero(frames.kinds < 0)
-        frames = (
-            self._rejected(frames, lost, reasons[position - first :][lost], mode)
-            if len(lost)
-            else frames
-        )
+        if len(lost):
+            frames = self._rejected(frames, lost, reasons[position - first :][lost], mode)
         if (
             len(frames)
             and frames.kinds[-1] >= 0
@@ -124,20 +121,21 @@ class _Batch:
             They, and why those that are no frames are none, 0 where they resemble none; `PLUGIN`
             where each is to be judged alone.
         """
-        number, known = len(starts), alike(sizes)
-        least, most = (
-            (known, known)
-            if known is not None
-            else (int(sizes.min()), int(sizes.max()))
-            if number
-            else (0, 0)
-        )
-        kinds, forms, reasons, left = (
-            repeated(-1, number),
-            repeated(-1, number),
-            np.zeros(number, np.uint8),
-            np.arange(number),
-        )
+        number = len(starts)
+        known = alike(sizes)
+        if known is not None:
+            least = known
+            most = known
+        elif number:
+            least = int(sizes.min())
+            most = int(sizes.max())
+        else:
+            least = 0
+            most = 0
+        kinds = repeated(-1, number)
+        forms = repeated(-1, number)
+        reasons = np.zeros(number, np.uint8)
+        left = np.arange(number)
         layouts: tuple[Layout, ...] = ()
         fixed = [(kind, self._framing.codecs[kind].size) for kind in self._framing.active(mode)]
         others = [
@@ -151,7 +149,9 @@ class _Batch:
             if not np.count_nonzero(marked):
                 continue
             if not marked.all():
-                own, lengths, which = own[marked], lengths[marked], left[marked]
+                own = own[marked]
+                lengths = lengths[marked]
+                which = left[marked]
             else:
                 which = left
             frames = self._survey(kind, own, lengths)
@@ -177,7 +177,8 @@ class _Batch:
 
     def _survey(self, kind: int, starts: Indices, sizes: Indices) -> Frames:
         """What datagrams are, if they are of a type."""
-        steady, self._steady = self._steady, None
+        steady = self._steady
+        self._steady = None
         if steady is not None and steady.kinds[0] == kind and len(starts) == len(steady):
             return steady
         return self._framing.survey(kind, self._buffer, starts, starts + sizes, gathered=False)
@@ -186,7 +187,8 @@ class _Batch:
         """Count those that are no frames; the types again, up to one that turns out to be a frame
         that changes what is looked for.
         """
-        parts, begun = list[Frames](), 0
+        parts = list[Frames]()
+        begun = 0
         for index in lost[reasons == PLUGIN].tolist():
             alone = self._judged_alone(frames.only(slice(index, index + 1)), mode)
             if alone is None:
@@ -202,7 +204,9 @@ class _Batch:
 
     def _judged_alone(self, datagram: Frames, mode: Mode) -> Frames | None:
         """One datagram as a frame, None where it is none; counts why."""
-        rejected, start, size = 0, datagram.starts, datagram.sizes
+        rejected = 0
+        start = datagram.starts
+        size = datagram.sizes
         data = self._buffer[start.item(0) : start.item(0) + size.item(0)]
         for kind in self._framing.active(mode) if len(data) else ():
             if not self._marked(kind, start, size).all():
@@ -232,7 +236,8 @@ class _Batch:
 
     def _marked(self, kind: int, starts: Indices, sizes: Indices) -> NDArray[np.bool_]:
         """Which datagrams have the constants of a type."""
-        constants, end = self._framing.words[kind], self._framing.ends[kind]
+        constants = self._framing.words[kind]
+        end = self._framing.ends[kind]
         size = alike(sizes)
         if size is None or size < end:
             whole = sizes >= end
@@ -244,16 +249,17 @@ class _Batch:
         step = step_between(starts)
         for word in constants if len(starts) else ():
             spot, dtype, _, _ = word
-            values = (
-                np.ndarray((len(starts),), dtype, self._buffer, starts.item(0) + spot, (step,))
-                if step
-                else np.ndarray(
+            if step:
+                values = np.ndarray(
+                    (len(starts),), dtype, self._buffer, starts.item(0) + spot, (step,)
+                )
+            else:
+                values = np.ndarray(
                     (len(self._buffer) - spot - dtype.itemsize + 1,),
                     dtype,
                     self._buffer,
                     spot,
                     (1,),
                 )[starts]
-            )
             marked &= equal(values, word)
         return marked

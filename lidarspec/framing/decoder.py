@@ -33,11 +33,15 @@ __all__ = ["BACKENDS", "Decoder", "backend", "frames_of", "is_stream"]
 
 #: bytes of a stream looked at in one go: at most, where frames follow one another and where not;
 #: and at least.
-LONGEST, PIECE, LEAST = 24 << 16, 6 << 16, 1 << 12
+LONGEST = 24 << 16
+PIECE = 6 << 16
+LEAST = 1 << 12
 
 #: datagrams of a list judged together; rows of an array, which need not be gathered first; and
 #: bytes of either, about.
-TOGETHER, ROWS, ROW_BYTES = 1 << 14, 1 << 17, 1 << 23
+TOGETHER = 1 << 14
+ROWS = 1 << 17
+ROW_BYTES = 1 << 23
 
 Data = bytes | bytearray | memoryview | NDArray[np.uint8]
 
@@ -80,7 +84,9 @@ class Decoder:
     ) -> None:
         if not sensor.incoming:
             raise UsageError(f"{sensor.id} has no frames yet: configure it with its file first")
-        self.sensor, self.stream, self.backend = sensor, stream, backend
+        self.sensor = sensor
+        self.stream = stream
+        self.backend = backend
         self.stats = Counters()
         self.witness: Witness | None = None
         keep_freed_memory()
@@ -91,13 +97,13 @@ class Decoder:
             "answer", ""
         )  # as if the frame that the answer comes after had been seen
         self._mode = Mode(after=sensor.frames[answer].after if answer in sensor.frames else None)
-        self._pending, self._base, self._need = b"", 0, 0
+        self._pending = b""
+        self._base = 0
+        self._need = 0
         self._gap = 0
         self._fillers = bytes(sensor.fillers)
-        link, longest = (
-            sensor.links.get("data"),
-            max(frame.max_length for frame in sensor.incoming.values()),
-        )
+        link = sensor.links.get("data")
+        longest = max(frame.max_length for frame in sensor.incoming.values())
         rule = link.assembled if isinstance(link, Udp) and not stream else None
         self._assembly = None if rule is None else Assembly(rule, longest, self.stats)
         self._least = max(LEAST, 2 * self.framing.reach)
@@ -143,11 +149,10 @@ class Decoder:
             data: the next bytes of the stream, or one datagram.
             at: their arrival time in ns, if known.
         """
-        view = (
-            np.ascontiguousarray(data).data.cast("B")
-            if isinstance(data, np.ndarray)
-            else memoryview(data).cast("B")
-        )
+        if isinstance(data, np.ndarray):
+            view = np.ascontiguousarray(data).data.cast("B")
+        else:
+            view = memoryview(data).cast("B")
         if not self.stream:
             return [self.datagrams([view], [at])]
         if self.witness is not None:
@@ -155,13 +160,15 @@ class Decoder:
             self.witness.fed(self, buffer, range(1), repeated(len(view), 1))
         self.stats.bytes_in += len(view)
         found: list[Frames] = []
-        start, lasting = 0, isinstance(data, bytes)
+        start = 0
+        lasting = isinstance(data, bytes)
         if self._pending:
             held = len(self._pending)
             head = b"".join((self._pending, view[: max(self._least, self._need)]))
             start = self._cut(np.frombuffer(head, np.uint8), at, found) - held
             if start < 0 or held + len(view) == len(head):
-                self._pending, start = head[start + held :], len(view)
+                self._pending = head[start + held :]
+                start = len(view)
         if start < len(view):
             rest = np.frombuffer(view[start:], np.uint8)
             self._pending = rest[self._cut(rest, at, found, lasting=lasting) :].tobytes()
@@ -176,7 +183,8 @@ class Decoder:
             self._drop(self._assembly.give_up())
         if self._pending:
             self._cut(np.frombuffer(self._pending, np.uint8), None, found, final=True)
-        self._pending, self.stats.pending = b"", 0
+        self._pending = b""
+        self.stats.pending = 0
         return found
 
     def datagrams(
@@ -189,18 +197,20 @@ class Decoder:
             at: their arrival times in ns, None where nobody knows.
         """
         if isinstance(data, np.ndarray):
-            buffer, sizes = data.reshape(-1), repeated(data.shape[1], len(data))
+            buffer = data.reshape(-1)
+            sizes = repeated(data.shape[1], len(data))
         else:
-            buffer, lengths = np.frombuffer(b"".join(data), np.uint8), list(map(len, data))
+            buffer = np.frombuffer(b"".join(data), np.uint8)
+            lengths = list(map(len, data))
             is_one_size = bool(lengths) and lengths.count(lengths[0]) == len(lengths)
-            sizes = (
-                repeated(lengths[0], len(lengths)) if is_one_size else np.array(lengths, np.intp)
-            )
-        times = (
-            repeated(-1, len(data))
-            if at is None
-            else np.array([-1 if one is None else one for one in at], np.int64)
-        )
+            if is_one_size:
+                sizes = repeated(lengths[0], len(lengths))
+            else:
+                sizes = np.array(lengths, np.intp)
+        if at is None:
+            times = repeated(-1, len(data))
+        else:
+            times = np.array([-1 if one is None else one for one in at], np.int64)
         return self.placed(buffer, _places(sizes), sizes, times)
 
     def placed(
@@ -220,36 +230,36 @@ class Decoder:
             at: their arrival times in ns, -1 where nobody knows.
         """
         size = alike(sizes)
-        total, places, joined = (
-            int(sizes.sum()) if size is None else size * len(sizes),
-            _places(sizes, self._base),
-            None,
-        )
+        total = int(sizes.sum()) if size is None else size * len(sizes)
+        places = _places(sizes, self._base)
+        joined = None
         if self.witness is not None:
             self.witness.fed(self, buffer, starts, sizes)
         if self._assembly is not None:
             joined = self._assembly.join(buffer, starts, sizes, at, self._base)
-            buffer, starts, sizes, at, places = (
-                joined.buffer,
-                joined.starts,
-                joined.sizes,
-                joined.at,
-                joined.places,
-            )
+            buffer = joined.buffer
+            starts = joined.starts
+            sizes = joined.sizes
+            at = joined.at
+            places = joined.places
             self.stats.bytes_skipped += joined.heads
             self.stats.bytes_filler += joined.heads
             self.stats.pending = self._assembly.pending
         piece = sorted_datagrams(self.framing, buffer, starts, sizes, self._mode)
         frames = piece.frames
-        self._base, self.stats.bytes_in = self._base + total, self.stats.bytes_in + total
+        self._base = self._base + total
+        self.stats.bytes_in = self.stats.bytes_in + total
         self._rejected(piece.rejected, piece.errors)
-        gaps, kind = repeated(0, len(frames)), alike(frames.kinds)
+        gaps = repeated(0, len(frames))
+        kind = alike(frames.kinds)
         is_good = kind >= 0 if kind is not None else not np.count_nonzero(frames.kinds < 0)
         if self._gap or not is_good or (joined is not None and joined.dropped.any()):
             good = frames.kinds >= 0
             gaps = self._lost(buffer, frames.starts, sizes, good, joined)
             if not is_good:
-                frames, places, at = frames.only(good), array_of(places)[good], at[good]
+                frames = frames.only(good)
+                places = array_of(places)[good]
+                at = at[good]
         self._count(frames.kinds)
         return self._shown(frames.located(self.framing.names, places, gaps, at))
 
@@ -281,7 +291,8 @@ class Decoder:
 
     def _drop(self, size: int) -> None:
         """Count bytes that are no frame, before the next one."""
-        self._gap, self.stats.bytes_skipped = self._gap + size, self.stats.bytes_skipped + size
+        self._gap = self._gap + size
+        self.stats.bytes_skipped = self.stats.bytes_skipped + size
 
     def _cut(
         self,
@@ -309,7 +320,8 @@ class Decoder:
             piece = self._piece(part, final=final and last)
             frames = self._entered(part, piece, at)
             found += [frames] if len(frames) else []  # none at all would keep its bytes
-            start, self._base = start + piece.end, self._base + piece.end
+            start = start + piece.end
+            self._base = self._base + piece.end
             self._need = piece.need if piece.waiting and last else 0
             if piece.waiting and last:
                 break
@@ -332,16 +344,16 @@ class Decoder:
         """The frames of a piece with their place in the input, and all that was found in it
         counted.
         """
-        frames, base = piece.frames, self._base
+        frames = piece.frames
+        base = self._base
         gaps = self._gaps(buffer, frames, piece.end)
         self._rejected(piece.rejected, piece.errors)
         self._count(frames.kinds)
         places = frames.places
-        places = (
-            range(places.start + base, places.stop + base, places.step)
-            if isinstance(places, range)
-            else places + base
-        )
+        if isinstance(places, range):
+            places = range(places.start + base, places.stop + base, places.step)
+        else:
+            places = places + base
         return self._shown(
             frames.located(
                 self.framing.names, places, gaps, repeated(-1 if at is None else at, len(frames))
@@ -430,7 +442,8 @@ def backend(name: str) -> str:
     """
     place = "backend"
     if name == "auto" and os.environ.get(BACKEND):
-        place, name = BACKEND, os.environ[BACKEND]
+        place = BACKEND
+        name = os.environ[BACKEND]
     if name not in BACKENDS:
         raise UsageError(f"{place} is one of {', '.join(BACKENDS)}, not {name!r}")
     return name

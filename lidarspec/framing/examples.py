@@ -114,9 +114,10 @@ def _header(
                     "a header alone does not make a frame of parts", path=unknown.leaf.info.path
                 ) from None
             own = drawn.get(unknown.leaf.info.path)
-            values[unknown.leaf.info.path] = (
-                own(source) if own else _some_value(source, unknown.leaf, keys)
-            )
+            if own:
+                values[unknown.leaf.info.path] = own(source)
+            else:
+                values[unknown.leaf.info.path] = _some_value(source, unknown.leaf, keys)
 
 
 def _switch_keys(root: Node) -> Iterator[int]:
@@ -129,11 +130,9 @@ def _switch_keys(root: Node) -> Iterator[int]:
 
 def _some_value(source: random.Random, leaf: Leaf, keys: list[int]) -> int:
     if leaf.info.const is not None or leaf.info.allowed:
-        return (
-            int(leaf.info.const)
-            if leaf.info.const is not None
-            else source.choice(leaf.info.allowed or ())
-        )
+        if leaf.info.const is not None:
+            return int(leaf.info.const)
+        return source.choice(leaf.info.allowed or ())
     top = (1 << leaf.info.bits) - 1
     kinds = [
         source.randint(0, top),

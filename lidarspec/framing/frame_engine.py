@@ -60,7 +60,8 @@ class CompiledCodec(Codec):
         if isinstance(layouts, NotCompilable):
             raise layouts
         super().__init__(frame)
-        self.tree, layout = layouts, layouts.layout(b"")
+        self.tree = layouts
+        layout = layouts.layout(b"")
         self.layout = layout if isinstance(layout, Layout) else None
         self._alike = AlikeLayouts()
 
@@ -79,7 +80,8 @@ class CompiledCodec(Codec):
             if self.layout is not None
             else self.tree.classify(buffer, offsets, stops)
         )
-        kinds, errors = repeated(kind, len(offsets)), list[PluginError]()
+        kinds = repeated(kind, len(offsets))
+        errors = list[PluginError]()
         if (
             len(groups) == 1
             and len(groups[0][1]) == len(offsets)
@@ -98,14 +100,19 @@ class CompiledCodec(Codec):
                 rows=rows,
                 errors=tuple(errors),
             )
-        status, forms = np.full(len(offsets), SHORT, np.uint8), np.full(len(offsets), -1, np.intp)
-        layouts, short = list[Layout](), list[tuple[NDArray[np.intp], NDArray[np.intp]]]()
+        status = np.full(len(offsets), SHORT, np.uint8)
+        forms = np.full(len(offsets), -1, np.intp)
+        layouts = list[Layout]()
+        short = list[tuple[NDArray[np.intp], NDArray[np.intp]]]()
         left = list[LayoutGroup]()
         for layout, which in groups:
             if isinstance(layout, Refused):
-                status[which] = (
-                    PLUGIN if layout.error else CONSTANT if layout.by_constant else LENGTH
-                )
+                if layout.error:
+                    status[which] = PLUGIN
+                elif layout.by_constant:
+                    status[which] = CONSTANT
+                else:
+                    status[which] = LENGTH
                 errors += [layout.error] if layout.error else []
                 continue
             forms[which] = len(layouts)
@@ -197,13 +204,17 @@ class CompiledCodec(Codec):
             that are whole, one a row, if these are wanted, are in front, and are not too many.
         """
         whole = offsets <= (len(buffer) if stops is None else stops) - layout.size
-        count, number = int(np.count_nonzero(whole)), len(offsets)
+        count = int(np.count_nonzero(whole))
+        number = len(offsets)
         own = offsets if count == number else offsets[whole]
         gathered = gathered and (count == number or bool(whole[:count].all()))
-        judge, step, kept = self.judge(layout), max(BLOCK // layout.size, 1), None
+        judge = self.judge(layout)
+        step = max(BLOCK // layout.size, 1)
+        kept = None
         if count <= step or not gathered:
             rows = rows_at(buffer, own, layout.size, gathered=gathered)
-            judged, kept = judge(rows, errors, sums), rows if gathered else None
+            judged = judge(rows, errors, sums)
+            kept = rows if gathered else None
         else:
             blocks = (own[start : start + step] for start in range(0, count, step))
             judged = np.concatenate(
@@ -211,7 +222,8 @@ class CompiledCodec(Codec):
             )
         if count == number:
             return judged, repeated(layout.size, number), kept
-        status, sizes = np.empty(number, np.uint8), np.full(number, layout.size)
+        status = np.empty(number, np.uint8)
+        sizes = np.full(number, layout.size)
         status[whole] = judged
         ends = len(buffer) if stops is None else stops[~whole]
         status[~whole], sizes[~whole] = _partial(
@@ -232,11 +244,10 @@ class CompiledCodec(Codec):
         least half of what is kept for them.
         """
         if frames.rows is not None and frames.layout is not None:
-            rows = (
-                frames.rows
-                if 2 * frames.rows.size >= len(frames.buffer)
-                else np.ascontiguousarray(frames.rows)
-            )
+            if 2 * frames.rows.size >= len(frames.buffer):
+                rows = frames.rows
+            else:
+                rows = np.ascontiguousarray(frames.rows)
             return Rows(self.schema, [Group(frames.layout, counted(len(rows)), rows)])
         known = (
             frames.by_layout()
@@ -288,11 +299,10 @@ class InterpretedCodec(Codec):
         status = np.zeros(len(offsets), np.uint8)
         sizes = np.zeros(len(offsets), np.intp)
         errors: list[PluginError] = []
-        ends = (
-            offsets + self.frame.room
-            if stops is None
-            else np.minimum(offsets + self.frame.room, stops)
-        )
+        if stops is None:
+            ends = offsets + self.frame.room
+        else:
+            ends = np.minimum(offsets + self.frame.room, stops)
         for index, (offset, end) in enumerate(zip(offsets.tolist(), ends.tolist(), strict=True)):
             data = buffer[offset:end].tobytes()
             status[index], sizes[index] = self._judge(data, errors)

@@ -82,9 +82,10 @@ class AlikeLayouts:
         left = list[LayoutGroup]()
         alike = dict[int, list[tuple[LayoutGroup, Likeness]]]()
         for layout, which in groups:
-            likeness = (
-                self.likeness(layout, make_judge(layout)) if len(which) < MANY_CANDIDATES else None
-            )
+            if len(which) < MANY_CANDIDATES:
+                likeness = self.likeness(layout, make_judge(layout))
+            else:
+                likeness = None
             if likeness is None:
                 left.append((layout, which))
             else:
@@ -140,17 +141,15 @@ def _place(leaf: Leaf, seal: Seal, size: int) -> tuple[str, int]:
     """Return where a checksum is: from the start of the frame, or from its end if it follows the
     last bytes covered.
     """
-    return (
-        ("end", size - leaf.offset) if leaf.offset >= seal.spans[-1][1] else ("start", leaf.offset)
-    )
+    if leaf.offset >= seal.spans[-1][1]:
+        return ("end", size - leaf.offset)
+    return ("start", leaf.offset)
 
 
 def _test_key(check: Check) -> Hashable:
-    return (
-        (check.table, check.offset, check.shape[1:], check.strides)
-        if isinstance(check, Lookup)
-        else None
-    )
+    if isinstance(check, Lookup):
+        return (check.table, check.offset, check.shape[1:], check.strides)
+    return None
 
 
 class Together:

@@ -75,13 +75,11 @@ class Judge:
         met: list[Check],
         checks: list[Check] | None,
     ) -> None:
-        self._frame, self._schema, self._layout, self._met, self._checks = (
-            frame,
-            schema,
-            layout,
-            met,
-            checks,
-        )
+        self._frame = frame
+        self._schema = schema
+        self._layout = layout
+        self._met = met
+        self._checks = checks
         self.checks = [*met, *(checks or ())]
         self.is_complete = checks is not None or frame.plausible is None
         self._constants = words(
@@ -211,11 +209,10 @@ def plausibility(frame: Frame, table: Table, errors: list[PluginError]) -> NDArr
     try:
         with np.errstate(all="ignore"):
             answer = frame.plausible(Fields(batch))
-        array = (
-            np.broadcast_to(np.asarray(answer), (len(table), *np.shape(answer)[1:]))
-            if np.ndim(answer)
-            else np.full(len(table), answer)
-        )
+        if np.ndim(answer):
+            array = np.broadcast_to(np.asarray(answer), (len(table), *np.shape(answer)[1:]))
+        else:
+            array = np.full(len(table), answer)
         holds = array.reshape(len(array), math.prod(array.shape[1:])).astype(np.bool_).all(axis=1)
         return np.where(holds, VALID, IMPLAUSIBLE).astype(np.uint8)
     except Exception as error:
@@ -351,11 +348,9 @@ class Lookup:
         held = self._each(rows)
         if not self.shape:
             return held
-        return (
-            np.ones(len(held), np.bool_)
-            if held.all()
-            else np.asarray(held.all(axis=tuple(range(1, held.ndim))))
-        )
+        if held.all():
+            return np.ones(len(held), np.bool_)
+        return np.asarray(held.all(axis=tuple(range(1, held.ndim))))
 
     def holds_within(self, rows: Bytes2D, lengths: NDArray[np.intp]) -> NDArray[np.bool_]:
         """Whether the condition holds in each frame, (n,), if its outermost array has fewer

@@ -32,7 +32,8 @@ VALID, SHORT, LENGTH, CONSTANT, CHECKSUM, IMPLAUSIBLE, PLUGIN = range(7)
 
 #: layouts whose frames are found one layout after another sooner than by sorting, and sooner than
 #: by counting first.
-FEW, FEWER = 16, 4
+FEW = 16
+FEWER = 4
 
 #: bytes that the repr of a frame shows.
 SHOWN = 8
@@ -208,14 +209,12 @@ class Frames:
         errors: tuple[PluginError, ...] = (),
     ) -> None:
         number = len(kinds)
-        self.buffer, self.kinds, self.sizes, self.layouts, self.rows, self.errors = (
-            buffer,
-            kinds,
-            sizes,
-            layouts,
-            rows,
-            errors,
-        )
+        self.buffer = buffer
+        self.kinds = kinds
+        self.sizes = sizes
+        self.layouts = layouts
+        self.rows = rows
+        self.errors = errors
         self._starts = self.places = starts
         self.forms = repeated(0 if layouts else -1, number) if forms is None else forms
         self.status = repeated(VALID, number) if status is None else status
@@ -231,7 +230,8 @@ class Frames:
         """Candidates in one buffer, one part after another, without their rows and tracebacks."""
         if len(parts) == 1:
             return parts[0]
-        layouts, firsts = list[Layout](), dict[int, int]()
+        layouts = list[Layout]()
+        firsts = dict[int, int]()
         for part in parts:
             if id(part.layouts) not in firsts:
                 firsts[id(part.layouts)] = len(layouts)
@@ -292,16 +292,14 @@ class Frames:
 
     def only(self, which: NDArray[np.bool_] | Indices | slice) -> Frames:
         """The frames that a mask, ascending indices or a slice choose."""
-        which = (
-            which if isinstance(which, slice) or which.dtype != np.bool_ else np.flatnonzero(which)
-        )
+        if not (isinstance(which, slice) or which.dtype != np.bool_):
+            which = np.flatnonzero(which)
         rows = self.rows
         if rows is not None:
-            rows = (
-                rows[which]
-                if isinstance(which, slice)
-                else taken(rows, which[: which.searchsorted(len(rows))])
-            )
+            if isinstance(which, slice):
+                rows = rows[which]
+            else:
+                rows = taken(rows, which[: which.searchsorted(len(rows))])
         chosen = {
             name: some(getattr(self, name), which)
             for name in ("kinds", "sizes", "forms", "status", "gaps", "at")
@@ -397,21 +395,17 @@ def packed(found: Sequence[Found]) -> Frames:
 
 def array_of(numbers: Numbers) -> NDArray[np.int64]:
     """The numbers as an array, (n,)."""
-    return (
-        np.arange(numbers.start, numbers.stop, numbers.step)
-        if isinstance(numbers, range)
-        else numbers
-    )
+    if isinstance(numbers, range):
+        return np.arange(numbers.start, numbers.stop, numbers.step)
+    return numbers
 
 
 def _shifted(forms: Indices, first: int) -> Indices:
     """Indices of layouts that stand behind others."""
     form = alike(forms)
-    return (
-        np.where(forms < 0, -1, forms + first)
-        if form is None
-        else repeated(form + first if form >= 0 else -1, len(forms))
-    )
+    if form is None:
+        return np.where(forms < 0, -1, forms + first)
+    return repeated(form + first if form >= 0 else -1, len(forms))
 
 
 def _chosen(numbers: Numbers, which: NDArray[np.bool_] | Indices | slice) -> Numbers:

@@ -196,7 +196,8 @@ def clocked(sensor: Spec, batch: Batch) -> tuple[NDArray[np.intp] | None, Times]
     parts in which it stands.
     """
     assert sensor.clock is not None
-    place, source = clock_parts(sensor, batch.table.schema), sensor.clock.source
+    place = clock_parts(sensor, batch.table.schema)
+    source = sensor.clock.source
     if place is not None:
         table, which = batch.table.parts(*place)
         frames, first = np.unique(which, return_index=True)
@@ -257,11 +258,10 @@ def part_times(
     """
     if not len(which) or sensor.clock is None or not _stands_in(sensor.clock, place):
         return times
-    readings, first = _in_parts(sensor, place, table), np.searchsorted(which, which)
-    steps, turn = (
-        readings - readings[first],
-        _turn(sensor.clock.wraps_at) if sensor.clock.wraps_at else 0,
-    )
+    readings = _in_parts(sensor, place, table)
+    first = np.searchsorted(which, which)
+    steps = readings - readings[first]
+    turn = _turn(sensor.clock.wraps_at) if sensor.clock.wraps_at else 0
     return times + ((steps + turn // 2) % turn - turn // 2 if turn else steps)
 
 
@@ -288,13 +288,11 @@ def _turn(seconds: float) -> int:
 
 def paths(clock: Clock) -> tuple[str, ...]:
     """The fields that add up to a clock; none where a function computes it."""
-    return (
-        (clock.source,)
-        if isinstance(clock.source, str)
-        else ()
-        if callable(clock.source)
-        else tuple(clock.source)
-    )
+    if isinstance(clock.source, str):
+        return (clock.source,)
+    if callable(clock.source):
+        return ()
+    return tuple(clock.source)
 
 
 @lru_cache(maxsize=256)
@@ -355,11 +353,10 @@ def _within(raw: NDArray[Any], furthest: int) -> Times:
 
 
 def _nanoseconds(seconds: Any, number: int) -> Times:
-    flat = (
-        np.broadcast_to(np.asarray(seconds, np.float64).reshape(-1), (number,))
-        if np.size(seconds) in (1, number)
-        else None
-    )
+    if np.size(seconds) in (1, number):
+        flat = np.broadcast_to(np.asarray(seconds, np.float64).reshape(-1), (number,))
+    else:
+        flat = None
     if flat is None:
         raise SpecError("a clock gives one time for each packet")
     return np.rint(np.clip(np.nan_to_num(flat), -9e9, 9e9) * 1e9).astype(np.int64)

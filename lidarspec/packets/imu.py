@@ -66,19 +66,12 @@ class ImuSamples:
 
 def joined(parts: Sequence[ImuSamples]) -> ImuSamples:
     """Samples one after another; none of none."""
-    parts = (
-        [*parts, ImuSamples(np.empty(0, np.int64), np.empty((0, 3)), np.empty((0, 3)))]
-        if len(parts) != 1
-        else parts
-    )
+    if len(parts) != 1:
+        parts = [*parts, ImuSamples(np.empty(0, np.int64), np.empty((0, 3)), np.empty((0, 3)))]
     names = ("time_ns", "angular_velocity", "linear_acceleration")
-    return (
-        parts[0]
-        if len(parts) == 1
-        else ImuSamples(
-            *(np.concatenate([getattr(part, name) for part in parts]) for name in names)
-        )
-    )
+    if len(parts) == 1:
+        return parts[0]
+    return ImuSamples(*(np.concatenate([getattr(part, name) for part in parts]) for name in names))
 
 
 def samples(sensor: Spec, frame: str, batch: Batch, time_ns: NDArray[np.int64]) -> ImuSamples:
@@ -114,7 +107,8 @@ def samples(sensor: Spec, frame: str, batch: Batch, time_ns: NDArray[np.int64]) 
             [np.asarray(flat(array, shape, mask, len(batch)), np.float64) for array in arrays],
             axis=1,
         )
-    found, turn = ImuSamples(time, values_of[:, :3], values_of[:, 3:]), vendor_turn(sensor)
+    found = ImuSamples(time, values_of[:, :3], values_of[:, 3:])
+    turn = vendor_turn(sensor)
     return found if turn is None else found.turned(turn)
 
 

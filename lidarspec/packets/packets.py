@@ -63,18 +63,20 @@ class Packets:
         order: NDArray[np.int64] | None = None,
         masked: NDArray[np.int64] | None = None,
     ) -> None:
-        self.sensor, self.frame, self.table = sensor, frame, table
+        self.sensor = sensor
+        self.frame = frame
+        self.table = table
         self._order = order
         self.is_clocked = order is not None
         self.masked = masked
-        self._offset, self.time_ns, self.host_ns, self._index, self.breaks = (
-            offset,
-            time_ns,
-            host_ns,
-            index,
-            breaks,
-        )
-        self.state, self.stats, self.backend = state, stats, backend
+        self._offset = offset
+        self.time_ns = time_ns
+        self.host_ns = host_ns
+        self._index = index
+        self.breaks = breaks
+        self.state = state
+        self.stats = stats
+        self.backend = backend
 
     @cached_property
     def offset(self) -> NDArray[np.int64]:
@@ -99,11 +101,10 @@ class Packets:
         return len(self.table)
 
     def __repr__(self) -> str:
-        span = (
-            f", {(int(self.time_ns[-1]) - int(self.time_ns[0])) / 1e9:.3f} s"
-            if len(self) > 1
-            else ""
-        )
+        if len(self) > 1:
+            span = f", {(int(self.time_ns[-1]) - int(self.time_ns[0])) / 1e9:.3f} s"
+        else:
+            span = ""
         return f"Packets({len(self)} {self.frame} frames of {self.sensor.id}{span})"
 
     _repr_html_ = drawn("packets")

@@ -229,11 +229,10 @@ class PointCloud:
         numbers, counts = np.unique(self.column[::each], return_counts=True)
         wrong = numbers[(numbers >= columns) | (counts > 1)]
         if len(wrong):
-            reason = (
-                f"comes {int(counts[numbers == wrong[0]][0])} times"
-                if wrong[0] < columns
-                else f"is not one of {columns}"
-            )
+            if wrong[0] < columns:
+                reason = f"comes {int(counts[numbers == wrong[0]][0])} times"
+            else:
+                reason = f"is not one of {columns}"
             raise UsageError(
                 f"column {wrong[0]} {reason}: give the points of one turn, and how many columns"
                 " that has"
@@ -270,7 +269,8 @@ class PointCloud:
         """The points at some indices, whole columns of them; -1 is an invalid one, in the row that
         it stands in.
         """
-        indices, each = indices.reshape(-1), grid_of(self).column
+        indices = indices.reshape(-1)
+        each = grid_of(self).column
         gaps = indices < 0
         picked = self[np.where(gaps, np.arange(len(indices)) % each, indices)]
         if gaps.any():
@@ -351,7 +351,8 @@ def arrow_schema(cloud: PointCloud, facts: Mapping[str, str]) -> Any:
     Args:
         facts: metadata of the schema, beside `units` as JSON and `calibration`: "nominal" or "own".
     """
-    arrow, units = import_library("pyarrow", "arrow"), units_of(cloud)
+    arrow = import_library("pyarrow", "arrow")
+    units = units_of(cloud)
     fields = [
         arrow.field(
             name,
@@ -368,10 +369,8 @@ def arrow_schema(cloud: PointCloud, facts: Mapping[str, str]) -> Any:
 
 def structured_type(extra: Mapping[str, np.dtype[Any]]) -> np.dtype[Any]:
     """PCL's layout with further columns behind it, each where its type allows."""
-    places, end = (
-        {name: place[:2] for name, place in (STRUCTURED.fields or {}).items()},
-        STRUCTURED.itemsize,
-    )
+    places = {name: place[:2] for name, place in (STRUCTURED.fields or {}).items()}
+    end = STRUCTURED.itemsize
     for name, dtype in extra.items():
         start = end + -end % dtype.itemsize
         places[name], end = (dtype.newbyteorder("<"), start), start + dtype.itemsize
@@ -392,11 +391,9 @@ def _pick(value: Any, which: Any) -> Any:
 
 def grid_of(cloud: PointCloud) -> Grid:
     """How the points of a cloud are organised."""
-    return (
-        Grid(cloud.shape[1], len(cloud) // max(cloud.shape[0] * cloud.shape[1], 1) or 1)
-        if cloud.shape
-        else Grid()
-    )
+    if cloud.shape:
+        return Grid(cloud.shape[1], len(cloud) // max(cloud.shape[0] * cloud.shape[1], 1) or 1)
+    return Grid()
 
 
 def organised(number: int, grid: Grid) -> tuple[int, int] | None:
@@ -445,11 +442,9 @@ class ColumnSource:
 
     def grid_between(self, start: int, stop: int) -> Grid:
         """How the points from `start` to `stop` are organised, whatever is around them."""
-        return (
-            self.grids.between(start, stop)
-            if self.grids
-            else whole_columns(self.grid, start, stop - start)
-        )
+        if self.grids:
+            return self.grids.between(start, stop)
+        return whole_columns(self.grid, start, stop - start)
 
     def times_at(self, indices: NDArray[np.intp]) -> NDArray[np.float64]:
         """The column "time" at some indices, of their shape, seconds since `base`; the others need
@@ -471,18 +466,20 @@ class CloudColumns(ColumnSource):
     """The columns of a cloud."""
 
     def __init__(self, cloud: PointCloud, grids: Grids | None = None) -> None:
-        self._cloud, self.size, self.base = cloud, len(cloud), cloud.stamp_ns
-        self.grids, self.nominal = grids, bool(cloud.nominal)
+        self._cloud = cloud
+        self.size = len(cloud)
+        self.base = cloud.stamp_ns
+        self.grids = grids
+        self.nominal = bool(cloud.nominal)
         self.grid = grids.between(0, self.size) if grids else grid_of(cloud)
         own = cloud.source.extra if isinstance(cloud, LazyCloud) else None
-        self.extra = (
-            {
+        if own is None:
+            self.extra = {
                 name: Kind(column.dtype, cloud.units.get(name, ""))
                 for name, column in cloud.extra.items()
             }
-            if own is None
-            else own
-        )
+        else:
+            self.extra = own
 
     def column(self, name: str) -> NDArray[Any] | None:
         column: NDArray[Any] | None = (
@@ -524,21 +521,22 @@ class Stretches(ColumnSource):
     """
 
     def __init__(self, parts: Sequence[Stretch], *, from_first: bool = False) -> None:
-        self._parts, self._from_first = parts, from_first
-        self.size, self.base = sum(part.size for part in parts), parts[0].source.base
+        self._parts = parts
+        self._from_first = from_first
+        self.size = sum(part.size for part in parts)
+        self.base = parts[0].source.base
         grids = {part.source.grid_between(part.start, part.stop) for part in parts}
         self.grid = grids.pop() if len(grids) == 1 else Grid()
         self.nominal = any(part.source.nominal for part in parts)
         first = parts[0].source.extra
-        self.extra = (
-            {
+        if first:
+            self.extra = {
                 name: first[name]
                 for name in first
                 if all(name in part.source.extra for part in parts)
             }
-            if first
-            else first
-        )
+        else:
+            self.extra = first
         self._together = parts[0].source.together(parts)
 
     def column(self, name: str) -> NDArray[Any] | None:
@@ -572,7 +570,8 @@ class Stretches(ColumnSource):
 
     def _times_at(self, indices: NDArray[np.intp]) -> NDArray[np.float64]:
         """Times of some points, which count from where those of the first source do."""
-        times, start = np.empty(len(indices)), 0
+        times = np.empty(len(indices))
+        start = 0
         for part in self._parts:
             inside = (indices >= start) & (indices < start + part.size)
             if inside.any():
@@ -602,7 +601,8 @@ class Extras(Mapping[str, NDArray[Any]]):
     """The columns of a source under names of the sensor's own, each made when it is first read."""
 
     def __init__(self, source: ColumnSource) -> None:
-        self._source, self._made = source, dict[str, Any]()
+        self._source = source
+        self._made = dict[str, Any]()
 
     def __getitem__(self, name: str) -> NDArray[Any]:
         if name not in self._made:
@@ -736,7 +736,8 @@ class Mount:
             stays what the sensor measured, from the sensor.
         """
         turn = self.rotation
-        azimuth, elevation = cloud.azimuth.astype(np.float64), cloud.elevation.astype(np.float64)
+        azimuth = cloud.azimuth.astype(np.float64)
+        elevation = cloud.elevation.astype(np.float64)
         level = np.cos(elevation)
         beam = turn @ np.stack(
             [level * np.cos(azimuth), level * np.sin(azimuth), np.sin(elevation)]

@@ -67,11 +67,9 @@ def returned_range(measured: Any) -> Any:
 
 def marked(measured: Any, invalid: Any) -> Any:
     """Ranges, nan where the sensor marks a point as wrong."""
-    return (
-        np.where(invalid, np.nan, measured)
-        if isinstance(invalid, Traced) or np.any(invalid)
-        else measured
-    )
+    if isinstance(invalid, Traced) or np.any(invalid):
+        return np.where(invalid, np.nan, measured)
+    return measured
 
 
 def coordinates(
@@ -119,11 +117,9 @@ def direction_of(x: Any, y: Any, z: Any) -> tuple[Any, Any, Any]:
 
 
 def _product(first: Any, second: Any) -> Any:
-    return (
-        first
-        if not isinstance(second, Traced) and np.size(second) == 1 and np.all(second == 1)
-        else first * second
-    )
+    if not isinstance(second, Traced) and np.size(second) == 1 and np.all(second == 1):
+        return first
+    return first * second
 
 
 def _is_row(value: Any) -> bool:
@@ -185,13 +181,15 @@ class Grids(NamedTuple):
         """How some points are organised: not, where their packets differ, or they are not whole
         columns.
         """
-        first, last = self.ends.searchsorted(start, side="right"), self.ends.searchsorted(stop)
-        begin, packets = int(self.ends[first - 1]) if first else 0, slice(first, last + 1)
+        first = self.ends.searchsorted(start, side="right")
+        last = self.ends.searchsorted(stop)
+        begin = int(self.ends[first - 1]) if first else 0
+        packets = slice(first, last + 1)
         has_points = np.diff(self.ends[packets], prepend=begin) > 0
         found = {self.grids[which] for which in np.unique(self.which[packets][has_points]).tolist()}
-        return (
-            whole_columns(found.pop(), start - begin, stop - start) if len(found) == 1 else Grid()
-        )
+        if len(found) == 1:
+            return whole_columns(found.pop(), start - begin, stop - start)
+        return Grid()
 
 
 def whole_columns(grid: Grid, first: int, number: int) -> Grid:
@@ -212,26 +210,24 @@ class Kind(NamedTuple):
         """What is declared, and else follows from the field that the values are."""
         is_own = isinstance(values, Column) and not values.frame
         info = values.batch.table.schema.fields.get(values.source) if is_own else None
-        as_sent = (
-            info.dtype if info is not None and info.kind == "int" and not info.scaled else None
-        )
+        if info is not None and info.kind == "int" and not info.scaled:
+            as_sent = info.dtype
+        else:
+            as_sent = None
         array = values.array if isinstance(values, Column) else np.asarray(values)
-        dtype = (
-            np.dtype(bool if array.dtype.kind == "b" else as_sent or np.float32)
-            if extra.dtype is None
-            else extra.dtype
-        )
+        if extra.dtype is None:
+            dtype = np.dtype(bool if array.dtype.kind == "b" else as_sent or np.float32)
+        else:
+            dtype = extra.dtype
         return cls(
             dtype, (info.unit if info is not None else "") if extra.unit is None else extra.unit
         )
 
     def column(self, values: NDArray[Any]) -> NDArray[Any]:
         """Values in the type, of the same shape."""
-        return (
-            values.astype(self.dtype, copy=False)
-            if self.dtype.kind == "f"
-            else numbers_of(values, self.dtype)
-        )
+        if self.dtype.kind == "f":
+            return values.astype(self.dtype, copy=False)
+        return numbers_of(values, self.dtype)
 
 
 def numbers_of(values: NDArray[Any], dtype: Any) -> NDArray[Any]:

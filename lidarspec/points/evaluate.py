@@ -96,11 +96,10 @@ def _planned(
             return None
     except (SpecError, ValueError):
         return None
-    ready = (
-        len(packets)
-        if final
-        else min((column.ready for column in remembered.values()), default=len(packets))
-    )
+    if final:
+        ready = len(packets)
+    else:
+        ready = min((column.ready for column in remembered.values()), default=len(packets))
     cloud = _cloud_of(packets, shares, batch, ready, stamp_of(packets, epoch))
     counts = np.empty(0, np.intp) if alone else _counts(shares, len(packets))[:ready]
     return Evaluated(cloud, ready, batch.carried(ready), counts, Fields(batch), plans[0].axes)
@@ -111,9 +110,9 @@ def _share(
 ) -> Share:
     """A group with its plain results; those that remember other packets are of the whole batch."""
     is_whole = len(group.where) == len(batch) and ascends(group.where)
-    return (
-        Share(plan, group, whole, batch) if is_whole else Share.part(plan, batch, group, remembered)
-    )
+    if is_whole:
+        return Share(plan, group, whole, batch)
+    return Share.part(plan, batch, group, remembered)
 
 
 def _holds(share: Share) -> bool:
@@ -137,7 +136,8 @@ def _moderate(share: Share, node: Node) -> bool:
     leaf = share.plan.layout.leaves.get(node.path)
     if leaf is None:
         return False
-    rows, step = share.group.rows, max(_AT_ONCE // max(math.prod(leaf.shape), 1), 1)
+    rows = share.group.rows
+    step = max(_AT_ONCE // max(math.prod(leaf.shape), 1), 1)
     return all(
         _all_moderate(leaf.load(rows[start : start + step])) for start in range(0, len(rows), step)
     )
@@ -158,7 +158,8 @@ def _cloud_of(
     packets: PacketBatch, shares: list[Share], batch: Batch, ready: int, stamp_ns: int
 ) -> LazyCloud:
     """The cloud of the first `ready` packets."""
-    plan, grids = shares[0].plan, None
+    plan = shares[0].plan
+    grids = None
     size = ready * plan.width
     if len(shares) > 1 or not ascends(shares[0].group.where):
         widths, which = np.zeros((2, len(packets)), np.intp)
@@ -169,7 +170,8 @@ def _cloud_of(
             which,
             [grid_of(share.plan.shape, share.plan.axes) for share in shares],
         )
-        starts, size = grids.ends - widths, int(widths[:ready].sum())
+        starts = grids.ends - widths
+        size = int(widths[:ready].sum())
         for share in shares:
             share.first = np.where(share.group.where < ready, starts[share.group.where], -1)
     return LazyCloud.of(

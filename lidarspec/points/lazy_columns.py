@@ -45,7 +45,8 @@ _MAIN = ("x", "y", "z", "intensity")
 
 #: points of a scan from which on its columns are made for itself; smaller ones share those of so
 #: many points.
-LEAST, SHARED = 1 << 14, 1 << 16
+LEAST = 1 << 14
+SHARED = 1 << 16
 #: bytes of a whole number that float64 holds exactly.
 EXACT = 4
 
@@ -56,7 +57,8 @@ class Plain:
     """
 
     def __init__(self, batch: Batch) -> None:
-        self._fields, self._table = Fields(batch), batch.table
+        self._fields = Fields(batch)
+        self._table = batch.table
         self._columns: dict[Node, Any] = {}
         self._arrays: dict[Node, Any] = {}
 
@@ -91,11 +93,10 @@ class Plain:
             return None
         if self._table.present(info.path) is not None:
             return None
-        some = (
-            self._table
-            if stop - first == len(self._table)
-            else self._table.take(np.arange(first, stop))
-        )
+        if stop - first == len(self._table):
+            some = self._table
+        else:
+            some = self._table.take(np.arange(first, stop))
         return field_array(info, some, self._table.schema.depth(), raw=True)
 
     def know(self, node: Node, column: Column) -> None:
@@ -154,12 +155,12 @@ class Share:
         of float64.
         """
         stop = len(self) if stop is None else stop
-        part, shape = self.plan.parts[name], (stop - first, *self.plan.shape)
-        array = (
-            self.known.sent(part, first, stop)
-            if isinstance(part, Node) and name in self.plan.extra
-            else None
-        )
+        part = self.plan.parts[name]
+        shape = (stop - first, *self.plan.shape)
+        if isinstance(part, Node) and name in self.plan.extra:
+            array = self.known.sent(part, first, stop)
+        else:
+            array = None
         if array is None:
             array = self.known.array(part) if isinstance(part, Node) else np.asarray(part)
             array = array[first:stop] if isinstance(part, Node) and len(array) > 1 else array
@@ -227,13 +228,13 @@ class Computed(ColumnSource):
     def __init__(
         self, parts: Sequence[tuple[BatchColumns, int, int]], made: dict[str, NDArray[Any]]
     ) -> None:
-        self._parts, self._made = parts, made
-        self.size, self.base = sum(stop - start for _, start, stop in parts), parts[0][0].base
-        self._packets, self._shares, self.extra = (
-            parts[0][0].packets,
-            parts[0][0].shares,
-            parts[0][0].extra,
-        )
+        self._parts = parts
+        self._made = made
+        self.size = sum(stop - start for _, start, stop in parts)
+        self.base = parts[0][0].base
+        self._packets = parts[0][0].packets
+        self._shares = parts[0][0].shares
+        self.extra = parts[0][0].extra
         self._turn = vendor_turn(self._packets.sensor)
 
     def column(self, name: str) -> NDArray[Any] | None:
@@ -268,11 +269,9 @@ class Computed(ColumnSource):
                 if name in ("range", "azimuth") and self._packets.backend == "jit"
                 else (name,)
             )
-            return (
-                columns | {"azimuth": self._azimuth(columns["azimuth"])}
-                if "azimuth" in columns
-                else columns
-            )
+            if "azimuth" in columns:
+                return columns | {"azimuth": self._azimuth(columns["azimuth"])}
+            return columns
         if name == "time":
             times = [
                 batch.times_of(share, *packets) + later(batch, self.base)
@@ -325,7 +324,8 @@ class Computed(ColumnSource):
 
     def _compiled(self, names: tuple[str, ...]) -> dict[str, NDArray[Any]]:
         """Columns that back ends make."""
-        pieces, backend = self._pieces(), self._packets.backend
+        pieces = self._pieces()
+        backend = self._packets.backend
         if not self._is_even:
             each = []
             for _, share, (first, stop) in pieces:
@@ -339,7 +339,8 @@ class Computed(ColumnSource):
         plan = self._shares[0].plan
         number = sum(stop - first for _, _, (first, stop) in pieces)
         maker = maker_of(plan, names, backend, number)
-        columns, start = maker.columns(number), 0
+        columns = maker.columns(number)
+        start = 0
         for _, share, (first, stop) in pieces:
             end = start + (stop - first) * plan.width
             share.fill(
@@ -392,9 +393,11 @@ def spread_out(
     a packet out.
     """
     kept = first >= 0
-    rows, starts = np.ascontiguousarray(values.reshape(len(first), width), column.dtype), first
+    rows = np.ascontiguousarray(values.reshape(len(first), width), column.dtype)
+    starts = first
     if not kept.all():
-        rows, starts = rows[kept], first[kept]
+        rows = rows[kept]
+        starts = first[kept]
     if rows.size:
         piece = np.dtype((np.void, rows.shape[1] * rows.itemsize))
         windows: NDArray[Any] = np.ndarray(
@@ -432,11 +435,17 @@ class BatchColumns(ColumnSource):
         grids: Grids | None,
         nominal: bool,
     ) -> None:
-        self.packets, self.shares, self.extra = packets, shares, shares[0].plan.extra
-        self.size, self.base, self.grids, self.nominal = size, base, grids, nominal
-        self.grid = (
-            grids.between(0, size) if grids else grid_of(shares[0].plan.shape, shares[0].plan.axes)
-        )
+        self.packets = packets
+        self.shares = shares
+        self.extra = shares[0].plan.extra
+        self.size = size
+        self.base = base
+        self.grids = grids
+        self.nominal = nominal
+        if grids:
+            self.grid = grids.between(0, size)
+        else:
+            self.grid = grid_of(shares[0].plan.shape, shares[0].plan.axes)
         self._made: dict[str, NDArray[Any]] = {}
         self._blocks: list[Block] = []
 
@@ -512,11 +521,10 @@ class BatchColumns(ColumnSource):
         if share is None or self.holds("time"):
             return super().times_at(indices)
         packets, places = np.divmod(indices, share.plan.width)
-        few = (
-            share.some(packets).plain("time")
-            if isinstance(share.plan.parts["time"], Node)
-            else share.plain("time")[packets]
-        )
+        if isinstance(share.plan.parts["time"], Node):
+            few = share.some(packets).plain("time")
+        else:
+            few = share.plain("time")[packets]
         offsets = seconds_since(self.packets.time_ns[packets], self.base)
         return np.asarray(few.reshape(len(packets), -1)[np.arange(len(packets)), places] + offsets)
 

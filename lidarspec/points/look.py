@@ -18,7 +18,8 @@ from lidarspec.errors import UnknownName
 from lidarspec.points.cloud import PointCloud
 
 #: share of the points that a picture's reach takes in, where a few are far beyond all others.
-MOST, FAR_BEYOND = 99.0, 1.5
+MOST = 99.0
+FAR_BEYOND = 1.5
 #: rings at most between the middle and an edge.
 RINGS = 4
 #: elevations below this, in radians, make a cloud a flat one.
@@ -115,7 +116,8 @@ def reach_of(cloud: PointCloud) -> float:
     if not len(cloud):
         return 1.0
     distance = np.hypot(cloud.x, cloud.y)
-    farthest, most = float(distance.max()), float(np.percentile(distance, MOST))
+    farthest = float(distance.max())
+    most = float(np.percentile(distance, MOST))
     return rounded_up(max(farthest if farthest <= FAR_BEYOND * most else most, 1e-3))
 
 

@@ -210,7 +210,8 @@ def make_cloud(
         known = np.isfinite(azimuth) & np.isfinite(elevation) & np.isfinite(xyz).all(axis=0)
         valid = known & (np.abs(distance) <= conventions.FARTHEST)
         if turn is not None:
-            xyz, azimuth = turn @ np.where(valid, xyz, 0), conventions.turned_azimuth(azimuth, turn)
+            xyz = turn @ np.where(valid, xyz, 0)
+            azimuth = conventions.turned_azimuth(azimuth, turn)
         angles = {
             "azimuth": conventions.narrowed(azimuth),
             "elevation": elevation.astype(np.float32),

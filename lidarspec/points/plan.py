@@ -102,7 +102,9 @@ class Plan:
         self._schema = schema = sample.table.schema
         if not isinstance(result, Polar | Cartesian):
             raise Untraceable(f"points that are {type(result).__name__}")
-        self.function, self.layout, self.nominal = function, layout, result.nominal
+        self.function = function
+        self.layout = layout
+        self.nominal = result.nominal
         given = parts_of(result)
         samples = {
             name: part.node.sample if isinstance(part, Traced) else part
@@ -131,14 +133,16 @@ class Plan:
             )
         self.positive = list[Node]()
         named = {name: part for name, part in parts_of(result).items() if isinstance(part, Along)}
-        expressions = (
-            self._by_coordinates(given) if self.exact else self._by_direction(given, named)
-        )
+        if self.exact:
+            expressions = self._by_coordinates(given)
+        else:
+            expressions = self._by_direction(given, named)
         intensity = given.get("intensity")
         if intensity is not None:
-            expressions["intensity"] = (
-                np.nan_to_num(intensity) if self._may_be_nan(intensity) else intensity
-            )
+            if self._may_be_nan(intensity):
+                expressions["intensity"] = np.nan_to_num(intensity)
+            else:
+                expressions["intensity"] = intensity
         expressions |= {
             name: self.parts[name] for name, kind in self.extra.items() if kind.dtype == np.float32
         }
@@ -166,12 +170,10 @@ class Plan:
         """The floating-point fields whose values have to be of moderate size, or the plan does not
         hold.
         """
-        return (
-            []
-            if self.exact
-            else self._floats_of(
-                *(part for name, part in self.parts.items() if not self.is_exact(name))
-            )
+        if self.exact:
+            return []
+        return self._floats_of(
+            *(part for name, part in self.parts.items() if not self.is_exact(name))
         )
 
     def is_exact(self, name: str) -> bool:
@@ -182,11 +184,10 @@ class Plan:
         """The place of the field that a further column is, where each point has its own; None where
         it is none, or of another type.
         """
-        leaf = (
-            self.layout.leaves.get(part.path)
-            if isinstance(part, Node) and part.kind == "field"
-            else None
-        )
+        if isinstance(part, Node) and part.kind == "field":
+            leaf = self.layout.leaves.get(part.path)
+        else:
+            leaf = None
         if (
             leaf is None
             or not is_full(part, self.width)
@@ -194,13 +195,13 @@ class Plan:
             or leaf.info.kind != "int"
         ):
             return None
-        return (
-            leaf
-            if leaf.info.dtype == dtype
+        if (
+            leaf.info.dtype == dtype
             and len(leaf.shape) == len(leaf.strides)
             and dtype.itemsize <= 4
-            else None
-        )
+        ):
+            return leaf
+        return None
 
     def _floats_of(self, *values: Any) -> list[Node]:
         """The floating-point fields that values are made of."""

@@ -63,11 +63,9 @@ def window(leaf: Leaf) -> Window | None:
     as an array.
     """
     if leaf.wire is not None:
-        return (
-            Window(leaf.offset, leaf.wire.itemsize)
-            if leaf.wire.itemsize <= 2 and leaf.wire.kind in "iu"
-            else None
-        )
+        if leaf.wire.itemsize <= 2 and leaf.wire.kind in "iu":
+            return Window(leaf.offset, leaf.wire.itemsize)
+        return None
     if len(leaf.shape) > len(leaf.strides):
         return None
     start, stop = leaf.held
@@ -92,7 +90,8 @@ def shift_of(leaf: Leaf, seen: Window) -> tuple[int, int] | None:
     ones = np.flatnonzero(raw[1 << np.arange(8 * seen.size)] == 1)
     if not len(ones):
         return None
-    shift, mask = int(ones[0]), int(raw[-1])
+    shift = int(ones[0])
+    mask = int(raw[-1])
     return (shift, mask) if np.array_equal(np.arange(len(raw)) >> shift & mask, raw) else None
 
 
@@ -104,11 +103,9 @@ def run_of(leaf: Leaf) -> tuple[str, int, int, int] | None:
         return None
     if leaf.wire is not None:
         is_whole = leaf.wire.kind == "u" and leaf.size <= 4
-        return (
-            (">" if leaf.wire.byteorder == ">" else "<", leaf.offset, leaf.size, 0)
-            if is_whole
-            else None
-        )
+        if is_whole:
+            return (">" if leaf.wire.byteorder == ">" else "<", leaf.offset, leaf.size, 0)
+        return None
     run = None if len(leaf.elements) != 1 or leaf.elements[0].signed else leaf.elements[0].run
     return None if run is None or run[2] > 4 else (run[0], leaf.offset + run[1], run[2], run[3])
 
@@ -134,11 +131,9 @@ def word_of(leaf: Leaf, layout: Layout) -> tuple[int, int, int] | None:
         )
         + 4
     )
-    return (
-        (start, 8 * (first - start) + lowest, (1 << leaf.info.bits) - 1)
-        if first + count <= start + 4 and last <= layout.size
-        else None
-    )
+    if first + count <= start + 4 and last <= layout.size:
+        return (start, 8 * (first - start) + lowest, (1 << leaf.info.bits) - 1)
+    return None
 
 
 def every_value(node: Node, leaf: Leaf) -> NDArray[Any] | None:

@@ -26,7 +26,9 @@ from lidarspec.transports.protocol import Chunk
 from lidarspec.unfinished import path_while_written, remove_abandoned
 
 #: when what was put in is written out, and when the disk is asked to keep it.
-FLUSH_BYTES, FLUSH_SECONDS, DISK_SECONDS = 1 << 16, 0.2, 1.0
+FLUSH_BYTES = 1 << 16
+FLUSH_SECONDS = 0.2
+DISK_SECONDS = 1.0
 #: bytes that may wait for a disk that does not keep up; what comes then is dropped and counted.
 BACKLOG = 1 << 26
 #: seconds that `sync` and `close` give a disk.
@@ -65,7 +67,8 @@ class RecordFile:
             ) from None
         except OSError as error:
             raise SourceError(f"{path}: {failure_reason(path, error)}") from None
-        self.size, self._size_at = 0, size_at
+        self.size = 0
+        self._size_at = size_at
 
     def append(self, records: bytes | bytearray) -> None:
         """Write whole records.
@@ -174,15 +177,19 @@ class Appender:
     """
 
     def __init__(self, path: str | Path, size_at: Size | None, *, overwrite: bool) -> None:
-        self.path, self.records, self.bytes, self.dropped = str(path), 0, 0, 0
+        self.path = str(path)
+        self.records = 0
+        self.bytes = 0
+        self.dropped = 0
         self.error: SourceError | None = None
-        self._changed, self._waiting = threading.Condition(), bytearray()
-        self._untold, self._raised, self._closing = 0, False, False
-        self._taken, self._asked, self._kept = (
-            0,
-            0,
-            0,
-        )  # pieces: in memory or further, asked to be on the disk, and there
+        self._changed = threading.Condition()
+        self._waiting = bytearray()
+        self._untold = 0
+        self._raised = False
+        self._closing = False
+        self._taken = 0
+        self._asked = 0
+        self._kept = 0  # pieces: in memory or further, asked to be on the disk, and there
         self._file = RecordFile(self.path, size_at, overwrite=overwrite)
         self._thread = threading.Thread(target=self._work, name=f"recorder of {path}", daemon=True)
         self._thread.start()
@@ -307,8 +314,11 @@ class Appender:
                         lambda: self._waiting or self._kept < self._taken or self._closing
                     )
                     self._changed.wait_for(self._is_urgent, FLUSH_SECONDS)
-                    waiting, self._waiting, taken = self._waiting, bytearray(), self._taken
-                    asked, is_begun = self._asked > self._kept or self._closing, self.records > 0
+                    waiting = self._waiting
+                    self._waiting = bytearray()
+                    taken = self._taken
+                    asked = self._asked > self._kept or self._closing
+                    is_begun = self.records > 0
                 self._file.append(waiting)
                 if is_begun:
                     self._file.settle()
@@ -321,11 +331,10 @@ class Appender:
         except Exception as error:
             with self._changed:
                 reason = (error.strerror if isinstance(error, OSError) else None) or error
-                held = (
-                    f"the recording is whole up to byte {self._file.size}"
-                    if self._file.is_settled
-                    else "what was there before is kept"
-                )
+                if self._file.is_settled:
+                    held = f"the recording is whole up to byte {self._file.size}"
+                else:
+                    held = "what was there before is kept"
                 self.error = WriteError(self.path, str(reason), held)
                 self._changed.notify_all()
         finally:

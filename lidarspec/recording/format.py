@@ -53,7 +53,9 @@ _ID = re.compile(r"[a-z0-9]+(-[a-z0-9]+)*")
 MAGIC = b"\x89LSR\r\n\x1a\n"
 MARK = b"\xb5LS\x1e"
 HEADER, RECEIVED, SENT, EVENT = range(4)
-DATAGRAM, GAP, QUIET = 1, 2, 4
+DATAGRAM = 1
+GAP = 2
+QUIET = 4
 #: most bytes of data in one record.
 LARGEST = 0xFFFF
 _HEAD = struct.Struct("<4sBBBHq")
@@ -161,13 +163,11 @@ def read_header(data: bytes) -> Header:
 
 
 def _plain(value: Any) -> Any:
-    return (
-        dict(value)
-        if isinstance(value, Mapping)
-        else value.to_dict()
-        if isinstance(value, Learned)
-        else str(value)
-    )
+    if isinstance(value, Mapping):
+        return dict(value)
+    if isinstance(value, Learned):
+        return value.to_dict()
+    return str(value)
 
 
 @dataclass(frozen=True, slots=True)
@@ -266,10 +266,13 @@ class Recording(Closing):
     def __init__(
         self, path: str | Path, file: BinaryIO | None = None, *, salvage: bool = False
     ) -> None:
-        self.path, self.salvage = str(path), salvage
-        self._window, self._place = b"", 0
+        self.path = str(path)
+        self.salvage = salvage
+        self._window = b""
+        self._place = 0
         self.records = self.damaged = self.leftover = 0
-        self.is_cut, self.offset = False, len(MAGIC)
+        self.is_cut = False
+        self.offset = len(MAGIC)
         with system_errors(path):
             self._file = file or (sys.stdin.buffer if self.path == "-" else file_of(self.path))
         try:
@@ -317,7 +320,8 @@ class Recording(Closing):
         """
         self._go(start)
         while self.offset < stop and self._holds(1):
-            size, place = self._good(), self._place
+            size = self._good()
+            place = self._place
             if size > 0:
                 kind, record = _unpacked(self._window[place : place + size])
                 if kind == RECEIVED and record.at is not None:
@@ -329,7 +333,9 @@ class Recording(Closing):
 
     def _go(self, offset: int) -> None:
         self._file.seek(offset)
-        self._window, self._place, self.offset = b"", 0, offset
+        self._window = b""
+        self._place = 0
+        self.offset = offset
 
     def _begin(self) -> Iterator[Record]:
         """Read the header; the records behind it."""
@@ -387,11 +393,9 @@ class Recording(Closing):
             zlib.crc32(self._window[self._place : end]) == _CRC.unpack_from(self._window, end)[0]
         )
         start = self._place + _HEAD.size
-        return (
-            size
-            if passes and _endpoints(self._window[start : start + self._window[self._place + 6]])
-            else 0
-        )
+        if passes and _endpoints(self._window[start : start + self._window[self._place + 6]]):
+            return size
+        return 0
 
     def _holds(self, number: int) -> bool:
         """Whether so many bytes are in the window from the place on, after reading more where it
@@ -401,7 +405,8 @@ class Recording(Closing):
             block = self._file.read(_BLOCK)
             if not block:
                 return False
-            self._window, self._place = self._window[self._place :] + block, 0
+            self._window = self._window[self._place :] + block
+            self._place = 0
         return True
 
     def _skip(self, number: int) -> None:
@@ -462,10 +467,8 @@ def _endpoints(data: bytes) -> list[Address | None] | None:
     place = 0
     while len(found) < 2 and place < len(data):
         length = data[place]
-        host, end = (
-            data[place + 1 : place + 1 + length].decode("utf-8", "replace"),
-            place + 1 + length + 2 * bool(length),
-        )
+        host = data[place + 1 : place + 1 + length].decode("utf-8", "replace")
+        end = place + 1 + length + 2 * bool(length)
         found.append((host, int.from_bytes(data[end - 2 : end], "little")) if length else None)
         place = end
     return (found or [None, None]) if place == len(data) and len(found) != 1 else None

@@ -176,7 +176,9 @@ class FrameRecorder(Appender):
 
     def __init__(self, path: str | Path, sensor: Spec, *, overwrite: bool = False) -> None:
         self._decoder = Decoder(sensor, stream=True)
-        self._held, self._base, self._at = bytearray(), 0, 0
+        self._held = bytearray()
+        self._base = 0
+        self._at = 0
         self._writing = WRITINGS[check_suffix(path)]
         super().__init__(path, self._writing.size, overwrite=overwrite)
         self._put(self._writing.head(USER_LINKS[0]))
@@ -286,11 +288,9 @@ def recorder(
     if suffix == ".lsr":
         return Recorder(path, sensor, source, datagrams=datagrams, baud=baud, overwrite=overwrite)
     port = declared_port(sensor if isinstance(sensor, Spec) else None)
-    return (
-        PcapRecorder(path, port=port, overwrite=overwrite)
-        if suffix in WRITINGS
-        else RawRecorder(path, overwrite=overwrite)
-    )
+    if suffix in WRITINGS:
+        return PcapRecorder(path, port=port, overwrite=overwrite)
+    return RawRecorder(path, overwrite=overwrite)
 
 
 def recorder_for(
@@ -310,11 +310,14 @@ def _header(
     known = (
         named_sensor(sensor) if isinstance(sensor, str) and sensor and datagrams is None else sensor
     )
-    name, options, link = (
-        (known.id, dict(known.options), known.datagrams)
-        if isinstance(known, Spec)
-        else (known or "", {}, False)
-    )
+    if isinstance(known, Spec):
+        name = known.id
+        options = dict(known.options)
+        link = known.datagrams
+    else:
+        name = known or ""
+        options = {}
+        link = False
     homes = {
         plugin.distribution: plugin.version
         for plugin in registry().plugins

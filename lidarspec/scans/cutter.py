@@ -32,7 +32,9 @@ class Turning:
     """
 
     def __init__(self) -> None:
-        self._direction, self._total, self._furthest = 0, 0.0, 0.0
+        self._direction = 0
+        self._total = 0.0
+        self._furthest = 0.0
 
     def push(self, steps: NDArray[np.float64]) -> NDArray[np.float64]:
         """1 or -1 for each of the next steps, (k,), given in turns; of length 1 where it is the
@@ -44,7 +46,9 @@ class Turning:
         first = self._direction
         self._total = float(totals[-1]) if len(totals) else self._total
         found: NDArray[np.float64] | None = None
-        start, size, is_new = 0, 64, True
+        start = 0
+        size = 64
+        is_new = True
         while start < len(totals):
             if self._direction and is_new:
                 is_new = False
@@ -64,10 +68,12 @@ class Turning:
                 furthest = np.maximum(np.maximum.accumulate(ahead), self._furthest)
                 turned = furthest - ahead >= 0.5
                 self._furthest = float(furthest[-1])
-            start, size = start + len(part), size * 2
+            start = start + len(part)
+            size = size * 2
             if turned.any():
                 spot = int(turned.argmax())
-                start, size = start - len(part) + spot, 64
+                start = start - len(part) + spot
+                size = 64
                 found = np.full(len(totals), float(first)) if found is None else found
                 self._direction = -self._direction or (1 if part[spot] > 0 else -1)
                 self._furthest = self._direction * float(part[spot])
@@ -118,13 +124,15 @@ class Cutter:
         self._direction = 0
         self._turned = 1.0  # turns since the last end in a sector
         self._before: float | None = None
-        self._armed, self._turning = True, Turning()
+        self._armed = True
+        self._turning = Turning()
         self._start: int | None = None
         self._leap = 0.0  # by how much of a turn the angle went on at the last cut
 
     def ends(self, packets: Packets, found: Evaluated) -> list[End]:
         """The ends in this batch, ascending."""
-        rule, steps = self._rule, None
+        rule = self._rule
+        steps = None
         if self.sector is not None:
             return self._ends_at(
                 packets, found, self.sector.middle if self._cut is None else self._cut
@@ -212,7 +220,8 @@ class Cutter:
         return list(map(End, points.tolist(), which, leaps))
 
     def _is_leap(self, step: float) -> bool:
-        before, self._leap = self._leap, step
+        before = self._leap
+        self._leap = step
         return before > 0 and step > max(AWAY, 2 * before)
 
     def _changes(
@@ -228,11 +237,10 @@ class Cutter:
         before = _before(values, self._before)
         self._before = float(values[-1])
         if isinstance(rule, OnJump):
-            steps = (
-                values - before
-                if full is None
-                else _folded(values - before + full / 2, full) - full / 2
-            )
+            if full is None:
+                steps = values - before
+            else:
+                steps = _folded(values - before + full / 2, full) - full / 2
             return np.flatnonzero(np.abs(steps) > rule.by)
         return np.flatnonzero(values < before if isinstance(rule, OnRewind) else values != before)
 
@@ -270,7 +278,8 @@ class Cutter:
         for spot in passed.tolist():
             if self._armed or _was_far(turned[since:spot], full):
                 found.append(spot)
-                self._armed, since = False, spot
+                self._armed = False
+                since = spot
         self._armed = self._armed or _was_far(turned[since:], full)
         return found
 
@@ -295,13 +304,11 @@ def _turn(packets: Packets, path: str) -> float | None:
 def _own_path(packets: Packets, path: str) -> str:
     """The path of a field of the frame as packets that are parts of it have it."""
     _, _, parts = packets.frame.partition(".")
-    return (
-        path
-        if not parts
-        else path.removeprefix(f"{parts}.")
-        if path.startswith(f"{parts}.")
-        else f"frame.{path}"
-    )
+    if not parts:
+        return path
+    if path.startswith(f"{parts}."):
+        return path.removeprefix(f"{parts}.")
+    return f"frame.{path}"
 
 
 def _field(found: Evaluated, path: str) -> Column:
@@ -354,16 +361,15 @@ def _sums(counts: NDArray[Any], kept: int) -> NDArray[np.intp]:
         repeats = counts.strides[-1] == 0 and counts.shape[-1] > 0
         times *= counts.shape[-1] if repeats else 1
         counts = counts[..., 0] if repeats else counts.sum(axis=-1)
-    return (
-        np.broadcast_to(counts.flat[0] * times, counts.shape)
-        if counts.size and not any(counts.strides)
-        else counts * times
-    )
+    if counts.size and not any(counts.strides):
+        return np.broadcast_to(counts.flat[0] * times, counts.shape)
+    return counts * times
 
 
 def _was_far(angles: NDArray[np.float64], full: float) -> bool:
     """Whether any of these angles is far from the cut at 0."""
-    least, most = full * AWAY, full * (1 - AWAY)
+    least = full * AWAY
+    most = full * (1 - AWAY)
     if len(angles) and least < angles[len(angles) // 2] < most:
         return True
     return bool(((angles > least) & (angles < most)).any())

@@ -43,7 +43,10 @@ class Planes:
         ring: int | None = None,
         heights: tuple[float, float] | None = None,
     ) -> None:
-        self._beams, self._wanted, self._ring, self._heights = beams, field, ring, heights
+        self._beams = beams
+        self._wanted = field
+        self._ring = ring
+        self._heights = heights
         self._is_flat: bool | None = None
         self._grid: tuple[int, tuple[float, float]] | None = None
 
@@ -74,11 +77,10 @@ class Planes:
             raise UsageError(
                 f"{scan.sensor.id}: ring {self._ring} is asked for, and its points have {rings}"
             )
-        wanted = (
-            np.ones(len(cloud), np.bool_)
-            if self._ring is None
-            else np.asarray(cloud.ring == self._ring)
-        )
+        if self._ring is None:
+            wanted = np.ones(len(cloud), np.bool_)
+        else:
+            wanted = np.asarray(cloud.ring == self._ring)
         if self._heights is not None:
             wanted &= (cloud.z >= self._heights[0]) & (cloud.z < self._heights[1])
         return replace(scan, points=_level_with(cloud[wanted]))
@@ -91,7 +93,8 @@ class Planes:
         )
         if low == high:  # it looks one way
             return 1, (low, high)
-        count, turn = self._beams or scan.beams or scan.sensor.beams or len(scan), 2 * np.pi
+        count = self._beams or scan.beams or scan.sensor.beams or len(scan)
+        turn = 2 * np.pi
         step = (high - low) / (len(azimuth) - 1)
         if high - low > TURN * turn:
             step = turn / count

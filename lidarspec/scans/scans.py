@@ -38,10 +38,12 @@ from lidarspec.spec.timing import Every, OnFlag, OnRewind, OnWrap, Split
 
 #: seconds that a turn takes at the slowest where no sensor says so; of a scan at least where
 #: packets bear the host's time, which may pause.
-SLOWEST, UNTIMED = 1.0, 1.0
+SLOWEST = 1.0
+UNTIMED = 1.0
 #: bytes of a scan at the most where neither points nor a line say so, and packets looked at
 #: together.
-LARGEST, TOGETHER = 1 << 26, 1024
+LARGEST = 1 << 26
+TOGETHER = 1024
 #: the frame that the points are in, by its usual name: x forward, y left, z up (REP-103).
 FRAME_ID = "laser"
 #: how much longer a scan with a gap may become than the whole one before it.
@@ -103,7 +105,8 @@ class Provenance:
     """The packets that the points of a scan are made of, in stream order."""
 
     def __init__(self) -> None:
-        self._size, self._batches = 0, list[tuple[int, int, Packets, Evaluated, int]]()
+        self._size = 0
+        self._batches = list[tuple[int, int, Packets, Evaluated, int]]()
 
     def add(self, packets: Packets, points: Evaluated, start: int, stop: int, before: int) -> None:
         """Further points, from `start` to `stop` of those of a batch; `before`: parts of the first
@@ -123,13 +126,12 @@ class Provenance:
         first, start, packets, points, before = next(
             batch for batch in reversed(self._batches) if batch[0] <= point
         )
-        starts, local = first_points(points), start + point - first
+        starts = first_points(points)
+        local = start + point - first
         row = int(starts.searchsorted(local, side="right")) - 1
-        frame, offset, at = (
-            packets.frame.partition(".")[0],
-            int(packets.offset[row]),
-            int(packets.host_ns[row]),
-        )
+        frame = packets.frame.partition(".")[0]
+        offset = int(packets.offset[row])
+        at = int(packets.host_ns[row])
         table, which = packets.frames
         data = table.frame(row if isinstance(which, slice) else int(which[row]))
         return Place(frame, offset, at, rank(packets, row, before), local - int(starts[row]), data)
@@ -254,20 +256,18 @@ class Scan:
         Raises:
             UsageError: for a number of angles that is none.
         """
-        count = (
-            _sectors(beams, "to_laserscan")
-            if beams is not None
-            else self.beams or self.sensor.beams or max(len(self), 1)
-        )
+        if beams is not None:
+            count = _sectors(beams, "to_laserscan")
+        else:
+            count = self.beams or self.sensor.beams or max(len(self), 1)
         first, last = field or (-np.pi, np.pi - 2 * np.pi / count)
         step = (last - first) / (count - 1) if count > 1 else 2 * np.pi
         ranges, intensities = self._binned(count, first, step)
         begin, slope = self._times(first, last)
-        period = (
-            1 / self.rate_hz
-            if np.isfinite(self.rate_hz) and self.rate_hz > 0
-            else abs(slope) * 2 * np.pi
-        )
+        if np.isfinite(self.rate_hz) and self.rate_hz > 0:
+            period = 1 / self.rate_hz
+        else:
+            period = abs(slope) * 2 * np.pi
         near, far = self.sensor.range_limits
         stamp_ns = self.stamp_ns + round(begin * 1e9)
         return LaserScan(
@@ -309,19 +309,22 @@ class Scan:
         """The nearest return within half a step of each of n angles from `first` on, and its
         intensity.
         """
-        points, turn = self.points, 2 * np.pi
+        points = self.points
+        turn = 2 * np.pi
         ahead = (points.azimuth[points.valid].astype(np.float64) - first + step / 2) % turn
         bins = (ahead % turn / step).astype(
             np.intp
         )  # a second time: of what is just below 0 the first is the whole turn
         inside = bins < n
         valid = np.flatnonzero(points.valid)[inside]
-        bins, ranges = bins[inside], points.range[valid]
+        bins = bins[inside]
+        ranges = points.range[valid]
         nearest = np.lexsort((ranges, bins))
         is_first = np.ones(len(nearest), np.bool_)
         is_first[1:] = np.diff(bins[nearest]) > 0
         chosen = nearest[is_first]
-        binned, strength = np.full(n, np.inf, np.float32), np.zeros(n, np.float32)
+        binned = np.full(n, np.inf, np.float32)
+        strength = np.zeros(n, np.float32)
         binned[bins[chosen]] = ranges[chosen]
         if points.intensity is not None:
             strength[bins[chosen]] = points.intensity[valid][chosen]
@@ -377,16 +380,18 @@ class Progress:
     """
 
     def __init__(self, sensor: Spec) -> None:
-        rule, link, counter = sensor.scan, sensor.links.get("data"), sensor.sequence
-        turn = (
-            rule.seconds
-            if isinstance(rule, Every)
-            else 1 / sensor.turn[0]
-            if sensor.turn
-            else SLOWEST
-        )
+        rule = sensor.scan
+        link = sensor.links.get("data")
+        counter = sensor.sequence
+        if isinstance(rule, Every):
+            turn = rule.seconds
+        elif sensor.turn:
+            turn = 1 / sensor.turn[0]
+        else:
+            turn = SLOWEST
         self.seconds = 2 * turn if sensor.clock is not None else max(2 * turn, UNTIMED)
-        self._longest, self._by_points = int(self.seconds * 1e9), sensor.beams is not None
+        self._longest = int(self.seconds * 1e9)
+        self._by_points = sensor.beams is not None
         self._most = (
             2 * sensor.beams
             if sensor.beams
@@ -394,7 +399,8 @@ class Progress:
             if isinstance(link, Serial)
             else LARGEST
         )
-        self._reason, self._starts_are_seen = _without_end(rule), isinstance(rule, OnFlag)
+        self._reason = _without_end(rule)
+        self._starts_are_seen = isinstance(rule, OnFlag)
         self._may_pass = isinstance(
             rule, OnWrap | OnFlag
         )  # whether an end that is missing leaves no trace
@@ -403,7 +409,8 @@ class Progress:
             if counter is not None and isinstance(rule, OnRewind) and rule.name == counter.field
             else None
         )
-        self._scan, self._has_ended = Underway(), False
+        self._scan = Underway()
+        self._has_ended = False
         self._last: tuple[int, int] | None = None  # time and index of the last packet
         self._turn = math.inf  # packets of the last whole scan, at first of the first piece
 
@@ -411,7 +418,9 @@ class Progress:
         """The cuts of a batch in order: at the ends, of which those that leap may be none, and
         where none came in time.
         """
-        number, found, start = points.ready, list[Cut](), 0
+        number = points.ready
+        found = list[Cut]()
+        start = 0
         if not number:
             return found
         first = first_points(points) if len(ends) or self._by_points else np.empty(0, np.intp)
@@ -429,7 +438,8 @@ class Progress:
                 self._ended(batch, edge, end, begins=begins, is_shared=is_shared, is_seen=not leaps)
             )
             if not self._has_ended:  # a rotor that spun up
-                packets.stats.unended, self._has_ended = "", True
+                packets.stats.unended = ""
+                self._has_ended = True
             start = edge
         found += self._without_end(packets, batch, start, number, points)
         self._last = int(batch.times[-1]), int(packets.index[number - 1])
@@ -439,11 +449,9 @@ class Progress:
         """What is looked at of the first packets, by the number of points of each, (n,), or their
         bytes; a frame of parts counts once.
         """
-        times, index, broken = (
-            packets.time_ns[:number],
-            packets.index[:number],
-            packets.breaks[:number],
-        )
+        times = packets.time_ns[:number]
+        index = packets.index[:number]
+        broken = packets.breaks[:number]
         before, (frames, which) = (
             int(index[0]) - 1 if self._last is None else self._last[1],
             packets.frames,
@@ -458,10 +466,11 @@ class Progress:
                 broken.copy() if broken.any() else broken,
             )
         steps = np.diff(index, prepend=before)
-        counts, missing = (
-            (steps != 0).astype(np.int64) if frames is not packets.table else repeated(1, number),
-            np.maximum(steps - 1, 0),
-        )
+        if frames is not packets.table:
+            counts = (steps != 0).astype(np.int64)
+        else:
+            counts = repeated(1, number)
+        missing = np.maximum(steps - 1, 0)
         if packets.masked is not None:
             masked = packets.masked[:number]
             missing = np.maximum(missing - masked, 0)
@@ -494,7 +503,9 @@ class Progress:
         """
         if begins:
             self._add(batch, slice(edge, edge + 1), gap_only=True)
-        scan, missing, is_broken = self._scan, batch.missing.item(edge), bool(batch.broken[edge])
+        scan = self._scan
+        missing = batch.missing.item(edge)
+        is_broken = bool(batch.broken[edge])
         whole = scan.begun and is_seen and scan.lost <= scan.packets
         if whole or (self._turn == math.inf and scan.packets and self._may_pass):
             self._turn = scan.packets + scan.lost
@@ -527,23 +538,20 @@ class Progress:
                 )
                 if is_endless and abs(step) < self._longest / 2:  # else nothing came for so long
                     packets.stats.unended = f"{self._reason} within {self.seconds:.3g} s"
-                self._scan, self._turn = (
-                    Underway(),
-                    self._turn * (1 if is_endless else 2),
-                )  # lest it be wrong for ever
+                self._scan = Underway()
+                self._turn = self._turn * (1 if is_endless else 2)  # lest it be wrong for ever
                 batch.forget(start)
-        return (
-            [
+        if found:
+            return [
                 Cut(point, whole=False, complete=False)
                 for point in first_points(points)[found].tolist()
             ]
-            if found
-            else []
-        )
+        return []
 
     def _within(self, batch: Batch, part: slice) -> bool:
         """Whether the scan may go on over all of these packets, which are then counted."""
-        times, before = batch.times[part], dataclasses.replace(self._scan)
+        times = batch.times[part]
+        before = dataclasses.replace(self._scan)
         self._add(batch, part)
         scan = self._scan
         farthest = max(int(times.max()) - scan.since, scan.since - int(times.min()))
@@ -557,7 +565,8 @@ class Progress:
         """Before which of some packets the scan is over, None where it is not; and whether for want
         of an end, else for a gap.
         """
-        scan, times = self._scan, batch.times[part]
+        scan = self._scan
+        times = batch.times[part]
         since = scan.since if scan.packets else times.item(0)
         endless = (np.abs(times - since) > self._longest) | (
             scan.size + np.cumsum(batch.sizes[part]) > self._most
@@ -573,7 +582,8 @@ class Progress:
 
     def _add(self, batch: Batch, part: slice, *, gap_only: bool = False) -> None:
         """Count packets as parts of the scan, or only what is missing before them."""
-        number, scan = part.stop - part.start, self._scan
+        number = part.stop - part.start
+        scan = self._scan
         if not number:
             return
         if not gap_only:
@@ -639,7 +649,9 @@ class ScanStream:
     def __init__(
         self, sensor: Spec, mount: Mount | None = None, imu: Waiting | None = None
     ) -> None:
-        self._sensor, self._mount, self._imu = sensor, mount, imu
+        self._sensor = sensor
+        self._mount = mount
+        self._imu = imu
         self._reorder = Reorder(
             enabled=sensor.sequence is not None or (sensor.clock is not None and sensor.datagrams)
         )
@@ -648,10 +660,8 @@ class ScanStream:
         self._waiting: Packets | None = None
         self._carry: Carry = {}
         self._parts: list[Stretch] = []
-        self._provenance, self._split = (
-            Provenance(),
-            0,
-        )  # parts of a frame that were ready before others of it
+        self._provenance = Provenance()
+        self._split = 0  # parts of a frame that were ready before others of it
         self._epoch: int | None = None
         self._progress = Progress(sensor)
         self._empty, self._broken = (
@@ -695,7 +705,8 @@ class ScanStream:
         ]
         scans = [*self._push_ordered(held), *self._push_ordered(self._masking.finish())]
         if self._waiting is not None and len(self._waiting):
-            waiting, self._waiting = self._waiting, None
+            waiting = self._waiting
+            self._waiting = None
             scans += self._push(waiting, final=True)
         left = self._close(None)
         return scans + ([left] if left else [])
@@ -725,12 +736,11 @@ class ScanStream:
         points = guarded(packets, self._carry, final=final, epoch=self._epoch)
         if points is None:
             return []
-        self._carry, before = points.carry, self._split
+        self._carry = points.carry
+        before = self._split
         if points.ready < len(packets):
-            self._waiting, self._split = (
-                packets.take(slice(points.ready, None)),
-                rank(packets, points.ready, before),
-            )
+            self._waiting = packets.take(slice(points.ready, None))
+            self._split = rank(packets, points.ready, before)
         else:
             self._split = 0
         return list(self._cut(packets, points, before))
@@ -743,26 +753,31 @@ class ScanStream:
         if parts is not packets:
             spots = np.searchsorted(packets.index, parts.index)
             empty = self._empty + np.cumsum(~np.isin(np.arange(len(packets)), spots))
-            parts.index, self._empty = parts.index - empty[spots], int(empty[-1])
+            parts.index = parts.index - empty[spots]
+            self._empty = int(empty[-1])
             parts.breaks[:1] |= self._broken
             left = packets.breaks[spots[-1] + 1 if len(spots) else 0 :]
             self._broken = bool(left.any()) or (self._broken and not len(spots))
         return parts
 
     def _cut(self, packets: Packets, points: Evaluated, before: int) -> Iterator[Scan]:
-        start, source = 0, source_of(points.cloud)
+        start = 0
+        source = source_of(points.cloud)
         cuts = self._progress.cuts(packets, points, self._cutter.ends(packets, points))
         starts = [0, *(cut.point for cut in cuts)]
         first, *times = _times_ns(source, starts)
-        arrived, *hosts = (
-            _hosts_ns(packets, points, starts) if cuts or self._host is None else [None]
-        )
+        if cuts or self._host is None:
+            arrived, *hosts = _hosts_ns(packets, points, starts)
+        else:
+            arrived, *hosts = [None]
         self._begins = first if self._begins is None else self._begins
         self._host = arrived if self._host is None else self._host
         for cut, time, host in zip(cuts, times, hosts, strict=True):
             self._take(packets, points, start, cut.point, before)
             scan = self._close(time, whole=cut.whole, complete=cut.complete)
-            self._begins, self._host, start = time, host, cut.point
+            self._begins = time
+            self._host = host
+            start = cut.point
             if scan is not None:
                 yield scan
         self._take(packets, points, start, source.size, before)
@@ -778,10 +793,13 @@ class ScanStream:
         self, ends: int | None, *, whole: bool = False, complete: bool = False
     ) -> Scan | None:
         """The scan of the points so far; `ends`: the time of the first point after it, ns."""
-        parts, self._parts = self._parts, []
-        provenance, self._provenance = self._provenance, Provenance()
+        parts = self._parts
+        self._parts = []
+        provenance = self._provenance
+        self._provenance = Provenance()
         if self._left_out:
-            self._left_out, parts = False, []
+            self._left_out = False
+            parts = []
             if self._imu is not None:
                 self._imu.until(ends)
         if not parts:
@@ -793,10 +811,8 @@ class ScanStream:
         cloud: PointCloud = LazyCloud.of(Stretches(parts, from_first=True), begins)
         samples = None if self._imu is None else self._imu.until(ends)
         if self._mount is not None:
-            cloud, samples = (
-                self._mount.applied(cloud),
-                None if samples is None else samples.turned(self._mount.rotation),
-            )
+            cloud = self._mount.applied(cloud)
+            samples = None if samples is None else samples.turned(self._mount.rotation)
         rate = float(rate) if whole else np.nan
         return Scan(
             cloud,
@@ -822,7 +838,8 @@ def _times_ns(source: ColumnSource, indices: Sequence[int]) -> list[int | None]:
 
 def _hosts_ns(packets: Packets, points: Evaluated, indices: Sequence[int]) -> list[int | None]:
     """When the packets of some points arrived, ns; None for points past the end."""
-    first, size = first_points(points), source_of(points.cloud).size
+    first = first_points(points)
+    size = source_of(points.cloud).size
     known = first.searchsorted([index for index in indices if index < size], side="right") - 1
     return [*packets.host_ns[known].tolist(), *[None] * (len(indices) - len(known))]
 

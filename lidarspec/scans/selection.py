@@ -28,7 +28,9 @@ Moment = float | datetime
 Times = tuple[Moment | None, Moment | None]
 #: seconds before a slice from which on is read, of its distance the share by which clocks differ,
 #: and seconds that passing over is worth.
-BEFORE, DRIFT, WORTH = 5.0, 1e-3, 5.0
+BEFORE = 5.0
+DRIFT = 1e-3
+WORTH = 5.0
 #: ns since 1970 from which on a time is a date, and not that of a clock that began with the sensor.
 DATED = 10**18
 
@@ -115,14 +117,16 @@ class Slice:
     """
 
     def __init__(self, times: Times) -> None:
-        self._times, self.ended = times, False
+        self._times = times
+        self.ended = False
         self.first: int | None = None
         self.last: int | None = None
 
     def holds(self, at: NDArray[np.int64]) -> NDArray[np.bool_]:
         """Which of the next times, (n,) ns, are wanted."""
         if len(at):
-            self.first, self.last = int(at[0]) if self.first is None else self.first, int(at[-1])
+            self.first = int(at[0]) if self.first is None else self.first
+            self.last = int(at[-1])
         begin, end = (self.ns(moment) for moment in self._times)
         self.ended = end is not None and self.last is not None and self.last >= end
         wanted = np.ones(len(at), np.bool_) if begin is None else at >= begin
@@ -132,7 +136,8 @@ class Slice:
         """That none of the times of a source was wanted, and which there are; `number`: how many,
         in words.
         """
-        first, last = self.first or 0, self.last or 0
+        first = self.first or 0
+        last = self.last or 0
         dates = f" ({dated(first)} to {dated(last)})" if first > DATED else ""
         text = (
             f"{source} has {number} from 0 s to {(last - first) * 1e-9:.3f} s{dates}, and nothing"
@@ -143,9 +148,9 @@ class Slice:
     @property
     def ahead(self) -> int:
         """Nanoseconds from the first time to where the slice begins."""
-        return (
-            (self.ns(self._times[0]) or 0) - (self.first or 0) if self._times[0] is not None else 0
-        )
+        if self._times[0] is not None:
+            return (self.ns(self._times[0]) or 0) - (self.first or 0)
+        return 0
 
     def ns(self, moment: Moment | None) -> int | None:
         """A moment as a time of the stream, of which one has come."""
@@ -168,7 +173,8 @@ def received(source: Transport, times: Times, name: object) -> Iterator[Chunk]:
     if times == (None, None):
         yield from source.chunks()
         return
-    wanted, any_came = Slice(times), False
+    wanted = Slice(times)
+    any_came = False
     for chunk in source.chunks():
         if chunk.at is None:
             raise UsageError(f"{name} does not say when its bytes arrived, by which --slice goes")
@@ -208,9 +214,13 @@ class Sieve:
         source: object = "the source",
         skip: Callable[[int], bool] = never,
     ) -> None:
-        self._selection, self._source, self._skip = selection, source, skip
+        self._selection = selection
+        self._source = source
+        self._skip = skip
         self._seen = self._kept = 0
-        self._skipped, self.ended, self.slice = False, False, Slice(selection.times)
+        self._skipped = False
+        self.ended = False
+        self.slice = Slice(selection.times)
 
     def of(self, scans: Iterable[Scan | None]) -> Iterator[Scan | None]:
         """What is wanted of some scans; None, for a turn of the caller's, is handed on.
@@ -236,13 +246,12 @@ class Sieve:
             UsageError: where nobody knows the time that is asked for, or the points have not the
                 columns.
         """
-        selection, number = self._selection, self._seen
+        selection = self._selection
+        number = self._seen
         start, stop = selection.scans
         self._seen += 1
-        wanted, self.ended = (
-            start <= number and (stop is None or number < stop),
-            stop is not None and self._seen >= stop,
-        )
+        wanted = start <= number and (stop is None or number < stop)
+        self.ended = stop is not None and self._seen >= stop
         if selection.is_timed:
             wanted &= bool(self.slice.holds(np.array([self._time(scan)]))[0])
             self.ended = self.ended or self.slice.ended
@@ -277,7 +286,8 @@ class Sieve:
 
     def _pass_over(self, scan: Scan) -> None:
         """Move the source on to a little before the slice."""
-        ahead, clock = self.slice.ahead * 1e-9, scan.sensor.clock
+        ahead = self.slice.ahead * 1e-9
+        clock = scan.sensor.clock
         near = BEFORE + DRIFT * ahead
         is_followed = (
             clock is None or not clock.wraps_at or clock.wraps_at >= 1
@@ -292,7 +302,8 @@ class Sieve:
 
     def _shaped(self, scan: Scan) -> Scan:
         """A scan with what is wanted of it."""
-        selection, cloud = self._selection, scan.points
+        selection = self._selection
+        cloud = scan.points
         stamp_ns = self._time(scan) if selection.time == "host" else cloud.stamp_ns
         if selection.ranges != (0.0, math.inf):
             cloud = LazyCloud.of(_Within(cloud, *selection.ranges), stamp_ns)
@@ -313,14 +324,17 @@ class _Within(CloudColumns):
 
     def __init__(self, cloud: PointCloud, near: float, far: float) -> None:
         super().__init__(cloud)
-        self._near, self._far = near, far
+        self._near = near
+        self._far = far
 
     def column(self, name: str) -> NDArray[Any] | None:
         column = super().column(name)
         if name not in ("x", "y", "z", "range", "valid") or column is None:
             return column
-        ranges, valid = self._cloud.range, self._cloud.valid
-        too_near, too_far = valid & (ranges < self._near), valid & (ranges > self._far)
+        ranges = self._cloud.range
+        valid = self._cloud.valid
+        too_near = valid & (ranges < self._near)
+        too_far = valid & (ranges > self._far)
         if name == "valid":
             return np.asarray(column & ~too_near & ~too_far)
         near, far = (-np.inf, np.inf) if name == "range" else (np.nan, np.nan)

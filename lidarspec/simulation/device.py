@@ -32,7 +32,8 @@ from lidarspec.spec.tree import FieldInfo
 
 SECOND = 1_000_000_000
 #: ns of the device's time for which data is made in one go, and the most packets.
-AHEAD, MOST = SECOND // 4, 128
+AHEAD = SECOND // 4
+MOST = 128
 #: frames of one type that the sensor sends by itself, such as those of an IMU, that are made
 #: together.
 UNASKED_BATCH = 50
@@ -71,7 +72,8 @@ class Answering:
     """
 
     def __init__(self, sensor: Spec, shake: float = 0.0) -> None:
-        self._sensor, self._shake = sensor, shake
+        self._sensor = sensor
+        self._shake = shake
         self._rests: dict[str, Rest] = {}
         self._heard: dict[str, int] = {}
         links = {command.link for command in sensor.commands.values() if command.frame}
@@ -161,9 +163,9 @@ class Answering:
             for one in sent
             if all(values.get(path) == value for path, value in one[1].fixed.items())
         ]
-        return (
-            Request(*max(fitting, key=lambda one: len(one[1].fixed)), values) if fitting else None
-        )
+        if fitting:
+            return Request(*max(fitting, key=lambda one: len(one[1].fixed)), values)
+        return None
 
 
 def _listening(sensor: Spec, link: str) -> Decoder:
@@ -217,8 +219,12 @@ class _Stream:
     def __init__(
         self, made: Simulation, frame: str, scene: Scene, began: float, shake: float
     ) -> None:
-        self._made, self._scene, self.frame, self._shake = made, scene, frame, shake
-        self._next, self._end = 0, began
+        self._made = made
+        self._scene = scene
+        self.frame = frame
+        self._shake = shake
+        self._next = 0
+        self._end = began
         self._frames: list[bytes] = []
         self._times: list[float] = []
         self._spot = 0
@@ -230,7 +236,8 @@ class _Stream:
         while self.due <= upto:
             if self._spot == len(self._frames):
                 self._more()
-            first, self._spot = self._spot, bisect.bisect_right(self._times, upto)
+            first = self._spot
+            self._spot = bisect.bisect_right(self._times, upto)
             taken += zip(
                 self._times[first : self._spot], self._frames[first : self._spot], strict=True
             )
@@ -242,8 +249,11 @@ class _Stream:
         count = max(min(int(AHEAD / max(self._made.interval, 1)), MOST), 1)
         block = self._made.block(self._next, count, self._scene, self._end / SECOND, self._shake)
         times = (self._end + block.times).tolist()
-        self._frames, self._times, self._spot = block.frames, times[:-1], 0
-        self._next, self._end = self._next + count, times[-1]
+        self._frames = block.frames
+        self._times = times[:-1]
+        self._spot = 0
+        self._next = self._next + count
+        self._end = times[-1]
 
 
 class SimulatedDevice:
@@ -275,8 +285,12 @@ class SimulatedDevice:
         rate: float = 1.0,
         faults: Faults | None = None,
     ) -> None:
-        self.sensor, self.rate, self.faults = sensor, rate, faults or Faults()
-        self.present, self.heard, self.sent = True, list[str](), Counter[str]()
+        self.sensor = sensor
+        self.rate = rate
+        self.faults = faults or Faults()
+        self.present = True
+        self.heard = list[str]()
+        self.sent = Counter[str]()
         self.lines = {name: self._line(name, seed) for name in sensor.links}
         self._scene = scene or furnished(seed)
         self._source = random.Random(f"device {seed}")
@@ -284,7 +298,8 @@ class SimulatedDevice:
         self._plan: list[_Due] = []
         self._planned = 0
         self._stream: _Stream | None = None
-        self._powered, self._time = 0, 0.0
+        self._powered = 0
+        self._time = 0.0
         self._plug: int | None = None
         self._simulation(sensor.data_frame)
 
@@ -299,7 +314,11 @@ class SimulatedDevice:
 
     def start(self, now: int) -> None:
         """Switch it on, or off and on again."""
-        self._plan, self._stream, self._powered, self._time, self.present = [], None, now, 0.0, True
+        self._plan = []
+        self._stream = None
+        self._powered = now
+        self._time = 0.0
+        self.present = True
         self._plug = now + int(self.faults.unplug * SECOND) if self.faults.unplug else None
         for name, frame in self.sensor.incoming.items():
             if frame.simulation.rate and not frame.data:
@@ -319,7 +338,8 @@ class SimulatedDevice:
 
     def unplug(self) -> None:
         """Pull the plug; `start` puts it in again."""
-        self.present, self._plug = False, None
+        self.present = False
+        self._plug = None
 
     def receive(self, data: bytes, now: int, link: str = "data") -> None:
         """Bytes, or a datagram, that arrive at the device."""
@@ -410,7 +430,9 @@ class SimulatedDevice:
         data follows the answer.
         """
         self.heard.append(request.name)
-        command, at, mode = request.command, now, None
+        command = request.command
+        at = now
+        mode = None
         if command.only_stopped and self._stream is not None:
             return
         if command.starts or command.stops:

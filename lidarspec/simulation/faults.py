@@ -112,7 +112,8 @@ class Line:
     def __init__(self, faults: Faults, *, seed: int = 0, stream: bool) -> None:
         if stream and faults.reorder:
             raise UsageError("reorder is for datagrams; bytes on a line keep their order")
-        self._faults, self._stream = faults, stream
+        self._faults = faults
+        self._stream = stream
         self._source = random.Random(f"line {seed}")
         self._clean = self._gap()
         self._number = 0
@@ -136,9 +137,10 @@ class Line:
                 if data in harmed:  # a byte inserted after the frame leaves it whole
                     self.intact += 1
                 depth = self._faults.reorder
-                delay = (
-                    self._source.randint(1, depth) if depth and self._source.random() < LATE else 0
-                )
+                if depth and self._source.random() < LATE:
+                    delay = self._source.randint(1, depth)
+                else:
+                    delay = 0
                 heapq.heappush(self._late, (self._number + delay, self._number, name, harmed))
             while self._late and self._late[0][0] <= self._number:
                 arrived.append(heapq.heappop(self._late)[2:])
@@ -155,18 +157,18 @@ class Line:
     def _harmed(self, frame: bytes) -> bytes:
         if not self._faults.errors:
             return frame
-        out, start = bytearray(), 0
+        out = bytearray()
+        start = 0
         while start + self._clean < len(frame):
             spot = start + self._clean
             out += frame[start:spot] + self._byte(frame[spot])
-            start, self._clean = spot + 1, self._gap()
+            start = spot + 1
+            self._clean = self._gap()
         self._clean -= len(frame) - start
         return bytes(out + frame[start:])
 
     def _byte(self, byte: int) -> bytes:
         changed = bytes([byte ^ 1 << self._source.randrange(8)])
-        return (
-            self._source.choice((b"", changed, bytes([byte, self._source.randrange(256)])))
-            if self._stream
-            else changed
-        )
+        if self._stream:
+            return self._source.choice((b"", changed, bytes([byte, self._source.randrange(256)])))
+        return changed

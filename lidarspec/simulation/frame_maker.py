@@ -61,13 +61,11 @@ class FrameMaker:
     def _makes(
         self, sensor: str, root: Node, limit: int, given: Mapping[str, int], elsewhere: set[str]
     ) -> None:
-        self._sensor, self._root, self._limit, self._given, self._elsewhere = (
-            sensor,
-            root,
-            limit,
-            given,
-            elsewhere,
-        )
+        self._sensor = sensor
+        self._root = root
+        self._limit = limit
+        self._given = given
+        self._elsewhere = elsewhere
         self.schema = schema(root)
         formulas = {
             axis: [ref.path for ref in refs(count)]
@@ -92,11 +90,10 @@ class FrameMaker:
         """
         members: dict[int, tuple[Layout, list[int]]] = {}
         given = [self._with_counts(values) for values in frames] if self._counts else frames
-        filled = (
-            [self._with_parts(values) for values in given]
-            if self.schema.parts
-            else [(values, {}) for values in given]
-        )
+        if self.schema.parts:
+            filled = [self._with_parts(values) for values in given]
+        else:
+            filled = [(values, {}) for values in given]
         for index, (values, _) in enumerate(filled):
             layout = self._layout(values)
             members.setdefault(id(layout), (layout, []))[1].append(index)
@@ -147,7 +144,8 @@ class FrameMaker:
         """The values of a frame with what follows from its parts, and the bytes of these, by their
         axis.
         """
-        given, made = dict(values), dict[str, bytes]()
+        given = dict(values)
+        made = dict[str, bytes]()
         for axis, node in self.schema.parts.items():
             parts = [dict(part) for part in given.pop(axis, ())]
             kinds = [kind_of(node, part) for part in parts]
@@ -185,11 +183,10 @@ class FrameMaker:
         """Set the field that a formula depends on, where it is not given, so that the formula gives
         a number.
         """
-        asked = (
-            []
-            if formula is None
-            else [ref.path for ref in refs(formula) if ref.path in self.schema.fields]
-        )
+        if formula is None:
+            asked = []
+        else:
+            asked = [ref.path for ref in refs(formula) if ref.path in self.schema.fields]
         if asked and asked[0] not in values:
             raw: dict[str, Any] = {}
             for path in asked[1:]:
@@ -275,7 +272,8 @@ def sealed(table: Rows) -> list[bytes]:
     frames = [b""] * len(table)
     for group in table.groups:
         group.layout.seal(group.rows)
-        size, data = group.layout.size, group.rows.tobytes()
+        size = group.layout.size
+        data = group.rows.tobytes()
         for spot, place in enumerate(group.where.tolist()):
             frames[place] = data[spot * size : (spot + 1) * size]
     return frames

@@ -167,16 +167,15 @@ def _meet(found: Floats, body: Box | Mover, beams: Vector, origin: Vector, time:
         return
 
     def chosen(value: Value) -> Any:
-        return (
-            value if np.ndim(value) == 0 else np.broadcast_to(value, found.shape).reshape(-1)[where]
-        )
+        if np.ndim(value) == 0:
+            return value
+        return np.broadcast_to(value, found.shape).reshape(-1)[where]
 
-    enter, leave = np.full(len(where), -np.inf), np.full(len(where), np.inf)
+    enter = np.full(len(where), -np.inf)
+    leave = np.full(len(where), np.inf)
     for corner, other, start, beam in zip(low, high, origin, beams, strict=True):
-        first, second = (
-            (chosen(corner) - chosen(start)) / chosen(beam),
-            (chosen(other) - chosen(start)) / chosen(beam),
-        )
+        first = (chosen(corner) - chosen(start)) / chosen(beam)
+        second = (chosen(other) - chosen(start)) / chosen(beam)
         np.fmax(enter, np.fmin(first, second), out=enter)
         np.fmin(leave, np.fmax(first, second), out=leave)
     hit = (enter > 0) & (enter <= leave)
@@ -205,11 +204,10 @@ def furnished(seed: int = 0) -> Room:
     )
     boxes = []
     for _ in range(source.randint(2, 4)):
-        x, y = (
-            source.choice((spread(-2.2, -1.2), spread(1.6, 2.6))),
-            source.choice((spread(-1.7, -1), spread(1.2, 2))),
-        )
-        wide, deep = spread(0.2, 0.5), spread(0.2, 0.5)
+        x = source.choice((spread(-2.2, -1.2), spread(1.6, 2.6)))
+        y = source.choice((spread(-1.7, -1), spread(1.2, 2)))
+        wide = spread(0.2, 0.5)
+        deep = spread(0.2, 0.5)
         boxes.append(Box((x - wide, y - deep, -1.2), (x + wide, y + deep, spread(-0.3, 1.2))))
     return Room(walls, tuple(boxes), (walker,))
 

@@ -127,13 +127,15 @@ class Measurement:
     """
 
     def __init__(self, sensor: Spec, frame: str, table: Rows, given: Container[str] = ()) -> None:
-        self._sensor, self._frame = sensor, frame
+        self._sensor = sensor
+        self._frame = frame
         self._points = sensor.points_of(_name(frame, table))
         self._encode: Callable[[Polar], Mapping[str, Any]] | None = sensor.simulation_of(
             frame
         ).encode
         intensity = self.beams(table).intensity
-        self._given, self._intensity = given, "" if intensity in given else intensity
+        self._given = given
+        self._intensity = "" if intensity in given else intensity
         self._targets = () if self._encode else self._traced(table)
         self._coupled = self._encode is not None or self._turning(table)
 
@@ -152,14 +154,16 @@ class Measurement:
             times: (n,) seconds since the scene began, of each packet.
         """
         steps = [self._step(table, target) for target in self._targets]
-        before, blind = np.zeros(1), np.zeros(1, np.bool_)
+        before = np.zeros(1)
+        blind = np.zeros(1, np.bool_)
         known: dict[str, NDArray[Any]] = {}
         for attempt in range(ROUNDS):
             beams = self.beams(table)
             ranges = self._measured(beams, scene, times)
             if attempt == ROUNDS - 2:
                 blind = ~np.isclose(ranges, before)
-            before, ranges = ranges, np.where(blind, 0, ranges)
+            before = ranges
+            ranges = np.where(blind, 0, ranges)
             values = self._values(table, beams, ranges, steps)
             if known and all(np.array_equal(known[path], raw) for path, raw in values.items()):
                 break
@@ -246,7 +250,8 @@ class Measurement:
 
     def _most(self, table: Rows, path: str) -> float:
         """The largest raw value that a field holds, and that the frame's wire form can write."""
-        most, form = table.schema.fields[path].limits[1], self._sensor.frames[self._frame].wire
+        most = table.schema.fields[path].limits[1]
+        form = self._sensor.frames[self._frame].wire
         leaves = [
             group.layout.leaves[path] for group in table.groups if path in group.layout.leaves
         ]
@@ -298,7 +303,8 @@ class Measurement:
 
     def _probed(self, table: Rows, paths: Iterable[str], *probes: int) -> list[Beams]:
         """The beams while some fields have one value and another; the table is left as it was."""
-        before, beams = {path: table.raw(path) for path in paths}, []
+        before = {path: table.raw(path) for path in paths}
+        beams = []
         for probe in probes:
             for path in before:
                 store(table, path, np.array(probe))
@@ -459,7 +465,8 @@ def _solved(slopes: Floats, aims: Floats) -> Floats:
     """What fields have to be, (k, n, ...), that move values by `slopes`, (k, m, n, ...), for these
     to be at `aims`, (m, n, ...).
     """
-    matrices, wanted = np.moveaxis(slopes, (0, 1), (-1, -2)), np.moveaxis(aims, 0, -1)
+    matrices = np.moveaxis(slopes, (0, 1), (-1, -2))
+    wanted = np.moveaxis(aims, 0, -1)
     first = matrices[(0,) * (matrices.ndim - 2)]
     inverse = np.linalg.pinv(first if (matrices == first).all() else matrices)
     return np.moveaxis((inverse @ wanted[..., None])[..., 0], -1, 0)
@@ -512,7 +519,8 @@ class PartRows(Rows):
         place = frames.schema.within(path)
         if place is None or place[2]:
             raise SpecError("the frame has no such parts", path=path)
-        self.place, self.frames = place[:2], frames
+        self.place = place[:2]
+        self.frames = frames
         own, self.which = frames.parts(*self.place)
         super().__init__(
             own.schema,
@@ -583,7 +591,9 @@ class Rest:
     """
 
     def __init__(self, sensor: Spec, frame: str, given: Container[str]) -> None:
-        self._sensor, self._frame, self._given = sensor, frame, given
+        self._sensor = sensor
+        self._frame = frame
+        self._given = given
         self._path = sensor.parts_with("imu", frame)
         self._targets: list[str] | None = None
 
@@ -604,11 +614,10 @@ class Rest:
             store(table, path, np.array(0))
         zero = self._felt(table)
         slopes = np.stack([self._probed(table, path) - zero for path in self._targets]) / PROBE
-        aims = (
-            np.random.default_rng(seed).normal(0.0, shake, zero.shape)
-            if shake
-            else np.zeros(zero.shape)
-        )
+        if shake:
+            aims = np.random.default_rng(seed).normal(0.0, shake, zero.shape)
+        else:
+            aims = np.zeros(zero.shape)
         aims[5] += GRAVITY
         for path, raw in zip(self._targets, _solved(slopes, aims - zero), strict=True):
             info = table.schema.fields[path]
@@ -626,7 +635,8 @@ class Rest:
 
     def _answering(self, table: Rows) -> list[str]:
         """The fields that what is felt is linear in."""
-        zero, found = self._felt(table), list[str]()
+        zero = self._felt(table)
+        found = list[str]()
         for path, info in table.schema.fields.items():
             if info.kind not in ("int", "float") or info.const is not None or path in self._given:
                 continue
@@ -686,7 +696,8 @@ class Pace:
     """
 
     def __init__(self, sensor: Spec, frame: str, table: Rows, beams: Beams) -> None:
-        self._sensor, self._rate = sensor, sensor.simulation_of(frame).rate
+        self._sensor = sensor
+        self._rate = sensor.simulation_of(frame).rate
         self._point = _seconds_per_point(beams)
         self._baud = next(
             (link.baud for link in (sensor.links.get("data"),) if isinstance(link, Serial)), 0
@@ -764,18 +775,19 @@ class Simulation:
             raise UsageError(
                 f"{sensor.id} declares no sweep for {frame!r} frames, and cannot be simulated"
             )
-        self._sensor, self._frame, self._sweep = sensor, frame, sweep
+        self._sensor = sensor
+        self._frame = frame
+        self._sweep = sweep
         self._maker = FrameMaker(sensor, frame)
         self._stuck = self._turning(sweep(1)) if blocked else {}
         length = len(self._maker.frame(self._swept(range(1))[0]))
         swept = self._swept(range(min(PROBED, max(PROBED_BYTES // length, LEAST_PROBED))))
         table = self._maker.table(swept)
         self._parts = sensor.parts_with("points", frame)
-        given = (
-            [part for values in swept for part in values[self._parts.partition(".")[0]]]
-            if self._parts
-            else swept
-        )
+        if self._parts:
+            given = [part for values in swept for part in values[self._parts.partition(".")[0]]]
+        else:
+            given = swept
         self._measurement = Measurement.of(
             sensor, frame, self._with_points(table), {path for values in given for path in values}
         )
@@ -799,7 +811,8 @@ class Simulation:
         numbers = range(start, start + count + AHEAD)
         table = self._maker.table(self._swept(numbers))
         times = self._pace.times(table, functools.partial(self._beams, table))
-        seconds, measured = since + times / 1e9, self._with_points(table)
+        seconds = since + times / 1e9
+        measured = self._with_points(table)
         if isinstance(measured, PartRows):
             self._measurement.fill(
                 measured,
@@ -834,7 +847,8 @@ class Simulation:
 
     def _turning(self, values: Mapping[str, Any]) -> dict[str, Any]:
         """Those of a frame's values that change because the rotor turns."""
-        fields, rule = codec(self._sensor.frames[self._frame]).schema.fields, self._sensor.scan
+        fields = codec(self._sensor.frames[self._frame]).schema.fields
+        rule = self._sensor.scan
         cut_by = "" if isinstance(rule, Every) else rule.name
         return {
             path: value

@@ -54,7 +54,8 @@ class BitField:
         byte, how many, and the lowest bit.
         """
         parts = sorted(self.segments, key=lambda part: part.byte)
-        first, count = parts[0].byte, parts[-1].byte - parts[0].byte + 1
+        first = parts[0].byte
+        count = parts[-1].byte - parts[0].byte + 1
         for order, places in (("<", range(count)), (">", range(count - 1, -1, -1))):
             lowest = {8 * places[part.byte - first] + part.low - part.target for part in parts}
             if len(lowest) == 1:

@@ -95,10 +95,8 @@ class Crc(Checksum):
         return _single_crc(self)(bytes(data))
 
     def describe(self) -> str:
-        digits, order = (
-            -(-self.width // 4),
-            ("", " refin", " refout", " reflected")[self.refin + 2 * self.refout],
-        )
+        digits = -(-self.width // 4)
+        order = ("", " refin", " refout", " reflected")[self.refin + 2 * self.refout]
         values = (
             f" {name} 0x{getattr(self, name):0{digits}x}"
             for name in ("poly", "init", "xorout")
@@ -191,7 +189,8 @@ class WordXor(Checksum):
     @cached_property
     def halves(self) -> tuple[list[slice], list[slice]]:
         """Where the low and the high bytes of the words stand."""
-        low, high = [slice(0, self.head, 2)], [slice(1, self.head, 2)]
+        low = [slice(0, self.head, 2)]
+        high = [slice(1, self.head, 2)]
         for number, size in enumerate(self.groups):
             place = self.head + sum(self.groups[:number])
             low.append(slice(place, None, sum(self.groups)))
@@ -213,7 +212,8 @@ class Fold15(Checksum):
     width = 15
 
     def __call__(self, data: Bytes) -> int:
-        odd, total = len(data) % 2, 0
+        odd = len(data) % 2
+        total = 0
         for (word,) in struct.iter_unpack("<H", bytes(data[odd - 60 :]) + bytes(odd)):
             total = (total << 1) + word
         return (total & 0x7FFF) + (total >> 15) & 0x7FFF
@@ -285,7 +285,8 @@ def mirrored_bytes(register: int) -> int:
 @lru_cache(maxsize=256)
 def byte_table(width: int, poly: int, refin: bool) -> tuple[int, ...]:
     """The register after one byte, by the XOR of that byte and the register's low byte."""
-    table, feedback = list(range(256)), reflected(poly, width)
+    table = list(range(256))
+    feedback = reflected(poly, width)
     for _ in range(8):
         table = [register >> 1 ^ (feedback if register & 1 else 0) for register in table]
     return tuple(table if refin else (mirrored_bytes(table[byte]) for byte in MIRROR))
@@ -361,13 +362,11 @@ def single(algorithm: Checksum) -> Single:
     if kind is Sum:
         mask = (1 << algorithm.width) - 1
         return lambda data: sum(data) & mask
-    return (
-        _single_crc(algorithm)
-        if kind is Crc
-        else _single_word_xor(algorithm)
-        if kind is WordXor
-        else algorithm
-    )
+    if kind is Crc:
+        return _single_crc(algorithm)
+    if kind is WordXor:
+        return _single_word_xor(algorithm)
+    return algorithm
 
 
 def _zlib_crc(algorithm: Crc) -> Single | None:
@@ -379,13 +378,16 @@ def _zlib_crc(algorithm: Crc) -> Single | None:
         True,
     ):
         return None
-    start, end = reflected(algorithm.init, 32) ^ 0xFFFFFFFF, algorithm.xorout ^ 0xFFFFFFFF
+    start = reflected(algorithm.init, 32) ^ 0xFFFFFFFF
+    end = algorithm.xorout ^ 0xFFFFFFFF
     return lambda data: zlib.crc32(data, start) ^ end
 
 
 @lru_cache(maxsize=256)
 def _single_crc(algorithm: Crc) -> Single:
-    init, xorout, known = algorithm.init, algorithm.xorout, _zlib_crc(algorithm)
+    init = algorithm.init
+    xorout = algorithm.xorout
+    known = _zlib_crc(algorithm)
     if known is not None:
         return known
     if (algorithm.width, algorithm.poly, algorithm.refin, algorithm.refout) == (
@@ -427,8 +429,10 @@ def _single_word_xor(algorithm: WordXor) -> Single:
     """Groups of words are XORed as a whole, whatever their sizes, and only their XOR is taken
     apart.
     """
-    head, groups = algorithm.head, algorithm.groups
-    size, head_powers = sum(groups), _powers(16, head + 1 >> 1)
+    head = algorithm.head
+    groups = algorithm.groups
+    size = sum(groups)
+    head_powers = _powers(16, head + 1 >> 1)
     words = [
         (8 * sum(groups[:number]), (1 << 8 * width) - 1) for number, width in enumerate(groups)
     ]

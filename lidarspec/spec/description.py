@@ -407,11 +407,10 @@ class Spec:
         """
         name, _, parts = frame.partition(".")
         own = self.frames[name].points
-        function = (
-            own.get(parts)
-            if isinstance(own, Mapping)
-            else own or (self.points if self.frames[name].data and not parts else None)
-        )
+        if isinstance(own, Mapping):
+            function = own.get(parts)
+        else:
+            function = own or (self.points if self.frames[name].data and not parts else None)
         if function is None:
             raise SpecError("this frame type has no points", path=frame, sensor=self.id)
         return function
@@ -426,11 +425,10 @@ class Spec:
         own = self.frames[name].imu
         function = own.get(parts) if isinstance(own, Mapping) else own
         if function is None:
-            having = (
-                f"those of {', '.join(self.imu_frames)} have"
-                if self.imu_frames
-                else "no frame of the sensor has"
-            )
+            if self.imu_frames:
+                having = f"those of {', '.join(self.imu_frames)} have"
+            else:
+                having = "no frame of the sensor has"
             raise SpecError(
                 f"this frame type has nothing of an IMU; {having}", path=frame, sensor=self.id
             )
@@ -452,10 +450,8 @@ class Spec:
         """What a simulation of one frame type needs: the frame's own, and for data the sensor's
         where the frame has none.
         """
-        own, shared = (
-            self.frames[frame].simulation,
-            self.simulation if self.frames[frame].data else Simulation(),
-        )
+        own = self.frames[frame].simulation
+        shared = self.simulation if self.frames[frame].data else Simulation()
         fields = ("sweep", "encode", "rate", "directions")
         return Simulation(**{name: getattr(own, name) or getattr(shared, name) for name in fields})
 

@@ -165,7 +165,9 @@ class Scaled(layer.Describing):
             )
             raise SpecError(f"Scaled takes {wanted}, not {', '.join(given)}")
         super().__init__(subcon)
-        self.scale, self.unit, self.offset = scale, unit, offset
+        self.scale = scale
+        self.unit = unit
+        self.offset = offset
 
     def described(self, info: FieldInfo) -> FieldInfo:
         return replace(info, scale=self.scale, offset=self.offset, unit=self.unit, measured=True)
@@ -257,7 +259,8 @@ class Checksummed(layer.Sealing):
         blank = obj
         for name, value in zip(self.fields, given, strict=True):
             blank = _replaced(blank, name, self._zero(name) if value is None else value)
-        con, trial = self._marked, io.BytesIO()
+        con = self._marked
+        trial = io.BytesIO()
         con._build(blank, trial, context, path)
         data = trial.getvalue()
         unverified = Container(
@@ -275,11 +278,9 @@ class Checksummed(layer.Sealing):
         """The struct as a frame has it, which notes where its members stand; an author may also
         parse with it alone.
         """
-        return (
-            self.subcon
-            if isinstance(layer.unwrap(self.subcon), layer.MarkedStruct)
-            else layer.prepare(self.subcon)
-        )
+        if isinstance(layer.unwrap(self.subcon), layer.MarkedStruct):
+            return self.subcon
+        return layer.prepare(self.subcon)
 
     def verdict(self, data: bytes, obj: Any, base: int = 0) -> tuple[int, int]:
         """The checksum that stands in one parsed struct and the one that should, for its bytes,
@@ -344,10 +345,12 @@ class Checksummed(layer.Sealing):
         """Where a dotted field stands, in bytes of the stream that was parsed; a bit field by the
         bytes that hold it.
         """
-        con, parts = self._marked, name.split(".")
+        con = self._marked
+        parts = name.split(".")
         for depth, part in enumerate(parts):
             start, end = obj["_marks"][part]
-            con, obj = layer.unwrap(con, bits=False)._subcons[part], obj[part]
+            con = layer.unwrap(con, bits=False)._subcons[part]
+            obj = obj[part]
             if parts[depth + 1 :] and layer.unwrap(con, bits=False) is not layer.unwrap(con):
                 inside = layer.bytes_of(con, parts[depth + 1 :])
                 return start + min(inside), start + max(inside) + 1
@@ -398,13 +401,18 @@ class Parts(layer.Partition):
         self.cases = dict(kinds) if isinstance(kinds, Mapping) else {"": kinds}
         if not self.cases or not all(map(layer.is_struct, self.cases.values())):
             raise SpecError("a part is a Struct, or one of several Structs by name")
-        self.count, self.size, self.following, self.within = count, size, following, within
+        self.count = count
+        self.size = size
+        self.following = following
+        self.within = within
 
     def _parse(self, stream: Any, context: Any, path: str) -> Any:
-        start, found = stream.tell(), layer.Pieces()
+        start = stream.tell()
+        found = layer.Pieces()
         goes_on = self._rule(context, path)
         while (announced := goes_on(found)) != 0:
-            place, spot = f"{path}[{len(found)}]", stream.tell()
+            place = f"{path}[{len(found)}]"
+            spot = stream.tell()
             kind = self._kind(stream, context, place)
             part = self.cases[kind]._parsereport(stream, context, place)
             self._take(found, kind, part, (spot, stream.tell()), announced, place)
@@ -415,9 +423,11 @@ class Parts(layer.Partition):
     def _build(self, obj: Any, stream: Any, context: Any, path: str) -> Any:
         if not isinstance(obj, list | tuple):
             raise layer.Mismatch(path, 0, "a list of its parts", repr(obj), "value")
-        built, goes_on = layer.Pieces(), self._rule(context, path)
+        built = layer.Pieces()
+        goes_on = self._rule(context, path)
         for index, part in enumerate(obj):
-            announced, place = goes_on(built), f"{path}[{index}]"
+            announced = goes_on(built)
+            place = f"{path}[{index}]"
             kind, value, data = self._built(part, context, place)
             self._take(
                 built, kind, value, (stream.tell(), stream.tell() + len(data)), announced, place
@@ -447,11 +457,9 @@ class Parts(layer.Partition):
             if count is not None:
                 return -1 if len(found) < count else 0
             if within is not None:
-                return (
-                    -1
-                    if found.size < within
-                    else layer.bounded(found.size, within, "length of parts", path) - within
-                )
+                if found.size < within:
+                    return -1
+                return layer.bounded(found.size, within, "length of parts", path) - within
             assert size is not None
             if not found:
                 return size
@@ -483,7 +491,8 @@ class Parts(layer.Partition):
         Raises:
             Mismatch: where those of no kind are.
         """
-        spot, names = stream.tell(), list(self.cases)
+        spot = stream.tell()
+        names = list(self.cases)
         trial = Container(
             {
                 **context,

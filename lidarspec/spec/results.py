@@ -89,11 +89,10 @@ def _named(extra: Mapping[str, Any]) -> Mapping[str, Extra]:
     """
     for name in extra:
         if not _NAME.fullmatch(name) or name in TAKEN:
-            reason = (
-                "is the name of something else"
-                if name in TAKEN
-                else "is no name: small letters, digits and _"
-            )
+            if name in TAKEN:
+                reason = "is the name of something else"
+            else:
+                reason = "is no name: small letters, digits and _"
             raise SpecError(f"{name!r} {reason}", path="extra")
     return MappingProxyType(
         {name: value if isinstance(value, Extra) else Extra(value) for name, value in extra.items()}

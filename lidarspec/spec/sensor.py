@@ -145,9 +145,10 @@ class Sensor(Spec):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        function = (
-            self.configure.function if isinstance(self.configure, Configure) else self.configure
-        )
+        if isinstance(self.configure, Configure):
+            function = self.configure.function
+        else:
+            function = self.configure
         object.__setattr__(self, "configure", Configure(self, function))
 
     def parse(
@@ -219,7 +220,8 @@ class Sensor(Spec):
         """
         from lidarspec.framing.decoder import Decoder, backend as checked_backend
 
-        chosen, sums = checked_backend(backend), None
+        chosen = checked_backend(backend)
+        sums = None
         if chosen == "jit":
             from lidarspec.points.numba_kernels import compiled_sums
 
@@ -272,10 +274,8 @@ class Sensor(Spec):
         frames = frames_of(decoder, data)
         name = frame or data_frame(self, frames) or self.data_frame
         stream = PacketStream(self, name, decoder.stats, backend=decoder.backend)
-        packets, imu = (
-            stream.add(frames, whole=True),
-            ImuStream(self, decoder.stats, backend=decoder.backend) if frame is None else None,
-        )
+        packets = stream.add(frames, whole=True)
+        imu = ImuStream(self, decoder.stats, backend=decoder.backend) if frame is None else None
         if imu is not None:
             imu.add(frames, packets, whole=True)
         return packets, None if imu is None else imu.waiting
@@ -355,11 +355,9 @@ class Configure:
         parameter; of others nobody knows.
         """
         kinds = self._kinds.get(name, {""})
-        return (
-            "Learned" in kinds
-            if isinstance(value, Learned)
-            else any(_TYPES.get(kind, _anything)(value) for kind in kinds)
-        )
+        if isinstance(value, Learned):
+            return "Learned" in kinds
+        return any(_TYPES.get(kind, _anything)(value) for kind in kinds)
 
     def options_of_file(self, options: Mapping[str, Any], folder: Path) -> dict[str, Any]:
         """The options that stand in a file in `folder` that anybody may have written: numbers,

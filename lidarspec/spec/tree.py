@@ -152,11 +152,9 @@ class FieldInfo:
     def limits(self) -> tuple[int, int]:
         """The lowest and highest raw value of an integer field."""
         signed = self.dtype is not None and self.dtype.kind == "i"
-        return (
-            (-(1 << (self.bits - 1)), (1 << (self.bits - 1)) - 1)
-            if signed
-            else (0, (1 << self.bits) - 1)
-        )
+        if signed:
+            return (-(1 << (self.bits - 1)), (1 << (self.bits - 1)) - 1)
+        return (0, (1 << self.bits) - 1)
 
     @property
     def initial(self) -> int:
@@ -404,13 +402,12 @@ def width(formula: Formula) -> int:
         case "*":
             return sum(args)
         case "<<":
-            most = (
-                formula.args[1]
-                if isinstance(formula.args[1], int)
-                else (1 << args[1]) - 1
-                if args[1] < 8
-                else 99
-            )
+            if isinstance(formula.args[1], int):
+                most = formula.args[1]
+            elif args[1] < 8:
+                most = (1 << args[1]) - 1
+            else:
+                most = 99
             return args[0] + most
         case "//" | ">>":
             return args[0] + 1
@@ -453,10 +450,8 @@ class Number:
     def encoded(self, value: float) -> bytes:
         """The bytes that a raw value is on the wire."""
         if self.kind == "float":
-            order, code = (
-                "<" if self.order == "little" else ">",
-                {2: "e", 4: "f", 8: "d"}[self.size],
-            )
+            order = "<" if self.order == "little" else ">"
+            code = {2: "e", 4: "f", 8: "d"}[self.size]
             return struct.pack(order + code, value)
         return int(value).to_bytes(self.size, self.order, signed=self.kind == "int")
 
@@ -821,11 +816,9 @@ def joined(symbol: str, one: Formula | None, other: Formula | None) -> Formula |
 def _chosen(cases: Sequence[tuple[Formula, Formula | None]]) -> Formula | None:
     """The size of alternatives, each with the condition under which it is there."""
     first = cases[0][1] if cases else 0
-    return (
-        first
-        if all(each == first for _, each in cases)
-        else total(joined("*", holds, each) for holds, each in cases)
-    )
+    if all(each == first for _, each in cases):
+        return first
+    return total(joined("*", holds, each) for holds, each in cases)
 
 
 def infos(node: Node) -> tuple[FieldInfo, ...]:
@@ -849,7 +842,9 @@ class Scope:
     """
 
     def __init__(self, parent: Scope | None, path: str, asked: list[Ref]) -> None:
-        self.parent, self.path, self.asked = parent, path, asked
+        self.parent = parent
+        self.path = path
+        self.asked = asked
         self.names: dict[str, Ref | Scope] = {}
         #: names of parts that branches have in different forms.
         self.several: set[str] = set()

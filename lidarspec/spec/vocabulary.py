@@ -33,7 +33,8 @@ class Along(NDArrayOperatorsMixin):
     """
 
     def __init__(self, axes: tuple[str, ...], array: NDArray[Any]) -> None:
-        self.axes, self.array = axes, array
+        self.axes = axes
+        self.array = array
 
     def __len__(self) -> int:
         return len(self.array)
@@ -108,7 +109,8 @@ def along(axis: str | tuple[str, ...], values: Array) -> Any:
     Raises:
         SpecError: for values with more or fewer axes than are named.
     """
-    axes, array = (axis,) if isinstance(axis, str) else tuple(axis), np.asarray(values)
+    axes = (axis,) if isinstance(axis, str) else tuple(axis)
+    array = np.asarray(values)
     if array.ndim != len(axes):
         raise SpecError(
             f"along({axis!r}, ...) takes an array with an axis for each name, not one of shape"
@@ -256,11 +258,9 @@ def take(table: Array, index: Array) -> Array:
     if entries.ndim == 1:
         return _applied(LookUp(entries), index)
     rows = np.concatenate([entries, np.full((1, entries.shape[1]), np.nan)])
-    return (
-        index.gathered(rows)
-        if hasattr(index, "gathered")
-        else rows[row_numbers(np.asarray(index), len(rows))]
-    )
+    if hasattr(index, "gathered"):
+        return index.gathered(rows)
+    return rows[row_numbers(np.asarray(index), len(rows))]
 
 
 def row_numbers(index: NDArray[Any], rows: int) -> NDArray[np.intp]:
@@ -274,15 +274,15 @@ class LookUp:
     """The function of an index that gives the entries of a table, (m,); nan where there is none."""
 
     def __init__(self, entries: Any) -> None:
-        self.entries, self.__name__ = entries, "take"
+        self.entries = entries
+        self.__name__ = "take"
 
     def __call__(self, spots: Any) -> Any:
         inside = (spots >= 0) & (spots < len(self.entries))
-        found = (
-            self.entries[np.where(inside, spots, 0).astype(np.intp)]
-            if len(self.entries)
-            else np.zeros(np.shape(spots))
-        )
+        if len(self.entries):
+            found = self.entries[np.where(inside, spots, 0).astype(np.intp)]
+        else:
+            found = np.zeros(np.shape(spots))
         return np.where(inside, found, np.nan)
 
 

@@ -246,9 +246,10 @@ def _added(plugin: Any, name: str) -> list[Sensor]:
 
 def loading(error: BaseException, files: list[Path]) -> Finding:
     """The finding for what a plugin failed with when it was loaded."""
-    cause = (
-        error.__cause__ if isinstance(error, SpecError) and error.__cause__ is not None else error
-    )
+    if isinstance(error, SpecError) and error.__cause__ is not None:
+        cause = error.__cause__
+    else:
+        cause = error
     spots = [
         (spot.filename, spot.lineno or 0)
         for each in (error, cause)
@@ -264,11 +265,10 @@ def loading(error: BaseException, files: list[Path]) -> Finding:
     file, line = own[-1] if own else (str(files[0]) if len(files) == 1 else "", 0)
     path = error.path if isinstance(error, SpecError) and error.rule else ""
     sensor = getattr(error, "sensor", "")
-    text = (
-        error.reason
-        if isinstance(error, SpecError) and cause is error
-        else f"{type(cause).__name__}: {cause}"
-    )
+    if isinstance(error, SpecError) and cause is error:
+        text = error.reason
+    else:
+        text = f"{type(cause).__name__}: {cause}"
     return Finding(_loading_rule(error, cause), " ".join(text.split()), path, sensor, file, line)
 
 
@@ -376,11 +376,9 @@ def _function(frame: str, name: str, sensor: Sensor | None) -> Spot | None:
     function = {**functions, "directions": simulated.directions}.get(name)
     while isinstance(function, functools.partial):
         function = function.func
-    return (
-        (function.__code__.co_filename, function.__code__.co_firstlineno)
-        if inspect.isfunction(function)
-        else None
-    )
+    if inspect.isfunction(function):
+        return (function.__code__.co_filename, function.__code__.co_firstlineno)
+    return None
 
 
 def _named(tree: ast.Module) -> Iterator[tuple[str, str, int]]:

@@ -189,11 +189,10 @@ def _learn(subject: Subject, name: str, reply: Reply) -> None:
         if told := learned(sensor, reply):
             sensor.configure(**told)
     except Exception as error:  # whatever `learns` and `configure` of the plugin fail with
-        which = (
-            "its reply, as given by"
-            if name in sensor.simulation.answers
-            else "its reply, which is made up without"
-        )
+        if name in sensor.simulation.answers:
+            which = "its reply, as given by"
+        else:
+            which = "its reply, which is made up without"
         what = f"{which} answers= of the Simulation, cannot be learned from: {error}"
         raise Violation("LS604", what, f"commands.{name}") from error
 

@@ -368,11 +368,10 @@ def _plausible(subject: Subject, name: str, frame: Frame) -> Findings:
         with np.errstate(all="ignore"):
             answer = frame.plausible(Fields(Batch(table, np.zeros(len(table), np.bool_))))  # type: ignore[misc]
     except Exception as error:
-        text = (
-            error.reason
-            if isinstance(error, SpecError)
-            else f"plausible: {type(error).__name__}: {error}"
-        )
+        if isinstance(error, SpecError):
+            text = error.reason
+        else:
+            text = f"plausible: {type(error).__name__}: {error}"
         yield getattr(error, "rule", "") or "LS414", text, f"{name}.plausible"
         return
     if is_expression(answer):
@@ -403,11 +402,10 @@ def _covered(name: str, layouts: list[Layout]) -> Findings:
                 or 0 in leaf.shape
             ):
                 continue
-            own = (
-                {leaf.offset}
-                if leaf.wire is not None
-                else {leaf.offset + part.byte for part in leaf.elements[0].segments}
-            )
+            if leaf.wire is not None:
+                own = {leaf.offset}
+            else:
+                own = {leaf.offset + part.byte for part in leaf.elements[0].segments}
             if not own <= under and max(own) > min(under):
                 reported.add(path)
                 yield (
@@ -526,11 +524,10 @@ def _reach(subject: Subject) -> Findings:
         except Exception:  # said elsewhere
             return
         value = getattr(result, "range", None)
-        info = (
-            field_of(subject, name, value.node)
-            if isinstance(value, Traced) and value.node.kind == "field"
-            else None
-        )
+        if isinstance(value, Traced) and value.node.kind == "field":
+            info = field_of(subject, name, value.node)
+        else:
+            info = None
         metres = factor(info.unit, "m") if info is not None and info.kind == "int" else None
         if info is None or metres is None:
             return
@@ -576,11 +573,10 @@ def _column(
                     order.index(info.path) if info.path in order else len(order),
                 ),
             )
-            said = (
-                f"{first.unit!r} is no unit of it: {' or '.join(units)}"
-                if first.unit
-                else f"it has no unit: {' or '.join(units)}"
-            )
+            if first.unit:
+                said = f"{first.unit!r} is no unit of it: {' or '.join(units)}"
+            else:
+                said = f"it has no unit: {' or '.join(units)}"
             yield (
                 "LS201",
                 f"the {column} of points comes from it, and {said}",

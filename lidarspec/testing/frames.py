@@ -57,19 +57,17 @@ def examples_are_valid_and_repeat(subject: Subject, name: str) -> None:
     try:
         found = [subject.example(name, seed=seed) for seed in subject.seeds(name)]
     except SpecError as error:
-        path = (
-            error.path
-            if error.path.startswith(name)
-            else f"{name}.{error.path}"
-            if error.path
-            else name
-        )
+        if error.path.startswith(name):
+            path = error.path
+        elif error.path:
+            path = f"{name}.{error.path}"
+        else:
+            path = name
         raise Violation(error.rule or "LS301", error.reason, path) from error
-    again = (
-        [subject.sensor.example(name, seed=seed) for seed in range(min(3, len(found)))]
-        if not subject.drawers(name)
-        else found[:3]
-    )
+    if not subject.drawers(name):
+        again = [subject.sensor.example(name, seed=seed) for seed in range(min(3, len(found)))]
+    else:
+        again = found[:3]
     require(found[:3] == again, "LS311", "two examples of one seed differ", name)
     longest = max(map(len, found))
     require(
@@ -196,9 +194,9 @@ def is_cut(before: Any, after: Any) -> bool:
         or not before - after > 0
     ):
         return False
-    return (
-        after == before - 1 if isinstance(before, int) else before - after < 0.1 * abs(before) + 1
-    )
+    if isinstance(before, int):
+        return after == before - 1
+    return before - after < 0.1 * abs(before) + 1
 
 
 def values_in_units_build_the_same_bytes(subject: Subject, name: str) -> None:

@@ -365,11 +365,10 @@ def angles_are_in_order(subject: Subject, name: str) -> None:
     if not frames:
         return
     found = evaluate(read(subject, name, frames).with_points)
-    counts = (
-        found.counts.reshape(len(found.counts), -1).sum(axis=1)
-        if found.counts.ndim > 1
-        else found.counts
-    )
+    if found.counts.ndim > 1:
+        counts = found.counts.reshape(len(found.counts), -1).sum(axis=1)
+    else:
+        counts = found.counts
     cloud = found.cloud
     packet = np.repeat(np.arange(found.ready), counts)
     rings = cloud.ring if cloud.ring is not None else np.zeros(len(cloud))
@@ -576,9 +575,10 @@ def a_simulated_scene_comes_back(subject: Subject, name: str) -> None:
         raise Violation("LS508", str(error), f"{name}.sweep") from error
     cloud = read(subject, name, block.frames).points()
     seconds = float(block.times[-1]) / 1e9
-    subject.picture[f"{name}: rate"] = (
-        f"{len(cloud) / seconds:.0f} points a second, simulated" if seconds else "nothing tells it"
-    )
+    if seconds:
+        subject.picture[f"{name}: rate"] = f"{len(cloud) / seconds:.0f} points a second, simulated"
+    else:
+        subject.picture[f"{name}: rate"] = "nothing tells it"
     known = len(cloud) - 2 * len(cloud) // len(
         block.frames
     )  # directions of the last packet may ask for what follows
@@ -589,9 +589,10 @@ def a_simulated_scene_comes_back(subject: Subject, name: str) -> None:
     )
     apart = off(room, cloud.xyz[:known][valid].astype(np.float64))
     worst = float(apart.max(initial=0))
-    each = (
-        np.sqrt(3) if subject.sensor.simulation_of(name).directions else 1
-    )  # coordinates are rounded one by one
+    if subject.sensor.simulation_of(name).directions:
+        each = np.sqrt(3)
+    else:
+        each = 1  # coordinates are rounded one by one
     near_enough = worst < half_step(subject, name) * each + EXACT
     require(
         near_enough,

@@ -228,13 +228,11 @@ def _gist(error: BaseException) -> str:
 
 
 def _rule_of(error: SpecError) -> str:
-    return (
-        "LS115"
-        if "expression of the struct" in error.reason
-        else "LS301"
-        if "random frame" in error.reason
-        else "LS414"
-    )
+    if "expression of the struct" in error.reason:
+        return "LS115"
+    if "random frame" in error.reason:
+        return "LS301"
+    return "LS414"
 
 
 def _unexpected(error: Exception, path: str, subject: Subject) -> Finding:

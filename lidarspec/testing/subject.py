@@ -71,11 +71,10 @@ def mutated(
     """
     found = bytearray(data)
     for _ in range(source.choice((1, 1, 2, 4))):
-        spot = (
-            source.choice(spots)
-            if spots and source.random() < 0.5
-            else source.randrange(len(found) + 1)
-        )
+        if spots and source.random() < 0.5:
+            spot = source.choice(spots)
+        else:
+            spot = source.randrange(len(found) + 1)
         kind = source.randrange(6 if words else 5)
         if kind == 0:
             found[spot : spot + 1] = source.randbytes(1)
@@ -268,11 +267,10 @@ class Subject:
         if (frame, seed) not in self._known:
             drawn = self.drawers(frame)
             source = random.Random(f"{self.sensor.id} {frame} {seed}")
-            example = (
-                random_frame(self.sensor, frame, source, drawn)
-                if drawn
-                else self.sensor.example(frame, seed=seed)
-            )
+            if drawn:
+                example = random_frame(self.sensor, frame, source, drawn)
+            else:
+                example = self.sensor.example(frame, seed=seed)
             self._known[frame, seed] = example
         return self._known[frame, seed]
 

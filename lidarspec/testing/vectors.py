@@ -144,11 +144,9 @@ def lacking(subject: Subject) -> str:
     if subject.vectors is None:
         return "there is no file of golden vectors"
     try:
-        return (
-            ""
-            if _read_entries(subject)
-            else f"{Path(subject.vectors).name} has none of {subject.sensor.id}"
-        )
+        if _read_entries(subject):
+            return ""
+        return f"{Path(subject.vectors).name} has none of {subject.sensor.id}"
     except Violation:
         return ""
 

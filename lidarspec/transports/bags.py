@@ -47,8 +47,10 @@ BYTES = ("data", "buf")
 NAMED = 6
 #: what lidarspec writes: the type, the time of arrival, int64 ns, and the label of the dimension of
 #: datagrams and of a byte stream.
-RAW, STAMP = "std_msgs/msg/UInt8MultiArray", struct.Struct("<q")
-DATAGRAM, STREAM = "datagram", "stream"
+RAW = "std_msgs/msg/UInt8MultiArray"
+STAMP = struct.Struct("<q")
+DATAGRAM = "datagram"
+STREAM = "stream"
 
 
 class Log(NamedTuple):
@@ -98,7 +100,8 @@ class BagTransport(Transport):
     datagrams = True
 
     def __init__(self, path: str, log: Log, *, sender: str | None = None) -> None:
-        self._path, self._kind = path, log
+        self._path = path
+        self._kind = log
         self.warnings: list[str] = []
         reader = getattr(import_library(log.module, "ros"), log.reader)
         with self._failures(), ExitStack() as undo:
@@ -194,7 +197,8 @@ class BagTransport(Transport):
 
 def raw_chunk(message: Any) -> Chunk:
     """A packet out of a message of the node, as rosbags or rclpy have it."""
-    data, padding = bytes(message.data), message.layout.data_offset
+    data = bytes(message.data)
+    padding = message.layout.data_offset
     return Chunk(data[padding:], STAMP.unpack_from(data)[0] if padding == STAMP.size else None)
 
 

@@ -36,7 +36,8 @@ INTERRUPTIONS = frozenset({"disconnect", "reconnect", "dropped"})
 #: bytes read at once.
 BLOCK = 1 << 18
 #: suffixes of text: of hexadecimal digits, and of what may be that or not.
-HEX_SUFFIXES, TEXT_SUFFIXES = {".hex", ".txt"}, {".log", ".csv", ".asc"}
+HEX_SUFFIXES = {".hex", ".txt"}
+TEXT_SUFFIXES = {".log", ".csv", ".asc"}
 
 
 class RecordingTransport(Transport):
@@ -64,12 +65,12 @@ class RecordingTransport(Transport):
         self._file = file or (sys.stdin.buffer if path == "-" else opened(path))
         self._recording = Recording(path, self._file, salvage=salvage)
         self.header: Header = self._recording.header
-        self.datagrams, self._origin = (
-            self.header.datagrams,
-            None if sender is None else parse_origin(sender),
-        )
+        self.datagrams = self.header.datagrams
+        self._origin = None if sender is None else parse_origin(sender)
         self.warnings: list[str] = []
-        self._no_events, self._was_set, self._has_skipped = 0, False, False
+        self._no_events = 0
+        self._was_set = False
+        self._has_skipped = False
 
     def known_sensor(self) -> Sensor:
         """The installed sensor that the recording names, with the options of then.
@@ -87,10 +88,12 @@ class RecordingTransport(Transport):
 
     def chunks(self) -> Iterator[Chunk]:
         """What was received, in order, with the arrival times of then."""
-        interrupted, damaged = False, 0
+        interrupted = False
+        damaged = 0
         for record in self._recording:
             interrupted = interrupted or self._has_skipped or self._recording.damaged > damaged
-            damaged, self._has_skipped = self._recording.damaged, False
+            damaged = self._recording.damaged
+            self._has_skipped = False
             if record.direction == "event":
                 interrupted = self._interrupts(record) or interrupted
             elif record.direction == "in" and self._wanted(record):
@@ -188,7 +191,8 @@ class FileTransport(Transport):
     """
 
     def __init__(self, path: str, file: BinaryIO) -> None:
-        self._path, self.file = path, file
+        self._path = path
+        self.file = file
         self.warnings: list[str] = []
 
     @property
@@ -315,7 +319,8 @@ class CaptureTransport(FileTransport):
 
     def _gap(self) -> bool:
         """Whether something was passed over, once."""
-        gap, self._has_skipped = self._has_skipped, False
+        gap = self._has_skipped
+        self._has_skipped = False
         return gap
 
 
@@ -350,11 +355,10 @@ def open_file(
         return BagTransport(path, log, sender=sender)
     name = "standard input" if path == "-" else path
     with system_errors(path), contextlib.ExitStack() as undo:
-        plain = (
-            sys.stdin.buffer
-            if path == "-"
-            else undo.enter_context(contextlib.closing(file_of(path)))
-        )
+        if path == "-":
+            plain = sys.stdin.buffer
+        else:
+            plain = undo.enter_context(contextlib.closing(file_of(path)))
         file = unpacked(name, plain, member)
         start = head(file)
         log = log_of(path, start)

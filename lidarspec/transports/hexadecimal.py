@@ -29,7 +29,8 @@ _BETWEEN, _NO_DIGIT, _COMMENT = (
     re.compile(r"[^0-9a-fA-F]"),
     re.compile(r"/\*|#|//"),
 )
-_HEX, _PLAIN = "[0-9a-fA-F]", re.compile(r"\s*(?:(?:[0-9a-fA-F]{2})+(?:\s+|$))*")
+_HEX = "[0-9a-fA-F]"
+_PLAIN = re.compile(r"\s*(?:(?:[0-9a-fA-F]{2})+(?:\s+|$))*")
 #: lines with the bytes as digits, where they belong to and when they came: of candump, of its log,
 #: of sigrok's annotations of a UART.
 FORMS = (
@@ -57,10 +58,8 @@ _CLOCK = re.compile(
 )
 _SECONDS = re.compile(r"\s*(?:[\[(]\s*)?(?P<at>\d+\.\d+)[\])]?:?\s+")
 #: what an array begins with, and a variable that is none; a string of escaped bytes.
-_ARRAY, _NUMBER = (
-    re.compile(r".*[\w\]]\s*=\s*(?:[{\[]|$)|\s*\[(?=\s*0[xX])"),
-    re.compile(r"[\w\s]+=\s*\w+\s*;\s*"),
-)
+_ARRAY = re.compile(r".*[\w\]]\s*=\s*(?:[{\[]|$)|\s*\[(?=\s*0[xX])")
+_NUMBER = re.compile(r"[\w\s]+=\s*\w+\s*;\s*")
 _STRING = re.compile(r"""\bb?(["'])((?:\\x[0-9a-fA-F]{2})*)\1|(["'])((?:\\x[0-9a-fA-F]{2})*)\3""")
 _IN_ARRAY = re.compile(rf"0[xX]{_HEX}{{1,2}}")
 #: lines that mean bytes in two ways, or others than those that stand there, and why.
@@ -128,10 +127,8 @@ class HexText:
         if found is None:
             return None
         facts = found.groupdict()
-        data, bus = (
-            bytes.fromhex(facts["digits"].replace(".", "")),
-            " ".join((facts.get("bus") or "").split()),
-        )
+        data = bytes.fromhex(facts["digits"].replace(".", ""))
+        bus = " ".join((facts.get("bus") or "").split())
         if self._bus and bus != self._bus:
             raise ValueError(f"CAN frames of {self._bus} and of {bus}; grep takes those of one")
         self._bus = bus
@@ -169,7 +166,8 @@ class HexText:
         found = _ROW.fullmatch(text)
         if found is None:
             return None
-        offset, rest = found["offset"], found["rest"].strip()
+        offset = found["offset"]
+        rest = found["rest"].strip()
         if found["mark"] == ":":
             return _shown(rest)
         if not int(offset, 16) and rest and len(offset) > 3:
@@ -197,19 +195,19 @@ class HexText:
             begun = _COMMENT.search(text)
             if begun is None or begun[0] != "/*":
                 return f"{kept} {text[: begun.start() if begun else None]}"
-            kept, text, self._in_comment = (
-                f"{kept} {text[: begun.start()]}",
-                text[begun.end() :],
-                True,
-            )
+            kept = f"{kept} {text[: begun.start()]}"
+            text = text[begun.end() :]
+            self._in_comment = True
 
     def _plain(self, text: str) -> bytes:
         """The bytes of a line that has nothing else in it."""
         if _NUMBER.fullmatch(text):  # the length that xxd -i prints
             return b""
         if begun := _ARRAY.match(text):
-            self._in_array, text = True, text[begun.end() :]
-        words, rest = text, ""
+            self._in_array = True
+            text = text[begun.end() :]
+        words = text
+        rest = ""
         if self._in_array:
             words, end, rest = text.replace("]", "}").partition("}")
             if bad := next(
@@ -232,11 +230,10 @@ def _timed(text: str) -> tuple[int | None, str]:
         raise ValueError(
             f"{found['clock']} is a time of the day or three bytes; [{found['clock']}] is a time"
         )
-    days = (
-        date.fromisoformat(found["date"]).toordinal() - date(1970, 1, 1).toordinal()
-        if found["date"]
-        else 0
-    )
+    if found["date"]:
+        days = date.fromisoformat(found["date"]).toordinal() - date(1970, 1, 1).toordinal()
+    else:
+        days = 0
     hours, minutes, seconds = map(int, found["clock"].split(":"))
     whole = ((days * 24 + hours) * 60 + minutes) * 60 + seconds
     return _nanoseconds(f"{whole}.{found['fraction'] or 0}"), text[found.end() :]
@@ -316,14 +313,18 @@ def hex_chunks(name: str, readline: Callable[[int], bytes]) -> Iterator[Chunk]:
     Raises:
         WireError: where something else is in it.
     """
-    reader, text, goes_on, number = HexText(), "", "", 1
+    reader = HexText()
+    text = ""
+    goes_on = ""
+    number = 1
     try:
         while (block := readline(BLOCK)) or text:
             text += block.decode("ascii", "replace")
             end = len(text) if len(block) < BLOCK or block.endswith(b"\n") else between(text)
             yield reader.line((goes_on + text[:end]).removesuffix("\n"))
             if block.endswith(b"\n"):
-                goes_on, number = "", number + 1
+                goes_on = ""
+                number = number + 1
             else:  # so does a comment in the line; an offset is at its beginning alone
                 goes_on = "#" if re.search("#|//", goes_on + text[:end]) else ","
             text = text[end:]

@@ -145,14 +145,16 @@ def control_link(source: str | Path, name: str, link: Link, host: str | None) ->
     if isinstance(link, Udp) and (known or link.broadcast):
         from lidarspec.transports.udp import UdpTransport
 
-        everybody = (
-            address.options.get("broadcast", "255.255.255.255") if address is not None else ""
-        )
+        if address is not None:
+            everybody = address.options.get("broadcast", "255.255.255.255")
+        else:
+            everybody = ""
         remote = (
             resolve_host(known or everybody, str(source)),
             port or (link.ports[0] if known and link.ports else link.broadcast),
         )
-        own, label = "::" if ":" in remote[0] else "", f"udp://{_bracketed(remote[0])}:{remote[1]}"
+        own = "::" if ":" in remote[0] else ""
+        label = f"udp://{_bracketed(remote[0])}:{remote[1]}"
         return UdpTransport(
             label,
             [link.local],

@@ -95,11 +95,11 @@ def users(port: str) -> tuple[User, ...]:
     are seen.
     """
     path = os.path.realpath(port)
-    return (
-        tuple(sorted(set(_holding(lambda target: target == path)), key=lambda user: user.pid))
-        if os.path.exists(path)
-        else ()
-    )
+    if os.path.exists(path):
+        return tuple(
+            sorted(set(_holding(lambda target: target == path)), key=lambda user: user.pid)
+        )
+    return ()
 
 
 def udp_users(port: int) -> tuple[User, ...] | None:
@@ -114,11 +114,9 @@ def udp_users(port: int) -> tuple[User, ...] | None:
                 columns = line.split()
                 if int(columns[1].rpartition(":")[2], 16) == port:
                     inodes.add(f"socket:[{columns[9]}]")
-    return (
-        tuple(sorted(set(_holding(inodes.__contains__)), key=lambda user: user.pid))
-        if inodes
-        else None
-    )
+    if inodes:
+        return tuple(sorted(set(_holding(inodes.__contains__)), key=lambda user: user.pid))
+    return None
 
 
 def _holding(wanted: Callable[[str], bool]) -> Iterator[User]:

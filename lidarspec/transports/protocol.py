@@ -44,7 +44,8 @@ class Origin:
         found = re.fullmatch(r"\[(.*)\](?::(.*))?|([^:]*):([^:]*)", text)
         if found is None:
             return cls(text)
-        host, port = found[1] or found[3] or "", found[4] if found[1] is None else found[2]
+        host = found[1] or found[3] or ""
+        port = found[4] if found[1] is None else found[2]
         if port is not None and not (port.isdecimal() and 0 < int(port) < 65536):
             raise UsageError(f"src={text}: a sender is ADDRESS or ADDRESS:PORT")
         return cls(host, None if port is None else int(port))
@@ -66,7 +67,8 @@ def sender_names(ends: Iterable[tuple[Sender | None, Sender | None]]) -> dict[Se
         ends: sender and receiver of datagrams; a sensor may send from several ports, but not the
             same.
     """
-    known, ports = dict.fromkeys(ends), defaultdict[tuple[str, int | None], set[int]](set)
+    known = dict.fromkeys(ends)
+    ports = defaultdict[tuple[str, int | None], set[int]](set)
     for sender, receiver in known:
         if sender is not None:
             ports[sender[0], receiver and receiver[1]].add(sender[1])

@@ -72,10 +72,12 @@ class SerialTransport(StreamTransport):
         sensor: Sensor | None = None,
     ) -> None:
         super().__init__(port, sensor)
-        self.baud, self._levels = baud, {"dtr": dtr, "rts": rts}
-        longest = (
-            max((frame.max_length for frame in sensor.frames.values()), default=0) if sensor else 0
-        )
+        self.baud = baud
+        self._levels = {"dtr": dtr, "rts": rts}
+        if sensor:
+            longest = max((frame.max_length for frame in sensor.frames.values()), default=0)
+        else:
+            longest = 0
         self.silence = max(
             self.silence, 2 * longest * 10 / baud
         )  # longer than a frame takes on the line
@@ -144,10 +146,8 @@ class SerialTransport(StreamTransport):
 
     def _refused(self, error: Exception) -> SourceError:
         """Why the port does not open, and what to type."""
-        number, source = (
-            error.errno if isinstance(error, OSError) else None,
-            f"serial://{self.label}{sensor_option(self._sensor)}",
-        )
+        number = error.errno if isinstance(error, OSError) else None
+        source = f"serial://{self.label}{sensor_option(self._sensor)}"
         if number == errno.ENOENT or "FileNotFoundError" in str(error):
             return source_error(f"{self.label}: no such port", "lidarspec ports")
         if number == errno.EACCES:

@@ -25,7 +25,8 @@ from lidarspec.transports.protocol import Disconnected
 #: bytes read at once.
 BLOCK = 1 << 18
 #: seconds that a connection may take at first, and when it is tried again.
-PATIENCE, AGAIN = 5.0, 0.5
+PATIENCE = 5.0
+AGAIN = 0.5
 #: seconds without a byte that a connection may need to bring what was sent: lost segments are sent
 #: again after 0.2 s, 0.4 s, 0.8 s ...
 SILENCE = 10.0

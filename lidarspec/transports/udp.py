@@ -44,9 +44,12 @@ from lidarspec.transports.host_clock import HostClock
 from lidarspec.transports.protocol import Chunk, LiveTransport, Sender
 
 #: datagrams in one call, and the room for each: memory that is not written to costs nothing.
-MANY, LARGEST = 256, 1 << 16
-NAME, CONTROL = 32, 128
-_HEADER, _TWO = struct.Struct("@Nii"), struct.Struct("@Niiqq")
+MANY = 256
+LARGEST = 1 << 16
+NAME = 32
+CONTROL = 128
+_HEADER = struct.Struct("@Nii")
+_TWO = struct.Struct("@Niiqq")
 _ALIGN = struct.calcsize("@N")
 #: bytes of receive buffer that are asked for.
 BUFFER = 8 << 20
@@ -58,7 +61,9 @@ PAUSE = 0.002
 #: ns that a datagram may have waited in the kernel, at most; more is a clock that was set.
 LATEST = 60_000_000_000
 #: socket options that Python has no names for (Linux, asm-generic/socket.h).
-SO_RCVBUFFORCE, SO_TIMESTAMPNS, SO_RXQ_OVFL = 33, 35, 40
+SO_RCVBUFFORCE = 33
+SO_TIMESTAMPNS = 35
+SO_RXQ_OVFL = 40
 TIME = struct.Struct("qq")
 OPTIONS = ("port", "group", "src")
 
@@ -133,12 +138,12 @@ class Slots:
                 ctypes.addressof(self._payload) + index * LARGEST, LARGEST
             )
             message = self._datagrams[index].message
-            message.name, message.name_size = ctypes.addressof(self._names) + index * NAME, NAME
-            message.vectors, message.vectors_number = ctypes.pointer(self._vectors[index]), 1
-            message.control, message.control_size = (
-                ctypes.addressof(self._control) + index * CONTROL,
-                CONTROL,
-            )
+            message.name = ctypes.addressof(self._names) + index * NAME
+            message.name_size = NAME
+            message.vectors = ctypes.pointer(self._vectors[index])
+            message.vectors_number = 1
+            message.control = ctypes.addressof(self._control) + index * CONTROL
+            message.control_size = CONTROL
         self._fresh = self._headers.raw
         self._known: dict[bytes, tuple[str, int]] = {}
 
@@ -182,7 +187,8 @@ class Slots:
 
     def said(self, index: int) -> list[tuple[int, memoryview]]:
         """What the socket layer said with a datagram: type and value."""
-        start, found = index * CONTROL, []
+        start = index * CONTROL
+        found = []
         end = start + self._told[_TOLD + index * _TOLD_STEP]
         while start + _HEADER.size <= end:
             size, level, kind = _HEADER.unpack_from(self._said, start)
@@ -196,7 +202,8 @@ class Slots:
 
 def _address(name: bytes) -> tuple[str, int]:
     """Host and port of a socket address as the kernel writes it."""
-    family, port = int.from_bytes(name[:2], sys.byteorder), int.from_bytes(name[2:4], "big")
+    family = int.from_bytes(name[:2], sys.byteorder)
+    port = int.from_bytes(name[2:4], "big")
     packed = name[8:24] if family == socket.AF_INET6 else name[4:8]
     return socket.inet_ntop(family, packed), port
 
@@ -237,12 +244,11 @@ class UdpTransport(LiveTransport):
         broadcast: bool = False,
     ) -> None:
         self.clock = HostClock()
-        self.label, self.datagrams = label, datagrams
-        self._origin, self._remote, self._sensor = (
-            None if sender is None else parse_origin(sender),
-            remote,
-            sensor,
-        )
+        self.label = label
+        self.datagrams = datagrams
+        self._origin = None if sender is None else parse_origin(sender)
+        self._remote = remote
+        self._sensor = sensor
         if self._origin is not None and self._origin.port is not None:
             self._remote = (self._origin.host, self._origin.port)
         self._selector = selectors.DefaultSelector()
@@ -320,7 +326,8 @@ class UdpTransport(LiveTransport):
             own = self._origin
             for data, sender, at in one.datagrams(*self.clock.now_and_wall()):
                 if own is not None and sender not in own:
-                    self.foreign, self.stranger = self.foreign + 1, sender
+                    self.foreign = self.foreign + 1
+                    self.stranger = sender
                     continue
                 found.append(Chunk(data, at, sender, one.address))
         except ConnectionRefusedError:
@@ -383,7 +390,9 @@ class _Socket:
     """
 
     def __init__(self, found: socket.socket, slots: Slots | None) -> None:
-        self.socket, self._slots, self.drops = found, slots, 0
+        self.socket = found
+        self._slots = slots
+        self.drops = 0
         self.address: tuple[str, int] = found.getsockname()[:2]
         self.buffer = _enlarged(found)
         self.is_timed = False

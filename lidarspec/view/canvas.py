@@ -26,7 +26,8 @@ Depth = Literal["truecolor", "256", "standard", "none"]
 #: the scale in 16 colours, as SGR numbers: those of its hues that get lighter from one to the next.
 _STANDARD = (94, 36, 92, 93)
 PLAIN, STRONG, FAINT, LABEL, GOOD, ALARM = range(6)
-ACROSS, DOWN = 2, 4
+ACROSS = 2
+DOWN = 4
 #: the bit of each dot of a braille character, by row and column.
 BITS = np.array([[0x01, 0x08], [0x02, 0x10], [0x04, 0x20], [0x40, 0x80]], np.int64)
 BLANK = 0x2800
@@ -140,10 +141,8 @@ class Cells:
 
     def paste(self, row: int, column: int, other: Cells) -> None:
         """Another picture with its upper left corner in a cell; what does not fit is cut off."""
-        width, height = (
-            min(other.size[0], self.size[0] - column),
-            min(other.size[1], self.size[1] - row),
-        )
+        width = min(other.size[0], self.size[0] - column)
+        height = min(other.size[1], self.size[1] - row)
         if width > 0 and height > 0:
             self.codes[row : row + height, column : column + width] = other.codes[:height, :width]
             self.inks[row : row + height, column : column + width] = other.inks[:height, :width]
@@ -192,7 +191,9 @@ class Canvas:
     """
 
     def __init__(self, width: int, height: int, ramp: str = "range") -> None:
-        self.width, self.height, self.ramp = width, height, ramp
+        self.width = width
+        self.height = height
+        self.ramp = ramp
         self.dots, self.lines = np.zeros((2, DOWN * height, ACROSS * width), np.bool_)
         self.steps = np.full((height, width), -1, np.int16)
         self.labels: dict[tuple[int, int], tuple[str, int]] = {}
@@ -234,7 +235,8 @@ class Canvas:
 
     def cells(self) -> Cells:
         """The picture."""
-        points, lines = _braille(self.dots), _braille(self.lines)
+        points = _braille(self.dots)
+        lines = _braille(self.lines)
         codes = np.where(
             points > 0, BLANK + points, np.where(lines > 0, BLANK + lines, _SPACE)
         ).astype(np.int32)

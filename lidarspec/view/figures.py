@@ -25,9 +25,16 @@ from lidarspec.view.meter import totals
 SUFFIXES = (".png", ".pdf", ".svg")
 #: inches: the width of a figure, the height of one panel, and of the view from the side at least
 #: and at most; dots an inch.
-WIDTH, PANEL, LOWEST, HIGHEST, DPI = 7.0, 4.2, 0.7, 3.0, 160
+WIDTH = 7.0
+PANEL = 4.2
+LOWEST = 0.7
+HIGHEST = 3.0
+DPI = 160
 #: bins of a histogram, of ranges, and of time at most; seconds of the narrowest of these.
-BINS, NEAR, MOMENTS, NARROWEST = 128, 200, 400, 0.1
+BINS = 128
+NEAR = 200
+MOMENTS = 400
+NARROWEST = 0.1
 #: the share of the ranges that the axis takes in.
 MOST = 99.8
 #: steps of the scale of colours.
@@ -87,11 +94,10 @@ def of_scan(scan: Scan, look: Look, title: str) -> Any:
     lowest, highest = bounds(cloud)
     low = min(float(lowest[2]), 0.0)
     high = max(float(highest[2]), 0.0)
-    tall = (
-        0.0
-        if look.flat
-        else float(np.clip((high - low) / (2 * look.reach) * WIDTH * 0.85, LOWEST, HIGHEST))
-    )
+    if look.flat:
+        tall = 0.0
+    else:
+        tall = float(np.clip((high - low) / (2 * look.reach) * WIDTH * 0.85, LOWEST, HIGHEST))
     figure = _figure(title, WIDTH * 0.92 + tall)
     rows = figure.subplots(
         1 if look.flat else 2,
@@ -145,7 +151,8 @@ def of_intensities(scans: Iterable[Scan], title: str) -> Any:
     middle = strengths[np.searchsorted(np.cumsum(counts), counts.sum() / 2)]
     figure = _figure(f"{title}: {int(counts.sum()):,} returns")
     axes = figure.subplots()
-    low, high = min(float(strengths[0]), 0.0), float(strengths[-1]) + 1
+    low = min(float(strengths[0]), 0.0)
+    high = float(strengths[-1]) + 1
     width = max(np.ceil((high - low) / BINS), 1.0)
     axes.hist(strengths, bins=np.arange(low, high + width, width), weights=counts, color="C0")
     axes.axvline(float(middle) + 0.5, color="C1", label=f"median {middle:g}")
@@ -168,18 +175,20 @@ def of_ranges(scans: Iterable[Scan], title: str) -> Any:
     Args:
         scans: one at least.
     """
-    every, step, number = list[tuple[int, NDArray[np.float32], bool]](), 1, 0
+    every = list[tuple[int, NDArray[np.float32], bool]]()
+    step = 1
+    number = 0
     for number, scan in enumerate(scans, 1):
         if (number - 1) % step == 0:
             every.append((scan.stamp_ns, scan.points.range[scan.points.valid], scan.whole))
         if len(every) == 2 * MOMENTS:  # what is held stays bounded, however long it lasts
-            every, step = every[::2], 2 * step
+            every = every[::2]
+            step = 2 * step
     every = [one for one in every if one[2]] or every  # pieces have fewer returns
-    farthest = (
-        np.percentile(np.concatenate([ranges for _, ranges, _ in every]), MOST)
-        if any(len(ranges) for _, ranges, _ in every)
-        else 1.0
-    )
+    if any(len(ranges) for _, ranges, _ in every):
+        farthest = np.percentile(np.concatenate([ranges for _, ranges, _ in every]), MOST)
+    else:
+        farthest = 1.0
     edges = np.linspace(0, float(farthest) * 1.05, NEAR + 1)
     times = np.array([(stamp - every[0][0]) * 1e-9 for stamp, *_ in every])
     order = np.argsort(times, kind="stable")
@@ -257,8 +266,12 @@ class Rates:
     """
 
     def __init__(self, feed: Feed, until: float) -> None:
-        self._feed, self._first, self._before = feed, 0, totals(feed.device.stats)
-        self.width, self.totals, self._last = NARROWEST, np.zeros((3, 1)), 0.0
+        self._feed = feed
+        self._first = 0
+        self._before = totals(feed.device.stats)
+        self.width = NARROWEST
+        self.totals = np.zeros((3, 1))
+        self._last = 0.0
         self.scans = list[tuple[float, float]]()
         while not feed.ended and time.monotonic() < until:
             feed.pump(0.0)

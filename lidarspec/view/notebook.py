@@ -29,13 +29,17 @@ from lidarspec.spec.tree import FieldInfo
 from lidarspec.view.svg import svg
 
 #: pixels of a side of a picture, and the dots of each of its views at most.
-SIDE, DOTS = 520, 12_000
+SIDE = 520
+DOTS = 12_000
 #: rows of packets at the beginning and at the end, their fields at most, and rows of an
 #: explanation.
-ENDS, FIELDS, ROWS = 5, 24, 200
+ENDS = 5
+FIELDS = 24
+ROWS = 200
 #: degrees of hue from one field to the next, and the most pixels that a table is high before it
 #: scrolls.
-HUE, TALL = 67, 640
+HUE = 67
+TALL = 640
 _CELL = "text-align:{align};white-space:nowrap;padding:1px 8px;vertical-align:top"
 
 
@@ -68,11 +72,12 @@ def packets(value: Packets) -> str:
     if len(value) > 2 * ENDS:
         rows.insert(ENDS, ["⋮"] * len(columns))
     more = f"; {len(fields) - len(shown)} further fields" * (len(fields) > len(shown))
-    first = (
-        f"; first at {np.datetime64(int(value.time_ns[0]), 'ns')} by the {_clock(value)} clock"
-        if len(value)
-        else ""
-    )
+    if len(value):
+        first = (
+            f"; first at {np.datetime64(int(value.time_ns[0]), 'ns')} by the {_clock(value)} clock"
+        )
+    else:
+        first = ""
     return _table(
         f"{value}{first}{more}",
         list(columns),
@@ -86,16 +91,16 @@ def explanation(value: Explanation) -> str:
     rows = []
     for number, row in enumerate(value.rows[:ROWS]):
         indent = "&nbsp;" * 2 * len(parents(row.path))
-        name, meaning = escape(row.path.rpartition(".")[2]), escape(printable(row.meaning))
+        name = escape(row.path.rpartition(".")[2])
+        meaning = escape(printable(row.meaning))
         tint = f"hsl({number * HUE % 360} 70% 50% / .25)" if row.right else "hsl(0 90% 50% / .55)"
         data = "<br>".join(
             row.data[start : start + 16].hex(" ") for start in range(0, len(row.data), 16)
         )
-        code = (
-            f'<code style="background:{tint};padding:1px 3px;color:inherit">{data}</code>'
-            if data
-            else ""
-        )
+        if data:
+            code = f'<code style="background:{tint};padding:1px 3px;color:inherit">{data}</code>'
+        else:
+            code = ""
         meaning = meaning if row.right else f"<b>{meaning}</b>"
         rows.append(
             [
@@ -172,11 +177,9 @@ def _values(column: NDArray[np.float64], info: FieldInfo) -> list[str]:
 
 def _span(values: NDArray[np.float64]) -> str:
     known = values[np.isfinite(values)]
-    return (
-        f"{len(known)} x {_number(float(known.min()))} to {_number(float(known.max()))}"
-        if len(known)
-        else "-"
-    )
+    if len(known):
+        return f"{len(known)} x {_number(float(known.min()))} to {_number(float(known.max()))}"
+    return "-"
 
 
 def _number(value: float) -> str:

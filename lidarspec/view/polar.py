@@ -19,7 +19,8 @@ RING_GAP = 4
 ABOVE = 0.62
 #: by how much heights may be drawn larger than lengths, and the share of the side view that they
 #: then fill at most.
-HEIGHTS, FILLED = (1, 2, 5, 10), 0.9
+HEIGHTS = (1, 2, 5, 10)
+FILLED = 0.9
 
 
 def picture(points: PointCloud, *, width: int, height: int, look: Look) -> Cells:
@@ -51,7 +52,8 @@ def _from_above(cloud: PointCloud, width: int, height: int, look: Look) -> Cells
     canvas = Canvas(width, height, look.ramp)
     scale = _scale(width, height, look.reach)
     middle = _middle(canvas)
-    across, down = middle[0] + look.middle[1] * scale, middle[1] + look.middle[0] * scale
+    across = middle[0] + look.middle[1] * scale
+    down = middle[1] + look.middle[0] * scale
     canvas.plot(across - cloud.y * scale, down - cloud.x * scale, shade(cloud, look))
     step = ring_step(look.reach)
     radii = [
@@ -85,7 +87,8 @@ def _label_ring(canvas: Canvas, home: tuple[int, int], radius: float, scale: flo
     free.
     """
     text = f"{radius:g} m"
-    across, down = round(radius * scale / ACROSS), round(radius * scale / DOWN)
+    across = round(radius * scale / ACROSS)
+    down = round(radius * scale / DOWN)
     row, column = home
     places = [
         (row, column + across - len(text)),
@@ -109,10 +112,8 @@ def _from_side(
         (n for n in HEIGHTS if (high - low) * scale * n <= canvas.dots.shape[0] * FILLED), default=1
     )
     middle = _middle(canvas)
-    across, level = (
-        middle[0] - look.middle[0] * scale,
-        middle[1] + (low + high) / 2 * scale * larger,
-    )
+    across = middle[0] - look.middle[0] * scale
+    level = middle[1] + (low + high) / 2 * scale * larger
     canvas.plot(across + cloud.x * scale, level - cloud.z * scale * larger, shade(cloud, look))
     step = ring_step(canvas.dots.shape[0] / scale / larger)
     half = canvas.dots.shape[0] / scale / larger / 2

@@ -31,18 +31,21 @@ def show(feed: Feed, target: str, *, ramp: str = "range", until: float) -> None:
     """
     with system_errors(target or "Rerun's viewer"), Log(ramp) as log:
         _open(log, target)
-        read_at, last = time.monotonic(), None
+        read_at = time.monotonic()
+        last = None
         while not feed.ended and time.monotonic() < until:
             feed.pump(time.monotonic() + LOOK_S)
             for scan in feed.scans:
                 log.scan(scan)
                 if last is None or not 0 <= scan.stamp_ns - last < FIGURES * 1e9:
-                    now, is_live = time.monotonic(), feed.device.is_live
+                    now = time.monotonic()
+                    is_live = feed.device.is_live
                     reading = feed.meter.reading(
                         feed.device.stats, now - read_at if is_live else None
                     )
                     log.figures({name: getattr(reading, name) for name in FIGURED})
-                    read_at, last = now, scan.stamp_ns
+                    read_at = now
+                    last = scan.stamp_ns
 
 
 def _open(log: Log, target: str) -> None:

@@ -40,12 +40,11 @@ _WINDOWS = {"H": "up", "P": "down", "M": "right", "K": "left"}
 #: seconds between two looks at the keyboard on Windows, which has nothing to wait on.
 _LOOK = 0.02
 #: the alternate screen, no cursor, no wrapping at the edge; and all of it back.
-ENTER, LEAVE = (
-    "\x1b[?1049h\x1b[?25l\x1b[?7l\x1b[2J",
-    "\x1b[?2026l\x1b[0m\x1b[?7h\x1b[?25h\x1b[?1049l",
-)
+ENTER = "\x1b[?1049h\x1b[?25l\x1b[?7l\x1b[2J"
+LEAVE = "\x1b[?2026l\x1b[0m\x1b[?7h\x1b[?25h\x1b[?1049l"
 #: the terminal holds a picture back until all of it is there, where it knows how to.
-BEGIN, END = "\x1b[?2026h", "\x1b[?2026l"
+BEGIN = "\x1b[?2026h"
+END = "\x1b[?2026l"
 #: unchanged cells between two changed ones that are written along: moving the cursor costs as much.
 BRIDGED = 4
 
@@ -147,11 +146,9 @@ else:
             taken: standard input is the data: keys come from the terminal itself.
         """
         try:
-            return (
-                Keyboard(sys.stdin.fileno())
-                if sys.stdin.isatty() and not taken
-                else Keyboard(os.open("/dev/tty", os.O_RDONLY))
-            )
+            if sys.stdin.isatty() and not taken:
+                return Keyboard(sys.stdin.fileno())
+            return Keyboard(os.open("/dev/tty", os.O_RDONLY))
         except (OSError, ValueError, termios.error):
             return Keys()
 
@@ -193,8 +190,10 @@ class Screen:
     """
 
     def __init__(self, stream: TextIO, keys: Keys) -> None:
-        self._stream, self.keys = stream, keys
-        self._depth, self._plain = depth(stream), not encodable(stream)
+        self._stream = stream
+        self.keys = keys
+        self._depth = depth(stream)
+        self._plain = not encodable(stream)
         self._shown: Cells | None = None
         # how often the terminal was taken over: what was shown before is gone, also in the middle
         # of `show`
@@ -284,10 +283,8 @@ def changes(before: Cells | None, after: Cells, depth: Depth) -> str:
             strict=True,
         ):
             parts.append(f"\x1b[{row + 1};{first + 1}H")
-            codes, inks = (
-                after.codes[row, first : last + 1].tolist(),
-                after.inks[row, first : last + 1].tolist(),
-            )
+            codes = after.codes[row, first : last + 1].tolist()
+            inks = after.inks[row, first : last + 1].tolist()
             for code, chosen in zip(codes, inks, strict=True):
                 if chosen != ink:
                     parts.append(sgr(chosen, depth))

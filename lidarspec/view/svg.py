@@ -18,10 +18,15 @@ from lidarspec.points.look import STEPS, Look, bounds, ring_step, steps
 
 #: pixels: of each side of the view from above, of the margins, of the lines above it, of one above
 #: each view, and of a dot.
-SIDE, MARGIN, HEAD, LINE, DOT = 720, 24, 58, 18, 1.6
+SIDE = 720
+MARGIN = 24
+HEAD = 58
+LINE = 18
+DOT = 1.6
 #: share of a side that heights take at most, and how near to dots and to the sensor the view from
 #: above ends, pixels.
-HIGHEST, NEAR = 0.45, 24
+HIGHEST = 0.45
+NEAR = 24
 #: pixels above the base line of a text, and of a character of it.
 FONT_HEIGHT = 11
 CHARACTER_WIDTH = 6.7
@@ -44,7 +49,8 @@ def svg(
     cloud = points[points.valid]
     views = _Views(cloud, look, side, most, steps(cloud, look))
     shown = [views.above()] if look.flat else [views.above(), views.beside()]
-    width, top = side + 2 * MARGIN, HEAD
+    width = side + 2 * MARGIN
+    top = HEAD
     body: list[str] = []
     for view in shown:
         body.append(f'<text x="{MARGIN}" y="{top + 12}" {_as("text")}>{view.told}</text>')
@@ -102,7 +108,8 @@ class _Views:
     def above(self) -> _View:
         """Rings with their ranges, axes, points, and the sensor; forward is up."""
         scale, side, (forward, left) = self._scale, self.side, self.look.middle
-        across, down = side / 2 + left * scale, side / 2 + forward * scale
+        across = side / 2 + left * scale
+        down = side / 2 + forward * scale
         step = ring_step(self.look.reach)
         reach = self.look.reach
         nearest = math.hypot(max(abs(forward) - reach, 0.0), max(abs(left) - reach, 0.0))
@@ -116,10 +123,8 @@ class _Views:
         )
         rows = down - self.cloud.x * scale
         dots, paths = self._dots(across - self.cloud.y * scale, rows, side)
-        top, bottom = (
-            max(min(float(rows.min(initial=down)), down) - NEAR, 0),
-            min(max(float(rows.max(initial=down)), down) + NEAR, side),
-        )
+        top = max(min(float(rows.min(initial=down)), down) - NEAR, 0)
+        bottom = min(max(float(rows.max(initial=down)), down) + NEAR, side)
         labels = _Labels(side, top, bottom)
         labels.write("0°", [(across + 6, top + 12)])
         labels.write("90°", [(2, down - 4)])
@@ -148,14 +153,18 @@ class _Views:
 
     def beside(self) -> _View:
         """Heights with their labels, and points; forward is right."""
-        scale, side = self._scale, self.side
+        scale = self._scale
+        side = self.side
         lowest, highest = bounds(self.cloud)
         low = min(float(lowest[2]), 0.0)
         high = max(float(highest[2]), 0.0)
         span = max(high - low, 1e-3)
         larger = max((n for n in (1, 2, 5, 10) if span * scale * n <= HIGHEST * side), default=1)
-        steep, top, height = scale * larger, high + 0.05 * span, span * 1.1 * scale * larger
-        across, level = side / 2 - self.look.middle[0] * scale, top * steep
+        steep = scale * larger
+        top = high + 0.05 * span
+        height = span * 1.1 * scale * larger
+        across = side / 2 - self.look.middle[0] * scale
+        level = top * steep
         step = ring_step(height / steep)
         marks = [
             number * step
@@ -193,7 +202,8 @@ class _Views:
             _, first = np.unique(places @ (1 << 20, 1), return_index=True)
             if self.most is None or len(first) <= self.most:
                 break
-        places, colours = places[first], self.colours[inside[first]]
+        places = places[first]
+        colours = self.colours[inside[first]]
         width = max(DOT, grid * 1.3) / grid
         paths = [
             f'<path class="dots{step}" d="{_path(places[colours == step])}"'

@@ -78,11 +78,11 @@ def word_at(context, array, index):
         held = target.make_array(signature.args[0])(target, builder, args[0])
         place = cgutils.gep_inbounds(builder, held.data, args[1])
         word = builder.load(builder.bitcast(place, ir.IntType(64).as_pointer()), align=1)
-        return (
-            builder.call(builder.module.declare_intrinsic("llvm.bswap", [ir.IntType(64)]), [word])
-            if _IS_BIG
-            else word
-        )
+        if _IS_BIG:
+            return builder.call(
+                builder.module.declare_intrinsic("llvm.bswap", [ir.IntType(64)]), [word]
+            )
+        return word
 
     return types.int64(array, types.int64), make
 
@@ -95,11 +95,11 @@ def four_at(context, array, index):
         held = target.make_array(signature.args[0])(target, builder, args[0])
         place = cgutils.gep_inbounds(builder, held.data, args[1])
         word = builder.load(builder.bitcast(place, ir.IntType(32).as_pointer()), align=1)
-        return (
-            builder.call(builder.module.declare_intrinsic("llvm.bswap", [ir.IntType(32)]), [word])
-            if _IS_BIG
-            else word
-        )
+        if _IS_BIG:
+            return builder.call(
+                builder.module.declare_intrinsic("llvm.bswap", [ir.IntType(32)]), [word]
+            )
+        return word
 
     return types.uint32(array, types.int64), make
 

@@ -24,7 +24,8 @@ from lidarspec.points.numba_kernels.source import HEAD
 from lidarspec.spec.checksums import Crc, WordXor, Xor
 
 #: frames of a layout that earn its tables, and that a batch has to have.
-EARNED, FEW = 4096, 64
+EARNED = 4096
+FEW = 64
 #: bytes whose tables stay in the fastest caches.
 LONGEST = 128
 #: bytes of a batch that earn calling a kernel that goes along the rows.
@@ -109,7 +110,8 @@ def kernel(rows, size, spans, table, start, found):
 def _along(algorithm: Crc, spans: tuple[tuple[int, int], ...], rows: Bytes2D) -> NDArray[np.uint64]:
     """The CRCs of some bytes of each row, (n,)."""
     table, _, _ = places(8, 0, algorithm.width, algorithm.poly, algorithm.refin)
-    found, edges = np.empty(len(rows), np.int64), np.array(spans, np.int64).reshape(-1)
+    found = np.empty(len(rows), np.int64)
+    edges = np.array(spans, np.int64).reshape(-1)
     start = int(np.uint64(algorithm.start).astype(np.int64))
     function_of(_ALONG)(
         rows.reshape(-1), rows.shape[1], edges, table.astype(np.uint64).view(np.int64), start, found
@@ -139,7 +141,8 @@ class _Shares:
             and seal.algorithm.width <= 16
             and len(self._places) <= LONGEST
         )
-        self.start, self.tables = 0, np.empty(0, np.uint16)
+        self.start = 0
+        self.tables = np.empty(0, np.uint16)
 
     def make(self, size: int) -> None:
         """Ask the algorithm, for frames of so many bytes."""
@@ -153,7 +156,8 @@ class _Shares:
             if not words or place >= words[-1] + 8:
                 words.append(min(place, size - 8))
         none = np.zeros(256, np.uint16)
-        self.words, self.start = np.array(words, np.int64), int(values[0])
+        self.words = np.array(words, np.int64)
+        self.start = int(values[0])
         self.tables = np.concatenate(
             [shares.pop(word + byte, none) for word in words for byte in range(8)]
         )
@@ -168,7 +172,8 @@ class _Shares:
 
     def values(self, rows: Bytes2D) -> NDArray[np.uint64]:
         """The checksums of frames, (n,)."""
-        found, flat = np.empty(len(rows), np.int64), rows.reshape(-1)
+        found = np.empty(len(rows), np.int64)
+        flat = rows.reshape(-1)
         if self.is_plain:
             function_of(_XORED)(
                 flat, rows.shape[1], self.words, self.lows, self.highs, self.start, found
@@ -186,7 +191,8 @@ def checksums(seal: Seal, rows: Bytes2D) -> NDArray[np.uint64] | None:
     known = _KNOWN.get(seal)
     if known is None and not seal.spans:
         return None  # over no bytes there is nothing to compute
-    algorithm, length = seal.algorithm, sum(stop - start for start, stop in seal.spans)
+    algorithm = seal.algorithm
+    length = sum(stop - start for start, stop in seal.spans)
     if isinstance(algorithm, Crc) and (
         algorithm.width > 16 or (algorithm.width > 8 and length > LONGEST)
     ):

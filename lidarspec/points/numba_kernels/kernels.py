@@ -38,7 +38,8 @@ SHARE = 1 << 16
 
 #: points of a job that earn loading Numba with a kernel compiled before, and with one to be
 #: compiled; about a second's worth each.
-WARM, COLD = 1 << 26, 1 << 28
+WARM = 1 << 26
+COLD = 1 << 28
 #: a count that nothing brings up to them.
 NEVER = -(1 << 62)
 
@@ -57,7 +58,8 @@ class Kernel(Maker):
     """
 
     def __init__(self, text: Text, width: int) -> None:
-        self._text, self._width = text, width
+        self._text = text
+        self._width = width
         self._numbers = np.array(text.wanted.numbers, np.int64)
         self._function: Any = None
 
@@ -83,7 +85,8 @@ class Kernel(Maker):
 
     def run(self, rows: Bytes2D, values: Values, columns: Mapping[str, NDArray[Any]]) -> None:
         self.compile()
-        count, stride = rows.shape[0], rows.strides[0]
+        count = rows.shape[0]
+        stride = rows.strides[0]
         given: list[Any] = []
         for node in self._text.wanted.nodes:
             given += _flat(values(node), node.shape)

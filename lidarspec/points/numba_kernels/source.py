@@ -75,11 +75,9 @@ class Expressions(Writer):
             if source is not None and is_full(source, self.width) and not is_cheap(node):
                 found = self.looked_up(node, source, np.float64, 1.0)
                 if found is not None:
-                    return (
-                        self.let(found.level, f"{found.text} != 0")
-                        if node.sample.array.dtype.kind == "b"
-                        else found
-                    )
+                    if node.sample.array.dtype.kind == "b":
+                        return self.let(found.level, f"{found.text} != 0")
+                    return found
             return self._call(node)
         if node.kind == "rows" and not self.shared(node.args[0]):
             return self._row(node, "float64")
@@ -87,7 +85,8 @@ class Expressions(Writer):
 
     def _row(self, node: Node, kind: str, table: NDArray[Any] | None = None) -> Value:
         """An element of the row of a table, by default the node's own, at an index."""
-        index, table = node.args[0], node.args[1] if table is None else table
+        index = node.args[0]
+        table = node.args[1] if table is None else table
         row = self.double(index)
         start = self.once(
             ("row", index, table.shape),
@@ -137,7 +136,8 @@ class Expressions(Writer):
         if len(node.shape) != depth:
             return self.given(node)
         if isinstance(node.function, LookUp) and len(node.function.entries):
-            index, table = self.double(node.args[0]), self.array(node.function.entries)
+            index = self.double(node.args[0])
+            table = self.array(node.function.entries)
             return self.let(index.level, f"looked_up({table}, {index.text})")
         if node.function is np.where and len(node.args) == 3:
             return self._where(*(self.double(arg, depth) for arg in node.args))
@@ -229,7 +229,8 @@ class Expressions(Writer):
         """A place on a beam, rounded once: what was sent times a direction in two halves, and its
         start; None where NumPy reads these.
         """
-        sent, table = self._marked(beam.distance, raw=True), beam.direction.args[1]
+        sent = self._marked(beam.distance, raw=True)
+        table = beam.direction.args[1]
         if sent is None or self.shared(beam.direction.args[0]) or self.shared(beam.start.args[0]):
             return None
         high, low, _ = self.once(
@@ -257,16 +258,13 @@ class Expressions(Writer):
                 and not leaf.info.offset
             )
             sent = self.raw(leaf) if leaf is not None and is_short else None
-            scale = (
-                f" * np.float32({float(leaf.info.scale)!r})"
-                if leaf is not None and leaf.info.scaled and not raw
-                else ""
-            )
-            return (
-                None
-                if sent is None
-                else self.let(self.inner, f"np.float32(np.int32({sent.text})){scale}")
-            )
+            if leaf is not None and leaf.info.scaled and not raw:
+                scale = f" * np.float32({float(leaf.info.scale)!r})"
+            else:
+                scale = ""
+            if sent is None:
+                return None
+            return self.let(self.inner, f"np.float32(np.int32({sent.text})){scale}")
         if node.kind != "call" or not isinstance(node.args[-1], Node):
             return None
         if node.function is not returned_range and not is_nan_where(node):
@@ -275,12 +273,10 @@ class Expressions(Writer):
             ("marked", node.args[-1], raw), lambda: self._marked(node.args[-1], raw=raw)
         )
         if made is None or node.function is returned_range:
-            return (
-                None
-                if made is None
-                else self.let(
-                    self.inner, f"{made.text} if np.float32(0) < {made.text} else np.float32(nan)"
-                )
+            if made is None:
+                return None
+            return self.let(
+                self.inner, f"{made.text} if np.float32(0) < {made.text} else np.float32(nan)"
             )
         flag = self.double(node.args[0], len(node.shape))
         return self.let(self.inner, f"np.float32(nan) if {flag.text} else {made.text}")
@@ -294,11 +290,10 @@ class Expressions(Writer):
     def _of_field(self, node: Node, *, exact: bool) -> Value | None:
         """An expression of one field that each point has: by a straight line or a table."""
         source = only_field(node)
-        leaf = (
-            self.layout.leaves.get(source.path)
-            if source is not None and is_full(source, self.width)
-            else None
-        )
+        if source is not None and is_full(source, self.width):
+            leaf = self.layout.leaves.get(source.path)
+        else:
+            leaf = None
         if leaf is None or source is None or window(leaf) is None:
             return None
         values = every_value(node, leaf)
@@ -333,7 +328,8 @@ class Expressions(Writer):
         return self._sum(value, factor)
 
     def _sum(self, node: Node, factor: float) -> Value:
-        function, args = node.function, node.args
+        function = node.function
+        args = node.args
         depth = max(len(arg.shape) for arg in args if isinstance(arg, Node))
         if function in FACTORS:
             return self.angle(args[0], factor * FACTORS[function], depth)
@@ -347,7 +343,8 @@ class Expressions(Writer):
             known, other = args if not isinstance(args[0], Node) else args[::-1]
             if np.size(known) == 1:
                 return self.angle(other, factor * float(np.asarray(known).reshape(())), depth)
-            row, made = self.constant(np.asarray(known) * factor, depth), self.double(other)
+            row = self.constant(np.asarray(known) * factor, depth)
+            made = self.double(other)
             return self.let(max(row.level, made.level), f"{made.text} * {row.text}")
         if function is np.where and len(args) == 3:
             return self._where(
@@ -428,9 +425,11 @@ class Assembly:
     def together(self, made: Mapping[str, Any]) -> None:
         """Coordinates that are nan all or none."""
         if all(isinstance(value, Value) for value in made.values()):
-            lines, texts = self.writer.lines[-1], {name: value.text for name, value in made.items()}
+            lines = self.writer.lines[-1]
+            texts = {name: value.text for name, value in made.items()}
         else:
-            lines, texts = self.flat, {name: self.text(value) for name, value in made.items()}
+            lines = self.flat
+            texts = {name: self.text(value) for name, value in made.items()}
         lines += [f"{name} = {text}" for name, text in texts.items()]
         lines.append(f"bad = np.float32({' + '.join(f'{name} * np.float32(0)' for name in made)})")
         lines += [f"put(out_{name}, o, {name} + bad)" for name in made]
@@ -475,9 +474,10 @@ def written(plan: Plan, names: tuple[str, ...], varying: Set[str]) -> Text:
     columns = {
         name: plan.extra[name].dtype if name in plan.sent else np.dtype(np.float32) for name in made
     }
-    directed = (
-        [] if plan.exact else [*plan.directed, *(plan.parts[name] for name in ("ox", "oy", "oz"))]
-    )
+    if plan.exact:
+        directed = []
+    else:
+        directed = [*plan.directed, *(plan.parts[name] for name in ("ox", "oy", "oz"))]
     places = {}
     if not all(
         is_number(value, plan.layout.leaves) for value in directed
@@ -503,7 +503,8 @@ def _both(expressions: Iterable[Any]) -> set[Node]:
 
 
 def _made(writer: Expressions, plan: Plan, name: str, value: Any) -> Any:
-    exact, raw = plan.is_exact(name), writer.raw(plan.sent[name]) if name in plan.sent else None
+    exact = plan.is_exact(name)
+    raw = writer.raw(plan.sent[name]) if name in plan.sent else None
     if name in plan.sent:
         made = raw or writer.double(value, len(writer.shape))
         return writer.let(made.level, f"np.{plan.extra[name].dtype}({made.text})")
@@ -539,10 +540,8 @@ def _function(
         (f"out_{name}", "MADE_SINGLES" if dtype.kind == "f" else f"MADE['{dtype}']")
         for name, dtype in columns.items()
     ]
-    arguments, types = (
-        ", ".join(name for name, _ in parameters),
-        ", ".join(kind for _, kind in parameters),
-    )
+    arguments = ", ".join(name for name, _ in parameters)
+    types = ", ".join(kind for _, kind in parameters)
     body = ["apart()"] + [
         f"n{index} = at(numbers, {index})" for index in range(len(wanted.numbers))
     ]

@@ -86,11 +86,10 @@ def integer(leaf: Leaf, byte: Any) -> str | None:
     order: Literal["little", "big"] = (
         "big" if leaf.wire is not None and leaf.wire.byteorder == ">" else "little"
     )
-    element = (
-        leaf.elements[0]
-        if leaf.wire is None
-        else whole_bytes(leaf.wire.itemsize, order, signed=leaf.wire.kind == "i")
-    )
+    if leaf.wire is None:
+        element = leaf.elements[0]
+    else:
+        element = whole_bytes(leaf.wire.itemsize, order, signed=leaf.wire.kind == "i")
     if element.width > 48:
         return None
     parts = []
@@ -99,7 +98,8 @@ def integer(leaf: Leaf, byte: Any) -> str | None:
         bits = bits if part.mask == 0xFF else f"({bits} & {part.mask})"
         bits = f"({bits} >> {part.low})" if part.low else bits
         parts.append(f"({bits} << {part.target})" if part.target else bits)
-    total, sign = f"({' | '.join(parts)})", 1 << (element.width - 1)
+    total = f"({' | '.join(parts)})"
+    sign = 1 << (element.width - 1)
     return f"(({total} ^ {sign}) - {sign})" if element.signed else total
 
 
@@ -134,12 +134,12 @@ class Line:
             for sign, limit in ((">=", self.low), ("<=", self.high))
             if limit is not None
         ]
-        return (
-            f"({found} if {' and '.join(tests)} else"
-            f" np.float32({'nan' if np.isnan(self.other) else 'inf'}))"
-            if tests
-            else found
-        )
+        if tests:
+            return (
+                f"({found} if {' and '.join(tests)} else"
+                f" np.float32({'nan' if np.isnan(self.other) else 'inf'}))"
+            )
+        return found
 
 
 def line(leaf: Leaf, values: NDArray[Any], *, exact: bool) -> Line | None:
@@ -152,20 +152,23 @@ def line(leaf: Leaf, values: NDArray[Any], *, exact: bool) -> Line | None:
     good = np.isfinite(values)
     if not good.any():
         return None
-    low, high = int(raw[good].min()), int(raw[good].max())
+    low = int(raw[good].min())
+    high = int(raw[good].max())
     others = values[~good]
     if ((raw[~good] >= low) & (raw[~good] <= high)).any() or high == low:
         return None
     if len(others) and not (np.isnan(others).all() or (others == np.inf).all()):
         return None
-    first, last = float(values[raw == low][0]), float(values[raw == high][0])
+    first = float(values[raw == low][0])
+    last = float(values[raw == high][0])
     slope = (last - first) / (high - low)
     start = first - slope * low
     slope, start = (
         float(f"{slope:.12g}"),
         0.0 if abs(start) < 1e-9 * abs(slope) else float(f"{start:.12g}"),
     )
-    wanted, some = values[good].astype(np.float32), raw[good]
+    wanted = values[good].astype(np.float32)
+    some = raw[good]
     limits = (low if (raw < low).any() else None, high if (raw > high).any() else None)
     other = float(others[0]) if len(others) else 0.0
     with np.errstate(all="ignore"):
@@ -218,7 +221,10 @@ class Writer:
         tables: dict[Any, NDArray[Any]],
         varying: Set[str],
     ) -> None:
-        self.layout, self.shape, self.width, self.varying = layout, shape, math.prod(shape), varying
+        self.layout = layout
+        self.shape = shape
+        self.width = math.prod(shape)
+        self.varying = varying
         self.inner = 1 + last_axis(shape)
         self.wanted = Wanted()
         self.lines: list[list[str]] = [[] for _ in range(self.inner + 1)]
@@ -338,10 +344,8 @@ class Writer:
         """What a function of `arithmetic` reads of the element of an array, or of the frame, from
         an offset on.
         """
-        shape, level = (
-            leaf.shape[: len(leaf.strides)],
-            1 + last_axis(leaf.shape[: len(leaf.strides)]),
-        )
+        shape = leaf.shape[: len(leaf.strides)]
+        level = 1 + last_axis(leaf.shape[: len(leaf.strides)])
         steps = self.once(
             ("element", shape, leaf.strides),
             lambda: self.let(level, f"base + {self.strided(shape, self._strides(leaf))}"),
@@ -409,9 +413,9 @@ class Writer:
         seen = window(leaf)
         assert seen is not None
         first = self.byte(leaf, seen.offset).text
-        return (
-            first if seen.size == 1 else f"({first} | {self.byte(leaf, seen.offset + 1).text} << 8)"
-        )
+        if seen.size == 1:
+            return first
+        return f"({first} | {self.byte(leaf, seen.offset + 1).text} << 8)"
 
     def beside(self, node: Node, leaf: Leaf) -> Value:
         """A cosine or sine from a table that has both side by side, so that they are fetched

@@ -38,7 +38,8 @@ class Blocks:
 
     def __init__(self, leaves: list[Leaf], size: int) -> None:
         first = leaves[0]
-        self.shape, strides = first.shape[: len(first.strides)], first.strides
+        self.shape = first.shape[: len(first.strides)]
+        strides = first.strides
         self.stride = strides[-1] if strides else size
         count = self.shape[-1] if self.shape else 1
         self.is_flat = self._regular(size, strides)
@@ -47,12 +48,12 @@ class Blocks:
         last = sum(
             (number - 1) * step for number, step in zip(self.shape, strides[:-1], strict=False)
         )  # from the first block on
-        self._base = (
-            0
-            if self.is_flat
-            else min(*(leaf.offset for leaf in leaves), size - last - self._length)
-        )
-        self._strides, self._size = strides[:-1], size
+        if self.is_flat:
+            self._base = 0
+        else:
+            self._base = min(*(leaf.offset for leaf in leaves), size - last - self._length)
+        self._strides = strides[:-1]
+        self._size = size
         self.room = 0 if self.is_flat or self.is_long else math.prod(self.shape[:-1]) * self._length
 
     def _regular(self, size: int, strides: tuple[int, ...]) -> bool:
@@ -105,13 +106,11 @@ class Loading:
         stride: int,
         arrays: tuple[tuple[int, ...], tuple[int, ...]] | None = None,
     ) -> None:
-        self._source, self._compact, self._base, self._size, self._stride = (
-            source,
-            compact,
-            base,
-            size,
-            stride,
-        )
+        self._source = source
+        self._compact = compact
+        self._base = base
+        self._size = size
+        self._stride = stride
         self._arrays = arrays
         self._start = -1
 

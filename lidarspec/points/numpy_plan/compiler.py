@@ -70,15 +70,15 @@ class Compiler:
     """
 
     def __init__(self, plan: Plan, tables: dict[Any, NDArray[Any]]) -> None:
-        self.program, self.low = Program(plan.width, plan.safe), list[Node]()
-        self._layout, self._shape, self._width, self._tables = (
-            plan.layout,
-            plan.shape,
-            plan.width,
-            tables,
-        )
+        self.program = Program(plan.width, plan.safe)
+        self.low = list[Node]()
+        self._layout = plan.layout
+        self._shape = plan.shape
+        self._width = plan.width
+        self._tables = tables
         self._known: dict[Any, Any] = {}
-        self._exact, self._shared = False, set[int]()
+        self._exact = False
+        self._shared = set[int]()
 
     def want(self, name: str, value: Any, kind: str, *, exact: bool = False) -> None:
         """Make a column of this name.
@@ -89,9 +89,10 @@ class Compiler:
                 float32, and sums in another order.
         """
         self._exact = exact
-        self.program.outputs[name] = (
-            self._single(value) if kind == "single" else self._double(value)
-        )
+        if kind == "single":
+            self.program.outputs[name] = self._single(value)
+        else:
+            self.program.outputs[name] = self._double(value)
 
     def want_sent(self, name: str, leaf: Leaf) -> None:
         """Make a column of whole numbers of a field, as they were sent."""
@@ -134,11 +135,10 @@ class Compiler:
         return self._once(("single", self._exact, value), lambda: self._full_single(value))
 
     def _full_single(self, node: Node) -> int:
-        register = (
-            self._gathered(node, "single")
-            if node.kind == "rows"
-            else self._of_field(node, "single")
-        )
+        if node.kind == "rows":
+            register = self._gathered(node, "single")
+        else:
+            register = self._of_field(node, "single")
         if register is None:
             register = self._marked(node, "single")
         if register is None and not self._exact:
@@ -171,11 +171,10 @@ class Compiler:
         again in float64.
         """
         beam = beam_of(node, self._layout.leaves)
-        parts = (
-            [self._gathered(rows, "single") for rows in (beam.direction, beam.start)]
-            if beam is not None
-            else [None]
-        )
+        if beam is not None:
+            parts = [self._gathered(rows, "single") for rows in (beam.direction, beam.start)]
+        else:
+            parts = [None]
         if beam is None or None in parts:
             return None
         distance, direction, start, step = beam
@@ -183,7 +182,8 @@ class Compiler:
             Read(self._single(distance)),
             *(Read(part) for part in parts if part is not None),
         )
-        inner, place = direction.args[1].shape[1], ("far", distance)
+        inner = direction.args[1].shape[1]
+        place = ("far", distance)
 
         def far(run: Run) -> tuple[int, NDArray[np.intp], NDArray[np.float64]]:
             """Where the chunk begins, which of its rows reach too far, and their distances as they
@@ -191,11 +191,10 @@ class Compiler:
             """
             if run.prepared.get(place, (-1,))[0] != run.start:
                 rows = measured(run).reshape(-1, inner)
-                which = (
-                    np.flatnonzero(np.fmax.reduce(rows, axis=1) > FINE)
-                    if np.fmax.reduce(rows, axis=None) > FINE
-                    else _NOWHERE
-                )
+                if np.fmax.reduce(rows, axis=None) > FINE:
+                    which = np.flatnonzero(np.fmax.reduce(rows, axis=1) > FINE)
+                else:
+                    which = _NOWHERE
                 distances = np.multiply(rows[which], 1 / step, dtype=np.float64)
                 np.multiply(np.rint(distances, out=distances), step, out=distances)
                 run.prepared[place] = run.start, which, distances
@@ -257,11 +256,9 @@ class Compiler:
             return None
         if value.function is returned_range and not is_full(condition, self._width):
             return self._returned(value.args[0], kind, condition)
-        mark, read, is_each = (
-            self._mark(condition, kind),
-            self._read(value, kind),
-            is_full(condition, self._width),
-        )
+        mark = self._mark(condition, kind)
+        read = self._read(value, kind)
+        is_each = is_full(condition, self._width)
 
         def run(execution: Run, out: NDArray[Any]) -> None:
             target = out.reshape(-1, *self._shape)
@@ -276,7 +273,8 @@ class Compiler:
 
     def _mark(self, condition: Node, kind: str) -> Callable[[Run], Any]:
         """1, or nan where a condition holds: for each point, or what packets and blocks have."""
-        depth, marks = len(self._shape), np.array([1, np.nan], TYPES[kind])
+        depth = len(self._shape)
+        marks = np.array([1, np.nan], TYPES[kind])
         if not is_full(condition, self._width):
             self.low.append(condition)
             return lambda run: marks[deep(run.part(run.values(condition)), depth).astype(np.intp)]
@@ -298,7 +296,9 @@ class Compiler:
         """Ranges, nan where nothing came back, or where packets or blocks are `lost`: what divided
         by itself is 1, or no number.
         """
-        read, shape, depth = self._read(value, kind), self._shape, len(self._shape)
+        read = self._read(value, kind)
+        shape = self._shape
+        depth = len(self._shape)
         self.low += [] if lost is None else [lost]
         leaf = self._layout.leaves.get(value.path)
         is_positive = (
@@ -327,11 +327,10 @@ class Compiler:
         None where it is neither.
         """
         source = only_field(node)
-        leaf = (
-            self._layout.leaves.get(source.path)
-            if source is not None and is_full(source, self._width)
-            else None
-        )
+        if source is not None and is_full(source, self._width):
+            leaf = self._layout.leaves.get(source.path)
+        else:
+            leaf = None
         seen = window(leaf) if leaf is not None else None
         if (
             leaf is not None
@@ -448,7 +447,9 @@ class Compiler:
 
     def _load(self, leaf: Leaf, seen: Window, dtype: np.dtype[Any], kind: str) -> int:
         """A window of every element as it stands, in its unit where that is float64."""
-        blocks, width, info = self._blocks(leaf, seen), self._width, leaf.info
+        blocks = self._blocks(leaf, seen)
+        width = self._width
+        info = leaf.info
         is_scaled = kind in ("single", "double") and info.scaled
 
         def run(execution: Run, out: NDArray[Any]) -> None:
@@ -475,7 +476,8 @@ class Compiler:
         """Some bits of a window of every element, in its unit; `dtype`: of the window's word, where
         that is not little-endian.
         """
-        words, dtype = f"u{seen.size}", dtype or seen.dtype
+        words = f"u{seen.size}"
+        dtype = dtype or seen.dtype
         word = Read(self._once((dtype, seen), lambda: self._load(leaf, seen, dtype, words)))
         is_whole = (
             kind in TYPES
@@ -530,7 +532,8 @@ class Compiler:
         depth = max(len(arg.shape) for arg in node.args if isinstance(arg, Node))
         reads = [self._argument(arg, depth) for arg in node.args]
         used = [Read(self._double(arg)) for arg in node.args if is_full(arg, self._width)]
-        function, shape = node.function, node.shape
+        function = node.function
+        shape = node.shape
 
         def run(execution: Run, out: NDArray[Any]) -> None:
             target = out.reshape(-1, *shape)
@@ -548,10 +551,8 @@ class Compiler:
         if not isinstance(value, Node):
             return _always(value)
         if is_full(value, self._width):
-            read, shape = (
-                Read(self._double(value)),
-                (*value.shape, *(1,) * (depth - len(value.shape))),
-            )
+            read = Read(self._double(value))
+            shape = (*value.shape, *(1,) * (depth - len(value.shape)))
             return lambda run: read(run).reshape(-1, *shape)
         self.low.append(value)
         return lambda run: deep(run.part(run.values(value)), depth)
@@ -577,7 +578,8 @@ class Compiler:
             return self.program.repeated(
                 "computed plainly before", kind, lambda run: run.values(value)
             )
-        shape, depth = self._shape, len(self._shape)
+        shape = self._shape
+        depth = len(self._shape)
 
         def run(execution: Run, out: NDArray[Any]) -> None:
             out.reshape(-1, *shape)[...] = deep(execution.part(execution.values(value)), depth)
@@ -600,14 +602,16 @@ class Compiler:
                 TYPES[kind]
             ),
         )
-        register, place = len(self.program.kinds), ("rows", index, number)
+        register = len(self.program.kinds)
+        place = ("rows", index, number)
 
         def run(execution: Run, out: NDArray[Any]) -> None:
             if place not in execution.prepared:
                 execution.prepared[place] = _numbers(execution, index, number)
             every, breaks = execution.prepared[place]
             each = _rows(execution, every[None])
-            numbers, first = every[each], int(every[each.start])
+            numbers = every[each]
+            first = int(every[each.start])
             last = first + len(numbers)
             if (
                 first < number and last < len(rows) and not breaks[each.start : each.stop - 1].any()
@@ -624,7 +628,8 @@ class Compiler:
         """A cosine or sine; where all points of a packet or block have the same or nearly so, it is
         computed once for them.
         """
-        value, function = node.args[0], node.function
+        value = node.args[0]
+        function = node.function
         angles = self._angles(value)
         if angles is not None and angles.all_alike:
             name = f"{function.__name__} of each block"
@@ -641,11 +646,9 @@ class Compiler:
 
     def _rotation(self, value: Node) -> products.Rotation | None:
         angles = self._angles(value)
-        return (
-            None
-            if angles is None
-            else self._once(("rotation", value), lambda: products.Rotation.of(angles))
-        )
+        if angles is None:
+            return None
+        return self._once(("rotation", value), lambda: products.Rotation.of(angles))
 
     def _wide(self, rotation: products.Rotation) -> int:
         """The angles of those packets or blocks whose points are too far apart for one rotation,
@@ -666,7 +669,8 @@ class Compiler:
         """Cosines or sines of angles that are turned a little from the one in their middle: a
         matrix product of series.
         """
-        read, which = Read(wide), 0 if function is np.cos else 1
+        read = Read(wide)
+        which = 0 if function is np.cos else 1
 
         def run(execution: Run, out: NDArray[Any]) -> None:
             turns: products.Turns = execution.prepared[rotation]
@@ -685,11 +689,13 @@ class Compiler:
         angles = self._angles(value)
         if angles is not None:
             return self._near(value, angles)
-        angle, turns = self._double(value), self.program.register("double")
+        angle = self._double(value)
+        turns = self.program.register("double")
         read = Read(angle)
 
         def run(execution: Run, out: NDArray[Any]) -> None:
-            radians, whole = read(execution), execution.views[turns]
+            radians = read(execution)
+            whole = execution.views[turns]
             np.multiply(radians, 1 / products.TURN, out=whole)
             np.rint(whole, out=whole)
             np.multiply(whole, products.TURN, out=whole)
@@ -772,7 +778,8 @@ class Compiler:
     def _plus(self, sum_: int, part: Term) -> int:
         """A sum and what is full."""
         assert part.full is not None
-        factor, options = float(part.row), chosen(part.full, self._width)
+        factor = float(part.row)
+        options = chosen(part.full, self._width)
         if options is None:
             return self.program.call(
                 "add", "double", np.add, Read(sum_), Read(self._scaled(part.full, factor))
@@ -787,7 +794,9 @@ class Compiler:
             for value in values
         )
         self.low.append(condition)
-        shape, depth, before = self._shape, len(self._shape), Read(sum_)
+        shape = self._shape
+        depth = len(self._shape)
+        before = Read(sum_)
 
         def run(execution: Run, out: NDArray[Any]) -> None:
             flags = execution.part(execution.values(condition)).astype(np.bool_)
@@ -821,7 +830,8 @@ class Compiler:
         )
 
 
-_NONE, _NOWHERE = np.zeros(0, np.bool_), np.zeros(0, np.intp)
+_NONE = np.zeros(0, np.bool_)
+_NOWHERE = np.zeros(0, np.intp)
 
 
 def _scale(out: NDArray[Any], info: FieldInfo) -> None:

@@ -67,11 +67,12 @@ class Product:
         level, crossing = split_level(parts, len(shape))
         if crossing and math.prod(shape[level:]) < WORTHWHILE:
             return None
-        whole, inner = (
-            (shape, math.prod(shape[level:]))
-            if crossing
-            else (shape[level:], math.prod(shape[level:]))
-        )
+        if crossing:
+            whole = shape
+            inner = math.prod(shape[level:])
+        else:
+            whole = shape[level:]
+            inner = math.prod(shape[level:])
         rows = np.stack([np.broadcast_to(part.row, whole).reshape(-1, inner) for part in parts])
         return cls([part.low for part in parts], rows if crossing else rows[:, 0], shape[:level])
 
@@ -155,7 +156,8 @@ class Angles:
         """The numbers, (k, rows), the first of each within half a turn; and where angles may be
         that have to be reduced all the same.
         """
-        found, rows = self.around.left(run), self.around.rows.reshape(len(self.around.rows), -1)
+        found = self.around.left(run)
+        rows = self.around.rows.reshape(len(self.around.rows), -1)
         start = found[0].reshape(len(run.rows), *self.around.outer)
         start[...] = 0
         for low, factor in self.start:
@@ -196,7 +198,8 @@ def multiplied(left: NDArray[Any], right: NDArray[Any], out: NDArray[Any]) -> No
         return
     step = max(_ALONE // right.size, 2)
     for start in range(0, len(left), step):
-        part, target = left[start : start + step], out[start : start + step]
+        part = left[start : start + step]
+        target = out[start : start + step]
         if len(part) > 1:
             np.matmul(part, right, out=target)
         else:
@@ -204,7 +207,8 @@ def multiplied(left: NDArray[Any], right: NDArray[Any], out: NDArray[Any]) -> No
 
 
 #: terms of the series, and radians from the middle up to which what follows them is below 1e-8.
-TERMS, NARROW = 5, 1 / 16
+TERMS = 5
+NARROW = 1 / 16
 #: of the derivatives of a cosine and of a sine, where cosine and sine take turns.
 _SIGNS = (1, -1, -1, 1, 1), (1, 1, -1, -1, 1)
 #: packets or blocks whose coefficients are made together.
@@ -230,9 +234,9 @@ class Rotation:
         numbers of packets or blocks.
         """
         numbered = [low for low in angles.around.lows if low is not None]
-        return (
-            None if len(numbered) > 1 or angles.more != (0.0, 0.0) else cls(angles, bool(numbered))
-        )
+        if len(numbered) > 1 or angles.more != (0.0, 0.0):
+            return None
+        return cls(angles, bool(numbered))
 
     @property
     def inner(self) -> int:
@@ -267,7 +271,8 @@ class Rotation:
     @cached_property
     def span(self) -> tuple[float, float]:
         """What is in the middle of the row, and half of its width."""
-        lowest, highest = float(self.row.min()), float(self.row.max())
+        lowest = float(self.row.min())
+        highest = float(self.row.max())
         return (highest + lowest) / 2, (highest - lowest) / 2
 
     @cached_property
@@ -283,7 +288,8 @@ class Rotation:
         )
         if not self.joint:
             return _single(cos), _single(sin)
-        across, along = np.sin(self.aside), np.cos(self.aside)
+        across = np.sin(self.aside)
+        along = np.cos(self.aside)
         pairs = list(zip(cos, sin, strict=True))
         return (
             _single([part for one, other in pairs for part in (one * along, -other * across)]),
@@ -294,11 +300,10 @@ class Rotation:
         """The left sides of the products, for a batch."""
         around, (middle, half) = self.angles.around, self.span
         numbered = [low for low in around.lows if low is not None]
-        terms = (
-            [*self.angles.start, *((low, middle) for low in numbered)]
-            if numbered
-            else [*self.angles.start, (None, middle)]
-        )
+        if numbered:
+            terms = [*self.angles.start, *((low, middle) for low in numbered)]
+        else:
+            terms = [*self.angles.start, (None, middle)]
         values = [
             (around.values(run, low), factor / TURN) for low, factor in terms if low is not None
         ]
@@ -336,17 +341,13 @@ class Turns:
         fixed: float,
         half: float,
     ) -> None:
-        self._rotation, self._number, self._terms, self._fixed, self._half = (
-            rotation,
-            number,
-            terms,
-            fixed,
-            half,
-        )
-        self._outer, self._groups = (
-            math.prod(rotation.angles.around.outer),
-            rotation.angles.around.groups,
-        )
+        self._rotation = rotation
+        self._number = number
+        self._terms = terms
+        self._fixed = fixed
+        self._half = half
+        self._outer = math.prod(rotation.angles.around.outer)
+        self._groups = rotation.angles.around.groups
         self._first = self._last = 0
 
     def move(self, start: int, stop: int) -> None:
@@ -369,7 +370,8 @@ class Turns:
                 self._of_chunk(array, start, stop).T.reshape(-1)
                 for array in (self._wide, self._middle, self._moved)
             )
-            self.some_wide, self.all_wide = bool(wide.any()), bool(wide.all())
+            self.some_wide = bool(wide.any())
+            self.all_wide = bool(wide.all())
             self.wide: slice | NDArray[np.intp] = (
                 slice(None) if self.all_wide else np.flatnonzero(wide)
             )
@@ -404,7 +406,8 @@ class Turns:
         middle *= TURN
         single = middle.astype(np.float32)
         rest = (middle - single).astype(np.float32)
-        cos, sin = np.cos(single), np.sin(single)
+        cos = np.cos(single)
+        sin = np.sin(single)
         series = self._series = np.empty(
             (TERMS if self._rotation.moving else 2, 2, len(middle)), np.float32
         )
@@ -412,7 +415,8 @@ class Turns:
         np.add(sin, rest * cos, out=series[0, 1])
         self._any_wide = False
         if self._rotation.moving:
-            self._moved, self._middle = chosen[-1], middle
+            self._moved = chosen[-1]
+            self._middle = middle
             aside = (chosen[-1] * self._half).astype(np.float32)
             self._wide = ~(np.abs(aside) <= NARROW)
             self._any_wide = bool(self._wide.any())

@@ -82,7 +82,8 @@ class Program(Maker):
     """
 
     def __init__(self, width: int, safe: Callable[[Values], bool]) -> None:
-        self.width, self._safe = width, safe
+        self.width = width
+        self._safe = safe
         self.chunk = max(CHUNK // max(width, 1), 1)
         self.most = self.chunk + self.chunk // 4
         self.steps: list[Step] = []
@@ -154,7 +155,8 @@ class Program(Maker):
             rows = np.ascontiguousarray(rows)
         step = -(-number // max(-(-number // self.most), 1))
         room = min(self.most, 1 << step.bit_length())  # the same for scans that are nearly as long
-        memory, execution = borrowed(), Run(rows, values)
+        memory = borrowed()
+        execution = Run(rows, values)
         made = memory.arrays(self._slots, room, self._wanted)
         execution.prepared = {
             blocks: blocks.loading(rows, space)
@@ -208,7 +210,8 @@ class Program(Maker):
         stop: int,
     ) -> None:
         count = (stop - start) * self.width
-        run.start, run.stop = start, stop
+        run.start = start
+        run.stop = stop
         run.views = [array[:count] for array in registers]
         for name, register in self.outputs.items():
             if register not in self._tiles:

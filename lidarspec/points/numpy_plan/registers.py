@@ -15,18 +15,21 @@ import numpy as np
 from numpy.typing import NDArray
 
 #: pieces of memory kept for use again, and bytes of each at most.
-MOST_KEPT, LARGEST = 2, 1 << 23
+MOST_KEPT = 2
+LARGEST = 1 << 23
 
 #: bytes; where arrays begin, and what is left between them, so that they do not all fall on the
 #: same places of a cache.
-ALIGNED, APART = 64, 320
+ALIGNED = 64
+APART = 320
 
 
 class Scratch:
     """A piece of memory from which arrays are taken one after another."""
 
     def __init__(self) -> None:
-        self._memory, self._wanted = _aligned(0), 0
+        self._memory = _aligned(0)
+        self._wanted = 0
         self._arranged: tuple[object, int, list[NDArray[Any]]] | None = None
 
     def arrays(
@@ -48,20 +51,21 @@ class Scratch:
         return self._arranged[2]
 
     def _taken(self, count: int, dtype: np.dtype[Any]) -> NDArray[Any]:
-        start, size = self._wanted, count * dtype.itemsize
+        start = self._wanted
+        size = count * dtype.itemsize
         self._wanted = start + size + -size % ALIGNED + APART
-        memory = (
-            self._memory[start : start + size]
-            if start + size <= len(self._memory)
-            else np.empty(size, np.uint8)
-        )
+        if start + size <= len(self._memory):
+            memory = self._memory[start : start + size]
+        else:
+            memory = np.empty(size, np.uint8)
         return memory.view(dtype)
 
     def grow(self) -> None:
         """See to it that the next arrays have room, if as much is wanted."""
         wanted = min(self._wanted, LARGEST)
         if wanted > len(self._memory):
-            self._memory, self._arranged = _aligned(wanted), None
+            self._memory = _aligned(wanted)
+            self._arranged = None
 
 
 _KEPT: list[Scratch] = []
@@ -114,7 +118,9 @@ def slots_of(
         used.
     """
     last = {register: place for place, used in enumerate(uses) for register in used}
-    slots, free, count = [-1] * len(kinds), dict[str, list[int]](), 0
+    slots = [-1] * len(kinds)
+    free = dict[str, list[int]]()
+    count = 0
     for place, used in enumerate(uses):
         shared = set(used) - set(own)
         for register in shared:

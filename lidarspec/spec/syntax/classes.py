@@ -55,7 +55,10 @@ class Mismatch(construct.ConstructError):  # type: ignore[misc]
 
     def __init__(self, path: str, offset: int, expected: object, got: object, reason: str) -> None:
         super().__init__(f"{reason}: expected {expected}, got {got}", path=path)
-        self.offset, self.expected, self.got, self.reason = offset, expected, got, reason
+        self.offset = offset
+        self.expected = expected
+        self.got = got
+        self.reason = reason
 
 
 class WireNaN(float):
@@ -129,7 +132,9 @@ class MarkedStruct(Struct):  # type: ignore[misc]
             _building=not is_parsing,
             _sizing=False,
         )
-        inner._subcons, inner._io, inner._index = self._subcons, stream, context.get("_index", None)
+        inner._subcons = self._subcons
+        inner._io = stream
+        inner._index = context.get("_index", None)
         inner._root = context.get("_root", None) or inner
         inner._marks = {}
         inner._sizings = []
@@ -189,7 +194,9 @@ class FullRange(construct.GreedyRange):  # type: ignore[misc]
         found = construct.ListContainer()
         while stream.read(1):
             stream.seek(-1, io.SEEK_CUR)
-            context._index, start, place = len(found), stream.tell(), f"{path}[{len(found)}]"
+            context._index = len(found)
+            start = stream.tell()
+            place = f"{path}[{len(found)}]"
             found.append(self.subcon._parsereport(stream, context, place))
             if stream.tell() == start:
                 raise construct.RangeError("an element without a byte never ends", path=place)
@@ -264,7 +271,8 @@ def _allowed(con: construct.Validator) -> tuple[int, ...] | None:
     """The raw values that a validator lets pass: those that it compares with, or of 16 bits all
     that pass; None where neither is known.
     """
-    field, subcon = unwrap(con), con.subcon
+    field = unwrap(con)
+    subcon = con.subcon
     while isinstance(subcon, Subconstruct) and not isinstance(subcon, construct.Enum):
         subcon = subcon.subcon
     if (
@@ -272,10 +280,8 @@ def _allowed(con: construct.Validator) -> tuple[int, ...] | None:
         or getattr(field, "fmtstr", "B")[-1] in "efd?"
     ):
         return None
-    width, signed = (
-        bit_width(field),
-        field.fmtstr[-1].islower() if isinstance(field, FormatField) else field.signed,
-    )
+    width = bit_width(field)
+    signed = field.fmtstr[-1].islower() if isinstance(field, FormatField) else field.signed
     low, high = (-(1 << (width - 1)), (1 << (width - 1)) - 1) if signed else (0, (1 << width) - 1)
     with contextlib.suppress(
         Exception
@@ -380,7 +386,10 @@ class Sizing(Subconstruct):  # type: ignore[misc]
         self, subcon: Construct, of: tuple[str, ...], plus: int = 0, since: str = ""
     ) -> None:
         super().__init__(subcon)
-        self.of, self.plus, self.since, self.flagbuildnone = of, plus, since, True
+        self.of = of
+        self.plus = plus
+        self.since = since
+        self.flagbuildnone = True
 
     @property
     def out(self) -> int:
@@ -392,11 +401,11 @@ class Sizing(Subconstruct):  # type: ignore[misc]
         *parents, name = self.of[self.out :] or ("",)
         try:
             marks = (member(obj, ".".join(parents)) if parents else obj)["_marks"]
-            start, end = (
-                marks[name]
-                if name
-                else (min(marks.values())[0], max(end for _, end in marks.values()))
-            )
+            if name:
+                start, end = marks[name]
+            else:
+                start = min(marks.values())[0]
+                end = max(end for _, end in marks.values())
             start = marks[self.since][0] if self.since else start
         except (KeyError, TypeError):
             raise SpecError(
@@ -427,7 +436,8 @@ class Counting(Subconstruct):  # type: ignore[misc]
 
     def __init__(self, subcon: Construct, of: str) -> None:
         super().__init__(subcon)
-        self.of, self.flagbuildnone = of, True
+        self.of = of
+        self.flagbuildnone = True
 
     def _build(self, obj: Any, stream: Any, context: Any, path: str) -> Any:
         array = context.get(self.of)
@@ -446,10 +456,8 @@ class Bounded(Subconstruct):  # type: ignore[misc]
         self.length = length
 
     def _parse(self, stream: Any, context: Any, path: str) -> Any:
-        start, length = (
-            stream.tell(),
-            bounded(construct.evaluate(self.length, context), sys.maxsize, "length", path),
-        )
+        start = stream.tell()
+        length = bounded(construct.evaluate(self.length, context), sys.maxsize, "length", path)
         stream.seek(0)
         within = io.BytesIO(construct.stream_read(stream, start + length, path))
         within.seek(start)
@@ -469,16 +477,15 @@ class Filler(CountedBytes):
         self, of: tuple[str, str], to: Any = None, modulus: Any = None, pattern: bytes = b"\0"
     ) -> None:
         super().__init__(self._missing)
-        self.of, self.to, self.modulus, self.pattern, self.flagbuildnone = (
-            of,
-            to,
-            modulus,
-            pattern,
-            True,
-        )
+        self.of = of
+        self.to = to
+        self.modulus = modulus
+        self.pattern = pattern
+        self.flagbuildnone = True
 
     def _missing(self, context: Any) -> int:
-        start, end = context._marks[self.of[0]][0], context._marks[self.of[1]][1]
+        start = context._marks[self.of[0]][0]
+        end = context._marks[self.of[1]][1]
         number = construct.evaluate(self.modulus if self.to is None else self.to, context)
         return int((start - end) % number if self.to is None else number - (end - start))
 
@@ -583,11 +590,10 @@ def prepare(con: Construct, limit: int = sys.maxsize, *, in_bits: bool = False) 
         counted.limit = limit
         return counted
     if isinstance(con, Struct):
-        members = (
-            con.subcons
-            if in_bits
-            else [member for child in con.subcons for member in _spelled_out(child)]
-        )
+        if in_bits:
+            members = con.subcons
+        else:
+            members = [member for child in con.subcons for member in _spelled_out(child)]
         return MarkedStruct(*(prepare(child, limit, in_bits=in_bits) for child in members))
     if isinstance(con, construct.Renamed):
         inner = con.subcon
@@ -614,7 +620,8 @@ def prepare(con: Construct, limit: int = sys.maxsize, *, in_bits: bool = False) 
     if isinstance(con, construct.Switch | Partition):
         same.cases = {key: prepare(case, limit, in_bits=in_bits) for key, case in con.cases.items()}
     if isinstance(same, IndexedArray):
-        same.limit, same.in_bits = limit, in_bits
+        same.limit = limit
+        same.in_bits = in_bits
     if isinstance(same, Partition):
         same.limit = limit
     return same
@@ -624,7 +631,9 @@ def _spelled_out(con: Construct) -> list[Construct]:
     """A member of a struct; of those that construct prefixes, pads or aligns, what it does not
     show: the length or count, the padding.
     """
-    name, inner, docs = con.name, con, con.docs
+    name = con.name
+    inner = con
+    docs = con.docs
     while isinstance(inner, construct.Renamed):
         inner = inner.subcon
 
@@ -641,15 +650,12 @@ def _spelled_out(con: Construct) -> list[Construct]:
         )
         return [con] if len(members) == 1 else list(optional)
     if name and isinstance(inner, construct.Prefixed):
-        plus, length = (
-            inner.lengthfield.sizeof() if inner.includelength else 0,
-            construct.this[f"{name}_size"],
-        )
-        content = (
-            Bounded(length - plus if plus else length, inner.subcon)
-            if is_greedy(inner.subcon)
-            else inner.subcon
-        )
+        plus = inner.lengthfield.sizeof() if inner.includelength else 0
+        length = construct.this[f"{name}_size"]
+        if is_greedy(inner.subcon):
+            content = Bounded(length - plus if plus else length, inner.subcon)
+        else:
+            content = inner.subcon
         members = _spelled_out(construct.Renamed(content, newname=name, newdocs=docs))
         return [
             named(
@@ -686,11 +692,9 @@ def _spelled_out(con: Construct) -> list[Construct]:
                 ),
             ]
         is_full = isinstance(inner.length, int) and inner.length == fixed_size(inner.subcon)
-        return (
-            members
-            if is_full
-            else [*members, named("_padding", Filler(span, to=inner.length), "padding of")]
-        )
+        if is_full:
+            return members
+        return [*members, named("_padding", Filler(span, to=inner.length), "padding of")]
     return [con]
 
 
@@ -791,13 +795,11 @@ def field_path(path: str | None) -> str:
 
 
 def _shown(value: object) -> str:
-    return (
-        value.hex(" ")
-        if isinstance(value, bytes)
-        else f"0x{value:x}"
-        if isinstance(value, int)
-        else repr(value)
-    )
+    if isinstance(value, bytes):
+        return value.hex(" ")
+    if isinstance(value, int):
+        return f"0x{value:x}"
+    return repr(value)
 
 
 def children(con: Construct) -> list[Construct]:
@@ -908,15 +910,14 @@ def random_value(
         )
     if isinstance(con, Limited):
         raw = source.choice(con.allowed)
-        return (
-            con.subcon._decode(raw, None, None) if isinstance(con.subcon, construct.Enum) else raw
-        )
+        if isinstance(con.subcon, construct.Enum):
+            return con.subcon._decode(raw, None, None)
+        return raw
     if isinstance(con, construct.Enum):
-        named = (
-            list(con.ksymapping)
-            if not isinstance(unwrap(con), Const) and source.random() < 0.5
-            else []
-        )
+        if not isinstance(unwrap(con), Const) and source.random() < 0.5:
+            named = list(con.ksymapping)
+        else:
+            named = []
         return con._decode(
             source.choice(named) if named else random_value(con.subcon, source, drawn, scope, path),
             None,
@@ -938,11 +939,9 @@ def _elements(con: Construct, scope: Any) -> int:
     with contextlib.suppress(
         Exception
     ):  # whatever an expression raises that asks for what is not there yet
-        return (
-            int(construct.evaluate(con.count, scope)) * _elements(con.subcon, scope)
-            if isinstance(con, Array)
-            else 1
-        )
+        if isinstance(con, Array):
+            return int(construct.evaluate(con.count, scope)) * _elements(con.subcon, scope)
+        return 1
     return 1
 
 
@@ -955,7 +954,8 @@ def _random_parts(
         {**scope, "_params": Container(), "_parsing": False, "_building": True, "_sizing": False}
     )
     for _ in range(source.randint(0, 4)):
-        name, stream = source.choice(list(con.cases)), io.BytesIO()
+        name = source.choice(list(con.cases))
+        stream = io.BytesIO()
         found.append(_random_part(con.cases[name], source, drawn, scope, path))
         con.cases[name]._build(found[-1], stream, around, path)
         found.spans.append((name, 0, stream.tell()))

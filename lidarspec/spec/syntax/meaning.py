@@ -111,7 +111,8 @@ class _Fields:
     """What an expression sees when it is evaluated: values by name, as construct shows them."""
 
     def __init__(self, read: tree.Read, paths: tuple[str, ...]) -> None:
-        self._read, self._paths = read, paths
+        self._read = read
+        self._paths = paths
 
     def __getitem__(self, name: str) -> Any:
         if name == "_":
@@ -184,7 +185,8 @@ class _Builder:
     def node(self, con: Construct, place: _Place) -> tree.Node:
         """The node of a construct, whatever it is."""
         inner, place = self._peeled(con, place)
-        name, info = place.name, place.info
+        name = place.name
+        info = place.info
         is_block = isinstance(inner, construct.Transformed | construct.Restreamed)
         if not place.in_bits and (is_block or (isinstance(inner, BytesInteger) and _is_odd(inner))):
             return self._block(inner, place)
@@ -291,7 +293,8 @@ class _Builder:
             else:
                 return value.formula
         except tree.Untraceable as untraceable:
-            reason, blind = str(untraceable), isinstance(untraceable, tree.Blind)
+            reason = str(untraceable)
+            blind = isinstance(untraceable, tree.Blind)
         except Exception as error:
             reason = f"a Python function of other fields ({type(error).__name__}: {error})"
         return self._code(expression, place, reason, tuple(scope.asked), blind=blind)
@@ -305,11 +308,13 @@ class _Builder:
         *,
         blind: bool = False,
     ) -> tree.Code:
-        paths, scope = list[str](), place.scope
+        paths = list[str]()
+        scope = place.scope
         while scope is not None:
             paths.append(scope.path)
             scope = scope.parent
-        ways, path = tuple(paths or [""]), place.info.path
+        ways = tuple(paths or [""])
+        path = place.info.path
 
         def function(read: tree.Read) -> Any:
             return expression(_Fields(read, ways)) if callable(expression) else expression
@@ -405,7 +410,8 @@ class _Builder:
 
     def _measuring(self, con: Sizing, place: _Place) -> tree.Formula | None:
         """What a part will add up to, once it is known."""
-        scope, self.rebuilding = place.scope, True
+        scope = place.scope
+        self.rebuilding = True
         for _ in range(con.out):
             scope = None if scope is None else scope.parent
         if scope not in self._measured:
@@ -418,9 +424,9 @@ class _Builder:
         self._measured[scope].append((index, con))
         self.sizes.append(None)
         size = self._sizes[index] if self._sizes else None
-        return (
-            None if isinstance(size, tree.Ref) and size.path == place.info.path else size
-        )  # what it says itself holds
+        if isinstance(size, tree.Ref) and size.path == place.info.path:
+            return None
+        return size  # what it says itself holds
 
     def _filling(self, con: construct.GreedyRange, place: _Place) -> tree.Node:
         """As many elements as fill a part, where all are of one size."""
@@ -438,12 +444,15 @@ class _Builder:
         return tree.Repeat(place.name, axis, tree.calculated("//", place.room, size), element)  # type: ignore[arg-type]
 
     def _parts(self, con: Partition, place: _Place) -> tree.Parts:
-        info, scope, axis = place.info, place.scope, axis_path(place.info)
+        info = place.info
+        scope = place.scope
+        axis = axis_path(place.info)
         assert scope is not None  # since parts are a member of a struct
         elements = [
             self.node(case, place.inside(axes=(*info.axes, axis))) for case in con.cases.values()
         ]
-        kinds, outer = list[tree.Kind](), dict[tree.Ref, None]()
+        kinds = list[tree.Kind]()
+        outer = dict[tree.Ref, None]()
         for (name, case), element in zip(con.cases.items(), elements, strict=True):
             root, following = self._alone(case, con.following, place)
             kinds.append(tree.Kind(name, element, root, following))
@@ -482,18 +491,18 @@ class _Builder:
             return _Place(tree.FieldInfo(""), tree.Outside(place.scope, builder._asked))  # type: ignore[arg-type]
 
         root, builder = _twice(lambda builder: builder.node(case, around(builder)))
-        rule = (
-            None
-            if following is None
-            else builder._formula(following, replace(around(builder), scope=builder.scopes[""]))
-        )
+        if following is None:
+            rule = None
+        else:
+            rule = builder._formula(following, replace(around(builder), scope=builder.scopes[""]))
         return root, rule
 
     def _check(self, con: construct.Check, place: _Place) -> tree.Node:
         """A condition on fields that stand side by side, as far as 64-bit integers hold what it
         comes to.
         """
-        condition, info = self._formula(con.func, place), place.info
+        condition = self._formula(con.func, place)
+        info = place.info
         if isinstance(condition, int):
             return tree.Empty(place.name) if condition else tree.Never(place.name)
         try:
@@ -508,11 +517,10 @@ class _Builder:
                 and all(map(_is_whole, tree.parts(condition)))
             ):
                 return tree.Check(place.name, info.path, info.axes, condition)
-            reason = (
-                f"{info.path}: it asks for {asked[0].path}, another array or frame"
-                if asked
-                else f"{info.path}: it may exceed 64 bits"
-            )
+            if asked:
+                reason = f"{info.path}: it asks for {asked[0].path}, another array or frame"
+            else:
+                reason = f"{info.path}: it may exceed 64 bits"
         except ValueError as code:
             reason = str(code)
         return tree.Opaque(
@@ -543,7 +551,8 @@ class _Builder:
         )
 
     def _leaf(self, con: Construct, place: _Place) -> tree.Node:
-        name, info = place.name, _typed(con, place.info)
+        name = place.name
+        info = _typed(con, place.info)
         if name and place.scope is not None:
             place.scope.add(name, tree.Ref(info.path, info))
         if isinstance(con, FormatField) and con.fmtstr[-1] != "?":
@@ -559,9 +568,10 @@ class _Builder:
             node = tree.Blob(name, info, self._formula(con.length, place), info.const)
         else:
             kind = type(con).__name__
-            size = (
-                self._formula(con.length, place) if isinstance(con, construct.FixedSized) else None
-            )
+            if isinstance(con, construct.FixedSized):
+                size = self._formula(con.length, place)
+            else:
+                size = None
             node = tree.Opaque(
                 name,
                 info,
@@ -632,11 +642,10 @@ def _below(node: tree.Node, names: Iterable[str]) -> tree.Node:
     """
     for name in names:
         body = node.struct if isinstance(node, tree.Sealed) else node
-        found = (
-            [member for member in body.members if member.name == name]
-            if isinstance(body, tree.Struct)
-            else []
-        )
+        if isinstance(body, tree.Struct):
+            found = [member for member in body.members if member.name == name]
+        else:
+            found = []
         if not found:
             raise SpecError(
                 f"SizeOf measures {'.'.join(names)!r}, and there is no part {name!r}",
@@ -729,11 +738,12 @@ def _typed(con: Construct, info: tree.FieldInfo) -> tree.FieldInfo:
     """What is known of a field, with the type of its values."""
     if isinstance(con, FormatField):
         code = con.fmtstr[-1]
-        kind, letter = (
-            ("float", "f")
-            if code in "efd"
-            else ("int", "u" if code.isupper() or code == "?" else "i")
-        )
+        if code in "efd":
+            kind = "float"
+            letter = "f"
+        else:
+            kind = "int"
+            letter = "u" if code.isupper() or code == "?" else "i"
         return replace(
             info, dtype=np.dtype(f"{letter}{con.length}"), kind=kind, bits=8 * con.length
         )
@@ -803,11 +813,9 @@ def _probed(con: Construct, size: int) -> list[BitField] | None:
     """The bit fields of a block; None where construct decides on its bits, or values are no plain
     integers.
     """
-    return (
-        probe(lambda block: dict(leaves(con.parse(block, _verify=False))), size)
-        if _is_even(con)
-        else None
-    )  # every pattern is tried
+    if _is_even(con):
+        return probe(lambda block: dict(leaves(con.parse(block, _verify=False))), size)
+    return None  # every pattern is tried
 
 
 def _is_even(con: Construct) -> bool:

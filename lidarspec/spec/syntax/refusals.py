@@ -126,13 +126,14 @@ def _check_ends(con: Construct, path: str, *, bounded: bool) -> None:
     """
     path = f"{path}.{con.name}".strip(".") if isinstance(con, construct.Renamed) else path
     if isinstance(con, GREEDY) and not bounded:
-        name, what = (
-            (type(con), "length")
-            if con is construct.GreedyBytes
-            else (construct.GreedyRange, "count")
-        )
+        if con is construct.GreedyBytes:
+            kind = type(con)
+            what = "length"
+        else:
+            kind = construct.GreedyRange
+            what = "count"
         reason = (
-            f"{name.__name__} has no end of its own on a stream: give a {what}, or a terminator, or"
+            f"{kind.__name__} has no end of its own on a stream: give a {what}, or a terminator, or"
             " bound it by Prefixed or FixedSized"
         )
         raise SpecError(reason, path=path, rule="LS111")
@@ -149,11 +150,10 @@ def _check_ends(con: Construct, path: str, *, bounded: bool) -> None:
     fits = is_sized and isinstance(con.length, int) and fixed_size(con.subcon) == con.length
     if isinstance(con, _BOUNDED) and not fits and not _fills(con.subcon, padded=is_sized):
         name = "Prefixed" if isinstance(con, Bounded) else type(con).__name__
-        named = (
-            ""
-            if isinstance(con, Bounded | construct.NullTerminated)
-            else ", unless it is a named member of a Struct"
-        )
+        if isinstance(con, Bounded | construct.NullTerminated):
+            named = ""
+        else:
+            named = ", unless it is a named member of a Struct"
         reason = (
             f"{name} loses what its content leaves of it{named}: let the content end with a field"
             " for it, 'rest' / GreedyBytes"

@@ -88,7 +88,8 @@ def plausible(f: Fields) -> Any:
 
 def points(f: Fields, packets: int) -> Polar:
     """Even steps, clockwise, through the span of one of so many packets a turn."""
-    count, span = (f.size - 5) / 3, 360 / packets
+    count = (f.size - 5) / 3
+    span = 360 / packets
     angles = spread(f.start_angle, f.start_angle + span - span / count, count, full=360.0)
     return Polar(
         range=f.samples.distance,

@@ -36,12 +36,18 @@ from lidarspec.spec import (
     hookimpl,
 )
 
-WEAK, BLINDED = (
-    100,
-    0xFFFF,
-)  # signals below and at which the distance is not to be relied on (TFmini-S 5.3, TF-Luna 5.4)
+WEAK = 100
+BLINDED = 0xFFFF  # signals below and at which the distance is not to be relied on (TFmini-S 5.3, TF-Luna 5.4)
 UNITS = {"cm": 0.01, "mm": 0.001}
-VERSION, RESET, RATE, TRIGGER, FORMAT, BAUD, OUTPUT, FACTORY, SAVE = 1, 2, 3, 4, 5, 6, 7, 0x10, 0x11
+VERSION = 1
+RESET = 2
+RATE = 3
+TRIGGER = 4
+FORMAT = 5
+BAUD = 6
+OUTPUT = 7
+FACTORY = 0x10
+SAVE = 0x11
 HEAD = "header" / Const(b"\x5a") * "then the length of the frame"
 
 

@@ -72,11 +72,10 @@ def data(form: int, count: int, *rest: Construct) -> Frame:
         "checksum" / Int16ul,
     )
     sealed = Checksummed(struct, field="checksum", algorithm=Fold15())
-    weak = (
-        {"LS310": "the sum loses the highest bits of the first words of a long packet"}
-        if count > 8
-        else {}
-    )
+    if count > 8:
+        weak = {"LS310": "the sum loses the highest bits of the first words of a long packet"}
+    else:
+        weak = {}
     return Frame(sealed, data=True, plausible=plausible, acknowledged=weak)
 
 

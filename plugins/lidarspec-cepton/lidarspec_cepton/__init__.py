@@ -44,7 +44,8 @@ from lidarspec.spec import (
 )
 
 MOST = 144  # points of a packet
-HEADER, POINT = 24, 10  # bytes
+HEADER = 24
+POINT = 10  # bytes
 STEP = 2e-6  # seconds from point to point of a simulated one
 PACKETS = 64  # of a simulated picture
 SIGNATURES = (0x56445453, 0x53544456)  # STDV in the order of the bytes, and as a number

@@ -65,10 +65,8 @@ from lidarspec.spec import (
 STEPS = 380  # points a turn: 360 degrees by the step of the manual's angle example, 0.9473 degrees
 SAMPLES = 25  # samples of a full packet (the manual's angle example)
 SETTLING = 1.0  # seconds; the manual has "less than 3" (1b)
-LOW_EXPOSURE, LOW_SPEED = (
-    2,
-    5.5,
-)  # Exp_M and Hz of the slower of the two speeds (manual 1c and 2.2.3, Exp_M)
+LOW_EXPOSURE = 2
+LOW_SPEED = 5.5  # Exp_M and Hz of the slower of the two speeds (manual 1c and 2.2.3, Exp_M)
 
 COMMAND = Checksummed(
     Struct(

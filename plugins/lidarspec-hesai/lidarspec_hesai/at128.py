@@ -56,10 +56,10 @@ from lidarspec_hesai.sealed import (
 
 STEPS = 256 * 100  # of the finer azimuth in a degree
 EVERY = 2  # degrees of the mirror between corrections
-LAST, SHOT = (
-    -9.249e-6,
-    41.666e-6,
-)  # seconds from the packet's time to the end of the last shot, and from shot to shot
+LAST = -9.249e-6
+SHOT = (
+    41.666e-6  # seconds from the packet's time to the end of the last shot, and from shot to shot
+)
 JUMP = 10.0  # degrees of the mirror
 SHOTS, AHEAD = (
     1200,
@@ -142,7 +142,8 @@ class Mirror(Calibration):
 
     def told(self) -> bytes:
         """The angles as a unit says them: its file."""
-        start, none = np.rint(self.faces * STEPS).astype(int).tolist(), bytes(LASERS * 180)
+        start = np.rint(self.faces * STEPS).astype(int).tolist()
+        none = bytes(LASERS * 180)
         values = {
             "faces": len(start),
             "fields": len(start),
@@ -197,7 +198,9 @@ def points(f: Fields, channels: Mirror) -> Polar:
     """Shots up to the packet's time (tier4/nebula); azimuths from the face behind, clockwise from
     the left.
     """
-    blocks, block, returns = f.body.blocks, np.arange(BLOCKS)[:, None], returns_of(f.return_mode)
+    blocks = f.body.blocks
+    block = np.arange(BLOCKS)[:, None]
+    returns = returns_of(f.return_mode)
     mirror = blocks.azimuth + blocks.fine_azimuth / STEPS
     turned = np.mod(mirror - channels.faces[0], 360)
     for face in channels.faces[1:]:

@@ -23,9 +23,11 @@ from lidarspec.spec import Learned, Points, Sensor
 Table = NDArray[np.float64]
 
 #: bytes of a correction file at most; characters of it that a message repeats.
-LARGEST, QUOTED = 1_000_000, 60
+LARGEST = 1_000_000
+QUOTED = 60
 #: what stands above the headings of some files, and below the table.
-MARK, HASH = "EEFF", re.compile(r"[0-9a-fA-F]{8,}")
+MARK = "EEFF"
+HASH = re.compile(r"[0-9a-fA-F]{8,}")
 #: how many times as far as the model's own values those of a unit may spread, or how little:
 #: radians do 57 times less than degrees.
 UNLIKE = 10
@@ -128,10 +130,8 @@ def configure(
     Raises:
         UsageError: for a file that cannot be read, or is none of this model; with line and column.
     """
-    angles, times = (
-        calibration or sensor.options.get("calibration"),
-        firing_times or sensor.options.get("firing_times"),
-    )
+    angles = calibration or sensor.options.get("calibration")
+    times = firing_times or sensor.options.get("firing_times")
     if angles:
         table = table.measured(angles)
     if times:
@@ -267,7 +267,8 @@ def _compare(
     """Nothing, where the values spread like the model's own, to a factor of ten, or those spread
     too little to tell by.
     """
-    spread, usual = float(np.ptp(table)), float(np.ptp(own))
+    spread = float(np.ptp(table))
+    usual = float(np.ptp(own))
     if usual > 1 and not usual / UNLIKE < spread < usual * UNLIKE:
         told = f"spread over {spread:g}" if spread else f"are all {table[0]:g}"
         raise _fault(

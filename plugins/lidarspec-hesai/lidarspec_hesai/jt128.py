@@ -34,10 +34,8 @@ from lidarspec_hesai.sealed import (
 
 MOST = 8  # blocks of the longest packet that would go into one datagram
 PER_TURN = 900  # blocks in a turn at 10 Hz: 0.4 degrees, by the time of a block
-LAST_SHOT, SHOT = (
-    -1.888e-3,
-    111e-6,
-)  # seconds from the packet's time to the last shot, and from shot to shot
+LAST_SHOT = -1.888e-3
+SHOT = 111e-6  # seconds from the packet's time to the last shot, and from shot to shot
 
 # fmt: off
 ELEVATION = (
@@ -75,7 +73,8 @@ FIRING_US = (
 
 def points(f: Fields, channels: Calibration) -> Polar:
     """Shots up to 1.888 ms before the packet's time (HesaiLidar_SDK_2.0)."""
-    block, returns = block_numbers(f), returns_of(f.return_mode)
+    block = block_numbers(f)
+    returns = returns_of(f.return_mode)
     fired = LAST_SHOT - SHOT * ((f.block_count - 1 - block) // returns)
     return beams(
         f.body.blocks, channels, distance=distance(f), block=block, returns=returns, fired=fired

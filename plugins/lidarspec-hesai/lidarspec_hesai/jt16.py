@@ -43,7 +43,9 @@ from lidarspec_hesai.calibration import Calibration, configure, nominal
 from lidarspec_hesai.parts import UTC, clock, turning
 from lidarspec_hesai.sealed import CRC
 
-CHANNELS, PER_TURN, RATE_HZ = 16, 600, 5.0
+CHANNELS = 16
+PER_TURN = 600
+RATE_HZ = 5.0
 
 ELEVATION = (
     0.60366, 3.32389, 6.01037, 8.64237, 11.27961, 13.92824, 16.57279, 19.21504,

@@ -179,11 +179,9 @@ def points(f: Fields, channels: Calibration, last: float, times: Any) -> Polar:
         last: seconds from the packet's time to the last shot.
         times: seconds of each channel, a row for each state.
     """
-    block, returns, slow = (
-        np.arange(BLOCKS)[:, None],
-        returns_of(f.return_mode),
-        np.where(f.operational_state == 0, 1, 2),
-    )
+    block = np.arange(BLOCKS)[:, None]
+    returns = returns_of(f.return_mode)
+    slow = np.where(f.operational_state == 0, 1, 2)
     state = np.mod(np.floor(f.azimuth_state / 4.0 ** (7 - block)), 4)
     within = take(times, np.where(f.operational_state == 0, state, 4 + np.mod(state, 2)))
     fired = last - SHOT * slow * ((BLOCKS - 1 - block) // returns) + within

@@ -23,12 +23,11 @@ from lidarspec_hesai.calibration import Calibration, nominal
 from lidarspec_hesai.family import spinning
 from lidarspec_hesai.parts import TAIL_40P, beams, clock, returns_of, turning
 
-BLOCKS, CHANNELS = 10, 40
+BLOCKS = 10
+CHANNELS = 40
 PER_TURN = 1800  # blocks in a turn at 10 Hz and single return: 0.2 degrees
-LAST_SHOT, SHOT = (
-    -28.58e-6,
-    55.56e-6,
-)  # seconds from the packet's time to the last shot, and from shot to shot
+LAST_SHOT = -28.58e-6
+SHOT = 55.56e-6  # seconds from the packet's time to the last shot, and from shot to shot
 
 # fmt: off
 ELEVATION = (
@@ -79,7 +78,8 @@ def points(f: Fields, channels: Calibration) -> Polar:
     """Shots before the packet's time (HesaiLidar_SDK_2.0); with dual return, pairs of blocks are
     one shot.
     """
-    block, returns = np.arange(BLOCKS)[:, None], returns_of(f.return_mode)
+    block = np.arange(BLOCKS)[:, None]
+    returns = returns_of(f.return_mode)
     fired = LAST_SHOT - SHOT * ((BLOCKS - 1 - block) // returns)
     return beams(
         f.blocks,

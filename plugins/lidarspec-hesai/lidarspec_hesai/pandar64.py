@@ -23,7 +23,8 @@ from lidarspec_hesai.headed import USUAL_UNIT, distance
 from lidarspec_hesai.pandar40p import SHOT, paced_clock
 from lidarspec_hesai.parts import TAIL_40P, beams, returns_of, turning
 
-BLOCKS, CHANNELS = 6, 64
+BLOCKS = 6
+CHANNELS = 64
 PER_TURN = 1800  # blocks in a turn at 10 Hz and single return: 0.2 degrees
 LAST_SHOT = -42.58e-6  # seconds from the packet's time to the last shot
 
@@ -81,7 +82,8 @@ def points(f: Fields, channels: Calibration) -> Polar:
     """Shots before the packet's time (HesaiLidar_SDK_2.0); with dual return, pairs of blocks are
     one shot.
     """
-    block, returns = np.arange(BLOCKS)[:, None], returns_of(f.return_mode)
+    block = np.arange(BLOCKS)[:, None]
+    returns = returns_of(f.return_mode)
     fired = LAST_SHOT - SHOT * ((BLOCKS - 1 - block) // returns)
     return beams(
         f.blocks, channels, distance=distance(f), block=block, returns=returns, fired=fired

@@ -29,10 +29,8 @@ from lidarspec_hesai.sealed import (
 )
 
 PER_TURN = 900  # blocks in a turn at 10 Hz and single return: 0.4 degrees
-FIRST_SHOT, SHOT = (
-    9e-6,
-    111.11e-6,
-)  # seconds from the packet's time to the first shot, and from shot to shot
+FIRST_SHOT = 9e-6
+SHOT = 111.11e-6  # seconds from the packet's time to the first shot, and from shot to shot
 
 # fmt: off
 ELEVATION = (
@@ -108,7 +106,8 @@ def points(f: Fields, channels: Calibration) -> Polar:
     """Shots after the packet's time (HesaiLidar_SDK_2.0); channels by the loop, which changes with
     each shot.
     """
-    block, returns = np.arange(BLOCKS)[:, None], returns_of(f.return_mode)
+    block = np.arange(BLOCKS)[:, None]
+    returns = returns_of(f.return_mode)
     loop = np.where(returns > 1, np.mod(f.mode_flag, 2), block % 2)
     fired = FIRST_SHOT + SHOT * (block // returns) + np.where(loop == 0, 0, 1) * LATER
     return beams(

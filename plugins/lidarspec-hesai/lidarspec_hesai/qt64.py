@@ -16,12 +16,11 @@ from lidarspec_hesai.family import spinning
 from lidarspec_hesai.headed import block_numbers, distance, header, longest, packet, plausible
 from lidarspec_hesai.parts import FACTORY, RETURN_MODES, UTC, beams, returns_of, turning
 
-BLOCKS, CHANNELS = 4, 64
+BLOCKS = 4
+CHANNELS = 64
 PER_TURN = 600  # blocks in a turn at 10 Hz and single return: 0.6 degrees
-FIRST_SHOT, SHOTS = (
-    25.71e-6,
-    (0.0, 166.67e-6, 333.33e-6, 500.0e-6),
-)  # seconds from the packet's time
+FIRST_SHOT = 25.71e-6
+SHOTS = (0.0, 166.67e-6, 333.33e-6, 500.0e-6)  # seconds from the packet's time
 
 # fmt: off
 ELEVATION = (
@@ -57,7 +56,8 @@ TAIL = (
 
 def points(f: Fields, channels: Calibration) -> Polar:
     """Four shots, or two with dual return, after the packet's time (HesaiLidar_SDK_2.0)."""
-    block, returns = block_numbers(f), returns_of(f.return_mode)
+    block = block_numbers(f)
+    returns = returns_of(f.return_mode)
     fired = FIRST_SHOT + take(SHOTS, block // returns)
     return beams(
         f.blocks, channels, distance=distance(f), block=block, returns=returns, fired=fired

@@ -33,7 +33,8 @@ from construct import (
 from lidarspec.spec import Checksummed, Crc, Fields, Scaled
 from lidarspec_hesai.headed import USUAL_UNIT
 
-LASERS, BLOCKS = 128, 2
+LASERS = 128
+BLOCKS = 2
 TWO = Const(BLOCKS, Int8ul)
 CRC = Crc(32, poly=0x04C11DB7, init=0xFFFFFFFF)  # CRC-32/MPEG-2
 

@@ -37,7 +37,8 @@ def points(f: Fields, channels: Calibration) -> Polar:
     """Shots up to the packet's time (HesaiLidar_SDK_2.0); the header says how many returns there
     can be, not how many there are.
     """
-    block, returns = block_numbers(f), returns_of(f.return_mode)
+    block = block_numbers(f)
+    returns = returns_of(f.return_mode)
     fired = -SHOT * ((f.block_count - 1 - block) // returns)
     return beams(
         f.blocks, channels, distance=distance(f), block=block, returns=returns, fired=fired

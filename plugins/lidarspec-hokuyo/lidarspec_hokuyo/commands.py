@@ -156,13 +156,15 @@ def orders(kind: str, *, is_urg: bool) -> dict[str, tuple[bytes, int, dict[str, 
 @cache
 def messages(kind: str, *, is_urg: bool) -> dict[str, Frame]:
     """All commands and answers, but for scans."""
-    rows, found = orders(kind, is_urg=is_urg), dict[str, Frame]()
+    rows = orders(kind, is_urg=is_urg)
+    found = dict[str, Frame]()
     for name, (command, size, _) in rows.items():
         found[f"{name}_order"] = order(command, size)
         if name not in TOLD_BY:
-            clock = (
-                ("time" / Scaled(Int32ub, 0.001, "s") * "24 bits",) if name == "get_time" else ()
-            )
+            if name == "get_time":
+                clock = ("time" / Scaled(Int32ub, 0.001, "s") * "24 bits",)
+            else:
+                clock = ()
             found[f"{name}_answer"] = answer(command, *clock, size=size, told=(4,) if clock else ())
     return found | {name: told(*row) for name, row in TOLD.items()}
 

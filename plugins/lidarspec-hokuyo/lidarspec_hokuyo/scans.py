@@ -129,10 +129,8 @@ def points(f: Fields, geometry: Geometry, echoes: int) -> Polar:
     """Points from the first step on, counter-clockwise; a distance below the shortest is the number
     of an error, or no echo.
     """
-    step, seen = (
-        number(f.first) + f.points.index * width(f) + (width(f) - 1) / 2,
-        f.points if echoes == 1 else f.points.echoes,
-    )
+    step = number(f.first) + f.points.index * width(f) + (width(f) - 1) / 2
+    seen = f.points if echoes == 1 else f.points.echoes
     return Polar(
         range=seen.distance,
         azimuth=(step - geometry.ahead) * (2 * np.pi / geometry.division),
@@ -146,16 +144,16 @@ def points(f: Fields, geometry: Geometry, echoes: int) -> Polar:
 @cache
 def scan(command: str, geometry: Geometry) -> Frame:
     """The answer to a command for scans."""
-    goes_on, echoes = command[0] in "MN", ECHOES if command[0] in "NH" else 1
+    goes_on = command[0] in "MN"
+    echoes = ECHOES if command[0] in "NH" else 1
     fields = FIELDS[command[1]]
-    rest = (
-        (
+    if goes_on:
+        rest = (
             "skip" / Int8ub * "turns left out between scans",
             decimal("left", 2) * "scans to come; 0: on and on",
         )
-        if goes_on
-        else ()
-    )
+    else:
+        rest = ()
     struct = Struct(
         "command" / Const(command.encode()),
         decimal("first", 4, geometry.end) * "step",

@@ -51,7 +51,8 @@ def cartesian(f: Fields, time: Any, *, returns: int = 1, tagged: bool = True) ->
 def spherical(f: Fields, time: Any, *, returns: int = 1, tagged: bool = True) -> Polar:
     """Points by depth and direction, whose zenith angle is counted from the z axis."""
     place = f.points if returns == 1 else f.points.returns
-    azimuth, elevation = np.deg2rad(f.points.azimuth), np.deg2rad(90 - f.points.zenith)
+    azimuth = np.deg2rad(f.points.azimuth)
+    elevation = np.deg2rad(90 - f.points.zenith)
     return Polar(place.depth, azimuth, elevation, **_common(place, time, returns, tagged))
 
 
@@ -76,5 +77,6 @@ def looking(shots: Any, rate: float, view: View) -> tuple[Any, Any]:
     second, and across 7.3 times.
     """
     right, left, low, high = view
-    across, up = np.sin(2 * np.pi * 7.3 * shots / rate), np.sin(2 * np.pi * 610 * shots / rate)
+    across = np.sin(2 * np.pi * 7.3 * shots / rate)
+    up = np.sin(2 * np.pi * 610 * shots / rate)
     return (right + left + (left - right) * across) / 2, (low + high + (high - low) * up) / 2

@@ -64,7 +64,9 @@ GPS = 3  # the type of timestamps that are a date
 IMU_RATE = 200  # samples a second
 MODEL_TYPES = "1 Mid-40, 2 Tele-15, 3 Horizon LiDAR, 6 Mid-70, 7 Avia"
 STATES = "0 starts, 1 normal, 2 saves power, 3 stands by, 4 error"
-COMMAND_PORT, DATA_PORT, IMU_PORT = 55_501, 56_001, 56_002  # of this computer
+COMMAND_PORT = 55_501
+DATA_PORT = 56_001
+IMU_PORT = 56_002  # of this computer
 
 #: in pieces that keep 64 bits of nanoseconds exact, and hold a date as well.
 TIMESTAMP = Struct(
@@ -96,13 +98,13 @@ def packet(kind: int, *members: Any) -> Struct:
 
 def clock(f: Fields) -> tuple[Any, ...]:
     """Seconds of a date, or the pieces of a number of nanoseconds: each term is exact."""
-    low, middle, high = f.timestamp.low, f.timestamp.middle, f.timestamp.high
+    low = f.timestamp.low
+    middle = f.timestamp.middle
+    high = f.timestamp.high
     dated = f.timestamp_type == GPS
     year, month, day, hour = (np.mod(np.floor(low / 256**place), 256) for place in range(4))
-    years, months = (
-        np.where(month <= 2, year - 1, year),
-        np.mod(month + 9, 12),
-    )  # from March on, so that the leap day is the last
+    years = np.where(month <= 2, year - 1, year)
+    months = np.mod(month + 9, 12)  # from March on, so that the leap day is the last
     days = (
         11_016 + day + 365 * years + np.floor(years / 4) + np.floor((153 * months + 2) / 5)
     )  # 2000-03-01 is day 11 017 of 1970
@@ -145,18 +147,17 @@ def pace(f: Fields, rate: float) -> Any:
 def data_frame(name: str, rate: float, **more: Any) -> Frame:
     """Points of one type, so many shots a second."""
     kind, shots, returns, members = TYPES[name]
-    by_angles, tagged = name.endswith("spherical"), kind > 1
+    by_angles = name.endswith("spherical")
+    tagged = kind > 1
 
     def points(f: Fields) -> Any:
         made = spherical if by_angles else cartesian
         return made(f, along("points", np.arange(shots) / rate), returns=returns, tagged=tagged)
 
     def plausible(f: Fields) -> Any:
-        return (
-            known(f) & (f.points[0].zenith <= 180) & (f.points[0].azimuth <= 360)
-            if by_angles
-            else known(f)
-        )
+        if by_angles:
+            return known(f) & (f.points[0].zenith <= 180) & (f.points[0].azimuth <= 360)
+        return known(f)
 
     shot = Struct(*members)
     return Frame(
@@ -227,20 +228,25 @@ POSE = (
     *(axis / Scaled(Int32sl, 0.001, "m") for axis in "xyz"),
 )
 STATUS = "status_code" / Int32ul * "as in packets of points; while it starts, per cent"
-ASK, ANSWER, TELL = 0, 1, 2
+ASK = 0
+ANSWER = 1
+TELL = 2
 #: (set, number) of what is asked without more, of what is set to a number, and of what is answered
 #: with one.
-INFORMATION, DISCONNECT, ADDRESS, EXTRINSICS = (0, 2), (0, 6), (0, 9), (1, 2)
-SAMPLING, COORDINATES, MODE, RAIN, FAN, RETURNS, IMU = (
-    (0, 4),
-    (0, 5),
-    (1, 0),
-    (1, 3),
-    (1, 4),
-    (1, 6),
-    (1, 8),
-)
-GET_FAN, GET_RETURNS, GET_IMU = (1, 5), (1, 7), (1, 9)
+INFORMATION = (0, 2)
+DISCONNECT = (0, 6)
+ADDRESS = (0, 9)
+EXTRINSICS = (1, 2)
+SAMPLING = (0, 4)
+COORDINATES = (0, 5)
+MODE = (1, 0)
+RAIN = (1, 3)
+FAN = (1, 4)
+RETURNS = (1, 6)
+IMU = (1, 8)
+GET_FAN = (1, 5)
+GET_RETURNS = (1, 7)
+GET_IMU = (1, 9)
 
 
 DATE = (

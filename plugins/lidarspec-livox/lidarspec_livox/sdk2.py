@@ -74,12 +74,15 @@ from lidarspec_livox.points import (
 )
 
 DISCOVERY = 56_000  # the port that is asked by a broadcast
-REBOOT, FACTORY_SETTINGS, SET_GPS_TIME = 0x0200, 0x0201, 0x0202
+REBOOT = 0x0200
+FACTORY_SETTINGS = 0x0201
+SET_GPS_TIME = 0x0202
 CRC32 = Crc(32, 0x04C11DB7, init=0xFFFFFFFF, refin=True, refout=True, xorout=0xFFFFFFFF)
 CRC16 = Crc(16, 0x1021, init=0xFFFF)
 LONGEST = 1472  # bytes of a datagram that is not cut into fragments
 ANY_NUMBER = {"LS203": "a datagram holds any number of parameters"}
-SHOTS, IMU_RATE = np.arange(96), 200  # of a simulated packet; IMU samples a second
+SHOTS = np.arange(96)
+IMU_RATE = 200  # of a simulated packet; IMU samples a second
 TYPES = "9 MID-360, 10 HAP, 15 HAP, 35 MID-360S"
 
 

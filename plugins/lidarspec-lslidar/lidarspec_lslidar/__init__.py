@@ -56,11 +56,15 @@ from lidarspec.spec import (
 )
 from lidarspec_lslidar.c16 import C16, DATE
 
-N_SAMPLES, M_SAMPLES = 16, 42
-SPAN, PACKETS = 15.0, 24  # degrees of a packet, and packets a turn
+N_SAMPLES = 16
+M_SAMPLES = 42
+SPAN = 15.0
+PACKETS = 24  # degrees of a packet, and packets a turn
 MOST = 200  # samples of an M10P's packet: more than twice what the driver takes for sound
 
-START, MARK, END = Const(b"\xa5\x5a"), Const(b"\xa5\x5a\x55"), Const(b"\xfa\xfb")
+START = Const(b"\xa5\x5a")
+MARK = Const(b"\xa5\x5a\x55")
+END = Const(b"\xfa\xfb")
 PERIOD: Construct = Scaled(Int16ub, 1e-6, "s") * "of 15 degrees"
 ANGLE: Construct = Scaled(Int16ub, 0.01, "deg")
 DISTANCE: Construct = Scaled(Int16ub, 0.001, "m") * "0 or FFFF: no return"

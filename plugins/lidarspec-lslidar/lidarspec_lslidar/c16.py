@@ -38,8 +38,11 @@ from lidarspec.spec import (
     wrap,
 )
 
-BLOCKS, GROUPS, LASERS = 12, 2, 16
-STRONGEST, DUAL = 0x37, 0x39
+BLOCKS = 12
+GROUPS = 2
+LASERS = 16
+STRONGEST = 0x37
+DUAL = 0x39
 LASER = 3.125e-6  # seconds from laser to laser
 BLOCK = GROUPS * LASERS * LASER
 CENTRE, ASIDE = (
@@ -122,13 +125,12 @@ def points(f: Fields, unit: float = UNITS[0]) -> Polar:
     the lasers, beside the axis.
     """
     dual = f.return_mode == DUAL
-    block, slot = (
-        np.arange(BLOCKS)[:, None, None],
-        np.arange(GROUPS)[:, None] * LASERS + np.arange(LASERS),
-    )
+    block = np.arange(BLOCKS)[:, None, None]
+    slot = np.arange(GROUPS)[:, None] * LASERS + np.arange(LASERS)
     rotor = np.deg2rad(f.blocks.azimuth + rotor_step(f, dual) * (slot / (GROUPS * LASERS)))
     firing = np.where(dual, block // 2 - (BLOCKS // 2 - 1), block - (BLOCKS - 1))
-    channels, aside = f.blocks.groups.channels, np.deg2rad(ASIDE)
+    channels = f.blocks.groups.channels
+    aside = np.deg2rad(ASIDE)
     return Polar(
         range=channels.distance * (unit / UNITS[0]),
         azimuth=-rotor,

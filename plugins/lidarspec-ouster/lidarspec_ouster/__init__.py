@@ -61,23 +61,23 @@ TOLD_BY = "nothing in their packets: the metadata name the model"
 
 def points(f: Fields, unit: Unit) -> Polar:
     """Pixels by the tables of the unit; of two returns, side by side."""
-    columns, bits = f.columns, PROFILES[unit.profile]
+    columns = f.columns
+    bits = PROFILES[unit.profile]
     names = dict.fromkeys(name for name in bits if name[0] != "_" and name[-1] != "2")
 
     def each(name: str) -> Any:
         column = getattr(columns.pixels, name)
-        return (
-            stack(column, getattr(columns.pixels, f"{name}2", column))
-            if "range2" in bits
-            else column
-        )
+        if "range2" in bits:
+            return stack(column, getattr(columns.pixels, f"{name}2", column))
+        return column
 
-    number, legacy = columns.measurement_id, unit.profile == "LEGACY"
+    number = columns.measurement_id
+    legacy = unit.profile == "LEGACY"
 
     def table(rows: Table) -> Any:
-        return (
-            along("pixels", rows[0]) if np.ptp(rows, axis=0).max() < 1e-12 else take(rows, number)
-        )
+        if np.ptp(rows, axis=0).max() < 1e-12:
+            return along("pixels", rows[0])
+        return take(rows, number)
 
     directions, starts = unit.beams()
     return Polar(
@@ -158,10 +158,12 @@ def shaped(sensor: Sensor, unit: Unit) -> Sensor:
 def nominal(model: str, rows: int, turn: int, profile: str) -> Unit:
     """A unit as the data sheet has it."""
     line, low, high, out, height, _ = MODELS[model]
-    beam, lifted = np.eye(4), np.diag([-1.0, -1.0, 1.0, 1.0])
+    beam = np.eye(4)
+    lifted = np.diag([-1.0, -1.0, 1.0, 1.0])
     beam[0, 3], lifted[2, 3] = out, height
     still = np.array(STILL).reshape(4, 4)
-    level, shifts = np.zeros(rows), np.zeros(rows, np.int64)
+    level = np.zeros(rows)
+    shifts = np.zeros(rows, np.int64)
     elevation = np.linspace(high, low, rows)
     window = (0, turn - 1)
     return Unit(

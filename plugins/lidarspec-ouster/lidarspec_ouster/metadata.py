@@ -23,7 +23,8 @@ from lidarspec_ouster.packets import COLUMNS, PROFILES
 Table = NDArray[np.float64]
 
 #: the most of each that a sensor has: pixels of a column, columns of a turn.
-ROWS, TURN = 256, 4096
+ROWS = 256
+TURN = 4096
 STILL = tuple(np.eye(4).ravel())
 # Stands in where metadata lack it, as in ouster-sdk (metadata.cpp): half a turn, and 36.18 mm up.
 LIDAR_TO_SENSOR = (
@@ -97,13 +98,15 @@ class Unit:
         range 0 on, (turn, rows, 3) in metres.
         """
         encoder = 2 * np.pi * (1 - np.arange(self.turn) / self.turn)[:, None]
-        azimuth, elevation = encoder - np.deg2rad(self.azimuth), np.deg2rad(self.elevation)
+        azimuth = encoder - np.deg2rad(self.azimuth)
+        elevation = np.deg2rad(self.elevation)
         level = np.cos(elevation)
         directions = np.stack(
             [np.cos(azimuth) * level, np.sin(azimuth) * level, np.sin(elevation) + 0 * azimuth],
             axis=-1,
         )
-        out, up = self.beam[0, 3], self.beam[2, 3]
+        out = self.beam[0, 3]
+        up = self.beam[2, 3]
         lens = np.stack([out * np.cos(encoder), out * np.sin(encoder), up + 0 * encoder], axis=-1)
         starts = lens - directions * np.hypot(out, up)
         turned = self.lidar[:3, :3].T
@@ -196,7 +199,8 @@ class Facts:
             UsageError: for a key that is missing, or has a value that cannot be.
         """
         elevation = self._numbers("beam_altitude_angles", None)
-        rows, mode = len(elevation), str(self.data.get("lidar_mode", ""))
+        rows = len(elevation)
+        mode = str(self.data.get("lidar_mode", ""))
         turn, _, rate = mode.partition("x")
         columns = self._whole("columns_per_packet", COLUMNS, COLUMNS)
         width = self._whole("columns_per_frame", TURN, int(turn) if turn.isdecimal() else None)

@@ -108,7 +108,8 @@ PROFILES: dict[str, Bits] = {
 COLUMNS = 16  # of a packet, unless the metadata say otherwise
 VALID = 0xFFFFFFFF  # status of a valid column of LEGACY; of others bit 0 says it
 ENCODER = 90_112  # counts of a turn
-LIDAR, IMU = 1, 2  # packet types
+LIDAR = 1
+IMU = 2  # packet types
 GRAVITY = 9.80665  # m/s2, one g of the IMU
 #: values of the footer's CRC that mean that none is filled in: of firmware 2.2, and of 2.3 up to
 #: 3.1.
@@ -163,9 +164,9 @@ def _field(name: str, bits: int) -> Construct:
     """
     if name.startswith("range"):
         return Scaled(BitsInteger(bits), 0.008 if bits == 15 else 0.001, "m")
-    return (
-        Scaled(BitsInteger(bits), 16, "") if (name, bits) == ("near_ir", 8) else BitsInteger(bits)
-    )
+    if (name, bits) == ("near_ir", 8):
+        return Scaled(BitsInteger(bits), 16, "")
+    return BitsInteger(bits)
 
 
 def packet(profile: str, rows: int, columns: int) -> Construct:

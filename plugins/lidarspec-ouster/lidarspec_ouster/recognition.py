@@ -19,9 +19,11 @@ from numpy.typing import NDArray
 
 from lidarspec_ouster.packets import COLUMNS, ENCODER, PROFILES, VALID, size
 
-ROWS, TURNS = (16, 32, 64, 128), (512, 1024, 2048, 4096)
+ROWS = (16, 32, 64, 128)
+TURNS = (512, 1024, 2048, 4096)
 #: packets that are looked into; nanoseconds of a turn as they leave the factory.
-LOOKED_AT, TEN_TURNS = 256, 100_000_000
+LOOKED_AT = 256
+TEN_TURNS = 100_000_000
 #: share of the pixels in which a captured OS2 sets bits that have no name stays below it.
 SET = 0.1
 Bytes2D = NDArray[np.uint8]
@@ -62,7 +64,8 @@ def recognise(datagrams: Sequence[bytes]) -> dict[str, Any]:
 
 def _turn(columns: Bytes2D, profile: str) -> int:
     """Columns of a turn, as far as they tell it."""
-    number, time = _word(columns, 8, 2), _word(columns, 0, 8)
+    number = _word(columns, 8, 2)
+    time = _word(columns, 0, 8)
     if profile == "LEGACY" and number.any():
         guess = float(
             np.median(
@@ -101,8 +104,10 @@ def _likeness(columns: Bytes2D, profile: str, rows: int) -> float:
     """The mean range of every fourth row, the least by the largest of the four; -1 where unused
     bits are set in many pixels.
     """
-    start, bits = (16 if profile == "LEGACY" else 12), PROFILES[profile]
-    step, spot = sum(bits.values()) // 8, 0
+    start = 16 if profile == "LEGACY" else 12
+    bits = PROFILES[profile]
+    step = sum(bits.values()) // 8
+    spot = 0
     pixels = columns[:, start : start + rows * step].reshape(len(columns), rows, step)
     for name, width in bits.items():
         if name[0] == "_" and (_bits(pixels, spot, width) != 0).mean() > SET:

@@ -34,7 +34,8 @@ from lidarspec.spec import (
     stack,
 )
 
-FIRINGS, LASERS = 50, 8
+FIRINGS = 50
+LASERS = 8
 TICKS = 10_400  # positions of a turn
 FINE = 5  # the first version of packets with steps of 10 um; before it they are of 10 mm
 PERIOD = LASERS / 420_000  # seconds from firing to firing

@@ -70,8 +70,11 @@ from lidarspec_robosense.rotor import (
     sweep_difop,
 )
 
-TYPE, MODEL_96, DUAL = 0x31, 2, 3
-BLOCKS, HALF = 8, 48
+TYPE = 0x31
+MODEL_96 = 2
+DUAL = 3
+BLOCKS = 8
+HALF = 48
 IMU_RATE = 200  # a second, as delivered (manual 4.4.4)
 GRAVITY = 9.80665
 
@@ -195,8 +198,11 @@ def plausible_imu(f: Fields) -> Any:
 
 def points(f: Fields) -> Polar:
     """96 lasers in pairs of blocks, the upper half in the second."""
-    azimuth, block, difop = f.blocks.azimuth, f.blocks.index, f.state.difop
-    dual, low = f.returns == DUAL, f.blocks.index % 2 == 0
+    azimuth = f.blocks.azimuth
+    block = f.blocks.index
+    difop = f.state.difop
+    dual = f.returns == DUAL
+    low = f.blocks.index % 2 == 0
     ahead = np.where(dual, following(azimuth, 4), following(azimuth, 2)) - azimuth
     behind = azimuth - np.where(dual, previous(azimuth, 4), previous(azimuth, 2))
     vertical = np.where(low, signed(difop.vertical_low), signed(difop.vertical_high))

@@ -52,10 +52,13 @@ from lidarspec_robosense.rotor import (
     sweep_difop,
 )
 
-BLOCKS, LASERS = 12, 32
-DUAL, STRONGEST = 0, 4  # return modes (manual 5.4.2)
+BLOCKS = 12
+LASERS = 32
+DUAL = 0
+STRONGEST = 4  # return modes (manual 5.4.2)
 PERIOD = 55.56e-6  # seconds from one firing of all lasers to the next (rs_driver, nebula)
-TYPE_5515, TYPE_1615 = 6, 7  # of the 16P too
+TYPE_5515 = 6
+TYPE_1615 = 7  # of the 16P too
 #: microseconds from the start of a firing to each laser of a 16P (nebula's decoder).
 TIMES_16P = (
     0,
@@ -186,7 +189,8 @@ def two_returns(f: Fields) -> Any:
     one echo.
     """
     distance = np.asarray(f.blocks.channels.distance)
-    one, other = distance[..., :16], distance[..., 16:]
+    one = distance[..., :16]
+    other = distance[..., 16:]
     return (one == other).sum(axis=(1, 2)) > ((one != other) | (one == 0)).sum(axis=(1, 2))
 
 

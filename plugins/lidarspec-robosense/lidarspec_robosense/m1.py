@@ -53,11 +53,10 @@ from lidarspec.spec import (
 )
 from lidarspec_robosense.rotor import TIME
 
-BLOCKS, CHANNELS = 25, 5
-SINGLE, DUAL = (
-    630,
-    1260,
-)  # packets of a frame (rs_driver; M1P user guide: the counter restarts with each frame)
+BLOCKS = 25
+CHANNELS = 5
+SINGLE = 630
+DUAL = 1260  # packets of a frame (rs_driver; M1P user guide: the counter restarts with each frame)
 FRAME_RATE = 10  # Hz (M1P user guide, page 6)
 FIRING = 10e-6 / 3  # seconds between blocks: 0, 3, 7, 10, 13, 17 us in the M1P guide's capture
 OFFSETS = np.round(np.arange(BLOCKS) * FIRING, 6)  # seconds, as the sensor rounds them
@@ -191,7 +190,8 @@ def looking(number: int) -> tuple[Any, Any]:
 
 def sweep(i: int) -> dict[str, Any]:
     """Packet i of frames with single return."""
-    number, time = i % SINGLE, i / (SINGLE * FRAME_RATE)
+    number = i % SINGLE
+    time = i / (SINGLE * FRAME_RATE)
     elevation, azimuth = looking(number)
     return {
         "pkt_psn": number + 1,

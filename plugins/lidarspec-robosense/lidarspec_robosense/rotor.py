@@ -189,7 +189,8 @@ def signed(entry: Any) -> Any:
     """Degrees of each laser, on the lasers' axis; nan, so no point, where the sensor is not
     calibrated.
     """
-    sign, value = entry.sign.on("channels"), entry.value.on("channels")
+    sign = entry.sign.on("channels")
+    value = entry.value.on("channels")
     return np.where(sign == 0, value, np.where(sign == 1, -value, np.nan))
 
 
@@ -202,25 +203,27 @@ def pairs(f: Fields, dual: Any, model: Rotor, *, late: Any = 0) -> Polar:
     """Points of blocks of all lasers; with dual return, pairs of blocks are one firing, the first
     of which began `late` blocks ago.
     """
-    azimuth, block = f.blocks.azimuth, f.blocks.index
+    azimuth = f.blocks.azimuth
+    block = f.blocks.index
     ahead = np.where(dual, following(azimuth, 2), following(azimuth)) - azimuth
     behind = azimuth - np.where(dual, previous(azimuth, 2), previous(azimuth))
-    shot, echo = np.where(dual, (block + late) // 2, block), np.where(dual, (block + late) % 2, 0)
+    shot = np.where(dual, (block + late) // 2, block)
+    echo = np.where(dual, (block + late) % 2, 0)
     times = {"elapsed": model.delay, "duration": model.period, "shot": shot}
     return beams(f, f.blocks.channels, model, directions(f), ahead, behind, echo=echo, **times)
 
 
 def halves(f: Fields, dual: Any, model: Rotor, lasers: tuple[Any, Any]) -> Polar:
     """Points of blocks of two firings of all lasers, or with dual return of the two returns of one."""
-    azimuth, group = f.blocks.azimuth, np.arange(2)[:, None]
+    azimuth = f.blocks.azimuth
+    group = np.arange(2)[:, None]
     duration = np.where(dual, 1, 2) * model.period
     elapsed = np.where(dual, 0, group) * model.period + model.delay
-    ahead, behind, echo = (
-        following(azimuth) - azimuth,
-        azimuth - previous(azimuth),
-        np.where(dual, group, 0),
-    )
-    channels, shot = f.blocks.groups.channels, f.blocks.index
+    ahead = following(azimuth) - azimuth
+    behind = azimuth - previous(azimuth)
+    echo = np.where(dual, group, 0)
+    channels = f.blocks.groups.channels
+    shot = f.blocks.index
     times = {"elapsed": elapsed, "duration": duration, "shot": shot}
     return beams(f, channels, model, lasers, ahead, behind, echo=echo, **times)
 
@@ -284,7 +287,8 @@ def pace(f: Fields, shots: float, period: float, dual: int) -> Any:
 
 def rotor_step(ahead: Any, behind: Any, usual: Any) -> Any:
     """Degrees to the next shot; over a loss or a gap as before it, or as the rotor was set to turn."""
-    ahead, behind = wrap(ahead, 360), wrap(behind, 360)
+    ahead = wrap(ahead, 360)
+    behind = wrap(behind, 360)
     return np.where(ahead <= GAP, ahead, np.where(behind <= GAP, behind, usual))
 
 

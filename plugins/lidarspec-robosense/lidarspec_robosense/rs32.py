@@ -38,9 +38,12 @@ from lidarspec_robosense.rotor import (
     sweep_difop,
 )
 
-BLOCKS, LASERS = 12, 32
-DUAL, STRONGEST = 0, 1  # return modes in DIFOP
-RS16_TYPE, RS32_TYPE = 1, 2
+BLOCKS = 12
+LASERS = 32
+DUAL = 0
+STRONGEST = 1  # return modes in DIFOP
+RS16_TYPE = 1
+RS32_TYPE = 2
 V4 = (3, 4)  # bytes 31 and 32 of a Bpearl of version 4
 SLOT = np.arange(LASERS)
 
@@ -153,10 +156,8 @@ def clock(f: Fields) -> tuple[Any, Any, Any]:
     """Whole seconds since 1970, milliseconds and microseconds; years begin in March, so that the
     leap day is the last.
     """
-    years, months = (
-        np.where(f.month <= 2, f.year + 1999, f.year + 2000),
-        np.where(f.month <= 2, f.month + 9, f.month - 3),
-    )
+    years = np.where(f.month <= 2, f.year + 1999, f.year + 2000)
+    months = np.where(f.month <= 2, f.month + 9, f.month - 3)
     leap_days = np.floor(years / 4) - np.floor(years / 100) + np.floor(years / 400)
     days = 365 * years + leap_days + np.floor((153 * months + 2) / 5) + f.day - 719_469
     return 86_400 * days + 3600 * f.hour + 60 * f.minute + f.second, f.milliseconds, f.microseconds

@@ -48,7 +48,8 @@ from lidarspec_robosense.rotor import (
     sweep_difop,
 )
 
-SINGLE, DUAL = 1, 3  # lower bits of the return mode in a packet
+SINGLE = 1
+DUAL = 3  # lower bits of the return mode in a packet
 PLUS = 5  # series
 MODELS = {128: 1, 80: 2, 48: 4}  # of the Ruby Plus, by lasers
 MODEL_80V = 3
@@ -166,7 +167,8 @@ def model(
     id: str, name: str, rotor: Rotor, aliases: tuple[str, ...], relative: str, variant: Any = None
 ) -> Sensor:
     """A Ruby, or where its id says so a Ruby Plus; what the two series have in common."""
-    lasers, plus = len(rotor.delay), "plus" in id
+    lasers = len(rotor.delay)
+    plus = "plus" in id
     own = {"series": PLUS, "model": MODELS[lasers]} if plus else {}
     data = partial(
         sweep, shots=BLOCKS[lasers], period=rotor.period, **own, **{"wave_mode.returns": SINGLE}

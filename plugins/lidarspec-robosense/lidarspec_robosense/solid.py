@@ -47,7 +47,8 @@ from lidarspec.spec import (
 from lidarspec_robosense.m1 import FRAME_RATE, HEADER, M1
 from lidarspec_robosense.rotor import TIME
 
-DUAL, STRONGEST = 0, 4  # return modes
+DUAL = 0
+STRONGEST = 4  # return modes
 GRAVITY = 9.80665
 MAGIC = Const(b"\xa5\xff\x00\x5a\x11\x11\x55\x55")
 UNIT = tuple(axis / Scaled(Int16sb, 1 / 32768, "") for axis in "xyz")
@@ -235,7 +236,8 @@ def sweep(i: int, model: Scanner, mode: int = STRONGEST) -> dict[str, Any]:
     """Packet i of frames of so many packets: lines to and fro, downwards; each channel an equal
     part of a line.
     """
-    number, time = i % model.packets, i / (model.packets * FRAME_RATE)
+    number = i % model.packets
+    time = i / (model.packets * FRAME_RATE)
     spot = (number * model.blocks + np.arange(model.blocks))[:, None] / (
         model.packets * model.blocks
     )

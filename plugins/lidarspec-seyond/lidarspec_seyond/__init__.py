@@ -58,14 +58,13 @@ UNIT = np.pi / 32768  # of angles
 CHANNELS = 4
 APART = 196  # units from channel to channel, to which their own differences are added
 DATAGRAM = 1472
-SHORT, HEADER, BLOCK, POINT = (
-    54,
-    70,
-    17,
-    4,
-)  # bytes: header of version 1 and from 2 on, head of a block, point
+SHORT = 54
+HEADER = 70
+BLOCK = 17
+POINT = 4  # bytes: header of version 1 and from 2 on, head of a block, point
 SIZE = {1: BLOCK + CHANNELS * POINT, 2: BLOCK + 2 * CHANNELS * POINT}  # of a block, by the returns
-PACKETS, LINES = 60, 12  # of a simulated frame
+PACKETS = 60
+LINES = 12  # of a simulated frame
 RATE = 10
 START = 1.7e9  # seconds since 1970 of a simulated frame
 
@@ -162,7 +161,9 @@ def plausible(f: Fields) -> Any:
 
 def points(f: Fields) -> Polar:
     """Blocks of four channels, of which the second return stands behind the first."""
-    block, pixels, more = f.blocks, f.blocks.pixels, f.blocks.more
+    block = f.blocks
+    pixels = f.blocks.pixels
+    more = f.blocks.more
     channel = pixels.index % CHANNELS
     angle, tilt = (
         np.where(channel == 0, 0, np.where(channel == 1, one, np.where(channel == 2, two, three)))

@@ -16,10 +16,8 @@ from construct import Bytes, Const, Construct, Enum, Int8ub, Int16ub, Int32sb, I
 from lidarspec.spec import Command, Frame, Scaled
 from lidarspec_sick.telegrams import binary, text
 
-CLIENT, PASSWORD = (
-    3,
-    0xF472_4744,
-)  # the user level "authorised client", and the hash of its password
+CLIENT = 3
+PASSWORD = 0xF472_4744  # the user level "authorised client", and the hash of its password
 MOST_TEXT = 200  # bytes of an answer with texts in it
 STRING = ("size" / Int16ub, "text" / Bytes(this.size))
 RANGE = (
@@ -116,7 +114,8 @@ def message(cola: str, kind: str, method: str, content: tuple[Construct, ...]) -
     nothing follows.
     """
     out = kind in ASKED
-    direction, most = "out" if out else "in", MOST_TEXT if set(STRING) & set(content) else 0
+    direction = "out" if out else "in"
+    most = MOST_TEXT if set(STRING) & set(content) else 0
     if cola == "A":
         names = [
             "kind" / Const(kind.encode()),

@@ -52,7 +52,8 @@ CRC = Crc(
 )
 MAGIC = "magic" / Const(b"\x02\x02\x02\x02")
 LONGEST = 16_384  # bytes: three echoes of the 900 beams of a segment of a multiScan136 take 14 160
-STEP, ZERO = 1 / 5215, 16_384  # radians for each step of an azimuth, and the step straight ahead
+STEP = 1 / 5215
+ZERO = 16_384  # radians for each step of an azimuth, and the step straight ahead
 TURNS = 20.0  # turns a second of a simulated one
 
 
@@ -139,7 +140,8 @@ def points(f: Fields, version: int) -> Polar:
     """Points of one module: all echoes of a beam, the beams of all layers one after another."""
     beam = f.beams
     number = beam.index / np.maximum(f.beam_count - 1, 1)
-    first, start = f.first_azimuth.on("beams[]"), f.start_time.on("beams[]")
+    first = f.first_azimuth.on("beams[]")
+    start = f.start_time.on("beams[]")
     even = first + (f.last_azimuth.on("beams[]") - first) * number
     return Polar(
         range=beam.echoes.distance * (f.scale if version == 4 else 1.0),
@@ -163,7 +165,8 @@ def sweep(
     i: int, version: int, elevations: tuple[float, ...], beams: int, segments: int
 ) -> dict[str, Any]:
     """Telegram i: one segment of a turn, in one module, with one echo."""
-    layers, begin = len(elevations), i / segments / TURNS * 1e6
+    layers = len(elevations)
+    begin = i / segments / TURNS * 1e6
     width = 360 / segments
     azimuths = np.deg2rad(i % segments * width - 180 + np.arange(beams) * width / beams)
     module = {

@@ -34,7 +34,8 @@ from lidarspec_sick.commands import ANSWERS, commands, messages
 from lidarspec_sick.telegrams import scans
 
 WRAP = 2**32 * 1e-6  # seconds after which the clock starts again
-SENT, ANSWERED = np.frombuffer(b"sSN", np.uint8), np.frombuffer(b"sRA", np.uint8)
+SENT = np.frombuffer(b"sSN", np.uint8)
+ANSWERED = np.frombuffer(b"sRA", np.uint8)
 EMPTY = ("channels8", "has_position", "has_name", "has_comment", "has_date", "has_event")
 NEAR = 1e-4  # degrees that an angle on the wire may be off
 
@@ -99,7 +100,8 @@ MODELS: dict[str, tuple[str, Kind, tuple[float, float], str]] = {
 
 def sweep(i: int, kind: Kind, echoes: int = 1) -> dict[str, Any]:
     """Telegram i of a scanner of this kind, with so many echoes and their strengths."""
-    rate, step = kind.rates[0], kind.steps[0]
+    rate = kind.rates[0]
+    step = kind.steps[0]
     channels = [f"{name}{number}" for number in range(1, echoes + 1) for name in ("dist", "rssi")]
     each = {"start": kind.start, "step": step, "count": kind.beams, "scale": 1.0, "offset": 0.0}
     return {
@@ -123,10 +125,8 @@ def frames(kind: Kind, cola: str) -> dict[str, Frame]:
     forms = sorted("AB", key=lambda form: form != cola)
     own = {{"A": "text", "B": "scan"}[form]: scans(form, 1) for form in forms}
     if kind.echoes > 1:
-        names, simulation = (
-            {"A": "echoes_text", "B": "echoes"},
-            Simulation(partial(sweep, kind=kind, echoes=kind.echoes)),
-        )
+        names = {"A": "echoes_text", "B": "echoes"}
+        simulation = Simulation(partial(sweep, kind=kind, echoes=kind.echoes))
         own |= {
             names[form]: dataclasses.replace(scans(form, kind.echoes), simulation=simulation)
             for form in forms

@@ -32,7 +32,8 @@ from construct import (
 
 from lidarspec.spec import Fields, Frame, Scaled, take
 
-SINGLE, STREAM = 0, 1  # the modes of a descriptor
+SINGLE = 0
+STREAM = 1  # the modes of a descriptor
 LONGEST_NAME = 64  # bytes of the name of a scan mode (SDK, LidarScanMode)
 
 #: series by the high nibble of the model (SDK, GetModelNameStringByModelID), and the models in
@@ -45,14 +46,12 @@ MODEL_NUMBERS = ", ".join(
 
 #: keys of configuration values; the first two are of the sensor, the others of one of its scan
 #: modes.
-MODE_COUNT, TYPICAL_MODE, US_PER_SAMPLE, MAX_DISTANCE, ANSWER_TYPE, MODE_NAME = (
-    0x70,
-    0x7C,
-    0x71,
-    0x74,
-    0x75,
-    0x7F,
-)
+MODE_COUNT = 0x70
+TYPICAL_MODE = 0x7C
+US_PER_SAMPLE = 0x71
+MAX_DISTANCE = 0x74
+ANSWER_TYPE = 0x75
+MODE_NAME = 0x7F
 
 #: the values of fixed width.
 VALUES: dict[int, Construct] = {

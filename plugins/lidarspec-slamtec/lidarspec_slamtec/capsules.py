@@ -33,10 +33,16 @@ from construct import (
 
 from lidarspec.spec import Checksummed, Fields, Polar, Scaled, Xor, following, stack, take, wrap
 
-EXPRESS_CABINS, ULTRA_CABINS, DENSE_CABINS, ULTRA_DENSE_CABINS = 16, 32, 40, 32
+EXPRESS_CABINS = 16
+ULTRA_CABINS = 32
+DENSE_CABINS = 40
+ULTRA_DENSE_CABINS = 32
 SIGNED = 32  # dtheta has six bits; read as signed, this one and those above are negative
 #: degrees of a simulated capsule: 720, 1440, 800 and 800 points a turn.
-EXPRESS_STEP, ULTRA_STEP, DENSE_STEP, ULTRA_DENSE_STEP = 16.0, 24.0, 18.0, 28.8
+EXPRESS_STEP = 16.0
+ULTRA_STEP = 24.0
+DENSE_STEP = 18.0
+ULTRA_DENSE_STEP = 28.8
 #: simulated capsules a second: 254 and 127 us a point, a live A1's, for 5.5 turns; 125 us, assumed,
 #: for 10 turns.
 EXPRESS_RATE, ULTRA_RATE, DENSE_RATE, ULTRA_DENSE_RATE = (
@@ -45,7 +51,8 @@ EXPRESS_RATE, ULTRA_RATE, DENSE_RATE, ULTRA_DENSE_RATE = (
 
 #: the ultra capsule's scale: values from STARTS on begin at BASES millimetres and go on in steps of
 #: 1, 2, 4, 8 and 16.
-_STARTS, _BASES = np.array([0, 512, 1280, 1792, 3328]), np.array([0, 512, 2048, 4096, 16384])
+_STARTS = np.array([0, 512, 1280, 1792, 3328])
+_BASES = np.array([0, 512, 2048, 4096, 16384])
 _CODES = np.arange(1 << 12)
 LEVELS = np.searchsorted(_STARTS, _CODES, side="right") - 1
 MILLIMETRES = _BASES[LEVELS] + ((_CODES - _STARTS[LEVELS]) << LEVELS)
@@ -145,7 +152,8 @@ def step(f: Fields, count: int) -> Any:
 
 def headings(f: Fields, cabins: int, points: int) -> Any:
     """Degrees clockwise of each point, not compensated, (n, cabins, points)."""
-    count, between = cabins * points, step(f, cabins * points)
+    count = cabins * points
+    between = step(f, cabins * points)
     return stack(
         *(f.start.angle + between * np.arange(place, count, points) for place in range(points))
     )
@@ -153,7 +161,9 @@ def headings(f: Fields, cabins: int, points: int) -> Any:
 
 def express_points(f: Fields, *, signed: bool = False) -> Polar:
     """32 points a capsule, with dtheta read as unsigned (SDK) or signed (protocol)."""
-    first, second, low = f.cabins.first, f.cabins.second, f.cabins.dtheta_low
+    first = f.cabins.first
+    second = f.cabins.second
+    low = f.cabins.dtheta_low
     eighths = stack(first.dtheta_high * 16 + low.first, second.dtheta_high * 16 + low.second)
     if signed:
         eighths = np.where(eighths >= SIGNED, eighths - 2 * SIGNED, eighths)
@@ -190,17 +200,14 @@ def ultra_points(f: Fields) -> Polar:
     """96 points a capsule: a major distance in each cabin, and two that are predicted from it and
     from the next one's.
     """
-    code, code_after = f.cabins.major, following(f.cabins.major)
-    major, after, after_level = (
-        take(MILLIMETRES, code),
-        take(MILLIMETRES, code_after),
-        take(LEVELS, code_after),
-    )
+    code = f.cabins.major
+    code_after = following(f.cabins.major)
+    major = take(MILLIMETRES, code)
+    after = take(MILLIMETRES, code_after)
+    after_level = take(LEVELS, code_after)
     lacking = (major == 0) & (after > 0)
-    base, level = (
-        np.where(lacking, after, major),
-        np.where(lacking, after_level, take(LEVELS, code)),
-    )
+    base = np.where(lacking, after, major)
+    level = np.where(lacking, after_level, take(LEVELS, code))
     first = predicted(base, level, f.cabins.predict1)
     second = predicted(after, after_level, f.cabins.predict2)
     mm = stack(major, first, second)
@@ -252,7 +259,8 @@ def nearest(mm: Any) -> Any:
 
 def prediction(mm: Any, code: Any) -> Any:
     """Steps from the distance that a code stands for to another one; 511 for no return."""
-    base, scale = MILLIMETRES[code], np.exp2(LEVELS[code])
+    base = MILLIMETRES[code]
+    scale = np.exp2(LEVELS[code])
     steps = np.rint((mm - base) / scale)
     return np.where(
         (mm > 0) & (base + steps * scale > 0) & (np.abs(steps) < 511), steps, 511

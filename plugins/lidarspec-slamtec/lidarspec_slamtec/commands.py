@@ -17,7 +17,8 @@ from lidarspec_slamtec import answers
 AFTER_STOP = 0.1  # seconds (SDK; the protocol asks for at least 1 ms)
 AFTER_RESET = 0.002  # seconds (protocol)
 AFTER_MOTOR = 0.5  # seconds (SDK, startMotor)
-FULL_DUTY, USUAL_DUTY = 1023, 660  # SDK, MAX_MOTOR_PWM and DEFAULT_MOTOR_PWM
+FULL_DUTY = 1023
+USUAL_DUTY = 660  # SDK, MAX_MOTOR_PWM and DEFAULT_MOTOR_PWM
 USUAL_SPEED = 600  # rpm: 10 turns a second (data sheets of S2 and C1)
 
 

@@ -14,7 +14,10 @@ from typing import Any
 
 from lidarspec_slamtec import answers
 
-NODE, EXPRESS, ULTRA, DENSE = 0x81, 0x82, 0x84, 0x85
+NODE = 0x81
+EXPRESS = 0x82
+ULTRA = 0x84
+DENSE = 0x85
 DESCRIPTOR = {
     NODE: "scan_descriptor",
     EXPRESS: "express_descriptor",
@@ -76,7 +79,8 @@ class Unit:
         """The answer to a request for a configuration value; none for a key or mode that it does
         not have.
         """
-        key, number = request["key"], request.get("mode", 0)
+        key = request["key"]
+        number = request.get("mode", 0)
         if number >= len(self.modes):
             return ()
         mode = self.modes[number]

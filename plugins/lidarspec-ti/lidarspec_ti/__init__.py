@@ -51,8 +51,10 @@ from lidarspec.spec import (
 CYCLE = 5  # ns, of 200 MHz
 TURN = 2**32 * CYCLE * 1e-9  # seconds after which the cycles start again
 PLATFORM = 0xA6843
-POINTS, RATE = 24, 10  # of a simulated frame; frames a second
-POINT, SIDE = 16, 4  # bytes
+POINTS = 24
+RATE = 10  # of a simulated frame; frames a second
+POINT = 16
+SIDE = 4  # bytes
 
 
 def part(kind: int, size: int, *members: Any) -> Struct:

@@ -187,7 +187,8 @@ def vls128_firings(returns: int) -> Firings:
     )
 
 
-VLS128_SINGLE, VLS128_DUAL = vls128_firings(1), vls128_firings(2)
+VLS128_SINGLE = vls128_firings(1)
+VLS128_DUAL = vls128_firings(2)
 VLS128_FRAMES = {
     "data": Frame(
         packet(

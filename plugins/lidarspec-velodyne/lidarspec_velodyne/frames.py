@@ -28,9 +28,12 @@ from construct import (
 
 from lidarspec.spec import Fields, Frame, Scaled, Simulation
 
-BLOCKS, SLOTS = 12, 32
-STRONGEST, DUAL = 0x37, 0x39
-VLP32C_PRODUCT, VLS128_PRODUCT = 0x28, 0xA1  # product bytes
+BLOCKS = 12
+SLOTS = 32
+STRONGEST = 0x37
+DUAL = 0x39
+VLP32C_PRODUCT = 0x28
+VLS128_PRODUCT = 0xA1  # product bytes
 HOUR = 3600.0  # seconds after which the clock starts again
 TURN = (5.0, 20.0)  # turns a second, slowest and fastest (data sheets)
 POSITIONS = 144  # position packets a second, about
@@ -153,7 +156,8 @@ def told(f: Fields) -> Any:
     the clock to it.
     """
     locked = np.asarray(f.pps).reshape(-1) == LOCKED
-    found, sentences = np.full(len(locked), np.nan), np.asarray(f.nmea).astype(np.uint8)
+    found = np.full(len(locked), np.nan)
+    sentences = np.asarray(f.nmea).astype(np.uint8)
     for row in np.flatnonzero(locked).tolist():
         found[row] = _seconds(sentences[row].tobytes())
         if found[row] > 0:
@@ -164,11 +168,12 @@ def told(f: Fields) -> Any:
 def _seconds(nmea: bytes) -> float:
     sentence = _RMC.match(nmea)
     try:
-        moment = (
-            datetime.datetime.strptime((sentence[2] + sentence[1]).decode(), "%d%m%y%H%M%S")
-            if sentence
-            else None
-        )
+        if sentence:
+            moment = datetime.datetime.strptime(
+                (sentence[2] + sentence[1]).decode(), "%d%m%y%H%M%S"
+            )
+        else:
+            moment = None
     except ValueError:
         moment = None
     return moment.replace(tzinfo=datetime.UTC).timestamp() if moment else float("nan")

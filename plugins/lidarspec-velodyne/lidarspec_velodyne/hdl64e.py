@@ -44,7 +44,8 @@ from lidarspec.spec import (
 from lidarspec_velodyne.firings import FASTEST, JITTER
 from lidarspec_velodyne.frames import BLOCKS, HOUR, SLOTS, TURN
 
-UPPER, LOWER = 0xFFEE, 0xFFDD
+UPPER = 0xFFEE
+LOWER = 0xFFDD
 LARGEST = 1 << 20  # bytes of a calibration file at most
 NAMES = (
     "rotCorrection_",
@@ -184,13 +185,18 @@ def dual(f: Fields) -> Any:
 
 def points(f: Fields, unit: Unit) -> Polar:
     """Lasers beside the axis of rotation, each from a place of its own."""
-    azimuth, block, twice = f.blocks.azimuth, f.blocks.index, dual(f)
+    azimuth = f.blocks.azimuth
+    block = f.blocks.index
+    twice = dual(f)
     ahead = np.where(twice, following(azimuth, 4), following(azimuth, 2))
     step = between_blocks(azimuth, ahead, limit=FASTEST * unit.period * JITTER)
     turned = np.deg2rad(azimuth + step * (unit.delay / unit.period) - unit.of_blocks(unit.offset))
     elevation = np.deg2rad(unit.of_blocks(unit.vertical))
-    height, aside = unit.of_blocks(unit.height), unit.of_blocks(unit.aside)
-    back, cos, sin = -height * np.sin(elevation), np.cos(turned), np.sin(turned)
+    height = unit.of_blocks(unit.height)
+    aside = unit.of_blocks(unit.aside)
+    back = -height * np.sin(elevation)
+    cos = np.cos(turned)
+    sin = np.sin(turned)
     distance = f.blocks.channels.distance
     return Polar(
         range=np.where(distance == 0, 0, distance + unit.of_blocks(unit.distance)),
@@ -304,4 +310,5 @@ def model(series: str, unit: Unit, other: str) -> Sensor:
     )
 
 
-HDL64E_S2, HDL64E_S3 = model("s2", S2, "s3"), model("s3", S3, "s2")
+HDL64E_S2 = model("s2", S2, "s3")
+HDL64E_S3 = model("s3", S3, "s2")

@@ -251,7 +251,8 @@ class Backlog:
 
     def _drop_old(self) -> None:
         """Drop the oldest inputs and results beyond the limits."""
-        inputs, results = self._inputs, self._results
+        inputs = self._inputs
+        results = self._results
         while self._input_size > MAX_INPUT_BYTES and len(inputs) > 1:
             self._input_size -= inputs.popleft().size
         oldest = inputs[0].offset

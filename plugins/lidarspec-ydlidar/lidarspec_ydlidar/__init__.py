@@ -164,11 +164,9 @@ def relative(own: Model, other: Model) -> str | Relative:
             "CT has bits set in packets that begin no turn",
             partial(tells_state, slowest=own.form.slowest),
         )
-    return (
-        "info.model"
-        if own.number and other.number
-        else "nothing in the packets: the baud rate, or the label on the housing"
-    )
+    if own.number and other.number:
+        return "info.model"
+    return "nothing in the packets: the baud rate, or the label on the housing"
 
 
 def relatives(name: str) -> dict[str, str | Relative]:
