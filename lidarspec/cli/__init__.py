@@ -12,7 +12,8 @@ order:
 * `listing`: the lines of an explanation, in colours.
 * `sensors`, `frames`, `build`: what is installed, what a frame says, a frame out of values.
 * `read`, `view`: a sensor at work: rows and figures, a picture.
-* `recordings`, `files`: into a file and out again; from file to file.
+* `recordings`: record a source into a file, and replay it.
+* `convert`, `info`, `plot`: from file to file, what is in a file, a picture of it.
 * `sim`: a simulated sensor on a port or in a file.
 * `finding`: which sensor, why nothing comes, which checksum.
 * `authors`: for those who write a sensor: a new one, its check, its exports.
