@@ -161,10 +161,9 @@ def messages(kind: str, *, is_urg: bool) -> dict[str, Frame]:
     for name, (command, size, _) in rows.items():
         found[f"{name}_order"] = order(command, size)
         if name not in TOLD_BY:
+            clock: tuple[Any, ...] = ()
             if name == "get_time":
                 clock = ("time" / Scaled(Int32ub, 0.001, "s") * "24 bits",)
-            else:
-                clock = ()
             found[f"{name}_answer"] = answer(command, *clock, size=size, told=(4,) if clock else ())
     return found | {name: told(*row) for name, row in TOLD.items()}
 

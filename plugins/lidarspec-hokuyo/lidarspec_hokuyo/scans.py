@@ -147,13 +147,12 @@ def scan(command: str, geometry: Geometry) -> Frame:
     goes_on = command[0] in "MN"
     echoes = ECHOES if command[0] in "NH" else 1
     fields = FIELDS[command[1]]
+    rest: tuple[Any, ...] = ()
     if goes_on:
         rest = (
             "skip" / Int8ub * "turns left out between scans",
             decimal("left", 2) * "scans to come; 0: on and on",
         )
-    else:
-        rest = ()
     struct = Struct(
         "command" / Const(command.encode()),
         decimal("first", 4, geometry.end) * "step",
