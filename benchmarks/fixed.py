@@ -111,7 +111,9 @@ def compact_telegram(sensor: ls.Sensor, frame: bytes) -> Sensor:
 
 
 def cola_telegram(sensor: ls.Sensor, frame: bytes) -> Sensor:
-    """A telegram of CoLa B with DIST1 and RSSI1 in 16 bits, as `lidarspec_sick.telegrams` has it."""
+    """A telegram of CoLa B with DIST1 and RSSI1 in 16 bits,
+    as `lidarspec_sick.telegrams` has it.
+    """
     beams = sensor.parse(frame).dist1.count
 
     def channel(content: bytes, values: Construct) -> Struct:

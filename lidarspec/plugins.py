@@ -70,7 +70,9 @@ def lidarspec_sensors() -> Iterable[Sensor]:  # type: ignore[empty-body]
 
 @hookspec(firstresult=True)
 def lidarspec_checksum(sensor: Sensor, frame: Frame) -> Checksum | None:
-    """The checksum algorithm of a frame type, or None to leave it as declared; never field or span."""
+    """The checksum algorithm of a frame type, or None to leave it as declared;
+    never field or span.
+    """
 
 
 @hookspec(firstresult=True)
@@ -677,7 +679,9 @@ def _describe_place(thread: threading.Thread) -> str:
 
 
 def _loaded(entry: EntryPoint, names: str, add: Callable[[Any], list[str]]) -> Plugin:
-    """What became of an entry point that is loaded and added; whatever it raises disturbs no other."""
+    """What became of an entry point that is loaded and added;
+    whatever it raises disturbs no other.
+    """
     plugin = Plugin(entry.distribution, entry.version, f"{names} = {entry.value}")
     try:
         return replace(plugin, sensors=tuple(add(_import_in_time(entry))))

@@ -25,7 +25,9 @@ def path_while_written(path: Path) -> Path:
 
 
 def remove_abandoned(path: Path) -> None:
-    """Remove what killed processes of this computer left behind while they wrote a file or folder."""
+    """Remove what killed processes of this computer left behind while they wrote a file
+    or folder.
+    """
     for process, name in _list_unfinished(path.parent.absolute()):
         left = path.with_name(f".{process}.{name}")
         with contextlib.suppress(OSError, SourceError):

@@ -1,4 +1,6 @@
-"""Every sensor, installed or an invented shape: for the long tests, which load them when they run."""
+"""Every sensor, installed or an invented shape:
+for the long tests, which load them when they run.
+"""
 
 from __future__ import annotations
 

@@ -25,7 +25,9 @@ SLACK = 5.0
 
 
 class Port:
-    """A serial port: a pseudo terminal, reached through a name that goes away when it is unplugged."""
+    """A serial port: a pseudo terminal, reached through a name that goes away
+    when it is unplugged.
+    """
 
     def __init__(self, name: Path) -> None:
         self.name, self._master, self._slave = name, -1, -1

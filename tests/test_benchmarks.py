@@ -152,7 +152,10 @@ def test_one_library_that_cannot_be_installed_does_not_stop_the_others(
     ("stderr", "reason"),
     [
         (
-            "WARNING: slow\nERROR: Could not find lds2d>=99 (from versions: 0.7)\nERROR: No match\n",
+            (
+                "WARNING: slow\nERROR: Could not find lds2d>=99 (from versions: 0.7)\n"
+                "ERROR: No match\n"
+            ),
             "Could not find lds2d>=99 (from versions: 0.7)",
         ),
         (

@@ -179,7 +179,8 @@ class CaptureReader(Closing):
         return self._datagrams
 
     def skip(self, at: int) -> bool:
-        """Seek shortly before the first datagram at or after a time; return whether it was possible.
+        """Seek shortly before the first datagram at or after a time;
+        return whether it was possible.
 
         Skipped datagrams are not counted. Datagrams with fragments on both sides are lost.
 

@@ -256,7 +256,9 @@ class PcapRecords:
         return int(places[right.argmax()]) if right.any() else None
 
     def _is_sure(self, captured: int, original: int) -> bool:
-        """Whether two lengths bear each other out: the packet is whole, or cut where the file says."""
+        """Whether two lengths bear each other out:
+        the packet is whole, or cut where the file says.
+        """
         return 0 < captured <= LARGEST_PACKET and captured in (original, self._snap_length)
 
     def _is_false(self, captured: int, original: int) -> bool:
@@ -311,7 +313,9 @@ class PcapngBlocks:
         )
 
     def claim(self, length: int) -> tuple[int, str, int]:
-        """Where in a block of a length that stands, as what type, and the number that stands there."""
+        """Where in a block of a length that stands, as what type,
+        and the number that stands there.
+        """
         return 4, f"{self.order}u4", length
 
     def pattern(self, record: bytes) -> Pattern | None:
@@ -492,7 +496,9 @@ def _interface(order: str, body: bytes) -> Interface:
 def _block_packet(
     order: str, kind: int, body: bytes, interfaces: list[Interface]
 ) -> CapturedPacket | None:
-    """The packet of a block, None where the block contradicts itself or names an unknown interface."""
+    """The packet of a block, None where the block contradicts itself
+    or names an unknown interface.
+    """
     if kind == _SIMPLE_PACKET:
         if len(body) < 4 or not interfaces:
             return None

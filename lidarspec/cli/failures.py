@@ -1,4 +1,6 @@
-"""Failures as one message on stderr and an exit code, by whose fault they are; never a traceback."""
+"""Failures as one message on stderr and an exit code, by whose fault they are;
+never a traceback.
+"""
 
 from __future__ import annotations
 

@@ -286,7 +286,9 @@ def nearest_fault(given: Heard) -> WireError:
 
 
 def _never_right(given: Heard) -> WireError | None:
-    """That the input is frames of a sensor whose checksums are never right; None where it is not."""
+    """That the input is frames of a sensor whose checksums are never right;
+    None where it is not.
+    """
     from lidarspec.detect.identification import never_right
 
     fault = never_right(given.chunks, datagrams=given.datagrams)

@@ -98,7 +98,9 @@ def configured(
 
 
 def _value(sensor: Sensor, name: str, text: str) -> Any:
-    """A number, true or false as in `lidarspec.toml`, where the option takes one; all else is text."""
+    """A number, true or false as in `lidarspec.toml`, where the option takes one;
+    all else is text.
+    """
     try:
         value = tomllib.loads(f"value = {text}")["value"]
     except (ValueError, RecursionError):

@@ -107,7 +107,8 @@ def sensors(as_json: bool, output: str | None) -> None:
         note(no_sensors())
     if broken:
         note(
-            f"{len(broken)} plugin{'s' * (len(broken) > 1)} could not be loaded; next: lidarspec plugins"
+            f"{len(broken)} plugin{'s' * (len(broken) > 1)} could not be loaded;"
+            " next: lidarspec plugins"
         )
 
 
@@ -151,7 +152,8 @@ def show(sensor_id: str, as_plan: bool, as_json: bool, output: str | None) -> No
     units = {role: _unit(sensor, path) for role, path in sensor.info.items()}
     parts += (
         [
-            f"  says    {', '.join(f'{role} ({path}{units[role]})' for role, path in sensor.info.items())}"
+            "  says    "
+            f"{', '.join(f'{role} ({path}{units[role]})' for role, path in sensor.info.items())}"
         ]
         if sensor.info
         else []
@@ -245,7 +247,8 @@ def trust(folder: str) -> None:
     For a single run the variable LIDARSPEC_TRUST names one.
     """
     say(
-        f"{trusted(folder)}: what its {FILE} names is believed from now on; a line in {user_folder() / TRUSTED} says so"
+        f"{trusted(folder)}: what its {FILE} names is believed from now on;"
+        f" a line in {user_folder() / TRUSTED} says so"
     )
 
 
@@ -298,7 +301,10 @@ def _command_text(sensor: Sensor, name: str) -> str:
         for name, argument in sensor.commands[name].arguments.items()
     )
     if command["reply"]:
-        answer = f", answered by {command['reply']}{' while it is stopped' if command['only_stopped'] else ''}"
+        answer = (
+            f", answered by {command['reply']}"
+            f"{' while it is stopped' if command['only_stopped'] else ''}"
+        )
     else:
         answer = ""
     return f"{args}{': ' if command['hex'] else ''}{command['hex']}{answer}"

@@ -236,7 +236,9 @@ def _sent(device: SimulatedDevice) -> str:
 )
 @click.option("--json", "as_json", is_flag=True, help="Print the summary as JSON.")
 def demo(sensor_id: str | Sensor | None, count: int, errors: float, as_json: bool) -> None:
-    """A simulated sensor on a port: started, read through a bad line, recorded, read again, drawn."""
+    """A simulated sensor on a port: started, read through a bad line, recorded,
+    read again, drawn.
+    """
     simulated = (
         one
         for one in registry().sensors().values()

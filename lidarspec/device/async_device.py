@@ -28,7 +28,8 @@ from lidarspec.scans.selection import EVERYTHING, Selection, Sieve
 from lidarspec.spec.sensor import Sensor
 
 T = TypeVar("T")
-#: A thread waits for so long before it returns to the event loop, which may have cancelled the call.
+#: A thread waits for so long before it returns to the event loop,
+#: which may have cancelled the call.
 _WAIT_S = 0.2
 
 

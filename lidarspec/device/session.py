@@ -552,7 +552,9 @@ def learned(sensor: Sensor, reply: Reply) -> dict[str, Any]:
 
 
 def _reasons(fields: Mapping[str, FieldInfo], values: Any) -> str:
-    """What the fields of a frame say that have words for it, with their numbers; "" where none has."""
+    """What the fields of a frame say that have words for it, with their numbers;
+    "" where none has.
+    """
     told = [
         f"{path} {name} ({number})"
         for path, info in fields.items()

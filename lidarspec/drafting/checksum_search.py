@@ -35,7 +35,10 @@ TOLD = 8
 SCREENED = 16
 #: share of the frames that a checksum with a constant of its own has to be right for.
 CERTAIN = 0.95
-ANYWHERE = "an XOR of a whole frame fits at other places of it as well: of those that do, this is where bytes vary most"
+ANYWHERE = (
+    "an XOR of a whole frame fits at other places of it as well:"
+    " of those that do, this is where bytes vary most"
+)
 #: heads and groups of words that are tried.
 HEADS = (0, 2, 4, 6, 8, 10, 12)
 GROUPS = ((2,), (1, 2), (2, 1), (1, 1, 2))
@@ -96,7 +99,10 @@ class Changed(Checksum):
         digits = self.width // 4
         if self.negative and self.constant in (0, self._mask):
             return f"{self.of.describe()}, {'negated' if self.constant == 0 else 'complemented'}"
-        return f"{self.of.describe()}, {'taken from' if self.negative else 'and'} 0x{self.constant:0{digits}x}"
+        return (
+            f"{self.of.describe()}, {'taken from' if self.negative else 'and'}"
+            f" 0x{self.constant:0{digits}x}"
+        )
 
     def batch(self, rows: NDArray[np.uint8]) -> Values:
         return self._changed(batch(self.of, rows))
@@ -257,7 +263,10 @@ def _nibbles(samples: Samples) -> Iterator[Match]:
         for span in (Span("behind"), Span("all"))[: 1 + (front > 0)]:
             right = int((samples.computed(Xor(), place, span) == halves).sum())
             if enough(right, len(samples)) and doubt(8, halves, 0, 8) > 0:
-                remark = "its halves are the low nibbles of two bytes, low half first: name both in Checksummed(field=(...))"
+                remark = (
+                    "its halves are the low nibbles of two bytes, low half first:"
+                    " name both in Checksummed(field=(...))"
+                )
                 yield Match(
                     Xor(),
                     place,
@@ -288,7 +297,8 @@ def _class(algorithm: Checksum) -> str:
         value = f"{pasted(base)}(data) ^ 0x{changed.constant:X}"
     elif isinstance(base, WordSum):
         steps = [
-            f'words = [int.from_bytes(data[i : i + 2]{_PADDED[base.words]}, "{base.words}") for i in range(0, len(data), 2)]'
+            f'words = [int.from_bytes(data[i : i + 2]{_PADDED[base.words]}, "{base.words}")'
+            " for i in range(0, len(data), 2)]"
         ]
         value = "sum(words)"
         if base.carry:
@@ -303,6 +313,7 @@ def _class(algorithm: Checksum) -> str:
         for line in (*steps, f"return ({value}) & 0x{(1 << changed.width) - 1:X}")
     )
     return (
-        f"class Check(Checksum):\n    width = {changed.width}\n\n    def __call__(self, data):\n{body}\n"
+        f"class Check(Checksum):\n    width = {changed.width}\n\n"
+        f"    def __call__(self, data):\n{body}\n"
         f'    def describe(self):\n        return "{algorithm.describe()}"'
     )

@@ -455,7 +455,10 @@ def drafted(draft: Draft, *, origin: str, link: str) -> dict[str, str]:
     )
     below = [f"f.{path} < 360" for path in angles if "." not in path]
     plausible = below[0] if len(below) == 1 else " & ".join(f"({one})" for one in below)
-    check = f'def plausible(f: Fields) -> Any:\n    """Angles below 360 degrees."""\n    return {plausible}\n\n\n'
+    check = (
+        'def plausible(f: Fields) -> Any:\n    """Angles below 360 degrees."""\n'
+        f"    return {plausible}\n\n\n"
+    )
     is_weak = not draft.datagrams and not below and _strength(draft) <= FEW_BITS
     counting = (
         one for one in draft.candidates if one.kind == "counter" and one.offset < draft.head
@@ -464,7 +467,10 @@ def drafted(draft: Draft, *, origin: str, link: str) -> dict[str, str]:
         counting, key=lambda one: (-one.right / one.total, -one.size)
     )  # the one that never jumps
     text = {
-        "frames_told": f"{len(draft.frames)} frame{'s' * (len(draft.frames) != 1)}, {draft.share:.1%} of its {draft.bytes_in} bytes",
+        "frames_told": (
+            f"{len(draft.frames)} frame{'s' * (len(draft.frames) != 1)},"
+            f" {draft.share:.1%} of its {draft.bytes_in} bytes"
+        ),
         "origin": origin,
         "checksum_class": f"\n{seal[1]}\n\n\n" if seal and seal[1] else "",
         "sealed": ""
@@ -514,7 +520,10 @@ def _known(draft: Draft) -> list[Field]:
     if (length := draft.length) is not None:
         sizes = sorted({len(frame) for _, frame in draft.frames})
         of_one = f"whole frames of {sizes[0]} bytes, and the beginning of another"
-        why = f"frames are as long as {length} says: {of_one if len(sizes) == 1 else f'frames of {sizes[0]} to {sizes[-1]} bytes'}"
+        why = (
+            f"frames are as long as {length} says: "
+            f"{of_one if len(sizes) == 1 else f'frames of {sizes[0]} to {sizes[-1]} bytes'}"
+        )
         found.append(
             Field(
                 length.place,
@@ -554,7 +563,9 @@ def _header(draft: Draft) -> Iterator[Field]:
 
 
 def _gap(rows: NDArray[np.uint8], start: int, end: int, cuts: Sequence[int]) -> Iterator[Field]:
-    """What lies between known fields, in pieces that the checksum's span and constant bytes make."""
+    """What lies between known fields, in pieces that the checksum's span
+    and constant bytes make.
+    """
     edges = {start, end, *(cut for cut in cuts if start < cut < end)}
     if len(rows) >= FEW and end - start <= LONG:
         edges |= _constant_edges(rows, start, end)
@@ -595,7 +606,10 @@ def _rising(draft: Draft, one: Candidate, what: str = "frame") -> Field:
             if same and follows(first, last, one.circle) > 1 - 1 / FEW:
                 why = (
                     *why,
-                    f"lies between this frame's {other.name} and the next one's: the angle of the last sample?",
+                    (
+                        f"lies between this frame's {other.name} and the next one's:"
+                        " the angle of the last sample?"
+                    ),
                 )
                 break
     return Field(one.offset, one.size, one.name, code, why)
@@ -618,8 +632,14 @@ def _block_field(draft: Draft, blocks: Blocks) -> Field:
         at = one.start + one.size
     indent = " " * (16 if draft.seal else 12)
     body = "\n".join(line for field in fields for line in field.lines(indent))
-    code = f"Array(\n{indent[8:]}    {blocks.count},\n{indent[8:]}    Struct(\n{body}\n{indent[8:]}    ),\n{indent[8:]})"
-    why = f"{blocks.count} blocks of {blocks.size} bytes that begin with {blocks.flag.hex(' ') or 'the same field'}"
+    code = (
+        f"Array(\n{indent[8:]}    {blocks.count},\n"
+        f"{indent[8:]}    Struct(\n{body}\n{indent[8:]}    ),\n{indent[8:]})"
+    )
+    why = (
+        f"{blocks.count} blocks of {blocks.size} bytes that begin with"
+        f" {blocks.flag.hex(' ') or 'the same field'}"
+    )
     return Field(blocks.start, blocks.end - blocks.start, "blocks", code, (why,))
 
 
@@ -672,7 +692,10 @@ def _check(draft: Draft, seal: Match, start: int) -> Field:
     for other in draft.others[:OFFERED]:
         why = (
             *why,
-            f"or {other.paste.splitlines()[0]} at byte {other.place.start(size)} over {other.span.told(other.place, size)}",
+            (
+                f"or {other.paste.splitlines()[0]} at byte {other.place.start(size)}"
+                f" over {other.span.told(other.place, size)}"
+            ),
         )
     return Field(start, seal.place.size, "check", _integer(seal.place.size, seal.order), why)
 
@@ -737,7 +760,10 @@ def _arguments(angles: Sequence[str], counters: Sequence[Candidate]) -> Iterator
     if counters:
         one = counters[0]
         limits = f", first={one.first}, last={one.circle - 1}" if one.wraps else ""
-        yield f'sequence=Sequence("{one.name}"{limits}),  # a jump in it is a loss{_or([other.name for other in counters[1:]], "")}'
+        yield (
+            f'sequence=Sequence("{one.name}"{limits}),'
+            f"  # a jump in it is a loss{_or([other.name for other in counters[1:]], '')}"
+        )
 
 
 def _or(names: Sequence[str], begin: str = "  #") -> str:
@@ -823,7 +849,8 @@ class Names:
     def __post_init__(self) -> None:
         if not _ID.fullmatch(self.id):
             raise UsageError(
-                f"{self.id!r} is no id: it is vendor-model in lower case with hyphens, such as acme-x1"
+                f"{self.id!r} is no id: it is vendor-model in lower case with hyphens,"
+                " such as acme-x1"
             )
         vendor, _, model = self.id.partition("-")
         defaults = {
@@ -835,7 +862,8 @@ class Names:
             object.__setattr__(self, name, getattr(self, name) or default)
         if not re.fullmatch(r"[a-z][a-z0-9]*(-[a-z0-9]+)*", self.distribution):
             raise UsageError(
-                f"{self.distribution!r} is no name of a distribution: lower case with hyphens, such as lidarspec-acme"
+                f"{self.distribution!r} is no name of a distribution: lower case with hyphens,"
+                " such as lidarspec-acme"
             )
         if unfit := re.search(r'["\\\n]', self.vendor + self.model):
             raise UsageError(f"vendor and model cannot have {unfit[0]!r} in them")
@@ -964,7 +992,8 @@ def joining(folder: Path, names: Names, texts: Mapping[str, str]) -> dict[str, s
         )
     if f'name = "{names.distribution}"\n' not in project or _LISTED not in project:
         raise UsageError(
-            f"{folder / 'pyproject.toml'} is not that of {names.distribution}, or lists no lidarspec.sensors"
+            f"{folder / 'pyproject.toml'} is not that of {names.distribution},"
+            " or lists no lidarspec.sensors"
         )
     part = names.id.partition("-")[2].replace("-", "_")
     part = part if part.isidentifier() else f"model_{part}"
@@ -982,7 +1011,11 @@ def joining(folder: Path, names: Names, texts: Mapping[str, str]) -> dict[str, s
         **new,
         "pyproject.toml": project.replace(_LISTED, _LISTED + entry),
         listed: f"{before}{'' if before == '[' else ','}{own}\n",
-        "README.md": f"{readme.rstrip()}\n\nThe {names.vendor} {names.model}, `{names.id}`, stands in `{names.module}/{part}.py`.\n",
+        "README.md": (
+            f"{readme.rstrip()}\n\n"
+            f"The {names.vendor} {names.model}, `{names.id}`,"
+            f" stands in `{names.module}/{part}.py`.\n"
+        ),
     }
 
 

@@ -483,7 +483,8 @@ def _by_length(data: NDArray[np.uint8]) -> Structure | None:
             continue
         begins = int(
             starts[0]
-            # of pairs in a header that do as well, the one in front: captures often begin with a frame
+            # of pairs in a header that do as well, the one in front:
+            # captures often begin with a frame
         )
         if (
             best is None

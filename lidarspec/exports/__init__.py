@@ -182,8 +182,11 @@ def _check(node: tree.Node) -> None:
             )
     if isinstance(node, tree.Opaque):
         raise Refused(
-            f"{node.info.path}:"
-            f" {node.reason if node.inside else f'{node.kind} is Python code, which no other language runs'}"
+            f"""{node.info.path}: {
+                node.reason
+                if node.inside
+                else f"{node.kind} is Python code, which no other language runs"
+            }"""
         )
     if isinstance(node, tree.Sealed):
         _ = node.algorithm

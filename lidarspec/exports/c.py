@@ -88,9 +88,13 @@ def checksum(algorithm: Checksum, name: str) -> str:
     if isinstance(algorithm, ZeroPadded):
         if isinstance(inner, Fold15):
             raise Refused(
-                "a folded sum that is padded with zeros: which bytes count depends on how many there are in all"
+                "a folded sum that is padded with zeros:"
+                " which bytes count depends on how many there are in all"
             )
-        pad = f"    for (; i % {algorithm.to}; ++i) {{\n        const uint8_t byte = 0;\n{indent(body.step, 8 * ' ')}\n    }}\n"
+        pad = (
+            f"    for (; i % {algorithm.to}; ++i) {{\n"
+            f"        const uint8_t byte = 0;\n{indent(body.step, 8 * ' ')}\n    }}\n"
+        )
     return _FUNCTION.format(
         text=algorithm.describe(),
         name=name,
@@ -124,7 +128,8 @@ def _body(algorithm: Checksum) -> _Body:
             )
             step = (
                 "if ((int64_t)i >= first)\n"
-                "    total = ((int64_t)i - (first > 0 ? first : 0)) % 2 ? total + ((uint64_t)byte << 8) : (total << 1) + byte;"
+                "    total = ((int64_t)i - (first > 0 ? first : 0)) % 2"
+                " ? total + ((uint64_t)byte << 8) : (total << 1) + byte;"
             )
             return _Body(begin, step, "((total & 0x7fff) + (total >> 15)) & 0x7fff")
     raise Refused(f"the checksum {type(algorithm).__name__} is Python code, which C does not run")
@@ -132,7 +137,10 @@ def _body(algorithm: Checksum) -> _Body:
 
 def _word_xor(algorithm: WordXor) -> _Body:
     halves = [half for size in algorithm.groups for half in range(size)]
-    begin = f"static const uint8_t halves[{len(halves)}] = {{{', '.join(map(str, halves))}}};\nuint64_t total = 0;"
+    begin = (
+        f"static const uint8_t halves[{len(halves)}] = {{{', '.join(map(str, halves))}}};\n"
+        "uint64_t total = 0;"
+    )
     head = f"i < {algorithm.head} ? i % 2 : " if algorithm.head else ""
     back = f"(i - {algorithm.head})" if algorithm.head else "i"
     return _Body(
@@ -268,7 +276,9 @@ def _needs(layout: CLayout) -> Iterator[str]:
                 ):
                     yield f"if ({before}!lidarspec_int({layout.formula(part.args[1])})) return 0;"
             if isinstance(entry.node, Repeat | Blob) and not isinstance(value, int):
-                yield f"if ({before}!lidarspec_within({layout.formula(value)}, {longest})) return 0;"
+                yield (
+                    f"if ({before}!lidarspec_within({layout.formula(value)}, {longest})) return 0;"
+                )
 
 
 def _checksum(layout: CLayout, entry: Entry, seal: Sealed, name: str, algorithm: str) -> str:
@@ -458,9 +468,13 @@ def _message(
         name("", own)
     layout = CLayout(message, name)
     yield comment(
-        f"---- {message.name}: {'from' if message.frame.direction == 'in' else 'to'} the sensor ----"
+        f"---- {message.name}: {'from' if message.frame.direction == 'in' else 'to'}"
+        " the sensor ----"
     )
-    yield f"#define {prefix.upper()}_{identifier(message.name).upper()}_MAX_LENGTH {message.frame.max_length}"
+    yield (
+        f"#define {prefix.upper()}_{identifier(message.name).upper()}"
+        f"_MAX_LENGTH {message.frame.max_length}"
+    )
     yield from (text for text in c_fields.fields(layout) if text)
     yield ""
     yield from _frame(layout, algorithms)

@@ -242,7 +242,8 @@ class CLayout:
                     0,
                     (
                         (
-                            f"(int64_t){self.name(entry.path, 'size')}({given(entry.node, entry.depth)})"
+                            f"(int64_t){self.name(entry.path, 'size')}"
+                            f"({given(entry.node, entry.depth)})"
                         ),
                     ),
                 )

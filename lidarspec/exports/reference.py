@@ -190,7 +190,9 @@ def _frame(name: str, frame: Frame, picture: str) -> Iterator[str]:
 
 
 def _geometry(sensor: Sensor) -> Iterator[str]:
-    """What points there are, in which axes, and the direction of each channel where that is fixed."""
+    """What points there are, in which axes, and the direction of each channel
+    where that is fixed.
+    """
     yield (
         "Points are in metres, x forward, y left, z up; the manual's zero direction is +x, and"
         " azimuth counts counter-clockwise."

@@ -145,7 +145,12 @@ class _Classes:
             case Repeat():
                 return f"list[{self._type(owner, name, node.element)}]"
             case Parts():
-                return f"list[{' | '.join(self._type(owner, name + camel(kind.name), kind.element) for kind in node.kinds)}]"
+                return f"""list[{
+                    " | ".join(
+                        self._type(owner, name + camel(kind.name), kind.element)
+                        for kind in node.kinds
+                    )
+                }]"""
             case When() | Select():
                 return " | ".join(
                     dict.fromkeys(self._type(owner, name, branch) for branch in children(node))

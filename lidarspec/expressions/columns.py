@@ -582,10 +582,9 @@ def _spot(
             )
             break
     else:
-        reason = (
-            "goes with no array of the frame:"
-            f" {', '.join(f'{axis} {length}' for (_, length), axis in whole.items()) or 'it has none'}"
-        )
+        reason = f"""goes with no array of the frame: {
+            ", ".join(f"{axis} {length}" for (_, length), axis in whole.items()) or "it has none"
+        }"""
     raise SpecError(f"an array of {' x '.join(map(str, shape))} values {reason}", rule="LS214")
 
 

@@ -438,7 +438,9 @@ def evaluate(
 
 
 def only_field(node: Node) -> Node | None:
-    """The one field that an expression is made of besides numbers; None where there is no such one."""
+    """The one field that an expression is made of besides numbers;
+    None where there is no such one.
+    """
     return node.fields[0] if node.fields is not None and len(node.fields) == 1 else None
 
 

@@ -114,7 +114,9 @@ def _describe(
 
 
 def _offset(places: NDArray[Any]) -> float:
-    """What places along an axis count from, metres: whole ones near the first, where 0 is far away."""
+    """What places along an axis count from, metres:
+    whole ones near the first, where 0 is far away.
+    """
     near = places[np.isfinite(places)][:1].round()
     return float(near[0]) if len(near) and abs(near[0]) > NEAR else 0.0
 

@@ -1,9 +1,9 @@
 """Encode one frame from the values of its fields, by its layout.
 
-The values are completed first: fields that count elements or bytes follow from what is counted. Then
-the values of the header fields select the layout, every value is stored at its place, and lengths,
-constants and checksums are written last. A part of a frame (`Parts`) is encoded like a frame, and
-copied into the frame around it.
+The values are completed first: fields that count elements or bytes follow from what is counted.
+Then the values of the header fields select the layout, every value is stored at its place, and
+lengths, constants and checksums are written last. A part of a frame (`Parts`) is encoded like a
+frame, and copied into the frame around it.
 """
 
 from __future__ import annotations

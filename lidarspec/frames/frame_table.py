@@ -507,7 +507,9 @@ def _there(value: Any) -> Any:
 
 
 def _put(column: NDArray[Any], index: int, value: Any) -> None:
-    """Copy a value, or lists of them, into its place in a padded array; lists may differ in length."""
+    """Copy a value, or lists of them, into its place in a padded array;
+    lists may differ in length.
+    """
     if isinstance(value, list) and column.ndim > 2:
         for place, part in enumerate(value):
             _put(column[index], place, part)

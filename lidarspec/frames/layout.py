@@ -438,7 +438,9 @@ class Condition:
     @classmethod
     @lru_cache(maxsize=4096)
     def of(cls, what: FieldInfo | Check) -> Condition:
-        """That a field has one of the values that it may have, or a check; the same in all layouts."""
+        """That a field has one of the values that it may have, or a check;
+        the same in all layouts.
+        """
         if isinstance(what, FieldInfo):
             return cls((what,), None, what.path)
         fields = tuple(ref.info for ref in refs(what.condition))

@@ -731,7 +731,9 @@ class _Places:
 
 
 class HeaderTree:
-    """All layouts of one frame type, or of a kind of parts, with the values of fields around them."""
+    """All layouts of one frame type, or of a kind of parts,
+    with the values of fields around them.
+    """
 
     def __init__(
         self, frame: tree.Node, limit: int, given: Mapping[str, int] | None = None

@@ -392,7 +392,9 @@ def _labelled(info: FieldInfo, numbers: Reader) -> Reader:
 
 
 class _Names(dict[int, Any]):
-    """What an Enum makes of a number; construct makes a new one each time, and they are all alike."""
+    """What an Enum makes of a number; construct makes a new one each time,
+    and they are all alike.
+    """
 
     def __init__(self, info: FieldInfo) -> None:
         super().__init__({raw: seen(info, raw) for raw in info.labels})

@@ -1,4 +1,5 @@
-"""The fields of one frame in the order of the wire, with their places: of a damaged or truncated one too.
+"""The fields of one frame in the order of the wire, with their places:
+of a damaged or truncated one too.
 
 `examine` finds the layout of the bytes, or as much of it as the bytes tell, and `Examined.fields`
 goes along the frame tree with it. Errors (`lidarspec.frames.diagnose`) and explanations are made of
@@ -123,7 +124,9 @@ class Examined:
         return self.known if isinstance(self.known, Layout) else None
 
     def fields(self) -> Iterator[WireField]:
-        """Return the fields in the order of the wire; the last one may be cut off (`raw` is None)."""
+        """Return the fields in the order of the wire;
+        the last one may be cut off (`raw` is None).
+        """
         cursor = _Cursor(self)
         yield from cursor.visit(self.root, "", self.prefix)
 

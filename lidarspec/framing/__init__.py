@@ -7,8 +7,8 @@ bytes whatever. Modules in reading order:
 * `results`: `Frames`, which each module passes on to the next; frames one by one; the counters.
 * `plausibility`: whether candidates of one layout are frames, many at a time.
 * `many_lengths`: candidates of layouts that differ only in the length of an array, judged together.
-* `frame_codec`: the interface of the engine of one frame type: its candidates judged, and its frames
-  as columns.
+* `frame_codec`: the interface of the engine of one frame type: its candidates judged,
+  and its frames as columns.
 * `text_frames`: this engine for frames with a wire form.
 * `frame_engine`: this engine for binary frames: compiled, and interpreted by construct.
 * `weak_frames`: types that are accepted only in runs: the runs among their candidates.

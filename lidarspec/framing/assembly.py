@@ -176,7 +176,9 @@ class Assembly:
         return _Fragment(key, index, count, payload) if is_whole and 0 <= index < count else None
 
     def _taken(self, fragment: _Fragment, place: int, time: int) -> tuple[bytes, int] | None:
-        """The message that a fragment completes, and where it began; None where others are missing."""
+        """The message that a fragment completes, and where it began;
+        None where others are missing.
+        """
         for key in [
             key for key, message in self._waiting.items() if 0 <= message.at < time - PATIENCE
         ]:

@@ -450,7 +450,9 @@ def backend(name: str) -> str:
 
 
 def frames_of(decoder: Decoder, data: Any) -> list[Frames]:
-    """Every frame of a whole input: bytes as a stream, an iterable or (n, size) array as datagrams."""
+    """Every frame of a whole input: bytes as a stream,
+    an iterable or (n, size) array as datagrams.
+    """
     if is_stream(data):
         return decoder.frames(data) + decoder.rest()
     packets: Any = (

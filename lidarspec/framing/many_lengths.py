@@ -181,7 +181,9 @@ class Together:
         )
 
     def by_layout(self, chosen: NDArray[np.bool_]) -> list[LayoutGroup]:
-        """Return some of the candidates with their layouts; `chosen`: which of `self.which`, (n,)."""
+        """Return some of the candidates with their layouts;
+        `chosen`: which of `self.which`, (n,).
+        """
         found = (
             (layout, self.which[chosen & (self.forms == form)])
             for form, layout in enumerate(self.layouts)
@@ -246,7 +248,9 @@ def _by_size(sizes: Offsets) -> Iterator[Offsets]:
 
 
 def _rows(buffer: Bytes1D, offsets: Offsets, size: int) -> Bytes2D:
-    """Return `size` bytes from each offset on, (n, size), with zeros behind the end of the buffer."""
+    """Return `size` bytes from each offset on, (n, size),
+    with zeros behind the end of the buffer.
+    """
     first = int(offsets.min())
     if int(offsets.max()) + size > len(buffer):
         buffer = np.concatenate([buffer[first:], np.zeros(size, np.uint8)])

@@ -43,7 +43,10 @@ class ImuSamples:
         return len(self.time_ns)
 
     def __repr__(self) -> str:
-        return f"ImuSamples({len(self)}{f', {np.ptp(self.time_ns) / 1e9:.3f} s' if len(self) > 1 else ''})"
+        return (
+            f"ImuSamples({len(self)}"
+            f"{f', {np.ptp(self.time_ns) / 1e9:.3f} s' if len(self) > 1 else ''})"
+        )
 
     def __getitem__(self, which: Any) -> ImuSamples:
         """The samples that a mask, indices or a slice pick."""

@@ -123,7 +123,9 @@ class PointCloud:
 
     @property
     def columns(self) -> Mapping[str, NDArray[Any]]:
-        """The columns that this cloud has, by name, those in `extra` last; those that were chosen."""
+        """The columns that this cloud has, by name, those in `extra` last;
+        those that were chosen.
+        """
         names = self.chosen or (*COLUMNS, *self.extra)
         source_of(self).prepare(names)
         columns = {
@@ -622,7 +624,12 @@ class Extras(Mapping[str, NDArray[Any]]):
         return len(self._source.extra)
 
     def __repr__(self) -> str:
-        return f"Extras({', '.join(f'{name} [{kind.unit}]' if kind.unit else name for name, kind in self._source.extra.items())})"
+        return f"""Extras({
+            ", ".join(
+                f"{name} [{kind.unit}]" if kind.unit else name
+                for name, kind in self._source.extra.items()
+            )
+        })"""
 
 
 class _Unread:

@@ -33,7 +33,9 @@ _LINEAR = (
 
 @dataclass(frozen=True)
 class Scale:
-    """The first and last lightness, from 0 to 1, the first and last hue in degrees, and the chroma."""
+    """The first and last lightness, from 0 to 1, the first and last hue in degrees,
+    and the chroma.
+    """
 
     lightness: tuple[float, float]
     hue: tuple[float, float]

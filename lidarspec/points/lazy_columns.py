@@ -483,7 +483,9 @@ class BatchColumns(ColumnSource):
         return pieces[0] if len(pieces) == 1 else np.concatenate(pieces)
 
     def _block(self, at: int) -> Block:
-        """The points around one that have their columns made together; they are in no other block."""
+        """The points around one that have their columns made together;
+        they are in no other block.
+        """
         index = bisect.bisect(self._blocks, at, key=lambda block: block.start)
         if index and at < self._blocks[index - 1].stop:
             return self._blocks[index - 1]

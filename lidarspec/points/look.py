@@ -178,7 +178,9 @@ def shade(cloud: PointCloud, look: Look) -> NDArray[np.float64]:
 
 
 def steps(cloud: PointCloud, look: Look) -> NDArray[np.intp]:
-    """The colour of each point by its number in the ramp, (n,); the first where nothing came back."""
+    """The colour of each point by its number in the ramp, (n,);
+    the first where nothing came back.
+    """
     return np.clip(np.nan_to_num(shade(cloud, look)) * STEPS, 0, STEPS - 1).astype(np.intp)
 
 

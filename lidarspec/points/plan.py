@@ -287,7 +287,9 @@ class Plan:
 
     @cached_property
     def _may_be_safe(self) -> bool:
-        """Whether everything in the directions is a number but for what is known of a batch only."""
+        """Whether everything in the directions is a number but for
+        what is known of a batch only.
+        """
         fixed = all(
             isinstance(part, Node) or np.isfinite(part).all() for part in self._directions_given
         )

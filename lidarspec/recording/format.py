@@ -8,7 +8,8 @@ first says what it is, in JSON.
     6       1     a, bytes of addresses
     7       2     n, bytes of data
     9       8     arrival time, ns since 1970, signed; the least number: nobody knows
-    17      a     sender, receiver: each a length byte, that many bytes of address, and, if there are any, the port in 2 bytes
+    17      a     sender, receiver: each a length byte, that many bytes of address,
+                  and, if there are any, the port in 2 bytes
     17+a    n     data
     17+a+n  4     CRC-32 (zlib) of everything before
 

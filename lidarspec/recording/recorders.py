@@ -193,7 +193,9 @@ class FrameRecorder(Appender):
             self._cut(self._decoder.feed(chunk.data, self._at))
 
     def _cut(self, found: list[Found]) -> None:
-        """Write the frames found, and what lies before them and is none; keep what waits for more."""
+        """Write the frames found, and what lies before them and is none;
+        keep what waits for more.
+        """
         for item in found:
             self._skip(item.offset - self._base)
             self._packet(len(item.data), item.at or self._at)
@@ -296,7 +298,9 @@ def recorder(
 def recorder_for(
     target: RecordTo, sensor: Spec | str | None, source: str | Path, opened: Transport
 ) -> tuple[Log, bool]:
-    """The recorder that a caller asks for, and whether it was made here, and has to be closed here."""
+    """The recorder that a caller asks for, and whether it was made here,
+    and has to be closed here.
+    """
     if isinstance(target, str | Path):
         return recorder(target, sensor, source, datagrams=opened.datagrams, baud=opened.baud), True
     if isinstance(target, Appender):

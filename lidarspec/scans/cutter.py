@@ -178,7 +178,9 @@ class Cutter:
         self._angle = angle
 
     def _ends_at(self, packets: Packets, found: Evaluated, at: float) -> list[End]:
-        """Return the ends where the angle passes `at`, in turns, of a sensor that may leap over it."""
+        """Return the ends where the angle passes `at`, in turns,
+        of a sensor that may leap over it.
+        """
         rows_are_packets = True
         if isinstance(self._rule, OnWrap):
             path = _own_path(packets, self._rule.name)
@@ -355,7 +357,9 @@ def first_points(found: Evaluated) -> NDArray[np.intp]:
 
 
 def _sums(counts: NDArray[Any], kept: int) -> NDArray[np.intp]:
-    """Sums over all axes but the first `kept`; along axes that repeat one number they are products."""
+    """Sums over all axes but the first `kept`;
+    along axes that repeat one number they are products.
+    """
     times = 1
     while counts.ndim > kept:
         repeats = counts.strides[-1] == 0 and counts.shape[-1] > 0
@@ -376,7 +380,9 @@ def _was_far(angles: NDArray[np.float64], full: float) -> bool:
 
 
 def _folded(angles: NDArray[np.float64], full: float) -> NDArray[np.float64]:
-    """Angles in [0, full), the results of `np.mod` in a fraction of its time; not to be written to."""
+    """Angles in [0, full), the results of `np.mod` in a fraction of its time;
+    not to be written to.
+    """
     outside = np.flatnonzero((angles < 0) | (angles >= full))
     if not len(outside):
         return angles

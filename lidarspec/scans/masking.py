@@ -117,7 +117,9 @@ class Masking:
         return [released if self.sector is None else self._mark(released)]
 
     def _find_leap(self, packets: Packets, angles: Angles) -> int | None:
-        """Look for the sector in the angles of the next packets; return the row of the first leap."""
+        """Look for the sector in the angles of the next packets;
+        return the row of the first leap.
+        """
         if self._finder is None:
             direction = self._reader.direction(packets.table)
             if not direction:

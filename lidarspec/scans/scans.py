@@ -667,8 +667,8 @@ class ScanStream:
         self._empty, self._broken = (
             0,
             False,
-            # frames without parts that have points, and whether there is a break before those at the
-            # end
+            # frames without parts that have points,
+            # and whether there is a break before those at the end
         )
         self._begins: int | None = (
             None  # time of the first point of the scan under way, ns, where it is known

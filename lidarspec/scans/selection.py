@@ -90,7 +90,9 @@ class Selection:
 
     @property
     def is_counted(self) -> bool:
-        """Whether it takes all scans of a source, from the first one on, to tell which are wanted."""
+        """Whether it takes all scans of a source, from the first one on,
+        to tell which are wanted.
+        """
         return self.is_timed or self.scans != (0, None) or self.every != 1
 
 

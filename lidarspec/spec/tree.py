@@ -158,7 +158,9 @@ class FieldInfo:
 
     @property
     def initial(self) -> int:
-        """The raw value that stands where none is given: 0, or the first of those that it may have."""
+        """The raw value that stands where none is given:
+        0, or the first of those that it may have.
+        """
         return 0 if self.allowed is None or 0 in self.allowed else self.allowed[0]
 
 
@@ -458,7 +460,9 @@ class Number:
 
 @dataclass(frozen=True, eq=False)
 class Blob:
-    """Plain bytes; `const`: what they must be, None where free. Without a name only as a constant."""
+    """Plain bytes; `const`: what they must be, None where free.
+    Without a name only as a constant.
+    """
 
     name: str
     info: FieldInfo

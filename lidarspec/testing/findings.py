@@ -186,7 +186,10 @@ class Finding:
         where = f"{file}:{self.line}" if self.line else str(file) if self.file else ""
         where = f"{place} ({where})" if place and where else place or where
         rule = self.rule
-        return f"{self.code} {rule.title}\n  where  {where}\n  what   {self.what}\n  why    {rule.why}\n  write  {rule.write}"
+        return (
+            f"{self.code} {rule.title}\n  where  {where}\n  what   {self.what}\n"
+            f"  why    {rule.why}\n  write  {rule.write}"
+        )
 
 
 class Violation(AssertionError):

@@ -52,7 +52,9 @@ FLIPPED_BYTES = 1 << 23
 
 
 def examples_are_valid_and_repeat(subject: Subject, name: str) -> None:
-    """Examples of a frame type are made up, parse, repeat, differ, and are no longer than declared."""
+    """Examples of a frame type are made up, parse, repeat, differ,
+    and are no longer than declared.
+    """
     frame = subject.sensor.frames[name]
     try:
         found = [subject.example(name, seed=seed) for seed in subject.seeds(name)]
@@ -408,7 +410,9 @@ def a_truncated_frame_is_a_wire_error(subject: Subject, name: str) -> None:
 
 
 def a_damaged_frame_is_at_worst_a_wire_error(subject: Subject, name: str) -> None:
-    """Hostile mutations of a frame parse, or are a `WireError`, whether or not they are verified."""
+    """Hostile mutations of a frame parse, or are a `WireError`,
+    whether or not they are verified.
+    """
     sensor = subject.sensor
     source = subject.source(f"mutations {name}")
     types = (name, None) if len(sensor.frames) <= MANY else (name,)

@@ -200,5 +200,6 @@ def _table(
         f'<div style="overflow:auto;max-height:{TALL}px;font-size:90%"><div style="padding:0 8px'
         f' 4px">{escape(printable(caption))}</div>'
         "<table"
-        f' style="border-collapse:collapse"><thead><tr>{head}</tr></thead>\n<tbody>{body}</tbody></table></div>'
+        f' style="border-collapse:collapse"><thead><tr>{head}</tr></thead>\n'
+        f"<tbody>{body}</tbody></table></div>"
     )

@@ -44,9 +44,9 @@ def test_a_finding_says_what_where_why_and_what_to_write(tmp_path: Path) -> None
     done = ran("check", file, "--max-examples", "8", code=1)
     line = next(number for number, row in enumerate(bare.splitlines(), 1) if '"distance" /' in row)
     assert (
-        f"LS201 {RULES['LS201'].title}\n  where  acme-x1 data.samples.distance ({file}:{line})\n  what   "
-        in done.output
-    )
+        f"LS201 {RULES['LS201'].title}\n  where  acme-x1 data.samples.distance ({file}:{line})\n"
+        "  what   "
+    ) in done.output
     assert f"  why    {RULES['LS201'].why}\n  write  {RULES['LS201'].write}" in done.output
     assert [line for line in done.output.splitlines() if line[:1] != " "][-1].startswith(
         "acme-x1: 1 finding, "
@@ -79,9 +79,9 @@ def test_what_was_measured_stands_beside_what_it_is_held_against() -> None:
     assert re.fullmatch(r"  data: rate: 21[56]\d\d points a second, simulated", lines[3])
     unproven = ran("check", STRANGER, "--max-examples", "3").output
     assert (
-        "  vectors: there is no file of golden vectors; x and y of points in two quadrants would prove the picture"
-        in unproven
-    )
+        "  vectors: there is no file of golden vectors;"
+        " x and y of points in two quadrants would prove the picture"
+    ) in unproven
 
 
 @pytest.mark.slow

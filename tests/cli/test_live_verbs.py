@@ -173,7 +173,8 @@ def test_view_prints_one_picture_where_there_is_no_terminal(capture: Path) -> No
 @pytest.mark.slow
 def test_view_draws_in_ascii_where_that_is_the_encoding(capture: Path) -> None:
     plain = subprocess.run(
-        [sys.executable, "-m", "lidarspec", "view", str(capture), *SENSOR], capture_output=True, check=True,
+        [sys.executable, "-m", "lidarspec", "view", str(capture), *SENSOR],
+        capture_output=True, check=True,
         env={**os.environ, "PYTHONIOENCODING": "ascii"},
     )  # fmt: skip
     assert b"^" in plain.stdout

@@ -164,7 +164,10 @@ def test_a_file_that_is_not_the_users_is_passed_over_and_said_once(
     assert ran("stats", "front").stderr.count(f"{file} is not read: {reason}") == 1
 
 
-EVIL = "from pathlib import Path\nPath(__file__).with_name('ran').touch()\nfrom {} import lidarspec_sensors\n"
+EVIL = (
+    "from pathlib import Path\nPath(__file__).with_name('ran').touch()\n"
+    "from {} import lidarspec_sensors\n"
+)
 
 
 @pytest.mark.parametrize("how", ["verb", "variable"])
@@ -219,7 +222,10 @@ def test_a_project_names_no_files_elsewhere_until_its_folder_is_allowed(
     (folder.parent / "outside.csv").write_text("-10 0 10 20", encoding="utf-8")
     (folder / "inside.csv").write_text("-10 0 10 20", encoding="utf-8")
     (folder / "link.csv").symlink_to(folder.parent / "outside.csv")
-    text = '[device.front]\nsource = "./front.bin"\nsensor = "hesai-xt16"\noptions = {{calibration = "{}"}}\n[device.rear]\nsource = "{}"\n'
+    text = (
+        '[device.front]\nsource = "./front.bin"\nsensor = "hesai-xt16"\n'
+        'options = {{calibration = "{}"}}\n[device.rear]\nsource = "{}"\n'
+    )
     (folder / "lidarspec.toml").write_text(text.format(place, place), encoding="utf-8")
     said = ran("stats", "front", code=2).stderr
     assert f"{folder / 'lidarspec.toml'}: [device.front]: calibration: " in said
@@ -252,9 +258,9 @@ def test_only_a_folder_of_ones_own_can_be_allowed(folder: Path) -> None:
     folder.chmod(0o777)
     said = ran("trust", folder, code=2).stderr
     assert (
-        f"{folder} is open to others: chmod 775 makes it yours; whoever writes there could run programs as you"
-        in said
-    )
+        f"{folder} is open to others: chmod 775 makes it yours;"
+        " whoever writes there could run programs as you"
+    ) in said
     assert "is no folder" in ran("trust", folder / "front.bin", code=2).stderr
 
 
@@ -340,7 +346,10 @@ def test_a_mistake_is_named_with_its_place(folder: Path, text: str, told: str) -
 
 
 def test_options_configure_the_sensor(folder: Path) -> None:
-    text = '[device.front]\nsource = "./front.bin"\nsensor = "velodyne-vlp16"\noptions = {frame = "vendor"}'
+    text = (
+        '[device.front]\nsource = "./front.bin"\nsensor = "velodyne-vlp16"\n'
+        'options = {frame = "vendor"}'
+    )
     (folder / "lidarspec.toml").write_text(text, encoding="utf-8")
     with ls.open("front") as device:
         assert device.sensor.options["frame"] == "vendor"
@@ -383,8 +392,8 @@ def test_no_return_stays_none_and_keeps_its_direction() -> None:
     nothing = np.full(1, np.nan, np.float32)
     zero = np.zeros(1, np.float32)
     cloud = ls.PointCloud(
-        x=nothing, y=nothing, z=nothing, range=np.full(1, np.inf, np.float32), azimuth=zero, elevation=zero,
-        time=np.zeros(1), valid=np.zeros(1, np.bool_),
+        x=nothing, y=nothing, z=nothing, range=np.full(1, np.inf, np.float32),
+        azimuth=zero, elevation=zero, time=np.zeros(1), valid=np.zeros(1, np.bool_),
     )  # fmt: skip
     found = Mount(x=3, yaw_deg=180).applied(cloud)
     assert np.isnan(found.xyz).all()

@@ -46,9 +46,7 @@ def sent(damaged: Iterable[bytes]) -> list[bytes]:
     return [*FRAMES[:5], *damaged, *FRAMES[5:20]]
 
 
-def test_a_flipped_bit_a_lost_and_an_inserted_byte_and_a_truncated_frame_are_told_from_each_other() -> (
-    None
-):
+def test_a_flipped_bit_a_lost_and_an_inserted_byte_and_a_truncated_frame_are_told_apart() -> None:
     data = FRAMES[30]
     flipped = data[:SPOT] + bytes([data[SPOT] ^ 4]) + data[SPOT + 1 :]
     headless = bytes([data[0] ^ 1]) + data[1:]

@@ -198,7 +198,7 @@ def test_yaml_quotes_what_would_mean_something_else() -> None:
         "i": "10",
         "j": [],
     }
-    assert (
-        yaml(value)
-        == 'a: "yes"\nb: "x: y"\nc: [1, 2]\nd:\n  e: ""\n  f:\n    - g: true\nh: "#1"\ni: "10"\nj: []\n'
+    assert yaml(value) == (
+        'a: "yes"\nb: "x: y"\nc: [1, 2]\nd:\n  e: ""\n  f:\n    - g: true\n'
+        'h: "#1"\ni: "10"\nj: []\n'
     )

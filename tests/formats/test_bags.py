@@ -117,8 +117,17 @@ def test_foxglove_has_its_own_messages(tmp_path: Path, name: str) -> None:
         fields = {
             field.name: (np.dtype(kinds[field.type]), field.offset) for field in message.fields
         }
-        rows = np.frombuffer(message.data, np.dtype({"names": list(fields), "formats": [kind for kind, _ in fields.values()],
-            "offsets": [at for _, at in fields.values()], "itemsize": message.point_stride}))  # fmt: skip
+        rows = np.frombuffer(
+            message.data,
+            np.dtype(
+                {
+                    "names": list(fields),
+                    "formats": [kind for kind, _ in fields.values()],
+                    "offsets": [at for _, at in fields.values()],
+                    "itemsize": message.point_stride,
+                }
+            ),
+        )
         for column in {"x", "y", "z", *one.points.extra}:
             np.testing.assert_array_equal(
                 rows[column], one.points.read(column)[column][one.points.valid]

@@ -1,4 +1,6 @@
-"""Files appear whole or not at all, in the format of their suffix, and hold what the clouds hold."""
+"""Files appear whole or not at all, in the format of their suffix,
+and hold what the clouds hold.
+"""
 
 from __future__ import annotations
 

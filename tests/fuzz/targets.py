@@ -613,7 +613,10 @@ def _scene(folder: Path) -> Target:
         room = read_scene(path)
         room.measure(np.linspace(-3, 3, 8), np.linspace(-1, 1, 8), time=np.linspace(0, 9, 8))
 
-    text = b"[room]\nlow=[-3.0,-2.2,-1.2]\nhigh=[4.6,3.1,1.6]\n[[box]]\nlow=[2.0,0.8,-1.2]\nhigh=[2.7,1.6,0.9]\n"
+    text = (
+        b"[room]\nlow=[-3.0,-2.2,-1.2]\nhigh=[4.6,3.1,1.6]\n"
+        b"[[box]]\nlow=[2.0,0.8,-1.2]\nhigh=[2.7,1.6,0.9]\n"
+    )
     mover = b"[[mover]]\nsize=[0.4,0.5,1.7]\npath=[[1.4,-1.5],[0.8,1.9]]\nspeed=0.8\nfloor=-1.2\n"
     return Target(
         "scene",
@@ -699,7 +702,8 @@ def _calibration(sensor: Sensor, option: str, folder: Path) -> Target:
             "Channel,Elevation,Azimuth" if option == "calibration" else "Channel,fire time(us)"
         )
         rows = [
-            f"{channel},{20.5 - channel / 2}{f',{channel % 5 * 15 - 30}' * heading.count('Azimuth')}"
+            f"{channel},{20.5 - channel / 2}"
+            f"{f',{channel % 5 * 15 - 30}' * heading.count('Azimuth')}"
             for channel in range(1, 129)
         ]
         return ["\n".join([heading, *rows[:number]]).encode() for number in (16, 32, 40, 64, 128)]

@@ -29,7 +29,9 @@ REPORTS = {
     "wrong-signature = lidarspec_broken.wrong_signature": "everything",
     "misspelt = lidarspec_broken.misspelt": "there is no hook 'lidarspec_sensor'",
     "unmarked = lidarspec_broken.unmarked": "lidarspec_sensors lacks @hookimpl",
-    "duplicate = lidarspec_broken.duplicate": "acme-x1: another sensor has this id already: that of acme-lidars:acme_lidars",
+    "duplicate = lidarspec_broken.duplicate": (
+        "acme-x1: another sensor has this id already: that of acme-lidars:acme_lidars"
+    ),
     "raises = lidarspec_broken.raises": "ZeroDivisionError",
     "no-sensor = lidarspec_broken.no_sensor": "returns sensors, not str",
     "bad-spec = lidarspec_broken.bad_spec": "no field may be called 'state' or 'on'",
@@ -82,7 +84,9 @@ for name in (n for n in sensors if n.startswith("broken-")):
 
 @pytest.fixture(scope="module")
 def site(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A folder with the stranger's and the broken distributions, installed by pip as a user would."""
+    """A folder with the stranger's and the broken distributions,
+    installed by pip as a user would.
+    """
     folder = tmp_path_factory.mktemp("plugins")
     sources = [shutil.copytree(HERE / name, folder / name) for name in ("stranger", "broken")]
     (folder / "broken" / "lidarspec_broken" / "syntax.py").write_text(
@@ -115,7 +119,10 @@ def site(tmp_path_factory: pytest.TempPathFactory) -> Path:
 @pytest.fixture(scope="module")
 def seen(site: Path) -> dict[str, Any]:
     """Output of a program that runs with these plugins installed."""
-    code = f"FRAME = {FRAME!r}\n{LOOK}{WORK}\nprint(json.dumps([plugins, good, sorted(sensors), report]))"
+    code = (
+        f"FRAME = {FRAME!r}\n{LOOK}{WORK}\n"
+        "print(json.dumps([plugins, good, sorted(sensors), report]))"
+    )
     done = python(site, "-c", code)
     assert done.returncode == 0, done.stderr
     return dict(zip(("plugins", "good", "sensors", "report"), json.loads(done.stdout), strict=True))
@@ -245,9 +252,9 @@ def test_of_two_with_one_id_both_are_named_and_the_one_that_is_meant_is_checked(
         for finding in report["findings"]
         if finding["code"] == "LS005"
     ]
-    assert (
-        taken["what"]
-        == "lidarspec-broken has acme-x1: another sensor has this id already: that of acme-lidars:acme_lidars"
+    assert taken["what"] == (
+        "lidarspec-broken has acme-x1: another sensor has this id already:"
+        " that of acme-lidars:acme_lidars"
     )
     assert taken["path"] == "duplicate = lidarspec_broken.duplicate"
     source = reports["acme-x1"]["picture"].get("source")

@@ -47,7 +47,10 @@ def distribution(
     folder = place / f"{name}-{version}.{kind}"
     folder.mkdir(parents=True)
     (folder / "entry_points.txt").write_text(entries, encoding="utf-8")
-    header = f"Metadata-Version: 2.1\nName: {name}\nVersion: {version}\n\nName: a line of its description\n"
+    header = (
+        f"Metadata-Version: 2.1\nName: {name}\nVersion: {version}\n\n"
+        "Name: a line of its description\n"
+    )
     (folder / ("METADATA" if kind == "dist-info" else "PKG-INFO")).write_text(
         header, encoding="utf-8"
     )
@@ -231,7 +234,10 @@ def test_unknown_sensor_names_plugins_of_unknown_content_that_failed(
 ) -> None:
     with pytest.raises(
         UnknownSensor,
-        match=r"^unknown sensor 'gamma-x1'.*; dist failed to load: ModuleNotFoundError: .* 'a_module_that",
+        match=(
+            r"^unknown sensor 'gamma-x1'.*; dist failed to load:"
+            r" ModuleNotFoundError: .* 'a_module_that"
+        ),
     ):
         registry("gamma = a_module_that_nobody_has", offered=OFFERED).sensor("gamma-x1")
 

@@ -98,9 +98,10 @@ def test_a_file_that_is_no_sensor_is_a_clear_error(tmp_path: Path) -> None:
         "def broken(:": "SyntaxError",
         "raise SystemExit(3)": "SystemExit",
         "": "no function lidarspec_sensors",
-        "from lidarspec.spec import hookimpl\n@hookimpl\ndef lidarspec_sensors():\n    return [1 / 0]": (
-            "ZeroDivisionError"
-        ),
+        (
+            "from lidarspec.spec import hookimpl\n@hookimpl\n"
+            "def lidarspec_sensors():\n    return [1 / 0]"
+        ): "ZeroDivisionError",
     }.items():
         file.write_text(text, encoding="utf-8")
         with pytest.raises(SpecError, match=message):

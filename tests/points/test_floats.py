@@ -124,7 +124,9 @@ def test_coordinates_may_lie_in_a_plane_and_be_turned(
 
 
 def scaled(backend: str, **values: Any) -> tuple[PointCloud, PointCloud]:
-    """Points of two frames with a float scale, one of them with these values; and the plain ones."""
+    """Points of two frames with a float scale, one of them with these values;
+    and the plain ones.
+    """
     sensor = SHAPES["shape-scales"]
     usual: dict[str, Any] = dict(
         scale=2.0, start=90.0, tilt=0.1, distances=[0, 1, 2, 1000, 4660, 65535], strengths=[1.5] * 6

@@ -1,4 +1,6 @@
-"""Columns of pixels: what is along which array, worked out by hand, and clouds of them as pictures."""
+"""Columns of pixels: what is along which array, worked out by hand,
+and clouds of them as pictures.
+"""
 
 from __future__ import annotations
 

@@ -357,7 +357,9 @@ def file_size_limit(size: int) -> Iterator[None]:
 
 
 def fill(path: Path) -> None:
-    """Record more than there is room for: the capture goes on, one error, and a file that is whole."""
+    """Record more than there is room for: the capture goes on, one error,
+    and a file that is whole.
+    """
     recorder = Recorder(path)
     for number in range(200):
         recorder.write(Chunk(bytes([number]) * 1000, number))

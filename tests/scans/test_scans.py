@@ -216,9 +216,7 @@ def test_no_two_turns_are_one_scan_whatever_is_missing(
     assert sum(scan.complete for scan in scans) >= len(sound) - 2 - turns - 3
 
 
-def test_a_frame_whose_first_packet_is_there_is_complete_though_the_end_of_the_one_before_is_missing() -> (
-    None
-):
+def test_a_frame_with_its_first_packet_is_complete_though_the_one_before_has_no_end() -> None:
     scans = scans_without("robosense-m1", range(1250, 1260))
     assert [(len(scan) // 125, scan.complete) for scan in scans] == [
         (630, False),

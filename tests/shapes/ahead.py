@@ -39,7 +39,9 @@ DATA = Checksummed(
 
 
 def points(f: Fields) -> Polar:
-    """The last packet before a loss has no next angle: there it takes the step from the one before."""
+    """The last packet before a loss has no next angle:
+    there it takes the step from the one before.
+    """
     step = wrap(following(f.angle) - f.angle, 360)
     before = wrap(f.angle - previous(f.angle), 360)
     step = np.where(np.isfinite(step), step, before) / SAMPLES

@@ -1,4 +1,6 @@
-"""A count further out: the length of an array stands in the header beside the struct that holds it."""
+"""A count further out: the length of an array stands in the header beside the struct
+that holds it.
+"""
 
 from __future__ import annotations
 

@@ -1,4 +1,6 @@
-"""The options of a sensor, wherever they are given: of the types that are declared, and no others."""
+"""The options of a sensor, wherever they are given:
+of the types that are declared, and no others.
+"""
 
 from __future__ import annotations
 

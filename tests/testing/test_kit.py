@@ -141,7 +141,8 @@ def test_the_plugin_loads_nothing_of_the_engine(tmp_path: Path) -> None:
     (tmp_path / "test_other.py").write_text(
         "import sys\n\ndef test_light():\n"
         "    assert 'lidarspec.testing.plugin' in sys.modules\n"
-        "    heavy = {'numpy', 'construct', 'hypothesis', 'lidarspec.spec.description', 'lidarspec.plugins'}\n"
+        "    heavy = {'numpy', 'construct', 'hypothesis', 'lidarspec.spec.description',"
+        " 'lidarspec.plugins'}\n"
         "    assert not heavy & sys.modules.keys()\n",
         encoding="utf-8",
     )
@@ -411,9 +412,9 @@ def test_vectors_of_several_sensors_say_whose_they_are() -> None:
     known = json.loads(BY_VECTORS.read_text(encoding="utf-8"))
     asked = told(sound.sensor(), known, "broken-one", "broken-two")
     assert (
-        'it names no sensor, and the file is shared by broken-one, broken-two: "sensor": "broken-one"'
-        in asked[0]
-    )
+        "it names no sensor, and the file is shared by broken-one, broken-two:"
+        ' "sensor": "broken-one"'
+    ) in asked[0]
     asked = told(
         sound.sensor(), [{**entry, "sensor": "borken-one"} for entry in known], "broken-one"
     )
@@ -510,7 +511,10 @@ def test_a_checksum_of_another_name_is_found_in_the_vectors(samples: int) -> Non
     sealed = replace(plain, struct=Checksummed(struct, field="end", algorithm=Crc(16, 0x8005)))
     examples = [sound.sensor(sealed).example("data", seed=seed) for seed in range(3)]
     vectors = [{"frame": "data", "hex": data.hex(), "source": "made up"} for data in examples]
-    said = "LS212 data.end: Crc(width=16, poly=0x8005) over all other bytes, in a field that is little-endian, fits every vector"
+    said = (
+        "LS212 data.end: Crc(width=16, poly=0x8005) over all other bytes,"
+        " in a field that is little-endian, fits every vector"
+    )
     assert told(sound.sensor(plain), vectors)[0].startswith(said)
     assert not any(text.startswith("LS212") for text in told(sound.sensor(sealed), vectors))
 
@@ -558,11 +562,13 @@ def test_a_reply_that_nothing_makes_up_asks_for_answers() -> None:
     )
     (empty,) = finding(learning, page)
     assert empty.startswith(
-        "LS604 commands.ask: its reply, which is made up without answers= of the Simulation, cannot be learned from"
+        "LS604 commands.ask: its reply, which is made up without answers= of the Simulation,"
+        " cannot be learned from"
     )
     (unmade,) = finding(Command("order", {"code": 9}, reply="page"), ended)
     assert unmade.startswith(
-        "LS604 commands.ask: its reply cannot be made up without answers= of the Simulation: cannot be simulated"
+        "LS604 commands.ask: its reply cannot be made up without answers= of the Simulation:"
+        " cannot be simulated"
     )
 
 
@@ -577,7 +583,9 @@ def test_vectors_that_prove_nothing_are_findings(tmp_path: Path) -> None:
         '[{"frame": "data", "hex": "", "units": 1, "source": "x"}]': "LS702",
         '[{"frame": "data", "hex": "", "points": {"first": {"x": 1}}, "source": "x"}]': "LS702",
         '[{"frame": "data", "hex": "", "points": {"0": {"x": [1]}}, "source": "x"}]': "LS702",
-        f'[{{"frame": "data", "hex": "{sound.sensor().example("data").hex()}", "source": " "}}]': "LS701",
+        (
+            f'[{{"frame": "data", "hex": "{sound.sensor().example("data").hex()}", "source": " "}}]'
+        ): "LS701",
     }.items():
         file.write_text(text, encoding="utf-8")
         with pytest.raises(Violation) as found:

@@ -44,7 +44,9 @@ LAYOUTS = {
     "rslidar_msgs/msg/rslidarScan": f"{STAMPED}uint8[1248] data".format(
         "rslidar_msgs", "rslidarPacket"
     ),
-    "rslidar_msg/msg/RslidarPacket": "std_msgs/Header header\nuint8 is_difop\nuint8 is_frame_begin\nuint8[] data",
+    "rslidar_msg/msg/RslidarPacket": (
+        "std_msgs/Header header\nuint8 is_difop\nuint8 is_frame_begin\nuint8[] data"
+    ),
     "ouster_sensor_msgs/msg/PacketMsg": "uint8[] buf",
 }
 KINDS = ["bag", "folder", "mcap", "db3", "untold"]
@@ -210,7 +212,8 @@ def test_packets_of_several_sensors_are_chosen_by_namespace_or_topic(tmp_path: P
     with contextlib.closing(transport(f"{path}?src=/left")) as opened:
         assert list(opened.chunks()) == []
         assert opened.warnings == [
-            f"{path} is an MCAP file, as ROS 2 bags are without packets of /left: /front/packets has {scan}; /rear/packets has {scan}"
+            f"{path} is an MCAP file, as ROS 2 bags are without packets of /left:"
+            f" /front/packets has {scan}; /rear/packets has {scan}"
         ]
 
 

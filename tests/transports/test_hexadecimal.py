@@ -118,8 +118,14 @@ def test_frames_are_read_as_analysers_and_terminals_print_them() -> None:
         "0000   54 2c 10 0e 54 2c 41 20 2e 2e 2e 2e 61 62 20 63   T,..T,A ....ab c\n"
         "0010   64 2c                                             d,\n"
     )
-    older = "0000  54 2c 10 0e 54 2c 41 20  2e 2e 2e 2e 61 62 20 63   T,..T,A ....ab c\n0010  64 2c   d,"
-    tcpdump = "\t0x0000:  542c 100e 542c 4120 2e2e 2e2e 6162 2063  T,..T,A.....ab.c\n\t0x0010:  642c                                     d,\n"
+    older = (
+        "0000  54 2c 10 0e 54 2c 41 20  2e 2e 2e 2e 61 62 20 63   T,..T,A ....ab c\n"
+        "0010  64 2c   d,"
+    )
+    tcpdump = (
+        "\t0x0000:  542c 100e 542c 4120 2e2e 2e2e 6162 2063  T,..T,A.....ab.c\n"
+        "\t0x0010:  642c                                     d,\n"
+    )
     for text in (wireshark, older, tcpdump):
         assert unhexed(text) == b"T,\x10\x0eT,A ....ab cd,", text
 
@@ -151,7 +157,11 @@ def test_times_before_the_bytes_are_when_they_came(text: str) -> None:
 
 
 SALEAE = "Time [s],Value,Parity Error,Framing Error\n0.000012500000000,0x54,,\n1.5,0x2C,Error,\n"
-LOGIC = 'name,type,start_time,duration,data\n"Async Serial","data",0.0000125,8.6e-05,0x54\n"Async Serial","data",1.5,8.6e-05,0x2C\n'
+LOGIC = (
+    "name,type,start_time,duration,data\n"
+    '"Async Serial","data",0.0000125,8.6e-05,0x54\n'
+    '"Async Serial","data",1.5,8.6e-05,0x2C\n'
+)
 
 
 @pytest.mark.parametrize("table", [SALEAE, LOGIC])
@@ -173,7 +183,10 @@ def test_tables_of_logic_analysers_are_read_with_their_times(table: str, tmp_pat
 @pytest.mark.parametrize(
     "text",
     [
-        "static const uint8_t frame[3] = { 0x8b, /* sync\n of it */ 0x13,\n 0x5A };\nunsigned int frame_len = 3;\n",
+        (
+            "static const uint8_t frame[3] = { 0x8b, /* sync\n of it */ 0x13,\n 0x5A };\n"
+            "unsigned int frame_len = 3;\n"
+        ),
         "unsigned char it[] =\n{\n  0x8B, 0x13, 0x5a\n};",
         "frame = [0x8b, 0x13,\n0x5a]",
         "[0x8b, 0x13, 0x5a]",
@@ -193,7 +206,9 @@ REFUSED = {
     ":10010000214601360121470136007EFE09D2190140": "it is Intel HEX",
     "0000000 2c54 0e10 0868": "words in the byte order of a computer",
     "000000 54 2c 10 0e 54 2c 41 20": "it begins with an offset, or with zeros",
-    "00000000: 0e102c54 20412c54  T,..T,A ": "the characters beside the bytes, 'T,..T,A', are not theirs",
+    "00000000: 0e102c54 20412c54  T,..T,A ": (
+        "the characters beside the bytes, 'T,..T,A', are not theirs"
+    ),
     "00000000  54 2c 10 0e  |T,..|\n*\n00000020": "stands for lines that were left out",
     "00000000  54 2c 10 0e  |T,..|\n00000020  54": "offset 00000020 behind 0x4 bytes",
     "00000000  54 2c 10 0e  |T,..|\n54 2c": "the lines before have offsets",
@@ -238,6 +253,6 @@ def test_the_command_line_takes_text_in_every_place(tmp_path: Path) -> None:
         code=4,
     ).stderr
     assert (
-        "standard input, line 7: not hexadecimal: CAN frames of can0 003 and of can0 004; grep takes those of one"
-        in said
-    )
+        "standard input, line 7: not hexadecimal: CAN frames of can0 003 and of can0 004;"
+        " grep takes those of one"
+    ) in said

@@ -45,8 +45,8 @@ def cloud(*xyz: tuple[float, float, float], intensity: Iterable[float] | None = 
     strength = None if intensity is None else np.array(list(intensity), np.float32)
     elevation = np.arctan2(z, np.hypot(x, y))
     return PointCloud(
-        x=x, y=y, z=z, range=np.hypot(x, y), azimuth=zero, elevation=elevation, time=zero.astype(float), valid=np.isfinite(x),
-        intensity=strength,
+        x=x, y=y, z=z, range=np.hypot(x, y), azimuth=zero, elevation=elevation,
+        time=zero.astype(float), valid=np.isfinite(x), intensity=strength,
     )  # fmt: skip
 
 

@@ -255,7 +255,9 @@ def looked_up(table, index):
 
 @njit(forceinline=True)
 def row_at(index, rows):
-    """The row of a table for an index; the last one, which is nan, for one that it does not have."""
+    """The row of a table for an index; the last one, which is nan,
+    for one that it does not have.
+    """
     return np.int64(index) if 0 <= index < rows - 1 else rows - 1
 
 

@@ -48,7 +48,9 @@ def _compiled(plan: Plan, names: tuple[str, ...], tables: dict[Any, NDArray[Any]
 
 
 def describe(plan: Plan) -> list[str]:
-    """A plan in lines: the shape, what is computed for each packet, and the calls for each chunk."""
+    """A plan in lines: the shape, what is computed for each packet,
+    and the calls for each chunk.
+    """
     names = tuple(
         name
         for name in ("x", "y", "z", "intensity")

@@ -455,7 +455,9 @@ def _single(rows: Sequence[Floats]) -> Singles:
 
 
 def split(node: Node, width: int) -> tuple[list[Term], list[Term]]:
-    """The parts of a sum that are low, and those that each of the `width` points of a packet has."""
+    """The parts of a sum that are low, and those that each of the `width` points
+    of a packet has.
+    """
     parts = terms(node, width)
     return [part for part in parts if part.full is None], [
         part for part in parts if part.full is not None
@@ -471,7 +473,9 @@ def product_of(node: Node, shape: tuple[int, ...]) -> Product | None:
 
 
 def angles_of(node: Node, shape: tuple[int, ...], leaves: Mapping[str, Leaf]) -> Angles | None:
-    """Angles that lie around one of their packet or block; None where they do not, or nobody knows."""
+    """Angles that lie around one of their packet or block;
+    None where they do not, or nobody knows.
+    """
     product = product_of(node, shape)
     if product is None:
         return None

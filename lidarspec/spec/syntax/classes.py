@@ -227,7 +227,9 @@ class CheckedConst(Const):  # type: ignore[misc]
 
 
 class Limited(Subconstruct):  # type: ignore[misc]
-    """A number that is one of some raw values, and no other: construct's OneOf, NoneOf and Mapping."""
+    """A number that is one of some raw values, and no other:
+    construct's OneOf, NoneOf and Mapping.
+    """
 
     def __init__(self, subcon: Construct, allowed: tuple[int, ...]) -> None:
         super().__init__(subcon)
@@ -425,14 +427,18 @@ class Sizing(Subconstruct):  # type: ignore[misc]
         return self.subcon._build(sizes.get(path, obj or 0), stream, context, path)
 
     def _enter(self, context: Any, said: tuple[str, int, Any]) -> None:
-        """Tell the struct that has the part; a bit block that is probed for itself stands in none."""
+        """Tell the struct that has the part; a bit block that is probed for itself stands
+        in none.
+        """
         for _ in range(self.out):
             context = context.get("_", {})
         context.get("_sizings", []).append((self, *said))
 
 
 class Counting(Subconstruct):  # type: ignore[misc]
-    """The number of elements of an array behind it, `of` which it is made whatever value is given."""
+    """The number of elements of an array behind it,
+    `of` which it is made whatever value is given.
+    """
 
     def __init__(self, subcon: Construct, of: str) -> None:
         super().__init__(subcon)

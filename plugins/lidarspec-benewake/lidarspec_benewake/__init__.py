@@ -36,8 +36,9 @@ from lidarspec.spec import (
     hookimpl,
 )
 
+# signals below and at which the distance is not to be relied on (TFmini-S 5.3, TF-Luna 5.4)
 WEAK = 100
-BLINDED = 0xFFFF  # signals below and at which the distance is not to be relied on (TFmini-S 5.3, TF-Luna 5.4)
+BLINDED = 0xFFFF
 UNITS = {"cm": 0.01, "mm": 0.001}
 VERSION = 1
 RESET = 2

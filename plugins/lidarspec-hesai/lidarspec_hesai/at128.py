@@ -64,8 +64,8 @@ JUMP = 10.0  # degrees of the mirror
 SHOTS, AHEAD = (
     1200,
     15.0,
-    # of a simulated scan, which begins so many degrees of the mirror after the face: 0.1 degrees from
-    # shot to shot
+    # of a simulated scan, which begins so many degrees of the mirror after the face:
+    # 0.1 degrees from shot to shot
 )
 
 # fmt: off

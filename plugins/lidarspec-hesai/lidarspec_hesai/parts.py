@@ -25,7 +25,8 @@ EPOCH = datetime.datetime(2024, 1, 1)  # of simulated packets
 TURN = (
     5.0,
     20.0,
-    # turns a second, slowest and fastest: 300 to 1200 rpm (tier4/nebula, rotation_speed of all models)
+    # turns a second, slowest and fastest:
+    # 300 to 1200 rpm (tier4/nebula, rotation_speed of all models)
 )
 
 UTC = Struct(
@@ -105,7 +106,9 @@ def beams(
 
 
 def turning(i: int, blocks: int, per_turn: int, rate_hz: float = 10.0) -> dict[str, Any]:
-    """Azimuths, speed and time of packet i of a sensor that fires `per_turn` blocks in each turn."""
+    """Azimuths, speed and time of packet i of a sensor that fires `per_turn` blocks
+    in each turn.
+    """
     shots = i * blocks + np.arange(blocks)
     now = EPOCH + datetime.timedelta(
         microseconds=round(1e6 * (i + 1) * blocks / (per_turn * rate_hz))

@@ -113,7 +113,9 @@ def seen_aside(distance: Any) -> Any:
 
 
 def points(f: Fields, rate: int, *, aside: bool = False) -> Polar:
-    """Even steps from the start angle to the end angle (manual 3.2), at `rate` points per second."""
+    """Even steps from the start angle to the end angle (manual 3.2),
+    at `rate` points per second.
+    """
     clockwise = spread(f.start_angle, f.end_angle, POINTS, full=360.0)  # degrees, (n, 12)
     if aside:
         clockwise = clockwise - seen_aside(f.points.distance)

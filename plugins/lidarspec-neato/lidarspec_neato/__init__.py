@@ -106,7 +106,9 @@ def lfcd_plausible(f: Fields) -> Any:
 
 
 def after_first(f: Fields, count: int) -> Any:
-    """Seconds from the first sample of a packet to each, a degree apart; 0 where the motor stands."""
+    """Seconds from the first sample of a packet to each, a degree apart;
+    0 where the motor stands.
+    """
     return np.where(f.speed > 0, np.arange(count) / (np.maximum(f.speed, 1 / 64) * 6), 0)
 
 

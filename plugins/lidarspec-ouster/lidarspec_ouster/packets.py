@@ -1,6 +1,7 @@
 """The packets of Ouster sensors: pixel profiles, lidar packets and IMU packets, all little-endian.
 
-    header | 16 columns: column header, H pixels, column footer | footer      (LEGACY has no header and no footer)
+    header | 16 columns: column header, H pixels, column footer | footer
+    (LEGACY has no header and no footer)
 
 How many pixels a column has, and how they are packed, no packet says: the metadata do.
 

@@ -214,7 +214,9 @@ def pairs(f: Fields, dual: Any, model: Rotor, *, late: Any = 0) -> Polar:
 
 
 def halves(f: Fields, dual: Any, model: Rotor, lasers: tuple[Any, Any]) -> Polar:
-    """Points of blocks of two firings of all lasers, or with dual return of the two returns of one."""
+    """Points of blocks of two firings of all lasers,
+    or with dual return of the two returns of one.
+    """
     azimuth = f.blocks.azimuth
     group = np.arange(2)[:, None]
     duration = np.where(dual, 1, 2) * model.period
@@ -286,7 +288,9 @@ def pace(f: Fields, shots: float, period: float, dual: int) -> Any:
 
 
 def rotor_step(ahead: Any, behind: Any, usual: Any) -> Any:
-    """Degrees to the next shot; over a loss or a gap as before it, or as the rotor was set to turn."""
+    """Degrees to the next shot; over a loss or a gap as before it,
+    or as the rotor was set to turn.
+    """
     ahead = wrap(ahead, 360)
     behind = wrap(behind, 360)
     return np.where(ahead <= GAP, ahead, np.where(behind <= GAP, behind, usual))

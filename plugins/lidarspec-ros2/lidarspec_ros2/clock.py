@@ -100,7 +100,9 @@ class Stamps:
         self._ahead = self._ahead if ahead is None else ahead
 
     def of(self, device_ns: int, host_ns: int, settings: Settings) -> int:
-        """The stamp of the next scan, by the sensor's time and the arrival of its first point, ns."""
+        """The stamp of the next scan, by the sensor's time and the arrival
+        of its first point, ns.
+        """
         return self._wanted(device_ns, self.clock.stamp(device_ns, host_ns), host_ns, settings)
 
     def at(self, time_ns: int, settings: Settings, *, by_clock: bool) -> int:

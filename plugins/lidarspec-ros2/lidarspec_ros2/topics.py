@@ -1,4 +1,6 @@
-"""What the node publishes of a sensor: messages as bytes, as logs have them, for whoever listens."""
+"""What the node publishes of a sensor: messages as bytes, as logs have them,
+for whoever listens.
+"""
 
 from __future__ import annotations
 
@@ -179,7 +181,9 @@ class Topics:
         return self.stamps.of(scan.stamp_ns, scan.host_ns, self._settings)
 
     def _publisher(self, kind: str) -> Any:
-        """The publisher of a kind of messages; that of `scan` is made when there is a planar one."""
+        """The publisher of a kind of messages; that of `scan` is made
+        when there is a planar one.
+        """
         if kind not in self._publishers:
             topic, message, depth = KINDS[kind]
             qos = QoSProfile(depth=depth, reliability=self._reliability)

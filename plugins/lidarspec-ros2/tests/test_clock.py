@@ -1,4 +1,6 @@
-"""Stamps are right within a millisecond, and in order, whatever the sensor's clock and the line do."""
+"""Stamps are right within a millisecond, and in order,
+whatever the sensor's clock and the line do.
+"""
 
 from __future__ import annotations
 

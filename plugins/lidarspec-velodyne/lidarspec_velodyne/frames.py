@@ -46,7 +46,9 @@ BANKS = np.array([0xFFEE, 0xFFDD, 0xFFCC, 0xFFBB])[:, None]
 def packet(
     flag: Construct, unit: float, mode: Construct, product: Construct, *, blocks: int = BLOCKS
 ) -> Struct:
-    """A data packet of so many blocks that hold points, with distances in steps of `unit` metres."""
+    """A data packet of so many blocks that hold points,
+    with distances in steps of `unit` metres.
+    """
     channel = Struct(
         "distance" / Scaled(Int16ul, unit, "m") * "0: no return",
         "intensity" / Int8ul * "calibrated reflectivity: to 100 diffuse, above retroreflecting",

@@ -55,7 +55,9 @@ class Shown:
         self._message_most = -1
 
     def message(self, most: int) -> bytes:
-        """Return the scan as a message of at most so many points; it is made once for each limit."""
+        """Return the scan as a message of at most so many points;
+        it is made once for each limit.
+        """
         if most != self._message_most:
             self._message = message(
                 self.scan, self.number, position=self.position, sent=self.sent, most=most
@@ -165,7 +167,9 @@ class Broadcast:
 
     @property
     def began_ns(self) -> int:
-        """When the first packet of the first scan arrived, ns since 1970; 0 if that is not known."""
+        """When the first packet of the first scan arrived, ns since 1970;
+        0 if that is not known.
+        """
         return 0 if self._first_scan is None else self._first_scan.host_ns
 
     def now(self) -> float:

@@ -1,4 +1,6 @@
-"""The bytes beside the picture: the frame that a point came from, frames by number, damaged ones."""
+"""The bytes beside the picture: the frame that a point came from, frames by number,
+damaged ones.
+"""
 
 from __future__ import annotations
 

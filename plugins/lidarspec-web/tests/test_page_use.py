@@ -1,4 +1,6 @@
-"""The page as it is used: on a phone, by keyboard, and by people who come back to it after a while."""
+"""The page as it is used: on a phone, by keyboard,
+and by people who come back to it after a while.
+"""
 
 from __future__ import annotations
 
