@@ -6,14 +6,10 @@ import ast
 import doctest
 import importlib
 import inspect
-import itertools
 import operator
 import os
 import re
-import sys
-import threading
 from pathlib import Path
-from types import FrameType
 
 import pytest
 
@@ -21,7 +17,6 @@ import lidarspec as ls
 from lidarspec import errors, plugins as hookspecs, spec
 from lidarspec.cli.root import VERBS
 from lidarspec.spec import Checksummed, Clock, Command, Frame, Polar, Scaled, Sequence
-from lidarspec.testing.fixtures import virtual_port
 from tests.docs import pages
 from tests.docs.pages import DOCS
 
@@ -235,35 +230,6 @@ def opened(section: str) -> list[tuple[str, str]]:
     return named
 
 
-@pytest.mark.parametrize(
-    ("module", "name"), [*opened("Where things are"), *opened("The way of a byte")]
-)
+@pytest.mark.parametrize(("module", "name"), opened("Where things are"))
 def test_what_contributing_says_to_open_is_there(module: str, name: str) -> None:
     assert operator.attrgetter(name)(importlib.import_module(f"lidarspec.{module}"))
-
-
-@pytest.mark.slow
-@pytest.mark.skipif(os.name == "nt", reason="there are no pseudo-terminals")
-def test_a_byte_goes_the_way_that_contributing_says() -> None:
-    passed: set[tuple[str, str]] = set()
-
-    def profile(frame: FrameType, event: str, _: object) -> None:
-        if event == "call":
-            passed.add(
-                (
-                    frame.f_globals.get("__name__", "").removeprefix("lidarspec."),
-                    frame.f_code.co_qualname,
-                )
-            )
-
-    threading.setprofile(profile)
-    sys.setprofile(profile)
-    try:
-        with virtual_port("ldrobot-stl27l") as port, ls.open(port.path, "ldrobot-stl27l") as device:
-            assert [len(scan.points.x) > 100 for scan in itertools.islice(device.scans(), 3)][-1]
-    finally:
-        sys.setprofile(None)
-        threading.setprofile(None)
-    stops = opened("The way of a byte")
-    assert {module for module, _ in stops} <= {module for module, _ in passed}
-    assert {(module, name) for module, name in stops if "." in name} <= passed
