@@ -111,7 +111,8 @@ def test_an_unsupported_link_layer_is_named_with_a_way_to_read_it(
     packets = [b"\xff\x03\x00\x21" + made.ipv4(made.udp(bytes(1210)))] * 3
     path = capture(tmp_path / "ppp.pcap", *map(made.record, packets), link=9)
     words = (verb, path) if verb in ("info", "detect") else (verb, path, "-s", M1)
-    output = ran(*words, code=code).output
+    done = ran(*words, code=code)
+    output = done.stdout + done.stderr
     message = f"{path}: 3 of 3 packets have an unsupported link layer, and were not read: 3 PPP"
     assert output.count(message) == 1, output
     assert output.count("editcap -C BYTES -T rawip") == 1
