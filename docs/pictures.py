@@ -1,8 +1,10 @@
 """Makes the pictures of the front page and the README from simulated sensors alone: the same bytes
 each time.
 
-    python docs/pictures.py [--into FOLDER]  # a terminal, a point cloud, a packet diagram: SVG
-    python docs/pictures.py --page [--into FOLDER] # the page in the browser, as PNG; needs Chromium
+    python docs/pictures.py [--into FOLDER]
+        a terminal, a point cloud and a packet diagram, as SVG
+    python docs/pictures.py --page [--into FOLDER]
+        the page in the browser, as PNG; requires Chromium
 
 `make docs` runs both. A PNG has other bytes wherever fonts are others: that of the page goes into
 the site alone, and for the README it is made by hand when the page has changed.

@@ -181,12 +181,9 @@ def _check(node: tree.Node) -> None:
                 " keeps none"
             )
     if isinstance(node, tree.Opaque):
-        raise Refused(
-            f"""{node.info.path}: {
-                node.reason
-                if node.inside
-                else f"{node.kind} is Python code, which no other language runs"
-            }"""
-        )
+        reason = node.reason
+        if not node.inside:
+            reason = f"{node.kind} is Python code, which no other language runs"
+        raise Refused(f"{node.info.path}: {reason}")
     if isinstance(node, tree.Sealed):
         _ = node.algorithm

@@ -145,12 +145,10 @@ class _Classes:
             case Repeat():
                 return f"list[{self._type(owner, name, node.element)}]"
             case Parts():
-                return f"""list[{
-                    " | ".join(
-                        self._type(owner, name + camel(kind.name), kind.element)
-                        for kind in node.kinds
-                    )
-                }]"""
+                types = [
+                    self._type(owner, name + camel(kind.name), kind.element) for kind in node.kinds
+                ]
+                return f"list[{' | '.join(types)}]"
             case When() | Select():
                 return " | ".join(
                     dict.fromkeys(self._type(owner, name, branch) for branch in children(node))

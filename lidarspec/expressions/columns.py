@@ -582,9 +582,8 @@ def _spot(
             )
             break
     else:
-        reason = f"""goes with no array of the frame: {
-            ", ".join(f"{axis} {length}" for (_, length), axis in whole.items()) or "it has none"
-        }"""
+        arrays = ", ".join(f"{axis} {length}" for (_, length), axis in whole.items())
+        reason = f"goes with no array of the frame: {arrays or 'it has none'}"
     raise SpecError(f"an array of {' x '.join(map(str, shape))} values {reason}", rule="LS214")
 
 

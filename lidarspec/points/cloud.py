@@ -624,12 +624,11 @@ class Extras(Mapping[str, NDArray[Any]]):
         return len(self._source.extra)
 
     def __repr__(self) -> str:
-        return f"""Extras({
-            ", ".join(
-                f"{name} [{kind.unit}]" if kind.unit else name
-                for name, kind in self._source.extra.items()
-            )
-        })"""
+        names = [
+            f"{name} [{kind.unit}]" if kind.unit else name
+            for name, kind in self._source.extra.items()
+        ]
+        return f"Extras({', '.join(names)})"
 
 
 class _Unread:
