@@ -46,10 +46,7 @@ GROUPS = {
         ),
         "demo": (
             "sim",
-            (
-                "A simulated sensor on a port: started, read through a bad line, recorded, read"
-                " again, drawn."
-            ),
+            "Start a simulated sensor on a port, read it over a bad line, record it and draw it.",
         ),
         "help": ("root", "What a verb does, and its options; without a verb, all of them."),
     },

@@ -236,9 +236,7 @@ def _sent(device: SimulatedDevice) -> str:
 )
 @click.option("--json", "as_json", is_flag=True, help="Print the summary as JSON.")
 def demo(sensor_id: str | Sensor | None, count: int, errors: float, as_json: bool) -> None:
-    """A simulated sensor on a port: started, read through a bad line, recorded,
-    read again, drawn.
-    """
+    """Start a simulated sensor on a port, read it over a bad line, record it and draw it."""
     simulated = (
         one
         for one in registry().sensors().values()
