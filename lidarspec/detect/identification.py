@@ -183,11 +183,13 @@ def _by_clock(sensor: Sensor, found: Sequence[Found]) -> str:
             else [item.data for item in data]
         )
     )
+    if len(packets) < 3:
+        return ""
     if sensor.clock.pace is None:
         expected = _pace(sensor.id, sensor)
     else:
         expected = _declared_pace(sensor.clock.pace, packets)
-    if expected is None or len(packets) < 3:
+    if expected is None:
         return ""
     if sensor.datagrams:  # lost, doubled and swapped ones leave most steps as they were
         step = float(np.median(np.diff(np.sort(packets.time_ns))))

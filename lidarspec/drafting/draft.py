@@ -15,6 +15,7 @@ from __future__ import annotations
 import itertools
 import json
 import re
+import textwrap
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from importlib.metadata import distribution
@@ -60,7 +61,7 @@ TAKEN = {"ACK", "COMMAND", "DATA", "RATE", "SAMPLES", "TURNS"}
 VECTORS = 3
 _ID = re.compile(r"([a-z0-9]+)-([a-z0-9]+(?:-[a-z0-9]+)*)")
 #: characters of a line of what is written, at most.
-LINE = 140
+LINE = 100
 _CONDITION = re.compile(r"^(.*?) *#if (\w+)\n", re.MULTILINE)
 #: bytes of a constant that are told, and how many have to be constant together to be a field.
 TOLD, RUN = 8, 2
@@ -433,7 +434,10 @@ class Field:
 
     def lines(self, indent: str) -> Iterator[str]:
         """Its text."""
-        yield from (f"{indent}# {line}" for line in self.why)
+        for line in self.why:
+            yield from textwrap.wrap(
+                line, LINE, initial_indent=f"{indent}# ", subsequent_indent=f"{indent}#   "
+            )
         gap = f"\n{indent}" if "\n" in self.code else " "
         yield f'{indent}"{self.name}"{gap}/ {self.code},'
 

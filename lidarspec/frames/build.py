@@ -8,7 +8,14 @@ from typing import Any
 import numpy as np
 from construct import Container
 
-from lidarspec.errors import OutOfRange, UnknownField, UnknownFrame, UsageError
+from lidarspec.errors import (
+    LidarSpecError,
+    OutOfRange,
+    SpecError,
+    UnknownField,
+    UnknownFrame,
+    UsageError,
+)
 from lidarspec.frames.compilability import NotCompilable
 from lidarspec.frames.encode import encode, fill_counts, known_paths
 from lidarspec.frames.layout_tree import frame_layouts
@@ -44,7 +51,16 @@ def build(
     if isinstance(frame_layouts(declared), NotCompilable):
         fill_counts(given, schema(declared.tree))
         return build_plain(declared, given, place)
-    struct = encode(declared.tree, given, declared.room, place)
+    try:
+        struct = encode(declared.tree, given, declared.room, place)
+    except LidarSpecError:
+        raise
+    except Exception as error:  # an expression or a checksum of the plugin
+        raise SpecError(
+            f"an expression of the struct failed: {type(error).__name__}: {error}",
+            path=frame,
+            sensor=sensor.id,
+        ) from error
     data = frame_coder(declared).encode(struct, (value or {}).get(SPELLING))
     if data is None:
         raise UsageError(

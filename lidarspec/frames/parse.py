@@ -193,6 +193,12 @@ def _named(
         return find(examined)
     except SpecError as error:
         raise SpecError(error.reason, path=name, sensor=sensor.id) from error
+    except Exception as error:  # an expression or a checksum of the plugin
+        raise SpecError(
+            f"an expression of the struct failed: {type(error).__name__}: {error}",
+            path=name,
+            sensor=sensor.id,
+        ) from error
 
 
 def _wire_error(
