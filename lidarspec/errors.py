@@ -43,6 +43,12 @@ class SpecError(LidarSpecError):
 _NOT_ITS_OWN = ("construct", "numpy", "pluggy", "hypothesis", "_pytest")
 
 
+def struct_error(error: Exception, *, path: str, sensor: str = "") -> SpecError:
+    """Return the error for an expression or a checksum of a struct that raised."""
+    reason = f"an expression of the struct failed: {type(error).__name__}: {error}"
+    return SpecError(reason, path=path, sensor=sensor)
+
+
 class PluginError(SpecError):
     """A function of a plugin raised, or returned what cannot be used; where a stream is read, it is
     counted.

@@ -16,11 +16,11 @@ from lidarspec.device.session import Reply
 from lidarspec.display import drawn
 from lidarspec.errors import LidarSpecError, WireError
 from lidarspec.explaining.damage import told
-from lidarspec.explaining.frame_rows import FrameRows, plain
+from lidarspec.explaining.frame_rows import FrameRows
 from lidarspec.explaining.listing import Line, Listing, text
 from lidarspec.explaining.wording import Difference, Point, Row, Span, Value
 from lidarspec.frames.parse import identify
-from lidarspec.frames.schema import schema
+from lidarspec.frames.schema import schema, without_indices
 from lidarspec.frames.wire_coder import frame_coder
 from lidarspec.frames.wire_fields import examine
 from lidarspec.framing.frame_engine import codec
@@ -279,8 +279,8 @@ def _numbers(
         return [int(numbers)] if not path and numbers >= 0 else []
     if (
         len(indices) != len(chain)
-        or not chain[-1].startswith(plain(path))
-        or plain(path) not in chain[-1].removesuffix("[]")
+        or not chain[-1].startswith(without_indices(path)[0])
+        or without_indices(path)[0] not in chain[-1].removesuffix("[]")
     ):
         return []
     own = dict(zip(chain, indices, strict=True))

@@ -5,7 +5,6 @@ from __future__ import annotations
 import contextlib
 import functools
 import itertools
-import re
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
 
@@ -14,7 +13,7 @@ from lidarspec.explaining.wording import Row, Value
 from lidarspec.frames.compilability import NotCompilable
 from lidarspec.frames.layout_tree import frame_layouts
 from lidarspec.frames.plain import plain_fields
-from lidarspec.frames.schema import schema
+from lidarspec.frames.schema import schema, without_indices
 from lidarspec.frames.wire_coder import frame_coder
 from lidarspec.frames.wire_fields import PlacedSeal, WireField, examine
 from lidarspec.frames.wire_table import bit_text, hexed
@@ -48,8 +47,9 @@ class FrameRows:
         self._verdicts: dict[str, tuple[str, bool]] = {}
         fields = self._read_fields(frame, decoded.struct)
         self._is_cut_off = fields is None or any(each.raw is None for each in fields)
-        self._fields = [self._placed(each) for each in fields or () if each.raw is not None]
-        self._blocks = {plain(each.block) for each in self._fields if each.bits is not None}
+        self._fields = [self._place_on_wire(each) for each in fields or () if each.raw is not None]
+        blocks = [each.block for each in self._fields if each.bits is not None]
+        self._blocks = {without_indices(path)[0] for path in blocks}
         self._first = self._offsets[0]
         self._end = max((each.end for each in self._fields), default=self._first)
         self._is_whole_text = self._has_form and not self._is_cut_off and decoded.problem is None
@@ -75,7 +75,7 @@ class FrameRows:
             fields.append(cut_off)
         return fields
 
-    def _placed(self, each: WireField) -> WireField:
+    def _place_on_wire(self, each: WireField) -> WireField:
         """Return a field with its place on the wire."""
         if not self._has_form:
             return each
@@ -112,7 +112,7 @@ class FrameRows:
     def _row_path(self, path: str) -> str:
         """Return the innermost array element that a field stands in, or the field itself."""
         head, bracket, _ = path.rpartition("]")
-        array = plain(head + bracket)
+        array = without_indices(head + bracket)[0]
         in_blocks = tuple(f"{block}." for block in self._blocks)
         further = any(
             axis.startswith(f"{array}.") and not axis.startswith(in_blocks) for axis in self._axes
@@ -140,8 +140,8 @@ class FrameRows:
 
     def _info(self, each: WireField) -> FieldInfo:
         docs = "constant" if each.path.endswith(UNNAMED) else ""
-        unknown = replace(each.info, path=plain(each.path), docs=docs)
-        found: FieldInfo = self._schema.all_fields.get(plain(each.path), unknown)
+        unknown = replace(each.info, path=without_indices(each.path)[0], docs=docs)
+        found: FieldInfo = self._schema.all_fields.get(without_indices(each.path)[0], unknown)
         return found
 
     def _remark(self, each: WireField, info: FieldInfo) -> str:
@@ -154,11 +154,6 @@ class FrameRows:
         if info.held and self._fault is not None and self._fault.path == each.path:
             return f"wrong: {each.raw}, expected {self._fault.expected}"
         return ""
-
-
-def plain(path: str) -> str:
-    """Return a path without indices: "points[1].intensity" is "points.intensity"."""
-    return re.sub(r"\[\d*\]", "", path)
 
 
 def _value(each: WireField, info: FieldInfo) -> Value:

@@ -11,10 +11,10 @@ from construct import Container
 from lidarspec.errors import (
     LidarSpecError,
     OutOfRange,
-    SpecError,
     UnknownField,
     UnknownFrame,
     UsageError,
+    struct_error,
 )
 from lidarspec.frames.compilability import NotCompilable
 from lidarspec.frames.encode import encode, fill_counts, known_paths
@@ -56,11 +56,7 @@ def build(
     except LidarSpecError:
         raise
     except Exception as error:  # an expression or a checksum of the plugin
-        raise SpecError(
-            f"an expression of the struct failed: {type(error).__name__}: {error}",
-            path=frame,
-            sensor=sensor.id,
-        ) from error
+        raise struct_error(error, path=frame, sensor=sensor.id) from error
     data = frame_coder(declared).encode(struct, (value or {}).get(SPELLING))
     if data is None:
         raise UsageError(

@@ -6,18 +6,17 @@ that it belongs to. Bytes that are missing or left over come last.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from lidarspec.errors import PluginError, SpecError
-from lidarspec.frames.layout import Condition, Layout
+from lidarspec.frames.layout import Condition, Layout, set_bits
 from lidarspec.frames.layout_tree import TooLong, Unknown, Unlike, Walk
 from lidarspec.frames.wire_fields import Examined, WireField
-from lidarspec.spec.tree import FieldInfo, evaluated, listed
+from lidarspec.spec.tree import format_hex, listed
 
 #: kinds of faults.
 CONSTANT = "constant"
@@ -41,6 +40,7 @@ class Fault:
         expected, got: texts or numbers.
         end: the byte up to which the frame was right; faults are ordered by it.
         needed: of a field that is cut off, its bytes.
+        is_bounded: whether it is cut off by the end of the parts, not by that of the frame.
     """
 
     kind: str
@@ -50,6 +50,7 @@ class Fault:
     got: Any
     end: int
     needed: int = 0
+    is_bounded: bool = False
 
     def reason(self, offset: int) -> str:
         """Return the fault in a sentence; `offset` is the place of the field that is shown."""
@@ -68,6 +69,8 @@ class Fault:
     def _shortage(self) -> str:
         total = "" if self.expected is None else f" of {self.expected}"
         where = f"frame ends at byte {self.end}{total}"
+        if self.is_bounded:
+            where = f"parts end at byte {self.end}"
         if not self.needed:
             return f"{where}: {self.path or 'the first field'} is cut off"
         plural = "s" if self.needed != 1 else ""
@@ -79,16 +82,22 @@ def find_fault(examined: Examined) -> Fault | None:
     """Return the first fault of a frame; None if it is sound.
 
     Raises:
-        SpecError: if an expression of the struct fails.
+        Exception: whatever an expression or a checksum of the plugin raises.
     """
     faults = [*_faults(examined)]
-    if faults:
-        return min(faults, key=lambda fault: fault.end)
-    return None
+    layout = examined.layout
+    if layout is not None and layout.size < len(examined.data):
+        size = len(examined.data)
+        faults.append(Fault(TRAILING, "", layout.size, layout.size, size, size))
+    return min(faults, key=lambda fault: fault.end, default=None)
 
 
 def find_shortage(examined: Examined) -> Fault | None:
-    """Return why the values of a frame cannot be read at all; None if they can."""
+    """Return why the values of a frame cannot be read at all; None if they can.
+
+    Raises:
+        Exception: whatever an expression of the struct raised.
+    """
     cut_off = next((each for each in examined.fields() if each.raw is None), None)
     if examined.layout is None or cut_off is not None:
         return _ending(examined, cut_off)
@@ -99,73 +108,134 @@ def _faults(examined: Examined) -> Iterator[Fault]:
     cut_off: WireField | None = None
     for each in examined.fields():
         if each.raw is None:
-            cut_off = each
-            break
+            cut_off = cut_off or each
+            continue
         fault = _fault_of_field(each)
         if fault is not None:
             yield fault
-    yield from _wrong_lengths(examined)
+    yield from _faults_of_layout(examined)
     for seal in examined.seals():
         if not seal.is_right:
             digits = (sum(leaf.info.bits for leaf in seal.seal.leaves) + 3) // 4
             expected = f"0x{seal.computed:0{digits}x}"
             got = f"0x{seal.stored:0{digits}x}"
             yield Fault(CHECKSUM, seal.path, seal.offset, expected, got, seal.end)
-    yield from _broken_conditions(examined)
-    yield from _broken_parts(examined)
+    part = _open_part(examined)
+    if part is not None:
+        yield from _faults(part)
     if cut_off is not None or examined.layout is None:
         yield _ending(examined, cut_off)
-    elif examined.layout.size < len(examined.data):
-        size = examined.layout.size
-        yield Fault(TRAILING, "", size, size, len(examined.data), len(examined.data))
 
 
 def _fault_of_field(each: WireField) -> Fault | None:
     info = each.info
     if info.const is not None and each.raw != info.const:
-        constant = _shown(info.const)
-        got = _shown(each.raw)
-        return Fault(CONSTANT, each.path, each.first_byte, constant, got, each.end)
+        expected = format_hex(info.const)
+        got = format_hex(each.raw)
+        return Fault(CONSTANT, each.path, each.first_byte, expected, got, each.end)
     if info.allowed is not None and each.raw not in info.allowed:
-        allowed = listed(info.allowed)
-        return Fault(VALUE, each.path, each.first_byte, allowed, int(each.raw), each.end)
+        expected = listed(info.allowed)
+        return Fault(VALUE, each.path, each.first_byte, expected, int(each.raw), each.end)
     return None
 
 
-def _shown(value: object) -> str:
-    if isinstance(value, bytes):
-        return value.hex(" ")
-    return f"0x{value:x}" if isinstance(value, int) else repr(value)
+def _faults_of_layout(examined: Examined) -> Iterator[Fault]:
+    """Return wrong lengths and broken conditions of a frame that is all there, and of its parts."""
+    layout = examined.layout
+    if layout is None or layout.size > len(examined.data):
+        return
+    row = np.frombuffer(examined.data[: layout.size], np.uint8).reshape(1, -1)
+    yield from _wrong_lengths(examined, layout, row)
+    yield from _broken_conditions(examined, layout, row)
+    for axis in layout.regions:
+        for part in examined.parts_of(axis):
+            yield from _faults_of_layout(part)
+        broken = examined.broken_part(axis)
+        if broken is not None:
+            yield _misfit(broken)
+
+
+def _misfit(part: Examined) -> Fault:
+    """Return why a part does not fit the bytes that there are for parts."""
+    shortage = find_shortage(part)
+    if shortage is not None:
+        return shortage
+    end = part.start + len(part.data)
+    return Fault(LENGTH, part.prefix, part.start, "filled by its parts", None, end)
+
+
+def _wrong_lengths(examined: Examined, layout: Layout, row: NDArray[np.uint8]) -> Iterator[Fault]:
+    """Return the fields that say how long a part is, and are wrong."""
+    if not layout.held:
+        return
+    right = row.copy()
+    set_bits(right, layout.held)
+    for leaf in layout.leaves.values():
+        if not leaf.info.held:
+            continue
+        is_wrong = (leaf.load(row) != leaf.load(right))[0]
+        if not is_wrong.any():
+            continue
+        indices = np.argwhere(is_wrong)[0].tolist()
+        index = (0, *indices)
+        path = f"{examined.prefix}.{_with_indices(leaf.info.path, leaf.info.axes, indices)}"
+        # Usually the part is measured in the struct around that of its length.
+        around = ".".join(leaf.info.path.split(".")[:-2])
+        end = examined.start + layout.places.get(around, (0, layout.size))[1]
+        offset = examined.start + leaf.held[0]
+        offset += sum(step * stride for step, stride in zip(indices, leaf.strides, strict=False))
+        expected = leaf.load(right)[index].item()
+        got = leaf.load(row)[index].item()
+        yield Fault(LENGTH, path.strip("."), offset, expected, got, end)
+
+
+def _broken_conditions(
+    examined: Examined, layout: Layout, row: NDArray[np.uint8]
+) -> Iterator[Fault]:
+    for condition in layout.conditions:
+        if condition.formula is None:
+            continue  # the values of a field are judged with the field
+        if layout.meets_condition(condition, row)[0]:
+            continue
+        leaves = [layout.leaves[info.path] for info in condition.fields]
+        end = examined.start + max((leaf.held[1] for leaf in leaves), default=0)
+        path = f"{examined.prefix}.{_first_failure(condition, layout, row)}".strip(".")
+        yield Fault(CONDITION, path, end, "a condition that holds", "one that does not", end)
+
+
+def _first_failure(condition: Condition, layout: Layout, row: NDArray[np.uint8]) -> str:
+    """Return the path of a condition that does not hold, with the indices of the first element."""
+    raw = {info.path: layout.leaves[info.path].load(row) for info in condition.fields}
+    holds = condition.values(raw)
+    if holds.ndim == 1:
+        return condition.path
+    axes = max((info.axes for info in condition.fields), key=len)
+    return _with_indices(condition.path, axes, np.argwhere(~holds[0])[0].tolist())
+
+
+def _with_indices(path: str, axes: Sequence[str], indices: Sequence[int]) -> str:
+    """Return a path with the indices of an element of its arrays."""
+    for axis, index in reversed(list(zip(axes, indices, strict=False))):
+        if path.startswith(f"{axis}.") or path == axis:
+            path = f"{axis}[{index}]{path[len(axis) :]}"
+    return path
 
 
 def _ending(examined: Examined, cut_off: WireField | None) -> Fault:
-    """Return why a frame has no end: its bytes end, or its header leads to none."""
-    failure = examined.failure
+    """Return why a frame has no end: its bytes end, or its header leads to none.
+
+    Raises:
+        Exception: whatever an expression of the struct raised.
+    """
     part = _open_part(examined)
     if part is not None and part.failure is not None:
         return _ending(part, cut_off)
-    end = examined.start + len(examined.data)
+    failure = examined.failure
     if failure is None or isinstance(failure, Unknown):
-        size = None if examined.layout is None else examined.layout.size
-        if cut_off is None:
-            return Fault(CUT_OFF, examined.prefix, end, size, end, end)
-        needed = cut_off.end - cut_off.start
-        return Fault(CUT_OFF, cut_off.block, cut_off.start, size, end, end, needed)
+        return _shortage(examined, cut_off)
     if isinstance(failure, TooLong | Unlike):
-        path = f"{examined.prefix}.{failure}".strip(".") or "frame"
-        held = next((each for each in examined.fields() if each.path == path), None)
-        if held is not None and held.info.held and isinstance(failure, TooLong):
-            offset = held.first_byte
-            return Fault(LENGTH, path, offset, failure.number, held.raw, end)
-        if isinstance(failure, TooLong) and failure.number is not None:
-            return Fault(COUNT, path, end, f"at most {examined.limit}", failure.number, end)
-        if isinstance(failure, Unlike):
-            expected = "made of known parts"
-        else:
-            expected = f"1 to {examined.limit} bytes long"
-        return Fault(LENGTH, path, end, expected, None, end)
-    error = PluginError.of(failure, "struct")
-    raise SpecError(f"an expression of the struct failed: {error.reason}") from failure
+        return _refusal(examined, failure)
+    raise failure
 
 
 def _open_part(examined: Examined) -> Examined | None:
@@ -177,79 +247,27 @@ def _open_part(examined: Examined) -> Examined | None:
     return None
 
 
-def _broken_parts(examined: Examined) -> Iterator[Fault]:
-    """Return the faults of parts that do not fill the bytes that they have."""
-    if examined.layout is None:
-        return
-    for axis in examined.layout.regions:
-        part = examined.broken_part(axis)
-        if part is None:
-            continue
-        fault = find_fault(part)
-        end = part.start + len(part.data)
-        yield fault or Fault(LENGTH, part.prefix, part.start, "a part that fits", None, end)
+def _shortage(examined: Examined, cut_off: WireField | None) -> Fault:
+    end = examined.start + len(examined.data)
+    size = None
+    if examined.layout is not None and not examined.prefix:
+        size = examined.layout.size
+    is_bounded = examined.is_bounded
+    if cut_off is None:
+        return Fault(CUT_OFF, examined.prefix, end, size, end, end, is_bounded=is_bounded)
+    needed = cut_off.end - cut_off.start
+    return Fault(CUT_OFF, cut_off.block, cut_off.start, size, end, end, needed, is_bounded)
 
 
-def _wrong_lengths(examined: Examined) -> Iterator[Fault]:
-    """Return the fields that say how long a part is, and are wrong."""
-    layout = examined.layout
-    if layout is None or not layout.held:
-        return
-    for each in examined.fields():
-        if each.info.held and each.info.rebuilt is not None and each.raw is not None:
-            expected = evaluated(each.info.rebuilt, _reader(examined, layout))
-            if each.raw != expected:
-                # Usually the part is measured in the struct around that of its length.
-                around = ".".join(each.info.path.split(".")[:-2])
-                end = examined.start + layout.places.get(around, (0, layout.size))[1]
-                yield Fault(LENGTH, each.path, each.first_byte, expected, each.raw, end)
-
-
-def _reader(examined: Examined, layout: Layout) -> Any:
-    """Return what formulas read fields with."""
-
-    def read(path: str) -> tuple[FieldInfo, int] | str | None:
-        if path in layout.leaves:
-            leaf = layout.leaves[path]
-            return leaf.info, leaf.scalar(examined.data)
-        for region in layout.regions.values():
-            if path == region.node.total.path:
-                assert region.size is not None
-                return region.node.total, region.size
-        return None
-
-    return read
-
-
-def _broken_conditions(examined: Examined) -> Iterator[Fault]:
-    layout = examined.layout
-    if layout is None or layout.size > len(examined.data):
-        return
-    row = np.frombuffer(examined.data[: layout.size], np.uint8).reshape(1, -1)
-    for condition in layout.conditions:
-        is_value = condition.formula is None  # reported with its field
-        if not is_value and not layout.meets_condition(condition, row)[0]:
-            leaves = [layout.leaves[info.path] for info in condition.fields]
-            end = examined.start + max((leaf.held[1] for leaf in leaves), default=0)
-            below = _first_failure(condition, layout, row)
-            path = f"{examined.prefix}.{below}".strip(".")
-            yield Fault(CONDITION, path, end, "a condition that holds", "one that does not", end)
-    for axis in layout.regions:
-        for part in examined.parts_of(axis):
-            yield from _broken_conditions(part)
-            yield from _wrong_lengths(part)
-
-
-def _first_failure(condition: Condition, layout: Layout, row: NDArray[np.uint8]) -> str:
-    """Return the path of a condition that does not hold, with the indices of the first element."""
-    raw = {info.path: layout.leaves[info.path].load(row) for info in condition.fields}
-    holds = condition.values(raw)
-    if holds.ndim == 1:
-        return condition.path
-    indices = np.argwhere(~holds[0])[0].tolist()
-    axes = max((info.axes for info in condition.fields), key=len)
-    path = condition.path
-    for axis, index in reversed(list(zip(axes, indices, strict=False))):
-        if path.startswith(f"{axis}.") or path == axis:
-            path = f"{axis}[{index}]{path[len(axis) :]}"
-    return path
+def _refusal(examined: Examined, failure: TooLong | Unlike) -> Fault:
+    """Return why a header leads to no frame."""
+    end = examined.start + len(examined.data)
+    path = f"{examined.prefix}.{failure}".strip(".") or "frame"
+    if isinstance(failure, Unlike):
+        return Fault(LENGTH, path, end, "made of known parts", None, end)
+    length = next((each for each in examined.fields() if each.path == path), None)
+    if length is not None and length.info.held:
+        return Fault(LENGTH, path, length.first_byte, failure.number, length.raw, end)
+    if failure.number is not None:
+        return Fault(COUNT, path, end, f"at most {examined.limit}", failure.number, end)
+    return Fault(LENGTH, path, end, f"1 to {examined.limit} bytes long", None, end)

@@ -11,7 +11,7 @@ from __future__ import annotations
 import bisect
 import functools
 import itertools
-from collections.abc import Iterable, Mapping
+from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
@@ -41,6 +41,7 @@ from lidarspec.spec.tree import (
     Struct,
     When,
     evaluated,
+    format_hex,
     listed,
     nodes,
     refs,
@@ -85,7 +86,10 @@ class _Encoder:
         #: values of fields of the frame around a part, by their path there.
         self._around = around or {}
         self._schema = schema(root)
-        self._sealing = {path for seal in _seals(root) for path in seal.fields}
+        #: paths of the fields that hold checksums, which need not be given.
+        self._checksums = {
+            path for node in nodes(root) if isinstance(node, Sealed) for path in node.fields
+        }
         #: raw values of each field, element by element.
         self._columns: dict[str, list[Any]] = {}
         #: index of the element that is being collected, by the axis of its array.
@@ -94,10 +98,12 @@ class _Encoder:
     def encode(self) -> bytes:
         fill_counts(self._given, self._schema)
         parts = {axis: self._encode_parts(node) for axis, node in self._schema.parts.items()}
-        totals = {
-            node.total.path: len(b"".join(parts[axis])) for axis, node in self._schema.parts.items()
-        }
-        layout = self._layout(totals)
+        layout = self._layout(
+            {
+                node.total.path: sum(map(len, parts[axis]))
+                for axis, node in self._schema.parts.items()
+            }
+        )
         self._collect(self._root, self._given, "", self._prefix, layout)
         row = np.zeros((1, layout.size), np.uint8)
         for path, leaf in layout.leaves.items():
@@ -212,7 +218,7 @@ class _Encoder:
             case Block():
                 self._collect_block(node, value, path, shown)
             case Number() | Blob() if path and node.name:
-                self._add(node.info, path, shown, value, _size(layout, path))
+                self._add(node.info, path, shown, value, layout.leaves[path].size)
 
     def _collect_struct(self, node: Struct, value: Any, shown: str, layout: Layout) -> None:
         if value is None:
@@ -255,7 +261,7 @@ class _Encoder:
             for key in part.bits.keys:
                 if isinstance(key, int):
                     below = f"{below}[{key}]"
-                    found = self._element(found, key, below, node)
+                    found = self._element(found, key, below)
                 else:
                     below = f"{below}.{key}".strip(".")
                     if found is not None and not isinstance(found, Mapping):
@@ -265,7 +271,7 @@ class _Encoder:
                 found = int(bool(found))
             self._add(part.info, names, below, found, 0)
 
-    def _element(self, array: Any, index: int, shown: str, node: Block) -> Any:
+    def _element(self, array: Any, index: int, shown: str) -> Any:
         """Return an element of an array in a bit block."""
         if array is None:
             return None
@@ -290,13 +296,12 @@ class _Encoder:
             if info.kind == "bytes" and isinstance(value, bytes) and len(value) == 1:
                 value *= size  # a pattern that fills the field
         if value is None:
-            if path not in self._sealing:
+            if path not in self._checksums:
                 raise MissingField(shown, place=self._place)
-            self._sealing.discard(path)
             column.append(bytes(size) if info.kind == "bytes" else 0)
             return
         if info.const is not None and raw_of(info, value) != info.const:
-            raise self._wrong(shown, _hexed(info.const), value)
+            raise self._wrong(shown, format_hex(info.const), value)
         if info.kind == "bytes":
             column.append(self._bytes(shown, value, size))
         elif info.kind == "float":
@@ -407,20 +412,6 @@ class _Encoder:
         return UsageError(
             f"{self._place}: {shown or 'frame'}: expected {expected}, got {found!r:.60}"
         )
-
-
-def _size(layout: Layout, path: str) -> int:
-    return layout.leaves[path].size
-
-
-def _hexed(value: object) -> str:
-    if isinstance(value, bytes):
-        return value.hex(" ")
-    return f"0x{value:x}" if isinstance(value, int) else repr(value)
-
-
-def _seals(node: Node) -> Iterable[Sealed]:
-    return [each for each in nodes(node) if isinstance(each, Sealed)]
 
 
 def raw_of(info: FieldInfo, value: Any) -> Any:

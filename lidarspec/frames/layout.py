@@ -594,10 +594,15 @@ class Layout:
         """Write the constants, and the values that follow from the header, into rows of bytes."""
         for leaf, value in self.following:
             leaf.store(rows, value)
-        if self.known:
-            spots = list(self.known)
-            facts = np.array(list(self.known.values()), np.uint8)
-            rows[:, spots] = rows[:, spots] & ~facts[:, 0] | facts[:, 1]
+        set_bits(rows, self.known)
+
+
+def set_bits(rows: Bytes2D, known: Mapping[int, tuple[int, int]]) -> None:
+    """Write bits into frames given as rows of bytes: offset -> (mask, value)."""
+    if known:
+        offsets = list(known)
+        bits = np.array(list(known.values()), np.uint8)
+        rows[:, offsets] = rows[:, offsets] & ~bits[:, 0] | bits[:, 1]
 
 
 #: constants: offset, mask, value.

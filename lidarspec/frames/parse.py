@@ -14,7 +14,7 @@ from typing import Any, Literal
 
 from construct import Container, ListContainer
 
-from lidarspec.errors import SpecError, UnknownFrame, WireError, refuse_text
+from lidarspec.errors import SpecError, UnknownFrame, WireError, refuse_text, struct_error
 from lidarspec.frames import diagnose
 from lidarspec.frames.compilability import NotCompilable
 from lidarspec.frames.layout import Layout, Leaf, Refused
@@ -176,29 +176,27 @@ def _error_of(
     Args:
         place: from an offset in the frame to one on the wire.
     """
-    fault = _named(sensor, name, diagnose.find_fault, examined)
+    fault = _search(sensor, name, diagnose.find_fault, examined)
     if fault is None:  # a plugin's checksum that gives another value each time
         return WireError("not a valid frame", sensor=sensor.id, frame=name, data=data)
     return _wire_error(sensor, name, data, fault, place)
 
 
-def _named(
+def _search(
     sensor: Spec,
     name: str,
     find: Callable[[Examined], diagnose.Fault | None],
     examined: Examined,
 ) -> diagnose.Fault | None:
-    """Return what a search finds; a failing expression names sensor and frame."""
+    """Return what a search finds.
+
+    Raises:
+        SpecError: if an expression or a checksum of the struct raises.
+    """
     try:
         return find(examined)
-    except SpecError as error:
-        raise SpecError(error.reason, path=name, sensor=sensor.id) from error
-    except Exception as error:  # an expression or a checksum of the plugin
-        raise SpecError(
-            f"an expression of the struct failed: {type(error).__name__}: {error}",
-            path=name,
-            sensor=sensor.id,
-        ) from error
+    except Exception as error:
+        raise struct_error(error, path=name, sensor=sensor.id) from error
 
 
 def _wire_error(
@@ -231,7 +229,7 @@ def _parse_unverified(sensor: Spec, name: str, data: bytes) -> Any:
             raise plain_fault(sensor, name, data) from None
     decoded = frame_coder(frame).decode(data)
     examined = examine(frame.tree, decoded.struct, frame.room)
-    shortage = _named(sensor, name, diagnose.find_shortage, examined)
+    shortage = _search(sensor, name, diagnose.find_shortage, examined)
     if shortage is not None or examined.layout is None:
         assert shortage is not None
         raise _wire_error(sensor, name, data, shortage, decoded.offset)

@@ -8,14 +8,13 @@ the part and the reason.
 from __future__ import annotations
 
 import io
-import re
 from collections.abc import Iterator, Mapping
 from typing import Any
 
 import construct
 
-from lidarspec.errors import MissingField, SpecError, UsageError, WireError
-from lidarspec.frames.schema import schema
+from lidarspec.errors import MissingField, SpecError, UsageError, WireError, struct_error
+from lidarspec.frames.schema import schema, without_indices
 from lidarspec.frames.wire_fields import WireField
 from lidarspec.spec.description import Frame, Spec
 from lidarspec.spec.syntax import Mismatch, clean, field_path, leaves
@@ -67,9 +66,7 @@ def build_plain(frame: Frame, values: Mapping[str, Any], place: str) -> bytes:
     except SpecError:
         raise
     except Exception as fault:
-        raise SpecError(
-            f"an expression of the struct failed: {type(fault).__name__}: {fault}", path=place
-        ) from fault
+        raise struct_error(fault, path=place) from fault
     return data
 
 
@@ -101,7 +98,7 @@ def _fields_of(
                 info = infos.get(f"{path}{below}", FieldInfo(f"{path}{below}"))
                 yield WireField(f"{path}{below}", path, info, start, end, None, raw)
         elif end > start:
-            info = infos.get(re.sub(r"\[\d+\]", "", path), FieldInfo(path, kind="bytes"))
+            info = infos.get(without_indices(path)[0], FieldInfo(path, kind="bytes"))
             raw = value if isinstance(value, int | float | bytes | str) else data[start:end]
             yield WireField(path, path, info, start, end, None, raw)
 
@@ -157,11 +154,7 @@ def plain_fault(sensor: Spec, name: str, data: bytes) -> WireError:
     except SpecError:
         raise
     except Exception as fault:
-        raise SpecError(
-            f"an expression of the struct failed: {type(fault).__name__}: {fault}",
-            path=name,
-            sensor=sensor.id,
-        ) from fault
+        raise struct_error(fault, path=name, sensor=sensor.id) from fault
     size = stream.tell()
     return WireError(
         f"{len(data) - size} more bytes after the frame's {size}",

@@ -1,9 +1,8 @@
-"""The fields of one frame in the order of the wire, with their places:
-of a damaged or truncated one too.
+"""The fields of one frame with their places, also of a damaged or truncated frame.
 
-`examine` finds the layout of the bytes, or as much of it as the bytes tell, and `Examined.fields`
-goes along the frame tree with it. Errors (`lidarspec.frames.diagnose`) and explanations are made of
-that.
+`examine` finds the layout of the bytes, or the beginning of it if the bytes end early, and
+`Examined.fields` walks along the frame tree with it. Errors (`lidarspec.frames.diagnose`) and
+explanations use both.
 """
 
 from __future__ import annotations
@@ -17,7 +16,7 @@ import numpy as np
 
 from lidarspec.frames.layout import Layout, Leaf, Seal
 from lidarspec.frames.layout_tree import Unknown, Walk, walk_layout
-from lidarspec.frames.parts import FOUND, Kind, Measure, Piece, Region
+from lidarspec.frames.parts import FOUND, Kind, Measure, Region
 from lidarspec.spec import tree
 from lidarspec.spec.bits import BitField
 
@@ -84,20 +83,15 @@ class PlacedSeal:
 
 @dataclass(frozen=True)
 class ExaminedParts:
-    """The parts of a frame at a path; the last one is broken unless `is_whole`.
-
-    Attributes:
-        end: the byte of the frame after the last valid part.
-    """
+    """The parts of a frame at a path; the last one is broken unless `is_whole`."""
 
     parts: list[Examined]
-    end: int
     is_whole: bool
 
 
 @dataclass(frozen=True, eq=False)
 class Examined:
-    """What the bytes of one frame, or of a part of one, tell of its layout.
+    """One frame, or a part of one, with its layout as far as the bytes determine it.
 
     Attributes:
         root: the frame type.
@@ -107,6 +101,7 @@ class Examined:
             `Unlike`, or an error of an expression; None for a layout.
         start: of a part, its first byte in the frame.
         prefix: of a part, its path in the frame.
+        is_bounded: of a part, whether the frame has bytes behind those of the parts.
     """
 
     root: tree.Node
@@ -116,6 +111,7 @@ class Examined:
     limit: int
     start: int = 0
     prefix: str = ""
+    is_bounded: bool = False
     _parts: dict[str, ExaminedParts] = field(default_factory=dict)
 
     @property
@@ -124,8 +120,9 @@ class Examined:
         return self.known if isinstance(self.known, Layout) else None
 
     def fields(self) -> Iterator[WireField]:
-        """Return the fields in the order of the wire;
-        the last one may be cut off (`raw` is None).
+        """Return the fields in the order of the wire.
+
+        The last one may be cut off: its `raw` is None.
         """
         cursor = _Cursor(self)
         yield from cursor.visit(self.root, "", self.prefix)
@@ -155,10 +152,6 @@ class Examined:
         """Return the parts at a path, as far as they can be told apart."""
         return self._examined_parts(axis).parts
 
-    def end_of_parts(self, axis: str) -> int:
-        """Return the byte of this frame after the last whole part at a path."""
-        return self._examined_parts(axis).end
-
     def broken_part(self, axis: str) -> Examined | None:
         """Return the part at a path that is no valid part; None if all are there."""
         found = self._examined_parts(axis)
@@ -177,13 +170,14 @@ def examine(
     given: Mapping[str, int] | None = None,
     start: int = 0,
     prefix: str = "",
+    is_bounded: bool = False,
 ) -> Examined:
-    """Find the layout of one frame, as far as its bytes tell.
+    """Find the layout of one frame, as far as its bytes determine it.
 
     Args:
         limit: the longest frame, in bytes.
         given: of a part, values of fields of the frame around it, by their path there.
-        start, prefix: of a part, its place and path in the frame.
+        start, prefix, is_bounded: of a part, as of `Examined`.
     """
 
     def read(leaf: Leaf | Measure, walk: Walk) -> int:
@@ -197,20 +191,23 @@ def examine(
     try:
         layout = walk_layout(walk, root)
     except Exception as failure:  # an expression of the struct may raise anything
-        return Examined(root, data, walk, failure, limit, start, prefix)
-    return Examined(root, data, layout, None, limit, start, prefix)
+        return Examined(root, data, walk, failure, limit, start, prefix, is_bounded)
+    return Examined(root, data, layout, None, limit, start, prefix, is_bounded)
 
 
 def _examine_parts(around: Examined, axis: str) -> ExaminedParts:
-    """Examine the parts at a path."""
     region = around.region(axis)
     assert region is not None
     data = np.frombuffer(around.data, np.uint8)
     walked = region.walked(data, np.zeros(1, np.intp))
     pieces = [piece for pieces in walked.rounds for piece in pieces]
-    found = [
-        _examined_piece(around, region, axis, index, piece) for index, piece in enumerate(pieces)
-    ]
+    found = list[Examined]()
+    for index, piece in enumerate(pieces):
+        start = int(piece.spots[0])
+        stop = start + piece.layout.size
+        found.append(
+            _examine_part(around, region, axis, index, region.kinds[piece.kind], start, stop)
+        )
     end = region.start + int(walked.sizes[0])
     is_whole = bool(walked.status[0] == FOUND) and region.size in (None, end - region.start)
     if not is_whole:
@@ -219,24 +216,23 @@ def _examine_parts(around: Examined, axis: str) -> ExaminedParts:
         if region.rule.within is not None:
             stop = min(stop, region.start + region.rule.within)
         found.append(_examine_part(around, region, axis, len(found), kind, end, stop))
-    return ExaminedParts(found, end, is_whole)
-
-
-def _examined_piece(
-    around: Examined, region: Region, axis: str, index: int, piece: Piece
-) -> Examined:
-    start = int(piece.spots[0])
-    return _examine_part(
-        around, region, axis, index, region.kinds[piece.kind], start, start + piece.layout.size
-    )
+    return ExaminedParts(found, is_whole)
 
 
 def _examine_part(
     around: Examined, region: Region, axis: str, index: int, kind: Kind, start: int, end: int
 ) -> Examined:
     prefix = f"{around.prefix}.{axis}[{index}]".strip(".")
-    data = around.data[start:end]
-    return examine(kind.node.root, data, around.limit, region.given, around.start + start, prefix)
+    is_bounded = around.is_bounded or end < len(around.data)
+    return examine(
+        kind.node.root,
+        around.data[start:end],
+        around.limit,
+        region.given,
+        around.start + start,
+        prefix,
+        is_bounded,
+    )
 
 
 def _likely_kind(region: Region, data: bytes) -> Kind:
@@ -307,20 +303,14 @@ class _Cursor:
                 return
 
     def _parts(self, node: tree.Parts) -> Iterator[WireField]:
-        axis = node.axis
-        if self._examined.region(axis) is None:
+        region = self._examined.region(node.axis)
+        if region is not None:
+            for part in self._examined.parts_of(node.axis):
+                yield from part.fields()
+        if region is None or region.size is None or region.start + region.size > len(self._data):
             self._is_over = True
-            return
-        for part in self._examined.parts_of(axis):
-            for each in part.fields():
-                yield each
-                if each.raw is None:
-                    self._is_over = True
-            if part.failure is not None:
-                self._is_over = True
-        self._offset = self._examined.end_of_parts(axis)
-        if axis not in self._known.regions:
-            self._is_over = True
+        else:
+            self._offset = region.start + region.size
 
     def _blob(self, node: tree.Blob, path: str, shown: str) -> Iterator[WireField]:
         if node.const is not None and not node.name:

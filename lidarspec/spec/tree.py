@@ -177,6 +177,13 @@ def runs_of(values: Sequence[int]) -> list[tuple[int, int]]:
     ]
 
 
+def format_hex(value: object) -> str:
+    """Return bytes and integers in hexadecimal, other values as Python shows them."""
+    if isinstance(value, bytes):
+        return value.hex(" ")
+    return f"0x{value:x}" if isinstance(value, int) else repr(value)
+
+
 def listed(values: Sequence[int]) -> str:
     """Some raw values in words: "1, 3, 5 to 7"."""
     between = {0: "{0}", 1: "{0}, {1}"}

@@ -28,13 +28,14 @@ from construct import (
 )
 
 import lidarspec as ls
-from lidarspec import Sensor
+from lidarspec import Sensor, SpecError
 from lidarspec.frames import layout_tree
 from lidarspec.frames.layout import Layout
 from lidarspec.frames.layout_tree import HeaderTree, frame_layouts
 from lidarspec.frames.parse import unpacked
-from lidarspec.spec import Frame
+from lidarspec.spec import Checksum, Checksummed, Frame
 from lidarspec.spec.syntax import clean
+from tests.engine import against_construct
 from tests.engine.engines import is_compiled
 from tests.representatives import each_sensor, each_shape, load_sensor
 from tests.shapes import SHAPES
@@ -214,3 +215,25 @@ def test_a_frame_is_built_from_what_was_parsed_of_it(name: str) -> None:
                 assert (
                     sensor.build(frame, sensor.parse(data, frame, units=True), units=True) == data
                 )
+
+
+class Failing(Checksum):
+    """A checksum with a bug."""
+
+    width = 8
+
+    def __call__(self, data: bytes | bytearray | memoryview) -> int:
+        return 1 // 0
+
+    def describe(self) -> str:
+        return "a checksum with a bug"
+
+
+def test_a_checksum_that_raises_is_the_plugins_fault() -> None:
+    sealed = Checksummed(Struct("x" / Int8ub, "sum" / Int8ub), "sum", Failing())
+    sensor = against_construct.sensor(sealed)
+    for use in (lambda: sensor.parse(b"\1\2"), lambda: sensor.build("data", x=1)):
+        with pytest.raises(SpecError, match="ZeroDivisionError") as error:
+            use()
+        assert (error.value.path, error.value.sensor) == ("data", sensor.id)
+    assert len(sensor.parse(b"\1\2", frame="data", verify=False)) == 2

@@ -11,9 +11,10 @@ from typing import Any
 import pytest
 from construct import Array, Bytes, Const, Int8ub, Int16ub, Int32ub, Struct, this
 
+import lidarspec as ls
 from lidarspec import Sensor, SpecError, UsageError, WireError
 from lidarspec.frames.layout_tree import HeaderNode, HeaderTree
-from lidarspec.spec import Checksummed, Frame, Parts, Simulation, Sum, Xor
+from lidarspec.spec import Checksummed, Frame, Parts, Simulation, SizeOf, Sum, Xor
 from tests.agreement import assert_backends_agree
 from tests.engine import against_construct
 from tests.engine.streams import Books
@@ -225,6 +226,42 @@ def test_a_wrong_part_is_reported_with_its_place() -> None:
     with pytest.raises(WireError) as fault:
         against_construct.sensor(COUNTED).parse(bytes.fromhex("01 09 00 09"))
     assert (fault.value.path, fault.value.offset) == ("parts[0].kind", 1)
+
+
+def test_a_wrong_part_is_reported_before_the_bytes_behind_the_parts() -> None:
+    part = Struct("mark" / Const(b"\xaa\xbb"), "size" / Int8ub, "text" / Bytes(this.size))
+    filled = Parts(part, within=this.size)
+    struct = Struct("head" / Bytes(10), "size" / Int8ub, "parts" / filled, "end" / Const(b"\x99"))
+    sensor = against_construct.sensor(struct)
+    texts = [{"text": b"abc"}, {"text": b"defg"}]
+    data = bytearray(sensor.build("data", head=bytes(10), parts=texts))
+    data[data.rindex(b"\xbb")] = 0xBA
+    with pytest.raises(WireError) as fault:
+        sensor.parse(bytes(data))
+    assert (fault.value.path, fault.value.offset) == ("parts[1].mark", 17)
+    assert "constant aa ba, expected aa bb" in fault.value.reason
+    last = ls.explain(bytes(data), sensor).rows[-1]
+    assert (last.path, last.data, last.right) == ("end", b"\x99", True)
+
+
+def test_a_part_that_is_longer_than_the_parts_is_cut_off_by_their_end() -> None:
+    part = Struct("n" / Int8ub, "text" / Bytes(this.n))
+    struct = Struct("size" / Int8ub, "parts" / Parts(part, within=this.size), "end" / Bytes(4))
+    with pytest.raises(WireError, match=r"parts end at byte 4: parts\[0\].text needs 5 bytes"):
+        against_construct.sensor(struct).parse(b"\3\5abcdef")
+
+
+def test_a_wrong_length_in_a_part_is_reported_with_its_place() -> None:
+    part = Struct("size" / SizeOf(Int8ub, "text"), "n" / Int8ub, "text" / Bytes(this.n))
+    struct = Struct("size" / SizeOf(Int8ub, "name"), "name" / Bytes(2), "parts" / Parts(part, 2))
+    sensor = against_construct.sensor(struct)
+    texts = [{"text": b"abc"}, {"text": b"defg"}]
+    data = bytearray(sensor.build("data", name=b"xy", parts=texts))
+    data[8] = 9
+    with pytest.raises(WireError) as fault:
+        sensor.parse(bytes(data))
+    found = fault.value
+    assert (found.path, found.offset, found.expected, found.got) == ("parts[1].size", 8, 4, 9)
 
 
 def test_a_part_of_no_kind_is_counted_alike_by_both_engines() -> None:

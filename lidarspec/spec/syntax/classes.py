@@ -222,7 +222,9 @@ class CheckedConst(Const):  # type: ignore[misc]
         start = stream.tell()
         obj = self.subcon._parsereport(stream, context, path)
         if obj != self.value and verifying(context):
-            raise Mismatch(path, start, _shown(self.value), _shown(obj), "constant")
+            raise Mismatch(
+                path, start, tree.format_hex(self.value), tree.format_hex(obj), "constant"
+            )
         return obj
 
 
@@ -798,14 +800,6 @@ def field_path(path: str | None) -> str:
     """
     names = re.sub(r" -> None(?=$| ->|\[)", "", path or "").split(" -> ")[1:]
     return ".".join(names)
-
-
-def _shown(value: object) -> str:
-    if isinstance(value, bytes):
-        return value.hex(" ")
-    if isinstance(value, int):
-        return f"0x{value:x}"
-    return repr(value)
 
 
 def children(con: Construct) -> list[Construct]:
