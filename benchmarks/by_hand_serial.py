@@ -151,8 +151,9 @@ def _m1c1_good(rows: Bytes) -> NDArray[np.bool_]:
 
 
 def _m1c1_chunk(packets: Bytes, found: Floats, start: int, scratch: Scratch) -> int:
-    """Write the points of good packets of one length from column `start` on;
-    the column after them.
+    """Write the points of valid packets of one length from column `start` on.
+
+    Returns the column after them.
     """
     count = int(packets.shape[1] - 10) // 3
     first, final = (

@@ -111,8 +111,9 @@ def compact_telegram(sensor: ls.Sensor, frame: bytes) -> Sensor:
 
 
 def cola_telegram(sensor: ls.Sensor, frame: bytes) -> Sensor:
-    """A telegram of CoLa B with DIST1 and RSSI1 in 16 bits,
-    as `lidarspec_sick.telegrams` has it.
+    """Return a sensor with a CoLa B telegram of DIST1 and RSSI1 in 16 bits.
+
+    The struct follows `lidarspec_sick.telegrams`.
     """
     beams = sensor.parse(frame).dist1.count
 

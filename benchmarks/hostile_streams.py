@@ -132,8 +132,9 @@ def _makers(subject: Subject) -> dict[str, Callable[[random.Random], bytes]]:
 
 
 def _of_random_header(subject: Subject, name: str, seed: int) -> bytes:
-    """Return a frame with a random header, no bytes if the type has one layout
-    or cannot be drawn.
+    """Return a frame with a random header.
+
+    Returns no bytes if the type has one layout, or if no such frame can be generated.
     """
     engine = codec(subject.sensor.frames[name])
     if isinstance(engine, CompiledCodec) and engine.size is None:

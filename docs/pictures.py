@@ -1,5 +1,6 @@
-"""Makes the pictures of the front page and the README from simulated sensors alone: the same bytes
-each time.
+"""Make the pictures of the front page and the README.
+
+They are made from simulated sensors alone, with the same bytes each time.
 
     python docs/pictures.py [--into FOLDER]
         a terminal, a point cloud and a packet diagram, as SVG

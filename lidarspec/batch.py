@@ -396,9 +396,7 @@ class Manifest:
         return []
 
     def clear(self, piece: Piece) -> None:
-        """Take away what was made of a file that has changed since,
-        or is made in another way now.
-        """
+        """Remove the outputs of a file that has changed or is converted differently now."""
         for number, record in self._records.get((piece.source, piece.target), {}).items():
             output = record.get("output")
             if output and self.has(output) and self.done(replace(piece, number=number)) is None:
@@ -611,8 +609,9 @@ def _is_large(piece: Piece) -> bool:
 
 
 def _try(to: str) -> None:
-    """Write nothing in a format, which tells whether its library is there,
-    before any file is read.
+    """Write an empty file in a format, to check that its library is installed.
+
+    This happens before any input is read.
     """
     with tempfile.TemporaryDirectory() as place, contextlib.suppress(ValueError, IndexError):
         write(Path(place) / f"none.{to}", [])

@@ -679,8 +679,9 @@ def _describe_place(thread: threading.Thread) -> str:
 
 
 def _loaded(entry: EntryPoint, names: str, add: Callable[[Any], list[str]]) -> Plugin:
-    """What became of an entry point that is loaded and added;
-    whatever it raises disturbs no other.
+    """Load and register an entry point; return the resulting plugin.
+
+    An exception is stored in the plugin, so that it does not affect other plugins.
     """
     plugin = Plugin(entry.distribution, entry.version, f"{names} = {entry.value}")
     try:

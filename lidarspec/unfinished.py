@@ -25,9 +25,7 @@ def path_while_written(path: Path) -> Path:
 
 
 def remove_abandoned(path: Path) -> None:
-    """Remove what killed processes of this computer left behind while they wrote a file
-    or folder.
-    """
+    """Remove partial files and folders that killed processes of this computer left."""
     for process, name in _list_unfinished(path.parent.absolute()):
         left = path.with_name(f".{process}.{name}")
         with contextlib.suppress(OSError, SourceError):

@@ -1,5 +1,6 @@
-"""Every sensor, installed or an invented shape:
-for the long tests, which load them when they run.
+"""All sensors, installed ones and invented shapes, for the long tests.
+
+They are loaded when a test runs.
 """
 
 from __future__ import annotations

@@ -31,8 +31,9 @@ def _entry_points() -> list[EntryPoint]:
 
 @functools.cache
 def _entry_points_by_distribution() -> dict[str, list[EntryPoint]]:
-    """Return the entry points by the name of their distribution,
-    which takes reading its metadata.
+    """Return the entry points by the name of their distribution.
+
+    The name is read from the metadata of the distribution.
     """
     found: dict[str, list[EntryPoint]] = {}
     names: dict[int, str] = {}

@@ -25,8 +25,9 @@ SLACK = 5.0
 
 
 class Port:
-    """A serial port: a pseudo terminal, reached through a name that goes away
-    when it is unplugged.
+    """A serial port: a pseudo-terminal behind a name.
+
+    The name is removed when the port is unplugged.
     """
 
     def __init__(self, name: Path) -> None:

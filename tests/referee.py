@@ -105,9 +105,7 @@ def _inputs_and_results(name: str) -> dict[str, Any]:
 
 
 def _make_inputs(sensor: Sensor) -> dict[str, list[Any]]:
-    """Return the bytes that a sensor is tried with, in base64,
-    with the name of their frame type.
-    """
+    """Return the inputs of a sensor in base64, with the names of their frame types."""
     chance = random.Random(sensor.id)
     frames = [
         (name, sensor.example(name, seed=seed))

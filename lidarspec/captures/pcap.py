@@ -179,13 +179,15 @@ class CaptureReader(Closing):
         return self._datagrams
 
     def skip(self, at: int) -> bool:
-        """Seek shortly before the first datagram at or after a time;
-        return whether it was possible.
+        """Seek shortly before the first datagram at or after a time.
 
         Skipped datagrams are not counted. Datagrams with fragments on both sides are lost.
 
         Args:
             at: ns since 1970.
+
+        Returns:
+            Whether seeking was possible.
         """
         return self._form is not None and sought(self._source, self._form, at)
 

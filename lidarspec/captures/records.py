@@ -256,9 +256,7 @@ class PcapRecords:
         return int(places[right.argmax()]) if right.any() else None
 
     def _is_sure(self, captured: int, original: int) -> bool:
-        """Whether two lengths bear each other out:
-        the packet is whole, or cut where the file says.
-        """
+        """Return whether two lengths agree: the packet is whole or cut at the snap length."""
         return 0 < captured <= LARGEST_PACKET and captured in (original, self._snap_length)
 
     def _is_false(self, captured: int, original: int) -> bool:
@@ -313,9 +311,7 @@ class PcapngBlocks:
         )
 
     def claim(self, length: int) -> tuple[int, str, int]:
-        """Where in a block of a length that stands, as what type,
-        and the number that stands there.
-        """
+        """Return the offset, type and value of the length field of a block."""
         return 4, f"{self.order}u4", length
 
     def pattern(self, record: bytes) -> Pattern | None:
@@ -496,8 +492,9 @@ def _interface(order: str, body: bytes) -> Interface:
 def _block_packet(
     order: str, kind: int, body: bytes, interfaces: list[Interface]
 ) -> CapturedPacket | None:
-    """The packet of a block, None where the block contradicts itself
-    or names an unknown interface.
+    """Return the packet of a block, None if the block is invalid.
+
+    A block is invalid if its lengths contradict each other, or if its interface is unknown.
     """
     if kind == _SIMPLE_PACKET:
         if len(body) < 4 or not interfaces:

@@ -1,5 +1,6 @@
-"""Failures as one message on stderr and an exit code, by whose fault they are;
-never a traceback.
+"""Failures as one message on stderr and an exit code.
+
+The exit code depends on whose fault the failure is. A traceback is never shown.
 """
 
 from __future__ import annotations

@@ -288,8 +288,9 @@ def detect(
 
 
 def _code(source: str | None, found: Sequence[Verdict]) -> int:
-    """Return the exit code if no sensor fits: live sources sent nothing,
-    or nothing that is known.
+    """Return the exit code if no sensor fits.
+
+    It is `DEVICE` if every live source was silent, else `NO_DATA`.
     """
     is_live = source is None or live_address(source) is not None
     is_silent = is_live and not any(one.heard.size for one in found)

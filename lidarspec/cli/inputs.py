@@ -286,8 +286,9 @@ def nearest_fault(given: Heard) -> WireError:
 
 
 def _never_right(given: Heard) -> WireError | None:
-    """That the input is frames of a sensor whose checksums are never right;
-    None where it is not.
+    """Return an error if all frames of a sensor in the input have wrong checksums.
+
+    Returns None otherwise.
     """
     from lidarspec.detect.identification import never_right
 

@@ -98,8 +98,10 @@ def configured(
 
 
 def _value(sensor: Sensor, name: str, text: str) -> Any:
-    """A number, true or false as in `lidarspec.toml`, where the option takes one;
-    all else is text.
+    """Return the value of an option given as text.
+
+    Numbers and booleans are parsed as in `lidarspec.toml` if the option accepts them. All other
+    values stay text.
     """
     try:
         value = tomllib.loads(f"value = {text}")["value"]

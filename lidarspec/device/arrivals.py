@@ -69,8 +69,9 @@ class Input(Protocol):
     told: Mapping[str, Found] = MappingProxyType({})
 
     def note(self, found: Sequence[Frames]) -> None:
-        """Keep what frames say of the device itself; of those with parts one that leaves out what
-        another one said is none.
+        """Keep the latest frame of each type that reports values of the sensor.
+
+        A frame with parts is ignored if it lacks values that an earlier frame reported.
         """
         telling = {path.partition(".")[0] for path in self.sensor.info.values()}
         for frames in found if telling else ():
@@ -110,25 +111,30 @@ class Input(Protocol):
 
     @property
     def place(self) -> tuple[int, int] | None:
-        """How many bytes of the stored file were read, and how many there are; None where nobody
-        knows.
+        """The bytes of the stored file read so far, and its size.
+
+        None if they are not known.
         """
         return None
 
     def skip(self, at: int) -> bool:
-        """Pass over what arrived before a time, ns since 1970, where that can be done without
-        reading it: whether it is.
+        """Skip data that arrived before a time, ns since 1970, if the source can seek.
+
+        Returns:
+            Whether data was skipped.
         """
         return False
 
     def read_ahead(self, size: int) -> None:
-        """Read a file in portions of about so many bytes from now on; what is live comes as it
-        does.
+        """Read a file in portions of about `size` bytes from now on.
+
+        Live sources ignore this.
         """
 
     def gather(self, until: float) -> None:
-        """Let what comes wait up to a time of `time.monotonic`, to be decoded together, and no
-        longer than one wait for it takes.
+        """Let arriving data wait until a time of `time.monotonic`.
+
+        It is then decoded together. It does not wait longer than the `wait` of `next`.
         """
 
     def begin(self) -> None:
@@ -151,8 +157,9 @@ class Input(Protocol):
         return 0
 
     def caught_up(self, mark: int) -> bool:
-        """Whether everything that had been produced at a mark has been decoded; of a file each scan
-        is looked at in its turn.
+        """Return whether everything produced before a mark has been decoded.
+
+        For a file it is always true: each scan is processed in order.
         """
         return True
 
@@ -179,14 +186,16 @@ class Input(Protocol):
         return FirstFrames()
 
     def close(self) -> None:
-        """Stop the sensor where it was started, and give everything back; a second call does
-        nothing.
+        """Stop the sensor if it was started, and release all resources.
+
+        A second call does nothing.
         """
 
 
 def fed(decoder: Decoder, chunks: Sequence[Chunk]) -> list[Frames]:
-    """The frames that consecutive chunks complete, each with the arrival time of the chunk that
-    holds its last byte.
+    """Return the frames that consecutive chunks complete.
+
+    Each frame has the arrival time of the chunk that holds its last byte.
     """
     if not decoder.stream:
         return [decoder.datagrams([chunk.data for chunk in chunks], [chunk.at for chunk in chunks])]
@@ -202,8 +211,9 @@ def fed(decoder: Decoder, chunks: Sequence[Chunk]) -> list[Frames]:
 
 
 def _streamed(decoder: Decoder, packets: Batch, together: int) -> Iterator[list[Frames]]:
-    """The frames that the packets of a byte stream complete, with the times of the packets that
-    hold their last bytes.
+    """Yield the frames that the packets of a byte stream complete.
+
+    Each frame has the arrival time of the packet that holds its last byte.
     """
     data = packets.joined
     ends = decoder.stats.bytes_in + np.cumsum(packets.sizes)
@@ -230,8 +240,9 @@ BATCH_CHUNKS = 1024
 
 
 class FileInput(Input):
-    """What a transport that ends holds; the consumer's own pace is the policy, so that nothing is
-    ever dropped.
+    """Input from a transport that ends, such as a file.
+
+    The consumer sets the pace, so nothing is ever dropped.
 
     Attributes:
         state: "streaming", "ended" or "closed".
@@ -317,8 +328,9 @@ class FileInput(Input):
         self._arrivals = iter(())  # which holds this one, and both what was read
 
     def first_frames(self) -> FirstFrames:
-        """Find the frames that apply from the start: the state of points, and the reference of the
-        clock.
+        """Find the frames that apply from the start of the file.
+
+        They are the state of points and the reference of the clock.
         """
         path = Path(str(self._source).partition("?")[0])
         if not is_searched(self.sensor) or not (
@@ -364,8 +376,9 @@ class FileInput(Input):
         yield Arrival(self.decoder.rest())
 
     def _batches(self) -> Iterator[list[Chunk]]:
-        """The chunks, as many at once as are worth decoding together, up to where the line was
-        interrupted or fell silent.
+        """Yield chunks in batches that are worth decoding together.
+
+        A batch ends before an interruption or silence of the line.
         """
         found: list[Chunk] = []
         size = 0

@@ -1,5 +1,4 @@
-"""Capture apart from decoding: a thread fetches what arrives and hands it on through a bounded
-queue.
+"""Capture in a thread, which queues incoming data for decoding.
 
 The thread does nothing but read, keep the time, record and queue, so that a consumer which is slow,
 or busy in Python, costs no byte. A recording gets everything; the queue is bounded by its policy:
@@ -94,8 +93,10 @@ class BoundedQueue:
             self._changed.notify_all()
 
     def take(self, timeout: float, *, until: float = 0.0, chunks: int = CHUNKS) -> list[Event]:
-        """What has arrived, in order; empty where nothing does within `timeout` seconds, or the
-        queue is closed and empty.
+        """Return the events that have arrived, in order.
+
+        The list is empty if nothing arrives within `timeout` seconds, or if the queue is closed and
+        empty.
 
         Args:
             until: a time of the monotonic clock up to which everything is gathered before any of it
@@ -209,8 +210,9 @@ class Capture:
         self.transport.close()
 
     def record(self, log: Log | None) -> None:
-        """Record from now on, and forget what waits in the queue: what comes out of it is what is
-        recorded.
+        """Record from now on, and discard the events in the queue.
+
+        All events that come out of the queue afterwards are recorded.
         """
         while not self._handing.acquire(timeout=POLL):
             self._queue.take(0.0)  # which it may wait for
@@ -261,8 +263,9 @@ class Capture:
             self._queue.put(self._link, chunks)
 
     def _look_at_the_clock(self, chunk: Chunk) -> None:
-        """Where the wall clock was set before a chunk came, arrival times go on as before; it is
-        said once, and recorded each time.
+        """Keep arrival times steady if the wall clock was set before a chunk arrived.
+
+        The step is reported in `warnings` and recorded each time.
         """
         ahead = self._clock.find_step()
         if ahead is None:
@@ -275,8 +278,9 @@ class Capture:
             self._log.event("clock", chunk.at, ahead_ns=ahead)
 
     def _found_again(self) -> bool:
-        """Say that the device is gone, and wait until it is back; False where somebody wants to
-        stop meanwhile.
+        """Report that the device is gone, and wait until it is back.
+
+        Returns False if the capture is stopped meanwhile.
         """
         self.connected = False
         self.disconnects += 1

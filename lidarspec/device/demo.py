@@ -1,5 +1,6 @@
-"""The main job with nothing attached, end to end: a simulated sensor on a real line, asked to
-start, read, recorded, read again.
+"""Demonstrate a session with a simulated sensor, end to end.
+
+The sensor is on a real line. It is asked to start, read, recorded and read again.
 
 A serial sensor stands on a pseudo-terminal, or on a TCP port where the system has none; the others
 send UDP datagrams on loopback. The line does its harm on the way. What was recorded is decoded once
@@ -109,8 +110,9 @@ def digest(scans: Sequence[Scan]) -> str:
 def _live(
     sensor: Sensor, simulated: SimulatedDevice, path: Path, turns: int
 ) -> tuple[str, tuple[Reply, ...], tuple[Scan, ...], Counters]:
-    """The place of the sensor, its replies, its scans and the counters; everything that came is
-    recorded.
+    """Return the address, replies, scans and counters of a live session.
+
+    Everything that arrives is recorded.
     """
     if sensor.datagrams:
         port = _free_port()

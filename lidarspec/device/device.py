@@ -133,7 +133,8 @@ class Device(Closing):
 
     @property
     def learned(self) -> Mapping[str, Any]:
-        """The options that the sensor reported when it was opened;
+        """The options that the sensor reported when it was opened.
+
         `sensor` is configured with them.
         """
         return self._input.learned

@@ -1,5 +1,6 @@
-"""The scans of a file in one pass that can be left at a bookmark, behind which another process goes
-on.
+"""The scans of a file in one pass that can be resumed at a bookmark.
+
+Another process can go on from a bookmark.
 
 What comes behind a place of a file depends on what was before it: bytes of a frame that has begun,
 frames that hold state, the turns that the clock has made, the counter, packets that wait for
@@ -92,8 +93,9 @@ class FileScans(Closing):
         yield from self._stream.finish()
 
     def survey(self, size: int) -> tuple[int, bytes | None]:
-        """How many scans begin in the next piece of the file, and a bookmark behind it; None where
-        the file ends, or none can be set.
+        """Return the number of scans in the next piece of the file, and a bookmark.
+
+        The bookmark is the end of the piece. It is None if the file ends, or if none can be set.
 
         Args:
             size: bytes of the piece, at least.
@@ -130,8 +132,9 @@ class FileScans(Closing):
         return self._input.decoder.stats.bytes_in if reader is None else reader.place
 
     def _bookmark(self) -> bytes | None:
-        """What has to be known to go on from here; None where that cannot be said, or the file not
-        be sought.
+        """Return the state that is required to go on from here.
+
+        Returns None if it cannot be pickled, or if the file cannot seek.
         """
         opened = self._transport
         if not isinstance(opened, FileTransport) or not opened.can_go_on:
@@ -201,8 +204,9 @@ class _Writer(pickle.Pickler):
         self._frames = {id(codec(frame).schema): name for name, frame in sensor.frames.items()}
 
     def persistent_id(self, obj: Any) -> Any:
-        """The name of what is not pickled; of a sensor that reads its time from another clock, that
-        of the clock.
+        """Return the name of an object that is not pickled.
+
+        For a sensor that reads its time from another clock it is the name of that clock.
         """
         name = self._names.get(id(obj))
         if name is None and isinstance(obj, Spec):
@@ -210,8 +214,9 @@ class _Writer(pickle.Pickler):
         return name
 
     def reducer_override(self, obj: Any) -> Any:
-        """Tables as the bytes of their frames, and with packets no more of other frames than
-        belongs to them.
+        """Reduce tables to the bytes of their frames.
+
+        Packets keep only the frames of other types that belong to them.
         """
         if isinstance(obj, Rows | Records):
             if id(obj.schema) not in self._frames:
@@ -249,8 +254,9 @@ def _table(sensor: Sensor, frame: str, frames: list[bytes]) -> Table:
 
 
 def _of_these(table: Table | None, which: Any) -> StateOf:
-    """The frames of another type that some packets have before them, and which: none that is
-    nobody's.
+    """Return the state frames of some packets, and the row of each packet's frame.
+
+    Frames that belong to no packet are left out.
     """
     rows = np.unique(which[which >= 0])
     if table is None or not len(rows):

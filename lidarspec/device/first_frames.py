@@ -1,5 +1,6 @@
-"""Frames of a file that apply from its start: the first ones with state for points, and the first
-reference of the clock.
+"""The frames of a file that apply from its start.
+
+They are the first frames with state for points, and the first reference of the clock.
 """
 
 from __future__ import annotations

@@ -1,5 +1,6 @@
-"""Frames as they come: what the capture threads queue, decoded every few milliseconds in the
-consumer's thread.
+"""Live input: decode queued chunks in the consumer's thread.
+
+The chunks that the capture threads queue are decoded every few milliseconds.
 
 `next` takes what has arrived, decodes it in one go and hands it on; while it waits it also drives
 the `Session`: sends what is to be sent, gives it the frames that may be answers, and lets it know
@@ -114,7 +115,9 @@ class Watch:
 
     @property
     def state(self) -> str:
-        """One of "disconnected", "silent", "no frames", "waiting" (for the first frame) and
+        """The state of the source.
+
+        One of "disconnected", "silent", "no frames", "waiting" (for the first frame) and
         "streaming".
         """
         if not self._capture.connected:
@@ -556,8 +559,9 @@ class LiveInput(Input):
         self._hand_on(link, found)
 
     def _of_the_sensor(self, chunks: list[Chunk]) -> list[Chunk]:
-        """What of it the sensor sent; where it turns out to be another one than was thought, that
-        one's frames are no longer waited for.
+        """Return the chunks that the sensor sent.
+
+        If another sensor is selected now, incomplete frames of the previous one are given up.
         """
         mine = self._kept.ours(chunks)
         self._watch.heard(ours=bool(mine))
@@ -603,8 +607,9 @@ class LiveInput(Input):
             self._speak()
 
     def _compare(self) -> None:
-        """Say it where the sensor that came back says something else of itself: it may be another
-        one.
+        """Warn if the sensor that came back reports other values than before.
+
+        It may be another sensor.
         """
         done = [one for one in self._checked if one.done]
         self._checked = [one for one in self._checked if not one.done]

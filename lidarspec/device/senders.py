@@ -1,5 +1,4 @@
-"""Whose datagrams a device is made of: those of one sensor, since the frames of two must not be
-mixed into one cloud.
+"""Select the datagrams of one sensor, so that frames of two are never mixed.
 
 A sensor is an address: its data, calibration and answers come from there. The frames of one type
 come from one port of it, from another one only after a restart; two ports that take turns are two
@@ -54,8 +53,9 @@ class Senders:
                 raise self._several(other, sender)
 
     def _younger(self, name: str, sender: Sender) -> Sender | None:
-        """The port that frames of a type came from until now, where it took turns with this one;
-        else None, and they come from this one.
+        """Return the port that took turns with this one for frames of a type.
+
+        Returns None if there is none. The frames then come from this port.
         """
         known = self._now.setdefault(name, sender)
         before = self._before.setdefault(name, {})
@@ -79,8 +79,9 @@ class Senders:
 
 
 class Kept(Senders):
-    """The sensor that is read of a live source: the first that sends data frames, and before that
-    the first that sends any.
+    """The sensor that is read from a live source.
+
+    It is the first sender of data frames, and before that the first sender of any frame.
 
     Args:
         datagrams: whether each datagram is a whole frame, not a piece of a stream.
@@ -134,8 +135,10 @@ class Kept(Senders):
         ]
 
     def ours(self, chunks: Sequence[Chunk]) -> list[Chunk]:
-        """Those of these datagrams that the sensor sent; while nobody has sent a frame, all (of a
-        stream the first sender's).
+        """Return the datagrams that the sensor sent.
+
+        Until a sender has sent a frame, all datagrams are returned, of a stream those of the first
+        sender.
         """
         mine: list[Chunk] = []
         self.has_changed = False
@@ -172,8 +175,10 @@ class Kept(Senders):
         return found.only(np.array(mine, np.bool_))
 
     def _replaces(self, sender: Sender, chunk: Chunk) -> bool:
-        """Look at what a sender sends while it is open who is the sensor; whether it takes the
-        place of another.
+        """Decide from a chunk which sender is the sensor.
+
+        Returns:
+            Whether the sender replaces another one.
         """
         owner = self._owner
         if (
@@ -211,8 +216,9 @@ class Kept(Senders):
         return {item.frame for item in decoder.feed(chunk.data)}
 
     def _take_turns(self, name: str, sender: Sender) -> Sender:
-        """The port that frames of a type come from: of those that take turns the one that was there
-        first.
+        """Return the port that frames of a type come from.
+
+        If several ports take turns, it is the first one.
         """
         younger = self._younger(name, sender)
         if younger is not None:
@@ -229,8 +235,9 @@ class Kept(Senders):
 
 
 def frame_senders(chunks: Sequence[Chunk], found: Frames, end: int) -> list[tuple[str, Sender]]:
-    """The type and the sender of each frame found in datagrams; where one sent them all, of each
-    type; [] where senders are not known.
+    """Return the type and the sender of each frame found in datagrams.
+
+    If one sender sent all of them, each type is listed once. Returns [] if senders are not known.
 
     Args:
         end: where these datagrams end in everything that was decoded.

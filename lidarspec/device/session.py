@@ -175,8 +175,9 @@ class Expected:
 
 
 def found_at(values: Any, path: str) -> Any:
-    """The value at a path of a parsed frame, a list of them below an array without an index, or a
-    mark that there is none.
+    """Return the value at a path of a parsed frame.
+
+    Below an array without an index, it is a list of values. If there is no value, it is `_MISSING`.
     """
     for name in steps(path):
         if isinstance(name, int):
@@ -396,8 +397,10 @@ class Session:
         return any(line.current is not None or line.queue for line in self._lines.values())
 
     def abandon(self, reason: str, link: str | None = None) -> None:
-        """Give up every request and heartbeat, or those on one link, since it was lost or nobody
-        waits; what was sent stays owed.
+        """Give up every request and heartbeat, or those on one link.
+
+        The link was lost, or no caller waits. Replies to commands that were sent are still
+        expected.
         """
         for name in [
             name for name in self._beats if link in (None, self.sensor.commands[name].link)
@@ -420,8 +423,9 @@ class Session:
         return self.sensor.commands[name].filled if name in self.sensor.commands else {}
 
     def _next(self, value: Filled) -> Any:
-        """A value that is found out now: our own address, or the next number, which all commands of
-        the session share.
+        """Return a value that is known only when a command is sent.
+
+        It is our own address, or the next number, which all commands of the session share.
         """
         if isinstance(value, Address):
             return self.host
@@ -482,8 +486,9 @@ class Session:
             current.wrong = f"{item.frame} with {', '.join(differs)}"
 
     def _is_refusal(self, line: _Line, item: Found, values: Any, now: int) -> bool:
-        """Whether a frame refuses the oldest request that waits or is owed an answer: it says of
-        none which it means.
+        """Return whether a frame refuses the oldest request that waits for a reply.
+
+        The frame does not tell which request it refuses.
         """
         owed = next((owed for owed in line.owed if owed.expected.refusal == item.frame), None)
         current = line.current
@@ -552,8 +557,9 @@ def learned(sensor: Sensor, reply: Reply) -> dict[str, Any]:
 
 
 def _reasons(fields: Mapping[str, FieldInfo], values: Any) -> str:
-    """What the fields of a frame say that have words for it, with their numbers;
-    "" where none has.
+    """Return the labels of the values of labelled fields, with their numbers.
+
+    Returns "" if no value has a label.
     """
     told = [
         f"{path} {name} ({number})"

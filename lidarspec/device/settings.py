@@ -173,8 +173,10 @@ def _known() -> tuple[dict[str, Named], list[LidarSpecError]]:
 
 
 def files() -> list[Path]:
-    """The settings files that count here: the user's own, then the nearest one of a project;
-    others' are passed over, with a warning.
+    """Return the settings files that apply here.
+
+    They are the user's own and the nearest one of a project. Files of other users are skipped with
+    a warning.
     """
     own = own_settings()
     here = Path.cwd()

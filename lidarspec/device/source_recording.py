@@ -1,5 +1,6 @@
-"""A source recorded as it comes: a live one until it is told to end, a file as fast as the disk
-takes it.
+"""Record a source as data arrives.
+
+A live source is recorded until it is told to end, a file as fast as the disk allows.
 
 A live source whose sensor is known is a `Device`: it is started and stopped, and what arrives is
 decoded to be counted. Without a sensor a `Capture` reads it and nothing is sent. The recorder is
@@ -40,8 +41,9 @@ _FIGURES = re.compile(r"[\d.]+")
 def recorder_like(
     opened: Transport, source: str, target: str, sensor: Spec | str | None, *, overwrite: bool
 ) -> Appender:
-    """The recorder of a new file in the place of an open source: of a recording its sensor, source
-    and baud rate are taken over.
+    """Return the recorder of a new file for an open source.
+
+    If the source is a recording, its sensor, source and baud rate are taken over.
 
     Raises:
         UnknownFormat, UsageError, SourceError: as `recorder`.
@@ -58,8 +60,9 @@ def recorder_like(
 
 
 class TimedLog:
-    """A recorder that takes what arrives within some seconds of the first arrival, until it is
-    ended. What is sent it always takes.
+    """A recorder with a time limit, which starts at the first arrival.
+
+    Sent data is always recorded.
 
     Args:
         recorder: what writes the file; closed with this one.
@@ -178,8 +181,9 @@ class SourceRecording:
         return self._record_bytes()
 
     def _record_device(self, sensor: Sensor) -> Generator[str, None, None]:
-        """What a sensor sends is recorded by a thread; here it is decoded to be counted, whatever
-        that fails at.
+        """Record the data of a sensor, and decode it to be counted.
+
+        A thread records. Failures of decoding do not stop it.
         """
         news = list[str]()
         failures = dict[str, None]()
@@ -263,8 +267,10 @@ class SourceRecording:
     def _count_queued(
         self, source: LiveTransport, queue: BoundedQueue, log: TimedLog, wait: float
     ) -> list[Mark]:
-        """Take what is in the queue, and count the datagrams that are in the file; return what
-        happened to the line meanwhile.
+        """Take all events from the queue, and count the recorded datagrams.
+
+        Returns:
+            The interruptions of the line meanwhile.
         """
         marks = list[Mark]()
         for _, item in queue.take(wait):
@@ -309,8 +315,9 @@ class SourceRecording:
         return self._log
 
     def _goes_on(self, log: TimedLog, *, timed: bool = True) -> bool:
-        """Whether it has neither taken its time nor got all that was asked for; raises what went
-        wrong with the file.
+        """Return whether neither the time nor the count of packets is reached.
+
+        Raises the error of the recorder, if there is one.
         """
         assert self.recorder is not None
         if self.recorder.error is not None:

@@ -567,8 +567,10 @@ def _header(draft: Draft) -> Iterator[Field]:
 
 
 def _gap(rows: NDArray[np.uint8], start: int, end: int, cuts: Sequence[int]) -> Iterator[Field]:
-    """What lies between known fields, in pieces that the checksum's span
-    and constant bytes make.
+    """Yield fields for the bytes between two known fields.
+
+    The gap is split at `cuts`, the borders of the checksum's span, and at the borders of constant
+    bytes.
     """
     edges = {start, end, *(cut for cut in cuts if start < cut < end)}
     if len(rows) >= FEW and end - start <= LONG:

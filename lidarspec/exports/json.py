@@ -220,8 +220,9 @@ def _parts(node: tree.Parts) -> dict[str, Any]:
 
 
 def formula_data(formula: tree.Formula | None) -> Any:
-    """A number as it is, a field as {"field": path},
-    an operation as {"op": symbol, "args": [...]}.
+    """Return a formula as JSON data.
+
+    Numbers stay numbers. A field is {"field": path}, an operation {"op": symbol, "args": [...]}.
     """
     match formula:
         case tree.Ref():

@@ -190,9 +190,7 @@ def _frame(name: str, frame: Frame, picture: str) -> Iterator[str]:
 
 
 def _geometry(sensor: Sensor) -> Iterator[str]:
-    """What points there are, in which axes, and the direction of each channel
-    where that is fixed.
-    """
+    """Describe the points of each data frame, their axes and fixed directions."""
     yield (
         "Points are in metres, x forward, y left, z up; the manual's zero direction is +x, and"
         " azimuth counts counter-clockwise."

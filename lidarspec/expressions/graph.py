@@ -438,9 +438,7 @@ def evaluate(
 
 
 def only_field(node: Node) -> Node | None:
-    """The one field that an expression is made of besides numbers;
-    None where there is no such one.
-    """
+    """Return the field of an expression of one field and numbers, else None."""
     return node.fields[0] if node.fields is not None and len(node.fields) == 1 else None
 
 

@@ -114,8 +114,9 @@ def _describe(
 
 
 def _offset(places: NDArray[Any]) -> float:
-    """What places along an axis count from, metres:
-    whole ones near the first, where 0 is far away.
+    """Return the offset of coordinates along an axis, metres.
+
+    It is 0 near the origin. Otherwise it is the first finite coordinate, rounded to whole metres.
     """
     near = places[np.isfinite(places)][:1].round()
     return float(near[0]) if len(near) and abs(near[0]) > NEAR else 0.0

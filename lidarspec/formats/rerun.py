@@ -138,8 +138,9 @@ class Log:
             self.stream.send_blueprint(self._layout())
 
     def figures(self, figures: Mapping[str, float | None]) -> None:
-        """Log figures by name at the time of the last scan;
-        those that are not known are left out.
+        """Log figures by name at the time of the last scan.
+
+        Figures that are None or not finite are left out.
         """
         for name, value in figures.items():
             if value is not None and np.isfinite(value):

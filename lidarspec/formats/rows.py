@@ -93,8 +93,9 @@ class Rows:
         return picture(rows, points).reshape(-1) if self.shape else rows
 
     def _columns(self, scan: Scan, number: int, names: Sequence[str]) -> dict[str, NDArray[Any]]:
-        """Those of some columns that the scan has, and its number,
-        of the points that are written.
+        """Return the requested columns that the scan has, of the points to write.
+
+        The column "scan" has the number of the scan.
         """
         columns = columns_of(scan, names, every_point=self._every_point)
         return columns | (

@@ -1,5 +1,6 @@
-"""Arrays that cost next to nothing: of one value repeated, of consecutive numbers, some of the rows
-of another; and their memory.
+"""Arrays that cost next to nothing, and the memory of arrays.
+
+They hold one repeated value, consecutive numbers, or some rows of another array.
 """
 
 from __future__ import annotations
@@ -19,8 +20,9 @@ KEPT = 1 << 24
 
 
 def repeated(value: int, count: int) -> NDArray[np.int64]:
-    """One value so many times, (count,), read-only; what `np.broadcast_to` gives, at a tenth of its
-    cost.
+    """Return `count` times one value, (count,), read-only.
+
+    It equals the result of `np.broadcast_to`, at a tenth of its cost.
     """
     return np.ndarray((count,), np.int64, value.to_bytes(8, sys.byteorder, signed=True), 0, (0,))
 
@@ -36,8 +38,9 @@ def some(
 
 
 def counted(count: int) -> NDArray[np.int64]:
-    """0, 1, 2 ... as many numbers as asked for, (count,), read-only; in the same memory each time,
-    unless they are very many.
+    """Return the numbers from 0 to `count` - 1, (count,), read-only.
+
+    Small counts share the same memory.
     """
     return _numbers()[:count] if count <= COUNTED else np.arange(count)
 
@@ -55,15 +58,14 @@ def _numbers() -> NDArray[np.int64]:
 
 
 def alike(values: NDArray[np.int64]) -> int | None:
-    """The value that all are, where the array itself says so, as one from `repeated` does; else
-    None.
-    """
+    """Return the value of a zero-stride array, as from `repeated`, else None."""
     return values.item(0) if values.strides == (0,) and len(values) else None
 
 
 def by_value(values: NDArray[Any], few: int) -> list[tuple[int, NDArray[np.intp]]]:
-    """Each of the different values, ascending, with the indices of those that are equal to it,
-    (k,), ascending.
+    """Return each different value, ascending, with the indices of its occurrences.
+
+    The indices are ascending, (k,).
 
     Args:
         few: so many different ones are found one by one sooner than sorted.
@@ -95,8 +97,9 @@ def taken(
 
 @lru_cache(maxsize=1)
 def keep_freed_memory() -> None:
-    """Lets the allocator keep freed blocks, 32 MiB of them at most, from the first work on large
-    batches on.
+    """Let the allocator keep freed blocks, up to 32 MiB.
+
+    This applies from the first work on large batches on.
 
     The columns of a batch are blocks of some hundred kilobytes that live for milliseconds. glibc
     takes such blocks from the system and gives them back, page by page, and fetching the pages anew
@@ -110,7 +113,8 @@ def keep_freed_memory() -> None:
 
 
 def deep(array: NDArray[Any], depth: int) -> NDArray[Any]:
-    """Values of packets, (n, ...), with axes of length 1 behind them, up to `depth` behind the
-    first.
+    """Return values of packets, (n, ...), with `depth` axes behind the first.
+
+    Additional axes have length 1.
     """
     return array.reshape(*array.shape, *(1,) * (depth + 1 - array.ndim))

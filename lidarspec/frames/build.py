@@ -67,8 +67,9 @@ def build(
 
 
 class _Values:
-    """The caller's values checked against the fields: names, ranges, and units where they are
-    physical.
+    """The caller's values, checked against the fields.
+
+    Names and ranges are checked, and units if the values are physical.
     """
 
     def __init__(self, table: Schema, known: frozenset[str], place: str, *, units: bool) -> None:
@@ -109,8 +110,9 @@ class _Values:
         return found
 
     def _bytes(self, found: list[Any], shown: str) -> bytes | list[Any]:
-        """Numbers as a byte string; an array of byte strings, or of what another branch has there,
-        stays one.
+        """Return a byte string of numbers.
+
+        Arrays of other values, such as byte strings, are returned unchanged.
         """
         if not any(isinstance(part, int | str) for part in found):
             return found

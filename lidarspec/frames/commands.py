@@ -67,8 +67,9 @@ def build_command(sensor: Spec, name: str, arguments: Mapping[str, Any]) -> byte
 
 @dataclass(frozen=True)
 class Slot:
-    """Where an argument goes: its field; and how many bytes, or numbers of an array, there are for
-    it, None where that varies.
+    """The destination of an argument.
+
+    `room` is the number of bytes, or of numbers in an array. It is None if it varies.
     """
 
     info: FieldInfo
@@ -171,8 +172,9 @@ def raw_argument(slot: Slot, kind: Taken, value: Any, argument: str, place: str)
 
 
 def _placed(slot: Slot, data: bytes) -> Any:
-    """Bytes as the raw value of a field that is plain bytes, an array of numbers, or one number in
-    network order.
+    """Return bytes as the raw value of a field.
+
+    The field is plain bytes, an array of numbers, or one number in network order.
     """
     if slot.info.kind == "bytes":
         return data
@@ -182,8 +184,9 @@ def _placed(slot: Slot, data: bytes) -> Any:
 
 
 def _found_out(sensor: Spec, name: str, path: str, value: Filled, given: Any) -> Any:
-    """A value that is found out when a command is sent; where nobody says it, the first number, and
-    no address.
+    """Return a value that is known only when a command is sent.
+
+    If it is not given, the first number is used, or an address of zeros.
     """
     if isinstance(value, Count):
         return value.first if given is None else given

@@ -1,5 +1,7 @@
-"""What has no computable place, whatever the header: told before any bytes arrive, and the frame is
-then interpreted by construct.
+"""Check which structs can be compiled.
+
+A part that has no computable place, whatever the header, is found before any bytes arrive. The
+frame is then interpreted by construct.
 """
 
 from __future__ import annotations
@@ -18,8 +20,9 @@ class NotCompilable(Exception):
 
 
 def check_compilable(root: tree.Node) -> None:
-    """Raise `NotCompilable` if any part of a tree has no computable place, whatever the header, or
-    values that no column holds.
+    """Raise `NotCompilable` if a tree has a part without a computable place.
+
+    It is also raised for values that no column can hold.
     """
     _check(root, "", in_array=False)
     _check_columns(root)

@@ -34,13 +34,16 @@ class Table(Protocol):
 
     def __len__(self) -> int: ...
     def raw(self, path: str) -> NDArray[Any]:
-        """Raw values, shape (n, *lengths of its axes), native byte order; 0 where a frame lacks the
-        field or element.
+        """Return raw values, shape (n, *lengths of its axes), in native byte order.
+
+        The value is 0 if a frame lacks the field or element.
         """
 
     def present(self, path: str) -> NDArray[np.bool_] | None:
-        """Which frames have the field, (n,), or which elements, where not all elements of a frame
-        have it; None where all have.
+        """Return which frames have the field, (n,), or which elements have it.
+
+        Elements are given if not all elements of a frame have the field. Returns None if all have
+        it.
         """
 
     def counts(self, axis: str) -> NDArray[np.intp]:
@@ -171,8 +174,9 @@ class Rows:
         return Rows(self.schema, groups)
 
     def walks(self, axis: str) -> list[tuple[Group, NDArray[np.uint8], Walked]]:
-        """The groups that have these parts, each with the buffer that its rows are of, and the
-        parts in that; walked through once.
+        """Return the groups that have these parts, with buffer and walked parts.
+
+        The result is cached.
         """
         if axis not in self._walks:  # the clock, the points and each kind of parts ask for them
             regions = ((group, group.layout.regions.get(axis)) for group in self.groups)
@@ -228,8 +232,10 @@ class Rows:
 
 
 def _loaded(leaf: Leaf, around: Sequence[str], rows: Bytes2D) -> NDArray[Any]:
-    """Raw values without the axes of which only one element is asked for; `around`: the arrays that
-    the field is in.
+    """Return raw values without the axes of which only one element is requested.
+
+    Args:
+        around: the arrays that the field is in.
     """
     values = leaf.load(rows)
     if len(around) == len(leaf.info.axes):
@@ -246,8 +252,9 @@ def _loaded(leaf: Leaf, around: Sequence[str], rows: Bytes2D) -> NDArray[Any]:
 
 @dataclass(frozen=True, eq=False)
 class _Piece:
-    """Parts of one layout that were found in one round: the bytes around them, where in these they
-    begin, and their frames, (k,).
+    """Parts of one layout that were found in one round.
+
+    `spots` are their offsets in the buffer, `frames` the frames that they are in, (k,).
     """
 
     buffer: NDArray[np.uint8]
@@ -257,8 +264,10 @@ class _Piece:
 
 
 def _by_layout(pieces: Sequence[_Piece], ranks: Sequence[NDArray[np.intp]]) -> list[Group]:
-    """Parts as groups, their rows in stream order; `ranks`: the places of those of each piece in
-    that.
+    """Return parts as groups, with their rows in stream order.
+
+    Args:
+        ranks: the positions of the parts of each piece in that order.
     """
     members: dict[int, dict[int, list[tuple[_Piece, NDArray[np.intp]]]]] = {}
     for piece, own in zip(pieces, ranks, strict=True):
@@ -340,8 +349,9 @@ def ascends(where: NDArray[np.intp]) -> bool:
 
 
 class Records:
-    """A `Table` of frames that construct parsed, for structs that do not compile and as the second
-    engine in tests.
+    """A `Table` of frames that construct parsed.
+
+    It is used for structs that do not compile, and as the second engine in tests.
     """
 
     def __init__(self, schema: Schema, parsed: Sequence[Any], frames: Sequence[bytes]) -> None:
@@ -507,8 +517,9 @@ def _there(value: Any) -> Any:
 
 
 def _put(column: NDArray[Any], index: int, value: Any) -> None:
-    """Copy a value, or lists of them, into its place in a padded array;
-    lists may differ in length.
+    """Copy a value or nested lists to an index of a padded array.
+
+    Lists may differ in length.
     """
     if isinstance(value, list) and column.ndim > 2:
         for place, part in enumerate(value):
@@ -522,8 +533,9 @@ def _put(column: NDArray[Any], index: int, value: Any) -> None:
 
 
 def _counts(value: Any, names: list[str], brackets: int) -> set[int]:
-    """The lengths of an array under a path in one parsed frame, of all of them where it stands in
-    another array.
+    """Return the lengths of an array under a path in one parsed frame.
+
+    If the array is in another array, the lengths of all its instances are returned.
     """
     if isinstance(value, list) and (names or brackets):
         below = brackets if names else brackets - 1

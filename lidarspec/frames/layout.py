@@ -1,5 +1,6 @@
-"""Where each field of a frame stands, as data: offsets, strides, bits, constants, checksums; and
-loading by it.
+"""The places of all fields of a frame, as data, and loading by them.
+
+They are offsets, strides, bits, constants and checksums.
 
 A `Layout` holds for frames of one kind of header; `lidarspec.frames.layout_tree` makes it from the
 frame tree. A `Leaf` is the place of one field, a `Seal` a checksum with the bytes that it covers.
@@ -43,8 +44,9 @@ def elements(
     shape: tuple[int, ...],
     strides: tuple[int, ...],
 ) -> NDArray[Any]:
-    """What stands at an offset of each row (contiguous by itself) and at these strides from there,
-    (n, *shape), not copied.
+    """Return a view of the elements at an offset of each row, (n, *shape).
+
+    Each row is contiguous by itself.
     """
     if rows.flags.c_contiguous:
         return np.ndarray((len(rows), *shape), dtype, rows, offset, (rows.shape[1], *strides))
@@ -55,8 +57,9 @@ def elements(
 
 
 def span(rows: Bytes2D) -> NDArray[np.uint8]:
-    """All bytes from the first of the first row to the last of the last one, those between the rows
-    included, (k,), not copied.
+    """Return a view of all bytes from the first row to the last, (k,).
+
+    Bytes between the rows are included.
     """
     if rows.flags.c_contiguous:
         return rows.reshape(-1)
@@ -68,8 +71,9 @@ def span(rows: Bytes2D) -> NDArray[np.uint8]:
 def rows_at(
     buffer: NDArray[np.uint8], offsets: NDArray[np.intp], size: int, *, gathered: bool = True
 ) -> NDArray[np.uint8]:
-    """`size` bytes from each of these offsets on, one a row, (n, size); no copy where they stand
-    back to back.
+    """Return `size` bytes from each of these offsets on, (n, size).
+
+    Nothing is copied if they are back to back.
 
     Args:
         gathered: C-contiguous; else no copy either where they stand at one distance, and each row
@@ -141,8 +145,9 @@ class Leaf:
         offsets: NDArray[np.intp],
         stops: NDArray[np.intp] | None = None,
     ) -> tuple[NDArray[np.intp] | None, NDArray[Any]]:
-        """An integer outside arrays in the candidates at these offsets: the indices of those that
-        have it, None for all; its values.
+        """Read an integer outside arrays in the candidates at these offsets.
+
+        Returns the indices of the candidates that have it (None: all), and its values.
 
         Args:
             stops: where the candidates end; by default with the buffer.
@@ -186,8 +191,9 @@ class Leaf:
         return offsets
 
     def raw(self, given: Sequence[Any]) -> NDArray[Any]:
-        """Physical values of n frames as raw ones, (n, ...), with room for the arrays that the
-        field is in; bytes fill up with zeros.
+        """Return physical values of n frames as raw values, (n, ...).
+
+        The result has room for the arrays that the field is in. Bytes are padded with zeros.
         """
         if self.info.kind == "bytes":
             size = self.shape[-1]
@@ -251,8 +257,9 @@ class Leaf:
         return total
 
     def _whole(self, rows: Bytes2D, element: BitField, wide: np.dtype[Any]) -> NDArray[Any] | None:
-        """Values of bits in a row, cut out of the words that end with their bytes; None where there
-        is not so much before, or in a word.
+        """Return values of contiguous bits, extracted from words that end with them.
+
+        Returns None if there are not enough bytes before them, or if they do not fit into a word.
         """
         if element.run is None:
             return None
@@ -270,8 +277,9 @@ class Leaf:
 
     @property
     def held(self) -> tuple[int, int]:
-        """The first byte that holds any bit of it, where it stands first in its arrays, and the one
-        after the last.
+        """The offsets of its first byte and of the byte after its last.
+
+        They are those of its first instance in its arrays.
         """
         if not self.elements:
             return self.offset, self.offset + self.size
@@ -279,8 +287,9 @@ class Leaf:
         return min(spots), max(spots) + 1
 
     def element(self, path: str, indices: Mapping[str, int]) -> Leaf | None:
-        """Some element of its arrays, counted from the last one where an index is negative; None
-        where there is none.
+        """Return one element of its arrays, None if it does not exist.
+
+        A negative index counts from the last element.
 
         An array that others stand in remains, with that one element, so that each array keeps its
         place.
@@ -324,7 +333,9 @@ Sums = Callable[["Seal", Bytes2D], "NDArray[np.uint64] | None"]
 
 @dataclass(frozen=True, eq=False)
 class Seal:
-    """A checksum of the frame: the fields that hold it, low bits first, and the byte ranges that it
+    """A checksum of the frame.
+
+    `leaves` are the fields that hold it, low bits first. `spans` are the byte ranges that it
     covers.
     """
 
@@ -406,8 +417,12 @@ class Seal:
         return single(self.algorithm)
 
     def intact(self, rows: Bytes2D, sums: Sums | None = None) -> NDArray[np.bool_]:
-        """Which frames carry the right value, or one that means "not filled", (n,); `sums` computes
-        it, by default the algorithm.
+        """Return which frames have a correct checksum, (n,).
+
+        A value that means "not filled" counts as correct.
+
+        Args:
+            sums: computes the checksums; by default the algorithm does.
         """
         stored = self.stored(rows)
         if self.absent:
@@ -426,8 +441,9 @@ class Seal:
 
 @dataclass(frozen=True, eq=False)
 class Condition:
-    """What frames have to meet: one field is one of some values, or a formula of fields side by
-    side is not 0.
+    """A condition that frames have to meet.
+
+    Either one field has one of some values, or a formula of fields is not 0.
     """
 
     fields: tuple[FieldInfo, ...]
@@ -438,8 +454,9 @@ class Condition:
     @classmethod
     @lru_cache(maxsize=4096)
     def of(cls, what: FieldInfo | Check) -> Condition:
-        """That a field has one of the values that it may have, or a check;
-        the same in all layouts.
+        """Return the condition of a check, or of the allowed values of a field.
+
+        All layouts share one object.
         """
         if isinstance(what, FieldInfo):
             return cls((what,), None, what.path)
@@ -447,8 +464,9 @@ class Condition:
         return cls(fields, what.condition, what.path)
 
     def values(self, raw: Mapping[str, NDArray[Any]]) -> NDArray[np.bool_]:
-        """Whether it holds, element by element, by the raw values of its fields; not where one is
-        left out.
+        """Return whether the condition holds, element by element.
+
+        It does not hold if one of its fields is missing in `raw`.
         """
         if len(raw) < len(self.fields):
             return np.zeros(1, np.bool_)
@@ -478,8 +496,10 @@ class Test(Protocol):
         """What it is made of."""
 
     def values(self, raw: Mapping[str, NDArray[Any]]) -> NDArray[Any]:
-        """Whether it holds, element by element, by the raw values of those of its fields that a
-        layout has.
+        """Return whether the test holds, element by element.
+
+        Args:
+            raw: the raw values of those of its fields that a layout has.
         """
 
 
@@ -497,8 +517,10 @@ def holding(test: Test, leaves: Mapping[str, Leaf], rows: Bytes2D) -> NDArray[np
 
 @dataclass(frozen=True, eq=False)
 class Refused:
-    """A header that leads to no frame: too long (after these `constants`), a constant is wrong, or
-    an expression of the plugin failed.
+    """A header that leads to no frame.
+
+    The frame is too long (after these `constants`), a constant is wrong, or an expression of the
+    plugin failed.
     """
 
     error: PluginError | None = None
@@ -541,8 +563,9 @@ class Layout:
 
     @cached_property
     def known(self) -> Mapping[int, tuple[int, int]]:
-        """The bits of a frame that its header leaves no choice of, constants and lengths: offset ->
-        (mask, value).
+        """The bits of a frame that follow from its header: offset -> (mask, value).
+
+        They belong to constants and lengths.
         """
         both = dict(self.constants)
         for spot, (mask, value) in self.held.items():
@@ -560,8 +583,9 @@ class Layout:
         return sum(value << 8 * spot for spot, (_, value) in self.known.items())
 
     def sound(self, frame: bytes) -> bool:
-        """Whether one frame has this size, all constants and the right checksums, and meets all
-        conditions.
+        """Return whether one frame is valid.
+
+        Its size, constants, checksums and conditions are checked.
         """
         return (
             len(frame) == self.size

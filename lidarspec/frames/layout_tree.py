@@ -166,8 +166,9 @@ class Walk:
         return Layout(*found, held, tuple(self.conditions.values()))
 
     def read(self, path: str) -> tuple[tree.FieldInfo, int] | str | None:
-        """What a formula reads by a path: a field and its raw value, the path of a struct, or None
-        for what the header leaves out.
+        """Return the field and raw value, or the struct path, that a formula reads.
+
+        Returns None if the header leaves it out.
 
         Raises:
             NotCompilable: for what is no field before the formula, or not one integer.
@@ -271,9 +272,7 @@ class Walk:
         self.cursor = start + size * count
 
     def _parts(self, node: tree.Parts, path: str) -> None:
-        """Go over parts: how many bytes they take is told by the header, or asked for as a field of
-        it would be.
-        """
+        """Visit parts; their size follows from the header or is requested like a field."""
         given = {ref.path: int(self._value(ref) or 0) for ref in node.outer}
         rule = Rule(
             *(
@@ -307,8 +306,9 @@ class Walk:
     def _no_element(
         self, node: tree.Node, path: str, shape: tuple[int, ...], strides: tuple[int, ...]
     ) -> None:
-        """Go through an element that the array has none of, for its fields alone: nothing is asked
-        of it.
+        """Visit an element that the array does not have, for its fields alone.
+
+        Nothing is required of it.
         """
         start = self.cursor
         constants = dict(self.constants)
@@ -414,8 +414,9 @@ class Walk:
         self.seals.append(Seal(leaves, tuple(spans), node.algorithm, node.absent, self.cursor))
 
     def _held(self) -> dict[int, tuple[int, int]]:
-        """What fields have to be that say how long parts are, as constants, which they are in one
-        layout.
+        """Return the bits of fields that hold lengths of parts, as constants.
+
+        They are constant within one layout.
         """
         rows = np.zeros((2, self.cursor), np.uint8)
         found = [leaf for leaf in self.leaves.values() if leaf.info.held]
@@ -435,8 +436,9 @@ class Walk:
         return {spot: (int(rows[1, spot]), int(rows[0, spot])) for spot in spots}
 
     def _following(self) -> Iterator[tuple[Leaf, int]]:
-        """The values of rebuilt fields that follow from constants and from those that the layout
-        depends on, and from no other.
+        """Yield the values of rebuilt fields that follow from known values.
+
+        These are constants, and the fields that the layout depends on.
         """
         for leaf in self.leaves.values():
             if leaf.info.rebuilt is not None and not leaf.info.held and not leaf.shape:
@@ -526,8 +528,9 @@ Group = tuple[Layout | Refused, NDArray[np.intp]]
 
 @dataclass(frozen=True)
 class _Told:
-    """Which values of a header field the layout tells apart: all from `low` to `high`, or `keys`
-    and any other.
+    """The values of a header field that lead to different layouts.
+
+    They are all from `low` to `high`, or `keys` and any other.
 
     A header may claim any of some billion lengths, or have any key, and garbage does: those that
     mean the same are one branch.
@@ -547,8 +550,9 @@ class _Told:
 
     @classmethod
     def of(cls, info: tree.FieldInfo, root: tree.Node, limit: int) -> _Told:
-        """What the formulas of a frame tell apart of a field; all its values, where that is not
-        seen from their form.
+        """Return the values of a field that the formulas of a frame distinguish.
+
+        Returns all its values if this cannot be derived from the formulas.
         """
         (low, high), known = info.limits, list(tree.nodes(root))
         asking = [
@@ -637,8 +641,9 @@ def _asks(formula: tree.Formula, info: tree.FieldInfo) -> bool:
 
 
 def _counts(node: tree.Node, formula: tree.Formula) -> bool:
-    """Whether a formula of a node counts bytes, or elements or parts, and all numbers above the
-    longest frame mean the same.
+    """Return whether a formula of a node counts bytes, elements or parts.
+
+    All numbers above the longest frame then mean the same.
 
     A part takes a byte at least (`parts`), and an array of more elements than the longest frame has
     bytes is refused as well.
@@ -666,8 +671,9 @@ def _with_value(formula: tree.Formula, value: int) -> int:
 
 
 class _Places:
-    """Candidates in a buffer, as `HeaderTree.classify` gets them, of frames of at most `limit`
-    bytes.
+    """Candidates in a buffer, as given to `HeaderTree.classify`.
+
+    Frames have at most `limit` bytes.
 
     Attributes:
         refuted: those whose header is cut off, or that are too long, and have a wrong constant
@@ -731,8 +737,9 @@ class _Places:
 
 
 class HeaderTree:
-    """All layouts of one frame type, or of a kind of parts,
-    with the values of fields around them.
+    """All layouts of one frame type or kind of parts.
+
+    They depend on the values of the fields around the parts.
     """
 
     def __init__(
@@ -755,8 +762,9 @@ class HeaderTree:
         offsets: NDArray[np.intp],
         stops: NDArray[np.intp] | None = None,
     ) -> list[Group]:
-        """The candidates at `offsets`, sorted by layout: (layout or refusal, indices) for each,
-        without those whose header is cut off.
+        """Return the candidates at `offsets` by layout: (layout or refusal, indices).
+
+        Candidates with an incomplete header are left out.
 
         Args:
             stops: where their bytes end, and no more will come; by default with those of the
@@ -819,8 +827,9 @@ class HeaderTree:
         return tuple(known.values()), prefix_of(self._frame, self._limit)
 
     def common(self, rows: NDArray[np.uint8]) -> Layout | None:
-        """The layout of candidates, one a row, if they have one and the fields that decide it mean
-        the same in all; else None.
+        """Return the common layout of candidates, one a row, else None.
+
+        The fields that select the layout have to mean the same in all rows.
         """
         node = self._root
         while node.result is None:
@@ -843,8 +852,9 @@ class HeaderTree:
     def header(
         self, frame: bytes, *, since: HeaderNode | None = None, is_all: bool = False
     ) -> HeaderNode:
-        """Return how far the header of a frame leads with the bytes that there are: to a result, or
-        to a field that they end before.
+        """Return the node that the available bytes of a header lead to.
+
+        It has a result, or a field that is not complete.
 
         Args:
             since: how far it led with fewer bytes.
@@ -878,8 +888,9 @@ class HeaderTree:
     def _explore(
         self, node: HeaderNode, data: bytes | memoryview = b"", *, is_all: bool = False
     ) -> HeaderNode:
-        """Find out, where nobody has yet, which fields decide next, as far as the header of a frame
-        tells, in one walk.
+        """Determine which fields select the layout next, in one walk.
+
+        The walk goes as far as the header of the frame allows.
 
         Returns:
             The last node: with a result, with a field that the bytes end before, or with neither
@@ -935,8 +946,9 @@ class HeaderTree:
         return node
 
     def _behind(self, walk: Walk) -> dict[int, tuple[int, int]]:
-        """The constants found by a walk, without those that all frames begin with, which candidates
-        are known to have.
+        """Return the constants found by a walk, without the common prefix.
+
+        Candidates are known to have the constants that all frames begin with.
         """
         return {
             spot: known for spot, known in walk.constants.items() if self._prefix.get(spot) != known

@@ -396,8 +396,9 @@ def _labelled(info: FieldInfo, numbers: Reader) -> Reader:
 
 
 class _Names(dict[int, Any]):
-    """What an Enum makes of a number; construct makes a new one each time,
-    and they are all alike.
+    """The results of an Enum by raw value.
+
+    construct makes a new object for each value; these are made once.
     """
 
     def __init__(self, info: FieldInfo) -> None:
@@ -412,8 +413,9 @@ def _names(names: _Names, numbers: Reader, frame: bytes) -> Sequence[Any]:
 
 
 def _bits(node: Block, path: str, layout: Layout, count: int) -> Reader:
-    """What reads a bit block: each as one number, in the order that leaves fewer runs of bits, and
-    its parts where construct has them.
+    """Return a reader of bit blocks, which returns the parts of each block.
+
+    A block is read as one number, in the byte order that leaves fewer runs of bits.
     """
     leaf = layout.leaves[".".join(name for name in (path, *node.parts[0].names) if name)]
     offsets = leaf.offsets()
@@ -443,8 +445,9 @@ def _parts(parts: Reader, blocks: Reader, frame: bytes) -> Sequence[Any]:
 def _runs(
     field: BitField, size: int, order: Literal["little", "big"]
 ) -> list[tuple[int, int, int]]:
-    """The bits of a part in its block as one number: lowest bit, mask and lowest bit of the value,
-    of each run.
+    """Return the runs of bits of a part, if its block is read as one number.
+
+    Each run is (lowest bit in the block, mask, lowest bit of the value).
     """
     runs = list[tuple[int, int, int]]()
     for segment in sorted(field.segments, key=lambda segment: segment.target):
@@ -506,16 +509,18 @@ def _rows(readers: Sequence[Reader], frame: bytes) -> Sequence[ListContainer]:
 
 
 def layout_of(sensor: Spec, name: str, data: bytes) -> Layout | Refused | None:
-    """The layout that the header of this frame leads to; None where it is not compiled or not all
-    there.
+    """Return the layout that the header of this frame leads to.
+
+    Returns None if the type is not compiled, or if the header is incomplete.
     """
     layouts = frame_layouts(sensor.frames[name])
     return None if isinstance(layouts, NotCompilable) else layouts.layout(data)
 
 
 def _progress(sensor: Spec, fault: WireError) -> tuple[int, int]:
-    """How far a type was right before it failed: a frame of this very size, or one in front, comes
-    before all others.
+    """Return how far a frame type matched before it failed.
+
+    A frame of exactly this size, or one at the start, precedes all others.
     """
     if sensor.frames[fault.frame].wire is not None:
         return 0, fault.offset

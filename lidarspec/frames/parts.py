@@ -36,15 +36,18 @@ class Layouts(Protocol):
     def classify(
         self, buffer: NDArray[np.uint8], offsets: Offsets, stops: Offsets | None = None
     ) -> list[tuple[Layout | Refused, Offsets]]:
-        """The candidates at these offsets by layout, without those whose header is cut off; `stops`
-        where their bytes end.
+        """Return the candidates at these offsets by layout.
+
+        Candidates with an incomplete header are left out. `stops` are the offsets after their last
+        bytes.
         """
 
 
 @dataclass(frozen=True, eq=False)
 class Kind:
-    """What a part can be: its layouts and fields, the constants that it begins with, and what says
-    how long the next part is.
+    """A kind of parts: its layouts, fields and first constants.
+
+    It also has the formula for the length of the next part.
     """
 
     node: tree.Kind
@@ -91,8 +94,9 @@ class Rule:
 
 @dataclass(frozen=True, eq=False)
 class Piece:
-    """Parts of one layout that were found in one round: of which kind they are, of which frames,
-    and where they begin in the buffer.
+    """Parts of one layout that were found in one round.
+
+    `owners` are the frames that they are in, `spots` their offsets in the buffer.
     """
 
     kind: int
@@ -103,8 +107,9 @@ class Piece:
 
 @dataclass(frozen=True, eq=False)
 class Walked:
-    """The parts of n frames: `FOUND` or why not, (n,); the bytes of those that were found, (n,);
-    and they, by round.
+    """The parts of n frames, by round.
+
+    `status` is `FOUND` or the reason why not, (n,). `sizes` are the bytes of the parts found, (n,).
     """
 
     status: NDArray[np.uint8]
@@ -136,8 +141,9 @@ class Region:
 
     @property
     def is_measured(self) -> bool:
-        """Whether frames of this layout are known to have these parts, but for their checksums and
-        conditions.
+        """Whether frames of this layout are known to have these parts.
+
+        Checksums and conditions of the parts may still fail.
         """
         return self.rule.within is None
 
@@ -149,8 +155,10 @@ class Region:
     def walked(
         self, buffer: NDArray[np.uint8], offsets: Offsets, stops: Offsets | None = None
     ) -> Walked:
-        """The parts of the frames at these offsets; `stops` where their bytes end, by default with
-        the buffer.
+        """Return the parts of the frames at these offsets.
+
+        Args:
+            stops: the offsets after their last bytes; by default the end of the buffer.
         """
         return _Walk(self, buffer, offsets + self.start, stops).walked()
 
@@ -217,8 +225,9 @@ class _Walk:
         return active
 
     def _round(self, active: Offsets) -> list[Piece]:
-        """A part of each frame; the first kind takes it whose constants are right, as far as the
-        bytes go.
+        """Find the next part of each frame.
+
+        The first kind with the right constants, as far as the bytes go, takes it.
         """
         pieces = list[Piece]()
         for number, kind in enumerate(self._region.kinds):
@@ -335,8 +344,9 @@ def right_at(
     constants: tuple[Word, ...],
     stops: Offsets | None = None,
 ) -> NDArray[np.bool_] | None:
-    """Where constants are right, as far as the bytes go, up to these `stops` or to the end of the
-    buffer, (n,); None where all are.
+    """Return which candidates have the right constants, (n,); None if all have.
+
+    Constants are compared as far as the bytes go, up to these `stops` or to the end of the buffer.
     """
     held: NDArray[np.bool_] | None = None
     for word in constants:
@@ -369,9 +379,7 @@ def _begins(data: bytes, word: Word) -> bool:
 
 @dataclass(frozen=True, eq=False)
 class Measure:
-    """The bytes of all parts, asked for like a field of the header: where it "stands" is said by
-    the region.
-    """
+    """The bytes of all parts, read like a field of the header."""
 
     info: tree.FieldInfo
     region: Region

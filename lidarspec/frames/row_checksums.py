@@ -1,5 +1,6 @@
-"""The checksums of many frames at once, given as rows of bytes: what calls one by one would give,
-by steps that take all rows.
+"""Compute the checksums of many frames at once, given as rows of bytes.
+
+The results equal those of one call for each row.
 
 `over` and `batch` know the algorithms of `lidarspec.spec.checksums`; one of an author's own is
 asked for its `batch`.
@@ -66,16 +67,15 @@ _BYTE_BITS = np.uint64(8)
 
 
 def batch(algorithm: Checksum, rows: NDArray[np.uint8]) -> Values:
-    """The checksum of each row, shape (n,), for frames of one length, shape (n, m), contiguous or
-    not.
+    """Return the checksum of each row, (n,), for frames of one length, (n, m).
+
+    The rows may be contiguous or not.
     """
     return over(algorithm, rows, ((0, rows.shape[1]),))
 
 
 def over(algorithm: Checksum, rows: NDArray[np.uint8], spans: Spans) -> Values:
-    """The checksum of some bytes of each row, shape (n,), wherever in the rows they stand: one span
-    after another.
-    """
+    """Return the checksum of some bytes of each row, (n,), one span after another."""
     values = _TOGETHER.get(type(algorithm))
     if values is None or _are_few(algorithm, rows, spans):
         return algorithm.batch(cut(rows, spans))
@@ -139,8 +139,9 @@ def _word_xor(algorithm: WordXor, rows: NDArray[np.uint8], spans: Spans) -> Valu
 def _word_masks(
     algorithm: WordXor, number: int
 ) -> list[tuple[list[int], tuple[np.uint64, np.uint64]]]:
-    """Where the low and the high bytes stand in so many words of `words`, as masks; with the words
-    that have the same.
+    """Return masks of the low and high bytes in `number` words of `words`.
+
+    Words with equal masks are grouped: their indices, and (low, high).
     """
     masks = np.zeros((2, 8 * number), np.uint8)
     for mask, half in zip(masks, algorithm.halves, strict=True):
@@ -176,8 +177,9 @@ _TOGETHER: dict[type[Checksum], Callable[[Any, NDArray[np.uint8], Spans], Values
 def words(
     rows: NDArray[np.uint8], *, spans: Spans | None = None, zeros_first: bool = False
 ) -> NDArray[np.uint64]:
-    """The rows, filled up with zeros, as columns of little-endian words of eight bytes; shape
-    (words, n), contiguous.
+    """Return rows as columns of little-endian 8-byte words, (words, n), contiguous.
+
+    The rows are padded with zeros.
 
     Args:
         spans: which bytes of each row, one span after another; by default all.
@@ -276,8 +278,9 @@ def byte_sums(columns: NDArray[np.uint64]) -> NDArray[np.uint64]:
 def registers(
     rows: NDArray[np.uint8], spans: Spans, start: int, width: int, poly: int, refin: bool
 ) -> NDArray[Any]:
-    """The register after some bytes of each row, shape (n,), in an integer of the bytes that it
-    takes.
+    """Return the register after some bytes of each row, (n,).
+
+    The dtype is the integer that holds the register.
     """
     length = sum(stop - first for first, stop in spans)
     if 0 < length <= SHORT and len(rows) * length <= FEW:
@@ -294,8 +297,9 @@ def cut(rows: NDArray[np.uint8], spans: Spans) -> NDArray[np.uint8]:
 
 
 def _by_zlib(rows: NDArray[np.uint8], start: int) -> NDArray[Any]:
-    """`registers` of CRC-32 by `zlib`, row by row, which starts from the register and ends with it
-    inverted.
+    """Return `registers` of CRC-32 by `zlib`, row by row.
+
+    zlib starts from the inverted register and ends with it inverted.
     """
     rows = rows if rows.strides[1] == 1 else np.ascontiguousarray(rows)
     return np.fromiter(
@@ -312,8 +316,9 @@ def _by_place(
     poly: int,
     refin: bool,
 ) -> NDArray[Any]:
-    """`registers` of a few short rows: what each byte comes to at the end is looked up, and the sum
-    is taken.
+    """Return `registers` of a few short rows, by a table for each position.
+
+    The result is the XOR of the final contributions of all bytes.
     """
     table, firsts, begun = places(length, start, width, poly, refin)
     found: NDArray[Any] = np.bitwise_xor.reduce(table.take(cut(rows, spans) + firsts), axis=1)
@@ -324,8 +329,9 @@ def _by_place(
 def places(
     length: int, start: int, width: int, poly: int, refin: bool
 ) -> tuple[NDArray[Any], NDArray[np.intp], Any]:
-    """The register after the bytes from each place of a row to its end, by the first of them, the
-    others being 0.
+    """Return a table of the contribution of each byte to the final register.
+
+    All other bytes are 0.
 
     Returns:
         All of them, (256 * length,); where those of each place begin; and the register after
@@ -370,8 +376,9 @@ def _narrow(
 
 
 def _summed(columns: NDArray[np.uint64], poly: int) -> NDArray[np.uint64]:
-    """One word of each row, (n,), that its bytes would give the same register with; `poly` has
-    eight bits.
+    """Return one word of each row that gives the same register, (n,).
+
+    `poly` has eight bits.
     """
     shares = _shares(len(columns), poly)
     onto = np.uint64(sum(1 << 8 * (7 - power) for power in range(8) if poly >> power & 1))
@@ -391,8 +398,9 @@ def _summed(columns: NDArray[np.uint64], poly: int) -> NDArray[np.uint64]:
 
 @lru_cache(maxsize=256)
 def _shares(number: int, poly: int) -> tuple[int, ...]:
-    """How many bytes further on each of so many words counts, relative to the last one: a bit for
-    each number from 0 to 7.
+    """Return the shift of each word relative to the last one, as sums of bytes.
+
+    Bit n of a value, from 0 to 7, stands for a shift by n bytes.
     """
     found = [1]
     while len(found) < number:
@@ -446,8 +454,9 @@ def _advance(distance: int, width: int, poly: int, refin: bool) -> bytes:
 
 @lru_cache(maxsize=16)
 def _word_table(width: int, poly: int, refin: bool) -> NDArray[Any]:
-    """The register after two bytes, by the XOR of that little-endian word and the register's low 16
-    bits; shape (65536,).
+    """Return the register after two bytes, (65536,).
+
+    The index is the XOR of the little-endian word and the low 16 bits of the register.
     """
     table = np.array(byte_table(width, poly, refin), f"<u{REGISTER_BYTES[width]}")
     first = np.tile(table, 256)
@@ -457,8 +466,9 @@ def _word_table(width: int, poly: int, refin: bool) -> NDArray[Any]:
 
 @lru_cache(maxsize=256)
 def _jump_table(power: int, width: int, poly: int, refin: bool) -> NDArray[Any]:
-    """The register after 2**power zero bytes, by place and value of each byte of the register;
-    shape (bytes, 256).
+    """Return the register after 2**power zero bytes, (bytes, 256).
+
+    The axes are the position and the value of each byte of the register.
     """
     if power:
         half = _jump_table(power - 1, width, poly, refin)

@@ -44,8 +44,9 @@ _Field = TypeVar("_Field")
 
 @lru_cache(maxsize=1024)
 def without_indices(path: str) -> tuple[str, dict[str, int]]:
-    """A path without the indices in it, and these, by the paths of their arrays: "a.b", {"a": 0}
-    for "a[0].b".
+    """Return a path without its indices, and these by the paths of their arrays.
+
+    For "a[0].b" the result is "a.b", {"a": 0}.
     """
     names = ""
     indices = dict[str, int]()
@@ -58,8 +59,9 @@ def without_indices(path: str) -> tuple[str, dict[str, int]]:
 
 
 class ByPath(dict[str, _Field]):
-    """What fields have, by their paths; elements of arrays too, which are fields by themselves:
-    "columns[0].timestamp".
+    """A mapping from paths to values of fields, also of elements of arrays.
+
+    An element is a field by itself: "columns[0].timestamp".
 
     Args:
         known: by the paths of the fields.
@@ -126,8 +128,9 @@ class Schema:
 
     @cached_property
     def named(self) -> Mapping[str, FieldInfo]:
-        """The fields of the frame and of its parts, as scans and clocks name them: those of a kind
-        behind its name, "tags.points.angle".
+        """The fields of the frame and its parts, by the names that scans and clocks use.
+
+        A field of a kind follows the name of the kind: "tags.points.angle".
         """
         found = dict(self.fields)
         for axis, node in self.parts.items():
@@ -139,8 +142,9 @@ class Schema:
         return found
 
     def within(self, path: str) -> tuple[str, str, str] | None:
-        """The parts that a path leads into: their axis, their kind, and the path in these; None
-        where it leads into none.
+        """Return the axis, the kind and the remaining path of a path into parts.
+
+        Returns None if the path leads into no parts.
 
         Raises:
             UnknownField: for parts of several kinds without one of them.
@@ -224,8 +228,9 @@ def schema(root: Node) -> Schema:
 def _element(
     arrays: Mapping[str, Formula | None], info: FieldInfo, path: str, indices: Mapping[str, int]
 ) -> FieldInfo | None:
-    """An element of a field, which is left out by some headers where these decide how many there
-    are; None where there never is one.
+    """Return an element of a field, None if it never exists.
+
+    The element is optional if the header determines the number of elements.
     """
     found = element_of(info, path, indices)
     counts = [(arrays.get(axis), index) for axis, index in indices.items()]
@@ -294,8 +299,9 @@ def _add(fields: dict[str, FieldInfo], info: FieldInfo) -> None:
 def _count(
     arrays: dict[str, Formula | None], axis: str, count: Formula | None, *, optional: bool
 ) -> None:
-    """Note the declared count of an array; one that several branches declare is a number only where
-    all say it.
+    """Store the declared count of an array.
+
+    If several branches declare the array, the count is a number only if all of them agree.
     """
     if optional and isinstance(count, int):
         count = Op(

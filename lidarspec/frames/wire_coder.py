@@ -74,8 +74,9 @@ class Coder:
         return values
 
     def find_size(self, data: bytes) -> int | None:
-        """Return the size of the frame that bytes begin with; None if its header has to tell it, or
-        its end is missing.
+        """Return the size of the frame that bytes begin with.
+
+        Returns None if the header determines the size, or if the end is missing.
         """
         return None
 
@@ -235,8 +236,7 @@ class FormCoder(Coder):
 
 
 def _describe_field(leaves: tuple[Leaf, ...], offset: int, end: int) -> tuple[str, int, str]:
-    """Return the path of the field that holds a byte of the struct, its offset there, and what it
-    should be.
+    """Return path, offset and expectation of the field with a byte of the struct.
 
     Args:
         end: of the struct.
@@ -304,8 +304,9 @@ def runs_between(leaves: tuple[Leaf, ...], first: int, end: int) -> tuple[Run, .
 def _number_types(
     leaves: Sequence[Leaf],
 ) -> tuple[NDArray[np.intp], NDArray[np.str_], NDArray[np.bool_]]:
-    """Return the bytes, the kind ("S" for bytes) and whether it is little-endian of one element of
-    each field; a block of bits is one number.
+    """Return the size, kind and byte order of one element of each field.
+
+    The size is in bytes. The kind is "S" for bytes. A block of bits is one number.
     """
     kinds = list[str]()
     is_little = list[bool]()

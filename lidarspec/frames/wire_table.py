@@ -1,5 +1,6 @@
-"""The wire table of a frame type, drawn from its tree: where each field stands, how wide it is,
-what it means.
+"""Make the wire table of a frame type from its tree.
+
+It has the place, width and meaning of each field.
 
 Nothing here knows a frame's bytes, so what depends on a header is a formula of its fields ("10 +
 3*i"), and a part that only some headers have is marked with the condition. `extent` gives the size
@@ -95,8 +96,10 @@ def frame_size(frame: Frame) -> str:
 
 
 def extent(node: tree.Node, shown: str = "") -> Extent:
-    """The size of a part; `shown` is how it is called where its size is only known from its bytes:
-    "size(points[i].text)".
+    """Return the size of a part.
+
+    Args:
+        shown: the name of a size that only the bytes determine: "size(points[i].text)".
     """
     match node:
         case tree.Number() | tree.Block():
@@ -227,8 +230,9 @@ def _part(shown: str, part: tree.Part) -> str:
 
 
 def _bits(part: tree.Part) -> tuple[str, str]:
-    """Size and type of a part of a block: bits, or bytes for an integer that is wider than any
-    number.
+    """Return the size and type of a part of a block.
+
+    The size is in bits, or in bytes for an integer that is wider than any number.
     """
     if part.info.dtype is None and part.bits.run is not None and part.bits.is_whole:
         order, _, size, _ = part.bits.run
@@ -276,8 +280,9 @@ def ruled(node: tree.Parts) -> str:
 
 
 def phrase(formula: tree.Formula) -> str:
-    """A formula as people write it, with its fields by their whole paths; "?" for a function that
-    cannot be read.
+    """Return a formula as text, with the whole paths of its fields.
+
+    Returns "?" for a function that cannot be read.
     """
     match formula:
         case tree.Op("==" | "!=" as symbol, (tree.Ref() as ref, int() as value)) if (
@@ -298,8 +303,9 @@ def _is_enclosed(text: str) -> bool:
 
 
 def bit_text(bits: BitField) -> str:
-    """The bits of a value in its block, the most significant first: "byte 1 bits 1-0, byte 0 bits
-    7-2".
+    """Return the bits of a value in its block, the most significant first.
+
+    Example: "byte 1 bits 1-0, byte 0 bits 7-2".
     """
     parts = []
     for part in sorted(bits.segments, key=lambda segment: -segment.target):
@@ -320,8 +326,9 @@ def unit_text(info: tree.FieldInfo) -> str:
 
 
 def meaning(info: tree.FieldInfo) -> str:
-    """What is said of a field: its constant, what it follows from, its text, the names of its
-    values.
+    """Return the description of a field.
+
+    It has its constant, the formula it follows from, its text and the names of its values.
     """
     const = f"always {hexed(info.const, info.bits)}" if info.const is not None else ""
     const = const or (

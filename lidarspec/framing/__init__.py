@@ -1,4 +1,4 @@
-"""Where frames are: from bytes as they come to frames of known type and layout.
+"""Find frames in bytes: known types and layouts, or counted as invalid.
 
 In: a byte stream in any pieces, or datagrams. Out: `Frames`, a struct of arrays of those that were
 found, and counters for all other bytes. No clock, port or thread in here, and no exception for any

@@ -42,8 +42,10 @@ class _Fragment:
 
 @dataclass
 class _Message:
-    """A message of which not all is there: fragments by their index, where the first one began in
-    the input, and when it came.
+    """An incomplete message.
+
+    It has fragments by their index, the offset of the first one in the input, and its time of
+    arrival.
     """
 
     count: int
@@ -113,8 +115,10 @@ class Assembly:
         at: NDArray[np.int64],
         base: int,
     ) -> Joined:
-        """The messages that datagrams complete, among those that are no fragments; `base`: where
-        these begin in the input.
+        """Return the messages that datagrams complete, among other datagrams.
+
+        Args:
+            base: the offset of the first datagram in the input.
         """
         data = list[bytes]()
         places = list[int]()
@@ -176,8 +180,9 @@ class Assembly:
         return _Fragment(key, index, count, payload) if is_whole and 0 <= index < count else None
 
     def _taken(self, fragment: _Fragment, place: int, time: int) -> tuple[bytes, int] | None:
-        """The message that a fragment completes, and where it began;
-        None where others are missing.
+        """Store a fragment and return the message that it completes, with its offset.
+
+        Returns None if other fragments are missing.
         """
         for key in [
             key for key, message in self._waiting.items() if 0 <= message.at < time - PATIENCE

@@ -1,5 +1,6 @@
-"""The candidates in a piece of a stream: the offsets with the constants of a type, and their
-verdicts.
+"""Find and judge the candidates in a piece of a stream.
+
+A candidate is an offset with the constants of a type.
 
 A type with `after` is looked for only while the frame that it names is the last seen of those named
 by any `after`. All candidates of a piece are judged in bulk, those of each type once, when the type
@@ -130,8 +131,9 @@ class Framing:
         return self.names[kind] in self.named and self.names[kind] != mode.after
 
     def switching(self, mode: Mode) -> NDArray[np.bool_]:
-        """Return whether a frame of each type changes which types are looked for, (types + 1,), by
-        its index; the last, for -1, is False.
+        """Return whether a frame of each type changes the types searched, (types + 1,).
+
+        The index is the type. The last value, for -1, is False.
         """
         return np.array([*(self.switches(kind, mode) for kind in range(len(self.names))), False])
 
@@ -144,8 +146,9 @@ class Framing:
         *,
         gathered: bool = True,
     ) -> Frames:
-        """Return the candidates of a type at some offsets that have its constants, each with its
-        layout and its status.
+        """Return the candidates of a type at some offsets that have its constants.
+
+        Each has its layout and its status.
         """
         return self.codecs[kind].survey(
             buffer, offsets, stops, kind=kind, gathered=gathered, sums=self.sums
@@ -179,8 +182,9 @@ def _right(buffer: Bytes1D, spot: int, mask: int, value: int) -> NDArray[np.bool
 
 
 def fitting(buffer: Bytes1D, offsets: Offsets, constants: Marks) -> Offsets:
-    """Return those of some ascending offsets at which the constants are right as far as the bytes
-    go.
+    """Return the offsets at which the constants match, as far as the bytes go.
+
+    The offsets are ascending.
     """
     for spot, mask, value in constants:
         if not len(offsets):
@@ -311,8 +315,9 @@ class Candidates:
 
 
 def merged(candidates: Sequence[Frames], *, final: bool) -> Frames:
-    """Return the candidates of several types that are valid or wait for bytes, by offset, at each
-    the one whose type comes first.
+    """Return the candidates of several types, by offset, one for each offset.
+
+    They are valid or incomplete. At the same offset, the type that comes first is kept.
     """
     worst = VALID if final else SHORT
     parts = list[Frames]()

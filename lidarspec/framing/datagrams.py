@@ -184,8 +184,9 @@ class _Batch:
         return self._framing.survey(kind, self._buffer, starts, starts + sizes, gathered=False)
 
     def _rejected(self, frames: Frames, lost: Indices, reasons: Status, mode: Mode) -> Frames:
-        """Count those that are no frames; the types again, up to one that turns out to be a frame
-        that changes what is looked for.
+        """Count datagrams that are no frames; judge again those with a plugin failure.
+
+        Returns the datagrams up to a frame that changes which types are searched.
         """
         parts = list[Frames]()
         begun = 0
@@ -222,8 +223,9 @@ class _Batch:
         return None
 
     def _count(self, reasons: NDArray[np.uint8], sizes: Indices, mode: Mode) -> None:
-        """Count datagrams as rejected: those that resemble no frame by their constants, or their
-        length where it is too short for these.
+        """Count datagrams as rejected.
+
+        Without the constants of a frame they count as such, or as too short to have them.
         """
         least = min(self._framing.ends[kind] for kind in self._framing.active(mode))
         unknown = np.isin(reasons, (VALID, CONSTANT))

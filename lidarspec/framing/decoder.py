@@ -1,5 +1,6 @@
-"""The incremental decoder: bytes in, frames out, everything counted. No clock, port or thread in
-here.
+"""Decode incrementally: bytes in, frames out, everything counted.
+
+This module has no clock, port or thread.
 
 A byte stream is cut into pieces that stay in the cache; what a piece leaves undecided is looked at
 again together with the next. Datagram links frame by datagram. However the input is cut, the frames
@@ -56,8 +57,9 @@ class Witness(Protocol):
     def fed(
         self, decoder: Decoder, buffer: NDArray[np.uint8], starts: Numbers, sizes: NDArray[np.intp]
     ) -> None:
-        """What a decoder, whose `stats` do not count it yet, is fed: a piece of a stream, or
-        datagrams, whose buffer stays as it is.
+        """Observe a piece of a stream, or datagrams, given to a decoder.
+
+        `decoder.stats` does not count it yet. The buffer does not change.
         """
 
     def found(self, frames: Frames) -> None:
@@ -130,20 +132,29 @@ class Decoder:
         return [found for frames in self.frames(data, at) for found in frames.found()]
 
     def idle(self) -> list[Found]:
-        """The line fell silent: candidates that wait for bytes are given up, and their bytes looked
-        at again.
+        """Handle silence on the line: give up candidates that wait for bytes.
+
+        Their bytes are searched again.
+
+        Returns:
+            The frames found.
         """
         return [found for frames in self.rest() for found in frames.found()]
 
     def finish(self) -> list[Found]:
-        """The input ended: candidates that wait for bytes are given up, and their bytes looked at
-        again.
+        """Handle the end of the input: give up candidates that wait for bytes.
+
+        Their bytes are searched again.
+
+        Returns:
+            The frames found.
         """
         return self.idle()
 
     def frames(self, data: Data, at: int | None = None) -> list[Frames]:
-        """The frames that these bytes complete, in stream order, as structs of arrays. Raises on no
-        bytes whatever.
+        """Return the frames that these bytes complete, in stream order.
+
+        They are structs of arrays. No input raises.
 
         Args:
             data: the next bytes of the stream, or one datagram.
@@ -220,8 +231,9 @@ class Decoder:
         sizes: NDArray[np.intp],
         at: NDArray[np.int64],
     ) -> Frames:
-        """Datagrams that stand in one buffer already, each one frame, whole, or none; nothing is
-        copied.
+        """Return the frames in datagrams that are in one buffer, without a copy.
+
+        Each datagram is one whole frame or none.
 
         Args:
             buffer: one-dimensional and contiguous; what stands between the datagrams does not
@@ -276,8 +288,9 @@ class Decoder:
         good: NDArray[np.bool_],
         joined: Joined | None,
     ) -> NDArray[np.int64]:
-        """The bytes in datagrams that are no frames before each one that is, fillers left out;
-        counts them.
+        """Return the invalid bytes before each frame in datagrams, and count them.
+
+        Fillers are left out.
         """
         lost = self._skipped(buffer, np.where(good, 0, sizes), starts + sizes)
         if joined is not None:
@@ -330,8 +343,9 @@ class Decoder:
         return start
 
     def _piece(self, buffer: Bytes1D, *, final: bool) -> Piece:
-        """Return a piece of a stream cut into frames: as rows while nothing disturbs, else by
-        search.
+        """Return a piece of a stream cut into frames.
+
+        It is cut into rows as long as the frames are regular, else by search.
         """
         piece = None
         if not final:
@@ -341,9 +355,7 @@ class Decoder:
         return piece
 
     def _entered(self, buffer: NDArray[np.uint8], piece: Piece, at: int | None) -> Frames:
-        """The frames of a piece with their place in the input, and all that was found in it
-        counted.
-        """
+        """Return the frames of a piece at their offsets in the input; count everything."""
         frames = piece.frames
         base = self._base
         gaps = self._gaps(buffer, frames, piece.end)
@@ -361,8 +373,9 @@ class Decoder:
         )
 
     def _gaps(self, buffer: NDArray[np.uint8], frames: Frames, end: int) -> NDArray[np.int64]:
-        """The bytes skipped before each frame of a piece that ends there, fillers left out; counts
-        them.
+        """Return the bytes skipped before each frame of a piece, and count them.
+
+        Fillers are left out. The piece ends at `end`.
         """
         places = frames.places
         if not self._gap and isinstance(places, range) and places.start == 0 and places.stop == end:
@@ -434,8 +447,9 @@ def _places(sizes: NDArray[np.intp], first: int = 0) -> Numbers:
 
 
 def backend(name: str) -> str:
-    """The back end that a name stands for; "auto" is what LIDARSPEC_BACKEND says, if it says
-    anything.
+    """Return the back end for a name.
+
+    For "auto" it is the value of LIDARSPEC_BACKEND, if that is set.
 
     Raises:
         UsageError: for a name that is none.
@@ -450,8 +464,9 @@ def backend(name: str) -> str:
 
 
 def frames_of(decoder: Decoder, data: Any) -> list[Frames]:
-    """Every frame of a whole input: bytes as a stream,
-    an iterable or (n, size) array as datagrams.
+    """Return all frames of a whole input.
+
+    Bytes are decoded as a stream, an iterable or (n, size) array as datagrams.
     """
     if is_stream(data):
         return decoder.frames(data) + decoder.rest()

@@ -150,8 +150,9 @@ def _some_value(source: random.Random, leaf: Leaf, keys: list[int]) -> int:
 
 
 def _random(engine: Codec, layout: Layout, number: int, source: random.Random) -> NDArray[np.uint8]:
-    """So many rows of random bytes, of which the wire form can write every value, with values that
-    fields may have.
+    """Return `number` rows of random bytes with allowed values.
+
+    The wire form can write every value.
     """
     rows = (
         np.frombuffer(source.randbytes(number * layout.size), np.uint8)
@@ -190,8 +191,9 @@ def _interpreted(
 
 
 def _left_open(values: Any, root: Node) -> Any:
-    """The values of a frame without those that say how many parts there are and how long, which
-    `build` fills in.
+    """Return the values of a frame without the counts and lengths of parts.
+
+    `build` fills them in.
     """
     for node in schema(root).parts.values():
         rules = (node.count, node.size, node.within)
@@ -247,8 +249,9 @@ def _sent(sensor: Spec, frame: str, layout: Layout, rows: NDArray[np.uint8]) -> 
 def _make_along_sweep(
     sensor: Spec, frame: str, engine: Codec, source: random.Random, drawn: Drawn
 ) -> bytes:
-    """A frame around the values that the sensor's `sweep` declares, where random ones are never
-    plausible.
+    """Return a frame with the values that the sensor's `sweep` declares.
+
+    It is used if random values are never plausible.
     """
     sweep = sensor.simulation_of(frame).sweep
     if sweep is None:
@@ -277,8 +280,9 @@ def _make_along_sweep(
 
 
 def _store_swept(leaf: Leaf, rows: NDArray[np.uint8], value: Any) -> None:
-    """Write a value of a sweep into a row, as far as there is room; a row with room for more
-    elements keeps its own.
+    """Write a value of a sweep into a row if its shape matches.
+
+    A row with room for more elements keeps its own values.
     """
     raw = leaf.raw([value])[(slice(None), *map(slice, leaf.shape))]
     if all(length in (1, room) for length, room in zip(raw.shape[1:], leaf.shape, strict=False)):

@@ -69,8 +69,10 @@ class Codec:
     def survey_rows(
         self, rows: NDArray[np.uint8], *, sums: Sums | None = None
     ) -> tuple[Layout, Status, tuple[PluginError, ...]] | None:
-        """The layout of candidates of one size, one a row, the status of each, and failures of the
-        plugin; None where they have not one.
+        """Return the common layout of candidates of one size, and their status.
+
+        The candidates are given as rows. Failures of the plugin are returned as well. Returns None
+        if there is no common layout.
         """
         return None
 

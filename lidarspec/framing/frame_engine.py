@@ -1,5 +1,6 @@
-"""One frame type as an engine: which candidates are frames, and frames as columns. Compiled, and
-interpreted.
+"""The engine of one frame type: judge candidates, and make columns of frames.
+
+There is a compiled and an interpreted one.
 
 Both codecs answer the same questions with the same results; every test runs on both.
 `CompiledCodec` works by layouts on whole batches: the header of a candidate is looked at once, when
@@ -156,8 +157,9 @@ class CompiledCodec(Codec):
         sizes: NDArray[np.intp],
         sums: Sums | None,
     ) -> list[LayoutGroup]:
-        """Judge the candidates of layouts that are alike; return those that are still to be judged
-        layout by layout.
+        """Judge the candidates of related layouts together.
+
+        Returns the groups that remain to be judged layout by layout.
 
         Args:
             status, sizes: of all candidates, changed here.
@@ -240,8 +242,9 @@ class CompiledCodec(Codec):
         )
 
     def gather(self, frames: Frames) -> Rows:
-        """Frames that were found, all of this type, as columns: where they stand, if they are at
-        least half of what is kept for them.
+        """Return frames of this type as columns.
+
+        Nothing is copied if the frames take at least half of the buffer.
         """
         if frames.rows is not None and frames.layout is not None:
             if 2 * frames.rows.size >= len(frames.buffer):
@@ -269,8 +272,9 @@ class CompiledCodec(Codec):
 
 
 class InterpretedCodec(Codec):
-    """A frame type that construct parses, one candidate at a time; `reason` says why it is not
-    compiled.
+    """A frame type that construct parses, one candidate at a time.
+
+    `reason` says why it is not compiled.
     """
 
     is_compiled = False
@@ -362,8 +366,9 @@ def _partial(
     layout: Layout,
     sizes: NDArray[np.intp],
 ) -> tuple[NDArray[np.uint8], NDArray[np.intp]]:
-    """Candidates whose end is not there yet: still possible, or already refuted by a constant or a
-    length; and how many bytes tell more.
+    """Return the status of incomplete candidates, and the bytes needed to decide.
+
+    A candidate is still possible, or already refuted by a constant or a length.
 
     Args:
         layout: whose constants and lengths they have.

@@ -74,9 +74,7 @@ class AlikeLayouts:
     def split(
         self, groups: list[LayoutGroup], make_judge: MakeJudge
     ) -> tuple[list[Together], list[LayoutGroup]]:
-        """Return the groups that are judged together, and those that are left to be judged layout
-        by layout.
-        """
+        """Return the groups to judge together, and those to judge layout by layout."""
         if len(groups) < MANY_LAYOUTS:
             return [], groups
         left = list[LayoutGroup]()
@@ -100,8 +98,9 @@ class AlikeLayouts:
         return together, left
 
     def likeness(self, layout: Layout, judge: Judge) -> Likeness | None:
-        """Return which others a layout is like; None if its candidates cannot be judged together
-        with those of others.
+        """Return the relation of a layout to others, for judging them together.
+
+        Returns None if its candidates cannot be judged together with others.
         """
         if self not in layout.notes:  # decoders of one frame type share its layouts
             layout.notes[self] = self._find(layout, judge)
@@ -138,8 +137,9 @@ def _seal_key(seal: Seal, size: int) -> Hashable:
 
 
 def _place(leaf: Leaf, seal: Seal, size: int) -> tuple[str, int]:
-    """Return where a checksum is: from the start of the frame, or from its end if it follows the
-    last bytes covered.
+    """Return the position of a checksum, from the start or the end of the frame.
+
+    It counts from the end if the checksum follows the last covered bytes.
     """
     if leaf.offset >= seal.spans[-1][1]:
         return ("end", size - leaf.offset)
@@ -181,8 +181,10 @@ class Together:
         )
 
     def by_layout(self, chosen: NDArray[np.bool_]) -> list[LayoutGroup]:
-        """Return some of the candidates with their layouts;
-        `chosen`: which of `self.which`, (n,).
+        """Return some of the candidates with their layouts.
+
+        Args:
+            chosen: whether each of `self.which` is wanted, (n,).
         """
         found = (
             (layout, self.which[chosen & (self.forms == form)])
@@ -211,8 +213,9 @@ class Together:
     def _judge_rows(
         self, rows: Bytes2D, sizes: Offsets, forms: Offsets, longest: int, sums: Sums | None
     ) -> Status:
-        """Return the status of candidates in rows of the longest layout, (n,); behind the end of
-        each there may be anything.
+        """Return the status of candidates in rows of the longest layout, (n,).
+
+        Bytes after the end of a candidate are ignored.
         """
         judge = self._judge(self.layouts[longest])
         status = np.zeros(len(rows), np.uint8)
@@ -233,8 +236,9 @@ def _length(check: Check) -> int:
 
 
 def _by_size(sizes: Offsets) -> Iterator[Offsets]:
-    """Return the indices of candidates in groups of similar size, each ascending by size, of rows
-    of `BLOCK_BYTES` at most.
+    """Yield the indices of candidates in groups of similar size.
+
+    Each group is ascending by size, with rows of at most `BLOCK_BYTES` together.
     """
     order = np.argsort(sizes, kind="stable")
     ordered = sizes[order]
@@ -248,8 +252,9 @@ def _by_size(sizes: Offsets) -> Iterator[Offsets]:
 
 
 def _rows(buffer: Bytes1D, offsets: Offsets, size: int) -> Bytes2D:
-    """Return `size` bytes from each offset on, (n, size),
-    with zeros behind the end of the buffer.
+    """Return `size` bytes from each offset on, (n, size).
+
+    Bytes behind the end of the buffer are 0.
     """
     first = int(offsets.min())
     if int(offsets.max()) + size > len(buffer):

@@ -1,5 +1,4 @@
-"""Whether candidates are frames: their constants, their checksums, and what is plausible, for many
-at a time.
+"""Judge many candidates at a time by constants, checksums and plausibility.
 
 The order is that of the counters: a candidate with a wrong constant is none at all, one with a
 wrong checksum is counted as such, and only what is intact is asked whether it is plausible.
@@ -116,9 +115,7 @@ class Judge:
         return status
 
     def check_constants(self, status: NDArray[np.uint8], rows: Bytes2D) -> None:
-        """Enter the candidates with a wrong constant or a wrong length, among those that are valid
-        so far.
-        """
+        """Set the status of valid candidates with a wrong constant or length."""
         held = right(self._constants, rows) if len(rows) else None
         if held is not None:
             status[~held] = CONSTANT
@@ -159,8 +156,9 @@ def _parts_among(
     errors: list[PluginError],
     sums: Sums | None,
 ) -> None:
-    """Judge by their parts those that are valid so far: whether these fill their room, and by the
-    checksums in them.
+    """Judge candidates that are valid so far by their parts.
+
+    The parts have to fill their room, and their checksums have to be right.
     """
     for region in layout.regions.values():
         if not region.is_measured or region.has_checks:
@@ -247,8 +245,9 @@ class Conditions:
         return [self._check(one, leaves) for one, leaves in every]
 
     def checks(self, layout: Layout) -> list[Check] | None:
-        """What frames of a layout, as rows of bytes, have to pass; None where only the function
-        itself can tell.
+        """Return the checks that frames of a layout have to pass, as rows of bytes.
+
+        Returns None if only the function itself can decide.
         """
         if self._parts is None:
             return None
@@ -328,8 +327,9 @@ class _Table:
 
 @dataclass(frozen=True, eq=False)
 class Lookup:
-    """A condition on one or two bytes of each frame, or of each element of an array in it, by a
-    table.
+    """A condition on one or two bytes, evaluated by a table.
+
+    It applies to each frame, or to each element of an array.
 
     Attributes:
         offset: of the first of these bytes.
@@ -353,8 +353,10 @@ class Lookup:
         return np.asarray(held.all(axis=tuple(range(1, held.ndim))))
 
     def holds_within(self, rows: Bytes2D, lengths: NDArray[np.intp]) -> NDArray[np.bool_]:
-        """Whether the condition holds in each frame, (n,), if its outermost array has fewer
-        elements than the row, (n,).
+        """Return whether the condition holds in each frame, (n,).
+
+        Args:
+            lengths: the length of the outermost array in each frame, (n,), at most that of the row.
         """
         held = self._each(rows)
         if not self.shape:
@@ -389,8 +391,9 @@ def _table(part: Test, leaves: Mapping[str, Leaf], size: int) -> _Table:
 
 
 def _bits(listed: NDArray[np.bool_]) -> tuple[int, tuple[int, ...]] | None:
-    """The bits on which a list depends, and with which values of these it holds, if they are one or
-    two; else None.
+    """Return the bits that a list depends on, and their allowed values.
+
+    Returns None unless there are one or two allowed values.
     """
     values = np.arange(len(listed))
     mask = sum(

@@ -50,8 +50,9 @@ COUNTED = {
 
 @dataclass(repr=False)
 class Counters:
-    """What became of the input. ``bytes_in == bytes in frames + bytes_skipped + pending`` always
-    holds.
+    """Counters of the input.
+
+    ``bytes_in == bytes in frames + bytes_skipped + pending`` always holds.
 
     Attributes:
         frames: number of frames by type.
@@ -104,8 +105,9 @@ class Counters:
         return {f.name: getattr(self, f.name) for f in fields(self) if f.compare}
 
     def error(self, failure: PluginError, number: int) -> None:
-        """Count so many packets at which a function of the plugin raised, and keep the first few
-        failures.
+        """Count packets at which a function of the plugin raised.
+
+        The first few failures are kept.
         """
         self.plugin_errors += number
         if len(self.failures) < 5:
@@ -117,8 +119,9 @@ class Counters:
         return [failure.traceback for failure in self.failures]
 
     def failure(self, sensor: str) -> PluginError | None:
-        """What the plugin of a sensor failed at first, with the number of packets, None where it
-        did not fail.
+        """Return the first failure of a sensor's plugin, with the number of packets.
+
+        Returns None if it did not fail.
         """
         if not self.failures:
             return None
@@ -263,8 +266,9 @@ class Frames:
 
     @cached_property
     def gaps(self) -> NDArray[np.int64]:
-        """The bytes (other than fillers) skipped before each frame, (n,); 0 until the decoder says
-        otherwise.
+        """The bytes skipped before each frame, (n,), without fillers.
+
+        They are 0 until the decoder sets them.
         """
         return repeated(0, len(self))
 
@@ -331,8 +335,9 @@ class Frames:
         gaps: NDArray[np.int64],
         at: NDArray[np.int64],
     ) -> Frames:
-        """These frames with their place in the input; gathered rows stand for the buffer, so that
-        the rest of it can go.
+        """Return these frames with their place in the input.
+
+        Gathered rows replace the buffer, so that the rest of it can be freed.
         """
         if self.rows is None or isinstance(self._starts, range):
             return self._with(names=names, places=places, gaps=gaps, at=at)

@@ -114,8 +114,9 @@ class _Walk:
         self._continued: list[tuple[int, int]] = []  # kinds and offsets of runs that go on
 
     def advance(self, position: int, piece: Piece) -> int:
-        """Take what is valid from an offset on, until the end or a frame that changes what is
-        looked for; return where that frame ends.
+        """Take valid candidates up to the end, or to a frame that changes the mode.
+
+        Returns the end of that frame.
 
         Args:
             piece: where it ends and what it waits for is entered into it, unless what is looked for
@@ -205,8 +206,9 @@ def _rows_of(runs: Offsets) -> Offsets:
 
 
 def _remember_size(mode: Mode, frames: Frames, since: int) -> None:
-    """Note for the next piece how the frames follow one another, of those since what is looked for
-    changed last.
+    """Store the regularity of the frames for the next piece.
+
+    Only frames since the last change of the mode count.
     """
     own = frames.starts[frames.starts.searchsorted(since) :]
     if len(own):
@@ -217,8 +219,9 @@ def _remember_size(mode: Mode, frames: Frames, since: int) -> None:
 def count_rejected(
     framing: Framing, piece: Piece, candidates: Candidates, stays: list[tuple[int, str | None]]
 ) -> None:
-    """Count the candidates outside the frames, and at a frame's first byte those of the types that
-    come before its own.
+    """Count the rejected candidates outside the frames.
+
+    At the first byte of a frame, candidates of earlier types count as well.
 
     Args:
         stays: from which offset on which types were looked for.

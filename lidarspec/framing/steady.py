@@ -86,8 +86,9 @@ def steady_datagrams(
 def judge_rows(
     framing: Framing, kind: int, buffer: NDArray[np.uint8], rows: Bytes2D, first: int
 ) -> Frames | None:
-    """Return rows with the constants of a type as candidates of one layout; None if the type has no
-    layout of their size.
+    """Return rows with the constants of a type as candidates of one layout.
+
+    Returns None if the type has no layout of their size.
 
     Args:
         rows: of the buffer, at equal distances.
@@ -113,8 +114,9 @@ def judge_rows(
 
 
 def leading(framing: Framing, kind: int, rows: Bytes2D) -> int | None:
-    """Return how many rows from the first on have the constants of a type, as far as the rows go;
-    None if no row has them.
+    """Return how many leading rows have the constants of a type.
+
+    Constants are compared as far as the rows go. Returns None if no row has them.
     """
     constants = tuple(
         word for word in framing.words[kind] if word[0] + word[1].itemsize <= rows.shape[1]
@@ -144,8 +146,9 @@ def _piece(framing: Framing, mode: Mode, frames: Frames) -> Piece:
 
 
 def _count_needed(framing: Framing, mode: Mode, kind: int, layout: Layout, rest: bytes) -> int:
-    """Return how many bytes are needed to judge a next frame of the same layout that has begun; 0
-    if it may be something else.
+    """Return how many bytes are needed to judge an incomplete frame of a layout.
+
+    Returns 0 if the bytes may be another frame.
     """
     first = next(
         (other for other in framing.active(mode) if _begins(framing.marks[other], rest)), None
@@ -167,8 +170,9 @@ def _begins(marks: Marks, data: bytes) -> bool:
 
 
 def _rows(buffer: NDArray[np.uint8], starts: Numbers, sizes: Indices) -> Bytes2D | None:
-    """Return datagrams of one size at equal distances as the rows of an array; None if they are
-    not.
+    """Return datagrams of one size at equal distances as rows of an array.
+
+    Returns None if they have other sizes or distances.
     """
     count = len(sizes)
     size = sizes.item(0) if count else 0
@@ -184,8 +188,9 @@ def _rows(buffer: NDArray[np.uint8], starts: Numbers, sizes: Indices) -> Bytes2D
 
 
 def _likely(framing: Framing, rows: Bytes2D, mode: Mode) -> int | None:
-    """Return the type with the constants of the first datagram; None if there is none, or if any
-    datagram with its constants has those of an earlier type as well.
+    """Return the type with the constants of the first datagram.
+
+    Returns None if there is none, or if any datagram has the constants of an earlier type as well.
     """
     first = rows[0].tobytes()
     before = list[int]()

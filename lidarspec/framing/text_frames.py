@@ -88,8 +88,9 @@ class TextCodec(Codec):
         return Frames(buffer, kinds, offsets, sizes, status=status, errors=tuple(errors))
 
     def _decode(self, data: bytes, errors: list[PluginError]) -> tuple[int, int, bytes | None]:
-        """Return the status of a candidate and its size, and its struct if that is to be judged,
-        which replaces the status.
+        """Return the status, the size and the struct of a candidate.
+
+        If there is a struct, it has to be judged; its status replaces the one returned.
 
         Args:
             data: the bytes from the candidate on, at most as many as the longest frame has.
@@ -115,8 +116,9 @@ class TextCodec(Codec):
     def _group(
         self, structs: Sequence[bytes]
     ) -> tuple[list[Group], list[tuple[Refused, NDArray[np.intp]]]]:
-        """Return structs by layout, without those that have none of their size; and the indices of
-        those that are refused.
+        """Return structs by layout, and the indices of refused structs by refusal.
+
+        Structs with no layout of their size are left out.
         """
         sizes = np.array([len(struct) for struct in structs], np.intp)
         starts = np.cumsum(sizes) - sizes

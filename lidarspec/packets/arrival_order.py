@@ -1,5 +1,6 @@
-"""Losses in packets that always arrive in order: those of byte streams, and datagrams without
-a counter and a clock.
+"""Count losses among packets that always arrive in order.
+
+They are packets of byte streams, and datagrams without a counter and a clock.
 
 `ArrivalOrder` numbers the packets as they arrive and leaves out as many numbers as packets are
 missing. Skipped bytes count as packets of the largest size so far. A step of the clock that is

@@ -90,8 +90,9 @@ class ClockOrder:
         )
 
     def push(self, batch: Batch, times: Times) -> tuple[Numbers, NDArray[np.int64]]:
-        """Return the index and the order of each packet, (n,); mark the breaks before packets in
-        `batch.breaks`.
+        """Return the index and the order of each packet, (n,).
+
+        Breaks before packets are marked in `batch.breaks`.
 
         Args:
             times: by the sensor's clock, (n,) ns.
@@ -128,8 +129,9 @@ class ClockOrder:
         return index, order
 
     def forget(self) -> None:
-        """Treat the next packet as the first one after the clock was set: nothing tells what passed
-        until then.
+        """Treat the next packet as the first one after the clock was set.
+
+        The time until then is not known.
         """
         self._arrived = None
         self._neighbours.clear()
@@ -226,8 +228,9 @@ class ClockOrder:
         return passed < -MAX_LATE_NS or (is_full and time < self._neighbours[0].time)
 
     def _begin(self, batch: Batch, row: int, time: int, checksum: int) -> Neighbour:
-        """Begin with a first packet, or anew after the clock was set: the index leaves out one
-        number.
+        """Begin with a first packet, or again after the clock was set.
+
+        After the clock was set the index leaves out one number.
         """
         before = self._newest
         if before is None:
@@ -243,8 +246,9 @@ class ClockOrder:
         return self._newest
 
     def _insert(self, position: int, row: int, time: int, pace: float, checksum: int) -> Neighbour:
-        """Place a late packet before a neighbour, and count anew what is missing on both sides of
-        it.
+        """Insert a late packet before a neighbour.
+
+        The missing packets on both sides of it are counted again.
         """
         self._stats.late += 1
         after = self._neighbours[position]

@@ -1,6 +1,4 @@
-"""The sensor's own clock: read from packets as integer nanoseconds, and made to run on where it
-starts again.
-"""
+"""Read the sensor's clock as integer nanoseconds, and unwrap it."""
 
 from __future__ import annotations
 
@@ -30,8 +28,9 @@ _FURTHEST = 9 * 10**18
 
 
 class Unwrapper:
-    """A clock that starts again at `wraps_at` seconds, made to run on; exact over any number of
-    wraps.
+    """Unwrap a clock that starts again at `wraps_at` seconds.
+
+    The result is exact over any number of wraps.
 
     The shorter way round decides between forward and backward, so late packets go back in time.
     Where the host's times say that more than most of a turn has passed, they decide how many turns
@@ -74,8 +73,9 @@ class Unwrapper:
 
 @dataclass(frozen=True)
 class ClockReference:
-    """A frame that tells the turn of a clock (`Clock.told`), found before the packets that it
-    applies to.
+    """A frame with the turn of a clock (`Clock.told`).
+
+    It is found before the packets that it applies to.
 
     Attributes:
         data: its bytes.
@@ -149,9 +149,7 @@ class Epoch:
     def _ns_by_reference(
         self, reference: ClockReference, reading: int, time: int, host: int
     ) -> int:
-        """Return what completes times, from what the clock reads in the first packet and in the
-        reference.
-        """
+        """Return the offset of times, from readings in a packet and the reference."""
         table = codec(self._sensor.frames[self.frame]).table([reference.data])
         told = told_seconds(self._clock, table)
         reading_there = self._reading_of(table, 0)
@@ -192,8 +190,9 @@ def clock_ns(sensor: Spec, batch: Batch) -> Times:
 
 
 def clocked(sensor: Spec, batch: Batch) -> tuple[NDArray[np.intp] | None, Times]:
-    """The packets that have the clock, None for all, and what it reads there: in the first of the
-    parts in which it stands.
+    """Return the packets that have the clock (None: all), and its readings.
+
+    If the clock is in parts, the first part counts.
     """
     assert sensor.clock is not None
     place = clock_parts(sensor, batch.table.schema)
@@ -209,8 +208,9 @@ def clocked(sensor: Spec, batch: Batch) -> tuple[NDArray[np.intp] | None, Times]
 
 
 def held(which: NDArray[np.intp], times: Times, before: Times) -> Times:
-    """The times of some packets, each held until the next of them, (n,); before the first of them
-    those given, (n,).
+    """Return the times of some packets, each held until the next of them, (n,).
+
+    Packets before the first of them have the times `before`, (n,).
     """
     spots = np.searchsorted(which, np.arange(len(before)), side="right") - 1
     return np.where(spots < 0, before, times[np.maximum(spots, 0)]) if len(times) else before
@@ -299,8 +299,10 @@ def paths(clock: Clock) -> tuple[str, ...]:
 def clock_terms(
     fields: tuple[str, ...], schema: Schema, sensor: str
 ) -> list[tuple[str, Any, Any, int]]:
-    """The fields that add up to a clock: path, nanoseconds in one step and at zero, furthest
-    reading (0 where these are fractions).
+    """Return the fields that add up to a clock.
+
+    Each has path, nanoseconds in one step and at zero, and furthest reading (0 if these are
+    fractions).
 
     Raises:
         SpecError: for one that is no time, or not one of each packet.
@@ -323,8 +325,9 @@ def clock_terms(
 
 
 def _scaling(unit: str, scale: float, offset: float) -> tuple[Any, Any] | None:
-    """Nanoseconds in one step of a field and at its zero: integers where both are whole, else
-    fractions; None if it is no time.
+    """Return the nanoseconds in one step of a field and at its zero.
+
+    They are integers if both are whole, else fractions. Returns None if the unit is no time.
     """
     per_unit = factor(unit, "s")
     if per_unit is None:

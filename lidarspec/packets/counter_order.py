@@ -84,8 +84,9 @@ class Readings:
 
 @dataclass
 class CountedLoss:
-    """Packets that are missing by the counter, and that a masked sector leaves out (see
-    `masked_sector.Loss`).
+    """Packets that are missing by the counter, and those in a masked sector.
+
+    See `masked_sector.Loss`.
     """
 
     missing: int
@@ -203,8 +204,9 @@ class CounterOrder:
         return largest if last is None else int(last)
 
     def _find_odd(self, readings: Readings) -> list[int]:
-        """Return the packets that do not follow the one that arrived before them, without the first
-        one.
+        """Return the packets that do not follow the previous one.
+
+        The first packet is left out.
         """
         numbers = readings.numbers
         if readings.has_counter is not None and not readings.has_counter.all():
@@ -275,10 +277,12 @@ class CounterOrder:
         return ahead
 
     def _correct(self, number: int, time: int, pace: float, by_clock: float) -> tuple[int, int]:
-        """Return the places ahead and the number of a packet, by the clock, if its own number does
-        not fit.
+        """Correct the number of a packet by the clock, if its own does not fit.
 
         If two such numbers follow one another, the counter has started again there.
+
+        Returns:
+            The places ahead and the number.
         """
         ahead = max(round(by_clock), 1)
         suspect = self._suspect
@@ -294,8 +298,10 @@ class CounterOrder:
     def _place(
         self, readings: Readings, row: int, ahead: int | None, number: int | None
     ) -> tuple[int, bool]:
-        """Return the index of a packet that does not follow the newest one, and whether there is
-        a break before it.
+        """Return the index of a packet that does not follow the newest one.
+
+        Returns:
+            The index, and whether there is a break before the packet.
         """
         if ahead is not None and ahead <= 0:
             return self._place_late(-ahead), False
@@ -331,8 +337,9 @@ class CounterOrder:
         return 0 < (number - jump.number) % self._period <= MAX_PLACES_LATE
 
     def _add_loss(self, row: int, ahead: int) -> CountedLoss:
-        """Advance the index to a packet, and count the packets between as lost if they are not
-        masked.
+        """Advance the index to a packet.
+
+        Packets between are counted as lost if they are not masked.
         """
         loss = CountedLoss(ahead - 1)
         before = self._index

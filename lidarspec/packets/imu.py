@@ -1,5 +1,6 @@
-"""What an IMU felt, out of packets: samples in stream order, in SI and the axes of the points, and
-which of them belong to a scan.
+"""IMU samples of packets, in stream order.
+
+They are in SI units and the axes of the points, with their assignment to scans.
 """
 
 from __future__ import annotations
@@ -116,8 +117,10 @@ def samples(sensor: Spec, frame: str, batch: Batch, time_ns: NDArray[np.int64]) 
 
 
 class Waiting:
-    """Samples that wait for the scan that they belong to: those from its first point to that of the
-    next, and what was before.
+    """Samples that wait for the scan that they belong to.
+
+    A scan has the samples from its first point to that of the next one. Earlier samples are kept as
+    well.
     """
 
     def __init__(self) -> None:

@@ -1,5 +1,6 @@
-"""Masked sectors: the part of each turn in which a rotating sensor sends nothing, since its user
-has set it so.
+"""Detect masked sectors, in which a rotating sensor sends nothing.
+
+The user of a sensor has configured this part of each turn.
 
 Between the packets on both sides of such a sector the clock advances and the angle leaps, as if
 packets were lost. A gap belongs to a masked sector if it recurs at the same angles while no packet
@@ -116,8 +117,9 @@ class AngleReader:
         self.is_available = bool(self._path) and sensor.datagrams
 
     def angles(self, table: Table) -> Angles | None:
-        """Return the angle at which each packet begins, (n,); None if the packets have no such
-        field, or no part that has it.
+        """Return the angle at which each packet begins, (n,).
+
+        Returns None if the packets have no such field, or no part that has it.
         """
         info = table.schema.fields.get(self._path) if self.is_available else None
         full = self._full if info is None or self._full is not None else FULL_TURNS.get(info.unit)
@@ -130,8 +132,9 @@ class AngleReader:
         return np.mod((first * info.scale + info.offset) / full, 1.0)
 
     def direction(self, table: Table) -> int:
-        """Return the direction in which the first packet of a table turns: 1 or -1; 0 if it does
-        not show it.
+        """Return the direction in which the first packet of a table turns: 1 or -1.
+
+        Returns 0 if the packet does not show it.
         """
         if self._grows:
             return 1
@@ -201,8 +204,9 @@ class SectorFinder:
         return any(self._is_unseen(gap, step) for gap in self._gaps)
 
     def _is_unseen(self, sector: Sector, step: float) -> bool:
-        """Return whether no packet began within a sector, its edges left out, although one of each
-        turn would.
+        """Return whether no packet began within a sector, without its edges.
+
+        At least one of each turn would, if the sector were not masked.
         """
         edge = EDGE_STEPS * step + 1 / BINS
         inner = sector.width - 2 * edge
@@ -272,8 +276,9 @@ class MaskedGaps:
         return math.nan if self._angles is None else self._angles.item(row)
 
     def count_masked(self, start: float, stop: float, missing: int) -> int:
-        """Return how many of the packets that are missing between two angles the masked sector
-        leaves out, if it is known.
+        """Return how many of the packets missing between two angles are masked.
+
+        Returns 0 if the masked sector is not known.
         """
         sector = None if self._finder is None else self._finder.sector
         if sector is None or math.isnan(start) or math.isnan(stop):

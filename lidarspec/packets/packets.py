@@ -85,15 +85,17 @@ class Packets:
 
     @cached_property
     def index(self) -> NDArray[np.int64]:
-        """The number of each, (n,), which runs on over what is missing: the sensor's, unwrapped,
-        where it counts its packets.
+        """The number of each packet, (n,), including missing packets.
+
+        It is the unwrapped counter of the sensor, if there is one.
         """
         return self._index() if callable(self._index) else array_of(self._index)
 
     @property
     def order(self) -> NDArray[np.int64]:
-        """The place of each among the others, (n,), equal for doubled packets: by the counter, or
-        else the clock, of datagrams.
+        """The position of each packet in order, (n,), equal for duplicates.
+
+        It follows from the counter, or else from the clock, of datagrams.
         """
         return self.index if self._order is None else self._order
 
@@ -110,8 +112,9 @@ class Packets:
     _repr_html_ = drawn("packets")
 
     def __getitem__(self, path: str) -> NDArray[np.float64]:
-        """A field in its unit: float64, shape (n, *lengths of its arrays); nan where a frame lacks
-        the field.
+        """Return a field in its unit, float64, shape (n, *lengths of its arrays).
+
+        The value is nan if a frame lacks the field.
 
         Raises:
             UnknownField: with the closest known path.
@@ -128,8 +131,9 @@ class Packets:
 
     @property
     def raw(self) -> NDArray[Any]:
-        """The integers of the wire: a structured array (n,), nested as in the struct, variable
-        arrays padded with 0.
+        """The integers of the wire, a structured array (n,), nested as in the struct.
+
+        Variable arrays are padded with 0.
         """
         columns = {path: self.table.raw(path) for path in self.table.schema.fields}
         found = np.zeros(len(self), _nested(self.table.schema, columns, ""))
@@ -173,8 +177,9 @@ class Packets:
         return cloud_of(self.with_points)
 
     def imu(self) -> ImuSamples:
-        """What the sensor's IMU felt, in all packets in stream order: columns in SI, and the time
-        of each sample.
+        """Return the samples of the sensor's IMU in all packets, in stream order.
+
+        Columns are in SI units. Each sample has its time.
 
         Raises:
             SpecError: where this frame type has nothing of an IMU, or its `imu` function fails or
@@ -208,8 +213,9 @@ class Packets:
         return {**columns, "order": order, "masked": masked}
 
     def parts(self, path: str) -> Packets:
-        """The parts of all packets, in stream order, as packets: with the times, numbers and state
-        of the frames that they are in.
+        """Return the parts of all packets, in stream order, as packets.
+
+        They have the times, numbers and state of the frames that they are in.
 
         Args:
             path: of the parts; "tlvs.points" for one of several kinds.
@@ -260,8 +266,10 @@ class Packets:
         return (self.table, slice(None)) if table is None else (table, which)
 
     def batch(self, carry: dict[int, NDArray[np.float64]] | None = None) -> Batch:
-        """The packets as a plugin's functions are given them, through `Fields`; `carry`: what the
-        batch before left.
+        """Return the packets as functions of a plugin receive them, through `Fields`.
+
+        Args:
+            carry: the state left by the previous batch.
         """
         return Batch(self.table, self.breaks, self.state, self.sensor.state, dict(carry or {}))
 
@@ -311,8 +319,10 @@ def joined_tables(tables: Sequence[Any]) -> Table:
 
 
 def _nested(schema: Schema, columns: Mapping[str, NDArray[Any]], prefix: str) -> np.dtype[Any]:
-    """The structured dtype of one level of the struct; SpecError where one name is a value, a
-    struct or an array by turns.
+    """Return the structured dtype of one level of the struct.
+
+    Raises:
+        SpecError: One name is a value, a struct or an array in different branches.
     """
     members: list[Any] = []
     seen: set[str] = set()
@@ -338,8 +348,9 @@ def _nested(schema: Schema, columns: Mapping[str, NDArray[Any]], prefix: str) ->
 
 
 def _forms(schema: Schema, here: str) -> set[tuple[bool, int]]:
-    """What a name is in the branches that have it: whether a value, and in how many arrays of its
-    own.
+    """Return the forms of a name in the branches that have it.
+
+    A form is whether it is a value, and the number of arrays of its own.
     """
     parts = [
         (path, info)

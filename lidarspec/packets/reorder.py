@@ -129,8 +129,7 @@ class Reorder:
         return [self._mark(packets.take(np.array(rows, np.intp)), before)] if rows else []
 
     def _mark(self, packets: Packets, before: int | None) -> Packets:
-        """Return packets in order with a break wherever the index leaves out a number, and nowhere
-        else.
+        """Return packets in order, with breaks exactly where the index leaves out numbers.
 
         Args:
             before: the index that follows the packets released before these; None if there are

@@ -171,8 +171,9 @@ class PacketStream:
     def _judge(
         self, batch: Batch, time: Integers | None, skipped: Integers
     ) -> tuple[Index, NDArray[np.bool_], Integers | None]:
-        """Return the index of packets, the breaks before them, and their order if the clock shows
-        it.
+        """Return the index of packets, the breaks before them, and their order.
+
+        The order is None if the clock does not show it.
         """
         unjudged = (range(len(batch)), batch.breaks)
         if self._clock_order is not None and time is not None:
@@ -441,8 +442,9 @@ def data_frame(sensor: Spec, found: Sequence[Frames]) -> str | None:
 
 
 def _clock_of(sensor: Spec, frame: str, schema: Schema) -> Clock | None:
-    """Return the clock of frames of a type: the sensor's in data, and in an IMU's frames that have
-    its fields; else their own, if any.
+    """Return the clock of frames of a type, if any.
+
+    Data frames use the clock of the sensor, as do frames of an IMU that have its fields.
     """
     declared = sensor.frames[frame]
     shared = sensor.clock
@@ -471,8 +473,9 @@ def _has_field(sensor: Spec, frame: str, path: str) -> bool:
 
 
 def _offsets(parts: Sequence[_Part]) -> Numbers:
-    """Return the offsets of frames in the input; as a range, if all have one size and follow one
-    another.
+    """Return the offsets of frames in the input.
+
+    They are a range if all frames have one size and follow one another.
     """
     runs = [part.frames.places for part in parts if part.where is None]
     ranges = [places for places in runs if isinstance(places, range)]

@@ -1,5 +1,6 @@
-"""Point clouds: flat arrays in SI units, REP-103 axes and REP-117 ranges; and how a sensor is
-mounted, which turns and moves them.
+"""Point clouds: flat arrays in SI units, REP-103 axes and REP-117 ranges.
+
+A mounting turns and moves the points of a sensor.
 
 A `PointCloud` holds its columns. A `LazyCloud` takes each from a `ColumnSource` when it is first
 read. There is one interface of such sources, whatever the points are: those of a batch of packets
@@ -123,8 +124,9 @@ class PointCloud:
 
     @property
     def columns(self) -> Mapping[str, NDArray[Any]]:
-        """The columns that this cloud has, by name, those in `extra` last;
-        those that were chosen.
+        """The columns of this cloud by name, `extra` last.
+
+        Only the chosen ones, if columns were chosen.
         """
         names = self.chosen or (*COLUMNS, *self.extra)
         source_of(self).prepare(names)
@@ -138,8 +140,10 @@ class PointCloud:
         return not self.chosen or name in (*self.chosen, "x", "y", "z")
 
     def only(self, *names: str) -> PointCloud:
-        """The same points, of which `columns`, `to_structured` and files have these columns alone;
-        x y z stay where a format takes them.
+        """Return the same points with these columns alone.
+
+        They apply to `columns`, `to_structured` and files. x, y and z remain if a format requires
+        them.
 
         Raises:
             UnknownName: for a column that the cloud has not; it names those that it has.
@@ -158,8 +162,9 @@ class PointCloud:
         return cloud
 
     def read(self, *names: str) -> dict[str, NDArray[Any]]:
-        """Some columns by name, "valid" and those in `extra` too, made together, which is quicker
-        than one after another.
+        """Return columns by name, including "valid" and those in `extra`.
+
+        They are computed together, which is faster than one after another.
 
         Raises:
             UnknownName: for a column that the cloud has not.
@@ -174,8 +179,9 @@ class PointCloud:
 
     @property
     def calibration(self) -> str:
-        """Whose calibration it is: "own", or "nominal" where a default stood in for the sensor's
-        own.
+        """The origin of the calibration.
+
+        "own" is the sensor's own, "nominal" means that defaults were used.
         """
         return "nominal" if self.nominal else "own"
 
@@ -185,8 +191,9 @@ class PointCloud:
         return np.stack([self.x, self.y, self.z], axis=-1)
 
     def __array__(self, dtype: DTypeLike | None = None, copy: bool | None = None) -> NDArray[Any]:
-        """`xyz`, which is what NumPy, SciPy and Open3D take for points; `to_structured` has the
-        other columns too.
+        """Return `xyz`, as NumPy, SciPy and Open3D expect points.
+
+        `to_structured` has the other columns too.
 
         Raises:
             ValueError: with ``copy=False``, since x, y and z are columns of their own.
@@ -198,8 +205,9 @@ class PointCloud:
         return self.xyz if dtype is None else self.xyz.astype(dtype, copy=False)
 
     def __getitem__(self, which: Any) -> PointCloud:
-        """The points that a mask, indices or a slice pick; organised only if a slice holds whole
-        columns; of one index the scalars.
+        """Return the points at a mask, indices or a slice.
+
+        The result is organised only if a slice holds whole columns. One index gives scalars.
         """
         picked = {f.name: _pick(getattr(self, f.name), which) for f in fields(self)}
         picked["extra"] = {name: column[which] for name, column in self.extra.items()}
@@ -212,8 +220,9 @@ class PointCloud:
         return PointCloud(**{**picked, "shape": shape})
 
     def organised(self, columns: int) -> PointCloud:
-        """The points as a picture of so many columns, each in the place of its number; one that was
-        lost is a gap of invalid points.
+        """Return the points as a picture of `columns` columns, placed by their number.
+
+        A missing column is a gap of invalid points.
 
         Args:
             columns: of a whole turn. The points are those of one turn at most.
@@ -246,8 +255,9 @@ class PointCloud:
         return replace(self._rearranged(indices), column=numbered, shape=(columns, self.shape[1]))
 
     def destaggered(self, shifts: Sequence[int]) -> PointCloud:
-        """The points of a picture, each row moved on by so many columns, round the turn: what looks
-        in one direction stands in one column.
+        """Return the points of a picture with each row shifted by some columns.
+
+        Rows wrap around. Afterwards one column has one direction.
 
         Args:
             shifts: columns for each row, (rows,), as the sensor's metadata has them.
@@ -268,8 +278,9 @@ class PointCloud:
         )
 
     def _rearranged(self, indices: NDArray[np.intp]) -> PointCloud:
-        """The points at some indices, whole columns of them; -1 is an invalid one, in the row that
-        it stands in.
+        """Return the points at some indices, which form whole columns.
+
+        Index -1 is an invalid point in its row.
         """
         indices = indices.reshape(-1)
         each = grid_of(self).column
@@ -282,8 +293,9 @@ class PointCloud:
         return picked
 
     def to_structured(self) -> NDArray[Any]:
-        """A structured array (N,) with PCL's layout: x y z intensity ring time, itemsize 32; what
-        is missing is 0.
+        """Return a structured array (N,) with PCL's layout.
+
+        The fields are x y z intensity ring time, itemsize 32. Missing values are 0.
 
         The columns in `extra` follow from byte 32 on, each where its type allows, and the itemsize
         is a multiple of 16.
@@ -300,8 +312,9 @@ class PointCloud:
         return structured
 
     def to_arrow(self, facts: Mapping[str, str] | None = None) -> Any:
-        """A `pyarrow.Table` with the columns of `columns`, which are not copied, but for bools;
-        each has its unit in its field's metadata.
+        """Return a `pyarrow.Table` with the columns of `columns`.
+
+        Columns are not copied, except bools. The metadata of each field has its unit.
 
         Args:
             facts: further metadata of the schema, beside `units` as JSON, `calibration` ("nominal"
@@ -320,8 +333,9 @@ class PointCloud:
         return self.to_arrow().__arrow_c_stream__(requested_schema)
 
     def to_pandas(self) -> Any:
-        """A `pandas.DataFrame` with the columns of `columns`, which are not copied; `attrs` has
-        "units" and "stamp_ns".
+        """Return a `pandas.DataFrame` with the columns of `columns`, not copied.
+
+        `attrs` has "units" and "stamp_ns".
 
         Raises:
             UsageError: where pandas is not installed.
@@ -347,8 +361,9 @@ def units_of(cloud: PointCloud) -> dict[str, str]:
 
 
 def arrow_schema(cloud: PointCloud, facts: Mapping[str, str]) -> Any:
-    """The `pyarrow.Schema` of a cloud. Fields that cannot be null are written faster; of a float
-    nan says that there is none.
+    """Return the `pyarrow.Schema` of a cloud.
+
+    Float columns are not nullable, which is faster to write: nan marks a missing value.
 
     Args:
         facts: metadata of the schema, beside `units` as JSON and `calibration`: "nominal" or "own".
@@ -423,8 +438,9 @@ class ColumnSource:
     extra: Mapping[str, Kind] = {}
 
     def column(self, name: str) -> NDArray[Any] | None:
-        """A column of `PointCloud`, (size,), "valid" or one of those in `extra`; None where the
-        sensor has none.
+        """Return a column of `PointCloud`, (size,), "valid", or one of `extra`.
+
+        Returns None if the sensor does not have it.
         """
         raise NotImplementedError
 
@@ -436,8 +452,9 @@ class ColumnSource:
         """Make columns that will be asked for together, where that is quicker."""
 
     def part(self, name: str, start: int, stop: int) -> NDArray[Any] | None:
-        """A column of the points from `start` to `stop`, (stop - start,); None where the sensor has
-        none.
+        """Return a column of the points from `start` to `stop`, (stop - start,).
+
+        Returns None if the sensor does not have it.
         """
         column = self.column(name)
         return None if column is None else column[start:stop]
@@ -449,8 +466,9 @@ class ColumnSource:
         return whole_columns(self.grid, start, stop - start)
 
     def times_at(self, indices: NDArray[np.intp]) -> NDArray[np.float64]:
-        """The column "time" at some indices, of their shape, seconds since `base`; the others need
-        not be made for them.
+        """Return the column "time" at some indices, in their shape.
+
+        Times are in seconds since `base`. Other times need not be computed.
         """
         times = self.column("time")
         assert times is not None  # since every cloud has it
@@ -458,8 +476,9 @@ class ColumnSource:
         return picked
 
     def together(self, parts: Sequence[Stretch]) -> ColumnSource | None:
-        """What makes the columns of stretches of this and further sources for these points alone;
-        None where nothing does.
+        """Return a source of the columns of several stretches for these points alone.
+
+        The stretches are of this and further sources. Returns None if there is no such source.
         """
         return None
 

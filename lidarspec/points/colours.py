@@ -1,5 +1,6 @@
-"""The colours of values, the same in every picture: blue for low values, over green, to yellow for
-high ones.
+"""The colours of values, the same in every picture.
+
+Low values are blue, medium ones green and high ones yellow.
 
 The scale is a helix in the colour space OKLab, in which equal steps look equal. Its lightness rises
 all the way, so that readers who confuse red and green, or blue and yellow, still see the order.
@@ -33,8 +34,9 @@ _LINEAR = (
 
 @dataclass(frozen=True)
 class Scale:
-    """The first and last lightness, from 0 to 1, the first and last hue in degrees,
-    and the chroma.
+    """A colour scale by lightness, hue and chroma.
+
+    Lightness runs from 0 to 1 and hue in degrees, each given as the first and the last value.
     """
 
     lightness: tuple[float, float]

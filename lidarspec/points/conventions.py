@@ -1,5 +1,6 @@
-"""What the columns of points mean, whichever way they are computed: REP-103 axes, REP-117 ranges,
-coordinates, types, organised shapes.
+"""Conventions of the columns of points, independent of the back end.
+
+They are REP-103 axes, REP-117 ranges, coordinates, types and organised shapes.
 
 The formulas take arrays (the plain evaluation) and traced columns (plans) alike, so that each is
 written once.
@@ -48,8 +49,9 @@ _FAR = 1e6
 
 
 def shown_range(measured: Any, invalid: Any) -> Any:
-    """The range that a cloud shows, metres: inf where nothing came back, nan where the sensor marks
-    a point as wrong (REP-117).
+    """Return the range that a cloud shows, metres (REP-117).
+
+    It is inf without a return, and nan if the sensor marks the point as invalid.
     """
     return marked(
         np.where(measured == 0, np.inf, np.where(measured < 0, np.nan, measured)), invalid
@@ -57,8 +59,9 @@ def shown_range(measured: Any, invalid: Any) -> Any:
 
 
 def returned_range(measured: Any) -> Any:
-    """The range of a return, metres; nan where nothing came back. Of what is traced it is one step,
-    which compilers know.
+    """Return the range of a return, metres, nan without a return.
+
+    A traced value gets a single step that compilers know.
     """
     if isinstance(measured, Traced):
         return measured.applied(returned_range, measured)
@@ -97,8 +100,10 @@ def coordinates(
 
 
 def placed(coordinates: Sequence[Any], invalid: Any) -> list[Any]:
-    """The coordinates of points that are given by them, metres: nan where nothing came back, one is
-    no number, or the sensor says so.
+    """Return the coordinates of points that are given by coordinates, metres.
+
+    They are nan without a return, if one is not finite, or if the sensor marks the point as
+    invalid.
 
     Args:
         coordinates: x, y and z as `Cartesian` has them.
@@ -123,8 +128,9 @@ def _product(first: Any, second: Any) -> Any:
 
 
 def _is_row(value: Any) -> bool:
-    """Whether a value is a row of a table: what is computed with such rows is computed once, for
-    the table.
+    """Return whether a value is a row of a table.
+
+    Computations with such rows are done once, for the table.
     """
     return isinstance(value, Traced) and value.node.kind == "rows"
 
@@ -140,8 +146,10 @@ def seconds_since(time_ns: NDArray[np.int64], base: int) -> NDArray[np.float64]:
 
 
 class Grid(NamedTuple):
-    """How the points of a packet are organised: places of a column, none where they are not, and
-    returns of each place, side by side.
+    """The organisation of the points of a packet.
+
+    `rows` is the number of places in a column, 0 if the points are not organised. The `returns` of
+    one place are side by side.
     """
 
     rows: int = 0
@@ -154,8 +162,9 @@ class Grid(NamedTuple):
 
 
 def grid_of(shape: Sequence[int], axes: Sequence[str | None]) -> Grid:
-    """How points are organised that have this shape in every packet, along axes of these names;
-    `stack` makes returns.
+    """Return the organisation of points with this shape and these axis names.
+
+    `stack` adds the axis of returns.
     """
     is_stacked = bool(axes) and (axes[-1] or "").startswith("<")
     *lengths, returns = shape if is_stacked else (*shape, 1)
@@ -178,8 +187,9 @@ class Grids(NamedTuple):
     grids: Sequence[Grid]
 
     def between(self, start: int, stop: int) -> Grid:
-        """How some points are organised: not, where their packets differ, or they are not whole
-        columns.
+        """Return the organisation of the points from `start` to `stop`.
+
+        They are not organised if their packets differ, or if they are not whole columns.
         """
         first = self.ends.searchsorted(start, side="right")
         last = self.ends.searchsorted(stop)
@@ -193,8 +203,9 @@ class Grids(NamedTuple):
 
 
 def whole_columns(grid: Grid, first: int, number: int) -> Grid:
-    """How some points of organised ones are, which begin so many points behind a column: not, where
-    they are not whole columns.
+    """Return the organisation of `number` points of organised ones.
+
+    They begin `first` points after a column, and are not organised if they are not whole columns.
     """
     return grid if grid.rows and first % grid.column == 0 and number % grid.column == 0 else Grid()
 
@@ -236,8 +247,9 @@ def numbers_of(values: NDArray[Any], dtype: Any) -> NDArray[Any]:
 
 
 def axis_matrix(axes: Sequence[str]) -> NDArray[np.float64]:
-    """The (3, 3) matrix that turns REP-103 coordinates into those of axes named by where x, y and z
-    point.
+    """Return the (3, 3) matrix from REP-103 coordinates to named axes.
+
+    The axes are named by the directions of x, y and z.
     """
     matrix = np.zeros((3, 3))
     for row, name in enumerate(axes):
@@ -247,24 +259,27 @@ def axis_matrix(axes: Sequence[str]) -> NDArray[np.float64]:
 
 
 def axes_of(sensor: Spec) -> tuple[str, str, str]:
-    """Where x, y and z of a sensor's points point: as REP-103 has it, or as its vendor does, where
-    that was asked for.
+    """Return the directions of x, y and z of a sensor's points.
+
+    They follow REP-103, or the vendor's axes if these are configured.
     """
     wanted = sensor.vendor_axes if sensor.options.get("frame") == "vendor" else None
     return wanted or REP_103
 
 
 def vendor_turn(sensor: Spec) -> NDArray[np.float64] | None:
-    """The (3, 3) matrix that turns REP-103 coordinates into the axes that were asked for; None
-    where these are REP-103's own.
+    """Return the (3, 3) matrix from REP-103 to the configured axes.
+
+    Returns None if these are the axes of REP-103.
     """
     axes = axes_of(sensor)
     return None if axes == REP_103 else axis_matrix(axes)
 
 
 def turned_azimuth(angles: NDArray[Any], turn: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Azimuths of the same directions in turned axes, radians in [-pi, pi], the shape of `angles`;
-    `turn` is (3, 3).
+    """Return azimuths of the same directions in turned axes, radians in [-pi, pi].
+
+    The shape is that of `angles`. `turn` is (3, 3).
     """
     direction = turn[:2, :2] @ np.stack([np.cos(angles), np.sin(angles)])
     return np.asarray(np.arctan2(direction[1], direction[0]))

@@ -35,8 +35,9 @@ def evaluated(
     final: bool = True,
     epoch: int | None = None,
 ) -> Evaluated:
-    """The points of a batch, quickly where that can be; the columns are those of `plain.evaluate`,
-    within a few units in the last place.
+    """Return the points of a batch by the fastest applicable evaluation.
+
+    The columns equal those of `plain.evaluate` within a few units in the last place.
 
     Args:
         carry: what the batch before left.
@@ -116,8 +117,9 @@ def _share(
 
 
 def _holds(share: Share) -> bool:
-    """Whether a plan holds for its packets: made for their counts, and for what factors and
-    floating-point fields have in them.
+    """Return whether a plan is valid for its packets.
+
+    Their counts, and the values of factors and floating-point fields, are checked.
     """
     if any(
         len(share.known.column(node).steps()) != number for node, number in share.plan.tape.steps
@@ -130,8 +132,9 @@ def _holds(share: Share) -> bool:
 
 
 def _moderate(share: Share, node: Node) -> bool:
-    """Whether all numbers of a floating-point field are finite, and neither so small nor so large
-    that float32 would lose them.
+    """Return whether all numbers of a floating-point field are of moderate size.
+
+    They are finite, and neither too small nor too large for float32.
     """
     leaf = share.plan.layout.leaves.get(node.path)
     if leaf is None:
@@ -144,8 +147,9 @@ def _moderate(share: Share, node: Node) -> bool:
 
 
 def _all_moderate(values: NDArray[Any]) -> bool:
-    """Whether floating-point numbers are all 0 or of moderate size: their bits without the sign are
-    integers in the same order.
+    """Return whether floating-point numbers are all 0 or of moderate size.
+
+    Without the sign, their bits are integers in the same order.
     """
     kind = np.dtype(f"u{values.dtype.itemsize}")
     least, most = np.clip(MODERATE, 0, np.finfo(values.dtype).max).astype(values.dtype).view(kind)
@@ -199,8 +203,9 @@ def _counts(shares: list[Share], number: int) -> NDArray[Any]:
 def guarded(
     packets: PacketBatch, carry: Carry | None = None, *, final: bool, epoch: int
 ) -> Evaluated | None:
-    """The points of a batch of a stream, which raises on nothing: a failing plugin is counted in
-    its `Counters`, and gives None.
+    """Return the points of a batch of a stream, None if the plugin fails.
+
+    Failures are counted in the `Counters` of the packets.
 
     Args:
         carry: what the batch before left.

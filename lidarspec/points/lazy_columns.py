@@ -1,5 +1,6 @@
-"""The columns of planned points, made when they are asked for: of a batch, or of a scan over
-several batches.
+"""The columns of planned points, computed when they are first read.
+
+They belong to a batch, or to a scan over several batches.
 
 `Share` is the packets of one layout in a batch: their plan, and what is known of them plainly
 (`Plain`). It has its columns made by what a back end compiles from the plan: `points.numpy_plan`,
@@ -52,8 +53,9 @@ EXACT = 4
 
 
 class Plain:
-    """The plain results of nodes for one batch, each computed once: as columns where axes have to
-    be named, else as arrays.
+    """The plain results of nodes for one batch, each computed once.
+
+    Results are columns if axes have to be named, else arrays.
     """
 
     def __init__(self, batch: Batch) -> None:
@@ -77,8 +79,9 @@ class Plain:
         return self._arrays[node]  # type: ignore[no-any-return]
 
     def sent(self, node: Node, first: int, stop: int) -> NDArray[Any] | None:
-        """Whole numbers of a field as they were sent, in the packets from `first` to `stop`, (n,
-        ...).
+        """Return the whole numbers of a field as sent, (n, ...).
+
+        They are those of the packets from `first` to `stop`.
 
         None for what is no such field, or not in every packet.
         """
@@ -118,8 +121,9 @@ class Plain:
 
 @dataclass(eq=False)
 class Share:
-    """The packets of one layout in a batch: their plan, the plain results, and where the first
-    point of each goes, -1 for nowhere.
+    """The packets of one layout in a batch, with their plan and plain results.
+
+    `first` is the index of the first point of each packet, -1 for none.
     """
 
     plan: Plan
@@ -146,8 +150,9 @@ class Share:
             maker.run(self.group.rows[first:stop], values, columns)
 
     def plain(self, name: str, first: int = 0, stop: int | None = None) -> NDArray[Any]:
-        """A part of what `points` returned, for every point of the packets from `first` to `stop`
-        (None: all), evaluated plainly.
+        """Return a part of the result of `points`, evaluated plainly.
+
+        It has every point of the packets from `first` to `stop` (None: all).
 
         Its shape is that of the plan, behind the packets.
 
@@ -172,8 +177,10 @@ class Share:
     def part(
         cls, plan: Plan, batch: Batch, group: Group, remembered: Mapping[int, Column]
     ) -> Share:
-        """The share of some packets of a batch; `remembered`: the results of all its packets that
-        remember others, by the node's number.
+        """Return the share of some packets of a batch.
+
+        Args:
+            remembered: results for all packets, by the number of a node that uses other packets.
         """
         own = batch.of(group)
         share = cls(plan, group, Plain(own), own)
@@ -200,8 +207,9 @@ class Share:
 
 
 def maker_of(plan: Plan, names: tuple[str, ...], backend: str, number: int) -> Maker:
-    """What makes columns of so many frames: a kernel where `backend` asks for one, or where it is
-    free to and that pays.
+    """Return an object that computes columns for `number` frames.
+
+    It is a kernel if `backend` requires one, or if it allows one and that pays.
     """
     if backend in ("auto", "jit"):
         try:
@@ -288,8 +296,9 @@ class Computed(ColumnSource):
         return {name: numbers_of(column, TYPES[name]) if extra is None else extra.column(column)}
 
     def _main(self, name: str) -> dict[str, NDArray[Any]]:
-        """The columns that are made together; where all points are level, the height only when it
-        is asked for.
+        """Return the columns that are computed together.
+
+        If all points are level, the height is made only on request.
         """
         if name not in self._main_names and name == "z":
             x = self._x()
@@ -355,9 +364,7 @@ class Computed(ColumnSource):
         return self._parts[0][0].even is not None
 
     def _pieces(self) -> list[tuple[BatchColumns, Share, tuple[int, int]]]:
-        """The shares that the points are of, and the packets of each: the first one, and the one
-        after the last.
-        """
+        """Return the shares that the points are in, and the range of packets of each."""
         if not self._is_even:
             batch = self._parts[0][0]
             return [(batch, share, (0, len(share))) for share in batch.shares]
@@ -389,8 +396,9 @@ class Computed(ColumnSource):
 def spread_out(
     values: NDArray[Any], first: NDArray[np.intp], width: int, column: NDArray[Any]
 ) -> None:
-    """Write the points of packets, `width` each, to where the first of each packet goes; -1 leaves
-    a packet out.
+    """Write the points of packets, `width` each, at the index of each packet's first.
+
+    Index -1 leaves a packet out.
     """
     kept = first >= 0
     rows = np.ascontiguousarray(values.reshape(len(first), width), column.dtype)
@@ -466,8 +474,10 @@ class BatchColumns(ColumnSource):
         Computed([(self, 0, self.size)], self._made).prepare(names)
 
     def part(self, name: str, start: int, stop: int) -> NDArray[Any] | None:
-        """A column of some points; those behind them have it made too, for whoever asks for them
-        next.
+        """Return a column of some points.
+
+        The column is made for the whole block of points around them, so that later requests find
+        it.
         """
         if self.even is None or self.holds(name) or self.size <= SHARED:
             return super().part(name, start, stop)
@@ -483,8 +493,9 @@ class BatchColumns(ColumnSource):
         return pieces[0] if len(pieces) == 1 else np.concatenate(pieces)
 
     def _block(self, at: int) -> Block:
-        """The points around one that have their columns made together;
-        they are in no other block.
+        """Return the block of points around an index, which are computed together.
+
+        Blocks do not overlap.
         """
         index = bisect.bisect(self._blocks, at, key=lambda block: block.start)
         if index and at < self._blocks[index - 1].stop:
@@ -497,8 +508,9 @@ class BatchColumns(ColumnSource):
         return block
 
     def together(self, parts: Sequence[Stretch]) -> ColumnSource | None:
-        """What makes columns for stretches alone: where they are many points, of packets of one
-        layout, in order.
+        """Return a source of the columns of these stretches alone.
+
+        Returns None unless they are many points, in order, of packets of one layout.
         """
         sources = [part.source for part in parts]
         batches = [
@@ -531,8 +543,9 @@ class BatchColumns(ColumnSource):
         return np.asarray(few.reshape(len(packets), -1)[np.arange(len(packets)), places] + offsets)
 
     def times_of(self, share: Share, first: int, stop: int) -> NDArray[np.float64]:
-        """The times of all points of some packets of a share, seconds since `base`: (packets,
-        *shape of the plan).
+        """Return the times of all points of some packets of a share, (packets, *shape).
+
+        Times are in seconds since `base`. `shape` is that of the plan.
         """
         offsets = seconds_since(self.packets.time_ns[share.group.where[first:stop]], self.base)
         return np.asarray(share.plain("time", first, stop) + deep(offsets, len(share.plan.shape)))

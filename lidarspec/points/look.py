@@ -1,7 +1,6 @@
-"""How a cloud is looked at: what a picture of it takes in, what colours show, and the values that
-they stand for.
+"""How to draw a cloud: its extent, its colours and the values that they show.
 
-Whatever draws points asks here, so that a scan looks alike in a terminal, on paper and in other
+All drawings use this module, so that a scan looks the same in a terminal, on paper and in other
 tools.
 """
 
@@ -76,8 +75,9 @@ def ramps(cloud: PointCloud) -> list[str]:
 
 
 def look(points: PointCloud, *, ramp: str = "range", reach: float | None = None) -> Look:
-    """How to draw a cloud so that all of it is seen; intensity is shown only where the cloud has
-    some.
+    """Return how to draw a cloud so that all of it is visible.
+
+    Intensity is shown only if the cloud has any.
 
     Raises:
         UnknownName: for a column that the cloud does not have.
@@ -110,8 +110,9 @@ def is_flat(cloud: PointCloud) -> bool:
 
 
 def reach_of(cloud: PointCloud) -> float:
-    """The range that shows a cloud of valid points: the farthest one's, or most points' where a few
-    are far beyond; rounded up.
+    """Return the range to draw for a cloud of valid points, rounded up.
+
+    It is that of the farthest point, or of most points if a few are far beyond.
     """
     if not len(cloud):
         return 1.0
@@ -178,8 +179,9 @@ def shade(cloud: PointCloud, look: Look) -> NDArray[np.float64]:
 
 
 def steps(cloud: PointCloud, look: Look) -> NDArray[np.intp]:
-    """The colour of each point by its number in the ramp, (n,);
-    the first where nothing came back.
+    """Return the index of each point's colour in the ramp, (n,).
+
+    Points without a return have the first colour.
     """
     return np.clip(np.nan_to_num(shade(cloud, look)) * STEPS, 0, STEPS - 1).astype(np.intp)
 

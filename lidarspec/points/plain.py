@@ -1,5 +1,7 @@
-"""From packets to points, plainly: the sensor's `points` function evaluated once per batch with
-ordinary NumPy, and its result flattened.
+"""Evaluate points plainly: the reference evaluator.
+
+The sensor's `points` function is called once per batch with ordinary NumPy, and its result is
+flattened.
 
 This is the reference. It serves where `points` cannot be traced, and the tests as the second
 engine; plans (`points.plan`) take the parts of a result and the meaning of columns from here and
@@ -49,8 +51,10 @@ class PacketBatch(Protocol):
     def __len__(self) -> int: ...
 
     def batch(self, carry: Carry | None = None) -> Batch:
-        """The packets as a plugin's functions are given them, through `Fields`; `carry`: what the
-        batch before left.
+        """Return the packets as functions of a plugin receive them, through `Fields`.
+
+        Args:
+            carry: the state left by the previous batch.
         """
 
 
@@ -113,8 +117,9 @@ def stamp_of(packets: PacketBatch, epoch: int | None) -> int:
 
 
 def parts_of(result: Points) -> dict[str, Any]:
-    """What a `points` function returned, by the names of its parts, as far as the sensor has them;
-    the origin as ox, oy and oz.
+    """Return the parts of a `points` result by name, without missing parts.
+
+    The origin is split into ox, oy and oz.
     """
     parts = {
         f.name: getattr(result, f.name)
@@ -161,8 +166,10 @@ def _flattened(
 
 
 def _grids(inside: NDArray[np.bool_], axes: tuple[str | None, ...]) -> conventions.Grids:
-    """How the points of packets are organised, by which elements of their arrays, (n, ...), are not
-    padding.
+    """Return the organisation of the points of packets.
+
+    Args:
+        inside: which elements of their arrays, (n, ...), are not padding.
     """
     inner = range(1, inside.ndim)
     lengths = np.stack(
@@ -182,8 +189,9 @@ def _grids(inside: NDArray[np.bool_], axes: tuple[str | None, ...]) -> conventio
 def flat(
     array: NDArray[Any], shape: tuple[int, ...], mask: NDArray[np.bool_] | None, ready: int
 ) -> NDArray[Any]:
-    """What an array that broadcasts to a shape, (n, ...), has for the first `ready` packets,
-    without padding: (N,).
+    """Return an array that broadcasts to a shape, (n, ...), flattened, (N,).
+
+    Only the first `ready` packets count. Padding is left out.
     """
     full = np.broadcast_to(array, shape)[:ready]
     return full.reshape(-1) if mask is None else full.reshape(mask[:ready].shape)[mask[:ready]]

@@ -167,8 +167,9 @@ class Plan:
 
     @cached_property
     def floats(self) -> list[Node]:
-        """The floating-point fields whose values have to be of moderate size, or the plan does not
-        hold.
+        """The floating-point fields that have to be of moderate size.
+
+        Otherwise the plan is not valid.
         """
         if self.exact:
             return []
@@ -181,8 +182,9 @@ class Plan:
         return self.exact or name == "intensity" or name in self.extra
 
     def _sent(self, part: Any, dtype: np.dtype[Any]) -> Leaf | None:
-        """The place of the field that a further column is, where each point has its own; None where
-        it is none, or of another type.
+        """Return the place of the field that is equal to a further column.
+
+        Returns None unless each point has its own value of such a field, of the same type.
         """
         if isinstance(part, Node) and part.kind == "field":
             leaf = self.layout.leaves.get(part.path)
@@ -218,16 +220,19 @@ class Plan:
 
     @cached_property
     def eager(self) -> list[Node]:
-        """What has to be computed for every batch: whatever remembers something between batches,
-        and what that needs.
+        """The nodes to compute for every batch.
+
+        They remember values between batches, or are inputs of such nodes.
         """
         wanted = [node for node in self.tape.nodes if node.kind in REMEMBERING]
         wanted += [node for node, _ in self.tape.steps] + self.positive
         return sorted(graph.traverse(*wanted), key=lambda node: node.number)
 
     def _by_direction(self, given: Mapping[str, Any], named: Mapping[str, Along]) -> dict[str, Any]:
-        """The columns that back ends make, of the parts of `Polar`; `named`: those that say along
-        which arrays they are.
+        """Return the columns that back ends make from the parts of `Polar`.
+
+        Args:
+            named: the parts with named arrays.
         """
         distance = marked(self._distance(given["range"]), given["invalid"])
         azimuth, elevation, *origin = (
@@ -252,8 +257,9 @@ class Plan:
         return dict(zip("xyz", placed(places, given["invalid"]), strict=True)) | columns
 
     def _distance(self, measured: Traced) -> Any:
-        """The distance of a return, nan where there is none; where a low value only scales it, that
-        value has to be positive.
+        """Return the distance of a return, nan without a return.
+
+        If a low value only scales the distance, that value has to be positive.
         """
         node = measured.node
         if only_field(node) is None and node.kind == "call" and node.function is np.multiply:
@@ -269,8 +275,9 @@ class Plan:
         return returned_range(measured)
 
     def safe(self, values: Callable[[Node], NDArray[Any]]) -> bool:
-        """Whether all directions are numbers where everything that they are made of is: then a nan
-        marks all coordinates alike.
+        """Return whether all directions are finite if their inputs are.
+
+        In that case a nan marks all coordinates alike.
         """
         if not self._may_be_safe or not all(
             np.isfinite(values(term.low)).all() for term in self._directions if term.low is not None
@@ -287,8 +294,9 @@ class Plan:
 
     @cached_property
     def _may_be_safe(self) -> bool:
-        """Whether everything in the directions is a number but for
-        what is known of a batch only.
+        """Whether all values of the directions that are known in advance are finite.
+
+        Values that are known only with a batch are not checked.
         """
         fixed = all(
             isinstance(part, Node) or np.isfinite(part).all() for part in self._directions_given

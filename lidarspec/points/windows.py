@@ -1,5 +1,6 @@
-"""Fields by the one or two bytes that they stand in: their windows, and what expressions of one
-field come to for all that these can hold.
+"""Tables of fields by the one or two bytes that hold them: their windows.
+
+A table has the result of an expression of one field for every value of these bytes.
 
 An expression of one such field is a table of at most 65,536 entries by the raw value of its window,
 made by evaluating the expression for every value: byte order, bits, scale, "0 is no return", sines
@@ -45,8 +46,9 @@ _DIVISIONS = {np.true_divide, np.mod}
 
 @dataclass(frozen=True)
 class Window:
-    """The bytes of a field in its element: from `offset` of the frame, `size` bytes, little-endian;
-    1 or 2 to look up by.
+    """The bytes of a field in its element, little-endian.
+
+    They are `size` bytes from `offset` of the frame on. Tables are indexed by one or two bytes.
     """
 
     offset: int
@@ -59,8 +61,9 @@ class Window:
 
 
 def window(leaf: Leaf) -> Window | None:
-    """The window of a field; None where it takes more than two bytes, or stands inside a bit block
-    as an array.
+    """Return the window of a field.
+
+    Returns None if it takes more than two bytes, or if it is an array inside a bit block.
     """
     if leaf.wire is not None:
         if leaf.wire.itemsize <= 2 and leaf.wire.kind in "iu":
@@ -83,8 +86,9 @@ def raw_values(leaf: Leaf, seen: Window) -> NDArray[Any]:
 
 
 def shift_of(leaf: Leaf, seen: Window) -> tuple[int, int] | None:
-    """By how much a window is shifted right, and what is masked then, to give the raw value of a
-    field; None where that is not all.
+    """Return the right shift and mask that give the raw value from a window.
+
+    Returns None if these do not suffice.
     """
     raw = raw_values(leaf, seen).astype(np.int64)
     ones = np.flatnonzero(raw[1 << np.arange(8 * seen.size)] == 1)
@@ -96,8 +100,10 @@ def shift_of(leaf: Leaf, seen: Window) -> tuple[int, int] | None:
 
 
 def run_of(leaf: Leaf) -> tuple[str, int, int, int] | None:
-    """Byte order, first byte, number of bytes, and lowest bit of a field of unsigned bits in a row
-    of up to four bytes; None for others.
+    """Return the place of a field of unsigned contiguous bits in up to four bytes.
+
+    The place is byte order, first byte, number of bytes and lowest bit. Returns None for other
+    fields.
     """
     if len(leaf.shape) > len(leaf.strides):
         return None
@@ -111,8 +117,9 @@ def run_of(leaf: Leaf) -> tuple[str, int, int, int] | None:
 
 
 def word_of(leaf: Leaf, layout: Layout) -> tuple[int, int, int] | None:
-    """Which four bytes of its element a field stands in, as a little-endian word: place, shift and
-    mask; None where there are no such.
+    """Return the 4-byte little-endian word of its element that holds a field.
+
+    It is given as offset, shift and mask. Returns None if there is no such word.
     """
     run = run_of(leaf)
     if run is None or (run[0] == ">" and run[2] > 1) or not leaf.strides or leaf.strides[-1] % 4:
@@ -137,8 +144,9 @@ def word_of(leaf: Leaf, layout: Layout) -> tuple[int, int, int] | None:
 
 
 def every_value(node: Node, leaf: Leaf) -> NDArray[Any] | None:
-    """An expression of one field for every value of the field's window, (256,) or (65536,); None
-    where it has no window.
+    """Return an expression of one field for every value of its window.
+
+    The shape is (256,) or (65536,). Returns None if the field has no window.
     """
     seen = window(leaf)
     if seen is None:
@@ -148,8 +156,9 @@ def every_value(node: Node, leaf: Leaf) -> NDArray[Any] | None:
 
 
 def possible(node: Node, leaves: Mapping[str, Leaf]) -> NDArray[Any] | None:
-    """All values that an expression can have, whatever the bytes are: (256,) or (65536,); None
-    where it is not of one such field.
+    """Return all values that an expression can have, (256,) or (65536,).
+
+    Returns None if it is not an expression of one field with a window.
     """
     source = only_field(node)
     leaf = leaves.get(source.path) if source is not None else None
@@ -157,8 +166,9 @@ def possible(node: Node, leaves: Mapping[str, Leaf]) -> NDArray[Any] | None:
 
 
 def is_number(value: Any, leaves: Any) -> bool:
-    """Whether an expression is finite wherever its fields are: made of some that the layout has, by
-    safe operations.
+    """Return whether an expression is finite if its fields are.
+
+    The layout has to have the fields, and the operations have to be safe.
     """
     if not isinstance(value, Node):
         return bool(np.isfinite(value).all())
@@ -182,8 +192,9 @@ def is_number(value: Any, leaves: Any) -> bool:
 
 
 class Beam(NamedTuple):
-    """A coordinate of points along beams: a measured distance times a row of a table, and the row
-    of another where the beams start.
+    """A coordinate of points along beams.
+
+    It is a measured distance times a row of a table, plus a row of another table for the start.
 
     Attributes:
         distance: as the sensor sent it, in such steps of metres; or nan.
@@ -197,8 +208,9 @@ class Beam(NamedTuple):
 
 
 def beam_of(node: Node, leaves: Mapping[str, Leaf]) -> Beam | None:
-    """The beam that a sum goes along; None where it is another sum, or float32 does not tell apart
-    the steps of the distance.
+    """Return the beam of a sum.
+
+    Returns None for other sums, and if float32 does not resolve the steps of the distance.
     """
     if node.function is not np.add or not all(isinstance(arg, Node) for arg in node.args):
         return None

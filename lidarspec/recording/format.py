@@ -1,5 +1,6 @@
-"""The bytes of an .lsr recording: records, each complete in itself, packed and found again; the
-first says what it is, in JSON.
+"""Encode and decode the bytes of an .lsr recording.
+
+A recording is a sequence of records, each complete in itself. The first one describes it in JSON.
 
     offset  size  of a record, little-endian
     0       4     mark b"\xb5LS\x1e"

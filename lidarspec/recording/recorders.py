@@ -193,8 +193,9 @@ class FrameRecorder(Appender):
             self._cut(self._decoder.feed(chunk.data, self._at))
 
     def _cut(self, found: list[Found]) -> None:
-        """Write the frames found, and what lies before them and is none;
-        keep what waits for more.
+        """Write the frames found and the skipped bytes before them.
+
+        Bytes that may still become a frame are kept.
         """
         for item in found:
             self._skip(item.offset - self._base)
@@ -298,8 +299,9 @@ def recorder(
 def recorder_for(
     target: RecordTo, sensor: Spec | str | None, source: str | Path, opened: Transport
 ) -> tuple[Log, bool]:
-    """The recorder that a caller asks for, and whether it was made here,
-    and has to be closed here.
+    """Return the recorder for a target, and whether it was made here.
+
+    A recorder that was made here has to be closed by the caller of this function.
     """
     if isinstance(target, str | Path):
         return recorder(target, sensor, source, datagrams=opened.datagrams, baud=opened.baud), True

@@ -44,8 +44,9 @@ class RecordingSwitch:
         return self
 
     def toggle(self) -> None:
-        """Start a file named after the sensor and the time,
-        or end the one that is being written.
+        """Start or end a recording.
+
+        The file is named after the sensor and the time.
         """
         with self._changing:
             self._change(on=self._recorder is None)

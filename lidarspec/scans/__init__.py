@@ -1,5 +1,6 @@
-"""Scans: one revolution or frame period each, cut out of the points of a stream by the sensor's
-declared rule.
+"""Cut the points of a stream into scans.
+
+A scan is one revolution or frame period, by the sensor's declared rule.
 
 In: batches of packets. Out: `Scan`, and `LaserScan` with ROS's names. Modules in reading order:
 

@@ -1,5 +1,6 @@
-"""Where one scan ends and the next begins, by the sensor's declared rule; remembers the value
-before each batch.
+"""Find the ends of scans by the sensor's declared rule.
+
+The value before each batch is kept.
 """
 
 from __future__ import annotations
@@ -25,8 +26,9 @@ AWAY = 1 / 8
 
 
 class Turning:
-    """Which way an angle turns: the way of the last half turn, and at the start of what it has
-    turned so far.
+    """The direction in which an angle turns.
+
+    It is that of the last half turn, and at the start that of the total so far.
 
     Each step is judged by those before it alone, so that batches do not change where scans are cut.
     """
@@ -37,8 +39,9 @@ class Turning:
         self._furthest = 0.0
 
     def push(self, steps: NDArray[np.float64]) -> NDArray[np.float64]:
-        """1 or -1 for each of the next steps, (k,), given in turns; of length 1 where it is the
-        same for all.
+        """Return the direction at each of the next steps, 1 or -1, (k,).
+
+        Steps are in turns. The length is 1 if the direction is the same for all.
         """
         totals = steps.copy()
         totals[:1] += self._total
@@ -82,9 +85,7 @@ class Turning:
         return np.array([float(first or 1)]) if found is None else found[:1]
 
     def _only_ahead(self, total: float, steps: NDArray[np.float64]) -> bool:
-        """Whether the angle has come further than ever with this total, and all steps after it go
-        on the same way.
-        """
+        """Return whether the angle is farther than ever, with no step back afterwards."""
         if (
             self._direction * total < self._furthest
             or float((self._direction * steps).min(initial=0.0)) < 0
@@ -178,8 +179,9 @@ class Cutter:
         self._angle = angle
 
     def _ends_at(self, packets: Packets, found: Evaluated, at: float) -> list[End]:
-        """Return the ends where the angle passes `at`, in turns,
-        of a sensor that may leap over it.
+        """Return the ends of scans at which the angle passes `at`, in turns.
+
+        The angles of the sensor may skip over `at`.
         """
         rows_are_packets = True
         if isinstance(self._rule, OnWrap):
@@ -249,8 +251,9 @@ class Cutter:
     def _wraps(
         self, angles: NDArray[np.float64], full: float, at: float
     ) -> tuple[NDArray[np.intp], NDArray[np.float64]]:
-        """Places where the angle has gone on past `at`, in whichever direction the sensor turns;
-        and by how much of a turn at each.
+        """Return the indices at which the angle passes `at`, and by how much.
+
+        Either direction of rotation is possible. Amounts are in turns.
         """
         finite = np.isfinite(angles)
         known = None if finite.all() else np.flatnonzero(finite)
@@ -326,8 +329,9 @@ def _field(found: Evaluated, path: str) -> Column:
 
 
 def _rows(column: Column, found: Evaluated) -> tuple[NDArray[np.float64], NDArray[np.intp]]:
-    """The values of a field row by row in stream order, and the index of the first point of each
-    row.
+    """Return the values of a field row by row, and the index of each first point.
+
+    Rows are in stream order.
     """
     levels = 1 + max(
         (index for index, name in enumerate(column.axes) if name is not None), default=-1
@@ -357,8 +361,9 @@ def first_points(found: Evaluated) -> NDArray[np.intp]:
 
 
 def _sums(counts: NDArray[Any], kept: int) -> NDArray[np.intp]:
-    """Sums over all axes but the first `kept`;
-    along axes that repeat one number they are products.
+    """Return the sums over all axes but the first `kept`.
+
+    Along axes that repeat one number, sums are computed as products.
     """
     times = 1
     while counts.ndim > kept:
@@ -380,8 +385,9 @@ def _was_far(angles: NDArray[np.float64], full: float) -> bool:
 
 
 def _folded(angles: NDArray[np.float64], full: float) -> NDArray[np.float64]:
-    """Angles in [0, full), the results of `np.mod` in a fraction of its time;
-    not to be written to.
+    """Return angles in [0, full), read-only.
+
+    The results equal `np.mod`, in a fraction of its time.
     """
     outside = np.flatnonzero((angles < 0) | (angles >= full))
     if not len(outside):

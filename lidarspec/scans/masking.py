@@ -1,5 +1,6 @@
-"""Finds the masked sector of a rotating sensor, by which its scans are cut, in the first turns of a
-stream.
+"""Find the masked sector of a rotating sensor, and cut its scans there.
+
+The first turns of a stream show it.
 
 Packets pass at once until the angle leaps. Then they are held until the leap recurs, which takes a
 turn, or until all angles have been seen, so that the first scans are cut as all others. Behind the
@@ -117,9 +118,7 @@ class Masking:
         return [released if self.sector is None else self._mark(released)]
 
     def _find_leap(self, packets: Packets, angles: Angles) -> int | None:
-        """Look for the sector in the angles of the next packets;
-        return the row of the first leap.
-        """
+        """Look for the sector in the next packets; return the row of the first leap."""
         if self._finder is None:
             direction = self._reader.direction(packets.table)
             if not direction:

@@ -1,5 +1,6 @@
-"""Planar scans: those of a sensor of one plane, or one ring or layer of another's, all on one grid
-of angles.
+"""Planar scans on one grid of angles.
+
+They are the scans of a planar sensor, or of one ring or layer of another sensor.
 
 The first complete scan shows the grid: how many beams, and from where to where they look, which is
 where the sensor's scans begin, so that one line of times fits all beams. Of a sensor that sees less

@@ -52,8 +52,9 @@ LONGER = 1.125
 
 @dataclass(frozen=True, eq=False)
 class LaserScan:
-    """A planar scan with ROS's names: `ranges[i]` is at ``angle_min + i * angle_increment``, inf
-    where there is no return.
+    """A planar scan with ROS's names.
+
+    `ranges[i]` is at ``angle_min + i * angle_increment``, inf without a return.
 
     Attributes:
         ranges, intensities: (n,) float32.
@@ -109,8 +110,10 @@ class Provenance:
         self._batches = list[tuple[int, int, Packets, Evaluated, int]]()
 
     def add(self, packets: Packets, points: Evaluated, start: int, stop: int, before: int) -> None:
-        """Further points, from `start` to `stop` of those of a batch; `before`: parts of the first
-        frame that an earlier batch had.
+        """Add the points from `start` to `stop` of a batch.
+
+        Args:
+            before: the number of parts of the first frame in earlier batches.
         """
         self._batches.append((self._size, start, packets, points, before))
         self._size += stop - start
@@ -141,8 +144,10 @@ class Provenance:
 
 
 def rank(packets: Packets, row: int, before: int) -> int:
-    """Which of its frame's parts a packet is, from 0; `before`: how many of the first one's frame
-    an earlier batch had.
+    """Return the index of a packet among the parts of its frame, from 0.
+
+    Args:
+        before: the number of parts of the first frame in earlier batches.
     """
     _, which = packets.frames
     if isinstance(which, slice):
@@ -208,8 +213,11 @@ class Scan:
 
     @property
     def facts(self) -> dict[str, str]:
-        """What files say of where points are from: `sensor`, `source` (what is known of its
-        format), `frame` (where x, y and z point), `calibration` ("nominal" or "own")."""
+        """The origin of the points, as stored in files.
+
+        `sensor`; `source`, the source of its format; `frame`, the directions of x, y and z;
+        `calibration`, "nominal" or "own".
+        """
         frame = ", ".join(
             f"{name} {way}" for name, way in zip("xyz", axes_of(self.sensor), strict=True)
         )
@@ -221,8 +229,9 @@ class Scan:
         }
 
     def to_arrow(self) -> Any:
-        """The `pyarrow.Table` of the points (see `PointCloud.to_arrow`) with `facts` in the
-        schema's metadata.
+        """Return the `pyarrow.Table` of the points, with `facts` in its metadata.
+
+        See `PointCloud.to_arrow`.
 
         Raises:
             UsageError: where pyarrow is not installed.
@@ -234,8 +243,9 @@ class Scan:
         return self.to_arrow().__arrow_c_stream__(requested_schema)
 
     def to_bins(self, n: int) -> NDArray[np.float32]:
-        """The nearest return in each of n equal sectors from -pi on: (n,) float32 metres, inf where
-        there is none.
+        """Return the nearest return in each of n equal sectors from -pi on.
+
+        The result is (n,) float32, metres, inf without a return.
 
         Raises:
             UsageError: for a number of sectors that is none.
@@ -285,17 +295,20 @@ class Scan:
         )
 
     def swept(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Of the points with a direction azimuths that go on over the turn, radians, and times,
-        seconds since the stamp.
+        """Return the azimuths and times of the points with a direction.
+
+        Azimuths are unwrapped, radians. Times are in seconds since the stamp.
         """
         azimuth = self.points.azimuth.astype(np.float64)
         known = np.isfinite(azimuth)
         return np.unwrap(azimuth[known]), self.points.time[known]
 
     def _times(self, first: float, last: float) -> tuple[float, float]:
-        """When a beam that looks at `first` was measured, seconds since the stamp, and by how much
-        later one is a radian on: the straight line that is nearest to the points, in the turn that
-        most of those up to `last` are of."""
+        """Return the time of a beam at azimuth `first`, and the seconds per radian.
+
+        The time is in seconds since the stamp. Both follow from a straight line fitted to the
+        points, in the turn of most points up to `last`.
+        """
         azimuth, time = self.swept()
         if len(azimuth) < 2 or not (spread := azimuth - azimuth.mean()).any():
             return 0.0, 0.0
@@ -306,8 +319,9 @@ class Scan:
     def _binned(
         self, n: int, first: float, step: float
     ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-        """The nearest return within half a step of each of n angles from `first` on, and its
-        intensity.
+        """Return the nearest return at each of n angles, and its intensity.
+
+        The angles begin at `first`. A return belongs to an angle if it is within half a step.
         """
         points = self.points
         turn = 2 * np.pi
@@ -340,8 +354,9 @@ def _sectors(number: Any, place: str) -> int:
 
 
 class Cut(NamedTuple):
-    """Where one scan ends and the next begins: before which point, and what the one is that ends
-    there (see `Scan`).
+    """The end of one scan and the start of the next.
+
+    `point` is the first point of the next scan. The flags describe the scan that ends (see `Scan`).
     """
 
     point: int
@@ -369,8 +384,7 @@ class Underway:
 
 
 class Progress:
-    """How far the scan under way has come: when it ends, whether it is complete then, and when its
-    end is waited for no longer.
+    """The progress of the current scan: its end, completeness and size limits.
 
     A scan becomes no longer than twice the slowest turn, by the packets' time; and no larger than
     twice the points of a scan where their number is constant, else the bytes that a serial line
@@ -415,8 +429,10 @@ class Progress:
         self._turn = math.inf  # packets of the last whole scan, at first of the first piece
 
     def cuts(self, packets: Packets, points: Evaluated, ends: Sequence[End]) -> list[Cut]:
-        """The cuts of a batch in order: at the ends, of which those that leap may be none, and
-        where none came in time.
+        """Return the cuts of a batch in order.
+
+        They are at the ends, and at the limits if no end came in time. An end at which the angle
+        leaps may be no cut.
         """
         number = points.ready
         found = list[Cut]()
@@ -446,8 +462,9 @@ class Progress:
         return found
 
     def _batch(self, packets: Packets, number: int, points: NDArray[np.intp] | None) -> Batch:
-        """What is looked at of the first packets, by the number of points of each, (n,), or their
-        bytes; a frame of parts counts once.
+        """Return the properties of the first packets that `Progress` reads.
+
+        Sizes are the points of each packet, (n,), or its bytes. A frame of parts counts once.
         """
         times = packets.time_ns[:number]
         index = packets.index[:number]
@@ -562,8 +579,10 @@ class Progress:
         return False
 
     def _over(self, batch: Batch, part: slice) -> tuple[int | None, bool]:
-        """Before which of some packets the scan is over, None where it is not; and whether for want
-        of an end, else for a gap.
+        """Return the packet before which the scan is over, None if it is not.
+
+        Returns:
+            The packet, and whether an end is missing; otherwise there is a gap.
         """
         scan = self._scan
         times = batch.times[part]
@@ -600,9 +619,11 @@ class Progress:
 
 @dataclass(frozen=True, eq=False)
 class Batch:
-    """What `Progress` looks at of some packets, (n,) each: their times, ns, how many each counts
-    for (a frame of parts with the first of them), their sizes, how many are missing before each,
-    and breaks."""
+    """The properties of some packets that `Progress` reads, (n,) each.
+
+    They are times in ns, counts (the first part counts for its frame), sizes, packets missing
+    before each, and breaks.
+    """
 
     times: NDArray[np.int64]
     counts: NDArray[np.int64]
@@ -611,8 +632,9 @@ class Batch:
     broken: NDArray[np.bool_]
 
     def forget(self, place: int) -> None:
-        """What is missing before a packet has been counted; itself, or the frame that it is part
-        of, is in the scan behind it as well.
+        """Reset the packets missing before a packet, which have been counted.
+
+        The packet, or the frame that it is part of, counts in the next scan as well.
         """
         if not self.counts[place]:
             self.counts[place] = 1
@@ -746,8 +768,9 @@ class ScanStream:
         return list(self._cut(packets, points, before))
 
     def _with_points(self, packets: Packets) -> Packets:
-        """The packets that points are made of: these, or the parts in them; a frame without any
-        leaves no gap.
+        """Return the packets with points: these, or the parts in them.
+
+        A frame without any part leaves no gap.
         """
         parts = packets.with_points
         if parts is not packets:
@@ -855,9 +878,7 @@ def scans_of(
 
 
 def handed_out(scans: list[Scan]) -> Iterator[Scan]:
-    """Scans one by one, each of which is forgotten then, and with it the columns that are made of
-    it.
-    """
+    """Yield scans one by one, and release each with its columns."""
     scans.reverse()
     while scans:
         yield scans.pop()

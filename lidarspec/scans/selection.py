@@ -90,8 +90,9 @@ class Selection:
 
     @property
     def is_counted(self) -> bool:
-        """Whether it takes all scans of a source, from the first one on,
-        to tell which are wanted.
+        """Whether scans are counted from the first scan of the source on.
+
+        This is required if scans are selected by number or time.
         """
         return self.is_timed or self.scans != (0, None) or self.every != 1
 
@@ -135,8 +136,12 @@ class Slice:
         return wanted if end is None else wanted & (at < end)
 
     def missed(self, source: object, number: str = "data") -> UsageError:
-        """That none of the times of a source was wanted, and which there are; `number`: how many,
-        in words.
+        """Return the error that no time of a source was selected.
+
+        It gives the times of the source.
+
+        Args:
+            number: the items of the source, in words.
         """
         first = self.first or 0
         last = self.last or 0

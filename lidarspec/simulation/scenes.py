@@ -193,8 +193,9 @@ def _near(body: Box | Mover, low: Vector, high: Vector, beams: Vector, origin: V
 
 
 def furnished(seed: int = 0) -> Room:
-    """A room with boxes and somebody who walks in it;
-    each seed has its own, the same every time.
+    """Return a room with boxes and a walking person.
+
+    Each seed gives another room, the same one every time.
     """
     walker = Mover((0.4, 0.5, 1.7), ((1.4, -1.5), (0.8, 1.9), (-1.8, 1.2)))
     if seed == 0:

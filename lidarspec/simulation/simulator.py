@@ -141,8 +141,9 @@ class Measurement:
 
     @classmethod
     def of(cls, sensor: Spec, frame: str, table: Rows, given: Container[str]) -> Measurement:
-        """The measurement of a sensor's points, as they are given by direction
-        or by coordinates.
+        """Return the measurement of a frame's points.
+
+        It is a `Placement` if the points are given by coordinates, else by direction.
         """
         return (
             Placement if _result(sensor, frame, table)[0].__class__ is Cartesian else Measurement

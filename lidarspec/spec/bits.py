@@ -120,8 +120,9 @@ def probe(parse: Parse, size: int) -> list[BitField] | None:
 def _field(
     keys: tuple[str | int, ...], pairs: list[tuple[int, int]], *, flag: bool
 ) -> BitField | None:
-    """A field from (bit of the block, weight);
-    None unless the weights are 1, 2, 4 ... each once.
+    """Return a field from pairs of (bit of the block, weight).
+
+    Returns None unless each of the weights 1, 2, 4 ... occurs exactly once.
     """
     width = len(pairs)
     signed = any(weight < 0 for _, weight in pairs)

@@ -158,9 +158,7 @@ class FieldInfo:
 
     @property
     def initial(self) -> int:
-        """The raw value that stands where none is given:
-        0, or the first of those that it may have.
-        """
+        """The raw value used if none is given: 0, or the first allowed value."""
         return 0 if self.allowed is None or 0 in self.allowed else self.allowed[0]
 
 
@@ -467,8 +465,9 @@ class Number:
 
 @dataclass(frozen=True, eq=False)
 class Blob:
-    """Plain bytes; `const`: what they must be, None where free.
-    Without a name only as a constant.
+    """Plain bytes with an optional constant content.
+
+    `const` is None if any content is allowed. Only a constant may have no name.
     """
 
     name: str

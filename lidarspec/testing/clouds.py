@@ -22,8 +22,9 @@ STAMP_TOLERANCE_NS = 1000
 
 
 def assert_well_formed(cloud: PointCloud) -> None:
-    """Fail unless the cloud keeps the conventions:
-    types, angles, REP-117, no place without return.
+    """Fail unless the cloud keeps the conventions of types, angles and REP-117.
+
+    Points without a return have no coordinates.
     """
     valid = cloud.valid
     assert cloud.x.dtype == cloud.y.dtype == cloud.z.dtype == cloud.range.dtype == np.float32

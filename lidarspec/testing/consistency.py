@@ -77,9 +77,7 @@ def times_of_points_fit_the_clock(subject: Subject, name: str) -> None:
 
 
 def turned_angles_turn_the_points(subject: Subject, name: str) -> None:
-    """If all angles of a packet are turned, its points turn with them,
-    also across the full circle.
-    """
+    """Points turn with the angles of their packet, also across the full circle."""
     sweep = subject.sensor.simulation_of(name).sweep
     if sweep is None:
         return
@@ -130,8 +128,10 @@ def turned_angles_turn_the_points(subject: Subject, name: str) -> None:
 def _turn_angles(
     values: Mapping[str, Any], angles: list[str], shift: float, full: float
 ) -> dict[str, Any]:
-    """Return the values of a packet with `shift` added to its angles,
-    whose full circle is `full`.
+    """Return the values of a packet with `shift` added to its angles.
+
+    Args:
+        full: the full circle, in the unit of the angles.
     """
     return {**values, **{path: (np.asarray(values[path]) + shift) % full for path in angles}}
 
@@ -151,8 +151,9 @@ def _read_azimuths(
 def _angles_between(
     one: NDArray[np.float64] | None, other: NDArray[np.float64] | None
 ) -> NDArray[np.float64] | None:
-    """Return the angles between two sets of azimuths;
-    None if one is missing, or has another shape.
+    """Return the angles between two sets of azimuths.
+
+    Returns None if one of them is missing, or if their shapes differ.
     """
     if one is None or other is None or one.shape != other.shape:
         return None

@@ -52,8 +52,9 @@ FLIPPED_BYTES = 1 << 23
 
 
 def examples_are_valid_and_repeat(subject: Subject, name: str) -> None:
-    """Examples of a frame type are made up, parse, repeat, differ,
-    and are no longer than declared.
+    """Examples of a frame type can be built, parse, repeat and differ.
+
+    None is longer than declared.
     """
     frame = subject.sensor.frames[name]
     try:
@@ -410,9 +411,7 @@ def a_truncated_frame_is_a_wire_error(subject: Subject, name: str) -> None:
 
 
 def a_damaged_frame_is_at_worst_a_wire_error(subject: Subject, name: str) -> None:
-    """Hostile mutations of a frame parse, or are a `WireError`,
-    whether or not they are verified.
-    """
+    """A mutated frame parses or raises `WireError`, with and without verification."""
     sensor = subject.sensor
     source = subject.source(f"mutations {name}")
     types = (name, None) if len(sensor.frames) <= MANY else (name,)

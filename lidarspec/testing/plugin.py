@@ -26,8 +26,9 @@ def pytest_configure(config: pytest.Config) -> None:
 
 @pytest.fixture
 def sensor(request: pytest.FixtureRequest) -> Sensor:
-    """The sensor under test: that of ``@pytest.mark.lidarspec("acme-x1")``,
-    or of the test class.
+    """Return the sensor under test.
+
+    It is the sensor of ``@pytest.mark.lidarspec("acme-x1")``, or of the test class.
     """
     from lidarspec.plugins import sensor as named
     from lidarspec.spec.sensor import Sensor

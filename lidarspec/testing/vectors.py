@@ -170,9 +170,7 @@ def the_status_is_proven(subject: Subject) -> None:
 
 
 def every_data_field_is_pinned_down(subject: Subject, name: str) -> None:
-    """Each field of a data frame with vectors has a value in one of them,
-    and another one than 0.
-    """
+    """Each field of a data frame with vectors has a nonzero value in a vector."""
     vectors = [vector for vector in entries(subject).values() if vector["frame"] == name]
     if not vectors:
         return

@@ -558,9 +558,7 @@ class PtyLine(Line):
             self._handle_hangup()
 
     def _handle_hangup(self) -> None:
-        """Discard all bytes for the reader that has gone,
-        so that the next one does not get them.
-        """
+        """Discard all bytes for the closed reader, so that the next one never gets them."""
         self.unsent_bytes += len(self._backlog)
         self._backlog.clear()
         if not self.has_listener:

@@ -107,8 +107,9 @@ class SimulatedTransport(LiveTransport):
             self._changed.notify_all()
 
     def _next_data_ns(self) -> float:
-        """Return the time at which the device sends again;
-        the other links wait for the data link.
+        """Return the time at which the device sends again.
+
+        Other links wait for the data link.
         """
         deadline = self.device.deadline if self._name == "data" else None
         if deadline is None:

@@ -45,9 +45,7 @@ def tshark(capture: Path, *arguments: str, scripts: Iterable[Path] = ()) -> str:
 def columns(
     capture: Path, script: Path, names: Sequence[str], *arguments: str
 ) -> Iterator[list[list[str]]]:
-    """For each packet the values of each of these fields,
-    in the order in which they stand in it.
-    """
+    """Yield the values of the named fields of each packet, in order of appearance."""
     wanted = [option for name in names for option in ("-e", name)]
     printed = tshark(
         capture,

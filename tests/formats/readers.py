@@ -39,8 +39,9 @@ def pcd_header(path: Path) -> dict[str, list[str]]:
 
 
 def read_pcd(path: Path) -> Columns:
-    """Read an uncompressed binary PCD file
-    (PCL documentation, the PCD file format, version 0.7).
+    """Read an uncompressed binary PCD file.
+
+    Source: PCL documentation, the PCD file format, version 0.7.
     """
     header = pcd_header(path)
     kinds = [
@@ -68,8 +69,9 @@ def read_ply(path: Path) -> Columns:
 
 
 def read_npy(path: Path) -> Columns:
-    """Read the structured array of an NPY file, without the column
-    that no cloud of the tests has.
+    """Read the structured array of an NPY file, without the column "ring".
+
+    No cloud of the tests has this column.
     """
     points = np.load(path, mmap_mode="r")
     return {name: points[name] for name in points.dtype.names if name != "ring"}

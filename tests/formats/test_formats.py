@@ -1,5 +1,6 @@
-"""Files appear whole or not at all, in the format of their suffix,
-and hold what the clouds hold.
+"""Files appear whole or not at all.
+
+They have the format of their suffix and the content of the clouds.
 """
 
 from __future__ import annotations

@@ -148,8 +148,9 @@ def test_a_number_is_built_as_its_name_is() -> None:
 
 @pytest.mark.parametrize("inside", [False, True])
 def test_what_build_fills_in_is_not_asked_of_a_frame_that_comes(inside: bool) -> None:
-    """`Rebuild` says what is written; single parse and both decoders take any value,
-    and keep it.
+    """`Rebuild` applies to building only; parsing accepts and keeps any value.
+
+    This holds for single frames and both decoders.
     """
     length = "length" / Rebuild(Int8ub, this._.size + 1 if inside else this.size + 1)
     head = "head" / Struct(length) if inside else length

@@ -84,8 +84,9 @@ for name in (n for n in sensors if n.startswith("broken-")):
 
 @pytest.fixture(scope="module")
 def site(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A folder with the stranger's and the broken distributions,
-    installed by pip as a user would.
+    """Return a folder with the external and the broken distributions.
+
+    They are installed by pip, as a user would install them.
     """
     folder = tmp_path_factory.mktemp("plugins")
     sources = [shutil.copytree(HERE / name, folder / name) for name in ("stranger", "broken")]

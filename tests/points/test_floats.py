@@ -124,8 +124,9 @@ def test_coordinates_may_lie_in_a_plane_and_be_turned(
 
 
 def scaled(backend: str, **values: Any) -> tuple[PointCloud, PointCloud]:
-    """Points of two frames with a float scale, one of them with these values;
-    and the plain ones.
+    """Return the points of two frames with a float scale, by both evaluators.
+
+    The second frame has the given values.
     """
     sensor = SHAPES["shape-scales"]
     usual: dict[str, Any] = dict(

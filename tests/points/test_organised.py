@@ -1,5 +1,6 @@
-"""Columns of pixels: what is along which array, worked out by hand,
-and clouds of them as pictures.
+"""Columns of pixels, and their clouds as pictures.
+
+The arrays that values run along were worked out by hand.
 """
 
 from __future__ import annotations

@@ -137,8 +137,9 @@ def test_a_length_may_follow_from_a_constant() -> None:
 
 
 def test_plausible_frames_are_found_around_the_lengths_of_the_sweep() -> None:
-    """Nothing says here that one length follows from the other,
-    and chance would never make both.
+    """No declaration relates one length to the other here.
+
+    Random lengths would never fit both.
     """
     shape = SHAPES["shape-sized"]
     children = [

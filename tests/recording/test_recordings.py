@@ -357,8 +357,9 @@ def file_size_limit(size: int) -> Iterator[None]:
 
 
 def fill(path: Path) -> None:
-    """Record more than there is room for: the capture goes on, one error,
-    and a file that is whole.
+    """Record more data than there is room for.
+
+    The capture continues, one error is raised, and the file stays whole.
     """
     recorder = Recorder(path)
     for number in range(200):

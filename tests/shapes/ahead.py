@@ -39,8 +39,9 @@ DATA = Checksummed(
 
 
 def points(f: Fields) -> Polar:
-    """The last packet before a loss has no next angle:
-    there it takes the step from the one before.
+    """Return points from the angles of a packet and the next one.
+
+    The last packet before a loss has no next angle. It uses the step from the packet before.
     """
     step = wrap(following(f.angle) - f.angle, 360)
     before = wrap(f.angle - previous(f.angle), 360)

@@ -1,6 +1,4 @@
-"""A count further out: the length of an array stands in the header beside the struct
-that holds it.
-"""
+"""An array with its count in the header, outside the struct of the array."""
 
 from __future__ import annotations
 

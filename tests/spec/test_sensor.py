@@ -1,6 +1,4 @@
-"""The options of a sensor, wherever they are given:
-of the types that are declared, and no others.
-"""
+"""The options of a sensor are of the declared types, and no others."""
 
 from __future__ import annotations
 

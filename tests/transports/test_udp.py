@@ -178,9 +178,7 @@ def test_the_kernel_says_when_a_datagram_came() -> None:
     with udp() as sender:
 
         def waited() -> int:
-            """Return for how many ns a datagram had been there, by its own time,
-            when it was read.
-            """
+            """Return the ns between the kernel's time of a datagram and its reading."""
             sender.sendto(b"early", ("127.0.0.1", port))
             time.sleep(0.5)
             (chunk,) = one.read(1.0)

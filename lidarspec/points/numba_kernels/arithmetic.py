@@ -1,5 +1,6 @@
-"""What generated kernels are written with: memory by index without checks, sines and cosines of
-float32, NumPy's odd cases.
+"""Primitives of generated kernels.
+
+They are indexing without checks, sine and cosine of float32, and the special cases of NumPy.
 
 The only module that imports Numba as it is imported; nothing imports it but a kernel.
 """
@@ -106,8 +107,9 @@ def four_at(context, array, index):
 
 @intrinsic
 def apart(context):
-    """Say of the arrays that the kernel is called with that none is a part of another, so that
-    several points are computed at a time.
+    """Declare that the array arguments of the kernel do not overlap.
+
+    The compiler can then compute several points at a time.
     """
 
     def make(target, builder, signature, args):
@@ -130,8 +132,9 @@ def fused(context, factor, other, added):
 
 
 def _float_at(bits, kind):
-    """What loads a float of so many bits from an index of bytes on, as a float64; one is kept for
-    each order of the bytes.
+    """Return an intrinsic that loads a float of `bits` bits as float64.
+
+    It loads from an index of bytes. One is made for each byte order.
     """
 
     def maker(is_swapped):
@@ -255,8 +258,9 @@ def looked_up(table, index):
 
 @njit(forceinline=True)
 def row_at(index, rows):
-    """The row of a table for an index; the last one, which is nan,
-    for one that it does not have.
+    """Return the table row for an index.
+
+    Returns the last row, which is nan, for an index that the table does not have.
     """
     return np.int64(index) if 0 <= index < rows - 1 else rows - 1
 

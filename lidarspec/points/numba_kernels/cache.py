@@ -1,5 +1,6 @@
-"""Compiled kernels kept on disk between runs, in a folder that is its user's alone: what is read
-from there is run.
+"""Keep compiled kernels on disk between runs.
+
+They are in a folder that only its user can access, because the files are executed.
 
 A kernel is one file: a keyed digest (HMAC), and behind it what Numba made of the kernel, a pickle,
 which is opened only where the digest is right. The key is a file that its user alone can read, and
@@ -50,8 +51,9 @@ class Kept:
         self._name = name
 
     def load_overload(self, signature: object, target: Any) -> Any:
-        """What Numba made of the kernel in an earlier run; None where that is not at hand, or not
-        beyond doubt.
+        """Return the result of compiling the kernel in an earlier run.
+
+        Returns None if there is none, or if it is not authentic.
         """
         from numba.core.compiler import CompileResult
 

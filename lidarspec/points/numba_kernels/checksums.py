@@ -1,5 +1,6 @@
-"""Checksums of many frames by compiled code, where each byte adds its share by XOR: a table of 256
-for each place.
+"""Compute checksums of many frames by compiled code.
+
+The contributions of all bytes are combined by XOR. Each position has a table of 256.
 
 A CRC is such a sum, and so is every XOR of bytes or words: the checksum of a frame is that of
 zeros, XORed with what each byte, alone among zeros, changes about it. The tables are made by the

@@ -1,5 +1,6 @@
-"""Kernels at work: compiled by Numba, or as an earlier run kept them; called by one thread or
-several; and when that pays.
+"""Compile or load kernels, call them, and decide when they pay.
+
+A kernel is called by one thread or several.
 
 Nothing here imports Numba before a kernel is wanted. The name of a kernel is a hash of all that its
 code depends on.
@@ -119,8 +120,9 @@ class Kernel(Maker):
 
 
 def _flat(array: NDArray[Any], shape: tuple[int, ...]) -> tuple[NDArray[np.float64], int]:
-    """A result for every packet, or one for all, (n or 1, *shape), as one run of numbers; and how
-    many each packet has of its own.
+    """Return an array, (n or 1, *shape), as flat numbers, and how many a packet has.
+
+    The second value is 0 if all packets share the numbers.
     """
     full = (len(array), *shape)
     array = array if array.shape == full else np.broadcast_to(array, full)
@@ -130,8 +132,9 @@ def _flat(array: NDArray[Any], shape: tuple[int, ...]) -> tuple[NDArray[np.float
 
 
 def kernel_of(plan: Plan, names: tuple[str, ...]) -> Kernel:
-    """The kernel for these columns; one for the layout alone, or one that serves all where there
-    have been several.
+    """Return the kernel for these columns.
+
+    It is for this layout alone, or for all layouts if there have been several.
     """
     kernel = plan.kernels.get(names)
     if not isinstance(kernel, Kernel):
@@ -145,8 +148,9 @@ def kernel_of(plan: Plan, names: tuple[str, ...]) -> Kernel:
 
 
 def pays(plan: Plan, names: tuple[str, ...], frames: int) -> bool:
-    """Whether so many points of a `points` function were asked for, these frames included, that its
-    kernel pays; it is compiled then.
+    """Return whether the kernel of a `points` function pays, and compile it if so.
+
+    It pays after a number of points, those of these frames included.
     """
     made = _MADE.setdefault(plan.function, {})
     made[names] = made.get(names, 0) + frames * plan.width
@@ -201,8 +205,9 @@ def require() -> None:
 
 @functools.cache
 def _module_name(source: str) -> str:
-    """A name by all that the compiled code depends on, but for the processor, which Numba looks
-    after.
+    """Return a name from everything that the compiled code depends on.
+
+    Numba itself checks the processor.
     """
     from importlib.metadata import version
 
@@ -220,8 +225,9 @@ def compiled_before(source: str) -> bool:
 
 @functools.lru_cache(maxsize=256)
 def function_of(source: str) -> Any:
-    """The compiled function of a kernel's text; where it cannot be kept on disk, compiled for this
-    run only.
+    """Return the compiled function of a kernel's source.
+
+    If it cannot be kept on disk, it is compiled for this run only.
     """
     name = _module_name(source)
     module = types.ModuleType(name)

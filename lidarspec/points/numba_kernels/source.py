@@ -1,5 +1,6 @@
-"""The source of a kernel: the columns of a plan as one loop over packets, blocks and points, which
-reads the frames' bytes.
+"""Write the source of a kernel, which reads the bytes of frames.
+
+The columns of a plan become one loop over packets, blocks and points.
 
 Each value is computed in the loop in which it varies: what a packet has once outside the loop over
 its blocks, and so on (`writer.Writer`). `Expressions` writes a traced expression so, in float64 or
@@ -42,8 +43,9 @@ SMALL = 0.125
 
 @dataclass(frozen=True, eq=False)
 class Later:
-    """A product or sum (`sign`) of float32 values, one of which is the sine or cosine of an angle
-    that the flat loop takes.
+    """A product or sum (`sign`) of float32 values.
+
+    One of them is the sine or cosine of an angle, computed in the flat loop.
     """
 
     sign: str
@@ -107,8 +109,9 @@ class Expressions(Writer):
         return self.let(1 + last_axis(node.shape), f"at({name}, {start.text} + {place})")
 
     def shared(self, node: Node) -> bool:
-        """Whether an expression is made of other frames' fields only: then NumPy computes it,
-        mostly once for all packets.
+        """Return whether an expression uses fields of other frames only.
+
+        NumPy computes it then, mostly once for all packets.
         """
         return self.once(("shared", node), lambda: self._shared(node))  # type: ignore[no-any-return]
 
@@ -226,8 +229,10 @@ class Expressions(Writer):
         )
 
     def _along(self, beam: Beam) -> Value | None:
-        """A place on a beam, rounded once: what was sent times a direction in two halves, and its
-        start; None where NumPy reads these.
+        """Return a coordinate along a beam, rounded once.
+
+        It is the raw distance times a direction in two halves, plus the start of the beam. Returns
+        None if NumPy reads these.
         """
         sent = self._marked(beam.distance, raw=True)
         table = beam.direction.args[1]
@@ -244,8 +249,10 @@ class Expressions(Writer):
         )
 
     def _marked(self, node: Node, *, raw: bool = False) -> Value | None:
-        """A distance in float32, nan where nothing came back or a condition says so; None for what
-        is none, or has to be float64 first.
+        """Return a distance in float32.
+
+        It is nan without a return, or if a condition says so. Returns None for other expressions,
+        and if float64 is required first.
         """
         if not is_full(node, self.width):
             return None

@@ -1,5 +1,6 @@
-"""What the source of a kernel is written with: fields, tables, constants and places as text, each
-in the loop in which it varies.
+"""Write fields, tables, constants and places as text in the loops of a kernel.
+
+Each is written in the loop in which it varies.
 
 A `Value` is text and the loop at which it varies. `Writer` keeps the lines of each loop, the
 arguments that the kernel is to be called with, and what it has written before, so that nothing is
@@ -78,8 +79,13 @@ def is_cheap(node: Node) -> bool:
 
 
 def integer(leaf: Leaf, byte: Any) -> str | None:
-    """The raw value of a field as an expression of its bytes, `byte(offset)` each; None where it
-    has no simple one.
+    """Return the raw value of a field as an expression of its bytes.
+
+    Args:
+        byte: returns the expression of the byte at an offset.
+
+    Returns:
+        None if there is no simple expression.
     """
     if len(leaf.shape) > len(leaf.strides) or (leaf.wire is not None and leaf.wire.kind == "f"):
         return None
@@ -105,8 +111,9 @@ def integer(leaf: Leaf, byte: Any) -> str | None:
 
 @dataclass(frozen=True)
 class Line:
-    """A table that is a straight line of the raw value from `low` to `high`, and `other` for all
-    values besides.
+    """A table that is a straight line of the raw value from `low` to `high`.
+
+    Its value is `other` for all other raw values.
 
     Attributes:
         exact: whether the arithmetic has to be that of float64.
@@ -143,8 +150,9 @@ class Line:
 
 
 def line(leaf: Leaf, values: NDArray[Any], *, exact: bool) -> Line | None:
-    """The line that a table by a field's window is, in float32: equal where `exact`, else within a
-    unit in the last place.
+    """Return the line that a table by a field's window follows, in float32.
+
+    It is equal if `exact`, else within a unit in the last place.
     """
     seen = window(leaf)
     assert seen is not None
@@ -186,8 +194,9 @@ def line(leaf: Leaf, values: NDArray[Any], *, exact: bool) -> Line | None:
 
 @dataclass(frozen=True)
 class Value:
-    """An expression in a kernel, and the loop at which it varies: 0 never, 1 with the packet, 2
-    with its first array, and so on.
+    """An expression in a kernel, and the loop at which it varies.
+
+    The level is 0 for never, 1 for the packet, 2 for its first array, and so on.
     """
 
     text: str
@@ -196,8 +205,9 @@ class Value:
 
 @dataclass
 class Wanted:
-    """What a kernel is called with besides the bytes: arrays and numbers that are known, results of
-    nodes that are not.
+    """The arguments of a kernel besides the bytes.
+
+    They are arrays and numbers that are known, and nodes with results to compute.
     """
 
     arrays: list[NDArray[Any]] = field(default_factory=list)
@@ -341,8 +351,9 @@ class Writer:
         return self._read(leaf, offset, "byte_at")
 
     def _read(self, leaf: Leaf, offset: int, reader: str) -> Value:
-        """What a function of `arithmetic` reads of the element of an array, or of the frame, from
-        an offset on.
+        """Return the value that a function of `arithmetic` reads at an offset.
+
+        The offset is relative to the element of an array, or to the frame.
         """
         shape = leaf.shape[: len(leaf.strides)]
         level = 1 + last_axis(leaf.shape[: len(leaf.strides)])
@@ -357,8 +368,9 @@ class Writer:
         )
 
     def _strides(self, leaf: Leaf) -> tuple[str, ...]:
-        """The steps of a field's arrays; that of the innermost arrays of all, on which most
-        depends, is the same in all frames.
+        """Return the strides of a field's arrays.
+
+        The stride of the innermost arrays is the same in all frames.
         """
         strides = [self.number(stride) for stride in leaf.strides]
         if leaf.strides and len(leaf.info.axes) == max(
@@ -368,8 +380,9 @@ class Writer:
         return tuple(strides)
 
     def _stays(self, leaf: Leaf) -> bool:
-        """Whether a field has the same place in all frames: it stands before what varies, or in the
-        first element of it.
+        """Return whether a field has the same place in all frames.
+
+        It is before everything that varies, or in the first element of it.
         """
         leaves = self.layout.leaves.values()
         found = [
@@ -418,8 +431,9 @@ class Writer:
         return f"({first} | {self.byte(leaf, seen.offset + 1).text} << 8)"
 
     def beside(self, node: Node, leaf: Leaf) -> Value:
-        """A cosine or sine from a table that has both side by side, so that they are fetched
-        together.
+        """Return a cosine or sine from a table that has both side by side.
+
+        Both are then loaded together.
         """
         name = ("kernel", "both", leaf.info, leaf.size, key(node.args[0]))
         if name not in self._tables:

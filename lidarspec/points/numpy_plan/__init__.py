@@ -1,5 +1,6 @@
-"""Points by NumPy alone: a back end that compiles the columns of a plan to calls on arrays that
-stay in the cache.
+"""Compute points by NumPy alone.
+
+This back end compiles the columns of a plan to calls on arrays that stay in the cache.
 
 In: a `points.plan.Plan`. Out: what fills its columns, by `compile`; nobody needs to know more of
 this package. Modules in reading order:
@@ -48,8 +49,9 @@ def _compiled(plan: Plan, names: tuple[str, ...], tables: dict[Any, NDArray[Any]
 
 
 def describe(plan: Plan) -> list[str]:
-    """A plan in lines: the shape, what is computed for each packet,
-    and the calls for each chunk.
+    """Describe a plan in lines of text.
+
+    They show the shape, the values computed for each packet, and the calls for each chunk.
     """
     names = tuple(
         name

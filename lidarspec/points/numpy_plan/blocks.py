@@ -1,5 +1,6 @@
-"""Frames compacted before anything is computed: the innermost arrays of a chunk of packets, without
-what stands between them.
+"""Compact frames before computing.
+
+The innermost arrays of a chunk of packets are copied without the bytes between them.
 
 Each field is then one long array with one distance from element to element, which NumPy reads
 several times as fast as a view with a distance for each level. Where elements follow each other at
@@ -23,8 +24,9 @@ LONG = 64
 
 
 class Blocks:
-    """The innermost arrays of frames, without what stands between them, a chunk of packets at a
-    time.
+    """The innermost arrays of frames, without the bytes between them.
+
+    A chunk of packets is loaded at a time.
 
     Args:
         leaves: the fields wanted; all of the same arrays.
@@ -115,8 +117,10 @@ class Loading:
         self._start = -1
 
     def column(self, seen: Window, start: int, stop: int, width: int) -> NDArray[Any]:
-        """A window of each of `width` elements of the packets from `start` to `stop`; along their
-        arrays where these are long.
+        """Return a window of each of `width` elements of some packets.
+
+        The packets are those from `start` to `stop`. If the arrays are long, the result has their
+        shape.
         """
         if self._arrays is not None:
             return elements(self._source[start:stop], seen.dtype, seen.offset, *self._arrays)

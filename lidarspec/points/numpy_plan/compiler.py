@@ -164,8 +164,9 @@ class Compiler:
         return self._along_beams(node) if node.kind == "call" and node.function is np.add else None
 
     def _along_beams(self, node: Node) -> int | None:
-        """Measured distances along rows of a table, from rows on where beams start; None for other
-        sums.
+        """Return distances along beams: a sum of a product with rows and the start.
+
+        Returns None for other sums.
 
         Points up to `FINE` metres away are float32 throughout. Rows that reach farther are computed
         again in float64.
@@ -186,8 +187,9 @@ class Compiler:
         place = ("far", distance)
 
         def far(run: Run) -> tuple[int, NDArray[np.intp], NDArray[np.float64]]:
-            """Where the chunk begins, which of its rows reach too far, and their distances as they
-            were sent.
+            """Return the start of the chunk, its rows with far points, and their distances.
+
+            The distances are the raw values.
             """
             if run.prepared.get(place, (-1,))[0] != run.start:
                 rows = measured(run).reshape(-1, inner)
@@ -240,8 +242,9 @@ class Compiler:
         return register if register is not None else self._spread(node, kind)
 
     def _marked(self, node: Node, kind: str) -> int | None:
-        """A value, or nan where a condition says so or nothing came back, without a branch; None
-        where it is none.
+        """Return a value, or nan if a condition says so or there is no return.
+
+        No branch is used. Returns None for other expressions.
         """
         if node.kind != "call" or not is_full(value := node.args[-1], self._width):
             return None
@@ -293,8 +296,9 @@ class Compiler:
         )
 
     def _returned(self, value: Node, kind: str, lost: Node | None) -> int:
-        """Ranges, nan where nothing came back, or where packets or blocks are `lost`: what divided
-        by itself is 1, or no number.
+        """Return ranges, nan without a return or for `lost` packets or blocks.
+
+        A value divided by itself is 1 or nan.
         """
         read = self._read(value, kind)
         shape = self._shape
@@ -323,8 +327,9 @@ class Compiler:
         return Read(self._single(value) if kind == "single" else self._double(value))
 
     def _of_field(self, node: Node, kind: str, factor: float = 1.0) -> int | None:
-        """An expression of one field, times a number: loaded as it is, or looked up by its window;
-        None where it is neither.
+        """Return an expression of one field, times a number.
+
+        It is loaded directly, or looked up by its window. Returns None if neither is possible.
         """
         source = only_field(node)
         if source is not None and is_full(source, self._width):
@@ -384,8 +389,9 @@ class Compiler:
         return not leaf.info.scaled or not (self._exact or leaf.info.offset)
 
     def _cut_out(self, leaf: Leaf, kind: str) -> int | None:
-        """A field of bits that stand in a row in four bytes, cut out of these; None where they do
-        not, or it has to be float64 first.
+        """Return a field of contiguous bits, extracted from four bytes.
+
+        Returns None if the bits are not contiguous, or if float64 is required first.
         """
         if kind == "single" and not self._is_short(leaf):
             return None
@@ -415,8 +421,9 @@ class Compiler:
         return None
 
     def _shift(self, leaf: Leaf, seen: Window) -> tuple[int, int] | None:
-        """How a field that shares its window with others is cut out of it: shift and mask, or None
-        where that takes a table.
+        """Return the shift and mask that extract a field from a shared window.
+
+        Returns None if a table is required.
         """
         if leaf.wire is not None:
             return None
@@ -473,8 +480,10 @@ class Compiler:
         kind: str,
         dtype: np.dtype[Any] | None = None,
     ) -> int:
-        """Some bits of a window of every element, in its unit; `dtype`: of the window's word, where
-        that is not little-endian.
+        """Return some bits of a window of every element, in the unit of the field.
+
+        Args:
+            dtype: the dtype of the window's word, if it is not little-endian.
         """
         words = f"u{seen.size}"
         dtype = dtype or seen.dtype
@@ -558,8 +567,9 @@ class Compiler:
         return lambda run: deep(run.part(run.values(value)), depth)
 
     def _factor(self, value: Any) -> Callable[[Run], Any]:
-        """A factor of a float32 product: a register, a number, or a row repeated for the whole
-        chunk.
+        """Return a factor of a float32 product.
+
+        It is a register, a number, or a row repeated for the whole chunk.
         """
         if is_full(value, self._width):
             return Read(self._single(value))
@@ -625,8 +635,9 @@ class Compiler:
         return self.program.step(f"rows of a table of {number} x {inner}", kind, run)
 
     def _direction(self, node: Node) -> int:
-        """A cosine or sine; where all points of a packet or block have the same or nearly so, it is
-        computed once for them.
+        """Return a cosine or sine.
+
+        If all points of a packet or block have nearly the same angle, it is computed once for them.
         """
         value = node.args[0]
         function = node.function
@@ -651,8 +662,9 @@ class Compiler:
         return self._once(("rotation", value), lambda: products.Rotation.of(angles))
 
     def _wide(self, rotation: products.Rotation) -> int:
-        """The angles of those packets or blocks whose points are too far apart for one rotation,
-        within half a turn.
+        """Return the angles of points that are too far apart for one rotation.
+
+        They belong to whole packets or blocks, and are reduced to within half a turn.
         """
 
         def run(execution: Run, out: NDArray[Any]) -> None:
@@ -666,8 +678,9 @@ class Compiler:
         return self.program.step("angles of what is wide", "single", run)
 
     def _turned(self, function: Any, rotation: products.Rotation, wide: int) -> int:
-        """Cosines or sines of angles that are turned a little from the one in their middle: a
-        matrix product of series.
+        """Return cosines or sines of angles close to the one in their middle.
+
+        They are a matrix product of series.
         """
         read = Read(wide)
         which = 0 if function is np.cos else 1
@@ -705,8 +718,9 @@ class Compiler:
         return self.program.step("reduce to half a turn", "single", run, read, Read(turns))
 
     def _near(self, value: Node, angles: products.Angles) -> int:
-        """Angles that lie around one of their packet or block, reduced so: most of them need no
-        reduction of their own.
+        """Return angles that vary around one angle, reduced together.
+
+        Most of them need no reduction of their own.
         """
         read = Read(
             self._added(
@@ -725,8 +739,9 @@ class Compiler:
         return self.program.step("reduce what is far from half a turn", "single", run, read)
 
     def _angles(self, value: Node) -> products.Angles | None:
-        """Angles that lie around one of their packet or block; None where they do not, or nobody
-        knows.
+        """Return angles that vary around one angle of their packet or block.
+
+        Returns None if they do not, or if this is not known.
         """
         angles = self._once(
             ("angles", value), lambda: products.angles_of(value, self._shape, self._layout.leaves)
@@ -813,8 +828,9 @@ class Compiler:
         return self.program.step("add one of two", "double", run, before, first, second)
 
     def _scaled(self, node: Node, factor: float) -> int:
-        """What is full times a number, in float64; the number is part of the table where there is
-        one.
+        """Return an expression with a value for each point, times a number, in float64.
+
+        If the expression has a table, the number is part of it.
         """
         register = self._of_field(node, "double", factor)
         if register is not None:
@@ -852,8 +868,9 @@ def _rows(run: Run, numbers: NDArray[Any]) -> slice:
 
 
 def _numbers(run: Run, index: Node, rows: int) -> tuple[NDArray[np.intp], NDArray[np.bool_]]:
-    """The rows of a table of so many, for all packets or blocks, (k,); and after which of them
-    another than the next one comes.
+    """Return the table rows of all packets or blocks, (k,), and where they jump.
+
+    A jump is a row that another than the next one follows.
 
     After the last one comes the first; the row of nan behind them is nobody's next.
     """

@@ -59,8 +59,9 @@ class Product:
 
     @classmethod
     def of(cls, parts: Sequence[Term], shape: tuple[int, ...]) -> Product | None:
-        """The product of the parts of a sum that are low, for points of this shape; None where
-        there are none, or it would be in crumbs.
+        """Return the product of the low terms of a sum, for points of this shape.
+
+        Returns None if there are none, or if the product would be of very small matrices.
         """
         if not parts:
             return None
@@ -120,8 +121,9 @@ class Angles:
 
     @classmethod
     def of(cls, product: Product, more: tuple[float, float]) -> Angles | None:
-        """The angles that a product makes; None where nothing is the same for all points of a
-        packet or block.
+        """Return the angles that a product gives.
+
+        Returns None if no term is the same for all points of a packet or block.
         """
         level = [bool((row == row.flat[0]).all()) for row in product.rows]
         start = [
@@ -153,8 +155,9 @@ class Angles:
         return len(self.around.rows) == 1 and self.more == (0.0, 0.0)
 
     def left(self, run: Run) -> tuple[Floats, NDArray[np.bool_]]:
-        """The numbers, (k, rows), the first of each within half a turn; and where angles may be
-        that have to be reduced all the same.
+        """Return the numbers, (k, rows), and which rows have angles to reduce.
+
+        The first numbers are reduced to within half a turn.
         """
         found = self.around.left(run)
         rows = self.around.rows.reshape(len(self.around.rows), -1)
@@ -182,8 +185,9 @@ def reduced(angles: Floats) -> Floats:
 
 
 def multiplied(left: NDArray[Any], right: NDArray[Any], out: NDArray[Any]) -> None:
-    """A matrix product in pieces that a BLAS does in one thread; with two, a chunk would wait for
-    the one that is busy elsewhere.
+    """Compute a matrix product in pieces that a BLAS does in one thread.
+
+    With two threads, a chunk would wait for the one that is busy elsewhere.
 
     Rows come out the same in any company: for that a lone one needs another, as it would be summed
     in another order. Where the right side differs by group, rows belong to the groups by turns.
@@ -230,8 +234,9 @@ class Rotation:
 
     @classmethod
     def of(cls, angles: Angles) -> Rotation | None:
-        """The rotation that makes these angles; None where several rows besides their middle have
-        numbers of packets or blocks.
+        """Return the rotation that gives these angles.
+
+        Returns None if several rows besides the middle have numbers of packets or blocks.
         """
         numbered = [low for low in angles.around.lows if low is not None]
         if len(numbered) > 1 or angles.more != (0.0, 0.0):
@@ -245,8 +250,9 @@ class Rotation:
 
     @cached_property
     def row(self) -> Floats:
-        """By what the number of a packet or block is multiplied; where none has one, how far each
-        point is turned.
+        """The factors of the number of a packet or block.
+
+        Without such numbers it is the angle by which each point is turned.
         """
         around = self.angles.around
         return next(
@@ -386,16 +392,18 @@ class Turns:
             )
 
     def _of_chunk(self, array: NDArray[Any], start: int, stop: int) -> NDArray[Any]:
-        """What an array, (..., rows of the window, group by group), holds for the packets of a
-        chunk: (..., groups, rows).
+        """Return a view of an array for the packets of a chunk, (..., groups, rows).
+
+        The array is (..., rows of the window), group by group.
         """
         each = self._outer // self._groups
         whole = array.reshape(*array.shape[:-1], self._groups, -1)
         return whole[..., (start - self._first) * each : (stop - self._first) * each]
 
     def _expand(self) -> None:
-        """The coefficients of the packets that come next: of each, its cosine and sine times powers
-        of how far its points go.
+        """Compute the coefficients of the next packets.
+
+        They are cosine and sine of each packet, times powers of the extent of its points.
         """
         chosen = [self._rows(values) for values, _ in self._terms]
         middle = chosen[0] * self._terms[0][1]
@@ -455,8 +463,9 @@ def _single(rows: Sequence[Floats]) -> Singles:
 
 
 def split(node: Node, width: int) -> tuple[list[Term], list[Term]]:
-    """The parts of a sum that are low, and those that each of the `width` points
-    of a packet has.
+    """Split a sum into its low terms and the terms with a value for each point.
+
+    A low term has one value for a packet or block, not one for each of the `width` points.
     """
     parts = terms(node, width)
     return [part for part in parts if part.full is None], [
@@ -465,16 +474,18 @@ def split(node: Node, width: int) -> tuple[list[Term], list[Term]]:
 
 
 def product_of(node: Node, shape: tuple[int, ...]) -> Product | None:
-    """What is low in a sum as one product; None where it is none, or what is full is multiplied by
-    a row.
+    """Return the low part of a sum as one product.
+
+    Returns None if there is none, or if a term with a value for each point has a row as its factor.
     """
     low, full = split(node, math.prod(shape))
     return None if any(part.row.ndim for part in full) else Product.of(low, shape)
 
 
 def angles_of(node: Node, shape: tuple[int, ...], leaves: Mapping[str, Leaf]) -> Angles | None:
-    """Angles that lie around one of their packet or block;
-    None where they do not, or nobody knows.
+    """Return angles that vary around one angle of their packet or block.
+
+    Returns None if they do not, or if this is not known.
     """
     product = product_of(node, shape)
     if product is None:

@@ -1,5 +1,6 @@
-"""A program: NumPy calls on registers, chunk by chunk of packets, that make some flat columns out
-of frames of one layout.
+"""A program: NumPy calls on registers, for one chunk of packets at a time.
+
+It computes flat columns from frames of one layout.
 
 The machine knows nothing of fields or expressions: `numpy_plan.compiler` appends the steps. A step
 makes one register out of others, of the frames' blocks, or of values of packets that are known.
@@ -120,8 +121,10 @@ class Program(Maker):
         )
 
     def repeated(self, text: str, kind: str, make: Callable[[Run], NDArray[Any]]) -> int:
-        """A new register with numbers of packets or blocks, made for the batch at its first chunk,
-        for each point of theirs.
+        """Return a new register that repeats numbers of packets or blocks.
+
+        Each point has the number of its packet or block. The numbers are made once for the batch,
+        at its first chunk.
         """
         place = object()
 
@@ -187,8 +190,9 @@ class Program(Maker):
 
     @cached_property
     def _wanted(self) -> list[tuple[int, np.dtype[Any]]]:
-        """The arrays that a chunk needs, of so many elements a packet: for the blocks, then for the
-        slots.
+        """The arrays that a chunk needs: elements for each packet, and dtype.
+
+        Those of the blocks come first, then those of the slots.
         """
         kinds = dict(
             sorted(

@@ -1,5 +1,6 @@
-"""The memory that programs compute in: registers, so few and so often used again that a chunk of
-packets stays in the cache.
+"""The memory of programs: registers.
+
+They are few and reused often, so that a chunk of packets stays in the cache.
 
 A register is an array of one kind for a chunk. Registers that are never needed at the same time
 share a slot (`slots_of`). Their memory comes from a `Scratch`, which is borrowed for one execution
@@ -105,8 +106,9 @@ TYPES: dict[str, np.dtype[Any]] = {kind: np.dtype(code) for kind, code in _CODES
 def slots_of(
     uses: Sequence[Collection[int]], kinds: Sequence[str], own: Collection[int]
 ) -> list[int]:
-    """A slot for each register, so that registers of one kind that are never needed at the same
-    time have the same one.
+    """Return a slot for each register.
+
+    Registers of one kind that are never needed at the same time share a slot.
 
     Args:
         uses: the registers that each step makes, reads or needs besides, in the order of the steps.

@@ -229,8 +229,9 @@ class CheckedConst(Const):  # type: ignore[misc]
 
 
 class Limited(Subconstruct):  # type: ignore[misc]
-    """A number that is one of some raw values, and no other:
-    construct's OneOf, NoneOf and Mapping.
+    """A number that accepts only some raw values.
+
+    It represents OneOf, NoneOf and Mapping of construct.
     """
 
     def __init__(self, subcon: Construct, allowed: tuple[int, ...]) -> None:
@@ -429,8 +430,9 @@ class Sizing(Subconstruct):  # type: ignore[misc]
         return self.subcon._build(sizes.get(path, obj or 0), stream, context, path)
 
     def _enter(self, context: Any, said: tuple[str, int, Any]) -> None:
-        """Tell the struct that has the part; a bit block that is probed for itself stands
-        in none.
+        """Register the value with the struct that contains the part.
+
+        A bit block that is probed on its own has no such struct.
         """
         for _ in range(self.out):
             context = context.get("_", {})
@@ -438,8 +440,9 @@ class Sizing(Subconstruct):  # type: ignore[misc]
 
 
 class Counting(Subconstruct):  # type: ignore[misc]
-    """The number of elements of an array behind it,
-    `of` which it is made whatever value is given.
+    """The number of elements of a later array, `of`.
+
+    It is built from the length of the array; the value given is ignored.
     """
 
     def __init__(self, subcon: Construct, of: str) -> None:

@@ -721,8 +721,9 @@ def _number(info: tree.FieldInfo, size: int, *, is_big: bool) -> tree.Number:
 
 
 def axis_path(info: tree.FieldInfo) -> str:
-    """The name of the axis of an array at this place;
-    an array directly in an array gets brackets.
+    """Return the name of the axis of an array at this path.
+
+    The axis of an array directly inside an array gets brackets.
     """
     path = info.path
     while path in info.axes:

@@ -106,8 +106,9 @@ def beams(
 
 
 def turning(i: int, blocks: int, per_turn: int, rate_hz: float = 10.0) -> dict[str, Any]:
-    """Azimuths, speed and time of packet i of a sensor that fires `per_turn` blocks
-    in each turn.
+    """Return azimuths, speed and time of packet i of a rotating sensor.
+
+    The sensor fires `per_turn` blocks in each turn.
     """
     shots = i * blocks + np.arange(blocks)
     now = EPOCH + datetime.timedelta(

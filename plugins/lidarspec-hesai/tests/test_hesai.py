@@ -775,8 +775,9 @@ def test_a_scan_of_an_at128_is_what_one_face_of_the_mirror_sees() -> None:
 
 
 def test_a_jt16_is_read_from_its_line_and_a_broken_byte_costs_one_packet(tmp_path: Path) -> None:
-    """Packets of 80 bytes and samples of 34 in one stream;
-    the CRC of those is over two zeros more.
+    """JT16 sends packets of 80 bytes and IMU samples of 34 bytes in one stream.
+
+    The CRC of the samples covers two additional zero bytes.
     """
     sensor = ls.sensor("hesai-jt16")
     own = json.loads((Path(at128.__file__).parent / "vectors.json").read_text(encoding="utf-8"))

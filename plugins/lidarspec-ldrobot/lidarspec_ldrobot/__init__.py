@@ -113,8 +113,9 @@ def seen_aside(distance: Any) -> Any:
 
 
 def points(f: Fields, rate: int, *, aside: bool = False) -> Polar:
-    """Even steps from the start angle to the end angle (manual 3.2),
-    at `rate` points per second.
+    """Return points at even steps from the start angle to the end angle.
+
+    `rate` is in points per second. Source: manual 3.2.
     """
     clockwise = spread(f.start_angle, f.end_angle, POINTS, full=360.0)  # degrees, (n, 12)
     if aside:

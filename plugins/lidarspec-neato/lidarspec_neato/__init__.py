@@ -106,8 +106,9 @@ def lfcd_plausible(f: Fields) -> Any:
 
 
 def after_first(f: Fields, count: int) -> Any:
-    """Seconds from the first sample of a packet to each, a degree apart;
-    0 where the motor stands.
+    """Return the seconds from the first sample of a packet to each sample.
+
+    Samples are one degree apart. The result is 0 if the motor stands still.
     """
     return np.where(f.speed > 0, np.arange(count) / (np.maximum(f.speed, 1 / 64) * 6), 0)
 

@@ -1,4 +1,6 @@
-"""The packets of Ouster sensors: pixel profiles, lidar packets and IMU packets, all little-endian.
+"""Packets of Ouster sensors: pixel profiles, lidar packets and IMU packets.
+
+All values are little-endian.
 
     header | 16 columns: column header, H pixels, column footer | footer
     (LEGACY has no header and no footer)

@@ -159,8 +159,9 @@ def pace(f: Fields) -> Any:
 
 
 def points(f: Fields) -> Polar:
-    """Range and direction as on the wire, which has REP-103 axes already
-    (M1P user guide, page 13).
+    """Return range and direction as on the wire, which has REP-103 axes.
+
+    Source: M1P user guide, page 13.
     """
     channels = f.blocks.channels
     return Polar(

@@ -214,8 +214,9 @@ def pairs(f: Fields, dual: Any, model: Rotor, *, late: Any = 0) -> Polar:
 
 
 def halves(f: Fields, dual: Any, model: Rotor, lasers: tuple[Any, Any]) -> Polar:
-    """Points of blocks of two firings of all lasers,
-    or with dual return of the two returns of one.
+    """Return the points of blocks with two groups of all lasers.
+
+    The groups are two firings, or with dual return the two returns of one firing.
     """
     azimuth = f.blocks.azimuth
     group = np.arange(2)[:, None]
@@ -288,8 +289,9 @@ def pace(f: Fields, shots: float, period: float, dual: int) -> Any:
 
 
 def rotor_step(ahead: Any, behind: Any, usual: Any) -> Any:
-    """Degrees to the next shot; over a loss or a gap as before it,
-    or as the rotor was set to turn.
+    """Return the degrees to the next shot.
+
+    Over a loss or a gap it is the step before, or the configured step of the rotor.
     """
     ahead = wrap(ahead, 360)
     behind = wrap(behind, 360)

@@ -169,8 +169,9 @@ def clock_of(source: Any, shots: int, model: Rotor) -> Clock:
 
 
 def points_16(f: Fields) -> Polar:
-    """Two firings in a block; angles up and down alone,
-    with their signs as they are in every unit.
+    """Return the points of blocks with two firings of 16 lasers each.
+
+    Only vertical angles are corrected. Their signs are the same in every unit.
     """
     up = np.where(np.arange(16) < 8, -1, 1) * f.state.difop.pitch.on("channels")
     return halves(f, f.state.difop.return_mode == DUAL, RS16_ROTOR, (up, 0.0))

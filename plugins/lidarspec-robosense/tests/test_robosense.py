@@ -222,8 +222,9 @@ def test_the_device_information() -> None:
 
 
 def test_each_layout_of_the_device_information_is_told_from_the_others() -> None:
-    """By what can stand where the modes and the time are;
-    what fits none of them keeps its bytes.
+    """Layouts are distinguished by the values at the offsets of modes and time.
+
+    A frame that fits none of them keeps its bytes.
     """
     head = bytes.fromhex("a5ff005a11115555000a") + bytes(18)
     modes = bytes([5, 2, 1]) + (1_700_000_000).to_bytes(6, "big") + (999_999).to_bytes(4, "big")

@@ -100,8 +100,9 @@ class Stamps:
         self._ahead = self._ahead if ahead is None else ahead
 
     def of(self, device_ns: int, host_ns: int, settings: Settings) -> int:
-        """The stamp of the next scan, by the sensor's time and the arrival
-        of its first point, ns.
+        """Return the stamp of the next scan, ns.
+
+        It follows from the sensor's time and the arrival time of the first point.
         """
         return self._wanted(device_ns, self.clock.stamp(device_ns, host_ns), host_ns, settings)
 

@@ -1,5 +1,6 @@
-"""What the node publishes of a sensor: messages as bytes, as logs have them,
-for whoever listens.
+"""The topics of a sensor: messages for any subscriber.
+
+Messages are published as bytes, in the encoding of log files.
 """
 
 from __future__ import annotations
@@ -181,8 +182,9 @@ class Topics:
         return self.stamps.of(scan.stamp_ns, scan.host_ns, self._settings)
 
     def _publisher(self, kind: str) -> Any:
-        """The publisher of a kind of messages; that of `scan` is made
-        when there is a planar one.
+        """Return the publisher of a kind of messages.
+
+        The publisher of `scan` is made when the first planar scan arrives.
         """
         if kind not in self._publishers:
             topic, message, depth = KINDS[kind]

@@ -1,5 +1,6 @@
-"""Stamps are right within a millisecond, and in order,
-whatever the sensor's clock and the line do.
+"""Stamps are in order and right within a millisecond.
+
+This holds for every clock of a sensor and every delay of the line.
 """
 
 from __future__ import annotations

@@ -184,8 +184,9 @@ def points(f: Fields) -> Polar:
 
 
 def sweep(i: int, returns: int = 1) -> dict[str, Any]:
-    """Packet i: lines of 120 degrees, four channels each,
-    from the top to the bottom of 25 degrees.
+    """Return the values of packet i.
+
+    Lines of 120 degrees, with four channels each, run from the top to the bottom of 25 degrees.
     """
     count = (DATAGRAM - HEADER) // SIZE[returns]
     spot = i % PACKETS * count + np.arange(count)

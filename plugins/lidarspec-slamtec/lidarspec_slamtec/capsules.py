@@ -145,8 +145,9 @@ def plausible(f: Fields) -> Any:
 
 
 def step(f: Fields, count: int) -> Any:
-    """Degrees from one of `count` points to the next, (n, 1);
-    nan where there is no next capsule.
+    """Return the degrees from one of `count` points to the next, (n, 1).
+
+    The step is nan if there is no next capsule.
     """
     after = np.where(following(f.start.sync) == 0, following(f.start.angle), np.nan)
     return wrap(after - f.start.angle, 360.0) / count

@@ -80,8 +80,9 @@ class Firings:
 
     @property
     def height(self) -> NDArray[np.float64]:
-        """Metres above the origin at which the beam of each slot leaves,
-        the shape of `elevation`.
+        """Height above the origin at which the beam of each slot leaves, metres.
+
+        The shape is that of `elevation`.
         """
         return -self.focal_distance * np.tan(np.deg2rad(self.elevation))
 
@@ -109,9 +110,7 @@ def points(f: Fields, model: Firings, last_block: str = "previous") -> Polar:
 
 
 def _step(f: Fields, dual: Any, model: Firings, last_block: str) -> Any:
-    """Degrees that the sensor turns from the azimuth of each block to the next one,
-    (n, blocks, 1).
-    """
+    """Return the degrees from each block's azimuth to the next, (n, blocks, 1)."""
     azimuth = f.blocks.azimuth
     ahead = np.where(dual, following(azimuth, 2 * model.sharing), following(azimuth, model.sharing))
     limit = FASTEST * model.period * JITTER

@@ -46,8 +46,9 @@ BANKS = np.array([0xFFEE, 0xFFDD, 0xFFCC, 0xFFBB])[:, None]
 def packet(
     flag: Construct, unit: float, mode: Construct, product: Construct, *, blocks: int = BLOCKS
 ) -> Struct:
-    """A data packet of so many blocks that hold points,
-    with distances in steps of `unit` metres.
+    """Return the struct of a data packet with `blocks` blocks of points.
+
+    Distances are in steps of `unit` metres.
     """
     channel = Struct(
         "distance" / Scaled(Int16ul, unit, "m") * "0: no return",

@@ -182,8 +182,9 @@ def test_dual_return_against_the_published_cloud() -> None:
 
 
 def other_decoder(data: bytes, name: str) -> NDArray[Any]:
-    """What velodyne-decoder makes of one packet:
-    x y z time ring, duplicates of dual return merged.
+    """Return the points of one packet as velodyne-decoder decodes them.
+
+    The columns are x, y, z, time and ring. Duplicates of dual return are merged.
     """
     peer = pytest.importorskip(
         "velodyne_decoder", reason="velodyne-decoder, a peer to compare with, is not installed"

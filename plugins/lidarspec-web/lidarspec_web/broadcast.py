@@ -55,8 +55,9 @@ class Shown:
         self._message_most = -1
 
     def message(self, most: int) -> bytes:
-        """Return the scan as a message of at most so many points;
-        it is made once for each limit.
+        """Return the scan as a message of at most `most` points.
+
+        The message is cached until `most` changes.
         """
         if most != self._message_most:
             self._message = message(
@@ -167,8 +168,9 @@ class Broadcast:
 
     @property
     def began_ns(self) -> int:
-        """When the first packet of the first scan arrived, ns since 1970;
-        0 if that is not known.
+        """The arrival time of the first packet of the first scan, ns since 1970.
+
+        It is 0 if the time is not known.
         """
         return 0 if self._first_scan is None else self._first_scan.host_ns
 

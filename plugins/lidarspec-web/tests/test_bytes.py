@@ -1,5 +1,6 @@
-"""The bytes beside the picture: the frame that a point came from, frames by number,
-damaged ones.
+"""The view of the bytes beside the picture.
+
+It shows the frame of a point, frames by number, and damaged frames.
 """
 
 from __future__ import annotations

@@ -1,6 +1,4 @@
-"""The page as it is used: on a phone, by keyboard,
-and by people who come back to it after a while.
-"""
+"""Use of the page on a phone, by keyboard, and after a pause."""
 
 from __future__ import annotations
 

@@ -40,8 +40,9 @@ class Form:
 
 
 def between(distance: Any) -> Any:
-    """Degrees between the laser's ray and where the camera sees it
-    ("angle second-level analysis").
+    """Return the degrees between the laser's ray and the ray of the camera.
+
+    Source: "angle second-level analysis".
     """
     mm = np.maximum(distance * 1000, 0.25)
     return np.where(distance > 0, np.rad2deg(np.arctan(21.8 * (155.3 - mm) / (155.3 * mm))), 0)
