@@ -241,8 +241,8 @@ def _ending(examined: Examined, cut_off: WireField | None) -> Fault:
 def _open_part(examined: Examined) -> Examined | None:
     """Return the last of the parts that have no end; None if there are none."""
     if isinstance(examined.known, Walk):
-        for axis in examined.known.open_regions:
-            if axis not in examined.known.regions:
+        for axis, region in examined.known.open_regions.items():
+            if axis not in examined.known.regions and region.start <= len(examined.data):
                 return examined.broken_part(axis)
     return None
 

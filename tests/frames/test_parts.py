@@ -244,6 +244,14 @@ def test_a_wrong_part_is_reported_before_the_bytes_behind_the_parts() -> None:
     assert (last.path, last.data, last.right) == ("end", b"\x99", True)
 
 
+def test_a_header_that_is_cut_off_is_reported_before_the_parts() -> None:
+    part = Struct("size" / Int8ub, "text" / Bytes(this.size))
+    struct = Struct("count" / Int8ub, "time" / Int32ub, "parts" / Parts(part, this.count))
+    with pytest.raises(WireError) as fault:
+        against_construct.sensor(struct).parse(b"\1\0\0")
+    assert (fault.value.path, fault.value.offset) == ("time", 1)
+
+
 def test_a_part_that_is_longer_than_the_parts_is_cut_off_by_their_end() -> None:
     part = Struct("n" / Int8ub, "text" / Bytes(this.n))
     struct = Struct("size" / Int8ub, "parts" / Parts(part, within=this.size), "end" / Bytes(4))
