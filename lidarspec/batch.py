@@ -267,7 +267,10 @@ def pieces(
         options = {}
     made: dict[str, Piece] = {}
     for source, below in (pair for pattern in sources for pair in found(str(pattern))):
-        target = f"{folder.rstrip('/')}/{below.rpartition('.')[0] or below}.{to}" if to else source
+        if to:
+            target = f"{folder.rstrip('/')}/{below.rpartition('.')[0] or below}.{to}"
+        else:
+            target = source
         if target in made and made[target].source != source:
             raise UsageError(
                 f"{made[target].source} and {source} would both become {target}: convert them to"
@@ -374,7 +377,9 @@ class Manifest:
         ):
             return None
         is_there = record["output"] is None or self.has(record["output"])
-        return record if is_there and self._is_same(piece.source, record) else None
+        if is_there and self._is_same(piece.source, record):
+            return record
+        return None
 
     def _is_same(self, source: str, record: Record) -> bool:
         """Whether a file is the one that a record is of."""

@@ -156,7 +156,10 @@ def _by_metadata(group: str) -> list[EntryPoint]:
                 for e in distribution.entry_points.select(group=group)
             ]
         except UnicodeDecodeError:
-            entries = [EntryPoint("entry_points.txt", "", name, version)] if group == GROUP else []
+            if group == GROUP:
+                entries = [EntryPoint("entry_points.txt", "", name, version)]
+            else:
+                entries = []
         except (
             FileNotFoundError
         ):  # so the finder of the library importlib_metadata says that there is no metadata

@@ -100,7 +100,10 @@ class PluginError(SpecError):
             file = code.co_filename
             line = code.co_firstlineno
         place = f" ({shown_path(file)}:{line})" if file else ""
-        kind = "" if type(error) is SpecError else f"{type(error).__name__}: "
+        if type(error) is SpecError:
+            kind = ""
+        else:
+            kind = f"{type(error).__name__}: "
         reason = f"{kind}{' '.join(str(error).split())}{place}"
         text = "".join(format_exception(error))
         return cls(
@@ -235,7 +238,10 @@ class LibraryError(UsageError):
         self.extra = extra
         self.least_version = least_version
         self.installed_version = installed_version
-        needed = f"{distribution} {least_version} or later" if least_version else distribution
+        if least_version:
+            needed = f"{distribution} {least_version} or later"
+        else:
+            needed = distribution
         if installed_version:
             found = f"version {installed_version} is installed"
         else:
@@ -273,14 +279,21 @@ def did_you_mean(
         meant for other, meant in by_letters.items() if len(name) > 1 and name.lower() in other
     )
     close = difflib.get_close_matches(name.lower(), by_letters, n=1, cutoff=alike)
-    named = list(parts) if 0 < len(parts) <= max_parts else [by_letters[other] for other in close]
-    return f"; did you mean {listed(named)}?" if named else ""
+    if 0 < len(parts) <= max_parts:
+        named = list(parts)
+    else:
+        named = [by_letters[other] for other in close]
+    if named:
+        return f"; did you mean {listed(named)}?"
+    return ""
 
 
 def listed(names: Sequence[str]) -> str:
     """Names in words: 'a', 'b' or 'c'."""
     *others, last = map(repr, names)
-    return f"{', '.join(others)} or {last}" if others else last
+    if others:
+        return f"{', '.join(others)} or {last}"
+    return last
 
 
 _NEXT = "next: "
@@ -345,7 +358,10 @@ class UnknownName(UsageError):
             name, self.known, alike=self.alike, aliases=aliases, max_parts=self.max_parts
         )
         is_listed = 0 < len(self.known) <= self.max_listed and not suggestion
-        names = f" (known: {', '.join(self.known)})" if is_listed else ""
+        if is_listed:
+            names = f" (known: {', '.join(self.known)})"
+        else:
+            names = ""
         where = f"{place}: " if place else ""
         super().__init__(f"{where}unknown {self.what} {name!r}{suggestion}{names}{hint}")
 

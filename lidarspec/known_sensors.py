@@ -126,7 +126,9 @@ def list_described_sensors() -> list[KnownSensor] | None:
     entries = entry_points(SENSORS)
     rows = describe_entry_points(entries)
     described = {name for row in rows for name in row.names}
-    return rows if len(described) == len(entries) else None
+    if len(described) == len(entries):
+        return rows
+    return None
 
 
 def find_known_sensor(name: str) -> KnownSensor | None:
@@ -161,7 +163,9 @@ def install_command(*distributions: str, extra: str = "") -> str:
 
 
 def _quote(word: str) -> str:
-    return word if re.fullmatch(r"[\w./:+-]+", word) else f"'{word}'"
+    if re.fullmatch(r"[\w./:+-]+", word):
+        return word
+    return f"'{word}'"
 
 
 def no_sensors() -> str:

@@ -70,7 +70,10 @@ def import_library(module: str, extra: str) -> Any:
     try:
         return importlib.import_module(module)
     except ImportError as error:
-        distribution = requirement.distribution if requirement else module.partition(".")[0]
+        if requirement:
+            distribution = requirement.distribution
+        else:
+            distribution = module.partition(".")[0]
         installed = installed_version(distribution)
         raise LibraryError(
             distribution,

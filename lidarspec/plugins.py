@@ -156,7 +156,9 @@ class HookedPoints:
 
     def __call__(self, fields: Any) -> Points:
         answer = self.hooks(sensor=self.sensor, fields=fields)
-        return self.own(fields) if answer is None else answer
+        if answer is None:
+            return self.own(fields)
+        return answer
 
 
 @dataclass(frozen=True)
@@ -315,7 +317,10 @@ class Registry:
 
     def _sensors_of(self, plugin: Any) -> list[Sensor]:
         function = getattr(plugin, "lidarspec_sensors", None)
-        sensors = list(function()) if function is not None and _is_hook(function) else []
+        if function is not None and _is_hook(function):
+            sensors = list(function())
+        else:
+            sensors = []
         for sensor in sensors:
             self._check(sensor, sensors)
         return sensors
@@ -343,7 +348,9 @@ class Registry:
         owners = chosen or [
             home for home, names in alike.items() if not wanted[home] and _is_vendor(home[0], names)
         ]
-        return owners[0] if len(owners) == 1 else None
+        if len(owners) == 1:
+            return owners[0]
+        return None
 
     def _alike(self, home: Home, name: str) -> set[str]:
         """All names of the sensor that somebody claims this one for, as far as they are known
@@ -477,7 +484,8 @@ class Registry:
             own = found
             name = found.id  # whoever has the id has its aliases too
             found = self._find(name)
-            found = found if found is not None and found.id == own.id else None
+            if found is None or found.id != own.id:
+                found = None
         if found is None:
             known = self._found()
             aliases = {alias: one.id for one in known.values() for alias in one.aliases}
@@ -611,7 +619,10 @@ def named_owners() -> dict[str, str]:
     """
     file = own_settings()
     try:
-        named = document(file).get("owners", {}) if file.is_file() else {}
+        if file.is_file():
+            named = document(file).get("owners", {})
+        else:
+            named = {}
         if not isinstance(named, dict) or not all(
             isinstance(value, str) for value in named.values()
         ):
@@ -910,7 +921,9 @@ def sensor(name: str | Path | Sensor) -> Sensor:
     if isinstance(name, Sensor):
         return name
     text = str(name)
-    return _from_file(text) if names_file(text) else registry().sensor(text)
+    if names_file(text):
+        return _from_file(text)
+    return registry().sensor(text)
 
 
 def names_file(text: str) -> bool:

@@ -211,4 +211,6 @@ def _failure_reason(url: str, error: Exception) -> str:
     text = str(error)
     if plain(text) != plain(url) and text.lstrip("/") != plain(url) and text:
         return text
-    return "no such file" if isinstance(error, FileNotFoundError) else type(error).__name__
+    if isinstance(error, FileNotFoundError):
+        return "no such file"
+    return type(error).__name__

@@ -54,7 +54,9 @@ def foreign(path: Path) -> str:
     """
     if not hasattr(os, "getuid"):
         home = os.path.expanduser("~")
-        return "" if path.resolve().is_relative_to(home) else f"{path} is not in {home}"
+        if path.resolve().is_relative_to(home):
+            return ""
+        return f"{path} is not in {home}"
     for place in (path, path.parent):
         with system_errors(place):
             status = place.stat()
@@ -75,14 +77,19 @@ def shared(status: os.stat_result, others: int) -> str:
     if status.st_uid != os.geteuid():
         return f"belongs to user {status.st_uid}"
     mode = stat.S_IMODE(status.st_mode)
-    return f"is open to others: chmod {mode & ~others:o} makes it yours" if mode & others else ""
+    if mode & others:
+        return f"is open to others: chmod {mode & ~others:o} makes it yours"
+    return ""
 
 
 def is_trusted(folder: Path) -> bool:
     """Whether the user has allowed what the files of a folder name."""
     file = user_folder() / TRUSTED
     with system_errors(file):
-        allowed = file.read_text(encoding="utf-8").splitlines() if file.is_file() else []
+        if file.is_file():
+            allowed = file.read_text(encoding="utf-8").splitlines()
+        else:
+            allowed = []
     once = os.environ.get(VARIABLE)
     return str(folder.resolve()) in (*allowed, *([os.path.realpath(once)] if once else []))
 
@@ -117,7 +124,10 @@ def beside(folder: Path, value: object) -> Path:
     Raises:
         UsageError: for any other path, and for what is no path or no regular file.
     """
-    found = folder / value if isinstance(value, str) and "\0" not in value else folder
+    if isinstance(value, str) and "\0" not in value:
+        found = folder / value
+    else:
+        found = folder
     if not found.is_file() or not found.resolve().is_relative_to(folder.resolve()):
         raise UsageError(f"{value!r} is no file beside it")
     return found

@@ -91,11 +91,19 @@ class Alike:
                 .ravel()
             )
             whole: NDArray[np.bool_] = np.asarray(ends == self.length, np.bool_)
-            good = whole if good is None else np.asarray(good & whole, np.bool_)
+            if good is None:
+                good = whole
+            else:
+                good = np.asarray(good & whole, np.bool_)
         if differs.any():
             alike: NDArray[np.bool_] = np.asarray(~differs.any(axis=1), np.bool_)
-            good = alike if good is None else np.asarray(alike & good, np.bool_)
-        return (None, at) if good is None or good.all() else (good, at[good])
+            if good is None:
+                good = alike
+            else:
+                good = np.asarray(alike & good, np.bool_)
+        if good is None or good.all():
+            return (None, at)
+        return (good, at[good])
 
 
 def alike(record: bytes, headers: Headers, source: Sender, form: Form) -> Alike | None:
@@ -167,7 +175,9 @@ def _same(storage: NDArray[np.uint8], at: int, count: int, length: int, form: Fo
     place, kind, claim = form.claim(length)
     claims: NDArray[Any] = np.ndarray((count,), kind, storage, at + place, (length,))
     others = claims != claim
-    return int(others.argmax()) if others.any() else count
+    if others.any():
+        return int(others.argmax())
+    return count
 
 
 def _windows(storage: NDArray[np.uint8], starts: Indices, width: int) -> NDArray[np.uint8]:
@@ -285,7 +295,8 @@ class CaptureBatches(CaptureReader):
                 )
                 if len(starts) < 2 and not stuck and self._source.more():
                     continue
-                starts = starts if len(starts) > 1 else np.array([self._source.at])
+                if len(starts) <= 1:
+                    starts = np.array([self._source.at])
                 found = _Records(self, self._source, form, starts, known)
                 ended = found.read()
                 place = self._source.place
@@ -386,7 +397,10 @@ class _Records:
         else:
             starts, sizes, senders = (np.full(len(known), fact) for fact in facts.ravel())
         columns = [self._starts[known] + starts, sizes, self._at[known], senders]
-        buffer = self._buffer if len(known) else np.empty(0, np.uint8)
+        if len(known):
+            buffer = self._buffer
+        else:
+            buffer = np.empty(0, np.uint8)
         if self._plain:
             buffer = self._with_plain(buffer, columns, known, names)
         return Batch(buffer, columns[0], columns[1], columns[2], columns[3], tuple(names))
@@ -445,7 +459,10 @@ class _Records:
             return
         places = self._reader.headers(packet)
         record = self._storage[self._starts[index] : self._starts[index + 1]].tobytes()
-        found = alike(record, places, datagram.source, self._form) if places else None
+        if places:
+            found = alike(record, places, datagram.source, self._form)
+        else:
+            found = None
         if found is not None:
             self._learnt += 1
             self._known = [*self._known, found]

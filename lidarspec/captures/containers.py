@@ -167,7 +167,9 @@ class Unpacking(io.RawIOBase):
 def damage(file: BinaryIO) -> Damage | None:
     """Why a file ended too early that was unpacked while it was read; None where it did not."""
     raw = getattr(file, "raw", None)
-    return raw.damage if isinstance(raw, Unpacking) else None
+    if isinstance(raw, Unpacking):
+        return raw.damage
+    return None
 
 
 def opened(path: str | os.PathLike[str], member: str = "") -> BinaryIO:

@@ -158,7 +158,10 @@ class CaptureReader(Closing):
         try:
             magic = bytes(self._source.ahead(4))
             if not is_capture(magic):
-                seen = f"it begins with {magic.hex(' ')}" if magic else "it is empty"
+                if magic:
+                    seen = f"it begins with {magic.hex(' ')}"
+                else:
+                    seen = "it is empty"
                 raise SourceError(
                     f"{getattr(file, 'name', 'input')}: neither a pcap nor a pcapng capture: {seen}"
                 )

@@ -253,7 +253,9 @@ class PcapRecords:
             & (captured[after] > 0)
         )
         right[followed] &= abs(seconds[after].astype(np.int64) - seconds[before]) <= _DAY
-        return int(places[right.argmax()]) if right.any() else None
+        if right.any():
+            return int(places[right.argmax()])
+        return None
 
     def _is_sure(self, captured: int, original: int) -> bool:
         """Return whether two lengths agree: the packet is whole or cut at the snap length."""
@@ -403,7 +405,9 @@ def records(source: Source) -> Form:
     Raises:
         Truncated: the head of the file is cut.
     """
-    return PcapngBlocks(source) if source.ahead(4) == _SECTION else PcapRecords(source)
+    if source.ahead(4) == _SECTION:
+        return PcapngBlocks(source)
+    return PcapRecords(source)
 
 
 def resume(source: Source, form: Form) -> bool:
@@ -482,7 +486,10 @@ def _interface(order: str, body: bytes) -> Interface:
         if len(value) < size:
             break
         if code == _TIME_RESOLUTION and size == 1:
-            ticks = 2 ** (value[0] & 0x7F) if value[0] & 0x80 else 10 ** value[0]
+            if value[0] & 0x80:
+                ticks = 2 ** (value[0] & 0x7F)
+            else:
+                ticks = 10 ** value[0]
         elif code == _TIME_OFFSET and size == 8:
             offset = struct.unpack(order + "q", value)[0] * _SECOND
         at += 4 + size + -size % 4

@@ -167,7 +167,10 @@ class Source:
         tail = self.storage[self.at : self.at + have]
         at = self.at
         if len(self._data) == size:
-            size = 2 * size if have == size else max(size, min(2 * size, self._largest))
+            if have == size:
+                size = 2 * size
+            else:
+                size = max(size, min(2 * size, self._largest))
         if self._lent is not None:
             self._kept = [*self._kept[1 - MOST_KEPT :], (self.storage, self._lent)]
         spare = self._spare(size)
@@ -206,7 +209,9 @@ def _into(file: BinaryIO) -> Callable[[memoryview], int | None]:
     """
     if isinstance(file, io.BufferedIOBase):
         return file.readinto1
-    return file.readinto if isinstance(file, io.RawIOBase) else functools.partial(_copied, file)
+    if isinstance(file, io.RawIOBase):
+        return file.readinto
+    return functools.partial(_copied, file)
 
 
 def _copied(file: BinaryIO, buffer: memoryview) -> int:
@@ -220,4 +225,6 @@ def _first_size(file: BinaryIO, largest: int) -> int:
         status = os.fstat(file.fileno())
     except (AttributeError, OSError):
         return SMALLEST
-    return min(max(status.st_size, SMALLEST), largest) if stat.S_ISREG(status.st_mode) else SMALLEST
+    if stat.S_ISREG(status.st_mode):
+        return min(max(status.st_size, SMALLEST), largest)
+    return SMALLEST

@@ -85,11 +85,15 @@ def new(
         texts = invented(names, "udp" if link == "udp" else "serial")
     else:
         texts = _drafted(names, link, capture)
-    texts = joining(folder, names, texts) if folder.exists() else texts
+    if folder.exists():
+        texts = joining(folder, names, texts)
     write(folder, texts)
     for name in texts:
         say(str(folder / name))
-    look = f"demo -s {sensor_id}" if capture is None else f"explain {quote(capture)} -s {sensor_id}"
+    if capture is None:
+        look = f"demo -s {sensor_id}"
+    else:
+        look = f"explain {quote(capture)} -s {sensor_id}"
     note(
         f"next: pip install -e {quote(f'{folder}[test]')} && pytest {quote(str(folder))} &&"
         f" lidarspec {look}"
@@ -180,8 +184,14 @@ def _told(report: Report, *, verbose: bool) -> list[str]:
     """A report in paragraphs."""
     paragraphs = [str(finding) for finding in report.findings]
     number = len(report.findings)
-    verdict = f"{number} finding{'s' * (number != 1)}" if number else "clean"
-    more = f", {report.held} properties hold" if report.held else ""
+    if number:
+        verdict = f"{number} finding{'s' * (number != 1)}"
+    else:
+        verdict = "clean"
+    if report.held:
+        more = f", {report.held} properties hold"
+    else:
+        more = ""
     more += f", {len(report.skipped)} skipped" if report.skipped else ""
     lines = [f"{report.name}: {verdict}{more}"]
     lines += [f"  {name}: {value}" for name, value in report.picture.items()]

@@ -127,7 +127,10 @@ def send(
         emit_json(_told(sensor, reply), output)
     else:
         said, rows = replied(sensor, reply)
-        shown = f"\n{table(['field', 'value', 'meaning'], rows, output)}" if rows else ""
+        if rows:
+            shown = f"\n{table(['field', 'value', 'meaning'], rows, output)}"
+        else:
+            shown = ""
         emit(f"{sensor.id} {reply.command}: {said}{shown}", output)
 
 
@@ -190,7 +193,10 @@ def _write(
     device.write(data)
     note(f"sent {len(data)} byte{'s' * (len(data) != 1)}: {data.hex(' ')}")
     heard = answer.after(before, ANSWERED if timeout is None else timeout)
-    found = list(pieces(sensor, heard, datagrams=sensor.datagrams)) if heard else []
+    if heard:
+        found = list(pieces(sensor, heard, datagrams=sensor.datagrams))
+    else:
+        found = []
     rest = [piece for piece in found if piece.frame not in sensor.data_frames]
     if len(rest) < len(
         found

@@ -94,7 +94,9 @@ def _items(
         for name in names(ctx, incomplete)
         if name.startswith(incomplete) and name != incomplete
     ]
-    return found if found or names in LISTED else [CompletionItem(incomplete, type="file")]
+    if found or names in LISTED:
+        return found
+    return [CompletionItem(incomplete, type="file")]
 
 
 def _sensors(ctx: click.Context, incomplete: str) -> Iterable[str]:
@@ -129,17 +131,23 @@ def _sensor(ctx: click.Context) -> Sensor | None:
         return named_sensor(ctx.params["sensor_id"])
     source = ctx.params.get("source") or ""
     known = named(source)
-    return known.configured() if known else declared(source)
+    if known:
+        return known.configured()
+    return declared(source)
 
 
 def _frames(ctx: click.Context, incomplete: str) -> Iterable[str]:
     sensor = _sensor(ctx)
-    return sensor.frames if sensor else ()
+    if sensor:
+        return sensor.frames
+    return ()
 
 
 def _commands(ctx: click.Context, incomplete: str) -> Iterable[str]:
     sensor = _sensor(ctx)
-    return sensor.commands if sensor else ()
+    if sensor:
+        return sensor.commands
+    return ()
 
 
 def _assignments(ctx: click.Context, incomplete: str) -> Iterable[str]:
@@ -179,7 +187,9 @@ def _files(ctx: click.Context, incomplete: str) -> Iterable[str]:
 
 def _verbs(ctx: click.Context, incomplete: str) -> Iterable[str]:
     root = ctx.find_root().command
-    return root.list_commands(ctx) if isinstance(root, click.Group) else ()
+    if isinstance(root, click.Group):
+        return root.list_commands(ctx)
+    return ()
 
 
 def _either(ctx: click.Context, incomplete: str) -> Iterable[str]:

@@ -197,7 +197,10 @@ def convert(
         return
     format_of(target)
     refuse_overwriting(targets(target), source, sensor_id, force=force)
-    sensor = _detect_sensor(source, target) if sensor_id is None else named_sensor(sensor_id)
+    if sensor_id is None:
+        sensor = _detect_sensor(source, target)
+    else:
+        sensor = named_sensor(sensor_id)
     with open_device(source, sensor) as device:
         if is_imu:
             summary = _write_imu(device, target, count)

@@ -111,7 +111,9 @@ def _following(error: Exception, command: str, verb: str) -> str:
     ):  # one of a file that was named
         return f"lidarspec check {shlex.quote(errors.shown_path(error.file))}"
     if "{sensor}" in command and not sensor:
-        return "lidarspec plugins" if isinstance(error, errors.SpecError) else "lidarspec sensors"
+        if isinstance(error, errors.SpecError):
+            return "lidarspec plugins"
+        return "lidarspec sensors"
     return command.format(sensor=shlex.quote(sensor) if sensor else "", verb=verb).replace(
         "  ", " "
     )

@@ -98,11 +98,15 @@ def _senders(port: int) -> list[str]:
 def _state(port: SerialPort) -> str:
     if not port.allowed:
         return "no permission: lidarspec doctor"
-    return f"in use by {', '.join(map(str, port.users))}" if port.users else "free"
+    if port.users:
+        return f"in use by {', '.join(map(str, port.users))}"
+    return "free"
 
 
 def _udp_state(users: tuple[User, ...] | None) -> str:
-    return "free" if users is None else f"in use by {', '.join(map(str, users)) or 'another user'}"
+    if users is None:
+        return "free"
+    return f"in use by {', '.join(map(str, users)) or 'another user'}"
 
 
 def _udp(port: int, users: tuple[User, ...] | None) -> dict[str, Any]:
@@ -161,7 +165,9 @@ def _frames(words: Sequence[str], period: int | None, offset: int) -> list[bytes
     if period is not None:
         return cut(whole, period, offset)
     each = [read([word]).data for word in words]
-    return each if min(map(len, each)) > 2 else [whole]
+    if min(map(len, each)) > 2:
+        return each
+    return [whole]
 
 
 def _of_file(path: str, period: int | None, offset: int) -> list[bytes]:
@@ -187,7 +193,10 @@ def _of_file(path: str, period: int | None, offset: int) -> list[bytes]:
             UsageError(f"{path}: where its frames begin cannot be seen"),
             f"lidarspec crc {quote(path)} --period BYTES --offset BYTES",
         )
-    length = f"{found.period} bytes" if found.period else f"{found.length} bytes"
+    if found.period:
+        length = f"{found.period} bytes"
+    else:
+        length = f"{found.length} bytes"
     note(f"{len(found.frames)} frames that begin with {found.sync.hex(' ')}, {length} long")
     return list(found.frames)
 
@@ -208,7 +217,10 @@ def checksum_told(match: Match) -> dict[str, Any]:
 
 
 def _text(match: Match, length: int) -> str:
-    order = f", {match.order}-endian" if match.place.size > 1 else ""
+    if match.place.size > 1:
+        order = f", {match.order}-endian"
+    else:
+        order = ""
     name = f" ({match.name})" if match.name else ""
     if match.doubt >= WEAK:
         chance = f"one wrong guess in {match.odds} would be"
@@ -223,7 +235,10 @@ def _text(match: Match, length: int) -> str:
         f"  over:  {match.span.told(match.place, length)}",
         *(f"  note:  {remark}" for remark in match.remarks),
     ]
-    paste = f"\n{indent(match.paste, '    ')}" if "\n" in match.paste else f" {match.paste}"
+    if "\n" in match.paste:
+        paste = f"\n{indent(match.paste, '    ')}"
+    else:
+        paste = f" {match.paste}"
     return "\n".join([*lines, f"  paste:{paste}"])
 
 
@@ -271,7 +286,10 @@ def detect(
                 tell=lambda text: progress(lambda: f"listening to {text}"),
             )
     fitting = [one for one in found if one.scores]
-    unknown = None if fitting or any(one.fault for one in found) else _unknown(found)
+    if fitting or any(one.fault for one in found):
+        unknown = None
+    else:
+        unknown = _unknown(found)
     if as_json:
         emit_json(
             {"sources": [_told(one) for one in found], "structure": _structure_told(unknown)},
@@ -294,7 +312,9 @@ def _code(source: str | None, found: Sequence[Verdict]) -> int:
     """
     is_live = source is None or live_address(source) is not None
     is_silent = is_live and not any(one.heard.size for one in found)
-    return DEVICE if is_silent else NO_DATA
+    if is_silent:
+        return DEVICE
+    return NO_DATA
 
 
 def _one(
@@ -322,7 +342,10 @@ def _everywhere(duration: float, *, start: bool) -> Iterator[Verdict]:
         try:
             return _one(source, duration, start=start)
         except (SourceError, UsageError) as error:
-            failure = error if isinstance(error, SourceError) else SourceError(str(error))
+            if isinstance(error, SourceError):
+                failure = error
+            else:
+                failure = SourceError(str(error))
             return [Verdict(Heard(source, failure=failure))]
 
     sources = [*serial, *(f"udp://:{port}" for port in udp)]
@@ -372,7 +395,9 @@ def _detected_text(found: Sequence[Verdict], output: str | None) -> str:
 
 def _place(heard: Heard) -> str:
     where = heard.source + (f" from {heard.sender}" if heard.sender else "")
-    return f"{where} at {heard.baud} baud" if heard.baud is not None else where
+    if heard.baud is not None:
+        return f"{where} at {heard.baud} baud"
+    return where
 
 
 def _conclusions(
@@ -423,8 +448,14 @@ def _conclusions(
         yield f"next: {install_commands(missing)}"
         return
     if size:
-        kind = " of text" if any(one.heard.is_text for one in found) else ""
-        structure_note = "" if unknown else "; nor can frames of one kind be seen in them"
+        if any(one.heard.is_text for one in found):
+            kind = " of text"
+        else:
+            kind = ""
+        if unknown:
+            structure_note = ""
+        else:
+            structure_note = "; nor can frames of one kind be seen in them"
         yield f"{size} bytes{kind}, and no frame of an installed sensor{structure_note}"
         yield f"next: {_following(source, unknown)}"
         return
@@ -453,11 +484,15 @@ def _missing(found: Sequence[Verdict]) -> list[KnownSensor]:
     if any(one.scores or one.fault for one in found):
         return []
     largest = max((one.heard for one in found), key=lambda heard: heard.size, default=None)
-    return recognize(largest) if largest is not None and largest.size else []
+    if largest is not None and largest.size:
+        return recognize(largest)
+    return []
 
 
 def _verb(one: Verdict) -> str:
-    return "read" if live_address(one.heard.source) is None else "view"
+    if live_address(one.heard.source) is None:
+        return "read"
+    return "view"
 
 
 def _following(source: str | None, unknown: Structure | None) -> str:
@@ -466,7 +501,10 @@ def _following(source: str | None, unknown: Structure | None) -> str:
         return f"lidarspec doctor {quote(source) if source else ''}".rstrip()
     if unknown is None or unknown.checksums:
         return "lidarspec sensors"
-    period = f" --period {unknown.period}" if unknown.period else ""
+    if unknown.period:
+        period = f" --period {unknown.period}"
+    else:
+        period = ""
     return f"lidarspec crc {quote(source)}{period}"
 
 
@@ -521,14 +559,20 @@ def _structure_told(found: Structure | None) -> dict[str, Any] | None:
 
 
 def _structure_text(found: Structure) -> str:
-    length = f"{found.period} bytes each" if found.period else f"of {found.length} bytes"
+    if found.period:
+        length = f"{found.period} bytes each"
+    else:
+        length = f"of {found.length} bytes"
     lines = [
         "unknown frames:",
         f"  sync      {found.sync.hex(' ') or 'not known'}",
         f"  length    {length}: {len(found.frames)} of them, {found.share:.0%} of the bytes",
     ]
     for match in found.checksums[:TOLD]:
-        told = match.paste if "\n" not in match.paste else match.algorithm.describe()
+        if "\n" not in match.paste:
+            told = match.paste
+        else:
+            told = match.algorithm.describe()
         lines.append(
             f"  checksum  {told} in {match.place}: right in {match.right} of {match.total}"
         )
@@ -562,10 +606,16 @@ def doctor(
     wrong interface. Without SOURCE all ports of this computer. Ends with 1 where something is
     wrong.
     """
-    sensor = None if sensor_id is None else named_sensor(sensor_id)
+    if sensor_id is None:
+        sensor = None
+    else:
+        sensor = named_sensor(sensor_id)
     if source is not None and not as_json:
         note(f"listening to {source}")
-    found = list(computer()) if source is None else list(examined(source, sensor, seconds=duration))
+    if source is None:
+        found = list(computer())
+    else:
+        found = list(examined(source, sensor, seconds=duration))
     if as_json:
         emit_json([vars(finding) for finding in found], output)
     else:

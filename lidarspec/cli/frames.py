@@ -182,7 +182,10 @@ def listing(
                 (value.path for value in part.fields.values() if value.covers(at - piece.offset)),
                 "",
             )
-        verdict = f": {part.verdict}" if verdicts and part.fault is not None else ""
+        if verdicts and part.fault is not None:
+            verdict = f": {part.verdict}"
+        else:
+            verdict = ""
         yield (title, Span(f"; byte {at} is in {place}" if place else ""), Span(verdict, "bad"))
         yield from part.lines(every=every)
 
@@ -290,7 +293,10 @@ class Selection:
             raise UsageError(f"{given.source} has {self._end} bytes: there is no byte {self._from}")
         if not self.valid and (self._ended or not self._bad):
             if self._fault is None and self._frame is not None:
-                others = f", and {self.others} of other types" if self.others else ""
+                if self.others:
+                    others = f", and {self.others} of other types"
+                else:
+                    others = ""
                 raise WireError(
                     f"{given.source} has no {self._frame} frame{others}", sensor=self._sensor.id
                 )

@@ -206,7 +206,12 @@ def refuse_overwriting(
         else:
             same = None
         if same is not None:
-            name = "standard input" if path == 0 else f"read as {path}" if path != same else "read"
+            if path == 0:
+                name = "standard input"
+            elif path != same:
+                name = f"read as {path}"
+            else:
+                name = "read"
             raise UsageError(f"{same} is {name}: it would be overwritten")
     if existing and not force:
         error = UsageError(f"{existing[0]} exists already; it is not overwritten unless asked for")
@@ -326,7 +331,10 @@ def nothing_came(device: Device, source: str, seconds: float | None = None) -> L
         return suggest(
             WireError(said, sensor=sensor.id), f"lidarspec explain {quote(source)} -s {sensor.id}"
         )
-    waited = "" if seconds is None else f" within {seconds:.1f} s".replace(".0 s", " s")
+    if seconds is None:
+        waited = ""
+    else:
+        waited = f" within {seconds:.1f} s".replace(".0 s", " s")
     if stats.bytes_in == 0:
         others = f", and others {stats.foreign} datagrams" * bool(stats.foreign)
         return suggest(
@@ -412,7 +420,10 @@ class Patience:
         self._device = device
         self._source = source
         self._began = time.monotonic()
-        self._awaited = device.sensor.data_frames if frame is None else (frame,)
+        if frame is None:
+            self._awaited = device.sensor.data_frames
+        else:
+            self._awaited = (frame,)
 
     def check(self) -> None:
         """Nothing, while there is hope.

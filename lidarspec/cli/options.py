@@ -107,7 +107,9 @@ def _value(sensor: Sensor, name: str, text: str) -> Any:
         value = tomllib.loads(f"value = {text}")["value"]
     except (ValueError, RecursionError):
         return text
-    return value if sensor.configure.takes(name, value) else text
+    if sensor.configure.takes(name, value):
+        return value
+    return text
 
 
 def count_option(what: str, **more: Any) -> Callable[[Function], Function]:
@@ -188,7 +190,10 @@ def _offset(text: str) -> int:
 
 
 def _speed(text: str) -> float:
-    speed = 0.0 if text == "max" else float(text.removesuffix("x"))
+    if text == "max":
+        speed = 0.0
+    else:
+        speed = float(text.removesuffix("x"))
     if text != "max" and not 0 < speed < math.inf:
         raise ValueError(text)
     return speed

@@ -142,7 +142,15 @@ def _bar(*, is_measured: bool) -> Bar:
     )
     rate = TextColumn("{task.fields[rate]}", markup=False)
     columns = (
-        (text, BarColumn(20), TaskProgressColumn(), rate, TimeRemainingColumn(compact=True))
+        (
+            (
+                text,
+                BarColumn(20),
+                TaskProgressColumn(),
+                rate,
+                TimeRemainingColumn(compact=True),
+            )
+        )
         if is_measured
         else (text,)
     )
@@ -155,8 +163,17 @@ def _bar(*, is_measured: bool) -> Bar:
 
 def size(number: float) -> str:
     """Bytes in words: "1.5 MB"."""
-    power = 0 if number < 1000 else 1 if number < 1e6 else 2 if number < 1e9 else 3
-    return f"{number:.0f} bytes" if not power else f"{number / 1000**power:.1f} {'?kMG'[power]}B"
+    if number < 1000:
+        power = 0
+    elif number < 1e6:
+        power = 1
+    elif number < 1e9:
+        power = 2
+    else:
+        power = 3
+    if not power:
+        return f"{number:.0f} bytes"
+    return f"{number / 1000**power:.1f} {'?kMG'[power]}B"
 
 
 def emit(content: str | bytes, output: str | None) -> None:
@@ -233,7 +250,8 @@ def table(headers: Sequence[str], rows: Sequence[Sequence[str]], output: str | N
     widths = _widths(lines, room)
     full = max(len(line[-1]) for line in lines)
     hangs = widths[-1] < min(full, PROSE) or sum(widths) + GAP * (len(widths) - 1) > room
-    widths = _widths([line[:-1] for line in lines], room) if hangs else widths
+    if hangs:
+        widths = _widths([line[:-1] for line in lines], room)
     return "\n".join(text.rstrip() for line in lines for text in _folded(line, widths, room))
 
 

@@ -85,7 +85,10 @@ def plot(
     at each range over time, and rates how many packets and scans a second, with what is lost or
     wrong among them. All but the SVG of a scan takes matplotlib: lidarspec[plot].
     """
-    suffix = ".svg" if output == "-" else Path(output).suffix.lower()
+    if output == "-":
+        suffix = ".svg"
+    else:
+        suffix = Path(output).suffix.lower()
     if suffix not in figures.SUFFIXES:
         raise UsageError(f"{output}: pictures are written as {', '.join(figures.SUFFIXES)}")
     refuse_overwriting(output, source, sensor_id)

@@ -135,7 +135,10 @@ def _points(scans: Iterable[Scan], *, every_point: bool) -> Iterator[tuple[Units
     """The points of each scan, when it is complete; of the pieces at the beginning and end too."""
     units: Units = UNITS
     for number, scan in enumerate(scans):
-        cloud = scan.points if every_point else scan.points[scan.points.valid]
+        if every_point:
+            cloud = scan.points
+        else:
+            cloud = scan.points[scan.points.valid]
         columns = dict(cloud.columns)
         units = {**units, **cloud.units}
         for values in zip(*columns.values(), strict=True):
@@ -174,20 +177,30 @@ def _packets(
 
 
 def _scalar(value: Any) -> Any:
-    return value if np.ndim(value) else float(value)
+    if np.ndim(value):
+        return value
+    return float(value)
 
 
 def _width(name: str) -> int:
-    return POINTS[name][0] if name in POINTS else 20 if name.endswith("_ns") else NARROWEST
+    if name in POINTS:
+        return POINTS[name][0]
+    if name.endswith("_ns"):
+        return 20
+    return NARROWEST
 
 
 def _text(name: str, value: Any) -> str:
     if isinstance(value, int | np.bool_):
         return str(int(value))
     if not math.isfinite(value):
-        return "-" if math.isnan(value) else "inf"
+        if math.isnan(value):
+            return "-"
+        return "inf"
     digits = SINGLE if isinstance(value, np.float32) else DIGITS
-    return f"{value:.{POINTS[name][1]}f}" if name in POINTS else f"{value:.{digits}g}"
+    if name in POINTS:
+        return f"{value:.{POINTS[name][1]}f}"
+    return f"{value:.{digits}g}"
 
 
 def _row(cells: Sequence[str], widths: Sequence[int]) -> str:
@@ -198,7 +211,10 @@ def _plain(value: Any) -> Any:
     """A value as JSON takes it: null for nan and infinity, whole numbers without a point."""
     if isinstance(value, np.ndarray):
         return [_plain(item) for item in value]
-    number = value.item() if isinstance(value, np.generic) else value
+    if isinstance(value, np.generic):
+        number = value.item()
+    else:
+        number = value
     single = isinstance(value, np.float32)
     if isinstance(number, float):
         if not math.isfinite(number):
@@ -262,7 +278,10 @@ class Lines:
                 {"kind": "summary", **self._figures(reading), "stats": self.device.stats.to_dict()}
             )
             return
-        lasted = f" in {reading.seconds:.1f} s" if reading.seconds else ""
+        if reading.seconds:
+            lasted = f" in {reading.seconds:.1f} s"
+        else:
+            lasted = ""
         say(
             f"\n{self.device.sensor.id}: {reading.packets} packets, {reading.scans} whole"
             f" scans{lasted}; {self.device.stats}"
@@ -401,7 +420,10 @@ def _by_the_packets(feed: Feed, lines: Lines, interval: float, lasting: float) -
         feed.pump(0.0)
         if not feed.packets:
             continue
-        times = feed.packets.host_ns if feed.packets.host_ns.any() else feed.packets.time_ns
+        if feed.packets.host_ns.any():
+            times = feed.packets.host_ns
+        else:
+            times = feed.packets.time_ns
         start = int(times[0]) if start is None else start
         passed = (int(times[-1]) - start) * 1e-9
         if passed >= (edges + 1) * interval:

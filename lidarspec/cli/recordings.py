@@ -88,15 +88,13 @@ def record(
         raise _slice_error(source, target, times)
     refuse_overwriting(target, source, sensor_id)
     known = named(source)
-    sensor = (
-        named_sensor(sensor_id)
-        if sensor_id
-        else declared(source)
-        if is_live(source)
-        else known.configured()
-        if known
-        else None
-    )
+    sensor: Sensor | None = None
+    if sensor_id:
+        sensor = named_sensor(sensor_id)
+    elif is_live(source):
+        sensor = declared(source)
+    elif known:
+        sensor = known.configured()
     task = SourceRecording(
         source,
         target,
@@ -318,7 +316,9 @@ def _find_sensor(source: Transport, sensor_id: str | Sensor | None) -> Sensor | 
     if sensor_id:
         return named_sensor(sensor_id)
     with contextlib.suppress(LidarSpecError):
-        return source.known_sensor() if isinstance(source, RecordingTransport) else None
+        if isinstance(source, RecordingTransport):
+            return source.known_sensor()
+        return None
     return None
 
 

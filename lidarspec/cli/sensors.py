@@ -164,7 +164,12 @@ def show(sensor_id: str, as_plan: bool, as_json: bool, output: str | None) -> No
             [row.offset, row.size, row.type, row.field, row.unit, row.meaning]
             for row in wire_table(frame)
         ]
-        kind = " (to the sensor)" if frame.direction == "out" else " (points)" if frame.data else ""
+        if frame.direction == "out":
+            kind = " (to the sensor)"
+        elif frame.data:
+            kind = " (points)"
+        else:
+            kind = ""
         headers = ["offset", "size", "type", "field", "unit", "meaning"]
         parts.append(f"\n{name}{kind}: {frame_size(frame)} bytes\n{table(headers, rows, output)}")
     emit("\n".join(parts), output)
@@ -175,8 +180,13 @@ def _unit(sensor: Sensor, path: str) -> str:
     from lidarspec.frames.schema import schema
 
     frame, _, field = path.partition(".")
-    unit = schema(sensor.frames[frame].tree).named[field].unit if frame in sensor.frames else ""
-    return f", {unit}" if unit else ""
+    if frame in sensor.frames:
+        unit = schema(sensor.frames[frame].tree).named[field].unit
+    else:
+        unit = ""
+    if unit:
+        return f", {unit}"
+    return ""
 
 
 def _plan(sensor: Sensor, frame: str) -> list[str]:
@@ -203,7 +213,9 @@ def _plan(sensor: Sensor, frame: str) -> list[str]:
         return ["plain evaluation: an example has no points"]
     largest = max(packets.table.groups, key=lambda group: group.layout.size)
     found = plan_for(sensor.points_of(packets.frame), packets.batch(), largest)
-    return describe(found) if isinstance(found, Plan) else [f"plain evaluation: {found}"]
+    if isinstance(found, Plan):
+        return describe(found)
+    return [f"plain evaluation: {found}"]
 
 
 @click.command()
@@ -234,7 +246,10 @@ def plugins(ctx: click.Context, as_json: bool, output: str | None) -> None:
 
 def _told(plugin: Plugin) -> str:
     """The sensors of a plugin, and what is wrong with it."""
-    error = f"not loaded: {plugin.error}" if plugin.error and not plugin.sensors else plugin.error
+    if plugin.error and not plugin.sensors:
+        error = f"not loaded: {plugin.error}"
+    else:
+        error = plugin.error
     return "; ".join(part for part in (", ".join(plugin.sensors), error, plugin.remark) if part)
 
 
@@ -282,7 +297,10 @@ def _frame(frame: Frame) -> dict[str, Any]:
 def _command(sensor: Sensor, name: str) -> Mapping[str, Any]:
     command = sensor.commands[name]
     args = {name: argument.to_dict() for name, argument in command.arguments.items()}
-    frame = "" if command.frame is None or args else sensor.command(name).hex(" ")
+    if command.frame is None or args:
+        frame = ""
+    else:
+        frame = sensor.command(name).hex(" ")
     return {
         "frame": command.frame,
         "arguments": args,

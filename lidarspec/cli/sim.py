@@ -171,7 +171,10 @@ def sim(
             serve(device, opened, seconds=duration, on_pass=_watching(device, opened, progress))
     finally:
         opened.close()
-        lost = f"; nobody was there for {size(opened.unsent_bytes)}" if opened.unsent_bytes else ""
+        if opened.unsent_bytes:
+            lost = f"; nobody was there for {size(opened.unsent_bytes)}"
+        else:
+            lost = ""
         note(f"{_sent(device)}{lost}")
 
 
@@ -266,7 +269,10 @@ def _summary(result: Demonstration, whole: list[Scan], errors: float) -> list[st
     stats = result.stats
     name = result.sensor.id
     frames = sum(stats.frames.values())
-    harm = "of the datagrams lost" if result.sensor.datagrams else "of the bytes damaged"
+    if result.sensor.datagrams:
+        harm = "of the datagrams lost"
+    else:
+        harm = "of the bytes damaged"
     lacks_pty = data_link(result.sensor, Serial) and not has_terminals()
     if lacks_pty:
         where = f"{result.place}, since this system has no pseudo-terminals"
@@ -282,12 +288,18 @@ def _summary(result: Demonstration, whole: list[Scan], errors: float) -> list[st
         ),
     ]
     facts = _facts(result, whole)
-    rate = f" at {facts['rate_hz']:.1f} Hz" if facts["rate_hz"] else ""
+    if facts["rate_hz"]:
+        rate = f" at {facts['rate_hz']:.1f} Hz"
+    else:
+        rate = ""
     told.append(
         f"{len(whole)} whole scan{'s' * (len(whole) != 1)}{rate}, {facts['points']} points; the"
         f" last one: {whole[-1]}"
     )
-    same = "the same points" if result.digest == result.again else "OTHER points"
+    if result.digest == result.again:
+        same = "the same points"
+    else:
+        same = "OTHER points"
     told.append(
         f"recorded ({size(result.recorded)}) and read again: {same}, SHA-256 {result.again[:16]}..."
     )

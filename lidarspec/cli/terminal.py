@@ -109,7 +109,9 @@ def silence() -> None:
 
 
 def _coloured(part: str) -> str:
-    return part if _COLOURS.fullmatch(part) else printable(part)
+    if _COLOURS.fullmatch(part):
+        return part
+    return printable(part)
 
 
 @contextlib.contextmanager

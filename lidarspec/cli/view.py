@@ -122,7 +122,10 @@ def view(
             say(_printed(device, source, ramp, duration or PATIENCE, selection), colour=True)
             conclude(device)
         return
-    switch = RecordingSwitch(source, Path.cwd()) if is_live(source) else None
+    if is_live(source):
+        switch = RecordingSwitch(source, Path.cwd())
+    else:
+        switch = None
     with open_device(
         source, sensor_id, record=switch.attached if switch else None, period=LOOK_S
     ) as device:

@@ -167,7 +167,11 @@ def _udp_numbers(address: Address, sensor: Sensor | None) -> list[int]:
     if given:
         return [int(part) for part in given.split(",") if part.isdecimal()]
     link = data_link(sensor, Udp)
-    return [port] if port else list(link.ports) if link else udp_ports()
+    if port:
+        return [port]
+    if link:
+        return list(link.ports)
+    return udp_ports()
 
 
 def _port_in_use(number: int) -> Iterator[Finding]:
@@ -276,13 +280,19 @@ def _verdict(source: str, found: Verdict, sensor: Sensor | None) -> Finding:
     if found.fault:
         return Finding(False, found.fault, f"lidarspec crc {quoted}")
     if not found.scores:
-        at = " at any baud rate" if heard.baud is not None and len(bauds()) > 1 else ""
+        if heard.baud is not None and len(bauds()) > 1:
+            at = " at any baud rate"
+        else:
+            at = ""
         return Finding(
             False,
             f"{heard.size} bytes came, and no frame of an installed sensor{at}",
             f"lidarspec detect {quoted}",
         )
-    at = f" at {heard.baud} baud" if heard.baud is not None else ""
+    if heard.baud is not None:
+        at = f" at {heard.baud} baud"
+    else:
+        at = ""
     if sensor is not None and sensor.id not in ids:
         return Finding(
             False,

@@ -99,7 +99,10 @@ def told_apart(candidates: Sequence[Sensor], found: Mapping[str, Sequence[Found]
         )
     timed = _spoken_for(left, _by_clock, found)
     named_among = [sensor for sensor in left if sensor.id in timed] or left
-    spoken_for = timed if len(timed) == 1 else _spoken_for(named_among, _by_name, found) or timed
+    if len(timed) == 1:
+        spoken_for = timed
+    else:
+        spoken_for = _spoken_for(named_among, _by_name, found) or timed
     if spoken_for:
         return Told(spoken_for, {})
     reasons = {name: why for seen in shown.values() for name, why in seen.items()}
@@ -133,7 +136,9 @@ def contradiction(sensor: Sensor, found: Sequence[Found]) -> str:
         for name in names
         for part in re.split(r",| and ", name)
     )
-    return "" if fits or not names else f"{sensor.info['model']} says {names[0]}"
+    if fits or not names:
+        return ""
+    return f"{sensor.info['model']} says {names[0]}"
 
 
 def _shown(sensor: Sensor, found: Sequence[Found]) -> dict[str, str]:
@@ -143,7 +148,10 @@ def _shown(sensor: Sensor, found: Sequence[Found]) -> dict[str, str]:
         for name, relative in sensor.relatives.items()
         if isinstance(relative, Relative)
     }
-    data = [item.data for item in found if item.frame == sensor.data_frame] if single else []
+    if single:
+        data = [item.data for item in found if item.frame == sensor.data_frame]
+    else:
+        data = []
     if not data:
         return {}
     packets = sensor.decode(data)
@@ -168,7 +176,9 @@ def _spoken_for(
     if len(left) == 1 and not left[0].relatives:
         return {}
     reasons = {sensor.id: reason for sensor in left if (reason := why(sensor, found[sensor.id]))}
-    return reasons if len(left) == 1 or len(reasons) < len(left) else {}
+    if len(left) == 1 or len(reasons) < len(left):
+        return reasons
+    return {}
 
 
 def _by_clock(sensor: Sensor, found: Sequence[Found]) -> str:
@@ -224,7 +234,9 @@ def _pace(sensor_id: str, sensor: Sensor) -> float | None:
     except LidarSpecError:
         return None
     steps = steps[steps >= 0]
-    return float(steps.mean()) if len(steps) and steps.mean() > 0 else None
+    if len(steps) and steps.mean() > 0:
+        return float(steps.mean())
+    return None
 
 
 def _declared_pace(pace: Callable[[Any], Any], packets: Packets) -> float:
@@ -353,7 +365,9 @@ class Verdict:
     @property
     def sensor(self) -> Sensor | None:
         """The sensor, None where none fits or several do."""
-        return self.alike[0].sensor if len(self.alike) == 1 and not self.others else None
+        if len(self.alike) == 1 and not self.others:
+            return self.alike[0].sensor
+        return None
 
     @property
     def is_clear(self) -> bool:
@@ -612,7 +626,10 @@ def declared(source: str | Path) -> Sensor | None:
         SourceError: for a file that cannot be opened.
     """
     device = named(source)
-    configured = device.configured() if device is not None else None
+    if device is not None:
+        configured = device.configured()
+    else:
+        configured = None
     if configured is not None:
         return configured
     if str(source) == "-":

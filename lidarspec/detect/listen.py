@@ -169,7 +169,10 @@ def heard_as(source: str | Path, sensor: Sensor, seconds: float) -> list[Heard]:
         end = time.monotonic() + seconds
         while (left := end - time.monotonic()) > 0 and isinstance(opened, LiveTransport):
             chunks += opened.read(min(left, LOOK))
-    baud = None if address is not None and has_no_baud(address.place) else opened.baud
+    if address is not None and has_no_baud(address.place):
+        baud = None
+    else:
+        baud = opened.baud
     if chunks:
         return list(_by_sender(Heard(str(source), (), opened.datagrams, baud), chunks))
     return []
@@ -216,7 +219,10 @@ def probe(source: str | Path) -> Iterator[Heard]:
             if asked in tried or address.options.get("baud", str(baud)) != str(baud):
                 continue
             tried.add(asked)
-            given = str(source) if "baud" in address.options else with_option(source, "baud", baud)
+            if "baud" in address.options:
+                given = str(source)
+            else:
+                given = with_option(source, "baud", baud)
             with contextlib.closing(live(given, sensor)) as opened:
                 chunks = _Probe(sensor, opened).run()
             yield Heard(str(source), tuple(chunks), baud=None if plain else baud)

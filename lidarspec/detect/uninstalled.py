@@ -79,7 +79,10 @@ def _matching_share(row: KnownSensor, heard: Heard) -> float:
     is_datagram = any(link.kind == "udp" for link in row.links.values())
     if is_datagram != heard.datagrams:
         return 0.0
-    share = _share_of_datagrams if heard.datagrams else _share_of_stream
+    if heard.datagrams:
+        share = _share_of_datagrams
+    else:
+        share = _share_of_stream
     return max((share(signature, heard) for signature in row.signatures), default=0.0)
 
 
@@ -91,7 +94,10 @@ def _pattern(sync: str) -> bytes:
 
 def _share_of_datagrams(signature: Signature, heard: Heard) -> float:
     begins = re.compile(_pattern(signature.sync), re.DOTALL)
-    sizes = {signature.size} if signature.size else {len(datagram) for datagram in heard.chunks}
+    if signature.size:
+        sizes = {signature.size}
+    else:
+        sizes = {len(datagram) for datagram in heard.chunks}
     count = sum(
         begins.match(datagram) is not None for datagram in heard.chunks if len(datagram) in sizes
     )
@@ -107,7 +113,9 @@ def _share_of_stream(signature: Signature, heard: Heard) -> float:
     if not signature.size:
         constant_bytes = sum(byte != ".." for byte in signature.sync.split())
         needed = max(MIN_SYNC_COUNT, MIN_SYNC_COUNT_BY_CHANCE * len(data) / 256**constant_bytes)
-        return MIN_MATCHING_SHARE if len(offsets) >= needed else 0.0
+        if len(offsets) >= needed:
+            return MIN_MATCHING_SHARE
+        return 0.0
     starts = set(offsets)
     followed = sum(offset + signature.size in starts for offset in offsets)
     count = followed + 1 if offsets else 0
@@ -121,7 +129,10 @@ def describe(found: Sequence[KnownSensor]) -> str:
     """Return the sentence that names the sensors and their distributions."""
     ids = [row.id for row in found[:MAX_LISTED]]
     more = len(found) - len(ids)
-    listed = f"{', '.join(ids)} and {more} more" if more else " or ".join(ids)
+    if more:
+        listed = f"{', '.join(ids)} and {more} more"
+    else:
+        listed = " or ".join(ids)
     distributions = _distributions(found)
     verb = "are" if len(distributions) > 1 else "is"
     return f"this looks like data of {listed}; {' and '.join(distributions)} {verb} not installed"

@@ -108,7 +108,10 @@ class AsyncDevice:
 
     async def latest(self, timeout: float | None = None) -> Scan:
         """Wait for the newest whole scan; see `Device.latest`."""
-        deadline = None if timeout is None else time.monotonic() + timeout
+        if timeout is None:
+            deadline = None
+        else:
+            deadline = time.monotonic() + timeout
         while self._newest is None:
             await _run(self._reading, partial(self._find_newest, deadline))
         newest = self._newest

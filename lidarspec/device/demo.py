@@ -80,7 +80,10 @@ def demonstrate(
         PluginError: where a function of the plugin raises.
     """
     longest = sensor.frames[sensor.data_frame].max_length
-    faults = Faults(loss=errors) if sensor.datagrams else Faults(errors=min(errors, 1 / longest))
+    if sensor.datagrams:
+        faults = Faults(loss=errors)
+    else:
+        faults = Faults(errors=min(errors, 1 / longest))
     simulated = SimulatedDevice(sensor, seed=seed, faults=faults)
     with tempfile.TemporaryDirectory(prefix="lidarspec-demo-") as folder:
         path = Path(folder) / "demo.lsr"
@@ -122,7 +125,10 @@ def _live(
             Served(simulated, simulated_outlet(sensor, at)) as served,
         ):
             return at, *_read(device, served, turns)
-    to = "pty" if has_terminals() and data_link(sensor, Serial) else f"tcp://{LOCALHOST}:0"
+    if has_terminals() and data_link(sensor, Serial):
+        to = "pty"
+    else:
+        to = f"tcp://{LOCALHOST}:0"
     with (
         Served(simulated, simulated_outlet(sensor, to), patient=True) as served,
         open_device(served.path, sensor, start=False, record=path) as device,

@@ -277,9 +277,15 @@ class Device(Closing):
             SourceTimeout: if none comes in time.
             SourceError: if the input has ended or the device was closed.
         """
-        deadline = None if timeout is None else time.monotonic() + timeout
+        if timeout is None:
+            deadline = None
+        else:
+            deadline = time.monotonic() + timeout
         while True:
-            wait = _LONG_WAIT_S if deadline is None else max(deadline - time.monotonic(), 0.0)
+            if deadline is None:
+                wait = _LONG_WAIT_S
+            else:
+                wait = max(deadline - time.monotonic(), 0.0)
             scan = self.newest(wait)
             if scan is not None:
                 return scan

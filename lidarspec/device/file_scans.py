@@ -115,7 +115,9 @@ class FileScans(Closing):
     def _next(self) -> Iterator[Scan] | None:
         """The scans that the next bytes complete; None at the end."""
         arrival = self._input.next(0)
-        return None if arrival is None else self._scans(arrival)
+        if arrival is None:
+            return None
+        return self._scans(arrival)
 
     def _scans(self, arrival: Any) -> Iterator[Scan]:
         yield from self._reader.find_scans(self._stream, arrival)
@@ -128,8 +130,13 @@ class FileScans(Closing):
     @property
     def _place(self) -> int:
         """How much of the file has been read, about."""
-        reader = self._transport.reader if isinstance(self._transport, CaptureTransport) else None
-        return self._input.decoder.stats.bytes_in if reader is None else reader.place
+        if isinstance(self._transport, CaptureTransport):
+            reader = self._transport.reader
+        else:
+            reader = None
+        if reader is None:
+            return self._input.decoder.stats.bytes_in
+        return reader.place
 
     def _bookmark(self) -> bytes | None:
         """Return the state that is required to go on from here.
@@ -139,7 +146,10 @@ class FileScans(Closing):
         opened = self._transport
         if not isinstance(opened, FileTransport) or not opened.can_go_on:
             return None
-        reader = opened.reader if isinstance(opened, CaptureTransport) else None
+        if isinstance(opened, CaptureTransport):
+            reader = opened.reader
+        else:
+            reader = None
         state = (self._input.decoder, self._input.senders, reader, self._reader, self._stream)
         content = io.BytesIO()
         try:
@@ -233,7 +243,9 @@ class _Writer(pickle.Pickler):
                 raise pickle.PicklingError("parts of frames")
             state = {name: _of_these(*of) for name, of in obj.state.items()}
             return object.__new__, (Packets,), {**vars(obj), "state": state, "_index": obj.index}
-        return (struct.Struct, (obj.format,)) if isinstance(obj, struct.Struct) else NotImplemented
+        if isinstance(obj, struct.Struct):
+            return (struct.Struct, (obj.format,))
+        return NotImplemented
 
 
 class _Loader(pickle.Unpickler):

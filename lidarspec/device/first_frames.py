@@ -48,7 +48,10 @@ def find_first_frames(sensor: Spec, batches: Iterable[list[Frames]]) -> FirstFra
     first = FirstFrames()
     missing = set(sensor.state)
     clock = sensor.clock
-    teller = clock.told[0] if clock is not None and clock.told is not None else ""
+    if clock is not None and clock.told is not None:
+        teller = clock.told[0]
+    else:
+        teller = ""
     has_teller = False
     seen_bytes = 0
     for batch in batches:

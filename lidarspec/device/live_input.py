@@ -90,7 +90,10 @@ class Watch:
 
     def heard(self, *, ours: bool) -> None:
         """Take note that something came: of the sensor, or of strangers alone."""
-        self._strangers_since = None if ours else self._strangers_since or time.monotonic()
+        if ours:
+            self._strangers_since = None
+        else:
+            self._strangers_since = self._strangers_since or time.monotonic()
 
     def saw(self, found: Sequence[Frames]) -> None:
         """Take note of what was decoded."""
@@ -133,12 +136,17 @@ class Watch:
             and self._unframed > longest
         ):
             return "no frames"
-        return "streaming" if self._decoder.stats.frames else "waiting"
+        if self._decoder.stats.frames:
+            return "streaming"
+        return "waiting"
 
     @property
     def warnings(self) -> list[str]:
         """What is wrong, with the next command."""
-        baud = f": {self._transport.baud} baud is likely wrong" if self._transport.baud else ""
+        if self._transport.baud:
+            baud = f": {self._transport.baud} baud is likely wrong"
+        else:
+            baud = ""
         text = {
             "disconnected": f"{self._source}: the device is gone; waiting for it to come back",
             "silent": (
@@ -150,7 +158,9 @@ class Watch:
                 f" them{baud}"
             ),
         }.get(self.state)
-        return [f"{text}; next: {self.following()}"] if text else []
+        if text:
+            return [f"{text}; next: {self.following()}"]
+        return []
 
     def following(self) -> str:
         """The command that finds out more."""
@@ -265,7 +275,9 @@ class LiveInput(Input):
     @property
     def state(self) -> str:
         """What `Watch` says, or "closed"."""
-        return "closed" if self._closed else self._watch.state
+        if self._closed:
+            return "closed"
+        return self._watch.state
 
     @property
     def warnings(self) -> list[str]:
@@ -283,7 +295,9 @@ class LiveInput(Input):
             f"{self._source}: {error}; it is started again"
             for error in list(self._session.unanswered.values())
         ]
-        return said if self._closed else said + silent + self._watch.warnings
+        if self._closed:
+            return said
+        return said + silent + self._watch.warnings
 
     @property
     def stats(self) -> Counters:
@@ -400,7 +414,10 @@ class LiveInput(Input):
             is_explained = isinstance(error, ReplyTimeout) or isinstance(
                 self.sensor.links[link], Http
             )
-            remarks = self._captures[link].transport.warnings if is_explained else []
+            if is_explained:
+                remarks = self._captures[link].transport.warnings
+            else:
+                remarks = []
             raise type(error)("; ".join([str(error), *remarks])) from None
 
     def _find_own_address(self, name: str) -> None:
@@ -499,7 +516,10 @@ class LiveInput(Input):
         """
         with self._talk:
             deadline = self._session.deadline
-        left = wait if deadline is None else (deadline - self._clock.now()) / 1e9
+        if deadline is None:
+            left = wait
+        else:
+            left = (deadline - self._clock.now()) / 1e9
         wait = wait if left < -TURN else min(wait, max(left, 0.0))
         events = self.queue.take(wait, until=self._due, chunks=TOGETHER)
         if events:
@@ -535,7 +555,10 @@ class LiveInput(Input):
                 self._failure = run
             else:
                 self._failure = SourceError(f"{self._source}: nothing is read any more: {run}")
-            self._failure.__cause__ = None if run is self._failure else run
+            if run is self._failure:
+                self._failure.__cause__ = None
+            else:
+                self._failure.__cause__ = run
 
     def _decode(self, link: str, chunks: list[Chunk]) -> None:
         decoder = self._decoders[link]

@@ -47,7 +47,10 @@ class PacketReader:
         self._first = first
         self._frame = frame
         self._undecided: deque[Frames] = deque(maxlen=_MAX_UNDECIDED_BATCHES)
-        self._stream = None if frame is None else self._make_stream(frame)
+        if frame is None:
+            self._stream = None
+        else:
+            self._stream = self._make_stream(frame)
         self._imu = self._make_imu_stream()
         self.last: Packets | None = None
         self.imu_samples = joined([])
@@ -55,13 +58,18 @@ class PacketReader:
     @property
     def waiting_imu(self) -> Waiting | None:
         """The IMU samples that wait for the end of their scan, if scans have any."""
-        return self._imu.waiting if self._imu is not None else None
+        if self._imu is not None:
+            return self._imu.waiting
+        return None
 
     def add(self, arrival: Arrival) -> Packets | None:
         """Return the packets among the frames of an arrival; None while their type is unknown."""
         if arrival.replaced:
             self._undecided.clear()
-            self._stream = None if self._frame is None else self._make_stream(self._frame)
+            if self._frame is None:
+                self._stream = None
+            else:
+                self._stream = self._make_stream(self._frame)
         self._undecided += arrival.found
         frames = list(self._undecided)
         if self._stream is None:

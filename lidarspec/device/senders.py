@@ -60,7 +60,9 @@ class Senders:
         known = self._now.setdefault(name, sender)
         before = self._before.setdefault(name, {})
         if sender == known or sender in before:
-            return None if sender == known else known
+            if sender == known:
+                return None
+            return known
         if len(before) == SENDERS:
             del before[next(iter(before))]
         before[known], self._now[name] = None, sender
@@ -165,7 +167,10 @@ class Kept(Senders):
         for name, sender in sent:
             if sender not in self._strangers:
                 self._take_turns(name, sender)
-                self._owner = sender if self._sensor.frames[name].data else self._owner
+                if self._sensor.frames[name].data:
+                    self._owner = sender
+                else:
+                    self._owner = self._owner
         if len(self._strangers) == known or len(sent) < len(found):
             return found
         mine = [sender not in self._strangers for _, sender in sent]
@@ -202,7 +207,9 @@ class Kept(Senders):
         if self._owner is None:
             self._first = self._first or (None if self._datagrams else sender)
             return self._first in (None, sender)
-        return self._is_near(sender, self._owner) if self._datagrams else sender == self._owner
+        if self._datagrams:
+            return self._is_near(sender, self._owner)
+        return sender == self._owner
 
     def _is_near(self, sender: Sender, owner: Sender) -> bool:
         """Whether a sender may be the sensor at another port."""

@@ -114,7 +114,9 @@ class Pending:
     @property
     def failure(self) -> CommandError | None:
         """Why there is no reply; None where there is one, or it is not known yet."""
-        return self._outcome if isinstance(self._outcome, CommandError) else None
+        if isinstance(self._outcome, CommandError):
+            return self._outcome
+        return None
 
     def result(self) -> Reply:
         """The reply.
@@ -181,7 +183,10 @@ def found_at(values: Any, path: str) -> Any:
     """
     for name in steps(path):
         if isinstance(name, int):
-            values = values[name] if isinstance(values, list) and name < len(values) else _MISSING
+            if isinstance(values, list) and name < len(values):
+                values = values[name]
+            else:
+                values = _MISSING
         elif isinstance(values, list):
             values = [found_at(element, name) for element in values]
         elif isinstance(values, Mapping) and name in values:
@@ -194,7 +199,9 @@ def found_at(values: Any, path: str) -> Any:
 def _physical(info: FieldInfo, value: Any) -> Any:
     if isinstance(value, list):
         return [_physical(info, element) for element in value]
-    return info.physical(value) if isinstance(value, int | float) else value
+    if isinstance(value, int | float):
+        return info.physical(value)
+    return value
 
 
 @dataclass(eq=False)
@@ -218,7 +225,9 @@ class _Request:
     def next_sending(self) -> int | None:
         """When it is sent once more, None where it is not."""
         again = self.sent[-1] + _ns(self.command.timeout)
-        return again if len(self.sent) <= self.command.retries and again < self.gives_up else None
+        if len(self.sent) <= self.command.retries and again < self.gives_up:
+            return again
+        return None
 
     @property
     def patience(self) -> int:
@@ -319,11 +328,20 @@ class Session:
         data = self.sensor.command(name, **arguments, **filled)
         command = self.sensor.commands[name]
         tables = {reply: self._table(reply) for reply in command.replies}
-        sent = self.sensor.parse(data, command.frame) if command.echoes else None
+        if command.echoes:
+            sent = self.sensor.parse(data, command.frame)
+        else:
+            sent = None
         values = {**command.matches, **{path: found_at(sent, path) for path in command.echoes}}
-        wait = _ns(command.timeout) * (1 + command.retries) if timeout is None else _ns(timeout)
+        if timeout is None:
+            wait = _ns(command.timeout) * (1 + command.retries)
+        else:
+            wait = _ns(timeout)
         pending = Pending(f"{self.sensor.id} {name}")
-        expected = Expected(tables, values, command.refusal) if tables else None
+        if tables:
+            expected = Expected(tables, values, command.refusal)
+        else:
+            expected = None
         self._lines.setdefault(command.link, _Line()).queue.append(
             _Request(name, command, data, expected, wait, pending)
         )
@@ -420,7 +438,9 @@ class Session:
                 request.pending.settle(CommandError(f"{self.sensor.id} {request.name}: {reason}"))
 
     def _filled(self, name: str) -> Mapping[str, Filled]:
-        return self.sensor.commands[name].filled if name in self.sensor.commands else {}
+        if name in self.sensor.commands:
+            return self.sensor.commands[name].filled
+        return {}
 
     def _next(self, value: Filled) -> Any:
         """Return a value that is known only when a command is sent.
@@ -575,12 +595,18 @@ def _silence(sensor: Sensor, request: _Request) -> CommandError:
     place = f"{sensor.id} {request.name}"
     if request.wrong:
         return CommandError(f"{place}: the device answered with {request.wrong}")
-    often = f", sent {len(request.sent)} times" if len(request.sent) > 1 else ""
+    if len(request.sent) > 1:
+        often = f", sent {len(request.sent)} times"
+    else:
+        often = ""
     if request.command.only_stopped:
         stop = next((name for name, command in sensor.commands.items() if command.stops), "stop")
     else:
         stop = ""
-    hint = f"; it is answered only while the sensor is stopped: send {stop!r} first" if stop else ""
+    if stop:
+        hint = f"; it is answered only while the sensor is stopped: send {stop!r} first"
+    else:
+        hint = ""
     waited = f"{request.timeout / SECOND:g} s{often}"
     return ReplyTimeout(
         f"{place}: no {' or '.join(request.command.replies)} frame came within {waited}{hint}"

@@ -110,7 +110,9 @@ class Named:
             f"{self.file}: [device.{self.name}]: {reason}: that takes a folder that you have"
             " allowed"
         )
-        return self._asking(error) if reason else None
+        if reason:
+            return self._asking(error)
+        return None
 
     def _asking(self, error: UsageError) -> UsageError:
         """The error, with the command that allows the folder of the file."""
@@ -235,7 +237,10 @@ def _device(path: Path, name: str, table: Mapping[str, Any]) -> Named:
         if key in table and not isinstance(table[key], kind):
             raise UsageError(f"{path}: {place}: {key} is {told}, not {shown(table[key])}")
     options = {key: _beside(path, value) for key, value in table.get("options", {}).items()}
-    mount = _mount(path, place, table["mount"]) if "mount" in table else None
+    if "mount" in table:
+        mount = _mount(path, place, table["mount"])
+    else:
+        mount = None
     sensor = table.get("sensor")
     if options and sensor is None:
         raise UsageError(f"{path}: {place}: options are a sensor's: name the sensor as well")
@@ -259,7 +264,10 @@ def _mount(path: Path, place: str, given: Mapping[str, Any]) -> Mount:
         else:
             right = isinstance(value, int | float) and not isinstance(value, bool)
         if not right or value in (float("inf"), float("-inf")) or value != value:
-            wanted = "true or false" if kinds[key] is bool else "a number"
+            if kinds[key] is bool:
+                wanted = "true or false"
+            else:
+                wanted = "a number"
             raise UsageError(f"{path}: {place}: mount.{key} is {wanted}, not {shown(value)}")
     return Mount(**given)
 

@@ -76,7 +76,10 @@ class TimedLog:
 
     def __init__(self, recorder: Appender, seconds: float | None) -> None:
         self._recorder = recorder
-        self._limit_ns = math.inf if seconds is None else seconds * 1e9
+        if seconds is None:
+            self._limit_ns = math.inf
+        else:
+            self._limit_ns = seconds * 1e9
         self.first: int | None = None
         self.last: int | None = None
         self.is_over = False
@@ -89,7 +92,9 @@ class TimedLog:
     @property
     def seconds(self) -> float | None:
         """The time from the first arrival in the file to the last; None if there is none."""
-        return None if self.first is None or self.last is None else (self.last - self.first) / 1e9
+        if self.first is None or self.last is None:
+            return None
+        return (self.last - self.first) / 1e9
 
     def has(self, chunk: Chunk) -> bool:
         """Return whether a chunk that was received is in the file."""

@@ -196,7 +196,10 @@ def _fitting(
         there = few.fields(place, order)
         found: list[Checksum]
         if isinstance(algorithm, Fold15):
-            found = [algorithm] if enough(int((there == computed).sum()), len(few)) else []
+            if enough(int((there == computed).sum()), len(few)):
+                found = [algorithm]
+            else:
+                found = []
         elif isinstance(algorithm, Xor | WordXor):
             found = [_changed(algorithm, constant) for constant in _constant(there ^ computed)]
         elif few.alone:
@@ -216,7 +219,10 @@ def _fitting(
             fitted = int(constant not in (0, int(mask)))
             right = samples.right(one, place, span, order)
             doubtful = doubt(one.width, there, fitted, tried)
-            proven = enough(right, len(samples)) if not fitted else right >= CERTAIN * len(samples)
+            if not fitted:
+                proven = enough(right, len(samples))
+            else:
+                proven = right >= CERTAIN * len(samples)
             if proven and doubtful > 0 and not (few.alone and fitted):
                 remarks: tuple[str, ...] = (
                     ("a constant is in it: fields left out of what it covers, or a start value",)
@@ -244,14 +250,18 @@ def _fitting(
 
 
 def _changed(algorithm: Checksum, constant: int) -> Checksum:
-    return Changed(algorithm, constant) if constant else algorithm
+    if constant:
+        return Changed(algorithm, constant)
+    return algorithm
 
 
 def _constant(values: NDArray[np.uint64]) -> list[int]:
     """The value that nearly all of them have, if there is one."""
     distinct, counts = np.unique(values, return_counts=True)
     most = int(counts.argmax())
-    return [int(distinct[most])] if enough(int(counts[most]), len(values)) else []
+    if enough(int(counts[most]), len(values)):
+        return [int(distinct[most])]
+    return []
 
 
 def _nibbles(samples: Samples) -> Iterator[Match]:
@@ -290,7 +300,10 @@ _WIDE: tuple[Checksum, ...] = (
 
 def _class(algorithm: Checksum) -> str:
     """The source of a class for a checksum that the package has no name for."""
-    changed = algorithm if isinstance(algorithm, Changed) else Changed(algorithm, 0)
+    if isinstance(algorithm, Changed):
+        changed = algorithm
+    else:
+        changed = Changed(algorithm, 0)
     base = changed.of
     steps = []
     if isinstance(base, Xor | WordXor):

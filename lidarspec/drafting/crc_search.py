@@ -94,8 +94,12 @@ def divisors(polynomial: int, degree: int) -> list[int]:
             for small in range((1 << spare) | 1, 2 << spare, 2)
             if remainder(polynomial, small) == 0
         )
-        return sorted(found) if spare else [polynomial]
-    return _tried(polynomial, degree) if degree <= 16 else []
+        if spare:
+            return sorted(found)
+        return [polynomial]
+    if degree <= 16:
+        return _tried(polynomial, degree)
+    return []
 
 
 def _tried(polynomial: int, degree: int) -> list[int]:
@@ -150,7 +154,9 @@ class _Reading:
         return int.from_bytes(data.translate(MIRROR) if self.refin else data, "big") << self.width
 
     def register(self, value: int) -> int:
-        return reflected(value, self.width) if self.refout else value
+        if self.refout:
+            return reflected(value, self.width)
+        return value
 
     def started(self, init: int, size: int) -> int:
         """What a start value adds to the message of `size` bytes."""
@@ -184,7 +190,10 @@ def crc_matches(
         quick: end after a fixed amount of work; the usual places come first.
         stands: whether a CRC may stand at a place.
     """
-    mirrors = [(False, True), (True, False)] if mixed else [(False, False), (True, True)]
+    if mixed:
+        mirrors = [(False, True), (True, False)]
+    else:
+        mirrors = [(False, False), (True, True)]
     picks = [samples.alike(TAKEN, pick) for pick in range(PICKS if len(samples) > 2 * TAKEN else 1)]
     by_width = [
         [place for place in filter(stands, samples.places(width // 8)) if _random(samples, place)]

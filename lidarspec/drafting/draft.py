@@ -135,11 +135,9 @@ class Draft:
     @property
     def tail(self) -> int:
         """Bytes of a checksum that stands at the end of frames of several lengths."""
-        return (
-            -self.seal.place.offset
-            if self.size is None and self.seal is not None and self.seal.place.offset < 0
-            else 0
-        )
+        if self.size is None and self.seal is not None and self.seal.place.offset < 0:
+            return -self.seal.place.offset
+        return 0
 
     @property
     def head(self) -> int:
@@ -172,11 +170,10 @@ def draft(chunks: Sequence[bytes], *, datagrams: bool) -> Draft:
         )
     parts = chunks if datagrams else [b"".join(chunks)]
     size = sum(map(len, chunks))
-    start = (
-        0
-        if datagrams or found.period is None or size % found.period == 0
-        else max(parts[0].find(found.sync), 0)
-    )
+    if datagrams or found.period is None or size % found.period == 0:
+        start = 0
+    else:
+        start = max(parts[0].find(found.sync), 0)
     first = Draft(datagrams, b"", found.period, found.length, (), size)
     first = (
         _begun(first, parts, start)
@@ -207,9 +204,14 @@ def _begun(first: Draft, parts: Sequence[bytes], start: int) -> Draft | None:
     rows = np.frombuffer(b"".join(frames), np.uint8).reshape(len(frames), -1)
     usual = usual_bytes(rows[:, :SYNC])
     steady = (rows[:, : len(usual)] == usual).mean(axis=0) >= (STEADY if len(rows) >= FEW else 1)
-    length = int(np.argmin(steady)) if not steady.all() else len(steady)
+    if not steady.all():
+        length = int(np.argmin(steady))
+    else:
+        length = len(steady)
     sync = usual[: length if len(rows) >= MANY else min(length, SHORT_SYNC)].tobytes()
-    return replace(first, sync=sync) if any(sync) else None
+    if any(sync):
+        return replace(first, sync=sync)
+    return None
 
 
 def _walk(known: Draft, parts: Sequence[bytes]) -> Iterator[tuple[int, bytes]]:
@@ -233,11 +235,10 @@ def _fits(known: Draft, part: bytes, at: int) -> int:
     """The length of the frame that begins here, 0 where none does."""
     size = known.size
     if size is None and known.length is not None:
-        size = (
-            known.length.of(part[at : at + known.length.end])
-            if at + known.length.end <= len(part)
-            else 0
-        )
+        if at + known.length.end <= len(part):
+            size = known.length.of(part[at : at + known.length.end])
+        else:
+            size = 0
     if (
         not size
         or at + size > len(part)
@@ -245,7 +246,9 @@ def _fits(known: Draft, part: bytes, at: int) -> int:
         or size < known.head + known.tail
     ):
         return 0
-    return size if known.seal is None or _sealed(known.seal, part[at : at + size]) else 0
+    if known.seal is None or _sealed(known.seal, part[at : at + size]):
+        return size
+    return 0
 
 
 def _sealed(seal: Match, frame: bytes) -> bool:
@@ -352,15 +355,17 @@ def _detailed(known: Draft) -> Draft:
         return known
     rows = known.rows
     found = known.candidates
-    blocks = (_blocks(rows) or _rows_of(found, rows.shape[1])) if known.size is not None else None
+    if known.size is not None:
+        blocks = _blocks(rows) or _rows_of(found, rows.shape[1])
+    else:
+        blocks = None
     if blocks is not None:
         inside = rows[:, blocks.start : blocks.end].reshape(-1, blocks.size)
         within = tuple(one for one in candidates(inside) if one.offset >= len(blocks.flag))
-        blocks = (
-            replace(blocks, candidates=within)
-            if blocks.flag or any(one.offset == 0 for one in within)
-            else None
-        )
+        if blocks.flag or any(one.offset == 0 for one in within):
+            blocks = replace(blocks, candidates=within)
+        else:
+            blocks = None
     if blocks is not None:
         found = tuple(one for one in found if one.end <= blocks.start or one.offset >= blocks.end)
     shortest = min(len(frame) for _, frame in known.frames)
@@ -454,11 +459,15 @@ def drafted(draft: Draft, *, origin: str, link: str) -> dict[str, str]:
     angles = _angles(draft)
     lines = [line for field in fields for line in field.lines(" " * (8 if seal else 4))]
     body = "\n".join(lines)
-    struct = (
-        f"Checksummed(\n    Struct(\n{body}\n    ),\n{seal[0]})" if seal else f"Struct(\n{body}\n)"
-    )
+    if seal:
+        struct = f"Checksummed(\n    Struct(\n{body}\n    ),\n{seal[0]})"
+    else:
+        struct = f"Struct(\n{body}\n)"
     below = [f"f.{path} < 360" for path in angles if "." not in path]
-    plausible = below[0] if len(below) == 1 else " & ".join(f"({one})" for one in below)
+    if len(below) == 1:
+        plausible = below[0]
+    else:
+        plausible = " & ".join(f"({one})" for one in below)
     check = (
         'def plausible(f: Fields) -> Any:\n    """Angles below 360 degrees."""\n'
         f"    return {plausible}\n\n\n"
@@ -556,7 +565,10 @@ def _header(draft: Draft) -> Iterator[Field]:
     """The sync bytes, in pieces where the checksum's span begins among them; those of blocks that
     begin with them are theirs.
     """
-    end = len(draft.sync) if draft.blocks is None else min(len(draft.sync), draft.blocks.start)
+    if draft.blocks is None:
+        end = len(draft.sync)
+    else:
+        end = min(len(draft.sync), draft.blocks.start)
     edges = [0, *(cut for cut in _span_cuts(draft) if 0 < cut < end), end]
     for a, b in itertools.pairwise(edges):
         if b > a:
@@ -661,7 +673,10 @@ def _varying(draft: Draft) -> Iterator[Field]:
             f'Array(this.{name}, Struct("unknown_0" / Bytes({draft.length.unit})))',
         )
     else:
-        number = f"this.{name}" if draft.length.unit == 1 else f"{draft.length.unit} * this.{name}"
+        if draft.length.unit == 1:
+            number = f"this.{name}"
+        else:
+            number = f"{draft.length.unit} * this.{name}"
         lengths = {len(frame) for _, frame in draft.frames}
         step = int(np.gcd.reduce([length - min(lengths) for length in lengths]))
         why = (
@@ -681,15 +696,16 @@ def _varying(draft: Draft) -> Iterator[Field]:
 
 
 def _counter_name(draft: Draft) -> str:
-    return "count" if draft.length is not None and draft.length.unit > 1 else "length"
+    if draft.length is not None and draft.length.unit > 1:
+        return "count"
+    return "length"
 
 
 def _check(draft: Draft, seal: Match, start: int) -> Field:
-    chance = (
-        "which may be chance: hold more frames against it"
-        if seal.doubt < WEAK
-        else f"a wrong one would be so once in {seal.odds}"
-    )
+    if seal.doubt < WEAK:
+        chance = "which may be chance: hold more frames against it"
+    else:
+        chance = f"a wrong one would be so once in {seal.odds}"
     why = (
         f"right in {seal.right} of {seal.total} frames, {chance}",
         *(one for one in seal.remarks if "constant" not in one),
@@ -713,7 +729,10 @@ def _seal_text(draft: Draft, fields: Sequence[Field]) -> tuple[str, str] | None:
     if draft.seal is None:
         return None
     own = draft.seal.paste.startswith("class ")
-    algorithm = "Check()" if own else draft.seal.paste.splitlines()[0]
+    if own:
+        algorithm = "Check()"
+    else:
+        algorithm = draft.seal.paste.splitlines()[0]
     over = ""
     shortest = min(len(frame) for _, frame in draft.frames)
     ranges = draft.seal.span.ranges(draft.seal.place, shortest)
@@ -743,17 +762,19 @@ def _span_cuts(draft: Draft) -> list[int]:
 
 def _angles(draft: Draft) -> list[str]:
     """The paths of the angles that wrap, those of blocks first."""
-    inside = (
-        [f"blocks.{one.name}" for one in draft.blocks.candidates if one.kind == "angle"]
-        if draft.blocks
-        else []
-    )
+    if draft.blocks:
+        inside = [f"blocks.{one.name}" for one in draft.blocks.candidates if one.kind == "angle"]
+    else:
+        inside = []
     return inside + [one.name for one in draft.candidates if one.kind == "angle"]
 
 
 def _strength(draft: Draft) -> int:
     """Bits of the constants and the checksum."""
-    flags = len(draft.blocks.flag) * draft.blocks.count if draft.blocks else 0
+    if draft.blocks:
+        flags = len(draft.blocks.flag) * draft.blocks.count
+    else:
+        flags = 0
     return 8 * (len(draft.sync) + flags + (draft.seal.place.size if draft.seal else 0))
 
 
@@ -765,7 +786,10 @@ def _arguments(angles: Sequence[str], counters: Sequence[Candidate]) -> Iterator
     )
     if counters:
         one = counters[0]
-        limits = f", first={one.first}, last={one.circle - 1}" if one.wraps else ""
+        if one.wraps:
+            limits = f", first={one.first}, last={one.circle - 1}"
+        else:
+            limits = ""
         yield (
             f'sequence=Sequence("{one.name}"{limits}),'
             f"  # a jump in it is a loss{_or([other.name for other in counters[1:]], '')}"
@@ -774,7 +798,9 @@ def _arguments(angles: Sequence[str], counters: Sequence[Candidate]) -> Iterator
 
 def _or(names: Sequence[str], begin: str = "  #") -> str:
     """The others that it could be, as the end of a comment."""
-    return f"{begin or ';'} or {', '.join(names[:OFFERED])}" if names else ""
+    if names:
+        return f"{begin or ';'} or {', '.join(names[:OFFERED])}"
+    return ""
 
 
 def _longest(draft: Draft) -> str:
@@ -807,11 +833,9 @@ def _imports(text: dict[str, str]) -> dict[str, str]:
 def _import(module: str, names: list[str]) -> str:
     """An import of these names, on one line where that holds them."""
     line = f"from {module} import {', '.join(names)}"
-    return (
-        line
-        if len(line) <= LINE
-        else f"from {module} import (\n" + "".join(f"    {name},\n" for name in names) + ")"
-    )
+    if len(line) <= LINE:
+        return line
+    return f"from {module} import (\n" + "".join(f"    {name},\n" for name in names) + ")"
 
 
 def _case(name: str) -> tuple[bool, str, int]:
@@ -825,7 +849,9 @@ def _case(name: str) -> tuple[bool, str, int]:
 
 
 def _integer(size: int, order: ByteOrder) -> str:
-    return f"Int{8 * size}u{order[0]}" if size > 1 else "Int8ul"
+    if size > 1:
+        return f"Int{8 * size}u{order[0]}"
+    return "Int8ul"
 
 
 def _bytes(data: bytes) -> str:
@@ -878,7 +904,9 @@ class Names:
     def constant(self) -> str:
         """The sensor's name in its module."""
         name = self.id.partition("-")[2].upper().replace("-", "_")
-        return name if name.isidentifier() and name not in TAKEN else f"SENSOR_{name}"
+        if name.isidentifier() and name not in TAKEN:
+            return name
+        return f"SENSOR_{name}"
 
     @property
     def module(self) -> str:
@@ -915,11 +943,10 @@ def captured(
         port: the UDP port that the datagrams were sent to, where that is known.
     """
     serial = "Serial(115_200)},  # the baud rate: a capture does not tell it"
-    udp = (
-        f"Udp({port})}},  # where the capture's datagrams went"
-        if port
-        else "Udp(2368)},  # the port: this capture does not tell it"
-    )
+    if port:
+        udp = f"Udp({port})}},  # where the capture's datagrams went"
+    else:
+        udp = "Udp(2368)},  # the port: this capture does not tell it"
     values = {
         **names.values(),
         **drafted(draft, origin=origin, link=serial if link == "serial" else udp),
@@ -993,9 +1020,10 @@ def joining(folder: Path, names: Names, texts: Mapping[str, str]) -> dict[str, s
         project, readme = (
             (folder / name).read_text(encoding="utf-8") for name in ("pyproject.toml", "README.md")
         )
-        vectors = (
-            (folder / listed).read_text(encoding="utf-8") if (folder / listed).exists() else "[]"
-        )
+        if (folder / listed).exists():
+            vectors = (folder / listed).read_text(encoding="utf-8")
+        else:
+            vectors = "[]"
     if f'name = "{names.distribution}"\n' not in project or _LISTED not in project:
         raise UsageError(
             f"{folder / 'pyproject.toml'} is not that of {names.distribution},"

@@ -117,7 +117,10 @@ class Candidate:
     def why(self, what: str = "frame") -> str:
         """The evidence in words; `what` it rises with."""
         low, usual, high = self.steps
-        by = f"{usual}" if low == high else f"{low} to {high}"
+        if low == high:
+            by = f"{usual}"
+        else:
+            by = f"{low} to {high}"
         text = f"rises by {by} from {what} to {what}, in {self.right} of {self.total}"
         if self.kind == "angle":
             return f"{text}, wraps at {self.circle}: {CIRCLES[self.circle][1]}?"
@@ -163,7 +166,10 @@ def _all(rows: NDArray[np.uint8]) -> Iterator[Candidate]:
     for size in (2, 4) if len(rows) >= FEW else (2,):
         for offset in _offsets(rows, size):
             for order in orders:
-                from_low = range(size) if order == "little" else range(size - 1, -1, -1)
+                if order == "little":
+                    from_low = range(size)
+                else:
+                    from_low = range(size - 1, -1, -1)
                 if all(varied[offset + spot] for spot in list(from_low)[: size // 2 + 1]):
                     yield from _counter(rows, offset, size, order)
                     yield from _rising(rows, offset, size, order)
@@ -216,8 +222,14 @@ def _rising(
     wraps = int(falls.sum())
     if wraps > (1 - MOST) * len(moved):
         return
-    circle = _circle(int(there.max()), int(np.median(usual - moved[falls])), usual) if wraps else 0
-    forward = np.where(falls, moved + circle, moved) if circle else moved
+    if wraps:
+        circle = _circle(int(there.max()), int(np.median(usual - moved[falls])), usual)
+    else:
+        circle = 0
+    if circle:
+        forward = np.where(falls, moved + circle, moved)
+    else:
+        forward = moved
     uneven = np.abs(np.diff(forward))
     within = (forward > 0) & (forward <= WIDE * usual)
     if (
@@ -281,7 +293,10 @@ class Length:
         return self.rest + self.unit * int.from_bytes(frame[self.place : self.end], self.order)
 
     def __str__(self) -> str:
-        kind = "byte" if self.size == 1 else f"{self.order}-endian word"
+        if self.size == 1:
+            kind = "byte"
+        else:
+            kind = f"{self.order}-endian word"
         return f"{self.rest} + {self.unit} x {kind} at {self.place}"
 
 
@@ -360,7 +375,9 @@ def _of_stream(data: NDArray[np.uint8]) -> Structure | None:
     if periodic is None or varying is None:
         return periodic or varying
     few = len(periodic.frames) < MANY <= len(varying.frames)
-    return varying if varying.share > periodic.share + CLOSE or few else periodic
+    if varying.share > periodic.share + CLOSE or few:
+        return varying
+    return periodic
 
 
 def _periodic(data: NDArray[np.uint8]) -> Structure | None:
@@ -382,7 +399,9 @@ def _periodic(data: NDArray[np.uint8]) -> Structure | None:
         key=lambda found: found.period or 0,
         default=None,
     )
-    return None if shortest is None else _divided(data, shortest)
+    if shortest is None:
+        return None
+    return _divided(data, shortest)
 
 
 def _divided(data: NDArray[np.uint8], whole: Structure) -> Structure:
@@ -492,7 +511,9 @@ def _by_length(data: NDArray[np.uint8]) -> Structure | None:
             or (found.share > best[0] - CLOSE and begins < best[1])
         ):
             best = (found.share, begins, found)
-    return best[2] if best is not None and best[0] > HALF else None
+    if best is not None and best[0] > HALF:
+        return best[2]
+    return None
 
 
 def _explained(data: NDArray[np.uint8], starts: NDArray[np.intp], sync: bytes) -> Structure | None:

@@ -45,12 +45,19 @@ class Place:
 
     def start(self, length: int) -> int:
         """The first byte in a frame of this length."""
-        return self.offset + length if self.offset < 0 else self.offset
+        if self.offset < 0:
+            return self.offset + length
+        return self.offset
 
     def __str__(self) -> str:
         if self.offset == -self.size:
-            return f"the last {self.size} bytes" if self.size > 1 else "the last byte"
-        where = f"{-self.offset} before the end" if self.offset < 0 else f"at byte {self.offset}"
+            if self.size > 1:
+                return f"the last {self.size} bytes"
+            return "the last byte"
+        if self.offset < 0:
+            where = f"{-self.offset} before the end"
+        else:
+            where = f"at byte {self.offset}"
         return f"{self.size} byte{'s' * (self.size > 1)} {where}"
 
 
@@ -170,7 +177,9 @@ class Samples:
     @property
     def shortest(self) -> int:
         """The length of the shortest frame."""
-        return len(self.frames[0]) if self.frames else 0
+        if self.frames:
+            return len(self.frames[0])
+        return 0
 
     def few(self, number: int) -> Samples:
         """So many frames, spread over all of them."""
@@ -236,7 +245,10 @@ class Samples:
         )
         for front in dict.fromkeys(by_front):
             from_end = len(self.groups) > 1 or front > last // 2
-            places = [Place(front - self.shortest, size)] if from_end else []
+            if from_end:
+                places = [Place(front - self.shortest, size)]
+            else:
+                places = []
             if not from_end or (len(self.groups) > 1 and front < NEAR):
                 places.append(Place(front, size))
             yield from (

@@ -93,7 +93,10 @@ def _octets(text: str, place: str) -> bytes:
 def _number(text: str, unit: str, place: str, wanted: str) -> tuple[Fraction, str]:
     """A number, turned into a unit where it has one of its own, and this one."""
     digits, given = split_unit(text)
-    per_unit = factor(given, unit) if given else Fraction(1)
+    if given:
+        per_unit = factor(given, unit)
+    else:
+        per_unit = Fraction(1)
     if per_unit is None:
         raise UsageError(
             f"{place} is in {unit or 'no unit'}, and {given!r} cannot be turned into that"
@@ -132,7 +135,10 @@ def _length(table: Schema, given: Mapping[str, Any], path: str, place: str) -> i
     except Exception:
         target: Any = given
         for name in path.removesuffix("[]").split("."):
-            target = target.get(name, {}) if isinstance(target, Mapping) else {}
+            if isinstance(target, Mapping):
+                target = target.get(name, {})
+            else:
+                target = {}
         if isinstance(target, list) and target:
             return 0
         raise UsageError(

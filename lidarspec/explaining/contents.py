@@ -201,8 +201,14 @@ def contents(path: str | Path) -> Contents:
         )
     with contextlib.closing(transport(path)) as opened:
         kind = KINDS.get(type(opened), "bytes as a sensor sent them")
-        file = str(path).partition("?")[0] if not os.path.exists(path) else str(path)
-        header = opened.header if isinstance(opened, RecordingTransport) else None
+        if not os.path.exists(path):
+            file = str(path).partition("?")[0]
+        else:
+            file = str(path)
+        if isinstance(opened, RecordingTransport):
+            header = opened.header
+        else:
+            header = None
         found = Contents(str(path), kind, _size(Path(file)), header)
         _count(found, opened)
         found.warnings += opened.warnings
@@ -241,7 +247,10 @@ def _count(found: Contents, opened: Transport) -> None:
             flow.bytes + len(chunk.data),
             left - len(chunk.data),
         )
-        found.first_ns = chunk.at if found.first_ns is None else found.first_ns
+        if found.first_ns is None:
+            found.first_ns = chunk.at
+        else:
+            found.first_ns = found.first_ns
         found.seen_ns = found.last_ns = chunk.at or found.last_ns
         if left <= 0 or number >= PACKETS:
             found.last_ns = _last(opened, chunks)
@@ -272,7 +281,10 @@ def _sent(found: Contents) -> list[Content]:
 
 
 def _content(path: str, one: Verdict) -> Content:
-    source = f"{path}?src={one.heard.sender}" if one.heard.sender and "?" not in path else path
+    if one.heard.sender and "?" not in path:
+        source = f"{path}?src={one.heard.sender}"
+    else:
+        source = path
     if not one.alike:
         return Content(source, tuple(names(one)))
     best = one.alike[0]
@@ -311,11 +323,17 @@ def shown(found: Contents) -> Sequence[tuple[str, str]]:
         rate = f", {found.packets / seconds:.1f}/s, {found.bytes / seconds / 1e3:.1f} kB/s"
     else:
         rate = ""
-    what = "packets" if any(flow.sender for flow in found.flows) else "pieces"
+    if any(flow.sender for flow in found.flows):
+        what = "packets"
+    else:
+        what = "pieces"
     lines.append(("holds", f"{found.packets} {what}, {found.bytes} bytes{rate}"))
     for flow in found.flows[:FLOWS]:
         if flow.sender is not None:
-            to = f" to {endpoint(flow.receiver)}" if flow.receiver is not None else ""
+            if flow.receiver is not None:
+                to = f" to {endpoint(flow.receiver)}"
+            else:
+                to = ""
             lines.append(
                 ("from", f"{endpoint(flow.sender)}{to}: {flow.packets} packets, {flow.bytes} bytes")
             )
@@ -354,7 +372,10 @@ def _told(content: Content) -> Iterator[tuple[str, str]]:
                     f" {reading.valid or 0:.0f} of them valid"
                 ),
             )
-        lost = "" if reading.loss_rate is None else f", lost {reading.loss_rate:.3%}"
+        if reading.loss_rate is None:
+            lost = ""
+        else:
+            lost = f", lost {reading.loss_rate:.3%}"
         rest = f", bytes in none of them {reading.skipped_rate:.3%}" * (content.share is None)
         yield "frames", f"wrong {reading.error_rate:.3%}{lost}{rest}"
     yield "next", content.command

@@ -90,8 +90,12 @@ def _most(engine: Codec, values: int) -> int:
     """The longest frame of which every candidate is tried, so many for a place."""
     is_compiled = isinstance(engine, CompiledCodec)
     if values > 8:
-        return SEARCHED if is_compiled and _deciding(engine.frame) <= HEADED else 0
-    return engine.frame.max_length if is_compiled else INTERPRETED
+        if is_compiled and _deciding(engine.frame) <= HEADED:
+            return SEARCHED
+        return 0
+    if is_compiled:
+        return engine.frame.max_length
+    return INTERPRETED
 
 
 @functools.cache
@@ -130,7 +134,10 @@ def _found(
         for spot, (mask, value) in engine.prefix.items():
             fits &= rows[:, spot] & mask == value
         which = np.flatnonzero(fits)
-        survey = engine.survey(rows.reshape(-1), which * size) if len(which) else None
+        if len(which):
+            survey = engine.survey(rows.reshape(-1), which * size)
+        else:
+            survey = None
         if survey is not None:
             right = which[(survey.status == VALID) & (survey.sizes == size)]
         else:

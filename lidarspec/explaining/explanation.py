@@ -80,7 +80,9 @@ class Explanation:
     @property
     def verdict(self) -> str:
         """What is wrong with the frame, in one sentence; "valid" where nothing is."""
-        return "valid" if self.fault is None else self.fault.reason
+        if self.fault is None:
+            return "valid"
+        return self.fault.reason
 
     @property
     def is_filler(self) -> bool:
@@ -137,7 +139,9 @@ class Explanation:
         return {**head, "rows": [row.to_dict() for row in self.rows]}
 
     def _bytes(self, value: Value | None) -> bytes:
-        return b"" if value is None else self.data[value.start : value.start + len(value.masks)]
+        if value is None:
+            return b""
+        return self.data[value.start : value.start + len(value.masks)]
 
 
 def explain(data: bytes, sensor: Sensor, frame: str | None = None) -> Explanation:
@@ -246,8 +250,14 @@ def _with_points(
             (spot for spot, part in enumerate(parts) if f"{row.path}.".startswith(f"{part}.")),
             None if parts else 0,
         )
-        path = row.path if not parts or spot is None else row.path[len(parts[spot]) + 1 :]
-        own = [] if spot is None else _numbers(path, chain, evaluated.axes, numbers[spot])
+        if not parts or spot is None:
+            path = row.path
+        else:
+            path = row.path[len(parts[spot]) + 1 :]
+        if spot is None:
+            own = []
+        else:
+            own = _numbers(path, chain, evaluated.axes, numbers[spot])
         within = tuple((spot or 0, number - int(first[spot or 0])) for number in own)
         given.append(replace(row, points=tuple(points[number] for number in own), numbers=within))
     return tuple(given), tuple(notes)
@@ -276,7 +286,9 @@ def _numbers(
     """
     indices = [int(part.partition("]")[0]) for part in path.split("[")[1:]]
     if not chain:
-        return [int(numbers)] if not path and numbers >= 0 else []
+        if not path and numbers >= 0:
+            return [int(numbers)]
+        return []
     if (
         len(indices) != len(chain)
         or not chain[-1].startswith(without_indices(path)[0])

@@ -117,7 +117,9 @@ class FrameRows:
         further = any(
             axis.startswith(f"{array}.") and not axis.startswith(in_blocks) for axis in self._axes
         )
-        return path if not bracket or further else head + bracket
+        if not bracket or further:
+            return path
+        return head + bracket
 
     def _row(self, path: str, group: Sequence[WireField]) -> Row:
         start = group[0].start

@@ -48,7 +48,10 @@ def folded(line: Line, width: int) -> Line:
             breaks = column + len(word) > width and column > indent
             part = f"\n{' ' * indent}{word.lstrip()}" if breaks else word
             spans.append(Span(part, span.role))
-            column = len(part) - 1 if breaks else column + len(part)
+            if breaks:
+                column = len(part) - 1
+            else:
+                column = column + len(part)
     return tuple(spans)
 
 
@@ -190,8 +193,14 @@ def _lines(difference: Difference) -> Iterator[Line]:
     new = difference.after
     assert old is not None
     assert new is not None
-    change = f" ({difference.change})" if difference.change else ""
-    moved = f" (in the second frame at {new.start:04x})" if new.start != old.start else ""
+    if difference.change:
+        change = f" ({difference.change})"
+    else:
+        change = ""
+    if new.start != old.start:
+        moved = f" (in the second frame at {new.start:04x})"
+    else:
+        moved = ""
     values = f"{_said(old)} -> {_said(new)}{change}{moved}"
     yield (Span(f"{old.start:04x}  ", "offset"), Span(f"{difference.path}  ", "name"), Span(values))
     masks = difference.masks
@@ -212,7 +221,10 @@ def _lines(difference: Difference) -> Iterator[Line]:
 
 def _missing(group: list[Difference], which: str) -> Line:
     paths = [difference.path for difference in group]
-    names = paths[0] if len(paths) == 1 else f"{paths[0]} to {paths[-1]}"
+    if len(paths) == 1:
+        names = paths[0]
+    else:
+        names = f"{paths[0]} to {paths[-1]}"
     return (Span(f"{'':6}{names}  ", "name"), Span(f"in the {which} frame alone"))
 
 

@@ -115,7 +115,10 @@ def _cut(sensor: Sensor, chunks: Iterable[Chunk], *, datagrams: bool) -> Iterato
     held = bytearray()
     start = 0
     for chunk in itertools.chain(chunks, [None]):
-        found = decoder.finish() if chunk is None or chunk.gap else []
+        if chunk is None or chunk.gap:
+            found = decoder.finish()
+        else:
+            found = []
         if chunk is not None:
             held += chunk.data
             found += decoder.feed(chunk.data)
@@ -231,7 +234,10 @@ def _end(sensor: Sensor, data: bytes, start: int, name: str, ends: list[int]) ->
     if not isinstance(layout, Layout):
         return following[0]
     whole = start + layout.size
-    cut_off = len(data) if len(data) < whole else min(following[0], whole)
+    if len(data) < whole:
+        cut_off = len(data)
+    else:
+        cut_off = min(following[0], whole)
     return next((end for end in (whole, whole - 1, whole + 1) if end in following), cut_off)
 
 

@@ -65,7 +65,10 @@ class Point(NamedTuple):
         )
         if math.isnan(self.x):
             return f"{direction} -> {'no return' if math.isinf(self.range) else 'not valid'}"
-        height = "" if level and fixed(self.z, 3) == "0.000" else f" z {fixed(self.z, 3)}"
+        if level and fixed(self.z, 3) == "0.000":
+            height = ""
+        else:
+            height = f" z {fixed(self.z, 3)}"
         return f"{direction} -> x {fixed(self.x, 3)} y {fixed(self.y, 3)}{height}"
 
 
@@ -117,16 +120,28 @@ class Value:
         if self.label:
             return f"{self.raw} {self.label}"
         plain = isinstance(self.raw, int) and self.digits == 0 and self.physical == float(self.raw)
-        text = str(self.raw) if plain else fixed(self.physical, self.digits)
-        turns = f" = {self.physical / DEGREES_PER_TURN:.1f} Hz" if self.unit == "deg/s" else ""
+        if plain:
+            text = str(self.raw)
+        else:
+            text = fixed(self.physical, self.digits)
+        if self.unit == "deg/s":
+            turns = f" = {self.physical / DEGREES_PER_TURN:.1f} Hz"
+        else:
+            turns = ""
         return f"{text} {self.unit}".strip() + turns
 
     def to_dict(self) -> dict[str, Any]:
         """The value for JSON: bytes and masks as hexadecimal text, no entry for what is not there,
         null for nan and infinity.
         """
-        raw = self.raw.hex(" ") if isinstance(self.raw, bytes | bytearray) else number(self.raw)
-        physical = {} if self.physical is None else {"value": number(self.physical)}
+        if isinstance(self.raw, bytes | bytearray):
+            raw = self.raw.hex(" ")
+        else:
+            raw = number(self.raw)
+        if self.physical is None:
+            physical = {}
+        else:
+            physical = {"value": number(self.physical)}
         place = {"start": self.start, "masks": self.masks.hex(" ")}
         more = {
             name: text
@@ -210,7 +225,10 @@ class Row:
             else:
                 name = value.path.removeprefix(f"{self.path}.")
             text = str(value)
-            where = f" ({value.bits})" if value.bits and self.first else ""
+            if value.bits and self.first:
+                where = f" ({value.bits})"
+            else:
+                where = ""
             says_enough = alone or units.count(value.unit) == 1
             words.append(
                 f"{text}{where}" if says_enough else f"{name} {text or value.raw.hex(' ')}{where}"
@@ -253,7 +271,11 @@ class Difference:
     @property
     def missing(self) -> str:
         """Which frame alone has the field, "first" or "second"; "" for both."""
-        return "second" if self.before is None else "first" if self.after is None else ""
+        if self.before is None:
+            return "second"
+        if self.after is None:
+            return "first"
+        return ""
 
     @property
     def masks(self) -> bytes:
@@ -310,13 +332,20 @@ def bit_picture(data: bytes, masks: bytes) -> str:
 
 def number(value: Any) -> Any:
     """A value as JSON takes it: null for nan and infinity."""
-    return None if isinstance(value, float) and not math.isfinite(value) else value
+    if isinstance(value, float) and not math.isfinite(value):
+        return None
+    return value
 
 
 def fixed(value: float, digits: int | None) -> str:
     """A number with so many decimals, or with seven figures, and no minus before a zero."""
-    text = f"{value:.7g}" if digits is None else f"{value:.{digits}f}"
-    return text if text.strip("-0.") else text.removeprefix("-")
+    if digits is None:
+        text = f"{value:.7g}"
+    else:
+        text = f"{value:.{digits}f}"
+    if text.strip("-0."):
+        return text
+    return text.removeprefix("-")
 
 
 def limits(low: float, high: float, between: str = "..") -> str:
@@ -328,13 +357,17 @@ def limits(low: float, high: float, between: str = "..") -> str:
 
 def asked(kind: Taken, between: str = "..") -> str:
     """What an argument of a command takes: a range of numbers, or the name of another kind."""
-    return limits(kind.low, kind.high, between) if isinstance(kind, Range) else kind.words(None)
+    if isinstance(kind, Range):
+        return limits(kind.low, kind.high, between)
+    return kind.words(None)
 
 
 def ascii_text(data: bytes | bytearray) -> str:
     """Printable ASCII, which zeros may follow, in quotes; nothing for other bytes."""
     text = bytes(data).rstrip(b"\0").decode("ascii", "replace")
-    return repr(text) if len(text) > 3 and text.isascii() and text.isprintable() else ""
+    if len(text) > 3 and text.isascii() and text.isprintable():
+        return repr(text)
+    return ""
 
 
 def hexdump(error: WireError) -> str:
@@ -363,7 +396,9 @@ def _marked(error: WireError) -> int:
     if isinstance(error.got, str):
         digits = error.got.removeprefix("0x").replace(" ", "")
         return min((len(digits) + 1) // 2, left) or 1
-    return left if error.got == len(error.data) else 1
+    if error.got == len(error.data):
+        return left
+    return 1
 
 
 def describe_losses(sensor: Spec) -> str:

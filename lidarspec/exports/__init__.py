@@ -60,7 +60,9 @@ def narrowed(sensor: Sensor, frame: str) -> Sensor:
 
 def beginning(sensor: Sensor) -> str:
     """What names begin with where they have to begin with a letter."""
-    return sensor.id if sensor.id[0].isalpha() else f"lidar-{sensor.id}"
+    if sensor.id[0].isalpha():
+        return sensor.id
+    return f"lidar-{sensor.id}"
 
 
 def export(sensor: Sensor, kind: str) -> str:

@@ -81,7 +81,10 @@ def checksum(algorithm: Checksum, name: str) -> str:
     Raises:
         Refused: for an algorithm that is a plugin's own Python code.
     """
-    inner = algorithm.algorithm if isinstance(algorithm, ZeroPadded) else algorithm
+    if isinstance(algorithm, ZeroPadded):
+        inner = algorithm.algorithm
+    else:
+        inner = algorithm
     body = _body(inner)
     pad = ""
     is_counting = isinstance(algorithm, ZeroPadded) or isinstance(inner, WordXor | Fold15)
@@ -141,7 +144,10 @@ def _word_xor(algorithm: WordXor) -> _Body:
         f"static const uint8_t halves[{len(halves)}] = {{{', '.join(map(str, halves))}}};\n"
         "uint64_t total = 0;"
     )
-    head = f"i < {algorithm.head} ? i % 2 : " if algorithm.head else ""
+    if algorithm.head:
+        head = f"i < {algorithm.head} ? i % 2 : "
+    else:
+        head = ""
     back = f"(i - {algorithm.head})" if algorithm.head else "i"
     return _Body(
         begin, f"total ^= (uint64_t)byte << 8 * ({head}halves[{back} % {len(halves)}]);", "total"
@@ -177,7 +183,9 @@ def _crc(crc: Crc) -> _Body:
 
 def _literal(value: int, size: int) -> str:
     digits = f"0x{value:0{size // 4}x}"
-    return f"UINT64_C({digits})" if size == 64 else f"{digits}u"
+    if size == 64:
+        return f"UINT64_C({digits})"
+    return f"{digits}u"
 
 
 _LENGTH = """\
@@ -375,7 +383,9 @@ def _number(value: Any) -> str:
     """A constant as C, unsigned where it is not negative."""
     if isinstance(value, float) or value < 0:
         return repr(value)
-    return f"UINT64_C({value})" if value > 0x7FFFFFFF else f"{value}u"
+    if value > 0x7FFFFFFF:
+        return f"UINT64_C({value})"
+    return f"{value}u"
 
 
 def _unless(entry: Entry, wrong: str) -> str:

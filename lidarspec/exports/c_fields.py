@@ -75,7 +75,9 @@ def comment(*texts: str) -> str:
         .replace("*/", "* /")
         .replace("/*", "/ *")
     )
-    return f"/* {text} */" if text else ""
+    if text:
+        return f"/* {text} */"
+    return ""
 
 
 def quoted(data: bytes) -> str:
@@ -128,12 +130,16 @@ class Entry:
     @property
     def info(self) -> tree.FieldInfo:
         """The field."""
-        return self.part.info if self.part is not None else tree.infos(self.node)[0]
+        if self.part is not None:
+            return self.part.info
+        return tree.infos(self.node)[0]
 
     @property
     def indices(self) -> tuple[int, ...]:
         """Where it stands in the arrays inside its bit block."""
-        return self.part.indices if self.part is not None else ()
+        if self.part is not None:
+            return self.part.indices
+        return ()
 
     @property
     def expression(self) -> str:
@@ -142,10 +148,15 @@ class Entry:
         if self.part is not None:
             return _bits(self.part, self.start)
         assert isinstance(node, tree.Number)
-        raw = f"p[{self.start}]" if node.size == 1 else word(self.start, node.size, node.order)
+        if node.size == 1:
+            raw = f"p[{self.start}]"
+        else:
+            raw = word(self.start, node.size, node.order)
         if node.kind == "float":
             return f"{FLOATS[node.size]}({raw})"
-        return f"lidarspec_signed({raw}, {8 * node.size})" if node.kind == "int" else raw
+        if node.kind == "int":
+            return f"lidarspec_signed({raw}, {8 * node.size})"
+        return raw
 
     @property
     def span(self) -> tuple[int, Extent]:
@@ -169,7 +180,9 @@ def given(node: tree.Node, depth: int) -> str:
     elements, it is that of the first.
     """
     is_own = any(ref.info.axes for ref in asked(node))
-    return arguments(depth) if is_own else ", ".join(["p", *["0"] * depth])
+    if is_own:
+        return arguments(depth)
+    return ", ".join(["p", *["0"] * depth])
 
 
 class CLayout:
@@ -222,7 +235,9 @@ class CLayout:
 
     def length(self, value: tree.Formula) -> str:
         """A number of elements or bytes as C."""
-        return str(value) if isinstance(value, int) else f"(size_t)({self.formula(value)})"
+        if isinstance(value, int):
+            return str(value)
+        return f"(size_t)({self.formula(value)})"
 
     def count(self, node: tree.Repeat, depth: int) -> int | str:
         """The number of elements of an array in so many others: a number, or C."""
@@ -285,7 +300,10 @@ class CLayout:
         """Note an entry and all in it."""
         node = entry.node
         if not isinstance(node, tree.Empty):
-            path = node.axis if isinstance(node, tree.Repeat) else entry.path
+            if isinstance(node, tree.Repeat):
+                path = node.axis
+            else:
+                path = entry.path
             self.entries.append(replace(entry, path=path, size=self.extent(entry)))
         if isinstance(node, tree.Repeat):
             step = self._element(entry, node).times(f"(int64_t){index(entry.depth)}")
@@ -384,8 +402,13 @@ def _bits(part: tree.Part, start: Extent) -> str:
         term = f"({wide})" + (f"({byte} & 0x{segment.mask:02x}u)" if segment.mask != 0xFF else byte)
         shift = segment.target - segment.low
         terms.append(f"{term} {'<<' if shift > 0 else '>>'} {abs(shift)}" if shift else term)
-    value = " | ".join(f"({term})" for term in terms) if len(terms) > 1 else terms[0]
-    return f"lidarspec_signed({value}, {part.bits.width})" if part.bits.signed else value
+    if len(terms) > 1:
+        value = " | ".join(f"({term})" for term in terms)
+    else:
+        value = terms[0]
+    if part.bits.signed:
+        return f"lidarspec_signed({value}, {part.bits.width})"
+    return value
 
 
 def accesses(layout: CLayout, path: str) -> list[Entry]:

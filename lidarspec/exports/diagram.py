@@ -74,7 +74,9 @@ def byte_order(message: Message) -> str:
         for node in tree.nodes(message.root)
         if isinstance(node, tree.Number) and node.size > 1
     }
-    return orders.pop() if len(orders) == 1 else ""
+    if len(orders) == 1:
+        return orders.pop()
+    return ""
 
 
 @dataclass
@@ -142,11 +144,10 @@ class _Cells:
         ] + f"{width}{f' {node.order[0]}e' * (self.mixed and is_long)}"
         detail = " ".join(filter(None, (short, unit_text(node.info))))
         if node.info.const is not None:
-            detail = (
-                f"{node.info.const:#0{2 * node.size + 2}x}"
-                if isinstance(node.info.const, int)
-                else str(node.info.const)
-            )
+            if isinstance(node.info.const, int):
+                detail = f"{node.info.const:#0{2 * node.size + 2}x}"
+            else:
+                detail = str(node.info.const)
         return self._cell(
             node.info,
             node.name,
@@ -189,8 +190,14 @@ class _Cells:
         """The box of some bits of a value, with their numbers where it has others, too."""
         width = high - low + 1
         name = (".".join(part.names) or node.name) + "".join(f"[{index}]" for index in part.indices)
-        numbers = f"{high}..{low}" if high > low else f"{low}"
-        detail = unit_text(part.info) if width == part.bits.width else numbers
+        if high > low:
+            numbers = f"{high}..{low}"
+        else:
+            numbers = f"{low}"
+        if width == part.bits.width:
+            detail = unit_text(part.info)
+        else:
+            detail = numbers
         return self._cell(part.info, name, width, detail, bit_text(part.bits), start)
 
     def _cell(
@@ -431,7 +438,10 @@ def _outlined(pieces: Sequence[Piece], cell: Cell) -> Iterator[str]:
         end = x + bits * BIT
         path += f"M{x:g} {y:g}v{ROW}M{end:g} {y:g}v{ROW}"
         before = pieces[index - 1] if index else None
-        after = pieces[index + 1] if index + 1 < len(pieces) else None
+        if index + 1 < len(pieces):
+            after = pieces[index + 1]
+        else:
+            after = None
         path += (
             f"M{max(x, _end(before)):g} {y:g}H{end:g}"
             if before is None or _end(before) < end
@@ -448,7 +458,9 @@ def _outlined(pieces: Sequence[Piece], cell: Cell) -> Iterator[str]:
 
 
 def _end(piece: Piece | None) -> float:
-    return 0 if piece is None else piece[0] + piece[2] * BIT
+    if piece is None:
+        return 0
+    return piece[0] + piece[2] * BIT
 
 
 def _below(one: Piece, other: Piece) -> bool:

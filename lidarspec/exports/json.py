@@ -81,7 +81,9 @@ def _plain(fact: Any) -> Any:
         return [_plain(value) for value in fact]
     if isinstance(fact, Count | Address):
         return {"kind": type(fact).__name__.lower(), **vars(fact)}
-    return fact.hex() if isinstance(fact, bytes | bytearray) else fact
+    if isinstance(fact, bytes | bytearray):
+        return fact.hex()
+    return fact
 
 
 def link_data(link: Link) -> dict[str, Any]:
@@ -100,7 +102,12 @@ def _clock(sensor: Sensor) -> dict[str, Any] | None:
     if sensor.clock is None:
         return None
     source = sensor.clock.source
-    fields = None if callable(source) else [source] if isinstance(source, str) else list(source)
+    if callable(source):
+        fields = None
+    elif isinstance(source, str):
+        fields = [source]
+    else:
+        fields = list(source)
     return {"fields": fields, "wraps_at": sensor.clock.wraps_at}
 
 
@@ -234,7 +241,10 @@ def formula_data(formula: tree.Formula | None) -> Any:
 
 
 def _info(info: tree.FieldInfo) -> dict[str, Any]:
-    const = info.const.hex() if isinstance(info.const, bytes | bytearray) else info.const
+    if isinstance(info.const, bytes | bytearray):
+        const = info.const.hex()
+    else:
+        const = info.const
     facts = {
         "path": info.path,
         "unit": info.unit,

@@ -72,14 +72,11 @@ def _entry(head: str, part: Any, indent: str) -> Iterator[str]:
 
 
 def _scalar(value: Any) -> str:
-    plain = isinstance(value, str) and _PLAIN.fullmatch(value) and value.lower() not in _WORDS
-    return (
-        value
-        if plain
-        else json.dumps(value, ensure_ascii=False)
-        if isinstance(value, str | bool)
-        else repr(value)
-    )
+    if isinstance(value, str) and _PLAIN.fullmatch(value) and value.lower() not in _WORDS:
+        return value
+    if isinstance(value, str | bool):
+        return json.dumps(value, ensure_ascii=False)
+    return repr(value)
 
 
 def identifier(name: str) -> str:
@@ -127,7 +124,9 @@ def truth(formula: tree.Formula, scope: Scope) -> str:
         case tree.Op(symbol, (left, right)) if symbol in tree.COMPARISONS:
             return f"{number(left, scope)} {symbol} {number(right, scope)}"
         case int():
-            return "true" if formula else "false"
+            if formula:
+                return "true"
+            return "false"
     return f"{number(formula, scope)} != 0"
 
 
@@ -219,13 +218,17 @@ def _any_of(info: tree.FieldInfo) -> Attribute:
 
 def _valid(part: tree.Part) -> Attribute:
     if part.info.const is None:
-        return _any_of(part.info) if part.bits.width > 1 else {}
+        if part.bits.width > 1:
+            return _any_of(part.info)
+        return {}
     return {"valid": bool(part.info.const) if part.bits.width == 1 else part.info.const}
 
 
 def _condition(more: Mapping[str, Any]) -> Attribute:
     """The condition under which an attribute is there, for the instances that are made from it."""
-    return {"if": more["if"]} if "if" in more else {}
+    if "if" in more:
+        return {"if": more["if"]}
+    return {}
 
 
 def _in_order(block: tree.Block) -> tuple[list[tree.Part], str] | None:
@@ -259,11 +262,10 @@ def _assembled(part: tree.Part, raw: str) -> str:
     """A part as an expression of the block's bytes."""
     terms = []
     for segment in part.bits.segments:
-        byte = (
-            f"{raw}[{segment.byte}]"
-            if segment.mask == 0xFF
-            else f"({raw}[{segment.byte}] & {segment.mask:#04x})"
-        )
+        if segment.mask == 0xFF:
+            byte = f"{raw}[{segment.byte}]"
+        else:
+            byte = f"({raw}[{segment.byte}] & {segment.mask:#04x})"
         shift = segment.target - segment.low
         terms.append(f"({byte} {'<<' if shift > 0 else '>>'} {abs(shift)})" if shift else byte)
     value = " | ".join(terms)
@@ -490,8 +492,14 @@ class _Types:
             raise Refused(
                 f"{node.info.path}: a float of {node.size} bytes, and Kaitai knows those of 4 and 8"
             )
-        order = {"little": "le", "big": "be"}[node.order] if node.size > 1 else ""
-        const = _any_of(node.info) if node.info.const is None else {"valid": node.info.const}
+        if node.size > 1:
+            order = {"little": "le", "big": "be"}[node.order]
+        else:
+            order = ""
+        if node.info.const is None:
+            const = _any_of(node.info)
+        else:
+            const = {"valid": node.info.const}
         return head | {"type": f"{letter}{node.size}{order}"} | const | self._doc(node.info)
 
     def _doc(self, info: tree.FieldInfo) -> Attribute:
@@ -500,9 +508,14 @@ class _Types:
             sealed = ""
         else:
             sealed = f"{seal.algorithm.describe()} over {_span(seal)}; not checked here"
-        unchecked = "a length, which is not checked here" if info.held else ""
+        if info.held:
+            unchecked = "a length, which is not checked here"
+        else:
+            unchecked = ""
         text = "; ".join(filter(None, (unit_text(info), meaning(info), unchecked, sealed)))
-        return {"doc": text} if text else {}
+        if text:
+            return {"doc": text}
+        return {}
 
     def _physical(
         self, kaitai: _Type, info: tree.FieldInfo, more: Mapping[str, Any], *, name: str = ""
@@ -518,7 +531,9 @@ class _Types:
 
 
 def _size(formula: tree.Formula, scope: Scope) -> int | str:
-    return formula if isinstance(formula, int) else number(formula, scope)
+    if isinstance(formula, int):
+        return formula
+    return number(formula, scope)
 
 
 def _value(node: tree.Node) -> tree.Node:
@@ -526,11 +541,15 @@ def _value(node: tree.Node) -> tree.Node:
     if isinstance(node, tree.Number):
         parent = node.info.path.rpartition(".")[0]
         return replace(node, info=replace(node.info, path=f"{parent}.value" if parent else "value"))
-    return node if isinstance(node, tree.Sealed) else replace(node, name="value")
+    if isinstance(node, tree.Sealed):
+        return node
+    return replace(node, name="value")
 
 
 def _span(seal: tree.Sealed) -> str:
     if seal.over is None:
         return "all other bytes"
     first, last = (path.rpartition(".")[2] for path in seal.over)
-    return first if first == last else f"{first} to {last}"
+    if first == last:
+        return first
+    return f"{first} to {last}"

@@ -87,7 +87,9 @@ def _link(link: Link) -> str:
         ] * bool(link.local)
         return ", ".join(["UDP", *ports, *asked, *["a byte stream in datagrams"] * link.stream])
     kind = type(link).__name__
-    return f"{kind.upper()}, port {link.port}" if isinstance(link, Tcp | Http) else kind
+    if isinstance(link, Tcp | Http):
+        return f"{kind.upper()}, port {link.port}"
+    return kind
 
 
 def _levels(lines: Mapping[str, bool | None]) -> list[str]:
@@ -113,7 +115,10 @@ def _clock(clock: Clock) -> str:
         fields = "calculated from the packet"
     else:
         fields = " + ".join(f"`{name}`" for name in names)
-    again = f", starts again at {clock.wraps_at:g} s" if clock.wraps_at else ""
+    if clock.wraps_at:
+        again = f", starts again at {clock.wraps_at:g} s"
+    else:
+        again = ""
     return fields + again + (f", completed by {clock.told[0]} frames" if clock.told else "")
 
 
@@ -253,7 +258,9 @@ def _rings(cloud: PointCloud) -> Sequence[tuple[str, str]]:
         if not len(angles) or not np.isfinite(angles).all() or np.ptp(angles) > 1e-3:
             return []
         rows.append((str(ring), f"{angles[0] + 0.0:.3f} deg"))
-    return rows if 1 < len(rows) <= RINGS else []
+    if 1 < len(rows) <= RINGS:
+        return rows
+    return []
 
 
 def _table(headers: Sequence[str], rows: Sequence[Sequence[str]]) -> Iterator[str]:

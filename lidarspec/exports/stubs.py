@@ -72,7 +72,9 @@ def pyi(sensor: Sensor) -> str:
 def camel(name: str) -> str:
     """A name as a class has it."""
     words = "".join(part[:1].upper() + part[1:] for part in re.split(r"\W+|_+", name) if part)
-    return words if words[:1].isalpha() else f"_{words}"
+    if words[:1].isalpha():
+        return words
+    return f"_{words}"
 
 
 _HEAD = '''"""{title}: the types of what `parse` returns and `build` and `command` take. Made by lidarspec export pyi {id}."""
@@ -120,7 +122,10 @@ class _Classes:
             infos = node
         else:
             kind = self._type(owner, name, node)
-            infos = [node.info] if isinstance(node, Number | Blob | Block) else []
+            if isinstance(node, Number | Blob | Block):
+                infos = [node.info]
+            else:
+                infos = []
         said = "; ".join(
             filter(None, (text(info) for info in infos[:1] for text in (unit_text, meaning)))
         )
@@ -135,11 +140,15 @@ class _Classes:
     def _type(self, owner: str, name: str, node: Node) -> str:
         match node:
             case Number():
-                return "float" if node.kind == "float" else "int"
+                if node.kind == "float":
+                    return "float"
+                return "int"
             case Blob():
                 return "bytes"
             case Block() if not node.parts[0].names:
-                return "int" if len(node.parts) == 1 else "list[int]"
+                if len(node.parts) == 1:
+                    return "int"
+                return "list[int]"
             case Struct() | Sealed() | Block():
                 return self.add(node, owner + camel(name), f"`{name}` of `{owner}`.")
             case Repeat():

@@ -61,7 +61,9 @@ _OPERATIONS = {
 
 def formula(value: tree.Formula) -> Code:
     """A formula as a number, or as a function of the values of fields."""
-    return Code(str(value)) if isinstance(value, int) else _function(value)
+    if isinstance(value, int):
+        return Code(str(value))
+    return _function(value)
 
 
 def _function(value: tree.Formula, missing: str = "") -> Code:
@@ -96,7 +98,9 @@ def lua(value: Any, indent: str = "") -> str:
 
 
 def _key(key: object) -> str:
-    return key if isinstance(key, str) and key.isidentifier() and key.isascii() else f"[{lua(key)}]"
+    if isinstance(key, str) and key.isidentifier() and key.isascii():
+        return key
+    return f"[{lua(key)}]"
 
 
 def quoted(text: str | bytes) -> str:
@@ -202,7 +206,10 @@ class _Writer:
 
     def _blob(self, node: tree.Blob) -> Table:
         name = node.name or "constant"
-        path = node.info.path if node.name else ".".join(filter(None, (node.info.path, name)))
+        if node.name:
+            path = node.info.path
+        else:
+            path = ".".join(filter(None, (node.info.path, name)))
         new = self._new("BYTES", path, name, node.info.docs, "NONE")
         table: Table = {
             "kind": "bytes",
@@ -285,7 +292,10 @@ class _Writer:
     def _repeat(self, node: tree.Repeat, path: str) -> Table:
         element = self.node(node.element, path)
         size = element.get("skip")
-        whole = size * node.count if isinstance(node.count, int) and size is not None else None
+        if isinstance(node.count, int) and size is not None:
+            whole = size * node.count
+        else:
+            whole = None
         few = isinstance(node.element, tree.Block) or (
             isinstance(node.element, tree.Struct) and len(_leaves(node.element)) <= SUMMED
         )
@@ -331,7 +341,12 @@ class _Writer:
         is_hex = (info.path in self.message.seals or info.const is not None) and kind.startswith(
             "UINT"
         )
-        shown = "HEX" if is_hex else "NONE" if kind in ("FLOAT", "DOUBLE") else "DEC"
+        if is_hex:
+            shown = "HEX"
+        elif kind in ("FLOAT", "DOUBLE"):
+            shown = "NONE"
+        else:
+            shown = "DEC"
         table: Table = {
             "field": self._new(kind, info.path, info.name, info.docs, shown, info.labels, mask)
         }
@@ -385,7 +400,9 @@ class _Writer:
         )
 
     def _keep(self, path: str) -> str | None:
-        return path if path in self.kept else None
+        if path in self.kept:
+            return path
+        return None
 
     def _skip(self, info: tree.FieldInfo, size: int) -> int | None:
         if info.path in self.kept or info.const is not None or info.allowed is not None:
@@ -474,7 +491,9 @@ def _word_order(block: tree.Block) -> str | None:
         for order in ("big", "little")
         if all(_run(part.bits, block.size, order) is not None for part in block.parts)
     )
-    return next(orders, None) if block.size <= 4 else None
+    if block.size <= 4:
+        return next(orders, None)
+    return None
 
 
 def _run(bits: BitField, size: int, order: str) -> int | None:
@@ -485,7 +504,9 @@ def _run(bits: BitField, size: int, order: str) -> int | None:
         (run, run.byte if order == "little" else size - 1 - run.byte) for run in bits.segments
     )
     starts = {8 * byte + run.low - run.target for run, byte in places}
-    return starts.pop() if len(starts) == 1 else None
+    if len(starts) == 1:
+        return starts.pop()
+    return None
 
 
 #: the link types that captures keep for private use, USER0 to USER15, by the numbers that

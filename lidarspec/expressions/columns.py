@@ -140,7 +140,9 @@ class Column(NDArrayOperatorsMixin):
         return self.array
 
     def __array__(self, dtype: Any = None, copy: bool | None = None) -> NDArray[Any]:
-        return self.array if dtype is None else self.array.astype(dtype)
+        if dtype is None:
+            return self.array
+        return self.array.astype(dtype)
 
     def __bool__(self) -> bool:
         raise SpecError(NO_TRUTH, rule="LS213")
@@ -248,7 +250,12 @@ class Column(NDArrayOperatorsMixin):
             for axis, count in schema.arrays.items()
             if isinstance(count, Ref) and count.path == self.source and not self.frame
         ]
-        axis = counted[0] if len(counted) == 1 else schema.chain[-1] if schema.chain else None
+        if len(counted) == 1:
+            axis = counted[0]
+        elif schema.chain:
+            axis = schema.chain[-1]
+        else:
+            axis = None
         if axis is None:
             return np.arange(most)
         return Along((axis,), np.arange(_reach(self.batch.table, axis, most)))
@@ -285,7 +292,10 @@ class Column(NDArrayOperatorsMixin):
         size = abs(step)
         slot = len(self.batch.left)
         carried = self.batch.carry.get(slot, np.empty(0))
-        values = np.concatenate([carried, row.values]) if len(carried) else row.values
+        if len(carried):
+            values = np.concatenate([carried, row.values])
+        else:
+            values = row.values
         edges = row.edges + len(carried)
         shifted = np.empty(len(values))
         ahead = max(step, 0)
@@ -332,7 +342,8 @@ class Column(NDArrayOperatorsMixin):
         indices = np.where(
             np.concatenate([np.ones(len(carried)), known.values]) > 0, np.arange(len(numbers)), -1
         )
-        indices = np.maximum.accumulate(indices) if len(indices) else indices
+        if len(indices):
+            indices = np.maximum.accumulate(indices)
         latest = np.where(indices >= 0, numbers[indices], np.nan)
         self.batch.left.append(lambda upto: latest[: len(carried) + row.starts[upto]][-1:])
         return Column(row.spread(latest[len(carried) :]), axes, self.batch, ready=ready)
@@ -606,7 +617,10 @@ def of_points(
     shape = together({"": np.empty((len(batch), *(1,) * len(axes)), np.bool_), **named}, axes)
     stray = next((name.strip("?") for name in axes if name is not None and "?" in name), None)
     if stray is not None or len(shape) > 1 + len(axes):
-        where = f"along {stray!r}" if stray is not None else "along a further axis"
+        if stray is not None:
+            where = f"along {stray!r}"
+        else:
+            where = "along a further axis"
         raise SpecError(
             f"points {where}, where no field of theirs is ({_lengths(named, axes)}); numbers go"
             " along an array with along(...)",
@@ -633,7 +647,9 @@ def _reaching(array: NDArray[Any], place: int, table: Table, axis: str) -> NDArr
     if missing > 0:
         gaps = [(0, missing * (place == other)) for other in range(array.ndim)]
         return np.pad(array.astype(np.float64), gaps, constant_values=np.nan)
-    return array.take(range(_reach(table, axis, length)), axis=place) if missing else array
+    if missing:
+        return array.take(range(_reach(table, axis, length)), axis=place)
+    return array
 
 
 def together(arrays: Mapping[str, NDArray[Any]], axes: tuple[str | None, ...]) -> tuple[int, ...]:
@@ -733,7 +749,10 @@ def field_array(info: FieldInfo, table: Table, depth: int, *, raw: bool = False)
     Args:
         raw: as it was sent, of its own type.
     """
-    array = table.raw(info.path) if raw else physical(info, table)
+    if raw:
+        array = table.raw(info.path)
+    else:
+        array = physical(info, table)
     places = [table.schema.places[axis] for axis in info.axes]
     if places and places[-1] >= len(places):  # an element of an array in which others stand
         lengths = dict(zip(places, array.shape[1:], strict=True))

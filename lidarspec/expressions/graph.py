@@ -75,7 +75,9 @@ class Node:
     def width(self) -> int:
         """Values for each packet; 0 where all packets share them."""
         size = int(np.prod(self.shape, dtype=np.intp))
-        return size if self.sample.shape[0] > 1 else 0
+        if self.sample.shape[0] > 1:
+            return size
+        return 0
 
     @cached_property
     def fields(self) -> tuple[Node, ...] | None:
@@ -89,7 +91,12 @@ class Node:
             return None
         found: dict[Node, None] = {}
         for arg in self.args:
-            fields = arg.fields if isinstance(arg, Node) else () if np.size(arg) == 1 else None
+            if isinstance(arg, Node):
+                fields = arg.fields
+            elif np.size(arg) == 1:
+                fields = ()
+            else:
+                fields = None
             if fields is None:
                 return None
             found |= dict.fromkeys(fields)
@@ -260,7 +267,10 @@ class Traced(NDArrayOperatorsMixin):
 
     def latest(self, where: Any = None) -> Traced:
         """The most recent value at which `where` was true, noted down."""
-        condition = where.node.sample if isinstance(where, Traced) else where
+        if isinstance(where, Traced):
+            condition = where.node.sample
+        else:
+            condition = where
         return self._tape.add(
             "latest",
             lambda column, flags=None: column.latest(flags),
@@ -365,12 +375,16 @@ def _folded(
         else:
             return None
     table = called(function, known)
-    return (index, table) if table.dtype == np.float64 and table.shape == first.shape else None
+    if table.dtype == np.float64 and table.shape == first.shape:
+        return (index, table)
+    return None
 
 
 def node_of(value: Any) -> Any:
     """The node of a traced column; what is none as it is."""
-    return value.node if isinstance(value, Traced) else value
+    if isinstance(value, Traced):
+        return value.node
+    return value
 
 
 def trace(function: Callable[[Any], Any], sample: Batch) -> tuple[Any, Tape]:
@@ -439,7 +453,9 @@ def evaluate(
 
 def only_field(node: Node) -> Node | None:
     """Return the field of an expression of one field and numbers, else None."""
-    return node.fields[0] if node.fields is not None and len(node.fields) == 1 else None
+    if node.fields is not None and len(node.fields) == 1:
+        return node.fields[0]
+    return None
 
 
 @dataclass(frozen=True, eq=False)
@@ -528,7 +544,9 @@ class HeaderFunction:
 
 
 def _several(terms: Any) -> Sequence[Any]:
-    return terms if isinstance(terms, tuple | list) else (terms,)
+    if isinstance(terms, tuple | list):
+        return terms
+    return (terms,)
 
 
 class _Term:

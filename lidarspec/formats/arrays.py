@@ -72,9 +72,10 @@ def write(path: Path, scans: Iterable[Scan], *, every_point: bool, organized: bo
             if organized:
                 height = len(picture(cloud.valid, cloud))
                 own = {name: picture(column, cloud).ravel() for name, column in own.items()}
-            if not (number):
+            if not number:
                 columns = {name: column(values.dtype) for name, values in own.items()}
-            units = units if number else {name: unit for name, unit in cloud.units.items() if unit}
+            if not number:
+                units = {name: unit for name, unit in cloud.units.items() if unit}
             columns = {name: kept for name, kept in columns.items() if name in own}
             for name, kept in columns.items():
                 kept.add(own[name])

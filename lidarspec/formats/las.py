@@ -119,7 +119,9 @@ def _offset(places: NDArray[Any]) -> float:
     It is 0 near the origin. Otherwise it is the first finite coordinate, rounded to whole metres.
     """
     near = places[np.isfinite(places)][:1].round()
-    return float(near[0]) if len(near) and abs(near[0]) > NEAR else 0.0
+    if len(near) and abs(near[0]) > NEAR:
+        return float(near[0])
+    return 0.0
 
 
 def _returns(own: Mapping[str, NDArray[Any]]) -> NDArray[np.uint8]:

@@ -121,7 +121,10 @@ class Log:
         )
         columns = columns_of(scan, names, every_point=every_point)
         places = np.stack([columns.pop(name) for name in "xyz"], axis=-1)
-        shown = scan.points if every_point else scan.points[scan.points.valid]
+        if every_point:
+            shown = scan.points
+        else:
+            shown = scan.points[scan.points.valid]
         points = self._rerun.Points3D(
             places,
             colors=self._colours(shown, self._ramp),

@@ -90,7 +90,9 @@ class Rows:
         for name, column in columns.items():
             rows[name] = column
         self.length += len(rows)
-        return picture(rows, points).reshape(-1) if self.shape else rows
+        if self.shape:
+            return picture(rows, points).reshape(-1)
+        return rows
 
     def _columns(self, scan: Scan, number: int, names: Sequence[str]) -> dict[str, NDArray[Any]]:
         """Return the requested columns that the scan has, of the points to write.

@@ -76,7 +76,9 @@ def tables(scans: Iterable[Scan], path: Path | None = None, *, every_point: bool
 def _table(arrow: Any, batches: Sequence[Any], schema: Any) -> Any:
     """The rows of some batches; many small ones are joined."""
     table = arrow.Table.from_batches(batches, schema)
-    return table.combine_chunks() if len(batches) > MANY else table
+    if len(batches) > MANY:
+        return table.combine_chunks()
+    return table
 
 
 def _of_scans(path: Path | None) -> list[Any]:

@@ -94,7 +94,9 @@ def _put_rows(put: Callable[[str], None], template: str, columns: Sequence[NDArr
 
 
 def _column(values: NDArray[Any] | None, length: int) -> NDArray[Any]:
-    return np.full(length, np.nan, np.float32) if values is None else values
+    if values is None:
+        return np.full(length, np.nan, np.float32)
+    return values
 
 
 CSV = Format(".csv", "comma-separated values, one row a point", write)

@@ -106,14 +106,18 @@ def behind(write: Callable[[_Piece], object]) -> Iterator[Callable[[_Piece], Non
 def written(scan: Scan, *, every_point: bool) -> PointCloud:
     """The points of a scan that are written: those with a valid return, or all."""
     which = kept(scan.points, every_point=every_point)
-    return scan.points if which is None else scan.points[which]
+    if which is None:
+        return scan.points
+    return scan.points[which]
 
 
 def kept(cloud: PointCloud, *, every_point: bool) -> NDArray[np.intp] | None:
     """The indices of the points that are written, which pick columns several times as fast as a
     mask; None for all.
     """
-    return None if every_point or cloud.valid.all() else np.flatnonzero(cloud.valid)
+    if every_point or cloud.valid.all():
+        return None
+    return np.flatnonzero(cloud.valid)
 
 
 def columns_of(scan: Scan, names: Iterable[str], *, every_point: bool) -> dict[str, NDArray[Any]]:

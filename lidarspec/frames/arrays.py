@@ -42,7 +42,9 @@ def counted(count: int) -> NDArray[np.int64]:
 
     Small counts share the same memory.
     """
-    return _numbers()[:count] if count <= COUNTED else np.arange(count)
+    if count <= COUNTED:
+        return _numbers()[:count]
+    return np.arange(count)
 
 
 def is_counted(numbers: NDArray[np.int64]) -> bool:
@@ -59,7 +61,9 @@ def _numbers() -> NDArray[np.int64]:
 
 def alike(values: NDArray[np.int64]) -> int | None:
     """Return the value of a zero-stride array, as from `repeated`, else None."""
-    return values.item(0) if values.strides == (0,) and len(values) else None
+    if values.strides == (0,) and len(values):
+        return values.item(0)
+    return None
 
 
 def by_value(values: NDArray[Any], few: int) -> list[tuple[int, NDArray[np.intp]]]:

@@ -93,8 +93,12 @@ class _Values:
                 self.checked(element, path, f"{shown}[{index}]")
                 for index, element in enumerate(value)
             ]
-            return self._bytes(found, shown) if info is not None and info.kind == "bytes" else found
-        return value if info is None or value is None else self._number(info, value, shown)
+            if info is not None and info.kind == "bytes":
+                return self._bytes(found, shown)
+            return found
+        if info is None or value is None:
+            return value
+        return self._number(info, value, shown)
 
     def _mapping(self, value: Mapping[str, Any], path: str, shown: str) -> Container:
         found = Container()
@@ -134,7 +138,9 @@ class _Values:
             return value
         if info.kind == "float":
             raw = info.raw(value) if self._units else value
-            return raw if isinstance(raw, int) else float(raw)
+            if isinstance(raw, int):
+                return raw
+            return float(raw)
         if isinstance(value, float) and (
             not np.isfinite(value) or (not self._units and value != int(value))
         ):
@@ -142,7 +148,10 @@ class _Values:
                 f"{self._place}: {shown} = {value} is not a raw integer; pass units=True for"
                 " physical values"
             )
-        raw = info.raw(value) if self._units else int(value)
+        if self._units:
+            raw = info.raw(value)
+        else:
+            raw = int(value)
         low, high = info.limits
         if not low <= raw <= high:
             told = [info.physical(part) if self._units else part for part in (raw, low, high)]

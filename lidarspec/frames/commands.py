@@ -141,7 +141,12 @@ def _slot(sensor: Spec, name: str, path: str, place: str) -> Slot:
                 path=place,
                 sensor=sensor.id,
             )
-    room = left[0] if left else info.bits // 8 if info.kind == "int" else None
+    if left:
+        room = left[0]
+    elif info.kind == "int":
+        room = info.bits // 8
+    else:
+        room = None
     return Slot(info, room if isinstance(room, int) else None, bool(left) and info.kind != "bytes")
 
 
@@ -167,7 +172,9 @@ def raw_argument(slot: Slot, kind: Taken, value: Any, argument: str, place: str)
             f"{place}: {argument} is {kind.words(slot.room)}, not {value!r:.60}"
         ) from None
     if info.kind == "other":
-        return data if isinstance(value, bytes) else str(value)
+        if isinstance(value, bytes):
+            return data
+        return str(value)
     return _placed(slot, data)
 
 
@@ -189,7 +196,9 @@ def _found_out(sensor: Spec, name: str, path: str, value: Filled, given: Any) ->
     If it is not given, the first number is used, or an address of zeros.
     """
     if isinstance(value, Count):
-        return value.first if given is None else given
+        if given is None:
+            return value.first
+        return given
     slot = _slot(sensor, name, path, f"commands.{name}.values.{path}")
     if given is None:
         return _placed(slot, bytes(slot.room or 4))

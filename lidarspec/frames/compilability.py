@@ -52,7 +52,10 @@ def _check(node: tree.Node, path: str, *, in_array: bool) -> None:
             _check_part(kind, path)
         return
     for child in tree.children(node):
-        below = f"{path}.{child.name}".strip(".") if isinstance(node, tree.Struct) else path
+        if isinstance(node, tree.Struct):
+            below = f"{path}.{child.name}".strip(".")
+        else:
+            below = path
         _check(child, below, in_array=in_array or isinstance(node, tree.Repeat))
 
 

@@ -67,7 +67,10 @@ class Fault:
         return f"{self.path} at byte {offset}: {self.kind} {self.got}, expected {self.expected}"
 
     def _shortage(self) -> str:
-        total = "" if self.expected is None else f" of {self.expected}"
+        if self.expected is None:
+            total = ""
+        else:
+            total = f" of {self.expected}"
         where = f"frame ends at byte {self.end}{total}"
         if self.is_bounded:
             where = f"parts end at byte {self.end}"

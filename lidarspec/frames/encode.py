@@ -150,15 +150,22 @@ class _Encoder:
                 value = value[step]
             else:
                 names = f"{names}.{step}".lstrip(".")
-                value = value.get(step) if isinstance(value, Mapping) else None
+                if isinstance(value, Mapping):
+                    value = value.get(step)
+                else:
+                    value = None
         if isinstance(value, list) and names in self._indices:
             value = value[self._indices[names]]
         if path not in self._schema.fields:
-            return None if value is None else path
+            if value is None:
+                return None
+            return path
         info = self._schema.fields[path]
         if value is None or (info.rebuilt is not None and not info.held):
             value = self._implied(info)
-        return None if value is None else (info, raw_of(info, value))
+        if value is None:
+            return None
+        return (info, raw_of(info, value))
 
     def _implied(self, info: FieldInfo) -> Any:
         """Return the value that a field has if none is given; None if it has to be given."""
@@ -233,7 +240,10 @@ class _Encoder:
     def _collect_array(
         self, node: Repeat, value: Any, path: str, shown: str, layout: Layout
     ) -> None:
-        count = node.count if isinstance(node.count, int) else layout.lengths[node.axis]
+        if isinstance(node.count, int):
+            count = node.count
+        else:
+            count = layout.lengths[node.axis]
         if value is None:
             value = node.default
         if value is None:
@@ -482,7 +492,10 @@ def _find_count(
     axis: str,
 ) -> int:
     """Return the value of the count field that gives this length, and leave it in its holder."""
-    top = int(info.limits[1]) if info.kind == "int" else MAX_COUNT_TRIED
+    if info.kind == "int":
+        top = int(info.limits[1])
+    else:
+        top = MAX_COUNT_TRIED
 
     def length_for(value: int) -> Any:
         holder[field] = value
@@ -546,4 +559,6 @@ def given_value(
     if isinstance(value, Mapping) or path not in fields:
         return path
     info = fields[path]
-    return None if value is None else (info, raw_of(info, value))
+    if value is None:
+        return None
+    return (info, raw_of(info, value))

@@ -91,15 +91,22 @@ class Rows:
     def raw(self, path: str) -> NDArray[Any]:
         info = self.schema.fields[path]
         assert info.dtype is not None
-        around = self.schema.fields[without_indices(path)[0]].axes if "[" in path else info.axes
-        only = self.groups[0].layout.leaves.get(path) if len(self.groups) == 1 else None
+        if "[" in path:
+            around = self.schema.fields[without_indices(path)[0]].axes
+        else:
+            around = info.axes
+        if len(self.groups) == 1:
+            only = self.groups[0].layout.leaves.get(path)
+        else:
+            only = None
         if (
             only is not None and 0 not in only.shape
         ):  # arrays in an empty one have no length, whatever their count says
             values = _loaded(only, around, self.groups[0].rows)
             if self._order is None:
                 self._order = _order(self.groups[0].where)
-            values = values if isinstance(self._order, slice) else values[self._order]
+            if not isinstance(self._order, slice):
+                values = values[self._order]
             return values.astype(info.dtype, copy=False)
         lengths = [self.length(axis) for axis in info.axes]
         column = np.zeros((len(self), *lengths), info.dtype)
@@ -338,7 +345,9 @@ def _address(array: NDArray[Any]) -> int:
 
 def _order(where: NDArray[np.intp]) -> NDArray[np.intp] | slice:
     """What puts the rows of the only group into stream order: nothing, where they are in it."""
-    return slice(None) if ascends(where) else np.argsort(where)
+    if ascends(where):
+        return slice(None)
+    return np.argsort(where)
 
 
 def ascends(where: NDArray[np.intp]) -> bool:
@@ -368,7 +377,10 @@ class Records:
             return self._element(self.raw(base), base, indices)[0]
         found = [_values(parsed, path.split("."), len(info.axes)) for parsed in self._parsed]
         lengths = [self.length(axis) for axis in info.axes]
-        dtype = info.dtype if info.dtype is not None else _common_type(found, path)
+        if info.dtype is not None:
+            dtype = info.dtype
+        else:
+            dtype = _common_type(found, path)
         column = np.zeros((len(self), *lengths), dtype)
         try:
             for index, value in enumerate(found):
@@ -388,15 +400,9 @@ class Records:
             elements, inside = self._element(
                 self.raw(base) if known is None or known.ndim == 1 else known, base, indices
             )
-            return (
-                inside
-                if known is None
-                else (
-                    inside & known
-                    if known.ndim == 1
-                    else deep(inside, elements.ndim - 1) & elements
-                )
-            )
+            if known is None:
+                return inside
+            return inside & known if known.ndim == 1 else deep(inside, elements.ndim - 1) & elements
         there = [_there(_values(parsed, path.split("."), len(axes))) for parsed in self._parsed]
         if not any(isinstance(one, list) for one in there):
             return np.array(there, np.bool_)
@@ -500,12 +506,16 @@ def _values(parsed: Any, names: list[str], axes: int) -> Any:
             return _elements(parsed, names[index + 1 :], axes)
     if isinstance(parsed, bytes):
         return list(parsed)
-    return next(iter(leaves(parsed)))[1] if not isinstance(parsed, dict) else None
+    if not isinstance(parsed, dict):
+        return next(iter(leaves(parsed)))[1]
+    return None
 
 
 def _elements(parsed: list[Any], names: list[str], axes: int) -> list[Any] | None:
     found = [_values(element, names, axes) for element in parsed]
-    return None if found and all(part is None for part in found) else found
+    if found and all(part is None for part in found):
+        return None
+    return found
 
 
 def _there(value: Any) -> Any:
@@ -513,7 +523,9 @@ def _there(value: Any) -> Any:
     if not isinstance(value, list):
         return value is not None
     found = [_there(part) for part in value]
-    return True if all(part is True for part in found) else found
+    if all(part is True for part in found):
+        return True
+    return found
 
 
 def _put(column: NDArray[Any], index: int, value: Any) -> None:
@@ -541,9 +553,16 @@ def _counts(value: Any, names: list[str], brackets: int) -> set[int]:
         below = brackets if names else brackets - 1
         return {length for part in value for length in _counts(part, names, below)}
     if names:
-        found = value.get(names[0]) if isinstance(value, dict) else None
-        return set() if found is None else _counts(found, names[1:], brackets)
-    return {len(value)} if isinstance(value, list | bytes) else set()
+        if isinstance(value, dict):
+            found = value.get(names[0])
+        else:
+            found = None
+        if found is None:
+            return set()
+        return _counts(found, names[1:], brackets)
+    if isinstance(value, list | bytes):
+        return {len(value)}
+    return set()
 
 
 def _numbers(value: Any) -> Iterator[Any]:

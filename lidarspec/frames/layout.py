@@ -85,7 +85,10 @@ def rows_at(
     if size == 1:
         return buffer.take(offsets).reshape(count, 1)
     first = offsets.item(0)
-    step = offsets.item(1) - offsets.item(0) if count > 1 else size
+    if count > 1:
+        step = offsets.item(1) - offsets.item(0)
+    else:
+        step = size
     even = offsets.item(-1) - first == (count - 1) * step
     if even and count > 2:
         even = np.count_nonzero(offsets[1:] - offsets[:-1] == step) == count - 1
@@ -164,7 +167,9 @@ class Leaf:
 
     def of(self, frame: bytes | memoryview) -> int | None:
         """Its value in the first bytes of a frame; None where they end before it does."""
-        return self.scalar(frame) if self.offset + self.size <= len(frame) else None
+        if self.offset + self.size <= len(frame):
+            return self.scalar(frame)
+        return None
 
     def store(self, rows: Bytes2D, values: Any) -> None:
         """Write raw values, broadcast to (n, *shape), into frames given as rows of bytes."""
@@ -311,7 +316,10 @@ class Leaf:
                 offset, shape[place] = offset + index % length * self.strides[place], 1
             else:
                 elements = (elements[index],)
-        size = 1 if self.info.kind == "bytes" and info.kind == "int" else self.size
+        if self.info.kind == "bytes" and info.kind == "int":
+            size = 1
+        else:
+            size = self.size
         return replace(
             self,
             info=info,
@@ -371,7 +379,9 @@ class Seal:
     def _powers(self, leaf: Leaf) -> NDArray[np.uint64]:
         """By how many bits each byte of a field of bytes is shifted, (k,)."""
         powers = np.arange(0, leaf.info.bits, 8, dtype=np.uint64)
-        return powers if self.algorithm.order == "little" else powers[::-1]
+        if self.algorithm.order == "little":
+            return powers
+        return powers[::-1]
 
     def computed(self, rows: Bytes2D, sums: Sums | None = None) -> NDArray[np.uint64]:
         """The values that should stand there, (n,).
@@ -380,7 +390,9 @@ class Seal:
             sums: asked first, before the algorithm.
         """
         values = None if sums is None else sums(self, rows)
-        return over(self.algorithm, rows, self.spans or ((0, 0),)) if values is None else values
+        if values is None:
+            return over(self.algorithm, rows, self.spans or ((0, 0),))
+        return values
 
     def fill(self, rows: Bytes2D) -> None:
         """Write the right value into each frame."""
@@ -485,7 +497,11 @@ class Condition:
     def _dtype(self) -> Any:
         """The smallest type that holds whatever the formula comes to on the way."""
         most = max(width(part) for part in parts(self.formula or 0))
-        return np.int16 if most < 15 else np.int32 if most < 31 else np.int64
+        if most < 15:
+            return np.int16
+        if most < 31:
+            return np.int32
+        return np.int64
 
 
 class Test(Protocol):
@@ -686,7 +702,10 @@ def right(constants: tuple[Word, ...], rows: Bytes2D) -> NDArray[np.bool_] | Non
         each = equal(elements(rows, dtype, spot, (), ()), word)
         number = np.count_nonzero(each)
         if number < len(rows):
-            held = each if held is None else np.bitwise_and(held, each, out=held)
+            if held is None:
+                held = each
+            else:
+                held = np.bitwise_and(held, each, out=held)
         if not number:
             break
     return held

@@ -196,7 +196,10 @@ class Walk:
     def _element(self, path: str) -> tuple[tree.FieldInfo, int]:
         """An element of an array: the whole of it stands before the formula."""
         base, indices = without_indices(path)
-        leaf = self.leaves[base].element(path, indices) if base in self.leaves else None
+        if base in self.leaves:
+            leaf = self.leaves[base].element(path, indices)
+        else:
+            leaf = None
         if leaf is None:
             raise IndexError(f"{base} has no such element")
         return leaf.info, self.values[path] if path in self.values else self.asked(leaf, self)
@@ -242,7 +245,10 @@ class Walk:
     ) -> None:
         self.parts.setdefault(path, path)
         for member in node.members:
-            below = f"{node.path}.{member.name}".strip(".") if member.name else ""
+            if member.name:
+                below = f"{node.path}.{member.name}".strip(".")
+            else:
+                below = ""
             self.visit(member, below, shape, strides)
             self.parts.setdefault(below, None)
 
@@ -510,7 +516,9 @@ class HeaderNode:
 
     def meant(self, value: int) -> int:
         """The value of its field that stands for one that means the same."""
-        return value if self.told is None else self.told.one(value)
+        if self.told is None:
+            return value
+        return self.told.one(value)
 
     def child(self, value: int) -> HeaderNode:
         """The branch of a value."""
@@ -614,7 +622,9 @@ class _Told:
     def one(self, value: int) -> int:
         """The value that stands for one that means the same."""
         if self.keys:
-            return value if value in self.keys else self.other
+            if value in self.keys:
+                return value
+            return self.other
         return min(max(value, self.low), self.high)
 
     def all(self, values: NDArray[Any]) -> NDArray[Any]:
@@ -806,7 +816,8 @@ class HeaderTree:
                 continue
             there, values = read(node, which)
             which = which if there is None else which[there]
-            values = values if node.told is None else node.told.all(values)
+            if node.told is not None:
+                values = node.told.all(values)
             if not len(which):
                 continue
             if np.count_nonzero(values == values[0]) == len(values):
@@ -841,13 +852,16 @@ class HeaderTree:
             if isinstance(leaf, Leaf) and leaf.offset + leaf.size > rows.shape[1]:
                 return None
             values = leaf.load(rows)
-            values = values if node.told is None else node.told.all(values)
+            if node.told is not None:
+                values = node.told.all(values)
             if np.count_nonzero(values == values[0]) < len(rows) or (
                 isinstance(leaf, Measure) and values[0] < 0
             ):
                 return None
             node = node.child(values.item(0))
-        return node.result if isinstance(node.result, Layout) else None
+        if isinstance(node.result, Layout):
+            return node.result
+        return None
 
     def header(
         self, frame: bytes, *, since: HeaderNode | None = None, is_all: bool = False
@@ -883,7 +897,9 @@ class HeaderTree:
             if value is None:
                 return node
             node = node.child(node.meant(value))
-        return node if node.result is not None else self._explore(node, data, is_all=is_all)
+        if node.result is not None:
+            return node
+        return self._explore(node, data, is_all=is_all)
 
     def _explore(
         self, node: HeaderNode, data: bytes | memoryview = b"", *, is_all: bool = False

@@ -61,7 +61,9 @@ def parse(
     if found is None:
         found = _parse_unsound(sensor, data, frame, verify=verify)
     name, values = found
-    return _physical(schema(sensor.frames[name].tree).all_fields, values, "") if units else values
+    if units:
+        return _physical(schema(sensor.frames[name].tree).all_fields, values, "")
+    return values
 
 
 def identify(sensor: Spec, data: bytes, *, frame: str | None = None) -> str:
@@ -76,7 +78,9 @@ def identify(sensor: Spec, data: bytes, *, frame: str | None = None) -> str:
     """
     data = _as_bytes(data)
     found = _find_sound(sensor, data, frame)
-    return found[0] if found is not None else _parse_unsound(sensor, data, frame, verify=True)[0]
+    if found is not None:
+        return found[0]
+    return _parse_unsound(sensor, data, frame, verify=True)[0]
 
 
 def _as_bytes(data: bytes) -> bytes:
@@ -106,7 +110,9 @@ def _parse_sound(frame: Frame, data: bytes) -> tuple[Any] | None:
     layouts = frame_layouts(frame)
     if isinstance(layouts, NotCompilable):
         values, size = parse_plain(frame, data)
-        return (values,) if size == len(data) else None
+        if size == len(data):
+            return (values,)
+        return None
     coder = frame_coder(frame)
     decoded = coder.decode(data)
     if decoded.problem is not None:
@@ -284,7 +290,10 @@ def _reader(node: Node, path: str, layout: Layout, count: int) -> Reader:
             )
             return functools.partial(_containers, readers, count)
         case Repeat():
-            length = layout.lengths[node.axis] if not isinstance(node.count, int) else node.count
+            if not isinstance(node.count, int):
+                length = layout.lengths[node.axis]
+            else:
+                length = node.count
             return functools.partial(
                 _lists, _reader(node.element, path, layout, count * length), count, length
             )
@@ -392,7 +401,9 @@ def _floats(numbers: Reader, offsets: Sequence[int], size: int, frame: bytes) ->
 
 
 def _labelled(info: FieldInfo, numbers: Reader) -> Reader:
-    return functools.partial(_names, _Names(info), numbers) if info.labels else numbers
+    if info.labels:
+        return functools.partial(_names, _Names(info), numbers)
+    return numbers
 
 
 class _Names(dict[int, Any]):
@@ -488,7 +499,9 @@ def _joined(
     if field.signed:
         sign = 1 << (field.width - 1)
         return [(value ^ sign) - sign for value in values]
-    return [value == 1 for value in values] if field.flag else values
+    if field.flag:
+        return [value == 1 for value in values]
+    return values
 
 
 def _grouped(parts: Sequence[tuple[tuple[str | int, ...], Reader]], count: int) -> Reader:
@@ -514,7 +527,9 @@ def layout_of(sensor: Spec, name: str, data: bytes) -> Layout | Refused | None:
     Returns None if the type is not compiled, or if the header is incomplete.
     """
     layouts = frame_layouts(sensor.frames[name])
-    return None if isinstance(layouts, NotCompilable) else layouts.layout(data)
+    if isinstance(layouts, NotCompilable):
+        return None
+    return layouts.layout(data)
 
 
 def _progress(sensor: Spec, fault: WireError) -> tuple[int, int]:
@@ -529,7 +544,9 @@ def _progress(sensor: Spec, fault: WireError) -> tuple[int, int]:
     whole = fault.reason.find("after the frame") >= 0 or (
         fits and fault.reason.find("checksum") >= 0
     )
-    return (1, len(fault.data)) if whole else (0, fault.offset)
+    if whole:
+        return (1, len(fault.data))
+    return (0, fault.offset)
 
 
 def _likeliest(sensor: Spec, data: bytes, faults: list[WireError]) -> WireError:
@@ -539,7 +556,10 @@ def _likeliest(sensor: Spec, data: bytes, faults: list[WireError]) -> WireError:
     starts = []
     for name, frame in sensor.frames.items():
         starts.append(f"{name} {frame_coder(frame).begins.hex(' ')}".strip())
-    begins = f"begins with {data[:4].hex(' ')}" if data else "is empty"
+    if data:
+        begins = f"begins with {data[:4].hex(' ')}"
+    else:
+        begins = "is empty"
     return WireError(
         f"no frame type fits: the data {begins}, expected {', '.join(starts)}",
         sensor=sensor.id,

@@ -199,7 +199,10 @@ class _Walk:
         rule = region.rule
         room = region.limit - region.start
         self._rule = rule
-        self._room = room if rule.within is None else min(room, rule.within)
+        if rule.within is None:
+            self._room = room
+        else:
+            self._room = min(room, rule.within)
         self._announced = np.full(len(starts), ANY if rule.size is None else rule.size)
         self._status = np.zeros(len(starts), np.uint8)
         self._errors = list[PluginError]()
@@ -217,7 +220,9 @@ class _Walk:
         if np.count_nonzero(self._status):
             active = active[self._status[active] == FOUND]
         if self._rule.count is not None:
-            return active if number < self._rule.count else active[:0]
+            if number < self._rule.count:
+                return active
+            return active[:0]
         if self._rule.within is not None:
             active = active[self._ends[active] - self._starts[active] < self._rule.within]
         else:
@@ -260,12 +265,17 @@ class _Walk:
                     pieces.append(Piece(number, layout, theirs, self._ends[theirs]))
                     self._taken(kind, layout, theirs)
             self._status[own[~seen]] = CUT_OFF
-            active = others[0] if len(others) == 1 else np.concatenate(others)
+            if len(others) == 1:
+                active = others[0]
+            else:
+                active = np.concatenate(others)
         self._status[active] = CONSTANT
         return pieces
 
     def _stops_of(self, which: Offsets) -> Offsets | None:
-        return None if self._stops is None else self._stops[which]
+        if self._stops is None:
+            return None
+        return self._stops[which]
 
     def _right(self, which: Offsets, constants: tuple[Word, ...]) -> NDArray[np.bool_] | None:
         """In which frames constants of the next part are right, as `right_at` has it."""
@@ -284,7 +294,10 @@ class _Walk:
 
     def _measured(self, layout: Layout, which: Offsets) -> Offsets:
         """Those whose lengths are right, as far as the bytes go; the status of the others."""
-        held = self._right(which, words(marks(layout.held))) if layout.held else None
+        if layout.held:
+            held = self._right(which, words(marks(layout.held)))
+        else:
+            held = None
         if held is None:
             return which
         self._status[which[~held]] = LENGTH
@@ -329,7 +342,9 @@ class _Walk:
             if path.startswith("_."):
                 return tree.FieldInfo(path), self._region.given[path[2:]]
             leaf = layout.leaves.get(path)
-            return None if leaf is None else (leaf.info, leaf.scalar(part))
+            if leaf is None:
+                return None
+            return (leaf.info, leaf.scalar(part))
 
         try:
             return min(int(tree.evaluated(formula, read)), self._region.limit + 1)
@@ -356,7 +371,10 @@ def right_at(
             windows: NDArray[Any] = np.ndarray((room + 1,), dtype, buffer.data, spot, (1,))
             each = equal(windows[spots], word)
         else:
-            ends = [len(buffer)] * len(spots) if stops is None else stops.tolist()
+            if stops is None:
+                ends = [len(buffer)] * len(spots)
+            else:
+                ends = stops.tolist()
             parts = (
                 buffer[at + spot : min(at + spot + dtype.itemsize, end)]
                 for at, end in zip(spots.tolist(), ends, strict=True)
@@ -403,7 +421,9 @@ class Measure:
     def of(self, frame: bytes | memoryview) -> int | None:
         """As `Leaf.of`."""
         values = self.read(np.frombuffer(frame, np.uint8), np.zeros(1, np.intp))[1]
-        return int(values[0]) if len(values) else None
+        if len(values):
+            return int(values[0])
+        return None
 
     def load(self, rows: Bytes2D) -> NDArray[Any]:
         """As `Leaf.load`; -1 where parts are cut off."""

@@ -90,7 +90,10 @@ def _fields_of(
         elements = value if isinstance(value, list) else [value]
         if elements and all(_is_placed(element, end) for element in elements):
             for index, element in enumerate(elements):
-                below = f"{path}[{index}]" if isinstance(value, list) else path
+                if isinstance(value, list):
+                    below = f"{path}[{index}]"
+                else:
+                    below = path
                 yield from _fields_of(element, below, data, infos)
         elif isinstance(value, dict):  # a bit block
             for keys, raw in leaves(value):
@@ -99,7 +102,10 @@ def _fields_of(
                 yield WireField(f"{path}{below}", path, info, start, end, None, raw)
         elif end > start:
             info = infos.get(without_indices(path)[0], FieldInfo(path, kind="bytes"))
-            raw = value if isinstance(value, int | float | bytes | str) else data[start:end]
+            if isinstance(value, int | float | bytes | str):
+                raw = value
+            else:
+                raw = data[start:end]
             yield WireField(path, path, info, start, end, None, raw)
 
 

@@ -113,7 +113,9 @@ def finished(algorithm: Crc, left: NDArray[Any]) -> Values:
     if algorithm.refin != algorithm.refout:
         mirrored = np.frombuffer(MIRROR, np.uint8).take(values.byteswap().view(np.uint8))
         values = mirrored.view(np.uint64) >> np.uint64(64 - algorithm.width)
-    return values ^ np.uint64(algorithm.xorout) if algorithm.xorout else values
+    if algorithm.xorout:
+        return values ^ np.uint64(algorithm.xorout)
+    return values
 
 
 def _xor(algorithm: Xor, rows: NDArray[np.uint8], spans: Spans) -> Values:
@@ -249,7 +251,9 @@ def _pieces(
 
 def xor(columns: NDArray[np.uint64], which: Sequence[int]) -> NDArray[np.uint64]:
     """The XOR of some words of each row, (n,)."""
-    total = columns[which[0]].copy() if len(which) else np.zeros(columns.shape[1], np.uint64)
+    total = np.zeros(columns.shape[1], np.uint64)
+    if len(which):
+        total[:] = columns[which[0]]
     for index in which[1:]:
         np.bitwise_xor(total, columns[index], out=total)
     return total
@@ -293,7 +297,9 @@ def registers(
 def cut(rows: NDArray[np.uint8], spans: Spans) -> NDArray[np.uint8]:
     """The bytes of each row that some spans cover, one span after another, (n, bytes)."""
     parts = [rows[:, start:stop] for start, stop in spans]
-    return parts[0] if len(parts) == 1 else np.concatenate(parts, axis=1)
+    if len(parts) == 1:
+        return parts[0]
+    return np.concatenate(parts, axis=1)
 
 
 def _by_zlib(rows: NDArray[np.uint8], start: int) -> NDArray[Any]:
@@ -301,7 +307,8 @@ def _by_zlib(rows: NDArray[np.uint8], start: int) -> NDArray[Any]:
 
     zlib starts from the inverted register and ends with it inverted.
     """
-    rows = rows if rows.strides[1] == 1 else np.ascontiguousarray(rows)
+    if rows.strides[1] != 1:
+        rows = np.ascontiguousarray(rows)
     return np.fromiter(
         map(zlib.crc32, rows, itertools.repeat(start ^ 0xFFFFFFFF)), np.uint32, len(rows)
     ) ^ np.uint32(0xFFFFFFFF)

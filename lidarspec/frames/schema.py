@@ -95,7 +95,9 @@ class ByPath(dict[str, _Field]):
             known = super().get(base)
             self._elements[path] = None if known is None else self._element(known, path, indices)
         found = self._elements[path]
-        return default if found is None else found
+        if found is None:
+            return default
+        return found
 
 
 @dataclass(frozen=True, eq=False)
@@ -115,7 +117,9 @@ class Schema:
     @cached_property
     def all_fields(self) -> Mapping[str, FieldInfo]:
         """The fields of the frame and of the parts in it."""
-        return {**self.fields, **self.inside} if self.inside else self.fields
+        if self.inside:
+            return {**self.fields, **self.inside}
+        return self.fields
 
     @cached_property
     def chain(self) -> tuple[str, ...]:

@@ -165,12 +165,16 @@ class FormCoder(Coder):
 
     def find_size(self, data: bytes) -> int | None:
         size = self.form.find_end(data[: self._limit])
-        return size if size > 0 else None
+        if size > 0:
+            return size
+        return None
 
     def refusal(self, struct: bytes) -> Refused | None:
         """Return why the header of a struct leads to no layout; None if that is not known."""
         result = self.tree.header(struct).result
-        return result if isinstance(result, Refused) else None
+        if isinstance(result, Refused):
+            return result
+        return None
 
     def encode(self, struct: bytes, spelling: object = None) -> bytes | None:
         if isinstance(spelling, bytes):
@@ -182,7 +186,9 @@ class FormCoder(Coder):
             return None
         data = self.form.encode(struct, runs_of(layout))
         decoded = self.decode(data)
-        return data if decoded.problem is None and decoded.struct == struct else None
+        if decoded.problem is None and decoded.struct == struct:
+            return data
+        return None
 
     def keep_spelling(self, values: Any, struct: bytes, data: bytes) -> Any:
         if self.encode(struct) != data:
@@ -226,7 +232,10 @@ class FormCoder(Coder):
             return None
         leaves, end = _known_fields(node)
         path, begin, expected = _describe_field(leaves, min(len(struct), end), end)
-        offset = decoded.offset(begin) if decoded.problem is None else decoded.problem.offset
+        if decoded.problem is None:
+            offset = decoded.offset(begin)
+        else:
+            offset = decoded.problem.offset
         if not leaves:
             reason = f"the header does not fit the frame's {size} bytes"
             return Problem(offset, reason, got=size)
@@ -252,14 +261,19 @@ def _describe_field(leaves: tuple[Leaf, ...], offset: int, end: int) -> tuple[st
         return "", offset, "the end of the frame"
     size = runs[0].sizes.item(0)
     is_text = isinstance(runs[0], TextRun)
-    expected = f"{size} characters of text" if is_text else f"a number of {size} bytes"
+    if is_text:
+        expected = f"{size} characters of text"
+    else:
+        expected = f"a number of {size} bytes"
     return path, offset, expected
 
 
 @functools.lru_cache(maxsize=2048)
 def frame_coder(frame: Frame) -> Coder:
     """Return the coder of a frame type, always the same one."""
-    return Coder(frame) if frame.wire is None else FormCoder(frame, frame.wire)
+    if frame.wire is None:
+        return Coder(frame)
+    return FormCoder(frame, frame.wire)
 
 
 def runs_of(layout: Layout) -> Sequence[Run]:

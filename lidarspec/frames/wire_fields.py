@@ -117,7 +117,9 @@ class Examined:
     @property
     def layout(self) -> Layout | None:
         """The layout; None if the bytes do not lead to one."""
-        return self.known if isinstance(self.known, Layout) else None
+        if isinstance(self.known, Layout):
+            return self.known
+        return None
 
     def fields(self) -> Iterator[WireField]:
         """Return the fields in the order of the wire.
@@ -146,7 +148,9 @@ class Examined:
         """Return the place of the parts at a path; None if it is not known."""
         if axis in self.known.regions:
             return self.known.regions[axis]
-        return self.known.open_regions.get(axis) if isinstance(self.known, Walk) else None
+        if isinstance(self.known, Walk):
+            return self.known.open_regions.get(axis)
+        return None
 
     def parts_of(self, axis: str) -> list[Examined]:
         """Return the parts at a path, as far as they can be told apart."""
@@ -155,7 +159,9 @@ class Examined:
     def broken_part(self, axis: str) -> Examined | None:
         """Return the part at a path that is no valid part; None if all are there."""
         found = self._examined_parts(axis)
-        return None if found.is_whole else found.parts[-1]
+        if found.is_whole:
+            return None
+        return found.parts[-1]
 
     def _examined_parts(self, axis: str) -> ExaminedParts:
         if axis not in self._parts:

@@ -59,7 +59,10 @@ class Extent:
             return Extent(self.number * factor, tuple(f"{factor}*({term})" for term in self.terms))
         if str(self) == "0":
             return self
-        size = f"({self})" if self.terms else str(self)
+        if self.terms:
+            size = f"({self})"
+        else:
+            size = str(self)
         return Extent(
             0,
             (
@@ -122,7 +125,9 @@ def extent(node: tree.Node, shown: str = "") -> Extent:
                 for branch in tree.children(node)
                 if not isinstance(branch, tree.Never)
             }
-            return sizes.pop() if len(sizes) == 1 else _length(None, shown)
+            if len(sizes) == 1:
+                return sizes.pop()
+            return _length(None, shown)
     return Extent()
 
 
@@ -134,7 +139,9 @@ def _length(size: tree.Formula | None, shown: str) -> Extent:
 
 
 def _count(node: tree.Repeat) -> int | str:
-    return node.count if isinstance(node.count, int) else phrase(node.count)
+    if isinstance(node.count, int):
+        return node.count
+    return phrase(node.count)
 
 
 def _member(shown: str, member: tree.Node) -> str:
@@ -258,7 +265,10 @@ def branches(node: tree.When | tree.Select) -> list[tuple[str, tree.Node]]:
         asked = phrase(node.condition)
         return [(f"if {asked}", node.then), (f"unless {asked}", node.otherwise)]
     key = phrase(node.key)
-    labels = node.key.info.labels if isinstance(node.key, tree.Ref) else {}
+    if isinstance(node.key, tree.Ref):
+        labels = node.key.info.labels
+    else:
+        labels = {}
     cases = [(f"if {key} == {labels.get(value, value)!r}", case) for value, case in node.cases]
     return [*cases, (f"for other values of {key}", node.default)]
 
@@ -293,7 +303,9 @@ def phrase(formula: tree.Formula) -> str:
         text = formula.text
     else:
         text = tree.written(formula, lambda ref: ref.path, {})
-    return text[1:-1] if _is_enclosed(text) else text
+    if _is_enclosed(text):
+        return text[1:-1]
+    return text
 
 
 def _is_enclosed(text: str) -> bool:
@@ -321,7 +333,10 @@ def unit_text(info: tree.FieldInfo) -> str:
     """Unit and scale of a field: "0.01 deg", "0.01 deg - 327.68"."""
     if not info.scaled:
         return info.unit
-    shift = f" {'-' if info.offset < 0 else '+'} {abs(info.offset):g}" if info.offset else ""
+    if info.offset:
+        shift = f" {'-' if info.offset < 0 else '+'} {abs(info.offset):g}"
+    else:
+        shift = ""
     return f"{info.scale:.10g} {info.unit}".strip() + shift
 
 
@@ -330,11 +345,17 @@ def meaning(info: tree.FieldInfo) -> str:
 
     It has its constant, the formula it follows from, its text and the names of its values.
     """
-    const = f"always {hexed(info.const, info.bits)}" if info.const is not None else ""
+    if info.const is not None:
+        const = f"always {hexed(info.const, info.bits)}"
+    else:
+        const = ""
     const = const or (
         f"only {tree.listed(info.allowed)}" if info.allowed is not None and not info.labels else ""
     )
-    follows = phrase(info.rebuilt) if info.rebuilt is not None else "?"
+    if info.rebuilt is not None:
+        follows = phrase(info.rebuilt)
+    else:
+        follows = "?"
     labels = ", ".join(f"{value} {name}" for value, name in info.labels.items())
     return "; ".join(
         filter(None, (const, "" if follows == "?" else f"= {follows}", info.docs, labels))
@@ -345,11 +366,16 @@ def hexed(value: object, bits: int) -> str:
     """Bytes and integers in hexadecimal, integers with all digits of their width."""
     if isinstance(value, bytes | bytearray):
         return value.hex(" ")
-    return f"0x{value:0{-(-bits // 4)}x}" if isinstance(value, int) else repr(value)
+    if isinstance(value, int):
+        return f"0x{value:0{-(-bits // 4)}x}"
+    return repr(value)
 
 
 def _sealed(node: tree.Sealed) -> str:
     """What is said of the fields that hold a checksum."""
-    name = node.declared.describe() if node.declared else "a checksum that a hook supplies"
+    if node.declared:
+        name = node.declared.describe()
+    else:
+        name = "a checksum that a hook supplies"
     first, last = (path.removeprefix(f"{node.struct.path}.") for path in node.over or ("", ""))
     return f"{name} over " + (f"{first} to {last}" if first != last else first or "all other bytes")

@@ -177,7 +177,9 @@ class Assembly:
         index = layout.leaves[rule.index].scalar(datagram) - rule.first
         count = layout.leaves[rule.count].scalar(datagram)
         is_whole = len(datagram) == layout.size or not rule.payload
-        return _Fragment(key, index, count, payload) if is_whole and 0 <= index < count else None
+        if is_whole and 0 <= index < count:
+            return _Fragment(key, index, count, payload)
+        return None
 
     def _taken(self, fragment: _Fragment, place: int, time: int) -> tuple[bytes, int] | None:
         """Store a fragment and return the message that it completes, with its offset.

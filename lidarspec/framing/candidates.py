@@ -288,7 +288,9 @@ class Candidates:
         return Live(frames, ends, all_runs)
 
     def _merge(self, parts: Sequence[Frames]) -> Frames:
-        return merged(parts, final=self.final) if parts else Frames.none(self.buffer)
+        if parts:
+            return merged(parts, final=self.final)
+        return Frames.none(self.buffer)
 
     def _find(self, mode: Mode) -> dict[int, Offsets]:
         """Return where the constants of types stand that have not been looked for before."""

@@ -101,7 +101,10 @@ class _Batch:
             self._known[mode.after] = position, frames, reasons, spots
         first, frames, reasons, spots = self._known[mode.after]
         index = bisect.bisect_left(spots, position)
-        stop = spots[index] + 1 if index < len(spots) else len(self._starts)
+        if index < len(spots):
+            stop = spots[index] + 1
+        else:
+            stop = len(self._starts)
         frames = frames.only(slice(position - first, stop - first))
         lost = np.flatnonzero(frames.kinds < 0)
         if len(lost):
@@ -201,7 +204,9 @@ class _Batch:
                 break
         counted = (reasons != PLUGIN) & (lost < len(frames))
         self._count(reasons[counted], frames.sizes[lost[counted]], mode)
-        return Frames.joined([*parts, frames.only(slice(begun, None))]) if parts else frames
+        if parts:
+            return Frames.joined([*parts, frames.only(slice(begun, None))])
+        return frames
 
     def _judged_alone(self, datagram: Frames, mode: Mode) -> Frames | None:
         """One datagram as a frame, None where it is none; counts why."""

@@ -106,8 +106,14 @@ class Decoder:
         self._fillers = bytes(sensor.fillers)
         link = sensor.links.get("data")
         longest = max(frame.max_length for frame in sensor.incoming.values())
-        rule = link.assembled if isinstance(link, Udp) and not stream else None
-        self._assembly = None if rule is None else Assembly(rule, longest, self.stats)
+        if isinstance(link, Udp) and not stream:
+            rule = link.assembled
+        else:
+            rule = None
+        if rule is None:
+            self._assembly = None
+        else:
+            self._assembly = Assembly(rule, longest, self.stats)
         self._least = max(LEAST, 2 * self.framing.reach)
         self._size = max(PIECE, self._least)
 
@@ -242,7 +248,10 @@ class Decoder:
             at: their arrival times in ns, -1 where nobody knows.
         """
         size = alike(sizes)
-        total = int(sizes.sum()) if size is None else size * len(sizes)
+        if size is None:
+            total = int(sizes.sum())
+        else:
+            total = size * len(sizes)
         places = _places(sizes, self._base)
         joined = None
         if self.witness is not None:
@@ -264,7 +273,10 @@ class Decoder:
         self._rejected(piece.rejected, piece.errors)
         gaps = repeated(0, len(frames))
         kind = alike(frames.kinds)
-        is_good = kind >= 0 if kind is not None else not np.count_nonzero(frames.kinds < 0)
+        if kind is not None:
+            is_good = kind >= 0
+        else:
+            is_good = not np.count_nonzero(frames.kinds < 0)
         if self._gap or not is_good or (joined is not None and joined.dropped.any()):
             good = frames.kinds >= 0
             gaps = self._lost(buffer, frames.starts, sizes, good, joined)
@@ -474,7 +486,10 @@ def frames_of(decoder: Decoder, data: Any) -> list[Frames]:
         np.ascontiguousarray(data, np.uint8) if isinstance(data, np.ndarray) else list(data)
     )
     most = ROWS if isinstance(data, np.ndarray) else TOGETHER
-    step = max(1, min(most, ROW_BYTES // max(len(packets[0]), 1))) if len(packets) else 1
+    if len(packets):
+        step = max(1, min(most, ROW_BYTES // max(len(packets[0]), 1)))
+    else:
+        step = 1
     return [
         decoder.datagrams(packets[start : start + step]) for start in range(0, len(packets), step)
     ] + decoder.rest()

@@ -146,7 +146,9 @@ def _some_value(source: random.Random, leaf: Leaf, keys: list[int]) -> int:
         and leaf.info.dtype.kind == "i"
         and value >> (leaf.info.bits - 1)
     )
-    return value - (1 << leaf.info.bits) if is_negative else value
+    if is_negative:
+        return value - (1 << leaf.info.bits)
+    return value
 
 
 def _random(engine: Codec, layout: Layout, number: int, source: random.Random) -> NDArray[np.uint8]:

@@ -165,7 +165,10 @@ class CompiledCodec(Codec):
             status, sizes: of all candidates, changed here.
         """
         which = together.which
-        ends = np.full(len(which), len(buffer)) if stops is None else stops[which]
+        if stops is None:
+            ends = np.full(len(which), len(buffer))
+        else:
+            ends = stops[which]
         is_whole = offsets[which] + sizes[which] <= ends
         partial = which[~is_whole]
         status[partial], sizes[partial] = _partial(
@@ -261,7 +264,10 @@ class CompiledCodec(Codec):
         for layout, which in known:
             if isinstance(layout, Refused):
                 continue
-            starts = frames.starts if len(which) == len(frames) else frames.starts[which]
+            if len(which) == len(frames):
+                starts = frames.starts
+            else:
+                starts = frames.starts[which]
             is_sparse = 2 * len(which) * layout.size < len(frames.buffer)
             groups.append(
                 Group(
@@ -282,7 +288,10 @@ class InterpretedCodec(Codec):
     def __init__(self, frame: Frame, reason: str = "") -> None:
         super().__init__(frame)
         self.reason = reason
-        lengths = ["lengths"] if any(info.held for info in self.schema.all_fields.values()) else []
+        if any(info.held for info in self.schema.all_fields.values()):
+            lengths = ["lengths"]
+        else:
+            lengths = []
         self._levels = [
             "constants",
             *lengths,

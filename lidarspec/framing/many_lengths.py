@@ -232,7 +232,9 @@ class Together:
 
 def _length(check: Check) -> int:
     """Return how many elements the outermost array of a test has; 0 if it is of no array."""
-    return check.shape[0] if isinstance(check, Lookup) and check.shape else 0
+    if isinstance(check, Lookup) and check.shape:
+        return check.shape[0]
+    return 0
 
 
 def _by_size(sizes: Offsets) -> Iterator[Offsets]:

@@ -368,7 +368,10 @@ class Lookup:
     def _each(self, rows: Bytes2D) -> NDArray[np.bool_]:
         """Whether it holds for each element, (n, *shape)."""
         view = elements(rows, self.table.dtype, self.offset, self.shape, self.strides)
-        values = view if view.itemsize == 1 else view.astype(self.table.dtype.newbyteorder("="))
+        if view.itemsize == 1:
+            values = view
+        else:
+            values = view.astype(self.table.dtype.newbyteorder("="))
         return self.table.holds(values)
 
 
@@ -402,13 +405,17 @@ def _bits(listed: NDArray[np.bool_]) -> tuple[int, tuple[int, ...]] | None:
         if bit < len(listed) and (listed != listed[values ^ bit]).any()
     )
     allowed = np.unique(values[listed] & mask).tolist()
-    return (mask, tuple(allowed)) if 0 < len(allowed) <= ALLOWED else None
+    if 0 < len(allowed) <= ALLOWED:
+        return (mask, tuple(allowed))
+    return None
 
 
 def _window(leaves: Iterable[Leaf]) -> tuple[int, int]:
     """First byte that the first elements of some fields take, and the one after their last."""
     spans = [leaf.held for leaf in leaves]
-    return (min(start for start, _ in spans), max(stop for _, stop in spans)) if spans else (0, 0)
+    if spans:
+        return (min(start for start, _ in spans), max(stop for _, stop in spans))
+    return (0, 0)
 
 
 def _parts(

@@ -219,7 +219,10 @@ class Frames:
         self.rows = rows
         self.errors = errors
         self._starts = self.places = starts
-        self.forms = repeated(0 if layouts else -1, number) if forms is None else forms
+        if forms is None:
+            self.forms = repeated(0 if layouts else -1, number)
+        else:
+            self.forms = forms
         self.status = repeated(VALID, number) if status is None else status
         self.names: tuple[str, ...] = ()
 
@@ -281,13 +284,17 @@ class Frames:
     def layout(self) -> Layout | None:
         """The layout that all frames have; None where they differ, or nobody knows."""
         form = alike(self.forms)
-        return None if form is None or form < 0 else self.layouts[form]
+        if form is None or form < 0:
+            return None
+        return self.layouts[form]
 
     @property
     def total(self) -> int:
         """The bytes of all frames together."""
         size = alike(self.sizes)
-        return int(self.sizes.sum()) if size is None else size * len(self)
+        if size is None:
+            return int(self.sizes.sum())
+        return size * len(self)
 
     @cached_property
     def is_sound(self) -> bool:
@@ -310,14 +317,19 @@ class Frames:
             if name in vars(self)
         }
         starts = _chosen(self._starts, which)
-        places = starts if self.places is self._starts else _chosen(self.places, which)
+        if self.places is self._starts:
+            places = starts
+        else:
+            places = _chosen(self.places, which)
         return self._with(**chosen, rows=rows, _starts=starts, places=places)
 
     def by_layout(self) -> list[tuple[Layout, Indices]]:
         """Each layout that is known, with the indices of its frames, (k,)."""
         form = alike(self.forms)
         if form is not None:
-            return [(self.layouts[form], counted(len(self)))] if form >= 0 else []
+            if form >= 0:
+                return [(self.layouts[form], counted(len(self)))]
+            return []
         if len(self.layouts) <= FEWER:
             groups = [
                 (layout, np.flatnonzero(self.forms == form))
@@ -414,4 +426,6 @@ def _shifted(forms: Indices, first: int) -> Indices:
 
 
 def _chosen(numbers: Numbers, which: NDArray[np.bool_] | Indices | slice) -> Numbers:
-    return numbers[which] if isinstance(which, slice) else array_of(numbers)[which]
+    if isinstance(which, slice):
+        return numbers[which]
+    return array_of(numbers)[which]

@@ -143,7 +143,10 @@ class _Walk:
                 piece.need = frames.sizes.item(last)
                 break
             self._take(row, last)
-            row = last + 1 if self._after is None else self._after.item(last)
+            if self._after is None:
+                row = last + 1
+            else:
+                row = self._after.item(last)
         return piece.end
 
     def frames(self) -> list[Frames]:

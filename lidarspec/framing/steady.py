@@ -53,7 +53,10 @@ def steady_stream(
         frames = judge_rows(framing, kind, buffer, rows[:lead], 0)
         if frames is None:
             return None
-        valid = lead if frames.is_sound else int((frames.status != 0).argmax())
+        if frames.is_sound:
+            valid = lead
+        else:
+            valid = int((frames.status != 0).argmax())
         mode.steady = 2 * valid > number
         if not mode.steady:
             return None
@@ -125,14 +128,18 @@ def leading(framing: Framing, kind: int, rows: Bytes2D) -> int | None:
         marked = right(constants, some)
         if marked is not None and np.count_nonzero(marked):
             return int(marked.argmin())
-    return len(rows) if marked is None else None
+    if marked is None:
+        return len(rows)
+    return None
 
 
 def step_between(starts: Indices) -> int:
     """Return the bytes from each start to the next; 0 if they differ."""
     steps = starts[1:] - starts[:-1]
     step = steps.item(0) if len(steps) else 0
-    return step if step > 0 and np.count_nonzero(steps == step) == len(steps) else 0
+    if step > 0 and np.count_nonzero(steps == step) == len(steps):
+        return step
+    return 0
 
 
 def _piece(framing: Framing, mode: Mode, frames: Frames) -> Piece:

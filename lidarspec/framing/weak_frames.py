@@ -47,7 +47,9 @@ class Runs:
     def ends(self) -> Indices:
         """Where the run of each candidate ends, (n,)."""
         ends = self.frames.starts + self.frames.sizes
-        return ends[self._jumps[-1]] if self._jumps else ends
+        if self._jumps:
+            return ends[self._jumps[-1]]
+        return ends
 
     @cached_property
     def heads(self) -> Frames:
@@ -70,7 +72,9 @@ class Runs:
         row = int(self.frames.starts.searchsorted(offset))
         if row == len(self.frames) or self.frames.starts.item(row) != offset:
             return None
-        return row if self.frames.status.item(row) == VALID else None
+        if self.frames.status.item(row) == VALID:
+            return row
+        return None
 
     def members(self, offsets: Indices) -> Frames:
         """Return the frames of the whole runs that begin at some offsets."""
@@ -90,7 +94,10 @@ class Runs:
         rows = np.arange(count)
         further = self.following[:count]
         found = list[Indices]()
-        jumps = rows if self.is_single else np.where(further < count, further, rows)
+        if self.is_single:
+            jumps = rows
+        else:
+            jumps = np.where(further < count, further, rows)
         while (jumps != rows).any():
             found.append(jumps)
             rows = jumps

@@ -87,7 +87,10 @@ class ArrivalOrder:
         packets = np.empty(0, np.int64)
         if alike(skipped) != 0:
             rows = np.flatnonzero(skipped > 0)
-            largest = sizes[rows] if size is not None else np.maximum.accumulate(sizes)[rows]
+            if size is not None:
+                largest = sizes[rows]
+            else:
+                largest = np.maximum.accumulate(sizes)[rows]
             packets = np.rint(skipped[rows] / np.maximum(largest, self._largest)).astype(np.int64)
         self._largest = max(self._largest, int(sizes.max()) if size is None else size)
         return rows, packets

@@ -160,7 +160,10 @@ class ClockOrder:
         assert self._newest is not None
         first = self._newest.index + 1
         for row in range(max(start, stop - MAX_PLACES_LATE), stop):
-            checksum = crc32(batch.table.frame(row)) if row >= stop - REMEMBERED_CHECKSUMS else None
+            if row >= stop - REMEMBERED_CHECKSUMS:
+                checksum = crc32(batch.table.frame(row))
+            else:
+                checksum = None
             time = times.item(row)
             self._newest = Neighbour(
                 time, time + self._offset, first + row - start, 0, checksum, self._angle_at(row)
@@ -201,13 +204,18 @@ class ClockOrder:
             time, order, newest.index + 1 + missing, missing, checksum, angle, masked
         )
         self._neighbours.append(self._newest)
-        self._leap = (newest.time, self._newest) if missing > MAX_PLACES_LATE else None
+        if missing > MAX_PLACES_LATE:
+            self._leap = (newest.time, self._newest)
+        else:
+            self._leap = None
         if missing and self._gaps is not None:
             self._stats.lost -= self._gaps.find_unlost(row, newest.angle, angle, self._newest)
         return self._newest
 
     def _angle_at(self, row: int) -> float:
-        return math.nan if self._gaps is None else self._gaps.angle_at(row)
+        if self._gaps is None:
+            return math.nan
+        return self._gaps.angle_at(row)
 
     @property
     def _places_late(self) -> int:
@@ -241,7 +249,10 @@ class ClockOrder:
             index = before.index + 2
             batch.breaks[row] = True
         self._newest = Neighbour(time, time + self._offset, index, 0, checksum, self._angle_at(row))
-        self._leap = None if before is None else (before.time, self._newest)
+        if before is None:
+            self._leap = None
+        else:
+            self._leap = (before.time, self._newest)
         self._neighbours = [self._newest]
         return self._newest
 

@@ -186,7 +186,9 @@ def clock_ns(sensor: Spec, batch: Batch) -> Times:
     that of the frame before.
     """
     which, readings = clocked(sensor, batch)
-    return readings if which is None else held(which, readings, np.zeros(len(batch), np.int64))
+    if which is None:
+        return readings
+    return held(which, readings, np.zeros(len(batch), np.int64))
 
 
 def clocked(sensor: Spec, batch: Batch) -> tuple[NDArray[np.intp] | None, Times]:
@@ -213,7 +215,9 @@ def held(which: NDArray[np.intp], times: Times, before: Times) -> Times:
     Packets before the first of them have the times `before`, (n,).
     """
     spots = np.searchsorted(which, np.arange(len(before)), side="right") - 1
-    return np.where(spots < 0, before, times[np.maximum(spots, 0)]) if len(times) else before
+    if len(times):
+        return np.where(spots < 0, before, times[np.maximum(spots, 0)])
+    return before
 
 
 def _summed(fields: tuple[str, ...], table: Table, sensor: str) -> Times:
@@ -230,8 +234,13 @@ def _summed(fields: tuple[str, ...], table: Table, sensor: str) -> Times:
             part = _nanoseconds(
                 raw.astype(np.float64) * float(step / 10**9) + float(zero / 10**9), len(table)
             )
-        total = part if total is None else np.add(total, part, out=total)
-    return np.zeros(len(table), np.int64) if total is None else total
+        if total is None:
+            total = part
+        else:
+            total = np.add(total, part, out=total)
+    if total is None:
+        return np.zeros(len(table), np.int64)
+    return total
 
 
 def clock_parts(sensor: Spec, schema: Schema) -> tuple[str, str] | None:
@@ -242,7 +251,9 @@ def clock_parts(sensor: Spec, schema: Schema) -> tuple[str, str] | None:
         if path not in schema.fields
     }
     found = {place[:2] for place in places if place is not None}
-    return found.pop() if len(found) == 1 else None
+    if len(found) == 1:
+        return found.pop()
+    return None
 
 
 def part_times(
@@ -261,7 +272,10 @@ def part_times(
     readings = _in_parts(sensor, place, table)
     first = np.searchsorted(which, which)
     steps = readings - readings[first]
-    turn = _turn(sensor.clock.wraps_at) if sensor.clock.wraps_at else 0
+    if sensor.clock.wraps_at:
+        turn = _turn(sensor.clock.wraps_at)
+    else:
+        turn = 0
     return times + ((steps + turn // 2) % turn - turn // 2 if turn else steps)
 
 
@@ -310,7 +324,10 @@ def clock_terms(
     found = []
     for path in fields:
         info = schema.fields.get(path)
-        scaling = _scaling(info.unit, info.scale, info.offset) if info else None
+        if info:
+            scaling = _scaling(info.unit, info.scale, info.offset)
+        else:
+            scaling = None
         if info is None or scaling is None or info.axes:
             reason = "a clock is one field of the frame, with a unit of time and outside arrays"
             raise SpecError(

@@ -74,11 +74,16 @@ class Readings:
 
     def time(self, row: int) -> int | None:
         """Return the time of a packet, ns."""
-        return None if self.times is None else self.times.item(row)
+        if self.times is None:
+            return None
+        return self.times.item(row)
 
     def period(self, row: int) -> int:
         """Return the number of values that the counter of a packet takes."""
-        period = self.periods if isinstance(self.periods, int) else self.periods.item(row)
+        if isinstance(self.periods, int):
+            period = self.periods
+        else:
+            period = self.periods.item(row)
         return max(period, 1)
 
 
@@ -187,7 +192,10 @@ class CounterOrder:
         if self._clock is None or times is None:
             unknown = np.broadcast_to(np.nan, (len(batch),))
             return Readings(numbers, periods, has_counter, None, None, unknown)
-        first_step = 1 if self._arrived is None else times.item(0) - self._arrived
+        if self._arrived is None:
+            first_step = 1
+        else:
+            first_step = times.item(0) - self._arrived
         self._arrived = times.item(-1)
         steps = np.empty(len(times), np.int64)
         steps[0] = first_step
@@ -200,8 +208,12 @@ class CounterOrder:
         last = self._rule.last
         if callable(last):
             (values,) = header_function(last, batch.table.schema, _integers)(batch)
-            return values.item(0) if (values == values[0]).all() else values
-        return largest if last is None else int(last)
+            if (values == values[0]).all():
+                return values.item(0)
+            return values
+        if last is None:
+            return largest
+        return int(last)
 
     def _find_odd(self, readings: Readings) -> list[int]:
         """Return the packets that do not follow the previous one.
@@ -269,7 +281,10 @@ class CounterOrder:
         if ahead == 0:
             return 0
         behind = period - ahead
-        reach = MAX_PLACES_LATE if self._index - behind >= self._first else MAX_PLACES_EARLY
+        if self._index - behind >= self._first:
+            reach = MAX_PLACES_LATE
+        else:
+            reach = MAX_PLACES_EARLY
         if behind <= min(reach, period // 2):
             return -behind
         if period >= LONG_PERIOD and ahead > min(period // 2, MAX_INDEX_STEP):
@@ -399,4 +414,6 @@ def _agree(ahead: int, by_clock: float) -> bool:
 
 def _integers(values: Any, count: int) -> NDArray[np.int64]:
     integers = np.asarray(values, np.float64).reshape(-1).astype(np.int64)
-    return integers if len(integers) == 1 else np.broadcast_to(integers, (count,))
+    if len(integers) == 1:
+        return integers
+    return np.broadcast_to(integers, (count,))

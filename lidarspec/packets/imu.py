@@ -113,7 +113,9 @@ def samples(sensor: Spec, frame: str, batch: Batch, time_ns: NDArray[np.int64]) 
         )
     found = ImuSamples(time, values_of[:, :3], values_of[:, 3:])
     turn = vendor_turn(sensor)
-    return found if turn is None else found.turned(turn)
+    if turn is None:
+        return found
+    return found.turned(turn)
 
 
 class Waiting:
@@ -140,6 +142,9 @@ class Waiting:
         """Hand out what was felt before a time, in the order of time; of None all there is."""
         found = joined(self._parts)
         found = found[np.argsort(found.time_ns, kind="stable")]
-        later = found.time_ns >= ns if ns is not None else np.zeros(len(found), np.bool_)
+        if ns is not None:
+            later = found.time_ns >= ns
+        else:
+            later = np.zeros(len(found), np.bool_)
         self._parts = [found[later]] if later.any() else []
         return found[~later]

@@ -84,13 +84,17 @@ class Sector:
         offset = forward(other.start - self.start, self.direction)
         if offset < self.width:
             return Sector(other.start, min(self.width - offset, other.width), self.direction)
-        return other.common(self) if other.contains(self.start) else None
+        if other.contains(self.start):
+            return other.common(self)
+        return None
 
 
 def forward(step: float, direction: int) -> float:
     """Return a step in the direction of rotation, from 0 to 1; a little back is none."""
     ahead = (direction * step) % 1
-    return 0.0 if ahead > 1 - JITTER else ahead
+    if ahead > 1 - JITTER:
+        return 0.0
+    return ahead
 
 
 class AngleReader:
@@ -121,8 +125,14 @@ class AngleReader:
 
         Returns None if the packets have no such field, or no part that has it.
         """
-        info = table.schema.fields.get(self._path) if self.is_available else None
-        full = self._full if info is None or self._full is not None else FULL_TURNS.get(info.unit)
+        if self.is_available:
+            info = table.schema.fields.get(self._path)
+        else:
+            info = None
+        if info is None or self._full is not None:
+            full = self._full
+        else:
+            full = FULL_TURNS.get(info.unit)
         if info is None or full is None:
             return None
         raw = table.raw(self._path)
@@ -253,7 +263,10 @@ class MaskedGaps:
         """Read the angles of the next packets."""
         if self._angles is not None:
             self._note_until(len(self._angles))
-        self._angles = self._reader.angles(table) if len(table) else None
+        if len(table):
+            self._angles = self._reader.angles(table)
+        else:
+            self._angles = None
         self._first_unnoted = 0
         if self._angles is not None and self._finder is None:
             direction = self._reader.direction(table)
@@ -273,19 +286,26 @@ class MaskedGaps:
 
     def angle_at(self, row: int) -> float:
         """Return the angle of one of the packets at hand, in turns; nan if unknown."""
-        return math.nan if self._angles is None else self._angles.item(row)
+        if self._angles is None:
+            return math.nan
+        return self._angles.item(row)
 
     def count_masked(self, start: float, stop: float, missing: int) -> int:
         """Return how many of the packets missing between two angles are masked.
 
         Returns 0 if the masked sector is not known.
         """
-        sector = None if self._finder is None else self._finder.sector
+        if self._finder is None:
+            sector = None
+        else:
+            sector = self._finder.sector
         if sector is None or math.isnan(start) or math.isnan(stop):
             return 0
         if not Sector.between(start, stop, sector.direction).contains(sector.middle):
             return 0
-        return missing if missing <= self.masked + VARYING_PACKETS else min(self.masked, missing)
+        if missing <= self.masked + VARYING_PACKETS:
+            return missing
+        return min(self.masked, missing)
 
     def find_unlost(self, row: int, start: float, stop: float, loss: Loss) -> int:
         """Compare a loss between two angles with earlier ones; if it recurs, both are masked.

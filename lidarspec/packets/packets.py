@@ -89,7 +89,9 @@ class Packets:
 
         It is the unwrapped counter of the sensor, if there is one.
         """
-        return self._index() if callable(self._index) else array_of(self._index)
+        if callable(self._index):
+            return self._index()
+        return array_of(self._index)
 
     @property
     def order(self) -> NDArray[np.int64]:
@@ -97,7 +99,9 @@ class Packets:
 
         It follows from the counter, or else from the clock, of datagrams.
         """
-        return self.index if self._order is None else self._order
+        if self._order is None:
+            return self.index
+        return self._order
 
     def __len__(self) -> int:
         return len(self.table)
@@ -209,7 +213,10 @@ class Packets:
         """Return what is known of some packets besides their fields, as `Packets` takes it."""
         columns: dict[str, Any] = {name: getattr(self, name)[indices] for name in _COLUMNS}
         order = None if self._order is None else self._order[indices]
-        masked = None if self.masked is None else self.masked[indices]
+        if self.masked is None:
+            masked = None
+        else:
+            masked = self.masked[indices]
         return {**columns, "order": order, "masked": masked}
 
     def parts(self, path: str) -> Packets:
@@ -251,19 +258,25 @@ class Packets:
             stats=self.stats,
             backend=self.backend,
         )
-        return parts.parts(below) if below else parts
+        if below:
+            return parts.parts(below)
+        return parts
 
     @property
     def with_points(self) -> Packets:
         """The packets that points are made of: these, or the parts in them."""
         path = self.sensor.parts_with("points", self.frame)
-        return self.parts(path) if path else self
+        if path:
+            return self.parts(path)
+        return self
 
     @property
     def frames(self) -> tuple[Table, NDArray[np.intp] | slice]:
         """The frames that they are, or that they are parts of, and the row of each there, (n,)."""
         table, which = self.state.get(AROUND, (None, slice(None)))
-        return (self.table, slice(None)) if table is None else (table, which)
+        if table is None:
+            return (self.table, slice(None))
+        return (table, which)
 
     def batch(self, carry: dict[int, NDArray[np.float64]] | None = None) -> Batch:
         """Return the packets as functions of a plugin receive them, through `Fields`.
@@ -342,7 +355,10 @@ def _nested(schema: Schema, columns: Mapping[str, NDArray[Any]], prefix: str) ->
             )
         own = [index for index, axis in enumerate(info.axes) if axis.rstrip("[]") == here]
         shape = tuple(columns[path].shape[1 + index] for index in own)
-        kind = _nested(schema, columns, f"{here}.") if below else columns[path].dtype
+        if below:
+            kind = _nested(schema, columns, f"{here}.")
+        else:
+            kind = columns[path].dtype
         members.append((name, kind, shape) if shape else (name, kind))
     return np.dtype(members)
 

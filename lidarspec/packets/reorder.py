@@ -45,7 +45,9 @@ class Reorder:
     def push(self, packets: Packets) -> list[Packets]:
         """Return the packets that are now in order; at most one batch."""
         if not self._enabled or not len(packets):
-            return [packets] if len(packets) else []
+            if len(packets):
+                return [packets]
+            return []
         held_count = 0
         if self._held is not None:
             held_count = len(self._held)
@@ -125,8 +127,13 @@ class Reorder:
                 rows.append(released)
                 if not shows_gaps:
                     break
-        self._held = packets.take(np.array([row for _, row in held], np.intp)) if held else None
-        return [self._mark(packets.take(np.array(rows, np.intp)), before)] if rows else []
+        if held:
+            self._held = packets.take(np.array([row for _, row in held], np.intp))
+        else:
+            self._held = None
+        if rows:
+            return [self._mark(packets.take(np.array(rows, np.intp)), before)]
+        return []
 
     def _mark(self, packets: Packets, before: int | None) -> Packets:
         """Return packets in order, with breaks exactly where the index leaves out numbers.

@@ -100,7 +100,10 @@ class PacketStream:
         if is_data and clock is not None and clock.told is not None:
             self._epoch = Epoch(self._timer, clock, reference)
 
-        data_clock = sensor.clock if is_data and clock is not None else None
+        if is_data and clock is not None:
+            data_clock = sensor.clock
+        else:
+            data_clock = None
         is_in_parts = data_clock is not None and self._has_clock_in_parts()
         self._counter_order: CounterOrder | None = None
         self._clock_order: ClockOrder | None = None
@@ -208,7 +211,10 @@ class PacketStream:
                 self._turn = self._epoch.push(batch, readings, times, host, whole=whole)
             return times
         times = self._clock.push(readings, host[which])
-        before = host if self._time is None else repeated(self._time, len(host))
+        if self._time is None:
+            before = host
+        else:
+            before = repeated(self._time, len(host))
         if len(times):
             self._time = times.item(-1)
         return held(which, times, before)
@@ -248,7 +254,9 @@ class PacketStream:
             for part in parts
             if part.number
         ]
-        return joined_tables(tables) if tables else self._codec.table([])
+        if tables:
+            return joined_tables(tables)
+        return self._codec.table([])
 
     def _states(self, parts: Sequence[_Part], number: int, *, whole: bool) -> dict[str, StateOf]:
         """Return the frames of each other type, and which was the last before each packet."""
@@ -399,7 +407,10 @@ class _Part:
     @classmethod
     def of(cls, frames: Frames, name: str) -> _Part:
         """Return the frames of one type in a piece."""
-        own = frames.names.index(name) if name in frames.names else -1
+        if name in frames.names:
+            own = frames.names.index(name)
+        else:
+            own = -1
         kind = alike(frames.kinds)
         if kind is not None and kind == own:
             return cls(frames, None, len(frames))
@@ -417,11 +428,15 @@ class _Part:
             return slice(0, self.number)
         first = where.item(0)
         last = where.item(-1)
-        return slice(first, last + 1) if last - first == len(where) - 1 else where
+        if last - first == len(where) - 1:
+            return slice(first, last + 1)
+        return where
 
     def column(self, array: Integers) -> Integers:
         """Return the rows of the type from an array of the piece."""
-        return array if self.where is None else some(array, self.own)
+        if self.where is None:
+            return array
+        return some(array, self.own)
 
 
 def data_frame(sensor: Spec, found: Sequence[Frames]) -> str | None:
@@ -451,10 +466,14 @@ def _clock_of(sensor: Spec, frame: str, schema: Schema) -> Clock | None:
     if declared.clock is not None or shared is None:
         return declared.clock
     if declared.data:
-        return shared if all(_has_field(sensor, frame, path) for path in paths(shared)) else None
+        if all(_has_field(sensor, frame, path) for path in paths(shared)):
+            return shared
+        return None
     if declared.imu is None or not paths(shared):
         return None
-    return shared if all(path in schema.fields for path in paths(shared)) else None
+    if all(path in schema.fields for path in paths(shared)):
+        return shared
+    return None
 
 
 def _has_counter(sensor: Spec, frame: str) -> bool:
@@ -494,7 +513,9 @@ def _times(parts: Sequence[Integers]) -> Integers:
     only = alike(times)
     if only is not None:
         return repeated(max(only, 0), len(times))
-    return np.maximum(times, 0) if len(times) and int(times.min()) < 0 else times
+    if len(times) and int(times.min()) < 0:
+        return np.maximum(times, 0)
+    return times
 
 
 def _all_or_joined(parts: Sequence[Integers]) -> Integers:
@@ -510,4 +531,6 @@ def _all_or_joined(parts: Sequence[Integers]) -> Integers:
 def _joined(parts: Sequence[NDArray[Any]], dtype: Any) -> NDArray[Any]:
     if len(parts) == 1:
         return parts[0]
-    return np.concatenate(parts) if parts else np.empty(0, dtype)
+    if parts:
+        return np.concatenate(parts)
+    return np.empty(0, dtype)

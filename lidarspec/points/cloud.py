@@ -114,7 +114,10 @@ class PointCloud:
         near, far = (
             f(self.range[self.valid], initial=start) for f, start in ((np.min, np.inf), (np.max, 0))
         )
-        span = f", {near:.2f}..{far:.2f} m" if self.valid.any() else ""
+        if self.valid.any():
+            span = f", {near:.2f}..{far:.2f} m"
+        else:
+            span = ""
         return (
             f"PointCloud({len(self)} points, {int(self.valid.sum())}"
             f" valid{span}{', nominal calibration' if self.nominal else ''})"
@@ -183,7 +186,9 @@ class PointCloud:
 
         "own" is the sensor's own, "nominal" means that defaults were used.
         """
-        return "nominal" if self.nominal else "own"
+        if self.nominal:
+            return "nominal"
+        return "own"
 
     @property
     def xyz(self) -> Floats:
@@ -202,7 +207,9 @@ class PointCloud:
             raise ValueError(
                 "x, y and z of a PointCloud are columns of their own, of which (N, 3) is a copy"
             )
-        return self.xyz if dtype is None else self.xyz.astype(dtype, copy=False)
+        if dtype is None:
+            return self.xyz
+        return self.xyz.astype(dtype, copy=False)
 
     def __getitem__(self, which: Any) -> PointCloud:
         """Return the points at a mask, indices or a slice.
@@ -267,7 +274,10 @@ class PointCloud:
                 shift for each row.
         """
         if self.shape is None or np.shape(shifts) != (self.shape[1],):
-            what = f"{self.shape[1]} rows" if self.shape else "points that are not organised"
+            if self.shape:
+                what = f"{self.shape[1]} rows"
+            else:
+                what = "points that are not organised"
             raise UsageError(f"{np.size(shifts)} shifts for {what}")
         grid, (columns, rows) = grid_of(self), self.shape
         source = (np.arange(columns)[:, None] - np.asarray(shifts)) % columns
@@ -403,7 +413,9 @@ def structured_type(extra: Mapping[str, np.dtype[Any]]) -> np.dtype[Any]:
 
 
 def _pick(value: Any, which: Any) -> Any:
-    return value[which] if isinstance(value, np.ndarray) and value.ndim else value
+    if isinstance(value, np.ndarray) and value.ndim:
+        return value[which]
+    return value
 
 
 def grid_of(cloud: PointCloud) -> Grid:
@@ -415,7 +427,9 @@ def grid_of(cloud: PointCloud) -> Grid:
 
 def organised(number: int, grid: Grid) -> tuple[int, int] | None:
     """The shape of a cloud of so many points."""
-    return (number // grid.column, grid.rows) if grid.rows else None
+    if grid.rows:
+        return (number // grid.column, grid.rows)
+    return None
 
 
 class ColumnSource:
@@ -457,7 +471,9 @@ class ColumnSource:
         Returns None if the sensor does not have it.
         """
         column = self.column(name)
-        return None if column is None else column[start:stop]
+        if column is None:
+            return None
+        return column[start:stop]
 
     def grid_between(self, start: int, stop: int) -> Grid:
         """How the points from `start` to `stop` are organised, whatever is around them."""
@@ -492,8 +508,14 @@ class CloudColumns(ColumnSource):
         self.base = cloud.stamp_ns
         self.grids = grids
         self.nominal = bool(cloud.nominal)
-        self.grid = grids.between(0, self.size) if grids else grid_of(cloud)
-        own = cloud.source.extra if isinstance(cloud, LazyCloud) else None
+        if grids:
+            self.grid = grids.between(0, self.size)
+        else:
+            self.grid = grid_of(cloud)
+        if isinstance(cloud, LazyCloud):
+            own = cloud.source.extra
+        else:
+            own = None
         if own is None:
             self.extra = {
                 name: Kind(column.dtype, cloud.units.get(name, ""))
@@ -547,7 +569,10 @@ class Stretches(ColumnSource):
         self.size = sum(part.size for part in parts)
         self.base = parts[0].source.base
         grids = {part.source.grid_between(part.start, part.stop) for part in parts}
-        self.grid = grids.pop() if len(grids) == 1 else Grid()
+        if len(grids) == 1:
+            self.grid = grids.pop()
+        else:
+            self.grid = Grid()
         self.nominal = any(part.source.nominal for part in parts)
         first = parts[0].source.extra
         if first:
@@ -610,7 +635,9 @@ class Stretches(ColumnSource):
             if column is None:
                 return None
             columns.append(column + later(part.source, self.base) if name == "time" else column)
-        return columns[0] if len(columns) == 1 else np.concatenate(columns)
+        if len(columns) == 1:
+            return columns[0]
+        return np.concatenate(columns)
 
 
 def later(source: ColumnSource, base: int) -> float:
@@ -711,7 +738,9 @@ for _name in (*COLUMNS, "valid"):
 
 def source_of(cloud: PointCloud) -> ColumnSource:
     """Where the columns of a cloud come from."""
-    return cloud.source if isinstance(cloud, LazyCloud) else CloudColumns(cloud)
+    if isinstance(cloud, LazyCloud):
+        return cloud.source
+    return CloudColumns(cloud)
 
 
 @dataclass(frozen=True)

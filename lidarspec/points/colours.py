@@ -81,6 +81,9 @@ def _srgb(lightness: float, a: float, b: float) -> list[int]:
     for row in _LINEAR:
         linear = sum(factor * cone for factor, cone in zip(row, cones, strict=True))
         linear = min(max(linear, 0.0), 1.0)
-        encoded = 12.92 * linear if linear <= 0.0031308 else 1.055 * linear ** (1 / 2.4) - 0.055
+        if linear <= 0.0031308:
+            encoded = 12.92 * linear
+        else:
+            encoded = 1.055 * linear ** (1 / 2.4) - 0.055
         parts.append(round(255 * encoded))
     return parts

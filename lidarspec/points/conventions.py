@@ -111,7 +111,8 @@ def placed(coordinates: Sequence[Any], invalid: Any) -> list[Any]:
     """
     away = sum(abs(place) for place in coordinates if not is_zero(place))
     lost = np.logical_not((away > 0) & (away <= FARTHEST))
-    lost = lost | invalid if isinstance(invalid, Traced) or np.any(invalid) else lost
+    if isinstance(invalid, Traced) or np.any(invalid):
+        lost = lost | invalid
     return [np.where(lost, np.nan, place) for place in coordinates]
 
 
@@ -170,7 +171,9 @@ def grid_of(shape: Sequence[int], axes: Sequence[str | None]) -> Grid:
     *lengths, returns = shape if is_stacked else (*shape, 1)
     while len(lengths) > 2 and lengths[-1] == 1:
         lengths.pop()
-    return Grid(lengths[-1], returns) if len(lengths) > 1 and lengths[-1] > 1 else Grid()
+    if len(lengths) > 1 and lengths[-1] > 1:
+        return Grid(lengths[-1], returns)
+    return Grid()
 
 
 class Grids(NamedTuple):
@@ -207,7 +210,9 @@ def whole_columns(grid: Grid, first: int, number: int) -> Grid:
 
     They begin `first` points after a column, and are not organised if they are not whole columns.
     """
-    return grid if grid.rows and first % grid.column == 0 and number % grid.column == 0 else Grid()
+    if grid.rows and first % grid.column == 0 and number % grid.column == 0:
+        return grid
+    return Grid()
 
 
 class Kind(NamedTuple):
@@ -220,12 +225,18 @@ class Kind(NamedTuple):
     def of(cls, extra: Extra, values: Any) -> Kind:
         """What is declared, and else follows from the field that the values are."""
         is_own = isinstance(values, Column) and not values.frame
-        info = values.batch.table.schema.fields.get(values.source) if is_own else None
+        if is_own:
+            info = values.batch.table.schema.fields.get(values.source)
+        else:
+            info = None
         if info is not None and info.kind == "int" and not info.scaled:
             as_sent = info.dtype
         else:
             as_sent = None
-        array = values.array if isinstance(values, Column) else np.asarray(values)
+        if isinstance(values, Column):
+            array = values.array
+        else:
+            array = np.asarray(values)
         if extra.dtype is None:
             dtype = np.dtype(bool if array.dtype.kind == "b" else as_sent or np.float32)
         else:
@@ -263,7 +274,10 @@ def axes_of(sensor: Spec) -> tuple[str, str, str]:
 
     They follow REP-103, or the vendor's axes if these are configured.
     """
-    wanted = sensor.vendor_axes if sensor.options.get("frame") == "vendor" else None
+    if sensor.options.get("frame") == "vendor":
+        wanted = sensor.vendor_axes
+    else:
+        wanted = None
     return wanted or REP_103
 
 
@@ -273,7 +287,9 @@ def vendor_turn(sensor: Spec) -> NDArray[np.float64] | None:
     Returns None if these are the axes of REP-103.
     """
     axes = axes_of(sensor)
-    return None if axes == REP_103 else axis_matrix(axes)
+    if axes == REP_103:
+        return None
+    return axis_matrix(axes)
 
 
 def turned_azimuth(angles: NDArray[Any], turn: NDArray[np.float64]) -> NDArray[np.float64]:

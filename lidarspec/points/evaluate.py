@@ -50,7 +50,9 @@ def evaluated(
             is chained.
     """
     planned = _planned(packets, carry, final=final, epoch=epoch)
-    return planned if planned is not None else evaluate(packets, carry, final=final, epoch=epoch)
+    if planned is not None:
+        return planned
+    return evaluate(packets, carry, final=final, epoch=epoch)
 
 
 def _planned(
@@ -102,7 +104,10 @@ def _planned(
     else:
         ready = min((column.ready for column in remembered.values()), default=len(packets))
     cloud = _cloud_of(packets, shares, batch, ready, stamp_of(packets, epoch))
-    counts = np.empty(0, np.intp) if alone else _counts(shares, len(packets))[:ready]
+    if alone:
+        counts = np.empty(0, np.intp)
+    else:
+        counts = _counts(shares, len(packets))[:ready]
     return Evaluated(cloud, ready, batch.carried(ready), counts, Fields(batch), plans[0].axes)
 
 

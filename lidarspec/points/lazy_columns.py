@@ -85,7 +85,10 @@ class Plain:
 
         None for what is no such field, or not in every packet.
         """
-        info = self._table.schema.fields.get(node.path) if node.kind == "field" else None
+        if node.kind == "field":
+            info = self._table.schema.fields.get(node.path)
+        else:
+            info = None
         if (
             info is None
             or info.scaled
@@ -107,7 +110,9 @@ class Plain:
         self._columns[node] = column
 
     def _read(self, node: Node) -> Any:
-        return node.function(self._fields) if node.kind in ("field", "state") else None
+        if node.kind in ("field", "state"):
+            return node.function(self._fields)
+        return None
 
     def _loaded(self, node: Node) -> Any:
         if node in self._columns:
@@ -116,7 +121,9 @@ class Plain:
             return field_array(
                 self._table.schema.fields[node.path], self._table, self._table.schema.depth()
             )
-        return None if node.kind == "call" else self.column(node).array
+        if node.kind == "call":
+            return None
+        return self.column(node).array
 
 
 @dataclass(eq=False)
@@ -142,7 +149,9 @@ class Share:
 
         def values(node: Node) -> NDArray[Any]:
             array = self.known.array(node)
-            return array[first:stop] if len(array) > 1 else array
+            if len(array) > 1:
+                return array[first:stop]
+            return array
 
         if stop - first == len(self):
             maker.run(self.group.rows, self.known.array, columns)
@@ -167,8 +176,12 @@ class Share:
         else:
             array = None
         if array is None:
-            array = self.known.array(part) if isinstance(part, Node) else np.asarray(part)
-            array = array[first:stop] if isinstance(part, Node) and len(array) > 1 else array
+            if isinstance(part, Node):
+                array = self.known.array(part)
+            else:
+                array = np.asarray(part)
+            if isinstance(part, Node) and len(array) > 1:
+                array = array[first:stop]
         return np.broadcast_to(
             deep(array, len(shape) - 1) if isinstance(part, Node) else array, shape
         )
@@ -186,7 +199,10 @@ class Share:
         share = cls(plan, group, Plain(own), own)
         for number, column in remembered.items():
             node = plan.tape.nodes[number]
-            array = column.array[group.where] if len(column.array) > 1 else column.array
+            if len(column.array) > 1:
+                array = column.array[group.where]
+            else:
+                array = column.array
             corner = (slice(None), *(slice(0, length) for length in node.shape))
             share.known.know(node, Column(array[corner], node.sample.axes, own))
         return share
@@ -260,7 +276,10 @@ class Computed(ColumnSource):
             for name in names
             if name not in self._made and all(name in plan.sent for plan in plans)
         ]
-        main = self._main_names if set(_MAIN).intersection(names) - self._made.keys() else ()
+        if set(_MAIN).intersection(names) - self._made.keys():
+            main = self._main_names
+        else:
+            main = ()
         if sent and len(sent) + len(main) > 1 and self._turn is None:
             self._made |= self._compiled((*main, *sent))
 
@@ -460,7 +479,9 @@ class BatchColumns(ColumnSource):
     @property
     def even(self) -> Share | None:
         """The share of all packets, where they have one layout and stand in order."""
-        return self.shares[0] if len(self.shares) == 1 and self.shares[0].first is None else None
+        if len(self.shares) == 1 and self.shares[0].first is None:
+            return self.shares[0]
+        return None
 
     def column(self, name: str) -> NDArray[Any] | None:
         if name not in self._made:
@@ -490,7 +511,9 @@ class BatchColumns(ColumnSource):
                 return None
             pieces.append(column[at - first : stop - first])
             at = end
-        return pieces[0] if len(pieces) == 1 else np.concatenate(pieces)
+        if len(pieces) == 1:
+            return pieces[0]
+        return np.concatenate(pieces)
 
     def _block(self, at: int) -> Block:
         """Return the block of points around an index, which are computed together.
@@ -501,7 +524,10 @@ class BatchColumns(ColumnSource):
         if index and at < self._blocks[index - 1].stop:
             return self._blocks[index - 1]
         width = self.shares[0].plan.width
-        after = self._blocks[index].start if index < len(self._blocks) else self.size
+        if index < len(self._blocks):
+            after = self._blocks[index].start
+        else:
+            after = self.size
         start = at // width * width
         block = Block(start, min(start + max(SHARED // width, 1) * width, after), {})
         self._blocks.insert(index, block)

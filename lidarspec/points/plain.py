@@ -113,7 +113,11 @@ def evaluate(
 
 def stamp_of(packets: PacketBatch, epoch: int | None) -> int:
     """The stamp of a batch's cloud, int64 ns: a given one, else the time of the first packet."""
-    return epoch if epoch is not None else int(packets.time_ns[0]) if len(packets) else 0
+    if epoch is not None:
+        return epoch
+    if len(packets):
+        return int(packets.time_ns[0])
+    return 0
 
 
 def parts_of(result: Points) -> dict[str, Any]:
@@ -149,7 +153,10 @@ def _flattened(
     }
     offsets = conventions.seconds_since(packets.time_ns, stamp_ns).reshape(-1, *(1,) * len(axes))
     every["time"] = every["time"] + flat(offsets, shape, mask, ready)
-    inside = np.ones(shape, np.bool_) if mask is None else mask.reshape(shape)
+    if mask is None:
+        inside = np.ones(shape, np.bool_)
+    else:
+        inside = mask.reshape(shape)
     cloud = make_cloud(
         every,
         conventions.vendor_turn(packets.sensor),
@@ -194,7 +201,9 @@ def flat(
     Only the first `ready` packets count. Padding is left out.
     """
     full = np.broadcast_to(array, shape)[:ready]
-    return full.reshape(-1) if mask is None else full.reshape(mask[:ready].shape)[mask[:ready]]
+    if mask is None:
+        return full.reshape(-1)
+    return full.reshape(mask[:ready].shape)[mask[:ready]]
 
 
 def make_cloud(

@@ -317,7 +317,9 @@ class Plan:
 
     @property
     def _directions_given(self) -> tuple[Any, ...]:
-        return () if self.exact else (self.parts["azimuth"], self.parts["elevation"])
+        if self.exact:
+            return ()
+        return (self.parts["azimuth"], self.parts["elevation"])
 
     def _finite(self, node: Node) -> bool:
         """Whether an expression is a number for every value that its field can have."""

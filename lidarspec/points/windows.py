@@ -72,7 +72,9 @@ def window(leaf: Leaf) -> Window | None:
     if len(leaf.shape) > len(leaf.strides):
         return None
     start, stop = leaf.held
-    return Window(start, stop - start) if stop - start <= 2 else None
+    if stop - start <= 2:
+        return Window(start, stop - start)
+    return None
 
 
 def raw_values(leaf: Leaf, seen: Window) -> NDArray[Any]:
@@ -96,7 +98,9 @@ def shift_of(leaf: Leaf, seen: Window) -> tuple[int, int] | None:
         return None
     shift = int(ones[0])
     mask = int(raw[-1])
-    return (shift, mask) if np.array_equal(np.arange(len(raw)) >> shift & mask, raw) else None
+    if np.array_equal(np.arange(len(raw)) >> shift & mask, raw):
+        return (shift, mask)
+    return None
 
 
 def run_of(leaf: Leaf) -> tuple[str, int, int, int] | None:
@@ -112,8 +116,13 @@ def run_of(leaf: Leaf) -> tuple[str, int, int, int] | None:
         if is_whole:
             return (">" if leaf.wire.byteorder == ">" else "<", leaf.offset, leaf.size, 0)
         return None
-    run = None if len(leaf.elements) != 1 or leaf.elements[0].signed else leaf.elements[0].run
-    return None if run is None or run[2] > 4 else (run[0], leaf.offset + run[1], run[2], run[3])
+    if len(leaf.elements) != 1 or leaf.elements[0].signed:
+        run = None
+    else:
+        run = leaf.elements[0].run
+    if run is None or run[2] > 4:
+        return None
+    return (run[0], leaf.offset + run[1], run[2], run[3])
 
 
 def word_of(leaf: Leaf, layout: Layout) -> tuple[int, int, int] | None:
@@ -161,8 +170,13 @@ def possible(node: Node, leaves: Mapping[str, Leaf]) -> NDArray[Any] | None:
     Returns None if it is not an expression of one field with a window.
     """
     source = only_field(node)
-    leaf = leaves.get(source.path) if source is not None else None
-    return every_value(node, leaf) if leaf is not None else None
+    if source is not None:
+        leaf = leaves.get(source.path)
+    else:
+        leaf = None
+    if leaf is not None:
+        return every_value(node, leaf)
+    return None
 
 
 def is_number(value: Any, leaves: Any) -> bool:
@@ -225,7 +239,10 @@ def beam_of(node: Node, leaves: Mapping[str, Leaf]) -> Beam | None:
     field = distance
     while is_nan_where(field) or field.function is returned_range:
         field = field.args[-1]
-    leaf = leaves.get(field.path) if field.kind == "field" and direction.kind == "rows" else None
+    if field.kind == "field" and direction.kind == "rows":
+        leaf = leaves.get(field.path)
+    else:
+        leaf = None
     if leaf is None or leaf.info.kind != "int" or leaf.info.bits > SHORT or leaf.info.offset:
         return None
     return Beam(distance, direction, start, leaf.info.scale)

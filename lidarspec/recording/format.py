@@ -210,7 +210,10 @@ def packed(
     Raises:
         UsageError: for more data, a longer address or another port or time than a record can hold.
     """
-    addresses = _endpoint(sender) + _endpoint(receiver) if sender or receiver else b""
+    if sender or receiver:
+        addresses = _endpoint(sender) + _endpoint(receiver)
+    else:
+        addresses = b""
     try:
         head = _HEAD.pack(
             MARK, kind, flags, len(addresses), len(data), _UNKNOWN if at is None else at
@@ -344,7 +347,10 @@ class Recording(Closing):
         with system_errors(self.path):
             magic = self._file.read(len(MAGIC))
             if magic != MAGIC:
-                seen = f"it begins with {magic.hex(' ')}" if magic else "it is empty"
+                if magic:
+                    seen = f"it begins with {magic.hex(' ')}"
+                else:
+                    seen = "it is empty"
                 raise SourceError(f"{self.path}: not an .lsr recording: {seen}")
             pairs = self._pairs()
             first = next(pairs, None)
@@ -473,4 +479,6 @@ def _endpoints(data: bytes) -> list[Address | None] | None:
         end = place + 1 + length + 2 * bool(length)
         found.append((host, int.from_bytes(data[end - 2 : end], "little")) if length else None)
         place = end
-    return (found or [None, None]) if place == len(data) and len(found) != 1 else None
+    if place == len(data) and len(found) != 1:
+        return found or [None, None]
+    return None

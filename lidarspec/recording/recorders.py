@@ -350,4 +350,6 @@ def _record_size(data: bytes | bytearray, at: int) -> int:
     """The length of the record that begins there in a piece of a recording, or of the magic bytes,
     which the first piece begins with.
     """
-    return len(MAGIC) if data.startswith(MAGIC, at) else size_at(data, at)
+    if data.startswith(MAGIC, at):
+        return len(MAGIC)
+    return size_at(data, at)

@@ -61,12 +61,16 @@ class RecordingSwitch:
     def recording(self) -> tuple[str, int] | None:
         """The name of the file that is being written, and the bytes of the wire in it."""
         current = self._recorder
-        return None if current is None else (Path(current.path).name, current.bytes)
+        if current is None:
+            return None
+        return (Path(current.path).name, current.bytes)
 
     @property
     def error(self) -> SourceError | None:
         """What went wrong with the file that is being written."""
-        return self._recorder.error if self._recorder is not None else None
+        if self._recorder is not None:
+            return self._recorder.error
+        return None
 
     def write(self, chunk: Chunk, direction: Literal["in", "out"] = "in") -> None:
         """Record what arrived or was sent, while it is on."""

@@ -47,7 +47,10 @@ class Turning:
         totals[:1] += self._total
         np.cumsum(totals, out=totals)
         first = self._direction
-        self._total = float(totals[-1]) if len(totals) else self._total
+        if len(totals):
+            self._total = float(totals[-1])
+        else:
+            self._total = self._total
         found: NDArray[np.float64] | None = None
         start = 0
         size = 64
@@ -77,12 +80,15 @@ class Turning:
                 spot = int(turned.argmax())
                 start = start - len(part) + spot
                 size = 64
-                found = np.full(len(totals), float(first)) if found is None else found
+                if found is None:
+                    found = np.full(len(totals), float(first))
                 self._direction = -self._direction or (1 if part[spot] > 0 else -1)
                 self._furthest = self._direction * float(part[spot])
         if found is not None and not (found == found[0]).all():
             return found
-        return np.array([float(first or 1)]) if found is None else found[:1]
+        if found is None:
+            return np.array([float(first or 1)])
+        return found[:1]
 
     def _only_ahead(self, total: float, steps: NDArray[np.float64]) -> bool:
         """Return whether the angle is farther than ever, with no step back afterwards."""
@@ -166,7 +172,9 @@ class Cutter:
 
     def _at(self, rule: OnWrap, full: float) -> float:
         """Return the angle at which scans are cut, in the unit in which a turn is `full`."""
-        return rule.at if self._cut is None else self._cut * full
+        if self._cut is None:
+            return rule.at
+        return self._cut * full
 
     def use_sector(self, sector: Sector, angle: float | None) -> None:
         """Cut scans in a masked sector from now on.
@@ -192,7 +200,10 @@ class Cutter:
             rows_are_packets = all(name is None for name in column.axes)
         else:
             read = self._reader.angles(packets.table)
-            angles = np.empty(0) if read is None else read[: found.ready]
+            if read is None:
+                angles = np.empty(0)
+            else:
+                angles = read[: found.ready]
             starts = first_points(found)
         self._direction = self._direction or self._reader.direction(packets.table)
         if not len(angles):
@@ -219,7 +230,10 @@ class Cutter:
         steps: NDArray[np.float64] | None = None,
     ) -> list[End]:
         """The ends at some points; `steps`: by how much of a turn the angle goes on at each."""
-        which = itertools.repeat(None) if packets is None else packets.tolist()
+        if packets is None:
+            which = itertools.repeat(None)
+        else:
+            which = packets.tolist()
         leaps = itertools.repeat(False) if steps is None else map(self._is_leap, steps.tolist())
         return list(map(End, points.tolist(), which, leaps))
 
@@ -293,7 +307,10 @@ class Cutter:
         times = packets.time_ns[: found.ready]
         if not len(times):
             return np.empty(0, np.intp)
-        self._start = int(times[0]) if self._start is None else self._start
+        if self._start is None:
+            self._start = int(times[0])
+        else:
+            self._start = self._start
         period = (times - self._start) // int(rule.seconds * 1e9)
         before = _before(period.astype(np.float64), self._before)
         self._before = float(period[-1])
@@ -302,7 +319,10 @@ class Cutter:
 
 def _turn(packets: Packets, path: str) -> float | None:
     """The whole turn in the unit of a field, None where it is no angle."""
-    table = packets.frames[0] if path.startswith("frame.") else packets.table
+    if path.startswith("frame."):
+        table = packets.frames[0]
+    else:
+        table = packets.table
     return FULL_TURNS.get(table.schema.fields[path.removeprefix("frame.")].unit)
 
 
@@ -351,7 +371,10 @@ def _rows(column: Column, found: Evaluated) -> tuple[NDArray[np.float64], NDArra
         return values, np.arange(len(values)) * each
     points = numbers.reshape(-1)
     starts = _starts(points)
-    kept = points > 0 if levels else np.ones(len(points), np.bool_)
+    if levels:
+        kept = points > 0
+    else:
+        kept = np.ones(len(points), np.bool_)
     return values[kept], starts[kept]
 
 
@@ -369,7 +392,10 @@ def _sums(counts: NDArray[Any], kept: int) -> NDArray[np.intp]:
     while counts.ndim > kept:
         repeats = counts.strides[-1] == 0 and counts.shape[-1] > 0
         times *= counts.shape[-1] if repeats else 1
-        counts = counts[..., 0] if repeats else counts.sum(axis=-1)
+        if repeats:
+            counts = counts[..., 0]
+        else:
+            counts = counts.sum(axis=-1)
     if counts.size and not any(counts.strides):
         return np.broadcast_to(counts.flat[0] * times, counts.shape)
     return counts * times

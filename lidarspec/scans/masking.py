@@ -66,20 +66,27 @@ class Masking:
     @property
     def sector(self) -> Sector | None:
         """The masked sector; None until it is found."""
-        return None if self._finder is None else self._finder.sector
+        if self._finder is None:
+            return None
+        return self._finder.sector
 
     def push(self, packets: Packets) -> list[Packets]:
         """Return the packets that may be cut into scans now; at most two batches."""
         if not len(packets):
             return []
         if self._is_settled:
-            return [packets] if self.sector is None else [self._mark(packets)]
+            if self.sector is None:
+                return [packets]
+            return [self._mark(packets)]
         angles = self._reader.angles(packets.table)
         if angles is None:
             self._is_settled = True
             return self._release(packets)
         leap = self._find_leap(packets, angles)
-        held = joined([*self._held, packets]) if self._held else packets
+        if self._held:
+            held = joined([*self._held, packets])
+        else:
+            held = packets
         if self._is_holding or leap is None:
             return self._pass_on(held)
         before = len(held) - len(packets) + max(leap - 1, -1 if self._held else 0)
@@ -106,7 +113,9 @@ class Masking:
                 return self._release(None)
             return []
         self._held = [held.take(slice(-1, None))]
-        return [self._note(held.take(slice(0, -1)))] if len(held) > 1 else []
+        if len(held) > 1:
+            return [self._note(held.take(slice(0, -1)))]
+        return []
 
     def _release(self, packets: Packets | None) -> list[Packets]:
         everything = [*self._held, *([packets] if packets is not None else [])]
@@ -148,7 +157,9 @@ class Masking:
         self._smallest_step = min(self._smallest_step, float(smallest[-1]))
         self._turned = float(turned[-1])
         self._angle = float(angles[-1])
-        return leaps.item(0) if len(leaps) else None
+        if len(leaps):
+            return leaps.item(0)
+        return None
 
     def _steps(self, angles: Angles, before: float | None) -> Angles:
         """Return by how much of a turn each packet is ahead of the one before it, (n,)."""
@@ -175,12 +186,18 @@ class Masking:
             self.angle_before_sector = self._marked_angle
         if angles is None or sector is None:
             return packets
-        start = angles[0] if self._marked_angle is None else self._marked_angle
+        if self._marked_angle is None:
+            start = angles[0]
+        else:
+            start = self._marked_angle
         before = np.append(start, angles[:-1])
         behind = (sector.direction * (before - sector.middle)) % 1
         is_leap = behind + self._steps(angles, self._marked_angle) >= 1
         index = packets.index
-        first = index.item(0) - 1 if self._marked_angle is None else self._index
+        if self._marked_angle is None:
+            first = index.item(0) - 1
+        else:
+            first = self._index
         missing = np.where(is_leap, np.maximum(np.diff(index, prepend=first) - 1, 0), 0)
         if not self._masked and missing.any():
             self._masked = int(np.median(missing[missing > 0]))

@@ -70,11 +70,16 @@ class Planes:
         if self._ring is None and self._heights is None:
             if self._is_flat is None and (valid := cloud.valid).any():
                 self._is_flat = bool((np.abs(cloud.elevation[valid]) < LEVEL).all())
-            return scan if self._is_flat else None
+            if self._is_flat:
+                return scan
+            return None
         if self._ring is not None and (
             cloud.ring is None or (self._grid is None and not (cloud.ring == self._ring).any())
         ):
-            rings = "none" if cloud.ring is None else f"{cloud.ring.min()} to {cloud.ring.max()}"
+            if cloud.ring is None:
+                rings = "none"
+            else:
+                rings = f"{cloud.ring.min()} to {cloud.ring.max()}"
             raise UsageError(
                 f"{scan.sensor.id}: ring {self._ring} is asked for, and its points have {rings}"
             )

@@ -203,10 +203,24 @@ class Scan:
 
     def __repr__(self) -> str:
         ranges = self.points.range[self.points.valid]
-        span = f"{ranges.min():.2f}..{ranges.max():.2f} m" if len(ranges) else "no returns"
-        rate = f"{self.rate_hz:.1f} Hz, " if np.isfinite(self.rate_hz) else ""
-        nominal = ", nominal calibration" if self.points.nominal else ""
-        state = "complete" if self.complete else "with gaps" if self.whole else "partial"
+        if len(ranges):
+            span = f"{ranges.min():.2f}..{ranges.max():.2f} m"
+        else:
+            span = "no returns"
+        if np.isfinite(self.rate_hz):
+            rate = f"{self.rate_hz:.1f} Hz, "
+        else:
+            rate = ""
+        if self.points.nominal:
+            nominal = ", nominal calibration"
+        else:
+            nominal = ""
+        if self.complete:
+            state = "complete"
+        elif self.whole:
+            state = "with gaps"
+        else:
+            state = "partial"
         return f"Scan({len(self)} points, {rate}{span}, {state}{nominal})"
 
     _repr_svg_ = drawn("scan")
@@ -271,7 +285,10 @@ class Scan:
         else:
             count = self.beams or self.sensor.beams or max(len(self), 1)
         first, last = field or (-np.pi, np.pi - 2 * np.pi / count)
-        step = (last - first) / (count - 1) if count > 1 else 2 * np.pi
+        if count > 1:
+            step = (last - first) / (count - 1)
+        else:
+            step = 2 * np.pi
         ranges, intensities = self._binned(count, first, step)
         begin, slope = self._times(first, last)
         if np.isfinite(self.rate_hz) and self.rate_hz > 0:
@@ -397,22 +414,23 @@ class Progress:
         rule = sensor.scan
         link = sensor.links.get("data")
         counter = sensor.sequence
+        turn: float = SLOWEST
         if isinstance(rule, Every):
             turn = rule.seconds
         elif sensor.turn:
             turn = 1 / sensor.turn[0]
+        if sensor.clock is not None:
+            self.seconds = 2 * turn
         else:
-            turn = SLOWEST
-        self.seconds = 2 * turn if sensor.clock is not None else max(2 * turn, UNTIMED)
+            self.seconds = max(2 * turn, UNTIMED)
         self._longest = int(self.seconds * 1e9)
         self._by_points = sensor.beams is not None
-        self._most = (
-            2 * sensor.beams
-            if sensor.beams
-            else self.seconds * link.baud / 10
-            if isinstance(link, Serial)
-            else LARGEST
-        )
+        if sensor.beams:
+            self._most: float = 2 * sensor.beams
+        elif isinstance(link, Serial):
+            self._most = self.seconds * link.baud / 10
+        else:
+            self._most = LARGEST
         self._reason = _without_end(rule)
         self._starts_are_seen = isinstance(rule, OnFlag)
         self._may_pass = isinstance(
@@ -439,14 +457,20 @@ class Progress:
         start = 0
         if not number:
             return found
-        first = first_points(points) if len(ends) or self._by_points else np.empty(0, np.intp)
+        if len(ends) or self._by_points:
+            first = first_points(points)
+        else:
+            first = np.empty(0, np.intp)
         batch = self._batch(
             packets,
             number,
             np.diff(first, append=source_of(points.cloud).size) if self._by_points else None,
         )
         for end, packet, leaps in ends:
-            edge = int(np.searchsorted(first, end, side="right")) - 1 if packet is None else packet
+            if packet is None:
+                edge = int(np.searchsorted(first, end, side="right")) - 1
+            else:
+                edge = packet
             begins = bool(first[edge] == end)
             found += self._without_end(packets, batch, start, edge + (not begins), points)
             is_shared = begins and not self._shows_start(packets, edge)
@@ -597,7 +621,9 @@ class Progress:
         )
         over[0] &= bool(scan.packets)
         spot = int(over.argmax())
-        return (spot, bool(endless[spot])) if over[spot] else (None, False)
+        if over[spot]:
+            return (spot, bool(endless[spot]))
+        return (None, False)
 
     def _add(self, batch: Batch, part: slice, *, gap_only: bool = False) -> None:
         """Count packets as parts of the scan, or only what is missing before them."""
@@ -606,7 +632,10 @@ class Progress:
         if not number:
             return
         if not gap_only:
-            scan.since = scan.since if scan.packets else batch.times.item(part.start)
+            if scan.packets:
+                scan.since = scan.since
+            else:
+                scan.since = batch.times.item(part.start)
             scan.packets, scan.size = (
                 scan.packets + _sum(batch.counts[part]),
                 scan.size + _sum(batch.sizes[part]),
@@ -646,7 +675,9 @@ class Batch:
 
 def _sum(values: NDArray[np.int64]) -> int:
     each = alike(values)
-    return int(values.sum()) if each is None else each * len(values)
+    if each is None:
+        return int(values.sum())
+    return each * len(values)
 
 
 def _without_end(rule: Split) -> str:
@@ -793,7 +824,10 @@ class ScanStream:
             arrived, *hosts = _hosts_ns(packets, points, starts)
         else:
             arrived, *hosts = [None]
-        self._begins = first if self._begins is None else self._begins
+        if self._begins is None:
+            self._begins = first
+        else:
+            self._begins = self._begins
         self._host = arrived if self._host is None else self._host
         for cut, time, host in zip(cuts, times, hosts, strict=True):
             self._take(packets, points, start, cut.point, before)
@@ -829,13 +863,22 @@ class ScanStream:
             return None
         begins = self._begins
         assert begins is not None  # since there are points
-        period = (ends - begins) * 1e-9 if ends is not None else np.nan
+        if ends is not None:
+            period = (ends - begins) * 1e-9
+        else:
+            period = np.nan
         rate = 1 / period if whole and period > 0 else np.nan
         cloud: PointCloud = LazyCloud.of(Stretches(parts, from_first=True), begins)
-        samples = None if self._imu is None else self._imu.until(ends)
+        if self._imu is None:
+            samples = None
+        else:
+            samples = self._imu.until(ends)
         if self._mount is not None:
             cloud = self._mount.applied(cloud)
-            samples = None if samples is None else samples.turned(self._mount.rotation)
+            if samples is None:
+                samples = None
+            else:
+                samples = samples.turned(self._mount.rotation)
         rate = float(rate) if whole else np.nan
         return Scan(
             cloud,
@@ -853,7 +896,10 @@ class ScanStream:
 def _times_ns(source: ColumnSource, indices: Sequence[int]) -> list[int | None]:
     """The times of some points in order, ns; None for those past the end."""
     known = [index for index in indices if index < source.size]
-    times = source.times_at(np.array(known, np.intp)).tolist() if known else []
+    if known:
+        times = source.times_at(np.array(known, np.intp)).tolist()
+    else:
+        times = []
     return [source.base + round(time * 1e9) for time in times] + [None] * (
         len(indices) - len(known)
     )

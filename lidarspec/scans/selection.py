@@ -132,8 +132,13 @@ class Slice:
             self.last = int(at[-1])
         begin, end = (self.ns(moment) for moment in self._times)
         self.ended = end is not None and self.last is not None and self.last >= end
-        wanted = np.ones(len(at), np.bool_) if begin is None else at >= begin
-        return wanted if end is None else wanted & (at < end)
+        if begin is None:
+            wanted = np.ones(len(at), np.bool_)
+        else:
+            wanted = at >= begin
+        if end is None:
+            return wanted
+        return wanted & (at < end)
 
     def missed(self, source: object, number: str = "data") -> UsageError:
         """Return the error that no time of a source was selected.
@@ -145,7 +150,10 @@ class Slice:
         """
         first = self.first or 0
         last = self.last or 0
-        dates = f" ({dated(first)} to {dated(last)})" if first > DATED else ""
+        if first > DATED:
+            dates = f" ({dated(first)} to {dated(last)})"
+        else:
+            dates = ""
         text = (
             f"{source} has {number} from 0 s to {(last - first) * 1e-9:.3f} s{dates}, and nothing"
             " of that is asked for"
@@ -163,7 +171,9 @@ class Slice:
         """A moment as a time of the stream, of which one has come."""
         if isinstance(moment, datetime):
             return round(moment.timestamp() * 1e6) * 1000
-        return None if moment is None or self.first is None else self.first + round(moment * 1e9)
+        if moment is None or self.first is None:
+            return None
+        return self.first + round(moment * 1e9)
 
 
 def dated(ns: int) -> str:
@@ -265,7 +275,9 @@ class Sieve:
             if not number:
                 self._pass_over(scan)
         self._kept += wanted
-        return self._shaped(scan) if wanted and (self._kept - 1) % selection.every == 0 else None
+        if wanted and (self._kept - 1) % selection.every == 0:
+            return self._shaped(scan)
+        return None
 
     @property
     def is_empty(self) -> bool:
@@ -289,7 +301,9 @@ class Sieve:
                 UsageError(f"{self._source} does not say when its bytes arrived"),
                 "the same with --scans 5:10",
             )
-        return scan.host_ns if by_host else scan.stamp_ns
+        if by_host:
+            return scan.host_ns
+        return scan.stamp_ns
 
     def _pass_over(self, scan: Scan) -> None:
         """Move the source on to a little before the slice."""
@@ -311,7 +325,10 @@ class Sieve:
         """A scan with what is wanted of it."""
         selection = self._selection
         cloud = scan.points
-        stamp_ns = self._time(scan) if selection.time == "host" else cloud.stamp_ns
+        if selection.time == "host":
+            stamp_ns = self._time(scan)
+        else:
+            stamp_ns = cloud.stamp_ns
         if selection.ranges != (0.0, math.inf):
             cloud = LazyCloud.of(_Within(cloud, *selection.ranges), stamp_ns)
         elif stamp_ns != cloud.stamp_ns:

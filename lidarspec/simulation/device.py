@@ -99,7 +99,10 @@ class Answering:
         declared = self._sensor.simulation.answers.get(request.name)
         chosen: Iterable[Answer] = request.command.replies[:1]
         if declared is not None:
-            chosen = declared(request.values) if callable(declared) else declared
+            if callable(declared):
+                chosen = declared(request.values)
+            else:
+                chosen = declared
         return [self._answer(answer, request) for answer in chosen]
 
     def frame(self, name: str, values: Mapping[str, Any]) -> bytes:
@@ -241,7 +244,10 @@ class _Stream:
             taken += zip(
                 self._times[first : self._spot], self._frames[first : self._spot], strict=True
             )
-            self.due = self._times[self._spot] if self._spot < len(self._frames) else self._end
+            if self._spot < len(self._frames):
+                self.due = self._times[self._spot]
+            else:
+                self.due = self._end
         return taken
 
     def _more(self) -> None:
@@ -319,7 +325,10 @@ class SimulatedDevice:
         self._powered = now
         self._time = 0.0
         self.present = True
-        self._plug = now + int(self.faults.unplug * SECOND) if self.faults.unplug else None
+        if self.faults.unplug:
+            self._plug = now + int(self.faults.unplug * SECOND)
+        else:
+            self._plug = None
         for name, frame in self.sensor.incoming.items():
             if frame.simulation.rate and not frame.data:
                 self._put(0.0, "data", name, self._answering.unasked_frame(name, 0))
@@ -415,7 +424,10 @@ class SimulatedDevice:
 
     def _again(self, due: _Due) -> None:
         """Plan the next one of a frame that is sent by itself."""
-        rate = self.sensor.frames[due.frame].simulation.rate if due.frame else 0.0
+        if due.frame:
+            rate = self.sensor.frames[due.frame].simulation.rate
+        else:
+            rate = 0.0
         if rate:
             number = round(due.at * rate / SECOND) + 1
             self._put(

@@ -44,7 +44,10 @@ class FrameMaker:
                 path=frame,
                 sensor=sensor.id,
             )
-        others = sensor.data_frames if sensor.frames[frame].data else ()
+        if sensor.frames[frame].data:
+            others = sensor.data_frames
+        else:
+            others = ()
         elsewhere = {path for other in others for path in codec(sensor.frames[other]).schema.fields}
         self.engine = engine
         self._coder: Coder | None = frame_coder(engine.frame)
@@ -256,7 +259,9 @@ class FrameMaker:
         base, indices = without_indices(path)
         if base in values:
             return int(info.raw(float(np.asarray(values[base])[tuple(indices.values())])))
-        return int(info.const) if isinstance(info.const, int) else info.initial
+        if isinstance(info.const, int):
+            return int(info.const)
+        return info.initial
 
 
 def nested(values: dict[str, Any], path: str, value: Any) -> None:

@@ -201,7 +201,10 @@ class Measurement:
             places = np.stack([np.broadcast_to(full[name], shape) for name in "xyz"])
             full |= dict(zip(("range", "azimuth", "elevation"), direction_of(*places), strict=True))
         origin = [full.get(name, np.zeros((1,) * depth)) for name in ("ox", "oy", "oz")]
-        intensity = result.intensity.source if isinstance(result.intensity, Column) else ""
+        if isinstance(result.intensity, Column):
+            intensity = result.intensity.source
+        else:
+            intensity = ""
         own = {name: full[name] for name in ("range", "azimuth", "elevation")} | {
             "time": np.nan_to_num(full["time"])
         }
@@ -258,7 +261,9 @@ class Measurement:
         leaves = [
             group.layout.leaves[path] for group in table.groups if path in group.layout.leaves
         ]
-        return most if form is None else min(most, *(form.largest(leaf.size) for leaf in leaves))
+        if form is None:
+            return most
+        return min(most, *(form.largest(leaf.size) for leaf in leaves))
 
     def _traced(self, table: Rows) -> tuple[Target, ...]:
         """The fields in metres that the ranges of the points answer to."""
@@ -275,7 +280,10 @@ class Measurement:
                 near = part[
                     np.isclose(part, expected)
                 ]  # a direction whose length is 1 but for its own steps is part of the range
-                step = info.scale if np.allclose(near, expected, EXACT, 0) else None
+                if np.allclose(near, expected, EXACT, 0):
+                    step = info.scale
+                else:
+                    step = None
                 found += [Target(path, spot, step, info.offset)] if near.size else []
         found = found or self._linear(table)
         if not found:
@@ -329,7 +337,9 @@ class Measurement:
     def _inner(self, table: Rows, answer: Floats) -> list[tuple[int, ...]]:
         """The indices of the axes of the points that are further in than those of the fields."""
         extra = answer.ndim - 1 - table.schema.depth()
-        return list(np.ndindex(*answer.shape[answer.ndim - extra :])) if extra > 0 else [()]
+        if extra > 0:
+            return list(np.ndindex(*answer.shape[answer.ndim - extra :]))
+        return [()]
 
     def _turning(self, table: Rows) -> bool:
         """Whether directions depend on ranges."""
@@ -477,7 +487,9 @@ def _solved(slopes: Floats, aims: Floats) -> Floats:
 
 def _name(frame: str, table: Rows) -> str:
     """What a table is of: a frame type, or parts of it."""
-    return ".".join(filter(None, (frame, *table.place))) if isinstance(table, PartRows) else frame
+    if isinstance(table, PartRows):
+        return ".".join(filter(None, (frame, *table.place)))
+    return frame
 
 
 def _result(sensor: Spec, frame: str, table: Rows) -> tuple[Points, Batch]:
@@ -507,7 +519,9 @@ def _batch(sensor: Spec, table: Rows) -> Batch:
 
 def whole(info: FieldInfo, raw: Floats) -> Floats:
     """Raw values as a field can hold them."""
-    return np.rint(raw) if info.kind == "int" else raw
+    if info.kind == "int":
+        return np.rint(raw)
+    return raw
 
 
 class PartRows(Rows):
@@ -719,7 +733,10 @@ class Pace:
         if self._point:
             steps = beams().counts * self._point * 1e9
         else:
-            steps = _sizes(table) * BITS * 1e9 / self._baud if self._baud else np.zeros(len(table))
+            if self._baud:
+                steps = _sizes(table) * BITS * 1e9 / self._baud
+            else:
+                steps = np.zeros(len(table))
         return np.asarray(np.rint(np.concatenate([[0], np.cumsum(steps[:-1])])), np.int64)
 
     def _by_clock(self, table: Rows) -> Times:
@@ -730,14 +747,18 @@ class Pace:
             steps = (steps + turn // 2) % turn - turn // 2
         times = np.concatenate([[0], np.cumsum(steps)])
         even = np.asarray(np.rint(np.linspace(0, times[-1], len(times))), np.int64)
-        return even if bool((np.abs(even - times) <= COARSE).all()) else times
+        if bool((np.abs(even - times) <= COARSE).all()):
+            return even
+        return times
 
 
 def _seconds_per_point(beams: Beams) -> float:
     """From one point of a packet to the next, 0 where the points bear one time."""
     times = np.broadcast_to(beams.time, beams.range.shape).reshape(len(beams.range), -1)
     steps: NDArray[Any] = np.diff(times, axis=1)
-    return float(np.median(steps[steps > 0])) if (steps > 0).any() else 0.0
+    if (steps > 0).any():
+        return float(np.median(steps[steps > 0]))
+    return 0.0
 
 
 def _sizes(table: Rows) -> NDArray[np.intp]:
@@ -832,7 +853,9 @@ class Simulation:
 
     def _with_points(self, table: Rows) -> Rows:
         """What points are made of: frames, or the parts in them."""
-        return PartRows(table, self._parts) if self._parts else table
+        if self._parts:
+            return PartRows(table, self._parts)
+        return table
 
     def _beams(self, table: Rows) -> Beams:
         """The beams of frames, those of their parts together."""
@@ -891,4 +914,6 @@ def opening(sensor: Spec) -> bytes:
     they need none.
     """
     after = sensor.frames[sensor.data_frame].after
-    return b"" if after is None else example(sensor, after)
+    if after is None:
+        return b""
+    return example(sensor, after)

@@ -51,7 +51,10 @@ class Text:
 
     def packed(self, value: Any, room: int | None) -> bytes:
         """The bytes of a text; ValueError for what it does not take."""
-        data = value.encode(self.encoding) if isinstance(value, str) else b""
+        if isinstance(value, str):
+            data = value.encode(self.encoding)
+        else:
+            data = b""
         if not isinstance(value, str) or len(data) > min(self.size, room or self.size):
             raise ValueError
         return data.ljust(room or 0, self.fill)
@@ -66,13 +69,20 @@ class Address:
 
     def words(self, room: int | None) -> str:
         """What it takes."""
-        return "an IPv6 address" if room == 16 else "an IPv4 address" if room else "an IP address"
+        if room == 16:
+            return "an IPv6 address"
+        if room:
+            return "an IPv4 address"
+        return "an IP address"
 
     def packed(self, value: Any, room: int | None) -> bytes:
         """The bytes of an address; ValueError for what is none, or does not fit."""
         from ipaddress import ip_address  # which takes longer to import than all else here
 
-        found = ip_address(value) if isinstance(value, str) else value
+        if isinstance(value, str):
+            found = ip_address(value)
+        else:
+            found = value
         if not hasattr(found, "packed") or room not in (None, len(found.packed)):
             raise ValueError
         return bytes(found.packed)
@@ -84,7 +94,9 @@ class Octets:
 
     def words(self, room: int | None) -> str:
         """What it takes."""
-        return "bytes" if room is None else f"{room} bytes"
+        if room is None:
+            return "bytes"
+        return f"{room} bytes"
 
     def packed(self, value: Any, room: int | None) -> bytes:
         """The bytes; ValueError for what are none, or not so many."""

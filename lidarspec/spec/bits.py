@@ -70,7 +70,9 @@ class BitField:
     def value(self, block: bytes | memoryview) -> int:
         """The value in one block of bytes."""
         total = sum((block[s.byte] & s.mask) >> s.low << s.target for s in self.segments)
-        return total - (1 << self.width) if self.signed and total >> (self.width - 1) else total
+        if self.signed and total >> (self.width - 1):
+            return total - (1 << self.width)
+        return total
 
     def masks(self, size: int) -> bytes:
         """Which bits of each byte of a block of `size` bytes are the value's."""
@@ -114,7 +116,9 @@ def probe(parse: Parse, size: int) -> list[BitField] | None:
         _field(keys, pairs, flag=isinstance(base[keys], bool)) for keys, pairs in weights.items()
     ]
     known = [field for field in fields if field is not None]
-    return known if len(known) == len(fields) and _confirmed(parse, size, known) else None
+    if len(known) == len(fields) and _confirmed(parse, size, known):
+        return known
+    return None
 
 
 def _field(

@@ -108,7 +108,9 @@ class Crc(Checksum):
     def start(self) -> int:
         """The register before the first byte, in wire order."""
         start = reflected(self.init, self.width)
-        return start if self.refin else mirrored_bytes(start)
+        if self.refin:
+            return start
+        return mirrored_bytes(start)
 
     def left(self, register: int) -> int:
         """What leaves the register, in wire order, after the last byte."""

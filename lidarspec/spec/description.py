@@ -185,8 +185,16 @@ class Frame:
             )
 
     def __repr__(self) -> str:
-        size = 0 if self.wire is not None else fixed_size(self.prepared)
-        kind = "data, " if self.data else "out, " if self.direction == "out" else ""
+        if self.wire is not None:
+            size = 0
+        else:
+            size = fixed_size(self.prepared)
+        if self.data:
+            kind = "data, "
+        elif self.direction == "out":
+            kind = "out, "
+        else:
+            kind = ""
         root = self.tree.struct if isinstance(self.tree, Sealed) else self.tree
         names = [member.name for member in children(root) if member.name]
         return (
@@ -293,7 +301,9 @@ class Command:
     @property
     def replies(self) -> tuple[str, ...]:
         """The frames that may answer; none where no answer is documented."""
-        return (self.reply,) if isinstance(self.reply, str) else tuple(self.reply or ())
+        if isinstance(self.reply, str):
+            return (self.reply,)
+        return tuple(self.reply or ())
 
 
 @dataclass(frozen=True)
@@ -423,7 +433,10 @@ class Spec:
         """
         name, _, parts = frame.partition(".")
         own = self.frames[name].imu
-        function = own.get(parts) if isinstance(own, Mapping) else own
+        if isinstance(own, Mapping):
+            function = own.get(parts)
+        else:
+            function = own
         if function is None:
             if self.imu_frames:
                 having = f"those of {', '.join(self.imu_frames)} have"
@@ -443,7 +456,10 @@ class Spec:
         """The path of the parts of a frame type that have its "points" or its "imu"; "" where the
         frame itself has them.
         """
-        own = getattr(self.frames[frame], what) if frame in self.frames else None
+        if frame in self.frames:
+            own = getattr(self.frames[frame], what)
+        else:
+            own = None
         return next(iter(own)) if isinstance(own, Mapping) else ""
 
     def simulation_of(self, frame: str) -> Simulation:
@@ -451,7 +467,10 @@ class Spec:
         where the frame has none.
         """
         own = self.frames[frame].simulation
-        shared = self.simulation if self.frames[frame].data else Simulation()
+        if self.frames[frame].data:
+            shared = self.simulation
+        else:
+            shared = Simulation()
         fields = ("sweep", "encode", "rate", "directions")
         return Simulation(**{name: getattr(own, name) or getattr(shared, name) for name in fields})
 

@@ -220,9 +220,17 @@ class Checksummed(layer.Sealing):
         absent: Iterable[int] = (),
     ) -> None:
         super().__init__(struct)
-        self.fields = (field,) if isinstance(field, str) else tuple(field)
+        if isinstance(field, str):
+            self.fields = (field,)
+        else:
+            self.fields = tuple(field)
         self.algorithm = algorithm
-        self.over = (over,) if isinstance(over, str) else tuple(over) if over is not None else None
+        if isinstance(over, str):
+            self.over = (over,)
+        elif over is not None:
+            self.over = tuple(over)
+        else:
+            self.over = None
         self.absent = frozenset(absent)
         inner = struct
         while isinstance(inner, Checksummed):
@@ -398,7 +406,10 @@ class Parts(layer.Partition):
                 "Parts takes one of count=, within=, and size= with following=: what says where the"
                 " last part is"
             )
-        self.cases = dict(kinds) if isinstance(kinds, Mapping) else {"": kinds}
+        if isinstance(kinds, Mapping):
+            self.cases = dict(kinds)
+        else:
+            self.cases = {"": kinds}
         if not self.cases or not all(map(layer.is_struct, self.cases.values())):
             raise SpecError("a part is a Struct, or one of several Structs by name")
         self.count = count
@@ -455,7 +466,9 @@ class Parts(layer.Partition):
 
         def goes_on(found: layer.Pieces) -> int:
             if count is not None:
-                return -1 if len(found) < count else 0
+                if len(found) < count:
+                    return -1
+                return 0
             if within is not None:
                 if found.size < within:
                     return -1

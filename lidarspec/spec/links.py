@@ -85,7 +85,9 @@ class Assembled:
     @property
     def keys(self) -> tuple[str, ...]:
         """The fields that tell messages apart."""
-        return (self.key,) if isinstance(self.key, str) else tuple(self.key)
+        if isinstance(self.key, str):
+            return (self.key,)
+        return tuple(self.key)
 
     def wrong(self, reason: str) -> SpecError:
         """An error that says where it is."""

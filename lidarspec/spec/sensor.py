@@ -275,7 +275,10 @@ class Sensor(Spec):
         name = frame or data_frame(self, frames) or self.data_frame
         stream = PacketStream(self, name, decoder.stats, backend=decoder.backend)
         packets = stream.add(frames, whole=True)
-        imu = ImuStream(self, decoder.stats, backend=decoder.backend) if frame is None else None
+        if frame is None:
+            imu = ImuStream(self, decoder.stats, backend=decoder.backend)
+        else:
+            imu = None
         if imu is not None:
             imu.add(frames, packets, whole=True)
         return packets, None if imu is None else imu.waiting
@@ -456,7 +459,10 @@ def _type_names(annotation: object) -> set[str]:
     """The names in an annotation, such as {"str", "Path"} of `str | pathlib.Path`; {""} of none."""
     if annotation is inspect.Parameter.empty:
         return {""}
-    text = annotation.__name__ if isinstance(annotation, type) else str(annotation)
+    if isinstance(annotation, type):
+        text = annotation.__name__
+    else:
+        text = str(annotation)
     return {word.rpartition(".")[2] for word in re.findall(r"[\w.]+", text)}
 
 

@@ -58,7 +58,9 @@ UNNAMED = "(constant)"
 
 def exact(number: float | int) -> Fraction:
     """The decimal number that was written, not the binary one nearest to it: 0.001 is 1/1000."""
-    return Fraction(repr(float(number))) if isinstance(number, float) else Fraction(number)
+    if isinstance(number, float):
+        return Fraction(repr(float(number)))
+    return Fraction(number)
 
 
 @dataclass(frozen=True, eq=False)
@@ -143,10 +145,17 @@ class FieldInfo:
         if isinstance(physical, Fraction):
             steps: Any = (physical - exact(self.offset)) / exact(self.scale)
         else:
-            steps = (physical - self.offset) / self.scale if self.scaled else physical
+            if self.scaled:
+                steps = (physical - self.offset) / self.scale
+            else:
+                steps = physical
         if self.kind == "float":
-            return float(steps) if isinstance(steps, Fraction) else steps
-        return np.rint(steps).astype(np.int64) if isinstance(steps, np.ndarray) else round(steps)
+            if isinstance(steps, Fraction):
+                return float(steps)
+            return steps
+        if isinstance(steps, np.ndarray):
+            return np.rint(steps).astype(np.int64)
+        return round(steps)
 
     @property
     def limits(self) -> tuple[int, int]:
@@ -159,7 +168,9 @@ class FieldInfo:
     @property
     def initial(self) -> int:
         """The raw value used if none is given: 0, or the first allowed value."""
-        return 0 if self.allowed is None or 0 in self.allowed else self.allowed[0]
+        if self.allowed is None or 0 in self.allowed:
+            return 0
+        return self.allowed[0]
 
 
 def runs_of(values: Sequence[int]) -> list[tuple[int, int]]:
@@ -179,7 +190,9 @@ def format_hex(value: object) -> str:
     """Return bytes and integers in hexadecimal, other values as Python shows them."""
     if isinstance(value, bytes):
         return value.hex(" ")
-    return f"0x{value:x}" if isinstance(value, int) else repr(value)
+    if isinstance(value, int):
+        return f"0x{value:x}"
+    return repr(value)
 
 
 def listed(values: Sequence[int]) -> str:
@@ -286,7 +299,9 @@ def evaluated(formula: Formula, read: Read) -> Any:
     match formula:
         case Ref():
             value = read(formula.path)
-            return value[1] if isinstance(value, tuple) else value
+            if isinstance(value, tuple):
+                return value[1]
+            return value
         case Op("*", (condition, _)) if _is_condition(condition) and not evaluated(condition, read):
             return (
                 0  # the size of an alternative that is not there, whose fields nobody can ask for
@@ -352,7 +367,9 @@ def written(formula: Formula, named: Callable[[Ref], str], operations: Mapping[s
             return text.format(*(written(arg, named, operations) for arg in args))
         case Code():
             raise ValueError(formula.reason)
-    return f"({formula})" if formula < 0 else str(formula)
+    if formula < 0:
+        return f"({formula})"
+    return str(formula)
 
 
 def element_of(info: FieldInfo, path: str, indices: Mapping[str, int]) -> FieldInfo | None:
@@ -420,7 +437,9 @@ def width(formula: Formula) -> int:
             return args[0] + 1
         case "not":
             return 1
-    return 1 if formula.symbol in COMPARISONS else max(args)
+    if formula.symbol in COMPARISONS:
+        return 1
+    return max(args)
 
 
 def moved(formula: Formula, axis: str) -> Formula:
@@ -622,7 +641,9 @@ class Parts:
         """The bytes of the part behind one of a kind, by the paths that its fields have in the
         frame.
         """
-        return None if kind.following is None else moved(kind.following, self.axis)
+        if kind.following is None:
+            return None
+        return moved(kind.following, self.axis)
 
 
 @dataclass(frozen=True, eq=False)
@@ -811,7 +832,9 @@ def joined(symbol: str, one: Formula | None, other: Formula | None) -> Formula |
         return None
     neutral = 1 if symbol == "*" else 0
     if other == neutral or (one == neutral and symbol != "-"):
-        return one if other == neutral else other
+        if other == neutral:
+            return one
+        return other
     if symbol == "*" and 0 in (one, other):
         return 0
     if symbol == "+" and isinstance(one, int):
@@ -874,7 +897,9 @@ class Scope:
         if name == "_":
             return self.parent
         if name == "_root":
-            return self.parent["_root"] if self.parent is not None else self
+            if self.parent is not None:
+                return self.parent["_root"]
+            return self
         if name not in self.names:
             raise Blind(f"an expression asks for {name!r}, which is not a field before it")
         part = self.names[name]

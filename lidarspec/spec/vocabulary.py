@@ -44,7 +44,9 @@ class Along(NDArrayOperatorsMixin):
         return self.array[which]
 
     def __array__(self, dtype: Any = None, copy: bool | None = None) -> NDArray[Any]:
-        return self.array if dtype is None else self.array.astype(dtype)
+        if dtype is None:
+            return self.array
+        return self.array.astype(dtype)
 
     def __array_ufunc__(self, ufunc: np.ufunc, method: str, *inputs: Any, **kwargs: Any) -> Any:
         if method != "__call__" or kwargs.get("out") is not None:
@@ -154,7 +156,9 @@ def steps(count: Array) -> Array:
         Integers, shape (count,); with a column as `count` as many as the longest packet of the
         batch has, as its arrays do.
     """
-    return count.steps() if hasattr(count, "steps") else np.arange(int(np.max(count, initial=0)))
+    if hasattr(count, "steps"):
+        return count.steps()
+    return np.arange(int(np.max(count, initial=0)))
 
 
 def wrap(a: Array, full: float) -> Array:
@@ -199,7 +203,10 @@ def last(a: Array, where: Array | None = None) -> Array:
     if where is not None and hasattr(where, "latest"):
         return (where * 0 + a).latest(where)
     values = np.asarray(a, np.float64)
-    known = ~np.isnan(values) if where is None else np.broadcast_to(where, values.shape)
+    if where is None:
+        known = ~np.isnan(values)
+    else:
+        known = np.broadcast_to(where, values.shape)
     spots = np.maximum.accumulate(np.where(known.ravel(), np.arange(values.size), -1))
     return np.where(spots >= 0, values.ravel()[spots], np.nan).reshape(values.shape)
 
@@ -240,7 +247,9 @@ def running(a: Array) -> Array:
     """The sum of the values so far along the innermost array that they are in, for differences on
     the wire: float64, the shape of `a`.
     """
-    return a.running() if hasattr(a, "running") else np.cumsum(np.asarray(a, np.float64), axis=-1)
+    if hasattr(a, "running"):
+        return a.running()
+    return np.cumsum(np.asarray(a, np.float64), axis=-1)
 
 
 def take(table: Array, index: Array) -> Array:

@@ -320,7 +320,9 @@ class Tokens:
         end = data.find(self.end, 1)
         if data.find(self.start, 1, end if end > 0 else len(data)) > 0:
             return NO_FRAME
-        return end + 1 if end > 0 else NO_END
+        if end > 0:
+            return end + 1
+        return NO_END
 
     def decode(self, data: bytes, next_runs: NextRuns) -> Decoded:
         size = len(data) if data.endswith(self.end) else None
@@ -393,7 +395,9 @@ class _TokenReader:
                 self._is_number[index] = True
 
     def read(self, run: Run) -> tuple[bytes, Offsets]:
-        return self._read_text(run) if isinstance(run, TextRun) else self._read_numbers(run)
+        if isinstance(run, TextRun):
+            return self._read_text(run)
+        return self._read_numbers(run)
 
     def _read_text(self, run: TextRun) -> tuple[bytes, Offsets]:
         begin = self.position
@@ -498,7 +502,9 @@ class Echoes:
         if not characters.startswith(self.mark):
             return False
         following = characters[len(self.mark) : len(self.mark) + 1]
-        return following != self.mark if following else not is_whole
+        if following:
+            return following != self.mark
+        return not is_whole
 
     def join(self, characters: bytes, zero: bytes) -> bytes:
         """Return the steps as they are sent.
@@ -590,10 +596,14 @@ class _SixBitReader:
 
     @property
     def position(self) -> int:
-        return self._offsets.item(self._index) if self._index < len(self._offsets) else self._end
+        if self._index < len(self._offsets):
+            return self._offsets.item(self._index)
+        return self._end
 
     def read(self, run: Run) -> tuple[bytes, Offsets]:
-        return self._read_text(run) if isinstance(run, TextRun) else self._read_numbers(run)
+        if isinstance(run, TextRun):
+            return self._read_text(run)
+        return self._read_numbers(run)
 
     def _read_text(self, run: TextRun) -> tuple[bytes, Offsets]:
         text = self._characters[self._index : self._index + run.size]
@@ -606,7 +616,10 @@ class _SixBitReader:
     def _read_numbers(self, run: NumberRun) -> tuple[bytes, Offsets]:
         digits = self._digits[self._index : self._index + run.ends.item(-1)]
         is_wrong = digits >= 1 << CHARACTER_BITS
-        size = int(is_wrong.argmax()) if is_wrong.any() else len(digits)
+        if is_wrong.any():
+            size = int(is_wrong.argmax())
+        else:
+            size = len(digits)
         count = int(run.ends.searchsorted(size, "right"))
         size = run.ends.item(count - 1) if count else 0
         begins = run.ends[:count] - run.sizes[:count]
@@ -680,7 +693,9 @@ class Lines:
 
     def find_end(self, data: bytes) -> int:
         end = data.find(b"\n\n")
-        return end + 2 if end >= 0 else NO_END
+        if end >= 0:
+            return end + 2
+        return NO_END
 
     def _has_check(self, number: int) -> bool:
         return self.check is not None and number >= self.bare
@@ -688,7 +703,10 @@ class Lines:
     def decode(self, data: bytes, next_runs: NextRuns) -> Decoded:
         characters, offsets, problem = self._strip(data)
         is_whole = data.endswith(b"\n\n")
-        end = len(data) if is_whole else int(offsets[-1:].sum()) + 1
+        if is_whole:
+            end = len(data)
+        else:
+            end = int(offsets[-1:].sum()) + 1
         end_mark = end - 1 if is_whole else end
         if self.numbers is None:
             spans = [(offsets, np.ones(len(offsets), np.intp))]
@@ -702,7 +720,9 @@ class Lines:
             offsets = np.append(offsets[:size], places)
         reader = _SixBitReader(self.numbers, characters, offsets, end)
         decoded = decode_runs(reader, next_runs, len(data) if is_whole else None)
-        return decoded if problem is None else replace(decoded, problem=problem)
+        if problem is None:
+            return decoded
+        return replace(decoded, problem=problem)
 
     def _strip(self, data: bytes) -> tuple[bytes, Offsets, Problem | None]:
         """Return the characters of all lines without checks, their offsets, and what is wrong; they
@@ -717,7 +737,10 @@ class Lines:
         for number, line in enumerate(lines):
             has_check = self._has_check(number)
             text = line[:-1] if has_check else line
-            length = self.head[number] if number < len(self.head) else self.width
+            if number < len(self.head):
+                length = self.head[number]
+            else:
+                length = self.width
             is_shorter_last = number == len(lines) - 1 >= len(self.head) and 0 < len(text) < length
             if len(text) != length and not is_shorter_last:
                 reason = f"line {number + 1} has {len(text)} characters, expected {length}"
@@ -746,7 +769,10 @@ class Lines:
         begin = 0
         while begin < len(characters):
             number = len(lines)
-            length = self.head[number] if number < len(self.head) else self.width
+            if number < len(self.head):
+                length = self.head[number]
+            else:
+                length = self.width
             line = characters[begin : begin + length]
             begin += length
             if self.check is not None and self._has_check(number):
@@ -798,7 +824,9 @@ class Escaped:
         end = data.find(self.flag, 1)
         if end == 1:
             return NO_FRAME
-        return end + 1 if end > 0 else NO_END
+        if end > 0:
+            return end + 1
+        return NO_END
 
     def decode(self, data: bytes, next_runs: NextRuns) -> Decoded:
         end = data.find(self.flag, 1)

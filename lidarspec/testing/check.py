@@ -127,7 +127,10 @@ def _folder(folder: Path) -> Target:
     """The distribution whose source is in a folder."""
     file = folder / "pyproject.toml"
     project = document(file).get("project")
-    name = project.get("name") if isinstance(project, dict) else None
+    if isinstance(project, dict):
+        name = project.get("name")
+    else:
+        name = None
     if not isinstance(name, str):
         raise SourceError(f"{file} names no project")
     entries = _entries(name)
@@ -263,7 +266,10 @@ def loading(error: BaseException, files: list[Path]) -> Finding:
     if isinstance(cause, SyntaxError) and cause.filename:
         own = [(cause.filename, cause.lineno or 0)]
     file, line = own[-1] if own else (str(files[0]) if len(files) == 1 else "", 0)
-    path = error.path if isinstance(error, SpecError) and error.rule else ""
+    if isinstance(error, SpecError) and error.rule:
+        path = error.path
+    else:
+        path = ""
     sensor = getattr(error, "sensor", "")
     if isinstance(error, SpecError) and cause is error:
         text = error.reason
@@ -281,7 +287,9 @@ def _loading_rule(error: BaseException, cause: BaseException) -> str:
         return "LS008"
     if isinstance(cause, SpecError):
         return _said(str(cause)) or "LS007"
-    return "LS006" if "lidarspec_sensors" in functions else "LS001"
+    if "lidarspec_sensors" in functions:
+        return "LS006"
+    return "LS001"
 
 
 def _said(text: str) -> str:
@@ -299,7 +307,9 @@ def module_files(value: str) -> list[Path]:
     if found is None or not found.origin or not found.origin.endswith(".py"):
         return []
     file = Path(found.origin)
-    return sorted(file.parent.rglob("*.py")) if file.name == "__init__.py" else [file]
+    if file.name == "__init__.py":
+        return sorted(file.parent.rglob("*.py"))
+    return [file]
 
 
 def _readable(file: Path) -> bool:
@@ -341,7 +351,9 @@ class Places:
         spot = self._spot(finding.path, sensor) or (
             self._others.get(("sensor", sensor.id)) if sensor else None
         )
-        return replace(finding, file=spot[0], line=spot[1]) if spot else finding
+        if spot:
+            return replace(finding, file=spot[0], line=spot[1])
+        return finding
 
     def _spot(self, path: str, sensor: Sensor | None) -> Spot | None:
         path = re.sub(r"\[\d*\]", "", path.rpartition(" ")[2])
@@ -359,7 +371,9 @@ class Places:
         fitting = [
             (len(chain), spot) for chain, spot in self._fields if parts[-len(chain) :] == chain
         ]
-        return max(fitting, key=lambda found: found[0])[1] if fitting else None
+        if fitting:
+            return max(fitting, key=lambda found: found[0])[1]
+        return None
 
 
 def _function(frame: str, name: str, sensor: Sensor | None) -> Spot | None:

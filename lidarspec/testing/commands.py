@@ -92,13 +92,13 @@ def arguments_are_held_to_their_ranges(subject: Subject, name: str) -> None:
     """An argument outside its range is refused."""
     for key, declared in subject.sensor.commands[name].arguments.items():
         kind = declared.kind
-        ends = (
-            (kind.low - 1, kind.high + 1)
-            if isinstance(kind, Range)
-            else ("x" * (kind.size + 1),)
-            if isinstance(kind, Text)
-            else ()
-        )
+        ends: tuple[float | str, ...]
+        if isinstance(kind, Range):
+            ends = (kind.low - 1, kind.high + 1)
+        elif isinstance(kind, Text):
+            ends = ("x" * (kind.size + 1),)
+        else:
+            ends = ()
         for outside in ends:
             try:
                 subject.sensor.command(name, **{**arguments(subject, name, 0.0), key: outside})
@@ -226,7 +226,10 @@ def _asked(subject: Subject, name: str, given: dict[str, float]) -> Reply:
             device.receive(out.data, now, out.link)
         now += STEP
         mine = [data for arrived, data in device.outgoing(now) if arrived == command.link]
-        found = [item for data in mine for item in decoder.feed(data)] if mine else decoder.idle()
+        if mine:
+            found = [item for data in mine for item in decoder.feed(data)]
+        else:
+            found = decoder.idle()
         session.receive(found, now, link=command.link)
         session.tick(now)
     return pending.result()

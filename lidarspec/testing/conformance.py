@@ -43,7 +43,10 @@ def assert_conformance(
             sensor are not tested again.
     """
     __tracebackhide__ = True
-    found = Target([sensor]) if isinstance(sensor, Sensor) else target(sensor)
+    if isinstance(sensor, Sensor):
+        found = Target([sensor])
+    else:
+        found = target(sensor)
     made = list(
         reports(
             found,
@@ -85,7 +88,10 @@ class SensorConformance:
     ) -> None:
         """The sensor conforms: its declaration is sound, and every property holds."""
         __tracebackhide__ = True
-        vectors = request.path.parent / self.vectors if self.vectors else None
+        if self.vectors:
+            vectors = request.path.parent / self.vectors
+        else:
+            vectors = None
         for report in assert_conformance(
             self.sensor, examples=self.examples, strategies=self.strategies, vectors=vectors
         ):

@@ -143,7 +143,9 @@ def _read_azimuths(
     try:
         frame = FrameMaker(subject.sensor, name).frame(values)
         packets = read(subject, name, [frame] * max(2, subject.sensor.frames[name].confirm))
-        return np.asarray(packets.points().azimuth, np.float64) if len(packets) else None
+        if len(packets):
+            return np.asarray(packets.points().azimuth, np.float64)
+        return None
     except LidarSpecError:
         return None
 

@@ -113,8 +113,14 @@ def _asked(sensor: Sensor) -> Findings:
     known = {
         path for name in sensor.data_frames for path in codec(sensor.frames[name]).schema.named
     }
-    cut_by = known | set(TYPES) if isinstance(sensor.scan, OnWrap) else known
-    clock = sensor.clock.source if sensor.clock is not None else ()
+    if isinstance(sensor.scan, OnWrap):
+        cut_by = known | set(TYPES)
+    else:
+        cut_by = known
+    if sensor.clock is not None:
+        clock = sensor.clock.source
+    else:
+        clock = ()
     asked = {
         "scan": getattr(sensor.scan, "name", ""),
         "sequence": sensor.sequence.field if sensor.sequence is not None else "",
@@ -163,7 +169,10 @@ def _options(sensor: Sensor) -> Findings:
     as it is.
     """
     function = sensor.configure.function
-    plain = function.func if isinstance(function, partial) else function
+    if isinstance(function, partial):
+        plain = function.func
+    else:
+        plain = function
     if not inspect.isfunction(plain):
         return
     parameters = inspect.signature(plain).parameters.values()
@@ -342,7 +351,9 @@ def _multiplied(subject: Subject, name: str) -> set[str]:
     except Exception:  # said elsewhere
         return set()
     known = any(info is not None and factor(info.unit, "m") is not None for info in infos)
-    return {info.path for info in infos if info is not None} if known else set()
+    if known:
+        return {info.path for info in infos if info is not None}
+    return set()
 
 
 def _measured(frame: Frame, *, with_scale: bool = False) -> set[str]:
@@ -466,7 +477,9 @@ def _weak_bits(sensor: Sensor, frame: Frame) -> int:
     """Return the bits of constants and checksums up to which a frame type is weak."""
     if sensor.datagrams:
         return WEAK_BITS_IN_DATAGRAMS
-    return WEAK_BITS if frame.data else WEAK_BITS_WITHOUT_POINTS
+    if frame.data:
+        return WEAK_BITS
+    return WEAK_BITS_WITHOUT_POINTS
 
 
 def _points(subject: Subject, name: str) -> Findings:
@@ -528,7 +541,10 @@ def _reach(subject: Subject) -> Findings:
             info = field_of(subject, name, value.node)
         else:
             info = None
-        metres = factor(info.unit, "m") if info is not None and info.kind == "int" else None
+        if info is not None and info.kind == "int":
+            metres = factor(info.unit, "m")
+        else:
+            metres = None
         if info is None or metres is None:
             return
         declared = "{:g} .. {:g}".format(*subject.sensor.range_limits)

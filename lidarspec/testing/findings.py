@@ -182,9 +182,18 @@ class Finding:
     def __str__(self) -> str:
         place = " ".join(part for part in (self.sensor, self.path) if part)
         file = Path(self.file)
-        file = file.relative_to(Path.cwd()) if file.is_relative_to(Path.cwd()) else file
-        where = f"{file}:{self.line}" if self.line else str(file) if self.file else ""
-        where = f"{place} ({where})" if place and where else place or where
+        if file.is_relative_to(Path.cwd()):
+            file = file.relative_to(Path.cwd())
+        if self.line:
+            where = f"{file}:{self.line}"
+        elif self.file:
+            where = str(file)
+        else:
+            where = ""
+        if place and where:
+            where = f"{place} ({where})"
+        else:
+            where = place or where
         rule = self.rule
         return (
             f"{self.code} {rule.title}\n  where  {where}\n  what   {self.what}\n"
@@ -239,7 +248,10 @@ def left_over(findings: list[Finding], sensor: Sensor, *, whole: bool) -> list[F
     for place, entries in given.items() if whole else ():
         for key, reason in entries.items():
             if (place, key) not in used:
-                said = "has no reason" if not reason.strip() else "is not found"
+                if not reason.strip():
+                    said = "has no reason"
+                else:
+                    said = "is not found"
                 left.append(
                     Finding("LS209", f"{key!r} is acknowledged, and {said}", place, sensor.id)
                 )

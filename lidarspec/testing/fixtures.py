@@ -47,7 +47,10 @@ def virtual_port(
     Raises:
         SourceError: where the port cannot be had.
     """
-    known = sensor if isinstance(sensor, Sensor) else named_sensor(sensor)
+    if isinstance(sensor, Sensor):
+        known = sensor
+    else:
+        known = named_sensor(sensor)
     device = SimulatedDevice(known, scene=scene, seed=seed, rate=rate, faults=faults)
     with contextlib.ExitStack() as stack:
         if to == "pty" and link is None:

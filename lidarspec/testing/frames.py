@@ -207,7 +207,10 @@ def values_in_units_build_the_same_bytes(subject: Subject, name: str) -> None:
     for seed in subject.seeds(name):
         data = subject.example(name, seed=seed)
         values = material.physical(subject.sensor, name, data)
-        built = data if values is None else subject.sensor.build(name, values, units=True)
+        if values is None:
+            built = data
+        else:
+            built = subject.sensor.build(name, values, units=True)
         if built != data:
             _lost(subject, name, data, built, "LS304")
 

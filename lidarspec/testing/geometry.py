@@ -110,7 +110,10 @@ def read(subject: Subject, name: str, frames: list[bytes], *, by_clock: bool = T
     """Frames of one data type, decoded, with the sensor's clock or without; a mode that another
     frame switches to begins with it.
     """
-    sensor = subject.sensor if by_clock else dataclasses.replace(subject.sensor, clock=None)
+    if by_clock:
+        sensor = subject.sensor
+    else:
+        sensor = dataclasses.replace(subject.sensor, clock=None)
     if sum(frame.data for frame in sensor.frames.values()) > 1:
         sensor = sensor.configure(answer=name)
     return sensor.decode(frames if sensor.datagrams else b"".join(frames), name)
@@ -186,7 +189,9 @@ def directions(subject: Subject, name: str, packets: Packets) -> list[NDArray[np
         )
         for array in arrays[:2]
     ]
-    return whole if mask is None else [angles[mask] for angles in whole]
+    if mask is None:
+        return whole
+    return [angles[mask] for angles in whole]
 
 
 def _declared(subject: Subject, name: str) -> list[NDArray[np.float64]] | None:
@@ -322,7 +327,10 @@ def the_points_turn_as_the_axes_do(subject: Subject, name: str) -> None:
     """
     for path, info in subject.fields(name).items():
         zero = _zero(info)
-        clouds = [] if zero is None else _with_values(subject, name, path, (zero, zero + SMALL))
+        if zero is None:
+            clouds = []
+        else:
+            clouds = _with_values(subject, name, path, (zero, zero + SMALL))
         sense = _turn(info, *clouds) if clouds else 0
         if not sense:
             continue
@@ -350,7 +358,11 @@ def _sense_of(axes: tuple[str, str, str], zero: float) -> int:
     x, y, _ = axis_matrix(axes)
     along = np.abs([x, y]) @ [np.cos(zero), np.sin(zero), 0]
     turning = round(float(np.cross(x, y)[2]))
-    return 0 if max(along) < ALONG else turning if along[0] > along[1] else -turning
+    if max(along) < ALONG:
+        return 0
+    if along[0] > along[1]:
+        return turning
+    return -turning
 
 
 def angles_are_in_order(subject: Subject, name: str) -> None:
@@ -453,20 +465,27 @@ def _zero(info: FieldInfo) -> int | None:
     ):
         return None
     raw = round(-info.offset / info.scale)
-    return raw if info.limits[0] <= raw <= info.limits[1] - SMALL else None
+    if info.limits[0] <= raw <= info.limits[1] - SMALL:
+        return raw
+    return None
 
 
 def _full_circle(info: FieldInfo) -> tuple[int, int] | None:
     """The raw values of no angle and of the full circle; None where the field cannot hold both."""
     zero = _zero(info)
-    circle = (FULL_TURNS[info.unit] - info.offset) / info.scale if zero is not None else math.nan
+    if zero is not None:
+        circle = (FULL_TURNS[info.unit] - info.offset) / info.scale
+    else:
+        circle = math.nan
     whole = (
         zero is not None
         and abs(circle - round(circle)) < 1e-6
         and round(circle) <= info.limits[1]
         and not info.physical(zero)
     )
-    return (zero, round(circle)) if zero is not None and whole else None
+    if zero is not None and whole:
+        return (zero, round(circle))
+    return None
 
 
 def _with_values(
@@ -511,7 +530,9 @@ def _turn(info: FieldInfo, nought: PointCloud, turned: PointCloud) -> int:
     most = float(max(moved[np.isfinite(moved)], key=abs, default=0)) / (
         SMALL * info.scale * 2 * np.pi / FULL_TURNS[info.unit]
     )
-    return int(np.sign(most)) if 0.5 < abs(most) < 1.5 else 0
+    if 0.5 < abs(most) < 1.5:
+        return int(np.sign(most))
+    return 0
 
 
 def _with(subject: Subject, name: str, path: str, value: int, parsed: Any) -> bytes:
@@ -553,7 +574,9 @@ def half_step(subject: Subject, name: str) -> float:
         for info in fields
         if factor(info.unit, "m") is not None
     ]
-    return max([UNTOLD, *metres]) / 2 if max(metres, default=0) > UNTOLD else UNTOLD
+    if max(metres, default=0) > UNTOLD:
+        return max([UNTOLD, *metres]) / 2
+    return UNTOLD
 
 
 def a_simulated_scene_comes_back(subject: Subject, name: str) -> None:

@@ -34,13 +34,18 @@ def sensor(request: pytest.FixtureRequest) -> Sensor:
     from lidarspec.spec.sensor import Sensor
 
     marker = request.node.get_closest_marker("lidarspec")
-    wanted = marker.args[0] if marker else getattr(request.cls, "sensor", None)
+    if marker:
+        wanted = marker.args[0]
+    else:
+        wanted = getattr(request.cls, "sensor", None)
     if not wanted:
         raise pytest.UsageError(
             'which sensor? mark the test with @pytest.mark.lidarspec("acme-x1"), or give its class'
             " a `sensor`"
         )
-    return wanted if isinstance(wanted, Sensor) else named(wanted)
+    if isinstance(wanted, Sensor):
+        return wanted
+    return named(wanted)
 
 
 @pytest.fixture

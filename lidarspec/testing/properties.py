@@ -26,16 +26,22 @@ def _no_sweep(subject: Subject) -> str:
     if not any(subject.sensor.simulation_of(name).sweep for name in names):
         return "it declares no `sweep`, and cannot be simulated"
     alone = [name for name in names if not codec(subject.sensor.frames[name]).is_compiled]
-    return f"{', '.join(alone)} is not compiled, and cannot be simulated" if alone else ""
+    if alone:
+        return f"{', '.join(alone)} is not compiled, and cannot be simulated"
+    return ""
 
 
 def _no_commands(subject: Subject) -> str:
-    return "" if subject.sensor.commands else "it has no commands"
+    if subject.sensor.commands:
+        return ""
+    return "it has no commands"
 
 
 def _no_device(subject: Subject) -> str:
     has_replies = any(command.replies for command in subject.sensor.commands.values())
-    return _no_sweep(subject) if has_replies else "it has no commands with a documented reply"
+    if has_replies:
+        return _no_sweep(subject)
+    return "it has no commands with a documented reply"
 
 
 @dataclass(frozen=True)
@@ -68,7 +74,9 @@ class Property:
     def cases(self, subject: Subject) -> Iterable[tuple[str, ...]]:
         """Return the arguments of each call, apart from the subject."""
         if self.each == "sensor":
-            return [] if self._is_tested_elsewhere(subject) else [()]
+            if self._is_tested_elsewhere(subject):
+                return []
+            return [()]
         if self.each == "vector":
             return [(place,) for place in vectors.places(subject)]
         names = {
@@ -224,7 +232,11 @@ PROPERTIES = (
 def _gist(error: BaseException) -> str:
     """The last line that says something."""
     lines = [line for line in str(error).splitlines() if line.strip()]
-    return (lines[-1] if "Traceback" in str(error) else lines[0]) if lines else type(error).__name__
+    if lines:
+        if "Traceback" in str(error):
+            return lines[-1]
+        return lines[0]
+    return type(error).__name__
 
 
 def _rule_of(error: SpecError) -> str:

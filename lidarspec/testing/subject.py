@@ -29,7 +29,9 @@ SPOTS = 50
 def delivery(sensor: Sensor, frames: list[tuple[str, bytes]]) -> Any:
     """Frames as the data link delivers them: datagrams, or one run of bytes."""
     parts = [data for _, data in frames]
-    return parts if sensor.datagrams else b"".join(parts)
+    if sensor.datagrams:
+        return parts
+    return b"".join(parts)
 
 
 def places(length: int, source: random.Random, spots: int = SPOTS) -> list[int]:
@@ -102,7 +104,12 @@ def integers(
         parsed.items() if isinstance(parsed, dict) else enumerate(parsed)
     )
     for key, value in entries:
-        below = path if isinstance(parsed, list) else f"{path}.{key}" if path else key
+        if isinstance(parsed, list):
+            below = path
+        elif path:
+            below = f"{path}.{key}"
+        else:
+            below = key
         if isinstance(value, dict | list):
             yield from integers(value, below, kinds)
         elif type(value) in kinds:
@@ -300,7 +307,10 @@ class Subject:
                 break
             for name in self.sensor.incoming:
                 frame = self.sensor.frames[name]
-                number = frame.confirm + 2 if frame.data or frame.confirm > 1 else 1
+                if frame.data or frame.confirm > 1:
+                    number = frame.confirm + 2
+                else:
+                    number = 1
                 first = (
                     seed * 1000 + turn * number
                 )  # the lowest seeds, whose examples other properties use as well

@@ -124,7 +124,10 @@ def vectors_hold(subject: Subject, only: str = "") -> None:
             f"{place} {name}",
         )
         if "command" in vector:
-            answer = unhexed(vector["reply"]) if "reply" in vector else None
+            if "reply" in vector:
+                answer = unhexed(vector["reply"])
+            else:
+                answer = None
             an_exchange_holds(
                 subject.sensor,
                 vector["command"],
@@ -212,7 +215,10 @@ def points_stand_in_two_quadrants(subject: Subject, name: str) -> None:
         for vector in vectors
     ]
     ranges = np.concatenate([np.empty(0), *(cloud.range[cloud.valid] for cloud in clouds)])
-    seen = f"{ranges.min():.4g} .. {ranges.max():.4g} m" if len(ranges) else "no returns"
+    if len(ranges):
+        seen = f"{ranges.min():.4g} .. {ranges.max():.4g} m"
+    else:
+        seen = "no returns"
     number = f"{len(quadrants)} quadrant{'s' * (len(quadrants) != 1)}"
     subject.picture[f"{name}: vectors"] = (
         f"{seen} in {len(vectors)} of them, which say x and y in {number}"
@@ -295,8 +301,14 @@ def _fitting(
     these do.
     """
     engine = codec(subject.sensor.frames[name])
-    layout = engine.tree.layout(frame) if isinstance(engine, CompiledCodec) else None
-    leaf = layout.leaves.get(path) if isinstance(layout, Layout) else None
+    if isinstance(engine, CompiledCodec):
+        layout = engine.tree.layout(frame)
+    else:
+        layout = None
+    if isinstance(layout, Layout):
+        leaf = layout.leaves.get(path)
+    else:
+        leaf = None
 
     def stands(place: Place) -> bool:
         return leaf is None or (place.start(len(frame)), 8 * place.size) == (
@@ -314,8 +326,14 @@ def _needs_class(match: Match) -> bool:
 
 def _in_words(match: Match, length: int) -> str:
     """A checksum that fits, what it covers, and the byte order of its field."""
-    order = f", in a field that is {match.order}-endian," if match.place.size > 1 else ""
-    algorithm = match.algorithm.describe() if _needs_class(match) else match.paste
+    if match.place.size > 1:
+        order = f", in a field that is {match.order}-endian,"
+    else:
+        order = ""
+    if _needs_class(match):
+        algorithm = match.algorithm.describe()
+    else:
+        algorithm = match.paste
     return f"{algorithm} over {match.span.told(match.place, length)}{order}"
 
 
@@ -339,7 +357,10 @@ def _common(frames: list[bytes]) -> list[Match]:
 def _standing(subject: Subject, name: str, match: Match, frame: bytes) -> str:
     """The field that a checksum stands in; "" where that cannot be told."""
     engine = codec(subject.sensor.frames[name])
-    layout = engine.tree.layout(frame) if isinstance(engine, CompiledCodec) else None
+    if isinstance(engine, CompiledCodec):
+        layout = engine.tree.layout(frame)
+    else:
+        layout = None
     start = match.place.start(len(frame))
     leaves = layout.leaves.items() if isinstance(layout, Layout) else ()
     return next(
@@ -480,14 +501,20 @@ def _values(
             if in_units and info is not None
             else raw
         )
-        near = abs(info.scale) * 0.5001 if in_units and info is not None else 0
+        if in_units and info is not None:
+            near = abs(info.scale) * 0.5001
+        else:
+            near = 0
         if plain == value or (
             isinstance(value, int | float)
             and isinstance(plain, int | float)
             and abs(plain - value) <= near
         ):
             continue
-        expected = info.raw(value) if in_units and info is not None else value
+        if in_units and info is not None:
+            expected = info.raw(value)
+        else:
+            expected = value
         raise Violation(
             _reading(info, raw, expected),
             f"{plain} is read, and {value} is printed",
@@ -504,7 +531,9 @@ def _reading(info: FieldInfo | None, raw: Any, wanted: Any) -> str:
         return "LS705"
     size = (info.bits + 7) // 8
     swapped = int.from_bytes((raw % top).to_bytes(size, "big"), "little")
-    return "LS704" if size > 1 and swapped % top == wanted % top else "LS706"
+    if size > 1 and swapped % top == wanted % top:
+        return "LS704"
+    return "LS706"
 
 
 def _points(

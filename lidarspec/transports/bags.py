@@ -82,7 +82,9 @@ def log_of(path: str, head: bytes = b"") -> Log | None:
     none.
     """
     if os.path.isdir(path):
-        return FOLDER if os.path.isfile(os.path.join(path, "metadata.yaml")) else None
+        if os.path.isfile(os.path.join(path, "metadata.yaml")):
+            return FOLDER
+        return None
     return next((log for beginning, log in LOGS.items() if head.startswith(beginning)), None)
 
 
@@ -136,7 +138,10 @@ class BagTransport(Transport):
         namespaces = {_namespace(link.topic) for link in self._links}
         with self._failures():
             for link, at, raw in self._log.messages(self._links) if self._links else ():
-                sender = (_namespace(link.topic), 0) if len(namespaces) > 1 else None
+                if len(namespaces) > 1:
+                    sender = (_namespace(link.topic), 0)
+                else:
+                    sender = None
                 message = self._message(link, raw)
                 if link.msgtype == RAW:
                     yield raw_chunk(message)
@@ -259,4 +264,6 @@ def _element(field: Any) -> Any:
     """What a field is an array of: the name of a type, or that of a number with its length; None
     where it is none.
     """
-    return field[1][0][1] if field is not None and field[0].name in ("ARRAY", "SEQUENCE") else None
+    if field is not None and field[0].name in ("ARRAY", "SEQUENCE"):
+        return field[1][0][1]
+    return None

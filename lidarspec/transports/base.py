@@ -107,8 +107,13 @@ def disconnected_error(label: str, error: BaseException | str) -> Disconnected:
 
 def system_reason(error: BaseException | str) -> str:
     """Return the text of the system for an error, without the words that pyserial adds to it."""
-    numbers = error_numbers(error) if isinstance(error, BaseException) else []
-    return os.strerror(numbers[0]) if numbers else str(error)
+    if isinstance(error, BaseException):
+        numbers = error_numbers(error)
+    else:
+        numbers = []
+    if numbers:
+        return os.strerror(numbers[0])
+    return str(error)
 
 
 def error_numbers(error: BaseException) -> list[int]:
@@ -118,10 +123,17 @@ def error_numbers(error: BaseException) -> list[int]:
 
 def data_link(sensor: Spec | None, kind: type[L]) -> L | None:
     """Return the data link of a sensor if it is of this kind."""
-    link = sensor.links.get("data") if sensor is not None else None
-    return link if isinstance(link, kind) else None
+    if sensor is not None:
+        link = sensor.links.get("data")
+    else:
+        link = None
+    if isinstance(link, kind):
+        return link
+    return None
 
 
 def sensor_option(sensor: Sensor | None) -> str:
     """Return the option that names a sensor in a command to type, after a space."""
-    return f" -s {sensor.id}" if sensor is not None else ""
+    if sensor is not None:
+        return f" -s {sensor.id}"
+    return ""

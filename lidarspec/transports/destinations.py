@@ -149,7 +149,9 @@ def _declared_port(link: Link) -> int:
     if isinstance(link, Tcp | Http):
         return link.port
     if isinstance(link, Udp):
-        return link.ports[0] if link.ports else link.broadcast
+        if link.ports:
+            return link.ports[0]
+        return link.broadcast
     return 0
 
 

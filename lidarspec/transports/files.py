@@ -66,7 +66,10 @@ class RecordingTransport(Transport):
         self._recording = Recording(path, self._file, salvage=salvage)
         self.header: Header = self._recording.header
         self.datagrams = self.header.datagrams
-        self._origin = None if sender is None else parse_origin(sender)
+        if sender is None:
+            self._origin = None
+        else:
+            self._origin = parse_origin(sender)
         self.warnings: list[str] = []
         self._no_events = 0
         self._was_set = False
@@ -108,7 +111,10 @@ class RecordingTransport(Transport):
                 interrupted = False
         if _is_whole(self, self._file) and self._recording.damaged:
             self.warnings.append(_damage(self._recording))
-            self.unread = 0 if self._recording.is_cut else self._recording.leftover
+            if self._recording.is_cut:
+                self.unread = 0
+            else:
+                self.unread = self._recording.leftover
         if self._no_events:
             self.warnings.append(
                 f"{self._recording.path}: {self._no_events} events were passed over, which have no"
@@ -283,7 +289,10 @@ class CaptureTransport(FileTransport):
 
     def __init__(self, path: str, file: BinaryIO, *, sender: str | None = None) -> None:
         super().__init__(path, file)
-        self._origin = None if sender is None else parse_origin(sender)
+        if sender is None:
+            self._origin = None
+        else:
+            self._origin = parse_origin(sender)
         self.reader: CaptureBatches | None = None
         self._has_skipped = False
 
@@ -306,7 +315,10 @@ class CaptureTransport(FileTransport):
         """
         reader = self.reader = self.reader or self.in_batches(self.file)
         for batch in reader.batches():
-            mine = batch if self._origin is None else batch.of(self._origin)
+            if self._origin is None:
+                mine = batch
+            else:
+                mine = batch.of(self._origin)
             self.foreign += len(batch) - len(mine)
             if len(mine):
                 yield replace(mine, gap=True) if self._gap() else mine
@@ -394,4 +406,6 @@ def _by_content(
     is_text = suffixes & HEX_SUFFIXES or (
         suffixes & TEXT_SUFFIXES and is_hexadecimal(start, whole=len(start) < HEAD)
     )
-    return HexTransport(name, file) if is_text else FileTransport(name, file)
+    if is_text:
+        return HexTransport(name, file)
+    return FileTransport(name, file)

@@ -245,7 +245,9 @@ def _nanoseconds(seconds: str | None) -> int | None:
     if not whole.isdecimal() or not (fraction or "0").isdecimal():
         return None
     ns = int(whole) * 1_000_000_000 + int(fraction[:9].ljust(9, "0"))
-    return ns if ns < 1 << 63 else None
+    if ns < 1 << 63:
+        return ns
+    return None
 
 
 def _shown(text: str) -> bytes:
@@ -255,7 +257,10 @@ def _shown(text: str) -> bytes:
     text, bar, _ = text.partition("  |")
     data = b""
     while text:
-        gap = None if bar or len(text) > LONGEST_ROW else _GAP.search(text)
+        if bar or len(text) > LONGEST_ROW:
+            gap = None
+        else:
+            gap = _GAP.search(text)
         area, beside = (text[: gap.start()], text[gap.end() :]) if gap else (text, "")
         comment = _COMMENT.search(area)
         try:
@@ -320,13 +325,19 @@ def hex_chunks(name: str, readline: Callable[[int], bytes]) -> Iterator[Chunk]:
     try:
         while (block := readline(BLOCK)) or text:
             text += block.decode("ascii", "replace")
-            end = len(text) if len(block) < BLOCK or block.endswith(b"\n") else between(text)
+            if len(block) < BLOCK or block.endswith(b"\n"):
+                end = len(text)
+            else:
+                end = between(text)
             yield reader.line((goes_on + text[:end]).removesuffix("\n"))
             if block.endswith(b"\n"):
                 goes_on = ""
                 number = number + 1
             else:  # so does a comment in the line; an offset is at its beginning alone
-                goes_on = "#" if re.search("#|//", goes_on + text[:end]) else ","
+                if re.search("#|//", goes_on + text[:end]):
+                    goes_on = "#"
+                else:
+                    goes_on = ","
             text = text[end:]
         reader.finish()
     except ValueError as error:

@@ -111,7 +111,10 @@ class HttpTransport(LiveTransport):
                     f" {self._link.timeout:g} s"
                 )
             is_redirection = 300 <= reply.status < 400
-            location = reply.getheader("Location", "") if is_redirection else ""
+            if is_redirection:
+                location = reply.getheader("Location", "")
+            else:
+                location = ""
             return reply.status, content, location
 
 

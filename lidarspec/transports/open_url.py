@@ -83,7 +83,9 @@ def live(source: str | Path, sensor: Sensor | None = None) -> LiveTransport:
 def resolved(source: str | Path) -> str:
     """The SOURCE itself: that of the device where it is the name of one in `lidarspec.toml`."""
     device = named(source)
-    return str(source) if device is None else device.source
+    if device is None:
+        return str(source)
+    return device.source
 
 
 def is_live(source: str | Path) -> bool:
@@ -100,7 +102,9 @@ def live_address(source: str | Path) -> Address | None:
         return Address.parse(text, scheme="serial")
     scheme = _SCHEME.match(text)
     is_file = scheme is None or is_stored(text) or os.path.exists(text)
-    return None if is_file else Address.parse(text)
+    if is_file:
+        return None
+    return Address.parse(text)
 
 
 def is_port(text: str) -> bool:
@@ -131,7 +135,10 @@ def control_link(source: str | Path, name: str, link: Link, host: str | None) ->
         SourceError: where it cannot be opened.
     """
     address = live_address(source)
-    said = address.options.get("control", "") if address is not None else ""
+    if address is not None:
+        said = address.options.get("control", "")
+    else:
+        said = ""
     if live_address(said) is not None:
         return live(said)
     found, port = Address(said, "", said).host_and_port()
@@ -204,4 +211,6 @@ def _opened(address: Address, sensor: Sensor | None) -> Transport:
 
 
 def _bracketed(host: str) -> str:
-    return f"[{host}]" if ":" in host else host
+    if ":" in host:
+        return f"[{host}]"
+    return host

@@ -209,7 +209,10 @@ class UdpLine(Line):
                 f"ping {host}",
             ) from None
         numeric_host = str(address[0])
-        bracketed = f"[{numeric_host}]" if ":" in numeric_host else numeric_host
+        if ":" in numeric_host:
+            bracketed = f"[{numeric_host}]"
+        else:
+            bracketed = numeric_host
         sender = socket.socket(family, kind)
         with contextlib.suppress(OSError):
             sender.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, _SEND_BUFFER_BYTES)
@@ -457,10 +460,14 @@ class PtyLine(Line):
         return math.inf
 
     def readable(self) -> Collection[int | socket.socket]:
-        return [self._master] if self.has_listener else []
+        if self.has_listener:
+            return [self._master]
+        return []
 
     def writable(self) -> Collection[int | socket.socket]:
-        return [self._master] if self._backlog else []
+        if self._backlog:
+            return [self._master]
+        return []
 
     def plug(self) -> None:
         """Make a terminal in raw mode that nobody has open."""

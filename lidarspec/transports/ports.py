@@ -56,8 +56,14 @@ def serial_ports() -> list[SerialPort]:
     """The serial ports of this computer, by name."""
     found = []
     for port in sorted(list_ports.comports(), key=lambda port: str(port.device)):
-        description = port.description if port.description not in (None, "n/a") else ""
-        maker = f" by {port.manufacturer}" if port.manufacturer else ""
+        if port.description not in (None, "n/a"):
+            description = port.description
+        else:
+            description = ""
+        if port.manufacturer:
+            maker = f" by {port.manufacturer}"
+        else:
+            maker = ""
         path = port.device
         found.append(
             SerialPort(

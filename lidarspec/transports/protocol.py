@@ -45,7 +45,10 @@ class Origin:
         if found is None:
             return cls(text)
         host = found[1] or found[3] or ""
-        port = found[4] if found[1] is None else found[2]
+        if found[1] is None:
+            port = found[4]
+        else:
+            port = found[2]
         if port is not None and not (port.isdecimal() and 0 < int(port) < 65536):
             raise UsageError(f"src={text}: a sender is ADDRESS or ADDRESS:PORT")
         return cls(host, None if port is None else int(port))
@@ -56,7 +59,9 @@ class Origin:
 
 def endpoint(sender: Sender) -> str:
     """A sender as it is written, and as `src=` takes it: "192.168.1.201:2368", "[fe80::1]:2368"."""
-    return f"[{sender[0]}]:{sender[1]}" if ":" in sender[0] else f"{sender[0]}:{sender[1]}"
+    if ":" in sender[0]:
+        return f"[{sender[0]}]:{sender[1]}"
+    return f"{sender[0]}:{sender[1]}"
 
 
 def sender_names(ends: Iterable[tuple[Sender | None, Sender | None]]) -> dict[Sender | None, str]:

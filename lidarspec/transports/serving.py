@@ -99,7 +99,10 @@ def serve(
     device.start(start_ns)
     for link, data in early_commands:
         device.receive(data, start_ns, link)
-    end_ns = math.inf if seconds is None else start_ns + seconds * SECOND
+    if seconds is None:
+        end_ns = math.inf
+    else:
+        end_ns = start_ns + seconds * SECOND
     is_plugged_in = True
     while not stop.is_set():
         if on_pass is not None:

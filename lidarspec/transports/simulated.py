@@ -54,7 +54,10 @@ class SimulatedTransport(LiveTransport):
         link = sensor.links.get(name)
         self.datagrams = is_datagram(link)
         self.baud = link.baud if isinstance(link, Serial) else None
-        self.overflow = "block" if math.isinf(device.rate) else "drop_oldest"
+        if math.isinf(device.rate):
+            self.overflow = "block"
+        else:
+            self.overflow = "drop_oldest"
         self._clock = HostClock()
         self._next_read_ns = 0
         self._changed: threading.Condition
@@ -111,7 +114,10 @@ class SimulatedTransport(LiveTransport):
 
         Other links wait for the data link.
         """
-        deadline = self.device.deadline if self._name == "data" else None
+        if self._name == "data":
+            deadline = self.device.deadline
+        else:
+            deadline = None
         if deadline is None:
             return math.inf
         return max(deadline, self._next_read_ns)
@@ -173,7 +179,10 @@ def parse_rate(text: str) -> float:
 
 def _make_device(sensor: Sensor, options: Mapping[str, str]) -> SimulatedDevice:
     """Return a device for options such as ``{"rate": "2", "scene": "hall.toml"}``."""
-    scene = read_scene(options["scene"]) if "scene" in options else None
+    if "scene" in options:
+        scene = read_scene(options["scene"])
+    else:
+        scene = None
     faults = faults_of({name: text for name, text in options.items() if name in FAULTS})
     seed = options.get("seed", "0")
     if not seed.isdecimal():

@@ -183,7 +183,9 @@ class Slots:
         if self._told[_TOLD + index * _TOLD_STEP] != _TWO.size:
             return None
         size, level, kind, first, second = _TWO.unpack_from(self._said, index * CONTROL)
-        return (kind, first, second) if size == _TWO.size and level == socket.SOL_SOCKET else None
+        if size == _TWO.size and level == socket.SOL_SOCKET:
+            return (kind, first, second)
+        return None
 
     def said(self, index: int) -> list[tuple[int, memoryview]]:
         """What the socket layer said with a datagram: type and value."""
@@ -204,7 +206,10 @@ def _address(name: bytes) -> tuple[str, int]:
     """Host and port of a socket address as the kernel writes it."""
     family = int.from_bytes(name[:2], sys.byteorder)
     port = int.from_bytes(name[2:4], "big")
-    packed = name[8:24] if family == socket.AF_INET6 else name[4:8]
+    if family == socket.AF_INET6:
+        packed = name[8:24]
+    else:
+        packed = name[4:8]
     return socket.inet_ntop(family, packed), port
 
 
@@ -246,7 +251,10 @@ class UdpTransport(LiveTransport):
         self.clock = HostClock()
         self.label = label
         self.datagrams = datagrams
-        self._origin = None if sender is None else parse_origin(sender)
+        if sender is None:
+            self._origin = None
+        else:
+            self._origin = parse_origin(sender)
         self._remote = remote
         self._sensor = sensor
         if self._origin is not None and self._origin.port is not None:
@@ -275,7 +283,10 @@ class UdpTransport(LiveTransport):
     def read(self, timeout: float) -> list[Chunk]:
         sleep_until(self._rested)
         found: list[Chunk] = []
-        ready = [] if self.closed else [key.data for key, _ in self._selector.select(timeout)]
+        if self.closed:
+            ready = []
+        else:
+            ready = [key.data for key, _ in self._selector.select(timeout)]
         for one in ready:
             self._fetch(one, found)
         self.kernel_drops = sum(each.drops for each in self._sockets)
@@ -311,7 +322,11 @@ class UdpTransport(LiveTransport):
         """Sockets stay open, whatever becomes of the sensor."""
 
     def peer(self) -> str | None:
-        return self._origin.host if self._origin else self._remote[0] if self._remote else None
+        if self._origin:
+            return self._origin.host
+        if self._remote:
+            return self._remote[0]
+        return None
 
     def close(self) -> None:
         self.closed = True
@@ -338,7 +353,10 @@ class UdpTransport(LiveTransport):
         _order_times(found, start)
 
     def _bound(self, host: str, port: int, group: str | None) -> socket.socket:
-        family = socket.AF_INET6 if ":" in host or ":" in (group or "") else socket.AF_INET
+        if ":" in host or ":" in (group or ""):
+            family = socket.AF_INET6
+        else:
+            family = socket.AF_INET
         found = socket.socket(family, socket.SOCK_DGRAM)
         try:
             if group is not None:
@@ -483,7 +501,10 @@ def connect(address: Address, sensor: Sensor | None = None) -> UdpTransport:
     address.check(OPTIONS)
     host, port = address.host_and_port()
     host = host and resolve_host(host, address.text)
-    link = sensor.links.get("data") if sensor is not None else None
+    if sensor is not None:
+        link = sensor.links.get("data")
+    else:
+        link = None
     ports = _ports(address) or (
         [port] if port else list(link.ports) if isinstance(link, Udp) else []
     )

@@ -94,7 +94,10 @@ def sgr(ink: int, depth: Depth) -> str:
     elif depth == "standard":
         parts.append(str(chosen.standard))
     else:
-        shown = ColorSystem.TRUECOLOR if depth == "truecolor" else ColorSystem.EIGHT_BIT
+        if depth == "truecolor":
+            shown = ColorSystem.TRUECOLOR
+        else:
+            shown = ColorSystem.EIGHT_BIT
         parts += Color.from_rgb(*chosen.rgb).downgrade(shown).get_ansi_codes()
     return f"\x1b[{';'.join(parts)}m"
 
@@ -102,7 +105,10 @@ def sgr(ink: int, depth: Depth) -> str:
 def style(ink: int) -> str:
     """An ink as a style of rich."""
     chosen = INKS[ink]
-    colour = "" if chosen.rgb is None else "#" + "".join(f"{part:02x}" for part in chosen.rgb)
+    if chosen.rgb is None:
+        colour = ""
+    else:
+        colour = "#" + "".join(f"{part:02x}" for part in chosen.rgb)
     return " ".join(part for part in ("bold" if chosen.bold else "", colour) if part)
 
 

@@ -126,8 +126,14 @@ class Feed:
     def _read(self) -> None:
         """Read the next batch, or the end."""
         # Figures begin with the first selected packet, but with the counters before it was read.
-        meter = self.meter if self._has_counted else self._make_meter()
-        packets = None if self._sieve.ended else next(self._batches, None)
+        if self._has_counted:
+            meter = self.meter
+        else:
+            meter = self._make_meter()
+        if self._sieve.ended:
+            packets = None
+        else:
+            packets = next(self._batches, None)
         self.packets = packets
         if packets is None:
             self._finish()
@@ -175,9 +181,14 @@ class Feed:
         """Return the packets at the selected times."""
         if not self._select.is_timed:
             return packets
-        times = packets.host_ns if self._select.time == "host" else packets.time_ns
+        if self._select.time == "host":
+            times = packets.host_ns
+        else:
+            times = packets.time_ns
         is_selected = self._times.holds(times)
-        return packets if is_selected.all() else packets.take(is_selected)
+        if is_selected.all():
+            return packets
+        return packets.take(is_selected)
 
     def _keep(self, scans: list[Scan]) -> None:
         """Show the selected ones of some scans, or keep them until they are due."""
@@ -218,7 +229,9 @@ class Feed:
     def _step(self) -> float:
         """Return the seconds from the last scan to the next, by their times."""
         step = (self._waiting[0].stamp_ns - self._last_stamp_ns) * 1e-9
-        return step if 0 < step <= MAX_STEP_S else DEFAULT_STEP_S
+        if 0 < step <= MAX_STEP_S:
+            return step
+        return DEFAULT_STEP_S
 
     def _show_next(self) -> None:
         scan = self._waiting.popleft()

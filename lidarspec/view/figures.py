@@ -83,13 +83,13 @@ def of_scan(scan: Scan, look: Look, title: str) -> Any:
     alike.
     """
     cloud = scan.points[scan.points.valid]
-    column = (
-        cloud.range
-        if look.ramp == "range"
-        else cloud.intensity
-        if look.ramp == "intensity"
-        else cloud.extra[look.ramp]
-    )
+    column: Any
+    if look.ramp == "range":
+        column = cloud.range
+    elif look.ramp == "intensity":
+        column = cloud.intensity
+    else:
+        column = cloud.extra[look.ramp]
     unit = "m" if look.ramp == "range" else look.unit
     lowest, highest = bounds(cloud)
     low = min(float(lowest[2]), 0.0)
@@ -192,7 +192,10 @@ def of_ranges(scans: Iterable[Scan], title: str) -> Any:
     edges = np.linspace(0, float(farthest) * 1.05, NEAR + 1)
     times = np.array([(stamp - every[0][0]) * 1e-9 for stamp, *_ in every])
     order = np.argsort(times, kind="stable")
-    last = float(np.median(np.diff(times[order]))) if len(times) > 1 else NARROWEST
+    if len(times) > 1:
+        last = float(np.median(np.diff(times[order])))
+    else:
+        last = NARROWEST
     counts = np.stack([np.histogram(every[which][1], edges)[0] for which in order], axis=1)
     figure = _figure(
         f"{title}: {number:,} scans" + f", of which one in {step} is shown" * (step > 1)
@@ -291,7 +294,10 @@ class Rates:
         packets = self._feed.packets
         if packets is None or not len(packets):
             return
-        times = packets.host_ns if packets.host_ns.any() else packets.time_ns
+        if packets.host_ns.any():
+            times = packets.host_ns
+        else:
+            times = packets.time_ns
         self._first = self._first or int(times[0])
         after = totals(self._feed.device.stats)
         lost, wrong = (after[name] - self._before[name] for name in ("lost", "rejected"))

@@ -158,7 +158,9 @@ class Tally:
         """Return packets per second, by their own times if they have them."""
         if self._gap_sum:
             return self._gap_count / self._gap_sum
-        return self.packets / duration if duration else None
+        if duration:
+            return self.packets / duration
+        return None
 
     def _jitter(self) -> float:
         mean = self._gap_sum / self._gap_count
@@ -233,8 +235,12 @@ def format_figure(value: float | None, form: str, factor: float = 1) -> str:
 
 def _share(some: int, others: int) -> float:
     total = some + others
-    return some / total if total > 0 else 0.0
+    if total > 0:
+        return some / total
+    return 0.0
 
 
 def _mean(values: Sequence[int]) -> float | None:
-    return float(np.mean(values)) if values else None
+    if values:
+        return float(np.mean(values))
+    return None

@@ -50,7 +50,9 @@ def scan(value: Scan) -> str:
 
 def cloud(value: PointCloud) -> str | None:
     """The same of a cloud; None of a single point."""
-    return _picture(value, str(value)) if np.ndim(value.x) else None
+    if np.ndim(value.x):
+        return _picture(value, str(value))
+    return None
 
 
 def packets(value: Packets) -> str:
@@ -93,7 +95,10 @@ def explanation(value: Explanation) -> str:
         indent = "&nbsp;" * 2 * len(parents(row.path))
         name = escape(row.path.rpartition(".")[2])
         meaning = escape(printable(row.meaning))
-        tint = f"hsl({number * HUE % 360} 70% 50% / .25)" if row.right else "hsl(0 90% 50% / .55)"
+        if row.right:
+            tint = f"hsl({number * HUE % 360} 70% 50% / .25)"
+        else:
+            tint = "hsl(0 90% 50% / .55)"
         data = "<br>".join(
             row.data[start : start + 16].hex(" ") for start in range(0, len(row.data), 16)
         )
@@ -155,7 +160,9 @@ def _ends(number: int) -> NDArray[np.intp]:
 
 
 def _clock(packets: Packets) -> str:
-    return "host's" if packets.sensor.clock is None else "sensor's"
+    if packets.sensor.clock is None:
+        return "host's"
+    return "sensor's"
 
 
 def _since(times: NDArray[np.int64]) -> list[str]:
@@ -183,7 +190,9 @@ def _span(values: NDArray[np.float64]) -> str:
 
 
 def _number(value: float) -> str:
-    return f"{value:.10g}" if math.isfinite(value) else "-"
+    if math.isfinite(value):
+        return f"{value:.10g}"
+    return "-"
 
 
 def _table(

@@ -104,7 +104,9 @@ if sys.platform == "win32":
 
     def keyboard(*, taken: bool = False) -> Keys:
         """The keyboard of the console; one without keys where there is none."""
-        return Keyboard() if sys.stdin.isatty() and not taken else Keys()
+        if sys.stdin.isatty() and not taken:
+            return Keyboard()
+        return Keys()
 
 else:
     import termios
@@ -171,7 +173,11 @@ def depth(stream: TextIO) -> Depth:
     system = console.color_system
     if system is None or console.no_color:
         return "none"
-    return "truecolor" if system == "truecolor" else "256" if system == "256" else "standard"
+    if system == "truecolor":
+        return "truecolor"
+    if system == "256":
+        return "256"
+    return "standard"
 
 
 def encodable(stream: TextIO) -> bool:
@@ -210,7 +216,10 @@ class Screen:
         if self._plain:
             cells = cells.ascii()
         taken = self._taken
-        before = self._shown if self._shown is not None and self._shown.size == cells.size else None
+        if self._shown is not None and self._shown.size == cells.size:
+            before = self._shown
+        else:
+            before = None
         text = changes(before, cells, self._depth)
         if text:
             self._write(BEGIN + ("" if before is not None else "\x1b[0m\x1b[2J") + text + END)
@@ -270,7 +279,10 @@ def changes(before: Cells | None, after: Cells, depth: Depth) -> str:
     """What to write to a terminal that shows `before` for it to show `after`; None is an empty
     screen.
     """
-    old = before if before is not None else Cells.blank(*after.size)
+    if before is not None:
+        old = before
+    else:
+        old = Cells.blank(*after.size)
     changed = (old.codes != after.codes) | (old.inks != after.inks)
     parts: list[str] = []
     ink = -1

@@ -48,7 +48,10 @@ def svg(
     """
     cloud = points[points.valid]
     views = _Views(cloud, look, side, most, steps(cloud, look))
-    shown = [views.above()] if look.flat else [views.above(), views.beside()]
+    if look.flat:
+        shown = [views.above()]
+    else:
+        shown = [views.above(), views.beside()]
     width = side + 2 * MARGIN
     top = HEAD
     body: list[str] = []

@@ -139,7 +139,10 @@ class Window:
         self._look: Look | None = None
         self._reading: Reading | None = None
         self._read_at = time.monotonic()
-        self._end = math.inf if duration is None else self._read_at + duration
+        if duration is None:
+            self._end = math.inf
+        else:
+            self._end = self._read_at + duration
 
     def run(self, screen: Screen) -> None:
         """Draw until the user quits or the duration is over.
@@ -250,15 +253,22 @@ class Window:
 
     def _state(self) -> tuple[str, int]:
         """Return the state in a word, and its ink."""
-        recording = None if self._record is None else self._record.recording
+        if self._record is None:
+            recording = None
+        else:
+            recording = self._record.recording
         if recording is not None:
             return f"● {recording[0]}", ALARM
         if self.choice.paused:
             return "‖ paused", STRONG
         if self._device.is_live:
             state = self._device.state
-            return ("● live", GOOD) if state == "streaming" else (state, ALARM)
-        return ("end", STRONG) if self._feed.ended else ("▶ playing", GOOD)
+            if state == "streaming":
+                return ("● live", GOOD)
+            return (state, ALARM)
+        if self._feed.ended:
+            return ("end", STRONG)
+        return ("▶ playing", GOOD)
 
     def _figures(self) -> list[Figure]:
         """Return the figures of the last second and of the scan that is shown."""
@@ -283,7 +293,10 @@ class Window:
             return [Figure("points", "0"), Figure("valid", "-"), Figure("nearest", "-")]
         points = self._scan.points
         ranges = points.range[points.valid]
-        valid_share = len(ranges) / len(points) if len(points) else None
+        if len(points):
+            valid_share = len(ranges) / len(points)
+        else:
+            valid_share = None
         nearest = float(ranges.min()) if len(ranges) else None
         figures = [
             Figure("points", str(len(points))),
@@ -312,9 +325,13 @@ class Window:
         if self._feed.ended:
             if self._scan is not None:
                 return ""
-            return warnings[-1] if warnings else "the input ended without a scan"
+            if warnings:
+                return warnings[-1]
+            return "the input ended without a scan"
         is_disturbed = device.is_live and device.state not in ("streaming", "waiting")
-        return warnings[-1] if is_disturbed and warnings else ""
+        if is_disturbed and warnings:
+            return warnings[-1]
+        return ""
 
 
 def _rate_figure(name: str, rate: float | None) -> Figure:

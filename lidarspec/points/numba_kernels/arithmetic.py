@@ -149,7 +149,9 @@ def _float_at(bits, kind):
                         builder.module.declare_intrinsic("llvm.bswap", [ir.IntType(bits)]), [word]
                     )
                 number = builder.bitcast(word, kind)
-                return number if bits == 64 else builder.fpext(number, ir.DoubleType())
+                if bits == 64:
+                    return number
+                return builder.fpext(number, ir.DoubleType())
 
             return types.float64(array, types.int64), make
 
@@ -227,13 +229,17 @@ def modulo(a, b):
 @njit(forceinline=True)
 def smaller(a, b):
     """np.minimum."""
-    return a if a <= b or a != a else b
+    if a <= b or a != a:
+        return a
+    return b
 
 
 @njit(forceinline=True)
 def larger(a, b):
     """np.maximum."""
-    return a if a >= b or a != a else b
+    if a >= b or a != a:
+        return a
+    return b
 
 
 @njit(forceinline=True)
@@ -247,13 +253,17 @@ def number(a):
 @njit(forceinline=True)
 def returned(a):
     """`conventions.returned_range`."""
-    return a if 0.0 < a < np.inf else np.nan
+    if 0.0 < a < np.inf:
+        return a
+    return np.nan
 
 
 @njit(forceinline=True)
 def looked_up(table, index):
     """The entry of a table; nan where there is none."""
-    return at(table, np.int64(index)) if 0 <= index < len(table) else np.nan
+    if 0 <= index < len(table):
+        return at(table, np.int64(index))
+    return np.nan
 
 
 @njit(forceinline=True)
@@ -262,7 +272,9 @@ def row_at(index, rows):
 
     Returns the last row, which is nan, for an index that the table does not have.
     """
-    return np.int64(index) if 0 <= index < rows - 1 else rows - 1
+    if 0 <= index < rows - 1:
+        return np.int64(index)
+    return rows - 1
 
 
 @njit(forceinline=True, error_model="numpy")
@@ -272,4 +284,8 @@ def narrowed(angle):
     if abs(angle) > _FAR:
         turned = (angle + _PI) % (2 * _PI) - _PI
     short = np.float32(turned)
-    return _BELOW_PI if short > _BELOW_PI else -_BELOW_PI if short < -_BELOW_PI else short
+    if short > _BELOW_PI:
+        return _BELOW_PI
+    if short < -_BELOW_PI:
+        return -_BELOW_PI
+    return short

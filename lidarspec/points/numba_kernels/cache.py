@@ -131,7 +131,9 @@ def _key(folder: Path) -> bytes | None:
     """The key of a folder; None where it has none, or not a whole one that is its user's alone."""
     with contextlib.suppress(OSError):
         key = _read(folder / "key")
-        return key if len(key) == SIZE else None
+        if len(key) == SIZE:
+            return key
+        return None
     return None
 
 

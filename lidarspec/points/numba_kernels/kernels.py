@@ -125,7 +125,8 @@ def _flat(array: NDArray[Any], shape: tuple[int, ...]) -> tuple[NDArray[np.float
     The second value is 0 if all packets share the numbers.
     """
     full = (len(array), *shape)
-    array = array if array.shape == full else np.broadcast_to(array, full)
+    if array.shape != full:
+        array = np.broadcast_to(array, full)
     return np.ascontiguousarray(array, np.float64).reshape(-1), math.prod(shape) if len(
         array
     ) > 1 else 0

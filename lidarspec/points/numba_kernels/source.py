@@ -135,7 +135,9 @@ class Expressions(Writer):
             chain = "".join(
                 f"{part.text} if i{depth} == {at} else " for at, part in enumerate(parts[:-1])
             )
-            return self.let(2 + depth, f"{chain}{parts[-1].text}") if len(parts) > 1 else parts[0]
+            if len(parts) > 1:
+                return self.let(2 + depth, f"{chain}{parts[-1].text}")
+            return parts[0]
         if len(node.shape) != depth:
             return self.given(node)
         if isinstance(node.function, LookUp) and len(node.function.entries):
@@ -170,7 +172,9 @@ class Expressions(Writer):
             }
             return logical.get(node.function)
         found = TEMPLATES.get(node.function)
-        return found if found is not None and found.count("{}") == len(node.args) else None
+        if found is not None and found.count("{}") == len(node.args):
+            return found
+        return None
 
     def _where(self, condition: Value, first: Value, second: Value) -> Value:
         level = max(condition.level, first.level, second.level)
@@ -264,7 +268,10 @@ class Expressions(Writer):
                 and leaf.info.bits < 32
                 and not leaf.info.offset
             )
-            sent = self.raw(leaf) if leaf is not None and is_short else None
+            if leaf is not None and is_short:
+                sent = self.raw(leaf)
+            else:
+                sent = None
             if leaf is not None and leaf.info.scaled and not raw:
                 scale = f" * np.float32({float(leaf.info.scale)!r})"
             else:
@@ -331,7 +338,9 @@ class Expressions(Writer):
         source = only_field(value)
         if source is not None and not is_cheap(value):
             found = self._small_angle(value, source, factor)
-            return found if found is not None else self._scaled(value, factor)
+            if found is not None:
+                return found
+            return self._scaled(value, factor)
         return self._sum(value, factor)
 
     def _sum(self, node: Node, factor: float) -> Value:
@@ -511,7 +520,10 @@ def _both(expressions: Iterable[Any]) -> set[Node]:
 
 def _made(writer: Expressions, plan: Plan, name: str, value: Any) -> Any:
     exact = plan.is_exact(name)
-    raw = writer.raw(plan.sent[name]) if name in plan.sent else None
+    if name in plan.sent:
+        raw = writer.raw(plan.sent[name])
+    else:
+        raw = None
     if name in plan.sent:
         made = raw or writer.double(value, len(writer.shape))
         return writer.let(made.level, f"np.{plan.extra[name].dtype}({made.text})")
@@ -528,7 +540,10 @@ def _function(
 ) -> str:
     """The signature and the loops."""
     width = writer.number(writer.width)
-    held = writer.number(max(CHUNK // writer.width, 1)) if turns else "count"
+    if turns:
+        held = writer.number(max(CHUNK // writer.width, 1))
+    else:
+        held = "count"
     loops = _loops(writer, width)
     wanted = writer.wanted
     parameters = [

@@ -101,12 +101,15 @@ def integer(leaf: Leaf, byte: Any) -> str | None:
     parts = []
     for part in element.segments:
         bits = byte(leaf.offset + part.byte)
-        bits = bits if part.mask == 0xFF else f"({bits} & {part.mask})"
+        if part.mask != 255:
+            bits = f"({bits} & {part.mask})"
         bits = f"({bits} >> {part.low})" if part.low else bits
         parts.append(f"({bits} << {part.target})" if part.target else bits)
     total = f"({' | '.join(parts)})"
     sign = 1 << (element.width - 1)
-    return f"(({total} ^ {sign}) - {sign})" if element.signed else total
+    if element.signed:
+        return f"(({total} ^ {sign}) - {sign})"
+    return total
 
 
 @dataclass(frozen=True)
@@ -338,7 +341,9 @@ class Writer:
                 f" np.uint32({mask}))",
             )
         text = integer(leaf, lambda offset: self.byte(leaf, offset).text)
-        return None if text is None else self.let(1 + last_axis(leaf.shape), text)
+        if text is None:
+            return None
+        return self.let(1 + last_axis(leaf.shape), text)
 
     def _float(self, leaf: Leaf) -> Value | None:
         if leaf.wire is None or leaf.wire.kind != "f" or leaf.wire.itemsize < 4:
@@ -361,7 +366,10 @@ class Writer:
             ("element", shape, leaf.strides),
             lambda: self.let(level, f"base + {self.strided(shape, self._strides(leaf))}"),
         )
-        place = str(offset) if self._stays(leaf) else self.number(offset)
+        if self._stays(leaf):
+            place = str(offset)
+        else:
+            place = self.number(offset)
         return self.once(  # type: ignore[no-any-return]
             (reader, shape, leaf.strides, offset),
             lambda: self.let(level, f"{reader}(rows, {steps.text} + {place})"),

@@ -71,6 +71,9 @@ def describe(plan: Plan) -> list[str]:
     lines.append(f"for each chunk of {program.chunk} packets, {len(tables)} tables:")
     outputs = {register: name for name, register in program.outputs.items()}
     for step in program.steps:
-        output = f"  -> {outputs[step.output]}" if step.output in outputs else ""
+        if step.output in outputs:
+            output = f"  -> {outputs[step.output]}"
+        else:
+            output = ""
         lines.append(f"  r{step.output:<3} {program.kinds[step.output]:<7} {step.text}{output}")
     return lines

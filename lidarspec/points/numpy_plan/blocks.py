@@ -56,7 +56,10 @@ class Blocks:
             self._base = min(*(leaf.offset for leaf in leaves), size - last - self._length)
         self._strides = strides[:-1]
         self._size = size
-        self.room = 0 if self.is_flat or self.is_long else math.prod(self.shape[:-1]) * self._length
+        if self.is_flat or self.is_long:
+            self.room = 0
+        else:
+            self.room = math.prod(self.shape[:-1]) * self._length
 
     def _regular(self, size: int, strides: tuple[int, ...]) -> bool:
         """Whether elements follow each other at one distance from frame to frame too."""

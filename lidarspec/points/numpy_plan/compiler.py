@@ -98,7 +98,10 @@ class Compiler:
         """Make a column of whole numbers of a field, as they were sent."""
         assert leaf.info.dtype is not None
         kind = f"{leaf.info.dtype.kind}{leaf.info.dtype.itemsize}"
-        register = self._cut_out(leaf, kind) if leaf.wire is None or self._is_shared(leaf) else None
+        if leaf.wire is None or self._is_shared(leaf):
+            register = self._cut_out(leaf, kind)
+        else:
+            register = None
         if register is None and leaf.wire is not None:
             register = self._load(leaf, Window(leaf.offset, leaf.size), leaf.wire, kind)
         if register is None:
@@ -161,7 +164,9 @@ class Compiler:
         if node.kind == "call" and (node.function is np.multiply or is_offset):
             first, second = (self._factor(arg) for arg in node.args)
             return self.program.call(node.function.__name__, "single", node.function, first, second)
-        return self._along_beams(node) if node.kind == "call" and node.function is np.add else None
+        if node.kind == "call" and node.function is np.add:
+            return self._along_beams(node)
+        return None
 
     def _along_beams(self, node: Node) -> int | None:
         """Return distances along beams: a sum of a product with rows and the start.
@@ -232,14 +237,23 @@ class Compiler:
         return self._once(("double", self._exact, value), lambda: self._full_double(value))
 
     def _full_double(self, node: Node) -> int:
-        kind = "flag" if node.sample.array.dtype.kind == "b" else "double"
-        register = self._gathered(node, kind) if node.kind == "rows" else self._of_field(node, kind)
+        if node.sample.array.dtype.kind == "b":
+            kind = "flag"
+        else:
+            kind = "double"
+        if node.kind == "rows":
+            register = self._gathered(node, kind)
+        else:
+            register = self._of_field(node, kind)
         if register is None and node.kind == "call":
             register = self._marked(node, kind)
             if register is None and not self._exact:
                 register = self._sum(node)
-            register = self._plain(node, kind) if register is None else register
-        return register if register is not None else self._spread(node, kind)
+            if register is None:
+                register = self._plain(node, kind)
+        if register is not None:
+            return register
+        return self._spread(node, kind)
 
     def _marked(self, node: Node, kind: str) -> int | None:
         """Return a value, or nan if a condition says so or there is no return.
@@ -313,10 +327,16 @@ class Compiler:
         )
 
         def run(execution: Run, out: NDArray[Any]) -> None:
-            measured = read(execution) if is_positive else np.maximum(read(execution), 0, out=out)
+            if is_positive:
+                measured = read(execution)
+            else:
+                measured = np.maximum(read(execution), 0, out=out)
             np.divide(measured, measured, out=out)
             np.multiply(out, read(execution), out=out)
-            flags = execution.part(execution.values(lost)) if lost is not None else _NONE
+            if lost is not None:
+                flags = execution.part(execution.values(lost))
+            else:
+                flags = _NONE
             if flags.any():
                 np.copyto(out.reshape(-1, *shape), np.nan, where=deep(flags, depth))
 
@@ -516,7 +536,10 @@ class Compiler:
             return word.register
 
         def run(execution: Run, out: NDArray[Any]) -> None:
-            bits = np.right_shift(word(execution), shift, out=out) if shift else word(execution)
+            if shift:
+                bits = np.right_shift(word(execution), shift, out=out)
+            else:
+                bits = word(execution)
             if is_masked:
                 np.bitwise_and(bits, mask, out=out)
 
@@ -604,7 +627,10 @@ class Compiler:
             return None
         self.low.append(index)
         number = len(table) - 1
-        times = 1 + -(-self.program.most * index.width // number) if number else 1
+        if number:
+            times = 1 + -(-self.program.most * index.width // number)
+        else:
+            times = 1
         times = times if times <= TURNS else 1
         rows = self._once(
             ("rows", id(table), kind),

@@ -446,7 +446,9 @@ class Turns:
             ),
             (number, self._outer),
         )
-        return rows.reshape(-1) if self._groups == 1 else rows.T.reshape(-1)
+        if self._groups == 1:
+            return rows.reshape(-1)
+        return rows.T.reshape(-1)
 
     def angles(self) -> Floats:
         """The angles of the rows that are wide, (rows, inner) radians."""
@@ -479,7 +481,9 @@ def product_of(node: Node, shape: tuple[int, ...]) -> Product | None:
     Returns None if there is none, or if a term with a value for each point has a row as its factor.
     """
     low, full = split(node, math.prod(shape))
-    return None if any(part.row.ndim for part in full) else Product.of(low, shape)
+    if any(part.row.ndim for part in full):
+        return None
+    return Product.of(low, shape)
 
 
 def angles_of(node: Node, shape: tuple[int, ...], leaves: Mapping[str, Leaf]) -> Angles | None:
@@ -512,4 +516,6 @@ def _every(value: Any, leaves: Mapping[str, Leaf]) -> Floats:
     if not isinstance(value, Node):
         return np.array([value])
     values = possible(value, leaves)
-    return np.array([np.inf]) if values is None else values
+    if values is None:
+        return np.array([np.inf])
+    return values

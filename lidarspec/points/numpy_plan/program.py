@@ -42,7 +42,9 @@ class Run:
 
     def part(self, array: NDArray[Any]) -> NDArray[Any]:
         """The chunk's packets of values that each packet has, or that all share."""
-        return array[self.start : self.stop] if len(array) > 1 else array
+        if len(array) > 1:
+            return array[self.start : self.stop]
+        return array
 
 
 @dataclass(frozen=True, eq=False)

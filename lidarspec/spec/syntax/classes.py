@@ -241,7 +241,9 @@ class Limited(Subconstruct):  # type: ignore[misc]
     def _parse(self, stream: Any, context: Any, path: str) -> Any:
         start = stream.tell()
         obj = self.subcon._parsereport(stream, context, path)
-        return self._held(obj, start, path) if verifying(context, "values") else obj
+        if verifying(context, "values"):
+            return self._held(obj, start, path)
+        return obj
 
     def _build(self, obj: Any, stream: Any, context: Any, path: str) -> Any:
         return self._held(self.subcon._build(obj, stream, context, path), 0, path)
@@ -256,7 +258,9 @@ class HeldCheck(construct.Check):  # type: ignore[misc]
     """A Check that can be read unchecked."""
 
     def _parse(self, stream: Any, context: Any, path: str) -> Any:
-        return super()._parse(stream, context, path) if verifying(context, "values") else None
+        if verifying(context, "values"):
+            return super()._parse(stream, context, path)
+        return None
 
 
 class _Compared:
@@ -286,7 +290,10 @@ def _allowed(con: construct.Validator) -> tuple[int, ...] | None:
     ):
         return None
     width = bit_width(field)
-    signed = field.fmtstr[-1].islower() if isinstance(field, FormatField) else field.signed
+    if isinstance(field, FormatField):
+        signed = field.fmtstr[-1].islower()
+    else:
+        signed = field.signed
     low, high = (-(1 << (width - 1)), (1 << (width - 1)) - 1) if signed else (0, (1 << width) - 1)
     with contextlib.suppress(
         Exception
@@ -334,7 +341,9 @@ class ExactFloat(FormatField):  # type: ignore[misc]
     def _parse(self, stream: Any, context: Any, path: str) -> Any:
         raw = construct.stream_read(stream, self.length, path)
         value = struct.unpack(self.fmtstr, raw)[0]
-        return WireNaN(raw) if math.isnan(value) else value
+        if math.isnan(value):
+            return WireNaN(raw)
+        return value
 
     def _build(self, obj: Any, stream: Any, context: Any, path: str) -> Any:
         if isinstance(obj, WireNaN) and len(obj.raw) == self.length:
@@ -520,7 +529,9 @@ class Pieces(construct.ListContainer):  # type: ignore[misc]
         return sum(end - start for _, start, end in self.spans)
 
     def __getitem__(self, key: Any) -> Any:
-        return self.size if key == "size" else super().__getitem__(key)
+        if key == "size":
+            return self.size
+        return super().__getitem__(key)
 
 
 class Partition(Construct):  # type: ignore[misc]
@@ -550,7 +561,9 @@ def verifying(context: Any, what: str = "constants") -> bool:
     them checks those before it.
     """
     wanted = context._params.get("_verify", True)
-    return LEVELS.index(what) <= LEVELS.index(wanted) if isinstance(wanted, str) else bool(wanted)
+    if isinstance(wanted, str):
+        return LEVELS.index(what) <= LEVELS.index(wanted)
+    return bool(wanted)
 
 
 #: construct's classes -> those that stand in for them.
@@ -576,7 +589,9 @@ def prepare(con: Construct, limit: int = sys.maxsize, *, in_bits: bool = False) 
         in_bits: whether it stands within a bit block.
     """
     if isinstance(con, FormatField):
-        return ExactFloat(con.fmtstr[0], con.fmtstr[-1]) if con.fmtstr[-1] in "efd" else con
+        if con.fmtstr[-1] in "efd":
+            return ExactFloat(con.fmtstr[0], con.fmtstr[-1])
+        return con
     if isinstance(
         con, construct.Hex | construct.HexDump
     ):  # how a value is printed; it is the value below it
@@ -659,9 +674,14 @@ def _spelled_out(con: Construct) -> list[Construct]:
             )
             for one in members
         )
-        return [con] if len(members) == 1 else list(optional)
+        if len(members) == 1:
+            return [con]
+        return list(optional)
     if name and isinstance(inner, construct.Prefixed):
-        plus = inner.lengthfield.sizeof() if inner.includelength else 0
+        if inner.includelength:
+            plus = inner.lengthfield.sizeof()
+        else:
+            plus = 0
         length = construct.this[f"{name}_size"]
         if is_greedy(inner.subcon):
             content = Bounded(length - plus if plus else length, inner.subcon)
@@ -999,5 +1019,7 @@ def _random_leaf(con: Construct, source: random.Random, scope: Any) -> Any:
         return source.randint(0, source.choice(MANY))
     if isinstance(con, BitsInteger):
         value = source.getrandbits(con.length)
-        return value - (1 << con.length) if con.signed and value >> (con.length - 1) else value
+        if con.signed and value >> (con.length - 1):
+            return value - (1 << con.length)
+        return value
     return con.parse(source.randbytes(con.sizeof()))

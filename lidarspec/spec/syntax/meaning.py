@@ -80,7 +80,9 @@ def _traced(expression: Any, scope: tree.Scope) -> Any:
         if expression.op is operator.not_ and isinstance(operand, tree.Symbol):
             return tree.Symbol(tree.Op("not", (operand.formula,)))
         return expression.op(operand)
-    return expression(scope) if callable(expression) else expression
+    if callable(expression):
+        return expression(scope)
+    return expression
 
 
 def _spelled(expression: Any, path: str) -> str:
@@ -103,7 +105,12 @@ def _whole_path(path: str, way: re.Match[str]) -> str:
     """
     names = path.split(".")[:-1]
     for name in way[0].split(".")[1:]:
-        names = [] if name == "_root" else names[:-1] if name == "_" else [*names, name]
+        if name == "_root":
+            names = []
+        elif name == "_":
+            names = names[:-1]
+        else:
+            names = [*names, name]
     return ".".join(names)
 
 
@@ -116,7 +123,9 @@ class _Fields:
 
     def __getitem__(self, name: str) -> Any:
         if name == "_":
-            return _Fields(self._read, self._paths[1:]) if len(self._paths) > 1 else None
+            if len(self._paths) > 1:
+                return _Fields(self._read, self._paths[1:])
+            return None
         if name == "_root":
             return _Fields(self._read, self._paths[-1:])
         value = self._read(f"{self._paths[0]}.{name}" if self._paths[0] else name)
@@ -132,7 +141,9 @@ def seen(info: tree.FieldInfo, raw: int) -> Any:
     """A raw value as the expressions of a struct see it: where construct's Enum has a name for it,
     that name.
     """
-    return construct.EnumIntegerString.new(raw, info.labels[raw]) if raw in info.labels else raw
+    if raw in info.labels:
+        return construct.EnumIntegerString.new(raw, info.labels[raw])
+    return raw
 
 
 def unnamed(raw: int) -> Any:
@@ -224,7 +235,9 @@ class _Builder:
             return self._check(inner, place)
         if inner is construct.Error:
             return tree.Never(name)
-        return tree.Empty(name) if inner is construct.Pass else self._leaf(inner, place)
+        if inner is construct.Pass:
+            return tree.Empty(name)
+        return self._leaf(inner, place)
 
     def _peeled(self, con: Construct, place: _Place) -> tuple[Construct, _Place]:
         """What is below the wrappers that only describe (name, unit, labels, constant), and what
@@ -249,7 +262,10 @@ class _Builder:
                 place = place.inside(rebuilt=self._measuring(con, place), held=True)
             elif isinstance(con, construct.Rebuild):
                 self.rebuilding = True
-                known = None if place.scope is None else self._known.get(place.scope.path)
+                if place.scope is None:
+                    known = None
+                else:
+                    known = self._known.get(place.scope.path)
                 place = place.inside(rebuilt=self._formula(con.func, place, known))
             elif isinstance(con, construct.Default):
                 place = place.inside(default=self._default(con.value, place))
@@ -259,7 +275,9 @@ class _Builder:
 
     def _default(self, value: Any, place: _Place) -> Any:
         """Return the value of a construct Default: itself, or a formula of a function."""
-        return self._formula(value, place) if callable(value) else value
+        if callable(value):
+            return self._formula(value, place)
+        return value
 
     def _formula(
         self,
@@ -317,7 +335,9 @@ class _Builder:
         path = place.info.path
 
         def function(read: tree.Read) -> Any:
-            return expression(_Fields(read, ways)) if callable(expression) else expression
+            if callable(expression):
+                return expression(_Fields(read, ways))
+            return expression
 
         return tree.Code(
             function,
@@ -363,7 +383,10 @@ class _Builder:
         self._measured[scope] = []
         for child in con.subcons:
             path = ".".join(part for part in (info.path, child.name) if part)
-            default = info.default.get(child.name) if isinstance(info.default, dict) else None
+            if isinstance(info.default, dict):
+                default = info.default.get(child.name)
+            else:
+                default = None
             said = tree.FieldInfo(
                 path,
                 info.axes,
@@ -406,7 +429,9 @@ class _Builder:
         number = self._formula(con.modulus if con.to is None else con.to, place)
         if con.to is not None:
             return tree.joined("-", number, size)
-        return size if size is None else tree.calculated("%", tree.calculated("-", size), number)
+        if size is None:
+            return size
+        return tree.calculated("%", tree.calculated("-", size), number)
 
     def _measuring(self, con: Sizing, place: _Place) -> tree.Formula | None:
         """What a part will add up to, once it is known."""
@@ -504,7 +529,9 @@ class _Builder:
         condition = self._formula(con.func, place)
         info = place.info
         if isinstance(condition, int):
-            return tree.Empty(place.name) if condition else tree.Never(place.name)
+            if condition:
+                return tree.Empty(place.name)
+            return tree.Never(place.name)
         try:
             asked = [
                 ref
@@ -541,7 +568,10 @@ class _Builder:
                 (body,),
             )
         prefix = f"{place.info.path}." if place.info.path else ""
-        over = (prefix + con.over[0], prefix + con.over[-1]) if con.over is not None else None
+        if con.over is not None:
+            over = (prefix + con.over[0], prefix + con.over[-1])
+        else:
+            over = None
         return tree.Sealed(
             body,
             tuple(prefix + name for name in con.fields),
@@ -752,7 +782,10 @@ def _typed(con: Construct, info: tree.FieldInfo) -> tree.FieldInfo:
         )
     if isinstance(con, BytesInteger | BitsInteger) and isinstance(con.length, int):
         bits = con.length * (8 if isinstance(con, BytesInteger) else 1)
-        dtype = integer_type(bits, signed=bool(con.signed)) if bits <= 64 else None
+        if bits <= 64:
+            dtype = integer_type(bits, signed=bool(con.signed))
+        else:
+            dtype = None
         return replace(info, dtype=dtype, kind="int" if dtype is not None else "other", bits=bits)
     if isinstance(con, type(construct.Flag)):
         return replace(info, dtype=np.dtype("u1"), kind="int", bits=1)

@@ -124,7 +124,8 @@ def _check_ends(con: Construct, path: str, *, bounded: bool) -> None:
     """Refuse what has no end on a stream: greedy parts, unless they are the last in one that has an
     end; and what such a one would drop.
     """
-    path = f"{path}.{con.name}".strip(".") if isinstance(con, construct.Renamed) else path
+    if isinstance(con, construct.Renamed):
+        path = f"{path}.{con.name}".strip(".")
     if isinstance(con, GREEDY) and not bounded:
         if con is construct.GreedyBytes:
             kind = type(con)
@@ -139,7 +140,10 @@ def _check_ends(con: Construct, path: str, *, bounded: bool) -> None:
         raise SpecError(reason, path=path, rule="LS111")
     below = children(con)
     for child in below:
-        passes = bounded and child is below[-1] if isinstance(con, Struct) else bounded
+        if isinstance(con, Struct):
+            passes = bounded and child is below[-1]
+        else:
+            passes = bounded
         _check_ends(
             child,
             path,
@@ -149,7 +153,10 @@ def _check_ends(con: Construct, path: str, *, bounded: bool) -> None:
     is_sized = isinstance(con, construct.FixedSized)
     fits = is_sized and isinstance(con.length, int) and fixed_size(con.subcon) == con.length
     if isinstance(con, _BOUNDED) and not fits and not _fills(con.subcon, padded=is_sized):
-        name = "Prefixed" if isinstance(con, Bounded) else type(con).__name__
+        if isinstance(con, Bounded):
+            name = "Prefixed"
+        else:
+            name = type(con).__name__
         if isinstance(con, Bounded | construct.NullTerminated):
             named = ""
         else:
@@ -176,7 +183,10 @@ def _check_names(struct: Struct, path: str, *, in_bits: bool) -> None:
     seen: set[str] = set()
     for child in struct.subcons:
         name = child.name
-        place = f"{path}.{name}" if path else str(name)
+        if path:
+            place = f"{path}.{name}"
+        else:
+            place = str(name)
         if isinstance(child, construct.Padded):
             continue  # refused on its own, and with a better reason
         if name is None:
@@ -218,7 +228,10 @@ def _check_measures(
     one of each.
     """
     if isinstance(con, construct.Renamed):
-        path = f"{path}.{con.name}" if path else str(con.name)
+        if path:
+            path = f"{path}.{con.name}"
+        else:
+            path = str(con.name)
         measure = (1, 0, "")
     if isinstance(con, Describing):
         said = con.described(tree.FieldInfo(""))

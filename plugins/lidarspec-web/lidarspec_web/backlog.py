@@ -246,7 +246,10 @@ class Backlog:
             shift = part.offset - piece.offset
             rows += [row.to_dict() | {"offset": row.offset + shift} for row in explanation.rows]
         notes = [note for explanation in frames for note in explanation.notes]
-        first = frames[0] if frames else Explanation(self.sensor.id, "", piece.data, ())
+        if frames:
+            first = frames[0]
+        else:
+            first = Explanation(self.sensor.id, "", piece.data, ())
         return first.to_dict() | {"size": len(piece.data), "notes": notes, "rows": rows}
 
     def _drop_old(self) -> None:

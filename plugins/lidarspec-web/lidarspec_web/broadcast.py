@@ -152,7 +152,9 @@ class Broadcast:
             return self.device.state
         if self._feed.ended:
             return "ended"
-        return "paused" if self.paused else "playing"
+        if self.paused:
+            return "paused"
+        return "playing"
 
     @property
     def has_ended(self) -> bool:
@@ -172,7 +174,9 @@ class Broadcast:
 
         It is 0 if the time is not known.
         """
-        return 0 if self._first_scan is None else self._first_scan.host_ns
+        if self._first_scan is None:
+            return 0
+        return self._first_scan.host_ns
 
     def now(self) -> float:
         """Return the time in seconds since 1970, by the clock that stamps arrivals."""

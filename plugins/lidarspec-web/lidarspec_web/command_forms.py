@@ -45,7 +45,9 @@ def _group(sensor: Sensor, name: str) -> str:
     command = sensor.commands[name]
     if command.starts or command.stops:
         return "switch"
-    return "ask" if name.startswith("get_") else "set"
+    if name.startswith("get_"):
+        return "ask"
+    return "set"
 
 
 def _argument(sensor: Sensor, name: str, argument: str) -> dict[str, Any]:

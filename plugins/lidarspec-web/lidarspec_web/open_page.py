@@ -179,7 +179,9 @@ class OpenPage:
         has_ended = self._broadcast.has_ended
         is_new = has_ended and not self._sent_end
         self._sent_end = has_ended
-        return {"is": "ended", "text": self._broadcast.ending} if is_new else None
+        if is_new:
+            return {"is": "ended", "text": self._broadcast.ending}
+        return None
 
     async def _frame_message(self) -> dict[str, Any] | None:
         if not self._shows_frames:

@@ -212,7 +212,9 @@ def _link_host(host: str) -> str:
     """Return the host in the link to a server that listens at an address."""
     if host in ANY_ADDRESS:
         return socket.gethostname()
-    return f"[{host}]" if ":" in host else host
+    if ":" in host:
+        return f"[{host}]"
+    return host
 
 
 def _listen(host: str, port: int) -> socket.socket:

@@ -84,12 +84,16 @@ class SourceServer:
     @property
     def recordings(self) -> Sequence[tuple[str, int]]:
         """Path of each recording that pages have made, and the bytes of the wire in it."""
-        return () if self.switch is None else self.switch.written
+        if self.switch is None:
+            return ()
+        return self.switch.written
 
     @property
     def trouble(self) -> str:
         """The reason why the last recording could not be started or written, "" if it could."""
-        return "" if self.switch is None else self.switch.trouble
+        if self.switch is None:
+            return ""
+        return self.switch.trouble
 
     def opening_page(self) -> str:
         """Return the URL of a file that leads to the link, to start a browser with.
